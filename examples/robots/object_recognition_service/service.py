@@ -33,11 +33,15 @@ _sift = cv2.SIFT_create(nfeatures=2000)
 
 
 class Request(msgspec.Struct):
-    """An undistorted ``image`` (JPEG or PNG), ``camera`` (fx, fy, cx, cy in px), and the size of the tags."""
+    """An undistorted ``image`` (JPEG or PNG), ``camera`` (fx, fy, cx, cy in px), and the size of the tags.
+
+    With ``tags_only`` no object is looked for, which is many times faster.
+    """
 
     image: bytes
     camera: Array
     tag_m: float = 0.1
+    tags_only: bool = False
 
 
 class Found(msgspec.Struct):
@@ -87,6 +91,8 @@ def serve(request: Request) -> Reply:
         raise BadRequest("not an image of at most 2000 px a side", hint="send JPEG or PNG bytes")
     fx, fy, cx, cy = request.camera
     K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    if request.tags_only:
+        return Reply(found=_tags(image, K, request.tag_m))
     keypoints, descriptors = _sift.detectAndCompute(image, None)
     found = [_object(model, keypoints, descriptors, K) for model in _models]
     return Reply(found=[each for each in found if each is not None] + _tags(image, K, request.tag_m))

@@ -1,0 +1,729 @@
+/**
+ * RSE-PF for browsers, web workers and Node: one robot, connected to the backend servers of a platform.
+ *
+ * The rules are those of docs/protocol.md; its section is named where a rule is applied.  The module has no
+ * dependencies, stores nothing and writes nothing to the console.  Inside, times are seconds of a clock that
+ * never jumps; names that begin with `_` are internal, and the minifier may shorten them.
+ */
+
+const FIRST_TRIES = 4;
+const PING_S = 2;
+const PONG_S = 3;
+const ANSWER_S = 5;
+const MAX_DEADLINE_MS = 3.6e6;
+const MAX_INFLATED_BYTES = 1 << 20;
+const MAX_BUFFERED_BYTES = 1 << 16;
+const MAX_PUT_BYTES = 1 << 18;
+const MAX_PART_BYTES = 1 << 20;
+const MAX_BAD_MESSAGES = 10;
+const MAX_RETRIES = 5;
+// A client that uses a little less than its limits is not refused when a network bunches messages.
+const SHARE = 0.9;
+
+const { min, max } = Math;
+const now = () => performance.now() / 1e3;
+const pause = (s) => new Promise((done) => setTimeout(done, s * 1e3));
+const nothing = () => {};
+/** Call a program's function so that its errors cannot disturb the session. */
+const later = (call, ...words) => queueMicrotask(() => call(...words));
+
+/** An error with a stable code of docs/protocol.md, section 5. */
+export class RsePfError extends Error {
+  constructor(code, message, hint = "", more = {}) {
+    super(message);
+    const { retry_after_ms: retryAfterMs = null, server = "", trace = "" } = more;
+    Object.assign(this, { name: "RsePfError", code, hint, retryAfterMs, server, trace });
+  }
+}
+
+const wrong = (...words) => new RsePfError(...words);
+const told = (failure) => wrong(failure.code, failure.message, failure.hint, failure);
+const unreadable = (message) => wrong("protocol", message, "is it an RSE-PF server?");
+const cancelled = () => wrong("cancelled", "the robot took the command back");
+const unauthorized = () =>
+  wrong("unauthorized", "the token is missing, wrong, expired or revoked", "connect with a fresh token");
+
+// --- codecs (section 1) ----------------------------------------------------------------------------------
+
+/** Return *data* after a compression stream; throws if that is more than *limit* bytes. */
+const through = async (stream, data, limit) => {
+  const writer = stream.writable.getWriter();
+  const reader = stream.readable.getReader();
+  // The reader throws the same errors.
+  writer.write(data).catch(nothing);
+  writer.close().catch(nothing);
+  let whole = new Uint8Array();
+  for (let step; !(step = await reader.read()).done; ) {
+    const joined = new Uint8Array(whole.length + step.value.length);
+    joined.set(whole);
+    joined.set(step.value, whole.length);
+    whole = joined;
+    if (whole.length > limit) {
+      reader.cancel().catch(nothing);
+      throw unreadable("a message is too large");
+    }
+  }
+  return whole;
+};
+
+/** Name -> how the text of a message becomes the content of a WebSocket message, and how that is read. */
+export const codecs = {
+  json: { encode: (text) => text, decode: JSON.parse },
+  "json+zlib": {
+    encode: (text) => through(new CompressionStream("deflate"), new TextEncoder().encode(text)),
+    decode: async (data) => {
+      const bytes = await through(new DecompressionStream("deflate"), data, MAX_INFLATED_BYTES);
+      return JSON.parse(new TextDecoder("utf-8", { fatal: true }).decode(bytes));
+    },
+  },
+};
+
+/** Bytes are base64, arrays of numbers are lists (section 2). */
+const plain = (_, value) =>
+  value instanceof Uint8Array
+    ? btoa(Array.from(value, (byte) => String.fromCharCode(byte)).join(""))
+    : ArrayBuffer.isView(value) ? Array.from(value) : value;
+
+const rounded = (values, scale) => Array.from(values, (value) => Math.round(value * scale) / scale);
+
+const sha256 = async (bytes) => {
+  if (!globalThis.crypto?.subtle) {
+    throw wrong("unsupported", "this page may not compute sha256", "serve it by https or from localhost");
+  }
+  const found = new Uint8Array(await crypto.subtle.digest("SHA-256", bytes));
+  return Array.from(found, (byte) => byte.toString(16).padStart(2, "0")).join("");
+};
+
+// --- a connection ----------------------------------------------------------------------------------------
+
+/** Return how many messages may be sent on *link* (section 4, "Rate"); adds what *time* has brought. */
+const allowance = (link, time) => {
+  const { max_commands_per_s: rate, command_burst: burst } = link._limits;
+  if (!rate) return Infinity;
+  const fresh = max(0, time - link._filledAt);
+  link._left = min(max(1, burst * link._share), link._left + fresh * rate * link._share);
+  link._filledAt += fresh;
+  return Math.floor(link._left);
+};
+
+/** Return whether the claims of a token say that it has expired; one that cannot be read has not. */
+const isExpired = (token) => {
+  try {
+    return JSON.parse(atob(token.split(".")[1].replace(/-/g, "+").replace(/_/g, "/"))).exp * 1e3 < Date.now();
+  } catch {
+    return false;
+  }
+};
+
+const bearer = (token) => (token ? { Authorization: "Bearer " + token } : {});
+
+const BROKEN = ["protocol", "the server says that this client breaks the protocol"];
+/** Close codes after which a robot does not connect again (section 6): code and sentence of its error. */
+const FINAL = {
+  1002: BROKEN,
+  1007: BROKEN,
+  1008: BROKEN,
+  1009: ["too-large", "a message is too large or in too many pieces"],
+  4400: BROKEN,
+  4406: ["unsupported", "the server speaks another version", "update rse-pf.js"],
+  4409: ["conflict", "another connection of this robot replaced this one", "give every robot its own token"],
+};
+
+/** Connect a robot: resolves at the first Welcome, rejects with an RsePfError; see rse-pf.d.ts. */
+export const connect = async (url, options = {}) => {
+  const {
+    codec = "json+zlib", tokenIn = "protocol", sdk = "rse-pf-js/0.3.0", onChange = nothing, connectTimeoutMs = 4000,
+    stallTimeoutMs = 1000, dataUrl = url.replace(/^ws/, "http"), WebSocket = globalThis.WebSocket,
+  } = options;
+  const { encode, decode } = codecs[codec] || {};
+  if (!encode) throw wrong("usage", `no codec named ${codec}`, `choose ${Object.keys(codecs)}`);
+  if (!WebSocket) throw wrong("unsupported", "there is no WebSocket here", "use Node 22 or newer");
+  const stallS = stallTimeoutMs / 1e3;
+  const links = new Set();
+  const pending = new Map();
+  const subscriptions = new Map();
+  const sequences = { __proto__: null };
+  const delivered = { __proto__: null };
+  const counts = { sent: 0, answered: 0, resent: 0, reconnects: 0, moves: 0, bytesUp: 0, bytesDown: 0 };
+  let { token } = options;
+  let current = null;
+  let lastId = 0;
+  let timer;
+  let timerAt = Infinity;
+  let attempt = 0;
+  let adoptedAt = -Infinity;
+  let notBefore = 0;
+  let isKeeping = false;
+  let moving = null;
+  let moveUntil;
+  let lateUntil = 0;
+  let share = SHARE;
+  let retries = MAX_RETRIES;
+  let renewal = null;
+  let error = null;
+  let roundTripMs = null;
+
+  // --- connect, reconnect, move --------------------------------------------------------------------------
+
+  const freshToken = async () => String((typeof token === "function" ? await token() : token) || "").trim();
+
+  /** Open a WebSocket; resolves at its Welcome. */
+  const dial = async () => {
+    const used = await freshToken();
+    const protocol = "rse-pf.v1." + codec;
+    const time = now();
+    const link = {
+      _token: used, _welcome: null, _limits: {}, _share: share, _left: 0, _filledAt: time, _heardAt: time, _checkedAt: time,
+      _pingedAt: -Infinity, _unansweredAt: null, _renewAt: Infinity, _outgoing: null, _incoming: null, _bad: 0,
+    };
+    let socket;
+    try {
+      socket = new WebSocket(
+        url,
+        !used ? protocol
+        : tokenIn === "header" ? { protocols: protocol, headers: bearer(used) }
+        : [protocol, "rse-pf.token." + used],
+      );
+    } catch (failed) {
+      // Its message may contain the token.
+      throw finally_(wrong("usage", "no WebSocket for this address and token: " + failed.name, "wss: from https pages"));
+    }
+    link._socket = socket;
+    links.add(link);
+    socket.binaryType = "arraybuffer";
+    return new Promise((resolve, reject) => {
+      const timeout = setTimeout(() => {
+        lateUntil = now() + 60;
+        lose(link, unreadable("no Welcome"));
+      }, connectTimeoutMs);
+      link._settle = (failed) => {
+        clearTimeout(timeout);
+        failed ? reject(failed) : resolve(link);
+      };
+      socket.onopen = () =>
+        socket.protocol === protocol
+          ? say(link, { type: "hello", sdk, capabilities: ["progress", "updates"] })
+          : lose(link, finally_(unreadable("the server does not speak " + protocol)));
+      socket.onmessage = (event) => hear(link, event.data);
+      socket.onerror = nothing; // the close event follows
+      socket.onclose = (event) => closed(link, event.code);
+    });
+  };
+
+  /** Mark an error as one after which the robot does not connect again. */
+  const finally_ = (failed) => Object.assign(failed, { _isFinal: true });
+
+  const closed = async (link, code) => {
+    const isUsed = link === current || !current;
+    // A browser does not say why a handshake failed.
+    if (code === 4401 || code === 4403 || (!link._welcome && (isExpired(link._token) || (await isRefused(link._token))))) {
+      const isSame = code === 4403 || (typeof token !== "function" && token === link._token);
+      return lose(link, isUsed && isSame ? finally_(unauthorized()) : unauthorized());
+    }
+    if (code === 4429) {
+      share = max(0.1, share / 2);
+      notBefore = now() + 5;
+    }
+    const failed = wrong(...(FINAL[code] || ["connect", "the connection ended with " + code, "is it running, and is the token valid?"]));
+    // An attempt that was given up may still replace the connection that came after it.
+    const isOwn = code === 4409 && (moving || now() < lateUntil);
+    lose(link, FINAL[code] && isUsed && !isOwn ? finally_(failed) : failed);
+  };
+
+  /** Ask why a handshake failed, where the answer may be read: in Node, and in pages of the same origin. */
+  const isRefused = async (used) => {
+    const address = new URL(url.replace(/^ws/, "http"));
+    if (globalThis.location && location.host !== address.host) return false;
+    try {
+      return (await fetch(address, { headers: bearer(used), signal: AbortSignal.timeout(1e3) })).status === 401;
+    } catch {
+      return false;
+    }
+  };
+
+  /** Keep one connection: reconnect with full jitter, and make before break (section 4, "Moving"). */
+  const keep = async () => {
+    if (isKeeping) return;
+    isKeeping = true;
+    if (moving || now() - adoptedAt > 1) attempt = 0;
+    while (!error && (!current || moving === current)) {
+      const longest = min(1, 0.1 * 2 ** min(9, attempt++));
+      await pause(max(0, notBefore - now()) + Math.random() * longest);
+      if (error) break;
+      if (moving && now() > moveUntil) moving = null;
+      else {
+        try {
+          const link = await dial();
+          const isBetter = !current || (current === moving && link._welcome.server !== current._welcome.server);
+          isBetter && !error ? adopt(link) : leave(link);
+        } catch (failed) {
+          if (failed._isFinal || (adoptedAt < 0 && attempt >= FIRST_TRIES)) {
+            end(failed instanceof RsePfError ? failed : wrong("connect", "no token: " + failed.name, "correct its function"));
+          }
+        }
+      }
+    }
+    moving = null;
+    isKeeping = false;
+  };
+
+  const adopt = (link) => {
+    if (!links.has(link)) return;
+    const before = current;
+    const isFirst = adoptedAt < 0;
+    current = link;
+    adoptedAt = now();
+    if (before) {
+      before._isLeaving = true;
+      counts.moves++;
+      // A job continues on any server, so the old connection can close now.
+      for (const each of pending.values()) if (each._isLong && !each._isCancelled) each._link = null;
+    } else if (!isFirst) counts.reconnects++;
+    for (const each of subscriptions.values()) ask(each);
+    renewal?.(); // this connection was opened with a token that is valid
+    tick();
+    if (!isFirst) later(onChange, before ? "moved" : "link-back", link._welcome.server);
+  };
+
+  const leave = (link) => lose(link, wrong("disconnected", "the robot left this connection"));
+
+  /** Forget a connection; its commands wait for the next one. */
+  const lose = (link, failed) => {
+    if (!links.delete(link)) return;
+    const { _socket: socket } = link;
+    socket.onopen = socket.onmessage = socket.onclose = null;
+    socket.close(1000);
+    for (const each of pending.values()) {
+      if (each._link !== link) continue;
+      each._link = null;
+      if (each._isCancelled && !each._isLong) pending.delete(each._id);
+    }
+    link._settle(failed);
+    const wasCurrent = link === current;
+    if (wasCurrent) current = null;
+    if (failed._isFinal) end(failed);
+    if (wasCurrent && !error) {
+      later(onChange, "link-lost", failed.message);
+      keep();
+    }
+  };
+
+  const end = (failed) => {
+    if (error) return;
+    error = failed;
+    clearTimeout(timer);
+    for (const each of pending.values()) settle(each, failed);
+    for (const each of subscriptions.values()) later(each._onEnd, failed);
+    for (const link of [...links]) lose(link, failed);
+    later(onChange, "ended", failed.message);
+  };
+
+  // --- messages ------------------------------------------------------------------------------------------
+
+  const say = (link, message) => send(link, JSON.stringify(message));
+
+  /** Write a message after those before it; its *command*, if any, ends if it is too large. */
+  const send = async (link, text, command) => {
+    link._left--;
+    const data = encode(text);
+    const before = link._outgoing;
+    const written = (async () => {
+      await before;
+      write(link, data.then ? await data : data, text, command);
+    })();
+    link._outgoing = written;
+  };
+
+  const write = (link, data, text, command) => {
+    const size = data.byteLength ?? data.length;
+    if (command && (size > link._limits.max_message_bytes || text.length > MAX_INFLATED_BYTES)) {
+      settle(command, wrong("too-large", `a command of ${size} bytes is above the limit`, "upload large data, and name its digest"));
+    } else if (links.has(link)) {
+      counts.bytesUp += size;
+      link._socket.send(data);
+    }
+  };
+
+  const hear = (link, data) => {
+    link._heardAt = now();
+    counts.bytesDown += data.byteLength ?? data.length;
+    const before = link._incoming;
+    link._incoming = (async () => {
+      let message;
+      try {
+        message = await decode(data);
+      } catch {
+        // Counted below, after the messages before it.
+      }
+      await before;
+      try {
+        receive(link, message);
+      } catch {
+        if (++link._bad > MAX_BAD_MESSAGES) lose(link, unreadable("messages that cannot be read"));
+      }
+    })();
+  };
+
+  const receive = (link, message) => {
+    if (!links.has(link)) return;
+    const time = now();
+    const { type, id } = message;
+    const each = pending.get(id);
+    const subscription = subscriptions.get(id);
+    const isHere = link === current;
+    if (type === "welcome") {
+      link._welcome = message;
+      link._limits = message.limits;
+      link._left = Infinity; // the burst, once it is bounded
+      expiresIn(link, message.token_s);
+      link._settle();
+    } else if (type === "pong") {
+      link._unansweredAt = null;
+      roundTripMs = (time - message.sent_s - (message.answered_s - message.received_s)) * 1e3;
+    } else if (type === "move") {
+      if (isHere) {
+        moving = link;
+        moveUntil = time + message.within_ms / 1e3;
+        keep();
+      }
+    } else if (type === "renewed") {
+      expiresIn(link, message.token_s);
+      renewal?.();
+    } else if (type === "update") {
+      if (isHere && subscription) later(subscription._onUpdate, message.key || "", message.payload ?? null, message.seq);
+    } else if (type === "progress") {
+      if (each?._link === link) progress(each, message);
+    } else if (type === "failure") {
+      if (id == null) notice(link, message, time);
+      else if (subscription && isHere) {
+        subscriptions.delete(id);
+        later(subscription._onEnd, told(message));
+      } else if (each?._link === link && !again(each, message, time)) settle(each, told(message));
+    } else if (type === "result") {
+      if (each) answer(each, message, time);
+    } else throw type;
+    flush();
+  };
+
+  const answer = (each, message, time) => {
+    const { _stream: stream, _seq: seq } = each;
+    if (time >= each._until) settle(each, expired(each, time));
+    else if (stream && !each._keep && seq < delivered[stream]) settle(each, wrong("stale", "a newer answer came first"));
+    else {
+      if (!each._isCancelled) delivered[stream] = max(seq, delivered[stream] || 0);
+      const { reply = null, object = "", server = "", queue_ms: queueMs = 0, compute_ms: computeMs = 0 } = message;
+      settle(each, null, { id: each._id, reply, object, server, queueMs, computeMs, roundTripMs: (time - each._from) * 1e3 });
+    }
+  };
+
+  /** A failure of a message or of the session, not of one command. */
+  const notice = (link, message, time) => {
+    const failed = told(message);
+    if (message.code === "busy") {
+      link._left = 0;
+      link._filledAt = time + (message.retry_after_ms || 0) / 1e3;
+    }
+    renewal?.(failed);
+    if (!link._welcome) lose(link, message.code === "unsupported" ? finally_(failed) : failed);
+  };
+
+  /** Send again where another server or a later time may help (section 5); return whether that happens. */
+  const again = (each, { code, retry_after_ms: afterMs }, time) => {
+    const after = time + (afterMs || 0) / 1e3;
+    const isLost = code === "worker-lost" && each._losses++ < 2;
+    const isBusy = code === "busy" && after < each._until && retries >= 1;
+    if (each._isCancelled || !(isLost || isBusy)) return false;
+    if (isBusy) {
+      retries--;
+      each._notBefore = after;
+    }
+    each._link = null;
+    return true;
+  };
+
+  const progress = (each, message) => {
+    if (each._isCancelled) {
+      if (!each._isLong) cancelOnServer(each);
+    } else {
+      if (each._isDefault) each._until = Infinity;
+      if (each._onProgress) later(each._onProgress, min(1, max(0, message.done)), message.what || "");
+    }
+    each._isLong = true;
+  };
+
+  const cancel = (each) => {
+    if (each._isCancelled || each._isSettled) return;
+    if (each._isLong) cancelOnServer(each); // its answer says whether the job ended before
+    else giveUp(each, cancelled());
+    schedule();
+  };
+
+  /** End a command for its caller; it counts for the server until its answer comes. */
+  const giveUp = (each, failed) => {
+    const { _link: link } = each;
+    settle(each, failed);
+    if (!link) return;
+    pending.set(each._id, each);
+    each._isCancelled = true;
+    each._until = now() + ANSWER_S;
+    if (each._isLong) cancelOnServer(each);
+  };
+
+  const cancelOnServer = (each) => {
+    each._isCancelled = true;
+    each._until = now() + ANSWER_S;
+    if (each._link) say(each._link, { type: "cancel", id: each._id });
+  };
+
+  const expired = (each, time) => wrong("expired", `no answer within ${Math.round((time - each._from) * 1e3)} ms`);
+
+  const settle = (each, failed, result) => {
+    pending.delete(each._id);
+    if (each._isSettled) return;
+    each._isSettled = true;
+    counts.answered++;
+    each._signal?.removeEventListener("abort", each._cancel);
+    failed ? each._reject(failed) : each._resolve(result);
+  };
+
+  const ask = ({ _id: id, _topic: topic }) => current && say(current, { type: "subscribe", id, topic });
+
+  const expiresIn = (link, seconds) => {
+    if (seconds == null) return;
+    link._expiresAt = now() + seconds;
+    link._renewAt = now() + 0.8 * seconds;
+  };
+
+  // --- time ----------------------------------------------------------------------------------------------
+
+  /** Send the waiting commands, oldest first, as far as the server's limits allow. */
+  const flush = () => {
+    const time = now();
+    const needed = new Set();
+    let room = current ? allowance(current, time) : 0;
+    if (current) {
+      let inFlight = 0;
+      for (const each of pending.values()) if (each._link === current) inFlight++;
+      room = min(room, max(1, current._limits.max_in_flight) - inFlight);
+      // What does not leave the machine yet can still be replaced by a newer frame.
+      if (current._socket.bufferedAmount > MAX_BUFFERED_BYTES) room = 0;
+    }
+    for (const each of pending.values()) {
+      if (each._link && !each._isCancelled) needed.add(each._link);
+      if (each._link || time < each._notBefore || !current) continue;
+      if (each._stream && !each._keep && each._seq < sequences[each._stream]) {
+        settle(each, wrong("stale", "a newer frame took its place"));
+      } else if (room-- > 0) {
+        if (each._at) counts.resent++;
+        each._link = current;
+        each._at = time;
+        const left = max(0, min(MAX_DEADLINE_MS, (each._until - time) * 1e3));
+        send(current, `${each._head},"deadline_ms":${left},"payload":${each._payload}}`, each);
+        if (each._isCancelled) cancelOnServer(each);
+      }
+    }
+    for (const link of [...links]) if (link._isLeaving && !needed.has(link)) leave(link);
+    schedule();
+  };
+
+  const tick = () => {
+    timerAt = Infinity;
+    const time = now();
+    for (const each of pending.values()) {
+      if (time < each._until) continue;
+      if (each._isCancelled) settle(each, cancelled());
+      else giveUp(each, expired(each, time));
+    }
+    for (const link of [...links]) check(link, time);
+    flush();
+  };
+
+  /** Send a ping when one is due, and find lost connections (section 4, "A lost connection"). */
+  const check = (link, time) => {
+    if (!link._welcome) return;
+    // A program that did not run for a while cannot tell whether the server was silent in that time.
+    if (time - link._checkedAt >= stallS) {
+      link._heardAt = time;
+      link._unansweredAt &&= time;
+    }
+    link._checkedAt = time;
+    let first = Infinity;
+    for (const each of pending.values()) if (each._link === link && !each._isLong) first = min(first, each._at);
+    const isSilent = time - max(link._heardAt, first) >= stallS;
+    if (isSilent || time - (link._unansweredAt ?? time) >= PONG_S) {
+      return lose(link, wrong("connect", "the server does not answer"));
+    }
+    if (time - link._pingedAt >= (first < time ? min(PING_S, stallS / 3) : PING_S)) {
+      link._unansweredAt ??= time;
+      link._pingedAt = time;
+      say(link, { type: "ping", sent_s: time });
+    }
+    if (time >= link._renewAt && typeof token === "function") {
+      link._renewAt = time + max(1.5, (link._expiresAt - time) / 2);
+      // Without a token in time the server closes the connection, and the next attempt asks again.
+      freshToken().then((fresh) => links.has(link) && say(link, { type: "renew", token: fresh }), nothing);
+    }
+  };
+
+  /** Set the timer for what is due next. */
+  const schedule = () => {
+    const time = now();
+    let due = time + stallS / 3;
+    let isWaiting = false;
+    for (const each of pending.values()) {
+      due = min(due, each._until);
+      if (each._link) continue;
+      if (each._notBefore > time) due = min(due, each._notBefore);
+      else isWaiting = true;
+    }
+    if (isWaiting && current) {
+      if (allowance(current, time) < 1) {
+        due = min(due, current._filledAt + (1 - current._left) / (current._limits.max_commands_per_s * current._share));
+      } else if (current._socket.bufferedAmount > MAX_BUFFERED_BYTES) due = min(due, time + 0.02);
+    }
+    if (error || due >= timerAt) return;
+    clearTimeout(timer);
+    timerAt = due;
+    timer = setTimeout(tick, max(1, (due - time) * 1e3));
+  };
+
+  // --- data (docs/data.md) -------------------------------------------------------------------------------
+
+  /** Send a request to the data service, again where that may help. */
+  const http = async (method, path, body, signal, more) => {
+    const address = new URL("/data/v1/" + path, dataUrl);
+    for (let tries = 0; ; tries++) {
+      const headers = { ...bearer(await freshToken()), ...more };
+      let failed;
+      try {
+        const response = await fetch(address, { method, body, headers, signal });
+        if (response.ok) return response;
+        failed = told({ code: "store", message: "HTTP " + response.status, ...(await response.json().catch(nothing)) });
+        if (![408, 429, 500, 502, 503, 504].includes(response.status)) throw failed;
+      } catch (problem) {
+        if (problem === failed) throw failed;
+        if (signal?.aborted) throw cancelled();
+        failed = wrong("connect", "no data service answers: " + problem.name, "is this page's origin in serving.allowed_origins?");
+      }
+      if (tries > 4) throw failed;
+      await pause(Math.random() * 0.2 * 2 ** tries);
+    }
+  };
+
+  // --- what programs use ---------------------------------------------------------------------------------
+
+  const robot = {
+    get server() {
+      return current?._welcome.server || "";
+    },
+    get robot() {
+      return current?._welcome.robot || "";
+    },
+    get error() {
+      return error;
+    },
+    get stats() {
+      return { ...counts, unanswered: pending.size, roundTripMs };
+    },
+
+    call: (service, payload = null, options = {}) =>
+      new Promise((resolve, reject) => {
+        const { deadlineMs, stream = "", keep: isKept = false, trace = "", onProgress, signal } = options;
+        if (error || signal?.aborted) throw error || cancelled();
+        if (deadlineMs != null && !(deadlineMs > 0 && deadlineMs <= MAX_DEADLINE_MS)) {
+          throw wrong("usage", `deadlineMs = ${deadlineMs} is not within 0..${MAX_DEADLINE_MS}`);
+        }
+        const time = now();
+        const id = ++lastId;
+        const seq = (sequences[stream] || 0) + 1;
+        const each = {
+          _id: id, _stream: stream, _seq: seq, _keep: isKept, _onProgress: onProgress, _signal: signal,
+          // As text, so that the caller may use the arrays again.
+          _head: JSON.stringify({ type: "command", id, service, stream, seq, keep: isKept, trace }).slice(0, -1),
+          _payload: JSON.stringify(payload, plain),
+          _from: time, _until: time + (deadlineMs ? deadlineMs / 1e3 : onProgress ? Infinity : ANSWER_S),
+          _isDefault: !deadlineMs, _link: null, _at: 0, _notBefore: 0, _losses: 0,
+          _resolve: resolve, _reject: reject, _cancel: () => cancel(each),
+        };
+        signal?.addEventListener("abort", each._cancel);
+        sequences[stream] = seq;
+        retries = min(MAX_RETRIES, retries + 0.1);
+        counts.sent++;
+        pending.set(id, each);
+        flush();
+      }),
+
+    solvePnp: ({ camera, pointsWorld, pixels, options: pnp, depthsM, depthNoise }, more) =>
+      robot.call(
+        "pnp",
+        {
+          camera, points_world: rounded(pointsWorld, 1e4), pixels: rounded(pixels, 1e2), options: pnp,
+          depths_m: depthsM && rounded(depthsM, 1e3), depth_noise: depthNoise,
+        },
+        { stream: "pose", ...more },
+      ),
+
+    subscribe: (topic, onUpdate, onEnd = nothing) => {
+      if (error) throw error;
+      const id = ++lastId;
+      const each = { _id: id, _topic: topic, _onUpdate: onUpdate, _onEnd: onEnd };
+      subscriptions.set(id, each);
+      ask(each);
+      return () => {
+        if (subscriptions.delete(id) && current) say(current, { type: "unsubscribe", id });
+      };
+    },
+
+    renew: (fresh) =>
+      new Promise((resolve, reject) => {
+        if (typeof token !== "function") token = fresh;
+        renewal?.(cancelled());
+        if (!current) return resolve();
+        const mine = (renewal = (failed) => {
+          if (renewal === mine) renewal = null;
+          clearTimeout(timeout);
+          failed ? reject(failed) : resolve();
+        });
+        const timeout = setTimeout(mine, ANSWER_S * 1e3, wrong("expired", "no answer to renew"));
+        say(current, { type: "renew", token: fresh });
+      }),
+
+    upload: async (data, { onProgress = nothing, signal } = {}) => {
+      const bytes = new Uint8Array(data); // a copy: the caller may change its own
+      const size = bytes.length;
+      const digest = await sha256(bytes);
+      const path = "uploads/" + digest;
+      const begin = () => http("PUT", path, JSON.stringify({ size }), signal);
+      if (size <= MAX_PUT_BYTES) await http("PUT", "objects/" + digest, bytes, signal);
+      else {
+        let state = await (await begin()).json();
+        while (state.offset < size) {
+          const { offset } = state;
+          onProgress(offset, size);
+          const part = bytes.subarray(offset, offset + min(state.part_bytes, MAX_PART_BYTES));
+          try {
+            state = await (await http("PATCH", path, part, signal, { "Upload-Offset": String(offset) })).json();
+          } catch (failed) {
+            // The answer to this part was lost, or another program uploads the same object.
+            if (failed.code !== "conflict" && failed.code !== "not-found") throw failed;
+            state = await (await begin()).json();
+          }
+        }
+      }
+      onProgress(size, size);
+      return digest;
+    },
+
+    download: async (digest, { signal } = {}) => {
+      const bytes = new Uint8Array(await (await http("GET", "objects/" + digest, undefined, signal)).arrayBuffer());
+      if ((await sha256(bytes)) !== digest) throw wrong("store", "the bytes do not match the digest", "try again");
+      return bytes;
+    },
+
+    close: () => end(wrong("disconnected", "the robot closed its connection")),
+  };
+
+  await keep();
+  if (error) throw error;
+  return robot;
+};
