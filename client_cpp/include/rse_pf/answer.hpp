@@ -1,0 +1,88 @@
+// What a call is given and what it returns.
+#pragma once
+
+#include <cstdint>
+#include <functional>
+#include <future>
+#include <optional>
+#include <string>
+#include <utility>
+#include <vector>
+
+#include <nlohmann/json.hpp>
+
+#include "errors.hpp"
+#include "msgpack.hpp"
+
+namespace rse_pf {
+
+using json = nlohmann::json;
+
+/// How one command is sent.
+struct CallOptions {
+    /// Seconds within which the answer is needed; without it `Options::answer_timeout_s`, or none for a long service.
+    std::optional<double> deadline_s{};
+    /// Name of the camera or task; within a stream the newest command wins. Empty: no stream.
+    std::string stream{};
+    /// Answer this command of the stream even if newer ones follow.
+    bool keep = false;
+    std::string trace{};
+    /// Called with the share that is done (0 to 1) and the last step of a long service, on the client's thread.
+    std::function<void(double, const std::string&)> on_progress{};
+};
+
+/// The result of a command.
+struct Answer {
+    std::uint64_t id = 0;
+    std::string reply_msgpack{};  ///< the reply as it came, in MessagePack; empty: null
+    std::string object{};         ///< digest of a reply that is stored as an object; `reply()` is then null
+    std::string server{};
+    double queue_ms = 0, compute_ms = 0;
+    double round_trip_ms = 0;  ///< from the call to the answer
+    /// One-way delays, known when the clocks of robot and server were compared.
+    std::optional<double> up_ms{}, down_ms{};
+
+    /// Return the reply as JSON; arrays are binary values, see `numbers`. Throws Error `bad-message`.
+    json reply() const {
+        if (reply_msgpack.empty()) return nullptr;
+        try {
+            return json::from_msgpack(reply_msgpack);
+        } catch (const json::exception& error) {
+            throw Error("bad-message", error.what());
+        }
+    }
+};
+
+/// A command that was sent: its id, for `Client::cancel`, and its result; `get()` throws Error.
+template <class T> struct Call {
+    std::uint64_t id = 0;
+    std::future<T> result{};
+
+    T get() { return result.get(); }
+};
+
+template <class T> using OnEnd = std::function<void(Outcome<T>)>;
+
+/// Return numbers as a payload holds them: an array of float64.
+inline json array(const std::vector<double>& values) {
+    std::string out;
+    msgpack::Writer(out).doubles(values.data(), values.size());
+    const std::size_t head = out.size() - 8 * values.size();
+    return json::binary(std::vector<std::uint8_t>(out.begin() + static_cast<std::ptrdiff_t>(head), out.end()),
+                        msgpack::float64);
+}
+
+/// Return the numbers of an array of a reply, or of a plain list; throws Error `bad-message` if it is neither.
+inline std::vector<double> numbers(const json& value) {
+    const auto encoded = json::to_msgpack(value);
+    return msgpack::Reader({reinterpret_cast<const char*>(encoded.data()), encoded.size()}).numbers();
+}
+
+/// Return *value* in MessagePack.
+inline std::string encoded(const json& value) {
+    std::string out;
+    json::to_msgpack(value, out);
+    return out;
+}
+
+}  // namespace rse_pf

@@ -1,0 +1,213 @@
+// A robot's connection to the platform: commands, poses, subscriptions; safe to call from any thread.
+//
+// A client has one thread. Every callback runs on it and must return soon, since pings wait for it; what a callback
+// throws ends there and is counted in `Stats`. A callback may call every method but those that wait.
+#pragma once
+
+#include <atomic>
+#include <future>
+#include <memory>
+#include <mutex>
+#include <string>
+#include <thread>
+#include <utility>
+
+#include "detail/connection.hpp"
+#include "pnp.hpp"
+
+namespace rse_pf {
+
+class Client {
+  public:
+    /// Store how to connect; nothing is opened yet. Throws Error `usage` if the address cannot be used.
+    explicit Client(Options options)
+        : core_(std::make_shared<Core>(std::move(options))) {}
+
+    ~Client() { close(); }
+    Client(const Client&) = delete;
+    Client& operator=(const Client&) = delete;
+
+    /// Connect and wait until a server answered; throws Error if none does, or if it refuses. Call it once.
+    void connect() {
+        if (core_->started.exchange(true)) throw Error("usage", "connect was called twice", "make another client");
+        auto opened = std::make_shared<std::promise<std::optional<Failure>>>();
+        auto result = opened->get_future();
+        const bool posted = post([core = core_, opened] {
+            core->connection->open([opened](std::optional<Failure> failure) { opened->set_value(std::move(failure)); });
+        });
+        if (!posted) throw Error("disconnected", "the client was closed", "make another client");
+        thread_ = std::thread([core = core_] {
+            core->thread = std::this_thread::get_id();
+            core->connection->io.run();  // nothing below it throws: handlers catch what callbacks throw
+            core->ended.set_value();
+        });
+        if (auto failure = result.get()) {
+            close();
+            throw Error(std::move(*failure));
+        }
+    }
+
+    /// Close the connection; unanswered commands end as `disconnected`. A destructor does the same.
+    void close() {
+        {
+            const std::lock_guard one_at_a_time(core_->posting);
+            if (!core_->closed.exchange(true) && core_->started) {  // what was posted before is answered; nothing is posted after it
+                boost::asio::post(core_->connection->io, [core = core_] {
+                    core->connection->shut({"disconnected", "the robot closed its connection"});
+                    core->guard.reset();
+                });
+            }
+        }
+        if (!thread_.joinable()) return;
+        if (on_own_thread()) {
+            thread_.detach();  // from a callback: the thread keeps what it needs until it has ended
+        } else {
+            thread_.join();
+        }
+    }
+
+    /// Send a command. *payload* is JSON (`array` makes arrays of numbers).
+    Call<Answer> call(const std::string& service, const json& payload, CallOptions options = {}) {
+        auto promise = std::make_shared<std::promise<Answer>>();
+        auto result = promise->get_future();
+        const auto id = call(service, payload, std::move(options), [promise](Outcome<Answer> outcome) { settle(*promise, std::move(outcome)); });
+        return {id, std::move(result)};
+    }
+    /// Send a command; *on_end* is called once, on the client's thread. Returns the command's id.
+    std::uint64_t call(const std::string& service, const json& payload, CallOptions options, OnEnd<Answer> on_end) {
+        return send(service, encoded(payload), std::move(options), std::move(on_end));
+    }
+    /// The same with a payload that is MessagePack already.
+    std::uint64_t send(const std::string& service, std::string payload, CallOptions options, OnEnd<Answer> on_end) {
+        const std::uint64_t id = core_->next_id++;
+        auto command = std::make_shared<detail::Command>(detail::Command{id, service, std::move(payload), std::move(options), std::move(on_end)});
+        const bool posted = core_->started && post([core = core_, command] {
+            auto& connection = *core->connection;
+            if (connection.fatal) {
+                connection.session.refuse(*command, *connection.fatal);
+                return;
+            }
+            connection.session.submit(std::move(*command), detail::now_s());
+            connection.pump();
+        });
+        if (!posted && command->on_end) command->on_end(Failure{"disconnected", "the client is not connected", "call connect first"});
+        return id;
+    }
+
+    /// Estimate the pose of one image. In a stream (here `pose`) the newest image wins.
+    Call<Pose> pnp(const PnpRequest& request, CallOptions options = in_stream("pose")) {
+        auto promise = std::make_shared<std::promise<Pose>>();
+        auto result = promise->get_future();
+        const auto id = pnp(request, std::move(options), [promise](Outcome<Pose> outcome) { settle(*promise, std::move(outcome)); });
+        return {id, std::move(result)};
+    }
+    std::uint64_t pnp(const PnpRequest& request, CallOptions options, OnEnd<Pose> on_end) {
+        return send("pnp", encoded(request), std::move(options), [on_end = std::move(on_end)](Outcome<Answer> outcome) {
+            if (on_end) on_end(pose_in(outcome));
+        });
+    }
+
+    /// Give up a command: it ends as `cancelled`, and a long one is cancelled at the server, too.
+    void cancel(std::uint64_t id) {
+        post([core = core_, id] {
+            core->connection->session.cancel(id);
+            core->connection->pump();
+        });
+    }
+
+    /// Ask for the updates of *topic*, such as `live/MAP`, on this connection and all later ones; returns an id.
+    /// *on_update* gets the present value of every key, and then each newer one.
+    std::uint64_t subscribe(const std::string& topic, OnUpdate on_update, OnSubscriptionEnd on_end = {}) {
+        const std::uint64_t id = core_->next_id++;
+        post([core = core_, id, topic, on_update = std::move(on_update), on_end = std::move(on_end)] {
+            auto& connection = *core->connection;
+            if (connection.fatal) {
+                connection.session.tell(on_end, *connection.fatal);
+                return;
+            }
+            connection.session.subscribe(id, topic, on_update, on_end, detail::now_s());
+            connection.pump();
+        });
+        return id;
+    }
+    void unsubscribe(std::uint64_t id) {
+        post([core = core_, id] {
+            core->connection->session.unsubscribe(id, detail::now_s());
+            core->connection->pump();
+        });
+    }
+
+    /// Use *token* from now on: on this connection, which then lives as long as the token, and on later ones.
+    void renew(const std::string& token) {
+        post([core = core_, token] { core->connection->use_token(token); });
+    }
+
+    /// Return the counts so far.
+    Stats stats() const {
+        const auto read = [core = core_] {
+            Stats stats = core->connection->session.stats;
+            stats.unanswered = core->connection->session.unanswered();
+            return stats;
+        };
+        if (!core_->started || on_own_thread()) return read();
+        auto promise = std::make_shared<std::promise<Stats>>();
+        auto result = promise->get_future();
+        if (post([promise, read] { promise->set_value(read()); })) return result.get();
+        core_->has_ended.wait();
+        return read();
+    }
+
+    /// Return options for a command of *stream*.
+    static CallOptions in_stream(std::string stream) {
+        CallOptions options;
+        options.stream = std::move(stream);
+        return options;
+    }
+
+  private:
+    struct Core {
+        explicit Core(Options options)
+            : connection(std::make_shared<detail::Connection>(options, times_of(options))), guard(connection->io.get_executor()) {}
+        static detail::SessionTimes times_of(const Options& options) {
+            detail::SessionTimes times;
+            times.answer_timeout = options.answer_timeout_s;
+            return times;
+        }
+        std::shared_ptr<detail::Connection> connection;
+        boost::asio::executor_work_guard<boost::asio::io_context::executor_type> guard;
+        std::atomic<std::uint64_t> next_id{1};
+        std::atomic<bool> started{false}, closed{false};
+        std::atomic<std::thread::id> thread{};
+        std::mutex posting;
+        std::promise<void> ended;
+        std::shared_future<void> has_ended = ended.get_future().share();
+    };
+
+    bool on_own_thread() const { return std::this_thread::get_id() == core_->thread; }
+
+    /// Let the client's thread do *work*; returns false if the client was closed, and nothing is done.
+    template <class Work> bool post(Work&& work) const {
+        const std::lock_guard one_at_a_time(core_->posting);
+        if (core_->closed) return false;
+        boost::asio::post(core_->connection->io, std::forward<Work>(work));
+        return true;
+    }
+
+    template <class T> static void settle(std::promise<T>& promise, Outcome<T> outcome) {
+        if (outcome.ok()) promise.set_value(std::move(outcome).value());
+        else promise.set_exception(std::make_exception_ptr(Error(outcome.failure())));
+    }
+    static Outcome<Pose> pose_in(const Outcome<Answer>& outcome) {
+        if (!outcome.ok()) return outcome.failure();
+        try {
+            return pose_of(outcome.value());
+        } catch (const Error& error) {
+            return error.failure();
+        }
+    }
+
+    std::shared_ptr<Core> core_;
+    std::thread thread_;
+};
+
+}  // namespace rse_pf

@@ -1,0 +1,463 @@
+// The sockets of a client: connect, read, write, reconnect, move; `Session` holds the rules. One thread calls it.
+#pragma once
+
+#include <algorithm>
+#include <chrono>
+#include <functional>
+#include <memory>
+#include <random>
+#include <string>
+#include <thread>
+#include <utility>
+
+#include "http_answer.hpp"
+#include "session.hpp"
+#include "transport.hpp"
+
+namespace rse_pf {
+
+/// A token, or a function that returns a fresh one for each connection and each renewal. The function is called on a
+/// thread of its own, one call at a time; what it throws counts as "no token".
+using TokenSource = std::function<std::string()>;
+
+/// What changed: `connected`, `lost`, `moved` or `ended`, and the server's name or the reason.
+using OnChange = std::function<void(const std::string& what, const std::string& why)>;
+
+/// Where a client connects, and how.
+struct Options {
+    std::string url{};             ///< ws://HOST:PORT/ws or wss://HOST/ws
+    std::string token{};           ///< the robot's token; empty: none, or `token_source`
+    TokenSource token_source{};    ///< gives fresh tokens; without it, a connection ends when its token expires
+    std::string sdk = "rse-pf-cpp/1";  ///< name and version of the program, for the server's log
+    std::string ca_file{};         ///< authorities to trust, in PEM; empty: the machine's
+    double connect_timeout_s = 2, reconnect_base_s = 0.1, reconnect_max_s = 1;
+    double answer_timeout_s = 5;   ///< deadline of a command that sets none
+    int first_tries = 4;           ///< attempts of `Client::connect` before it gives up
+    OnChange on_change{};          ///< called on the client's thread
+};
+
+namespace detail {
+
+/// Return how a close code ends a robot's connections for good; an empty code: connect again.
+inline Failure fatal_of(unsigned code, const std::string& reason) {
+    const std::string why = reason.empty() ? "" : ": " + reason;
+    switch (code) {
+        case 4403: return {"forbidden", "the robot was disabled, or its token revoked" + why, "ask the operator"};
+        case 4406: return {"unsupported", "the server speaks another version of the protocol" + why, "update the client"};
+        case 4409: return {"conflict", "the same robot opened a newer connection" + why, "give each robot a token of its own"};
+        case 1002: case 1007: case 1008: case 1009: case 4400:
+            return {"protocol", "the server closed the connection with " + std::to_string(code) + why, "report this as a defect of the client"};
+        default: return {};
+    }
+}
+
+class Connection : public std::enable_shared_from_this<Connection> {
+  public:
+    Connection(Options options, SessionTimes times)
+        : session(times, options.sdk), options_(std::move(options)), address_(address_of(options_.url)),
+          tls_(tls_context(address_, {options_.ca_file})), token_(options_.token), tick_(io), retry_(io), random_(std::random_device{}()) {
+        if (address_.target.empty()) address_.target = "/ws";
+    }
+    ~Connection() {
+        if (token_thread_.joinable()) token_thread_.detach();
+    }
+
+    asio::io_context io{1};
+    Session session;
+    std::optional<Failure> fatal;
+
+    /// Connect; *on_open* is called once: with nothing, or with why there is no connection.
+    void open(std::function<void(std::optional<Failure>)> on_open) {
+        on_open_ = std::move(on_open);
+        tick();
+        dial();
+    }
+
+    /// Send what the session has to send.
+    void pump() {
+        if (const auto& now = channel_) write(now);
+        for (const auto& each : leaving_) write(each);
+        const auto old = leaving_;
+        for (const auto& each : old) {
+            if (session.unanswered_on(each->link) == 0 && each->link->outgoing.empty() && !each->writing) close(each);
+        }
+        if (session.next_due(now_s()) < next_tick_ - 1e-3) schedule_tick();
+    }
+
+    void use_token(const std::string& token) {
+        token_ = token;
+        if (channel_) {
+            renewing_ = token;
+            session.renew(*channel_->link, token, now_s());
+            pump();
+        }
+    }
+
+    /// End everything; the io_context has no work left soon after.
+    void shut(const Failure& failure) {
+        if (std::exchange(shut_, true)) return;
+        if (!fatal) fatal = failure;
+        session.abandon(*fatal);
+        tick_.cancel();
+        retry_.cancel();
+        if (dialing_) drop(dialing_);
+        const auto old = leaving_;
+        for (const auto& each : old) close(each);
+        if (channel_) close(channel_);
+        opened(*fatal);
+        if (token_thread_.joinable() && !token_pending_) token_thread_.join();
+    }
+
+    bool connected() const { return channel_ != nullptr; }
+
+  private:
+    /// One WebSocket.
+    struct Channel {
+        Channel(asio::io_context& io, std::shared_ptr<asio::ssl::context> tls) : ws(io, std::move(tls)), resolver(io), timer(io) {}
+        websocket::stream<Transport, false> ws;
+        asio::ip::basic_resolver<tcp, asio::io_context::executor_type> resolver;
+        asio::steady_timer timer;
+        beast::flat_buffer buffer;
+        websocket::response_type response;
+        std::shared_ptr<Link> link;
+        std::string sent, token, wrong;
+        bool writing = false, ended = false, closing = false, timed_out = false;
+        int bad_messages = 0;
+    };
+    using ChannelPtr = std::shared_ptr<Channel>;
+
+    // --- connecting -------------------------------------------------------------------------------
+
+    /// Begin an attempt to connect: first the token, then the socket.
+    void dial() {
+        if (shut_ || fatal || dialing_ || token_pending_) return;
+        dial_began_ = now_s();
+        if (options_.token_source) {
+            ask_token([this](std::optional<std::string> token) {
+                if (token) connect_socket(*token);
+                else dial_failed({{"connect", "no token: the token source failed: " + token_error_, "fix the token source"}});
+            });
+        } else {
+            connect_socket(token_);
+        }
+    }
+
+    void connect_socket(const std::string& token) {
+        auto channel = std::make_shared<Channel>(io, tls_);
+        channel->token = token;
+        dialing_ = channel;
+        const auto self = shared_from_this();
+        channel->timer.expires_after(std::chrono::duration_cast<std::chrono::milliseconds>(std::chrono::duration<double>(options_.connect_timeout_s)));
+        channel->timer.async_wait([self, channel](error_code stopped) {
+            if (stopped || channel->link) return;
+            channel->timed_out = true;
+            channel->resolver.cancel();
+            channel->ws.next_layer().close();
+        });
+        channel->resolver.async_resolve(address_.host, address_.port, [self, channel](error_code failed, auto found) {
+            if (self->gone(channel, failed)) return;
+            asio::async_connect(channel->ws.next_layer().socket(), found, [self, channel](error_code unreachable, const tcp::endpoint&) {
+                if (self->gone(channel, unreachable)) return;
+                error_code ignored;
+                channel->ws.next_layer().socket().set_option(tcp::no_delay(true), ignored);
+                channel->ws.next_layer().async_secure(self->address_.host, [self, channel](error_code untrusted) {
+                    if (!self->gone(channel, untrusted)) self->handshake(channel);
+                });
+            });
+        });
+    }
+
+    void handshake(const ChannelPtr& channel) {
+        auto& ws = channel->ws;
+        websocket::stream_base::timeout times{std::chrono::seconds(2), websocket::stream_base::none(), false};
+        ws.set_option(times);
+        ws.auto_fragment(false);
+        ws.write_buffer_bytes(16384);
+        ws.read_message_max(16 << 20);
+        ws.binary(true);
+        // The stream keeps this function, so it must not keep the channel.
+        ws.set_option(websocket::stream_base::decorator([token = channel->token](websocket::request_type& request) {
+            request.set(http::field::sec_websocket_protocol, "rse-pf.v1.bin");
+            if (!token.empty()) request.set(http::field::authorization, "Bearer " + token);
+        }));
+        const auto self = shared_from_this();
+        ws.async_handshake(channel->response, address_.authority(), address_.target, [self, channel](error_code failed) {
+            const auto& response = channel->response;
+            if (failed == websocket::error::upgrade_declined && channel == self->dialing_) {
+                self->drop(channel);
+                self->dial_failed(refused(self->address_.shown(), response.result_int(), std::string(response[http::field::retry_after]), response.body()));
+                return;
+            }
+            if (self->gone(channel, failed)) return;
+            channel->timer.cancel();
+            if (response[http::field::sec_websocket_protocol] != "rse-pf.v1.bin") {
+                self->drop(channel);
+                self->dial_failed({{"unsupported", self->address_.shown() + " does not speak rse-pf.v1.bin", "is it an RSE-PF server?"}, 0, false, true});
+                return;
+            }
+            channel->link = self->session.open(now_s());
+            self->write(channel);
+            self->read(channel);
+        });
+    }
+
+    /// Return whether an attempt is over: given up, or failed.
+    bool gone(const ChannelPtr& channel, error_code failed) {
+        if (channel != dialing_) return true;
+        if (!failed) return false;
+        const std::string cause = channel->timed_out ? "no answer in time" : cause_of(failed);
+        drop(channel);
+        dial_failed({{"connect", "cannot connect to " + address_.shown() + ": " + cause, "is the platform running? is the address right?"}});
+        return true;
+    }
+
+    void dial_failed(DialFailure failed) {
+        session.stats.last_error = failed.failure.message;
+        if (shut_) return;
+        if (failed.is_final && options_.token_source && failed.failure.code == "unauthorized" && !std::exchange(asked_again_, true)) {
+            failed.is_final = false;
+        }
+        ++attempt_;
+        const bool first = on_open_ != nullptr;
+        if (failed.is_final || (first && (failed.wrong_address || attempt_ >= options_.first_tries))) {
+            end(failed.failure);
+            return;
+        }
+        if (channel_ && now_s() >= move_until_) return;
+        const double spent = now_s() - dial_began_;
+        retry_in(std::max(failed.after_s, pause_s() - spent));
+    }
+
+    double pause_s() {
+        const double most = std::min(options_.reconnect_max_s, options_.reconnect_base_s * std::pow(2.0, std::min(attempt_, 20)));
+        return std::uniform_real_distribution<double>(0, most)(random_);
+    }
+
+    void retry_in(double seconds) {
+        retry_.expires_after(std::chrono::microseconds(static_cast<std::int64_t>(std::max(0.0, seconds) * 1e6)));
+        const auto self = shared_from_this();
+        retry_.async_wait([self](error_code stopped) {
+            if (!stopped && (!self->channel_ || now_s() < self->move_until_)) self->dial();
+        });
+    }
+
+    void welcomed(const ChannelPtr& channel) {
+        if (channel != dialing_) return;
+        dialing_.reset();
+        asked_again_ = false;
+        if (channel_ && channel->link->server == channel_->link->server && now_s() < move_until_) {
+            close(channel);  // the server that wants to be left
+            ++attempt_;
+            retry_in(pause_s());
+            return;
+        }
+        const bool moved = channel_ != nullptr;
+        if (moved) leaving_.push_back(channel_);
+        channel_ = channel;
+        move_until_ = 0;
+        adopted_ = now_s();
+        session.adopt(channel->link, adopted_);
+        if (moved) ++session.stats.moves;
+        else if (!on_open_) ++session.stats.reconnects;
+        changed(moved ? "moved" : "connected", channel->link->server);
+        opened(std::nullopt);
+    }
+
+    // --- one socket -------------------------------------------------------------------------------
+
+    void read(const ChannelPtr& channel) {
+        const auto self = shared_from_this();
+        channel->ws.async_read(channel->buffer, [self, channel](error_code failed, std::size_t size) {
+            if (failed) {
+                self->lost(channel, failed == websocket::error::closed ? "closed" : cause_of(failed));
+                return;
+            }
+            self->session.stats.bytes_in += size;
+            self->hear(channel);
+            if (!channel->ended) self->read(channel);
+        });
+    }
+
+    void hear(const ChannelPtr& channel) {
+        const auto data = channel->buffer.cdata();
+        Heard heard;
+        try {
+            if (!channel->ws.got_binary()) throw Error("bad-message", "the server sent text");
+            heard = session.receive(channel->link, {static_cast<const char*>(data.data()), data.size()}, now_s());
+        } catch (const std::exception& error) {
+            session.stats.last_error = error.what();
+            if (++channel->bad_messages > 10) lost(channel, "too many messages that cannot be decoded");
+        }
+        channel->buffer.consume(channel->buffer.size());
+        switch (heard.what) {
+            case Heard::welcome: welcomed(channel); break;
+            case Heard::move:
+                if (channel == channel_ && !shut_) {
+                    move_until_ = now_s() + heard.within_s;
+                    attempt_ = 0;
+                    dial();
+                }
+                break;
+            case Heard::renewed:
+                if (!renewing_.empty()) channel->token = renewing_;
+                break;
+            case Heard::notice: session.stats.last_error = heard.failure.code + ": " + heard.failure.message; break;
+            case Heard::nothing: break;
+        }
+        pump();
+    }
+
+    void write(const ChannelPtr& channel) {
+        auto& outgoing = channel->link->outgoing;
+        if (channel->writing || channel->ended || channel->closing || outgoing.empty()) return;
+        channel->writing = true;
+        channel->sent = std::move(outgoing.front());
+        outgoing.pop_front();
+        session.stats.bytes_out += channel->sent.size();
+        const auto self = shared_from_this();
+        channel->ws.async_write(asio::buffer(channel->sent), [self, channel](error_code failed, std::size_t) {
+            channel->writing = false;
+            if (failed) self->lost(channel, cause_of(failed));
+            else if (channel->link->outgoing.empty()) self->pump();
+            else self->write(channel);
+        });
+    }
+
+    /// Close politely; the timeout of the WebSocket ends it otherwise.
+    void close(const ChannelPtr& channel) {
+        if (channel->ended || std::exchange(channel->closing, true)) return;
+        const auto self = shared_from_this();
+        channel->ws.async_close(websocket::close_code::normal, [self, channel](error_code) { self->lost(channel, "closed by the robot"); });
+    }
+
+    void drop(const ChannelPtr& channel) {
+        channel->ended = true;
+        channel->timer.cancel();
+        channel->resolver.cancel();
+        channel->ws.next_layer().close();
+        if (channel->link) session.lose(channel->link);
+        if (dialing_ == channel) dialing_.reset();
+    }
+
+    void lost(const ChannelPtr& channel, const std::string& why) {
+        if (channel->ended) return;
+        const bool was_dialing = channel == dialing_, was_current = channel == channel_;
+        drop(channel);
+        leaving_.erase(std::remove(leaving_.begin(), leaving_.end(), channel), leaving_.end());
+        if (was_current) channel_.reset();
+        if (shut_ || channel->closing) return;
+        const auto code = channel->ws.reason().code;
+        const std::string reason(channel->ws.reason().reason.data(), channel->ws.reason().reason.size());
+        Failure ends = fatal_of(code, reason);
+        if (code == 4401 && !options_.token_source && channel->token == token_) {
+            ends = {"unauthorized", "the token has expired", "give a token_source, or call renew in time"};
+        }
+        if (!ends.code.empty()) {
+            end(ends);
+            return;
+        }
+        if (was_dialing) {
+            dial_failed({{"connect", address_.shown() + " sent no Welcome: " + why, "is it an RSE-PF server?"}});
+        } else if (was_current) {
+            session.stats.last_error = why;
+            changed("lost", why);
+            if (now_s() - adopted_ > options_.reconnect_max_s) attempt_ = 0;
+            retry_in(code == 4429 ? 6 : pause_s());
+        }
+        pump();
+    }
+
+    void end(const Failure& failure) {
+        if (fatal) return;
+        fatal = failure;
+        session.stats.last_error = failure.message;
+        session.abandon(failure);
+        if (dialing_) drop(dialing_);
+        changed("ended", failure.code);
+        opened(failure);
+        if (channel_) close(channel_);
+    }
+
+    void opened(std::optional<Failure> failure) {
+        const auto on_open = std::exchange(on_open_, nullptr);
+        if (on_open) on_open(std::move(failure));
+    }
+
+    void changed(const char* what, const std::string& why) { session.tell(options_.on_change, std::string(what), why); }
+
+    // --- time and tokens --------------------------------------------------------------------------
+
+    void tick() {
+        if (shut_) return;
+        const double now = now_s();
+        session.due(now);
+        auto all = leaving_;
+        if (channel_) all.push_back(channel_);
+        if (dialing_ && dialing_->link) all.push_back(dialing_);
+        for (const auto& each : all) {
+            bool renewal = false;
+            if (const char* why = session.check(each->link, now, renewal)) lost(each, why);
+            else if (renewal && options_.token_source && each == channel_ && !token_pending_) renew_from_source();
+        }
+        pump();
+        schedule_tick();
+    }
+
+    void schedule_tick() {
+        next_tick_ = std::max(session.next_due(now_s()), now_s() + 1e-3);
+        tick_.expires_after(std::chrono::microseconds(static_cast<std::int64_t>((next_tick_ - now_s()) * 1e6) + 1));
+        const auto self = shared_from_this();
+        tick_.async_wait([self](error_code stopped) {
+            if (!stopped) self->tick();
+        });
+    }
+
+    void renew_from_source() {
+        ask_token([this](std::optional<std::string> token) {
+            if (token) use_token(*token);
+            if (!channel_ || now_s() < move_until_) retry_in(pause_s());
+        });
+    }
+
+    /// Call the token source on a thread of its own; the answer comes back to this one.
+    void ask_token(std::function<void(std::optional<std::string>)> then) {
+        token_pending_ = true;
+        if (token_thread_.joinable()) token_thread_.join();
+        const auto self = shared_from_this();
+        token_thread_ = std::thread([self, then = std::move(then), source = options_.token_source] {
+            std::optional<std::string> token;
+            std::string error;
+            try {
+                token = source();
+            } catch (const std::exception& failed) {
+                error = failed.what();
+            } catch (...) {
+                error = "an exception";
+            }
+            asio::post(self->io, [weak = std::weak_ptr<Connection>(self), then, token, error] {
+                const auto here = weak.lock();
+                if (!here) return;
+                here->token_pending_ = false;
+                here->token_error_ = error;
+                if (!here->shut_) then(token);
+            });
+        });
+    }
+
+    Options options_;
+    Address address_;
+    std::shared_ptr<asio::ssl::context> tls_;
+    std::string token_, renewing_, token_error_;
+    asio::steady_timer tick_, retry_;
+    std::mt19937_64 random_;
+    ChannelPtr channel_, dialing_;
+    std::vector<ChannelPtr> leaving_;
+    std::function<void(std::optional<Failure>)> on_open_;
+    std::thread token_thread_;
+    double next_tick_ = 0, dial_began_ = 0, adopted_ = 0, move_until_ = 0;
+    int attempt_ = 0;
+    bool shut_ = false, token_pending_ = false, asked_again_ = false;
+};
+
+}  // namespace detail
+}  // namespace rse_pf

@@ -1,0 +1,73 @@
+// What an HTTP answer that is no success means: to a handshake, or of the data service.
+#pragma once
+
+#include <algorithm>
+#include <chrono>
+#include <map>
+#include <string>
+
+#include <nlohmann/json.hpp>
+
+#include "../errors.hpp"
+
+namespace rse_pf::detail {
+
+inline double now_s() {
+    return std::chrono::duration<double>(std::chrono::steady_clock::now().time_since_epoch()).count();
+}
+
+/// Why an attempt to connect failed.
+struct DialFailure {
+    Failure failure;
+    double after_s = 0;
+    bool is_final = false;       // whatever the robot does with this token
+    bool wrong_address = false;  // final for the first attempt
+};
+
+/// The strings of a JSON object, without those in objects inside of it; a tree would make programs larger.
+struct Strings final : nlohmann::json_sax<nlohmann::json> {
+    std::map<std::string, std::string> found;
+    std::string name;
+    int level = 0;
+
+    bool string(string_t& value) override {
+        if (level == 1) found[name] = value;
+        return true;
+    }
+    bool key(string_t& value) override {
+        if (level == 1) name = value;
+        return true;
+    }
+    bool start_object(std::size_t) override { return ++level < 16; }
+    bool end_object() override { return --level >= 0; }
+    bool start_array(std::size_t) override { return ++level < 16; }
+    bool end_array() override { return --level >= 0; }
+    bool null() override { return true; }
+    bool boolean(bool) override { return true; }
+    bool number_integer(number_integer_t) override { return true; }
+    bool number_unsigned(number_unsigned_t) override { return true; }
+    bool number_float(number_float_t, const string_t&) override { return true; }
+    bool binary(binary_t&) override { return true; }
+    bool parse_error(std::size_t, const std::string&, const nlohmann::detail::exception&) override { return false; }
+};
+
+/// Return what an HTTP answer to the handshake means.
+inline DialFailure refused(const std::string& address, unsigned status, const std::string& retry_after, const std::string& body) {
+    Strings told;
+    nlohmann::json::sax_parse(body, &told);
+    const auto field = [&](const char* name) { return told.found[name]; };
+    DialFailure out;
+    out.failure = {field("code"), field("message"), field("hint")};
+    if (!retry_after.empty() && retry_after.size() < 6 && retry_after.find_first_not_of("0123456789") == std::string::npos) {
+        out.after_s = std::min(30.0, std::stod(retry_after));
+    }
+    out.is_final = status == 401 || status == 403;
+    out.wrong_address = status == 400 || status == 404 || status == 426 || status == 200;
+    if (out.failure.code.empty()) {
+        out.failure.code = status == 401 ? "unauthorized" : status == 403 ? "forbidden" : out.wrong_address ? "unsupported" : "connect";
+    }
+    if (out.failure.message.empty()) out.failure.message = address + " answered the handshake with HTTP " + std::to_string(status);
+    return out;
+}
+
+}  // namespace rse_pf::detail

@@ -1,0 +1,64 @@
+// Failures: what the server, the network or this client could not do, as values and as one exception class.
+#pragma once
+
+#include <optional>
+#include <stdexcept>
+#include <string>
+#include <utility>
+#include <variant>
+
+namespace rse_pf {
+
+/// A command or a connection that ended without a result. `code` is one of section 5 of docs/protocol.md.
+struct Failure {
+    std::string code;
+    std::string message;
+    std::string hint{};
+    std::optional<double> retry_after_ms{};
+    std::string server{};
+    std::string trace{};
+};
+
+/// The exception of this client; it carries a `Failure`.
+class Error : public std::runtime_error {
+  public:
+    explicit Error(Failure failure)
+        : std::runtime_error(failure.code + ": " + failure.message +
+                             (failure.hint.empty() ? "" : "\n  hint: " + failure.hint)),
+          failure_(std::move(failure)) {}
+    Error(std::string code, std::string message, std::string hint = {})
+        : Error(Failure{std::move(code), std::move(message), std::move(hint)}) {}
+
+    const Failure& failure() const noexcept { return failure_; }
+    const std::string& code() const noexcept { return failure_.code; }
+
+  private:
+    Failure failure_;
+};
+
+/// Either a value or a `Failure`: what a callback is given, since no exception reaches or leaves it.
+template <class T> class Outcome {
+  public:
+    Outcome(T value) : state_(std::move(value)) {}
+    Outcome(Failure failure) : state_(std::move(failure)) {}
+
+    bool ok() const noexcept { return state_.index() == 0; }
+    explicit operator bool() const noexcept { return ok(); }
+
+    /// Return the value; throws Error if there is none.
+    const T& value() const& {
+        if (!ok()) throw Error(std::get<1>(state_));
+        return std::get<0>(state_);
+    }
+    T&& value() && {
+        if (!ok()) throw Error(std::get<1>(state_));
+        return std::get<0>(std::move(state_));
+    }
+    /// Return the failure; call it only if `ok()` is false.
+    const Failure& failure() const { return std::get<1>(state_); }
+
+  private:
+    std::variant<T, Failure> state_;
+};
+
+}  // namespace rse_pf

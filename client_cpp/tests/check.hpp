@@ -1,0 +1,25 @@
+// Checks of a test program: each prints what does not hold, and the program then ends with 1.
+#pragma once
+
+#include <cstdio>
+#include <string>
+
+inline int& failures() {
+    static int count = 0;
+    return count;
+}
+
+inline void expect(bool holds, const std::string& what) {
+    if (holds) return;
+    std::printf("FAILED: %s\n", what.c_str());
+    ++failures();
+}
+
+template <class Work> void expect_error(const std::string& code, Work work, const std::string& what) {
+    try {
+        work();
+        expect(false, what + ": no error");
+    } catch (const rse_pf::Error& error) {
+        expect(error.code() == code, what + ": " + error.what());
+    }
+}

@@ -1,0 +1,158 @@
+// The client against servers that refuse, say nothing or speak something else, and its calls from many threads.
+#include <rse_pf/rse_pf.hpp>
+
+#include "check.hpp"
+
+using namespace rse_pf;
+namespace asio = boost::asio;
+using asio::ip::tcp;
+
+namespace {
+
+/// A server on loopback that answers each connection with the same bytes, or with nothing.
+class Server {
+  public:
+    explicit Server(std::string answer) : answer_(std::move(answer)), acceptor_(io_, {asio::ip::address_v4::loopback(), 0}) {
+        accept();
+        thread_ = std::thread([this] { io_.run(); });
+    }
+    ~Server() {
+        io_.stop();
+        thread_.join();
+    }
+    std::string url() const { return "ws://127.0.0.1:" + std::to_string(acceptor_.local_endpoint().port()) + "/ws"; }
+    std::atomic<int> connections{0};
+
+  private:
+    void accept() {
+        acceptor_.async_accept([this](boost::system::error_code failed, tcp::socket socket) {
+            if (failed) return;
+            ++connections;
+            auto held = std::make_shared<tcp::socket>(std::move(socket));
+            open_.push_back(held);
+            auto request = std::make_shared<std::string>(4096, ' ');
+            held->async_read_some(asio::buffer(*request), [this, held, request](boost::system::error_code, std::size_t) {
+                boost::system::error_code ignored;
+                if (answer_.empty()) return;
+                asio::write(*held, asio::buffer(answer_), ignored);
+                held->close(ignored);
+            });
+            accept();
+        });
+    }
+    std::string answer_;
+    asio::io_context io_;
+    tcp::acceptor acceptor_;
+    std::vector<std::shared_ptr<tcp::socket>> open_;
+    std::thread thread_;
+};
+
+Options to(const std::string& url) {
+    Options options;
+    options.url = url;
+    options.connect_timeout_s = 0.2;
+    options.reconnect_base_s = options.reconnect_max_s = 0.01;
+    options.first_tries = 2;
+    return options;
+}
+
+void addresses_are_checked_before_anything_is_opened() {
+    for (const char* url : {"", "robot", "ftp://a/ws", "ws://", "ws://a:b/ws", "ws://u@a/ws", "ws://a/ws?token=x", "ws://a:1 /ws"}) {
+        expect_error("usage", [&] { Client client(to(url)); }, url);
+    }
+    const auto address = detail::address_of("wss://[::1]:8443/ws");
+    expect(address.secure && address.host == "::1" && address.port == "8443" && address.authority() == "[::1]:8443", "an address of IPv6");
+    Options options = to("wss://localhost/ws");
+    options.ca_file = "missing.pem";
+    expect_error("usage", [&] { Client client(options); }, "a file that is missing");
+}
+
+void nobody_listens() {
+    Client client(to("ws://127.0.0.1:1/ws"));
+    expect_error("connect", [&] { client.connect(); }, "no server");
+    expect_error("disconnected", [&] { client.call("echo", {}).get(); }, "a call without a connection");
+    expect_error("usage", [&] { client.connect(); }, "connected twice");
+}
+
+void a_refusal_keeps_its_code_and_is_final() {
+    const std::string body = R"({"code":"unauthorized","message":"no","hint":"ask for a token"})";
+    Server server("HTTP/1.1 401 Unauthorized\r\nContent-Type: application/json\r\nContent-Length: " + std::to_string(body.size()) + "\r\n\r\n" + body);
+    Client client(to(server.url()));
+    try {
+        client.connect();
+        expect(false, "connected");
+    } catch (const Error& error) {
+        expect(error.code() == "unauthorized" && error.failure().hint == "ask for a token", error.what());
+    }
+    expect(server.connections == 1, "tried once");
+}
+
+void another_program_answers() {
+    Server talks("220 mail.example.org ESMTP\r\n"), is_silent(""), web("HTTP/1.1 200 OK\r\nContent-Length: 0\r\n\r\n");
+    expect_error("connect", [&] { Client(to(talks.url())).connect(); }, "a mail server");
+    expect_error("connect", [&] { Client(to(is_silent.url())).connect(); }, "a silent server");
+    expect_error("unsupported", [&] { Client(to(web.url())).connect(); }, "a web server");
+    Options tls = to("wss" + is_silent.url().substr(2));
+    expect_error("connect", [&] { Client(tls).connect(); }, "a server without TLS");
+    DataOptions quick;
+    quick.deadline_s = 0.1;
+    expect_error("connect", [&] { DataClient(talks.url(), "", quick).download(sha256("x")); }, "no data service");
+}
+
+void a_token_source_is_asked_again_after_a_refusal() {
+    Server server("HTTP/1.1 401 Unauthorized\r\nContent-Length: 0\r\n\r\n");
+    Options options = to(server.url());
+    std::atomic<int> asked{0};
+    options.token_source = [&] { return "token-" + std::to_string(++asked); };
+    expect_error("unauthorized", [&] { Client(options).connect(); }, "refused");
+    expect(asked == 2, "a fresh token was tried");
+    options.token_source = []() -> std::string { throw std::runtime_error("no file"); };
+    expect_error("connect", [&] { Client(options).connect(); }, "a source that throws");
+}
+
+void calls_of_many_threads_end_when_the_client_closes() {
+    Server server("");
+    for (int round = 0; round < 5; ++round) {
+        std::atomic<int> ended{0};
+        {
+            Client client(to(server.url()));
+            std::thread opens([&] {
+                try {
+                    client.connect();
+                } catch (const Error&) {
+                }
+            });
+            std::vector<std::thread> threads;
+            for (int i = 0; i < 4; ++i) {
+                threads.emplace_back([&] {
+                    for (int k = 0; k < 50; ++k) {
+                        const auto id = client.call("echo", {{"value", k}}, {}, [&](Outcome<Answer>) { ++ended; });
+                        if (k % 7 == 0) client.cancel(id);
+                        if (k % 11 == 0) client.renew("token");
+                    }
+                });
+            }
+            for (auto& each : threads) each.join();
+            opens.join();
+        }
+        expect(ended == 200, "each call ended once: " + std::to_string(ended));
+    }
+}
+
+void digests_are_those_of_sha256() {
+    expect(sha256("abc") == "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad", "abc");
+}
+
+}  // namespace
+
+int main() {
+    addresses_are_checked_before_anything_is_opened();
+    nobody_listens();
+    a_refusal_keeps_its_code_and_is_final();
+    another_program_answers();
+    a_token_source_is_asked_again_after_a_refusal();
+    calls_of_many_threads_end_when_the_client_closes();
+    digests_are_those_of_sha256();
+    std::printf(failures() == 0 ? "all hold\n" : "%d do not hold\n", failures());
+    return failures() == 0 ? 0 : 1;
+}
