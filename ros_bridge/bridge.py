@@ -1,0 +1,261 @@
+"""The bridge itself: frames into a mapper, its answers out as messages; without ROS.
+
+A shell gives it the bytes of messages by `Bridge.receive`, from any thread, and a function that publishes.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import time
+from collections.abc import AsyncIterator, Callable
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import numpy as np
+
+from client_sdk.bags.message_maker import MessageMaker
+from client_sdk.frontend import Frame, TrackedFrame
+from client_sdk.live import LiveMapper
+from client_sdk.mapper import Mapper
+from client_sdk.robot import Robot, connect
+from ros_bridge.incoming import IncomingFrames, PairedImages, Role
+from ros_bridge.options import BridgeOptions
+from ros_bridge.outgoing import Message, OutgoingMessages
+from rse_pf.errors import RsePfError, UsageError
+from rse_pf.geometry import Array
+
+__all__ = ["Bridge", "CallReply", "Publish", "connected_bridge"]
+
+Publish = Callable[[Message], None]
+"""Publishes a message; called from the bridge's event loop, so it must not wait."""
+
+_DIAGNOSTICS_EVERY_S = 1.0
+_PATH_EVERY_S = 0.5
+_LEAST_READINGS = 2
+_CALL_S = 10.0
+_IDENTITY = np.eye(4)
+
+
+@dataclass(frozen=True, slots=True)
+class CallReply:
+    """The answer to a service of ROS: the reply as JSON, or the code and the message of an error."""
+
+    ok: bool
+    reply: str = ""
+    code: str = ""
+    message: str = ""
+
+
+class Bridge:
+    """One robot; `run` it, `receive` messages from any thread."""
+
+    def __init__(
+        self,
+        mapper: Mapper | LiveMapper,
+        options: BridgeOptions,
+        publish: Publish,
+        *,
+        is_ros1: bool,
+        robot: Robot | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """Describe a bridge.
+
+        Args:
+            mapper: Of a connected robot.
+            options: What is bridged.
+            publish: Gets each message.
+            is_ros1: Whether messages are in the format of ROS 1, or in CDR.
+            robot: For services of ROS that call services of the platform; None refuses them.
+            clock: Seconds, monotonic; for pauses between clouds, paths and diagnostics.
+        """
+        maker = MessageMaker(is_ros1=is_ros1)
+        self.frames = 0
+        self.lost_frames = 0
+        self.track_s: list[float] = []
+        self._mapper, self._options, self._publish, self._robot = mapper, options, publish, robot
+        self._incoming = IncomingFrames(maker, options)
+        self._outgoing = OutgoingMessages(maker, options)
+        self._clock = clock
+        self._loop = asyncio.get_running_loop()
+        self._has_frame = asyncio.Event()
+        self._due = {"cloud": clock() + options.cloud_every_s, "path": clock()}
+        self._stamp_ns = 0
+        self._reason = ""
+        self._cloud: asyncio.Task[None] | None = None
+
+    def receive(self, role: Role, data: bytes | memoryview) -> None:
+        """Take the bytes of a message of a topic; quick, never waits, raises nothing."""
+        if self._incoming.add(role, data):
+            with contextlib.suppress(RuntimeError):  # the loop has ended: so has the bridge
+                self._loop.call_soon_threadsafe(self._has_frame.set)
+
+    async def run(self) -> None:
+        """Track frames and publish, until cancelled."""
+        reporting = asyncio.create_task(self._report())
+        try:
+            while True:
+                await self._has_frame.wait()
+                self._has_frame.clear()
+                while (images := self._incoming.take()) is not None:
+                    await self._bridge(images)
+        finally:
+            ending = [reporting, *([self._cloud] if self._cloud is not None else [])]
+            for task in ending:
+                task.cancel()
+            await asyncio.gather(*ending, return_exceptions=True)
+
+    async def save(self) -> CallReply:
+        """Write map and trajectory into the folder of the options."""
+        if not self._options.out:
+            return CallReply(ok=False, code="usage", message="no folder: set the parameter out")
+        try:
+            report = await asyncio.to_thread(self._mapper.save, Path(self._options.out))
+        except RsePfError as error:
+            return CallReply(ok=False, code=error.code, message=error.message)
+        return CallReply(ok=True, reply=json.dumps(report))
+
+    async def call(self, service: str, payload: str) -> CallReply:
+        """Call a service of the platform with a payload in JSON."""
+        if self._robot is None:
+            return CallReply(ok=False, code="disconnected", message="this bridge has no connection")
+        try:
+            request = json.loads(payload or "null")
+        except ValueError as error:
+            return CallReply(ok=False, code="bad-request", message=f"the payload is no JSON: {error}")
+        try:
+            answer = await self._robot.call(service, request, deadline_s=_CALL_S, keep=True)
+            return CallReply(ok=True, reply=json.dumps(answer.reply, default=_plain))
+        except RsePfError as error:
+            return CallReply(ok=False, code=error.code, message=error.message)
+
+    async def _bridge(self, images: PairedImages) -> None:
+        frame = await asyncio.to_thread(self._incoming.decode, images)
+        if frame is None:
+            return
+        started = time.perf_counter()
+        try:
+            tracked = await self._track(frame)
+        except UsageError as error:
+            self._reason = error.message
+            self._incoming.left_out["not tracked"] += 1
+            return
+        self.track_s.append(time.perf_counter() - started)
+        del self.track_s[:-10_000]
+        self.frames += 1
+        self._stamp_ns = images.stamp_ns
+        self._reason = tracked.reason if tracked.lost else ""
+        self.lost_frames += tracked.lost
+        T_map_odom, alignment = self._alignment()
+        for message in self._outgoing.of_frame(
+            tracked, images.stamp_ns, images.camera_frame, T_map_odom=T_map_odom, alignment=alignment
+        ):
+            self._publish(message)
+        now = self._clock()
+        if now >= self._due["path"]:
+            self._due["path"] = now + _PATH_EVERY_S
+            for message in self._outgoing.path():
+                self._publish(message)
+        if now >= self._due["cloud"] and (self._cloud is None or self._cloud.done()):
+            self._due["cloud"] = now + self._options.cloud_every_s
+            self._cloud = asyncio.create_task(self._publish_cloud(images.stamp_ns))
+
+    async def _track(self, frame: Frame) -> TrackedFrame:
+        return await self._mapper.track(frame)
+
+    def _alignment(self) -> tuple[Array | None, Array | None]:
+        """Return where the odometry frame is in the map; a map of its own begins where the robot did."""
+        if isinstance(self._mapper, LiveMapper):
+            return self._mapper.T_map_odom, self._mapper.covariance
+        return _IDENTITY, None
+
+    async def _publish_cloud(self, stamp_ns: int) -> None:
+        def made() -> list[Message]:
+            least = 1 if isinstance(self._mapper, LiveMapper) else _LEAST_READINGS
+            points, colours = self._mapper.map.points(min_readings=least)
+            return self._outgoing.cloud(stamp_ns, points, colours)
+
+        for message in await asyncio.to_thread(made):
+            self._publish(message)
+
+    async def _report(self) -> None:
+        """Publish how the bridge is, each second, whether frames come or not."""
+        last = -1
+        while True:
+            connected = self._robot is None or self._robot.connected
+            values = {
+                "frames": str(self.frames),
+                "lost frames": str(self.lost_frames),
+                "scale": self._mapper.scale,
+                "track ms (median)": f"{1e3 * median(self.track_s):.1f}" if self.track_s else "",
+                "connected": str(connected).lower(),
+                **{f"left out: {why}": str(count) for why, count in sorted(self._incoming.left_out.items())},
+            }
+            trouble = "" if connected else "no connection to the platform"
+            trouble = trouble or self._reason or self._incoming.trouble
+            if isinstance(self._mapper, LiveMapper):
+                values |= {"map": self._mapper.name, "map state": self._mapper.state}
+                values["aligned"] = str(self._mapper.aligned).lower()
+                trouble = trouble or self._mapper.trouble or self._mapper.reason
+            if not trouble and self.frames == last:
+                trouble = f"no new frame of {self._options.named(self._options.colour)}"
+            last = self.frames
+            self._publish(
+                self._outgoing.diagnostics(
+                    self._stamp_ns, trouble=trouble, is_working=connected and self.frames > 0, values=values
+                )
+            )
+            await asyncio.sleep(_DIAGNOSTICS_EVERY_S)
+
+
+@contextlib.asynccontextmanager
+async def connected_bridge(
+    options: BridgeOptions, publish: Publish, *, is_ros1: bool
+) -> AsyncIterator[Bridge]:
+    """Connect to the platform that the options name, join its live map if they name one, give a bridge.
+
+    Raises:
+        UsageError: There is no address, or no token.
+        RsePfError: The platform refuses the robot.
+    """
+    async with _connect(options) as robot:
+        if not options.map:
+            mapper = robot.mapper(depth=bool(options.depth))
+            yield Bridge(mapper, options, publish, is_ros1=is_ros1, robot=robot)
+            return
+        async with robot.live_map(options.map) as live:
+            yield Bridge(live, options, publish, is_ros1=is_ros1, robot=robot)
+
+
+def _connect(options: BridgeOptions) -> Robot:
+    if options.enrolment:
+        return connect(enrolment=options.enrolment)
+    if not (options.url and options.token_file):
+        raise UsageError(
+            "the bridge needs a platform: url and token_file, or enrolment",
+            hint="rse-pf local prints the address; rse-pf token ROBOT issues a token",
+        )
+    file = Path(options.token_file)
+
+    async def token() -> str:
+        try:
+            return file.read_text(encoding="ascii").strip()
+        except (OSError, UnicodeDecodeError) as error:
+            raise UsageError(f"cannot read the token in {file}", hint="rse-pf token") from error
+
+    return connect(options.url, token=token)
+
+
+def _plain(value: Any) -> Any:
+    """Return an array as a list; bytes as text in base64."""
+    if hasattr(value, "tolist"):
+        return value.tolist()
+    if isinstance(value, bytes):
+        import base64
+
+        return base64.b64encode(value).decode()
+    raise TypeError(type(value).__name__)

@@ -1,0 +1,195 @@
+"""From the bytes of image messages to frames: paired by their time stamps, undistorted, with depth in metres.
+
+It never waits and never grows: what does not fit is counted in `IncomingFrames.left_out`.  The time of a
+frame is the stamp that the camera's driver gave, never the time of arrival.
+"""
+
+from __future__ import annotations
+
+import bisect
+import threading
+from collections import Counter, deque
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from client_sdk.bags.bag_file import BrokenMessage
+from client_sdk.bags.images import ImageFormat, check_image, decode_colour, decode_depth, format_of
+from client_sdk.bags.lens import Rectifier, lens_of
+from client_sdk.bags.message_maker import MessageMaker
+from client_sdk.bags.message_types import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE
+from client_sdk.frontend import Frame
+from ros_bridge.options import BridgeOptions
+from rse_pf.errors import RsePfError
+from rse_pf.geometry import Camera
+
+__all__ = ["IncomingFrames", "PairedImages", "Role", "kind_of"]
+
+Role = Literal["colour", "depth", "info"]
+_FAULTS = (ArithmeticError, AttributeError, LookupError, TypeError, ValueError)
+_JUMP_NS = 1_000_000_000
+"""A stamp that lies so far back is of a clock that was set, or of a bag that is played again."""
+_WAITING = 30
+"""So many images of a topic wait for their partner."""
+
+
+def kind_of(role: Role, topic: str) -> str:
+    """Return the type of a topic, as ROS 2 names it: by its role, and by the end of its name."""
+    if role == "info":
+        return CAMERA_INFO
+    return COMPRESSED_IMAGE if topic.rstrip("/").endswith(("compressed", "compressedDepth")) else IMAGE
+
+
+@dataclass(frozen=True, slots=True)
+class PairedImages:
+    """The messages of one frame: time stamp, frame of the camera, colours, and depth unless there is none."""
+
+    stamp_ns: int
+    camera_frame: str
+    colour: Any
+    depth: Any
+
+
+class IncomingFrames:
+    """Pairs the images of two topics; any thread may `add`, another may `take` and `decode`."""
+
+    def __init__(self, maker: MessageMaker, options: BridgeOptions) -> None:
+        self.left_out: Counter[str] = Counter()
+        self.trouble = "no message yet"
+        self._maker, self._options = maker, options
+        self._bound_ns = round(1e9 * options.pair_within_s)
+        self._kinds = {
+            "colour": kind_of("colour", options.colour),
+            "depth": kind_of("depth", options.depth),
+            "info": CAMERA_INFO,
+        }
+        self._lock = threading.Lock()
+        self._waiting: dict[str, list[tuple[int, Any]]] = {"colour": [], "depth": []}
+        self._formats: dict[str, ImageFormat] = {}
+        self._ready: deque[PairedImages] = deque()
+        self._last_ns = -1
+        self._camera: tuple[Camera, Rectifier] | None = None
+
+    def add(self, role: Role, data: bytes | memoryview) -> bool:
+        """Take the bytes of a message; return whether a frame became ready.  Nothing is raised."""
+        with self._lock:
+            try:
+                message = self._maker.decode(self._kinds[role], data)
+                if role == "info":
+                    self._learn_camera(message)
+                    return False
+                self._check(role, message)
+            except (BrokenMessage, RsePfError, *_FAULTS) as error:
+                self.left_out["broken"] += 1
+                self.trouble = f"a message of {getattr(self._options, role)} cannot be used: {error}"
+                return False
+            stamp = message.header.stamp
+            stamp_ns = int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
+            if stamp_ns < self._last_ns - _JUMP_NS:
+                self._begin_again()
+            elif stamp_ns <= self._last_ns:
+                self.left_out["too late"] += 1
+                return False
+            bisect.insort(self._waiting[role], (stamp_ns, message), key=lambda each: each[0])
+            if len(self._waiting[role]) > _WAITING:
+                del self._waiting[role][0]
+                self.left_out["without partner"] += 1
+            before = len(self._ready)
+            self._pair()
+            return len(self._ready) > before
+
+    def take(self) -> PairedImages | None:
+        """Return the oldest frame that is ready, None if there is none."""
+        with self._lock:
+            return self._ready.popleft() if self._ready else None
+
+    def decode(self, images: PairedImages) -> Frame | None:
+        """Return a frame without distortion; None, and a count, if its images make no sense."""
+        camera = self._camera
+        try:
+            if camera is None:
+                raise BrokenMessage(f"no camera_info came on {self._options.info}")
+            wanted, rectifier = camera
+            rgb = decode_colour(images.colour)
+            if rgb.shape[:2] != (wanted.height, wanted.width):
+                raise BrokenMessage(
+                    f"images of {rgb.shape[1]}x{rgb.shape[0]} px do not fit the camera_info of "
+                    f"{wanted.width}x{wanted.height} px"
+                )
+            if images.depth is None:
+                depth_m = np.zeros((wanted.height, wanted.width), dtype=np.float32)
+            else:
+                depth_m = decode_depth(images.depth, self._options.depth_scale)
+                if depth_m.shape != rgb.shape[:2]:
+                    raise BrokenMessage(f"depth on {self._options.depth} is not registered to the colours")
+            return Frame(
+                timestamp_s=images.stamp_ns / 1e9,
+                rgb=rectifier.colour(rgb),
+                depth_m=rectifier.depth(depth_m),
+                camera=wanted,
+            )
+        except (BrokenMessage, *_FAULTS) as error:
+            with self._lock:
+                self.left_out["broken"] += 1
+                self.trouble = str(error)
+            return None
+
+    def _begin_again(self) -> None:
+        """Forget what waits, and take stamps from before the last frame again."""
+        self.left_out["before the clock jumped back"] += sum(map(len, self._waiting.values()))
+        for waiting in self._waiting.values():
+            waiting.clear()
+        self._last_ns = -1
+
+    def _learn_camera(self, message: Any) -> None:
+        """Take the camera of the first good message; later ones of the same camera cost nothing."""
+        if self._camera is None:
+            is_rectified = "rect" in self._options.colour.rsplit("/", 1)[-1]
+            lens = lens_of(message, self._options.info, is_rectified=is_rectified)
+            self._camera = (lens.camera, Rectifier(lens, lens.camera))
+
+    def _check(self, role: Role, message: Any) -> None:
+        """Refuse an image that is cut off, or unlike the first one of its topic."""
+        if role not in self._formats:
+            found = format_of(message, self._kinds[role])
+            if found.holds != role:
+                holds = f"holds {found.holds}" if found.holds else f"has the encoding {found.encoding}"
+                raise BrokenMessage(f"it {holds}, where {role} is expected")
+            self._formats[role] = found
+        check_image(message, self._formats[role])
+
+    def _pair(self) -> None:
+        """Make frames ready, in the order of time: a colour image with the depth image nearest to it."""
+        colours, depths = self._waiting["colour"], self._waiting["depth"]
+        while colours:
+            stamp_ns, colour = colours[0]
+            if not self._options.depth:
+                self._make_ready(stamp_ns, colour, None)
+                del colours[0]
+                continue
+            if not depths:
+                return
+            nearest = min(range(len(depths)), key=lambda row: abs(depths[row][0] - stamp_ns))
+            gap_ns = abs(depths[nearest][0] - stamp_ns)
+            may_come = depths[-1][0] < stamp_ns + (gap_ns if gap_ns <= self._bound_ns else self._bound_ns)
+            if may_come and gap_ns:
+                return  # a nearer one may still arrive
+            del colours[0]
+            if gap_ns > self._bound_ns:
+                self.left_out["without partner"] += 1
+                self.trouble = f"colours have no depth within {self._options.pair_within_s:g} s"
+                continue
+            self._make_ready(stamp_ns, colour, depths[nearest][1])
+            self.left_out["without partner"] += nearest
+            del depths[: nearest + 1]
+
+    def _make_ready(self, stamp_ns: int, colour: Any, depth: Any) -> None:
+        frame = self._options.camera_frame or str(colour.header.frame_id).lstrip("/") or "camera"
+        self._ready.append(PairedImages(stamp_ns, frame, colour, depth))
+        self._last_ns = stamp_ns
+        if self.trouble.startswith(("no message", "colours have no depth")):
+            self.trouble = ""
+        if len(self._ready) > self._options.queue_frames:
+            self._ready.popleft()
+            self.left_out["too fast"] += 1

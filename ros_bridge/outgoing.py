@@ -1,0 +1,166 @@
+"""From tracked frames to messages of ROS, with the time stamps of the frames.
+
+Covariances leave the platform as those of a twist on the left of the pose that maps the world into the
+camera; ROS wants those of the camera's position, and of its rotation about the axes of the frame that it is
+in.  `ros_covariance` and `with_alignment` turn one into the other.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from client_sdk.bags.message_maker import MessageMaker
+from client_sdk.bags.message_types import DIAGNOSTICS, PATH, POINT_CLOUD, POSE_WITH_COVARIANCE, TF
+from client_sdk.frontend import TrackedFrame
+from ros_bridge.options import BridgeOptions
+from rse_pf.geometry import Array
+
+__all__ = ["Message", "OutgoingMessages", "advertised", "ros_covariance", "with_alignment"]
+
+_UNKNOWN = np.diag(np.full(6, 1e6))
+"""Covariance of a pose that comes with none: so large that no filter believes it."""
+_OK, _WARNING, _ERROR = 0, 1, 2
+
+
+@dataclass(frozen=True, slots=True)
+class Message:
+    """The bytes of a message: name of its topic, its type, and whether late subscribers get it, too."""
+
+    topic: str
+    kind: str
+    data: bytes
+
+
+def ros_covariance(covariance: Array, T_world_camera: Array) -> Array:
+    """Return the ``(6, 6)`` covariance of position and rotation in the world.
+
+    Args:
+        covariance: ``(6, 6)`` of the twist (metres, radians) on the left of ``T_camera_world``.
+        T_world_camera: ``(4, 4)``.
+    """
+    # exp(xi) T_camera_world has the inverse T_world_camera exp(-xi): both parts are rotated into the world.
+    turn = np.zeros((6, 6))
+    turn[:3, :3] = turn[3:, 3:] = T_world_camera[:3, :3]
+    found: Array = turn @ covariance @ turn.T
+    return found
+
+
+def with_alignment(covariance: Array, T_map_camera: Array, alignment: Array) -> Array:
+    """Return the ``(6, 6)`` covariance of a pose in the map: its own, and that of its alignment.
+
+    Args:
+        covariance: ``(6, 6)`` of position and rotation in the map, as if the alignment were exact.
+        T_map_camera: ``(4, 4)``.
+        alignment: ``(6, 6)`` of the twist (metres, radians) on the left of ``T_map_odom``.
+    """
+    x, y, z = T_map_camera[:3, 3]
+    lever = np.eye(6)
+    lever[:3, 3:] = -np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    found: Array = covariance + lever @ alignment @ lever.T
+    return found
+
+
+def advertised(options: BridgeOptions) -> list[tuple[str, str, bool]]:
+    """Return the topics that a bridge publishes: names, types, and whether late subscribers get the last."""
+    topics = (
+        ("rse_pf/pose", POSE_WITH_COVARIANCE, False),
+        ("rse_pf/path", PATH, False),
+        ("rse_pf/cloud", POINT_CLOUD, True),
+        ("/tf", TF, False),
+        ("/diagnostics", DIAGNOSTICS, False),
+    )
+    return [(options.named(topic), kind, latched) for topic, kind, latched in topics]
+
+
+class OutgoingMessages:
+    """Makes the messages of one robot; it keeps its path."""
+
+    def __init__(self, maker: MessageMaker, options: BridgeOptions) -> None:
+        self._maker, self._options = maker, options
+        self._path: list[tuple[int, Any]] = []
+        self._every = 1
+        self._counted = 0
+
+    def of_frame(
+        self,
+        tracked: TrackedFrame,
+        stamp_ns: int,
+        camera_frame: str,
+        *,
+        T_map_odom: Array | None,
+        alignment: Array | None = None,
+    ) -> list[Message]:
+        """Return pose and transforms of a frame; a lost one gives nothing.
+
+        Args:
+            tracked: The result of the mapper.
+            stamp_ns: Time stamp of its images.
+            camera_frame: Name of the camera's frame.
+            T_map_odom: ``(4, 4)``, where the odometry frame is in the map; None if that is unknown.
+            alignment: ``(6, 6)``, its covariance, None if unknown or exact.
+        """
+        T_odom_camera = tracked.T_world_camera
+        if T_odom_camera is None:
+            return []
+        options, odom = self._options, self._options.own_odom_frame
+        covariance = _UNKNOWN
+        is_in_map = T_map_odom is not None
+        pose = T_map_odom @ T_odom_camera if T_map_odom is not None else T_odom_camera
+        if tracked.covariance is not None:
+            covariance = ros_covariance(tracked.covariance, pose)
+            if is_in_map and alignment is not None:
+                covariance = with_alignment(covariance, pose, alignment)
+        frame = options.map_frame if is_in_map else odom
+        moved = []
+        if T_map_odom is not None:
+            moved.append(self._maker.transform(stamp_ns, options.map_frame, odom, T_map_odom))
+        if options.publish_odom:
+            moved.append(self._maker.transform(stamp_ns, odom, camera_frame, T_odom_camera))
+        made = self._maker.pose_with_covariance(stamp_ns, frame, pose, covariance)
+        found = [self._message("rse_pf/pose", POSE_WITH_COVARIANCE, made)]
+        if moved:
+            found.append(self._message("/tf", TF, self._maker.transforms(moved)))
+        self._extend_path(stamp_ns, T_odom_camera)
+        return found
+
+    def path(self) -> list[Message]:
+        """Return the path in the odometry frame: the transform to the map moves all of it at once."""
+        if not self._path:
+            return []
+        frame = self._options.own_odom_frame
+        made = self._maker.path_of(self._path[-1][0], frame, [pose for _, pose in self._path])
+        return [self._message("rse_pf/path", PATH, made)]
+
+    def cloud(
+        self, stamp_ns: int, points: npt.NDArray[np.float32], colours: npt.NDArray[np.uint8]
+    ) -> list[Message]:
+        """Return the robot's own cloud in its odometry frame."""
+        made = self._maker.cloud(stamp_ns, self._options.own_odom_frame, points, colours)
+        return [self._message("rse_pf/cloud", POINT_CLOUD, made)]
+
+    def diagnostics(
+        self, stamp_ns: int, *, trouble: str, is_working: bool, values: dict[str, str]
+    ) -> Message:
+        """Return how the bridge is: well, with a warning, or not working, and why."""
+        level = _ERROR if not is_working else _WARNING if trouble else _OK
+        name = f"rse_pf: {self._options.namespace.strip('/') or 'robot'}"
+        made = self._maker.diagnostics(stamp_ns, name, level, trouble or "poses are given", values)
+        return self._message("/diagnostics", DIAGNOSTICS, made)
+
+    def _message(self, topic: str, kind: str, message: Any) -> Message:
+        return Message(self._options.named(topic), kind, self._maker.encode(kind, message))
+
+    def _extend_path(self, stamp_ns: int, T_odom_camera: Array) -> None:
+        """Add a pose; where the path is full, each second pose goes, and later ones come half as often."""
+        self._counted += 1
+        if self._counted % self._every:
+            return
+        frame = self._options.own_odom_frame
+        self._path.append((stamp_ns, self._maker.pose(stamp_ns, frame, T_odom_camera)))
+        if len(self._path) > self._options.path_poses:
+            self._path = self._path[::2]
+            self._every *= 2

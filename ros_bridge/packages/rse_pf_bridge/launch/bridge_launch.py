@@ -1,0 +1,39 @@
+"""Start the bridge in ROS 2: ros2 launch rse_pf_bridge/launch/bridge_launch.py url:=... token_file:=...
+
+Not yet run against a ROS 2.
+"""
+
+import sys
+
+from launch import LaunchDescription
+from launch.actions import DeclareLaunchArgument, ExecuteProcess
+from launch.substitutions import LaunchConfiguration
+
+ARGUMENTS = {
+    "url": "",
+    "token_file": "",
+    "enrolment": "",
+    "namespace": "",
+    "map": "",
+    "colour": "camera/color/image_raw",
+    "depth": "camera/aligned_depth_to_color/image_raw",
+    "info": "camera/color/camera_info",
+    "publish_odom": "true",
+    "out": "",
+}
+
+
+def generate_launch_description() -> LaunchDescription:
+    """Return the bridge with its arguments; python is that of the environment with rse-pf[ros]."""
+    options = [
+        word for name in ARGUMENTS for word in (f"--{name.replace('_', '-')}", LaunchConfiguration(name))
+    ]
+    return LaunchDescription(
+        [
+            DeclareLaunchArgument("python", default_value=sys.executable),
+            *(DeclareLaunchArgument(name, default_value=value) for name, value in ARGUMENTS.items()),
+            ExecuteProcess(
+                cmd=[LaunchConfiguration("python"), "-m", "ros_bridge", "ros2", *options], output="screen"
+            ),
+        ]
+    )

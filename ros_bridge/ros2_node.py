@@ -1,0 +1,114 @@
+"""The bridge as a node of ROS 2: messages travel through rclpy as CDR bytes, and are read by the core alone.
+
+Not yet run against a ROS 2: there was none where this was written.  What is tested is the core, with the
+same bytes; nothing of this file is.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import functools
+import importlib
+import threading
+from typing import Any
+
+from ros_bridge.bridge import Bridge, CallReply, connected_bridge
+from ros_bridge.options import BridgeOptions
+from ros_bridge.outgoing import Message, advertised
+from ros_bridge.shell import end_by_signal, run_until, taken
+from rse_pf.errors import UsageError
+
+__all__ = ["run_ros2_node"]
+
+_CALL_S = 30.0
+
+
+def run_ros2_node(arguments: list[str], options: dict[str, Any]) -> int:
+    """Run the node until it is ended; *options* come before the parameters of the node.
+
+    Raises:
+        UsageError: rclpy is not installed, or a parameter cannot be used.
+        RsePfError: The platform refuses the robot.
+    """
+    try:
+        rclpy = importlib.import_module("rclpy")
+    except ImportError as error:
+        raise UsageError(
+            f"rclpy cannot be imported: {error}",
+            hint="source the setup.bash of your ROS 2, and use its Python, 3.10 or newer",
+        ) from error
+    rclpy.init(args=["rse-pf-ros", *arguments])
+    node = rclpy.create_node(
+        "rse_pf_bridge", allow_undeclared_parameters=True,
+        automatically_declare_parameters_from_overrides=True,
+    )  # fmt: skip
+    try:
+        own = {name: each.value for name, each in node.get_parameters_by_prefix("").items()}
+        own = {name: value for name, value in own.items() if name != "use_sim_time" and "." not in name}
+        namespace = str(node.get_namespace()).strip("/")
+        found = BridgeOptions.of({"namespace": namespace, **own, **options})
+        return asyncio.run(_run(rclpy, node, found))
+    finally:
+        node.destroy_node()
+        rclpy.try_shutdown()
+
+
+async def _run(rclpy: Any, node: Any, options: BridgeOptions) -> int:
+    """Bridge until a signal; the exit code is 0."""
+    ended = end_by_signal()
+    publishers = {
+        topic: node.create_publisher(_class_of(kind), topic, _quality(kept=latched))
+        for topic, kind, latched in advertised(options)
+    }
+
+    def publish(message: Message) -> None:
+        publishers[message.topic].publish(message.data)
+
+    async with connected_bridge(options, publish, is_ros1=False) as bridge:
+        for role, topic, kind in taken(options):
+            receive = functools.partial(bridge.receive, role)
+            quality = _quality(depth=options.queue_frames, sensor=True)
+            node.create_subscription(_class_of(kind), topic, receive, quality, raw=True)
+        _offer(node, bridge, asyncio.get_running_loop())
+        executor = rclpy.executors.SingleThreadedExecutor()
+        executor.add_node(node)
+        threading.Thread(target=executor.spin, name="rclpy", daemon=True).start()
+        try:
+            await run_until(bridge, options, ended)
+        finally:
+            executor.shutdown()
+    return 0
+
+
+def _offer(node: Any, bridge: Bridge, loop: asyncio.AbstractEventLoop) -> None:
+    """Offer ``~/save``; a service with a payload needs an interface that a workspace builds."""
+    trigger = importlib.import_module("std_srvs.srv").Trigger
+
+    def saved(_: Any, answer: Any) -> Any:
+        reply: CallReply = asyncio.run_coroutine_threadsafe(bridge.save(), loop).result(_CALL_S)
+        answer.success, answer.message = reply.ok, reply.reply or f"{reply.code}: {reply.message}"
+        return answer
+
+    node.create_service(trigger, "~/save", saved)
+
+
+def _class_of(kind: str) -> Any:
+    """Return the class of a type such as ``sensor_msgs/msg/Image``."""
+    package, _, name = kind.partition("/msg/")
+    try:
+        return getattr(importlib.import_module(f"{package}.msg"), name)
+    except (ImportError, AttributeError) as error:
+        raise UsageError(
+            f"{package} is not installed", hint=f"apt install ros-$ROS_DISTRO-{package.replace('_', '-')}"
+        ) from error
+
+
+def _quality(*, depth: int = 10, sensor: bool = False, kept: bool = False) -> Any:
+    """Return the quality of service: images best effort, the newest; what is published is reliable."""
+    qos = importlib.import_module("rclpy.qos")
+    return qos.QoSProfile(
+        depth=1 if kept else depth,
+        history=qos.HistoryPolicy.KEEP_LAST,
+        reliability=qos.ReliabilityPolicy.BEST_EFFORT if sensor else qos.ReliabilityPolicy.RELIABLE,
+        durability=qos.DurabilityPolicy.TRANSIENT_LOCAL if kept else qos.DurabilityPolicy.VOLATILE,
+    )

@@ -1,0 +1,42 @@
+"""What the shells share: the topics that they take, and how a bridge runs until a signal ends it."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import signal
+
+from ros_bridge.bridge import Bridge
+from ros_bridge.incoming import Role, kind_of
+from ros_bridge.options import BridgeOptions
+from rse_pf.terminal import show
+
+__all__ = ["end_by_signal", "run_until", "taken"]
+
+_ROLES: tuple[Role, ...] = ("info", "depth", "colour")
+
+
+def taken(options: BridgeOptions) -> list[tuple[Role, str, str]]:
+    """Return role, name and type of each topic that is subscribed to, the camera first."""
+    topics = ((role, str(getattr(options, role))) for role in _ROLES)
+    return [(role, options.named(topic), kind_of(role, topic)) for role, topic in topics if topic]
+
+
+def end_by_signal() -> asyncio.Event:
+    """Return an event that SIGINT and SIGTERM set; in the main thread, with a running loop."""
+    ended, loop = asyncio.Event(), asyncio.get_running_loop()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, ended.set)
+    return ended
+
+
+async def run_until(bridge: Bridge, options: BridgeOptions, ended: asyncio.Event) -> None:
+    """Run a bridge until *ended* is set, or it fails; say what it takes, and what it did."""
+    show(f"bridging {options.named(options.colour)} to {options.named('rse_pf/pose')}")
+    running, waiting = asyncio.create_task(bridge.run()), asyncio.create_task(ended.wait())
+    await asyncio.wait([running, waiting], return_when=asyncio.FIRST_COMPLETED)
+    for task in (waiting, running):
+        task.cancel()
+    with contextlib.suppress(asyncio.CancelledError):
+        await running
+    show(f"{bridge.frames} frames, {bridge.lost_frames} lost")

@@ -1,0 +1,158 @@
+"""Tests of `ros_bridge.bridge` with a robot that answers by itself: no ROS, no platform."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from client_sdk.bags.message_maker import MessageMaker
+from client_sdk.bags.message_types import CAMERA_INFO, DIAGNOSTICS, IMAGE, POSE_WITH_COVARIANCE
+from client_sdk.frontend import Frame
+from client_sdk.mapper import Mapper
+from ros_bridge import Bridge, BridgeOptions
+from ros_bridge.outgoing import Message
+from tests.client_sdk.bags.small_bags import raw_image
+from tests.client_sdk.mapper.flat_world import frame_at
+from tests.client_sdk.mapper.test_mapper import solve
+
+START_NS = 1_700_000_000_000_000_000
+
+
+class Heard:
+    """What a bridge published; `until` waits for it."""
+
+    def __init__(self) -> None:
+        self.messages: list[Message] = []
+        self._changed = asyncio.Event()
+
+    def publish(self, message: Message) -> None:
+        self.messages.append(message)
+        self._changed.set()
+
+    async def until(self, enough: Callable[[list[Message]], bool]) -> None:
+        while not enough(self.messages):
+            self._changed.clear()
+            await asyncio.wait_for(self._changed.wait(), 20)
+
+    def of(self, kind: str, maker: MessageMaker) -> list[Any]:
+        return [maker.decode(kind, each.data) for each in self.messages if each.kind == kind]
+
+
+def messages_of(maker: MessageMaker, frame: Frame, row: int) -> list[tuple[str, bytes]]:
+    """Return the messages that a driver would send for a frame."""
+    stamp, camera = START_NS + row * 100_000_000, frame.camera
+    roi = maker.make(
+        "sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False
+    )
+    info = maker.make(
+        CAMERA_INFO, header=maker.header(stamp, "eye"), height=camera.height, width=camera.width,
+        distortion_model="plumb_bob", d=np.zeros(5), k=camera.matrix.ravel(), r=np.eye(3).ravel(),
+        p=np.hstack((camera.matrix, np.zeros((3, 1)))).ravel(), binning_x=0, binning_y=0, roi=roi,
+    )  # fmt: skip
+    colour = raw_image(maker, stamp, frame.rgb, "rgb8")
+    depth = raw_image(maker, stamp, np.round(1000 * frame.depth_m).astype(np.uint16), "16UC1")
+    return [
+        ("info", maker.encode(CAMERA_INFO, info)),
+        ("colour", maker.encode(IMAGE, colour)),
+        ("depth", maker.encode(IMAGE, depth)),
+    ]
+
+
+async def bridged(rows: list[int], work: Callable[[Bridge, Heard], Any], **options: Any) -> Heard:
+    """Send frames of the flat world to a bridge, wait for their poses, and return what it published."""
+    heard, maker = Heard(), MessageMaker(is_ros1=True)
+    bridge = Bridge(Mapper(ask=solve), BridgeOptions.of(options), heard.publish, is_ros1=True)
+    running = asyncio.create_task(bridge.run())
+    try:
+        for count, row in enumerate(rows, start=1):
+            for role, data in messages_of(maker, frame_at(row, depth=True), row):
+                bridge.receive(role, data)  # type: ignore[arg-type]
+            await heard.until(lambda all_, n=count: sum(m.kind == POSE_WITH_COVARIANCE for m in all_) == n)
+        await work(bridge, heard)
+    finally:
+        running.cancel()
+        await asyncio.gather(running, return_exceptions=True)
+    return heard
+
+
+async def nothing(bridge: Bridge, heard: Heard) -> None:
+    """Do nothing more."""
+
+
+def test_poses_are_those_of_the_mapper_with_the_stamps_of_the_images() -> None:
+    heard = asyncio.run(bridged([0, 1, 2], nothing))
+
+    poses = heard.of(POSE_WITH_COVARIANCE, MessageMaker(is_ros1=True))
+    own = Mapper(ask=solve, depth=True)
+
+    async def track() -> None:
+        for row in range(3):
+            await own.track(frame_at(row, depth=True))
+
+    asyncio.run(track())
+    places = [[each.pose.pose.position.x, each.pose.pose.position.y] for each in poses]
+    assert np.allclose(places, own.trajectory.positions[:, :2], atol=2e-3)  # depth is rounded to 1 mm
+    stamps = [each.header.stamp.sec * 10**9 + each.header.stamp.nanosec for each in poses]
+    assert stamps == [START_NS, START_NS + 100_000_000, START_NS + 200_000_000]
+
+
+def test_a_service_saves_the_map_into_the_folder_of_the_options(tmp_path: Path) -> None:
+    async def save(bridge: Bridge, heard: Heard) -> None:
+        reply = await bridge.save()
+        assert reply.ok
+        assert json.loads(reply.reply)["frames"] == 2
+
+    asyncio.run(bridged([0, 1], save, out=str(tmp_path / "saved")))
+    assert {each.name for each in (tmp_path / "saved").iterdir()} == {
+        "map.ply", "trajectory.txt", "report.json"
+    }  # fmt: skip
+
+
+def test_without_a_folder_or_a_connection_services_say_so() -> None:
+    async def ask(bridge: Bridge, heard: Heard) -> None:
+        assert (await bridge.save()).code == "usage"
+        assert (await bridge.call("pnp", "{}")).code == "disconnected"
+
+    asyncio.run(bridged([0], ask))
+
+
+def test_diagnostics_count_what_was_left_out_and_say_why() -> None:
+    async def spoil(bridge: Bridge, heard: Heard) -> None:
+        bridge.receive("colour", b"broken")
+        heard.messages.clear()
+        await heard.until(lambda all_: any(m.kind == DIAGNOSTICS for m in all_))
+
+    heard = asyncio.run(bridged([0], spoil))
+    status = heard.of(DIAGNOSTICS, MessageMaker(is_ros1=True))[-1].status[0]
+    values = {each.key: each.value for each in status.values}
+    assert (status.level, values["frames"], values["left out: broken"]) == (1, "1", "1")
+    assert "cannot be used" in status.message
+
+
+def test_a_frame_without_texture_is_counted_as_lost_and_the_next_one_goes_on() -> None:
+    heard, maker = Heard(), MessageMaker(is_ros1=True)
+
+    async def drive() -> Bridge:
+        bridge = Bridge(Mapper(ask=solve), BridgeOptions(), heard.publish, is_ros1=True)
+        running = asyncio.create_task(bridge.run())
+        for row in range(5):
+            frame = frame_at(row, depth=True)
+            if row == 2:
+                frame = replace(frame, rgb=np.full_like(frame.rgb, 128))
+            for role, data in messages_of(maker, frame, row):
+                bridge.receive(role, data)  # type: ignore[arg-type]
+        await heard.until(lambda all_: sum(m.kind == POSE_WITH_COVARIANCE for m in all_) == 4)
+        running.cancel()
+        await asyncio.gather(running, return_exceptions=True)
+        return bridge
+
+    bridge = asyncio.run(drive())
+    assert (bridge.frames, bridge.lost_frames) == (5, 1)
+    stamps = [each.header.stamp.nanosec for each in heard.of(POSE_WITH_COVARIANCE, maker)]
+    assert stamps == [0, 100_000_000, 300_000_000, 400_000_000]

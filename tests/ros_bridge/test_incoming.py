@@ -1,0 +1,180 @@
+"""Tests of `ros_bridge.incoming`: which images make a frame, when, and what is counted."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from client_sdk.bags.message_maker import MessageMaker
+from client_sdk.bags.message_types import CAMERA_INFO, IMAGE
+from ros_bridge import BridgeOptions, IncomingFrames
+from ros_bridge.incoming import Role
+from tests.client_sdk.bags.small_bags import camera_info, raw_image, scene, stamp_of
+
+SHOWN = scene()
+MS = 1_000_000
+
+
+class Robot:
+    """The messages of a robot, as bytes of ROS 1 or CDR, into what is tested."""
+
+    def __init__(self, *, is_ros1: bool = True, **options: object) -> None:
+        self.maker = MessageMaker(is_ros1=is_ros1)
+        self.frames = IncomingFrames(self.maker, BridgeOptions.of(options))
+        self.send("info", camera_info(self.maker, stamp_of(0)))
+
+    def send(self, role: Role, message: object) -> bool:
+        kind = CAMERA_INFO if role == "info" else IMAGE
+        return self.frames.add(role, self.maker.encode(kind, message))
+
+    def colour(self, stamp_ns: int, row: int = 0) -> bool:
+        return self.send("colour", raw_image(self.maker, stamp_ns, SHOWN.colours[row], "rgb8"))
+
+    def depth(self, stamp_ns: int, row: int = 0) -> bool:
+        return self.send("depth", raw_image(self.maker, stamp_ns, SHOWN.depths_mm[row], "16UC1"))
+
+    def taken(self) -> list[int]:
+        found = []
+        while (images := self.frames.take()) is not None:
+            found.append(images.stamp_ns)
+        return found
+
+
+@pytest.mark.parametrize("is_ros1", [True, False])
+def test_a_frame_has_the_pixels_the_depth_and_the_stamp_of_its_messages(is_ros1: bool) -> None:
+    robot = Robot(is_ros1=is_ros1)
+
+    assert not robot.colour(stamp_of(1), 1)
+    assert robot.depth(stamp_of(1), 1)
+    images = robot.frames.take()
+    assert images is not None
+    frame = robot.frames.decode(images)
+
+    assert frame is not None
+    assert (images.stamp_ns, images.camera_frame) == (stamp_of(1), "eye")
+    assert frame.timestamp_s == stamp_of(1) / 1e9
+    assert np.array_equal(frame.rgb, SHOWN.colours[1])
+    assert np.array_equal(frame.depth_m, SHOWN.depths_mm[1].astype(np.float32) / np.float32(1000))
+
+
+def test_colours_take_the_nearest_depth_and_wait_while_a_nearer_one_may_come() -> None:
+    robot = Robot()
+    stamp = stamp_of(0)
+
+    robot.depth(stamp - 8 * MS, 0)
+    assert not robot.colour(stamp)
+    assert robot.depth(stamp + 3 * MS, 1)
+
+    images = robot.frames.take()
+    assert images is not None
+    frame = robot.frames.decode(images)
+    assert frame is not None
+    assert frame.depth_m[20, 20] == pytest.approx(SHOWN.depths_mm[1][20, 20] / 1000)
+
+
+def test_colours_without_depth_within_the_bound_are_left_out_and_counted() -> None:
+    robot = Robot(pair_within_s=0.01)
+
+    robot.colour(stamp_of(0))
+    robot.depth(stamp_of(0) + 30 * MS)
+    robot.colour(stamp_of(1))
+    robot.depth(stamp_of(1))
+
+    assert robot.taken() == [stamp_of(1)]
+    assert robot.frames.left_out["without partner"] == 2
+
+
+def test_frames_leave_in_the_order_of_their_stamps_and_late_ones_are_counted() -> None:
+    robot = Robot()
+    for stamp in (stamp_of(1), stamp_of(0)):
+        robot.colour(stamp)
+    for stamp in (stamp_of(0), stamp_of(1)):
+        robot.depth(stamp)
+    robot.colour(stamp_of(0))
+
+    assert robot.taken() == [stamp_of(0), stamp_of(1)]
+    assert robot.frames.left_out["too late"] == 1
+
+
+def test_a_bag_that_is_played_again_gives_frames_again() -> None:
+    robot = Robot(queue_frames=10)
+    for row in (0, 1, 2, 3):
+        robot.colour(stamp_of(row) + 10 * row * MS)
+        robot.depth(stamp_of(row) + 10 * row * MS)
+    robot.colour(stamp_of(90))  # waits for its depth when the bag ends
+    robot.depth(stamp_of(20))
+    robot.colour(stamp_of(20))
+
+    robot.colour(stamp_of(0))
+    robot.depth(stamp_of(0))
+
+    assert robot.taken()[-2:] == [stamp_of(20), stamp_of(0)]
+    assert robot.frames.left_out == {"without partner": 0, "before the clock jumped back": 1}
+
+
+def test_the_oldest_frame_is_dropped_where_too_many_wait() -> None:
+    robot = Robot(queue_frames=2, depth="")
+    for row in range(4):
+        robot.colour(stamp_of(row))
+
+    assert robot.taken() == [stamp_of(2), stamp_of(3)]
+    assert robot.frames.left_out["too fast"] == 2
+
+
+def test_without_depth_each_colour_image_is_a_frame() -> None:
+    robot = Robot(depth="")
+    assert robot.colour(stamp_of(0))
+    images = robot.frames.take()
+    assert images is not None
+    frame = robot.frames.decode(images)
+    assert frame is not None
+    assert not frame.depth_m.any()
+
+
+def test_images_that_wait_for_depth_are_bounded() -> None:
+    robot = Robot()
+    for number in range(100):
+        robot.colour(stamp_of(0) + number * MS)
+
+    assert robot.taken() == []
+    assert robot.frames.left_out["without partner"] == 70
+
+
+@pytest.mark.parametrize("cut", [0, 3, 40, 2000])
+def test_a_broken_message_is_counted_and_the_next_one_is_taken(cut: int) -> None:
+    robot = Robot(depth="")
+    whole = robot.maker.encode(IMAGE, raw_image(robot.maker, stamp_of(0), SHOWN.colours[0], "rgb8"))
+
+    assert not robot.frames.add("colour", whole[:cut])
+    assert robot.colour(stamp_of(1))
+
+    assert robot.frames.left_out["broken"] == 1
+    assert robot.taken() == [stamp_of(1)]
+
+
+def test_a_topic_of_the_wrong_content_says_so() -> None:
+    robot = Robot()
+    robot.send("colour", raw_image(robot.maker, stamp_of(0), SHOWN.depths_mm[0], "16UC1"))
+    assert "holds depth, where colour is expected" in robot.frames.trouble
+
+
+def test_frames_before_any_camera_info_are_left_out() -> None:
+    robot = Robot(depth="")
+    robot.frames._camera = None
+    robot.colour(stamp_of(0))
+    images = robot.frames.take()
+    assert images is not None
+    assert robot.frames.decode(images) is None
+    assert "no camera_info" in robot.frames.trouble
+
+
+def test_a_lens_with_distortion_is_undistorted() -> None:
+    robot = Robot(depth="")
+    robot.frames._camera = None
+    robot.send("info", camera_info(robot.maker, stamp_of(0), (0.3, -0.1, 0.0, 0.0, 0.0)))
+    robot.colour(stamp_of(0))
+    images = robot.frames.take()
+    assert images is not None
+    frame = robot.frames.decode(images)
+    assert frame is not None
+    assert not np.array_equal(frame.rgb, SHOWN.colours[0])

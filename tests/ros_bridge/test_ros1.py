@@ -1,0 +1,265 @@
+"""A real robot of ROS 1: roscore, a bag that rosbag plays, the bridge, and a node that hears its topics."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, TypedDict
+
+import numpy as np
+import pytest
+
+from benchmarks.maps.bags import write_recording
+from client_sdk import connect
+from client_sdk.bags import BagOptions, open_bag
+from client_sdk.bags.message_types import load_types
+from rse_pf.config import PlatformSettings
+from rse_pf.local.control.platform import LocalPlatform
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
+
+_PYTHON = "/usr/bin/python3"
+_DIST = Path("/usr/lib/python3/dist-packages")
+_FRAMES = 60
+_TOPICS = {"colour": "/camera/image_raw", "depth": "/camera/aligned_depth", "info": "/camera/camera_info"}
+_NEEDED = ("rospy", "geometry_msgs", "nav_msgs", "sensor_msgs", "tf2_msgs", "diagnostic_msgs")
+
+
+class Line(TypedDict, total=False):
+    """A line of the listener."""
+
+    kind: str
+    stamp: int
+    at: float
+    frame: str
+    child: str
+    position: list[float]
+    values: dict[str, str]
+
+
+class Program:
+    """A process whose lines are kept; it is ended with its group."""
+
+    def __init__(self, words: list[str], env: dict[str, str]) -> None:
+        self.lines: list[str] = []
+        self._changed = threading.Condition()
+        self.process = subprocess.Popen(
+            words,
+            env=env,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            bufsize=1,
+            start_new_session=True,
+        )
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+
+    def _read(self) -> None:
+        assert self.process.stdout is not None
+        for line in self.process.stdout:
+            with self._changed:
+                self.lines.append(line)
+                self._changed.notify_all()
+
+    def until(self, enough: Callable[[list[str]], bool], timeout_s: float = 60) -> None:
+        """Wait for lines; fail with all of them after *timeout_s*."""
+        with self._changed:
+            assert self._changed.wait_for(lambda: enough(self.lines), timeout_s), "".join(self.lines[-20:])
+
+    def heard(self, kind: str) -> list[Line]:
+        """Return the lines of a kind that a listener wrote."""
+        found: list[Line] = [json.loads(line) for line in list(self.lines) if line.startswith("{")]
+        return [line for line in found if line["kind"] == kind]
+
+    def end(self, number: int = signal.SIGINT) -> int:
+        """End the process, and return its exit code."""
+        if self.process.poll() is None:
+            os.killpg(self.process.pid, number)
+            try:
+                self.process.wait(15)
+            except subprocess.TimeoutExpired:
+                os.killpg(self.process.pid, signal.SIGKILL)
+        code = self.process.wait(15)
+        self._reader.join(15)
+        if self.process.stdout is not None and not self._reader.is_alive():
+            self.process.stdout.close()
+        return code
+
+
+class Ros:
+    """A master on a free port, and programs that know it."""
+
+    def __init__(self, folder: Path) -> None:
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            self._port = free.getsockname()[1]
+        self._env = {
+            **{name: value for name, value in os.environ.items() if not name.startswith("ROS")},
+            "ROS_MASTER_URI": f"http://127.0.0.1:{self._port}", "ROS_IP": "127.0.0.1",
+            "ROS_HOME": str(folder), "PYTHONPATH": str(Path(__file__).parents[2]),
+        }  # fmt: skip
+        self._stack = contextlib.ExitStack()
+
+    def start(self, *words: str) -> Program:
+        program = Program(list(words), self._env)
+        self._stack.callback(program.end, signal.SIGTERM)
+        return program
+
+    def master(self) -> Program:
+        # roscore would start this program in a group of its own, and leave it behind when it is killed.
+        return self.start("rosmaster", "--core", "-p", str(self._port))
+
+    def listener(self, colour: str = "") -> Program:
+        env_words = (_PYTHON, str(Path(__file__).with_name("ros1_listener.py")), colour)
+        program = self.start(*env_words)
+        program.until(lambda lines: any('"ready"' in line for line in lines))
+        return program
+
+    def bridge(self, url: str, token_file: Path, **options: str) -> Program:
+        words = [f"--{name.replace('_', '-')}={value}" for name, value in {**_TOPICS, **options}.items()]
+        program = self.start(
+            sys.executable, "-m", "ros_bridge", "ros1", "--url", url, "--token-file", str(token_file),
+            "--publish-odom=false", "--queue-frames=100", *words,
+        )  # fmt: skip
+        program.until(lambda lines: any(line.startswith("bridging") for line in lines))
+        return program
+
+    def play(self, bag: Path, rate: float) -> Program:
+        return self.start("rosbag", "play", "-q", "-d", "2", "-r", str(rate), str(bag))
+
+    def end(self) -> None:
+        self._stack.close()
+
+
+@pytest.fixture
+def ros(tmp_path: Path) -> Iterator[Ros]:
+    missing = [each for each in _NEEDED if not (_DIST / each).is_dir()]
+    missing += [each for each in ("rosmaster", "rosbag") if shutil.which(each) is None]
+    if missing:
+        pytest.skip(f"no ROS 1: {', '.join(missing)} (apt install ros-core python3-nav-msgs ...)")
+    world = Ros(tmp_path / "ros")
+    yield world
+    world.end()
+
+
+@pytest.fixture(scope="module")
+def bag(recordings: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("bag") / "kitchen.bag"
+    write_recording(recordings / "7scenes_redkitchen", path, "ros1", is_raw=True, frames=_FRAMES)
+    return path
+
+
+def test_our_definitions_are_those_of_ros(ros: Ros) -> None:
+    """The sum of a definition is what nodes of ROS 1 compare; Debian's packages are the reference."""
+    types = load_types(is_ros1=True)
+    wanted = [kind for kind in types.types if (_DIST / kind.partition("/")[0]).is_dir()]
+    script = (
+        "import importlib,json,sys;print(json.dumps({k:getattr(importlib.import_module("
+        "k.split('/')[0]+'.msg'),k.split('/')[2])._md5sum for k in json.loads(sys.argv[1])}))"
+    )
+    words = [_PYTHON, "-c", script, json.dumps(wanted)]
+    theirs = json.loads(subprocess.run(words, check=True, capture_output=True, text=True).stdout)
+    assert {kind: types.generate_msgdef(kind, ros_version=1)[1] for kind in wanted} == theirs
+    assert len(wanted) >= 20
+
+
+def test_poses_equal_those_of_the_sdk_and_survive_a_killed_server_and_a_killed_master(
+    ros: Ros, bag: Path, tmp_path: Path
+) -> None:
+    asyncio.run(_drive(ros, bag, tmp_path))
+
+
+async def _drive(ros: Ros, bag: Path, folder: Path) -> None:
+    token_file = folder / "token"
+    async with LocalPlatform(PlatformSettings(), port=0, servers=2, state=folder / "platform") as platform:
+        token_file.write_text(platform.issue_token("ros-1"), encoding="ascii")
+        expected = await _own_run(bag, platform)
+
+        master = await asyncio.to_thread(ros.master)
+        listener = await asyncio.to_thread(ros.listener, _TOPICS["colour"])
+        bridge = await asyncio.to_thread(ros.bridge, platform.url, token_file)
+
+        first = await _played(ros, bag, listener, _FRAMES)
+        assert _worst_mm(first, expected) <= 1.0
+        assert {line["frame"] for line in first} == {"map"}
+        assert {(line["frame"], line["child"]) for line in listener.heard("tf")} >= {("map", "odom")}
+        assert listener.heard("path")
+        assert listener.heard("cloud")
+        _tell_delay(listener)
+        await asyncio.to_thread(bridge.end)
+        assert bridge.lines[-1] == f"{_FRAMES} frames, 0 lost\n"
+
+        bridge = await asyncio.to_thread(ros.bridge, platform.url, token_file)
+        player = ros.play(bag, 0.5)
+        await asyncio.to_thread(listener.until, _poses(_FRAMES + 10))
+        platform.kill(await _server_of_the_robot(platform))
+        await asyncio.to_thread(listener.until, _poses(_FRAMES + 20))
+        master.end(signal.SIGKILL)
+        await asyncio.to_thread(listener.until, _poses(2 * _FRAMES))
+        await asyncio.to_thread(player.end)
+        second = listener.heard("pose")[_FRAMES:]
+        assert _worst_mm(second, expected) <= 1.0
+
+        await asyncio.to_thread(ros.master)
+        await asyncio.to_thread(bridge.until, lambda lines: any("registered again" in each for each in lines))
+        late = await asyncio.to_thread(ros.listener)
+        player = ros.play(bag, 0.5)
+        await asyncio.to_thread(late.until, _poses(1))
+        await asyncio.to_thread(player.end)
+        assert await asyncio.to_thread(bridge.end) == 0
+
+
+async def _own_run(bag: Path, platform: LocalPlatform) -> dict[int, np.ndarray[Any, Any]]:
+    """Return the positions that the SDK alone finds, by time stamps."""
+    with open_bag(bag, BagOptions()) as opened:
+        async with connect(platform.url, token=platform.issue_token("sdk")) as robot:
+            mapper = robot.mapper()
+            for frame in opened:
+                await mapper.track(frame)
+    path = mapper.trajectory
+    assert len(path) == _FRAMES
+    return {round(1e9 * s / 1e6): p for s, p in zip(path.timestamps_s, path.positions, strict=True)}
+
+
+async def _played(ros: Ros, bag: Path, listener: Program, poses: int) -> list[Line]:
+    player = ros.play(bag, 0.5)
+    await asyncio.to_thread(listener.until, _poses(poses))
+    await asyncio.to_thread(player.end)
+    return listener.heard("pose")
+
+
+def _poses(number: int) -> Callable[[list[str]], bool]:
+    return lambda lines: sum('"kind": "pose"' in line for line in lines) >= number
+
+
+def _worst_mm(heard: list[Line], expected: dict[int, np.ndarray[Any, Any]]) -> float:
+    """Return the largest distance from the SDK's own poses of the same time stamps, millimetres."""
+    by_ms = {round(line["stamp"] / 1e6): line["position"] for line in heard}
+    assert by_ms.keys() == expected.keys()
+    return 1e3 * max(float(np.linalg.norm(np.array(by_ms[ms]) - expected[ms])) for ms in expected)
+
+
+async def _server_of_the_robot(platform: LocalPlatform) -> str:
+    """Return the server that the one connected robot is on."""
+    pages = {each.name: await platform.backend_servers.status(each) for each in platform.servers}
+    (name,) = (name for name, page in pages.items() if page is not None and page["robots"])
+    return name
+
+
+def _tell_delay(listener: Program) -> None:
+    """Print how long after its image a pose came, and how long the mapper needed of that."""
+    came = {line["stamp"]: line["at"] for line in listener.heard("image")}
+    delays = [1e3 * (line["at"] - came[line["stamp"]]) for line in listener.heard("pose")]
+    tracking = listener.heard("status")[-1]["values"]["track ms (median)"]
+    print(f"image to pose: median {np.median(delays):.1f} ms, of which the mapper took {tracking} ms")
