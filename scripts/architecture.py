@@ -18,8 +18,8 @@ from pathlib import Path
 
 __all__ = ["draw", "main", "package_imports", "read_sources"]
 
-TOPS = ("rse_pf", "client_sdk", "lambda_pnp", "stacks")
-PROCESSES = {"backend", "data_server", "local", "client_sdk", "lambda_pnp", "stacks"}
+TOPS = ("rse_pf", "client_sdk", "lambda_pnp", "ros_bridge", "stacks")
+PROCESSES = {"backend", "data_server", "local", "client_sdk", "lambda_pnp", "ros_bridge", "stacks"}
 ABOVE = {"cli", "experiments"}
 
 _TITLE_PX, _LINE_PX, _PAD_PX = 22, 15, 10

@@ -26,6 +26,12 @@ lock docs docs build
 lock release release build
 lock browser browser
 lock foxglove foxglove
+lock ros ros-dds
+# A client of the conformance table, which the platform itself does not need.
+# shellcheck disable=SC2086
+.venv/bin/uv pip compile tests/clients/rosbridge.in --quiet --universal --python-version 3.10 \
+  --generate-hashes --no-emit-index-url --no-emit-find-links --no-annotate $constraints \
+  --custom-compile-command 'make lock' --output-file locks/rosbridge.txt
 # What boots has one platform, so its locks have no conditions.
 for_platform() { # for_platform FILE PYTHON INPUT...
   file=$1 python=$2

@@ -27,7 +27,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-PACKAGES = ("rse_pf", "client_sdk", "lambda_pnp")
+PACKAGES = ("rse_pf", "client_sdk", "lambda_pnp", "ros_bridge")
 SINGLE_FILES = ("pyproject.toml", "MANIFEST.in", "README.md", "CHANGELOG.md", "LICENSE")
 PAGES = (".md", ".json")
 """Of docs/, what the sdist holds; pictures are left out."""

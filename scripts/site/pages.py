@@ -156,7 +156,7 @@ def _public_names(module: str) -> list[str]:
 
 def cli_page() -> str:
     """Return the help pages of all verbs and their actions, as the parsers print them."""
-    from rse_pf.cli.main import VERBS
+    from rse_pf.cli.main import VERBS, parser_of
 
     lines = [
         "# Which commands does `rse-pf` have?",
@@ -169,26 +169,11 @@ def cli_page() -> str:
         "",
     ]
     for verb in VERBS:
-        parser = _parser(verb)
+        parser = parser_of(verb)
         lines += [f"## rse-pf {verb}", "", *_help(parser)]
         for name, sub in _actions(parser):
             lines += [f"### rse-pf {verb} {name}", "", *_help(sub)]
     return "\n".join(lines) + "\n"
-
-
-def _parser(verb: str) -> argparse.ArgumentParser:
-    from rse_pf.cli.main import Parser
-
-    module: Any = importlib.import_module(f"rse_pf.cli.{verb}")
-    parser = Parser(
-        prog=f"rse-pf {verb}",
-        description=(module.__doc__ or "").strip(),
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
-    )
-    parser.add_argument("--settings", type=Path, metavar="FILE", help="read settings from FILE")
-    module.add_arguments(parser)
-    return parser
 
 
 def _actions(parser: argparse.ArgumentParser) -> Iterator[tuple[str, argparse.ArgumentParser]]:

@@ -36,7 +36,7 @@ EXECUTED_IN = {
     "rse-pf map diff": "tests/cli/test_pages.py",
     "rse-pf map rollback": "tests/cli/test_pages.py",
     "rse-pf map export": "tests/cli/test_pages.py",
-    "rse-pf robot adopt": "tests/cli/test_adopt.py",
+    "rse-pf robot adopt": "tests/cli/access/test_adopt.py",
 }
 """Commands that need a store or a robot with a past: another test makes it, and runs them."""
 _START = re.compile(r"rse-pf local(?= --(?!lan)| *$)")

@@ -112,7 +112,8 @@ def platform(
 ) -> Iterator[ExamplePlatform]:
     """A platform of one server with the service of the examples; robots-1 to 3 are enrolled.
 
-    It has a data service if the module of the test says ``HAS_DATA``.
+    It has a data service if the module of the test says ``HAS_DATA``, and lets pages of its
+    ``ALLOWED_ORIGINS`` connect.
     """
     folder = tmp_path_factory.mktemp("examples")
     state = folder / "platform"
@@ -128,6 +129,7 @@ def platform(
         auth={"leeway_s": 1},
         local={"start_timeout_s": START_S},
         services={"folder": str(folder / "services"), "accept_weak_isolation": True},
+        serving={"allowed_origins": getattr(request.module, "ALLOWED_ORIGINS", "")},
     )
     cloud = LocalPlatform(
         settings, state=state, servers=1, port=0, data=getattr(request.module, "HAS_DATA", False)

@@ -21,8 +21,8 @@ from tests.examples.conftest import ExamplePlatform, Program, Relay
 from tests.examples.example_page import REPOSITORY
 
 cv2 = pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
-from tests.examples.rendered_inputs import SCENE_CAMERA, draw_scene, write_video  # noqa: E402
-from tests.examples.test_object_recognition import COVER, placed  # noqa: E402
+from tests.examples.rendered_inputs import SCENE_CAMERA, draw_scene, write_video  # noqa: E402  after importorskip
+from tests.examples.test_object_recognition import COVER, placed  # noqa: E402  after importorskip
 
 pytestmark = pytest.mark.system
 Start = Callable[[list[str]], Program]

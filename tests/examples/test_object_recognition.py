@@ -16,7 +16,7 @@ from rse_pf.services.custom.installed import read_service
 from rse_pf.services.custom.runtime import Runtime, open_runtime
 
 cv2 = pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
-from tests.examples.rendered_inputs import SCENE_CAMERA, TAG_M, draw_scene  # noqa: E402
+from tests.examples.rendered_inputs import SCENE_CAMERA, TAG_M, draw_scene  # noqa: E402  after importorskip
 
 FOLDER = Path(__file__).parents[2] / "examples" / "robots" / "object_recognition_service"
 COVER = FOLDER / "objects" / "cover.png"
@@ -61,6 +61,16 @@ def test_a_cover_and_a_tag_are_found_where_they_are(service: Runtime, seed: int)
     metres, degrees = pose_difference(found[1].T_camera_object.reshape(4, 4), tag)
     assert metres <= 0.02
     assert degrees <= 4.0
+
+
+def test_tags_alone_are_found_where_they_were_found_with_objects(service: Runtime) -> None:
+    cover, tag = placed(0)
+    request = request_of(draw_scene(COVER, cover, tag, tag=7, seed=0))
+
+    alone = service.call(request | {"tags_only": True}).found
+
+    assert [each.name for each in alone] == ["tag36h11:7"]
+    assert (alone[0].T_camera_object == service.call(request).found[1].T_camera_object).all()
 
 
 def test_an_image_without_objects_has_none(service: Runtime) -> None:

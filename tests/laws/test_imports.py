@@ -20,6 +20,7 @@ ORDER = (
     "recording", "recording.explain", "recording.replay",
     "aws", "aws.storage", "aws.fleet", "aws.money",
     "backend", "backend.scheduling", "backend.sandbox", "backend.jobs", "backend.live_map", "backend.compute",
+    "backend.rosbridge",
     "backend.gateway",
     "backend.supervisor",
     "data_server",
@@ -28,6 +29,7 @@ ORDER = (
     "client_sdk", "client_sdk.bags", "client_sdk.transfer", "client_sdk.datasets", "client_sdk.cameras",
     "client_sdk.simulator",
     "client_sdk.facade",
+    "ros_bridge",
     "fleet_page",
     "lambda_pnp",
     "stacks", "stacks.boot", "app",
@@ -77,6 +79,7 @@ ONLY: dict[str, set[str]] = {
         "recording",
     },
     "fleet_page": _BELOW | {"local", "client_sdk"},
+    "ros_bridge": {"errors", "geometry", "terminal", "client_sdk"},
     "stacks": {"config", "scaling", "errors"},
     "app": {"config", "errors", "stacks"},
     "experiments": _BELOW | LEAVES - {"stacks"},
@@ -85,7 +88,7 @@ ONLY: dict[str, set[str]] = {
 """Where the order alone would allow too much, by top package."""
 
 PACKAGES: dict[str, tuple[str, ...]] = {
-    "numpy": ("rse_pf/", "client_sdk/", "lambda_pnp/"),
+    "numpy": ("rse_pf/", "client_sdk/", "lambda_pnp/", "ros_bridge/"),
     "msgspec": ("rse_pf/", "client_sdk/", "lambda_pnp/"),
     "websockets": ("client_sdk/connection.py",),
     "cv2": (
@@ -124,6 +127,7 @@ PACKAGES: dict[str, tuple[str, ...]] = {
     "mcap": ("rse_pf/recording/",),
     "rosbags": ("client_sdk/bags/",),
     "apsw": ("client_sdk/bags/",),
+    "cyclonedds": ("ros_bridge/dds.py",),
     "foxglove": ("rse_pf/fleet_page/foxglove_export.py",),
     "viser": ("rse_pf/experiments/plots/map_viewer.py",),
     "rich": ("rse_pf/cli/", "rse_pf/experiments/"),
@@ -209,7 +213,7 @@ def broken_import_laws(tree: Mapping[str, str]) -> list[str]:
 
 def _wrong(path: str, package: str, name: str, at_import: bool) -> Iterator[str]:
     top, room = name.split(".")[0], package.partition(".")[0]
-    if top in {"rse_pf", "client_sdk", "lambda_pnp", "stacks", "app"}:
+    if top in {"rse_pf", "client_sdk", "lambda_pnp", "ros_bridge", "stacks", "app"}:
         other = package_of(name)
         if other == "client_sdk.facade" and room != "client_sdk":
             other = "client_sdk"

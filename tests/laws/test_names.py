@@ -25,8 +25,9 @@ LEFT_OUT = (
 )  # fmt: skip
 ENDINGS = {".py", ".md", ".json", ".toml", ".sh", ".c", ".h", ".hpp", ".cpp", ".lua", ".service", ""}
 MEANT: dict[str, dict[str, str]] = {
-    "benchmarks/map_services.py": {"walls": "of a synthetic room"},
+    "benchmarks/maps/services.py": {"walls": "of a synthetic room"},
     "client_sdk/simulator/": {"door": "of the rendered world", "doors": "the same", "seams": "between tiles"},
+    "tests/client_sdk/simulator/": {"doors": "of the rendered world"},
     "rse_pf/services/mapping/wifi.py": {"walls": "they damp the signal"},
     "rse_pf/services/synthetic_maps.py": {"walls": "of a synthetic room"},
     "tests/services/mapping/test_icp.py": {"walls": "of a synthetic room"},
@@ -36,6 +37,7 @@ MEANT: dict[str, dict[str, str]] = {
 }
 """Path or folder -> word -> why that word is right there."""
 TEMPLATES = "/templates/"
+UNREAD = {"__pycache__", "node_modules"}
 
 
 def double_class_names(tree: Mapping[str, str]) -> list[str]:
@@ -111,7 +113,9 @@ def searched(repository: Path) -> Mapping[str, str]:
     return {
         name: file.read_text(encoding="utf-8", errors="replace")
         for name, file in named.items()
-        if file.is_file() and not name.startswith(LEFT_OUT) and "__pycache__" not in name
+        if file.is_file()
+        and not name.startswith(LEFT_OUT)
+        and not {"__pycache__", "node_modules"} & {*file.parts}
     }
 
 

@@ -55,7 +55,7 @@ def test_nothing_writes_past_the_one_writer(sources: Mapping[str, str]) -> None:
     ],
 )
 def test_the_law_sees_each_other_way_to_write(text: str) -> None:
-    assert other_writers({"rse_pf/cli/map.py": text}) != []
+    assert other_writers({"rse_pf/cli/maps/map.py": text}) != []
 
 
 def test_every_exception_is_a_file_that_needs_it(sources: Mapping[str, str]) -> None:

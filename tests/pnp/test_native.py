@@ -23,7 +23,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from benchmarks.native_solver import (
+from benchmarks.solver.native import (
     case,
     compare,
     degenerate,

@@ -167,7 +167,7 @@ def test_what_is_shipped_is_what_git_tracks_of_the_packages_and_of_their_readers
     assert {"rse_pf/services/custom/templates/python/service.json", "rse_pf/config/renamed.json"} <= names
     assert {"examples/services/icp-python/service.py", "docs/protocol.md"} <= names
     assert {name.partition("/")[0] for name in names if "/" in name} == {
-        "rse_pf", "client_sdk", "lambda_pnp", "docs", "examples",
+        "rse_pf", "client_sdk", "lambda_pnp", "ros_bridge", "docs", "examples",
     }  # fmt: skip
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.map_services import (
+from benchmarks.maps.services import (
     cloud_distances,
     joined_poses,
     localise_row,
