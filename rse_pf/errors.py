@@ -13,6 +13,7 @@ from typing import ClassVar
 
 __all__ = [
     "ERRORS_PAGE",
+    "Archived",
     "AuthError",
     "BadMessage",
     "BadRequest",
@@ -459,6 +460,15 @@ class StoreFull(StoreError, code="store-full"):
     Cause: The disk of the store is full, or the robot's quota of bytes is used up.
     Check: Run df on the folder of data.store, and compare the quota with data.quota_bytes.
     Fix: Delete objects that are not needed, or raise the quota or the disk.
+    """
+
+
+class Archived(StoreError, code="archived"):
+    """The object is in an archive of S3, from which it cannot be read at once.
+
+    Cause: A lifecycle rule, or an operator, moved it to the class GLACIER or DEEP_ARCHIVE.
+    Check: Ask S3 for its class and the state of its restoration: aws s3api head-object.
+    Fix: Restore it with aws s3api restore-object, wait for some hours, then copy it onto itself.
     """
 
 

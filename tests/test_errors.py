@@ -20,6 +20,7 @@ from rse_pf.errors import (
 )
 
 CODES = {
+    "Archived": "archived",
     "AuthError": "auth",
     "BadMessage": "bad-message",
     "BadRequest": "bad-request",

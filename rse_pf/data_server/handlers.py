@@ -278,22 +278,33 @@ class Handlers:
             refused = failure_reply(error)
             return HttpReply(status=416, body=refused.body, headers={"Content-Range": f"bytes */{size}"})
         start, end = part or (0, size)
+        first = await self._piece(robot, name, start, end)  # an error is answered as one, before the header
         headers = {**_content_headers(digest), "Content-Length": str(end - start)}
         if part:
             headers["Content-Range"] = f"bytes {start}-{end - 1}/{size}"
         return HttpReply(
-            status=206 if part else 200, body=self._pieces(robot, name, start, end), headers=headers,
+            status=206 if part else 200, body=self._pieces(robot, name, first, start, end),
+            headers=headers,
             media_type=BYTES,
         )  # fmt: skip
 
-    async def _pieces(self, robot: RobotId, name: str, start: int, end: int) -> AsyncIterator[bytes]:
+    async def _pieces(
+        self, robot: RobotId, name: str, piece: bytes, start: int, end: int
+    ) -> AsyncIterator[bytes]:
         while start < end:
-            length = min(_PIECE_BYTES, end - start)
-            piece = await self.threads.run(robot, read_range, self._store, name, start, length)
-            if not piece:
-                raise NotFound("the object was removed while it was read")
-            start += len(piece)
             yield piece
+            start += len(piece)
+            piece = await self._piece(robot, name, start, end)
+
+    async def _piece(self, robot: RobotId, name: str, start: int, end: int) -> bytes:
+        """Return the bytes from *start* on, at most `_PIECE_BYTES`; none if there are none before *end*."""
+        if start >= end:
+            return b""
+        length = min(_PIECE_BYTES, end - start)
+        piece: bytes = await self.threads.run(robot, read_range, self._store, name, start, length)
+        if not piece:
+            raise NotFound("the object was removed while it was read")
+        return piece
 
 
 def _content_headers(digest: str) -> dict[str, str]:

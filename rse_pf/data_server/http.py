@@ -17,6 +17,7 @@ import msgspec
 
 from rse_pf.config import DataSettings
 from rse_pf.errors import (
+    Archived,
     BadRequest,
     Busy,
     Conflict,
@@ -70,7 +71,7 @@ _STATUS: dict[type[RsePfError], int] = {
     MethodNotAllowed: 405, TooManyRequests: 429,
     Unauthorized: 401, Forbidden: 403, NotFound: 404, Expired: 408, Conflict: 409, LimitExceeded: 413,
     QuotaExceeded: 413, Crashed: 413, BadRequest: 400, InvalidCamera: 400, Busy: 503, WorkerLost: 503,
-    StoreFull: 507, StoreError: 503,
+    Archived: 409, StoreFull: 507, StoreError: 503,
 }  # fmt: skip
 _RANGE = re.compile(r"bytes=(\d{0,18})-(\d{0,18})")
 

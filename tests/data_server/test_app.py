@@ -17,7 +17,7 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
 from rse_pf.auth.tokens import SigningKey
-from rse_pf.errors import StoreError, StoreFull
+from rse_pf.errors import Archived, StoreError, StoreFull
 from rse_pf.object_store import DirectoryStore, MemoryStore, ObjectInfo, digest_of
 
 DATA = bytes(range(256)) * 4
@@ -49,6 +49,21 @@ def test_the_server_makes_the_name_of_an_object(service: Service) -> None:
 def test_bytes_with_another_digest_are_refused(service: Service) -> None:
     assert service.ask("PUT", OBJECT, DATA + b"x").status == 400
     assert list(service.store.list()) == []
+
+
+def test_an_object_that_cannot_be_read_is_refused_as_a_whole(service: Service) -> None:
+    class Archive(MemoryStore):
+        def get_range(self, name: str, start: int, length: int) -> bytes:
+            raise Archived(f"{name!r} is archived", hint="restore it")
+
+    service.store = Archive()
+    service.restart()
+    service.ask("PUT", OBJECT, DATA)
+
+    answer = service.ask("GET", OBJECT)
+
+    assert (answer.status, answer.json["code"]) == (409, "archived")
+    assert service.ask("HEAD", OBJECT).status == 200
 
 
 @pytest.mark.parametrize("method", ["GET", "HEAD"])

@@ -15,7 +15,7 @@ from typing import Any
 
 from rse_pf.aws.clients import error_code, make_client, status_of, with_retries
 from rse_pf.config import PlatformSettings
-from rse_pf.errors import Conflict, NotFound, StoreError, StoreFull
+from rse_pf.errors import Archived, Conflict, NotFound, StoreError, StoreFull
 from rse_pf.object_store import ObjectInfo, ObjectStore, check_name, open_store
 
 __all__ = ["S3Store", "open_bucket", "open_data_store"]
@@ -24,6 +24,7 @@ _NOT_FOUND, _PRECONDITION_FAILED, _CONFLICT, _RANGE_OUTSIDE = 404, 412, 409, 416
 _PART_BYTES = 8 << 20
 """Of a large object; S3 takes parts of 5 MiB or more."""
 _FULL = {"QuotaExceeded", "EntityTooLarge", "InsufficientStorage"}
+_ARCHIVED = "InvalidObjectState"
 
 
 def open_bucket(bucket: str, region: str) -> S3Store:
@@ -44,7 +45,7 @@ class S3Store:
         self._bucket = bucket
 
     def get(self, name: str) -> bytes:
-        """Return the object; raises NotFound."""
+        """Return the object; raises NotFound, or Archived if a rule of the bucket has archived it."""
         return self._read(name)[0]
 
     def get_range(self, name: str, start: int, length: int) -> bytes:
@@ -221,6 +222,12 @@ def _as_store_errors(name: str) -> Iterator[None]:
             raise StoreError(
                 "the bucket does not exist",
                 hint="correct data.store, or deploy RsePf-Data",
+            ) from error
+        if code == _ARCHIVED:
+            raise Archived(
+                f"{name!r} is archived and cannot be read now",
+                hint=f"restore it: aws s3api restore-object --bucket BUCKET --key {name} "
+                "--restore-request Days=7",
             ) from error
         if status_of(error) == _NOT_FOUND:
             raise NotFound(f"no object named {name!r}") from error

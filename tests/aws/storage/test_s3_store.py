@@ -11,7 +11,7 @@ from botocore.exceptions import ClientError, ConnectTimeoutError
 
 from rse_pf.aws.clients import MAX_S, MAX_TRIES, make_client, with_retries
 from rse_pf.aws.storage import S3Store, open_bucket
-from rse_pf.errors import Conflict, NotFound, StoreError
+from rse_pf.errors import Archived, Conflict, NotFound, StoreError
 
 
 @pytest.fixture
@@ -177,3 +177,21 @@ def test_a_missing_bucket_is_a_store_error(region: str) -> None:
         open_bucket("nowhere", region).get("a")
 
     assert not isinstance(told.value, NotFound)
+
+
+@pytest.mark.parametrize(
+    ("tier", "is_readable"), [("GLACIER_IR", True), ("STANDARD_IA", True), ("GLACIER", False)]
+)
+def test_an_object_in_an_archive_is_told_apart_from_a_refusal(
+    store: S3Store, region: str, tier: str, is_readable: bool
+) -> None:
+    make_client("s3", region).put_object(Bucket="maps", Key="maps/a", Body=b"map", StorageClass=tier)
+
+    if is_readable:
+        assert (store.get("maps/a"), store.get_range("maps/a", 1, 1)) == (b"map", b"a")
+        return
+    for read in (lambda: store.get("maps/a"), lambda: store.get_range("maps/a", 0, 1)):
+        with pytest.raises(Archived, match="'maps/a' is archived") as told:
+            read()
+        assert "restore-object" in told.value.hint
+        assert "policy" not in told.value.hint
