@@ -1,4 +1,4 @@
-"""The agent of a backend server on its instance: publish metrics, fetch keys and access control, drain.
+"""The agent of a backend server on its instance: a table of tasks, each repeated in its own period.
 
     python -m rse_pf.aws.fleet.agent --settings FILE --bucket B --keys-file FILE --group G --hook H
 
@@ -16,155 +16,91 @@ import sys
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rse_pf.audit.log import SYNC_S
 from rse_pf.auth.control_token import ensure_control_token
-from rse_pf.auth.roster import DenyList, Roster, from_json
-from rse_pf.auth.tokens import KeySet
-from rse_pf.auth.trust_store import DENY_NAME, REFRESH_S, ROBOTS_NAME
-from rse_pf.aws.clients import call_api, make_client
-from rse_pf.aws.fleet.drain_hook import leave_group
+from rse_pf.aws.clients import make_client
 from rse_pf.aws.fleet.instance import Instance
-from rse_pf.aws.fleet.metrics import ServerMetrics, datums, read_page
+from rse_pf.aws.fleet.task import AgentConfig, AgentContext, Phase, Task
+from rse_pf.aws.fleet.tasks import access_control, audit, keys, lifecycle, server_metrics
 from rse_pf.aws.storage.audit_archive import Shipper
 from rse_pf.aws.storage.s3_store import open_bucket
-from rse_pf.config import PlatformSettings, load_settings
-from rse_pf.errors import NotFound, RsePfError, message_of
-from rse_pf.files import replace_file
-from rse_pf.object_store import ObjectStore
-from rse_pf.scaling.alarms import NAMESPACE
+from rse_pf.config import load_settings
+from rse_pf.errors import RsePfError, message_of
 from rse_pf.terminal import show, show_error
 
-__all__ = ["Agent", "AgentConfig", "main"]
+__all__ = ["SERVICES", "TASKS", "Agent", "AgentConfig", "AgentContext", "main"]
 
-_NO_KEYS = "no keys in the bucket yet, so robots are refused; run rse-pf token init --cloud"
+TASKS: tuple[Callable[[AgentContext], Task], ...] = (
+    lifecycle.task,
+    keys.task,
+    server_metrics.task,
+    audit.task,
+    access_control.task,
+)
+"""The table, in the order of a step: one row and one module for each task."""
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AgentConfig:
-    """Group and lifecycle hook of the instance; object name and local file of the public keys."""
-
-    group: str
-    hook: str
-    keys_name: str
-    keys_file: Path
+SERVICES = ("autoscaling", "cloudwatch")
+"""The AWS services whose clients the tasks use, beside the buckets."""
 
 
 class Agent:
-    """The tasks of the agent; `step` runs those that are due and is called repeatedly."""
+    """The tasks of one instance; `step` runs those that are due and is called repeatedly."""
 
     def __init__(
-        self,
-        machine: Instance,
-        *,
-        cloudwatch: Any,
-        autoscaling: Any,
-        artifacts: ObjectStore,
-        config: AgentConfig,
-        settings: PlatformSettings,
-        log: Callable[..., None],
-        shipper: Shipper | None = None,
-        clock: Callable[[], float] = time.monotonic,
-        sleep: Callable[[float], None] = time.sleep,
+        self, context: AgentContext, tasks: tuple[Callable[[AgentContext], Task], ...] = TASKS
     ) -> None:
-        self._machine = machine
-        self._cloudwatch = cloudwatch
-        self._autoscaling = autoscaling
-        self._artifacts = artifacts
-        self._config = config
-        self._settings = settings
-        self._log = log
-        self._shipper = shipper
-        self._clock = clock
-        self._sleep = sleep
-        self._before: ServerMetrics | None = None
-        self._due_s = self._ship_due_s = 0.0
-        self.has_left = False
+        """Make the *tasks* of *context*; none of them runs yet."""
+        self._context = context
+        self._tasks = {task.name: task for task in (make(context) for make in tasks)}
+        self._due_s = dict.fromkeys(self._tasks, float("-inf"))
+        context.state.flush = self._flush
+
+    @property
+    def has_left(self) -> bool:
+        """Whether the instance has drained and completed its hook."""
+        return self._context.state.phase is Phase.LEFT
 
     def step(self) -> None:
-        """Check the lifecycle; when due, fetch keys, publish metrics and ship the audit log."""
-        if not self.has_left:
-            self._try("lifecycle", self._check_lifecycle)
-        if self._clock() >= self._due_s:
-            self._due_s = self._clock() + self._settings.scaling.period_s
-            self._try("keys", self.fetch_keys)
-            if not self.has_left:
-                self._try("metrics", self._publish)
-        if self._clock() >= self._ship_due_s:
-            self._ship_due_s = self._clock() + self._settings.cloud.audit_ship_s
-            self._try("audit", self._ship)
+        """Run each task that is due in this phase of the instance."""
+        for task in self._tasks.values():
+            now_s = self._context.clock()
+            if not task.in_thread and self._may_run(task) and now_s >= self._due_s[task.name]:
+                self._due_s[task.name] = now_s + task.period_s
+                self._try(task)
 
-    def fetch_keys(self) -> None:
-        """Write the public keys if they changed; an invalid key set is refused and the old one stays."""
-        file = self._config.keys_file
-        exists = self._fetch(
-            self._config.keys_name, file, lambda data: KeySet.from_json(data.decode("utf-8", "replace"))
-        )
-        if not exists and not file.exists():
-            replace_file(file, b'{"keys":[]}\n')
-            self._log("no-keys", hint=_NO_KEYS)
+    def run(self, name: str) -> None:
+        """Run the task *name* once; raises what it raises."""
+        self._tasks[name].call()
 
-    def fetch_access_control(self) -> None:
-        """Write roster and deny list if they changed; a missing or invalid one changes nothing."""
-        folder = self._config.keys_file.parent
-        self._fetch(ROBOTS_NAME, folder / ROBOTS_NAME, lambda data: from_json(data, Roster))
-        self._fetch(DENY_NAME, folder / DENY_NAME, lambda data: from_json(data, DenyList))
-
-    def _fetch(self, name: str, file: Path, check: Callable[[bytes], object]) -> bool:
-        """Write the object *name* to *file* if it changed and passes *check*; return whether it exists."""
-        try:
-            fresh = self._artifacts.get(name)
-        except NotFound:
-            return False
-        if not file.exists() or file.read_bytes() != fresh:
-            check(fresh)
-            file.parent.mkdir(exist_ok=True)
-            replace_file(file, fresh)
-            self._log("fetched", name=name, bytes=len(fresh))
-        return True
-
-    def watch_access_control(self, sleep: Callable[[float], None] = time.sleep) -> None:
-        """Fetch roster and deny list for ever; in a thread, because a drain blocks `step`."""
+    def repeat(self, name: str, sleep: Callable[[float], None] = time.sleep) -> None:
+        """Run the task *name* for ever, in a thread of its own."""
+        task = self._tasks[name]
         while True:
-            self._try("access-control", self.fetch_access_control)
-            sleep(REFRESH_S)
+            if self._may_run(task):
+                self._try(task)
+            sleep(task.period_s)
 
-    def _check_lifecycle(self) -> None:
-        if self._machine.is_leaving():
-            self._log("leaving", group=self._config.group)
-            self._try("audit", self._ship)  # most of the log is uploaded before time is short
-            drained = leave_group(
-                self._machine, self._autoscaling, group=self._config.group, hook=self._config.hook,
-                settings=self._settings, clock=self._clock, sleep=self._sleep, before_end=self._ship_last,
-            )  # fmt: skip
-            self.has_left = True
-            self._log("left", drained=drained)
+    def start_threads(self) -> None:
+        """Start a thread for each task that wants one."""
+        for task in self._tasks.values():
+            if task.in_thread:
+                threading.Thread(target=self.repeat, args=(task.name,), daemon=True).start()
 
-    def _ship_last(self) -> None:
-        self._sleep(2 * SYNC_S)  # a server that has ended was still writing
-        self._try("audit", self._ship)
+    def _may_run(self, task: Task) -> bool:
+        return self._context.state.phase in task.phases
 
-    def _ship(self) -> None:
-        count = 0 if self._shipper is None else self._shipper.ship()
-        if count:
-            self._log("shipped", pieces=count)
+    def _flush(self) -> None:
+        for task in self._tasks.values():
+            if task.flushes:
+                self._try(task)
 
-    def _publish(self) -> None:
-        now = read_page(self._machine.page())
-        if self._before is None:
-            self._before = now  # counts from before the agent's start do not belong to this period
-        data = datums(self._before, now, self._config.group, self._machine.instance_id())
-        call_api(self._cloudwatch, "put_metric_data", Namespace=NAMESPACE, MetricData=data)
-        self._before = now
-
-    def _try(self, task: str, work: Callable[[], None]) -> None:
+    def _try(self, task: Task) -> None:
         try:
-            work()
+            task.call()
         except (RsePfError, OSError) as error:
-            self._log("failed", task=task, error=message_of(error)[:200])
+            self._context.log("failed", task=task.name, error=message_of(error)[:200])
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -182,31 +118,38 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--once", action="store_true", help="fetch the keys and exit")
     args = parser.parse_args(arguments)
     try:
-        settings = load_settings(args.settings)
-        if args.once and args.control_token is not None:
-            ensure_control_token(args.control_token, seed=secrets.token_bytes(32))
-        region = settings.cloud.region
-        config = AgentConfig(
-            group=args.group, hook=args.hook, keys_name=args.keys_name, keys_file=args.keys_file
-        )
-        machine = Instance(settings.serving.control_port, args.control_token)
-        agent = Agent(
-            machine,
-            cloudwatch=make_client("cloudwatch", region),
-            autoscaling=make_client("autoscaling", region), artifacts=open_bucket(args.bucket, region),
-            config=config, settings=settings, log=_log, shipper=_shipper(args, region, machine),
-        )  # fmt: skip
+        context = _context(args)
+        agent = Agent(context)
         if args.once:
-            agent.fetch_keys()
-            agent.fetch_access_control()
+            agent.run("keys")
+            agent.run("access-control")
             return 0
     except RsePfError as error:
         show_error(error)
         return 2
-    threading.Thread(target=agent.watch_access_control, daemon=True).start()
+    agent.start_threads()
     while True:
         agent.step()
-        time.sleep(settings.cloud.poll_s)  # AWS does not notify an instance, so the agent polls
+        time.sleep(context.settings.cloud.poll_s)  # AWS does not notify an instance, so the agent polls
+
+
+def _context(args: argparse.Namespace) -> AgentContext:
+    settings = load_settings(args.settings)
+    if args.once and args.control_token is not None:
+        ensure_control_token(args.control_token, seed=secrets.token_bytes(32))
+    region = settings.cloud.region
+    machine = Instance(settings.serving.control_port, args.control_token)
+    return AgentContext(
+        machine=machine,
+        clients={service: make_client(service, region) for service in SERVICES},
+        artifacts=open_bucket(args.bucket, region),
+        config=AgentConfig(
+            group=args.group, hook=args.hook, keys_name=args.keys_name, keys_file=args.keys_file
+        ),
+        settings=settings,
+        log=_log,
+        shipper=_shipper(args, region, machine),
+    )
 
 
 def _shipper(args: argparse.Namespace, region: str, machine: Instance) -> Shipper | None:

@@ -15,7 +15,7 @@ from rse_pf.audit.verify import check_folder
 from rse_pf.auth.tokens import SigningKey
 from rse_pf.auth.trust_store import DENY_NAME, AccessControlStore
 from rse_pf.aws.clients import make_client
-from rse_pf.aws.fleet.agent import Agent, AgentConfig, main
+from rse_pf.aws.fleet.agent import Agent, AgentConfig, AgentContext, main
 from rse_pf.aws.storage.audit_archive import Shipper, fetch_audit
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import StoreError
@@ -41,10 +41,13 @@ class AgentSetup:
             on_broken=lambda chain, problem: self.log.append(("broken", {"chain": chain})),
         )  # fmt: skip
         self.agent = Agent(
-            self.machine, cloudwatch=cloudwatch, autoscaling=self.scaling, artifacts=self.artifacts,
-            config=AgentConfig(group="rse-pf", hook="drain", keys_name="keys.json", keys_file=self.file),
-            settings=PlatformSettings(), clock=self.machine.clock, sleep=self.machine.sleep,
-            log=lambda event, **fields: self.log.append((event, fields)), shipper=shipper,
+            AgentContext(
+                machine=self.machine, clients={"cloudwatch": cloudwatch, "autoscaling": self.scaling},
+                artifacts=self.artifacts, settings=PlatformSettings(), shipper=shipper,
+                config=AgentConfig(group="rse-pf", hook="drain", keys_name="keys.json", keys_file=self.file),
+                clock=self.machine.clock, sleep=self.machine.sleep,
+                log=lambda event, **fields: self.log.append((event, fields)),
+            )
         )  # fmt: skip
 
     def note(self, action: str) -> None:
@@ -125,11 +128,11 @@ def test_without_keys_robots_are_refused_and_one_line_says_so(setup: AgentSetup)
 
 
 def test_keys_are_written_when_they_appear_and_when_they_change(setup: AgentSetup) -> None:
-    setup.agent.fetch_keys()
+    setup.agent.run("keys")
     setup.artifacts.put("keys.json", KEYS)
-    setup.agent.fetch_keys()
+    setup.agent.run("keys")
     first = setup.file.stat().st_ino
-    setup.agent.fetch_keys()
+    setup.agent.run("keys")
 
     assert setup.file.read_bytes() == KEYS
     assert setup.file.stat().st_ino == first, "written again without a change"
@@ -138,7 +141,7 @@ def test_keys_are_written_when_they_appear_and_when_they_change(setup: AgentSetu
 
 def test_an_invalid_key_set_does_not_replace_the_keys(setup: AgentSetup) -> None:
     setup.artifacts.put("keys.json", KEYS)
-    setup.agent.fetch_keys()
+    setup.agent.run("keys")
     setup.artifacts.put("keys.json", b"<html>sorry</html>")
     setup.agent.step()
 
@@ -148,9 +151,9 @@ def test_an_invalid_key_set_does_not_replace_the_keys(setup: AgentSetup) -> None
 
 def test_keys_that_vanish_from_the_bucket_stay_on_the_server(setup: AgentSetup) -> None:
     setup.artifacts.put("keys.json", KEYS)
-    setup.agent.fetch_keys()
+    setup.agent.run("keys")
     setup.artifacts.delete("keys.json")
-    setup.agent.fetch_keys()
+    setup.agent.run("keys")
 
     assert setup.file.read_bytes() == KEYS
 
@@ -203,12 +206,12 @@ def test_a_missing_settings_file_is_two_lines(tmp_path: Path, capsys: pytest.Cap
 
 def test_the_deny_list_is_fetched_beside_the_keys_when_it_changes(setup: AgentSetup) -> None:
     room = AccessControlStore(setup.artifacts)
-    setup.agent.fetch_access_control()
+    setup.agent.run("access-control")
     assert not (setup.file.parent / DENY_NAME).exists()
 
     room.change_deny_list(lambda denied: denied.with_robot("default", "r", 1.0))
-    setup.agent.fetch_access_control()
-    setup.agent.fetch_access_control()
+    setup.agent.run("access-control")
+    setup.agent.run("access-control")
 
     assert (setup.file.parent / DENY_NAME).read_bytes() == setup.artifacts.get(DENY_NAME)
     assert setup.events() == ["fetched"]
@@ -219,7 +222,7 @@ def test_an_invalid_or_missing_deny_list_changes_nothing_on_the_machine(setup: A
     AccessControlStore(setup.artifacts).change_deny_list(
         lambda denied: denied.with_robot("default", "r", 1.0)
     )
-    setup.agent.fetch_access_control()
+    setup.agent.run("access-control")
     good = (setup.file.parent / DENY_NAME).read_bytes()
     if harm == "missing":
         setup.artifacts.delete(DENY_NAME)
@@ -233,7 +236,7 @@ def test_an_invalid_or_missing_deny_list_changes_nothing_on_the_machine(setup: A
         raise Enough
 
     with pytest.raises(Enough):
-        setup.agent.watch_access_control(stop)
+        setup.agent.repeat("access-control", stop)
 
     assert (setup.file.parent / DENY_NAME).read_bytes() == good
     assert setup.events() == ["fetched"] + ["failed"] * (harm == "invalid")

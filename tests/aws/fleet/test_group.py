@@ -17,7 +17,7 @@ from aws.fleet.fake_machine import FakeMachine, FakeScaling
 
 from rse_pf.aws.account import Account, open_account
 from rse_pf.aws.clients import make_client
-from rse_pf.aws.fleet.agent import Agent, AgentConfig
+from rse_pf.aws.fleet.agent import Agent, AgentConfig, AgentContext
 from rse_pf.aws.fleet.group import GROUP, AutoScalingGroup, Server, read_group
 from rse_pf.aws.fleet.group_metrics import read_group_metrics
 from rse_pf.aws.fleet.metrics import ServerMetrics, datums
@@ -120,10 +120,12 @@ def test_the_status_shows_what_a_running_agent_publishes(
     machine.instance_id = lambda: servers[0]  # type: ignore[method-assign]
     machine.text = "rse_pf_robots 7\n"
     config = AgentConfig(group=GROUP, hook="h", keys_name="k", keys_file=tmp_path / "keys.json")
+    clients = {"cloudwatch": make_client("cloudwatch", region), "autoscaling": FakeScaling(machine)}
     Agent(
-        machine, cloudwatch=make_client("cloudwatch", region), autoscaling=FakeScaling(machine),
-        config=config, artifacts=MemoryStore(), settings=SETTINGS, log=lambda event, **fields: None,
-        clock=machine.clock, sleep=machine.sleep,
+        AgentContext(
+            machine=machine, clients=clients, config=config, artifacts=MemoryStore(), settings=SETTINGS,
+            log=lambda event, **fields: None, clock=machine.clock, sleep=machine.sleep,
+        )
     ).step()  # fmt: skip
 
     group = read_group(open_account(region), SETTINGS, now=datetime.now(timezone.utc) + timedelta(minutes=1))

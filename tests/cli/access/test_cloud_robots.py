@@ -19,7 +19,7 @@ from guarded_server import GuardedServer
 
 from rse_pf.auth.robot_key import RobotKey
 from rse_pf.auth.trust_store import DENY_NAME, ROBOTS_NAME, AccessControlStore, TrustStore
-from rse_pf.aws.fleet.agent import Agent, AgentConfig
+from rse_pf.aws.fleet.agent import Agent, AgentConfig, AgentContext
 from rse_pf.aws.storage.s3_store import S3Store
 from rse_pf.cli.main import main
 from rse_pf.config import AuthSettings, PlatformSettings
@@ -41,9 +41,12 @@ def agent_of(s3: Any, folder: Path) -> Agent:
     """Return the agent of an instance whose server reads *folder*."""
     machine = FakeMachine()
     return Agent(
-        machine, cloudwatch=None, autoscaling=FakeScaling(machine), artifacts=S3Store(s3, "artifacts"),
-        config=AgentConfig(group="g", hook="h", keys_name="keys.json", keys_file=folder / "keys.json"),
-        settings=PlatformSettings(), log=lambda event, **fields: None,
+        AgentContext(
+            machine=machine, clients={"autoscaling": FakeScaling(machine)},
+            artifacts=S3Store(s3, "artifacts"),
+            config=AgentConfig(group="g", hook="h", keys_name="keys.json", keys_file=folder / "keys.json"),
+            settings=PlatformSettings(), log=lambda event, **fields: None,
+        )
     )  # fmt: skip
 
 
@@ -58,7 +61,7 @@ def watching(agent: Agent) -> Iterator[None]:
 
     def watch() -> None:
         with contextlib.suppress(Done):
-            agent.watch_access_control(sleep)
+            agent.repeat("access-control", sleep)
 
     thread = threading.Thread(target=watch, daemon=True)
     thread.start()
@@ -160,8 +163,8 @@ def test_one_fetch_of_the_agent_and_one_refresh_of_the_server_apply_a_change(
     tokens.append(output_of(capsys, "token", "issue", "robot-2", "--cloud").strip())
 
     def known() -> list[str]:
-        agent.fetch_keys()
-        agent.fetch_access_control()
+        agent.run("keys")
+        agent.run("access-control")
         trust.refresh()
         assert trust.problem == ""
         return [problem_of(trust, token) for token in tokens]
@@ -193,8 +196,8 @@ def test_a_live_socket_ends_within_two_seconds_of_the_command(
     key = enrol(capsys, "robot-1")
     (tmp_path / "machine").mkdir()
     server, agent = GuardedServer(tmp_path / "machine", workers=1), agent_of(cloud, tmp_path / "machine")
-    agent.fetch_keys()
-    agent.fetch_access_control()
+    agent.run("keys")
+    agent.run("access-control")
     token = asyncio.run(key.token())
     if how == "all-of":  # in whole seconds: only tokens of an earlier second are revoked
         token = output_of(capsys, "token", "issue", "robot-1", "--cloud").strip()

@@ -1,0 +1,18 @@
+"""Ship the audit log of the servers to the audit bucket."""
+
+from __future__ import annotations
+
+from rse_pf.aws.fleet.task import AgentContext, Task
+
+__all__ = ["task"]
+
+
+def task(context: AgentContext) -> Task:
+    """Upload the entries that are not in the bucket yet; also before and after a drain."""
+
+    def ship() -> None:
+        count = 0 if context.shipper is None else context.shipper.ship()
+        if count:
+            context.log("shipped", pieces=count)
+
+    return Task(name="audit", period_s=context.settings.cloud.audit_ship_s, call=ship, flushes=True)

@@ -1,0 +1,30 @@
+"""Fetch the public keys of the robots' tokens."""
+
+from __future__ import annotations
+
+from rse_pf.auth.tokens import KeySet
+from rse_pf.aws.fleet.task import AgentContext, Task
+from rse_pf.aws.fleet.tasks.fetch import fetch
+from rse_pf.files import replace_file
+
+__all__ = ["task"]
+
+_NO_KEYS = "no keys in the bucket yet, so robots are refused; run rse-pf token init --cloud"
+
+
+def task(context: AgentContext) -> Task:
+    """Write the public keys if they changed; an invalid key set is refused and the old one stays."""
+
+    def fetch_keys() -> None:
+        file = context.config.keys_file
+        exists = fetch(
+            context,
+            context.config.keys_name,
+            file,
+            lambda data: KeySet.from_json(data.decode("utf-8", "replace")),
+        )
+        if not exists and not file.exists():
+            replace_file(file, b'{"keys":[]}\n')
+            context.log("no-keys", hint=_NO_KEYS)
+
+    return Task(name="keys", period_s=context.settings.scaling.period_s, call=fetch_keys)
