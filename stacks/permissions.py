@@ -1,0 +1,77 @@
+"""Grant one action at a time, and record which line of code needs it.
+
+`tests/stacks/test_permissions.py` compares the records with the templates: an action without a user, and a
+user that does not make the call, are both errors.  Nothing is granted elsewhere.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import aws_cdk as cdk
+from aws_cdk import aws_iam as iam
+from constructs import IConstruct
+
+from stacks.findings import acknowledge
+
+__all__ = ["BY_AWS", "USED_BY", "allow", "explain"]
+
+USED_BY = "rse-pf:used-by"
+"""The type of the construct metadata that holds the records; it is written to the assembly's manifest."""
+BY_AWS = "aws: "
+"""What ``used_by`` begins with where a service of AWS makes the call itself; the reason follows."""
+
+
+def allow(
+    role: iam.IRole,
+    actions: Sequence[str],
+    resources: Sequence[str],
+    *,
+    used_by: str | Sequence[str],
+    conditions: Mapping[str, Any] | None = None,
+    why: str = "",
+) -> None:
+    """Allow *role* the *actions* on *resources*, and record who calls them.
+
+    Args:
+        role: A role of the same stack.
+        actions: Names such as ``s3:GetObject``; no wildcards.
+        resources: ARNs, or ``*`` for actions that know no resources.
+        used_by: ``path/of/file.py:function`` or ``path/of/file.py:Class.method``, one or more; each action
+            is called by at least one of them.  `BY_AWS` and a reason where a service makes the call.
+        conditions: Of the statement.
+        why: Accepts the finding of cdk-nag about each resource that holds ``*``; needed only then.
+    """
+    role.add_to_principal_policy(
+        iam.PolicyStatement(
+            actions=list(actions), resources=list(resources), conditions=dict(conditions or {})
+        )
+    )
+    explain(role, actions, used_by=used_by)
+    if why:
+        stack = cdk.Stack.of(role)
+        wide = [name for each in resources if "*" in (name := _flat(stack.resolve(each)))]
+        acknowledge(role, why, *(f"IAM5[Resource::{name}]" for name in wide))
+
+
+def explain(role: IConstruct, actions: Sequence[str], *, used_by: str | Sequence[str]) -> None:
+    """Record who needs *actions* that the CDK granted to *role*, or to a role inside that construct."""
+    users = [used_by] if isinstance(used_by, str) else list(used_by)
+    role.node.add_metadata(USED_BY, {"actions": list(actions), "used_by": users})
+
+
+def _flat(resolved: Any) -> str:
+    """Return a resolved ARN as cdk-nag writes it in the name of a finding."""
+    if isinstance(resolved, str):
+        return resolved.replace("${", "<").replace("}", ">")
+    if "Fn::Join" in resolved:
+        between, parts = resolved["Fn::Join"]
+        return str(between).join(_flat(each) for each in parts)
+    if "Fn::GetAtt" in resolved:
+        return f"<{'.'.join(resolved['Fn::GetAtt'])}>"
+    for name in ("Fn::ImportValue", "Fn::Sub"):
+        if name in resolved:
+            return _flat(resolved[name])
+    return f"<{resolved['Ref']}>" if "Ref" in resolved else json.dumps(resolved, separators=(",", ":"))
