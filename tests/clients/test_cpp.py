@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import subprocess
+import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -109,3 +111,46 @@ def test_a_client_that_nobody_answers_gives_up_with_a_hint(tmp_path: Path) -> No
     assert "connect: cannot connect to 127.0.0.1:1" in done.stderr
     assert "hint:" in done.stderr
     assert time.monotonic() - began < 20
+
+
+def test_a_platform_with_tls_is_trusted_by_its_authority_alone(tmp_path: Path) -> None:
+    build(tmp_path, ("rse_pf_first_pose",))
+    command = [sys.executable, "-m", "rse_pf.cli.main"]
+    where = {"cwd": tmp_path, "env": {**os.environ, "XDG_STATE_HOME": str(tmp_path)}, "text": True}
+    platform = subprocess.Popen(
+        [*command, "local", "--lan", "--port", "0", "--metrics-port", "0", "--servers", "1", "--no-data"],
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, **where,
+    )  # fmt: skip
+    try:
+        assert platform.stdout is not None
+        said = ""
+        for line in platform.stdout:
+            said += line
+            if "logs and state" in line:
+                break
+        if "hint: for example: --lan" in said:
+            pytest.skip(f"this machine has no address: {said}")
+        url = re.search(r"wss://\S+", said)
+        authority = re.search(r"authority +(\S+)", said)
+        assert url is not None, said
+        assert authority is not None, said
+        issued = subprocess.run(
+            [*command, "token", "issue", "robot-1"], capture_output=True, check=True, **where
+        )
+
+        def pose(**trust: str) -> subprocess.CompletedProcess[str]:
+            return subprocess.run(
+                [tmp_path / "rse_pf_first_pose", url[0], issued.stdout.strip()],
+                capture_output=True, text=True, timeout=60, check=False, env={**os.environ, **trust},
+            )  # fmt: skip
+
+        trusted, stranger = pose(SSL_CERT_FILE=authority[1]), pose()
+
+        assert trusted.returncode == 0, trusted.stderr
+        assert "8 inliers" in trusted.stdout
+        assert (stranger.returncode, stranger.stdout) == (1, "")
+        assert "the certificate is not trusted" in stranger.stderr
+        assert "hint: name its authority in ca_file" in stranger.stderr
+    finally:
+        platform.terminate()
+        platform.communicate(timeout=60)

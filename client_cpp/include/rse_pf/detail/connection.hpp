@@ -207,7 +207,8 @@ class Connection : public std::enable_shared_from_this<Connection> {
         if (!failed) return false;
         const std::string cause = channel->timed_out ? "no answer in time" : cause_of(failed);
         drop(channel);
-        dial_failed({{"connect", "cannot connect to " + address_.shown() + ": " + cause, "is the platform running? is the address right?"}});
+        const std::string hint = cause == untrusted_certificate ? "name its authority in ca_file, or in the variable SSL_CERT_FILE" : "is the platform running? is the address right?";
+        dial_failed({{"connect", "cannot connect to " + address_.shown() + ": " + cause, hint}});
         return true;
     }
 

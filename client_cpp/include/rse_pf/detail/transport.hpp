@@ -181,11 +181,13 @@ template <class Handler> void async_teardown(beast::role_type, Transport& transp
 }
 inline void beast_close_socket(Transport& transport) { transport.close(); }
 
+inline const std::string untrusted_certificate = "the certificate is not trusted";
+
 /// Return one sentence for what a handshake or a connection ended with.
 inline std::string cause_of(const error_code& error) {
     if (error.category() == asio::error::get_ssl_category()) {
         return ERR_GET_REASON(static_cast<unsigned long>(error.value())) == SSL_R_CERTIFICATE_VERIFY_FAILED
-                   ? "the certificate is not trusted"
+                   ? untrusted_certificate
                    : "TLS failed: " + error.message();
     }
     return error.message();
