@@ -116,10 +116,10 @@ def test_a_client_that_nobody_answers_gives_up_with_a_hint(tmp_path: Path) -> No
 def test_a_platform_with_tls_is_trusted_by_its_authority_alone(tmp_path: Path) -> None:
     build(tmp_path, ("rse_pf_first_pose",))
     command = [sys.executable, "-m", "rse_pf.cli.main"]
-    where = {"cwd": tmp_path, "env": {**os.environ, "XDG_STATE_HOME": str(tmp_path)}, "text": True}
+    home = {**os.environ, "XDG_STATE_HOME": str(tmp_path)}
     platform = subprocess.Popen(
         [*command, "local", "--lan", "--port", "0", "--metrics-port", "0", "--servers", "1", "--no-data"],
-        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, **where,
+        cwd=tmp_path, env=home, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
     )  # fmt: skip
     try:
         assert platform.stdout is not None
@@ -135,8 +135,9 @@ def test_a_platform_with_tls_is_trusted_by_its_authority_alone(tmp_path: Path) -
         assert url is not None, said
         assert authority is not None, said
         issued = subprocess.run(
-            [*command, "token", "issue", "robot-1"], capture_output=True, check=True, **where
-        )
+            [*command, "token", "issue", "robot-1"],
+            cwd=tmp_path, env=home, capture_output=True, text=True, check=True,
+        )  # fmt: skip
 
         def pose(**trust: str) -> subprocess.CompletedProcess[str]:
             return subprocess.run(
