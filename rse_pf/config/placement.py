@@ -12,12 +12,13 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from rse_pf.config.settings import PlatformSettings
+from rse_pf.config.settings import LiveSettings, PlatformSettings
 from rse_pf.errors import SettingsError
 
-__all__ = ["ServerPlacement", "is_loopback"]
+__all__ = ["ServerPlacement", "is_loopback", "live_ports"]
 
-_STORE = "store"
+_ELSEWHERE = {"store": ("data", "store"), "live_host": ("live", "host")}
+"""Fields that are no settings of the group serving: their groups and names there."""
 _FILE_KEY = "placement"
 
 
@@ -25,8 +26,8 @@ _FILE_KEY = "placement"
 class ServerPlacement:
     """The addresses, processes and object store of one backend server.
 
-    Each field is a setting of the same name, ``store`` of the group data and the others of the group serving;
-    port 0 takes a free one, workers 0 means one for each core.
+    Each field is a setting of the same name of the group serving, but for ``store`` (data.store) and
+    ``live_host`` (live.host); port 0 takes a free one, workers 0 means one for each core.
     """
 
     host: str
@@ -35,13 +36,14 @@ class ServerPlacement:
     control_port: int
     workers: int
     store: str
+    live_host: str
 
     @classmethod
     def of(cls, settings: PlatformSettings, **changes: Any) -> ServerPlacement:
         """Return the placement that *settings* describe, with *changes*; raises SettingsError."""
         placed = _placed(settings, changes)
-        serving = {name: getattr(placed.serving, name) for name in cls.__slots__ if name != _STORE}
-        return cls(**serving, store=placed.data.store)
+        groups = {name: _ELSEWHERE.get(name, ("serving", name)) for name in cls.__slots__}
+        return cls(**{name: getattr(getattr(placed, group), of) for name, (group, of) in groups.items()})
 
     @classmethod
     def read(cls, file: Path | None, settings: PlatformSettings, **changes: Any) -> ServerPlacement:
@@ -73,6 +75,16 @@ class ServerPlacement:
         return {"context": {"rse-pf": settings.to_dict()}, _FILE_KEY: asdict(self)}
 
 
+def live_ports(live: LiveSettings) -> range:
+    """Return the ports on which owners of live maps listen on ``live.host``; port 0 takes any free one.
+
+    Where other machines connect the ports are known beforehand, so that a firewall can name them.
+    """
+    if is_loopback(live.host) or not live.first_port:
+        return range(1)
+    return range(live.first_port, live.first_port + live.ports)
+
+
 def is_loopback(host: str) -> bool:
     """Return whether only this machine can reach *host*: a loopback address, or the name ``localhost``.
 
@@ -86,6 +98,8 @@ def is_loopback(host: str) -> bool:
 
 
 def _placed(settings: PlatformSettings, changes: dict[str, Any]) -> PlatformSettings:
-    serving = {name: value for name, value in changes.items() if name != _STORE}
-    data = {_STORE: changes[_STORE]} if _STORE in changes else {}
-    return settings.replace(serving=serving, data=data)
+    groups: dict[str, dict[str, Any]] = {}
+    for name, value in changes.items():
+        group, of = _ELSEWHERE.get(name, ("serving", name))
+        groups.setdefault(group, {})[of] = value
+    return settings.replace(**groups)

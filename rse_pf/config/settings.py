@@ -14,9 +14,13 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from rse_pf.config.elasticity import check_elasticity
+from rse_pf.config.profiles import with_profile
 from rse_pf.config.validation import (
     WHERE,
     SettingRow,
+    check_burst_url,
+    check_deployment,
     check_origin,
     check_range,
     hint_for_unknown,
@@ -27,6 +31,8 @@ from rse_pf.errors import SettingsError
 
 __all__ = [
     "AuthSettings",
+    "BatchSettings",
+    "BurstSettings",
     "CloudSettings",
     "DataSettings",
     "HealthSettings",
@@ -110,7 +116,10 @@ class SessionSettings:
     hello_timeout_s: float = setting(5.0, unit="s", doc="a socket without a Hello message is closed after this", low=0.1)
     connect_timeout_s: float = setting(2.0, unit="s", doc="time limit of one attempt to connect", low=0.1)
     reconnect_base_s: float = setting(0.1, unit="s", doc="first reconnect back-off; full jitter", source="AWS Architecture Blog, 2015", low=0.001)
-    reconnect_max_s: float = setting(1.0, unit="s", doc="longest reconnect back-off", low=0.01)
+    reconnect_max_s: float = setting(1.0, unit="s", doc="longest reconnect back-off in the first seconds without a connection", low=0.01)
+    reconnect_long_max_s: float = setting(120.0, unit="s", doc="longest reconnect back-off after minutes without a connection", low=0.01)
+    dial_burst: int = setting(20, unit="dials", doc="attempts to connect that a robot may make at once; the firewall's limit follows", low=1)
+    dials_per_minute: float = setting(10.0, unit="dials/min", doc="attempts to connect of a robot after the burst; the firewall's limit follows", low=1)
     answer_timeout_s: float = setting(5.0, unit="s", doc="deadline of a command that sets none", low=0.05)
     stall_timeout_s: float = setting(1.0, unit="s", doc="the client reconnects when a command is unanswered and nothing arrived for this long", low=0.05)
 
@@ -150,6 +159,11 @@ class ScalingSettings:
     warm_up_s: int = setting(60, unit="s", doc="the CPU of a new server does not count for this long", low=0)
     max_robots_per_server: int = setting(0, unit="robots", source="paper, Sect. 3.1", doc="add a server above this many robots each; 0 is off", low=0)
     max_queue_ms: float = setting(0.0, unit="ms", doc="add a server above this queue delay; 0 is off", low=0)
+    profile: str = setting("paper", doc="how fast load is noticed; paper: samples of scaling.period_s; fast: three samples of 10 s that the servers publish themselves", choices=("paper", "fast"))
+    underused_s: int = setting(900, unit="s", doc="remove a server after CPU was below underused_cpu_percent for this long, although robots send commands; 0 is off", low=0, high=86400)
+    underused_cpu_percent: float = setting(15.0, unit="%", doc="average CPU below which a server can be spared; at most half of busy_cpu_percent", low=0, high=100)
+    schedule: str = setting("", doc="min_servers by day and time, such as: weekdays 08:00 min 4; weekdays 18:00 min 1; sat,sun 10:00 min 2")
+    time_zone: str = setting("UTC", doc="time zone of scaling.schedule, such as Asia/Seoul", source="IANA time zones")
     moves_per_s: float = setting(20.0, unit="robots/s", doc="robots that a crowded server asks to move each second", low=0.1)
 
 
@@ -157,7 +171,7 @@ class ScalingSettings:
 class DataSettings:
     """Data servers: images, keyframes, clouds and maps."""
 
-    enabled: bool = setting(False, doc="run the data service beside each backend server")
+    enabled: bool = setting(True, doc="run the data service beside each backend server on AWS, and keep objects and maps in the map bucket; without it servers there share no objects, maps or jobs, and have no live maps")
     store: str = setting("memory:", doc="object store: dir:PATH, s3:BUCKET or memory:")
     port: int = setting(8767, doc="port of the data service; 0 takes a free one", low=0, high=65535)
     host: str = setting("127.0.0.1", doc="address the data service listens on")
@@ -210,7 +224,7 @@ class LiveSettings:
     """Maps that robots make together while they drive; each has an owner process on one server."""
 
     host: str = setting("127.0.0.1", doc="address on which owners of live maps listen for the other servers; 0.0.0.0 listens on all and tells the main one")
-    first_port: int = setting(0, doc="first port of owners of live maps; 0 takes any free one", low=0, high=65535)
+    first_port: int = setting(8800, doc="first port of owners of live maps; on loopback, and with 0, any free one is taken", low=0, high=65535)
     ports: int = setting(64, doc="number of ports from live.first_port on", low=1, high=10000)
     max_owners: int = setting(4, doc="owner processes of one worker; further maps are refused until another server takes them; 0 switches live maps off", low=0, high=64)
     max_memory_bytes: int = setting(2147483648, unit="bytes", doc="memory of one owner process; one that needs more is ended", low=134217728)
@@ -232,6 +246,17 @@ class RecordingSettings:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class BatchSettings:
+    """Merges that are computed in parts, by several processes or machines: rse-pf batch."""
+
+    workers: int = setting(2, unit="processes", doc="processes on this machine that compute parts; 0 leaves all parts to job servers", low=0, high=64)
+    pairs_per_part: int = setting(500, unit="pairs", doc="keyframe pairs of one part; what a killed worker loses", source="5.3 ms for a pair of 1,000 features each: 2.7 s", low=10, high=100000)
+    max_keyframes: int = setting(20000, unit="keyframes", doc="keyframes of all maps of one merge in parts", source="the largest map that is stored", low=1, high=20000)
+    part_tries: int = setting(3, doc="a part whose workers ended this often is not tried again", low=1, high=10)
+    scheduler_restarts: int = setting(3, doc="how often a lost scheduler on this machine is started again", low=0, high=10)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class LocalSettings:
     """The platform on one machine."""
 
@@ -249,19 +274,41 @@ class LocalSettings:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class BurstSettings:
+    """Poses from a serverless function while the servers are busy, late or gone."""
+
+    url: str = setting("", doc="where robots send commands by HTTP when no server answers in time: an address, or a path at their own address, which is /burst on AWS; empty: nowhere")
+    robot_commands_per_day: int = setting(10000, unit="commands", doc="commands of one robot that go there in a day; more are refused, and the robot computes them itself", low=1)
+    commands_per_day: int = setting(500000, unit="commands", doc="commands of all robots that are answered there in a day; more are refused", low=1)
+    commands_per_5_minutes: int = setting(50000, unit="commands", doc="WAF: commands of all robots in five minutes; more are refused with 429", low=100)
+    address_commands_per_5_minutes: int = setting(20000, unit="commands", doc="WAF: the same for one address", low=100)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class CloudSettings:
     """The platform on AWS."""
 
+    name: str = setting("", doc="name of the deployment, for several in one account: up to 16 small letters, digits and hyphens; empty for the only one")
+    bootstrap_qualifier: str = setting("hnb659fds", doc="qualifier that the account was bootstrapped with for the CDK", source="the CDK's default")
     region: str = setting("ap-northeast-2", doc="AWS region", source="paper, Sect. 6.1 (Seoul)")
     allow_insecure: bool = setting(True, doc="true: ws:// without a certificate, for trials only; false: wss://")
     certificate_arn: str = setting("", doc="ACM certificate of the load balancer; required if allow_insecure is false")
     domain_name: str = setting("", doc="DNS name of the load balancer; required if allow_insecure is false")
     instance_type: str = setting("c7i.large", doc="EC2 type of a backend server (x86-64)")
+    other_instance_types: str = setting("", doc="further EC2 types that serve where instance_type is not to be had, with spaces between; of the same size")
+    warm_servers: int = setting(0, unit="servers", doc="stopped servers that are ready to start; not together with spot or other_instance_types", source="warm pools of AWS Auto Scaling", low=0, high=50)
+    spot: bool = setting(False, doc="servers above on_demand_servers are Spot instances, which AWS may take back within two minutes")
+    on_demand_servers: int = setting(1, unit="servers", doc="servers that are never Spot instances", low=0, high=1000)
     image_parameter: str = setting("/aws/service/debian/release/12/latest/amd64", doc="SSM parameter that names the machine image", source="Debian's public parameter")
-    endpoints: str = setting("minimal", doc="interface endpoints: minimal (monitoring, autoscaling, logs) or full (also ssm, secretsmanager)", choices=("minimal", "full"))
+    profile: str = setting("standard", doc="small: one zone for servers and endpoints, and one server of a small type unless you set these; see docs/operations.md", choices=("standard", "small"))
+    canary: bool = setting(True, doc="a function that asks for one known pose through the load balancer every minute, and an alarm")
+    budget_per_month: float = setting(0.0, unit="USD", doc="cost of the account in a month above which the topic of alarms is told; 0 is off", low=0)
+    journal_ship_s: int = setting(60, unit="s", doc="time between two uploads of a server's journals; a machine that fails loses at most this much", low=5, high=3600)
     s3_prefix_list: str = setting("", doc="prefix list of S3 in the region; empty: from the table in stacks/firewall.py")
     robot_cidr: str = setting("0.0.0.0/0", doc="addresses that robots may connect from")
     requests_per_5_minutes: int = setting(2000, unit="requests", doc="WAF: handshakes of one address in five minutes", low=100)
+    robots_per_site: int = setting(100, unit="robots", doc="WAF: robots behind one address that may all connect, and send data, in the same minute", low=1, high=100000)
+    data_requests_per_minute: int = setting(600, unit="requests/min", doc="WAF: data requests of one robot, averaged over the robots of a site; data.max_requests_per_s bounds each alone", low=10)
     drain_s: int = setting(60, unit="s", doc="time that the termination hook gives a server to drain", low=30, high=7200)
     poll_s: int = setting(5, unit="s", doc="time between two reads of an instance's lifecycle state", low=1, high=60)
     lambda_memory_mb: int = setting(1769, unit="MB", doc="memory of the serverless PnP; 1769 is one vCPU", low=128, high=10240)
@@ -285,7 +332,9 @@ class PlatformSettings:
     services: ServiceSettings = field(default_factory=ServiceSettings)
     live: LiveSettings = field(default_factory=LiveSettings)
     recording: RecordingSettings = field(default_factory=RecordingSettings)
+    batch: BatchSettings = field(default_factory=BatchSettings)
     local: LocalSettings = field(default_factory=LocalSettings)
+    burst: BurstSettings = field(default_factory=BurstSettings)
     cloud: CloudSettings = field(default_factory=CloudSettings)
 
     def __post_init__(self) -> None:
@@ -295,10 +344,10 @@ class PlatformSettings:
 
     @classmethod
     def from_dict(cls, overrides: Mapping[str, Any]) -> PlatformSettings:
-        """Return the defaults with the overrides ``{group: {name: value}}``."""
+        """Return the defaults, those of ``cloud.profile``, with the overrides ``{group: {name: value}}``."""
         groups = typing.get_type_hints(cls)
         made: dict[str, Any] = {}
-        for name, values in overrides.items():
+        for name, values in with_profile(overrides).items():
             if name not in groups:
                 raise SettingsError(f"unknown group {name!r}", hint=hint_for_unknown(name, groups))
             if not isinstance(values, Mapping):
@@ -335,7 +384,10 @@ def _check_contradictions(s: PlatformSettings) -> None:
         ("scaling", "idle_cpu_percent", "busy_cpu_percent"),
         ("scaling", "step", "big_step"),
         ("session", "max_message_bytes", "max_inflated_bytes"),
+        ("burst", "robot_commands_per_day", "commands_per_day"),
+        ("burst", "address_commands_per_5_minutes", "commands_per_5_minutes"),
         ("session", "reconnect_base_s", "reconnect_max_s"),
+        ("session", "reconnect_max_s", "reconnect_long_max_s"),
         ("services", "scratch_bytes", "memory_bytes"),
         ("live", "heartbeat_s", "lease_s"),
         ("recording", "max_file_bytes", "max_bytes"),
@@ -353,18 +405,36 @@ def _check_contradictions(s: PlatformSettings) -> None:
             f"{s.local.private_key!r}",
             hint=f"set both files or neither {WHERE}",
         )
+    check_burst_url("burst.url", s.burst.url)
     for origin in s.serving.allowed_origins.split():
         check_origin("serving.allowed_origins", origin)
-    if s.scaling.idle_s % s.scaling.period_s:
-        raise SettingsError(
-            f"scaling.idle_s = {s.scaling.idle_s} is no multiple of scaling.period_s = {s.scaling.period_s}",
-            hint=f"make it a multiple {WHERE}",
-        )
+    check_elasticity(s.scaling, s.cloud)
+    check_deployment(s.cloud.name, s.cloud.bootstrap_qualifier)
+    _check_live_ports(s)
     if not s.cloud.allow_insecure and not (s.cloud.certificate_arn and s.cloud.domain_name):
         raise SettingsError(
             "cloud.allow_insecure = false needs cloud.certificate_arn and cloud.domain_name",
             hint=f"set both {WHERE}, or set cloud.allow_insecure to true",
         )
+
+
+def _check_live_ports(s: PlatformSettings) -> None:
+    """Raise SettingsError if a port of live maps is none, or is another port of the same server."""
+    first, last = s.live.first_port, s.live.first_port + s.live.ports - 1
+    if first and last > 65535:
+        raise SettingsError(
+            f"live.first_port = {first} with live.ports = {s.live.ports} ends at port {last}, above 65535",
+            hint=f"lower one of them {WHERE}",
+        )
+    for name, port in (
+        ("serving.port", s.serving.port), ("serving.control_port", s.serving.control_port),
+        ("data.port", s.data.port),
+    ):  # fmt: skip
+        if first and first <= port <= last:
+            raise SettingsError(
+                f"{name} = {port} is one of the ports of live maps, {first} to {last}",
+                hint=f"change {name} or live.first_port {WHERE}",
+            )
 
 
 def setting_rows(settings: PlatformSettings | None = None) -> Iterator[SettingRow]:

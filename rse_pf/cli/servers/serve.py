@@ -25,8 +25,11 @@ __all__ = ["add_arguments", "run"]
 
 _PLACEMENT: dict[str, type] = {
     "host": str, "port": int, "control_host": str, "control_port": int, "workers": int, "store": str,
+    "live_host": str,
 }  # fmt: skip
 """Options that override the placement in the settings file."""
+_ROWS = {"store": ("data", "store"), "live_host": ("live", "host")}
+"""Options that are no settings of the group serving."""
 _SETTINGS: dict[str, type] = {"emulated_cores": float, "log_level": str}
 """Options that override settings of the same name."""
 
@@ -35,12 +38,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     rows = {(row.group, row.name): row for row in setting_rows()}
     for name, kind in {**_PLACEMENT, **_SETTINGS}.items():
-        row = rows["data" if name == "store" else "serving", name]
+        row = rows[_ROWS.get(name, ("serving", name))]
         unit = f" [{row.unit}]" if row.unit else ""
         parser.add_argument(
             f"--{name.replace('_', '-')}", type=kind, choices=row.choices or None,
             metavar=None if row.choices else name.rpartition("_")[2].upper(),
-            help=f"{row.doc}{unit} ({row.group}.{name}, default {row.default})",
+            help=f"{row.doc}{unit} ({row.group}.{row.name}, default {row.default})",
         )  # fmt: skip
     parser.add_argument(
         "--keys", type=Path, metavar="FILE",

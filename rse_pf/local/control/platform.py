@@ -79,7 +79,7 @@ class LocalPlatform:
         servers: int | None = None,
         port: int | None = None,
         name: str | None = None,
-        data: bool | None = None,
+        data: bool = False,
         adoptable: bool = False,
         control: ControlOptions | None = None,
         on_event: Callable[[Event], None] | None = None,
@@ -96,7 +96,7 @@ class LocalPlatform:
                 ``scaling.min_servers`` and ``scaling.max_servers`` is a bound of the scale modifier, too.
             port: Port that robots connect to, 0 takes a free one; None means ``local.port``.
             name: Name of this platform for people; None means the name of the folder.
-            data: Whether robots get the data service under ``/data/``; None means ``data.enabled``.
+            data: Whether robots get the data service under ``/data/``.
             adoptable: Whether servers and balancer survive a control plane that is killed, and whether those
                 of an earlier one in *state* are adopted.
             control: What the control plane does by itself; None means nothing.
@@ -117,7 +117,7 @@ class LocalPlatform:
         self._placement = local_placement(settings, self.state)
         self._count = settings.local.servers if servers is None else servers
         self._wanted_port = settings.local.port if port is None else port
-        self._has_data = settings.data.enabled if data is None else data
+        self._has_data = data
         self._adoptable = adoptable
         self._on_event = on_event
         self.lan = LanListener(address=lan, folder=self.state) if lan else None

@@ -43,6 +43,7 @@ from rse_pf.backend.live_map.owner.work.whole_fit import fit_apart
 from rse_pf.backend.log import JsonLog
 from rse_pf.backend.sandbox.ipc import FrameReader, encode_message, receive
 from rse_pf.config import PlatformSettings
+from rse_pf.config.placement import live_ports
 from rse_pf.errors import StoreError
 from rse_pf.linux import die_with_parent, set_process_name
 from rse_pf.maps.registry import MapRegistry
@@ -141,7 +142,7 @@ def main(arguments: list[str]) -> None:
     kind: MapKind = getattr(importlib.import_module(module), name)
     store = open_data_store(settings)
     address = advertised_address(settings.live.host)
-    listener = listen(settings.live.host, settings.live.first_port, settings.live.ports)
+    listener = listen(settings.live.host, live_ports(settings.live))
     context, certificate = server_context(address, now_s=time.time())
     worker.sendall(encode_message(["ready"]))
     claim = receive(worker)

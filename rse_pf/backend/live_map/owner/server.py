@@ -29,8 +29,8 @@ _HELLO_S = 5.0
 _FLUSH_S = 2.0
 
 
-def listen(host: str, first_port: int, ports: int) -> Any:
-    """Return a socket that listens on *host*, on the first free of *ports* ports; 0 takes any.
+def listen(host: str, ports: range) -> Any:
+    """Return a socket that listens on *host*, on the first of *ports* that is free; port 0 takes any.
 
     Raises:
         OSError: None of them is free.
@@ -38,7 +38,7 @@ def listen(host: str, first_port: int, ports: int) -> Any:
     import socket
 
     failed: OSError | None = None
-    for port in range(first_port, first_port + (ports if first_port else 1)):
+    for port in ports:
         try:
             return socket.create_server((host, port), backlog=128)
         except OSError as error:
