@@ -11,24 +11,32 @@ import random as random_module
 import ssl
 from collections.abc import Awaitable, Callable, Coroutine, Iterable
 from typing import TYPE_CHECKING, Any
-from urllib.parse import urlsplit
 
 from websockets.asyncio.client import ClientConnection
 from websockets.asyncio.client import connect as websocket_connect
 from websockets.exceptions import ConnectionClosed, InvalidStatus, WebSocketException
 from websockets.typing import Subprotocol
 
+from client_sdk.backoff import Backoff
+from client_sdk.dialling import (
+    CHECK_ADDRESS,
+    CHECK_RUNNING,
+    ISSUE,
+    DialError,
+    dial_error_of,
+    shown_address,
+    unreachable,
+    untrusted,
+)
 from client_sdk.token_text import checked_token
 from rse_pf.config import SessionSettings
 from rse_pf.errors import (
     Conflict,
     ConnectError,
-    Forbidden,
     ProtocolError,
     RsePfError,
     Unauthorized,
     UnsupportedProtocol,
-    UsageError,
 )
 from rse_pf.wire import SUBPROTOCOLS
 from rse_pf.wire.client_session import (
@@ -51,14 +59,10 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Connection",
-    "DialError",
     "ForRobot",
     "OnChange",
     "Token",
     "cancel_all",
-    "dial_error_of",
-    "shown_address",
-    "untrusted",
     "websocket_options",
 ]
 
@@ -72,18 +76,9 @@ OnChange = Callable[[str, str], None] | None
 """Called with ``link-lost`` and a reason, or with ``link-back`` or ``moved`` and the server's name."""
 
 _FIRST_TRIES = 4
-_MAX_RETRY_AFTER_S = 30.0
 _MIN_TICK_S = 0.001
 # How long a server that was stopped may take to accept a connection attempt that was given up.
 _LATE_WELCOME_S = 60.0
-_CHECK_RUNNING = "is the platform running? start it with rse-pf local start"
-_CHECK_ADDRESS = "is it an RSE-PF server?"
-_TIMES = (9, 10)
-"""Of X509_verify_cert_error_string(3): not yet valid, expired."""
-_ISSUE = (
-    "a token of rse-pf token issue is valid for 15 minutes: issue another one, or give the robot a key by "
-    "rse-pf robot enrol; if it has one, rse-pf robot list shows whether it was disabled or has a newer key"
-)
 
 
 def websocket_options(settings: SessionSettings) -> dict[str, Any]:
@@ -137,20 +132,19 @@ class Connection:
         self.last_error = ""
         self.fatal: RsePfError | None = None
         self._address = shown_address(url) if url else ""
-        self._ssl_context: ssl.SSLContext | None = None
+        self.ssl_context: ssl.SSLContext | None = None
         self._token = token
         self._session = session
         self._settings = session.settings
         self._on_answer = on_answer
         self._on_change = on_change or (lambda what, why: None)
         self._clock = clock
-        self._random = random
         self._sockets: list[_Socket] = []
         self._tasks: set[asyncio.Task[Any]] = set()
         self._changed = asyncio.Event()
         self._wake = asyncio.Event()
         self._next_tick = 0.0
-        self._attempt = 0
+        self._backoff = Backoff(self._settings, random)
         self._adopted = 0.0
         self._move_request: tuple[_Socket, float] | None = None
         self._late_welcome_until = float("-inf")
@@ -160,7 +154,7 @@ class Connection:
     def use(self, url: str, token: Token, ssl_context: ssl.SSLContext | None) -> None:
         """Connect to *url* from now on, trust what *ssl_context* trusts, and use *token*."""
         self.url, self._token = url, token
-        self._ssl_context = ssl_context if url.startswith("wss:") else None
+        self.ssl_context = ssl_context if url.startswith("wss:") else None
         self._address = shown_address(url)
 
     async def open(self, *, may_be_down: bool = False) -> None:
@@ -186,7 +180,7 @@ class Connection:
                     break
                 if attempt == _FIRST_TRIES:
                     raise failed.error from None
-                await asyncio.sleep(self._pause_s(failed.after_s))
+                await asyncio.sleep(self._pause_s(failed))
         self._main_tasks = [self._spawn(self._tick()), self._spawn(self._keep_connected())]
 
     async def close(self) -> None:
@@ -240,15 +234,17 @@ class Connection:
         The pause counts from the start of the last attempt, so none is added after one that timed out.
         """
         if self._clock() - self._adopted > self._settings.reconnect_max_s:
-            self._attempt = 0
-        after_s, spent_s = 0.0, 0.0
+            self._backoff.restart()
+        failed: DialError | None = None
+        began = self._clock()
         while True:
-            await asyncio.sleep(max(after_s, self._pause_s(after_s) - spent_s))
+            asked_s = 0.0 if failed is None else failed.after_s
+            await asyncio.sleep(max(asked_s, self._pause_s(failed) - (self._clock() - began)))
             began = self._clock()
             try:
                 socket = await self._dial()
-            except DialError as failed:
-                after_s, spent_s = failed.after_s, self._clock() - began
+            except DialError as error:
+                failed = error
                 if failed.is_final:
                     self._end(failed.error)
                     return
@@ -263,13 +259,13 @@ class Connection:
 
     async def _move(self, old: _Socket, until: float) -> None:
         """Make before break: leave *old* once another server has sent Welcome."""
-        self._attempt = 0
+        self._backoff.restart()
         while self._session.current is old.state and self._clock() < until:
-            after_s = 0.0
+            failed: DialError | None = None
             try:
                 fresh = await self._dial()
-            except DialError as failed:
-                after_s = failed.after_s
+            except DialError as error:
+                failed = error
             else:
                 if self._session.current is not old.state:
                     self._reconnected(fresh)
@@ -280,7 +276,7 @@ class Connection:
                     self._on_change("moved", fresh.state.server)
                     return
                 self._spawn(self._close_socket(fresh))
-            pause_s = min(self._pause_s(after_s), max(0.0, until - self._clock()))
+            pause_s = min(self._pause_s(failed), max(0.0, until - self._clock()))
             await _either(old.ended, pause_s)
 
     # --- one socket ------------------------------------------------------------------------------
@@ -303,7 +299,7 @@ class Connection:
         try:
             done, _ = await asyncio.wait({socket.welcome}, timeout=self._settings.connect_timeout_s)
             if not done:
-                raise DialError(ConnectError(f"{self._address} sends no Welcome", hint=_CHECK_ADDRESS))
+                raise DialError(ConnectError(f"{self._address} sends no Welcome", hint=CHECK_ADDRESS))
             socket.welcome.result()
         except BaseException:
             self._late_welcome_until = self._clock() + _LATE_WELCOME_S
@@ -312,11 +308,12 @@ class Connection:
         return socket
 
     async def _handshake(self) -> ClientConnection:
+        self._backoff.dialled(self._clock())
         subprotocol = SUBPROTOCOLS[self._session.codec.name]
-        token = self._used_token = await self._read_token()
+        token = self._used_token = await self.read_token()
         options = websocket_options(self._settings)
-        if self._ssl_context is not None:
-            options["ssl"] = self._ssl_context
+        if self.ssl_context is not None:
+            options["ssl"] = self.ssl_context
         try:
             websocket = await websocket_connect(
                 self.url,
@@ -325,25 +322,23 @@ class Connection:
                 **options,
             )
         except InvalidStatus as error:
-            retry_after = error.response.headers.get("Retry-After", "")
-            raise dial_error_of(self._address, error.response.status_code, retry_after) from error
+            told = error.response
+            after = told.headers.get("Retry-After", "")
+            raise dial_error_of(self._address, told.status_code, after, bytes(told.body or b"")) from error
         except ssl.SSLCertVerificationError as error:
             raise untrusted(self._address, error) from error
         except (OSError, asyncio.TimeoutError, WebSocketException, EOFError) as error:
             self._late_welcome_until = self._clock() + _LATE_WELCOME_S
-            cause = getattr(error, "strerror", None) or str(error) or type(error).__name__
-            raise DialError(
-                ConnectError(f"cannot connect to {self._address}: {cause}", hint=_CHECK_RUNNING)
-            ) from error
+            raise unreachable(self._address, error) from error
         if websocket.subprotocol != subprotocol:
             websocket.transport.abort()
             unsupported = UnsupportedProtocol(
-                f"{self._address} does not speak {subprotocol}", hint=_CHECK_ADDRESS
+                f"{self._address} does not speak {subprotocol}", hint=CHECK_ADDRESS
             )
             raise DialError(unsupported, is_wrong_address=True)
         return websocket
 
-    async def _read_token(self) -> str | None:
+    async def read_token(self) -> str | None:
         """Return the token without the white space around it, which files and shells add."""
         if not callable(self._token):
             token = self._token
@@ -366,7 +361,7 @@ class Connection:
     async def _renew(self, socket: _Socket) -> None:
         """Send a fresh token on a live socket; without one, the robot reconnects when the socket expires."""
         try:
-            token = await self._read_token()
+            token = await self.read_token()
         except DialError as failed:
             self.last_error = failed.error.message
             return
@@ -386,7 +381,7 @@ class Connection:
             if socket.websocket.close_code == CLOSE_RATE:
                 self.last_error = "the server closed the connection: this robot exceeds its rate"
             elif socket.websocket.close_code == CLOSE_REVOKED and not callable(self._token):
-                self._end(Unauthorized("the token was revoked, or the robot was disabled", hint=_ISSUE))
+                self._end(Unauthorized("the token was revoked, or the robot was disabled", hint=ISSUE))
             is_replaced = socket.websocket.close_code == CLOSE_REPLACED
             by_itself = self._move_request is not None or self._clock() < self._late_welcome_until
             if is_replaced and self._session.current is socket.state and not by_itself:
@@ -482,7 +477,7 @@ class Connection:
             if task is not asyncio.current_task():
                 task.cancel()
         if not socket.welcome.done():
-            error = ConnectError(f"{self._address} closed without a Welcome", hint=_CHECK_RUNNING)
+            error = ConnectError(f"{self._address} closed without a Welcome", hint=CHECK_RUNNING)
             socket.welcome.set_exception(DialError(error))
             socket.welcome.exception()
         self._changed.set()
@@ -495,12 +490,9 @@ class Connection:
         self._handle(None, self._session.abandon(error.code, error.message, error.hint))
         self._changed.set()
 
-    def _pause_s(self, after_s: float) -> float:
-        """Return the next back-off: full jitter, added to what the server asked for."""
-        s = self._settings
-        max_s = min(s.reconnect_max_s, s.reconnect_base_s * 2.0 ** min(self._attempt, 16))
-        self._attempt += 1
-        return after_s + self._random.uniform(0.0, max_s)
+    def _pause_s(self, failed: DialError | None) -> float:
+        after_s, is_offline = (0.0, False) if failed is None else (failed.after_s, failed.is_offline)
+        return self._backoff.pause_s(self._clock(), after_s, is_offline=is_offline)
 
     def _spawn(self, work: Coroutine[Any, Any, Any]) -> asyncio.Task[Any]:
         task = asyncio.get_running_loop().create_task(work)
@@ -524,74 +516,3 @@ async def _either(event: asyncio.Event, timeout_s: float) -> None:
         await asyncio.wait({waiting}, timeout=timeout_s)
     finally:
         waiting.cancel()
-
-
-class DialError(Exception):
-    """A failed connection attempt: its error, how long to wait, and whether a further attempt is of use.
-
-    ``is_final`` means that no later attempt can succeed, ``is_wrong_address`` that the URL is probably wrong.
-    """
-
-    def __init__(
-        self,
-        error: RsePfError,
-        *,
-        after_s: float = 0.0,
-        is_wrong_address: bool = False,
-        is_final: bool = False,
-    ) -> None:
-        super().__init__(error.message)
-        self.error = error
-        self.after_s = after_s
-        self.is_wrong_address = is_wrong_address
-        self.is_final = is_final
-
-
-def untrusted(address: str, error: ssl.SSLCertVerificationError) -> DialError:
-    """Return the error of a server whose certificate this robot does not trust, or not now.
-
-    A later attempt may succeed: in some networks another machine answers first, and clocks are set.
-    """
-    hint = "connect by the file of rse-pf robot enrol ROBOT --out FILE, made by this platform"
-    if error.verify_code in _TIMES:
-        hint = "check the clock of this robot; a platform renews its certificate by itself"
-    why = error.verify_message.rstrip(".")
-    message = f"{address} shows a certificate that this robot does not trust: {why}"
-    return DialError(ConnectError(message, hint=hint), is_wrong_address=True)
-
-
-def dial_error_of(address: str, status: int, retry_after: str) -> DialError:
-    """Return the error of an HTTP *status* that came instead of a WebSocket.
-
-    Args:
-        address: The URL as shown to users.
-        status: HTTP status of the handshake.
-        retry_after: The header ``Retry-After``, empty if there was none.
-    """
-    if status == 401:
-        message = "the token is missing, wrong or expired"
-        return DialError(Unauthorized(message, hint=_ISSUE), is_final=True)
-    if status == 403:
-        message = f"{address} forbids this robot to connect"
-        return DialError(Forbidden(message, hint="ask the operator"), is_final=True)
-    is_client_error = 400 <= status < 500 and status != 429
-    hint = "check the URL: it ends with the path of the servers, /ws"
-    error = ConnectError(
-        f"{address} answers {status}", hint=hint if is_client_error else "it is full or not ready; try later"
-    )
-    after_s = float(retry_after) if retry_after.isdecimal() else 0.0
-    return DialError(error, after_s=min(after_s, _MAX_RETRY_AFTER_S), is_wrong_address=status in (400, 404))
-
-
-def shown_address(url: str) -> str:
-    """Return *url* without user name and password; raises UsageError if it is no WebSocket address."""
-    parts = urlsplit(url)
-    try:
-        port = parts.port
-    except ValueError:
-        port = -1
-    if parts.scheme not in ("ws", "wss") or not parts.hostname or port == -1:
-        raise UsageError(
-            f"{url!r} is not a WebSocket address", hint="write ws://HOST:PORT/ws or wss://HOST/ws"
-        )
-    return f"{parts.scheme}://{parts.netloc.rpartition('@')[2]}{parts.path}"

@@ -20,6 +20,7 @@ from rse_pf.config import SessionSettings
 from rse_pf.service import Registry, dispatch
 from rse_pf.services import echo
 from rse_pf.wire import SUBPROTOCOLS, Command, Failure, Result, Update, codec_for, make_codec
+from rse_pf.wire.refusal import refusal_body
 from rse_pf.wire.server_session import BeginUpdates, Close, EndUpdates, Send, ServerSession, Submit
 
 __all__ = ["FakePlatform", "FakeSocket", "echo_services"]
@@ -260,7 +261,9 @@ class FakePlatform:
 
 
 def _refusal(status: int, retry_after: int | None) -> Response:
-    headers = Headers({"Content-Length": "0", "Connection": "close"})
+    code = {401: "unauthorized", 403: "forbidden"}.get(status, "full")
+    body = refusal_body(code, "refused", "")
+    headers = Headers({"Content-Length": str(len(body)), "Connection": "close"})
     if retry_after is not None:
         headers["Retry-After"] = str(retry_after)
-    return Response(status, http.HTTPStatus(status).phrase, headers, b"")
+    return Response(status, http.HTTPStatus(status).phrase, headers, body)

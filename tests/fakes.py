@@ -29,6 +29,7 @@ from rse_pf.config import SessionSettings
 from rse_pf.service import Registry, dispatch
 from rse_pf.services import echo
 from rse_pf.wire import SUBPROTOCOLS, Codec, Command, Failure, Result, codec_for, make_codec
+from rse_pf.wire.refusal import refusal_body
 from rse_pf.wire.server_session import Close, Send, ServerSession, Submit
 
 
@@ -296,7 +297,9 @@ class FakeServer:
         if self.refuse is None:
             return None
         status, headers = self.refuse
-        return Response(status, HTTPStatus(status).phrase, Headers(headers), b"{}")
+        body = refusal_body({401: "unauthorized", 403: "forbidden"}.get(status, "full"), "refused", "")
+        sized = Headers({**headers, "Content-Length": str(len(body))})
+        return Response(status, HTTPStatus(status).phrase, sized, body)
 
     async def _talk(self, websocket: ServerConnection) -> None:
         codec = make_codec(codec_for([str(websocket.subprotocol)]) or "json")

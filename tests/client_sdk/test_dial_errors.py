@@ -2,18 +2,83 @@
 
 from __future__ import annotations
 
+import errno
+import socket
+
 import pytest
 
-from client_sdk.connection import dial_error_of, shown_address
+from client_sdk.dialling import dial_error_of, shown_address, unreachable
+from rse_pf.auth.tokens import KeySet
+from rse_pf.backend.gateway.handshake import HandshakePolicy, Rejected
+from rse_pf.config import PlatformSettings
 from rse_pf.errors import ConnectError, Forbidden, Unauthorized, UsageError
+from rse_pf.wire.refusal import refusal_body
+
+REFUSALS = [(401, "unauthorized", Unauthorized), (403, "forbidden", Forbidden)]
 
 
-@pytest.mark.parametrize(("status", "error"), [(401, Unauthorized), (403, Forbidden)])
-def test_a_refused_token_or_robot_is_final(status, error):
-    failed = dial_error_of("ws://host/ws", status, "")
+@pytest.mark.parametrize(("status", "code", "error"), REFUSALS)
+def test_a_refusal_by_one_of_our_servers_is_final(status, code, error):
+    failed = dial_error_of("ws://host/ws", status, "", refusal_body(code, "no", "ask"))
 
     assert isinstance(failed.error, error)
     assert failed.is_final
+
+
+@pytest.mark.parametrize("status", [401, 403])
+@pytest.mark.parametrize(
+    "body",
+    [
+        b"",
+        b"<html><center><h1>403 Forbidden</h1></center></html>",
+        b'{"message":"Forbidden"}',
+        b'{"code":"forbidden","message":"no","hint":""}',
+        b'{"platform":"rse-pf","code":"full"}',
+        b"[" * 4000,
+        b'["rse-pf"]',
+        b"\xff",
+        refusal_body("forbidden", "x" * 5000, ""),
+    ],
+)
+def test_a_refusal_of_whoever_stands_between_is_temporary(status, body):
+    failed = dial_error_of("ws://host/ws", status, "60", body)
+
+    assert isinstance(failed.error, ConnectError)
+    assert not failed.is_final
+    assert not failed.is_wrong_address
+    assert failed.after_s == 60.0
+    assert "firewall" in failed.error.hint
+
+
+def test_every_refusal_of_the_handshake_carries_the_mark():
+    policy = HandshakePolicy(PlatformSettings(), KeySet({}))
+
+    refused = policy.judge(
+        path=b"/ws",
+        authorization="Bearer x",
+        offered=["rse-pf.v1.json"],
+        is_full=False,
+        anonymous="",
+        now_s=0.0,
+    )
+    origin = policy.judge(
+        path=b"/ws", authorization="", offered=[], is_full=False, anonymous="", now_s=0.0,
+        origin="https://elsewhere.example",
+    )  # fmt: skip
+
+    assert isinstance(refused, Rejected)
+    assert isinstance(origin, Rejected)
+    assert dial_error_of("ws://host/ws", refused.status, "", refused.body).is_final
+    assert dial_error_of("ws://host/ws", origin.status, "", origin.body).is_final
+
+
+def test_what_does_not_leave_the_robot_is_told_from_what_a_firewall_counts():
+    away = OSError(errno.ENETUNREACH, "Network is unreachable")
+
+    assert unreachable("ws://host/ws", away).is_offline
+    assert unreachable("ws://host/ws", socket.gaierror(-2, "Name or service not known")).is_offline
+    assert not unreachable("ws://host/ws", ConnectionRefusedError(errno.ECONNREFUSED, "refused")).is_offline
+    assert not unreachable("ws://host/ws", TimeoutError()).is_offline
 
 
 @pytest.mark.parametrize(
@@ -29,7 +94,7 @@ def test_other_statuses_allow_another_attempt_and_hint_at_the_cause(status, is_w
     assert hint in failed.error.hint
 
 
-@pytest.mark.parametrize(("header", "after_s"), [("", 0.0), ("5", 5.0), ("86400", 30.0), ("soon", 0.0)])
+@pytest.mark.parametrize(("header", "after_s"), [("", 0.0), ("5", 5.0), ("86400", 300.0), ("soon", 0.0)])
 def test_the_wait_that_a_server_asks_for_is_bounded(header, after_s):
     assert dial_error_of("ws://host/ws", 503, header).after_s == after_s
 

@@ -7,7 +7,6 @@ need no WebSocket library then.
 
 from __future__ import annotations
 
-import json
 import math
 import re
 from collections.abc import Mapping
@@ -22,6 +21,7 @@ from rse_pf.config.resource_names import HEALTH_PATH, ROSBRIDGE_PATH
 from rse_pf.errors import Unauthorized
 from rse_pf.identity import DEFAULT_TENANT, RobotId
 from rse_pf.wire import SUBPROTOCOLS, codec_for
+from rse_pf.wire.refusal import refusal_body
 
 __all__ = ["HEALTH", "Accepted", "HandshakePolicy", "Rejected", "RequestHead"]
 
@@ -129,7 +129,7 @@ class RequestHead:
 
 
 def _rejection(status: int, code: str, message: str, hint: str, **headers: str) -> Rejected:
-    body = json.dumps({"code": code, "message": message, "hint": hint}, separators=(",", ":")).encode()
+    body = refusal_body(code, message, hint)
     return _answered(status, code, body, {**_JSON, **{k.replace("_", "-"): v for k, v in headers.items()}})
 
 

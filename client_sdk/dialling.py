@@ -1,0 +1,131 @@
+"""What a failed attempt to connect means for the next one, and how an address is shown.
+
+Nothing here opens a socket.  Between a robot and its servers stand firewalls, load balancers and login pages
+that answer with HTTP statuses of their own.  Only a refusal with the mark of our servers ends a robot for
+good; every other one is temporary.
+"""
+
+from __future__ import annotations
+
+import errno
+import socket
+import ssl
+from urllib.parse import urlsplit
+
+from rse_pf.errors import ConnectError, Forbidden, RsePfError, Unauthorized, UsageError
+from rse_pf.wire.refusal import is_refusal_of_ours
+
+__all__ = [
+    "CHECK_ADDRESS",
+    "CHECK_RUNNING",
+    "ISSUE",
+    "DialError",
+    "dial_error_of",
+    "shown_address",
+    "unreachable",
+    "untrusted",
+]
+
+CHECK_RUNNING = "is the platform running? start it with rse-pf local start"
+CHECK_ADDRESS = "is it an RSE-PF server?"
+ISSUE = (
+    "a token of rse-pf token issue is valid for 15 minutes: issue another one, or give the robot a key by "
+    "rse-pf robot enrol; if it has one, rse-pf robot list shows whether it was disabled or has a newer key"
+)
+_MAX_RETRY_AFTER_S = 300.0
+_TIMES = (9, 10)
+"""Of X509_verify_cert_error_string(3): not yet valid, expired."""
+_NOWHERE = (errno.ENETUNREACH, errno.EHOSTUNREACH, errno.ENETDOWN, errno.EHOSTDOWN)
+
+
+class DialError(Exception):
+    """A failed connection attempt: its error, how long to wait, and whether a further attempt is of use.
+
+    ``is_final`` means that no later attempt can succeed, ``is_wrong_address`` that the URL is probably wrong,
+    ``is_offline`` that nothing left this machine.
+    """
+
+    def __init__(
+        self,
+        error: RsePfError,
+        *,
+        after_s: float = 0.0,
+        is_wrong_address: bool = False,
+        is_final: bool = False,
+        is_offline: bool = False,
+    ) -> None:
+        super().__init__(error.message)
+        self.error = error
+        self.after_s = after_s
+        self.is_wrong_address = is_wrong_address
+        self.is_final = is_final
+        self.is_offline = is_offline
+
+
+def unreachable(address: str, error: Exception) -> DialError:
+    """Return the error of an attempt that got no HTTP answer from *address*."""
+    cause = getattr(error, "strerror", None) or str(error) or type(error).__name__
+    is_offline = isinstance(error, socket.gaierror) or getattr(error, "errno", None) in _NOWHERE
+    told = ConnectError(f"cannot connect to {address}: {cause}", hint=CHECK_RUNNING)
+    return DialError(told, is_offline=is_offline)
+
+
+def untrusted(address: str, error: ssl.SSLCertVerificationError) -> DialError:
+    """Return the error of a server whose certificate this robot does not trust, or not now.
+
+    A later attempt may succeed: in some networks another machine answers first, and clocks are set.
+    """
+    hint = "connect by the file of rse-pf robot enrol ROBOT --out FILE, made by this platform"
+    if error.verify_code in _TIMES:
+        hint = "check the clock of this robot; a platform renews its certificate by itself"
+    why = error.verify_message.rstrip(".")
+    message = f"{address} shows a certificate that this robot does not trust: {why}"
+    return DialError(ConnectError(message, hint=hint), is_wrong_address=True)
+
+
+def dial_error_of(address: str, status: int, retry_after: str, body: bytes = b"") -> DialError:
+    """Return the error of an HTTP *status* that came instead of a WebSocket.
+
+    Args:
+        address: The URL as shown to users.
+        status: HTTP status of the handshake.
+        retry_after: The header ``Retry-After``, empty if there was none.
+        body: Of the answer; 401 and 403 are final only with the mark of our servers in it.
+    """
+    after_s = float(retry_after) if retry_after.isdecimal() else 0.0
+    after_s = min(after_s, _MAX_RETRY_AFTER_S)
+    if status in (401, 403):
+        code = Unauthorized.code if status == 401 else Forbidden.code
+        is_ours = is_refusal_of_ours(body, code)
+        return DialError(_refused(address, status, is_ours=is_ours), is_final=is_ours, after_s=after_s)
+    is_client_error = 400 <= status < 500 and status != 429
+    hint = "check the URL: it ends with the path of the servers, /ws"
+    error = ConnectError(
+        f"{address} answers {status}", hint=hint if is_client_error else "it is full or not ready; try later"
+    )
+    return DialError(error, after_s=after_s, is_wrong_address=status in (400, 404))
+
+
+def _refused(address: str, status: int, *, is_ours: bool) -> RsePfError:
+    if not is_ours:
+        hint = "a firewall or a login page between robot and platform answered: ask who runs the network"
+        return ConnectError(
+            f"{address} answers {status}, and it is not an RSE-PF server that says so", hint=hint
+        )
+    if status == 401:
+        return Unauthorized("the token is missing, wrong or expired", hint=ISSUE)
+    return Forbidden(f"{address} forbids this robot to connect", hint="ask the operator")
+
+
+def shown_address(url: str) -> str:
+    """Return *url* without user name and password; raises UsageError if it is no WebSocket address."""
+    parts = urlsplit(url)
+    try:
+        port = parts.port
+    except ValueError:
+        port = -1
+    if parts.scheme not in ("ws", "wss") or not parts.hostname or port == -1:
+        raise UsageError(
+            f"{url!r} is not a WebSocket address", hint="write ws://HOST:PORT/ws or wss://HOST/ws"
+        )
+    return f"{parts.scheme}://{parts.netloc.rpartition('@')[2]}{parts.path}"

@@ -1,0 +1,75 @@
+"""How many requests of one address the firewall of the front door lets pass.
+
+Many robots may share an address: those of one site stand behind one router.  The limit of each rule is what
+the robots of a site do at the most, computed from the settings by which they bound themselves; so robots that
+all lose their connection at the same moment stay below it.  Pure arithmetic: the stacks write these rules
+down, tests and benchmarks play them.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from rse_pf.config.settings import PlatformSettings
+
+__all__ = ["BURST_PATH", "DATA_PATH", "RETRY_AFTER_S", "STATUS", "RateRule", "rate_rules"]
+
+DATA_PATH = "/data/"
+BURST_PATH = "/burst"
+"""At the robots' address, where the serverless PnP answers."""
+STATUS = 429
+RETRY_AFTER_S = 60
+"""What an address above its limit is told: after one window without requests it is below."""
+_MINUTE_S = 60
+"""The shortest window that AWS WAF has, so that an address is free again soon."""
+_FIVE_MINUTES_S = 300
+_LEAST = 10
+"""AWS WAF accepts no lower limit."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RateRule:
+    """At most ``limit`` requests within ``window_s`` seconds, of one address or ``of_all``.
+
+    It counts paths that begin with ``path``, or with ``but`` all that begin with none of these.
+    """
+
+    name: str
+    limit: int
+    window_s: int = _MINUTE_S
+    path: str = ""
+    but: tuple[str, ...] = ()
+    of_all: bool = False
+
+
+def rate_rules(settings: PlatformSettings) -> tuple[RateRule, ...]:
+    """Return the rules, in the order in which they are applied.
+
+    Dials are what is neither data nor burst, so that a path that is written in an unusual way counts in the
+    strictest rule.
+    """
+    robots, session, burst = settings.cloud.robots_per_site, settings.session, settings.burst
+    dials = robots * (session.dial_burst + session.dials_per_minute)
+    requests = robots * settings.cloud.data_requests_per_minute
+    return (
+        RateRule(name="dials", limit=_limit(dials), but=(DATA_PATH, BURST_PATH)),
+        RateRule(name="data", limit=_limit(requests), path=DATA_PATH),
+        RateRule(
+            name="burst",
+            limit=burst.address_commands_per_5_minutes,
+            window_s=_FIVE_MINUTES_S,
+            path=BURST_PATH,
+        ),
+        RateRule(
+            name="burst-of-all",
+            limit=burst.commands_per_5_minutes,
+            window_s=_FIVE_MINUTES_S,
+            path=BURST_PATH,
+            of_all=True,
+        ),
+    )
+
+
+def _limit(requests: float) -> int:
+    return max(_LEAST, math.ceil(requests))

@@ -1,0 +1,135 @@
+"""When robots dial again, on a fake clock: soon, then rarely, never more often than the firewall allows."""
+
+from __future__ import annotations
+
+import heapq
+from dataclasses import dataclass
+from random import Random
+
+import pytest
+
+from benchmarks.cloud.played_firewall import PlayedFirewall, rules_of_settings
+from client_sdk.backoff import Backoff
+from rse_pf.config import PlatformSettings, SessionSettings
+
+SITE = "203.0.113.7"
+BEGAN_S = 1000.0
+
+
+@dataclass
+class Outage:
+    """What a fleet behind one address did: when each robot was connected again, and what was blocked."""
+
+    connected_s: list[float]
+    blocked: int
+    most_per_minute: int
+
+
+def play(settings: PlatformSettings, *, robots: int, outage_s: float, seed: int = 0) -> Outage:
+    """Cut all robots off at the same moment; the load balancer answers 503, and the firewall its rules."""
+    firewall = PlayedFirewall(rules_of_settings(settings))
+    backoffs = [Backoff(settings.session, Random(f"{seed}/{robot}")) for robot in range(robots)]
+    due = [(BEGAN_S + each.pause_s(BEGAN_S), robot) for robot, each in enumerate(backoffs)]
+    heapq.heapify(due)
+    connected_s: list[float] = []
+    dials: list[list[float]] = [[] for _ in range(robots)]
+    while due:
+        now, robot = heapq.heappop(due)
+        dials[robot].append(now)
+        backoffs[robot].dialled(now)
+        reply = firewall.judge(SITE, "/ws", now)
+        if reply is None and now >= BEGAN_S + outage_s:
+            connected_s.append(now - BEGAN_S)
+            continue
+        asked_s = 0.0 if reply is None else float(reply.headers["Retry-After"])
+        heapq.heappush(due, (now + backoffs[robot].pause_s(now, asked_s), robot))
+    most = max(_most_within_a_minute(each) for each in dials)
+    return Outage(sorted(connected_s), firewall.blocked, most)
+
+
+def _most_within_a_minute(times: list[float]) -> int:
+    return max(sum(begin <= each < begin + 60.0 for each in times) for begin in times)
+
+
+@pytest.mark.parametrize("robots", [40, 100])
+@pytest.mark.parametrize("seed", range(3))
+def test_robots_behind_one_address_are_back_within_30_s_of_an_outage_of_60_s(robots, seed):
+    outage = play(PlatformSettings(), robots=robots, outage_s=60.0, seed=seed)
+
+    assert outage.blocked == 0
+    assert outage.connected_s[-1] <= 60.0 + 30.0
+    assert len(outage.connected_s) == robots
+
+
+def test_without_the_bounds_a_site_is_blocked_and_back_much_later():
+    eager = {"reconnect_long_max_s": 1.0, "dial_burst": 10_000, "dials_per_minute": 600.0}
+    bounded = PlatformSettings()
+    loose = SessionSettings(**eager)
+    firewall = PlayedFirewall(rules_of_settings(bounded))
+    backoffs = [Backoff(loose, Random(robot)) for robot in range(100)]
+    now = [BEGAN_S] * 100
+    for _ in range(60):
+        for robot, backoff in enumerate(backoffs):
+            now[robot] += backoff.pause_s(now[robot])
+            backoff.dialled(now[robot])
+            firewall.judge(SITE, "/ws", now[robot])
+
+    assert firewall.blocked > 0
+
+
+@pytest.mark.parametrize("outage_s", [5.0, 60.0, 600.0])
+def test_no_robot_dials_more_often_than_the_limit_is_derived_from(outage_s):
+    settings = PlatformSettings()
+    bound = settings.session.dial_burst + settings.session.dials_per_minute
+
+    outage = play(settings, robots=20, outage_s=outage_s)
+
+    assert outage.most_per_minute <= bound
+
+
+def test_a_server_that_accepts_and_dies_again_and_again_does_not_empty_the_allowance():
+    session = SessionSettings()
+    backoff, now, dials = Backoff(session, Random(1)), 0.0, 0
+    while now < 600.0:
+        now += backoff.pause_s(now)
+        backoff.dialled(now)
+        dials += 1
+        now += 1.5  # longer than reconnect_max_s: counts as a connection that lasted
+        backoff.restart()
+
+    assert dials <= session.dial_burst + 10 * session.dials_per_minute + 1
+
+
+def test_a_server_that_dies_is_dialled_again_within_a_second():
+    for seed in range(50):
+        assert Backoff(SessionSettings(), Random(seed)).pause_s(50.0) <= 0.1
+
+
+def test_the_pauses_grow_to_minutes_and_not_beyond():
+    session = SessionSettings()
+    backoff, now, pauses = Backoff(session, Random(5)), 0.0, []
+    while now < 3600.0:
+        pauses.append(backoff.pause_s(now))
+        now += pauses[-1]
+
+    assert max(pauses[-10:]) <= session.reconnect_long_max_s
+    assert min(pauses[-10:]) >= 0.5 * session.reconnect_long_max_s
+
+
+def test_robots_that_are_told_the_same_time_do_not_come_back_together():
+    pauses = [Backoff(SessionSettings(), Random(seed)).pause_s(0.0, 60.0) for seed in range(100)]
+
+    assert min(pauses) >= 60.0
+    assert max(pauses) - min(pauses) >= 10.0
+
+
+def test_attempts_that_do_not_leave_the_robot_go_on_every_few_seconds_and_cost_no_allowance():
+    backoff, now = Backoff(SessionSettings(), Random(3)), 0.0
+    for _ in range(200):
+        backoff.dialled(now)
+        pause_s = backoff.pause_s(now, is_offline=True)
+        assert pause_s <= 5.0
+        now += pause_s
+    assert now > 300.0
+
+    assert backoff.pause_s(now, is_offline=True) <= 5.0
