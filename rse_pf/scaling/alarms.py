@@ -6,14 +6,19 @@ template; tests read them back from it and compare both on the same load.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from rse_pf.config import ScalingSettings
+from rse_pf.scaling.profile import cadence_of
 
-__all__ = ["NAMESPACE", "Alarm", "Metric", "ScalingStep", "alarms_of"]
+__all__ = ["CPU", "NAMESPACE", "Alarm", "Metric", "ScalingStep", "alarms_of"]
 
 NAMESPACE = "RsePf"
 """CloudWatch namespace of what the backend servers publish."""
+
+CPU = "CpuPercent"
+"""CPU of a server past its warm-up; published in the fast profile only."""
 
 _EC2 = "AWS/EC2"
 
@@ -39,7 +44,7 @@ class ScalingStep:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Alarm:
-    """An alarm and the step policy that runs in every period in which its state is ALARM.
+    """An alarm and the step policy that runs while its state is ALARM: at once, and then every minute.
 
     ``comparison`` and ``missing`` are terms of CloudWatch; *periods* of *periods* must breach.
     """
@@ -57,6 +62,7 @@ class Alarm:
 
 
 _CPU = Metric(name="cpu", namespace=_EC2, metric="CPUUtilization", statistic="Average")
+_FAST_CPU = Metric(name="cpu", namespace=NAMESPACE, metric=CPU, statistic="Average")
 _REQUESTS = Metric(name="requests", namespace=NAMESPACE, metric="Requests", statistic="Sum")
 _ROBOTS = Metric(name="robots", namespace=NAMESPACE, metric="Robots", statistic="Average")
 _QUEUE = Metric(name="queue", namespace=NAMESPACE, metric="QueueMs", statistic="Maximum")
@@ -67,29 +73,21 @@ def alarms_of(settings: ScalingSettings) -> tuple[Alarm, ...]:
 
     Missing data never breaches: a fleet without data neither grows nor shrinks.
     """
+    cpu = _FAST_CPU if cadence_of(settings).is_fast else _CPU
     further = settings.very_busy_cpu_percent - settings.busy_cpu_percent
     steps = [ScalingStep(lower=0.0, upper=further, change=settings.step)] if further else []
     busy = _grow(
         settings,
         "busy",
-        _CPU,
+        cpu,
         settings.busy_cpu_percent,
         (*steps, ScalingStep(lower=further, upper=None, change=settings.big_step)),
         "the average CPU of the servers is too high",
     )
-    idle = Alarm(
-        name="idle",
-        metrics=(_CPU, _REQUESTS),
-        expression=f"IF(requests == 0 AND cpu < {settings.idle_cpu_percent:g}, 1, 0)",
-        comparison="GreaterThanOrEqualToThreshold",
-        threshold=1.0,
-        period_s=settings.period_s,
-        periods=settings.idle_s // settings.period_s,
-        missing="notBreaching",
-        steps=(ScalingStep(lower=0.0, upper=None, change=-1),),
-        meaning="there were no requests, and the servers are idle",
-    )
-    alarms = [busy, idle]
+    cadence = cadence_of(settings)
+    alarms = [busy, _idle(settings, cpu)]
+    if cadence.underused:
+        alarms.append(_underused(settings, cpu))
     one = (ScalingStep(lower=0.0, upper=None, change=settings.step),)
     if settings.max_robots_per_server:
         alarms.append(
@@ -117,15 +115,54 @@ def _grow(
     steps: tuple[ScalingStep, ...],
     meaning: str,
 ) -> Alarm:
+    cadence = cadence_of(settings)
     return Alarm(
         name=name,
         metrics=(metric,),
         expression=metric.name,
         comparison="GreaterThanOrEqualToThreshold",
         threshold=threshold,
-        period_s=settings.period_s,
-        periods=settings.busy_periods,
+        period_s=cadence.period_s,
+        periods=cadence.busy,
         missing="notBreaching",
         steps=steps,
+        meaning=meaning,
+    )
+
+
+def _idle(settings: ScalingSettings, cpu: Metric) -> Alarm:
+    conditions = {_REQUESTS: "== 0", cpu: f"< {settings.idle_cpu_percent:g}", **_spare(settings, 1.0)}
+    cadence = cadence_of(settings)
+    return _shrink(
+        "idle", conditions, cadence.period_s, cadence.idle, "there were no requests, and the servers are idle"
+    )
+
+
+def _underused(settings: ScalingSettings, cpu: Metric) -> Alarm:
+    conditions = {cpu: f"< {settings.underused_cpu_percent:g}", **_spare(settings, 0.5)}
+    cadence = cadence_of(settings)
+    return _shrink(
+        "underused", conditions, cadence.period_s, cadence.underused, "a server less can do the work"
+    )
+
+
+def _spare(settings: ScalingSettings, share: float) -> dict[Metric, str]:
+    """Return what keeps servers that the limits would add again; empty if no limit is on."""
+    limits = ((_ROBOTS, settings.max_robots_per_server), (_QUEUE, settings.max_queue_ms))
+    return {metric: f"< {share * limit:g}" for metric, limit in limits if limit}
+
+
+def _shrink(name: str, conditions: Mapping[Metric, str], period_s: int, periods: int, meaning: str) -> Alarm:
+    told = " AND ".join(f"{metric.name} {limit}" for metric, limit in conditions.items())
+    return Alarm(
+        name=name,
+        metrics=tuple(conditions),
+        expression=f"IF({told}, 1, 0)",
+        comparison="GreaterThanOrEqualToThreshold",
+        threshold=1.0,
+        period_s=period_s,
+        periods=periods,
+        missing="notBreaching",
+        steps=(ScalingStep(lower=0.0, upper=None, change=-1),),
         meaning=meaning,
     )

@@ -2,19 +2,20 @@
 
 `decide` takes measurements and the time, keeps no state between calls, and returns what the caller has to do.
 A period without a sample is no reason to act.  `rse_pf.scaling.alarms` describes the same policy to
-CloudWatch; a test compares the two.
+CloudWatch; a test compares the two, in both profiles.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 from rse_pf.config import ScalingSettings
+from rse_pf.scaling.profile import Cadence, cadence_of
 
-__all__ = ["Action", "FleetState", "Kind", "Sample", "decide"]
+__all__ = ["Action", "FleetState", "Kind", "Sample", "decide", "holding_since"]
 
 Kind = Literal["grow", "shrink", "replace", "stay"]
 
@@ -52,6 +53,17 @@ class Action:
     reason: str = ""
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Rule:
+    """A condition on *samples* samples in a row, and by how many servers it changes the fleet."""
+
+    name: str
+    samples: int
+    holds: Callable[[Sample], bool]
+    change: Callable[[Sample], int]
+    reason: Callable[[Sample], str]
+
+
 def decide(
     samples: Sequence[Sample],
     fleet: FleetState,
@@ -60,19 +72,22 @@ def decide(
     now_s: float,
     acted_s: float = -math.inf,
     compress: float = 1.0,
+    since_s: Mapping[str, float] | None = None,
 ) -> tuple[Action, ...]:
     """Return what to do now: replacements first, then exactly one of grow, shrink or stay.
 
-    A busy platform grows again in every period that stays busy; servers that still warm up count as
-    already added, as in step scaling of Amazon EC2 Auto Scaling, and block every shrink.
+    A platform that stays busy grows again every minute, or every period where that is longer; servers that
+    still warm up count as already added, as in step scaling of Amazon EC2 Auto Scaling, and block every
+    shrink.
 
     Args:
         samples: Whole periods, in order; later ones than *now_s* are ignored.
         fleet: The servers now.
-        settings: Thresholds and limits.
+        settings: Profile, thresholds and limits.
         now_s: Seconds, on the clock of the samples.
         acted_s: When the number of servers was last changed; each period leads to one change at most.
         compress: Factor by which periods are shorter; for experiments.
+        since_s: What `holding_since` returned; None finds it in *samples*, which must then reach back so far.
 
     Source:
         RSE-PF paper, Sect. 6.2: busy above 70 % CPU, one server less after five idle minutes.
@@ -87,22 +102,143 @@ def decide(
                 reason=f"{len(fleet.unhealthy)} failed their health checks",
             ),
         )
-    period_s = settings.period_s / compress
-    # The small term guards against a start that is a rounding error below its multiple.
-    ended = math.floor(now_s / period_s + 1e-6)
+    cadence = cadence_of(settings)
+    period_s = cadence.period_s / compress
+    ended = _periods(now_s, period_s)
     if fleet.servers < settings.min_servers:
         missing = settings.min_servers - fleet.servers
         return (*replacements, Action(kind="grow", servers=missing, reason="fewer than scaling.min_servers"))
-    if math.isfinite(acted_s) and ended <= math.floor(acted_s / period_s + 1e-6):
+    if math.isfinite(acted_s) and ended <= _periods(acted_s, period_s):
         return (*replacements, Action(kind="stay", reason="this period has led to an action already"))
     by_period = {round(sample.start_s / period_s): sample for sample in samples}
-    return (*replacements, _scale(by_period, ended, fleet, settings))
+    if since_s is None:
+        since_s = _since(by_period, ended, settings, cadence, period_s, {})
+    acting = [
+        rule
+        for rule in _rules(settings, cadence)
+        if rule.name in since_s
+        and (ended - _periods(since_s[rule.name], period_s)) % cadence.repeat == 0
+        and ended - 1 in by_period
+    ]
+    return (*replacements, _scale(acting, by_period.get(ended - 1), fleet, settings))
 
 
-def _scale(by_period: dict[int, Sample], ended: int, fleet: FleetState, settings: ScalingSettings) -> Action:
-    growth, reason = _growth(_last(by_period, ended, settings.busy_periods), settings)
-    if growth:
-        target = min(settings.max_servers, fleet.servers - fleet.warming + growth)
+def holding_since(
+    samples: Sequence[Sample],
+    settings: ScalingSettings,
+    *,
+    now_s: float,
+    compress: float = 1.0,
+    before: Mapping[str, float] | None = None,
+) -> dict[str, float]:
+    """Return since when each rule that holds now has held without a break, by its name, in seconds.
+
+    Args:
+        samples: Whole periods, as many as the longest rule needs, and one more.
+        settings: As for `decide`.
+        now_s: As for `decide`.
+        compress: As for `decide`.
+        before: What this returned a period ago; None at the first call.
+    """
+    cadence = cadence_of(settings)
+    period_s = cadence.period_s / compress
+    by_period = {round(sample.start_s / period_s): sample for sample in samples}
+    return _since(by_period, _periods(now_s, period_s), settings, cadence, period_s, before or {})
+
+
+def _rules(settings: ScalingSettings, cadence: Cadence) -> list[_Rule]:
+    """Return the rules that are on, those that grow first."""
+    most_robots, most_queue_ms = settings.max_robots_per_server, settings.max_queue_ms
+    rules = [
+        _Rule(
+            name="busy",
+            samples=cadence.busy,
+            holds=lambda one: one.cpu_percent >= settings.busy_cpu_percent,
+            change=lambda one: (
+                settings.big_step if one.cpu_percent >= settings.very_busy_cpu_percent else settings.step
+            ),
+            reason=lambda one: f"CPU at {one.cpu_percent:.0f} %",
+        )
+    ]
+    if most_robots:
+        rules.append(
+            _Rule(
+                name="crowded",
+                samples=cadence.busy,
+                holds=lambda one: one.robots_per_server >= most_robots,
+                change=lambda one: settings.step,
+                reason=lambda one: f"{one.robots_per_server:.0f} robots on each server",
+            )
+        )
+    if most_queue_ms:
+        rules.append(
+            _Rule(
+                name="queueing",
+                samples=cadence.busy,
+                holds=lambda one: one.queue_ms >= most_queue_ms,
+                change=lambda one: settings.step,
+                reason=lambda one: f"commands wait {one.queue_ms:.0f} ms",
+            )
+        )
+
+    def spare(one: Sample, share: float) -> bool:
+        robots = not most_robots or one.robots_per_server < share * most_robots
+        return robots and (not most_queue_ms or one.queue_ms < share * most_queue_ms)
+
+    rules.append(
+        _Rule(
+            name="idle",
+            samples=cadence.idle,
+            holds=lambda one: (
+                one.requests == 0 and one.cpu_percent < settings.idle_cpu_percent and spare(one, 1.0)
+            ),
+            change=lambda one: -1,
+            reason=lambda one: f"idle for {settings.idle_s} s",
+        )
+    )
+    if cadence.underused:
+        rules.append(
+            _Rule(
+                name="underused",
+                samples=cadence.underused,
+                holds=lambda one: one.cpu_percent < settings.underused_cpu_percent and spare(one, 0.5),
+                change=lambda one: -1,
+                reason=lambda one: f"CPU at {one.cpu_percent:.0f} %, low for {settings.underused_s} s",
+            )
+        )
+    return rules
+
+
+def _since(
+    by_period: Mapping[int, Sample],
+    ended: int,
+    settings: ScalingSettings,
+    cadence: Cadence,
+    period_s: float,
+    before: Mapping[str, float],
+) -> dict[str, float]:
+    """Return since when each rule holds; a run as long as the history began when *before* says."""
+    found, oldest = {}, min(by_period, default=ended)
+    for rule in _rules(settings, cadence):
+        first = ended
+        while first - 1 in by_period and rule.holds(by_period[first - 1]):
+            first -= 1
+        if ended - first >= rule.samples:
+            began_s = (first + rule.samples) * period_s
+            found[rule.name] = min(began_s, before.get(rule.name, began_s)) if first == oldest else began_s
+    return found
+
+
+def _scale(
+    acting: Sequence[_Rule], newest: Sample | None, fleet: FleetState, settings: ScalingSettings
+) -> Action:
+    if newest is None or not acting:
+        return Action(kind="stay", reason="neither busy nor idle")
+    growing = [rule for rule in acting if rule.change(newest) > 0]
+    if growing:
+        rule = max(growing, key=lambda each: each.change(newest))
+        reason = rule.reason(newest)
+        target = min(settings.max_servers, fleet.servers - fleet.warming + rule.change(newest))
         more = target - fleet.servers
         if more > 0:
             return Action(kind="grow", servers=more, reason=reason)
@@ -110,39 +246,15 @@ def _scale(by_period: dict[int, Sample], ended: int, fleet: FleetState, settings
         return Action(
             kind="stay", reason=f"{reason}, but {'at scaling.max_servers' if bound else 'still warming up'}"
         )
-    if _idle(_last(by_period, ended, settings.idle_s // settings.period_s), settings):
-        if fleet.warming:
-            return Action(kind="stay", reason="idle, but still warming up")
-        if fleet.servers > settings.min_servers:
-            return Action(kind="shrink", servers=1, reason=f"idle for {settings.idle_s} s")
-        return Action(kind="stay", reason="idle, at scaling.min_servers")
-    return Action(kind="stay", reason="neither busy nor idle")
+    reason = acting[0].reason(newest)
+    if fleet.warming:
+        return Action(kind="stay", reason=f"{reason}, but still warming up")
+    if fleet.servers > settings.min_servers:
+        return Action(kind="shrink", servers=1, reason=reason)
+    return Action(kind="stay", reason=f"{reason}, at scaling.min_servers")
 
 
-def _last(by_period: dict[int, Sample], ended: int, count: int) -> list[Sample]:
-    """Return the samples of the last *count* whole periods, or nothing if one is missing."""
-    found = [by_period[each] for each in range(ended - count, ended) if each in by_period]
-    return found if len(found) == count else []
-
-
-def _growth(last: list[Sample], settings: ScalingSettings) -> tuple[int, str]:
-    """Return by how many servers to grow, and why; 0 if the servers are not busy."""
-    if not last:
-        return 0, ""
-    if all(sample.cpu_percent >= settings.busy_cpu_percent for sample in last):
-        newest = last[-1].cpu_percent
-        very = newest >= settings.very_busy_cpu_percent
-        return (settings.big_step if very else settings.step), f"CPU at {newest:.0f} %"
-    if settings.max_robots_per_server and all(
-        sample.robots_per_server >= settings.max_robots_per_server for sample in last
-    ):
-        return settings.step, f"{last[-1].robots_per_server:.0f} robots on each server"
-    if settings.max_queue_ms and all(sample.queue_ms >= settings.max_queue_ms for sample in last):
-        return settings.step, f"commands wait {last[-1].queue_ms:.0f} ms"
-    return 0, ""
-
-
-def _idle(last: list[Sample], settings: ScalingSettings) -> bool:
-    return bool(last) and all(
-        sample.requests == 0 and sample.cpu_percent < settings.idle_cpu_percent for sample in last
-    )
+def _periods(now_s: float, period_s: float) -> int:
+    """Return how many periods have ended by *now_s*."""
+    # The small term guards against a start that is a rounding error below its multiple.
+    return math.floor(now_s / period_s + 1e-6)

@@ -83,6 +83,8 @@ def test_a_contradiction_is_refused_with_both_numbers(overrides: dict[str, Any],
         ({"serving": {"allowed_origins": "https://a.example/"}}, "is no origin", "write it"),
         ({"serving": {"log_level": "loud"}}, "is not one of debug, info", "choose"),
         ({"scaling": {"busy_cpu_percent": float("nan")}}, "not a finite number", "correct it"),
+        ({"burst": {"url": "robots.example.org"}}, "no place to send commands to", "/burst"),
+        ({"burst": {"url": "ftp://robots.example.org/burst"}}, "no place to send commands to", "/burst"),
         ({"session": {"max_inflate_ratio": float("inf")}}, "not a finite number", "correct it"),
         ({"session": {"max_inflate_ratio": 10**400}}, "not a finite number", "correct it"),
         ({"serving": {"max_robots": 10**5000}}, "not a finite number", "correct it"),
@@ -117,6 +119,10 @@ def test_the_digest_changes_with_every_setting(row: SettingRow) -> None:
         "certificate": {"private_key": "key.pem"},
         "private_key": {"certificate": "chain.pem"},
         "allowed_origins": {"allowed_origins": "https://robots.example.org"},
+        "url": {"url": "/burst"},
+        "schedule": {"schedule": "daily 08:00 min 3"},
+        "time_zone": {"time_zone": "Asia/Seoul"},
+        "other_instance_types": {"other_instance_types": "c6i.large"},
     }
     values = {row.name: other(row), **companions.get(row.name, {})}
 

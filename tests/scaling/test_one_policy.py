@@ -1,22 +1,25 @@
 """The law: `decide` and CloudWatch, with the alarms of `alarms_of`, do the same on any load.
 
-`Cloud` follows Amazon's documents: an alarm goes by its last N datapoints; a step policy runs in every
-period in which its alarm stands; the newest datapoint chooses the step; instances in their warm-up do not
-count as capacity when growing and block shrinking; the policy that asks for most wins.
+`Cloud` follows Amazon's documents: an alarm goes by its last N datapoints; a step policy runs when its alarm
+begins to stand and then once each minute; the newest datapoint chooses the step; instances in their warm-up
+do not count as capacity when growing and block shrinking; the policy that asks for most wins.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+import itertools
+import operator
+import re
 
 import pytest
 from hypothesis import given, seed, settings
 from hypothesis import strategies as st
 
 from rse_pf.config import ScalingSettings
-from rse_pf.scaling.alarms import Alarm, alarms_of
-from rse_pf.scaling.policy import FleetState, Sample, decide
+from rse_pf.scaling.alarms import NAMESPACE, Alarm, alarms_of
+from rse_pf.scaling.policy import FleetState, Sample, decide, holding_since
+from rse_pf.scaling.profile import cadence_of
 
 Point = dict[str, float] | None
 Run = list[int]
@@ -28,9 +31,12 @@ def value(alarm: Alarm, point: Point) -> float | None:
         return None
     if alarm.expression in point:
         return point[alarm.expression]
-    idle_below = float(alarm.expression.partition("cpu < ")[2].partition(",")[0])
-    assert alarm.expression == f"IF(requests == 0 AND cpu < {idle_below:g}, 1, 0)"
-    return 1.0 if point["requests"] == 0 and point["cpu"] < idle_below else 0.0
+    found = re.fullmatch(r"IF\((.+), 1, 0\)", alarm.expression)
+    assert found is not None
+    conditions = [condition.split() for condition in found[1].split(" AND ")]
+    assert {name for name, _, _ in conditions} == {metric.name for metric in alarm.metrics}
+    compare = {"==": operator.eq, "<": operator.lt}
+    return float(all(compare[sign](point[name], float(limit)) for name, sign, limit in conditions))
 
 
 class Cloud:
@@ -40,6 +46,7 @@ class Cloud:
         self.alarms, self.scaling = alarms, scaling
         self.launched = [-1e9] * scaling.min_servers
         self.points: list[Point] = []
+        self.stands_since_s: dict[str, float] = {}
 
     def warm(self, now_s: float) -> int:
         return sum(now_s - each >= self.scaling.warm_up_s for each in self.launched)
@@ -58,6 +65,10 @@ class Cloud:
             each is not None and each >= alarm.threshold for each in values
         )
         if not stands:
+            self.stands_since_s.pop(alarm.name, None)
+            return None
+        stands_s = now_s - self.stands_since_s.setdefault(alarm.name, now_s)
+        if alarm.period_s < 60 and stands_s % 60:
             return None
         assert alarm.missing == "notBreaching"
         newest = values[-1]
@@ -74,10 +85,12 @@ class Cloud:
 
 
 class Local:
-    """The local platform's loop around `decide`."""
+    """The local platform's loop around `decide`, which keeps only so many samples as it must."""
 
     def __init__(self, scaling: ScalingSettings) -> None:
         self.scaling = scaling
+        self.cadence = cadence_of(scaling)
+        self.since_s: dict[str, float] = {}
         self.launched = [-1e9] * scaling.min_servers
         self.samples: list[Sample] = []
 
@@ -85,7 +98,7 @@ class Local:
         if point is not None:
             self.samples.append(
                 Sample(
-                    start_s=now_s - self.scaling.period_s,
+                    start_s=now_s - self.cadence.period_s,
                     cpu_percent=point["cpu"],
                     requests=point["requests"],
                     robots_per_server=point["robots"],
@@ -94,7 +107,9 @@ class Local:
             )
         warming = sum(now_s - each < self.scaling.warm_up_s for each in self.launched)
         fleet = FleetState(servers=len(self.launched), warming=warming)
-        (action,) = decide(self.samples, fleet, self.scaling, now_s=now_s)
+        del self.samples[: -self.cadence.most - 1]
+        self.since_s = holding_since(self.samples, self.scaling, now_s=now_s, before=self.since_s)
+        (action,) = decide(self.samples, fleet, self.scaling, now_s=now_s, since_s=self.since_s)
         if action.kind == "grow":
             self.launched += [now_s] * action.servers
         elif action.kind == "shrink":
@@ -105,7 +120,7 @@ def run(side: Cloud | Local, loads: list[float | None], *, closed_loop: bool) ->
     """Return the number of servers after each period of a load, in per cent of one server."""
     trace = []
     for i, load in enumerate(loads):
-        now_s = (i + 1) * float(side.scaling.period_s)
+        now_s = (i + 1) * float(cadence_of(side.scaling).period_s)
         point = None
         if load is not None:
             shared = load / len(side.launched) if closed_loop else load
@@ -121,23 +136,25 @@ def run(side: Cloud | Local, loads: list[float | None], *, closed_loop: bool) ->
 def walks(draw: st.DrawFn) -> list[float | None]:
     """Random walks with plateaus on and beside every threshold, rests, and gaps."""
     loads: list[float | None] = []
+    longest = draw(st.sampled_from([8, 40]))
     for _ in range(draw(st.integers(1, 8))):
         level = draw(
             st.one_of(
-                st.sampled_from([0.0, 19.9, 20.0, 69.9, 70.0, 84.9, 85.0, 100.0]),
+                st.sampled_from([0.0, 14.9, 15.0, 19.9, 20.0, 69.9, 70.0, 84.9, 85.0, 100.0]),
                 st.floats(0, 900).map(lambda each: round(each, 1)),
                 st.none(),
             )
         )
-        loads += [level] * draw(st.integers(1, 8))
+        loads += [level] * draw(st.integers(1, longest))
     return loads
 
 
 SCALINGS = st.builds(
-    lambda low, more, warm, busy, robots, queue: ScalingSettings(
-        min_servers=low, max_servers=low + more, warm_up_s=warm, busy_periods=busy,
-        max_robots_per_server=robots, max_queue_ms=queue,
+    lambda profile, idle_s, underused_s, low, more, warm, busy, robots, queue: ScalingSettings(
+        profile=profile, idle_s=idle_s, underused_s=underused_s, min_servers=low, max_servers=low + more,
+        warm_up_s=warm, busy_periods=busy, max_robots_per_server=robots, max_queue_ms=queue,
     ),
+    st.sampled_from(["paper", "fast"]), st.sampled_from([60, 180, 300]), st.sampled_from([0, 120, 900]),
     st.integers(1, 3), st.integers(0, 8), st.sampled_from([0, 30, 60, 90, 180]), st.integers(1, 3),
     st.sampled_from([0, 60]), st.sampled_from([0.0, 32.0]),
 )  # fmt: skip
@@ -155,10 +172,6 @@ def test_the_policy_and_the_cloud_alarms_agree_on_any_load(
     assert local == cloud
 
 
-def _other(change: Callable[[Alarm], Alarm]) -> tuple[Alarm, ...]:
-    return tuple(change(alarm) for alarm in alarms_of(ScalingSettings()))
-
-
 LOADS: list[float | None] = [
     70.0,
     70.0,
@@ -170,30 +183,62 @@ LOADS: list[float | None] = [
     None,
     *[0.0] * 12,
     69.9,
-    85.0,
-    85.0,
+    *[85.0] * 12,
+    *[14.9] * 30,
+    *[0.0] * 30,
+    15.0,
+    *[14.9] * 20,
+    *[70.0] * 4,
 ]
+MUTATED = {
+    "paper": ScalingSettings(min_servers=1, underused_s=900),
+    "fast": ScalingSettings(min_servers=1, profile="fast", idle_s=60, underused_s=200),
+}
+
+
+def _changed(alarm: Alarm, what: str) -> Alarm:
+    if what == "higher":
+        return dataclasses.replace(alarm, threshold=alarm.threshold + 0.5)
+    if what == "lower":
+        return dataclasses.replace(alarm, threshold=alarm.threshold - 0.5)
+    if what in ("longer", "shorter"):
+        return dataclasses.replace(alarm, periods=alarm.periods + (1 if what == "longer" else -1))
+    if what == "one step":
+        return dataclasses.replace(alarm, steps=alarm.steps[-1:]) if len(alarm.steps) > 1 else alarm
+    if what == "each period":  # it repeats its action, instead of each minute
+        return dataclasses.replace(alarm, period_s=60)
+    if what == "twice as much":
+        steps = tuple(dataclasses.replace(step, change=step.change * 2) for step in alarm.steps)
+        return dataclasses.replace(alarm, steps=steps)
+    old, new = what.split("|")
+    return dataclasses.replace(alarm, expression=alarm.expression.replace(old, new))
 
 
 @pytest.mark.parametrize(
-    "mutate",
+    ("what", "profile"),
     [
-        lambda alarm: dataclasses.replace(alarm, threshold=alarm.threshold + 0.5),
-        lambda alarm: dataclasses.replace(alarm, threshold=alarm.threshold - 0.5),
-        lambda alarm: dataclasses.replace(alarm, periods=alarm.periods + 1),
-        lambda alarm: dataclasses.replace(alarm, periods=alarm.periods - 1),
-        lambda alarm: dataclasses.replace(alarm, steps=alarm.steps[-1:]) if len(alarm.steps) > 1 else alarm,
-        lambda alarm: dataclasses.replace(
-            alarm, steps=tuple(dataclasses.replace(step, change=step.change * 2) for step in alarm.steps)
+        *itertools.product(
+            (
+                "higher", "lower", "longer", "shorter", "one step", "twice as much",
+                "cpu < 20|cpu < 0", "cpu < 15|cpu < 14", "requests == 0 AND |",
+            ),
+            ("paper", "fast"),
         ),
-        lambda alarm: dataclasses.replace(alarm, expression=alarm.expression.replace("cpu < 20", "cpu < 0")),
+        ("each period", "fast"),
     ],
-)
-def test_an_alarm_that_says_something_else_breaks_the_law(mutate: Callable[[Alarm], Alarm]) -> None:
-    scaling = ScalingSettings()
+)  # fmt: skip
+def test_an_alarm_that_says_something_else_breaks_the_law(what: str, profile: str) -> None:
+    scaling = MUTATED[profile]
     honest = run(Cloud(alarms_of(scaling), scaling), LOADS, closed_loop=False)
+    mutated = []
+    for alarm in alarms_of(scaling):
+        other = _changed(alarm, what)
+        if "|" in what:  # the expression forgets a metric, or has another limit
+            metrics = tuple(each for each in other.metrics if each.name in other.expression)
+            other = dataclasses.replace(other, metrics=metrics)
+        mutated.append(other)
     try:
-        changed = run(Cloud(_other(mutate), scaling), LOADS, closed_loop=False)
+        changed = run(Cloud(tuple(mutated), scaling), LOADS, closed_loop=False)
     except StopIteration:
         return
 
@@ -201,9 +246,27 @@ def test_an_alarm_that_says_something_else_breaks_the_law(mutate: Callable[[Alar
     assert changed != honest
 
 
-def test_the_busy_alarm_has_the_papers_numbers() -> None:
-    busy, idle = alarms_of(ScalingSettings())
+def test_the_alarms_of_the_papers_profile_have_the_papers_numbers() -> None:
+    busy, idle, underused = alarms_of(ScalingSettings())
 
     assert (busy.threshold, busy.periods, busy.period_s) == (70.0, 2, 60)
     assert [(step.lower, step.upper, step.change) for step in busy.steps] == [(0, 15, 1), (15, None, 2)]
     assert (idle.periods, idle.period_s, idle.steps[0].change) == (5, 60, -1)
+    assert idle.expression == "IF(requests == 0 AND cpu < 20, 1, 0)"
+    assert (underused.periods, underused.period_s, underused.expression) == (15, 60, "IF(cpu < 15, 1, 0)")
+
+
+def test_the_fast_profile_needs_three_samples_of_ten_seconds_of_the_servers_own_metrics() -> None:
+    alarms = {alarm.name: alarm for alarm in alarms_of(ScalingSettings(profile="fast"))}
+
+    assert (alarms["busy"].period_s, alarms["busy"].periods) == (10, 3)
+    assert (alarms["idle"].period_s, alarms["idle"].periods) == (10, 30)
+    assert {metric.namespace for alarm in alarms.values() for metric in alarm.metrics} == {NAMESPACE}
+
+
+def test_limits_that_are_on_keep_servers_that_they_would_add_again() -> None:
+    scaling = ScalingSettings(max_robots_per_server=60, max_queue_ms=32.0)
+    expressions = {alarm.name: alarm.expression for alarm in alarms_of(scaling)}
+
+    assert expressions["idle"] == "IF(requests == 0 AND cpu < 20 AND robots < 60 AND queue < 32, 1, 0)"
+    assert expressions["underused"] == "IF(cpu < 15 AND robots < 30 AND queue < 16, 1, 0)"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from rse_pf.config import ScalingSettings
-from rse_pf.scaling.policy import Action, FleetState, Sample, decide
+from rse_pf.scaling.policy import Action, FleetState, Sample, decide, holding_since
 
 SETTINGS = ScalingSettings(min_servers=1)
 
@@ -109,6 +109,59 @@ def test_crowds_and_queues_grow_the_fleet_when_switched_on(
 
     assert decide(samples, FleetState(servers=3), settings, now_s=120.0)[-1].servers == 1
     assert decide(samples, FleetState(servers=3), SETTINGS, now_s=120.0)[-1].kind == "stay"
+
+
+def test_a_slow_robot_does_not_hold_servers_that_have_nothing_to_do() -> None:
+    assert actions(*[10.0] * 15, requests=1.0) == ["stay"] * 14 + ["shrink"]
+    assert actions(*[10.0] * 14, 15.0, requests=1.0) == ["stay"] * 15
+    off = ScalingSettings(min_servers=1, underused_s=0)
+    assert actions(*[10.0] * 15, requests=1.0, settings=off) == ["stay"] * 15
+
+
+def test_a_server_that_leaves_would_not_crowd_the_others() -> None:
+    scaling = ScalingSettings(min_servers=1, max_robots_per_server=60, busy_periods=20)
+    few, many = (
+        [Sample(start_s=60.0 * i, cpu_percent=10.0, requests=1, robots_per_server=robots) for i in range(15)]
+        for robots in (29.0, 30.0)
+    )
+
+    assert decide(few, FleetState(servers=2), scaling, now_s=900.0)[-1].kind == "shrink"
+    assert decide(many, FleetState(servers=2), scaling, now_s=900.0)[-1].kind == "stay"
+
+
+def fast(*cpu: float, idle_s: int = 300) -> list[str]:
+    """What the fast profile decides after each sample of 10 s."""
+    scaling = ScalingSettings(min_servers=1, profile="fast", idle_s=idle_s)
+    samples = [Sample(start_s=10.0 * i, cpu_percent=each, requests=each) for i, each in enumerate(cpu)]
+    fleet = FleetState(servers=3)
+    return [
+        decide(samples[: i + 1], fleet, scaling, now_s=10.0 * (i + 1))[-1].kind for i in range(len(samples))
+    ]
+
+
+def test_the_fast_profile_grows_at_the_third_busy_sample_and_again_after_a_minute() -> None:
+    assert fast(*[80.0] * 10) == ["stay", "stay", "grow", *["stay"] * 5, "grow", "stay"]
+    assert fast(80, 80, 69, 80, 80, 80) == ["stay"] * 5 + ["grow"]
+
+
+def test_the_fast_profile_waits_as_long_for_idle_servers_as_the_papers() -> None:
+    assert fast(*[0.0] * 37) == ["stay"] * 29 + ["shrink"] + ["stay"] * 5 + ["shrink", "stay"]
+
+
+def test_a_rule_that_holds_for_longer_than_the_history_keeps_its_minute() -> None:
+    scaling = ScalingSettings(min_servers=1, profile="fast")
+    kinds: list[str] = []
+    since_s: dict[str, float] = {}
+    for i in range(200):
+        samples = [
+            Sample(start_s=10.0 * each, cpu_percent=80.0, requests=1) for each in range(max(i - 20, 0), i)
+        ]
+        since_s = holding_since(samples, scaling, now_s=10.0 * i, before=since_s)
+        kinds.append(
+            decide(samples, FleetState(servers=3), scaling, now_s=10.0 * i, since_s=since_s)[-1].kind
+        )
+
+    assert [i for i, kind in enumerate(kinds) if kind == "grow"] == list(range(3, 200, 6))
 
 
 def test_compressed_time_gives_the_same_actions() -> None:

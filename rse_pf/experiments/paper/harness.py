@@ -34,6 +34,7 @@ from rse_pf.experiments.results.result_folder import remove_keys
 from rse_pf.local.control.control_plane import ControlOptions
 from rse_pf.local.control.monitor import MonitorSample
 from rse_pf.local.control.platform import LocalPlatform
+from rse_pf.scaling.profile import cadence_of
 
 __all__ = ["Harness", "generator_event", "generator_of", "policy_parameters"]
 
@@ -220,13 +221,13 @@ def generator_of(records: Records) -> dict[str, Any]:
 
 def policy_parameters(settings: PlatformSettings, compress: float) -> dict[str, Any]:
     """Return the parameters of the scaling policy, with its periods after compression."""
-    scaling = settings.scaling
+    scaling, cadence = settings.scaling, cadence_of(settings.scaling)
     return {
         "min_servers": scaling.min_servers,
         "max_servers_allowed": scaling.max_servers,
         "busy_cpu_percent": scaling.busy_cpu_percent,
-        "busy_periods": scaling.busy_periods,
-        "period_s": scaling.period_s / compress,
+        "busy_periods": cadence.busy,
+        "period_s": cadence.period_s / compress,
         "idle_s": scaling.idle_s / compress,
         "size": settings.serving.emulated_cores,
     }

@@ -31,6 +31,7 @@ from rse_pf.local.processes import is_alive, mark_of
 from rse_pf.local.servers.control_client import ControlPort
 from rse_pf.local.state import platform_settings, read_state
 from rse_pf.local.together import run_together
+from rse_pf.scaling.profile import cadence_of
 from rse_pf.terminal import printable
 
 __all__ = ["LocalFeed", "fleet_document", "group_of", "moved_robots"]
@@ -248,7 +249,7 @@ def fleet_document(state: Mapping[str, Any], settings: PlatformSettings, *, time
         "min_servers": policy.get("min_servers"),
         "max_servers": policy.get("max_servers"),
         "busy_percent": settings.scaling.busy_cpu_percent,
-        "period_s": settings.scaling.period_s / float(policy.get("compress", 1.0)),
+        "period_s": cadence_of(settings.scaling).period_s / float(policy.get("compress", 1.0)),
     }
 
 

@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from rse_pf.config import ScalingSettings
+from rse_pf.scaling.profile import cadence_of
 
 __all__ = ["event_sentence", "waiting_for"]
 
@@ -30,11 +31,13 @@ def waiting_for(policy: Mapping[str, Any], settings: ScalingSettings, *, servers
     )
     samples = list(policy.get("samples", ()))
     if not samples:
-        period_s = settings.period_s / float(policy.get("compress", 1.0))
+        period_s = cadence_of(settings).period_s / float(policy.get("compress", 1.0))
         return [*said, f"no whole period of {period_s:g} s was measured yet"]
     busy = _busy(samples, policy, settings, servers)
     idle = _idle(samples, policy, settings, servers)
-    return said + ([busy] if busy else [idle] if idle else ["the servers are neither busy nor idle"])
+    if busy or idle:
+        return [*said, busy or idle]
+    return [*said, _underused(samples, policy, settings, servers) or "the servers are neither busy nor idle"]
 
 
 def event_sentence(event: Mapping[str, Any]) -> str:
@@ -51,7 +54,7 @@ def event_sentence(event: Mapping[str, Any]) -> str:
 def _busy(
     samples: Sequence[Mapping[str, Any]], policy: Mapping[str, Any], settings: ScalingSettings, servers: int
 ) -> str:
-    limit, wanted = settings.busy_cpu_percent, settings.busy_periods
+    limit, wanted = settings.busy_cpu_percent, cadence_of(settings).busy
     count = _last_that(samples, lambda each: float(each["cpu_percent"]) >= limit)
     if not count:
         return ""
@@ -70,21 +73,36 @@ def _busy(
 def _idle(
     samples: Sequence[Mapping[str, Any]], policy: Mapping[str, Any], settings: ScalingSettings, servers: int
 ) -> str:
-    wanted = settings.idle_s // settings.period_s
     limit = settings.idle_cpu_percent
     count = _last_that(
         samples, lambda each: float(each["requests"]) == 0 and float(each["cpu_percent"]) < limit
     )
+    return _fewer(count, cadence_of(settings).idle, "idle", policy, settings, servers)
+
+
+def _underused(
+    samples: Sequence[Mapping[str, Any]], policy: Mapping[str, Any], settings: ScalingSettings, servers: int
+) -> str:
+    wanted, limit = cadence_of(settings).underused, settings.underused_cpu_percent
+    count = _last_that(samples, lambda each: float(each["cpu_percent"]) < limit)
+    enough = wanted and servers > int(policy.get("min_servers", settings.min_servers))
+    return _fewer(count, wanted, f"below {limit:g} % CPU", policy, settings, servers) if enough else ""
+
+
+def _fewer(
+    count: int, wanted: int, what: str, policy: Mapping[str, Any], settings: ScalingSettings, servers: int
+) -> str:
     if not count:
         return ""
-    measured = f"{min(count, wanted)} of {wanted} samples idle"
+    measured = f"{min(count, wanted)} of {wanted} samples {what}"
     least = int(policy.get("min_servers", settings.min_servers))
     if servers <= least:
         verb = "is" if least == 1 else "are"
         return f"{measured}: nothing happens, {_servers(least)} {verb} the fewest that are allowed"
     if count >= wanted:
         return f"{measured}: one server leaves now"
-    return f"{measured}: one server leaves after {_counted(wanted - count, 'further idle sample')}"
+    kind = "idle" if what == "idle" else "such"
+    return f"{measured}: one server leaves after {_counted(wanted - count, f'further {kind} sample')}"
 
 
 def _last_that(samples: Sequence[Mapping[str, Any]], holds: Any) -> int:

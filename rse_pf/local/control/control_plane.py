@@ -14,10 +14,12 @@ import os
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from datetime import datetime
 from typing import Any
 
 from rse_pf.config import PlatformSettings, ScalingSettings
 from rse_pf.config.resource_names import READY_PATH
+from rse_pf.config.schedule import minimum_at, parse_schedule, zone_named
 from rse_pf.errors import ConfigurationError
 from rse_pf.local.balancer.load_balancer import EnvoyLoadBalancer
 from rse_pf.local.control.fleet import Fleet, Member
@@ -35,6 +37,7 @@ from rse_pf.local.control.rebalancer import MoveRequest, Rebalancer
 from rse_pf.local.control.scale_modifier import LocalScaleModifier
 from rse_pf.local.servers.control_client import ControlPort
 from rse_pf.scaling.health import LOCAL_INTERVAL_S, LOCAL_TIMEOUT_S, observe
+from rse_pf.scaling.profile import cadence_of
 
 __all__ = ["ControlOptions", "ControlPlane"]
 
@@ -79,11 +82,13 @@ class ControlPlane:
     ) -> None:
         self.sample: MonitorSample | None = None
         self.hold = False
+        cadence = cadence_of(scaling)
         self.modifier = LocalScaleModifier(
             fleet,
             scaling,
             max_restarts_per_minute=settings.local.max_restarts_per_minute,
             compress=options.compress,
+            minimum=_scheduled(scaling),
             emit=emit,
         )
         self._fleet = fleet
@@ -95,9 +100,9 @@ class ControlPlane:
         self._emit = emit
         self._changed = changed
         self._on_sample = options.on_sample
-        period_s = scaling.period_s / options.compress
+        period_s = cadence.period_s / options.compress
         self._every_s = sample_interval_s(period_s)
-        self._periods = Periods(period_s, keep=scaling.idle_s // scaling.period_s + scaling.busy_periods + 1)
+        self._periods = Periods(period_s, keep=cadence.most + 2)
         self._rebalancer = Rebalancer(scaling) if options.elastic and options.rebalance else None
         self._ports: dict[str, ControlPort] = {}
         self._cores = len(os.sched_getaffinity(0))
@@ -297,3 +302,11 @@ class ControlPlane:
                 self._emit("balancer-failed", reason=error.message, wait_s=pause_s)
             await asyncio.sleep(pause_s)
             pause_s = min(2 * pause_s, _MAX_PAUSE_S)
+
+
+def _scheduled(scaling: ScalingSettings) -> Callable[[], int] | None:
+    """Return the minimum at the time of day, as a scheduled action sets it; None without a schedule."""
+    entries, zone = parse_schedule(scaling.schedule), zone_named(scaling.time_zone)
+    if not entries:
+        return None
+    return lambda: minimum_at(entries, datetime.now(zone), otherwise=scaling.min_servers)

@@ -8,13 +8,14 @@ monitor or the machine.  Time is an argument, and the effects are those of the `
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
 from rse_pf.config import ScalingSettings
 from rse_pf.local.control.fleet import Fleet, ServerHealth
-from rse_pf.scaling.policy import Action, FleetState, Sample, decide
+from rse_pf.scaling.policy import Action, FleetState, Sample, decide, holding_since
 
 __all__ = ["LocalScaleModifier", "may_start_s", "replace_now"]
 
@@ -42,7 +43,10 @@ def replace_now(broken: Sequence[str], *, healthy: int, replacing: int) -> tuple
 
 
 class LocalScaleModifier:
-    """Applies the policy to the servers of a `Fleet`; remembers only when it acted and what it started."""
+    """Applies the policy to the servers of a `Fleet`.
+
+    It remembers when it acted, what it started, and since when each rule holds.
+    """
 
     def __init__(
         self,
@@ -51,10 +55,14 @@ class LocalScaleModifier:
         *,
         max_restarts_per_minute: int,
         compress: float = 1.0,
+        minimum: Callable[[], int] | None = None,
         emit: Callable[..., None],
     ) -> None:
+        """Make a modifier of *servers*; *minimum* is the scheduled ``min_servers``, if any."""
         self._servers = servers
         self._settings = settings
+        self._minimum = minimum
+        self._since_s: dict[str, float] = {}
         self._restarts_per_minute = max_restarts_per_minute
         self._compress = compress
         self._emit = emit
@@ -83,6 +91,12 @@ class LocalScaleModifier:
             warming=standing.warming,
             unhealthy=(*standing.dead, *standing.broken),
         )
+        if self._minimum is not None:
+            self._settings = dataclasses.replace(self._settings, min_servers=self._minimum())
+        if period_over:
+            self._since_s = holding_since(
+                samples, self._settings, now_s=now_s, compress=self._compress, before=self._since_s
+            )
         actions = decide(
             samples,
             fleet,
@@ -90,6 +104,7 @@ class LocalScaleModifier:
             now_s=now_s,
             acted_s=self._acted_s if period_over else now_s,
             compress=self._compress,
+            since_s=self._since_s,
         )
         if period_over:
             self._acted_s = now_s

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import pytest
@@ -46,7 +46,9 @@ class FakeServers:
         return f"server-{self.number}"
 
 
-def made(standing: ServerHealth) -> tuple[LocalScaleModifier, FakeServers, list[Mapping[str, Any]]]:
+def made(
+    standing: ServerHealth, minimum: Callable[[], int] | None = None
+) -> tuple[LocalScaleModifier, FakeServers, list[Mapping[str, Any]]]:
     servers, told = FakeServers(standing), []
 
     def emit(event: str, **details: Any) -> None:
@@ -56,6 +58,7 @@ def made(standing: ServerHealth) -> tuple[LocalScaleModifier, FakeServers, list[
         servers,  # type: ignore[arg-type]
         SCALING,
         max_restarts_per_minute=5,
+        minimum=minimum,
         emit=emit,
     )
     return modifier, servers, told
@@ -100,6 +103,19 @@ def test_missing_servers_are_launched_at_once_but_not_while_somebody_else_change
     assert servers.asked == []
     modifier.act([], now_s=61.0, period_over=False)
     assert servers.asked == [("grow", 1)]
+
+
+def test_the_scheduled_minimum_holds_from_its_minute_on() -> None:
+    modifier, servers, _ = made(ServerHealth(servers=2, healthy=2), minimum=lambda: scheduled)
+    scheduled = 2
+    modifier.act([], now_s=61.0, period_over=False)
+    assert servers.asked == []
+
+    scheduled = 4
+    modifier.act([], now_s=62.0, period_over=False)
+
+    assert servers.asked == [("grow", 2)]
+    assert modifier.document()["min_servers"] == 4
 
 
 def test_a_dead_server_is_replaced_at_once_also_between_periods_and_on_hold() -> None:

@@ -1,0 +1,175 @@
+"""The alarms that call an operator, as data: what is measured, when it is wrong, and what it means.
+
+They notify and scale nothing.  The stacks write them into a template, `rse_pf.aws.money.costs` counts them,
+and each has a chapter of its own in docs/operations.md.  While the platform is parked, it has no servers on
+purpose: alarms about servers then stay quiet, because they compare with the wanted size of the group.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from rse_pf.config import PlatformSettings
+from rse_pf.scaling.alarms import NAMESPACE
+
+__all__ = ["LAMBDA_TIMEOUT_S", "OperatorAlarm", "Series", "Source", "operator_alarms"]
+
+LAMBDA_TIMEOUT_S = 10
+"""Of one execution of the serverless PnP."""
+_SLOW_SHARE = 0.8
+"""An execution that takes more of its time-out than this is slow."""
+_BLOCKED_PER_PERIOD = 100.0
+_PERIOD_S, _LONG_PERIOD_S = 60, 300
+
+Source = str
+"""Of a series: ``group``, ``balancer``, ``targets``, ``firewall``, ``function`` or ``canary``."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Series:
+    """One metric; ``name`` is its name in an expression, *source* says whose dimensions it has."""
+
+    name: str
+    namespace: str
+    metric: str
+    statistic: str
+    source: Source
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OperatorAlarm:
+    """An alarm whose expression is 1 while something is wrong, in *datapoints* of *periods*."""
+
+    name: str
+    meaning: str
+    series: tuple[Series, ...]
+    expression: str
+    period_s: int = _PERIOD_S
+    periods: int = 3
+    datapoints: int = 3
+    missing: str = "notBreaching"
+
+    threshold: float = 1.0
+    comparison: str = "GreaterThanOrEqualToThreshold"
+
+    @property
+    def sources(self) -> set[Source]:
+        """Return whose metrics the alarm needs."""
+        return {each.source for each in self.series}
+
+
+def _balancer(name: str, metric: str, statistic: str, source: Source = "balancer") -> Series:
+    return Series(
+        name=name, namespace="AWS/ApplicationELB", metric=metric, statistic=statistic, source=source
+    )  # fmt: skip
+
+
+def _group(name: str, metric: str) -> Series:
+    return Series(
+        name=name, namespace="AWS/AutoScaling", metric=metric, statistic="Average", source="group"
+    )  # fmt: skip
+
+
+def _function(name: str, metric: str, statistic: str, source: Source = "function") -> Series:
+    return Series(name=name, namespace="AWS/Lambda", metric=metric, statistic=statistic, source=source)
+
+
+_WANTED = _group("wanted", "GroupDesiredCapacity")
+_SERVING = _group("serving", "GroupInServiceInstances")
+_HEALTHY = _balancer("healthy", "HealthyHostCount", "Minimum", "targets")
+_UNHEALTHY = _balancer("unhealthy", "UnHealthyHostCount", "Maximum", "targets")
+_TARGET_ERRORS = _balancer("errors", "HTTPCode_Target_5XX_Count", "Sum", "targets")
+_BALANCER_ERRORS = _balancer("errors", "HTTPCode_ELB_5XX_Count", "Sum")
+_REPORTS = Series(
+    name="reports", namespace=NAMESPACE, metric="Robots", statistic="SampleCount", source="group"
+)  # fmt: skip
+_BLOCKED = Series(
+    name="blocked", namespace="AWS/WAFV2", metric="BlockedRequests", statistic="Sum", source="firewall"
+)  # fmt: skip
+
+
+def operator_alarms(settings: PlatformSettings) -> tuple[OperatorAlarm, ...]:
+    """Return the alarms of a deployment with *settings*."""
+    floor, slow_ms = settings.scaling.min_servers, LAMBDA_TIMEOUT_S * 1e3 * _SLOW_SHARE
+    alarms = [
+        OperatorAlarm(
+            name="few-servers",
+            meaning=f"fewer servers are healthy than scaling.min_servers = {floor}",
+            series=(_HEALTHY, _WANTED),
+            # A target group without targets publishes nothing; a group that is gone wants nothing.
+            expression=f"IF(FILL(wanted, {floor}) > 0 AND FILL(healthy, 0) < {floor}, 1, 0)",
+            periods=5,
+            datapoints=5,
+            missing="breaching",
+        ),
+        OperatorAlarm(
+            name="unhealthy",
+            meaning="a server fails its health checks",
+            series=(_UNHEALTHY,),
+            expression="IF(unhealthy >= 1, 1, 0)",
+        ),
+        OperatorAlarm(
+            name="errors",
+            meaning="servers answer handshakes with 5xx",
+            series=(_TARGET_ERRORS,),
+            expression="IF(errors >= 1, 1, 0)",
+        ),
+        OperatorAlarm(
+            name="balancer-errors",
+            meaning="the load balancer answers with 5xx itself: it finds no server, or servers do not answer",
+            series=(_BALANCER_ERRORS, _WANTED),
+            expression=f"IF(FILL(wanted, {floor}) > 0 AND FILL(errors, 0) >= 1, 1, 0)",
+        ),
+        OperatorAlarm(
+            name="silent-agent",
+            meaning="a server in service publishes no metrics: its agent is down, or cannot reach AWS",
+            series=(_REPORTS, _SERVING),
+            expression="IF(FILL(reports, 0) < FILL(serving, 0), 1, 0)",
+            period_s=_LONG_PERIOD_S,
+            periods=2,
+            datapoints=2,
+        ),
+        OperatorAlarm(
+            name="lambda-errors",
+            meaning="executions of the serverless PnP fail",
+            series=(_function("errors", "Errors", "Sum"),),
+            expression="IF(errors >= 1, 1, 0)",
+            datapoints=2,
+        ),
+        OperatorAlarm(
+            name="lambda-throttles",
+            meaning="calls of the serverless PnP exceed cloud.lambda_concurrency",
+            series=(_function("throttles", "Throttles", "Sum"),),
+            expression="IF(throttles >= 1, 1, 0)",
+            datapoints=2,
+        ),
+        OperatorAlarm(
+            name="lambda-slow",
+            meaning=f"executions of the serverless PnP take more than {_SLOW_SHARE:.0%} of their time-out",
+            series=(_function("duration", "Duration", "p95"),),
+            expression=f"IF(duration >= {slow_ms:g}, 1, 0)",
+            datapoints=2,
+        ),
+        OperatorAlarm(
+            name="blocked",
+            meaning=f"the firewall blocks {_BLOCKED_PER_PERIOD:g} requests a minute or more",
+            series=(_BLOCKED,),
+            expression=f"IF(blocked >= {_BLOCKED_PER_PERIOD:g}, 1, 0)",
+        ),
+    ]
+    if settings.cloud.canary:
+        calls = (
+            _function("calls", "Invocations", "Sum", "canary"),
+            _function("errors", "Errors", "Sum", "canary"),
+            _WANTED,
+        )
+        alarms.append(
+            OperatorAlarm(
+                name="canary",
+                meaning="the canary gets no correct pose through the front door",
+                series=calls,
+                expression=f"IF(FILL(wanted, {floor}) > 0 AND FILL(calls, 0) - FILL(errors, 0) < 1, 1, 0)",
+                missing="breaching",
+            )
+        )
+    return tuple(alarms)
