@@ -10,6 +10,7 @@ from typing import Any
 import aws_cdk as cdk
 
 from rse_pf.config import PlatformSettings, load_settings
+from rse_pf.config.resource_names import DEPLOYMENT_TAG, ResourceNames
 from rse_pf.errors import RsePfError, SettingsError
 from stacks.backend_stack import BackendStack
 from stacks.data_stack import DataStack
@@ -19,16 +20,35 @@ from stacks.serverless_stack import ServerlessStack
 
 
 def build(app: cdk.App, settings: PlatformSettings, assets: Path) -> dict[str, cdk.Stack]:
-    """Add the five stacks to *app*, with the packages in the folder *assets*."""
-    common: Any = {"settings": settings, "env": cdk.Environment(region=settings.cloud.region)}
-    network = NetworkStack(app, "RsePf-Network", **common)
-    data = DataStack(app, "RsePf-Data", **common)
-    backend = BackendStack(app, "RsePf-Backend", assets=assets, network=network, data=data, **common)
-    serverless = ServerlessStack(app, "RsePf-Serverless", assets=assets, data=data, **common)
-    observability = ObservabilityStack(app, "RsePf-Observability", backend=backend, **common)
+    """Add the five stacks to *app*, with the packages in the folder *assets*.
+
+    They share no objects: values pass through `stacks.values`, and the dependencies below only say which
+    stack is deployed before which.
+    """
+    names, env = ResourceNames(settings.cloud.name), cdk.Environment(region=settings.cloud.region)
+
+    def common() -> Any:
+        qualifier = settings.cloud.bootstrap_qualifier
+        return {
+            "settings": settings, "env": env, "synthesizer": cdk.DefaultStackSynthesizer(qualifier=qualifier),
+        }  # fmt: skip
+
+    network = NetworkStack(app, names.stack("Network"), **common())
+    data = DataStack(app, names.stack("Data"), **common())
+    backend = BackendStack(app, names.stack("Backend"), assets=assets, **common())
+    serverless = ServerlessStack(app, names.stack("Serverless"), assets=assets, **common())
+    observability = ObservabilityStack(app, names.stack("Observability"), **common())
+    for reader, providers in (
+        (backend, [network, data]), (serverless, [data]), (observability, [backend]),
+    ):  # fmt: skip
+        for provider in providers:
+            reader.add_stack_dependency(provider)
     stacks: list[cdk.Stack] = [network, data, backend, serverless, observability]
     for stack in stacks:
-        cdk.Tags.of(stack).add("rse-pf", settings.digest())
+        # Parameters are found by their names; emulators take tags of theirs in another form than AWS.
+        untagged = ["AWS::SSM::Parameter"]
+        cdk.Tags.of(stack).add(DEPLOYMENT_TAG, names.prefix, exclude_resource_types=untagged)
+        cdk.CfnOutput(stack, "Settings", value=settings.digest(), description="digest of the settings")
     return {stack.stack_name: stack for stack in stacks}
 
 

@@ -21,17 +21,15 @@ from aws_cdk import aws_sns as sns
 from constructs import Construct
 
 from rse_pf.config import PlatformSettings
-from rse_pf.config.resource_names import AUDIT_PREFIX, GROUP, HOOK
+from rse_pf.config.resource_names import AUDIT_PREFIX, ResourceNames
 from rse_pf.scaling.alarms import NAMESPACE
 from stacks.findings import acknowledge
 
 __all__ = ["BackendServers"]
 
 _BOOT = Path(__file__).parent / "boot" / "first_boot.py"
-_MAPS_FINDING = "IAM5[Resource::RsePf-Data:ExportsOutputFnGetAttMaps9A995C1AArn072BF5B2/*]"
-_AUDIT_FINDING = (
-    f"IAM5[Resource::RsePf-Data:ExportsOutputFnGetAttAuditLogsB945E340Arn0187FED2/{AUDIT_PREFIX}/*]"
-)
+_MAPS_FINDING = "IAM5[Resource::arn:aws:s3:::<DataMaps>/*]"
+_AUDIT_FINDING = f"IAM5[Resource::arn:aws:s3:::<DataAuditLogs>/{AUDIT_PREFIX}/*]"
 _GIB = 8
 _START_S = 300
 
@@ -51,27 +49,28 @@ class BackendServers(Construct):
         topic: sns.ITopic,
         targets: Sequence[elbv2.IApplicationTargetGroup],
         artifacts: s3.IBucket,
-        maps: s3.IBucket,
+        maps: s3.IBucket | None,
         audit_logs: s3.IBucket,
         key_set: str,
         settings: PlatformSettings,
     ) -> None:
         super().__init__(scope, construct_id)
-        scaling = settings.scaling
+        scaling, names = settings.scaling, ResourceNames(settings.cloud.name)
         self.role = self._role(package, artifacts)
-        if settings.data.enabled:
+        if maps is not None:
             self._allow_objects(maps)
         self._allow_audit(audit_logs)
         self.group = autoscaling.AutoScalingGroup(
-            self, "Group", auto_scaling_group_name=GROUP, vpc=vpc,
+            self, "Group", auto_scaling_group_name=names.group, vpc=vpc,
             min_capacity=scaling.min_servers, max_capacity=scaling.max_servers,
             vpc_subnets=ec2.SubnetSelection(subnet_type=ec2.SubnetType.PRIVATE_ISOLATED),
             launch_template=self._template(
                 firewall_group, settings,
                 {
                     "package": package.s3_object_url, "sha256": package_sums, "region": settings.cloud.region,
-                    "bucket": artifacts.bucket_name, "keys": key_set, "group": GROUP, "hook": HOOK,
-                    "store": f"s3:{maps.bucket_name}" if settings.data.enabled else settings.data.store,
+                    "bucket": artifacts.bucket_name, "keys": key_set, "group": names.group,
+                    "hook": names.drain_hook,
+                    "store": f"s3:{maps.bucket_name}" if maps is not None else settings.data.store,
                     "audit": audit_logs.bucket_name,
                 },
             ),
@@ -91,7 +90,7 @@ class BackendServers(Construct):
             each.target_group_arn for each in targets
         ]
         self.group.add_lifecycle_hook(
-            "Drain", lifecycle_hook_name=HOOK,
+            "Drain", lifecycle_hook_name=names.drain_hook,
             lifecycle_transition=autoscaling.LifecycleTransition.INSTANCE_TERMINATING,
             heartbeat_timeout=cdk.Duration.seconds(settings.cloud.drain_s),
             default_result=autoscaling.DefaultResult.CONTINUE,

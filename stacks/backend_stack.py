@@ -12,14 +12,14 @@ from aws_cdk import aws_sns as sns
 from constructs import Construct
 
 from rse_pf.config import PlatformSettings
-from rse_pf.config.resource_names import DENY_NAME, GROUP, KEYS_NAME, ROBOTS_NAME
+from rse_pf.config.resource_names import DENY_NAME, KEYS_NAME, ROBOTS_NAME, ResourceNames
 from stacks.assets import WHEELHOUSE, staged, sums_digest
 from stacks.backend_servers import BackendServers
-from stacks.data_stack import DataStack
 from stacks.findings import acknowledge
 from stacks.load_balancer import LoadBalancer
-from stacks.network_stack import NetworkStack
+from stacks.network_stack import CIDR, ZONES
 from stacks.scale_modifier import ScaleModifier
+from stacks.values import imported_bucket, imported_group, imported_network, provide
 
 __all__ = ["TRUSTED", "BackendStack"]
 
@@ -28,7 +28,11 @@ TRUSTED = (KEYS_NAME, ROBOTS_NAME, DENY_NAME)
 
 
 class BackendStack(cdk.Stack):
-    """Everything that a release changes."""
+    """Everything that a release changes.
+
+    It reads the network and the buckets, and provides ``backend/topic``, ``backend/balancer`` and
+    ``backend/robots``: ARNs of the topic, the load balancer and the robots' target group.
+    """
 
     def __init__(
         self,
@@ -37,11 +41,13 @@ class BackendStack(cdk.Stack):
         *,
         settings: PlatformSettings,
         assets: Path,
-        network: NetworkStack,
-        data: DataStack,
         env: cdk.Environment,
+        synthesizer: cdk.IStackSynthesizer | None = None,
     ) -> None:
-        super().__init__(scope, construct_id, env=env)
+        super().__init__(scope, construct_id, env=env, synthesizer=synthesizer)
+        names = ResourceNames(settings.cloud.name)
+        vpc = imported_network(self, names, zones=ZONES, cidr=CIDR)
+        artifacts = imported_bucket(self, names, "artifacts")
         self.topic = sns.Topic(self, "Events", enforce_ssl=True)
         # A topic with a policy of its own forgets the one that lets the account's alarms in.
         self.topic.add_to_resource_policy(
@@ -52,21 +58,22 @@ class BackendStack(cdk.Stack):
             )
         )  # fmt: skip
         self.balancer = LoadBalancer(
-            self, "LoadBalancer", vpc=network.vpc, group=network.firewall.balancer, settings=settings,
-            logs=data.access_logs,
+            self, "LoadBalancer", vpc=vpc, group=imported_group(self, names, "balancer"), settings=settings,
+            logs=imported_bucket(self, names, "access-logs"),
         )  # fmt: skip
         with tempfile.TemporaryDirectory() as folder:
             path = staged(assets, WHEELHOUSE, settings, Path(folder))
             package, sums = s3_assets.Asset(self, "Package", path=str(path)), sums_digest(path)
         self.servers = BackendServers(
-            self, "Servers", vpc=network.vpc, firewall_group=network.firewall.servers, package=package,
+            self, "Servers", vpc=vpc, firewall_group=imported_group(self, names, "servers"), package=package,
             package_sums=sums, topic=self.topic, targets=list(self.balancer.targets.values()),
-            settings=settings, artifacts=data.artifacts, maps=data.maps,
-            audit_logs=data.audit_logs, key_set=KEYS_NAME,
+            settings=settings, artifacts=artifacts,
+            maps=imported_bucket(self, names, "maps") if settings.data.enabled else None,
+            audit_logs=imported_bucket(self, names, "audit-logs"), key_set=KEYS_NAME,
         )  # fmt: skip
         self.servers.role.add_to_policy(
             iam.PolicyStatement(
-                actions=["s3:GetObject"], resources=[data.artifacts.arn_for_objects(name) for name in TRUSTED]
+                actions=["s3:GetObject"], resources=[artifacts.arn_for_objects(name) for name in TRUSTED]
             )
         )
         group = self.servers.group
@@ -77,7 +84,7 @@ class BackendStack(cdk.Stack):
                 resources=[
                     self.format_arn(
                         service="autoscaling", resource="autoScalingGroup",
-                        resource_name=f"*:autoScalingGroupName/{GROUP}",
+                        resource_name=f"*:autoScalingGroupName/{names.group}",
                         arn_format=cdk.ArnFormat.COLON_RESOURCE_NAME,
                     )
                 ],
@@ -85,7 +92,7 @@ class BackendStack(cdk.Stack):
         )  # fmt: skip
         finding = (
             f"IAM5[Resource::arn:aws:autoscaling:{self.region}:<AWS::AccountId>:autoScalingGroup:*"
-            f":autoScalingGroupName/{GROUP}]"
+            f":autoScalingGroupName/{names.group}]"
         )
         reason = "the ARN of an Auto Scaling group holds an id that only AWS knows"
         acknowledge(self.servers.role, reason, finding)
@@ -93,6 +100,9 @@ class BackendStack(cdk.Stack):
             self, "ScaleModifier", group_name=group.auto_scaling_group_name, topic_arn=self.topic.topic_arn,
             settings=settings,
         )  # fmt: skip
+        provide(self, names, "backend/topic", self.topic.topic_arn)
+        provide(self, names, "backend/balancer", self.balancer.alb.load_balancer_arn)
+        provide(self, names, "backend/robots", self.balancer.targets["robots"].target_group_arn)
         self._outputs(settings)
 
     def _outputs(self, settings: PlatformSettings) -> None:

@@ -7,26 +7,43 @@ Audit logs also need a role that may bypass their retention.
 from __future__ import annotations
 
 import aws_cdk as cdk
+from aws_cdk import aws_iam as iam
 from aws_cdk import aws_s3 as s3
 from aws_cdk import aws_secretsmanager as secretsmanager
+from aws_cdk import region_info
 from constructs import Construct
 
 from rse_pf.config import PlatformSettings
+from rse_pf.config.resource_names import ResourceNames
 from stacks.findings import acknowledge
+from stacks.values import provide
 
-__all__ = ["DataStack"]
+__all__ = ["BALANCER_LOGS", "DataStack"]
+
+BALANCER_LOGS = "alb"
+"""Prefix of the load balancer's access logs in their bucket."""
 
 _INFREQUENT_AFTER_DAYS = 30
 """The soonest that S3 takes an object there; ``data.glacier_after_days`` is not less."""
 
 
 class DataStack(cdk.Stack):
-    """Map, artifact, audit-log and access-log buckets; the secret of the signing key."""
+    """Map, artifact, audit-log and access-log buckets; the secret of the signing key.
+
+    It provides the buckets' names as ``data/maps``, ``data/artifacts``, ``data/audit-logs`` and
+    ``data/access-logs``.
+    """
 
     def __init__(
-        self, scope: Construct, construct_id: str, *, settings: PlatformSettings, env: cdk.Environment
+        self,
+        scope: Construct,
+        construct_id: str,
+        *,
+        settings: PlatformSettings,
+        env: cdk.Environment,
+        synthesizer: cdk.IStackSynthesizer | None = None,
     ) -> None:
-        super().__init__(scope, construct_id, env=env, termination_protection=True)
+        super().__init__(scope, construct_id, env=env, synthesizer=synthesizer, termination_protection=True)
         self.access_logs = self._bucket("AccessLogs", None)
         self.access_logs.add_lifecycle_rule(expiration=cdk.Duration.days(settings.cloud.log_days))
         self.maps = self._bucket("Maps", self.access_logs)
@@ -53,6 +70,24 @@ class DataStack(cdk.Stack):
             removal_policy=cdk.RemovalPolicy.RETAIN,
         )  # fmt: skip
         acknowledge(self.signing_key, "rotated by two overlapping keys, see docs/operations.md", "SMG4")
+        self._admit_balancer()
+        names = ResourceNames(settings.cloud.name)
+        for name, bucket in (
+            ("maps", self.maps), ("artifacts", self.artifacts), ("audit-logs", self.audit_logs),
+            ("access-logs", self.access_logs),
+        ):  # fmt: skip
+            provide(self, names, f"data/{name}", bucket.bucket_name)
+
+    def _admit_balancer(self) -> None:
+        """Allow load balancers of this account to write access logs: its stack cannot change our policies."""
+        writer = region_info.RegionInfo.get(self.region).elbv2_account
+        service = iam.ServicePrincipal("logdelivery.elasticloadbalancing.amazonaws.com")
+        self.access_logs.add_to_resource_policy(
+            iam.PolicyStatement(
+                principals=[iam.AccountPrincipal(writer) if writer else service], actions=["s3:PutObject"],
+                resources=[self.access_logs.arn_for_objects(f"{BALANCER_LOGS}/AWSLogs/{self.account}/*")],
+            )
+        )  # fmt: skip
 
     def _bucket(self, name: str, logs: s3.Bucket | None, locked_for: cdk.Duration | None = None) -> s3.Bucket:
         lock = None if locked_for is None else s3.ObjectLockRetention.governance(locked_for)

@@ -10,8 +10,9 @@ from aws_cdk import aws_wafv2 as wafv2
 from constructs import Construct
 
 from rse_pf.config import PlatformSettings
-from rse_pf.config.resource_names import READY_PATH
+from rse_pf.config.resource_names import READY_PATH, ResourceNames
 from rse_pf.scaling.health import CLOUD_TIMEOUT_S, HEALTHY_CHECKS
+from stacks.data_stack import BALANCER_LOGS
 from stacks.firewall import front_port
 
 __all__ = ["LoadBalancer"]
@@ -43,7 +44,7 @@ class LoadBalancer(Construct):
             desync_mitigation_mode=elbv2.DesyncMitigationMode.STRICTEST,
         )  # fmt: skip
         # Their fields name no request header but Host and User-Agent (docs/security.md): no token is in them.
-        self.alb.log_access_logs(logs, "alb")
+        self.alb.log_access_logs(logs, BALANCER_LOGS)
         self.targets = {"robots": self._targets("Robots", vpc, settings.serving.port, settings)}
         insecure = settings.cloud.allow_insecure
         listener = self.alb.add_listener(
@@ -89,6 +90,8 @@ class LoadBalancer(Construct):
         )  # fmt: skip
 
     def _waf(self, settings: PlatformSettings) -> None:
+        prefix = ResourceNames(settings.cloud.name).prefix
+
         def seen(name: str) -> wafv2.CfnWebACL.VisibilityConfigProperty:
             # Samples would show the headers of handshakes, and so the tokens of robots, for hours.
             return wafv2.CfnWebACL.VisibilityConfigProperty(
@@ -96,12 +99,12 @@ class LoadBalancer(Construct):
             )
 
         acl = wafv2.CfnWebACL(
-            self, "Waf", scope="REGIONAL", visibility_config=seen("rse-pf-waf"),
+            self, "Waf", scope="REGIONAL", visibility_config=seen(f"{prefix}-waf"),
             default_action=wafv2.CfnWebACL.DefaultActionProperty(allow={}),
             rules=[
                 wafv2.CfnWebACL.RuleProperty(
                     name="rate", priority=0, action=wafv2.CfnWebACL.RuleActionProperty(block={}),
-                    visibility_config=seen("rse-pf-rate"),
+                    visibility_config=seen(f"{prefix}-rate"),
                     statement=wafv2.CfnWebACL.StatementProperty(
                         rate_based_statement=wafv2.CfnWebACL.RateBasedStatementProperty(
                             aggregate_key_type="IP", limit=settings.cloud.requests_per_5_minutes,

@@ -12,10 +12,17 @@ from aws_cdk import aws_logs as logs
 from constructs import Construct
 
 from rse_pf.config import PlatformSettings
+from rse_pf.config.resource_names import ResourceNames
 from stacks.findings import acknowledge
 from stacks.firewall import Firewall, front_port, inner_ports
+from stacks.values import provide, provide_network
 
-__all__ = ["NetworkStack"]
+__all__ = ["CIDR", "ZONES", "NetworkStack"]
+
+CIDR = "10.20.0.0/16"
+"""Of the VPC."""
+ZONES = 2
+"""That the network spans; a load balancer needs two."""
 
 _MINIMAL = {
     "Monitoring": ec2.InterfaceVpcEndpointAwsService.CLOUDWATCH_MONITORING,
@@ -33,18 +40,27 @@ _ENDPOINTS = {
 _FIRST_ANSWER_PORT, _LAST_PORT = 1024, 65535
 _HTTPS = 443
 _WHY_LISTS = "the paper's firewall has access control lists (Sect. 3.1); they stand behind security groups"
-_CIDR = "10.20.0.0/16"
 
 
 class NetworkStack(cdk.Stack):
-    """VPC, endpoints, access control lists, flow logs and the firewall."""
+    """VPC, endpoints, access control lists, flow logs and the firewall.
+
+    It provides ``network/vpc``, ``network/front-N`` and ``network/servers-N`` for the subnets of zone N, and
+    ``network/group-balancer``, ``-servers`` and ``-endpoints``.
+    """
 
     def __init__(
-        self, scope: Construct, construct_id: str, *, settings: PlatformSettings, env: cdk.Environment
+        self,
+        scope: Construct,
+        construct_id: str,
+        *,
+        settings: PlatformSettings,
+        env: cdk.Environment,
+        synthesizer: cdk.IStackSynthesizer | None = None,
     ) -> None:
-        super().__init__(scope, construct_id, env=env)
+        super().__init__(scope, construct_id, env=env, synthesizer=synthesizer)
         self.vpc = ec2.Vpc(
-            self, "Vpc", ip_addresses=ec2.IpAddresses.cidr(_CIDR), max_azs=2, nat_gateways=0,
+            self, "Vpc", ip_addresses=ec2.IpAddresses.cidr(CIDR), max_azs=ZONES, nat_gateways=0,
             restrict_default_security_group=False,
             subnet_configuration=[
                 ec2.SubnetConfiguration(
@@ -68,12 +84,19 @@ class NetworkStack(cdk.Stack):
             )
         self._control_lists(settings)
         self._flow_logs(settings)
+        names = ResourceNames(settings.cloud.name)
+        provide_network(self, names, self.vpc)
+        for name, group in (
+            ("balancer", self.firewall.balancer), ("servers", self.firewall.servers),
+            ("endpoints", self.firewall.endpoints),
+        ):  # fmt: skip
+            provide(self, names, f"network/group-{name}", group.security_group_id)
 
     @property
     @jsii.member(jsii_name="availabilityZones")
     def availability_zones(self) -> list[str]:
-        """The two zones, so that synthesis makes no request to AWS."""
-        return [cdk.Fn.select(at, cdk.Fn.get_azs()) for at in range(2)]
+        """The zones, so that synthesis makes no request to AWS."""
+        return [cdk.Fn.select(at, cdk.Fn.get_azs()) for at in range(ZONES)]
 
     def _control_lists(self, settings: PlatformSettings) -> None:
         """Repeat what the security groups allow, with the responses: access control lists are stateless."""

@@ -7,6 +7,7 @@ from aws_cdk import aws_cloudwatch as cloudwatch
 from constructs import Construct
 
 from rse_pf.config import PlatformSettings
+from rse_pf.config.resource_names import ResourceNames
 from rse_pf.scaling.alarms import Alarm, Metric, alarms_of
 
 __all__ = ["ScaleModifier"]
@@ -25,6 +26,7 @@ class ScaleModifier(Construct):
         settings: PlatformSettings,
     ) -> None:
         super().__init__(scope, construct_id)
+        self._names = ResourceNames(settings.cloud.name)
         for alarm in alarms_of(settings.scaling):
             self._alarm(alarm, group_name, topic_arn, settings.scaling.warm_up_s)
 
@@ -55,7 +57,7 @@ class ScaleModifier(Construct):
             id="verdict", expression=alarm.expression, return_data=True
         )
         cloudwatch.CfnAlarm(
-            self, f"{alarm.name.capitalize()}Alarm", alarm_name=f"rse-pf-{alarm.name}",
+            self, f"{alarm.name.capitalize()}Alarm", alarm_name=self._names.alarm(alarm.name),
             alarm_description=f"{alarm.meaning}; runbook: docs/operations.md#{alarm.name}",
             metrics=[*queries, verdict], comparison_operator=alarm.comparison, threshold=alarm.threshold,
             evaluation_periods=alarm.periods, datapoints_to_alarm=alarm.periods,

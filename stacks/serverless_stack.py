@@ -13,11 +13,11 @@ from aws_cdk import aws_logs as logs
 from constructs import Construct
 
 from rse_pf.config import PlatformSettings
-from rse_pf.config.resource_names import KEYS_NAME
+from rse_pf.config.resource_names import KEYS_NAME, ResourceNames
 from stacks.assets import staged
 from stacks.backend_stack import TRUSTED
-from stacks.data_stack import DataStack
 from stacks.findings import acknowledge
+from stacks.values import imported_bucket
 
 __all__ = ["ServerlessStack"]
 
@@ -26,7 +26,7 @@ _TIMEOUT_S = 10
 
 
 class ServerlessStack(cdk.Stack):
-    """The function, its URL and its log."""
+    """The function, its URL and its log; it reads the artifact bucket."""
 
     def __init__(
         self,
@@ -35,16 +35,17 @@ class ServerlessStack(cdk.Stack):
         *,
         settings: PlatformSettings,
         assets: Path,
-        data: DataStack,
         env: cdk.Environment,
+        synthesizer: cdk.IStackSynthesizer | None = None,
     ) -> None:
-        super().__init__(scope, construct_id, env=env)
+        super().__init__(scope, construct_id, env=env, synthesizer=synthesizer)
+        artifacts = imported_bucket(self, ResourceNames(settings.cloud.name), "artifacts")
         log = logs.LogGroup(self, "Log", removal_policy=cdk.RemovalPolicy.DESTROY)
         cast("logs.CfnLogGroup", log.node.default_child).retention_in_days = settings.cloud.log_days
         role = iam.Role(self, "Role", assumed_by=iam.ServicePrincipal("lambda.amazonaws.com"))
         role.add_to_policy(
             iam.PolicyStatement(
-                actions=["s3:GetObject"], resources=[data.artifacts.arn_for_objects(name) for name in TRUSTED]
+                actions=["s3:GetObject"], resources=[artifacts.arn_for_objects(name) for name in TRUSTED]
             )
         )
         log.grant_write(role)
@@ -56,7 +57,7 @@ class ServerlessStack(cdk.Stack):
                 memory_size=settings.cloud.lambda_memory_mb,
                 timeout=cdk.Duration.seconds(_TIMEOUT_S),
                 reserved_concurrent_executions=settings.cloud.lambda_concurrency,
-                environment={"RSE_PF_KEYS": f"{data.artifacts.bucket_name}/{KEYS_NAME}"},
+                environment={"RSE_PF_KEYS": f"{artifacts.bucket_name}/{KEYS_NAME}"},
             )  # fmt: skip
         acknowledge(function, "the newest runtime with wheels of every package in the lock", "L1")
         # Robots carry our own tokens, which the handler checks; AWS's signatures are not for robots.

@@ -52,6 +52,7 @@ _FOLDERS = {
     "service": "services",
     "serve": "servers", "data": "servers",
     "camera": "maps", "map": "maps",
+    "cloud": "cloud",
 }  # fmt: skip
 """Folder of a verb whose module does not lie beside this one."""
 

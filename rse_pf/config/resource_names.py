@@ -1,6 +1,7 @@
 """What things of a deployment are called by more than one side: by the stacks, and by who looks for them.
 
-Promises to import nothing, and to hold no setting: a name here is the same in every deployment.
+Promises to import nothing, and to read no setting: constants are the same in every deployment, and
+`ResourceNames` makes the others of the deployment's name.
 """
 
 from __future__ import annotations
@@ -9,11 +10,9 @@ from dataclasses import dataclass
 
 __all__ = [
     "AUDIT_PREFIX",
-    "DATA_STACK",
     "DENY_NAME",
-    "GROUP",
+    "DEPLOYMENT_TAG",
     "HEALTH_PATH",
-    "HOOK",
     "KEYS_NAME",
     "READY_PATH",
     "ROBOTS_NAME",
@@ -21,17 +20,14 @@ __all__ = [
     "ResourceNames",
 ]
 
-GROUP = "rse-pf"
-"""Of the Auto Scaling group; fixed, so that an instance knows it before the group exists."""
-HOOK = "rse-pf-drain"
-"""Of the lifecycle hook that an instance completes when its robots are gone."""
+DEPLOYMENT_TAG = "rse-pf"
+"""Key of the tag of every resource; its value is `ResourceNames.prefix`."""
 HEALTH_PATH = "/healthz"
 """At the robots' port; it tells everybody that robots are served, and nothing else."""
 READY_PATH = "/readyz"
 """At the control port, and below ``/data`` at the data service; load balancers ask it."""
 ROSBRIDGE_PATH = "/rosbridge"
 """At the robots' port, where ``serving.rosbridge`` is on."""
-DATA_STACK = "RsePf-Data"
 KEYS_NAME = "keys.json"
 """Of the public key set in the artifact bucket."""
 ROBOTS_NAME = "control/robots.json"
@@ -44,13 +40,16 @@ AUDIT_PREFIX = "audit"
 
 @dataclass(frozen=True, slots=True)
 class ResourceNames:
-    """The names in AWS of one deployment; *deployment* is ``cloud.name``, empty for the only one."""
+    """The names in AWS of one deployment; *deployment* is ``cloud.name``, empty for the only one.
+
+    No name of one deployment is a name of another, whatever they are called.
+    """
 
     deployment: str = ""
 
     @property
     def prefix(self) -> str:
-        """Return what the names of alarms, groups and hooks begin with, such as ``rse-pf-lab``."""
+        """Return what the names of groups and hooks begin with, and the tag's value: ``rse-pf-lab``."""
         return f"rse-pf-{self.deployment}" if self.deployment else "rse-pf"
 
     @property
@@ -82,9 +81,22 @@ class ResourceNames:
         """Return the name of the stack *box*, such as ``RsePf-lab-Backend``."""
         return f"{self.stack_prefix}{box}"
 
+    def owns_stack(self, name: str) -> bool:
+        """Return whether *name* is of a stack, or of what CloudFormation named after one, of this deployment.
+
+        A box begins with a capital letter and a deployment does not: RsePf-Data is none of ``lab``.
+        """
+        rest = name.removeprefix(self.stack_prefix)
+        return rest != name and rest[:1].isupper()
+
+    @property
+    def alarm_prefix(self) -> str:
+        """Return what the names of alarms begin with; the slash keeps those of other deployments apart."""
+        return f"{self.prefix}/"
+
     def alarm(self, name: str) -> str:
-        """Return the name of an alarm, such as ``rse-pf-lab-busy``."""
-        return f"{self.prefix}-{name}"
+        """Return the name of an alarm, such as ``rse-pf-lab/busy``."""
+        return f"{self.alarm_prefix}{name}"
 
     def parameter(self, path: str) -> str:
         """Return the name of an SSM parameter, such as ``/rse-pf-lab/network/vpc``."""

@@ -300,6 +300,7 @@ class CloudSettings:
     spot: bool = setting(False, doc="servers above on_demand_servers are Spot instances, which AWS may take back within two minutes")
     on_demand_servers: int = setting(1, unit="servers", doc="servers that are never Spot instances", low=0, high=1000)
     image_parameter: str = setting("/aws/service/debian/release/12/latest/amd64", doc="SSM parameter that names the machine image", source="Debian's public parameter")
+    endpoints: str = setting("minimal", doc="interface endpoints: minimal (monitoring, autoscaling, logs) or full (also ssm, secretsmanager)", choices=("minimal", "full"))
     profile: str = setting("standard", doc="small: one zone for servers and endpoints, and one server of a small type unless you set these; see docs/operations.md", choices=("standard", "small"))
     canary: bool = setting(True, doc="a function that asks for one known pose through the load balancer every minute, and an alarm")
     budget_per_month: float = setting(0.0, unit="USD", doc="cost of the account in a month above which the topic of alarms is told; 0 is off", low=0)

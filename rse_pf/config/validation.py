@@ -17,6 +17,8 @@ from rse_pf.errors import SettingsError
 __all__ = [
     "WHERE",
     "SettingRow",
+    "check_burst_url",
+    "check_deployment",
     "check_origin",
     "check_range",
     "did_you_mean",
@@ -26,7 +28,10 @@ __all__ = [
 ]
 
 _LARGEST = 1e15
+_DEPLOYMENT = re.compile(r"(?:[a-z](?:[a-z0-9-]{0,14}[a-z0-9])?)?")
+_QUALIFIER = re.compile(r"[a-z0-9]{1,10}")
 _ORIGIN = re.compile(r"[a-z][a-z0-9+.-]*://(?:[a-z0-9._-]+|\[[0-9a-f:.]+\])(?::[0-9]{1,5})?", re.IGNORECASE)
+_BURST_URL = re.compile(r"(?:https?://(?:[A-Za-z0-9._-]+|\[[0-9A-Fa-f:.]+\])(?::[0-9]{1,5})?)?/[!-~]{0,200}")
 WHERE = 'in cdk.json, context."rse-pf"'
 
 
@@ -107,6 +112,29 @@ def check_origin(name: str, origin: str) -> None:
         raise SettingsError(
             f"{name} has {_shown(origin)}, which is no origin of a web page",
             hint=f"write it as https://robots.example.org or http://localhost:9000 {WHERE}",
+        )
+
+
+def check_burst_url(name: str, url: str) -> None:
+    """Raise SettingsError if *url* is neither empty, nor a path, nor an address of HTTP."""
+    if url and _BURST_URL.fullmatch(url) is None:
+        raise SettingsError(
+            f"{name} = {_shown(url)} is no place to send commands to",
+            hint=f"use /burst, or an address such as https://robots.example.org/burst, {WHERE}",
+        )
+
+
+def check_deployment(name: str, qualifier: str) -> None:
+    """Raise SettingsError if AWS would not take ``cloud.name`` or ``cloud.bootstrap_qualifier`` in a name."""
+    if _DEPLOYMENT.fullmatch(name) is None:
+        raise SettingsError(
+            f"cloud.name = {_shown(name)} is no name of a deployment",
+            hint=f"use at most 16 small letters, digits and hyphens, such as lab or team-2, {WHERE}",
+        )
+    if _QUALIFIER.fullmatch(qualifier) is None:
+        raise SettingsError(
+            f"cloud.bootstrap_qualifier = {_shown(qualifier)} is no qualifier of the CDK",
+            hint=f"use 1 to 10 small letters and digits, as at npx cdk bootstrap --qualifier, {WHERE}",
         )
 
 

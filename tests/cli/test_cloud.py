@@ -12,8 +12,8 @@ import pytest
 from rse_pf.aws.account import Account
 from rse_pf.aws.clients import make_client
 from rse_pf.aws.fleet.group import AutoScalingGroup, Server
-from rse_pf.cli import cloud
-from rse_pf.cli.cloud import check_tools
+from rse_pf.cli.cloud import doctor
+from rse_pf.cli.cloud.doctor import check_tools
 from rse_pf.cli.main import main
 
 REGION = "ap-northeast-2"
@@ -191,7 +191,7 @@ def checkout(folder: Path, *, version: str = "2.1148.1", reads: str = ">=55.5.0"
 def test_a_command_line_that_cannot_read_the_librarys_assembly_is_caught(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, changes: dict[str, str], grade: str
 ) -> None:
-    monkeypatch.setattr(cloud.metadata, "version", lambda name: "55.3.0")
+    monkeypatch.setattr(doctor.metadata, "version", lambda name: "55.3.0")
 
     _, cli, packages = check_tools(checkout(tmp_path, **changes))
 
@@ -216,7 +216,7 @@ def test_a_node_that_the_cdk_no_longer_supports_is_caught(
     node = tmp_path / "node"
     node.write_text(f"#!/bin/sh\necho {told}\n", encoding="utf-8")
     node.chmod(0o755)
-    monkeypatch.setattr(cloud.sysconfig, "get_path", lambda name: str(tmp_path))
+    monkeypatch.setattr(doctor.sysconfig, "get_path", lambda name: str(tmp_path))
 
     assert next(check_tools(tmp_path)).grade == grade
 

@@ -42,7 +42,6 @@ IGNORED = {
 """Types of ours that moto 5.2 accepts and then forgets."""
 
 REGION = "ap-northeast-2"
-_MISSING = "not-on-moto"
 _TRIED = re.compile(r"Tried to parse (\S+) but")
 
 
@@ -68,31 +67,22 @@ def references(value: Any) -> Iterator[tuple[str, str]]:
             yield from references(each)
 
 
-def without_imports(value: Any, dropped: set[str]) -> Any:
-    """Return *value* with a plain text where it imports an output that moto cannot give."""
-    if isinstance(value, dict):
-        if value.get("Fn::ImportValue") in dropped:
-            return _MISSING
-        return {key: without_imports(each, dropped) for key, each in value.items()}
-    return [without_imports(each, dropped) for each in value] if isinstance(value, list) else value
+def adapted(template: dict[str, Any], image: str) -> dict[str, Any]:
+    """Return *template* without the outputs that read what moto ignores.
 
-
-def adapted(template: dict[str, Any], dropped: set[str], image: str) -> dict[str, Any]:
-    """Return *template* without the outputs that read what moto ignores; their names go into *dropped*.
-
-    The machine image is given: moto knows no parameters of Debian, and lets nobody write them.
+    The machine image is given: moto knows no parameters of Debian, and lets nobody write them.  Values that
+    another stack provides are read by moto itself.
     """
-    made = without_imports(copy.deepcopy(template), dropped)
-    for parameter in made.get("Parameters", {}).values():
-        if parameter["Type"].startswith("AWS::SSM::Parameter::Value"):
-            is_image = "Image::Id" in parameter["Type"]
-            parameter.update(Type="String", Default=image if is_image else "30")
+    made = copy.deepcopy(template)
+    for name, parameter in made.get("Parameters", {}).items():
+        if "Image::Id" in parameter["Type"]:
+            parameter.update(Type="String", Default=image)
+        elif name == "BootstrapVersion":
+            parameter.update(Type="String", Default="30")
     ignored = {name for name, each in made["Resources"].items() if each["Type"] in IGNORED}
     for name, output in list(made.get("Outputs", {}).items()):
         read = set(references(output["Value"]))
         if any(resource in ignored or attribute == "TargetGroupFullName" for resource, attribute in read):
-            if "Export" in output:
-                dropped.add(output["Export"]["Name"])
             del made["Outputs"][name]
     for resource in made["Resources"].values():
         depends = resource.get("DependsOn", [])
@@ -120,10 +110,9 @@ def created(assembly: Assembly, monkeypatch: pytest.MonkeyPatch) -> Iterator[Cre
                 for where in asset["destinations"].values():
                     s3.put_object(Bucket=bucket, Key=where["objectKey"], Body=_EMPTY_ZIP)
         formation = boto3.client("cloudformation", region_name=REGION)
-        dropped: set[str] = set()
         made = Created()
         for stack in ORDER:
-            template = adapted(assembly.templates[f"RsePf-{stack}"], dropped, image)
+            template = adapted(assembly.templates[f"RsePf-{stack}"], image)
             text = json.dumps(template)
             if arn := assembly.settings.cloud.certificate_arn:  # moto wants one that it made
                 text = text.replace(arn, certificate["CertificateArn"])

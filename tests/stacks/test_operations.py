@@ -111,7 +111,7 @@ def account(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[None]:
         s3 = make_client("s3", REGION)
         for name in ("artifacts", "auditlogs"):
             s3.create_bucket(Bucket=name, CreateBucketConfiguration={"LocationConstraint": REGION})
-        tag = [{"Key": "rse-pf", "Value": "digest"}]
+        tag = [{"Key": "rse-pf", "Value": "rse-pf"}]
         make_client("secretsmanager", REGION).create_secret(Name="signingkey", SecretString="x", Tags=tag)
         monkeypatch.setattr("rse_pf.aws.account.open_account", lambda region: made)
         yield

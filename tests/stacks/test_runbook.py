@@ -14,6 +14,6 @@ def test_every_alarm_has_a_chapter_in_the_runbook(assembly: Any, repository: Pat
 
     assert len(alarms) >= 4
     for alarm in alarms:
-        name = alarm["AlarmName"].removeprefix("rse-pf-")
+        name = alarm["AlarmName"].removeprefix("rse-pf/")
         assert alarm["AlarmDescription"].endswith(f"runbook: docs/operations.md#{name}")
         assert name in chapters

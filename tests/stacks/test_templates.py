@@ -33,7 +33,7 @@ def parsed_alarms(assembly: Assembly) -> list[Alarm]:
         *series, verdict = alarm["Metrics"]
         found.append(
             Alarm(
-                name=alarm["AlarmName"].removeprefix("rse-pf-"),
+                name=alarm["AlarmName"].removeprefix("rse-pf/"),
                 metrics=tuple(
                     Metric(
                         name=each["Id"],
@@ -132,15 +132,15 @@ def _listed(value: str | list[str]) -> list[str]:
 
 def test_what_the_commands_look_for_is_what_the_stacks_call_it(assembly: Assembly) -> None:
     from rse_pf.auth.trust_store import DENY_NAME, ROBOTS_NAME
-    from rse_pf.aws.fleet.group import GROUP
     from rse_pf.aws.money.costs import interface_endpoints
-    from rse_pf.aws.storage.key_store import DATA_STACK, KEYS_NAME
+    from rse_pf.aws.storage.key_store import KEYS_NAME
+    from rse_pf.config.resource_names import ResourceNames
     from stacks import backend_stack
 
     (group,) = assembly.all("AWS::AutoScaling::AutoScalingGroup")
-    assert group["AutoScalingGroupName"] == GROUP
+    assert group["AutoScalingGroupName"] == ResourceNames().group
     assert {KEYS_NAME, ROBOTS_NAME, DENY_NAME} == set(backend_stack.TRUSTED)
-    resources = assembly.templates[DATA_STACK]["Resources"]
+    resources = assembly.templates[ResourceNames().stack("Data")]["Resources"]
     for word, kind in (
         ("SigningKey", "AWS::SecretsManager::Secret"), ("Artifacts", "AWS::S3::Bucket"),
         ("AuditLogs", "AWS::S3::Bucket"),
@@ -285,7 +285,7 @@ def test_audit_logs_are_written_once_and_read_changed_or_deleted_by_no_server(as
         statement
         for policy in assembly.all("AWS::IAM::Policy")
         for statement in policy["PolicyDocument"]["Statement"]
-        if "AuditLogs" in json.dumps(statement["Resource"])
+        if "DataAuditLogs" in json.dumps(statement["Resource"])
     ]
 
     assert bucket["ObjectLockConfiguration"]["Rule"]["DefaultRetention"] == lock
@@ -305,7 +305,7 @@ def test_packages_carry_the_merged_settings_and_one_digest(assembly: Assembly) -
     digests = {load_settings(path).digest() for path in assembly.folder.glob("asset.*/settings.json")}
 
     assert digests == {assembly.settings.digest()}
-    tag = {"Key": "rse-pf", "Value": assembly.settings.digest()}
+    tag = {"Key": "rse-pf", "Value": "rse-pf"}
     assert tag in assembly.one("AWS::EC2::VPC")["Tags"]
 
 
@@ -313,6 +313,37 @@ def test_synthesis_asks_nobody(assembly: Assembly) -> None:
     manifest = json.loads((assembly.folder / "manifest.json").read_text(encoding="utf-8"))
 
     assert not manifest.get("missing")
+
+
+def test_no_stack_holds_on_to_a_value_of_another(assembly: Assembly) -> None:
+    """CloudFormation refuses to remove an export that is imported: a switch could not be turned off again."""
+    text = json.dumps(assembly.templates)
+    provided = {each["Name"] for each in assembly.all("AWS::SSM::Parameter")}
+    wanted = {
+        parameter["Default"]
+        for template in assembly.templates.values()
+        for parameter in template["Parameters"].values()
+        if parameter["Default"].startswith("/rse-pf/")
+    }
+
+    assert "Fn::ImportValue" not in text
+    assert '"Export"' not in text
+    assert len(wanted) >= 12
+    assert wanted <= provided, "read, and written by no stack"
+
+
+def test_a_stack_is_deployed_after_those_whose_values_it_reads(assembly: Assembly) -> None:
+    manifest = json.loads((assembly.folder / "manifest.json").read_text(encoding="utf-8"))
+    writers = {
+        resource["Properties"]["Name"]: stack
+        for stack, template in assembly.templates.items()
+        for resource in template["Resources"].values()
+        if resource["Type"] == "AWS::SSM::Parameter"
+    }
+
+    for stack, template in assembly.templates.items():
+        reads = {writers.get(each["Default"]) for each in template["Parameters"].values()} - {None}
+        assert reads <= set(manifest["artifacts"][stack]["dependencies"]), stack
 
 
 def test_nag_finds_nothing_that_is_not_acknowledged(assembly: Assembly) -> None:

@@ -11,13 +11,12 @@ from datetime import datetime, timedelta
 from rse_pf.aws.account import Account
 from rse_pf.aws.fleet.metrics import ROBOTS, dimensions_of
 from rse_pf.config import PlatformSettings
-from rse_pf.config.resource_names import GROUP
+from rse_pf.config.resource_names import ResourceNames
 from rse_pf.errors import ConfigurationError
 from rse_pf.scaling.alarms import NAMESPACE
 
-__all__ = ["GROUP", "AutoScalingGroup", "Server", "read_group"]
+__all__ = ["AutoScalingGroup", "Server", "read_group"]
 
-_ALARMS = "rse-pf-"
 _PERIODS = 3
 
 
@@ -71,8 +70,9 @@ def read_group(
         ConfigurationError: There is no group in the region, or AWS refused.
         StoreError: AWS does not answer.
     """
+    of = ResourceNames(settings.cloud.name)
     found = account.pages(
-        "autoscaling", "describe_auto_scaling_groups", "AutoScalingGroups", AutoScalingGroupNames=[GROUP]
+        "autoscaling", "describe_auto_scaling_groups", "AutoScalingGroups", AutoScalingGroupNames=[of.group]
     )
     if not found:
         raise ConfigurationError(
@@ -81,8 +81,8 @@ def read_group(
     group = found[0]
     health = [_target_health(account, arn) for arn in group["TargetGroupARNs"]]
     names = [each["InstanceId"] for each in group["Instances"]]
-    robots = _robots(account, names, settings.scaling.period_s, now) if asks_robots else {}
-    alarms = account.pages("cloudwatch", "describe_alarms", "MetricAlarms", AlarmNamePrefix=_ALARMS)
+    robots = _robots(account, of.group, names, settings.scaling.period_s, now) if asks_robots else {}
+    alarms = account.pages("cloudwatch", "describe_alarms", "MetricAlarms", AlarmNamePrefix=of.alarm_prefix)
     return AutoScalingGroup(
         min_servers=group["MinSize"],
         wanted_servers=group["DesiredCapacity"],
@@ -97,9 +97,10 @@ def read_group(
             )
             for each in sorted(group["Instances"], key=lambda one: str(one["InstanceId"]))
         ),
-        alarms={each["AlarmName"].removeprefix(_ALARMS): each["StateValue"] for each in alarms},
+        alarms={each["AlarmName"].removeprefix(of.alarm_prefix): each["StateValue"] for each in alarms},
         reasons={
-            each["AlarmName"].removeprefix(_ALARMS): str(each.get("StateReason", "")) for each in alarms
+            each["AlarmName"].removeprefix(of.alarm_prefix): str(each.get("StateReason", ""))
+            for each in alarms
         },
         target_groups=tuple(group["TargetGroupARNs"]),
     )
@@ -111,7 +112,9 @@ def _target_health(account: Account, arn: str) -> dict[str, str]:
     return {row["Target"]["Id"]: row["TargetHealth"]["State"] for row in rows}
 
 
-def _robots(account: Account, servers: list[str], period_s: int, now: datetime) -> dict[str, float]:
+def _robots(
+    account: Account, group: str, servers: list[str], period_s: int, now: datetime
+) -> dict[str, float]:
     """Return the newest value of each server within the last complete periods; unknown ones are left out.
 
     The current period is left out: some agents may not have published theirs yet.
@@ -122,7 +125,7 @@ def _robots(account: Account, servers: list[str], period_s: int, now: datetime) 
             "Id": f"q{at}",
             "MetricStat": {
                 "Metric": {
-                    "Namespace": NAMESPACE, "MetricName": ROBOTS, "Dimensions": dimensions_of(GROUP, server),
+                    "Namespace": NAMESPACE, "MetricName": ROBOTS, "Dimensions": dimensions_of(group, server),
                 },
                 "Period": period_s,
                 "Stat": "Maximum",

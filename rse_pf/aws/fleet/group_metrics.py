@@ -13,7 +13,7 @@ from typing import Any
 from rse_pf.aws.account import Account
 from rse_pf.aws.fleet.metrics import ROBOTS, dimensions_of
 from rse_pf.config import PlatformSettings
-from rse_pf.config.resource_names import GROUP
+from rse_pf.config.resource_names import ResourceNames
 from rse_pf.scaling.alarms import NAMESPACE
 
 __all__ = ["PERIODS", "GroupMetrics", "read_group_metrics"]
@@ -69,7 +69,7 @@ def read_group_metrics(
         ConfigurationError: AWS refused.
         StoreError: AWS does not answer.
     """
-    period_s = settings.scaling.period_s
+    period_s, group = settings.scaling.period_s, ResourceNames(settings.cloud.name).group
     end_s = int(now.timestamp()) // period_s * period_s
     times_s = tuple(end_s - period_s * back for back in range(PERIODS - 1, -1, -1))
     asked = [("", name, what) for name, what in _GROUP_SERIES.items()]
@@ -80,7 +80,8 @@ def read_group_metrics(
     rows = account.pages(
         "cloudwatch", "get_metric_data", "MetricDataResults",
         MetricDataQueries=[
-            _query(f"q{at}", server, what, period_s) for at, (server, _, what) in enumerate(asked)
+            _query(f"q{at}", dimensions_of(group, server), server, what, period_s)
+            for at, (server, _, what) in enumerate(asked)
         ],
         ScanBy="TimestampAscending", StartTime=end - timedelta(seconds=PERIODS * period_s), EndTime=end,
     )  # fmt: skip
@@ -101,13 +102,11 @@ def read_group_metrics(
     return GroupMetrics(period_s=period_s, times_s=times_s, series=series, servers=newest)
 
 
-def _query(identity: str, server: str, what: tuple[str, str, str], period_s: int) -> dict[str, Any]:
+def _query(
+    identity: str, of_group: list[dict[str, str]], server: str, what: tuple[str, str, str], period_s: int
+) -> dict[str, Any]:
     namespace, metric, statistic = what
-    dimensions = (
-        [{"Name": "InstanceId", "Value": server}]
-        if server and namespace == _EC2
-        else dimensions_of(GROUP, server)
-    )
+    dimensions = [{"Name": "InstanceId", "Value": server}] if server and namespace == _EC2 else of_group
     return {
         "Id": identity,
         "MetricStat": {

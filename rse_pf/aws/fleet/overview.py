@@ -14,7 +14,7 @@ from typing import TypeVar
 from rse_pf.aws.account import Account
 from rse_pf.aws.fleet.group import AutoScalingGroup, read_group
 from rse_pf.config import PlatformSettings
-from rse_pf.config.resource_names import GROUP
+from rse_pf.config.resource_names import ResourceNames
 from rse_pf.errors import RsePfError
 
 __all__ = ["CloudBalancer", "CloudOverview", "ScalingActivity", "read_overview"]
@@ -79,7 +79,9 @@ def read_overview(account: Account, settings: PlatformSettings, *, now: datetime
         group=group,
         balancer=_or_problem(problems, None, lambda: _balancer(account, group.target_groups)),
         launched_s=_or_problem(problems, {}, lambda: _launched_s(account, names)),
-        activities=_or_problem(problems, (), lambda: _activities(account)),
+        activities=_or_problem(
+            problems, (), lambda: _activities(account, ResourceNames(settings.cloud.name).group)
+        ),
         problems=tuple(problems),
     )
 
@@ -122,9 +124,9 @@ def _launched_s(account: Account, names: list[str]) -> dict[str, float]:
     }
 
 
-def _activities(account: Account) -> tuple[ScalingActivity, ...]:
+def _activities(account: Account, group: str) -> tuple[ScalingActivity, ...]:
     found = account.find(
-        "autoscaling", "describe_scaling_activities", AutoScalingGroupName=GROUP, MaxRecords=_ACTIVITIES
+        "autoscaling", "describe_scaling_activities", AutoScalingGroupName=group, MaxRecords=_ACTIVITIES
     )
     rows = (found or {}).get("Activities", ())
     return tuple(

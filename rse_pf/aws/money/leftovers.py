@@ -6,18 +6,17 @@ owns is not left over.  Nothing is deleted; each leftover names the command that
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
 from rse_pf.aws.account import Account
+from rse_pf.config.resource_names import DEPLOYMENT_TAG, ResourceNames
 from rse_pf.errors import ConfigurationError
 
 __all__ = ["Leftover", "find_leftovers", "living_stacks"]
 
-_TAG = "rse-pf"
-_STACKS = "RsePf-"
-_ALARMS = "rse-pf-"
+_OF_FUNCTIONS = "/aws/lambda/"
 _GONE = ("DELETE_COMPLETE", "REVIEW_IN_PROGRESS")
 _KEPT = {
     "bucket": "kept on purpose: holds maps, packages, access logs or audit logs",
@@ -39,24 +38,26 @@ class Leftover:
     unread: bool = False
 
 
-def living_stacks(account: Account) -> list[str]:
-    """Return the names of our stacks that exist."""
+def living_stacks(account: Account, of: ResourceNames) -> list[str]:
+    """Return the names of the stacks of the deployment *of* that exist."""
     found = account.pages("cloudformation", "describe_stacks", "Stacks")
     names = [row["StackName"] for row in found if row["StackStatus"] not in _GONE]
-    return sorted(name for name in names if name.startswith(_STACKS))
+    return sorted(name for name in names if of.owns_stack(name))
 
 
-def find_leftovers(account: Account) -> list[Leftover]:
+def find_leftovers(account: Account, of: ResourceNames) -> list[Leftover]:
     """Return what no existing stack owns, sorted by kind and name; raises as `Account.find`."""
     owned = {
         str(row.get("PhysicalResourceId", ""))
-        for stack in living_stacks(account)
+        for stack in living_stacks(account, of)
         for row in account.pages(
             "cloudformation", "list_stack_resources", "StackResourceSummaries", StackName=stack
         )
     }
     unread: dict[str, str] = {}
-    found = {(kind, name) for kind, name, alias in _all_of_ours(account, unread) if not owned & {name, alias}}
+    found = {
+        (kind, name) for kind, name, alias in _all_of_ours(account, of, unread) if not owned & {name, alias}
+    }
     return sorted(
         Leftover(
             kind=kind, name=name, remove=_remove(kind, name), unread=name in unread,
@@ -66,25 +67,31 @@ def find_leftovers(account: Account) -> list[Leftover]:
     )  # fmt: skip
 
 
-def _all_of_ours(account: Account, unread: dict[str, str]) -> Iterator[tuple[str, str, str]]:
+def _all_of_ours(
+    account: Account, of: ResourceNames, unread: dict[str, str]
+) -> Iterator[tuple[str, str, str]]:
     """Yield kind, name, and the other name that CloudFormation may know it by; fill *unread* with reasons."""
     for row in account.pages("s3", "list_buckets", "Buckets"):
         try:
-            is_ours = _is_tagged(account, row["Name"])
+            is_ours = _is_tagged(account, of, row["Name"])
         except ConfigurationError as error:
             unread[row["Name"]] = f"perhaps not ours, it cannot be looked into: {error.message}"
             is_ours = True
         if is_ours:
             yield "bucket", row["Name"], ""
     for row in account.pages("secretsmanager", "list_secrets", "SecretList"):
-        if any(tag["Key"] == _TAG for tag in row.get("Tags", ())):
+        if _has_tag(of, row.get("Tags", ())):
             yield "secret", row["Name"], row["ARN"]
-    for prefix in (_STACKS, f"/aws/lambda/{_STACKS}"):
+    for before in ("", _OF_FUNCTIONS):
+        prefix = f"{before}{of.stack_prefix}"
         for row in account.pages("logs", "describe_log_groups", "logGroups", logGroupNamePrefix=prefix):
-            yield "log group", row["logGroupName"], ""
-    for row in account.pages("cloudwatch", "describe_alarms", "MetricAlarms", AlarmNamePrefix=_ALARMS):
+            if of.owns_stack(row["logGroupName"].removeprefix(before)):
+                yield "log group", row["logGroupName"], ""
+    for row in account.pages(
+        "cloudwatch", "describe_alarms", "MetricAlarms", AlarmNamePrefix=of.alarm_prefix
+    ):
         yield "alarm", row["AlarmName"], row["AlarmArn"]
-    free: list[dict[str, Any]] = [{"Name": "tag-key", "Values": [_TAG]}]
+    free: list[dict[str, Any]] = [{"Name": f"tag:{DEPLOYMENT_TAG}", "Values": [of.prefix]}]
     unattached = [*free, {"Name": "status", "Values": ["available"]}]
     for row in account.pages("ec2", "describe_volumes", "Volumes", Filters=unattached):
         yield "volume", row["VolumeId"], ""
@@ -92,9 +99,13 @@ def _all_of_ours(account: Account, unread: dict[str, str]) -> Iterator[tuple[str
         yield "network interface", row["NetworkInterfaceId"], ""
 
 
-def _is_tagged(account: Account, bucket: str) -> bool:
+def _is_tagged(account: Account, of: ResourceNames, bucket: str) -> bool:
     found = account.find("s3", "get_bucket_tagging", Bucket=bucket) or {}
-    return any(tag["Key"] == _TAG for tag in found.get("TagSet", ()))
+    return _has_tag(of, found.get("TagSet", ()))
+
+
+def _has_tag(of: ResourceNames, tags: Iterable[dict[str, Any]]) -> bool:
+    return any(tag["Key"] == DEPLOYMENT_TAG and tag["Value"] == of.prefix for tag in tags)
 
 
 def _remove(kind: str, name: str) -> str:

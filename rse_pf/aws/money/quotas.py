@@ -13,15 +13,14 @@ from rse_pf.aws.account import Account
 from rse_pf.aws.money.leftovers import living_stacks
 from rse_pf.aws.money.prices import load_prices
 from rse_pf.config import PlatformSettings
+from rse_pf.config.resource_names import ResourceNames
 from rse_pf.errors import ConfigurationError
 
 __all__ = ["Check", "check_account"]
 
-_BOOTSTRAP = "/cdk-bootstrap/hnb659fds/version"
 _VCPUS, _EXECUTIONS, _VPCS = ("ec2", "L-1216C47A"), ("lambda", "L-B99A9384"), ("vpc", "L-F678F1CE")
 _ALWAYS_UNRESERVED = 100
 """AWS keeps this many executions of an account for functions without a reservation."""
-_NETWORK_STACK = "RsePf-Network"
 _ASK_FOR_MORE = "ask for more in the Service Quotas console"
 
 
@@ -53,7 +52,8 @@ def check_account(account: Account, settings: PlatformSettings) -> Iterator[Chec
 
 
 def _bootstrap(account: Account, settings: PlatformSettings) -> Check:
-    found = account.find("ssm", "get_parameter", Name=_BOOTSTRAP)
+    qualifier = settings.cloud.bootstrap_qualifier
+    found = account.find("ssm", "get_parameter", Name=f"/cdk-bootstrap/{qualifier}/version")
     if found is None:
         return Check("fail", f"the CDK is not bootstrapped in {account.region}", "npx cdk bootstrap")
     return Check("ok", f"bootstrapped, version {found['Parameter']['Value']}")
@@ -120,7 +120,8 @@ def _executions(account: Account, settings: PlatformSettings) -> Check:
 
 
 def _vpcs(account: Account, settings: PlatformSettings) -> Check:
-    ours = _NETWORK_STACK in living_stacks(account)
+    names = ResourceNames(settings.cloud.name)
+    ours = names.stack("Network") in living_stacks(account, names)
     there = len(account.pages("ec2", "describe_vpcs", "Vpcs"))
     return _enough(account, _VPCS, there + (0 if ours else 1), "VPCs in the region, with this one")
 

@@ -28,7 +28,7 @@ from rse_pf.audit.heads import write_heads
 from rse_pf.audit.log import chain_names, files_of, newest_head
 from rse_pf.aws.account import Account
 from rse_pf.aws.storage.s3_store import S3Store
-from rse_pf.config.resource_names import AUDIT_PREFIX, DATA_STACK
+from rse_pf.config.resource_names import AUDIT_PREFIX, ResourceNames
 from rse_pf.errors import Conflict
 from rse_pf.files import replace_json
 from rse_pf.object_store import ObjectStore
@@ -123,9 +123,11 @@ def piece_name(instance: str, who: str, first: int, data: bytes) -> str:
     return f"{AUDIT_PREFIX}/{instance}/{who}.{first:012d}.{digest}.jsonl"
 
 
-def open_audit_archive(account: Account) -> S3Store:
-    """Return the bucket of the audit logs in *account*; raises ConfigurationError if there is none."""
-    return S3Store(account.client("s3"), account.resource(DATA_STACK, "AWS::S3::Bucket", "AuditLogs"))
+def open_audit_archive(account: Account, names: ResourceNames) -> S3Store:
+    """Return the bucket of a deployment's audit logs; raises ConfigurationError if there is none."""
+    return S3Store(
+        account.client("s3"), account.resource(names.stack("Data"), "AWS::S3::Bucket", "AuditLogs")
+    )
 
 
 def fetch_audit(store: ObjectStore, folder: Path) -> list[str]:

@@ -15,10 +15,10 @@ from rse_pf.auth.trust_store import AccessControlStore
 from rse_pf.aws.account import Account
 from rse_pf.aws.storage.s3_store import S3Store
 from rse_pf.config import PlatformSettings
-from rse_pf.config.resource_names import DATA_STACK, KEYS_NAME
+from rse_pf.config.resource_names import KEYS_NAME, ResourceNames
 from rse_pf.errors import ConfigurationError, NotFound, UsageError
 
-__all__ = ["DATA_STACK", "KEYS_NAME", "KeyRing", "KeyStore", "open_key_store", "spread_s"]
+__all__ = ["KEYS_NAME", "KeyRing", "KeyStore", "open_key_store", "spread_s"]
 
 _MAKE_ONE = "make one with rse-pf token init --cloud"
 
@@ -134,7 +134,9 @@ class KeyStore:
         """
         secret = {"SecretId": self._secret, "SecretString": ring.to_json()}
         if self._account.find("secretsmanager", "put_secret_value", **secret) is None:
-            raise NotFound(f"no secret named {self._secret!r}", hint=f"deploy {DATA_STACK} first")
+            raise NotFound(
+                f"no secret named {self._secret!r}", hint="deploy the platform first: rse-pf cloud up"
+            )
         self.publish(ring)
 
     def access_control_store(self) -> AccessControlStore:
@@ -147,10 +149,10 @@ class KeyStore:
         self._bucket.put(KEYS_NAME, ring.key_set().to_json().encode())
 
 
-def open_key_store(account: Account) -> KeyStore:
-    """Return the store of the deployment in *account*; raises ConfigurationError if there is none."""
+def open_key_store(account: Account, names: ResourceNames) -> KeyStore:
+    """Return the store of the deployment *names* in *account*; raises ConfigurationError if there is none."""
     return KeyStore(
         account,
-        secret=account.resource(DATA_STACK, "AWS::SecretsManager::Secret", "SigningKey"),
-        bucket=account.resource(DATA_STACK, "AWS::S3::Bucket", "Artifacts"),
+        secret=account.resource(names.stack("Data"), "AWS::SecretsManager::Secret", "SigningKey"),
+        bucket=account.resource(names.stack("Data"), "AWS::S3::Bucket", "Artifacts"),
     )

@@ -221,7 +221,7 @@ def _as_store_errors(name: str) -> Iterator[None]:
         if code == "NoSuchBucket":
             raise StoreError(
                 "the bucket does not exist",
-                hint="correct data.store, or deploy RsePf-Data",
+                hint="correct data.store, or deploy the data stack",
             ) from error
         if code == _ARCHIVED:
             raise Archived(

@@ -33,6 +33,7 @@ from rse_pf.audit.chain import Entry, Head, parse_head
 from rse_pf.audit.log import audit_folder, chain_names, files_of
 from rse_pf.audit.verify import Verdict, check_chain, check_folder, entries_of
 from rse_pf.config import PlatformSettings
+from rse_pf.config.resource_names import ResourceNames
 from rse_pf.errors import UsageError
 from rse_pf.terminal import counted, show
 
@@ -82,7 +83,7 @@ def _run_in_cloud(args: argparse.Namespace, settings: PlatformSettings) -> int:
         raise UsageError("--cloud and files exclude each other", hint="leave one of them out")
     if args.out is not None and args.out.exists() and any(args.out.iterdir()):
         raise UsageError(f"{args.out} is not empty", hint="name a new folder")
-    archive = open_audit_archive(open_account(settings.cloud.region))
+    archive = open_audit_archive(open_account(settings.cloud.region), ResourceNames(settings.cloud.name))
     with tempfile.TemporaryDirectory() as temporary:
         args.files = [args.out or Path(temporary)]
         problems = fetch_audit(archive, args.files[0])

@@ -64,7 +64,7 @@ def _place(args: argparse.Namespace) -> tuple[str, Path | None]:
         if args.cloud:
             raise UsageError(
                 "the address of the deployment is not known here",
-                hint="name it with --url; the output of RsePf-Backend ends with it",
+                hint="name it with --url; rse-pf cloud up and status print it",
             )
         raise UsageError(
             f"platform {args.name!r} does not run, so its address is not known",

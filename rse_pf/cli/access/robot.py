@@ -46,6 +46,7 @@ from rse_pf.auth.roster import (
 from rse_pf.auth.trust_store import AccessControlStore
 from rse_pf.cli.access.enrolment import enrolment_lines, make_enrolment
 from rse_pf.config import PlatformSettings
+from rse_pf.config.resource_names import ResourceNames
 from rse_pf.errors import UsageError
 from rse_pf.terminal import show, show_json
 
@@ -162,7 +163,8 @@ def open_access_control(args: argparse.Namespace, settings: PlatformSettings) ->
         from rse_pf.aws.account import open_account
         from rse_pf.aws.storage.key_store import open_key_store
 
-        return open_key_store(open_account(settings.cloud.region)).access_control_store()
+        account, names = open_account(settings.cloud.region), ResourceNames(settings.cloud.name)
+        return open_key_store(account, names).access_control_store()
     from rse_pf.local.firewall import key_set_file
     from rse_pf.local.state import state_folder
     from rse_pf.object_store import DirectoryStore

@@ -34,6 +34,7 @@ from rse_pf.auth.tokens import KeySet, SigningKey, unverified_parts
 from rse_pf.auth.trust_store import AccessControlStore
 from rse_pf.cli.access.robot import add_place, max_token_s, open_access_control, record_action
 from rse_pf.config import PlatformSettings
+from rse_pf.config.resource_names import ResourceNames
 from rse_pf.errors import ConfigurationError, Unauthorized, UsageError
 from rse_pf.files import OWNER_ONLY, replace_file
 from rse_pf.terminal import show, show_json
@@ -228,7 +229,7 @@ def _key_store(settings: PlatformSettings) -> KeyStore:
     from rse_pf.aws.account import open_account
     from rse_pf.aws.storage.key_store import open_key_store
 
-    return open_key_store(open_account(settings.cloud.region))
+    return open_key_store(open_account(settings.cloud.region), ResourceNames(settings.cloud.name))
 
 
 def _inspect(args: argparse.Namespace, settings: PlatformSettings) -> int:

@@ -12,22 +12,24 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from aws.conftest import REGION
 from aws.fleet.fake_machine import FakeMachine, FakeScaling
+from emulated_aws import REGION, emulated_aws
 
 from rse_pf.aws.account import Account, open_account
 from rse_pf.aws.clients import make_client
 from rse_pf.aws.fleet.agent import Agent, AgentConfig, AgentContext
-from rse_pf.aws.fleet.group import GROUP, AutoScalingGroup, Server, read_group
+from rse_pf.aws.fleet.group import AutoScalingGroup, Server, read_group
 from rse_pf.aws.fleet.group_metrics import read_group_metrics
 from rse_pf.aws.fleet.metrics import ServerMetrics, datums
 from rse_pf.aws.fleet.overview import read_overview
 from rse_pf.aws.money.spending import read_spending
 from rse_pf.config import PlatformSettings
+from rse_pf.config.resource_names import ResourceNames
 from rse_pf.errors import ConfigurationError
 from rse_pf.object_store import MemoryStore
 from rse_pf.scaling.alarms import NAMESPACE
 
+GROUP = ResourceNames().group
 SETTINGS = PlatformSettings()
 START = datetime.now(timezone.utc).replace(second=0, microsecond=0)
 HOURS = itertools.count(1)
@@ -37,10 +39,7 @@ HEALTHY = Server(name="i-1", zone="a", state="InService", targets=("healthy",), 
 @pytest.fixture(scope="module")
 def region() -> Iterator[str]:
     """An emulated region that the tests of this module share."""
-    moto = pytest.importorskip("moto", reason="the dev extra is not installed")
-    with pytest.MonkeyPatch.context() as patch, moto.mock_aws():
-        for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
-            patch.setenv(name, "testing")
+    with pytest.MonkeyPatch.context() as patch, emulated_aws(patch, __name__):
         yield REGION
 
 
@@ -73,7 +72,7 @@ def servers(region: str) -> list[str]:
         TargetGroupARNs=[targets["TargetGroupArn"]],
     )  # fmt: skip
     account.client("cloudwatch").put_metric_alarm(
-        AlarmName="rse-pf-busy", MetricName="m", Namespace="n", Statistic="Sum", Period=60, Threshold=1,
+        AlarmName="rse-pf/busy", MetricName="m", Namespace="n", Statistic="Sum", Period=60, Threshold=1,
         EvaluationPeriods=1, ComparisonOperator="GreaterThanThreshold",
     )  # fmt: skip
     (group,) = account.client("autoscaling").describe_auto_scaling_groups()["AutoScalingGroups"]

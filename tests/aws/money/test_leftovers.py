@@ -8,11 +8,13 @@ import pytest
 
 from rse_pf.aws.account import Account, open_account
 from rse_pf.aws.money.leftovers import find_leftovers, living_stacks
+from rse_pf.config.resource_names import ResourceNames
 from rse_pf.errors import ConfigurationError
 
-TAG = {"Key": "rse-pf", "Value": "digest"}
+TAG = {"Key": "rse-pf", "Value": "rse-pf"}
+NAMES = ResourceNames()
 STACK = """{"Resources": {"Maps": {"Type": "AWS::S3::Bucket", "Properties": {
-  "BucketName": "maps-of-a-stack", "Tags": [{"Key": "rse-pf", "Value": "d"}]}},
+  "BucketName": "maps-of-a-stack", "Tags": [{"Key": "rse-pf", "Value": "rse-pf"}]}},
   "Log": {"Type": "AWS::Logs::LogGroup", "Properties": {"LogGroupName": "RsePf-Data-Log"}}}}"""
 
 
@@ -21,9 +23,13 @@ def fill(account: Account, region: str) -> dict[str, str]:
     s3, ec2 = account.client("s3"), account.client("ec2")
     for name in ("ours", "theirs"):
         s3.create_bucket(Bucket=f"maps-{name}", CreateBucketConfiguration={"LocationConstraint": region})
-        account.client("logs").create_log_group(logGroupName={"ours": "RsePf-Log", "theirs": "log"}[name])
+        account.client("logs").create_log_group(
+            
+            logGroupName={"ours": "RsePf-Data-Log", "theirs": "log"}[name]
+        
+        )
         account.client("cloudwatch").put_metric_alarm(
-            AlarmName={"ours": "rse-pf-busy", "theirs": "busy"}[name], MetricName="m", Namespace="n",
+            AlarmName={"ours": "rse-pf/busy", "theirs": "busy"}[name], MetricName="m", Namespace="n",
             Statistic="Sum", Period=60, Threshold=1, EvaluationPeriods=1,
             ComparisonOperator="GreaterThanThreshold",
         )  # fmt: skip
@@ -41,7 +47,7 @@ def fill(account: Account, region: str) -> dict[str, str]:
     )["NetworkInterface"]["NetworkInterfaceId"]
     ec2.create_network_interface(SubnetId=subnet)
     return {
-        "bucket": "maps-ours", "log group": "RsePf-Log", "alarm": "rse-pf-busy", "secret": "key-ours",
+        "bucket": "maps-ours", "log group": "RsePf-Data-Log", "alarm": "rse-pf/busy", "secret": "key-ours",
         "volume": volume, "network interface": interface,
     }  # fmt: skip
 
@@ -50,7 +56,7 @@ def test_each_kind_of_ours_is_found_and_nothing_of_others(region: str) -> None:
     account = open_account(region)
     ours = fill(account, region)
 
-    found = find_leftovers(account)
+    found = find_leftovers(account, NAMES)
 
     assert {each.kind: each.name for each in found} == ours
     assert len(found) == len(ours)
@@ -72,7 +78,7 @@ def test_a_bucket_that_cannot_be_looked_into_is_told_and_ends_nothing(
         return real(service, method, **arguments)
 
     monkeypatch.setattr(account, "find", find)
-    found = find_leftovers(account)
+    found = find_leftovers(account, NAMES)
 
     (unread,) = [each for each in found if each.unread]
     assert (unread.kind, unread.name) == ("bucket", "maps-theirs")
@@ -81,7 +87,7 @@ def test_a_bucket_that_cannot_be_looked_into_is_told_and_ends_nothing(
 
 
 def test_an_empty_account_has_none(region: str) -> None:
-    assert find_leftovers(open_account(region)) == []
+    assert find_leftovers(open_account(region), NAMES) == []
 
 
 def test_what_a_living_stack_owns_is_no_leftover_until_it_is_gone(region: str) -> None:
@@ -92,15 +98,15 @@ def test_what_a_living_stack_owns_is_no_leftover_until_it_is_gone(region: str) -
         StackName="Other", TemplateBody='{"Resources": {"T": {"Type": "AWS::SNS::Topic"}}}'
     )
 
-    assert living_stacks(account) == ["RsePf-Data"]
-    assert find_leftovers(account) == []
+    assert living_stacks(account, NAMES) == ["RsePf-Data"]
+    assert find_leftovers(account, NAMES) == []
 
     kept = account.client("s3")
     formation.delete_stack(StackName="RsePf-Data")
     kept.create_bucket(Bucket="maps-of-a-stack", CreateBucketConfiguration={"LocationConstraint": region})
     kept.put_bucket_tagging(Bucket="maps-of-a-stack", Tagging={"TagSet": [TAG]})
-    assert living_stacks(account) == []
-    assert [each.name for each in find_leftovers(account)] == ["maps-of-a-stack"]
+    assert living_stacks(account, NAMES) == []
+    assert [each.name for each in find_leftovers(account, NAMES)] == ["maps-of-a-stack"]
 
 
 @pytest.mark.parametrize("state", ["in-use", "available"])
@@ -116,4 +122,4 @@ def test_a_volume_in_use_is_no_leftover(region: str, state: str) -> None:
         (instance,) = ec2.run_instances(ImageId=image, MinCount=1, MaxCount=1)["Instances"]
         ec2.attach_volume(VolumeId=volume, InstanceId=instance["InstanceId"], Device="/dev/sdf")
 
-    assert [each.name for each in find_leftovers(account)] == ([] if state == "in-use" else [volume])
+    assert [each.name for each in find_leftovers(account, NAMES)] == ([] if state == "in-use" else [volume])

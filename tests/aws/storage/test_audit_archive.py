@@ -13,6 +13,7 @@ from rse_pf.aws.account import Account
 from rse_pf.aws.clients import make_client
 from rse_pf.aws.storage.audit_archive import Shipper, fetch_audit, open_audit_archive, piece_name
 from rse_pf.aws.storage.s3_store import S3Store
+from rse_pf.config.resource_names import ResourceNames
 from rse_pf.errors import ConfigurationError, StoreError
 from rse_pf.object_store import MemoryStore
 
@@ -302,5 +303,5 @@ def test_a_deployment_without_the_bucket_says_to_deploy() -> None:
             return {"StackResourceSummaries": [row]}
 
     with pytest.raises(ConfigurationError) as told:
-        open_audit_archive(Account("r", lambda service, region: NoLogs()))
+        open_audit_archive(Account("r", lambda service, region: NoLogs()), ResourceNames())
     assert "cdk deploy" in told.value.hint

@@ -14,6 +14,7 @@ from rse_pf.aws.account import Account
 from rse_pf.aws.clients import make_client
 from rse_pf.aws.storage.key_store import KEYS_NAME, KeyRing, KeyStore, open_key_store, spread_s
 from rse_pf.config import PlatformSettings
+from rse_pf.config.resource_names import ResourceNames
 from rse_pf.errors import ConfigurationError, NotFound, Unauthorized
 
 SETTINGS = PlatformSettings()
@@ -185,13 +186,13 @@ def test_secret_and_bucket_are_found_through_the_stack(region: str, store: KeySt
         ),
     )
 
-    open_key_store(account).write(ring("a"))
+    open_key_store(account, ResourceNames()).write(ring("a"))
 
     assert store.ring().to_json() == ring("a").to_json()
 
 
 def test_without_a_deployment_the_hint_says_to_deploy(region: str) -> None:
     with pytest.raises(ConfigurationError) as told:
-        open_key_store(beside(region, Formation()))
+        open_key_store(beside(region, Formation()), ResourceNames())
 
     assert "cdk deploy" in told.value.hint

@@ -1,0 +1,100 @@
+"""rse-pf cloud doctor: check tools, packages, account, certificate and quotas before a deployment."""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import json
+import os
+import re
+import shutil
+import subprocess
+import sysconfig
+from collections.abc import Iterator
+from importlib import metadata
+from pathlib import Path
+
+from rse_pf.cli.doctor import Finding, report
+from rse_pf.config import PlatformSettings
+from rse_pf.errors import MissingExtra, RsePfError
+
+__all__ = ["add_arguments", "check_tools", "run"]
+
+_OLDEST_NODE = 22
+_NODE_ANSWERS_S = 10.0
+_CLI = Path("node_modules", "aws-cdk", "package.json")
+_PINNED = Path("package.json")
+_PACKAGES = Path("build")
+_SCHEMA = "@aws-cdk/cloud-assembly-schema"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare nothing: the action has no options."""
+
+
+def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
+    """Print one line for each finding; return 1 if one has to be fixed first."""
+    findings = itertools.chain(check_tools(Path.cwd()), _account_findings(settings))
+    return report(findings, "ready: npx cdk deploy --all")
+
+
+def _account_findings(settings: PlatformSettings) -> Iterator[Finding]:
+    from rse_pf.aws.account import open_account
+    from rse_pf.aws.money.quotas import check_account
+
+    try:
+        for check in check_account(open_account(settings.cloud.region), settings):
+            yield Finding(grade=check.grade, what=check.what, fix=check.fix)
+    except RsePfError as error:
+        yield Finding(grade="fail", what=error.message, fix=error.hint)
+
+
+def check_tools(checkout: Path) -> Iterator[Finding]:
+    """Yield what a deployment from *checkout* needs on this machine; no account is asked."""
+    yield _node()
+    yield _cli(checkout)
+    yield (
+        Finding(grade="ok", what="packages are built")
+        if all(any((checkout / _PACKAGES / name).glob("*")) for name in ("wheelhouse", "lambda"))
+        else Finding(grade="fail", what=f"no packages in {_PACKAGES}", fix="make assets")
+    )
+
+
+def _node() -> Finding:
+    fix = f"make setup installs Node {_OLDEST_NODE} or newer into .venv"
+    path = os.pathsep.join((sysconfig.get_path("scripts"), os.environ.get("PATH", "")))
+    found = shutil.which("node", path=path)
+    if found is None:
+        return Finding(grade="fail", what="Node is not installed", fix=fix)
+    try:
+        told = subprocess.run(
+            [found, "--version"], capture_output=True, text=True, timeout=_NODE_ANSWERS_S, check=True
+        ).stdout.strip()
+    except (OSError, subprocess.SubprocessError) as error:
+        return Finding(grade="fail", what=f"Node does not run: {error}", fix=fix)
+    version = re.match(r"v(\d+)\.", told)
+    if version is None or int(version[1]) < _OLDEST_NODE:
+        return Finding(grade="fail", what=f"Node {told} is too old for the CDK", fix=fix)
+    return Finding(grade="ok", what=f"Node {told}")
+
+
+def _cli(checkout: Path) -> Finding:
+    """Compare the assembly that the library writes with the newest that the command line reads."""
+    fix = "make setup installs the one in package-lock.json; never npm install aws-cdk"
+    try:
+        writes = metadata.version("aws-cdk.cloud-assembly-schema")
+    except metadata.PackageNotFoundError:
+        return Finding(grade="fail", what="aws-cdk-lib is not installed", fix=MissingExtra.command("infra"))
+    try:
+        cli = json.loads((checkout / _CLI).read_text(encoding="utf-8"))
+        pinned = json.loads((checkout / _PINNED).read_text(encoding="utf-8"))["devDependencies"]["aws-cdk"]
+        version, reads = str(cli["version"]), str(cli["devDependencies"][_SCHEMA])
+        newest = int(re.sub(r"^\D*", "", reads).partition(".")[0])
+    except (OSError, ValueError, KeyError, TypeError):
+        return Finding(grade="fail", what="the CDK's command line is not installed here", fix=fix)
+    line = f"CDK command line {version} reads assembly schema {newest}, the library writes {writes}"
+    if newest < int(writes.partition(".")[0]):
+        return Finding(grade="fail", what=line, fix=fix)
+    if version != pinned:
+        return Finding(grade="warn", what=f"{line}; package.json pins {pinned}", fix=fix)
+    return Finding(grade="ok", what=line)

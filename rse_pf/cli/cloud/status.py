@@ -1,0 +1,43 @@
+"""rse-pf cloud status: servers, their health, alarms, robots."""
+
+from __future__ import annotations
+
+import argparse
+from datetime import datetime, timezone
+
+from rse_pf.config import PlatformSettings
+from rse_pf.terminal import counted, show
+
+__all__ = ["add_arguments", "run"]
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare nothing: the action has no options."""
+
+
+def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
+    """Print the state of the deployment; return 1 if it is not healthy."""
+    from rse_pf.aws.account import open_account
+    from rse_pf.aws.fleet.group import read_group
+
+    account = open_account(settings.cloud.region)
+    fleet = read_group(account, settings, now=datetime.now(timezone.utc))
+    show(
+        f"{counted(len(fleet.servers), 'server')}, wanted {fleet.wanted_servers}"
+        f" of {fleet.min_servers} to {fleet.max_servers}"
+    )
+    for each in fleet.servers:
+        health = ", ".join(each.targets) or "in no target group"
+        robots = "robots: not told" if each.robots is None else counted(int(each.robots), "robot")
+        show(f"  {each.name}  {each.zone}  {each.state:<12}  {health:<20}  {robots}")
+    if fleet.robots:
+        told = fleet.robots
+        of = f" of {len(fleet.servers)}" if len(told) < len(fleet.servers) else ""
+        servers = "server" if len(told) == 1 and not of else "servers"
+        show(f"{sum(told):g} robots on {len(told)}{of} {servers}, {min(told):g} to {max(told):g} on each")
+    else:
+        show("robots: no server told how many it has")
+    for name, state in sorted(fleet.alarms.items()):
+        hint = f"  docs/operations.md#{name}" if state == "ALARM" else ""
+        show(f"  alarm {name:<12} {state}{hint}")
+    return 0 if fleet.is_healthy else 1

@@ -1,0 +1,85 @@
+"""Hand values from one stack to another through SSM parameters with fixed names.
+
+CloudFormation's exports are not used: it refuses to change or remove an export as long as another stack
+imports it, so that a switch such as ``data.enabled`` could be turned on and never off again.  A parameter
+may change or vanish at any time; the reader sees it at its own next update.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import aws_cdk as cdk
+from aws_cdk import aws_ec2 as ec2
+from aws_cdk import aws_s3 as s3
+from aws_cdk import aws_ssm as ssm
+from constructs import Construct
+
+from rse_pf.config.resource_names import ResourceNames
+
+__all__ = ["imported_bucket", "imported_group", "imported_network", "provide", "provide_network", "read"]
+
+_TYPE = "AWS::SSM::Parameter::Value<String>"
+
+
+def provide(scope: Construct, names: ResourceNames, path: str, value: str) -> None:
+    """Write *value* into the parameter *path*, such as ``data/maps``, for `read` in another stack."""
+    stack = cdk.Stack.of(scope)
+    ssm.CfnParameter(
+        stack, f"{_identity(path)}Value", type="String", name=names.parameter(path), value=value,
+        description="read by other stacks of this deployment",
+    )  # fmt: skip
+
+
+def read(scope: Construct, names: ResourceNames, path: str) -> str:
+    """Return the value that another stack provides as *path*; known when this stack is deployed.
+
+    The logical id is *path* in camel case, such as ``DataMaps``, without a hash: findings can name it.
+    """
+    stack = cdk.Stack.of(scope)
+    known = stack.node.try_find_child(_identity(path))
+    if isinstance(known, cdk.CfnParameter):
+        return known.value_as_string
+    made = cdk.CfnParameter(stack, _identity(path), type=_TYPE, default=names.parameter(path))
+    return made.value_as_string
+
+
+def imported_bucket(scope: Construct, names: ResourceNames, name: str) -> s3.IBucket:
+    """Return a bucket of the data stack: ``maps``, ``artifacts``, ``audit-logs`` or ``access-logs``."""
+    return s3.Bucket.from_bucket_name(scope, f"{_identity(name)}Bucket", read(scope, names, f"data/{name}"))
+
+
+def imported_group(scope: Construct, names: ResourceNames, name: str) -> ec2.ISecurityGroup:
+    """Return the security group *name* of the firewall; its rules are written in the network stack only."""
+    known = read(scope, names, f"network/group-{name}")
+    return ec2.SecurityGroup.from_security_group_id(scope, f"{_identity(name)}Group", known, mutable=False)
+
+
+def provide_network(scope: Construct, names: ResourceNames, vpc: ec2.Vpc) -> None:
+    """Write what `imported_network` reads."""
+    provide(scope, names, "network/vpc", vpc.vpc_id)
+    for kind, subnets in (("front", vpc.public_subnets), ("servers", vpc.isolated_subnets)):
+        for at, subnet in enumerate(subnets):
+            provide(scope, names, f"network/{kind}-{at}", subnet.subnet_id)
+
+
+def imported_network(scope: Construct, names: ResourceNames, *, zones: int, cidr: str) -> ec2.IVpc:
+    """Return the VPC of the network stack, with one subnet of each kind in each of *zones* zones."""
+    front, servers = (_subnets(scope, names, kind, zones) for kind in ("front", "servers"))
+    vpc = ec2.Vpc.from_vpc_attributes(
+        scope, "Network", vpc_id=read(scope, names, "network/vpc"), vpc_cidr_block=cidr,
+        availability_zones=[cdk.Fn.select(at, cdk.Fn.get_azs()) for at in range(zones)],
+        public_subnet_ids=front, isolated_subnet_ids=servers,
+    )  # fmt: skip
+    # Nothing outside of the network stack adds a route.
+    cdk.Annotations.of(vpc).acknowledge_warning("@aws-cdk/aws-ec2:noSubnetRouteTableId", "no route is added")
+    return vpc
+
+
+def _subnets(scope: Construct, names: ResourceNames, kind: str, zones: int) -> Sequence[str]:
+    return [read(scope, names, f"network/{kind}-{at}") for at in range(zones)]
+
+
+def _identity(path: str) -> str:
+    """Return *path* in camel case: letters and digits are all that a logical id may hold."""
+    return "".join(word.capitalize() for word in path.replace("/", "-").split("-"))
