@@ -109,6 +109,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--settings", type=Path, required=True, metavar="FILE")
     for name in ("bucket", "keys-name", "group", "hook"):
         parser.add_argument(f"--{name}", required=True)
+    parser.add_argument("--launch-hook", default="", metavar="H", help="the hook that waits for readiness")
     parser.add_argument("--keys-file", type=Path, required=True, metavar="FILE")
     parser.add_argument(
         "--control-token", type=Path, metavar="FILE", help="the token of the control port; --once makes it"
@@ -138,13 +139,18 @@ def _context(args: argparse.Namespace) -> AgentContext:
     if args.once and args.control_token is not None:
         ensure_control_token(args.control_token, seed=secrets.token_bytes(32))
     region = settings.cloud.region
-    machine = Instance(settings.serving.control_port, args.control_token)
+    data_port = settings.data.port if settings.data.enabled else 0
+    machine = Instance(settings.serving.control_port, args.control_token, data_port)
     return AgentContext(
         machine=machine,
         clients={service: make_client(service, region) for service in SERVICES},
         artifacts=open_bucket(args.bucket, region),
         config=AgentConfig(
-            group=args.group, hook=args.hook, keys_name=args.keys_name, keys_file=args.keys_file
+            group=args.group,
+            hook=args.hook,
+            launch_hook=args.launch_hook,
+            keys_name=args.keys_name,
+            keys_file=args.keys_file,
         ),
         settings=settings,
         log=_log,

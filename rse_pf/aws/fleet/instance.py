@@ -11,9 +11,13 @@ import urllib.request
 from pathlib import Path
 
 from rse_pf.auth.control_token import bearer, read_control_token
+from rse_pf.config.resource_names import READY_PATH
 from rse_pf.errors import Disconnected, UsageError
 
-__all__ = ["Instance"]
+__all__ = ["IN_SERVICE", "TERMINATED", "WARMED", "Instance"]
+
+IN_SERVICE, TERMINATED, WARMED = "InService", "Terminated", "Warmed:"
+"""Target lifecycle states; the last is what those of a warm pool begin with."""
 
 _IMDS = "http://169.254.169.254/latest/"
 _TOKEN_TTL_S = "60"
@@ -24,10 +28,24 @@ _NOT_FOUND = 404
 class Instance:
     """This EC2 instance, with the control port of its backend server."""
 
-    def __init__(self, port: int, token_file: Path | None = None) -> None:
-        """Make an instance whose server listens on *port* and expects the token in *token_file*, if any."""
+    def __init__(self, port: int, token_file: Path | None = None, data_port: int = 0) -> None:
+        """Make an instance whose server listens on *port* and expects the token in *token_file*, if any.
+
+        A data service listens on *data_port*, if that is not 0.
+        """
         self._base = f"http://127.0.0.1:{port}"
         self._token_file = token_file
+        self._data_base = f"http://127.0.0.1:{data_port}/data" if data_port else ""
+
+    def is_ready(self) -> bool:
+        """Return whether the server, and the data service where there is one, take work."""
+        try:
+            _ask(f"{self._base}{READY_PATH}", "GET", {})
+            if self._data_base:
+                _ask(f"{self._data_base}{READY_PATH}", "GET", {})
+        except (Disconnected, FileNotFoundError):
+            return False
+        return True
 
     def page(self) -> str:
         """Return the server's /metrics; raises Disconnected when no server runs."""
@@ -50,9 +68,9 @@ class Instance:
         """Return the instance's id; raises Disconnected."""
         return self._metadata("instance-id") or ""
 
-    def is_leaving(self) -> bool:
-        """Return whether the target lifecycle state is ``Terminated``; raises Disconnected."""
-        return self._metadata("autoscaling/target-lifecycle-state") == "Terminated"
+    def target_state(self) -> str:
+        """Return the lifecycle state that the instance has or is on its way to; raises Disconnected."""
+        return self._metadata("autoscaling/target-lifecycle-state") or IN_SERVICE
 
     def _metadata(self, path: str) -> str | None:
         ttl = {"X-aws-ec2-metadata-token-ttl-seconds": _TOKEN_TTL_S}

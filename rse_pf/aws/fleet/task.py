@@ -24,7 +24,13 @@ __all__ = ["ALWAYS", "AgentConfig", "AgentContext", "AgentState", "Phase", "Task
 class Phase(Enum):
     """Where the instance is in its life; `rse_pf.aws.fleet.tasks.lifecycle` moves it."""
 
+    STARTING = "starting"
+    """Not in service yet."""
+    WARMED = "warmed"
+    """Prepared in the warm pool; it takes no robots and publishes nothing."""
     SERVING = "serving"
+    LEAVING = "leaving"
+    """Drained, or about to be; the hook is not completed yet."""
     LEFT = "left"
 
 
@@ -34,19 +40,23 @@ ALWAYS = frozenset(Phase)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AgentConfig:
-    """Group and lifecycle hook of the instance; object name and local file of the public keys."""
+    """Group and lifecycle hooks of the instance; object name and local file of the public keys.
+
+    ``hook`` is completed when the robots are gone, ``launch_hook`` when the server is ready; empty: none.
+    """
 
     group: str
     hook: str
     keys_name: str
     keys_file: Path
+    launch_hook: str = ""
 
 
 @dataclass(slots=True, kw_only=True)
 class AgentState:
     """The phase, and `flush`: run every task with ``flushes`` now, whatever its period says."""
 
-    phase: Phase = Phase.SERVING
+    phase: Phase = Phase.STARTING
     flush: Callable[[], None] = lambda: None
 
 

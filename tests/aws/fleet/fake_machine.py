@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
+
+from botocore.exceptions import ClientError
 
 from rse_pf.errors import Disconnected
 
@@ -14,6 +17,8 @@ class FakeMachine:
         self.now_s = 100.0
         self.runs = runs
         self.leaving = False
+        self.ready = True
+        self.target = "InService"
         self.text = ""
         self.waits: list[float] = []
         self._ends_after_s = ends_after_s
@@ -28,8 +33,11 @@ class FakeMachine:
     def instance_id(self) -> str:
         return "i-0123456789abcdef0"
 
-    def is_leaving(self) -> bool:
-        return self.leaving
+    def target_state(self) -> str:
+        return "Terminated" if self.leaving else self.target
+
+    def is_ready(self) -> bool:
+        return self.ready
 
     def page(self) -> str:
         if not self.runs or self.now_s >= self._ended_at_s:
@@ -43,12 +51,19 @@ class FakeMachine:
 
 
 class FakeScaling:
-    """The Auto Scaling service as far as a hook needs it: the emulator has no such call."""
+    """The Auto Scaling service as far as a hook needs it: the emulator has no such call.
+
+    A hook that does not wait is refused, as AWS does; `waits` says which one waits at which time.
+    """
 
     def __init__(self, machine: FakeMachine) -> None:
         self._machine = machine
+        self.waits: Callable[[str], bool] = lambda hook: True
         self.completed: list[tuple[float, dict[str, Any]]] = []
 
     def complete_lifecycle_action(self, **arguments: Any) -> dict[str, Any]:
+        if not self.waits(arguments["LifecycleHookName"]):
+            refusal = {"Error": {"Code": "ValidationError", "Message": "No active Lifecycle Action found"}}
+            raise ClientError(refusal, "CompleteLifecycleAction")
         self.completed.append((self._machine.now_s, arguments))
         return {}

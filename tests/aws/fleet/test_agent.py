@@ -44,7 +44,10 @@ class AgentSetup:
             AgentContext(
                 machine=self.machine, clients={"cloudwatch": cloudwatch, "autoscaling": self.scaling},
                 artifacts=self.artifacts, settings=PlatformSettings(), shipper=shipper,
-                config=AgentConfig(group="rse-pf", hook="drain", keys_name="keys.json", keys_file=self.file),
+                config=AgentConfig(
+                    group="rse-pf", hook="drain", launch_hook="launch", keys_name="keys.json",
+                    keys_file=self.file,
+                ),
                 clock=self.machine.clock, sleep=self.machine.sleep,
                 log=lambda event, **fields: self.log.append((event, fields)),
             )

@@ -2,22 +2,37 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+from typing import Any
+
 import boto3
 from aws.fleet.fake_machine import FakeMachine, FakeScaling
 from botocore.stub import Stubber
 
-from rse_pf.aws.fleet.drain_hook import leave_group
+from rse_pf.audit.log import SYNC_S
+from rse_pf.aws.fleet.agent import AgentConfig, AgentContext
+from rse_pf.aws.fleet.task import Phase
+from rse_pf.aws.fleet.tasks import lifecycle
 from rse_pf.config import PlatformSettings
+from rse_pf.object_store import MemoryStore
 from rse_pf.scaling.health import CLOUD_TIMEOUT_S, time_to_notice_s
 
 SETTINGS = PlatformSettings()
 
 
 def leave(machine: FakeMachine, scaling: object, settings: PlatformSettings = SETTINGS) -> bool:
-    return leave_group(
-        machine, scaling, group="rse-pf", hook="drain", settings=settings, clock=machine.clock,
-        sleep=machine.sleep,
+    """Follow the lifecycle of a leaving instance once; return whether its server ended in time."""
+    machine.leaving = True
+    told: list[dict[str, Any]] = []
+    context = AgentContext(
+        machine=machine, clients={"autoscaling": scaling}, artifacts=MemoryStore(), settings=settings,
+        config=AgentConfig(group="rse-pf", hook="drain", keys_name="k", keys_file=Path("k")),
+        log=lambda event, **fields: told.append({"event": event, **fields}),
+        clock=machine.clock, sleep=machine.sleep,
     )  # fmt: skip
+    lifecycle.task(context).call()
+    assert context.state.phase is Phase.LEFT
+    return bool(told[-1]["drained"])
 
 
 def test_the_hook_is_completed_once_the_server_has_ended() -> None:
@@ -27,7 +42,7 @@ def test_the_hook_is_completed_once_the_server_has_ended() -> None:
     assert leave(machine, scaling)
 
     ((at_s, told),) = scaling.completed
-    assert 120.0 <= at_s <= 121.0
+    assert 120.0 <= at_s <= 121.0 + 2 * SYNC_S
     assert told == {
         "AutoScalingGroupName": "rse-pf", "LifecycleHookName": "drain",
         "InstanceId": "i-0123456789abcdef0", "LifecycleActionResult": "CONTINUE",
@@ -49,7 +64,7 @@ def test_without_a_server_the_hook_is_completed_at_once() -> None:
     scaling = FakeScaling(machine)
 
     assert leave(machine, scaling)
-    assert [at_s for at_s, _ in scaling.completed] == [100.0]
+    assert [at_s for at_s, _ in scaling.completed] == [100.0 + 2 * SYNC_S]
 
 
 def test_robots_move_only_after_the_load_balancer_has_noticed() -> None:

@@ -1,32 +1,79 @@
-"""Follow the lifecycle of the instance in its group: drain when it leaves."""
+"""Follow the lifecycle of the instance in its group: join it when ready, wait while warmed, drain at the end.
+
+Auto Scaling writes the state that an instance is on its way to into the instance's metadata.  The agent
+completes the launch hook for each such way, because a warmed instance that is used later waits again.
+"""
 
 from __future__ import annotations
 
 from rse_pf.audit.log import SYNC_S
-from rse_pf.aws.fleet.drain_hook import leave_group
+from rse_pf.aws.fleet.drain_hook import drain_server
+from rse_pf.aws.fleet.instance import IN_SERVICE, TERMINATED, WARMED
+from rse_pf.aws.fleet.launch_hook import LaunchAction, complete_hook, launch_action, ready_within_s
 from rse_pf.aws.fleet.task import ALWAYS, AgentContext, Phase, Task
 
 __all__ = ["task"]
 
 
 def task(context: AgentContext) -> Task:
-    """Ask where the instance is to go, and drain it once when that is out of the group."""
-    config, state = context.config, context.state
+    """Ask where the instance is to go, and do once what each way needs."""
+    return Task(name="lifecycle", period_s=0.0, call=_Lifecycle(context).follow, phases=ALWAYS - {Phase.LEFT})
 
-    def flush_last() -> None:
-        context.sleep(2 * SYNC_S)  # a server that has ended was still writing
-        state.flush()
 
-    def follow() -> None:
-        if not context.machine.is_leaving():
+class _Lifecycle:
+    """What was done already: the target that the instance joined for, and whether its server has ended."""
+
+    def __init__(self, context: AgentContext) -> None:
+        self._context = context
+        self._joined = ""
+        self._began_s: float | None = None
+        self._drained: bool | None = None
+
+    def follow(self) -> None:
+        target = self._context.machine.target_state()
+        if target == TERMINATED:
+            self._leave()
+        elif target != self._joined and (target == IN_SERVICE or target.startswith(WARMED)):
+            self._join(target)
+
+    def _join(self, target: str) -> None:
+        """Complete the launch hook once the server is ready, or give the machine up."""
+        context, state = self._context, self._context.state
+        if state.phase is Phase.WARMED:
+            state.phase = Phase.STARTING
+        if self._began_s is None:
+            self._began_s = context.clock()
+        age_s = context.clock() - self._began_s
+        action = launch_action(
+            is_ready=context.machine.is_ready(), age_s=age_s, budget_s=ready_within_s(context.settings)
+        )
+        if action is LaunchAction.WAIT:
             return
-        context.log("leaving", group=config.group)
-        state.flush()  # most of the log is uploaded before time is short
-        drained = leave_group(
-            context.machine, context.clients["autoscaling"], group=config.group, hook=config.hook,
-            settings=context.settings, clock=context.clock, sleep=context.sleep, before_end=flush_last,
-        )  # fmt: skip
-        state.phase = Phase.LEFT
-        context.log("left", drained=drained)
+        did_wait = self._complete(context.config.launch_hook, action.value)
+        self._joined, self._began_s = target, None
+        if action is LaunchAction.CONTINUE or not did_wait:
+            state.phase = Phase.WARMED if target.startswith(WARMED) else Phase.SERVING
+        event = "joined" if action is LaunchAction.CONTINUE else "not-ready"
+        context.log(event, target=target, after_s=round(age_s, 1), hook=did_wait)
 
-    return Task(name="lifecycle", period_s=0.0, call=follow, phases=ALWAYS - {Phase.LEFT})
+    def _leave(self) -> None:
+        """Drain the server once, and complete the hook as soon as it waits."""
+        context = self._context
+        context.state.phase = Phase.LEAVING
+        if self._drained is None:
+            context.log("leaving", group=context.config.group)
+            context.state.flush()  # most of the log is uploaded before time is short
+            self._drained = drain_server(
+                context.machine, settings=context.settings, clock=context.clock, sleep=context.sleep
+            )
+            context.sleep(2 * SYNC_S)  # a server that has ended was still writing
+            context.state.flush()
+        if self._complete(context.config.hook, LaunchAction.CONTINUE.value):
+            context.state.phase = Phase.LEFT
+            context.log("left", drained=self._drained)
+
+    def _complete(self, hook: str, result: str) -> bool:
+        return bool(hook) and complete_hook(
+            self._context.clients["autoscaling"], group=self._context.config.group, hook=hook,
+            instance=self._context.machine.instance_id(), result=result,
+        )  # fmt: skip

@@ -1,0 +1,172 @@
+"""An instance joins its group only when its server takes work, and a warmed one stays silent."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from aws.fleet.fake_machine import FakeMachine, FakeScaling
+from botocore.exceptions import ClientError
+
+from rse_pf.aws.fleet.agent import Agent, AgentConfig, AgentContext
+from rse_pf.aws.fleet.launch_hook import LaunchAction, launch_action, ready_within_s, retry_within_s
+from rse_pf.aws.fleet.task import Phase, Task
+from rse_pf.config import PlatformSettings
+from rse_pf.errors import ConfigurationError
+from rse_pf.object_store import MemoryStore
+from rse_pf.scaling.boot_time import BOOT_S
+
+SETTINGS = PlatformSettings()
+LAUNCH, DRAIN = "rse-pf-launch", "rse-pf-drain"
+
+
+class Setup:
+    """An agent of a new instance, and a task that counts when it may publish."""
+
+    def __init__(self, tmp_path: Path) -> None:
+        self.machine = FakeMachine()
+        self.scaling = FakeScaling(self.machine)
+        self.log: list[tuple[str, dict[str, Any]]] = []
+        self.published: list[float] = []
+        self.context = AgentContext(
+            machine=self.machine, clients={"autoscaling": self.scaling}, artifacts=MemoryStore(),
+            settings=SETTINGS, log=lambda event, **fields: self.log.append((event, fields)),
+            config=AgentConfig(
+                group="rse-pf", hook=DRAIN, launch_hook=LAUNCH, keys_name="k", keys_file=tmp_path / "k"
+            ),
+            clock=self.machine.clock, sleep=self.machine.sleep,
+        )  # fmt: skip
+        from rse_pf.aws.fleet.tasks import lifecycle
+
+        self.agent = Agent(self.context, (lifecycle.task, self._publisher))
+
+    def _publisher(self, context: AgentContext) -> Task:
+        def publish() -> None:
+            self.published.append(self.machine.now_s)
+
+        return Task(name="p", period_s=0.0, call=publish, phases=frozenset({Phase.SERVING}))
+
+    def steps(self, count: int, pause_s: float = 5.0) -> None:
+        for _ in range(count):
+            self.agent.step()
+            self.machine.sleep(pause_s)
+
+    def results(self) -> list[tuple[str, str]]:
+        return [(a["LifecycleHookName"], a["LifecycleActionResult"]) for _, a in self.scaling.completed]
+
+
+@pytest.fixture
+def setup(tmp_path: Path) -> Setup:
+    return Setup(tmp_path)
+
+
+def test_an_instance_joins_once_and_only_when_its_server_is_ready(setup: Setup) -> None:
+    setup.machine.ready = False
+    setup.steps(4)
+    assert setup.results() == []
+    assert setup.published == [], "a server that takes no robots has no load"
+
+    setup.machine.ready = True
+    setup.steps(10)
+
+    assert setup.results() == [(LAUNCH, "CONTINUE")]
+    assert len(setup.published) == 10
+
+
+def test_a_server_that_never_gets_ready_is_abandoned_within_its_budget(setup: Setup) -> None:
+    setup.machine.ready = False
+    began_s = setup.machine.now_s
+
+    setup.steps(100)
+
+    assert setup.results() == [(LAUNCH, "ABANDON")]
+    ((at_s, _),) = setup.scaling.completed
+    assert at_s - began_s <= ready_within_s(SETTINGS) + 5.0
+    assert [event for event, _ in setup.log] == ["not-ready"]
+    assert setup.published == []
+
+
+def test_an_agent_that_restarts_in_service_finds_no_hook_and_goes_on(setup: Setup) -> None:
+    setup.scaling.waits = lambda hook: False
+
+    setup.steps(3)
+
+    assert setup.scaling.completed == []
+    assert len(setup.published) == 3
+    assert setup.log == [("joined", {"target": "InService", "after_s": 0.0, "hook": False})]
+
+
+def test_a_restart_beside_a_dead_server_ends_no_instance_and_does_not_stop_the_agent(setup: Setup) -> None:
+    setup.scaling.waits = lambda hook: False
+    setup.machine.ready = False
+
+    setup.steps(100)
+
+    assert setup.context.state.phase is Phase.SERVING
+
+
+def test_a_refusal_of_aws_is_told_and_repeated(setup: Setup, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(**_: Any) -> None:
+        raise ClientError({"Error": {"Code": "AccessDenied"}}, "CompleteLifecycleAction")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(setup.scaling, "complete_lifecycle_action", refuse)
+        setup.steps(2)
+        with pytest.raises(ConfigurationError, match="AccessDenied"):
+            setup.agent.run("lifecycle")
+    assert [event for event, _ in setup.log] == ["failed", "failed"]
+    setup.steps(1)
+
+    assert setup.results() == [(LAUNCH, "CONTINUE")]
+
+
+@pytest.mark.parametrize("warmed", ["Warmed:Stopped", "Warmed:Running", "Warmed:Hibernated"])
+def test_a_warmed_instance_is_prepared_and_silent_and_joins_when_it_is_used(
+    setup: Setup, warmed: str
+) -> None:
+    setup.machine.target = warmed
+    setup.steps(5)
+    assert setup.results() == [(LAUNCH, "CONTINUE")]
+    assert setup.context.state.phase is Phase.WARMED
+    assert setup.published == []
+
+    setup.machine.target, setup.machine.ready = "InService", False
+    setup.steps(2)
+    assert setup.results() == [(LAUNCH, "CONTINUE")], "it joined before its server was ready again"
+    setup.machine.ready = True
+    setup.steps(2)
+
+    assert setup.results() == [(LAUNCH, "CONTINUE")] * 2
+    assert setup.published
+
+
+def test_a_drain_begins_before_the_hook_waits_and_is_done_once(setup: Setup) -> None:
+    """The load balancer deregisters first, for up to its delay; the hook waits only after that."""
+    setup.steps(1)
+    setup.machine.leaving = True
+    hook_waits_at_s = setup.machine.now_s + 60.0
+    setup.scaling.waits = lambda hook: hook != DRAIN or setup.machine.now_s >= hook_waits_at_s
+
+    setup.steps(30)
+
+    assert len(setup.machine.waits) == 1
+    assert setup.results() == [(LAUNCH, "CONTINUE"), (DRAIN, "CONTINUE")]
+    assert setup.scaling.completed[-1][0] <= hook_waits_at_s + 6.0
+    assert [event for event, _ in setup.log].count("leaving") == 1
+
+
+def test_the_decision_waits_within_the_budget_only() -> None:
+    assert launch_action(is_ready=True, age_s=1e9, budget_s=1.0) is LaunchAction.CONTINUE
+    assert launch_action(is_ready=False, age_s=0.9, budget_s=1.0) is LaunchAction.WAIT
+    assert launch_action(is_ready=False, age_s=1.0, budget_s=1.0) is LaunchAction.ABANDON
+
+
+@pytest.mark.parametrize("boot_s", [180, SETTINGS.cloud.boot_s, 7200])
+def test_retries_boot_and_readiness_fit_into_the_hook(boot_s: int) -> None:
+    settings = PlatformSettings.from_dict({"cloud": {"boot_s": boot_s}})
+    late_role_s, late_server_s = retry_within_s(settings), ready_within_s(settings)
+
+    assert late_role_s + late_server_s + 0.2 * boot_s < boot_s
+    assert late_role_s >= 2 * 20, "a role that comes 20 s late is no reason to end a machine"
+    assert boot_s >= 2 * BOOT_S
