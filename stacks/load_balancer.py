@@ -6,18 +6,17 @@ import aws_cdk as cdk
 from aws_cdk import aws_ec2 as ec2
 from aws_cdk import aws_elasticloadbalancingv2 as elbv2
 from aws_cdk import aws_s3 as s3
-from aws_cdk import aws_wafv2 as wafv2
 from constructs import Construct
 
 from rse_pf.config import PlatformSettings
-from rse_pf.config.resource_names import READY_PATH, ResourceNames
+from rse_pf.config.resource_names import READY_PATH
 from rse_pf.scaling.health import CLOUD_TIMEOUT_S, HEALTHY_CHECKS
 from stacks.data_stack import BALANCER_LOGS
 from stacks.firewall import front_port
+from stacks.web_firewall import WebFirewall
 
 __all__ = ["LoadBalancer"]
 
-_FIVE_MINUTES_S = 300
 _IDLE_TIMEOUT_S = 120
 """The ALB closes a connection without traffic after this; robots send pings far more often."""
 _DEREGISTRATION_S = 30
@@ -25,7 +24,7 @@ _DEREGISTRATION_S = 30
 
 
 class LoadBalancer(Construct):
-    """Listener, target groups of the services that run, and a WAF with a rate rule."""
+    """Listener, target groups of the services that run, and the web firewall in front of it."""
 
     def __init__(
         self,
@@ -66,7 +65,7 @@ class LoadBalancer(Construct):
                 conditions=[elbv2.ListenerCondition.path_patterns([f"/data{READY_PATH}"])],
                 action=elbv2.ListenerAction.fixed_response(404),
             )  # fmt: skip
-        self._waf(settings)
+        WebFirewall(self, "Waf", alb_arn=self.alb.load_balancer_arn, settings=settings)
 
     def _targets(
         self, name: str, vpc: ec2.IVpc, port: int, settings: PlatformSettings
@@ -88,32 +87,3 @@ class LoadBalancer(Construct):
                 unhealthy_threshold_count=health.unhealthy_checks,
             ),
         )  # fmt: skip
-
-    def _waf(self, settings: PlatformSettings) -> None:
-        prefix = ResourceNames(settings.cloud.name).prefix
-
-        def seen(name: str) -> wafv2.CfnWebACL.VisibilityConfigProperty:
-            # Samples would show the headers of handshakes, and so the tokens of robots, for hours.
-            return wafv2.CfnWebACL.VisibilityConfigProperty(
-                cloud_watch_metrics_enabled=True, metric_name=name, sampled_requests_enabled=False
-            )
-
-        acl = wafv2.CfnWebACL(
-            self, "Waf", scope="REGIONAL", visibility_config=seen(f"{prefix}-waf"),
-            default_action=wafv2.CfnWebACL.DefaultActionProperty(allow={}),
-            rules=[
-                wafv2.CfnWebACL.RuleProperty(
-                    name="rate", priority=0, action=wafv2.CfnWebACL.RuleActionProperty(block={}),
-                    visibility_config=seen(f"{prefix}-rate"),
-                    statement=wafv2.CfnWebACL.StatementProperty(
-                        rate_based_statement=wafv2.CfnWebACL.RateBasedStatementProperty(
-                            aggregate_key_type="IP", limit=settings.cloud.requests_per_5_minutes,
-                            evaluation_window_sec=_FIVE_MINUTES_S,
-                        )
-                    ),
-                )
-            ],
-        )  # fmt: skip
-        wafv2.CfnWebACLAssociation(
-            self, "WafOfAlb", resource_arn=self.alb.load_balancer_arn, web_acl_arn=acl.attr_arn
-        )

@@ -1,0 +1,84 @@
+"""The web ACL in the template: what it counts, what it answers, and that it is the rule that tests play."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from benchmarks.cloud.played_firewall import PlayedFirewall, rules_of_settings, rules_of_template
+from client_sdk.dialling import dial_error_of
+from rse_pf.config.resource_names import ROSBRIDGE_PATH
+
+SITE = "203.0.113.7"
+PATHS = ["/ws", ROSBRIDGE_PATH, "/", "/healthz", "/%64ata/v1", "//data/v1/maps", "/data/v1/maps", "/burst"]
+
+
+@pytest.fixture
+def template(assembly: Any) -> Any:
+    return assembly.templates["RsePf-Backend"]
+
+
+def test_the_template_has_the_rules_that_follow_from_the_settings(assembly: Any, template: Any) -> None:
+    written, expected = rules_of_template(template), rules_of_settings(assembly.settings)
+
+    assert [(each.name, each.limit, each.window_s, each.of_all) for each in written] == [
+        (each.name, each.limit, each.window_s, each.of_all) for each in expected
+    ]
+    for one, other in zip(written, expected, strict=True):
+        one.limit = other.limit = 0
+        assert [one.blocks(SITE, path, 0.0) for path in PATHS] == [
+            other.blocks(SITE, path, 0.0) for path in PATHS
+        ]
+
+
+def test_dials_data_and_burst_are_counted_apart(template: Any) -> None:
+    counted = {
+        path: [rule.name for rule in rules_of_template(template) if rule.limit and _counts(rule, path)]
+        for path in PATHS
+    }
+
+    assert counted == {
+        **{path: ["dials"] for path in PATHS[:6]},
+        "/data/v1/maps": ["data"],
+        "/burst": ["burst", "burst-of-all"],
+    }
+
+
+def _counts(rule: Any, path: str) -> bool:
+    rule.limit = 0
+    return bool(rule.blocks(SITE, path, 0.0))
+
+
+def test_the_limit_of_dials_is_that_of_the_robots_of_a_site(assembly: Any, template: Any) -> None:
+    settings = assembly.settings
+    dials = next(rule for rule in rules_of_template(template) if rule.name == "dials")
+    of_a_robot = settings.session.dial_burst + settings.session.dials_per_minute
+
+    assert dials.window_s == 60
+    assert dials.limit == settings.cloud.robots_per_site * of_a_robot
+
+
+def test_what_is_blocked_is_told_when_to_come_back_and_never_ends_a_robot(template: Any) -> None:
+    for rule in rules_of_template(template):
+        rule.limit = 0
+        reply = PlayedFirewall([rule]).judge(SITE, "/data/x" if rule.name == "data" else "/burst", 0.0)
+        reply = reply or PlayedFirewall([rule]).judge(SITE, "/ws", 0.0)
+        assert reply is not None
+        failed = dial_error_of("ws://host/ws", reply.status, reply.headers["Retry-After"], reply.body)
+
+        assert reply.status == 429
+        assert not failed.is_final
+        assert failed.after_s == 60.0
+
+
+def test_an_address_above_its_limit_does_not_block_another(template: Any) -> None:
+    firewall = PlayedFirewall(rules_of_template(template))
+    limit = firewall.rules[0].limit
+    judged = [firewall.judge(SITE, "/ws", now=limit_s / limit) for limit_s in range(limit + 1)]
+
+    assert judged[:limit] == [None] * limit
+    assert judged[limit] is not None
+    assert firewall.judge("198.51.100.1", "/ws", 1.0) is None
+    assert firewall.judge(SITE, "/data/v1/maps", 1.0) is None
+    assert firewall.judge(SITE, "/ws", 62.0) is None
