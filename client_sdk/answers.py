@@ -18,7 +18,8 @@ __all__ = ["Answer", "PoseAnswer", "Source", "decode_reply"]
 
 T = TypeVar("T")
 
-Source = Literal["cloud", "robot"]
+Source = Literal["cloud", "burst", "robot"]
+"""A server, the burst function, or the robot itself."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -40,9 +41,9 @@ class _Origin:
 class Answer(_Origin):
     """A reply, who computed it, and where the time went (ms; None if unknown).
 
-    If *source* is ``robot``, ``why`` says why the cloud did not answer.  ``object`` is the digest of a reply
-    that is stored as an object (of long services); if it is too large for a message, ``reply`` is None, and
-    ``decode_reply(DataClient(...).download(answer.object), ReplyType)`` returns it.
+    If *source* is ``burst`` or ``robot``, ``why`` says why no server answered.  ``object`` is the digest of
+    a reply that is stored as an object (of long services); if it is too large for a message, ``reply`` is
+    None, and ``decode_reply(DataClient(...).download(answer.object), ReplyType)`` returns it.
     """
 
     reply: Any

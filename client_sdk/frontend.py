@@ -312,7 +312,7 @@ class TrackedFrame:
     reason: str = ""
     scale: Literal["metric", "up to scale"] = "metric"
     covariance: Array | None = None
-    source: Literal["cloud", "robot", "none"] = "none"
+    source: Literal["cloud", "burst", "robot", "none"] = "none"
     round_trip_ms: float | None = None
     corrected: bool = False
     T_map_camera: Array | None = None

@@ -8,14 +8,18 @@ from __future__ import annotations
 import asyncio
 import random as random_module
 import time
-from collections.abc import Callable, Coroutine, Generator
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Generator
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from client_sdk.answers import Answer, PoseAnswer
-from client_sdk.connection import Connection, ForRobot, OnChange, Token, cancel_all
+from client_sdk.asking import Asking, Call, OnProgress
+from client_sdk.burst import Burst
+from client_sdk.burst_rules import checked_burst_url
+from client_sdk.connection import Connection, ForRobot, OnChange, Token
+from client_sdk.dialling import DialError
 from client_sdk.enrolment import read_enrolment
 from client_sdk.local_services import LocalServices
 from client_sdk.offload import CloudFirst
@@ -24,8 +28,8 @@ from client_sdk.stats import Stats, StatsKeeper
 from client_sdk.updates import RobotSubscriptions, Updates
 from rse_pf.config import SessionSettings
 from rse_pf.errors import Disconnected, RsePfError, UsageError, error_from_code
-from rse_pf.wire import CODECS, Command, Failure, Result, as_type, make_codec
-from rse_pf.wire.client_session import Answered, ClientSession, Progressed
+from rse_pf.wire import CODECS, Failure, as_type, make_codec
+from rse_pf.wire.client_session import Answered, ClientSession
 from rse_pf.wire.client_subscriptions import SubscriptionEnded, Updated
 
 if TYPE_CHECKING:
@@ -45,23 +49,7 @@ __all__ = ["OnProgress", "Robot", "connect"]
 
 T = TypeVar("T")
 
-OnProgress = Callable[[float, str], None]
-"""Called with the share of a long command that is done (0..1), and what was done last."""
-
 _MAX_DEADLINE_S = 3600.0
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Call:
-    """The arguments of one call."""
-
-    service: str
-    request: Any
-    deadline_s: float
-    stream: str
-    keep: bool
-    is_open_ended: bool = False
-    on_progress: OnProgress | None = None
 
 
 class Robot:
@@ -81,6 +69,7 @@ class Robot:
         on_change: OnChange = None,
         record: str | Path | None = None,
         thumbnails: bool = False,
+        burst_url: str | None = None,
     ) -> None:
         """Describe a robot to be used as ``async with connect(...) as robot``, or awaited.
 
@@ -96,6 +85,8 @@ class Robot:
             on_change: Called with ``link-lost``, ``link-back`` or ``moved``, and the reason or the server.
             record: Folder for a recording of what this robot says and hears, for rse-pf replay.
             thumbnails: Whether small pictures of the frames of its `mapper` are recorded, too.
+            burst_url: ``https://HOST/burst``, a function that answers while no server can, also before the
+                first connection; None takes the one that the servers name, and "" none.
 
         Raises:
             UsageError: The address or the codec cannot be used, or there are an address and an enrolment.
@@ -126,19 +117,25 @@ class Robot:
         self._offload = offload
         self._clock = clock
         self._local = None if offload is None else LocalServices(offload.registry, clock)
-        self._waiting: dict[int, asyncio.Future[Answered] | Callable[[Answered], None]] = {}
-        self._on_progress: dict[int, OnProgress] = {}
         self._subscriptions = RobotSubscriptions(self._session, self._connection.flush, clock)
-        self._tasks: set[asyncio.Task[Answer | Failure]] = set()
         self._keeper = StatsKeeper(random)
+        self._burst = Burst(
+            codec=self._session.codec, read_token=self._read_token, clock=clock, random=random,
+            own=lambda: (self._connection.url, self._connection.ssl_context),
+            max_answer_bytes=settings.max_message_bytes, url=checked_burst_url(burst_url, url),
+        )  # fmt: skip
+        self._asking = Asking(
+            session=self._session, flush=self._connection.flush, keeper=self._keeper, clock=clock,
+            offload=offload, local=self._local, burst=self._burst,
+        )  # fmt: skip
         self._open = False
 
     async def __aenter__(self) -> Robot:
-        """Connect; with an offload, return also while no server answers: the robot answers until one does.
+        """Connect; with an offload or a *burst_url*, return also while no server answers.
 
         Raises:
             Unauthorized: The token is missing, wrong or expired.
-            ConnectError: No server answers, and there is no offload.
+            ConnectError: No server answers, and nobody stands in for one.
             MissingExtra: There is an offload, and no solver for it.
             UsageError: The file of the enrolment cannot be used.
         """
@@ -150,7 +147,10 @@ class Robot:
                 self._connection.use(access.url, access.token, access.ssl_context)
             if self._local is not None:
                 await self._local.prepare()
-            await self._connection.open(may_be_down=self._offload is not None)
+            await self._connection.open(
+                may_be_down=self._offload is not None or self._burst.address is not None
+            )
+            self._asking.hear_welcome()
         except BaseException:
             await self.close()
             raise
@@ -176,7 +176,7 @@ class Robot:
             if isinstance(event, Answered | SubscriptionEnded):
                 self._answered(event)
         await self._connection.close()
-        await cancel_all(self._tasks)
+        await self._asking.close()
         if self._local is not None:
             self._local.close()
         if self._recorder is not None:
@@ -260,7 +260,7 @@ class Robot:
                 hint="give the number of seconds that the call may take",
             )
         self._keeper.sent += 1
-        call = _Call(
+        call = Call(
             service=service,
             request=request,
             deadline_s=wait_s,
@@ -274,11 +274,7 @@ class Robot:
             fatal = self._connection.fatal
             if fatal is not None:
                 raise error_from_code(fatal.code, fatal.message, hint=fatal.hint)
-            if self._offload is None or self._local is None:
-                answer = await self._ask_cloud(call)
-            else:
-                answer = await self._ask_both(self._offload, self._local, call)
-            return self._typed(answer, reply_type, started)
+            return self._typed(await self._asking.ask(call), reply_type, started)
         except RsePfError as error:
             self._keeper.failures[error.code] += 1
             raise
@@ -378,7 +374,7 @@ class Robot:
         identity = self._session.submit(
             service, request, now=self._clock(), deadline_s=deadline_s, stream=stream, keep=keep
         )
-        self._waiting[identity] = on_end
+        self._asking.waiting[identity] = on_end
         self._connection.flush()
         return identity
 
@@ -407,6 +403,7 @@ class Robot:
             sent=keeper.sent,
             answered=keeper.answered,
             failed=sum(keeper.failures.values()),
+            answered_by_burst=keeper.answered_by_burst,
             answered_by_robot=keeper.answered_by_robot,
             failures_by_code=dict(keeper.failures),
             unanswered=session.unanswered,
@@ -432,124 +429,6 @@ class Robot:
             last_error=connection.last_error,
         )
 
-    async def _ask_cloud(self, call: _Call) -> Answer | Failure:
-        identity = self._session.submit(
-            call.service,
-            call.request,
-            now=self._clock(),
-            stream=call.stream,
-            keep=call.keep,
-            deadline_s=None if call.is_open_ended else call.deadline_s,
-            is_open_ended=call.on_progress is not None,
-        )
-        future: asyncio.Future[Answered] = asyncio.get_running_loop().create_future()
-        self._waiting[identity] = future
-        if call.on_progress is not None:
-            self._on_progress[identity] = call.on_progress
-        self._connection.flush()
-        try:
-            ended = await future
-        finally:
-            self._on_progress.pop(identity, None)
-            self._waiting.pop(identity, None)
-            self._session.cancel(identity)
-            self._connection.flush()
-        round_trip_s = self._clock() - ended.sent_s
-        answer = ended.answer
-        if isinstance(answer, Result) or answer.code == "expired":
-            self._keeper.add_round_trip(round_trip_s)
-        return self._from_cloud(ended, answer, round_trip_s) if isinstance(answer, Result) else answer
-
-    async def _ask_both(self, offload: CloudFirst, local: LocalServices, call: _Call) -> Answer | Failure:
-        """Carry out the plan of *offload*: ask the cloud, the robot, or both and take the first answer."""
-        started = self._clock()
-        plan = offload.plan(
-            deadline_s=call.deadline_s,
-            connected=self._session.current is not None,
-            expected_round_trip_s=self._keeper.expected_round_trip_s(),
-            robot_solve_s=local.solve_s,
-            robot_can=local.offers(call.service),
-        )
-        if plan.where == "cloud":
-            return await self._ask_cloud(call)
-        racing: list[asyncio.Task[Answer | Failure]] = []
-        try:
-            why, cloud = plan.why, None
-            if plan.where == "both":
-                cloud = self._spawn(self._ask_cloud(call))
-                racing.append(cloud)
-                await asyncio.wait({cloud}, timeout=plan.robot_after_s)
-                if cloud.done():
-                    done = cloud.result()
-                    if not (isinstance(done, Failure) and offload.can_recover(done.code)):
-                        return done
-                    why, cloud = f"the cloud answered {done.code}", None
-            robot = self._spawn(self._ask_robot(local, call, why))
-            racing.append(robot)
-            remaining_s = max(0.0, call.deadline_s - (self._clock() - started))
-            return await self._first_answer(offload, cloud, robot, remaining_s)
-        except asyncio.CancelledError:
-            for task in racing:
-                task.cancel()
-            raise
-
-    async def _first_answer(
-        self,
-        offload: CloudFirst,
-        cloud: asyncio.Task[Answer | Failure] | None,
-        robot: asyncio.Task[Answer | Failure],
-        remaining_s: float,
-    ) -> Answer | Failure:
-        """Return the first good answer; a late answer of the cloud still counts in the statistics."""
-        until = self._clock() + remaining_s
-        racing = {robot} if cloud is None else {cloud, robot}
-        while racing:
-            timeout_s = max(0.0, until - self._clock())
-            done, racing = await asyncio.wait(racing, timeout=timeout_s, return_when=asyncio.FIRST_COMPLETED)
-            if not done:
-                break
-            for task in sorted(done, key=lambda task: task is robot):
-                answer = task.result()
-                if not (task is cloud and isinstance(answer, Failure) and offload.can_recover(answer.code)):
-                    return answer
-        robot.cancel()
-        return Failure(
-            code="expired",
-            message="neither the cloud nor the robot answered in time",
-            hint="set a longer deadline_s",
-        )
-
-    async def _ask_robot(self, local: LocalServices, call: _Call, why: str) -> Answer | Failure:
-        started = self._clock()
-        ended = await local.ask(Command(id=0, service=call.service, payload=call.request))
-        if isinstance(ended, Failure):
-            return ended
-        round_trip_ms = (self._clock() - started) * 1e3
-        return Answer(
-            reply=ended.reply,
-            source="robot",
-            server=ended.server,
-            round_trip_ms=round_trip_ms,
-            queue_ms=0.0,
-            compute_ms=ended.compute_ms,
-            why=why,
-        )
-
-    def _from_cloud(self, ended: Answered, result: Result, round_trip_s: float) -> Answer:
-        up_ms, down_ms = (None if s is None else s * 1e3 for s in (ended.up_s, ended.down_s))
-        return Answer(
-            reply=result.reply,
-            source="cloud",
-            server=result.server,
-            round_trip_ms=round_trip_s * 1e3,
-            queue_ms=result.queue_ms,
-            compute_ms=result.compute_ms,
-            up_ms=up_ms,
-            down_ms=down_ms,
-            payload_bytes=ended.wire_bytes,
-            object=result.object,
-        )
-
     def _typed(self, answer: Answer | Failure, reply_type: type[Any] | None, started: float) -> Answer:
         """Return the answer with its reply typed and the caller's round trip; raise if it is a failure."""
         if isinstance(answer, Failure):
@@ -561,6 +440,7 @@ class Robot:
         answer = replace(answer, reply=reply, round_trip_ms=(self._clock() - started) * 1e3)
         keeper = self._keeper
         keeper.answered += 1
+        keeper.answered_by_burst += answer.source == "burst"
         keeper.answered_by_robot += answer.source == "robot"
         if answer.source == "cloud":
             keeper.add_payload(answer.payload_bytes)
@@ -568,31 +448,17 @@ class Robot:
                 keeper.add(name, getattr(answer, name))
         return answer
 
+    async def _read_token(self) -> str | None:
+        try:
+            return await self._connection.read_token()
+        except DialError as failed:
+            raise failed.error from None
+
     def _answered(self, event: ForRobot) -> None:
         if isinstance(event, Updated | SubscriptionEnded):
             self._subscriptions.take(event)
             return
-        if isinstance(event, Progressed):
-            if event.id in self._on_progress:
-                self._on_progress[event.id](event.done, event.what)
-            return
-        waiting = self._waiting.get(event.id)
-        if isinstance(waiting, asyncio.Future):
-            if waiting.done():
-                self._keeper.duplicates += not waiting.cancelled()
-            else:
-                waiting.set_result(event)
-        elif waiting is not None:
-            del self._waiting[event.id]
-            waiting(event)
-        else:
-            self._keeper.duplicates += 1
-
-    def _spawn(self, work: Coroutine[Any, Any, Answer | Failure]) -> asyncio.Task[Answer | Failure]:
-        task = asyncio.get_running_loop().create_task(work)
-        self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
-        return task
+        self._asking.answered(event)
 
 
 connect = Robot

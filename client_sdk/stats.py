@@ -33,6 +33,7 @@ class Stats:
     sent: int
     answered: int
     failed: int
+    answered_by_burst: int
     answered_by_robot: int
     failures_by_code: Mapping[str, int]
     unanswered: int
@@ -64,6 +65,7 @@ class StatsKeeper:
     def __init__(self, random: Random) -> None:
         self.sent = 0
         self.answered = 0
+        self.answered_by_burst = 0
         self.answered_by_robot = 0
         self.duplicates = 0
         self.failures: Counter[str] = Counter()

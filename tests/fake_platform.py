@@ -16,7 +16,7 @@ from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
-from rse_pf.config import SessionSettings
+from rse_pf.config import BurstSettings, SessionSettings
 from rse_pf.service import Registry, dispatch
 from rse_pf.services import echo
 from rse_pf.wire import SUBPROTOCOLS, Command, Failure, Result, Update, codec_for, make_codec
@@ -48,6 +48,7 @@ class FakeSocket:
             server=server,
             session=f"s-{len(platform.sockets)}",
             limits=platform.settings,
+            burst=platform.burst,
         )
         self.commands: list[Command] = []
         self.topics: dict[int, str] = {}
@@ -130,6 +131,7 @@ class FakePlatform:
         self.settings = settings or SessionSettings()
         self.registry = registry or echo_services()
         self.clock = clock
+        self.burst: BurstSettings | None = None
         self.landing = "server-a"
         self.token: str | None = None
         self.tokens_seen: list[str] = []

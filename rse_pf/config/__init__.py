@@ -7,6 +7,7 @@ from rse_pf.config.loading import load_settings
 from rse_pf.config.reference_page import settings_page
 from rse_pf.config.settings import (
     AuthSettings,
+    BurstSettings,
     CloudSettings,
     DataSettings,
     HealthSettings,
@@ -25,6 +26,7 @@ from rse_pf.config.validation import SettingRow
 
 __all__ = [
     "AuthSettings",
+    "BurstSettings",
     "CloudSettings",
     "DataSettings",
     "HealthSettings",

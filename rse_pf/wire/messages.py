@@ -51,12 +51,16 @@ class _Message(msgspec.Struct, frozen=True, kw_only=True, tag_field="type", omit
 
 
 class Limits(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """What the server accepts from this robot; a rate of 0 is none."""
+    """What the server accepts from this robot; a rate of 0 is none.
+
+    ``burst_commands_per_day`` bounds what it may send to `Welcome.burst_url`.
+    """
 
     max_message_bytes: int
     max_in_flight: int
     max_commands_per_s: float = 0.0
     command_burst: int = 0
+    burst_commands_per_day: int = 0
 
 
 class Hello(_Message, frozen=True, kw_only=True, tag="hello"):
@@ -70,7 +74,8 @@ class Hello(_Message, frozen=True, kw_only=True, tag="hello"):
 class Welcome(_Message, frozen=True, kw_only=True, tag="welcome"):
     """Server, answer to Hello: who serves, and what it accepts.
 
-    ``token_s``: the socket ends in so many seconds, unless a fresh token comes first.
+    ``token_s``: the socket ends in so many seconds, unless a fresh token comes first.  ``burst_url``: where
+    commands are answered by HTTP while the servers cannot, an address or a path at the robot's own address.
     """
 
     server: str
@@ -80,6 +85,7 @@ class Welcome(_Message, frozen=True, kw_only=True, tag="welcome"):
     limits: Limits
     clock_s: float
     token_s: float | None = None
+    burst_url: str = ""
 
 
 class Command(_Message, frozen=True, kw_only=True, tag="command"):

@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 import msgspec
 
-from rse_pf.config import SessionSettings
+from rse_pf.config import BurstSettings, SessionSettings
 from rse_pf.errors import (
     BadMessage,
     BadRequest,
@@ -169,7 +169,14 @@ class ServerSession:
     ends_when_idle = False
 
     def __init__(
-        self, *, codec: Codec, robot: str, server: str, session: str, limits: SessionSettings
+        self,
+        *,
+        codec: Codec,
+        robot: str,
+        server: str,
+        session: str,
+        limits: SessionSettings,
+        burst: BurstSettings | None = None,
     ) -> None:
         self.robot = robot
         self.state: Literal["opening", "open", "closed"] = "opening"
@@ -181,6 +188,7 @@ class ServerSession:
         self._server = server
         self._session = session
         self._limits = limits
+        self._burst = burst or BurstSettings()
         self.bad_messages = 0
         self._next_renewal_s = float("-inf")
 
@@ -334,9 +342,11 @@ class ServerSession:
                 max_in_flight=self._limits.max_in_flight,
                 max_commands_per_s=self._limits.max_commands_per_s,
                 command_burst=self._limits.command_burst if self._limits.max_commands_per_s else 0,
+                burst_commands_per_day=self._burst.robot_commands_per_day if self._burst.url else 0,
             ),
             clock_s=now,
             token_s=None if self.ends_s is None else max(0.0, self.ends_s - now),
+            burst_url=self._burst.url,
         )
         return [self._send(welcome)]
 

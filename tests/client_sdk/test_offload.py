@@ -88,3 +88,48 @@ def test_the_robot_mends_what_the_cloud_broke_but_not_what_the_command_broke():
     for code in ("degenerate", "no-consensus", "too-few", "bad-request", "stale", PnpError.code):
         assert not CloudFirst.can_recover(code)
     assert not CloudFirst.can_recover(CommandFailed.code)
+
+
+def test_a_late_server_leaves_the_burst_function_its_time_before_the_robots_own():
+    decided = plan(burst_s=0.03)
+
+    assert decided.where == "both"
+    assert decided.robot_after_s == pytest.approx(0.16)
+    assert decided.burst_after_s == pytest.approx(0.16 - 2 * 0.03)
+
+
+@pytest.mark.parametrize("changes", [{"connected": False}, {"expected_round_trip_s": 0.3}])
+def test_without_a_server_that_is_in_time_the_burst_function_is_asked_at_once_and_the_robot_last(changes):
+    decided = plan(burst_s=0.05, **changes)
+
+    assert (decided.burst_after_s, decided.robot_after_s) == (0.0, pytest.approx(0.16))
+    assert decided.where == ("both" if decided.why.startswith("the cloud takes") else "robot")
+
+
+def test_a_burst_function_that_cannot_be_in_time_is_not_asked():
+    assert plan(burst_s=0.17).burst_after_s is None
+    assert plan(burst_s=0.17, connected=False).robot_after_s == 0.0
+
+
+def test_a_robot_without_a_solver_has_two_places():
+    decided = plan(robot_can=False, burst_s=0.05, connected=False)
+
+    assert (decided.where, decided.burst_after_s) == ("cloud", 0.0)
+
+
+@given(
+    deadline_s=seconds, mine_s=seconds, burst_s=st.none() | seconds, round_trip_s=st.none() | seconds,
+    connected=st.booleans(), can=st.booleans(),
+)  # fmt: skip
+def test_no_place_is_asked_when_it_cannot_be_in_time(
+    deadline_s, mine_s, burst_s, round_trip_s, connected, can
+):
+    decided = plan(
+        deadline_s=deadline_s, robot_solve_s=mine_s, burst_s=burst_s, robot_can=can,
+        expected_round_trip_s=round_trip_s, connected=connected,
+    )  # fmt: skip
+
+    if decided.burst_after_s is not None:
+        assert decided.burst_after_s + burst_s <= deadline_s
+        if can and decided.robot_after_s:
+            assert decided.burst_after_s + burst_s <= decided.robot_after_s + 1e-9

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
-from rse_pf.config import SessionSettings
+from rse_pf.config import BurstSettings, SessionSettings
 from rse_pf.wire import (
     CODECS,
     Command,
@@ -245,3 +245,19 @@ class IpcChannel(RuleBasedStateMachine):
 
 
 TestConversation = IpcChannel.TestCase
+
+
+def test_the_welcome_names_the_burst_only_if_there_is_one() -> None:
+    def welcome(burst: BurstSettings) -> bytes:
+        codec = make_codec("json")
+        server = ServerSession(codec=codec, robot="r", server="s", session="x", limits=LIMITS, burst=burst)
+        (sent,) = server.receive(codec.encode(HELLO), 0.0)
+        assert isinstance(sent, Send)
+        return sent.data
+
+    told, none = welcome(BurstSettings(url="/burst", robot_commands_per_day=7)), welcome(BurstSettings())
+    message = make_codec("json").decode_from_server(told)
+
+    assert isinstance(message, Welcome)
+    assert (message.burst_url, message.limits.burst_commands_per_day) == ("/burst", 7)
+    assert b"burst_" not in none, "older clients see what they always saw"

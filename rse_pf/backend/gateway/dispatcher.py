@@ -227,6 +227,7 @@ class Dispatcher:
                 server=self.context.server_id,
                 session=self._new_session_id(),
                 limits=self.context.settings.session,
+                burst=self.context.settings.burst,
             )
             session.ends_s = expires_s
         connection = RobotConnection(self, wire, session, accepted, now=now, number=number)

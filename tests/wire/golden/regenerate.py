@@ -53,6 +53,10 @@ MESSAGES: dict[str, Message] = {
         server="server-1", session="5f0c", robot="robot-7", protocol=1, clock_s=1234.5, token_s=899.5,
         limits=Limits(max_message_bytes=262144, max_in_flight=8),
     ),
+    "welcome-with-burst": Welcome(
+        server="server-1", session="5f0c", robot="robot-7", protocol=1, clock_s=1234.5, burst_url="/burst",
+        limits=Limits(max_message_bytes=262144, max_in_flight=8, burst_commands_per_day=10000),
+    ),
     "renew": Renew(token="eyJhbGciOiJFZERTQSJ9.eyJzdWIiOiJyb2JvdC03In0.c2lnbmF0dXJl"),
     "renewed": Renewed(token_s=900.0),
     "command": Command(

@@ -1,0 +1,132 @@
+"""The budget and the breaker of a robot, and which address a token may be sent to."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from client_sdk.burst_rules import BurstRules, burst_address, checked_burst_url
+from rse_pf.errors import UsageError
+
+DAY_S = 86400.0
+
+
+def rules(budget: int = 1000) -> BurstRules:
+    return BurstRules(commands_per_day=budget)
+
+
+def fail(of: BurstRules, now: float, times: int = 1, **changes: float) -> None:
+    for _ in range(times):
+        of.sent()
+        of.failed(now, 0.1, **changes)
+
+
+def test_the_budget_of_a_day_is_spent_once_and_is_there_again_on_the_next():
+    budget = rules(3)
+    for _ in range(3):
+        assert budget.may_send(10.0)
+        budget.sent()
+        budget.answered(10.0, 0.1)
+
+    assert not budget.may_send(10.0 + DAY_S - 1)
+    assert budget.may_send(10.0 + DAY_S)
+
+
+@given(st.lists(st.tuples(st.floats(0, 3 * DAY_S), st.booleans()), max_size=200), st.integers(0, 20))
+def test_no_run_spends_more_than_the_budget_in_its_day(events: list[tuple[float, bool]], budget: int):
+    limited, sent = rules(budget), []
+    for now, works in sorted(events):
+        if limited.may_send(now):
+            limited.sent()
+            sent.append(now)
+            if works:
+                limited.answered(now, 0.1)
+            else:
+                limited.failed(now, 0.1)
+
+    first = sent[0] if sent else 0.0
+    assert sum(now < first + DAY_S for now in sent) <= budget
+    assert len(sent) <= 4 * budget
+
+
+def test_three_failures_in_a_row_open_the_breaker_and_one_trial_closes_it():
+    breaker = rules()
+    assert breaker.may_send(0.0)
+    fail(breaker, 0.0, 2)
+    assert breaker.may_send(0.0)
+    fail(breaker, 0.0)
+
+    assert not breaker.may_send(0.4)
+    assert breaker.may_send(0.75)
+    breaker.sent()
+    assert not breaker.may_send(0.75), "one trial at a time"
+    breaker.answered(0.8, 0.05)
+    assert breaker.may_send(0.8)
+
+
+def test_the_pause_doubles_and_is_never_longer_than_a_minute():
+    breaker = rules()
+    breaker.may_send(0.0)
+    fail(breaker, 0.0, 4, jitter=1.0)
+    assert not breaker.may_send(1.9)
+    assert breaker.may_send(2.0)
+    fail(breaker, 2.0, 30, jitter=1.0)
+    assert not breaker.may_send(61.0)
+    assert breaker.may_send(62.0)
+
+
+def test_a_function_that_asks_for_a_pause_gets_it():
+    breaker = rules()
+    breaker.may_send(0.0)
+    fail(breaker, 0.0, retry_after_s=30.0)
+
+    assert not breaker.may_send(29.0)
+    assert breaker.may_send(30.0)
+
+
+def test_a_single_cold_start_is_forgotten_after_ten_seconds():
+    slow = rules()
+    slow.may_send(0.0)
+    slow.sent()
+    slow.answered(1.0, 1.5)
+
+    assert slow.expected_s(1.0) == 1.5
+    assert slow.expected_s(11.0) == slow.first_s
+
+
+def test_most_answers_decide_and_not_the_slowest():
+    mixed = rules()
+    for took_s in (0.02, 0.03, 0.03, 2.0):
+        mixed.sent()
+        mixed.answered(1.0, took_s)
+
+    assert mixed.expected_s(1.0) == 0.03
+
+
+@pytest.mark.parametrize(
+    ("url", "own", "address"),
+    [
+        ("/burst", "ws://127.0.0.1:8700/ws", "http://127.0.0.1:8700/burst"),
+        ("/burst", "wss://user:secret@robots.example/ws", "https://robots.example/burst"),
+        ("https://other.example/burst", "wss://robots.example/ws", "https://other.example/burst"),
+        ("http://127.0.0.1:8702/burst", "ws://127.0.0.1:8700/ws", "http://127.0.0.1:8702/burst"),
+        ("http://robots.example/burst", "wss://robots.example/ws", None),
+        ("//other.example/burst", "ws://robots.example/ws", None),
+        ("ftp://robots.example/burst", "ws://robots.example/ws", None),
+        ("https://robots.example:x/burst", "ws://robots.example/ws", None),
+        ("https://robots.example/a b", "ws://robots.example/ws", None),
+        ("https://robots.example/\r\nX: y", "ws://robots.example/ws", None),
+    ],
+)
+def test_a_token_goes_only_where_it_is_as_safe_as_at_the_servers(url: str, own: str, address: str | None):
+    assert burst_address(url, own) == address
+
+
+def test_an_address_that_the_user_cannot_mean_is_refused_at_once():
+    with pytest.raises(UsageError) as told:
+        checked_burst_url("robots.example/burst", "ws://robots.example/ws")
+
+    assert "https://HOST/burst" in told.value.hint
+    assert checked_burst_url("", "ws://robots.example/ws") == ""
+    assert checked_burst_url(None, "ws://robots.example/ws") is None
