@@ -1,52 +1,121 @@
-"""Estimate what a load costs a month on the EC2 fleet and on the Lambda.
+"""Estimate what a deployment costs a month: line by line, by box of Fig. 2, on the fleet and on the Lambda.
 
 A server accepts commands up to ``scaling.busy_cpu_percent``; the fleet has as many servers as that needs, but
-never fewer than ``scaling.min_servers``.  What the estimate leaves out is in `NOT_INCLUDED`.
+never fewer than ``scaling.min_servers``.  A sum is always the sum of its lines, each rounded to a cent.  What
+the estimate leaves out is in `NOT_INCLUDED`.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from typing import Literal
 
+from rse_pf.aws.fleet.metrics import ServerMetrics, datums
 from rse_pf.aws.money.prices import Prices
 from rse_pf.config import PlatformSettings
+from rse_pf.scaling.alarms import alarms_of
+from rse_pf.scaling.operator_alarms import operator_alarms
 
 __all__ = [
     "HOURS",
     "NOT_INCLUDED",
+    "Bill",
+    "CostLine",
     "Costs",
     "Load",
+    "bill_of",
     "compare",
     "crossing_commands_per_s",
-    "interface_endpoints",
+    "endpoint_services",
+    "parked",
+    "parked_at_night",
+    "zone_count",
 ]
 
 HOURS = 730.0
 """Hours of a month, as in the calculator of AWS."""
 NOT_INCLUDED = (
-    "taxes, data out to the robots (the same for both), stored maps and logs, WAF by the handshake, "
-    "savings plans, the free tier"
+    "taxes, data out to the robots (the same for both), stored maps and logs, savings plans, the free tier"
 )
+FIREWALL_RULES = 1
+"""Rules of the web ACL; tests/stacks/test_money.py compares them with the template."""
+VOLUME_GB = 8
+"""Of a server."""
+
 _DAY_H = 24.0
-_ZONES = 2
-_ENDPOINTS = {"minimal": 3, "full": 5}
+_MONTH_S = HOURS * 3600
 _CONNECTIONS_OF_A_UNIT, _BYTES_OF_A_UNIT = 3000, 1e9
 _MB_OF_A_VCPU = 1769
+_DETAILED_METRICS = 7
+"""That EC2 publishes each minute for a server with detailed monitoring."""
+_UNITS = "capacity units"
+_CANARY_MB, _CANARY_S, _CANARY_PERIOD_S = 256, 1.0, 60
+
+Needs = Literal["servers", "front", "nothing"]
+"""What a line is paid for: running servers, the front door (balancer, firewall, endpoints), or anyway."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Load:
-    """How many robots send how many commands, and for how long each day."""
+    """How many robots send how many commands, and for how long each day.
+
+    ``burst_commands_per_day`` are answered by the Lambda beside the fleet.
+    """
 
     robots: int
     fps: float
     hours_per_day: float = _DAY_H
+    burst_commands_per_day: float = 0.0
 
     @property
     def commands_per_s(self) -> float:
         """Return the commands per second of all robots together, in their hours."""
         return self.robots * self.fps
+
+    @property
+    def robot_hours(self) -> float:
+        """Return the hours of all robots in a month."""
+        return self.robots * HOURS * self.hours_per_day / _DAY_H
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CostLine:
+    """One line of a bill: *count* units of *unit* in a month at *price* each; *box* is one of Fig. 2."""
+
+    box: str
+    what: str
+    count: float
+    unit: str
+    price: float
+    needs: Needs = "nothing"
+    all_day: bool = True
+    """Whether the line is paid in every hour, and not in the hours of the load alone."""
+
+    @property
+    def amount(self) -> float:
+        """Return what the line costs a month, rounded to a cent."""
+        return round(self.count * self.price, 2)
+
+
+@dataclass(frozen=True, slots=True)
+class Bill:
+    """What a month costs, in the currency of the prices."""
+
+    lines: tuple[CostLine, ...]
+
+    @property
+    def total(self) -> float:
+        """Return the sum of the lines."""
+        return round(sum(line.amount for line in self.lines), 2)
+
+    def by_box(self) -> dict[str, float]:
+        """Return the sum of each box, in the order of the lines."""
+        sums: dict[str, float] = {}
+        for line in self.lines:
+            sums[line.box] = round(sums.get(line.box, 0.0) + line.amount, 2)
+        return sums
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -64,25 +133,63 @@ class Costs:
     crossing_commands_per_s: float | None
 
 
-def interface_endpoints(settings: PlatformSettings) -> int:
-    """Return how many interface endpoints the VPC has, counted in each zone."""
-    return _ENDPOINTS[settings.cloud.endpoints] * _ZONES
+def zone_count(settings: PlatformSettings) -> int:
+    """Return in how many zones servers and endpoints are; the load balancer always needs two."""
+    return 1 if settings.cloud.profile == "small" else 2
+
+
+def endpoint_services(settings: PlatformSettings) -> dict[str, str]:
+    """Return the interface endpoints of the VPC: the service of AWS, and the box of Fig. 2 that uses it.
+
+    Without them the agents reach neither the monitor nor the group; S3 has a gateway endpoint, which is free.
+    """
+    return {"monitoring": "monitor", "autoscaling": "scale modifier"}
+
+
+def bill_of(settings: PlatformSettings, prices: Prices, load: Load | None = None) -> Bill:
+    """Return the bill of a month with *load*; without it, of a month without any robot.
+
+    Raises:
+        ConfigurationError: The price of ``cloud.instance_type`` is not known.
+    """
+    load = load or Load(robots=0, fps=0.0)
+    lines = (
+        *_server_lines(settings, prices, load),
+        *_front_lines(settings, prices, load),
+        *_monitor_lines(settings, prices),
+        *_data_lines(settings, prices),
+        *_function_lines(settings, prices, load),
+    )
+    return Bill(tuple(line for line in lines if line.count))
+
+
+def parked(bill: Bill, *, deep: bool) -> Bill:
+    """Return what is left of *bill* without servers and, if *deep*, without the front door either."""
+    gone: tuple[Needs, ...] = ("servers", "front") if deep else ("servers",)
+    return Bill(tuple(line for line in bill.lines if line.needs not in gone))
+
+
+def parked_at_night(bill: Bill, load: Load, *, deep: bool) -> Bill:
+    """Return *bill* of a platform that is parked outside the hours of *load*."""
+    gone: tuple[Needs, ...] = ("servers", "front") if deep else ("servers",)
+    share = load.hours_per_day / _DAY_H
+    return Bill(
+        tuple(
+            replace(line, count=line.count * share) if line.needs in gone and line.all_day else line
+            for line in bill.lines
+        )
+    )
 
 
 def compare(settings: PlatformSettings, prices: Prices, load: Load) -> Costs:
     """Return what *load* costs on the fleet and on the Lambda."""
     tariff = _Tariff(settings, prices, load.fps)
-    servers = max(
-        settings.scaling.min_servers,
-        math.ceil(round(load.commands_per_s / tariff.capacity_per_s, 9)),
-        math.ceil(load.robots / settings.serving.max_robots),
-    )
-    hours = HOURS * load.hours_per_day / _DAY_H
+    seconds = _MONTH_S * load.hours_per_day / _DAY_H
     return Costs(
-        floor=tariff.fleet(settings.scaling.min_servers, hours),
-        fleet=tariff.fleet(servers, hours) + load.commands_per_s * tariff.units_per_command * hours,
-        serverless=load.commands_per_s * tariff.serverless_per_command * 3600 * hours,
-        servers=servers,
+        floor=bill_of(settings, prices).total,
+        fleet=bill_of(settings, prices, load).total,
+        serverless=load.commands_per_s * tariff.serverless_per_command * seconds,
+        servers=_servers(settings, tariff, load),
         executions=load.commands_per_s * tariff.billed_ms / 1e3,
         crossing_commands_per_s=crossing_commands_per_s(settings, prices, load.fps, load.hours_per_day),
     )
@@ -100,9 +207,11 @@ def crossing_commands_per_s(
     saved = hours * (3600 * tariff.serverless_per_command - tariff.units_per_command)  # by 1 command/s
     if saved <= 0 or hours <= 0:
         return None
+    floor, floor_servers = bill_of(settings, prices).total, settings.scaling.min_servers
     most, below = min(tariff.capacity_per_s, settings.serving.max_robots * fps), 0.0
-    for servers in range(settings.scaling.min_servers, settings.scaling.max_servers + 1):
-        rate = max(below, tariff.fleet(servers, hours) / saved)
+    for servers in range(floor_servers, settings.scaling.max_servers + 1):
+        more = _more_servers(settings, prices, servers - floor_servers, hours)
+        rate = max(below, (floor + sum(line.amount for line in more)) / saved)
         if rate <= servers * most:
             return rate
         below = servers * most
@@ -110,25 +219,151 @@ def crossing_commands_per_s(
 
 
 class _Tariff:
-    """The cost of a server, a command and an execution under *settings*, for robots of *fps*."""
+    """The cost of a command and of an execution under *settings*, for robots of *fps*."""
 
     def __init__(self, settings: PlatformSettings, prices: Prices, fps: float) -> None:
         busy = settings.scaling.busy_cpu_percent / 100
         memory_mb = settings.cloud.lambda_memory_mb
-        self.capacity_per_s = prices.server_vcpus * busy / (prices.command_cpu_ms / 1e3)
+        vcpus = prices.server(settings.cloud.instance_type).vcpus
+        self.capacity_per_s = vcpus * busy / (prices.command_cpu_ms / 1e3)
         # AWS counts connections or bytes of the load balancer, whichever costs more.
-        units = max(1 / fps / _CONNECTIONS_OF_A_UNIT, 3600 * prices.command_bytes / _BYTES_OF_A_UNIT)
+        connections = 1 / fps / _CONNECTIONS_OF_A_UNIT if fps else 0.0
+        units = max(connections, 3600 * prices.command_bytes / _BYTES_OF_A_UNIT)
         self.units_per_command = prices.balancer_unit_per_hour * units
         # A warm execution; less memory is less of a vCPU.
         self.billed_ms = math.ceil(prices.command_cpu_ms * max(1.0, _MB_OF_A_VCPU / memory_mb))
-        gb_s = memory_mb / 1024 * self.billed_ms / 1e3
-        self.serverless_per_command = prices.lambda_per_million / 1e6 + gb_s * prices.lambda_per_gb_s
-        self._settings, self._prices = settings, prices
+        self.gb_s = memory_mb / 1024 * self.billed_ms / 1e3
+        self.serverless_per_command = prices.lambda_per_million / 1e6 + self.gb_s * prices.lambda_per_gb_s
 
-    def fleet(self, servers: int, hours: float) -> float:
-        """Return the floor, and what *servers* cost beyond it in the busy *hours* of a month."""
-        prices, min_servers = self._prices, self._settings.scaling.min_servers
-        hourly = prices.balancer_per_hour + prices.endpoint_per_hour * interface_endpoints(self._settings)
-        each = prices.server_per_hour + prices.server_per_month / HOURS
-        floor = prices.fixed_per_month + (hourly + min_servers * each) * HOURS
-        return floor + (servers - min_servers) * each * hours
+
+def _servers(settings: PlatformSettings, tariff: _Tariff, load: Load) -> int:
+    return max(
+        settings.scaling.min_servers,
+        math.ceil(round(load.commands_per_s / tariff.capacity_per_s, 9)),
+        math.ceil(load.robots / settings.serving.max_robots),
+    )
+
+
+def _server_lines(settings: PlatformSettings, prices: Prices, load: Load) -> Iterable[CostLine]:
+    floor = settings.scaling.min_servers
+    servers = _servers(settings, _Tariff(settings, prices, load.fps), load)
+    yield from _running(settings, prices, "always", 0, floor, HOURS)
+    hours = HOURS * load.hours_per_day / _DAY_H
+    yield from _more_servers(settings, prices, servers - floor, hours)
+    box, kept = "backend servers", settings.cloud.warm_servers
+    yield CostLine(
+        box=box, what="volumes of stopped warm servers", count=kept * VOLUME_GB, unit="GB",
+        price=prices.volume_per_gb_month,
+    )  # fmt: skip
+
+
+def _more_servers(
+    settings: PlatformSettings, prices: Prices, count: int, hours: float
+) -> tuple[CostLine, ...]:
+    floor = settings.scaling.min_servers
+    return tuple(_running(settings, prices, "in busy hours", floor, floor + count, hours))
+
+
+def _running(
+    settings: PlatformSettings, prices: Prices, when: str, first: int, last: int, hours: float
+) -> Iterable[CostLine]:
+    """Yield what the servers *first* to *last* of the fleet cost in *hours* of a month."""
+    kind, count = settings.cloud.instance_type, last - first
+    each = prices.server(kind)
+    demanded = max(0, min(last, settings.cloud.on_demand_servers) - first) if settings.cloud.spot else count
+    months = hours / HOURS
+    servers = {"on demand": (demanded, each.per_hour), "Spot": (count - demanded, each.spot_per_hour)}
+    for how, (some, price) in servers.items():
+        yield CostLine(
+            box="backend servers", what=f"{some} {kind} {how}, {when}", count=some * hours, unit="h",
+            price=price, needs="servers", all_day=not first,
+        )  # fmt: skip
+    for box, what, number, unit, price in (
+        ("backend servers", f"volumes, {when}", count * VOLUME_GB, "GB", prices.volume_per_gb_month),
+        ("monitor", f"metrics of each server, {when}", count * _metrics_of_a_server(), "metrics",
+         prices.metric_per_month),
+        ("data servers", f"audit logs and journals, {when}", count * _puts_of_a_server(settings),
+         "thousand", prices.put_per_thousand),
+    ):  # fmt: skip
+        yield CostLine(
+            box=box, what=what, count=number * months, unit=unit, price=price, needs="servers",
+            all_day=not first,
+        )  # fmt: skip
+
+
+def _front_lines(settings: PlatformSettings, prices: Prices, load: Load) -> Iterable[CostLine]:
+    hours = HOURS * load.hours_per_day / _DAY_H
+    units = load.commands_per_s * _Tariff(settings, prices, load.fps).units_per_command
+    rows: tuple[tuple[str, str, float, str, float], ...] = (
+        ("load balancer", "load balancer", HOURS, "h", prices.balancer_per_hour),
+        ("load balancer", "its public addresses, in two zones", 2 * HOURS, "h", prices.address_per_hour),
+        ("load balancer", _UNITS, 0 if not units else units / prices.balancer_unit_per_hour * hours,
+         "h", prices.balancer_unit_per_hour),
+        ("firewall", "web ACL", 1, "", prices.firewall_per_month),
+        ("firewall", "its rules", FIREWALL_RULES, "rules", prices.firewall_rule_per_month),
+        *(
+            (box, f"endpoint of {service}, in {zone_count(settings)} zone(s)",
+             zone_count(settings) * HOURS, "h", prices.endpoint_per_hour)
+            for service, box in endpoint_services(settings).items()
+        ),
+    )  # fmt: skip
+    for box, what, count, unit, price in rows:
+        yield CostLine(
+            box=box, what=what, count=count, unit=unit, price=price, needs="front",
+            all_day=what != _UNITS,
+        )  # fmt: skip
+
+
+def _monitor_lines(settings: PlatformSettings, prices: Prices) -> Iterable[CostLine]:
+    alarm = prices.alarm_metric_per_month
+    yield CostLine(
+        box="monitor", what="metrics of the fleet", count=len(_metrics("")), unit="metrics",
+        price=prices.metric_per_month, needs="servers",
+    )  # fmt: skip
+    calling = sum(len(each.series) for each in operator_alarms(settings))
+    scaling = sum(len(each.metrics) for each in alarms_of(settings.scaling))
+    for box, what, count in (
+        ("monitor", "alarms for the operator", calling), ("scale modifier", "alarms that scale", scaling),
+    ):  # fmt: skip
+        yield CostLine(box=box, what=what, count=count, unit="metrics", price=alarm)
+    if settings.cloud.canary:
+        calls = _MONTH_S / _CANARY_PERIOD_S
+        gb_s = calls * _CANARY_S * _CANARY_MB / 1024
+        yield CostLine(
+            box="monitor", what="canary, each minute", count=gb_s, unit="GB-s",
+            price=prices.lambda_per_gb_s + prices.lambda_per_million / 1e6 * calls / gb_s,
+        )  # fmt: skip
+
+
+def _data_lines(settings: PlatformSettings, prices: Prices) -> Iterable[CostLine]:
+    secrets = 2 if settings.cloud.canary else 1
+    yield CostLine(
+        box="data servers", what="secrets", count=secrets, unit="secrets", price=prices.secret_per_month
+    )  # fmt: skip
+
+
+def _function_lines(settings: PlatformSettings, prices: Prices, load: Load) -> Iterable[CostLine]:
+    commands = load.burst_commands_per_day * HOURS / _DAY_H
+    tariff = _Tariff(settings, prices, load.fps)
+    for what, count, unit, price in (
+        ("executions of bursts", commands / 1e6, "million", prices.lambda_per_million),
+        ("computing of bursts", commands * tariff.gb_s, "GB-s", prices.lambda_per_gb_s),
+        ("inspecting bursts", commands / 1e6, "million", prices.firewall_per_million),
+    ):
+        yield CostLine(box="Lambda", what=what, count=count, unit=unit, price=price)
+
+
+def _metrics(server: str) -> set[tuple[str, bool]]:
+    """Return the metrics that an agent publishes: name, and whether it is of one server."""
+    some = ServerMetrics(answers={1.0: 1.0})
+    told = datums(ServerMetrics(), some, "group", server)
+    return {(each["MetricName"], len(each["Dimensions"]) > 1) for each in told}
+
+
+def _metrics_of_a_server() -> int:
+    return _DETAILED_METRICS + sum(is_of_one for _, is_of_one in _metrics("server"))
+
+
+def _puts_of_a_server(settings: PlatformSettings) -> float:
+    """Return the thousands of objects that a server writes in a month, if it always has something new."""
+    return (_MONTH_S / settings.cloud.audit_ship_s + _MONTH_S / settings.cloud.journal_ship_s) / 1e3

@@ -107,7 +107,7 @@ def _instance_type(account: Account, settings: PlatformSettings) -> Check:
 
 def _vcpus(account: Account, settings: PlatformSettings) -> Check:
     # An instance that drains still runs when its replacement starts.
-    needed = (settings.scaling.max_servers + 1) * load_prices().server_vcpus
+    needed = (settings.scaling.max_servers + 1) * load_prices().vcpus(settings.cloud.instance_type)
     return _enough(
         account, _VCPUS, needed, "vCPUs of on-demand instances for scaling.max_servers and one more"
     )

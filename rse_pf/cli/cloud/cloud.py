@@ -19,7 +19,8 @@ __all__ = ["ACTIONS", "add_arguments", "run"]
 
 ACTIONS = {
     "doctor": "check tools, packages, account, certificate and quotas before a deployment",
-    "cost": "what a load costs a month, on the fleet and on the Lambda",
+    "cost": "what a load costs a month, line by line, on the fleet and on the Lambda",
+    "prices": "the prices of an estimate; --refresh reads them from AWS",
     "status": "servers, their health, alarms, robots",
     "leftovers": "resources in the account that belong to no stack",
 }

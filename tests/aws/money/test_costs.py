@@ -1,31 +1,53 @@
-"""What a load costs: capacity, the floor, and the load from which the fleet is cheaper."""
+"""What a load costs: line by line, the floor, parked, and the load from which the fleet is cheaper."""
 
 from __future__ import annotations
 
 import msgspec
 import pytest
 
-from rse_pf.aws.money.costs import Load, compare, crossing_commands_per_s, interface_endpoints
-from rse_pf.aws.money.prices import Prices, load_prices
+from rse_pf.aws.money.costs import (
+    Bill,
+    CostLine,
+    Load,
+    bill_of,
+    compare,
+    crossing_commands_per_s,
+    parked,
+    parked_at_night,
+)
+from rse_pf.aws.money.prices import Prices, ServerPrice, load_prices
 from rse_pf.config import PlatformSettings
+from rse_pf.errors import ConfigurationError
 
-SETTINGS = PlatformSettings().replace(scaling={"min_servers": 2, "max_servers": 4, "busy_cpu_percent": 70.0})
-PRICES = msgspec.structs.replace(
-    load_prices(),
-    server_per_hour=0.1, server_vcpus=2, server_per_month=0.0, balancer_per_hour=0.01,
-    balancer_unit_per_hour=0.0, endpoint_per_hour=0.01, fixed_per_month=10.0,
-    lambda_per_million=0.2, lambda_per_gb_s=0.0, command_cpu_ms=7.0,
+SETTINGS = PlatformSettings().replace(
+    scaling={"min_servers": 2, "max_servers": 4, "busy_cpu_percent": 70.0}, cloud={"canary": False}
+)
+SMALL = PlatformSettings.from_dict({"cloud": {"profile": "small"}})
+NOTHING = dict.fromkeys(
+    ("volume_per_gb_month", "metric_per_month", "alarm_metric_per_month", "balancer_unit_per_hour",
+     "firewall_per_month", "firewall_rule_per_month", "firewall_per_million", "secret_per_month",
+     "put_per_thousand", "lambda_per_gb_s"), 0.0,
 )  # fmt: skip
-FLOOR = 10 + 730 * (0.01 + 6 * 0.01 + 2 * 0.1)
-"""Fixed, balancer, three endpoints in two zones, two servers."""
+PRICES = msgspec.structs.replace(
+    load_prices(), **NOTHING,
+    servers={"c7i.large": ServerPrice(vcpus=2, per_hour=0.1, spot_per_hour=0.04)},
+    balancer_per_hour=0.01, address_per_hour=0.02, endpoint_per_hour=0.01, lambda_per_million=0.2,
+    command_cpu_ms=7.0,
+)  # fmt: skip
+FLOOR = 730 * (0.01 + 2 * 0.02 + 4 * 0.01 + 2 * 0.1)
+"""Balancer, two addresses, two endpoints in two zones, two servers."""
 
 
-def replaced(**values: float) -> Prices:
+def replaced(**values: object) -> Prices:
     return msgspec.structs.replace(PRICES, **values)
 
 
 def at(robots: int, fps: float = 10.0, hours: float = 24.0) -> Load:
     return Load(robots=robots, fps=fps, hours_per_day=hours)
+
+
+def amounts(bill: Bill, box: str) -> float:
+    return bill.by_box().get(box, 0.0)
 
 
 def test_the_floor_is_paid_when_hardly_anybody_asks() -> None:
@@ -34,6 +56,65 @@ def test_the_floor_is_paid_when_hardly_anybody_asks() -> None:
     assert costs.floor == pytest.approx(FLOOR)
     assert costs.fleet == pytest.approx(FLOOR)
     assert costs.serverless < 0.001
+
+
+def test_a_bill_is_the_sum_of_its_lines_and_of_its_boxes_to_the_cent() -> None:
+    spot, warm = SETTINGS.replace(cloud={"spot": True}), SETTINGS.replace(cloud={"warm_servers": 3})
+    for settings in (PlatformSettings(), SMALL, spot, warm):
+        bill = bill_of(settings, load_prices(), Load(robots=333, fps=7.7, hours_per_day=5.5))
+
+        printed = [f"{line.count * line.price:.2f}" for line in bill.lines]
+        assert f"{sum(map(float, printed)):.2f}" == f"{bill.total:.2f}"
+        assert f"{sum(bill.by_box().values()):.2f}" == f"{bill.total:.2f}"
+
+
+def test_the_small_profile_costs_less_than_a_hundred_a_month_and_parked_less_than_twenty_five() -> None:
+    bill = bill_of(SMALL, load_prices())
+
+    assert 50 < bill.total < 100
+    assert 0 < parked(bill, deep=True).total < 25
+    assert parked(bill, deep=True).total < parked(bill, deep=False).total < bill.total
+
+
+def test_parked_there_is_no_server_and_deep_no_front_door() -> None:
+    bill = bill_of(PlatformSettings(), load_prices())
+    shallow, deep = parked(bill, deep=False), parked(bill, deep=True)
+
+    assert amounts(shallow, "backend servers") == 0
+    assert amounts(shallow, "load balancer") == amounts(bill, "load balancer") > 0
+    assert {"load balancer", "firewall"}.isdisjoint(deep.by_box())
+    assert set(deep.by_box()) == {"monitor", "scale modifier", "data servers"}
+
+
+def test_parked_at_night_costs_between_always_and_never() -> None:
+    load = at(60, hours=6.0)
+    bill = bill_of(SETTINGS, PRICES, load)
+
+    night = parked_at_night(bill, load, deep=False)
+
+    # Two servers for a quarter of the day, and the third one only then anyway.
+    assert bill.total - night.total == pytest.approx(2 * 0.1 * 730 * 3 / 4)
+    assert parked(bill, deep=True).total < parked_at_night(bill, load, deep=True).total < night.total
+
+
+def test_servers_above_the_floor_of_on_demand_ones_are_spot_instances() -> None:
+    spot = SETTINGS.replace(cloud={"spot": True, "on_demand_servers": 1})
+
+    saved = bill_of(SETTINGS, PRICES).total - bill_of(spot, PRICES).total
+
+    assert saved == pytest.approx(730 * 0.06)
+
+
+def test_a_burst_is_answered_by_the_lambda_and_has_lines_of_its_own() -> None:
+    quiet = bill_of(SETTINGS, PRICES, at(1, fps=0.001))
+    burst = bill_of(SETTINGS, PRICES, Load(robots=1, fps=0.001, burst_commands_per_day=24e6 / 730))
+
+    assert amounts(burst, "Lambda") == pytest.approx(0.2)
+    assert burst.total == pytest.approx(quiet.total + 0.2)
+
+
+def test_a_robot_hour_is_counted_in_the_hours_at_work() -> None:
+    assert Load(robots=10, fps=5.0, hours_per_day=12.0).robot_hours == 3650.0
 
 
 @pytest.mark.parametrize(("robots", "servers"), [(1, 2), (40, 2), (41, 3), (60, 3), (61, 4), (100, 5)])
@@ -95,6 +176,12 @@ def test_sockets_or_bytes_pay_the_balancers_units_whichever_is_more() -> None:
     assert by_bytes == pytest.approx(FLOOR + 730)
 
 
-def test_the_profile_of_endpoints_counts() -> None:
-    assert interface_endpoints(SETTINGS) == 6
-    assert interface_endpoints(SETTINGS.replace(cloud={"endpoints": "full"})) == 10
+def test_an_unknown_type_of_server_has_no_price_and_no_guess() -> None:
+    with pytest.raises(ConfigurationError, match=r"no price of z1d\.large") as caught:
+        bill_of(SETTINGS.replace(cloud={"instance_type": "z1d.large"}), PRICES)
+
+    assert "cloud prices --refresh" in caught.value.hint
+
+
+def test_a_line_is_rounded_to_a_cent() -> None:
+    assert CostLine(box="monitor", what="x", count=3, unit="h", price=0.0049).amount == 0.01

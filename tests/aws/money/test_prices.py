@@ -3,28 +3,29 @@
 from __future__ import annotations
 
 import json
+from datetime import date
 from pathlib import Path
 
 import pytest
 
-from rse_pf.aws.money.prices import load_prices
+from rse_pf.aws.money.prices import load_prices, operators_prices
 from rse_pf.errors import ConfigurationError
 
 
 def test_our_prices_say_when_and_where_they_held_and_who_read_them() -> None:
     prices = load_prices()
 
-    assert all((prices.as_of, prices.region, prices.currency, prices.source, prices.instance_type))
+    assert all((prices.as_of, prices.region, prices.currency, prices.source, prices.servers))
 
 
 def test_a_file_replaces_only_what_it_names(tmp_path: Path) -> None:
     file = tmp_path / "prices.json"
-    file.write_text(json.dumps({"region": "eu-central-1", "server_per_hour": 1}), encoding="utf-8")
+    file.write_text(json.dumps({"region": "eu-central-1", "endpoint_per_hour": 1}), encoding="utf-8")
 
     prices, ours = load_prices(file), load_prices()
 
-    assert (prices.region, prices.server_per_hour) == ("eu-central-1", 1.0)
-    assert prices.endpoint_per_hour == ours.endpoint_per_hour
+    assert (prices.region, prices.endpoint_per_hour) == ("eu-central-1", 1.0)
+    assert prices.balancer_per_hour == ours.balancer_per_hour
 
 
 @pytest.mark.parametrize(
@@ -33,10 +34,13 @@ def test_a_file_replaces_only_what_it_names(tmp_path: Path) -> None:
         (b"", "holds no prices"),
         (b"[1]", "holds no prices"),
         (b"[" * 100_000, "holds no prices"),
-        (b'{"server_per_day": 1}', "server_per_day"),
-        (b'{"server_per_hour": "1"}', "server_per_hour"),
-        (b'{"server_per_hour": -1}', "server_per_hour"),
-        (b'{"server_vcpus": 0}', "server_vcpus"),
+        (b'{"endpoint_per_day": 1}', "endpoint_per_day"),
+        (b'{"endpoint_per_hour": "1"}', "endpoint_per_hour"),
+        (b'{"endpoint_per_hour": -1}', "endpoint_per_hour"),
+        (b'{"servers": {"a.large": {"vcpus": 0, "per_hour": 1, "spot_per_hour": 1}}}', "vcpus"),
+        (b'{"servers": 1}', "servers"),
+        (b'{"as_of": "2025-02-31"}', "day"),
+        (b'{"as_of": "lately"}', "as_of"),
         (b'{"command_cpu_ms": 0}', "command_cpu_ms"),
     ],
 )
@@ -48,9 +52,43 @@ def test_a_bad_file_is_one_line_and_a_hint(tmp_path: Path, data: bytes, problem:
         load_prices(file)
 
     assert "\n" not in caught.value.message
-    assert "server_per_hour" in caught.value.hint
+    assert "endpoint_per_hour" in caught.value.hint
 
 
 def test_a_file_that_is_missing_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(ConfigurationError, match="cannot read"):
         load_prices(tmp_path / "nothing.json")
+
+
+def test_prices_that_nobody_checked_or_that_are_old_or_of_another_region_are_told() -> None:
+    ours = load_prices()
+    day = date.fromisoformat(ours.as_of)
+
+    (unverified,) = ours.warnings(today=day, region=ours.region)
+    stale = ours.warnings(today=date(day.year + 1, 1, 1), region=ours.region)
+    elsewhere = ours.warnings(today=day, region="eu-central-1")
+
+    assert unverified.startswith("UNVERIFIED: these prices")
+    assert [each.partition(":")[0] for each in stale] == ["UNVERIFIED", "STALE"]
+    assert [each.partition(":")[0] for each in elsewhere] == ["UNVERIFIED", "WRONG REGION"]
+
+
+def test_a_type_of_server_is_added_to_ours(tmp_path: Path) -> None:
+    file = tmp_path / "prices.json"
+    file.write_text('{"servers": {"x.large": {"vcpus": 2, "per_hour": 1, "spot_per_hour": 1}}}')
+
+    assert load_prices(file).servers.keys() == {*load_prices().servers, "x.large"}
+
+
+def test_the_operators_file_beside_the_settings_is_used_before_ours(tmp_path: Path) -> None:
+    assert operators_prices(None, tmp_path) == load_prices()
+    (tmp_path / "prices.json").write_text('{"endpoint_per_hour": 9}', encoding="utf-8")
+
+    assert operators_prices(None, tmp_path).endpoint_per_hour == 9
+
+
+@pytest.mark.parametrize(
+    ("kind", "vcpus"), [("c7i.large", 2), ("z1d.xlarge", 4), ("z1d.4xlarge", 16), ("z1d.medium", 2)]
+)
+def test_the_vcpus_of_an_unknown_type_follow_from_its_size(kind: str, vcpus: int) -> None:
+    assert load_prices().vcpus(kind) == vcpus
