@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 import pytest
+from emulated_aws import REGION, emulated_aws
 from hypothesis import HealthCheck, given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
@@ -44,7 +45,6 @@ STORES: dict[str, Callable[[Path], ObjectStore]] = {
     "memory": lambda folder: MemoryStore(),
 }
 """Every other store is added here; S3 comes with its emulator, in the fixture."""
-REGION = "ap-northeast-2"
 
 
 @pytest.fixture(params=[*STORES, "s3"])
@@ -55,10 +55,7 @@ def store(
     if request.param in STORES:
         yield STORES[request.param](tmp_path)
         return
-    moto = pytest.importorskip("moto", reason="the dev extra is not installed")
-    for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
-        monkeypatch.setenv(name, "testing")
-    with moto.mock_aws():
+    with emulated_aws(monkeypatch, request.node.nodeid):
         bucket = open_bucket("objects", REGION)
         make_client("s3", REGION).create_bucket(
             Bucket="objects", CreateBucketConfiguration={"LocationConstraint": REGION}

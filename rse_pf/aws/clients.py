@@ -7,6 +7,7 @@ first began.  Only errors that may be temporary are retried: lost connections, t
 from __future__ import annotations
 
 import functools
+import os
 import time
 from collections.abc import Callable
 from typing import Any, TypeVar
@@ -57,9 +58,15 @@ def make_client(service: str, region: str) -> Any:
         read_timeout=_READ_S,
         retries={"total_max_attempts": 1},
         signature_version="s3v4" if service == "s3" else None,
-        s3={"addressing_style": "virtual"} if service == "s3" else None,
+        s3={"addressing_style": _addressing()} if service == "s3" else None,
     )
     return session.create_client(service, region_name=region, config=config)
+
+
+def _addressing() -> str:
+    """Return how the address names a bucket: in the host at AWS, in the path where an emulator is named."""
+    is_named = any(os.environ.get(name) for name in ("AWS_ENDPOINT_URL_S3", "AWS_ENDPOINT_URL"))
+    return "path" if is_named else "virtual"
 
 
 @functools.cache

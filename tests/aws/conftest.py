@@ -1,19 +1,15 @@
-"""An emulated AWS in this process."""
+"""An emulated AWS."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
 import pytest
-
-REGION = "ap-northeast-2"
+from emulated_aws import REGION, emulated_aws
 
 
 @pytest.fixture
-def region(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+def region(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     """A region in which nothing is yet."""
-    moto = pytest.importorskip("moto", reason="the dev extra is not installed")
-    for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
-        monkeypatch.setenv(name, "testing")
-    with moto.mock_aws():
+    with emulated_aws(monkeypatch, request.node.nodeid):
         yield REGION

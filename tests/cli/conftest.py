@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from emulated_aws import REGION, emulated_aws
 
 from rse_pf.aws.account import Account
 from rse_pf.aws.clients import make_client
@@ -24,7 +25,6 @@ def platform(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return folder
 
 
-REGION = "ap-northeast-2"
 ROWS = (
     ("SigningKey8FF1", "AWS::SecretsManager::Secret", "signing-key"),
     ("Artifacts1F2E", "AWS::S3::Bucket", "artifacts"),
@@ -44,13 +44,12 @@ class Formation:
 
 
 @pytest.fixture
-def cloud(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+def cloud(
+    request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[Any]:
     """A deployment without keys; the S3 client that sees its buckets."""
-    moto = pytest.importorskip("moto", reason="the dev extra is not installed")
     monkeypatch.chdir(tmp_path)
-    for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
-        monkeypatch.setenv(name, "testing")
-    with moto.mock_aws():
+    with emulated_aws(monkeypatch, request.node.nodeid):
         s3 = make_client("s3", REGION)
         for name in ("artifacts", "audit-logs"):
             s3.create_bucket(Bucket=name, CreateBucketConfiguration={"LocationConstraint": REGION})

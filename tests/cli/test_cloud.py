@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from emulated_aws import emulated_aws
 
 from rse_pf.aws.account import Account
 from rse_pf.aws.clients import make_client
@@ -36,12 +37,9 @@ def nobody(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 
 
 @pytest.fixture
-def emulator(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """An account in this process."""
-    moto = pytest.importorskip("moto", reason="the dev extra is not installed")
-    for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
-        monkeypatch.setenv(name, "testing")
-    with moto.mock_aws():
+def emulator(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """An account in this process, or on LocalStack."""
+    with emulated_aws(monkeypatch, request.node.nodeid):
         yield
 
 

@@ -120,12 +120,16 @@ def test_the_status_shows_what_a_running_agent_publishes(
     machine.text = "rse_pf_robots 7\n"
     config = AgentConfig(group=GROUP, hook="h", keys_name="k", keys_file=tmp_path / "keys.json")
     clients = {"cloudwatch": make_client("cloudwatch", region), "autoscaling": FakeScaling(machine)}
-    Agent(
+    agent = Agent(
         AgentContext(
             machine=machine, clients=clients, config=config, artifacts=MemoryStore(), settings=SETTINGS,
             log=lambda event, **fields: None, clock=machine.clock, sleep=machine.sleep,
+            wall_clock=machine.wall_clock,
         )
-    ).step()  # fmt: skip
+    )  # fmt: skip
+    agent.step()
+    machine.sleep(60.0)
+    agent.step()
 
     group = read_group(open_account(region), SETTINGS, now=datetime.now(timezone.utc) + timedelta(minutes=1))
 
