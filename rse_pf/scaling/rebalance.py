@@ -9,12 +9,18 @@ from __future__ import annotations
 
 import heapq
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
-__all__ = ["MARGIN", "moves", "share"]
+__all__ = ["MARGIN", "MAX_PAUSE_S", "MoveOrder", "Totals", "moves", "order_of", "pause_after_s", "share"]
 
 MARGIN = 0.2
 """Crowded servers hand robots over until all are within this share of even."""
+MAX_PAUSE_S = 600.0
+"""The longest pause of a server whose robots do not move."""
+
+_STEADY_SHARE = 0.1
+"""Of all robots; sums that change by more from one period to the next are not acted on."""
 
 
 def moves(robots: Mapping[str, int], margin: float = MARGIN) -> dict[str, int]:
@@ -65,3 +71,51 @@ def _highest(total: int, servers: int, margin: float) -> int:
 
 def _lowest(total: int, servers: int, margin: float) -> int:
     return min(total // servers, math.ceil(total / servers * (1 - margin) - 1e-9))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Totals:
+    """Robots of all servers, and the number of servers, in the period that began at ``start_s``."""
+
+    start_s: float
+    robots: int
+    servers: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MoveOrder:
+    """Let *robots* robots move, spread over *spread_s*."""
+
+    robots: int
+    spread_s: float
+
+
+def order_of(mine: int, totals: Sequence[Totals], *, moves_per_s: float) -> MoveOrder | None:
+    """Return what a server with *mine* robots orders; None if nothing, or if the sums still change.
+
+    Args:
+        mine: Robots of this server now.
+        totals: Of whole periods, the newest first.
+        moves_per_s: ``scaling.moves_per_s``.
+    """
+    if len(totals) < 2 or not _is_steady(totals[0], totals[1]):
+        return None
+    robots = share(mine, totals[0].robots, totals[0].servers)
+    return MoveOrder(robots=robots, spread_s=round(robots / moves_per_s, 3)) if robots else None
+
+
+def pause_after_s(order: MoveOrder, *, within_s: float, failures: int) -> float:
+    """Return how long a server asks nobody after *order*.
+
+    Args:
+        order: The last one.
+        within_s: Time that a robot gets to move.
+        failures: Orders before it, in a row, after which the server had no robot less: such robots cannot
+            move, or the load balancer sends them back, and the pause doubles.
+    """
+    return min((order.spread_s + within_s) * 2.0**failures, MAX_PAUSE_S)
+
+
+def _is_steady(newest: Totals, before: Totals) -> bool:
+    changed = abs(newest.robots - before.robots)
+    return newest.servers == before.servers and changed <= max(2.0, _STEADY_SHARE * newest.robots)

@@ -23,7 +23,15 @@ from rse_pf.auth.control_token import ensure_control_token
 from rse_pf.aws.clients import make_client
 from rse_pf.aws.fleet.instance import Instance
 from rse_pf.aws.fleet.task import AgentConfig, AgentContext, Phase, Task
-from rse_pf.aws.fleet.tasks import access_control, audit, keys, lifecycle, server_metrics
+from rse_pf.aws.fleet.tasks import (
+    access_control,
+    audit,
+    keys,
+    lifecycle,
+    rebalancing,
+    server_metrics,
+    spot_notice,
+)
 from rse_pf.aws.storage.audit_archive import Shipper
 from rse_pf.aws.storage.s3_store import open_bucket
 from rse_pf.config import load_settings
@@ -36,10 +44,14 @@ TASKS: tuple[Callable[[AgentContext], Task], ...] = (
     lifecycle.task,
     keys.task,
     server_metrics.task,
+    rebalancing.task,
+    spot_notice.task,
     audit.task,
     access_control.task,
 )
 """The table, in the order of a step: one row and one module for each task."""
+
+_STEP_S = 1.0
 
 SERVICES = ("autoscaling", "cloudwatch")
 """The AWS services whose clients the tasks use, beside the buckets."""
@@ -131,7 +143,7 @@ def main(arguments: list[str] | None = None) -> int:
     agent.start_threads()
     while True:
         agent.step()
-        time.sleep(context.settings.cloud.poll_s)  # AWS does not notify an instance, so the agent polls
+        time.sleep(_STEP_S)
 
 
 def _context(args: argparse.Namespace) -> AgentContext:

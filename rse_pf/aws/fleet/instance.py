@@ -6,11 +6,13 @@ Only link-local and loopback addresses are used, with short timeouts.
 from __future__ import annotations
 
 import http.client
+import json
 import urllib.error
 import urllib.request
 from pathlib import Path
 
 from rse_pf.auth.control_token import bearer, read_control_token
+from rse_pf.aws.fleet.metrics import read_cpu_times
 from rse_pf.config.resource_names import READY_PATH
 from rse_pf.errors import Disconnected, UsageError
 
@@ -19,6 +21,7 @@ __all__ = ["IN_SERVICE", "TERMINATED", "WARMED", "Instance"]
 IN_SERVICE, TERMINATED, WARMED = "InService", "Terminated", "Warmed:"
 """Target lifecycle states; the last is what those of a warm pool begin with."""
 
+_STAT = Path("/proc/stat")
 _IMDS = "http://169.254.169.254/latest/"
 _TOKEN_TTL_S = "60"
 _TIMEOUT_S = 2.0
@@ -54,6 +57,29 @@ class Instance:
     def drain(self, wait_s: float) -> None:
         """Tell the server to drain after *wait_s*; raises Disconnected when no server runs."""
         self._ask(f"/drain?wait={wait_s:g}", "POST")
+
+    def move(self, robots: int, spread_s: float) -> int:
+        """Have the server ask *robots* of its robots to move within *spread_s*; return how many it asks.
+
+        Raises:
+            Disconnected: No server runs, or it drains.
+        """
+        told = json.loads(self._ask(f"/move?robots={robots}&spread_s={spread_s:g}", "POST"))
+        return int(told.get("robots", 0))
+
+    def cpu_times(self) -> tuple[float, float]:
+        """Return how long the machine's processors worked, and how long they were there; in ticks."""
+        return read_cpu_times(_STAT.read_text(encoding="ascii"))
+
+    def spot_notice(self) -> str:
+        """Return why AWS will take this instance back: ``interruption``, ``rebalance`` or nothing.
+
+        Raises:
+            Disconnected: The instance has no metadata.
+        """
+        if self._metadata("spot/instance-action") is not None:
+            return "interruption"
+        return "" if self._metadata("events/recommendations/rebalance") is None else "rebalance"
 
     def _ask(self, target: str, method: str) -> str:
         headers = {}

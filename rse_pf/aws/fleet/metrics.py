@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-__all__ = ["ROBOTS", "ServerMetrics", "datums", "dimensions_of", "read_page"]
+__all__ = ["ROBOTS", "ServerMetrics", "datums", "dimensions_of", "read_cpu_times", "read_page"]
 
 ROBOTS = "Robots"
 """The only metric that is also published for each server."""
@@ -65,6 +65,16 @@ def read_page(text: str) -> ServerMetrics:
         bytes_out=totals["bytes_total out"],
         answers=dict(answers),
     )
+
+
+def read_cpu_times(stat: str) -> tuple[float, float]:
+    """Return how long the processors worked and how long they were there, in ticks, from /proc/stat.
+
+    Time that the hypervisor took away counts as work, as in CPUUtilization of EC2.
+    """
+    user, nice, system, idle, waiting, *others = (float(each) for each in stat.splitlines()[0].split()[1:9])
+    busy = user + nice + system + sum(others)
+    return busy, busy + idle + waiting
 
 
 def dimensions_of(group: str, server: str = "") -> list[dict[str, str]]:

@@ -72,6 +72,7 @@ class AgentContext:
     log: Callable[..., None]
     shipper: Shipper | None = None
     clock: Callable[[], float] = time.monotonic
+    wall_clock: Callable[[], float] = time.time
     sleep: Callable[[float], None] = time.sleep
     state: AgentState = field(default_factory=AgentState)
 
@@ -82,7 +83,7 @@ class Task:
 
     Attributes:
         name: For the log.
-        period_s: Seconds between two calls; 0 is at every step, that is every ``cloud.poll_s``.
+        period_s: Seconds between two calls; 0 is at every step, that is every second.
         call: The work.
         phases: When it is called at all.
         flushes: Whether it is also called before an instance drains, and before its hook is completed.

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from typing import Any
 
 from botocore.exceptions import ClientError
 
 from rse_pf.errors import Disconnected
+
+WALL_S = float(int(time.time()) // 60 * 60)
+"""The wall clock of every machine at 120 s: the begin of this minute."""
 
 
 class FakeMachine:
@@ -21,6 +25,9 @@ class FakeMachine:
         self.target = "InService"
         self.text = ""
         self.waits: list[float] = []
+        self.moves: list[tuple[int, float]] = []
+        self.notice = ""
+        self.cpu = (0.0, 0.0)
         self._ends_after_s = ends_after_s
         self._ended_at_s = float("inf")
 
@@ -38,6 +45,21 @@ class FakeMachine:
 
     def is_ready(self) -> bool:
         return self.ready
+
+    def wall_clock(self) -> float:
+        """Return Unix seconds; a period of a minute ends at 120."""
+        return WALL_S + self.now_s - 120.0
+
+    def cpu_times(self) -> tuple[float, float]:
+        return self.cpu
+
+    def spot_notice(self) -> str:
+        return self.notice
+
+    def move(self, robots: int, spread_s: float) -> int:
+        self.page()
+        self.moves.append((robots, spread_s))
+        return robots
 
     def page(self) -> str:
         if not self.runs or self.now_s >= self._ended_at_s:

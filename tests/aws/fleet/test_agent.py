@@ -48,7 +48,7 @@ class AgentSetup:
                     group="rse-pf", hook="drain", launch_hook="launch", keys_name="keys.json",
                     keys_file=self.file,
                 ),
-                clock=self.machine.clock, sleep=self.machine.sleep,
+                clock=self.machine.clock, sleep=self.machine.sleep, wall_clock=self.machine.wall_clock,
                 log=lambda event, **fields: self.log.append((event, fields)),
             )
         )  # fmt: skip

@@ -17,7 +17,12 @@ __all__ = ["task"]
 
 def task(context: AgentContext) -> Task:
     """Ask where the instance is to go, and do once what each way needs."""
-    return Task(name="lifecycle", period_s=0.0, call=_Lifecycle(context).follow, phases=ALWAYS - {Phase.LEFT})
+    return Task(
+        name="lifecycle",
+        period_s=float(context.settings.cloud.poll_s),
+        call=_Lifecycle(context).follow,
+        phases=ALWAYS - {Phase.LEFT},
+    )
 
 
 class _Lifecycle:

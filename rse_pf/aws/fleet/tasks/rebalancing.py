@@ -1,0 +1,132 @@
+"""Move robots of this server when it has too many, so that a new server relieves those who are connected.
+
+No agent knows the other servers.  Each reads from CloudWatch how many robots all servers have, and how many
+servers published that; `rse_pf.scaling.rebalance.share` says how many of its own are too many.  Nothing moves
+while these numbers still change, and moves do not change them, so the agents need not agree.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import datetime, timedelta, timezone
+from typing import Any
+
+from rse_pf.aws.clients import call_api
+from rse_pf.aws.fleet.metrics import ROBOTS, dimensions_of, read_page
+from rse_pf.aws.fleet.task import AgentContext, Phase, Task
+from rse_pf.errors import Disconnected
+from rse_pf.scaling.alarms import NAMESPACE
+from rse_pf.scaling.profile import cadence_of
+from rse_pf.scaling.rebalance import MoveOrder, Totals, order_of, pause_after_s
+
+__all__ = ["LATE_S", "read_totals", "task"]
+
+LATE_S = 8.0
+"""Numbers of a period are read so long after its end: a second for the agents, a few for CloudWatch."""
+
+_PERIODS = 4
+
+
+def task(context: AgentContext) -> Task:
+    """Read the sums once in each period, and order the server to move what is too much."""
+    return Task(
+        name="rebalancing",
+        period_s=0.0,
+        call=_Rebalancing(context).follow,
+        phases=frozenset({Phase.SERVING}),
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Asked:
+    """The last order, and how many robots the server had then."""
+
+    order: MoveOrder
+    robots: int
+    failures: int = 0
+
+
+class _Rebalancing:
+    def __init__(self, context: AgentContext) -> None:
+        self._context = context
+        self._period_s = cadence_of(context.settings.scaling).period_s
+        self._period = -1
+        self._quiet_until_s = -math.inf
+        self._asked: _Asked | None = None
+
+    def follow(self) -> None:
+        """Look once in each period, and not while the robots of the last order still move."""
+        context = self._context
+        period = int((context.wall_clock() - LATE_S) // self._period_s)
+        if period == self._period or context.clock() < self._quiet_until_s:
+            return
+        self._period = period
+        try:
+            robots = int(read_page(context.machine.page()).robots)
+        except Disconnected:
+            return  # no server runs, and the task that publishes says so
+        if robots == 0:
+            return  # saves the request, which is charged
+        totals = read_totals(
+            context.clients["cloudwatch"], context.config.group, self._period_s, period * self._period_s
+        )
+        self._order(robots, totals)
+
+    def _order(self, robots: int, totals: Sequence[Totals]) -> None:
+        context = self._context
+        order = order_of(robots, totals, moves_per_s=context.settings.scaling.moves_per_s)
+        if order is None:
+            self._asked = None
+            return
+        asked = context.machine.move(order.robots, order.spread_s)
+        failures = 0 if self._asked is None else self._asked.failures
+        stayed = self._asked is not None and robots >= self._asked.robots
+        self._asked = _Asked(order=order, robots=robots, failures=failures + 1 if stayed else 0)
+        within_s = context.settings.serving.drain_within_ms / 1e3
+        pause_s = pause_after_s(order, within_s=within_s, failures=self._asked.failures)
+        self._quiet_until_s = context.clock() + pause_s
+        newest = totals[0]
+        context.log(
+            "rebalance", robots=asked, of=robots, all_robots=newest.robots, servers=newest.servers,
+            pause_s=round(pause_s, 1),
+        )  # fmt: skip
+
+
+def read_totals(cloudwatch: Any, group: str, period_s: int, end_s: float) -> tuple[Totals, ...]:
+    """Return the robots and the servers of the newest periods before *end_s*, the newest first.
+
+    Args:
+        cloudwatch: A boto3 client.
+        group: Name of the Auto Scaling group.
+        period_s: Length of a period.
+        end_s: Unix seconds, a multiple of *period_s*.
+
+    Raises:
+        ConfigurationError: AWS refused.
+        StoreError: AWS does not answer.
+    """
+    end = datetime.fromtimestamp(end_s, timezone.utc)
+    metric = {"Namespace": NAMESPACE, "MetricName": ROBOTS, "Dimensions": dimensions_of(group)}
+    told = call_api(
+        cloudwatch, "get_metric_data", ScanBy="TimestampDescending", EndTime=end,
+        StartTime=end - timedelta(seconds=_PERIODS * period_s),
+        MetricDataQueries=[
+            {"Id": identity, "MetricStat": {"Metric": metric, "Period": period_s, "Stat": stat}}
+            for identity, stat in (("robots", "Sum"), ("servers", "SampleCount"))
+        ],
+    )  # fmt: skip
+    found = {
+        row["Id"]: {
+            int(at.timestamp()): float(value)
+            for at, value in zip(row["Timestamps"], row["Values"], strict=False)
+        }
+        for row in told["MetricDataResults"]
+    }
+    robots, servers = found.get("robots", {}), found.get("servers", {})
+    return tuple(
+        Totals(start_s=float(at), robots=round(robots[at]), servers=round(servers[at]))
+        for at in sorted(robots, reverse=True)
+        if at in servers
+    )

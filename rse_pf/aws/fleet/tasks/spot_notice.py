@@ -1,0 +1,37 @@
+"""Drain the server when AWS announces that it takes the instance back: a Spot interruption or its forecast.
+
+The notice comes two minutes before the interruption, the recommendation to rebalance usually earlier; the
+group then starts another instance (`stacks.capacity`).  Robots move within seconds, and the machine stays
+idle until it is taken or the group ends it.
+"""
+
+from __future__ import annotations
+
+from rse_pf.aws.fleet.drain_hook import drain_server
+from rse_pf.aws.fleet.task import AgentContext, Phase, Task
+
+__all__ = ["LOOK_EVERY_S", "task"]
+
+LOOK_EVERY_S = 2.0
+"""A drain begins within this, a step of the agent and a request: less than 5 s after the notice."""
+
+
+def task(context: AgentContext) -> Task:
+    """Look for a notice every two seconds, where there are Spot instances, and drain once."""
+
+    def follow() -> None:
+        if not context.settings.cloud.spot:
+            return
+        notice = context.machine.spot_notice()
+        if not notice:
+            return
+        context.log("spot-notice", notice=notice)
+        context.state.phase = Phase.LEAVING
+        context.state.flush()
+        drained = drain_server(
+            context.machine, settings=context.settings, clock=context.clock, sleep=context.sleep
+        )
+        context.state.flush()
+        context.log("drained", drained=drained)
+
+    return Task(name="spot-notice", period_s=LOOK_EVERY_S, call=follow, phases=frozenset({Phase.SERVING}))
