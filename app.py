@@ -39,7 +39,7 @@ def build(app: cdk.App, settings: PlatformSettings, assets: Path) -> dict[str, c
     serverless = ServerlessStack(app, names.stack("Serverless"), assets=assets, **common())
     observability = ObservabilityStack(app, names.stack("Observability"), **common())
     for reader, providers in (
-        (backend, [network, data]), (serverless, [data]), (observability, [backend]),
+        (backend, [network, data]), (serverless, [data]), (observability, [backend, data]),
     ):  # fmt: skip
         for provider in providers:
             reader.add_stack_dependency(provider)

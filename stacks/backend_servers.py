@@ -1,7 +1,12 @@
 """The backend servers of Fig. 2: an Auto Scaling group of Debian machines without a route to the internet.
 
 They boot from one package in S3, whose digest is in the template.  There is no SSH and no public address;
-IMDSv2 is limited to one hop.  An instance that the load balancer finds unhealthy is replaced.
+IMDSv2 is limited to one hop.  An instance that the load balancer finds unhealthy is replaced, and one that
+does not tell that it is ready never joins.
+
+A deployment makes a new version of the launch template and moves no server: the group keeps the version that
+the stack's parameter `VERSION_PARAMETER` names.  Only rse-pf cloud upgrade changes it, after it has replaced
+the servers.
 """
 
 from __future__ import annotations
@@ -20,18 +25,18 @@ from aws_cdk import aws_s3_assets as s3_assets
 from aws_cdk import aws_sns as sns
 from constructs import Construct
 
+from rse_pf.aws.fleet.launch_hook import retry_within_s
 from rse_pf.config import PlatformSettings
-from rse_pf.config.resource_names import AUDIT_PREFIX, ResourceNames
+from rse_pf.config.resource_names import AUDIT_PREFIX, VERSION_PARAMETER, ResourceNames
 from rse_pf.scaling.alarms import NAMESPACE
-from stacks.findings import acknowledge
+from stacks.capacity import Capacity
+from stacks.permissions import allow
 
 __all__ = ["BackendServers"]
 
 _BOOT = Path(__file__).parent / "boot" / "first_boot.py"
-_MAPS_FINDING = "IAM5[Resource::arn:aws:s3:::<DataMaps>/*]"
-_AUDIT_FINDING = f"IAM5[Resource::arn:aws:s3:::<DataAuditLogs>/{AUDIT_PREFIX}/*]"
+_STORE = "rse_pf/aws/storage/s3_store.py:S3Store"
 _GIB = 8
-_START_S = 300
 
 
 class BackendServers(Construct):
@@ -69,7 +74,8 @@ class BackendServers(Construct):
                 {
                     "package": package.s3_object_url, "sha256": package_sums, "region": settings.cloud.region,
                     "bucket": artifacts.bucket_name, "keys": key_set, "group": names.group,
-                    "hook": names.drain_hook,
+                    "hook": names.drain_hook, "launch": names.launch_hook,
+                    "retry_s": f"{retry_within_s(settings):g}",
                     "store": f"s3:{maps.bucket_name}" if maps is not None else settings.data.store,
                     "audit": audit_logs.bucket_name,
                 },
@@ -81,14 +87,19 @@ class BackendServers(Construct):
             default_instance_warmup=cdk.Duration.seconds(scaling.warm_up_s),
             group_metrics=[autoscaling.GroupMetrics.all()],
             notifications=[autoscaling.NotificationConfiguration(topic=topic)],
-            update_policy=autoscaling.UpdatePolicy.rolling_update(
-                max_batch_size=1, min_instances_in_service=scaling.min_servers,
-                pause_time=cdk.Duration.seconds(settings.health.grace_s + _START_S),
-            ),
         )  # fmt: skip
-        cast("autoscaling.CfnAutoScalingGroup", self.group.node.default_child).target_group_arns = [
-            each.target_group_arn for each in targets
-        ]
+        Capacity(self, "Capacity", group=self.group, settings=settings)
+        resource = cast("autoscaling.CfnAutoScalingGroup", self.group.node.default_child)
+        resource.target_group_arns = [each.target_group_arn for each in targets]
+        # In the group itself: a hook of its own would come after the first instances.
+        resource.lifecycle_hook_specification_list = [
+            autoscaling.CfnAutoScalingGroup.LifecycleHookSpecificationProperty(
+                lifecycle_hook_name=names.launch_hook,
+                lifecycle_transition="autoscaling:EC2_INSTANCE_LAUNCHING",
+                heartbeat_timeout=settings.cloud.boot_s, default_result="ABANDON",
+            )
+        ]  # fmt: skip
+        self._keep_version(resource)
         self.group.add_lifecycle_hook(
             "Drain", lifecycle_hook_name=names.drain_hook,
             lifecycle_transition=autoscaling.LifecycleTransition.INSTANCE_TERMINATING,
@@ -96,43 +107,55 @@ class BackendServers(Construct):
             default_result=autoscaling.DefaultResult.CONTINUE,
         )  # fmt: skip
 
+    def _keep_version(self, resource: autoscaling.CfnAutoScalingGroup) -> None:
+        """Name the version of the launch template by a parameter, whose value a deployment keeps."""
+        version = cdk.CfnParameter(
+            cdk.Stack.of(self), VERSION_PARAMETER, default="1", allowed_pattern="[1-9][0-9]*",
+            description="launch template of the servers; rse-pf cloud upgrade changes it",
+        )  # fmt: skip
+        path = "LaunchTemplate"
+        if resource.mixed_instances_policy is not None:
+            path = "MixedInstancesPolicy.LaunchTemplate.LaunchTemplateSpecification"
+        resource.add_property_override(f"{path}.Version", version.value_as_string)
+
     def _role(self, package: s3_assets.Asset, artifacts: s3.IBucket) -> iam.Role:
         role = iam.Role(self, "Role", assumed_by=iam.ServicePrincipal("ec2.amazonaws.com"))
-        role.add_to_policy(
-            iam.PolicyStatement(
-                actions=["s3:GetObject"], resources=[package.bucket.arn_for_objects(package.s3_object_key)]
-            )
-        )
-        # Without it S3 answers "forbidden" for a key set that is not there yet, instead of "not found".
-        role.add_to_policy(iam.PolicyStatement(actions=["s3:ListBucket"], resources=[artifacts.bucket_arn]))
-        role.add_to_policy(
-            iam.PolicyStatement(
-                actions=["cloudwatch:PutMetricData"], resources=["*"],
-                conditions={"StringEquals": {"cloudwatch:namespace": NAMESPACE}},
-            )
+        allow(
+            role, ["s3:GetObject"], [package.bucket.arn_for_objects("*.zip")],
+            used_by="stacks/boot/first_boot.py:asked",
+            why="servers of the version before boot from the package before; a digest says what may run",
         )  # fmt: skip
-        acknowledge(
-            role, "PutMetricData knows no resources; the condition allows one namespace", "IAM5[Resource::*]"
-        )
+        # Without it S3 answers "forbidden" for a key set that is not there yet, instead of "not found".
+        allow(role, ["s3:ListBucket"], [artifacts.bucket_arn], used_by=f"{_STORE}._get")
+        allow(
+            role, ["cloudwatch:PutMetricData"], ["*"],
+            conditions={"StringEquals": {"cloudwatch:namespace": NAMESPACE}},
+            used_by="rse_pf/aws/fleet/tasks/server_metrics.py:_Publisher.publish",
+            why="PutMetricData knows no resources; the condition allows one namespace",
+        )  # fmt: skip
+        allow(
+            role, ["cloudwatch:GetMetricData"], ["*"],
+            used_by="rse_pf/aws/fleet/tasks/rebalancing.py:read_totals",
+            why="GetMetricData knows neither resources nor conditions; it reads numbers only",
+        )  # fmt: skip
         return role
 
     def _allow_objects(self, maps: s3.IBucket) -> None:
         """Allow the servers and the data service beside them to read and write robots' objects and maps."""
-        objects = maps.arn_for_objects("*")
-        actions = ["s3:GetObject", "s3:PutObject", "s3:DeleteObject"]
-        self.role.add_to_policy(iam.PolicyStatement(actions=actions, resources=[objects]))
-        self.role.add_to_policy(iam.PolicyStatement(actions=["s3:ListBucket"], resources=[maps.bucket_arn]))
-        acknowledge(self.role, "names of objects are digests, which nobody knows beforehand", _MAPS_FINDING)
+        allow(
+            self.role, ["s3:GetObject", "s3:PutObject", "s3:DeleteObject"], [maps.arn_for_objects("*")],
+            used_by=(f"{_STORE}._get", f"{_STORE}._write", f"{_STORE}.delete"),
+            why="names of objects are digests, which nobody knows beforehand",
+        )  # fmt: skip
+        allow(self.role, ["s3:ListBucket"], [maps.bucket_arn], used_by=f"{_STORE}._pages")
 
     def _allow_audit(self, audit_logs: s3.IBucket) -> None:
         """Allow the servers to write pieces of the audit log under new names; not to read, list or delete."""
-        self.role.add_to_policy(
-            iam.PolicyStatement(
-                actions=["s3:PutObject"], resources=[audit_logs.arn_for_objects(f"{AUDIT_PREFIX}/*")],
-                conditions={"Null": {"s3:if-none-match": "false"}},
-            )
+        allow(
+            self.role, ["s3:PutObject"], [audit_logs.arn_for_objects(f"{AUDIT_PREFIX}/*")],
+            conditions={"Null": {"s3:if-none-match": "false"}}, used_by=f"{_STORE}._write",
+            why="names hold the instance's id and a digest; no name twice",
         )  # fmt: skip
-        acknowledge(self.role, "names hold the instance's id and a digest; no name twice", _AUDIT_FINDING)
 
     def _template(
         self,

@@ -13,11 +13,11 @@ from constructs import Construct
 
 from rse_pf.config import PlatformSettings
 from rse_pf.config.resource_names import DENY_NAME, KEYS_NAME, ROBOTS_NAME, ResourceNames
-from stacks.assets import WHEELHOUSE, staged, sums_digest
+from stacks.assets import SERVERS, staged, sums_digest
 from stacks.backend_servers import BackendServers
-from stacks.findings import acknowledge
 from stacks.load_balancer import LoadBalancer
 from stacks.network_stack import CIDR, ZONES
+from stacks.permissions import allow
 from stacks.scale_modifier import ScaleModifier
 from stacks.values import imported_bucket, imported_group, imported_network, provide
 
@@ -52,7 +52,10 @@ class BackendStack(cdk.Stack):
         # A topic with a policy of its own forgets the one that lets the account's alarms in.
         self.topic.add_to_resource_policy(
             iam.PolicyStatement(
-                principals=[iam.ServicePrincipal("cloudwatch.amazonaws.com")], actions=["sns:Publish"],
+                principals=[
+                    iam.ServicePrincipal(f"{each}.amazonaws.com") for each in ("cloudwatch", "budgets")
+                ],
+                actions=["sns:Publish"],
                 resources=[self.topic.topic_arn],
                 conditions={"StringEquals": {"aws:SourceAccount": self.account}},
             )
@@ -62,7 +65,7 @@ class BackendStack(cdk.Stack):
             logs=imported_bucket(self, names, "access-logs"),
         )  # fmt: skip
         with tempfile.TemporaryDirectory() as folder:
-            path = staged(assets, WHEELHOUSE, settings, Path(folder))
+            path = staged(assets, SERVERS, settings, Path(folder))
             package, sums = s3_assets.Asset(self, "Package", path=str(path)), sums_digest(path)
         self.servers = BackendServers(
             self, "Servers", vpc=vpc, firewall_group=imported_group(self, names, "servers"), package=package,
@@ -71,31 +74,24 @@ class BackendStack(cdk.Stack):
             maps=imported_bucket(self, names, "maps") if settings.data.enabled else None,
             audit_logs=imported_bucket(self, names, "audit-logs"), key_set=KEYS_NAME,
         )  # fmt: skip
-        self.servers.role.add_to_policy(
-            iam.PolicyStatement(
-                actions=["s3:GetObject"], resources=[artifacts.arn_for_objects(name) for name in TRUSTED]
-            )
-        )
+        allow(
+            self.servers.role, ["s3:GetObject"], [artifacts.arn_for_objects(name) for name in TRUSTED],
+            used_by="rse_pf/aws/storage/s3_store.py:S3Store._get",
+        )  # fmt: skip
         group = self.servers.group
         # By name, not by reference: a reference would make a cycle with the group.
-        self.servers.role.add_to_policy(
-            iam.PolicyStatement(
-                actions=["autoscaling:CompleteLifecycleAction"],
-                resources=[
-                    self.format_arn(
-                        service="autoscaling", resource="autoScalingGroup",
-                        resource_name=f"*:autoScalingGroupName/{names.group}",
-                        arn_format=cdk.ArnFormat.COLON_RESOURCE_NAME,
-                    )
-                ],
-            )
+        allow(
+            self.servers.role, ["autoscaling:CompleteLifecycleAction"],
+            [
+                self.format_arn(
+                    service="autoscaling", resource="autoScalingGroup",
+                    resource_name=f"*:autoScalingGroupName/{names.group}",
+                    arn_format=cdk.ArnFormat.COLON_RESOURCE_NAME,
+                )
+            ],
+            used_by=("rse_pf/aws/fleet/launch_hook.py:complete_hook", "stacks/boot/first_boot.py:abandon"),
+            why="the ARN of an Auto Scaling group holds an id that only AWS knows",
         )  # fmt: skip
-        finding = (
-            f"IAM5[Resource::arn:aws:autoscaling:{self.region}:<AWS::AccountId>:autoScalingGroup:*"
-            f":autoScalingGroupName/{names.group}]"
-        )
-        reason = "the ARN of an Auto Scaling group holds an id that only AWS knows"
-        acknowledge(self.servers.role, reason, finding)
         ScaleModifier(
             self, "ScaleModifier", group_name=group.auto_scaling_group_name, topic_arn=self.topic.topic_arn,
             settings=settings,

@@ -11,10 +11,12 @@ from aws_cdk import aws_iam as iam
 from aws_cdk import aws_logs as logs
 from constructs import Construct
 
+from rse_pf.aws.money.costs import endpoint_services, zone_count
 from rse_pf.config import PlatformSettings
 from rse_pf.config.resource_names import ResourceNames
 from stacks.findings import acknowledge
-from stacks.firewall import Firewall, front_port, inner_ports
+from stacks.firewall import Firewall, front_port, inner_ports, live_range
+from stacks.permissions import BY_AWS, LOG_ACTIONS, explain
 from stacks.values import provide, provide_network
 
 __all__ = ["CIDR", "ZONES", "NetworkStack"]
@@ -24,19 +26,6 @@ CIDR = "10.20.0.0/16"
 ZONES = 2
 """That the network spans; a load balancer needs two."""
 
-_MINIMAL = {
-    "Monitoring": ec2.InterfaceVpcEndpointAwsService.CLOUDWATCH_MONITORING,
-    "AutoScaling": ec2.InterfaceVpcEndpointAwsService.AUTOSCALING,
-    "Logs": ec2.InterfaceVpcEndpointAwsService.CLOUDWATCH_LOGS,
-}
-_ENDPOINTS = {
-    "minimal": _MINIMAL,
-    "full": {
-        **_MINIMAL,
-        "Ssm": ec2.InterfaceVpcEndpointAwsService.SSM,
-        "Secrets": ec2.InterfaceVpcEndpointAwsService.SECRETS_MANAGER,
-    },
-}
 _FIRST_ANSWER_PORT, _LAST_PORT = 1024, 65535
 _HTTPS = 443
 _WHY_LISTS = "the paper's firewall has access control lists (Sect. 3.1); they stand behind security groups"
@@ -78,10 +67,12 @@ class NetworkStack(cdk.Stack):
                 resources=["*"], conditions={"StringEquals": {"aws:ResourceAccount": self.account}},
             )
         )  # fmt: skip
-        for name, service in _ENDPOINTS[settings.cloud.endpoints].items():
+        for service in endpoint_services(settings):
             self.vpc.add_interface_endpoint(
-                name, service=service, open=False, security_groups=[self.firewall.endpoints]
-            )
+                service.capitalize(), service=ec2.InterfaceVpcEndpointAwsService(service), open=False,
+                security_groups=[self.firewall.endpoints],
+                subnets=ec2.SubnetSelection(subnets=self.vpc.isolated_subnets[: zone_count(settings)]),
+            )  # fmt: skip
         self._control_lists(settings)
         self._flow_logs(settings)
         names = ResourceNames(settings.cloud.name)
@@ -112,6 +103,10 @@ class NetworkStack(cdk.Stack):
         for at, port in enumerate(inner_ports(settings)):
             traffic = ec2.AclTraffic.tcp_port(port)
             self._entry(back, f"Balancer{at}", 100 + at, inside, traffic, inward=True)
+        live = live_range(settings)
+        if live is not None:
+            traffic = ec2.AclTraffic.tcp_port_range(live[0], live[-1])
+            self._entry(back, "LiveMaps", 105, inside, traffic, inward=True)
         https = ec2.AclTraffic.tcp_port(_HTTPS)
         self._entry(back, "Endpoints", 110, inside, https, inward=True)
         self._entry(back, "Answers", 120, anywhere, answers, inward=True)
@@ -134,4 +129,8 @@ class NetworkStack(cdk.Stack):
     def _flow_logs(self, settings: PlatformSettings) -> None:
         group = logs.LogGroup(self, "FlowLog", removal_policy=cdk.RemovalPolicy.DESTROY)
         cast("logs.CfnLogGroup", group.node.default_child).retention_in_days = settings.cloud.log_days
-        self.vpc.add_flow_log("Flow", destination=ec2.FlowLogDestination.to_cloud_watch_logs(group))
+        flow = self.vpc.add_flow_log("Flow", destination=ec2.FlowLogDestination.to_cloud_watch_logs(group))
+        explain(
+            flow, [*LOG_ACTIONS, "logs:DescribeLogStreams", "iam:PassRole"],
+            used_by=f"{BY_AWS}the VPC delivers its flow logs to this log group",
+        )  # fmt: skip

@@ -1,30 +1,37 @@
-"""Monitoring for the operator: one dashboard, with the paper's Fig. 8, and alarms with a runbook each.
+"""Monitoring for the operator: a dashboard of the boxes of Fig. 2, alarms with a runbook each, and a budget.
 
-The alarms here notify people; they do not scale the group.
+The alarms here notify people; they do not scale the group.  What they measure is in
+`rse_pf.scaling.operator_alarms`.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import aws_cdk as cdk
+from aws_cdk import aws_budgets as budgets
 from aws_cdk import aws_cloudwatch as cloudwatch
-from aws_cdk import aws_cloudwatch_actions as actions
-from aws_cdk import aws_sns as sns
 from constructs import Construct
 
 from rse_pf.config import PlatformSettings
 from rse_pf.config.resource_names import ResourceNames
 from rse_pf.scaling.alarms import NAMESPACE
+from rse_pf.scaling.operator_alarms import OperatorAlarm, Series, operator_alarms
 from stacks.values import read
 
 __all__ = ["ObservabilityStack"]
 
 _WIDTH = 12
-_ALB = "AWS/ApplicationELB"
-_PERIODS = 3
+_ALB, _EC2, _GROUP, _LAMBDA, _S3 = (
+    "AWS/ApplicationELB", "AWS/EC2", "AWS/AutoScaling", "AWS/Lambda", "AWS/S3",
+)  # fmt: skip
+_BUDGET_ACTUAL_PERCENT, _BUDGET_FORECAST_PERCENT = 80, 100
+
+Dimensions = Mapping[str, str]
 
 
 class ObservabilityStack(cdk.Stack):
-    """Dashboard and operator alarms; it reads the ARNs that the backend stack provides."""
+    """Dashboard, operator alarms and budget; it reads what the backend and data stacks provide."""
 
     def __init__(
         self,
@@ -38,47 +45,159 @@ class ObservabilityStack(cdk.Stack):
         super().__init__(scope, construct_id, env=env, synthesizer=synthesizer)
         names = ResourceNames(settings.cloud.name)
         self._period = cdk.Duration.seconds(settings.scaling.period_s)
-        group = {"AutoScalingGroupName": names.group}
-        robots = {
-            "LoadBalancer": _after(read(self, names, "backend/balancer"), ":loadbalancer/"),
-            "TargetGroup": cdk.Fn.select(5, cdk.Fn.split(":", read(self, names, "backend/robots"))),
+        balancer = {"LoadBalancer": _after(read(self, names, "backend/balancer"), ":loadbalancer/")}
+        robots = cdk.Fn.select(5, cdk.Fn.split(":", read(self, names, "backend/robots")))
+        self._dimensions: dict[str, Dimensions] = {
+            "group": {"AutoScalingGroupName": names.group},
+            "balancer": balancer,
+            "targets": {**balancer, "TargetGroup": robots},
+            "firewall": {"WebACL": names.firewall, "Region": settings.cloud.region, "Rule": "ALL"},
+            "function": {"FunctionName": names.function},
+            "canary": {"FunctionName": names.canary},
+            "maps": {"BucketName": read(self, names, "data/maps"), "StorageType": "StandardStorage"},
         }
-        topic = sns.Topic.from_topic_arn(self, "Events", read(self, names, "backend/topic"))
-        unhealthy = self._metric(_ALB, "UnHealthyHostCount", "Average", robots)
-        errors = self._metric(_ALB, "HTTPCode_Target_5XX_Count", "Sum", robots)
-        rows = {
-            "CPU (Fig. 8)": [self._metric("AWS/EC2", "CPUUtilization", "Average", group)],
-            "Bandwidth (Fig. 8)": [
-                self._metric("AWS/EC2", name, "Sum", group) for name in ("NetworkIn", "NetworkOut")
-            ],
-            "Servers": [self._metric(_ALB, "HealthyHostCount", "Average", robots), unhealthy],
-            "Robots": [self._metric(NAMESPACE, "Robots", "Sum", group)],
-            "Requests": [self._metric(NAMESPACE, "Requests", "Sum", group)],
-            "Queue": [self._metric(NAMESPACE, "QueueMs", "Maximum", group)],
-            "Answers, p95": [self._metric(NAMESPACE, "AnswerMs", "p95", group)],
-        }
+        topic = read(self, names, "backend/topic")
+        self._dashboard(names, settings)
+        for alarm in operator_alarms(settings):
+            self._alarm(alarm, names, topic)
+        if settings.cloud.budget_per_month:
+            self._budget(names, settings.cloud.budget_per_month, topic)
+
+    def _dashboard(self, names: ResourceNames, settings: PlatformSettings) -> None:
+        """Show each box of Fig. 2 in a row of its own, with what it does and what is wrong with it."""
+        of = self._metric
+        rows: dict[str, dict[str, list[cloudwatch.IMetric]]] = {
+            "Firewall": {
+                "Requests blocked and allowed": [
+                    of("firewall", "AWS/WAFV2", name, "Sum")
+                    for name in ("BlockedRequests", "AllowedRequests")
+                ],
+                "Handshakes that servers refused (4xx)": [
+                    of("targets", _ALB, "HTTPCode_Target_4XX_Count", "Sum")
+                ],
+            },
+            "Load balancer": {
+                "Robots' connections": [
+                    of("balancer", _ALB, name, "Sum")
+                    for name in ("ActiveConnectionCount", "NewConnectionCount")
+                ],
+                "5xx of the balancer and of the servers": [
+                    of("balancer", _ALB, "HTTPCode_ELB_5XX_Count", "Sum"),
+                    of("targets", _ALB, "HTTPCode_Target_5XX_Count", "Sum"),
+                ],
+            },
+            "Backend servers": {
+                "CPU (Fig. 8)": [of("group", _EC2, "CPUUtilization", "Average")],
+                "Bandwidth (Fig. 8)": [
+                    of("group", _EC2, name, "Sum") for name in ("NetworkIn", "NetworkOut")
+                ],
+                "Robots and requests": [
+                    of("group", NAMESPACE, name, "Sum") for name in ("Robots", "Requests")
+                ],
+                "Queue, and answers' p95": [
+                    of("group", NAMESPACE, "QueueMs", "Maximum"), of("group", NAMESPACE, "AnswerMs", "p95"),
+                ],
+            },
+            "Monitor": {
+                "Reports of the agents": [of("group", NAMESPACE, "Robots", "SampleCount")],
+                "Serverless PnP": [
+                    of("function", _LAMBDA, name, "Sum") for name in ("Invocations", "Errors", "Throttles")
+                ],
+            },
+            "Scale modifier": {
+                "Servers wanted and in service": [
+                    of("group", _GROUP, name, "Average")
+                    for name in ("GroupDesiredCapacity", "GroupInServiceInstances")
+                ],
+                "Servers healthy and unhealthy": [
+                    of("targets", _ALB, "HealthyHostCount", "Minimum"),
+                    of("targets", _ALB, "UnHealthyHostCount", "Maximum"),
+                ],
+            },
+            "Data servers": {
+                "Objects and maps, bytes": [
+                    of("maps", _S3, "BucketSizeBytes", "Average", period=cdk.Duration.days(1))
+                ],
+            },
+        }  # fmt: skip
+        if settings.cloud.canary:
+            rows["Monitor"]["Canary"] = [
+                of("canary", _LAMBDA, "Duration", "p95"), of("canary", _LAMBDA, "Errors", "Sum"),
+            ]  # fmt: skip
         board = cloudwatch.Dashboard(self, "Dashboard", dashboard_name=names.dashboard)
-        board.add_widgets(
-            *(
-                cloudwatch.GraphWidget(title=title, left=series, width=_WIDTH)
-                for title, series in rows.items()
+        for box, graphs in rows.items():
+            board.add_widgets(cloudwatch.TextWidget(markdown=f"# {box}", width=2 * _WIDTH, height=1))
+            board.add_widgets(
+                *(
+                    cloudwatch.GraphWidget(title=title, left=series, width=_WIDTH)
+                    for title, series in graphs.items()
+                )
             )
-        )
-        for name, metric, threshold in (("unhealthy", unhealthy, 1), ("errors", errors, 1)):
-            alarm = cloudwatch.Alarm(
-                self, name.capitalize(), alarm_name=names.alarm(name), metric=metric, threshold=threshold,
-                evaluation_periods=_PERIODS,
-                alarm_description=f"runbook: docs/operations.md#{name}",
-                treat_missing_data=cloudwatch.TreatMissingData.NOT_BREACHING,
-            )  # fmt: skip
-            alarm.add_alarm_action(actions.SnsAction(topic))
 
     def _metric(
-        self, namespace: str, name: str, statistic: str, dimensions: dict[str, str]
+        self, source: str, namespace: str, name: str, statistic: str, *, period: cdk.Duration | None = None
     ) -> cloudwatch.Metric:
         return cloudwatch.Metric(
-            namespace=namespace, metric_name=name, statistic=statistic, period=self._period,
-            dimensions_map=dimensions,
+            namespace=namespace, metric_name=name, statistic=statistic, period=period or self._period,
+            dimensions_map=self._dimensions[source],
+        )  # fmt: skip
+
+    def _alarm(self, alarm: OperatorAlarm, names: ResourceNames, topic: str) -> None:
+        queries = [
+            cloudwatch.CfnAlarm.MetricDataQueryProperty(
+                id=series.name, return_data=False,
+                metric_stat=cloudwatch.CfnAlarm.MetricStatProperty(
+                    period=alarm.period_s, stat=series.statistic, metric=self._series(series)
+                ),
+            )
+            for series in alarm.series
+        ]  # fmt: skip
+        verdict = cloudwatch.CfnAlarm.MetricDataQueryProperty(
+            id="verdict", expression=alarm.expression, return_data=True
+        )
+        identity = "".join(word.capitalize() for word in alarm.name.split("-"))
+        cloudwatch.CfnAlarm(
+            self, identity, alarm_name=names.alarm(alarm.name),
+            alarm_description=f"{alarm.meaning}; runbook: docs/operations.md#{alarm.name}",
+            metrics=[*queries, verdict], comparison_operator=alarm.comparison, threshold=alarm.threshold,
+            evaluation_periods=alarm.periods, datapoints_to_alarm=alarm.datapoints,
+            treat_missing_data=alarm.missing, alarm_actions=[topic], ok_actions=[topic],
+        )  # fmt: skip
+
+    def _series(self, series: Series) -> cloudwatch.CfnAlarm.MetricProperty:
+        return cloudwatch.CfnAlarm.MetricProperty(
+            namespace=series.namespace, metric_name=series.metric,
+            dimensions=[
+                cloudwatch.CfnAlarm.DimensionProperty(name=name, value=value)
+                for name, value in self._dimensions[series.source].items()
+            ],
+        )  # fmt: skip
+
+    def _budget(self, names: ResourceNames, usd: float, topic: str) -> None:
+        """Tell the topic when the account's month has cost, or will cost, too much.
+
+        Of the whole account: AWS tells costs apart by a tag only after the tag was activated by hand.
+        """
+        budgets.CfnBudget(
+            self, "Budget",
+            budget=budgets.CfnBudget.BudgetDataProperty(
+                budget_name=names.budget, budget_type="COST", time_unit="MONTHLY",
+                budget_limit=budgets.CfnBudget.SpendProperty(amount=usd, unit="USD"),
+            ),
+            notifications_with_subscribers=[
+                budgets.CfnBudget.NotificationWithSubscribersProperty(
+                    notification=budgets.CfnBudget.NotificationProperty(
+                        notification_type=kind, comparison_operator="GREATER_THAN",
+                        threshold=percent, threshold_type="PERCENTAGE",
+                    ),
+                    subscribers=[
+                        budgets.CfnBudget.SubscriberProperty(subscription_type="SNS", address=topic)
+                    ],
+                )
+                for kind, percent in (
+                    ("ACTUAL", _BUDGET_ACTUAL_PERCENT), ("FORECASTED", _BUDGET_FORECAST_PERCENT),
+                )
+            ],
         )  # fmt: skip
 
 

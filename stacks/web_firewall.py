@@ -32,16 +32,16 @@ class WebFirewall(Construct):
         self, scope: Construct, construct_id: str, *, alb_arn: str, settings: PlatformSettings
     ) -> None:
         super().__init__(scope, construct_id)
-        prefix = ResourceNames(settings.cloud.name).prefix
+        names = ResourceNames(settings.cloud.name)
         acl = wafv2.CfnWebACL(
-            self, "Acl", scope="REGIONAL", visibility_config=_seen(f"{prefix}-waf"),
+            self, "Acl", scope="REGIONAL", visibility_config=_seen(names.firewall),
             default_action=wafv2.CfnWebACL.DefaultActionProperty(allow={}),
             custom_response_bodies={
                 _BODY: wafv2.CfnWebACL.CustomResponseBodyProperty(
                     content=json.dumps(_TOLD), content_type="APPLICATION_JSON"
                 )
             },
-            rules=[_rule(prefix, place, rule) for place, rule in enumerate(rate_rules(settings))],
+            rules=[_rule(names.prefix, place, rule) for place, rule in enumerate(rate_rules(settings))],
         )  # fmt: skip
         wafv2.CfnWebACLAssociation(self, "OfAlb", resource_arn=alb_arn, web_acl_arn=acl.attr_arn)
 

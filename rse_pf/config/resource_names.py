@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 __all__ = [
     "AUDIT_PREFIX",
+    "BUDGET_NAME",
     "DENY_NAME",
     "DEPLOYMENT_TAG",
     "HEALTH_PATH",
@@ -17,6 +18,9 @@ __all__ = [
     "READY_PATH",
     "ROBOTS_NAME",
     "ROSBRIDGE_PATH",
+    "SERVICES_PREFIX",
+    "STACKS",
+    "VERSION_PARAMETER",
     "ResourceNames",
 ]
 
@@ -34,8 +38,16 @@ ROBOTS_NAME = "control/robots.json"
 """Of the roster beside it: who is enrolled."""
 DENY_NAME = "control/deny.json"
 """Of the deny-list beside it: who is refused."""
+SERVICES_PREFIX = "services"
+"""Of the published services in the artifact bucket: their list and their archives."""
+BUDGET_NAME = "burst/budget.json"
+"""Of the object of the artifact bucket that counts the commands of the burst function of a day."""
+VERSION_PARAMETER = "ServersVersion"
+"""Of the backend stack: the version of the launch template that the servers run."""
 AUDIT_PREFIX = "audit"
 """Of the pieces of audit logs in their bucket."""
+STACKS = ("Network", "Data", "Serverless", "Backend", "Observability")
+"""The boxes that are stacks, in an order in which they can be deployed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,6 +88,31 @@ class ResourceNames:
     def dashboard(self) -> str:
         """Return the name of the dashboard."""
         return self.prefix
+
+    @property
+    def firewall(self) -> str:
+        """Return the name of the metrics of the web firewall."""
+        return f"{self.prefix}-waf"
+
+    @property
+    def function(self) -> str:
+        """Return the name of the function that computes poses."""
+        return f"{self.prefix}-pnp"
+
+    @property
+    def canary(self) -> str:
+        """Return the name of the function that asks for a known pose, and of its robot."""
+        return f"{self.prefix}-canary"
+
+    @property
+    def budget(self) -> str:
+        """Return the name of the budget."""
+        return f"{self.prefix}-budget"
+
+    @property
+    def parked(self) -> str:
+        """Return the name of the SSM parameter that exists while the deployment is parked."""
+        return self.parameter("parked")
 
     def stack(self, box: str) -> str:
         """Return the name of the stack *box*, such as ``RsePf-lab-Backend``."""

@@ -19,6 +19,7 @@ from rse_pf.config.profiles import with_profile
 from rse_pf.config.validation import (
     WHERE,
     SettingRow,
+    check_buckets,
     check_burst_url,
     check_deployment,
     check_origin,
@@ -120,6 +121,7 @@ class SessionSettings:
     reconnect_long_max_s: float = setting(120.0, unit="s", doc="longest reconnect back-off after minutes without a connection", low=0.01)
     dial_burst: int = setting(20, unit="dials", doc="attempts to connect that a robot may make at once; the firewall's limit follows", low=1)
     dials_per_minute: float = setting(10.0, unit="dials/min", doc="attempts to connect of a robot after the burst; the firewall's limit follows", low=1)
+    region_hold_s: float = setting(60.0, unit="s", doc="a robot with several addresses changes to another region that has been clearly nearer for this long", low=0.1)
     answer_timeout_s: float = setting(5.0, unit="s", doc="deadline of a command that sets none", low=0.05)
     stall_timeout_s: float = setting(1.0, unit="s", doc="the client reconnects when a command is unanswered and nothing arrived for this long", low=0.05)
 
@@ -188,7 +190,7 @@ class DataSettings:
     presigned_url_ttl_s: int = setting(300, unit="s", doc="validity of a presigned URL of the bucket", low=10, high=300)
     background_bytes_per_s: int = setting(262144, unit="bytes/s", doc="rate at which a robot uploads keyframes in the background", low=1024)
     max_spool_bytes: int = setting(1073741824, unit="bytes", doc="keyframes that a robot keeps on its disk while it is offline", low=1024)
-    glacier_after_days: int = setting(90, unit="days", source="paper, Sect. 5.1", doc="maps move to Glacier", low=30)
+    glacier_after_days: int = setting(90, unit="days", source="paper, Sect. 5.1", doc="what was not written for this long moves to Glacier Instant Retrieval, which is read like any object", low=30)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -207,6 +209,7 @@ class ServiceSettings:
     """Services that the operator installs; each robot has a sandbox of its own."""
 
     folder: str = setting("", doc="folder of installed services; empty means none")
+    follow: bool = setting(False, doc="the services folder is a link that changes while the server runs: load it anew when the control port is told to, and serve without what cannot be loaded")
     published: bool = setting(False, doc="also run the services that installed Python packages publish (entry points rse_pf.services)")
     max_sandboxes: int = setting(64, doc="sandboxes of one server", low=1)
     memory_bytes: int = setting(536870912, unit="bytes", doc="memory of one sandbox: its address space and its scratch folder together", low=16777216)
@@ -300,7 +303,6 @@ class CloudSettings:
     spot: bool = setting(False, doc="servers above on_demand_servers are Spot instances, which AWS may take back within two minutes")
     on_demand_servers: int = setting(1, unit="servers", doc="servers that are never Spot instances", low=0, high=1000)
     image_parameter: str = setting("/aws/service/debian/release/12/latest/amd64", doc="SSM parameter that names the machine image", source="Debian's public parameter")
-    endpoints: str = setting("minimal", doc="interface endpoints: minimal (monitoring, autoscaling, logs) or full (also ssm, secretsmanager)", choices=("minimal", "full"))
     profile: str = setting("standard", doc="small: one zone for servers and endpoints, and one server of a small type unless you set these; see docs/operations.md", choices=("standard", "small"))
     canary: bool = setting(True, doc="a function that asks for one known pose through the load balancer every minute, and an alarm")
     budget_per_month: float = setting(0.0, unit="USD", doc="cost of the account in a month above which the topic of alarms is told; 0 is off", low=0)
@@ -316,6 +318,9 @@ class CloudSettings:
     lambda_concurrency: int = setting(20, doc="concurrent executions of the serverless PnP", low=1)
     log_days: int = setting(30, unit="days", doc="retention of logs", low=1)
     audit_ship_s: int = setting(60, unit="s", doc="time between two uploads of a server's audit log; a machine that fails loses at most this much", low=5, high=3600)
+    deleted_days: int = setting(30, unit="days", doc="an object of the map or artifact bucket that was overwritten or deleted can be restored for this long", low=1)
+    replica_maps: str = setting("", doc="map buckets of deployments in other regions, with spaces between; new versions of maps are copied there")
+    replica_artifacts: str = setting("", doc="artifact buckets of deployments in other regions, with spaces between; public keys, roster, deny list and published services are copied there")
     audit_days: int = setting(365, unit="days", doc="an audit log in the bucket cannot be changed or deleted for this long, and is then deleted", low=1)
 
 
@@ -411,6 +416,8 @@ def _check_contradictions(s: PlatformSettings) -> None:
         check_origin("serving.allowed_origins", origin)
     check_elasticity(s.scaling, s.cloud)
     check_deployment(s.cloud.name, s.cloud.bootstrap_qualifier)
+    for name in ("replica_maps", "replica_artifacts"):
+        check_buckets(f"cloud.{name}", getattr(s.cloud, name))
     _check_live_ports(s)
     if not s.cloud.allow_insecure and not (s.cloud.certificate_arn and s.cloud.domain_name):
         raise SettingsError(

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 from rse_pf.config import PlatformSettings
 from rse_pf.scaling.alarms import NAMESPACE
+from rse_pf.scaling.profile import cadence_of
 
 __all__ = ["LAMBDA_TIMEOUT_S", "OperatorAlarm", "Series", "Source", "operator_alarms"]
 
@@ -91,6 +92,7 @@ _BLOCKED = Series(
 def operator_alarms(settings: PlatformSettings) -> tuple[OperatorAlarm, ...]:
     """Return the alarms of a deployment with *settings*."""
     floor, slow_ms = settings.scaling.min_servers, LAMBDA_TIMEOUT_S * 1e3 * _SLOW_SHARE
+    samples = _LONG_PERIOD_S // cadence_of(settings.scaling).period_s
     alarms = [
         OperatorAlarm(
             name="few-servers",
@@ -124,7 +126,8 @@ def operator_alarms(settings: PlatformSettings) -> tuple[OperatorAlarm, ...]:
             name="silent-agent",
             meaning="a server in service publishes no metrics: its agent is down, or cannot reach AWS",
             series=(_REPORTS, _SERVING),
-            expression="IF(FILL(reports, 0) < FILL(serving, 0), 1, 0)",
+            # Each server reports once in a sample; half of the reports of one server may be late.
+            expression=f"IF(FILL(reports, 0) < (FILL(serving, 0) - 0.5) * {samples}, 1, 0)",
             period_s=_LONG_PERIOD_S,
             periods=2,
             datapoints=2,

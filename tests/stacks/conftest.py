@@ -18,12 +18,14 @@ INSECURE = PlatformSettings()
 PUBLIC = PlatformSettings.from_dict(
     {
         "cloud": {
-            "allow_insecure": False, "domain_name": "robots.example.org", "endpoints": "full",
+            "allow_insecure": False, "domain_name": "robots.example.org", "budget_per_month": 300.0,
             "certificate_arn": "arn:aws:acm:ap-northeast-2:111122223333:certificate/a",
+            "replica_maps": "maps-in-virginia maps-in-ireland", "replica_artifacts": "artifacts-in-virginia",
         },
         "data": {"enabled": True},
         "scaling": {
             "busy_cpu_percent": 60.0, "max_servers": 7, "min_servers": 3, "idle_s": 420, "max_queue_ms": 40,
+            "profile": "fast",
         },
         "serving": {"port": 9001, "control_port": 9002},
     }
@@ -56,7 +58,7 @@ class Assembly:
 
 def stub_assets(folder: Path) -> Path:
     """Make packages that are there, and nothing more."""
-    for name in ("wheelhouse", "lambda"):
+    for name in ("servers", "lambda"):
         (folder / name).mkdir(parents=True)
         (folder / name / "package.txt").write_text(name, encoding="utf-8")
     return folder

@@ -85,25 +85,13 @@ def test_alarms_of_this_account_may_publish_to_the_topic_and_nobody_without_tls(
     statements = assembly.one("AWS::SNS::TopicPolicy")["PolicyDocument"]["Statement"]
     allowed = [each for each in statements if each["Effect"] == "Allow"]
 
-    assert [each["Principal"] for each in allowed] == [{"Service": "cloudwatch.amazonaws.com"}]
+    assert [each["Principal"] for each in allowed] == [
+        {"Service": ["budgets.amazonaws.com", "cloudwatch.amazonaws.com"]}
+    ]
     assert allowed[0]["Condition"] == {"StringEquals": {"aws:SourceAccount": {"Ref": "AWS::AccountId"}}}
     assert [each["Condition"] for each in statements if each["Effect"] == "Deny"] == [
         {"Bool": {"aws:SecureTransport": "false"}}
     ]
-
-
-def test_parts_of_an_upload_that_was_not_completed_are_removed_after_a_day(assembly: Any) -> None:
-    rules = [
-        rule
-        for bucket in assembly.all("AWS::S3::Bucket")
-        for rule in bucket.get("LifecycleConfiguration", {}).get("Rules", [])
-    ]
-
-    assert [
-        rule["AbortIncompleteMultipartUpload"]["DaysAfterInitiation"]
-        for rule in rules
-        if "Transitions" in rule
-    ] == [1]
 
 
 def test_no_role_may_do_anything_to_everything_but_publish_numbers(assembly: Assembly) -> None:
@@ -387,7 +375,7 @@ def test_missing_packages_are_one_line_and_a_hint(tmp_path: Path) -> None:
     from stacks.assets import staged
 
     with pytest.raises(ConfigurationError) as told:
-        staged(tmp_path / "build", "wheelhouse", PlatformSettings(), tmp_path)
+        staged(tmp_path / "build", "servers", PlatformSettings(), tmp_path)
 
     assert told.value.hint == "run make assets"
     assert "\n" not in told.value.message

@@ -15,6 +15,7 @@ from typing import Literal
 from rse_pf.aws.fleet.metrics import ServerMetrics, datums
 from rse_pf.aws.money.prices import Prices
 from rse_pf.config import PlatformSettings
+from rse_pf.config.front_door import rate_rules
 from rse_pf.scaling.alarms import alarms_of
 from rse_pf.scaling.operator_alarms import operator_alarms
 
@@ -39,8 +40,6 @@ HOURS = 730.0
 NOT_INCLUDED = (
     "taxes, data out to the robots (the same for both), stored maps and logs, savings plans, the free tier"
 )
-FIREWALL_RULES = 1
-"""Rules of the web ACL; tests/stacks/test_money.py compares them with the template."""
 VOLUME_GB = 8
 """Of a server."""
 
@@ -300,7 +299,7 @@ def _front_lines(settings: PlatformSettings, prices: Prices, load: Load) -> Iter
         ("load balancer", _UNITS, 0 if not units else units / prices.balancer_unit_per_hour * hours,
          "h", prices.balancer_unit_per_hour),
         ("firewall", "web ACL", 1, "", prices.firewall_per_month),
-        ("firewall", "its rules", FIREWALL_RULES, "rules", prices.firewall_rule_per_month),
+        ("firewall", "its rules", len(rate_rules(settings)), "rules", prices.firewall_rule_per_month),
         *(
             (box, f"endpoint of {service}, in {zone_count(settings)} zone(s)",
              zone_count(settings) * HOURS, "h", prices.endpoint_per_hour)
