@@ -27,6 +27,7 @@ lock release release build
 lock browser browser
 lock foxglove foxglove
 lock ros ros-dds
+lock batch batch build
 # A client of the conformance table, which the platform itself does not need.
 # shellcheck disable=SC2086
 .venv/bin/uv pip compile tests/clients/rosbridge.in --quiet --universal --python-version 3.10 \

@@ -86,6 +86,10 @@ EXTRAS: dict[str, Extra] = {
         modules={"gtsam": "gtsam", "small_gicp": "small_gicp", "faiss": "faiss-cpu"},
         enables="merging maps, localising in maps, clouds",
     ),
+    "batch": Extra(
+        modules=_same("distributed"), enables="merges in parts, by several processes or machines",
+        includes=("maps", "keys"),
+    ),
     "view": Extra(modules=_same("viser"), enables="maps in the browser", includes=("demo",)),
     "experiments": Extra(modules=_same("matplotlib"), enables="figures of experiments", includes=("local",)),
     "aws": Extra(modules=_same("boto3"), enables="everything with --cloud, stores in S3"),
@@ -145,6 +149,8 @@ VERBS_NEED: dict[str, tuple[str, ...]] = {
     "settings": (),
     "doctor": (),
     "errors": (),
+    "batch": (),
+    "batch run": ("batch",),
     "replay": ("record", "solver"),
     "replay --html": ("local",),
 }

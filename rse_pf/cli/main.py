@@ -37,6 +37,7 @@ VERBS = {
     "data": "run the data service: images, keyframes, clouds and maps by HTTP",
     "camera": "calibrate a camera, print a board for it, check what it gives",
     "map": "show, merge, localise in, roll back and export the maps that robots share",
+    "batch": "merge maps that outgrow one process, in parts that survive a crash",
     "replay": "explain a bad pose from a recording, and solve recorded commands again",
     "audit": "show the audit log of robots and changes, and check that it is unchanged",
     "cloud": "check the platform on AWS: doctor, cost, status, leftovers",

@@ -15,7 +15,7 @@ from rse_pf.config import PlatformSettings, settings_page
 
 EMPTY = [
     "demo", "experiment", "local", "fleet", "swarm", "token", "robot", "service", "serve", "data",
-    "camera", "map", "replay", "audit", "cloud", "settings", "doctor", "errors",
+    "camera", "map", "batch", "replay", "audit", "cloud", "settings", "doctor", "errors",
 ]  # fmt: skip
 HELP_S = 0.3
 

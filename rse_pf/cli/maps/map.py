@@ -26,7 +26,7 @@ import re
 import threading
 import time
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -39,19 +39,19 @@ from rse_pf.aws.storage import open_data_store
 from rse_pf.cli.maps.bags import BAG_ACTIONS, BAG_FORMAT, add_bag_actions, export_bag, run_bags
 from rse_pf.cli.maps.from_camera import add_from_camera_arguments, run_from_camera
 from rse_pf.cli.maps.live import add_live_arguments, run_live, run_publish
+from rse_pf.cli.maps.merge_output import commit_merge, merge_progress
 from rse_pf.config import PlatformSettings
-from rse_pf.errors import CommandFailed, NotFound, UsageError
+from rse_pf.errors import NotFound, UsageError
 from rse_pf.files import replace_file
 from rse_pf.geometry import Camera, rotation_angle_deg, to_quaternion
 from rse_pf.local.state import state_folder
 from rse_pf.maps.export import FORMATS, export_map
 from rse_pf.maps.format import MapVersion
 from rse_pf.maps.registry import MapRecord, MapRegistry, difference
-from rse_pf.terminal import at_work, counted, show, show_json, show_progress
+from rse_pf.terminal import at_work, counted, show, show_json
 
 if TYPE_CHECKING:
     from rse_pf.services.mapping.localise import LocaliseReply
-    from rse_pf.services.mapping.merge import MergeReply
     from rse_pf.services.mapping.relative_pose import View
 
 __all__ = ["add_arguments", "run"]
@@ -298,50 +298,12 @@ def _merge(args: argparse.Namespace, maps: MapRegistry) -> int:
         maps=[maps.data(name, record.id) for (name, _), record in zip(names, records, strict=True)]
     )
     began = time.perf_counter()
-    reply = merge_maps(request, report=_progress)
+    reply = merge_maps(request, report=merge_progress)
     seconds = round(time.perf_counter() - began, 3)
-    not_joined = [(args.names[each.map], each.reason) for each in reply.not_joined]
-    if len(args.names) > 1 and len(reply.joined) < 2:
-        reasons = "; ".join(f"{name}: {reason}" for name, reason in not_joined)
-        raise CommandFailed(
-            f"no two of these maps can be joined, so nothing was written: {reasons}",
-            hint="record frames at places that another robot has seen, then merge again",
-        )
-    joined = [args.names[row] for row in reply.joined]
-    made = maps.commit(
-        args.into, reply.map, parent=parent, author="rse-pf map merge", created_s=time.time(),
-        note=args.note or f"merged {', '.join(joined)}",
+    return commit_merge(
+        reply, maps, args.names, into=args.into, parent=parent, author="rse-pf map merge",
+        note=args.note, seconds=seconds, as_json=args.json,
     )  # fmt: skip
-    refused = _refused(args.names, reply)
-    _print(
-        args,
-        {
-            "name": args.into,
-            "id": made.id,
-            "number": made.number,
-            "joined": joined,
-            "not_joined": [{"map": name, "reason": reason} for name, reason in not_joined],
-            "refused": refused,
-            "links": reply.merges,
-            "loops": reply.loops,
-            "seconds": seconds,
-        },
-        f"{args.into} is now version {made.number}, {made.id[:12]}: {counted(made.keyframes, 'keyframe')}, "
-        f"{counted(made.points, 'point')}, {counted(reply.merges, 'link')} between maps, "
-        f"{counted(reply.loops, 'loop')}",
-        *_rows(
-            ("joined", ", ".join(joined)),
-            *(("not joined", f"{name}: {reason}") for name, reason in not_joined),
-            *(
-                (
-                    "not linked",
-                    f"{each['between']}: " + ", ".join(f"{n} {why}" for why, n in each["reasons"].items()),
-                )
-                for each in refused
-            ),
-        ),
-    )
-    return 1 if not_joined else 0
 
 
 def _localise(args: argparse.Namespace, maps: MapRegistry) -> int:
@@ -531,22 +493,6 @@ def _location_line(found: dict[str, Any]) -> str:
         f"{start}  x {x:7.3f}  y {y:7.3f}  z {z:7.3f} m, turned {found['turned_deg']:6.2f} deg; "
         f"{found['inliers']} inliers, {found['rmse_px']:.2f} px, keyframes {keyframes}{reason}"
     )
-
-
-def _refused(names: Sequence[str], reply: MergeReply) -> list[dict[str, Any]]:
-    """Return the counts of pairs of keyframes that were not linked, by their maps and reasons."""
-    pairs: dict[str, dict[str, int]] = {}
-    for each in reply.refused:
-        between = " and ".join(dict.fromkeys(names[row] for row in each.maps))
-        if len(set(each.maps)) == 1:
-            between = f"within {between}"
-        pairs.setdefault(between, {})[each.reason] = each.count
-    return [{"between": between, "reasons": reasons} for between, reasons in pairs.items()]
-
-
-def _progress(done: float, what: str) -> None:
-    """Show how much of a merge is done, between 0 and 1, and what is being done."""
-    show_progress(f"{100 * done:3.0f} %  {what}", is_over=done >= 1.0)
 
 
 def _record_line(record: MapRecord) -> str:

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from rse_pf.geometry import Array, inverse, transform
 from rse_pf.maps.format import Keyframe, MapVersion
 
-__all__ = ["deform_clouds"]
+__all__ = ["Colours", "Points", "deform_cloud", "deform_clouds", "joined_cloud", "observers_of"]
 
 Points = npt.NDArray[np.float32]
 Colours = npt.NDArray[np.uint8]
@@ -35,26 +35,43 @@ def deform_clouds(
         T_world_camera: ``(n, 4, 4)``, their new poses.
         rows: Keyframes that are in the result.
     """
-    clouds, colours = [], []
+    clouds: list[Array] = []
+    colours: list[Colours] = []
     for which in np.unique(of_map[rows]).tolist():
         version = versions[which]
-        if not len(version.points):
-            continue
         own = [int(row) for row in rows if of_map[row] == which]
-        observer = _observer_of(np.asarray(version.points, dtype=np.float64), [keyframes[row] for row in own])
-        moved = np.empty((len(version.points), 3))
-        for place, row in enumerate(own):
-            mine = observer == place
-            correction = T_world_camera[row] @ inverse(keyframes[row].T_world_camera)
-            moved[mine] = transform(correction, version.points[mine].astype(np.float64))
-        clouds.append(moved)
-        colours.append(version.colours)
+        if len(version.points):
+            moved = T_world_camera[own]
+            clouds.append(deform_cloud(version.points, [keyframes[row] for row in own], moved))
+            colours.append(version.colours)
+    return joined_cloud(clouds, colours)
+
+
+def deform_cloud(points: Points, keyframes: Sequence[Keyframe], T_world_camera: Array) -> Array:
+    """Return ``(m, 3)`` *points* of one map, each moved like the keyframe that observed it.
+
+    Args:
+        points: ``(m, 3)``, metres, in the old world of the map.
+        keyframes: All *n* of the map, with their old poses.
+        T_world_camera: ``(n, 4, 4)``, their new poses.
+    """
+    observer = observers_of(np.asarray(points, dtype=np.float64), keyframes)
+    moved = np.empty((len(points), 3))
+    for place, keyframe in enumerate(keyframes):
+        mine = observer == place
+        correction = T_world_camera[place] @ inverse(keyframe.T_world_camera)
+        moved[mine] = transform(correction, points[mine].astype(np.float64))
+    return moved
+
+
+def joined_cloud(clouds: Sequence[Array], colours: Sequence[Colours]) -> tuple[Points, Colours]:
+    """Return moved clouds as one, with one point for each voxel."""
     if not clouds:
         return np.empty((0, 3), dtype=np.float32), np.empty((0, 3), dtype=np.uint8)
     return _thin(np.concatenate(clouds), np.concatenate(colours))
 
 
-def _observer_of(points: Array, keyframes: Sequence[Keyframe]) -> npt.NDArray[np.int64]:
+def observers_of(points: Array, keyframes: Sequence[Keyframe]) -> npt.NDArray[np.int64]:
     """Return for each point the keyframe that observed it at the smallest depth, else the nearest one."""
     best = np.full(len(points), np.inf)
     observer = np.zeros(len(points), dtype=np.int64)

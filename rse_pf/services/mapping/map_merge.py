@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import msgspec
@@ -16,91 +16,41 @@ import numpy as np
 import numpy.typing as npt
 
 from rse_pf.budget import PROVENANCE, check_msgpack
-from rse_pf.errors import BadRequest, LimitExceeded
+from rse_pf.errors import LimitExceeded
 from rse_pf.geometry import Array, inverse
-from rse_pf.maps.format import Edge, Keyframe, MapVersion
+from rse_pf.maps.format import Edge, MapVersion
 from rse_pf.service import Report
-from rse_pf.services.mapping.cloud_deform import deform_clouds
-from rse_pf.services.mapping.loop_consistency import LoopClosure, OdometryNoise, consistent
-from rse_pf.services.mapping.optimise import OptimiseOptions, ignore_progress, optimise_graph
-from rse_pf.services.mapping.place import PlaceIndex
+from rse_pf.services.mapping.cloud_deform import Colours, Points, deform_clouds
+from rse_pf.services.mapping.links import (
+    Atlas,
+    LoopProposals,
+    MergeOptions,
+    Refused,
+    agreeing_links,
+    maps_of,
+    propose_links,
+)
+from rse_pf.services.mapping.loop_consistency import LoopClosure, OdometryNoise
+from rse_pf.services.mapping.optimise import (
+    OptimisedGraph,
+    OptimiseOptions,
+    ignore_progress,
+    optimise_graph,
+)
 from rse_pf.services.mapping.pose_graph import PoseGraph
-from rse_pf.services.mapping.relative_pose import RelativePoseOptions, measure_relative_pose
 
-__all__ = ["Atlas", "LoopProposals", "MergeOptions", "MergedMap", "merge_versions", "propose_links"]
+__all__ = [
+    "Atlas",
+    "LoopProposals",
+    "MergeOptions",
+    "MergeSteps",
+    "MergedMap",
+    "merge_versions",
+    "propose_links",
+]
 
-_MAX_PAIRS = 500_000
-"""Keyframe pairs that may be tried; each takes some milliseconds."""
-_MIN_LOOP_LENGTH = 3
-"""Keyframes of one robot that are closer than this along its trajectory are not a loop."""
 _DRIFT = OdometryNoise(step_m=0.007, step_deg=0.5)
 """The drift of a tracker with depth; whether a loop may be true is judged by the larger default."""
-
-
-class MergeOptions(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """How to merge.
-
-    ``candidates`` other keyframes are tried for each keyframe and each map; two maps are joined by
-    ``min_links`` loops that agree with each other, or not at all; ``close_loops`` also looks for loops
-    within each map.
-
-    Raises:
-        BadRequest: A number is out of its range.
-    """
-
-    candidates: int = 6
-    min_inliers: int = 40
-    min_inlier_ratio: float = 0.5
-    min_links: int = 3
-    close_loops: bool = True
-    cauchy: float = 3.0
-
-    def __post_init__(self) -> None:
-        within = (
-            1 <= self.candidates <= 100 and self.min_inliers >= 12 and 0 < self.min_inlier_ratio <= 1
-            and self.min_links >= 1 and self.cauchy >= 0
-        )  # fmt: skip
-        if not within:
-            raise BadRequest("an option of merge is out of its range", hint="leave it out for the default")
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Atlas:
-    """The keyframes of all maps in one list, each map in its own world frame."""
-
-    keyframes: tuple[Keyframe, ...]
-    of_map: npt.NDArray[np.int64]
-    """``(n,)``: the map of each keyframe."""
-    order: npt.NDArray[np.int64]
-    """``(n,)``: index of each keyframe along the trajectory of its robot."""
-    T_world_camera: Array
-    """``(n, 4, 4)``."""
-    row_of: Mapping[tuple[int, int], int]
-    """Row of (map, id)."""
-
-    @classmethod
-    def of(cls, versions: Sequence[MapVersion]) -> Atlas:
-        """Return the atlas of *versions*, keyframes by map, robot and time."""
-        rows = [
-            (which, keyframe)
-            for which, version in enumerate(versions)
-            for keyframe in sorted(version.keyframes, key=lambda k: (k.robot, k.timestamp_s, k.id))
-        ]
-        return cls(
-            keyframes=tuple(keyframe for _, keyframe in rows),
-            of_map=np.array([which for which, _ in rows], dtype=np.int64),
-            order=np.arange(len(rows), dtype=np.int64),
-            T_world_camera=np.array([k.T_world_camera for _, k in rows], dtype=np.float64),
-            row_of={(which, k.id): row for row, (which, k) in enumerate(rows)},
-        )
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class LoopProposals:
-    """Links that PnP measured, and the number of keyframe pairs of two maps that failed, by reason."""
-
-    links: tuple[LoopClosure, ...]
-    failed: Counter[tuple[int, int, str]]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -117,12 +67,66 @@ class MergedMap:
     cost_after: float
 
 
+def _select(
+    atlas: Atlas, proposals: LoopProposals, options: MergeOptions
+) -> tuple[list[LoopClosure], Refused]:
+    """Return the links that agree, for each pair of maps, and the reasons for refusing the others."""
+    refused = Counter(proposals.failed)
+    groups: dict[tuple[int, int], list[LoopClosure]] = {}
+    for link in proposals.links:
+        groups.setdefault(maps_of(atlas, link.a, link.b), []).append(link)
+    accepted: list[LoopClosure] = []
+    for pair, links in sorted(groups.items()):
+        rows, reasons = agreeing_links(pair, links, atlas.T_world_camera, atlas.order, options)
+        accepted += [links[row] for row in rows]
+        refused.update(reasons)
+    return accepted, Counter({key: count for key, count in refused.items() if count})
+
+
+def _no_alignments(atlas: Atlas, placed: Array, links: Sequence[LoopClosure]) -> list[LoopClosure]:
+    return []
+
+
+def _optimise(graph: PoseGraph, of_map: npt.NDArray[np.int64], options: OptimiseOptions) -> OptimisedGraph:
+    return optimise_graph(graph, options)
+
+
+def _deform(
+    versions: Sequence[MapVersion], atlas: Atlas, poses: Array, rows: npt.NDArray[np.int64]
+) -> tuple[Points, Colours]:
+    return deform_clouds(versions, atlas.of_map, atlas.keyframes, poses, rows)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MergeSteps:
+    """The steps of a merge that take long; `rse_pf.batch` runs them in several processes.
+
+    Attributes:
+        propose: Returns measured links.
+        select: Returns the links that agree, and how many were refused by maps and reason.
+        align: Returns further links, found by aligning clouds with all maps at their ``(n, 4, 4)`` places.
+        optimise: Returns the poses of the graph; its second argument is the map of each pose.
+        deform: Returns the cloud of the maps of ``rows`` for the new ``(n, 4, 4)`` poses.
+    """
+
+    propose: Callable[[Atlas, MergeOptions, Report], LoopProposals] = propose_links
+    select: Callable[[Atlas, LoopProposals, MergeOptions], tuple[list[LoopClosure], Refused]] = field(
+        default=_select
+    )
+    align: Callable[[Atlas, Array, Sequence[LoopClosure]], list[LoopClosure]] = _no_alignments
+    optimise: Callable[[PoseGraph, npt.NDArray[np.int64], OptimiseOptions], OptimisedGraph] = _optimise
+    deform: Callable[[Sequence[MapVersion], Atlas, Array, npt.NDArray[np.int64]], tuple[Points, Colours]] = (
+        _deform
+    )
+
+
 def merge_versions(
     versions: Sequence[MapVersion],
     options: MergeOptions | None = None,
     *,
     report: Report = ignore_progress,
     propose: Callable[[Atlas, MergeOptions, Report], LoopProposals] | None = None,
+    steps: MergeSteps | None = None,
 ) -> MergedMap:
     """Merge *versions* into one map in the world frame of the first.
 
@@ -130,7 +134,8 @@ def merge_versions(
         versions: Maps with at least one keyframe each.
         options: ``None`` means the defaults.
         report: Called with the progress; may raise Cancelled.
-        propose: Proposes links; None means `propose_links`.
+        propose: Proposes links; None means the first of *steps*.
+        steps: The steps that take long; None means the functions of this package, in this process.
 
     Raises:
         MissingExtra: faiss, gtsam or a solver is not installed.
@@ -138,19 +143,22 @@ def merge_versions(
     """
     options = options or MergeOptions()
     atlas = Atlas.of(versions)
-    proposals = (propose or propose_links)(atlas, options, report)
-    accepted, refused = _select_consistent(atlas, proposals, options)
+    steps = steps or MergeSteps()
+    proposals = (propose or steps.propose)(atlas, options, report)
+    accepted, refused = steps.select(atlas, proposals, options)
     report(0.8, f"{len(accepted)} of {len(proposals.links)} links agree")
     placed, joined = _place(atlas, accepted, len(versions))
     kept = [link for link in accepted if {int(atlas.of_map[link.a]), int(atlas.of_map[link.b])} <= joined]
     rows = np.flatnonzero(np.isin(atlas.of_map, sorted(joined)))
     odometry = _odometry(atlas, versions, joined)
+    kept += steps.align(atlas, placed, kept)
     graph = _graph(atlas, placed, rows, odometry, kept)
-    found = optimise_graph(graph, OptimiseOptions(cauchy=options.cauchy))
+    found = steps.optimise(graph, atlas.of_map[rows], OptimiseOptions(cauchy=options.cauchy))
     report(0.95, "optimised")
     poses = placed.copy()
     poses[rows] = found.T_world_pose
-    version = _version(atlas, versions, poses, rows, odometry, kept)
+    points, colours = steps.deform(versions, atlas, poses, rows)
+    version = _version(atlas, versions, poses, rows, odometry, kept, points, colours)
     report(1.0, "merged")
     merges = sum(atlas.of_map[link.a] != atlas.of_map[link.b] for link in kept)
     return MergedMap(
@@ -168,100 +176,6 @@ def merge_versions(
     )  # fmt: skip
 
 
-def propose_links(atlas: Atlas, options: MergeOptions, report: Report = ignore_progress) -> LoopProposals:
-    """Measure the relative poses of keyframes that place recognition considers the same place.
-
-    Raises:
-        LimitExceeded: There may be more pairs than can be measured.
-    """
-    most = len(atlas.keyframes) * (int(atlas.of_map.max()) + 1) * options.candidates
-    if most > _MAX_PAIRS:
-        raise LimitExceeded(
-            f"up to {most} pairs of keyframes are above {_MAX_PAIRS}",
-            hint="merge fewer maps at once, or ask for fewer candidates",
-        )
-    index = PlaceIndex(atlas.keyframes)
-    pairs = _candidate_pairs(atlas, index, options)
-    pose_options = RelativePoseOptions(
-        min_inliers=options.min_inliers, min_inlier_ratio=options.min_inlier_ratio
-    )
-    links: list[LoopClosure] = []
-    failed: Counter[tuple[int, int, str]] = Counter()
-    for done, (a, b) in enumerate(pairs):
-        if done % 16 == 0:
-            report(0.1 + 0.7 * done / len(pairs), f"{done} of {len(pairs)} keyframe pairs")
-        measured = measure_relative_pose(atlas.keyframes[a], atlas.keyframes[b], pose_options)
-        if isinstance(measured, str):
-            one, other = _pair(atlas, a, b)
-            failed[one, other, measured] += 1
-        else:
-            links.append(
-                LoopClosure(
-                    a=a, b=b, T_a_b=measured.T_a_b, information=measured.information,
-                    inliers=measured.inliers, matches=measured.matches,
-                )
-            )  # fmt: skip
-    return LoopProposals(links=tuple(links), failed=failed)
-
-
-def _candidate_pairs(atlas: Atlas, index: PlaceIndex, options: MergeOptions) -> list[tuple[int, int]]:
-    pairs: set[tuple[int, int]] = set()
-    every = np.arange(len(atlas.keyframes))
-    for a in range(len(atlas.keyframes)):
-        for which in np.unique(atlas.of_map).tolist():
-            own = which == atlas.of_map[a]
-            if own and not options.close_loops:
-                continue
-            allowed = every[atlas.of_map == which]
-            if own:
-                allowed = allowed[np.abs(atlas.order[allowed] - atlas.order[a]) >= _MIN_LOOP_LENGTH]
-            for b, _ in index.nearest_to(index.vector(a), options.candidates, allowed):
-                pairs.add((min(a, b), max(a, b)))
-    return sorted(pairs)
-
-
-def _select_consistent(
-    atlas: Atlas, proposals: LoopProposals, options: MergeOptions
-) -> tuple[list[LoopClosure], Counter[tuple[int, int, str]]]:
-    """Return the links that agree, for each pair of maps, and the reasons for refusing the others."""
-    refused = Counter(proposals.failed)
-    groups: dict[tuple[int, int], list[LoopClosure]] = {}
-    for link in proposals.links:
-        groups.setdefault(_pair(atlas, link.a, link.b), []).append(link)
-    accepted: list[LoopClosure] = []
-    noise = OdometryNoise()
-    for (one, other), links in sorted(groups.items()):
-        if one == other:
-            # Within one map a loop must also agree with the odometry.
-            links = [link for link in links if _fits_odometry(atlas, link, noise)]
-            refused[one, other, "against-odometry"] += len(groups[one, other]) - len(links)
-        rows = consistent(links, atlas.T_world_camera, atlas.order, noise)
-        if one != other and len(rows) < options.min_links:
-            refused[one, other, "too-few-agree"] += len(links)
-            continue
-        accepted += [links[row] for row in rows]
-        refused[one, other, "inconsistent"] += len(links) - len(rows)
-    return accepted, Counter({key: count for key, count in refused.items() if count})
-
-
-def _fits_odometry(atlas: Atlas, link: LoopClosure, noise: OdometryNoise) -> bool:
-    """Return whether a loop differs from odometry by at most three sigma of its drift."""
-    predicted = inverse(atlas.T_world_camera[link.a]) @ atlas.T_world_camera[link.b]
-    off = inverse(link.T_a_b) @ predicted
-    walked = abs(int(atlas.order[link.a] - atlas.order[link.b])) + 2
-    rad = 3.0 * math.sqrt(3.0 * walked) * math.radians(noise.step_deg)
-    metres = 3.0 * math.sqrt(3.0 * walked) * noise.step_m + rad * _lever_m(atlas, link)
-    turned = math.acos(min(1.0, max(-1.0, (np.trace(off[:3, :3]) - 1.0) / 2.0)))
-    return bool(np.linalg.norm(off[:3, 3]) <= metres and turned <= rad)
-
-
-def _lever_m(atlas: Atlas, link: LoopClosure) -> float:
-    """Return the largest distance of the path between a link's ends from its end: the lever of rotations."""
-    low, high = sorted((link.a, link.b))
-    way = atlas.T_world_camera[low : high + 1, :3, 3]
-    return float(np.linalg.norm(way - way[-1], axis=1).max())
-
-
 def _place(atlas: Atlas, links: Sequence[LoopClosure], maps: int) -> tuple[Array, set[int]]:
     """Transform every map that is connected to map 0 into its world frame, pairs with most links first.
 
@@ -272,7 +186,7 @@ def _place(atlas: Atlas, links: Sequence[LoopClosure], maps: int) -> tuple[Array
     joined = {0}
     groups: dict[tuple[int, int], list[LoopClosure]] = {}
     for link in links:
-        one, other = _pair(atlas, link.a, link.b)
+        one, other = maps_of(atlas, link.a, link.b)
         if one != other:
             groups.setdefault((one, other), []).append(link)
     while True:
@@ -353,6 +267,8 @@ def _version(
     rows: npt.NDArray[np.int64],
     odometry: Sequence[tuple[LoopClosure, str]],
     links: Sequence[LoopClosure],
+    points: Points,
+    colours: Colours,
 ) -> MapVersion:
     """Return the merged map; ids are row numbers, the provenance has the original map and id of each."""
     place = {int(row): number for number, row in enumerate(rows)}
@@ -361,7 +277,6 @@ def _version(
     )
     edges = [(link, kind) for link, kind in odometry]
     edges += [(link, "loop" if atlas.of_map[link.a] == atlas.of_map[link.b] else "merge") for link in links]
-    points, colours = deform_clouds(versions, atlas.of_map, atlas.keyframes, poses, rows)
     return MapVersion(
         keyframes=keyframes,
         edges=tuple(
@@ -414,8 +329,3 @@ def _reason_not_joined(
         f"fewer than {options.min_links} views shared with maps {sorted(joined)} agree "
         f"({reasons or 'no candidates'})"
     )
-
-
-def _pair(atlas: Atlas, a: int, b: int) -> tuple[int, int]:
-    one, other = int(atlas.of_map[a]), int(atlas.of_map[b])
-    return min(one, other), max(one, other)

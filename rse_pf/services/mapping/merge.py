@@ -15,7 +15,7 @@ from rse_pf.services.mapping.map_merge import MergedMap, MergeOptions, merge_ver
 from rse_pf.services.mapping.optimise import ignore_progress
 from rse_pf.services.mapping.place import MAX_KEYFRAMES, map_limits
 
-__all__ = ["MAX_MAPS", "MergeReply", "MergeRequest", "NotJoined", "Refusal", "merge_maps", "register"]
+__all__ = ["MAX_MAPS", "MergeReply", "MergeRequest", "NotJoined", "Refusal", "merge_maps", "register", "reply_of"]
 
 
 MAX_MAPS = 64
@@ -83,7 +83,7 @@ def merge_maps(
             )
     if not all(version.keyframes for version in versions):
         raise BadRequest("a map has no keyframes", hint="leave it out")
-    return _reply(merge_versions(versions, request.options, report=report))
+    return reply_of(merge_versions(versions, request.options, report=report))
 
 
 def register(registry: Registry, data: DataSettings | None = None) -> None:
@@ -95,7 +95,8 @@ def register(registry: Registry, data: DataSettings | None = None) -> None:
         return merge_maps(request, report=report, data=data)
 
 
-def _reply(merged: MergedMap) -> MergeReply:
+def reply_of(merged: MergedMap) -> MergeReply:
+    """Return the reply of the service: the merged map encoded, and the account of it."""
     return MergeReply(
         map=encode_map(merged.version),
         joined=list(merged.joined),

@@ -93,14 +93,18 @@ class OptimisedGraph:
 
 
 def optimise_graph(
-    graph: PoseGraph, options: OptimiseOptions | None = None, *, report: Report = ignore_progress
+    graph: PoseGraph,
+    options: OptimiseOptions | None = None,
+    *,
+    report: Report = ignore_progress,
+    chordal: bool = True,
 ) -> OptimisedGraph:
     """Return the poses of *graph* that fit its edges best.
 
     Minimises ``sum of squares of odometry + sum of cauchy**2 log(1 + squares / cauchy**2)`` of the
     other edges by Levenberg-Marquardt, once from the given poses and once from poses whose rotations
     the chordal relaxation found, and keeps the better.  The pose with the smallest row number of each
-    connected component stays fixed.
+    connected component stays fixed.  With *chordal* False only the given poses are a start.
 
     Raises:
         MissingExtra: gtsam is not installed.
@@ -121,7 +125,7 @@ def optimise_graph(
             T_world_pose=best, cost_before=0.0, cost_after=0.0, components=len(anchors)
         )  # fmt: skip
     report(0.0, "from the given poses")
-    for share, start in ((0.1, None), (0.5, "chordal")):
+    for share, start in ((0.1, None), (0.5, "chordal"))[: 2 if chordal else 1]:
         report(share, "from the given poses" if start is None else "from the chordal start")
         poses = graph.T_world_pose if start is None else _chordal(gtsam, graph, anchors)
         found = None if poses is None else _minimise(gtsam, graph, poses, anchors, options)

@@ -35,12 +35,14 @@ __all__ = [
     "PlaceIndex",
     "PlaceReply",
     "PlaceRequest",
+    "VectorIndex",
     "Within",
     "check_comparisons",
     "map_limits",
     "open_map",
     "register",
     "view_of",
+    "view_vectors",
 ]
 
 WORDS = 32
@@ -99,34 +101,25 @@ class PlaceReply(msgspec.Struct, frozen=True, kw_only=True):
     candidates: list[Candidate]
 
 
-class PlaceIndex:
-    """An index of keyframes by their descriptors; immutable."""
+class VectorIndex:
+    """An index of the vectors of keyframes; immutable."""
 
-    def __init__(self, keyframes: Sequence[Keyframe], *, words: int = WORDS, seed: int = SEED) -> None:
-        self.keyframes = tuple(keyframes)
-        self._words = train_words([each.descriptors for each in self.keyframes], words, seed)
-        vectors = np.empty((len(self.keyframes), self._words.size), dtype=np.float32)
-        for row, each in enumerate(self.keyframes):
-            vectors[row] = view_vector(each.descriptors, self._words)
+    def __init__(self, vectors: npt.NDArray[np.float32]) -> None:
+        """Copy *vectors* ``(n, d)``, unit or zero."""
         self._index = load_faiss().IndexFlatIP(vectors.shape[1])
-        self._index.add(vectors)  # a copy of them; the only one that stays
+        self._index.add(vectors)
+        self._count = len(vectors)
 
     def vector(self, row: int) -> npt.NDArray[np.float32]:
         """Return the vector of the keyframe at *row*."""
         found: npt.NDArray[np.float32] = self._index.reconstruct(row)
         return found
 
-    def nearest(
-        self, descriptors: Descriptors, count: int, allowed: npt.NDArray[np.int64] | None = None
-    ) -> list[tuple[int, float]]:
-        """Return up to *count* ``(row, score)``, best first, among the *allowed* rows."""
-        return self.nearest_to(view_vector(descriptors, self._words), count, allowed)
-
     def nearest_to(
         self, vector: npt.NDArray[np.float32], count: int, allowed: npt.NDArray[np.int64] | None = None
     ) -> list[tuple[int, float]]:
-        """Return up to *count* ``(row, score)`` for the vector of a view."""
-        count = min(count, len(self.keyframes) if allowed is None else len(allowed))
+        """Return up to *count* ``(row, score)`` for the vector of a view, best first, of *allowed* rows."""
+        count = min(count, self._count if allowed is None else len(allowed))
         if count == 0:
             return []
         faiss, parameters = load_faiss(), None
@@ -137,6 +130,25 @@ class PlaceIndex:
             (int(row), float(score)) for row, score in zip(rows[0], scores[0], strict=True) if row >= 0
         ]  # fmt: skip
 
+
+class PlaceIndex:
+    """An index of keyframes by their descriptors; immutable."""
+
+    def __init__(self, keyframes: Sequence[Keyframe], *, words: int = WORDS, seed: int = SEED) -> None:
+        self.keyframes = tuple(keyframes)
+        self._words = train_words([each.descriptors for each in self.keyframes], words, seed)
+        self.vectors = VectorIndex(view_vectors(self.keyframes, self._words))
+
+    def vector(self, row: int) -> npt.NDArray[np.float32]:
+        """Return the vector of the keyframe at *row*."""
+        return self.vectors.vector(row)
+
+    def nearest(
+        self, descriptors: Descriptors, count: int, allowed: npt.NDArray[np.int64] | None = None
+    ) -> list[tuple[int, float]]:
+        """Return up to *count* ``(row, score)``, best first, among the *allowed* rows."""
+        return self.vectors.nearest_to(view_vector(descriptors, self._words), count, allowed)
+
     def rows_within(self, within: Within | None) -> npt.NDArray[np.int64] | None:
         """Return the rows of keyframes in the sphere of *within*; None means all."""
         if within is None:
@@ -144,6 +156,14 @@ class PlaceIndex:
         centre = np.array([within.x, within.y, within.z])
         places = np.array([each.T_world_camera[:3, 3] for each in self.keyframes])
         return np.flatnonzero(np.linalg.norm(places - centre, axis=1) <= within.radius_m).astype(np.int64)
+
+
+def view_vectors(keyframes: Sequence[Keyframe], words: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    """Return the ``(n, k * 256)`` vectors of *keyframes* in the vocabulary *words*."""
+    vectors = np.empty((len(keyframes), words.size), dtype=np.float32)
+    for row, each in enumerate(keyframes):
+        vectors[row] = view_vector(each.descriptors, words)
+    return vectors
 
 
 def map_limits(keyframe_features: int, keyframes: int = MAX_KEYFRAMES) -> MapLimits:

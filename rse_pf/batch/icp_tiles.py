@@ -1,0 +1,98 @@
+"""Align the clouds of two maps tile by tile, and turn each alignment into a link between two keyframes.
+
+A tile is a cube of the first map's world in which both maps have points.  Tiles are aligned apart from each
+other, because two clouds of drifted maps do not fit as a whole.  Deterministic.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from rse_pf.errors import BadRequest
+from rse_pf.geometry import Array, inverse, transform
+from rse_pf.services.mapping.cloud_deform import observers_of
+from rse_pf.services.mapping.icp import IcpOptions, align
+from rse_pf.services.mapping.links import Atlas
+from rse_pf.services.mapping.loop_consistency import LoopClosure
+from rse_pf.services.mapping.relative_pose import RelativePoseOptions
+
+__all__ = ["TILE_M", "align_tiles"]
+
+Mask = npt.NDArray[np.bool_]
+Rows = npt.NDArray[np.int64]
+Points = npt.NDArray[np.floating[Any]]
+
+TILE_M = 3.0
+_MAX_TILES = 6
+"""Of two maps; those with most points are taken."""
+_MIN_POINTS = 2000
+"""Of each of the two clouds in a tile."""
+
+
+def align_tiles(
+    atlas: Atlas, clouds: tuple[Points, Points], T_one_other: Array
+) -> tuple[list[LoopClosure], Counter[str]]:
+    """Return a link for each tile that could be aligned, and why others were refused.
+
+    Args:
+        atlas: The keyframes of the two maps; links have its rows.
+        clouds: ``(n, 3)`` and ``(m, 3)``, metres, each in the world of its map.
+        T_one_other: ``(4, 4)``, where the second map is in the first one.
+    """
+    target, source = (np.asarray(cloud, dtype=np.float64) for cloud in clouds)
+    links: list[LoopClosure] = []
+    refused: Counter[str] = Counter()
+    if len(target) < _MIN_POINTS or len(source) < _MIN_POINTS:
+        return links, refused
+    moved = transform(T_one_other, source)
+    options, floor = IcpOptions(), RelativePoseOptions()
+    spread = np.array([floor.floor_m] * 3 + [math.radians(floor.floor_deg)] * 3)
+    rows = [np.flatnonzero(atlas.of_map == which) for which in (0, 1)]
+    for low in _tiles(target, moved):
+        near = _within(target, low - options.reach_m, TILE_M + 2.0 * options.reach_m)
+        inside = _within(moved, low, TILE_M)
+        try:
+            found = align(target[near], source[inside], T_one_other, options)
+        except BadRequest:  # too few points are left after thinning
+            refused["few-points"] += 1
+            continue
+        if found.verdict != "ok":
+            refused[found.reason] += 1
+            continue
+        centre = moved[inside].mean(axis=0)
+        a = _observer(atlas, rows[0], centre)
+        b = _observer(atlas, rows[1], transform(inverse(T_one_other), centre[None])[0])
+        T_a_b = inverse(atlas.T_world_camera[a]) @ found.T_target_source @ atlas.T_world_camera[b]
+        links.append(LoopClosure(a=a, b=b, T_a_b=T_a_b, information=np.diag(spread**-2.0)))
+    return links, refused
+
+
+def _tiles(target: Array, moved: Array) -> list[Array]:
+    """Return the lower corners of the tiles with most points of both clouds, in the order of space."""
+    counts = []
+    for cloud in (target, moved):
+        numbers, count = np.unique(np.floor(cloud / TILE_M).astype(np.int64), axis=0, return_counts=True)
+        counts.append({tuple(number): int(n) for number, n in zip(numbers.tolist(), count, strict=True)})
+    both = {
+        number: min(n, counts[1][number])
+        for number, n in counts[0].items()
+        if min(n, counts[1].get(number, 0)) >= _MIN_POINTS
+    }
+    most = sorted(both, key=lambda number: (-both[number], number))[:_MAX_TILES]
+    return [np.array(number, dtype=np.float64) * TILE_M for number in sorted(most)]
+
+
+def _within(cloud: Array, low: Array, size_m: float) -> Mask:
+    inside = (cloud >= low) & (cloud < low + size_m)
+    return inside[:, 0] & inside[:, 1] & inside[:, 2]
+
+
+def _observer(atlas: Atlas, rows: Rows, point: Array) -> int:
+    """Return the row of the keyframe that saw *point* best."""
+    place = observers_of(point[None], [atlas.keyframes[row] for row in rows.tolist()])[0]
+    return int(rows[place])

@@ -1,0 +1,121 @@
+"""One process of a cluster of Dask: a scheduler, or a worker that computes one part at a time.
+
+    python -m rse_pf.batch.node scheduler|worker  < ORDER
+
+The order is JSON on the standard input, because it has the key of the cluster.  A scheduler prints its
+address as one line.  Both speak TLS only, and only with those who have the cluster's key: what Dask sends is
+pickled, so that whoever may connect may run any code.  A robot's bytes are never among it: a part names
+objects of the store, and its result is an object of the store.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import functools
+import sys
+import tempfile
+from typing import Any
+
+import msgspec
+
+from rse_pf.aws.storage import open_data_store
+from rse_pf.batch.parts import decode_part
+from rse_pf.batch.tasks import compute_part
+from rse_pf.config import PlatformSettings
+from rse_pf.errors import RsePfError, message_of
+from rse_pf.linux import die_with_parent, set_process_name
+from rse_pf.object_store import ObjectStore
+from rse_pf.terminal import show
+
+__all__ = ["NodeOrder", "compute", "main", "security_of"]
+
+_DEATH_TIMEOUT_S = 20.0
+"""A worker that finds no scheduler ends after this."""
+
+
+class NodeOrder(msgspec.Struct, frozen=True, kw_only=True):
+    """What a process of a cluster is told: the cluster's key and certificate (PEM), and where to connect."""
+
+    certificate: str
+    key: str
+    host: str = "127.0.0.1"
+    port: int = 0
+    address: str = ""
+    parent: int = 0
+    """The process with which it ends; 0 is none."""
+
+
+def security_of(certificate: str, key: str) -> Any:
+    """Return Dask's TLS for a cluster with one certificate, which everybody shows and nobody else has."""
+    from distributed.security import Security
+
+    return Security(
+        require_encryption=True, tls_ca_file=certificate, tls_client_key=key, tls_client_cert=certificate,
+        tls_scheduler_key=key, tls_scheduler_cert=certificate, tls_worker_key=key,
+        tls_worker_cert=certificate,
+    )  # fmt: skip
+
+
+def compute(settings: bytes, part: bytes) -> list[str]:
+    """Compute a part on a worker; return an empty list, or code, message and hint of what failed.
+
+    Args:
+        settings: The platform's settings as JSON; ``data.store`` has the parts.
+        part: As `encode_part` returned it.
+    """
+    try:
+        compute_part(_store_of(settings), decode_part(part))
+    except RsePfError as error:
+        return [error.code, error.message, error.hint]
+    except MemoryError:
+        return ["crashed", "a part needs more memory than its worker has", "merge fewer maps at once"]
+    except Exception as error:  # noqa: BLE001  a defect is reported where the command runs
+        return ["internal", f"a part failed: {message_of(error)[:200]}", "report it with the maps' sizes"]
+    return []
+
+
+def main(arguments: list[str]) -> int:
+    """Run until the other side is gone or a signal comes."""
+    order = msgspec.json.decode(sys.stdin.buffer.readline(), type=NodeOrder)
+    if order.parent and not die_with_parent(order.parent):
+        return 1
+    set_process_name(f"batch-{arguments[0]}"[:15])
+    act = _scheduler if arguments[0] == "scheduler" else _worker
+    try:
+        asyncio.run(act(order))
+    except (OSError, asyncio.TimeoutError) as error:
+        show(f"{arguments[0]}: {message_of(error)[:200]}", error=True)
+        return 1
+    return 0
+
+
+async def _scheduler(order: NodeOrder) -> None:
+    from distributed import Scheduler
+
+    security = security_of(order.certificate, order.key)
+    async with Scheduler(
+        host=order.host, port=order.port, protocol="tls", security=security, dashboard=False
+    ) as scheduler:
+        show(scheduler.address)
+        await scheduler.finished()
+
+
+async def _worker(order: NodeOrder) -> None:
+    from distributed import Worker
+
+    security = security_of(order.certificate, order.key)
+    with tempfile.TemporaryDirectory(prefix="rse-pf-batch-") as folder:
+        async with Worker(
+            order.address, nthreads=1, security=security, local_directory=folder, memory_limit=0,
+            death_timeout=_DEATH_TIMEOUT_S,
+        ) as worker:  # fmt: skip
+            await worker.finished()
+
+
+@functools.lru_cache(maxsize=1)
+def _store_of(settings: bytes) -> ObjectStore:
+    return open_data_store(PlatformSettings.from_dict(msgspec.json.decode(settings)))
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

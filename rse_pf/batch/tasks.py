@@ -1,0 +1,220 @@
+"""What each kind of part computes: from objects of the store to one result, the same in every process.
+
+Maps are decoded here within the limits of the platform's services.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections import Counter
+from collections.abc import Callable, Hashable, Sequence
+from typing import Any, cast
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from rse_pf.batch.icp_tiles import align_tiles
+from rse_pf.batch.parts import Part, PartResult, encode_result, is_done, read_result
+from rse_pf.errors import BadRequest
+from rse_pf.maps.format import MapVersion, decode_map
+from rse_pf.object_store import ObjectStore
+from rse_pf.services.mapping.cloud_deform import deform_cloud
+from rse_pf.services.mapping.descriptors import train_words
+from rse_pf.services.mapping.links import (
+    Atlas,
+    MergeOptions,
+    Refused,
+    agreeing_links,
+    candidate_pairs,
+    measure_pairs,
+)
+from rse_pf.services.mapping.loop_consistency import LoopClosure
+from rse_pf.services.mapping.optimise import OptimiseOptions, optimise_graph
+from rse_pf.services.mapping.place import SEED, WORDS, VectorIndex, map_limits, view_vectors
+from rse_pf.services.mapping.pose_graph import PoseGraph
+
+__all__ = ["InProcessEngine", "compute_part", "graph_arrays", "graph_of", "link_arrays", "links_of"]
+
+_CACHED_MAPS = 4
+
+
+def compute_part(store: ObjectStore, part: Part) -> None:
+    """Compute *part* and store its result, unless it is stored already.
+
+    Raises:
+        BadRequest: There is no such kind of part, or an input is damaged.
+        StoreError: The store failed.
+    """
+    if part.kind not in _KINDS:
+        raise BadRequest(f"there is no kind of part {part.kind!r}", hint="run the same version everywhere")
+    if not is_done(store, part):
+        store.put(part.name, encode_result(_KINDS[part.kind](store, part)))
+
+
+class InProcessEngine:
+    """Computes parts one after the other, in this process."""
+
+    def __init__(self, store: ObjectStore) -> None:
+        self._store = store
+
+    def run(self, parts: Sequence[Part], on_done: Callable[[int], None]) -> None:
+        """Compute *parts*."""
+        for number, part in enumerate(parts, start=1):
+            compute_part(self._store, part)
+            on_done(number)
+
+
+def link_arrays(links: Sequence[LoopClosure]) -> dict[str, npt.NDArray[Any]]:
+    """Return links as arrays of one row each."""
+    return {
+        "a": np.array([link.a for link in links], dtype=np.int64),
+        "b": np.array([link.b for link in links], dtype=np.int64),
+        "T_a_b": np.array([link.T_a_b for link in links], dtype=np.float64).reshape(-1, 4, 4),
+        "information": np.array([link.information for link in links], dtype=np.float64).reshape(-1, 6, 6),
+        "inliers": np.array([link.inliers for link in links], dtype=np.int64),
+        "matches": np.array([link.matches for link in links], dtype=np.int64),
+    }
+
+
+def links_of(result: PartResult) -> list[LoopClosure]:
+    """Return the links of `link_arrays`."""
+    of = result.arrays
+    return [
+        LoopClosure(a=a, b=b, T_a_b=T, information=information, inliers=inliers, matches=matches)
+        for a, b, T, information, inliers, matches in zip(
+            of["a"].tolist(), of["b"].tolist(), of["T_a_b"], of["information"],
+            of["inliers"].tolist(), of["matches"].tolist(), strict=True,
+        )
+    ]  # fmt: skip
+
+
+def graph_arrays(graph: PoseGraph) -> dict[str, npt.NDArray[Any]]:
+    """Return a pose graph as arrays."""
+    return {
+        "poses": graph.T_world_pose, "a": graph.a, "b": graph.b, "T_a_b": graph.T_a_b,
+        "information": graph.information, "robust": graph.robust.astype(np.uint8),
+    }  # fmt: skip
+
+
+def graph_of(result: PartResult) -> PoseGraph:
+    """Return the pose graph of `graph_arrays`."""
+    of = result.arrays
+    return PoseGraph(
+        T_world_pose=of["poses"], a=of["a"], b=of["b"], T_a_b=of["T_a_b"], information=of["information"],
+        robust=of["robust"].astype(np.bool_), ids=np.arange(len(of["poses"])),
+    )  # fmt: skip
+
+
+def _words(store: ObjectStore, part: Part) -> PartResult:
+    """Train the vocabulary of all maps."""
+    views = []
+    for name in part.inputs:
+        atlas = Atlas.of([_decoded(store.get(name), part.arguments["keyframe_features"])])
+        views += [each.descriptors for each in atlas.keyframes]
+    return PartResult(arrays={"words": train_words(views, WORDS, SEED)})
+
+
+def _vectors(store: ObjectStore, part: Part) -> PartResult:
+    """Describe each keyframe of a map by a vector."""
+    atlas = _atlas(store, part, 1)
+    words = read_result(store, part.inputs[1]).arrays["words"]
+    return PartResult(arrays={"vectors": view_vectors(atlas.keyframes, words)})
+
+
+def _pairs(store: ObjectStore, part: Part) -> PartResult:
+    """Propose pairs of keyframes of two maps, or of one."""
+    vectors = [read_result(store, name).arrays["vectors"] for name in part.inputs]
+    of_map = np.concatenate([np.full(len(each), which) for which, each in enumerate(vectors)])
+    stacked = np.concatenate(vectors)
+    pairs = candidate_pairs(
+        VectorIndex(stacked), of_map, np.arange(len(stacked)), _options(part), between=(0, len(vectors) - 1)
+    )
+    return PartResult(arrays={"pairs": np.array(pairs, dtype=np.int64).reshape(-1, 2)})
+
+
+def _links(store: ObjectStore, part: Part) -> PartResult:
+    """Measure some of the proposed pairs."""
+    first, last = part.arguments["rows"]
+    pairs = read_result(store, part.inputs[-1]).arrays["pairs"][first:last]
+    atlas = _atlas(store, part, len(part.inputs) - 1)
+    links, failed = measure_pairs(atlas, [(a, b) for a, b in pairs.tolist()], _options(part))
+    return PartResult(arrays=link_arrays(links), counts=_by_reason(failed))
+
+
+def _agree(store: ObjectStore, part: Part) -> PartResult:
+    """Select the links of two maps that agree."""
+    maps = part.arguments["maps"]
+    atlas = _atlas(store, part, maps)
+    links = [link for name in part.inputs[maps:] for link in links_of(read_result(store, name))]
+    rows, refused = agreeing_links((0, maps - 1), links, atlas.T_world_camera, atlas.order, _options(part))
+    return PartResult(arrays={"rows": np.array(rows, dtype=np.int64)}, counts=_by_reason(refused))
+
+
+def _tiles(store: ObjectStore, part: Part) -> PartResult:
+    """Align the clouds of two maps by tiles."""
+    versions = [_map(store, name, part.arguments["keyframe_features"]) for name in part.inputs[:2]]
+    pose = read_result(store, part.inputs[2]).arrays["T_one_other"]
+    links, refused = align_tiles(Atlas.of(versions), (versions[0].points, versions[1].points), pose)
+    return PartResult(arrays=link_arrays(links), counts=dict(refused))
+
+
+def _optimise(store: ObjectStore, part: Part) -> PartResult:
+    """Optimise a pose graph from its poses."""
+    graph = graph_of(read_result(store, part.inputs[0]))
+    options = msgspec.convert(part.arguments["options"], OptimiseOptions)
+    found = optimise_graph(graph, options, chordal=False)
+    return PartResult(
+        arrays={"poses": found.T_world_pose, "costs": np.array([found.cost_before, found.cost_after])},
+        counts={"components": found.components},
+    )
+
+
+def _cloud(store: ObjectStore, part: Part) -> PartResult:
+    """Move the cloud of a map with its keyframes."""
+    atlas = _atlas(store, part, 1)
+    points = _map(store, part.inputs[0], part.arguments["keyframe_features"]).points
+    poses = read_result(store, part.inputs[1]).arrays["poses"]
+    return PartResult(arrays={"points": deform_cloud(points, atlas.keyframes, poses)})
+
+
+_KINDS: dict[str, Callable[[ObjectStore, Part], PartResult]] = {
+    "words": _words,
+    "vectors": _vectors,
+    "pairs": _pairs,
+    "links": _links,
+    "agree": _agree,
+    "tiles": _tiles,
+    "optimise": _optimise,
+    "cloud": _cloud,
+}
+
+
+def _atlas(store: ObjectStore, part: Part, maps: int) -> Atlas:
+    return Atlas.of([_map(store, name, part.arguments["keyframe_features"]) for name in part.inputs[:maps]])
+
+
+def _map(store: ObjectStore, name: str, keyframe_features: int) -> MapVersion:
+    version: MapVersion = _cached_map(cast("Hashable", store), name, keyframe_features)
+    return version
+
+
+@functools.lru_cache(maxsize=_CACHED_MAPS)
+def _cached_map(store: Any, name: str, keyframe_features: int) -> MapVersion:
+    """Return a map; its name has its digest, so that it never changes."""
+    return _decoded(store.get(name), keyframe_features)
+
+
+def _decoded(data: bytes, keyframe_features: int) -> MapVersion:
+    return decode_map(data, limits=map_limits(keyframe_features))
+
+
+def _options(part: Part) -> MergeOptions:
+    return msgspec.convert(part.arguments["options"], MergeOptions)
+
+
+def _by_reason(refused: Refused) -> dict[str, int]:
+    counts: Counter[str] = Counter()
+    for (_, _, reason), count in refused.items():
+        counts[reason] += count
+    return {reason: count for reason, count in sorted(counts.items()) if count}

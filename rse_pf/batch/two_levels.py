@@ -1,0 +1,105 @@
+"""Pose graphs in two levels: each map by itself, then the maps against each other as rigid bodies.
+
+The result is a start for the optimisation of the whole graph, which then needs fewer steps.  Pure.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+
+from rse_pf.geometry import Array
+from rse_pf.services.mapping.pose_graph import PoseGraph, components, inverses
+
+__all__ = ["graph_between", "graphs_within", "poses_of_levels", "stacked"]
+
+Rows = npt.NDArray[np.int64]
+
+
+def graphs_within(graph: PoseGraph, of_map: Rows) -> list[tuple[Rows, PoseGraph]]:
+    """Return for each map the rows of its poses, and the graph of its poses and of the edges between them.
+
+    Args:
+        graph: Of *n* poses.
+        of_map: ``(n,)``, the map of each pose.
+    """
+    found = []
+    for which in np.unique(of_map).tolist():
+        rows = np.flatnonzero(of_map == which)
+        place = np.full(len(of_map), -1)
+        place[rows] = np.arange(len(rows))
+        own = (of_map[graph.a] == which) & (of_map[graph.b] == which)
+        inner = replace(
+            graph, T_world_pose=graph.T_world_pose[rows], a=place[graph.a[own]], b=place[graph.b[own]],
+            T_a_b=graph.T_a_b[own], information=graph.information[own], robust=graph.robust[own],
+            ids=np.arange(len(rows)),
+        )  # fmt: skip
+        found.append((rows, inner))
+    return found
+
+
+def graph_between(graph: PoseGraph, of_map: Rows, T_world_pose: Array) -> tuple[Rows, PoseGraph]:
+    """Return the rigid body of each pose, and the graph that moves these bodies.
+
+    A body is what the edges within one map connect.  The pose of a body is the motion of all its poses from
+    ``T_world_pose``, so that it is the identity at first.
+
+    Args:
+        graph: Of *n* poses.
+        of_map: ``(n,)``, the map of each pose.
+        T_world_pose: ``(n, 4, 4)``, the poses after each map was optimised by itself.
+    """
+    inner = of_map[graph.a] == of_map[graph.b]
+    root = components(len(of_map), graph.a[inner], graph.b[inner])
+    _, body = np.unique(root, return_inverse=True)
+    body = body.ravel().astype(np.int64)
+    outer = body[graph.a] != body[graph.b]
+    a, b = graph.a[outer], graph.b[outer]
+    T_pose_b = T_world_pose[b]
+    # log(inverse(M) inverse(A) B) = Ad(T_world_b) log(inverse(T_a_b) ...) with M = T_world_a T_a_b T_b_world.
+    adjoint = _adjoints(inverses(T_pose_b))
+    information = np.swapaxes(adjoint, 1, 2) @ graph.information[outer] @ adjoint
+    count = int(body.max()) + 1
+    condensed = PoseGraph(
+        T_world_pose=np.tile(np.eye(4), (count, 1, 1)),
+        a=body[a],
+        b=body[b],
+        T_a_b=T_world_pose[a] @ graph.T_a_b[outer] @ inverses(T_pose_b),
+        information=0.5 * (information + np.swapaxes(information, 1, 2)),
+        robust=graph.robust[outer],
+        ids=np.arange(count),
+    )
+    return body, condensed
+
+
+def poses_of_levels(body: Rows, T_bodies: Array, T_world_pose: Array) -> Array:
+    """Return ``(n, 4, 4)`` poses: each moved with its body."""
+    moved: Array = T_bodies[body] @ T_world_pose
+    return moved
+
+
+def _adjoints(T: Array) -> Array:
+    """Return the ``(m, 6, 6)`` adjoints of ``(m, 4, 4)`` poses for twists ``(rho, phi)``.
+
+    Source:
+        Barfoot, State Estimation for Robotics (2017), eq. 7.45.
+    """
+    rotation, t = T[:, :3, :3], T[:, :3, 3]
+    cross = np.zeros((len(T), 3, 3))
+    cross[:, 0, 1], cross[:, 0, 2], cross[:, 1, 2] = -t[:, 2], t[:, 1], -t[:, 0]
+    cross -= np.swapaxes(cross, 1, 2)
+    found = np.zeros((len(T), 6, 6))
+    found[:, :3, :3] = found[:, 3:, 3:] = rotation
+    found[:, :3, 3:] = cross @ rotation
+    return found
+
+
+def stacked(parts: Sequence[tuple[Rows, Array]], count: int) -> Array:
+    """Return ``(count, 4, 4)`` poses of rows and their poses."""
+    poses = np.zeros((count, 4, 4))
+    for rows, each in parts:
+        poses[rows] = each
+    return poses

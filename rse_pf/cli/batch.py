@@ -1,0 +1,191 @@
+"""Merge maps that outgrow one process: in parts, by worker processes here and by job servers.
+
+Finished parts are kept in the store of the maps, so that the same command continues after an interruption: a
+worker that ends is replaced, a scheduler that ends is started again, and Ctrl-C or a crash of this machine
+lose at most the parts that were being computed.  The result is that of rse-pf map merge, plus links from
+aligned clouds (--no-icp leaves them out).  With --host, idle job servers join (docs/batch.md).
+
+examples:
+  rse-pf batch run merge robot-1 robot-2 robot-3 --out kitchen --store dir:objects
+  rse-pf batch clean --store dir:objects
+"""
+
+from __future__ import annotations
+
+import argparse
+import ipaddress
+import os
+import time
+
+from rse_pf.audit.operator import record_map_change
+from rse_pf.aws.storage import open_data_store
+from rse_pf.cli.extras import require
+from rse_pf.cli.maps.merge_output import commit_merge, merge_progress
+from rse_pf.config import PlatformSettings
+from rse_pf.errors import NotFound, UsageError
+from rse_pf.local.state import state_folder
+from rse_pf.maps.registry import MapRecord, MapRegistry
+from rse_pf.object_store import ObjectStore
+from rse_pf.terminal import counted, show
+
+__all__ = ["add_arguments", "run"]
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the actions and their options."""
+    actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
+    common = argparse.ArgumentParser(add_help=False)
+    common.add_argument("--store", help="store of the maps: dir:PATH or s3:BUCKET (default: data.store)")
+    run_ = actions.add_parser(
+        "run", help="run one job in parts", description="Run one job in parts.",
+        epilog="example:\n  rse-pf batch run merge robot-1 robot-2 --out kitchen --store dir:objects",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )  # fmt: skip
+    jobs = run_.add_subparsers(dest="job", required=True, metavar="JOB")
+    merge = jobs.add_parser(
+        "merge", parents=[common], help="merge several maps into one, or close the loops of one map",
+        description="Merge several maps into one, or close the loops of one map.",
+        epilog="example:\n  rse-pf batch run merge robot-1 robot-2 --out kitchen --store dir:objects",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )  # fmt: skip
+    merge.add_argument(
+        "names", nargs="+", metavar="MAP",
+        help="MAP or MAP@VERSION; the world frame of the first is kept; a single map gets its loops closed",
+    )  # fmt: skip
+    merge.add_argument("--out", required=True, metavar="MAP", help="the map that gets a new version")
+    merge.add_argument(
+        "--workers", type=int, metavar="N",
+        help="worker processes on this machine; 0 leaves all parts to job servers (batch.workers)",
+    )  # fmt: skip
+    merge.add_argument(
+        "--candidates", type=int, default=6, metavar="N", help="other keyframes tried for each"
+    )
+    merge.add_argument("--no-icp", action="store_true", help="do not align clouds")
+    merge.add_argument(
+        "--host", default="127.0.0.1", metavar="ADDRESS",
+        help="address of this machine on which job servers reach it (default: only this machine)",
+    )  # fmt: skip
+    merge.add_argument("--tenant", default="default", help="tenant of the maps (default: %(default)s)")
+    merge.add_argument("--note", default="", help="note of the new version")
+    merge.add_argument("--json", action="store_true", help="print JSON")
+    actions.add_parser(
+        "clean", parents=[common], help="delete the parts of jobs that were not finished",
+        description="Delete the parts of jobs that were not finished; no job may be running.",
+        epilog="example:\n  rse-pf batch clean --store dir:objects",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )  # fmt: skip
+
+
+def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
+    """Do one action and return the exit code."""
+    chosen = settings if args.store is None else settings.replace(data={"store": args.store})
+    if chosen.data.store == "memory:":
+        kept = state_folder("default", os.environ) / "objects"
+        raise UsageError(
+            "no store is named, and one in memory belongs to another process",
+            hint=f"name --store dir:PATH; that of rse-pf local is dir:{kept}",
+        )
+    kind, _, path = chosen.data.store.partition(":")
+    if kind == "dir" and not os.path.isdir(path):
+        raise UsageError(f"there is no folder {path}", hint="name the store that holds the maps")
+    if kind == "dir":
+        chosen = chosen.replace(data={"store": f"dir:{os.path.abspath(path)}"})
+    if args.action == "clean":
+        return _clean(open_data_store(chosen))
+    if args.workers is not None:
+        chosen = chosen.replace(batch={"workers": args.workers})
+    require("batch run")
+    return _merge(args, chosen)
+
+
+def _merge(args: argparse.Namespace, settings: PlatformSettings) -> int:
+    """Merge in parts; the exit code is 1 if a map was not joined."""
+    from rse_pf.batch.cluster import DaskEngine, LocalCluster, new_cluster_key
+    from rse_pf.batch.invitation import Invitation
+    from rse_pf.batch.merge import BatchMerge
+    from rse_pf.services.mapping.links import MergeOptions
+    from rse_pf.services.mapping.merge import reply_of
+
+    is_alone = _is_loopback(args.host)
+    if is_alone and settings.batch.workers == 0:
+        raise UsageError(
+            "no worker would compute anything: --workers 0 without --host",
+            hint="name --host ADDRESS, on which job servers reach this machine, or --workers 2",
+        )
+    store = open_data_store(settings)
+
+    def record(action: str, name: str, made: MapRecord) -> None:
+        record_map_change(settings, action, name, version=made.id, number=made.number)
+
+    maps = MapRegistry(
+        store, args.tenant, max_bytes=4 * settings.data.max_object_bytes, on_change=record
+    )  # fmt: skip
+    options = MergeOptions(candidates=args.candidates)
+    inputs = [_object_of(word, maps) for word in args.names]
+    parent = _id_of_head(args.out, maps)
+    key = new_cluster_key()
+    cluster = LocalCluster(
+        key, settings.batch.workers, part_tries=settings.batch.part_tries, host=args.host
+    )  # fmt: skip
+    invitation = None if is_alone else Invitation(store, key)
+    engine = DaskEngine(
+        store, settings, cluster, key, on_event=lambda text: show(text, error=True),
+        on_start=invitation.announce if invitation is not None else None,
+    )  # fmt: skip
+    merge = BatchMerge(
+        store, engine, settings, options=options, align_clouds=not args.no_icp, report=merge_progress
+    )  # fmt: skip
+    began = time.perf_counter()
+    try:
+        engine.start()
+        found = merge.run(inputs)
+    finally:
+        engine.close()
+        cluster.stop()
+        if invitation is not None:
+            invitation.withdraw()
+    seconds = round(time.perf_counter() - began, 3)
+    parts = {"parts": {"computed": found.computed, "found": found.found}, "clouds": len(found.tiles)}
+    code = commit_merge(
+        reply_of(found.merged), maps, args.names, into=args.out, parent=parent,
+        author="rse-pf batch run merge", note=args.note, seconds=seconds, as_json=args.json, more=parts,
+    )  # fmt: skip
+    merge.forget()
+    if not args.json:
+        show(
+            f"{'parts':<11} {found.computed} computed, {found.found} found; "
+            f"{counted(len(found.tiles), 'link')} from aligned clouds; {seconds:.1f} s"
+        )
+    return code
+
+
+def _clean(store: ObjectStore) -> int:
+    from rse_pf.batch.parts import PREFIX
+
+    names = [each.name for each in store.list(f"{PREFIX}/")]
+    for name in names:
+        store.delete(name)
+    show(f"{counted(len(names), 'object')} deleted")
+    return 0
+
+
+def _object_of(word: str, maps: MapRegistry) -> str:
+    """Return the object of ``MAP`` or ``MAP@VERSION``."""
+    name, _, version = word.partition("@")
+    return maps.blob_name(name, maps.record(name, version or "head"))
+
+
+def _id_of_head(name: str, maps: MapRegistry) -> str | None:
+    try:
+        return maps.head(name).id
+    except NotFound:
+        return None
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError as error:
+        raise UsageError(
+            f"--host {host[:80]!r} is no address", hint="write an address such as 10.0.1.7"
+        ) from error

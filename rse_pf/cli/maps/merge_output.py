@@ -1,0 +1,103 @@
+"""What a merge of maps shows while it runs and when it is done, for the verbs map and batch."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from typing import Any
+
+from rse_pf.errors import CommandFailed
+from rse_pf.maps.registry import MapRegistry
+from rse_pf.services.mapping.merge import MergeReply
+from rse_pf.terminal import counted, show, show_json, show_progress
+
+__all__ = ["commit_merge", "merge_progress"]
+
+
+def commit_merge(
+    reply: MergeReply,
+    maps: MapRegistry,
+    names: Sequence[str],
+    *,
+    into: str,
+    parent: str | None,
+    author: str,
+    note: str,
+    seconds: float,
+    as_json: bool,
+    more: dict[str, Any] | None = None,
+) -> int:
+    """Commit the merged map as a version of *into*, and print what was joined; return the exit code.
+
+    Args:
+        reply: Of the merge.
+        maps: Where the version goes.
+        names: What the user called the maps, in the order of the merge.
+        into: The map that gets a new version.
+        parent: Its head before the merge, None if there is none.
+        author: The command.
+        note: Of the user; empty names what was joined.
+        seconds: How long the merge took.
+        as_json: Print JSON.
+        more: Further fields of the JSON.
+
+    Raises:
+        CommandFailed: No two maps could be joined; nothing is written.
+    """
+    not_joined = [(names[each.map], each.reason) for each in reply.not_joined]
+    if len(names) > 1 and len(reply.joined) < 2:
+        reasons = "; ".join(f"{name}: {reason}" for name, reason in not_joined)
+        raise CommandFailed(
+            f"no two of these maps can be joined, so nothing was written: {reasons}",
+            hint="record frames at places that another robot has seen, then merge again",
+        )
+    joined = [names[row] for row in reply.joined]
+    made = maps.commit(
+        into, reply.map, parent=parent, author=author, created_s=time.time(),
+        note=note or f"merged {', '.join(joined)}",
+    )  # fmt: skip
+    refused = _refused(names, reply)
+    if as_json:
+        plain = {
+            "name": into, "id": made.id, "number": made.number, "joined": joined,
+            "not_joined": [{"map": name, "reason": reason} for name, reason in not_joined],
+            "refused": refused, "links": reply.merges, "loops": reply.loops, "seconds": seconds,
+            **(more or {}),
+        }  # fmt: skip
+        show_json(plain, indent=2, sort_keys=True)
+        return 1 if not_joined else 0
+    show(
+        f"{into} is now version {made.number}, {made.id[:12]}: {counted(made.keyframes, 'keyframe')}, "
+        f"{counted(made.points, 'point')}, {counted(reply.merges, 'link')} between maps, "
+        f"{counted(reply.loops, 'loop')}",
+        _row("joined", ", ".join(joined)),
+        *(_row("not joined", f"{name}: {reason}") for name, reason in not_joined),
+        *(
+            _row(
+                "not linked",
+                f"{each['between']}: " + ", ".join(f"{n} {why}" for why, n in each["reasons"].items()),
+            )
+            for each in refused
+        ),
+    )
+    return 1 if not_joined else 0
+
+
+def merge_progress(done: float, what: str) -> None:
+    """Show how much of a merge is done, between 0 and 1, and what is being done."""
+    show_progress(f"{100 * done:3.0f} %  {what}", is_over=done >= 1.0)
+
+
+def _refused(names: Sequence[str], reply: MergeReply) -> list[dict[str, Any]]:
+    """Return the counts of pairs of keyframes that were not linked, by their maps and reasons."""
+    pairs: dict[str, dict[str, int]] = {}
+    for each in reply.refused:
+        between = " and ".join(dict.fromkeys(names[row] for row in each.maps))
+        if len(set(each.maps)) == 1:
+            between = f"within {between}"
+        pairs.setdefault(between, {})[each.reason] = each.count
+    return [{"between": between, "reasons": reasons} for between, reasons in pairs.items()]
+
+
+def _row(name: str, value: object) -> str:
+    return f"{name:<11} {value}"

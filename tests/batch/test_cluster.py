@@ -1,0 +1,107 @@
+"""Parts on real processes: a killed worker and a killed scheduler cost time, and strangers are refused."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import socket
+import ssl
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rse_pf.batch.cluster import DaskEngine, LocalCluster, new_cluster_key
+from rse_pf.batch.merge import BatchMerge
+from rse_pf.batch.parts import Part
+from rse_pf.config import PlatformSettings
+from rse_pf.errors import BadRequest
+from rse_pf.maps.format import MapVersion, encode_map
+from rse_pf.object_store import DirectoryStore
+from rse_pf.services.mapping.map_merge import Atlas, MergeOptions, merge_versions, propose_links
+from rse_pf.services.synthetic_maps import make_world
+
+pytestmark = pytest.mark.slow
+
+for package in ("distributed", "faiss", "gtsam"):
+    pytest.importorskip(package, reason="the extra batch is not installed")
+
+
+@pytest.fixture
+def versions() -> list[MapVersion]:
+    world = make_world(1)
+    a, _ = world.walk("a", np.linspace(0.0, 0.5, 13), seed=1)
+    b, _ = world.walk("b", np.linspace(0.3, 0.8, 13), seed=2)
+    return [a, b]
+
+
+def test_a_merge_survives_its_workers_and_its_scheduler(tmp_path: Path, versions: list[MapVersion]) -> None:
+    store = DirectoryStore(tmp_path)
+    for name, version in zip("ab", versions, strict=True):
+        store.put(name, encode_map(version))
+    settings = PlatformSettings().replace(
+        data={"store": f"dir:{tmp_path}"}, batch={"pairs_per_part": 10, "workers": 2}
+    )
+    key, events, killed = new_cluster_key(), [], []
+    cluster = LocalCluster(key, 2)
+    engine = DaskEngine(store, settings, cluster, key, on_event=events.append)
+
+    def report(done: float, what: str) -> None:
+        if "parts of links" in what and not killed:
+            killed.append(cluster.worker_pids[0])
+            os.kill(cluster.worker_pids[0], signal.SIGKILL)
+        elif what.startswith("4 of") and len(killed) == 1:
+            killed.append(cluster.scheduler_pid)
+            os.kill(cluster.scheduler_pid, signal.SIGKILL)
+
+    try:
+        engine.start()
+        found = BatchMerge(store, engine, settings, report=report).run(["a", "b"])
+    finally:
+        engine.close()
+        cluster.stop()
+
+    assert len(killed) == 2
+    assert "the scheduler ended and was started again" in events
+    expected = propose_links(Atlas.of(versions), MergeOptions()).links
+    assert len(found.links) == len(expected)
+    for one, other in zip(found.links, expected, strict=True):
+        assert np.array_equal(one.T_a_b, other.T_a_b)
+    whole = merge_versions(versions)
+    for one, other in zip(found.merged.version.keyframes, whole.version.keyframes, strict=True):
+        assert np.abs(one.T_world_camera - other.T_world_camera).max() < 1e-4
+
+
+def test_a_part_that_fails_is_one_error_with_a_hint(tmp_path: Path) -> None:
+    settings = PlatformSettings().replace(data={"store": f"dir:{tmp_path}"})
+    key = new_cluster_key()
+    cluster = LocalCluster(key, 1)
+    engine = DaskEngine(DirectoryStore(tmp_path), settings, cluster, key)
+    try:
+        engine.start()
+        with pytest.raises(BadRequest, match="no kind of part") as caught:
+            engine.run([Part(kind="what", inputs=())], lambda _: None)
+    finally:
+        engine.close()
+        cluster.stop()
+    assert caught.value.hint
+
+
+def test_who_has_not_the_key_is_refused() -> None:
+    cluster = LocalCluster(new_cluster_key(), 0)
+    try:
+        cluster.start()
+        host, port = cluster.address.removeprefix("tls://").rsplit(":", 1)
+        stranger = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+        stranger.check_hostname, stranger.verify_mode = False, ssl.CERT_NONE
+        answer = b""
+        with (
+            socket.create_connection((host, int(port)), timeout=10) as plain,
+            contextlib.suppress(ssl.SSLError, ConnectionError),
+            stranger.wrap_socket(plain) as wrapped,
+        ):
+            answer = wrapped.recv(1)  # TLS 1.3 refuses a client without a certificate here
+        assert answer == b""
+    finally:
+        cluster.stop()

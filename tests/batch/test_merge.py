@@ -1,0 +1,142 @@
+"""A merge in parts gives what a merge in one process gives, and continues after an interruption."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import pytest
+
+from rse_pf.batch.merge import BatchMerge, BatchMergeResult
+from rse_pf.batch.parts import PREFIX, Part
+from rse_pf.batch.tasks import InProcessEngine
+from rse_pf.config import PlatformSettings
+from rse_pf.errors import BadRequest, Disconnected, LimitExceeded
+from rse_pf.geometry import Array
+from rse_pf.maps.format import MapVersion, encode_map
+from rse_pf.object_store import MemoryStore
+from rse_pf.services.mapping.map_merge import Atlas, MergedMap, MergeOptions, merge_versions, propose_links
+from rse_pf.services.synthetic_maps import make_world
+
+for package in ("faiss", "gtsam"):
+    pytest.importorskip(package, reason="the extra maps is not installed")
+
+SETTINGS = PlatformSettings().replace(batch={"pairs_per_part": 40})
+NAMES = ("maps/a", "maps/b")
+
+
+@functools.cache
+def two_robots() -> tuple[MapVersion, MapVersion]:
+    world = make_world(1)
+    a, _ = world.walk("a", np.linspace(0.0, 0.5, 13), seed=1)
+    b, _ = world.walk("b", np.linspace(0.3, 0.8, 13), seed=2)
+    return a, b
+
+
+@functools.cache
+def in_one_process() -> MergedMap:
+    return merge_versions(two_robots())
+
+
+def a_store() -> MemoryStore:
+    store = MemoryStore()
+    for name, version in zip(NAMES, two_robots(), strict=True):
+        store.put(name, encode_map(version))
+    return store
+
+
+class Interrupted:
+    """An engine that is gone after some parts."""
+
+    def __init__(self, store: MemoryStore, parts: int) -> None:
+        self._engine = InProcessEngine(store)
+        self._left = parts
+
+    def run(self, parts: Sequence[Part], on_done: Callable[[int], None]) -> None:
+        for number, part in enumerate(parts, start=1):
+            if self._left == 0:
+                raise Disconnected("the scheduler ended", hint="run it again")
+            self._left -= 1
+            self._engine.run([part], lambda _: None)
+            on_done(number)
+
+
+@functools.cache
+def in_parts() -> BatchMergeResult:
+    store = a_store()
+    return BatchMerge(store, InProcessEngine(store), SETTINGS).run(NAMES)
+
+
+def poses(merged: MergedMap) -> Array:
+    return np.array([each.T_world_camera for each in merged.version.keyframes])
+
+
+def test_the_links_are_those_of_one_process_to_the_bit() -> None:
+    expected = propose_links(Atlas.of(two_robots()), MergeOptions()).links
+
+    found = in_parts().links
+
+    assert [(link.a, link.b, link.inliers) for link in found] == [
+        (link.a, link.b, link.inliers) for link in expected
+    ]
+    for one, other in zip(found, expected, strict=True):
+        assert np.array_equal(one.T_a_b, other.T_a_b)
+        assert np.array_equal(one.information, other.information)
+
+
+def test_the_map_is_that_of_one_process() -> None:
+    one, parts = in_one_process(), in_parts().merged
+
+    assert parts.joined == one.joined == (0, 1)
+    assert parts.refused == one.refused
+    assert (parts.loops, parts.merges) == (one.loops, one.merges)
+    assert np.abs(poses(parts) - poses(one)).max() < 1e-4
+
+
+def test_an_interrupted_merge_continues_with_the_parts_that_are_missing() -> None:
+    store = a_store()
+    with pytest.raises(Disconnected):
+        BatchMerge(store, Interrupted(store, 7), SETTINGS).run(NAMES)
+
+    again = BatchMerge(store, InProcessEngine(store), SETTINGS).run(NAMES)
+
+    whole = in_parts()
+    assert again.found == 7
+    assert again.computed == whole.computed - 7
+    assert encode_map(again.merged.version) == encode_map(whole.merged.version)
+
+
+def test_a_finished_merge_leaves_nothing_in_the_store() -> None:
+    store = a_store()
+    merge = BatchMerge(store, InProcessEngine(store), SETTINGS)
+    merge.run(NAMES)
+
+    merge.forget()
+
+    assert not list(store.list(f"{PREFIX}/"))
+
+
+def test_progress_never_goes_back() -> None:
+    store, shares = a_store(), []
+    BatchMerge(store, InProcessEngine(store), SETTINGS, report=lambda done, what: shares.append(done)).run(
+        NAMES
+    )
+
+    assert shares == sorted(shares)
+    assert shares[-1] == 1.0
+
+
+def test_too_many_keyframes_are_refused_before_any_work() -> None:
+    store = a_store()
+    small = PlatformSettings().replace(batch={"max_keyframes": 20})
+
+    with pytest.raises(LimitExceeded, match="20 keyframes"):
+        BatchMerge(store, InProcessEngine(store), small).run(NAMES)
+
+
+def test_an_unknown_kind_of_part_is_refused() -> None:
+    store = a_store()
+
+    with pytest.raises(BadRequest, match="no kind of part"):
+        InProcessEngine(store).run([Part(kind="what", inputs=())], lambda _: None)
