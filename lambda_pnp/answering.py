@@ -15,6 +15,7 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
+from lambda_pnp.day_budget import Claim, DayBudget, claim_in_bucket
 from lambda_pnp.keys import KeyCache, read_object
 from rse_pf.auth.roster import scopes_allow
 from rse_pf.auth.tokens import verify_token
@@ -39,6 +40,8 @@ _SERVER = "lambda"
 # How long a revoked token may still be accepted; there is no connection that could be closed.
 _MAX_STALE_S = 30.0
 _MAX_HEADERS = 200
+_READ = ("authorization", "content-type")
+"""Headers that mean something here."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -49,26 +52,36 @@ class LambdaAnswer:
     content_type: str
     body: bytes
 
-    def as_http(self, *, init_ms: float, cold: bool) -> dict[str, Any]:
-        """Return the response of a Function URL, with ``init_ms`` and ``cold`` as headers."""
+    def as_http(self, event: object, *, init_ms: float, cold: bool) -> dict[str, Any]:
+        """Return the response to *event*, with ``init_ms`` and ``cold`` as headers.
+
+        A load balancer wants headers in the form in which it sent its own: one value each, or lists.
+        """
+        headers = {
+            "content-type": self.content_type,
+            "x-rse-pf-init-ms": f"{init_ms:.1f}",
+            "x-rse-pf-cold": str(cold).lower(),
+        }
+        has_lists = isinstance(event, Mapping) and "multiValueHeaders" in event
         return {
             "statusCode": self.status,
-            "headers": {
-                "content-type": self.content_type,
-                "x-rse-pf-init-ms": f"{init_ms:.1f}",
-                "x-rse-pf-cold": str(cold).lower(),
-            },
+            **(
+                {"multiValueHeaders": {name: [value] for name, value in headers.items()}}
+                if has_lists
+                else {"headers": headers}
+            ),
             "isBase64Encoded": True,
             "body": base64.b64encode(self.body).decode(),
         }
 
 
 class Answering:
-    """Keys and settings of one function, and the service that it offers."""
+    """Keys, settings and budget of one execution, and the service that it offers."""
 
-    def __init__(self, settings: PlatformSettings, keys: KeyCache) -> None:
+    def __init__(self, settings: PlatformSettings, keys: KeyCache, claim: Claim) -> None:
         self._settings = settings
         self._keys = keys
+        self._budget = DayBudget(settings.burst, claim)
         self._registry = Registry()
         pnp.register(self._registry, settings.pnp)
         self._codecs: dict[str, Codec] = {
@@ -92,6 +105,7 @@ class Answering:
         except RsePfError as error:
             return _rejected(error)
         try:
+            self._budget.take(who.robot, now_s)
             message = codec.decode_from_robot(self._decoded(body))
             if not isinstance(message, Command):
                 raise BadMessage(
@@ -160,25 +174,41 @@ def _read(event: object) -> tuple[dict[str, str], str | bytes]:
     """
     if not isinstance(event, Mapping):
         raise _no_event("it is not an object")
-    headers, body = event.get("headers") or {}, event.get("body") or ""
-    if not isinstance(headers, Mapping) or len(headers) > _MAX_HEADERS:
-        raise _no_event(f"its headers are not an object of at most {_MAX_HEADERS} texts")
-    if not all(isinstance(name, str) and isinstance(value, str) for name, value in headers.items()):
-        raise _no_event("a header is not a text")
+    headers, body = _headers(event), event.get("body") or ""
     if not isinstance(body, str):
         raise _no_event("its body is not a text")
-    lowered = {name.lower(): value for name, value in headers.items()}
     if event.get("isBase64Encoded"):
-        return lowered, body
+        return headers, body
     try:
-        return lowered, body.encode()
+        return headers, body.encode()
     except UnicodeEncodeError as error:
         raise _no_event("its body is not UTF-8") from error
 
 
+def _headers(event: Mapping[Any, Any]) -> dict[str, str]:
+    """Return the headers, names in small letters; one that came twice is not guessed at."""
+    lists = event.get("multiValueHeaders")
+    headers = lists or event.get("headers") or {}
+    if not isinstance(headers, Mapping) or len(headers) > _MAX_HEADERS:
+        raise _no_event(f"its headers are not an object of at most {_MAX_HEADERS} texts")
+    lowered: dict[str, str] = {}
+    for name, value in headers.items():
+        if lists and isinstance(value, list) and len(value) == 1:
+            (value,) = value
+        if not isinstance(name, str) or not (isinstance(value, str) or (lists and isinstance(value, list))):
+            raise _no_event("a header is not a text")
+        if name.lower() in lowered or not isinstance(value, str):
+            if name.lower() in _READ:
+                raise _no_event(f"there is more than one {name.lower()}")
+            continue
+        lowered[name.lower()] = value
+    return lowered
+
+
 def _no_event(problem: str) -> BadMessage:
     return BadMessage(
-        f"this is not an event of a Function URL: {problem}", hint="call the function by its URL"
+        f"this is not an event of a load balancer or a Function URL: {problem}",
+        hint="call the function by the address of the platform",
     )
 
 
@@ -189,5 +219,8 @@ def load_answering() -> Answering:
     def read(control: str = "") -> str:
         return read_object(os.environ, datetime.now(timezone.utc), control)
 
+    def claim(day: str, wanted: int, most: int) -> int:
+        return claim_in_bucket(os.environ, day, wanted, most)
+
     period_s = min(_MAX_STALE_S, settings.scaling.period_s)
-    return Answering(settings, KeyCache(read, period_s, read_control=read))
+    return Answering(settings, KeyCache(read, period_s, read_control=read), claim)

@@ -19,7 +19,7 @@ _ANSWERING: list[Answering] = []
 
 
 def handler(event: Mapping[str, Any], context: Any) -> dict[str, Any]:
-    """Answer one event of a Function URL."""
+    """Answer one event of a load balancer, or of a Function URL."""
     cold = not _ANSWERING
     if cold:
         _ANSWERING.append(load_answering())
@@ -28,4 +28,4 @@ def handler(event: Mapping[str, Any], context: Any) -> dict[str, Any]:
     answered: LambdaAnswer = _ANSWERING[0].answer(
         event, now_s=time.time(), left_ms=left_ms, clock=time.monotonic
     )
-    return answered.as_http(init_ms=init_ms, cold=cold)
+    return answered.as_http(event, init_ms=init_ms, cold=cold)

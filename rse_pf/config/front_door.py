@@ -13,11 +13,13 @@ from dataclasses import dataclass
 
 from rse_pf.config.settings import PlatformSettings
 
-__all__ = ["BURST_PATH", "DATA_PATH", "RETRY_AFTER_S", "STATUS", "RateRule", "rate_rules"]
+__all__ = ["BEARER_PATTERN", "BURST_PATH", "DATA_PATH", "RETRY_AFTER_S", "STATUS", "RateRule", "rate_rules"]
 
 DATA_PATH = "/data/"
 BURST_PATH = "/burst"
 """At the robots' address, where the serverless PnP answers."""
+BEARER_PATTERN = r"^[Bb]earer +[A-Za-z0-9_-]+\.[A-Za-z0-9_-]+\.[A-Za-z0-9_-]{86}$"
+"""What the header Authorization looks like with a token: three parts, the last one an Ed25519 signature."""
 STATUS = 429
 RETRY_AFTER_S = 60
 """What an address above its limit is told: after one window without requests it is below."""

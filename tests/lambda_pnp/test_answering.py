@@ -35,6 +35,10 @@ GOLDEN = json.loads(
 )
 
 
+def answering(settings: PlatformSettings = SETTINGS) -> Answering:
+    return Answering(settings, KEYS, lambda day, wanted, most: wanted)
+
+
 def event(body: bytes, codec: str = "zlib", token: str = TOKEN) -> dict[str, Any]:
     """An event of a Function URL, payload format 2.0."""
     return {
@@ -48,7 +52,7 @@ def event(body: bytes, codec: str = "zlib", token: str = TOKEN) -> dict[str, Any
 
 
 def answer(what: dict[str, Any], *, codec: str = "zlib", clock: Callable[[], float] = lambda: 0.0) -> Message:
-    answered = Answering(SETTINGS, KEYS).answer(what, now_s=NOW_S, left_ms=9e3, clock=clock)
+    answered = answering().answer(what, now_s=NOW_S, left_ms=9e3, clock=clock)
     assert answered.status == 200
     return make_codec(codec).decode_from_server(answered.body)
 
@@ -89,7 +93,7 @@ def test_every_golden_command_gets_the_backends_answer(name: str, codec: str) ->
 
 @pytest.mark.parametrize("token", ["", "a.b.c", TOKEN[:-4] + "AAAA"])
 def test_a_bad_token_is_rejected_before_anything_is_decoded(token: str) -> None:
-    answered = Answering(SETTINGS, KEYS).answer(
+    answered = answering().answer(
         event(b"not even a message", token=token), now_s=NOW_S, left_ms=9e3, clock=lambda: 0.0
     )
 
@@ -99,7 +103,7 @@ def test_a_bad_token_is_rejected_before_anything_is_decoded(token: str) -> None:
 
 def test_an_expired_token_is_rejected() -> None:
     late = NOW_S + SETTINGS.auth.token_ttl_s + SETTINGS.auth.leeway_s + 1
-    answered = Answering(SETTINGS, KEYS).answer(event(b""), now_s=late, left_ms=9e3, clock=lambda: 0.0)
+    answered = answering().answer(event(b""), now_s=late, left_ms=9e3, clock=lambda: 0.0)
 
     assert answered.status == 401
 
@@ -107,7 +111,7 @@ def test_an_expired_token_is_rejected() -> None:
 def test_an_unknown_sub_protocol_is_rejected() -> None:
     what = event(b"")
     what["headers"]["content-type"] = "text/html"
-    answered = Answering(SETTINGS, KEYS).answer(what, now_s=NOW_S, left_ms=9e3, clock=lambda: 0.0)
+    answered = answering().answer(what, now_s=NOW_S, left_ms=9e3, clock=lambda: 0.0)
 
     assert (answered.status, json.loads(answered.body)["code"]) == (400, "unsupported")
 
@@ -209,17 +213,80 @@ def test_another_service_is_unknown_here() -> None:
 
 
 def test_the_answer_says_whether_the_start_was_cold() -> None:
-    made = Answering(SETTINGS, KEYS).answer(event(b""), now_s=NOW_S, left_ms=9e3, clock=lambda: 0.0)
+    made = answering().answer(event(b""), now_s=NOW_S, left_ms=9e3, clock=lambda: 0.0)
 
-    http = made.as_http(init_ms=12.34, cold=True)
+    http = made.as_http(event(b""), init_ms=12.34, cold=True)
 
     assert http["headers"]["x-rse-pf-init-ms"] == "12.3"
     assert http["headers"]["x-rse-pf-cold"] == "true"
     assert base64.b64decode(http["body"]) == made.body
 
 
+def of_a_load_balancer(what: dict[str, Any], **changes: Any) -> dict[str, Any]:
+    """The same request as an ALB with lists of header values sends it."""
+    headers = {name: [value] for name, value in what["headers"].items()}
+    return {
+        "requestContext": {"elb": {"targetGroupArn": "arn"}}, "httpMethod": "POST", "path": "/burst",
+        "queryStringParameters": {}, "multiValueHeaders": headers, "body": what["body"],
+        "isBase64Encoded": True, **changes,
+    }  # fmt: skip
+
+
+def test_a_load_balancer_gets_the_answer_of_a_function_url_and_headers_in_its_own_form() -> None:
+    command = Command(id=1, service="pnp", deadline_ms=0.0)
+    plain = event(make_codec("zlib").encode(command))
+    listed = of_a_load_balancer(plain)
+    single = {**listed, "headers": plain["headers"]}
+    del single["multiValueHeaders"]
+
+    made = [
+        answering()
+        .answer(what, now_s=NOW_S, left_ms=9e3, clock=lambda: 0.0)
+        .as_http(what, init_ms=0.0, cold=False)
+        for what in (plain, single, listed)
+    ]
+
+    assert [each["body"] for each in made] == [made[0]["body"]] * 3
+    assert made[0] == made[1]
+    assert made[2]["multiValueHeaders"] == {name: [value] for name, value in made[0]["headers"].items()}
+    assert "headers" not in made[2]
+
+
+@pytest.mark.parametrize("name", ["authorization", "content-type"])
+def test_a_header_that_came_twice_is_not_guessed_at(name: str) -> None:
+    what = of_a_load_balancer(event(b""))
+    what["multiValueHeaders"][name] *= 2
+    assert rejected(what) == (400, "bad-message")
+    what = of_a_load_balancer(event(b""))
+    what["multiValueHeaders"][name.title()] = what["multiValueHeaders"][name]
+    assert rejected(what) == (400, "bad-message")
+    what = of_a_load_balancer(event(b""))
+    what["multiValueHeaders"]["x-forwarded-for"] = ["203.0.113.7", "198.51.100.4"]
+    assert answer(what) is not None
+
+
+def test_the_health_check_of_a_load_balancer_is_answered_without_work() -> None:
+    asked = {"requestContext": {"elb": {}}, "httpMethod": "GET", "path": "/", "headers": {}, "body": ""}
+
+    assert rejected(asked) == (401, "unauthorized")
+
+
+def test_the_budget_of_a_robot_counts_whatever_it_sends() -> None:
+    few = answering(SETTINGS.replace(burst={"robot_commands_per_day": 2}))
+    bodies = [b"nonsense", make_codec("zlib").encode(Command(id=1, service="echo")), b""]
+
+    codes = []
+    for body in bodies:
+        told = few.answer(event(body), now_s=NOW_S, left_ms=9e3, clock=lambda: 0.0)
+        message = make_codec("zlib").decode_from_server(told.body)
+        assert isinstance(message, Failure)
+        codes.append(message.code)
+
+    assert codes == ["bad-message", "unknown-service", "quota"]
+
+
 def rejected(what: Any) -> tuple[int, str]:
-    answered = Answering(SETTINGS, KEYS).answer(what, now_s=NOW_S, left_ms=9e3, clock=lambda: 0.0)
+    answered = answering().answer(what, now_s=NOW_S, left_ms=9e3, clock=lambda: 0.0)
     return answered.status, json.loads(answered.body)["code"]
 
 
@@ -272,7 +339,7 @@ def test_a_huge_body_is_refused_by_its_length_before_it_is_decoded() -> None:
 def test_no_event_raises(what: dict[str, Any]) -> None:
     assert rejected(what)[0] in (400, 401)
     signed = what | {"headers": event(b"")["headers"]}
-    answered = Answering(SETTINGS, KEYS).answer(signed, now_s=NOW_S, left_ms=9e3, clock=lambda: 0.0)
+    answered = answering().answer(signed, now_s=NOW_S, left_ms=9e3, clock=lambda: 0.0)
     assert answered.status in (200, 400)
 
 

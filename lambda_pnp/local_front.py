@@ -1,0 +1,231 @@
+"""Play, on one machine, what stands before the function on AWS: firewall, load balancer and Lambda.
+
+    python -m lambda_pnp.local_front FOLDER [--port P] [--parent PID]
+
+FOLDER is that of a local platform: its settings and its public keys.  Requests become the events of a load
+balancer.  Each execution answers one command at a time; an idle one is used again, and no more than
+``cloud.lambda_concurrency`` exist.  It is for trials and measurements: it listens on loopback only.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import base64
+import contextlib
+import re
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+from lambda_pnp.answering import Answering
+from lambda_pnp.keys import KeyCache
+from rse_pf.config import PlatformSettings, load_settings
+from rse_pf.config.front_door import BEARER_PATTERN, BURST_PATH
+from rse_pf.errors import NotFound, RsePfError
+from rse_pf.linux import die_with_parent, set_process_name
+from rse_pf.terminal import show_json
+
+__all__ = ["LocalFront", "answering_of", "read_beside"]
+
+_HOST = "127.0.0.1"
+_TIMEOUT_S = 10.0
+_IDLE_S = 120.0
+_MAX_HEAD_BYTES = 16384
+_MAX_BODY_BYTES = 1_048_576
+"""Of a request that an ALB passes on to a function."""
+_TOKEN = re.compile(BEARER_PATTERN)
+_REASONS = {
+    200: "OK", 400: "Bad Request", 401: "Unauthorized", 404: "Not Found", 413: "Payload Too Large",
+    502: "Bad Gateway",
+}  # fmt: skip
+
+
+class LocalFront:
+    """The front door and the executions of one function.
+
+    Attributes:
+        url: Where commands are posted, once it listens.
+        answered: Requests that an execution answered; ``refused`` those that met none.
+        executions: How many were started.
+    """
+
+    def __init__(self, make: Callable[[], Answering], *, most: int) -> None:
+        """Describe the front; nothing listens yet.
+
+        Args:
+            make: Starts an execution.
+            most: How many there may be at a time.
+        """
+        self.url = ""
+        self.answered = self.refused = self.executions = 0
+        self._make = make
+        self._most = most
+        self._idle: list[Answering] = []
+        self._threads = ThreadPoolExecutor(most, "execution")
+        self._writers: set[asyncio.StreamWriter] = set()
+        self._server: asyncio.Server | None = None
+
+    async def start(self, port: int = 0) -> None:
+        """Listen on loopback; port 0 takes a free one."""
+        self._server = await asyncio.start_server(self._serve, _HOST, port, limit=_MAX_HEAD_BYTES)
+        self.url = f"http://{_HOST}:{self._server.sockets[0].getsockname()[1]}{BURST_PATH}"
+
+    async def stop(self) -> None:
+        """Stop listening and end every connection."""
+        assert self._server is not None
+        self._server.close()
+        for writer in self._writers:
+            writer.transport.abort()
+        await self._server.wait_closed()
+        self._threads.shutdown(wait=False, cancel_futures=True)
+
+    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        self._writers.add(writer)
+        try:
+            while True:
+                head = await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), _IDLE_S)
+                if not await self._exchange(head, reader, writer):
+                    return
+        except (OSError, EOFError, asyncio.LimitOverrunError, asyncio.TimeoutError):
+            return
+        finally:
+            self._writers.discard(writer)
+            writer.transport.abort()
+
+    async def _exchange(
+        self, head: bytes, reader: asyncio.StreamReader, writer: asyncio.StreamWriter
+    ) -> bool:
+        """Answer one request; return whether another may follow on the connection."""
+        first, *lines = head.decode("latin-1").split("\r\n")
+        headers: dict[str, list[str]] = {}
+        for line in lines:
+            name, colon, value = line.partition(":")
+            if colon:
+                headers.setdefault(name.strip().lower(), []).append(value.strip())
+        size = headers.get("content-length", ["0"])[0]
+        if not size.isdecimal() or int(size) > _MAX_BODY_BYTES or "transfer-encoding" in headers:
+            await _write(writer, 413, {"connection": "close"}, b"")
+            return False
+        body = await asyncio.wait_for(reader.readexactly(int(size)), _TIMEOUT_S)
+        status, told, answer = await self._judged(first, headers, body)
+        await _write(writer, status, told, answer)
+        return True
+
+    async def _judged(
+        self, first: str, headers: dict[str, list[str]], body: bytes
+    ) -> tuple[int, dict[str, str], bytes]:
+        method, _, rest = first.partition(" ")
+        path = rest.partition(" ")[0].partition("?")[0]
+        if not path.startswith(BURST_PATH):
+            return 404, {}, b""
+        if not all(_TOKEN.fullmatch(value) for value in headers.get("authorization", [""])):
+            return 401, {}, b""
+        if path != BURST_PATH or method != "POST":
+            return 404, {}, b""
+        execution = self._idle.pop() if self._idle else None
+        if execution is None and self.executions >= self._most:
+            self.refused += 1
+            return 502, {}, b""
+        is_cold = execution is None
+        self.executions += is_cold
+        event = {
+            "requestContext": {"elb": {"targetGroupArn": "arn:local"}},
+            "httpMethod": method,
+            "path": path,
+            "multiValueHeaders": headers,
+            "body": base64.b64encode(body).decode(),
+            "isBase64Encoded": True,
+        }
+        loop = asyncio.get_running_loop()
+        used, answer = await loop.run_in_executor(self._threads, self._run, execution, event)
+        self._idle.append(used)
+        self.answered += 1
+        told = {name: str(values[0]) for name, values in answer["multiValueHeaders"].items()}
+        return int(answer["statusCode"]), told, base64.b64decode(answer["body"])
+
+    def _run(self, execution: Answering | None, event: dict[str, Any]) -> tuple[Answering, dict[str, Any]]:
+        began, is_cold = time.monotonic(), execution is None
+        execution = execution or self._make()
+        init_ms = (time.monotonic() - began) * 1e3 if is_cold else 0.0
+        answer = execution.answer(
+            event, now_s=time.time(), left_ms=_TIMEOUT_S * 1e3, clock=time.monotonic
+        ).as_http(event, init_ms=init_ms, cold=is_cold)
+        return execution, answer
+
+
+async def _write(writer: asyncio.StreamWriter, status: int, headers: dict[str, str], body: bytes) -> None:
+    told = "".join(f"{name}: {value}\r\n" for name, value in headers.items())
+    head = f"HTTP/1.1 {status} {_REASONS.get(status, 'Status')}\r\n{told}content-length: {len(body)}\r\n\r\n"
+    writer.write(head.encode() + body)
+    await writer.drain()
+
+
+def answering_of(settings: PlatformSettings, folder: Path) -> Callable[[], Answering]:
+    """Return what starts executions with the keys in *folder*; they share one budget, as on AWS."""
+    granted: dict[str, int] = {}
+    lock = threading.Lock()
+
+    def claim(day: str, wanted: int, most: int) -> int:
+        with lock:
+            grant = max(0, min(wanted, most - granted.get(day, 0)))
+            granted[day] = granted.get(day, 0) + grant
+            return grant
+
+    def make() -> Answering:
+        keys = KeyCache(
+            lambda: read_beside(folder), settings.scaling.period_s,
+            read_control=lambda name: read_beside(folder, f"control/{name}"),
+        )  # fmt: skip
+        return Answering(settings, keys, claim)
+
+    return make
+
+
+def read_beside(folder: Path, name: str = "keys.json") -> str:
+    """Return a file of a platform; raises NotFound if there is none."""
+    try:
+        return (folder / name).read_text(encoding="utf-8")
+    except FileNotFoundError as error:
+        raise NotFound(f"there is no {name} in {folder}") from error
+
+
+async def _run(folder: Path, port: int) -> None:
+    settings = load_settings(folder / "settings.json")
+    front = LocalFront(answering_of(settings, folder), most=settings.cloud.lambda_concurrency)
+    await front.start(port)
+    stopped = asyncio.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        asyncio.get_running_loop().add_signal_handler(number, stopped.set)
+    show_json({"url": front.url})
+    await stopped.wait()
+    await front.stop()
+
+
+def main() -> int:
+    """Serve until a signal; print the address as JSON."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--port", type=int, default=0)
+    parser.add_argument("--parent", type=int, default=0)
+    args = parser.parse_args()
+    if args.parent:
+        die_with_parent(args.parent)
+    set_process_name("rse-pf-burst")
+    try:
+        with contextlib.suppress(KeyboardInterrupt):
+            asyncio.run(_run(args.folder, args.port))
+    except (RsePfError, OSError) as error:
+        told = error.report() if isinstance(error, RsePfError) else f"cannot listen: {error}"
+        sys.stderr.write(f"{told}\n")
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
