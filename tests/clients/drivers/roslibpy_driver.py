@@ -179,7 +179,7 @@ def deadline(run: Run) -> None:
             run.calls[id(call)] = call
         message = {
             "op": "call_service", "id": f"d:{number}", "service": f"/{service}", "args": payload,
-            "timeout": 0.001,
+            "timeout": 1e-5,  # any wait in the server is longer
         }  # fmt: skip
         run.ros.call_async_service(
             roslibpy.Message(message),
