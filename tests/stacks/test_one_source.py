@@ -11,6 +11,7 @@ import pytest
 
 from rse_pf.config import PlatformSettings, load_settings
 from rse_pf.local.control.platform import LocalPlatform
+from rse_pf.scaling.profile import cadence_of
 
 Assembly = Any
 
@@ -52,7 +53,10 @@ def test_the_template_follows_each_watched_setting(assembly: Assembly) -> None:
     settings = assembly.settings
 
     assert f'"Threshold": {settings.scaling.busy_cpu_percent:g}' in backend
-    assert f'"EvaluationPeriods": {settings.scaling.idle_s // settings.scaling.period_s}' in backend
+    cadence = cadence_of(settings.scaling)
+    assert f'"EvaluationPeriods": {cadence.idle}' in backend
+    assert f'"EvaluationPeriods": {cadence.underused}' in backend
+    assert f'"Period": {cadence.period_s}' in backend
     assert f'"Port": {settings.serving.port}' in backend
     assert f'"HealthCheckPort": "{settings.serving.control_port}"' in backend
     assert f'"FromPort": {settings.serving.port}' in network

@@ -94,7 +94,7 @@ def test_alarms_of_this_account_may_publish_to_the_topic_and_nobody_without_tls(
     ]
 
 
-def test_no_role_may_do_anything_to_everything_but_publish_numbers(assembly: Assembly) -> None:
+def test_no_role_may_do_anything_to_everything_but_publish_and_read_numbers(assembly: Assembly) -> None:
     statements = [
         each
         for policy in assembly.all("AWS::IAM::Policy")
@@ -104,8 +104,9 @@ def test_no_role_may_do_anything_to_everything_but_publish_numbers(assembly: Ass
 
     assert len(statements) >= 6
     wide = [each for each in statements if each["Resource"] == "*"]
-    assert [(each["Action"], each["Condition"]) for each in wide] == [
-        ("cloudwatch:PutMetricData", {"StringEquals": {"cloudwatch:namespace": "RsePf"}})
+    assert [(each["Action"], each.get("Condition")) for each in wide] == [
+        ("cloudwatch:PutMetricData", {"StringEquals": {"cloudwatch:namespace": "RsePf"}}),
+        ("cloudwatch:GetMetricData", None),
     ]
     actions = [action for each in statements for action in _listed(each["Action"])]
     assert not [action for action in actions if "*" in action]

@@ -1,0 +1,88 @@
+"""Where the servers' capacity comes from: a warm pool, Spot, several instance types, zones and a schedule.
+
+Everything here changes the Auto Scaling group that `stacks.backend_servers` made, and nothing else.
+"""
+
+from __future__ import annotations
+
+from typing import cast
+
+from aws_cdk import aws_autoscaling as autoscaling
+from constructs import Construct
+
+from rse_pf.config import PlatformSettings
+from rse_pf.config.elasticity import instance_types
+from rse_pf.config.schedule import ScheduleEntry, parse_schedule
+
+__all__ = ["Capacity"]
+
+_ALL_ON_DEMAND = 100
+
+
+class Capacity(Construct):
+    """Warm pool, purchase options, zones and scheduled minimum of one group."""
+
+    def __init__(
+        self,
+        scope: Construct,
+        construct_id: str,
+        *,
+        group: autoscaling.AutoScalingGroup,
+        settings: PlatformSettings,
+    ) -> None:
+        super().__init__(scope, construct_id)
+        raw = cast("autoscaling.CfnAutoScalingGroup", group.node.default_child)
+        # Zones are equally full as long as all of them have capacity; one that fails is left.
+        raw.availability_zone_distribution = (
+            autoscaling.CfnAutoScalingGroup.AvailabilityZoneDistributionProperty(
+                capacity_distribution_strategy="balanced-best-effort"
+            )
+        )
+        if settings.cloud.spot or len(instance_types(settings.cloud)) > 1:
+            self._mix(raw, settings)
+        if settings.cloud.warm_servers:
+            # The group prepares no more than its minimum, so that the pool has exactly its own minimum.
+            autoscaling.CfnWarmPool(
+                self, "WarmPool", auto_scaling_group_name=group.auto_scaling_group_name, pool_state="Stopped",
+                min_size=settings.cloud.warm_servers,
+                max_group_prepared_capacity=settings.scaling.min_servers,
+                instance_reuse_policy=autoscaling.CfnWarmPool.InstanceReusePolicyProperty(
+                    reuse_on_scale_in=False
+                ),
+            )  # fmt: skip
+        for number, entry in enumerate(parse_schedule(settings.scaling.schedule)):
+            autoscaling.CfnScheduledAction(
+                self, f"Schedule{number}", auto_scaling_group_name=group.auto_scaling_group_name,
+                min_size=entry.min_servers, recurrence=_cron(entry), time_zone=_zone(settings),
+            )  # fmt: skip
+
+    def _mix(self, raw: autoscaling.CfnAutoScalingGroup, settings: PlatformSettings) -> None:
+        """Let the group take several instance types, and Spot instances above the servers on demand."""
+        cloud, kind = settings.cloud, autoscaling.CfnAutoScalingGroup
+        raw.mixed_instances_policy = kind.MixedInstancesPolicyProperty(
+            launch_template=kind.LaunchTemplateProperty(
+                launch_template_specification=cast(
+                    "autoscaling.CfnAutoScalingGroup.LaunchTemplateSpecificationProperty", raw.launch_template
+                ),
+                overrides=[
+                    kind.LaunchTemplateOverridesProperty(instance_type=name) for name in instance_types(cloud)
+                ],
+            ),
+            instances_distribution=kind.InstancesDistributionProperty(
+                on_demand_allocation_strategy="prioritized",
+                on_demand_base_capacity=cloud.on_demand_servers,
+                on_demand_percentage_above_base_capacity=0 if cloud.spot else _ALL_ON_DEMAND,
+                spot_allocation_strategy="price-capacity-optimized",
+            ),
+        )
+        raw.launch_template = None
+        raw.capacity_rebalance = cloud.spot
+
+
+def _cron(entry: ScheduleEntry) -> str:
+    return f"{entry.minute} {entry.hour} * * {','.join(map(str, entry.days))}"
+
+
+def _zone(settings: PlatformSettings) -> str:
+    # The name of Universal Time that Auto Scaling knows.
+    return "Etc/UTC" if settings.scaling.time_zone == "UTC" else settings.scaling.time_zone
