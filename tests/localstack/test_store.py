@@ -1,12 +1,8 @@
-"""The same code against LocalStack, if somebody runs one: S3 and CloudFormation, through localstack-client.
-
-Set LOCALSTACK_HOST (as localhost.localstack.cloud:4566) and it runs; without, it says that it did not.
-"""
+"""An object store in the bucket of a stack on LocalStack, through localstack-client."""
 
 from __future__ import annotations
 
 import json
-import os
 import uuid
 from collections.abc import Iterator
 from typing import Any
@@ -17,9 +13,6 @@ from rse_pf.aws.storage.key_store import KEYS_NAME
 from rse_pf.aws.storage.s3_store import S3Store
 from rse_pf.errors import Conflict, NotFound
 
-pytestmark = pytest.mark.skipif(
-    not os.environ.get("LOCALSTACK_HOST"), reason="LOCALSTACK_HOST is not set: no LocalStack to test against"
-)
 TEMPLATE = {"Resources": {"Maps": {"Type": "AWS::S3::Bucket", "Properties": {}}}}
 READY_S, LOOKS = 2, 30
 
