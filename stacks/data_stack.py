@@ -16,6 +16,7 @@ from constructs import Construct
 from rse_pf.config import PlatformSettings
 from rse_pf.config.resource_names import ResourceNames
 from stacks.findings import acknowledge
+from stacks.replication import Replication
 from stacks.values import provide
 
 __all__ = ["BALANCER_LOGS", "DataStack"]
@@ -23,6 +24,7 @@ __all__ = ["BALANCER_LOGS", "DataStack"]
 BALANCER_LOGS = "alb"
 """Prefix of the load balancer's access logs in their bucket."""
 
+_DAY = cdk.Duration.days(1)
 _INFREQUENT_AFTER_DAYS = 30
 """The soonest that S3 takes an object there; ``data.glacier_after_days`` is not less."""
 
@@ -44,27 +46,37 @@ class DataStack(cdk.Stack):
         synthesizer: cdk.IStackSynthesizer | None = None,
     ) -> None:
         super().__init__(scope, construct_id, env=env, synthesizer=synthesizer, termination_protection=True)
+        deleted = cdk.Duration.days(settings.cloud.deleted_days)
         self.access_logs = self._bucket("AccessLogs", None)
-        self.access_logs.add_lifecycle_rule(expiration=cdk.Duration.days(settings.cloud.log_days))
+        self.access_logs.add_lifecycle_rule(
+            expiration=cdk.Duration.days(settings.cloud.log_days),
+            noncurrent_version_expiration=_DAY, abort_incomplete_multipart_upload_after=_DAY,
+        )  # fmt: skip
         self.maps = self._bucket("Maps", self.access_logs)
         self.maps.add_lifecycle_rule(
             transitions=[
                 s3.Transition(storage_class=kind, transition_after=cdk.Duration.days(days))
                 for kind, days in (
                     (s3.StorageClass.INFREQUENT_ACCESS, _INFREQUENT_AFTER_DAYS),
-                    (s3.StorageClass.GLACIER, settings.data.glacier_after_days),
+                    (s3.StorageClass.GLACIER_INSTANT_RETRIEVAL, settings.data.glacier_after_days),
                 )
             ],
-            abort_incomplete_multipart_upload_after=cdk.Duration.days(1),
         )
         self.artifacts = self._bucket("Artifacts", self.access_logs)
+        for bucket in (self.maps, self.artifacts):
+            bucket.add_lifecycle_rule(
+                noncurrent_version_expiration=deleted, expired_object_delete_marker=True,
+                abort_incomplete_multipart_upload_after=_DAY,
+            )  # fmt: skip
         self.audit_logs = self._bucket(
             "AuditLogs", self.access_logs, cdk.Duration.days(settings.cloud.audit_days)
         )
         self.audit_logs.add_lifecycle_rule(
             expiration=cdk.Duration.days(settings.cloud.audit_days + 1),
-            noncurrent_version_expiration=cdk.Duration.days(1),
-        )
+            noncurrent_version_expiration=_DAY, abort_incomplete_multipart_upload_after=_DAY,
+        )  # fmt: skip
+        if settings.cloud.replica_artifacts or settings.cloud.replica_maps:
+            Replication(self, "Replication", artifacts=self.artifacts, maps=self.maps, settings=settings)
         self.signing_key = secretsmanager.Secret(
             self, "SigningKey", description="private half of the robots' tokens; rse-pf token init --cloud",
             removal_policy=cdk.RemovalPolicy.RETAIN,

@@ -1,7 +1,7 @@
 """The firewall of Fig. 2: world -> load balancer -> backend servers, and nothing else in any direction.
 
-Servers reach only S3 and the interface endpoints.  Only the listener is open to a range of addresses,
-``cloud.robot_cidr``.
+Servers reach only S3, the interface endpoints, and owners of live maps on each other.  Only the listener is
+open to a range of addresses, ``cloud.robot_cidr``.
 """
 
 from __future__ import annotations
@@ -10,10 +10,11 @@ from aws_cdk import aws_ec2 as ec2
 from constructs import Construct
 
 from rse_pf.config import PlatformSettings
+from rse_pf.config.placement import live_ports
 from rse_pf.errors import ConfigurationError
 from stacks.findings import acknowledge
 
-__all__ = ["S3_PREFIX_LISTS", "Firewall", "front_port", "inner_ports", "s3_prefix_list"]
+__all__ = ["S3_PREFIX_LISTS", "Firewall", "front_port", "inner_ports", "live_range", "s3_prefix_list"]
 
 _HTTP, _HTTPS = 80, 443
 
@@ -61,6 +62,11 @@ class Firewall(Construct):
         for port in inner_ports(settings):
             self.balancer.add_egress_rule(self.servers, ec2.Port.tcp(port), "to the servers")
             self.servers.add_ingress_rule(self.balancer, ec2.Port.tcp(port), "from the load balancer")
+        live = live_range(settings)
+        if live is not None:
+            ports = ec2.Port.tcp_range(live[0], live[-1])
+            self.servers.add_egress_rule(self.servers, ports, "to owners of live maps")
+            self.servers.add_ingress_rule(self.servers, ports, "from the other servers, to live maps")
         self.servers.add_egress_rule(
             ec2.Peer.prefix_list(s3_prefix_list(settings)), ec2.Port.tcp(_HTTPS), "S3"
         )
@@ -75,3 +81,19 @@ def inner_ports(settings: PlatformSettings) -> list[int]:
     """Return the ports of a server that the load balancer uses."""
     ports = [settings.serving.port, settings.serving.control_port]
     return [*ports, settings.data.port] if settings.data.enabled else ports
+
+
+def live_range(settings: PlatformSettings) -> range | None:
+    """Return the ports on which servers reach owners of live maps on each other; None without live maps.
+
+    Raises:
+        ConfigurationError: The ports are not known beforehand.
+    """
+    if not settings.data.enabled or not settings.live.max_owners:
+        return None
+    if not settings.live.first_port:
+        raise ConfigurationError(
+            "live.first_port = 0 takes any free port, which the firewall of AWS cannot name",
+            hint='remove live.first_port from cdk.json, context."rse-pf"',
+        )
+    return live_ports(settings.replace(live={"host": "0.0.0.0"}).live)

@@ -131,6 +131,6 @@ class NetworkStack(cdk.Stack):
         cast("logs.CfnLogGroup", group.node.default_child).retention_in_days = settings.cloud.log_days
         flow = self.vpc.add_flow_log("Flow", destination=ec2.FlowLogDestination.to_cloud_watch_logs(group))
         explain(
-            flow, [*LOG_ACTIONS, "logs:DescribeLogStreams", "iam:PassRole"],
+            flow, [*LOG_ACTIONS, "logs:DescribeLogStreams"],
             used_by=f"{BY_AWS}the VPC delivers its flow logs to this log group",
         )  # fmt: skip

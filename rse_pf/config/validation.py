@@ -17,6 +17,7 @@ from rse_pf.errors import SettingsError
 __all__ = [
     "WHERE",
     "SettingRow",
+    "check_buckets",
     "check_burst_url",
     "check_deployment",
     "check_origin",
@@ -32,6 +33,7 @@ _DEPLOYMENT = re.compile(r"(?:[a-z](?:[a-z0-9-]{0,14}[a-z0-9])?)?")
 _QUALIFIER = re.compile(r"[a-z0-9]{1,10}")
 _ORIGIN = re.compile(r"[a-z][a-z0-9+.-]*://(?:[a-z0-9._-]+|\[[0-9a-f:.]+\])(?::[0-9]{1,5})?", re.IGNORECASE)
 _BURST_URL = re.compile(r"(?:https?://(?:[A-Za-z0-9._-]+|\[[0-9A-Fa-f:.]+\])(?::[0-9]{1,5})?)?/[!-~]{0,200}")
+_BUCKET = re.compile(r"[a-z0-9][a-z0-9.-]{1,61}[a-z0-9]")
 WHERE = 'in cdk.json, context."rse-pf"'
 
 
@@ -122,6 +124,16 @@ def check_burst_url(name: str, url: str) -> None:
             f"{name} = {_shown(url)} is no place to send commands to",
             hint=f"use /burst, or an address such as https://robots.example.org/burst, {WHERE}",
         )
+
+
+def check_buckets(name: str, buckets: str) -> None:
+    """Raise SettingsError if *buckets*, with spaces between, holds a name that no bucket of S3 has."""
+    for bucket in buckets.split():
+        if _BUCKET.fullmatch(bucket) is None:
+            raise SettingsError(
+                f"{name} has {_shown(bucket)}, which is no name of a bucket",
+                hint=f"write names such as rsepf-data-maps-1a2b3c, without s3:// and paths, {WHERE}",
+            )
 
 
 def check_deployment(name: str, qualifier: str) -> None:

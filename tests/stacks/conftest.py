@@ -6,6 +6,7 @@ import fcntl
 import json
 import os
 import shutil
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -91,6 +92,24 @@ def assembly(
     }
     findings = [each for plugin in report["pluginReports"] for each in plugin["violations"]]
     return Assembly(settings, folder / "out", templates, findings)
+
+
+@pytest.fixture
+def synthesise(tmp_path: Path, repository: Path) -> Callable[[PlatformSettings], dict[str, Any]]:
+    """Return what synthesises other settings and returns the templates by stack: 10 s, for slow tests."""
+    if shutil.which("node") is None:
+        pytest.skip("the CDK needs Node.js")
+    pytest.importorskip("aws_cdk", reason="the infra extra is not installed")
+    pytest.importorskip("cdk_nag", reason="the infra extra is not installed")
+
+    def made(settings: PlatformSettings) -> dict[str, Any]:
+        _synthesise(settings, tmp_path, repository)
+        return {
+            path.name.removesuffix(".template.json"): json.loads(path.read_text(encoding="utf-8"))
+            for path in sorted((tmp_path / "out").glob("*.template.json"))
+        }
+
+    return made
 
 
 def _synthesise(settings: PlatformSettings, folder: Path, repository: Path) -> None:

@@ -1,0 +1,83 @@
+"""Copy what makes an identity valid, and maps, to the buckets of deployments in other regions.
+
+One deployment is the home: operators enrol robots, rotate keys and publish services there.  S3 copies public
+keys, roster, deny list, published services and versions of maps to the others, one way.  Live maps, jobs and
+robots' objects stay where they are: a lease must have one home.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import cast
+
+import aws_cdk as cdk
+from aws_cdk import aws_iam as iam
+from aws_cdk import aws_s3 as s3
+from constructs import Construct
+
+from rse_pf.config import PlatformSettings
+from rse_pf.config.resource_names import KEYS_NAME, SERVICES_PREFIX
+from stacks.permissions import BY_AWS, allow
+
+__all__ = ["ARTIFACT_PREFIXES", "MAP_PREFIXES", "Replication"]
+
+ARTIFACT_PREFIXES = (KEYS_NAME, "control/", f"{SERVICES_PREFIX}/")
+"""Of what is copied from the artifact bucket; `rse_pf.auth.trust_store` writes below ``control/``."""
+MAP_PREFIXES = ("maps/",)
+"""Of what is copied from the map bucket: versions and heads, not ``live/``."""
+_BY_S3 = f"{BY_AWS}S3 copies the objects of a replication rule in this role"
+
+
+class Replication(Construct):
+    """The rules of the artifact and the map bucket, and the role that S3 copies in."""
+
+    def __init__(
+        self,
+        scope: Construct,
+        construct_id: str,
+        *,
+        artifacts: s3.Bucket,
+        maps: s3.Bucket,
+        settings: PlatformSettings,
+    ) -> None:
+        super().__init__(scope, construct_id)
+        self._role = iam.Role(self, "Role", assumed_by=iam.ServicePrincipal("s3.amazonaws.com"))
+        self._copy(artifacts, settings.cloud.replica_artifacts.split(), ARTIFACT_PREFIXES)
+        self._copy(maps, settings.cloud.replica_maps.split(), MAP_PREFIXES)
+
+    def _copy(self, bucket: s3.Bucket, replicas: Sequence[str], prefixes: Sequence[str]) -> None:
+        """Copy new objects below *prefixes*, and their deletions, to the buckets *replicas*."""
+        if not replicas:
+            return
+        targets = [f"arn:{cdk.Aws.PARTITION}:s3:::{each}" for each in replicas]
+        allow(
+            self._role, ["s3:GetReplicationConfiguration", "s3:ListBucket"], [bucket.bucket_arn],
+            used_by=_BY_S3,
+        )  # fmt: skip
+        allow(
+            self._role,
+            ["s3:GetObjectVersionForReplication", "s3:GetObjectVersionAcl", "s3:GetObjectVersionTagging"],
+            [bucket.arn_for_objects(f"{each}*") for each in prefixes],
+            used_by=_BY_S3, why="the rule copies whatever lies below these prefixes",
+        )  # fmt: skip
+        allow(
+            self._role, ["s3:ReplicateObject", "s3:ReplicateDelete", "s3:ReplicateTags"],
+            [f"{target}/{each}*" for target in targets for each in prefixes],
+            used_by=_BY_S3, why="the rule copies whatever lies below these prefixes",
+        )  # fmt: skip
+        rules = [
+            s3.CfnBucket.ReplicationRuleProperty(
+                id=f"to-{at}-{prefix.rstrip('/').replace('.', '-')}", priority=number, status="Enabled",
+                filter=s3.CfnBucket.ReplicationRuleFilterProperty(prefix=prefix),
+                delete_marker_replication=s3.CfnBucket.DeleteMarkerReplicationProperty(status="Enabled"),
+                destination=s3.CfnBucket.ReplicationDestinationProperty(bucket=target),
+            )
+            for number, (at, target, prefix) in enumerate(
+                ((at, target, prefix) for at, target in enumerate(targets) for prefix in prefixes), 1
+            )
+        ]  # fmt: skip
+        cast(
+            "s3.CfnBucket", bucket.node.default_child
+        ).replication_configuration = s3.CfnBucket.ReplicationConfigurationProperty(
+            role=self._role.role_arn, rules=rules
+        )

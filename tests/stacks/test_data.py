@@ -1,0 +1,158 @@
+"""What the buckets keep and for how long, what is copied elsewhere, and how servers reach live maps."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from rse_pf.auth.trust_store import DENY_NAME, ROBOTS_NAME
+from rse_pf.config import PlatformSettings
+from rse_pf.config.resource_names import KEYS_NAME, SERVICES_PREFIX
+from rse_pf.errors import ConfigurationError
+
+Assembly = Any
+READ_LIKE_ANY_OBJECT = {"STANDARD_IA", "GLACIER_IR"}
+"""Storage classes from which S3 answers a GET at once; from GLACIER and DEEP_ARCHIVE it does not."""
+
+
+def buckets(assembly: Assembly) -> dict[str, dict[str, Any]]:
+    """Return the properties of each bucket by its name in the data stack."""
+    resources = assembly.templates["RsePf-Data"]["Resources"]
+    return {
+        name[:-8]: each["Properties"] for name, each in resources.items() if each["Type"] == "AWS::S3::Bucket"
+    }
+
+
+def rules(bucket: dict[str, Any]) -> list[dict[str, Any]]:
+    found: list[dict[str, Any]] = bucket["LifecycleConfiguration"]["Rules"]
+    assert all(each["Status"] == "Enabled" for each in found)
+    return found
+
+
+def test_no_rule_makes_a_map_unreadable_that_robots_still_use(assembly: Assembly) -> None:
+    """Objects are named by digest: old keyframes of a map that grows every day are never written again."""
+    moved = {
+        transition["StorageClass"]: transition["TransitionInDays"]
+        for bucket in buckets(assembly).values()
+        for rule in rules(bucket)
+        for transition in rule.get("Transitions", [])
+    }
+
+    assert set(moved) == READ_LIKE_ANY_OBJECT
+    assert moved["GLACIER_IR"] == assembly.settings.data.glacier_after_days > moved["STANDARD_IA"]
+
+
+def test_what_nobody_can_see_is_deleted_in_every_bucket(assembly: Assembly) -> None:
+    """Parts of uploads that were given up, and former versions: S3 lists neither, and both cost money."""
+    cloud = assembly.settings.cloud
+    kept = {"AccessLogs": 1, "AuditLogs": 1, "Maps": cloud.deleted_days, "Artifacts": cloud.deleted_days}
+
+    assert buckets(assembly).keys() == kept.keys()
+    for name, bucket in buckets(assembly).items():
+        aborted = [each["AbortIncompleteMultipartUpload"] for each in rules(bucket) if "Abort" in str(each)]
+        former = [
+            each["NoncurrentVersionExpiration"]["NoncurrentDays"]
+            for each in rules(bucket)
+            if "NoncurrentVersionExpiration" in each
+        ]
+        assert aborted == [{"DaysAfterInitiation": 1}], name
+        assert former == [kept[name]], name
+
+
+def test_access_logs_end_and_maps_do_not(assembly: Assembly) -> None:
+    ends = {
+        name: [each["ExpirationInDays"] for each in rules(bucket) if "ExpirationInDays" in each]
+        for name, bucket in buckets(assembly).items()
+    }
+
+    cloud = assembly.settings.cloud
+    assert ends == {
+        "AccessLogs": [cloud.log_days], "AuditLogs": [cloud.audit_days + 1], "Maps": [], "Artifacts": [],
+    }  # fmt: skip
+
+
+def test_an_identity_and_maps_are_copied_to_other_regions_and_nothing_else(assembly: Assembly) -> None:
+    copied = {
+        name: [
+            (rule["Destination"]["Bucket"]["Fn::Join"][1][-1], rule["Filter"]["Prefix"])
+            for rule in bucket["ReplicationConfiguration"]["Rules"]
+        ]
+        for name, bucket in buckets(assembly).items()
+        if "ReplicationConfiguration" in bucket
+    }
+    if not assembly.settings.cloud.replica_maps:
+        assert copied == {}
+        return
+
+    artifacts = ":s3:::artifacts-in-virginia"
+    assert copied == {
+        "Artifacts": [
+            (artifacts, KEYS_NAME), (artifacts, "control/"), (artifacts, f"{SERVICES_PREFIX}/"),
+        ],
+        "Maps": [(":s3:::maps-in-virginia", "maps/"), (":s3:::maps-in-ireland", "maps/")],
+    }  # fmt: skip
+    prefixes = tuple(prefix for _, prefix in copied["Artifacts"])
+    assert all(name.startswith(prefixes) for name in (KEYS_NAME, ROBOTS_NAME, DENY_NAME))
+    for bucket in buckets(assembly).values():
+        found = bucket.get("ReplicationConfiguration", {"Rules": []})["Rules"]
+        assert len({rule["Priority"] for rule in found}) == len({rule["Id"] for rule in found}) == len(found)
+
+
+def test_servers_reach_live_maps_on_each_other_and_nothing_else_does(assembly: Assembly) -> None:
+    live = assembly.settings.live
+    ports = (live.first_port, live.first_port + live.ports - 1)
+    resources = assembly.templates["RsePf-Network"]["Resources"]
+    (servers,) = [name for name in resources if name.startswith("FirewallServers") and len(name) == 23]
+    allowed = {"AWS::EC2::SecurityGroupIngress": [], "AWS::EC2::SecurityGroupEgress": []}  # type: dict[str, list[Any]]
+    for each in resources.values():
+        rule = each["Properties"]
+        if each["Type"] in allowed and (rule["FromPort"], rule["ToPort"]) == ports:
+            sides = [rule[name]["Fn::GetAtt"][0] for name in rule if name.endswith("GroupId")]
+            allowed[each["Type"]].append((rule["IpProtocol"], *sides))
+
+    assert allowed == {
+        "AWS::EC2::SecurityGroupIngress": [("tcp", servers, servers)],
+        "AWS::EC2::SecurityGroupEgress": [("tcp", servers, servers)],
+    }
+    entries = [
+        (each.get("Egress", False), each["CidrBlock"], each["RuleAction"])
+        for each in assembly.all("AWS::EC2::NetworkAclEntry")
+        if (each.get("PortRange") or {}) == {"From": ports[0], "To": ports[1]}
+    ]
+    assert entries == [(False, {"Fn::GetAtt": [_vpc(resources), "CidrBlock"]}, "allow")]
+
+
+def _vpc(resources: dict[str, Any]) -> str:
+    (name,) = [name for name, each in resources.items() if each["Type"] == "AWS::EC2::VPC"]
+    return name
+
+
+def test_the_units_let_owners_of_live_maps_listen_where_the_firewall_lets_servers_in(
+    assembly: Assembly,
+) -> None:
+    for unit in assembly.folder.glob("asset.*/rse-pf.service"):
+        (start,) = [line for line in unit.read_text().splitlines() if line.startswith("ExecStart=")]
+        assert "--live-host 0.0.0.0 " in start
+        return
+    pytest.fail("no package holds the unit")
+
+
+@pytest.mark.parametrize(
+    ("groups", "has_ports"),
+    [({}, True), ({"data": {"enabled": False}}, False), ({"live": {"max_owners": 0}}, False)],
+)
+def test_without_live_maps_no_port_is_open_between_servers(groups: Any, has_ports: bool) -> None:
+    pytest.importorskip("aws_cdk", reason="the infra extra is not installed")
+    from stacks.firewall import live_range
+
+    assert (live_range(PlatformSettings.from_dict(groups)) is not None) == has_ports
+
+
+def test_ports_of_live_maps_that_no_firewall_can_name_are_refused() -> None:
+    pytest.importorskip("aws_cdk", reason="the infra extra is not installed")
+    from stacks.firewall import live_range
+
+    with pytest.raises(ConfigurationError, match=r"live\.first_port = 0") as told:
+        live_range(PlatformSettings.from_dict({"live": {"first_port": 0}}))
+    assert told.value.hint
