@@ -1,4 +1,4 @@
-"""Build the packages of the cloud: a folder of wheels for the servers, an unpacked folder for the function.
+"""Build the packages of the cloud: archives of a server's environment, an unpacked folder for the function.
 
     python scripts/assets.py [--into build] [--arm]
 
@@ -7,8 +7,11 @@ compiler of locks/native.txt.  The build is reproducible: the time of every entr
 default the earliest of a zip file).  Nothing is built when neither a lock nor a source has changed; the
 network is needed only for a changed lock.
 
-The function's sources are compiled to bytecode, which it could not keep: /var/task is read-only there.  That
-needs a Python of the function's version (python3.13 in the path); without one, each cold start compiles them.
+A server unpacks its virtual environment instead of installing it: libraries.tar.gz holds what the lock names,
+platform.tar.gz holds ours.  Only a changed lock makes the first one anew.
+
+Both packages hold bytecode, because the processes that run them may not write it there.  That needs a Python
+of the same version (python3.11 for servers, python3.13 for the function); without one, each start compiles.
 
 The native core is compiled here and goes into both packages; without a C++ compiler they have PoseLib alone.
 With --arm its wheel for aarch64 is built, too, and lies with its hash in build/native.
@@ -17,11 +20,15 @@ With --arm its wheel for aarch64 is built, too, and lies with its hash in build/
 from __future__ import annotations
 
 import argparse
+import configparser
+import gzip
 import hashlib
+import json
 import os
 import shutil
 import subprocess
 import sys
+import tarfile
 import tempfile
 import zipfile
 from pathlib import Path
@@ -33,10 +40,15 @@ LAMBDA_PACKAGES = ("rse_pf", "lambda_pnp")
 UNUSED = ("tests", "__pycache__", "f2py", "_pyinstaller", "include", "testing")
 """Folders of wheels that are never used at run time."""
 UNUSED_ENDINGS = (".pyi", ".pxd", ".c", ".h", ".a")
+UNUSED_BY_SERVERS = ("tests", "__pycache__", "_pytest", "pytest", "pluggy", "pygments", "iniconfig")
+"""The same for servers, whose own services may use more; gtsam asks for pytest and never imports it."""
 DEBIAN_12 = ("3.11", 36)
 AMAZON_2023 = ("3.13", 34)
 FUNCTION_FOLDER = "/var/task"
 """Where Lambda puts the function, for its tracebacks."""
+ENVIRONMENT = "/opt/rse-pf/venv"
+"""Where a server unpacks its environment: stacks/boot/install.py."""
+LIBRARIES, PLATFORM, ENVIRONMENT_FILE = "libraries.tar.gz", "platform.tar.gz", "environment.json"
 NATIVE_SOURCES = ("src/*.cpp", "src/*.hpp", "include/*.h", "wheel_builder/*.py", "Makefile", "*.toml", "*.md")
 
 
@@ -62,6 +74,7 @@ def _packages(into: Path) -> int:
             ours = _our_wheel(Path(work))
             core = _native_wheels(into / "native", "x86_64")
             _wheelhouse(into / "wheelhouse", [ours, *core], into / "downloads" / "boot")
+            _servers(into / "servers", [ours, *core], into / "downloads")
             _function(into / "lambda", ours, core, into / "downloads" / "lambda")
     except subprocess.CalledProcessError as error:
         sys.stderr.write(
@@ -69,7 +82,7 @@ def _packages(into: Path) -> int:
         )
         return 2
     stamp.write_text(wanted, encoding="utf-8")
-    for name in ("wheelhouse", "lambda"):
+    for name in ("servers", "lambda"):
         size = sum(file.stat().st_size for file in (into / name).rglob("*") if file.is_file())
         sys.stderr.write(f"assets: {into / name} {size / 1e6:.1f} MB\n")
     return 0
@@ -89,7 +102,8 @@ def _sources() -> list[Path]:
 def _state_of_the_sources() -> str:
     state = hashlib.sha256(os.environ.get("SOURCE_DATE_EPOCH", EPOCH).encode())
     has_compiler = any(map(shutil.which, (os.environ.get("CXX", "c++"), "g++", "clang++")))
-    state.update(f"compiler: {has_compiler}\0bytecode: {_function_python() is not None}\0".encode())
+    pythons = [_python_of(version) is not None for version in (DEBIAN_12[0], AMAZON_2023[0])]
+    state.update(f"compiler: {has_compiler}\0bytecode: {pythons}\0".encode())
     native = sorted(file for pattern in NATIVE_SOURCES for file in (ROOT / "native").glob(pattern))
     locks = [ROOT / "locks/boot.txt", ROOT / "locks/lambda.txt"]
     for file in [*_sources(), *native, Path(__file__), *locks]:
@@ -179,6 +193,85 @@ def _write_hashes(folder: Path) -> None:
     (folder / "requirements.txt").write_text("".join(lines), encoding="utf-8")
 
 
+def _servers(folder: Path, ours: list[Path], downloads: Path) -> None:
+    """Write the two archives of a server's environment into *folder*, and what they were made of and for."""
+    _empty(folder)
+    shutil.copyfile(_libraries(downloads), folder / LIBRARIES)
+    with tempfile.TemporaryDirectory() as work:
+        tree = Path(work)
+        site = tree / "lib" / f"python{DEBIAN_12[0]}" / "site-packages"
+        for wheel in ours:
+            _unpack(wheel, site, None, (), ())
+        has_bytecode = _compile(tree, DEBIAN_12[0], ENVIRONMENT)
+        (tree / "pyvenv.cfg").write_text(
+            f"home = /usr/bin\ninclude-system-site-packages = false\nversion = {DEBIAN_12[0]}\n",
+            encoding="utf-8",
+        )
+        (tree / "bin").mkdir()
+        for name in ("python", "python3"):
+            (tree / "bin" / name).symlink_to("/usr/bin/python3")
+        _write_scripts(site, tree / "bin")
+        _pack(tree, folder / PLATFORM)
+        sources = {
+            file.relative_to(site).as_posix(): hashlib.sha256(file.read_bytes()).hexdigest()
+            for file in sorted((site / "rse_pf").rglob("*.py"))
+        }
+    about = {"python": DEBIAN_12[0], "bytecode": has_bytecode, "sources": sources}
+    (folder / ENVIRONMENT_FILE).write_text(json.dumps(about, sort_keys=True) + "\n", encoding="utf-8")
+
+
+def _libraries(downloads: Path) -> Path:
+    """Return the archive of what the lock of the servers names; it is made again only for another lock."""
+    archive, stamp = downloads / LIBRARIES, downloads / f"{LIBRARIES}.sha256"
+    state = hashlib.sha256(Path(__file__).read_bytes() + (ROOT / "locks/boot.txt").read_bytes())
+    state.update(f"{_python_of(DEBIAN_12[0]) is not None}".encode())
+    wanted = state.hexdigest()
+    if archive.is_file() and stamp.is_file() and stamp.read_text(encoding="utf-8") == wanted:
+        return archive
+    stamp.unlink(missing_ok=True)
+    with tempfile.TemporaryDirectory() as work:
+        site = Path(work) / "lib" / f"python{DEBIAN_12[0]}" / "site-packages"
+        for wheel in sorted((downloads / "boot").glob("*.whl")):
+            _unpack(wheel, site, None, UNUSED_BY_SERVERS)
+        _compile(Path(work), DEBIAN_12[0], ENVIRONMENT)
+        _pack(Path(work), archive)
+    stamp.write_text(wanted, encoding="utf-8")
+    return archive
+
+
+def _write_scripts(site: Path, folder: Path) -> None:
+    """Write the commands that our wheels declare, as an installer would."""
+    for declared in sorted(site.glob("*.dist-info/entry_points.txt")):
+        points = configparser.ConfigParser()
+        points.read(declared, encoding="utf-8")
+        for name, place in points.items("console_scripts") if points.has_section("console_scripts") else ():
+            module, _, function = place.partition(":")
+            (folder / name).write_text(
+                f"#!{ENVIRONMENT}/bin/python\nimport sys\nfrom {module} import {function}\n\n"
+                f"sys.exit({function}())\n",
+                encoding="utf-8",
+            )
+            (folder / name).chmod(0o755)
+
+
+def _pack(tree: Path, archive: Path) -> None:
+    """Write *tree* into *archive*; the same tree gives the same bytes."""
+    epoch = int(os.environ.get("SOURCE_DATE_EPOCH", EPOCH))
+
+    def same(entry: tarfile.TarInfo) -> tarfile.TarInfo:
+        entry.mtime, entry.uid, entry.gid, entry.uname, entry.gname = epoch, 0, 0, "root", "root"
+        entry.mode = 0o755 if entry.isdir() or entry.mode & 0o100 else 0o644
+        return entry
+
+    with (
+        archive.open("wb") as file,
+        gzip.GzipFile("", "wb", compresslevel=6, fileobj=file, mtime=epoch) as packed,
+        tarfile.open(fileobj=packed, mode="w", format=tarfile.GNU_FORMAT) as made,
+    ):
+        for path in sorted(tree.rglob("*")):
+            made.add(path, path.relative_to(tree).as_posix(), recursive=False, filter=same)
+
+
 def _function(folder: Path, ours: Path, core: list[Path], wheels: Path) -> None:
     """Unpack the function's wheels into *folder*, without files that are never used."""
     _empty(folder)
@@ -186,30 +279,33 @@ def _function(folder: Path, ours: Path, core: list[Path], wheels: Path) -> None:
     for wheel in (*sorted(wheels.glob("*.whl")), *core):
         _unpack(wheel, folder, None)
     _unpack(ours, folder, LAMBDA_PACKAGES)
-    _compile(folder)
+    _compile(folder, AMAZON_2023[0], FUNCTION_FOLDER)
 
 
-def _compile(folder: Path) -> None:
-    """Add the bytecode of *folder*; the same sources give the same bytes."""
-    python = _function_python()
+def _compile(folder: Path, version: str, runs_in: str) -> bool:
+    """Add the bytecode of *folder*, which will lie in *runs_in*; return whether there is a Python for it.
+
+    The same sources give the same bytes.
+    """
+    python = _python_of(version)
     if python is None:
         sys.stderr.write(
-            f"assets: no Python {AMAZON_2023[0]} is in the path: each cold start compiles, 0.6 s of CPU\n"
-            f"  hint: install python{AMAZON_2023[0]}, and run make assets again\n"
+            f"assets: no Python {version} is in the path: what is in {runs_in} compiles at each cold start\n"
+            f"  hint: install python{version}, and run make assets again\n"
         )
-        return
+        return False
     subprocess.run(
         [
             python, "-P", "-S", "-s", "-m", "compileall", "-q", "--invalidation-mode", "unchecked-hash",
-            "-s", str(folder), "-p", FUNCTION_FOLDER, str(folder),
+            "-s", str(folder), "-p", runs_in, str(folder),
         ],
         check=True, env={**os.environ, "PYTHONHASHSEED": "0"}, stdout=sys.stderr,
     )  # fmt: skip
+    return True
 
 
-def _function_python() -> str | None:
-    """Return a Python of the function's version, None if there is none."""
-    wanted = AMAZON_2023[0]
+def _python_of(wanted: str) -> str | None:
+    """Return a Python of the version *wanted*, None if there is none."""
     for python in (shutil.which(f"python{wanted}"), sys.executable):
         command = [python or "", "-c", "import sys; print('%d.%d' % sys.version_info[:2])"]
         if python and subprocess.run(command, capture_output=True, text=True).stdout.strip() == wanted:
@@ -217,14 +313,25 @@ def _function_python() -> str | None:
     return None
 
 
-def _unpack(wheel: Path, folder: Path, only: tuple[str, ...] | None) -> None:
+def _unpack(
+    wheel: Path,
+    folder: Path,
+    only: tuple[str, ...] | None,
+    without: tuple[str, ...] = UNUSED,
+    endings: tuple[str, ...] = UNUSED_ENDINGS,
+) -> None:
+    """Put the files of *wheel* into *folder*, but for folders named in *without* and files with *endings*."""
     with zipfile.ZipFile(wheel) as archive:
         for name in sorted(archive.namelist()):
             parts = Path(name).parts
-            unused = set(parts[:-1]) & set(UNUSED) or name.endswith((*UNUSED_ENDINGS, "/"))
+            if len(parts) > 2 and parts[0].endswith(".data"):
+                if parts[1] not in ("purelib", "platlib"):
+                    continue  # scripts and headers
+                parts = parts[2:]
+            unused = set(parts[:-1]) & set(without) or name.endswith((*endings, "/"))
             if unused or (only and parts[0] not in only and not parts[0].endswith(".dist-info")):
                 continue
-            target = folder / name
+            target = folder.joinpath(*parts)
             target.parent.mkdir(parents=True, exist_ok=True)
             target.write_bytes(archive.read(name))
             target.chmod(0o644)

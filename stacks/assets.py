@@ -8,18 +8,20 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
-import zipfile
-import zlib
 from pathlib import Path
 
 from rse_pf.config import PlatformSettings
+from rse_pf.config.server_settings import server_settings
 from rse_pf.errors import ConfigurationError
 
-__all__ = ["SETTINGS_FILE", "SUMS_FILE", "WHEELHOUSE", "staged", "sums_digest"]
+__all__ = ["ENVIRONMENT_FILE", "SERVERS", "SETTINGS_FILE", "SUMS_FILE", "staged", "sums_digest"]
 
 SETTINGS_FILE = "settings.json"
 SUMS_FILE = "SHA256SUMS"
-WHEELHOUSE = "wheelhouse"
+SERVERS = "servers"
+"""The folder of what a backend server unpacks."""
+ENVIRONMENT_FILE = "environment.json"
+"""In that folder: the Python that the archives are for, and the digests of our sources in them."""
 _BOOT = Path(__file__).parent / "boot"
 _IN_USER_DATA = "first_boot.py"
 _ROOT = Path(__file__).resolve().parents[1]
@@ -29,14 +31,16 @@ _OURS = "rse_pf"
 def staged(assets: Path, name: str, settings: PlatformSettings, into: Path) -> Path:
     """Return a copy of the folder *name* of *assets* below *into*, with the merged settings inside.
 
-    The settings file has the form of cdk.json, so that `rse-pf --settings` reads it.  The wheelhouse gets the
-    boot files too, and a list of all sums for `first_boot.py`.
+    The settings file has the form of cdk.json, so that `rse-pf --settings` reads it.  The package of the
+    servers gets the boot files too, and a list of all sums for `first_boot.py`; of the settings it holds only
+    those that a server reads, so that no other change replaces servers.
 
     Raises:
         ConfigurationError: The folder is missing, empty, cannot be read, or holds other sources than these.
     """
     source, target = assets / name, into / name
-    document = {"context": {"rse-pf": settings.to_dict()}}
+    chosen = server_settings(settings) if name == SERVERS else settings.to_dict()
+    document = {"context": {"rse-pf": chosen}}
     try:
         if not any(source.iterdir()):
             raise FileNotFoundError(f"{source} is empty")
@@ -45,7 +49,7 @@ def staged(assets: Path, name: str, settings: PlatformSettings, into: Path) -> P
         raise ConfigurationError(f"no packages in {source}", hint="run make assets") from error
     _check_fresh(source)
     (target / SETTINGS_FILE).write_text(json.dumps(document, sort_keys=True) + "\n", encoding="utf-8")
-    if name == WHEELHOUSE:
+    if name == SERVERS:
         for file in sorted(_BOOT.iterdir()):
             if file.is_file() and file.name != _IN_USER_DATA:
                 shutil.copyfile(file, target / file.name)
@@ -61,27 +65,31 @@ def sums_digest(package: Path) -> str:
 def _check_fresh(packages: Path) -> None:
     """Refuse packages that were built of other sources: they might not even know the settings beside them."""
     built = {
-        file.relative_to(packages).as_posix(): file.read_bytes() for file in (packages / _OURS).rglob("*.py")
+        file.relative_to(packages).as_posix(): _digest(file) for file in (packages / _OURS).rglob("*.py")
     }
-    for wheel in packages.glob(f"{_OURS}-*.whl"):
-        built.update(_inside(wheel))
+    built.update(_listed(packages / ENVIRONMENT_FILE))
     if not built:
         return
     sources = {file.relative_to(_ROOT).as_posix(): file for file in (_ROOT / _OURS).rglob("*.py")}
-    if built.keys() != sources.keys() or any(sources[each].read_bytes() != built[each] for each in built):
+    if built.keys() != sources.keys() or any(_digest(sources[each]) != built[each] for each in built):
         raise ConfigurationError(
             f"the packages in {packages} were built of other sources", hint="run make assets"
         )
 
 
-def _inside(wheel: Path) -> dict[str, bytes]:
-    """Return our sources in *wheel*."""
+def _listed(file: Path) -> dict[str, str]:
+    """Return the digests of our sources that the builder wrote into *file*; none without such a file."""
+    if not file.exists():
+        return {}
     try:
-        with zipfile.ZipFile(wheel) as archive:
-            names = [each for each in archive.namelist() if each.startswith(f"{_OURS}/")]
-            return {each: archive.read(each) for each in names if each.endswith(".py")}
-    except (OSError, EOFError, NotImplementedError, zipfile.BadZipFile, zlib.error) as error:
-        raise ConfigurationError(f"{wheel} cannot be read: {error}", hint="run make assets") from error
+        listed: dict[str, str] = dict(json.loads(file.read_text(encoding="utf-8"))["sources"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ConfigurationError(f"{file} cannot be read: {error}", hint="run make assets") from error
+    return listed
+
+
+def _digest(file: Path) -> str:
+    return hashlib.sha256(file.read_bytes()).hexdigest()
 
 
 def _sums(folder: Path) -> str:

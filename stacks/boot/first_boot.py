@@ -1,10 +1,13 @@
 #!/usr/bin/python3
 """Fetch a backend server's package, verify it, let it install itself; cloud-init runs this once, as root.
 
-Standard library alone: credentials from IMDSv2, one GET signed with SigV4.  Promises no address but IMDS and
-S3, and that not one byte is written or run that the template's digest does not vouch for.
+Standard library alone: credentials from IMDSv2, requests signed with SigV4.  Promises no address but IMDS, S3
+and Auto Scaling, and that not one byte is written or run that the template's digest does not vouch for.  A
+boot that fails writes its last lines to the console and abandons the launch: the group replaces the machine.
 """
 
+import collections
+import contextlib
 import datetime
 import hashlib
 import hmac
@@ -19,27 +22,29 @@ import urllib.parse
 import urllib.request
 import zipfile
 
-__all__ = ["main", "signed_headers", "verified"]
+__all__ = ["abandon", "main", "signed_headers", "verified"]
 
 IMDS = "http://169.254.169.254/latest/"
 PACKAGE = pathlib.Path("/opt/rse-pf/package")
 SUMS = "SHA256SUMS"
-TRIES, PAUSE_S = 30, 5.0
+PAUSE_S = 5.0
+CONSOLE = pathlib.Path("/dev/console")
+LINES = collections.deque(maxlen=20)
 
 
-def signed_headers(host, path, region, credentials, now):
-    """Return the headers of a GET that S3 accepts (Signature Version 4)."""
+def signed_headers(host, path, region, credentials, now, service="s3", query=""):
+    """Return the headers of a GET that *service* accepts (Signature Version 4)."""
     stamp, day = now.strftime("%Y%m%dT%H%M%SZ"), now.strftime("%Y%m%d")
     headers = {"host": host, "x-amz-content-sha256": hashlib.sha256(b"").hexdigest(), "x-amz-date": stamp}
     if credentials.get("Token"):
         headers["x-amz-security-token"] = credentials["Token"]
     names = ";".join(sorted(headers))
     lines = "".join(f"{name}:{headers[name]}\n" for name in sorted(headers))
-    request = "\n".join(["GET", path, "", lines, names, headers["x-amz-content-sha256"]])
-    scope = f"{day}/{region}/s3/aws4_request"
+    request = "\n".join(["GET", path, query, lines, names, headers["x-amz-content-sha256"]])
+    scope = f"{day}/{region}/{service}/aws4_request"
     text = "\n".join(["AWS4-HMAC-SHA256", stamp, scope, hashlib.sha256(request.encode()).hexdigest()])
     key = ("AWS4" + credentials["SecretAccessKey"]).encode()
-    for part in (day, region, "s3", "aws4_request"):
+    for part in (day, region, service, "aws4_request"):
         key = hmac.new(key, part.encode(), hashlib.sha256).digest()
     signature = hmac.new(key, text.encode(), hashlib.sha256).hexdigest()
     headers["authorization"] = (
@@ -69,27 +74,62 @@ def verified(data, sha256):
 
 
 def main(facts):
-    """Fetch, verify, install; any failure ends the boot, and the group replaces the machine."""
-    data, server = patiently(lambda: fetched(facts))
+    """Fetch, verify, install; tell a failure to the console and to the group, which replaces the machine."""
+    try:
+        install(facts)
+    except BaseException as error:
+        say(f"first boot: failed: {type(error).__name__}: {error}")
+        tell_console()
+        abandon(facts)
+        raise SystemExit(1) from error
+
+
+def install(facts):
+    """Fetch and verify the package, and run its install.py."""
+    data, server = patiently(lambda: fetched(facts), float(facts["retry_s"]))
     PACKAGE.mkdir(parents=True, exist_ok=True)
     verified(data, facts["sha256"]).extractall(PACKAGE)
     told = json.dumps({**facts, "server": server})
-    subprocess.run([sys.executable, str(PACKAGE / "install.py"), told], check=True)
+    command = [sys.executable, str(PACKAGE / "install.py"), told]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as running:
+        for line in running.stdout:
+            say(line.rstrip())
+    if running.returncode:
+        raise SystemExit(f"install.py ended with {running.returncode}")
 
 
 def fetched(facts):
     """Return the package's bytes and the name of this instance."""
     token = imds("api/token")
-    role = imds("meta-data/iam/security-credentials/", token).split()[0]
-    credentials = json.loads(imds("meta-data/iam/security-credentials/" + role, token))
     bucket, _, name = facts["package"].split("://", 1)[1].partition("/")
     host = f"{bucket}.s3.{facts['region']}.amazonaws.com"
-    path = "/" + urllib.parse.quote(name)
+    return asked(host, "/" + urllib.parse.quote(name), facts, token), imds("meta-data/instance-id", token)
+
+
+def abandon(facts):
+    """Tell the group that this launch failed; without it the hook's own timeout ends the machine."""
+    try:
+        token = imds("api/token")
+        call = {
+            "Action": "CompleteLifecycleAction", "AutoScalingGroupName": facts["group"],
+            "InstanceId": imds("meta-data/instance-id", token), "LifecycleActionResult": "ABANDON",
+            "LifecycleHookName": facts["launch"], "Version": "2011-01-01",
+        }  # fmt: skip
+        host = f"autoscaling.{facts['region']}.amazonaws.com"
+        asked(host, "/", facts, token, "autoscaling", urllib.parse.urlencode(sorted(call.items())))
+    except (OSError, ValueError, IndexError) as error:
+        say(f"first boot: not abandoned: {error}")
+
+
+def asked(host, path, facts, token, service="s3", query=""):
+    """Return the answer to a GET, signed as the instance's role."""
+    role = imds("meta-data/iam/security-credentials/", token).split()[0]
+    credentials = json.loads(imds("meta-data/iam/security-credentials/" + role, token))
     now = datetime.datetime.now(datetime.timezone.utc)
-    headers = signed_headers(host, path, facts["region"], credentials, now)
-    request = urllib.request.Request(f"https://{host}{path}", headers=headers)
+    headers = signed_headers(host, path, facts["region"], credentials, now, service, query)
+    request = urllib.request.Request(f"https://{host}{path}{'?' if query else ''}{query}", headers=headers)
     with urllib.request.urlopen(request, timeout=60) as answer:
-        return answer.read(), imds("meta-data/instance-id", token)
+        return answer.read()
 
 
 def imds(path, token=None):
@@ -103,14 +143,26 @@ def imds(path, token=None):
         return answer.read().decode()
 
 
-def patiently(call):
+def patiently(call, within_s):
     """Return what *call* returns; roles and endpoints may come a little later than the machine."""
-    for left in range(TRIES - 1, -1, -1):
+    until = time.monotonic() + within_s
+    while True:
         try:
             return call()
-        except OSError as error:
-            sys.stderr.write(f"first boot: {error}\n")
-            if not left:
+        except (OSError, IndexError, ValueError) as error:
+            say(f"first boot: {error}")
+            if time.monotonic() + PAUSE_S >= until:
                 raise
             time.sleep(PAUSE_S)
-    return None
+
+
+def say(line):
+    """Write *line* to cloud-init's log, and keep it."""
+    sys.stderr.write(line + "\n")
+    LINES.append(line)
+
+
+def tell_console():
+    """Write the last lines to the console, which outlives the machine: aws ec2 get-console-output."""
+    with contextlib.suppress(OSError):
+        CONSOLE.write_text("".join(f"rse-pf: {line}\r\n" for line in LINES), encoding="utf-8")

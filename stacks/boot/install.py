@@ -1,9 +1,9 @@
 #!/usr/bin/python3
 """Install a backend server on a plain Debian 12 machine; first_boot.py runs this file of the package as root.
 
-Uses the standard library only.  Installs the wheels beside this file, by hash and without any index, into a
-virtual environment, and starts the units.  A second run has the same result.  The server, its agent and the
-data service run as a user who may write one folder.
+Uses the standard library only.  Unpacks the archives beside this file, which first_boot.py has verified, into
+a virtual environment with its bytecode, and starts the units.  A second run has the same result.  The server,
+its agent and the data service run as a user who may write one folder.
 """
 
 import json
@@ -11,6 +11,7 @@ import pathlib
 import shutil
 import subprocess
 import sys
+import time
 
 __all__ = ["environment_file", "main", "units_of"]
 
@@ -19,6 +20,8 @@ HOME = PACKAGE.parent
 USER = "rse-pf"
 UNITS = pathlib.Path("/etc/systemd/system")
 CONFIGURATION = pathlib.Path("/etc/rse-pf")
+VENV = HOME / "venv"
+ARCHIVES = ("libraries.tar.gz", "platform.tar.gz")
 ALWAYS = ("rse-pf.service", "rse-pf-agent.service")
 DATA = "rse-pf-data.service"
 
@@ -31,11 +34,11 @@ def units_of(settings):
 def environment_file(facts):
     """Return the environment file of the units: names of this server, its group and its buckets.
 
-    *facts* holds ``server``, ``bucket``, ``keys``, ``group``, ``hook``, ``store`` and ``audit``.
+    *facts* holds ``server``, ``bucket``, ``keys``, ``group``, ``hook``, ``launch``, ``store`` and ``audit``.
     """
     names = {
         "SERVER_ID": "server", "BUCKET": "bucket", "KEYS_NAME": "keys", "GROUP": "group", "HOOK": "hook",
-        "STORE": "store", "AUDIT_BUCKET": "audit",
+        "LAUNCH_HOOK": "launch", "STORE": "store", "AUDIT_BUCKET": "audit",
     }  # fmt: skip
     for name in names.values():
         if not facts[name] or any(sign in facts[name] for sign in "\n\r\"'\\ $"):
@@ -48,14 +51,7 @@ def main(facts):
     settings = json.loads((PACKAGE / "settings.json").read_text(encoding="utf-8"))["context"]["rse-pf"]
     if subprocess.run(["/usr/bin/id", USER], capture_output=True, check=False).returncode:
         run("/usr/sbin/useradd", "--system", "--no-create-home", "--shell", "/usr/sbin/nologin", USER)
-    python = HOME / "venv" / "bin" / "python"
-    run("/usr/bin/python3", "-m", "venv", "--clear", "--without-pip", str(HOME / "venv"))
-    (pip,) = PACKAGE.glob("pip-*.whl")
-    run(
-        str(python), f"{pip}/pip", "install", "--quiet", "--no-index", "--no-deps", "--require-hashes",
-        "--no-cache-dir", "--disable-pip-version-check", "--root-user-action=ignore",
-        "--find-links", str(PACKAGE), "--requirement", str(PACKAGE / "requirements.txt"),
-    )  # fmt: skip
+    unpack(json.loads((PACKAGE / "environment.json").read_text(encoding="utf-8")))
     CONFIGURATION.mkdir(exist_ok=True)
     (CONFIGURATION / "server.env").write_text(environment_file(facts), encoding="utf-8")
     started = units_of(settings)
@@ -64,6 +60,25 @@ def main(facts):
     run("/usr/bin/systemctl", "daemon-reload")
     run("/usr/bin/systemctl", "enable", "--now", *started)
     sys.stderr.write(f"install: started {' '.join(started)}\n")
+
+
+def unpack(about):
+    """Make the virtual environment of the archives; *about* says which Python they are for."""
+    if about["python"] != ".".join(map(str, sys.version_info[:2])):
+        raise SystemExit(
+            f"install: the environment is for Python {about['python']}, "
+            f"the machine has {sys.version.split()[0]}: check cloud.image_parameter"
+        )
+    began_s = time.monotonic()
+    shutil.rmtree(VENV, ignore_errors=True)
+    VENV.mkdir(parents=True)
+    tar = ("/usr/bin/tar", "--extract", "--gzip", "--no-same-owner", "--directory", str(VENV), "--file")
+    for running in [subprocess.Popen([*tar, str(PACKAGE / name)]) for name in ARCHIVES]:
+        if running.wait():
+            raise SystemExit(f"install: {running.args[-1]} cannot be unpacked")
+    if not about["bytecode"]:
+        run(str(VENV / "bin/python"), "-m", "compileall", "-q", "-j", "0", str(VENV / "lib"))
+    sys.stderr.write(f"install: unpacked the environment in {time.monotonic() - began_s:.1f} s\n")
 
 
 def run(*command):

@@ -165,7 +165,7 @@ def test_the_doctor_asks_the_account(
 
 def checkout(folder: Path, *, version: str = "2.1148.1", reads: str = ">=55.5.0") -> Path:
     """A checkout with packages and a command line of the CDK."""
-    for name in ("wheelhouse", "lambda"):
+    for name in ("servers", "lambda"):
         (folder / "build" / name).mkdir(parents=True)
         (folder / "build" / name / "file").touch()
     cli = folder / "node_modules" / "aws-cdk"

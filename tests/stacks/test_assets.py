@@ -7,7 +7,6 @@ import importlib.util
 import json
 import shutil
 import sys
-import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -15,29 +14,33 @@ from typing import Any
 import pytest
 
 from rse_pf.config import PlatformSettings, load_settings
+from rse_pf.config.server_settings import server_settings
 from rse_pf.errors import ConfigurationError
-from stacks.assets import SETTINGS_FILE, SUMS_FILE, WHEELHOUSE, staged, sums_digest
+from stacks.assets import ENVIRONMENT_FILE, SERVERS, SETTINGS_FILE, SUMS_FILE, staged, sums_digest
 
 
 @pytest.fixture
 def assets(tmp_path: Path) -> Path:
     """Packages with one file each."""
-    for name in (WHEELHOUSE, "lambda"):
+    for name in (SERVERS, "lambda"):
         (tmp_path / "build" / name).mkdir(parents=True)
-        (tmp_path / "build" / name / "thing-1-py3-none-any.whl").write_bytes(b"wheel")
+        (tmp_path / "build" / name / "thing.tar.gz").write_bytes(b"archive")
     return tmp_path / "build"
 
 
 def test_a_package_carries_the_merged_settings(assets: Path, tmp_path: Path) -> None:
-    settings = PlatformSettings.from_dict({"scaling": {"busy_cpu_percent": 61.5}})
+    settings = PlatformSettings.from_dict({"scaling": {"busy_cpu_percent": 61.5}, "serving": {"workers": 3}})
 
-    for name in (WHEELHOUSE, "lambda"):
-        package = staged(assets, name, settings, tmp_path / "out")
-        assert load_settings(package / SETTINGS_FILE).digest() == settings.digest()
+    function = load_settings(staged(assets, "lambda", settings, tmp_path / "out") / SETTINGS_FILE)
+    server = load_settings(staged(assets, SERVERS, settings, tmp_path / "out") / SETTINGS_FILE)
+
+    assert function == settings
+    assert server_settings(server) == server_settings(settings)
+    assert server.serving.workers == 3
 
 
-def test_the_sums_name_every_file_of_the_wheelhouse_once(assets: Path, tmp_path: Path) -> None:
-    package = staged(assets, WHEELHOUSE, PlatformSettings(), tmp_path / "out")
+def test_the_sums_name_every_file_of_the_package_once(assets: Path, tmp_path: Path) -> None:
+    package = staged(assets, SERVERS, PlatformSettings(), tmp_path / "out")
 
     lines = (package / SUMS_FILE).read_text().splitlines()
 
@@ -49,10 +52,10 @@ def test_the_sums_name_every_file_of_the_wheelhouse_once(assets: Path, tmp_path:
         assert digest == hashlib.sha256((package / name).read_bytes()).hexdigest()
 
 
-def test_the_boot_files_travel_with_the_wheels_and_the_script_of_the_user_data_does_not(
+def test_the_boot_files_travel_with_the_environment_and_the_script_of_the_user_data_does_not(
     assets: Path, tmp_path: Path
 ) -> None:
-    names = {file.name for file in staged(assets, WHEELHOUSE, PlatformSettings(), tmp_path / "out").iterdir()}
+    names = {file.name for file in staged(assets, SERVERS, PlatformSettings(), tmp_path / "out").iterdir()}
 
     assert {"install.py", "rse-pf.service", "rse-pf-agent.service", "rse-pf-data.service"} <= names
     assert "first_boot.py" not in names
@@ -60,17 +63,20 @@ def test_the_boot_files_travel_with_the_wheels_and_the_script_of_the_user_data_d
 
 def test_the_same_input_gives_the_same_sums_and_another_setting_others(assets: Path, tmp_path: Path) -> None:
     def digest(folder: str, **groups: Any) -> str:
-        return sums_digest(staged(assets, WHEELHOUSE, PlatformSettings.from_dict(groups), tmp_path / folder))
+        return sums_digest(staged(assets, SERVERS, PlatformSettings.from_dict(groups), tmp_path / folder))
 
     assert digest("a") == digest("b")
-    assert digest("a") != digest("c", scaling={"max_servers": 9})
+    assert digest("a") != digest("c", serving={"workers": 3})
+    assert digest("a") == digest(
+        "d", scaling={"max_servers": 9}, cloud={"log_days": 9, "allow_insecure": True}
+    )
 
 
 @pytest.mark.parametrize("damage", ["missing", "empty", "file"])
-def test_a_wheelhouse_that_cannot_be_read_is_one_line_and_a_hint(
+def test_a_package_that_cannot_be_read_is_one_line_and_a_hint(
     assets: Path, tmp_path: Path, damage: str
 ) -> None:
-    folder = assets / WHEELHOUSE
+    folder = assets / SERVERS
     shutil.rmtree(folder)
     if damage == "empty":
         folder.mkdir()
@@ -78,7 +84,7 @@ def test_a_wheelhouse_that_cannot_be_read_is_one_line_and_a_hint(
         folder.write_text("not a folder")
 
     with pytest.raises(ConfigurationError) as told:
-        staged(assets, WHEELHOUSE, PlatformSettings(), tmp_path / "out")
+        staged(assets, SERVERS, PlatformSettings(), tmp_path / "out")
 
     assert told.value.hint == "run make assets"
     assert "\n" not in told.value.message
@@ -95,15 +101,14 @@ def test_packages_of_other_sources_are_refused(
         del files["rse_pf/errors.py"]
     if change == "more":
         files["rse_pf/attic.py"] = ""
-    with zipfile.ZipFile(assets / WHEELHOUSE / "rse_pf-0.1.0-py3-none-any.whl", "w") as wheel:
-        for name, text in files.items():
-            wheel.writestr(name, text)
+    digests = {name: hashlib.sha256(text.encode()).hexdigest() for name, text in files.items()}
+    (assets / SERVERS / ENVIRONMENT_FILE).write_text(json.dumps({"sources": digests}), encoding="utf-8")
 
     if change == "none":
-        staged(assets, WHEELHOUSE, PlatformSettings(), tmp_path / "out")
+        staged(assets, SERVERS, PlatformSettings(), tmp_path / "out")
         return
     with pytest.raises(ConfigurationError, match="other sources") as told:
-        staged(assets, WHEELHOUSE, PlatformSettings(), tmp_path / "out")
+        staged(assets, SERVERS, PlatformSettings(), tmp_path / "out")
     assert told.value.hint == "run make assets"
 
 
@@ -142,12 +147,12 @@ def test_the_function_carries_the_bytecode_of_its_python_and_the_same_each_time(
     repository: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     builder = _builder(repository)
-    monkeypatch.setattr(builder, "AMAZON_2023", (f"{sys.version_info[0]}.{sys.version_info[1]}", 34))
+    version = f"{sys.version_info[0]}.{sys.version_info[1]}"
     found = []
     for name in ("a", "b"):
         (tmp_path / name).mkdir()
         (tmp_path / name / "thing.py").write_text('"""Docs."""\nWORDS = {"x", "y", "z"}\n')
-        builder._compile(tmp_path / name)
+        assert builder._compile(tmp_path / name, version, "/var/task")
         (file,) = (tmp_path / name / "__pycache__").glob("thing.*.pyc")
         found.append(file.read_bytes())
 
@@ -168,9 +173,7 @@ def test_without_a_python_of_the_functions_version_a_line_says_what_is_slower(
     repository: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     builder = _builder(repository)
-    monkeypatch.setattr(builder, "AMAZON_2023", ("3.0", 34))
-
-    builder._compile(tmp_path)
+    assert not builder._compile(tmp_path, "3.0", "/var/task")
 
     assert "cold start" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())

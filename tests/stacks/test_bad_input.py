@@ -8,7 +8,6 @@ import os
 import shutil
 import subprocess
 import sys
-import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -32,7 +31,7 @@ class Checkout:
         self.folder = folder
         self.document = json.loads((repository / "cdk.json").read_text(encoding="utf-8"))
         shutil.copy(repository / "app.py", folder / "app.py")
-        for name in ("wheelhouse", "lambda"):
+        for name in ("servers", "lambda"):
             (folder / "build" / name).mkdir(parents=True)
             (folder / "build" / name / "package.txt").write_text(name, encoding="utf-8")
         self.overrides({})
@@ -60,36 +59,31 @@ def checkout(tmp_path: Path, repository: Path, monkeypatch: pytest.MonkeyPatch) 
     return Checkout(tmp_path, repository)
 
 
-def wheelhouse(checkout: Checkout) -> Path:
-    return checkout.folder / "build" / "wheelhouse"
+def package(checkout: Checkout) -> Path:
+    return checkout.folder / "build" / "servers"
 
 
 def lost(checkout: Checkout) -> None:
-    shutil.rmtree(wheelhouse(checkout))
+    shutil.rmtree(package(checkout))
 
 
 def a_file(checkout: Checkout) -> None:
     lost(checkout)
-    wheelhouse(checkout).write_text("no folder", encoding="utf-8")
+    package(checkout).write_text("no folder", encoding="utf-8")
 
 
 def stale(checkout: Checkout) -> None:
-    (wheelhouse(checkout) / "rse_pf").mkdir()
-    (wheelhouse(checkout) / "rse_pf" / "errors.py").write_text("old", encoding="utf-8")
+    (package(checkout) / "rse_pf").mkdir()
+    (package(checkout) / "rse_pf" / "errors.py").write_text("old", encoding="utf-8")
 
 
 def torn(checkout: Checkout) -> None:
-    (wheelhouse(checkout) / "rse_pf-0.1.0-py3-none-any.whl").write_bytes(b"half a wheel")
+    (package(checkout) / "environment.json").write_text('{"sources": {"a', encoding="utf-8")
 
 
 def rotten(checkout: Checkout) -> None:
-    """A wheel whose table of contents is whole, and what it holds is not."""
-    wheel = wheelhouse(checkout) / "rse_pf-0.1.0-py3-none-any.whl"
-    with zipfile.ZipFile(wheel, "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr("rse_pf/errors.py", "x = 1\n" * 500)
-    data = bytearray(wheel.read_bytes())
-    data[50:60] = bytes(10)
-    wheel.write_bytes(data)
+    """JSON, and not what the builder writes."""
+    (package(checkout) / "environment.json").write_text('["rse_pf"]', encoding="utf-8")
 
 
 def settings(**groups: dict[str, Any]) -> Callable[[Checkout], None]:
@@ -119,8 +113,8 @@ def surroundings(repository: Path) -> dict[str, str]:
         (lost, "no packages in"),
         (a_file, "no packages in"),
         (stale, "were built of other sources"),
-        (torn, "rse_pf-0.1.0-py3-none-any.whl cannot be read: "),
-        (rotten, "rse_pf-0.1.0-py3-none-any.whl cannot be read: "),
+        (torn, "environment.json cannot be read: "),
+        (rotten, "environment.json cannot be read: "),
     ],
 )
 def test_bad_input_is_one_line_and_a_hint(

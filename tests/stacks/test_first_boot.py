@@ -23,7 +23,7 @@ NOW = datetime(2026, 11, 21, 6, 0, 0, tzinfo=timezone.utc)
 USER_DATA_BYTES = 16384
 FACTS = {
     "server": "i-0abc", "bucket": "artifacts", "keys": "keys.json", "group": "rse-pf", "hook": "drain",
-    "store": "s3:maps", "audit": "audit-logs",
+    "launch": "launch",    "store": "s3:maps", "audit": "audit-logs",
 }  # fmt: skip
 
 
@@ -161,6 +161,7 @@ def test_a_data_group_is_attached_exactly_when_the_data_unit_starts(assembly: An
 def test_the_environment_file_holds_plain_words_only() -> None:
     assert environment_file(FACTS).splitlines() == [
         "SERVER_ID=i-0abc", "BUCKET=artifacts", "KEYS_NAME=keys.json", "GROUP=rse-pf", "HOOK=drain",
+        "LAUNCH_HOOK=launch",
         "STORE=s3:maps", "AUDIT_BUCKET=audit-logs",
     ]  # fmt: skip
     for bad in ("", "a\nUser=root", "a b", '"', "$HOME"):

@@ -18,8 +18,10 @@ from rse_pf.cli.doctor import Finding, report
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import MissingExtra, RsePfError
 
-__all__ = ["add_arguments", "check_tools", "run"]
+__all__ = ["NO_PACKAGES", "add_arguments", "check_tools", "run"]
 
+NO_PACKAGES = "no packages"
+"""What a finding says for which `rse-pf cloud up` has a step."""
 _OLDEST_NODE = 22
 _NODE_ANSWERS_S = 10.0
 _CLI = Path("node_modules", "aws-cdk", "package.json")
@@ -55,8 +57,8 @@ def check_tools(checkout: Path) -> Iterator[Finding]:
     yield _cli(checkout)
     yield (
         Finding(grade="ok", what="packages are built")
-        if all(any((checkout / _PACKAGES / name).glob("*")) for name in ("wheelhouse", "lambda"))
-        else Finding(grade="fail", what=f"no packages in {_PACKAGES}", fix="make assets")
+        if all(any((checkout / _PACKAGES / name).glob("*")) for name in ("servers", "lambda"))
+        else Finding(grade="fail", what=f"{NO_PACKAGES} in {_PACKAGES}", fix="make assets")
     )
 
 

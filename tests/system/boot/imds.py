@@ -1,6 +1,8 @@
 """The instance metadata service as EC2 answers it, IMDSv2 only: run it where 169.254.169.254 is local.
 
-python imds.py LIFECYCLE_FILE      whose text is the target lifecycle state
+python imds.py LIFECYCLE_FILE ROLE_FILE
+
+Their texts are the target lifecycle state and the name of the instance's role; empty: none yet.
 """
 
 from __future__ import annotations
@@ -27,11 +29,12 @@ class Metadata(http.server.BaseHTTPRequestHandler):
     def do_GET(self) -> None:
         base = "/latest/meta-data/"
         pages = {
-            f"{base}iam/security-credentials/": "server-role",
-            f"{base}iam/security-credentials/server-role": json.dumps(CREDENTIALS),
             f"{base}instance-id": "i-0123456789abcdef0",
             f"{base}autoscaling/target-lifecycle-state": Path(sys.argv[1]).read_text(),
         }
+        if role := Path(sys.argv[2]).read_text():
+            pages[f"{base}iam/security-credentials/"] = role
+            pages[f"{base}iam/security-credentials/{role}"] = json.dumps(CREDENTIALS)
         if self.headers.get("X-aws-ec2-metadata-token") != TOKEN:
             self._answer(401, "")
         else:

@@ -14,31 +14,55 @@ from system.boot.world import World, debian_root, missing
 from rse_pf.auth.tokens import SigningKey
 from rse_pf.config import PlatformSettings
 from rse_pf.config.resource_names import READY_PATH
+from rse_pf.config.server_settings import server_settings
 
-pytestmark = [pytest.mark.slow, pytest.mark.system, pytest.mark.timeout(900)]
+pytestmark = [pytest.mark.slow, pytest.mark.system, pytest.mark.timeout(1800)]
 
-SETTINGS = PlatformSettings.from_dict({"scaling": {"period_s": 10}, "cloud": {"poll_s": 1, "drain_s": 120}})
+SETTINGS = PlatformSettings.from_dict(
+    {
+        "scaling": {"period_s": 10},
+        "cloud": {"poll_s": 1, "drain_s": 120, "boot_s": 180},
+        "serving": {"workers": 1},
+    }
+)
 KEY = SigningKey.from_seed(b"k" * 32, "boot-key")
 TOLERANCE = 0.02
 """Metres and radians: ten times what half a pixel of noise moves a pose by."""
 
 
+LAUNCH = "rse-pf-launch"
+
+
 @pytest.fixture(scope="module")
-def world(repository: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
-    """The machine, switched on, without keys in the bucket."""
+def kept(repository: Path) -> Path:
+    """A bare Debian, and the packages; skips where one of them cannot be had."""
     if missing():
         pytest.skip(missing())
     pytest.importorskip("flask", reason="the infra extra is not installed: moto's server")
-    from stacks.assets import WHEELHOUSE, staged, sums_digest
+    from stacks.assets import ENVIRONMENT_FILE, SERVERS
 
-    if not (repository / "build" / WHEELHOUSE / "requirements.txt").is_file():
-        pytest.skip("no wheelhouse in build: run make assets")
+    if not (repository / "build" / SERVERS / ENVIRONMENT_FILE).is_file():
+        pytest.skip("no packages in build: run make assets")
     kept = repository / "build" / "debian12"
     if not (kept / "made").is_file() and not shutil.which("debootstrap"):
         pytest.skip("needs debootstrap, to make a bare Debian once")
-    folder = tmp_path_factory.mktemp("boot")
-    package = staged(repository / "build", WHEELHOUSE, SETTINGS, folder)
-    with World(folder, debian_root(kept)) as made:
+    return debian_root(kept)
+
+
+@pytest.fixture(scope="module")
+def package(repository: Path, kept: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The package of a server, as it is deployed."""
+    from stacks.assets import SERVERS, staged
+
+    return staged(repository / "build", SERVERS, SETTINGS, tmp_path_factory.mktemp("package"))
+
+
+@pytest.fixture(scope="module")
+def world(kept: Path, package: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
+    """The machine, switched on, without keys in the bucket."""
+    from stacks.assets import sums_digest
+
+    with World(tmp_path_factory.mktemp("boot"), kept) as made:
         made.boot(package, sums_digest(package))
         yield made
     shutil.rmtree(made.root, ignore_errors=True)
@@ -61,6 +85,12 @@ def test_the_machine_becomes_healthy_in_every_attached_target_group(world: World
     assert "user-data ended with 0" in world.text()
 
 
+def test_the_machine_joins_its_group_once_it_is_ready(world: World) -> None:
+    world.wait(lambda: bool(world.completed()), 30, "completed launch hook")
+
+    assert world.completed() == [(LAUNCH, "CONTINUE")]
+
+
 def test_without_keys_robots_are_refused_and_one_line_says_why(world: World) -> None:
     assert ask_for_a_pose(world) == {"failed": "unauthorized"}
     assert world.text().count("agent-no-keys") == 1
@@ -81,6 +111,14 @@ def test_once_the_keys_appear_a_robot_gets_a_right_pose(world: World) -> None:
     assert answer["off"] < TOLERANCE
 
 
+def test_every_service_of_maps_answers_on_the_machine(world: World) -> None:
+    serving = SETTINGS.serving
+
+    said = world.inside("services", token(), f"ws://127.0.0.1:{serving.port}{serving.path}")
+
+    assert said == {"icp": "", "optimise": "", "live-start": ""}
+
+
 def test_the_agent_publishes_what_the_alarms_read(world: World) -> None:
     ask_for_a_pose(world)
 
@@ -94,7 +132,7 @@ def test_the_server_runs_as_its_own_user_with_the_settings_of_the_template(world
     settings = json.loads((world.root / "opt/rse-pf/package/settings.json").read_text())["context"]["rse-pf"]
 
     assert owner != 0
-    assert PlatformSettings.from_dict(settings).digest() == SETTINGS.digest()
+    assert settings == server_settings(SETTINGS)
     assert (world.root / "var/lib/rse-pf/keys.json").read_text() == KEY.key_set().to_json()
 
 
@@ -116,6 +154,8 @@ def test_a_leaving_instance_drains_and_its_server_stays_down(world: World) -> No
 
     world.wait(lambda: "rse-pf.service ended with 0" in world.text(), 90, "drained server")
 
+    world.wait(lambda: len(world.completed()) == 2, 30, "completed drain hook")
+    assert world.completed()[1] == ("rse-pf-drain", "CONTINUE")
     assert "agent-leaving" in world.text()
     assert world.status(SETTINGS.serving.control_port, "/healthz") == 0
 

@@ -19,12 +19,15 @@ from pathlib import Path
 from typing import Any
 
 HERE = Path(__file__).parent
+FIRST_BOOT = HERE.parents[2] / "stacks/boot/first_boot.py"
 REGION = "ap-northeast-2"
 AWS = "127.0.0.2"
 NAMES = [
     f"{name}.{REGION}.amazonaws.com"
-    for name in ("assets.s3", "artifacts.s3", "s3", "monitoring", "autoscaling")
+    for name in ("assets.s3", "artifacts.s3", "audit.s3", "maps.s3", "s3", "monitoring")
 ]
+SCALING, SCALING_NAME = "127.0.0.3", f"autoscaling.{REGION}.amazonaws.com"
+"""Of a small server of ours: the emulator has no CompleteLifecycleAction."""
 PACKAGES = "python3,ca-certificates,systemd"
 TOOLS = ("ip", "unshare", "openssl", "chroot", "cp")
 
@@ -59,6 +62,8 @@ class World:
         self.space = f"rse-pf-boot-{os.getpid()}"
         self.ca = folder / "ca.pem"
         self.lifecycle = folder / "lifecycle"
+        self.role = folder / "role"
+        self.hooks = folder / "hooks"
         self.log: list[str] = []
         self._heard = threading.Condition()
         self._kept_root = kept_root
@@ -69,30 +74,36 @@ class World:
             self._make_network(ends)
             self._make_root()
             self.lifecycle.write_text("InService")
-            self._serve(ends, [sys.executable, str(HERE / "imds.py"), str(self.lifecycle)])
+            self.role.write_text("server-role")
+            self.hooks.write_text("")
+            self._serve(ends, [sys.executable, str(HERE / "imds.py"), str(self.lifecycle), str(self.role)])
+            scaling = [str(HERE / "scaling.py"), SCALING, str(self.ca), str(self.folder / "ca.key")]
+            self._serve(ends, [sys.executable, *scaling, str(self.hooks)])
             moto = [str(Path(sys.executable).with_name("moto_server")), "-H", AWS, "-p", "443"]
             self._serve(ends, [*moto, "-s", "-c", str(self.ca), "-k", str(self.folder / "ca.key")])
-            self.wait(lambda: self._opens("169.254.169.254", 80) and self._opens(AWS, 443), 60, "IMDS and S3")
+            places = (("169.254.169.254", 80), (AWS, 443), (SCALING, 443))
+            self.wait(lambda: all(self._opens(*each) for each in places), 120, "IMDS and AWS")
             self._ends = ends.pop_all()
         return self
 
     def __exit__(self, *exception: object) -> None:
         self._ends.close()
 
-    def boot(self, package: Path, digest: str) -> None:
-        """Put the package into S3 and switch the machine on."""
+    def boot(self, package: Path, digest: str, *, script: Path = FIRST_BOOT, **changes: str) -> None:
+        """Put the package into S3 and switch the machine on; *changes* are facts that its user data tells."""
         archive = self.folder / "package.zip"
-        with zipfile.ZipFile(archive, "w") as made:
+        with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED) as made:  # as the CDK does
             for file in sorted(package.rglob("*")):
                 if file.is_file():
                     made.write(file, file.relative_to(package).as_posix())
         self.inside("fill", str(archive))
         facts = {
             "package": "s3://assets/package.zip", "sha256": digest, "region": REGION, "bucket": "artifacts",
-            "keys": "keys.json", "group": "rse-pf", "hook": "rse-pf-drain", "store": "memory:",
+            "keys": "keys.json", "group": "rse-pf", "hook": "rse-pf-drain", "store": "s3:maps",
+            "launch": "rse-pf-launch", "retry_s": "120", "audit": "audit", **changes,
         }  # fmt: skip
-        script = (HERE.parents[2] / "stacks/boot/first_boot.py").read_text()
-        (self.root / "boot-test/user-data").write_text(f"{script}\nmain({json.dumps(facts)})\n")
+        text = script.read_text(encoding="utf-8")
+        (self.root / "boot-test/user-data").write_text(f"{text}\nmain({json.dumps(facts)})\n")
         machine = [
             "unshare", "--mount", "--pid", "--fork", "--kill-child", f"--mount-proc={self.root}/proc",
             "chroot", str(self.root), "/usr/bin/python3", "/boot-test/machine.py",
@@ -104,6 +115,14 @@ class World:
             self._ends, machine, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
         )
         listener.start()
+
+    def completed(self) -> list[tuple[str, str]]:
+        """Return each lifecycle action that was completed: its hook and its result."""
+        return [tuple(line.split()) for line in self.hooks.read_text().splitlines()]
+
+    def console(self) -> str:
+        """Return what was written to the machine's console."""
+        return (self.root / "dev/console").read_text()
 
     def inside(self, *arguments: str) -> Any:
         """Run inside.py in the machine's network; return what it printed, as JSON."""
@@ -184,7 +203,7 @@ class World:
 
     def _make_root(self) -> None:
         subprocess.run(["cp", "-a", "--reflink=auto", f"{self._kept_root}/.", str(self.root)], check=True)
-        names = ",".join(f"DNS:{name}" for name in NAMES) + f",IP:{AWS}"
+        names = ",".join(f"DNS:{name}" for name in (*NAMES, SCALING_NAME)) + f",IP:{AWS}"
         subprocess.run(
             ["openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "2", "-subj", "/CN=aws",
              "-addext", f"subjectAltName={names}", "-keyout", str(self.folder / "ca.key"),
@@ -193,8 +212,12 @@ class World:
         )  # fmt: skip
         with (self.root / "etc/ssl/certs/ca-certificates.crt").open("a") as trusted:
             trusted.write(self.ca.read_text())
-        (self.root / "etc/hosts").write_text(f"127.0.0.1 localhost\n{AWS} {' '.join(NAMES)}\n")
+        hosts = f"127.0.0.1 localhost\n{AWS} {' '.join(NAMES)}\n{SCALING} {SCALING_NAME}\n"
+        (self.root / "etc/hosts").write_text(hosts)
         (self.root / "etc/resolv.conf").write_text("nameserver 192.0.2.53\n")
+        console = self.root / "dev/console"
+        console.unlink(missing_ok=True)
+        console.write_text("")  # a file instead of the device: it is read
         (self.root / "boot-test").mkdir()
         shutil.copyfile(HERE / "machine.py", self.root / "boot-test/machine.py")
         systemctl = self.root / "usr/bin/systemctl"

@@ -1,0 +1,94 @@
+"""What travels to the servers: changing anything else replaces no server."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rse_pf.config import PlatformSettings
+from rse_pf.config.server_settings import READ_BY_SERVERS, server_settings
+from rse_pf.config.settings import setting_rows
+from rse_pf.config.validation import SettingRow
+from rse_pf.errors import SettingsError
+
+ROWS = list(setting_rows())
+BASE = PlatformSettings()
+TOGETHER: dict[tuple[str, str], dict[str, Any]] = {
+    ("cloud", "allow_insecure"): {"certificate_arn": "arn:aws:acm:a:1:certificate/b", "domain_name": "a.org"},
+    ("local", "certificate"): {"private_key": "key.pem"},
+    ("local", "private_key"): {"certificate": "chain.pem"},
+    ("scaling", "period_s"): {"idle_s": 420},
+}
+"""Settings that are refused alone, with what they need."""
+SERVER_FOLDERS = (
+    "backend", "data_server", "live_map", "services", "wire", "auth", "audit", "recording", "pnp",
+    "aws/fleet/tasks", "aws/storage", "cli/servers",
+)  # fmt: skip
+SERVER_FILES = ("aws/fleet/agent.py", "aws/fleet/drain_hook.py", "aws/fleet/launch_hook.py")
+
+
+def changed(row: SettingRow) -> PlatformSettings | None:
+    """Return the defaults with another value of one setting; None where no other one was found."""
+    value = row.default
+    tries: list[Any] = [*(row.choices or ())]
+    if isinstance(value, bool):
+        tries = [not value]
+    elif isinstance(value, int):
+        tries += [value + 1, value - 1, value * 2, 70]
+    elif isinstance(value, float):
+        tries += [value * 1.01 + 0.001, value * 0.99 - 0.001]
+    else:
+        tries += [
+            "other",
+            "https://robots.example.org", "https://robots.example.org/burst",
+            "weekdays 08:00 min 3",
+            "Asia/Seoul",
+            "m7i.large",
+        ]
+    for other in tries:
+        if other == value:
+            continue
+        try:
+            return BASE.replace(**{row.group: {row.name: other, **TOGETHER.get((row.group, row.name), {})}})
+        except SettingsError:
+            continue
+    return None
+
+
+@pytest.mark.parametrize("row", ROWS, ids=[f"{row.group}.{row.name}" for row in ROWS])
+def test_a_setting_changes_the_package_exactly_when_a_server_reads_it(row: SettingRow) -> None:
+    other = changed(row)
+    assert other is not None, f"no other value found for {row.group}.{row.name}: add one to TOGETHER"
+    travels = row.name in READ_BY_SERVERS.get(row.group, (row.name,))
+
+    assert (server_settings(other) != server_settings(BASE)) == travels
+
+
+def test_the_listed_settings_exist_and_a_server_starts_with_what_travels() -> None:
+    known = {group.name: group.type for group in dataclasses.fields(PlatformSettings)}
+    for group, names in READ_BY_SERVERS.items():
+        assert group in known
+        assert set(names) <= set(BASE.to_dict()[group])
+
+    assert server_settings(PlatformSettings.from_dict(server_settings(BASE))) == server_settings(BASE)
+
+
+def test_no_code_of_a_server_reads_a_setting_that_stays_behind(repository: Path) -> None:
+    """Finds ``settings.cloud.x`` and the like; a group in a variable of another name would hide from it."""
+    package = repository / "rse_pf"
+    files = [package / name for name in SERVER_FILES]
+    files += [file for folder in SERVER_FOLDERS for file in (package / folder).rglob("*.py")]
+    pattern = re.compile(rf"settings\.({'|'.join(READ_BY_SERVERS)})\.(\w+)")
+
+    found = {
+        (group, name, file.relative_to(package).as_posix())
+        for file in files
+        for group, name in pattern.findall(file.read_text(encoding="utf-8"))
+    }
+
+    assert len(found) >= 5, "the pattern finds nothing"
+    assert [each for each in sorted(found) if each[1] not in READ_BY_SERVERS[each[0]]] == []
