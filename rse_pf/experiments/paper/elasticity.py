@@ -34,6 +34,7 @@ __all__ = [
     "crashes",
     "elasticity_figures",
     "elasticity_page",
+    "emulated_cores",
     "run_elasticity",
     "slowest_replacement_s",
     "unjustified_scale_outs",
@@ -87,9 +88,11 @@ def run_elasticity(options: ElasticityOptions, settings: PlatformSettings) -> in
     runs = _runs(options, folder)
     for part, _ in runs.values():
         part.mkdir(exist_ok=True)
-    cores, cost = asyncio.run(_emulated_cores(options, settings, folder))
+    cores, cost = asyncio.run(emulated_cores(options, settings, folder))
     chosen = settings.replace(
-        serving={"emulated_cores": cores}, local={"servers": settings.scaling.min_servers}
+        serving={"emulated_cores": cores},
+        local={"servers": settings.scaling.min_servers},
+        scaling={"profile": "paper", "underused_s": 0, "schedule": ""},  # the paper's rules alone
     )
     for part, rebalance in runs.values():
         asyncio.run(_run(options, chosen, part, rebalance))
@@ -127,9 +130,10 @@ def _runs(options: ElasticityOptions, folder: Path) -> dict[str, tuple[Path, boo
     }
 
 
-async def _emulated_cores(
+async def emulated_cores(
     options: ElasticityOptions, settings: PlatformSettings, folder: Path
 ) -> tuple[float, CpuCost | None]:
+    """Return the cores of a server with which all robots need five, and the cost that was measured for it."""
     if options.emulated_cores is not None:
         return options.emulated_cores, None
     scratch = folder / "calibration"

@@ -39,7 +39,8 @@ _MIN_UPTIME_S = 10.0
 
 @dataclass(slots=True, kw_only=True)
 class Member:
-    """One server.  ``leaving``: it drains; ``out``: it was replaced and is killed.
+    """One server.  ``leaving``: it drains; ``out``: it was replaced and is killed; it takes no robots before
+    ``held_until_s``.
 
     Times are monotonic seconds; those of ``health`` are compressed with the rest.
     """
@@ -57,6 +58,7 @@ class Member:
     adopted: bool = False
     robots: int = 0
     observed: Observed | None = None
+    held_until_s: float = 0.0
 
     @property
     def phase(self) -> ServerPhase:
@@ -96,9 +98,12 @@ class Fleet:
         settings: PlatformSettings,
         *,
         compress: float,
+        launch_s: float = 0.0,
         emit: Callable[..., None],
         changed: Callable[[], None],
     ) -> None:
+        """Make a fleet without members; later servers serve *launch_s* after their launch, compressed."""
+        self._launch_s = launch_s / compress
         self.members: dict[str, Member] = {}
         self.dead: dict[str, bool] = {}
         self.launched = 0
@@ -183,7 +188,6 @@ class Fleet:
         Raises:
             ConfigurationError: It ended, did not announce itself, or the balancer found it unhealthy.
         """
-        end = time.monotonic() + timeout_s
         try:
             server = await self._backend_servers.wait_ready(member.name, timeout_s)
         except ConfigurationError:
@@ -192,6 +196,8 @@ class Fleet:
             self._forget(member)
             self._emit("server-gone", server=member.name, pid=None, exit_code=code)
             raise
+        await asyncio.sleep(member.held_until_s - time.monotonic())
+        end = time.monotonic() + timeout_s
         member.server = server
         self._still_targets.discard(member.name)
         self._set_targets()
@@ -253,6 +259,7 @@ class Fleet:
         """Launch *count* servers at once; return their names."""
         members = [self.launch() for _ in range(count)]
         for member in members:
+            member.held_until_s = member.launched_s + self._launch_s
             self.start(member)
         return [member.name for member in members]
 
@@ -278,6 +285,7 @@ class Fleet:
             member.out = True
             self._set_targets()
         new = self.launch(replaces_living=cut_off)
+        new.held_until_s = new.launched_s + self._launch_s
         if cut_off:
             self._backend_servers.send(name, signal.SIGKILL)
         self.start(new)

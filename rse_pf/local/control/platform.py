@@ -148,7 +148,8 @@ class LocalPlatform:
         )
         self._fleet = Fleet(
             self.backend_servers, self.load_balancer, settings,
-            compress=control.compress, emit=self._emit, changed=self._write_state,
+            compress=control.compress, launch_s=control.delays.launch_s, emit=self._emit,
+            changed=self._write_state,
         )  # fmt: skip
         self._operator_port = OperatorPort(
             self, metrics=self.backend_servers.metrics, keep=self._fleet.keep, emit=self._emit
