@@ -14,9 +14,9 @@ from typing import Any, Literal
 
 from client_sdk.answers import Answer
 from client_sdk.burst import Burst
-from client_sdk.connection import cancel_all
 from client_sdk.local_services import LocalServices
 from client_sdk.offload import CloudFirst, Plan
+from client_sdk.region_sockets import cancel_all
 from client_sdk.stats import StatsKeeper
 from rse_pf.wire import Command, Failure, Result
 from rse_pf.wire.client_session import Answered, ClientSession, Progressed
@@ -157,9 +157,9 @@ class Asking:
                 task.cancel()
             raise
         finally:
-            # Late answers of a server, if it was asked at all, and of the robot still count as measured.
+            # Late answers still count as measured; but what waits for a server is not sent later.
             for task, turn in racing.items():
-                if turn.place == "burst" or (turn.place == "server" and self._session.current is None):
+                if turn.place == "server" and self._session.current is None:
                     task.cancel()
 
     def _can_be_in_time(self, turn: _Turn, call: Call, left_s: float) -> bool:

@@ -1,7 +1,8 @@
 """The sockets of a robot: connect, read, write, ping, reconnect, move; `ClientSession` holds the rules.
 
-This is the only module that knows the WebSocket library.  There is one current socket, and a second one only
-during a move.  Reconnects are delayed with full jitter.  Commands survive the loss of a socket.
+There is one current socket, a second one during a
+move, and one that stands by for each further address.  Reconnects are delayed (`client_sdk.backoff`).
+Commands survive the loss of a socket.
 """
 
 from __future__ import annotations
@@ -9,27 +10,16 @@ from __future__ import annotations
 import asyncio
 import random as random_module
 import ssl
-from collections.abc import Awaitable, Callable, Coroutine, Iterable
+from collections.abc import Callable, Coroutine, Sequence
 from typing import TYPE_CHECKING, Any
 
-from websockets.asyncio.client import ClientConnection
-from websockets.asyncio.client import connect as websocket_connect
-from websockets.exceptions import ConnectionClosed, InvalidStatus, WebSocketException
-from websockets.typing import Subprotocol
+from websockets.exceptions import ConnectionClosed
 
 from client_sdk.backoff import Backoff
-from client_sdk.dialling import (
-    CHECK_ADDRESS,
-    CHECK_RUNNING,
-    ISSUE,
-    DialError,
-    dial_error_of,
-    shown_address,
-    unreachable,
-    untrusted,
-)
-from client_sdk.token_text import checked_token
-from rse_pf.config import SessionSettings
+from client_sdk.dialling import CHECK_ADDRESS, CHECK_RUNNING, ISSUE, DialError
+from client_sdk.handshake import Dialler, Token
+from client_sdk.region_sockets import Region, RegionSocket, cancel_all, either
+from client_sdk.regions import MAX_REGIONS, RegionChoice
 from rse_pf.errors import (
     Conflict,
     ConnectError,
@@ -37,13 +27,12 @@ from rse_pf.errors import (
     RsePfError,
     Unauthorized,
     UnsupportedProtocol,
+    UsageError,
 )
-from rse_pf.wire import SUBPROTOCOLS
 from rse_pf.wire.client_session import (
     Answered,
     ClientSession,
     ConnectionLost,
-    ConnectionState,
     Event,
     MoveRequested,
     Notice,
@@ -61,50 +50,23 @@ __all__ = [
     "Connection",
     "ForRobot",
     "OnChange",
-    "Token",
-    "cancel_all",
-    "websocket_options",
 ]
-
-Token = str | Callable[[], Awaitable[str]] | None
-"""A robot's token, or an async callable that returns a fresh one for each connect and each renewal."""
 
 ForRobot = Answered | Progressed | Updated | SubscriptionEnded
 """What concerns a command or a subscription, and not a connection."""
 
 OnChange = Callable[[str, str], None] | None
-"""Called with ``link-lost`` and a reason, or with ``link-back`` or ``moved`` and the server's name."""
+"""Called with ``link-lost`` and a reason, or with ``link-back``, ``moved`` or, for a further region,
+``stands-by`` and the server's name."""
 
 _FIRST_TRIES = 4
 _MIN_TICK_S = 0.001
+# How long the answers of other regions are waited for, in times of the first one, and at the most.
+_OTHERS_TIMES, _OTHERS_MAX_S = 1.0, 0.7
+# Within this time after a robot opened another connection, that one is what replaced the earlier one.
+_DOUBLE_S = 5.0
 # How long a server that was stopped may take to accept a connection attempt that was given up.
 _LATE_WELCOME_S = 60.0
-
-
-def websocket_options(settings: SessionSettings) -> dict[str, Any]:
-    """Return the options of every WebSocket: no compression, no pings of the library, our size limit."""
-    return {
-        "compression": None,
-        "max_size": settings.max_message_bytes,
-        "ping_interval": None,
-        "open_timeout": settings.connect_timeout_s,
-        "close_timeout": settings.stall_timeout_s,
-        "proxy": None,
-    }
-
-
-class _Socket:
-    """One WebSocket with its state in the session and its two tasks."""
-
-    def __init__(self, websocket: ClientConnection, state: ConnectionState) -> None:
-        self.websocket = websocket
-        self.state = state
-        self.welcome: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-        self.ended = asyncio.Event()
-        self.dirty = asyncio.Event()
-        self.tasks: list[asyncio.Task[None]] = []
-        self.is_closing = False
-        self.bad_messages = self.recorded = 0
 
 
 class Connection:
@@ -112,7 +74,7 @@ class Connection:
 
     def __init__(
         self,
-        url: str,
+        urls: Sequence[str],
         *,
         token: Token,
         session: ClientSession,
@@ -122,40 +84,45 @@ class Connection:
         on_change: OnChange = None,
         recorder: RobotRecorder | None = None,
     ) -> None:
-        self.url = url
         self._recorder = recorder
-        self._used_token: str | None = None
         self.reconnects = 0
         self.moves = 0
+        self.region_changes = 0
         self.bytes_in = 0
         self.bytes_out = 0
         self.last_error = ""
         self.fatal: RsePfError | None = None
-        self._address = shown_address(url) if url else ""
-        self.ssl_context: ssl.SSLContext | None = None
-        self._token = token
         self._session = session
         self._settings = session.settings
+        self.dialler = Dialler(token, codec=session.codec.name, settings=session.settings)
         self._on_answer = on_answer
         self._on_change = on_change or (lambda what, why: None)
         self._clock = clock
-        self._sockets: list[_Socket] = []
+        self._sockets: list[RegionSocket] = []
         self._tasks: set[asyncio.Task[Any]] = set()
-        self._changed = asyncio.Event()
         self._wake = asyncio.Event()
         self._next_tick = 0.0
-        self._backoff = Backoff(self._settings, random)
-        self._adopted = 0.0
-        self._move_request: tuple[_Socket, float] | None = None
+        self._random = random
+        self._regions, self._choice = self._regions_of(urls)
+        self._last_region: Region | None = None
         self._late_welcome_until = float("-inf")
         self._main_tasks: list[asyncio.Task[None]] = []
         self._closed = False
 
-    def use(self, url: str, token: Token, ssl_context: ssl.SSLContext | None) -> None:
-        """Connect to *url* from now on, trust what *ssl_context* trusts, and use *token*."""
-        self.url, self._token = url, token
-        self.ssl_context = ssl_context if url.startswith("wss:") else None
-        self._address = shown_address(url)
+    def use(self, urls: Sequence[str], token: Token, ssl_context: ssl.SSLContext | None) -> None:
+        """Connect to *urls* from now on, trust what *ssl_context* trusts, and use *token*."""
+        self._regions, self._choice = self._regions_of(urls)
+        self.dialler.token, self.dialler.ssl_context = token, ssl_context
+
+    @property
+    def url(self) -> str:
+        """The address that is used now, or else the first one."""
+        return self._current_region().url
+
+    @property
+    def region(self) -> str:
+        """The same, as shown to users."""
+        return self._current_region().address
 
     async def open(self, *, may_be_down: bool = False) -> None:
         """Connect to a server, with a few attempts.
@@ -169,19 +136,24 @@ class Connection:
             ConnectError: No server answers at the address.
         """
         for attempt in range(1, _FIRST_TRIES + 1):
-            try:
-                self._adopt(await self._dial())
+            failures = await self._join_nearest()
+            best = self._choice.best(self._usable())
+            if best is not None:
+                self._adopt(self._usable()[best])
                 break
-            except DialError as failed:
-                if failed.is_final or failed.is_wrong_address:
-                    raise failed.error from None
-                if may_be_down:
-                    self._on_change("link-lost", failed.error.message)
-                    break
-                if attempt == _FIRST_TRIES:
-                    raise failed.error from None
-                await asyncio.sleep(self._pause_s(failed))
-        self._main_tasks = [self._spawn(self._tick()), self._spawn(self._keep_connected())]
+            failed = min(failures, key=lambda each: each.is_final or each.is_wrong_address)
+            if failed.is_final or failed.is_wrong_address:
+                raise failed.error from None
+            if may_be_down:
+                self._on_change("link-lost", failed.error.message)
+                break
+            if attempt == _FIRST_TRIES:
+                raise failed.error from None
+            await asyncio.sleep(self._pause_s(self._regions[0], failed))
+        self._main_tasks = [self._spawn(self._tick()), *map(self._spawn, map(self._keep, self._regions))]
+        for socket in self._usable().values():
+            if socket.state is not self._session.current:
+                self._on_change("stands-by", socket.state.server)
 
     async def close(self) -> None:
         """Close every socket and end every task."""
@@ -201,7 +173,93 @@ class Connection:
         if self._session.next_due(self._clock()) < self._next_tick:
             self._wake.set()
 
-    # --- the two main tasks -----------------------------------------------------------------
+    # --- several regions -------------------------------------------------------------------------
+
+    def _regions_of(self, urls: Sequence[str]) -> tuple[list[Region], RegionChoice]:
+        if len(set(urls)) != len(urls) or not 0 < len(urls) <= MAX_REGIONS:
+            raise UsageError(
+                f"{len(urls)} addresses, of which {len(set(urls))} differ",
+                hint=f"name 1 to {MAX_REGIONS} different addresses",
+            )
+        made = [Region(n, url, Backoff(self._settings, self._random)) for n, url in enumerate(urls)]
+        return made, RegionChoice(len(made), hold_s=self._settings.region_hold_s)
+
+    def _current_region(self) -> Region:
+        current = self._session.current
+        held = (each.region for each in self._sockets if each.state is current)
+        return next(held, self._regions[0])
+
+    def _usable(self) -> dict[int, RegionSocket]:
+        """Return the sockets that may carry the commands, by the number of their region."""
+        usable = {region.number: region.usable for region in self._regions}
+        return {number: socket for number, socket in usable.items() if socket is not None}
+
+    async def _join_nearest(self) -> list[DialError]:
+        """Dial every region until one is measured, and those that are not much later; return what failed."""
+        began = self._clock()
+        joining = [self._spawn(self._join(region)) for region in self._regions]
+        waiting = set(joining)
+        try:
+            while waiting and not self._usable():
+                _, waiting = await asyncio.wait(waiting, return_when=asyncio.FIRST_COMPLETED)
+            if waiting:
+                others_s = min(_OTHERS_MAX_S, _OTHERS_TIMES * (self._clock() - began))
+                _, waiting = await asyncio.wait(waiting, timeout=others_s)
+        except asyncio.CancelledError:
+            await cancel_all(joining)
+            raise
+        for region, task in zip(self._regions, joining, strict=True):
+            region.joining = task if task in waiting else None
+        ended = (task.result() for task in joining if task not in waiting)
+        lost = DialError(ConnectError(f"{self.region} closed at once", hint=CHECK_RUNNING))
+        return [failed for failed in ended if failed is not None] or [lost]
+
+    async def _join(self, region: Region) -> DialError | None:
+        """Dial *region*, and measure it if there are others; return what failed."""
+        try:
+            socket = await self._dial(region)
+        except DialError as failed:
+            return failed
+        if len(self._regions) > 1:
+            self._handle(socket, self._session.check(socket.state, self._clock()))
+            self.flush()
+            await either(socket.measured, self._settings.ping_timeout_s)
+        self._hold(socket)
+        return None
+
+    def _hold(self, socket: RegionSocket) -> None:
+        """Keep *socket* for its region: it carries the commands, or stands by."""
+        region = socket.region
+        if not socket.ended.is_set():
+            region.socket, region.since = socket, self._clock()
+            region.refused = region.is_double = False
+            if self._session.current is not None and self._main_tasks:
+                self._on_change("stands-by", socket.state.server)
+
+    def _measure(self, socket: RegionSocket) -> None:
+        """Take the last pong into account, and change to a region that has been better for long enough."""
+        exchange = socket.state.last_exchange
+        if exchange is None or exchange is socket.exchange:
+            return
+        socket.exchange = exchange
+        socket.measured.set()
+        self._choice.measured(socket.region.number, exchange.round_trip_s)
+        usable, current = self._usable(), self._current_region()
+        if len(self._regions) > 1 and current.number in usable:
+            better = self._choice.better(current.number, usable, self._clock())
+            if better is not None:
+                self._adopt(usable[better])
+                self._on_change("moved", usable[better].state.server)
+
+    def _use_standby(self) -> None:
+        """Continue in the best region that stands by, if there is one."""
+        usable = self._usable()
+        best = self._choice.best(usable)
+        if best is not None and self._main_tasks and self.fatal is None:
+            self._choice.changed()
+            self._reconnected(usable[best])
+
+    # --- the main tasks -------------------------------------------------------------------------
 
     async def _tick(self) -> None:
         """Call the session when something is due."""
@@ -213,93 +271,103 @@ class Connection:
             self._next_tick = self._session.next_due(now)
             self.flush()
             pause_s = max(_MIN_TICK_S, self._next_tick - self._clock())
-            await _either(self._wake, pause_s)
+            await either(self._wake, pause_s)
             self._wake.clear()
 
-    async def _keep_connected(self) -> None:
-        """Reconnect when there is no socket, and move when a server asks for it."""
+    async def _keep(self, region: Region) -> None:
+        """Reconnect to *region* when there is no socket, and move when a server asks for it."""
+        if region.joining is not None:
+            await region.joining
+            self._resume(region)
         while self.fatal is None and not self._closed:
-            if self._session.current is None:
-                await self._reconnect()
-            elif self._move_request is not None:
-                await self._move(*self._move_request)
-                self._move_request = None
+            if region.socket is None and not (region.is_double and self._usable()):
+                await self._reconnect(region)
+            elif region.move_request is not None:
+                await self._move(region, *region.move_request)
+                region.move_request = None
             else:
-                self._changed.clear()
-                await self._changed.wait()
+                region.changed.clear()
+                await region.changed.wait()
 
-    async def _reconnect(self) -> None:
-        """Connect with full jitter until a server sends Welcome.
+    async def _reconnect(self, region: Region) -> None:
+        """Connect to *region*, with pauses, until a server sends Welcome.
 
         The pause counts from the start of the last attempt, so none is added after one that timed out.
         """
-        if self._clock() - self._adopted > self._settings.reconnect_max_s:
-            self._backoff.restart()
+        if self._clock() - region.since > self._settings.reconnect_max_s:
+            region.backoff.restart()
         failed: DialError | None = None
         began = self._clock()
-        while True:
+        while self.fatal is None:
             asked_s = 0.0 if failed is None else failed.after_s
-            await asyncio.sleep(max(asked_s, self._pause_s(failed) - (self._clock() - began)))
+            await asyncio.sleep(max(asked_s, self._pause_s(region, failed) - (self._clock() - began)))
             began = self._clock()
-            try:
-                socket = await self._dial()
-            except DialError as error:
-                failed = error
-                if failed.is_final:
-                    self._end(failed.error)
-                    return
-            else:
-                self._reconnected(socket)
+            failed = await self._join(region)
+            if failed is None:
+                self._resume(region)
                 return
+            region.refused = failed.is_final
+            if all(each.refused for each in self._regions):
+                self._end(failed.error)
+            elif failed.is_final:
+                failed.after_s = self._settings.reconnect_long_max_s
 
-    def _reconnected(self, socket: _Socket) -> None:
+    def _resume(self, region: Region) -> None:
+        """Send the commands to *region* if no other one carries them."""
+        if region.socket is not None and self._session.current is None:
+            self._reconnected(region.socket)
+
+    def _reconnected(self, socket: RegionSocket) -> None:
         self.reconnects += 1
         self._adopt(socket)
         self._on_change("link-back", socket.state.server)
 
-    async def _move(self, old: _Socket, until: float) -> None:
-        """Make before break: leave *old* once another server has sent Welcome."""
-        self._backoff.restart()
+    async def _move(self, region: Region, old: RegionSocket, until: float) -> None:
+        """Make before break: leave *old* once another server of its region has sent Welcome."""
+        region.backoff.restart()
         while self._session.current is old.state and self._clock() < until:
             failed: DialError | None = None
             try:
-                fresh = await self._dial()
+                fresh = await self._dial(region)
             except DialError as error:
                 failed = error
             else:
                 if self._session.current is not old.state:
-                    self._reconnected(fresh)
+                    self._hold(fresh)
+                    self._resume(region)
                     return
                 if fresh.state.server != old.state.server:
                     self.moves += 1
+                    region.socket = fresh
                     self._adopt(fresh)
                     self._on_change("moved", fresh.state.server)
                     return
                 self._spawn(self._close_socket(fresh))
-            pause_s = min(self._pause_s(failed), max(0.0, until - self._clock()))
-            await _either(old.ended, pause_s)
+            pause_s = min(self._pause_s(region, failed), max(0.0, until - self._clock()))
+            await either(old.ended, pause_s)
 
     # --- one socket ------------------------------------------------------------------------------
 
-    async def _dial(self) -> _Socket:
+    async def _dial(self, region: Region) -> RegionSocket:
         """Open a socket through the load balancer and wait for the Welcome; raises DialError."""
+        region.backoff.dialled(self._clock())
         try:
-            websocket = await self._handshake()
+            websocket, token = await self.dialler.open(region.url)
         except DialError as failed:
-            if not callable(self._token) or not isinstance(failed.error, Unauthorized):
-                self.last_error = failed.error.message
-                raise
-            websocket = await self._handshake()
-        socket = _Socket(websocket, self._session.open_connection(self._clock()))
+            self.last_error = failed.error.message
+            if failed.is_unanswered:
+                self._late_welcome_until = self._clock() + _LATE_WELCOME_S
+            raise
+        socket = RegionSocket(region, websocket, self._session.open_connection(self._clock()))
         self._sockets.append(socket)
         if self._recorder is not None:
-            socket.recorded = self._recorder.opened(self._session.codec, self._used_token)
+            socket.recorded = self._recorder.opened(self._session.codec, token)
         socket.tasks = [self._spawn(self._read(socket)), self._spawn(self._write(socket))]
         socket.dirty.set()
         try:
             done, _ = await asyncio.wait({socket.welcome}, timeout=self._settings.connect_timeout_s)
             if not done:
-                raise DialError(ConnectError(f"{self._address} sends no Welcome", hint=CHECK_ADDRESS))
+                raise DialError(ConnectError(f"{region.address} sends no Welcome", hint=CHECK_ADDRESS))
             socket.welcome.result()
         except BaseException:
             self._late_welcome_until = self._clock() + _LATE_WELCOME_S
@@ -307,61 +375,10 @@ class Connection:
             raise
         return socket
 
-    async def _handshake(self) -> ClientConnection:
-        self._backoff.dialled(self._clock())
-        subprotocol = SUBPROTOCOLS[self._session.codec.name]
-        token = self._used_token = await self.read_token()
-        options = websocket_options(self._settings)
-        if self.ssl_context is not None:
-            options["ssl"] = self.ssl_context
-        try:
-            websocket = await websocket_connect(
-                self.url,
-                subprotocols=[Subprotocol(subprotocol)],
-                additional_headers={} if token is None else {"Authorization": f"Bearer {token}"},
-                **options,
-            )
-        except InvalidStatus as error:
-            told = error.response
-            after = told.headers.get("Retry-After", "")
-            raise dial_error_of(self._address, told.status_code, after, bytes(told.body or b"")) from error
-        except ssl.SSLCertVerificationError as error:
-            raise untrusted(self._address, error) from error
-        except (OSError, asyncio.TimeoutError, WebSocketException, EOFError) as error:
-            self._late_welcome_until = self._clock() + _LATE_WELCOME_S
-            raise unreachable(self._address, error) from error
-        if websocket.subprotocol != subprotocol:
-            websocket.transport.abort()
-            unsupported = UnsupportedProtocol(
-                f"{self._address} does not speak {subprotocol}", hint=CHECK_ADDRESS
-            )
-            raise DialError(unsupported, is_wrong_address=True)
-        return websocket
-
-    async def read_token(self) -> str | None:
-        """Return the token without the white space around it, which files and shells add."""
-        if not callable(self._token):
-            token = self._token
-        else:
-            try:
-                token = await self._token()
-            except Exception as error:
-                told = ConnectError(
-                    f"no token: the token callable raised {type(error).__name__}",
-                    hint="fix the token callable",
-                )
-                raise DialError(told) from error
-        if token is None:
-            return None
-        try:
-            return checked_token(token)
-        except Unauthorized as error:
-            raise DialError(error, is_final=True) from None
-
-    async def _renew(self, socket: _Socket) -> None:
+    async def _renew(self, socket: RegionSocket) -> None:
         """Send a fresh token on a live socket; without one, the robot reconnects when the socket expires."""
         try:
-            token = await self.read_token()
+            token = await self.dialler.read_token()
         except DialError as failed:
             self.last_error = failed.error.message
             return
@@ -369,7 +386,7 @@ class Connection:
             self._session.renew(socket.state, token)
             self.flush()
 
-    async def _read(self, socket: _Socket) -> None:
+    async def _read(self, socket: RegionSocket) -> None:
         try:
             while True:
                 data = await socket.websocket.recv(decode=False)
@@ -380,17 +397,27 @@ class Connection:
         except (ConnectionClosed, OSError):
             if socket.websocket.close_code == CLOSE_RATE:
                 self.last_error = "the server closed the connection: this robot exceeds its rate"
-            elif socket.websocket.close_code == CLOSE_REVOKED and not callable(self._token):
+            elif socket.websocket.close_code == CLOSE_REVOKED and not callable(self.dialler.token):
                 self._end(Unauthorized("the token was revoked, or the robot was disabled", hint=ISSUE))
             is_replaced = socket.websocket.close_code == CLOSE_REPLACED
-            by_itself = self._move_request is not None or self._clock() < self._late_welcome_until
+            is_double = is_replaced and self._is_double(socket)
+            is_moving = socket.region.move_request is not None
+            by_itself = is_double or is_moving or self._clock() < self._late_welcome_until
             if is_replaced and self._session.current is socket.state and not by_itself:
                 message = "another connection of this robot replaced this one"
                 self._end(Conflict(message, hint="give every robot a token of its own"))
         finally:
             self._forget(socket)
 
-    def _receive(self, socket: _Socket, data: bytes) -> None:
+    def _is_double(self, socket: RegionSocket) -> bool:
+        """Note if two addresses lead to one platform, which keeps the newest connection of a robot only."""
+        since = max(socket.state.opened, self._clock() - _DOUBLE_S)
+        others = (each for each in self._sockets if each.region is not socket.region)
+        if any(each.state.opened >= since for each in others):
+            socket.region.is_double = True
+        return socket.region.is_double
+
+    def _receive(self, socket: RegionSocket, data: bytes) -> None:
         try:
             events = self._session.receive(socket.state, data, self._clock())
         except ProtocolError as error:
@@ -400,9 +427,10 @@ class Connection:
                 self._abort(socket)
             return
         self._handle(socket, events)
+        self._measure(socket)
         self.flush()
 
-    async def _write(self, socket: _Socket) -> None:
+    async def _write(self, socket: RegionSocket) -> None:
         is_text = self._session.codec.is_text
         try:
             while True:
@@ -417,14 +445,14 @@ class Connection:
         except (ConnectionClosed, OSError):
             return  # the reader handles the end, after the data that still arrived
 
-    def _handle(self, socket: _Socket | None, events: list[Event]) -> None:
+    def _handle(self, socket: RegionSocket | None, events: list[Event]) -> None:
         for event in events:
             if isinstance(event, ForRobot):
                 self._on_answer(event)
             elif socket is not None:
                 self._handle_socket_event(socket, event)
 
-    def _handle_socket_event(self, socket: _Socket, event: Event) -> None:
+    def _handle_socket_event(self, socket: RegionSocket, event: Event) -> None:
         match event:
             case Welcomed() if not socket.welcome.done():
                 socket.welcome.set_result(None)
@@ -433,7 +461,7 @@ class Connection:
                 if not socket.state.leaving and self._session.current is None:
                     self._on_change("link-lost", event.reason)
                 self._abort(socket)
-            case RenewalDue() if callable(self._token):
+            case RenewalDue() if callable(self.dialler.token):
                 self._spawn(self._renew(socket))
             case Notice():
                 failure = event.failure
@@ -441,28 +469,33 @@ class Connection:
                 if not socket.welcome.done():
                     error = UnsupportedProtocol(failure.message, hint=failure.hint)
                     socket.welcome.set_exception(DialError(error, is_final=failure.code == error.code))
-            case MoveRequested() if socket.state is self._session.current and not self._move_request:
-                self._move_request = (socket, self._clock() + event.within_s)
-                self._changed.set()
+            case MoveRequested() if socket.state is self._session.current:
+                if socket.region.move_request is None:
+                    socket.region.move_request = (socket, self._clock() + event.within_s)
+                    socket.region.changed.set()
+            case MoveRequested() if len(self._regions) > 1 and not socket.state.leaving:
+                self._spawn(self._close_socket(socket))  # it stands by: nothing is lost
 
-    def _adopt(self, socket: _Socket) -> None:
-        self._adopted = self._clock()
+    def _adopt(self, socket: RegionSocket) -> None:
+        now = self._clock()
         if socket.ended.is_set():
             return
-        self._handle(socket, self._session.adopt(socket.state, self._adopted))
-        self._handle(socket, self._session.check(socket.state, self._adopted))
+        self.region_changes += self._last_region not in (None, socket.region)
+        self._last_region = socket.region
+        self._handle(socket, self._session.adopt(socket.state, now))
+        self._handle(socket, self._session.check(socket.state, now))
         self.flush()
 
-    def _abort(self, socket: _Socket) -> None:
+    def _abort(self, socket: RegionSocket) -> None:
         socket.websocket.transport.abort()
         self._forget(socket)
 
-    async def _close_socket(self, socket: _Socket) -> None:
+    async def _close_socket(self, socket: RegionSocket) -> None:
         socket.is_closing = True
         await socket.websocket.close()
         self._forget(socket)
 
-    def _forget(self, socket: _Socket) -> None:
+    def _forget(self, socket: RegionSocket) -> None:
         """Keep the socket's commands for the next one, and wake up the task that reconnects."""
         if socket.ended.is_set():
             return
@@ -477,42 +510,39 @@ class Connection:
             if task is not asyncio.current_task():
                 task.cancel()
         if not socket.welcome.done():
-            error = ConnectError(f"{self._address} closed without a Welcome", hint=CHECK_RUNNING)
+            error = ConnectError(f"{socket.region.address} closed without a Welcome", hint=CHECK_RUNNING)
             socket.welcome.set_exception(DialError(error))
             socket.welcome.exception()
-        self._changed.set()
+        socket.measured.set()
+        self._release(socket)
         self._wake.set()
+
+    def _release(self, socket: RegionSocket) -> None:
+        """Take an ended socket from its region, and continue in another region that stands by."""
+        region = socket.region
+        if region.socket is socket:
+            region.socket = None
+            if not socket.is_closing:
+                self._choice.lost(region.number, self._clock())
+        if self._session.current is None and not self._closed:
+            self._use_standby()
+        for each in self._regions:
+            each.changed.set()
 
     def _end(self, error: RsePfError) -> None:
         """Stop reconnecting: every command ends with *error*."""
         self.fatal = error
         self.last_error = error.message
         self._handle(None, self._session.abandon(error.code, error.message, error.hint))
-        self._changed.set()
+        for region in self._regions:
+            region.changed.set()
 
-    def _pause_s(self, failed: DialError | None) -> float:
+    def _pause_s(self, region: Region, failed: DialError | None) -> float:
         after_s, is_offline = (0.0, False) if failed is None else (failed.after_s, failed.is_offline)
-        return self._backoff.pause_s(self._clock(), after_s, is_offline=is_offline)
+        return region.backoff.pause_s(self._clock(), after_s, is_offline=is_offline)
 
     def _spawn(self, work: Coroutine[Any, Any, Any]) -> asyncio.Task[Any]:
         task = asyncio.get_running_loop().create_task(work)
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
         return task
-
-
-async def cancel_all(tasks: Iterable[asyncio.Task[Any]]) -> None:
-    """Cancel *tasks* and wait until all have ended."""
-    ending = list(tasks)
-    for task in ending:
-        task.cancel()
-    await asyncio.gather(*ending, return_exceptions=True)
-
-
-async def _either(event: asyncio.Event, timeout_s: float) -> None:
-    """Wait for *event*, at most *timeout_s*; unlike ``wait_for``, never swallow a cancellation."""
-    waiting = asyncio.ensure_future(event.wait())
-    try:
-        await asyncio.wait({waiting}, timeout=timeout_s)
-    finally:
-        waiting.cancel()

@@ -42,7 +42,7 @@ class DialError(Exception):
     """A failed connection attempt: its error, how long to wait, and whether a further attempt is of use.
 
     ``is_final`` means that no later attempt can succeed, ``is_wrong_address`` that the URL is probably wrong,
-    ``is_offline`` that nothing left this machine.
+    ``is_offline`` that nothing left this machine, and ``is_unanswered`` that a server may still accept it.
     """
 
     def __init__(
@@ -53,6 +53,7 @@ class DialError(Exception):
         is_wrong_address: bool = False,
         is_final: bool = False,
         is_offline: bool = False,
+        is_unanswered: bool = False,
     ) -> None:
         super().__init__(error.message)
         self.error = error
@@ -60,6 +61,7 @@ class DialError(Exception):
         self.is_wrong_address = is_wrong_address
         self.is_final = is_final
         self.is_offline = is_offline
+        self.is_unanswered = is_unanswered
 
 
 def unreachable(address: str, error: Exception) -> DialError:
@@ -67,7 +69,7 @@ def unreachable(address: str, error: Exception) -> DialError:
     cause = getattr(error, "strerror", None) or str(error) or type(error).__name__
     is_offline = isinstance(error, socket.gaierror) or getattr(error, "errno", None) in _NOWHERE
     told = ConnectError(f"cannot connect to {address}: {cause}", hint=CHECK_RUNNING)
-    return DialError(told, is_offline=is_offline)
+    return DialError(told, is_offline=is_offline, is_unanswered=True)
 
 
 def untrusted(address: str, error: ssl.SSLCertVerificationError) -> DialError:

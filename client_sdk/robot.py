@@ -8,7 +8,7 @@ from __future__ import annotations
 import asyncio
 import random as random_module
 import time
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
@@ -18,9 +18,10 @@ from client_sdk.answers import Answer, PoseAnswer
 from client_sdk.asking import Asking, Call, OnProgress
 from client_sdk.burst import Burst
 from client_sdk.burst_rules import checked_burst_url
-from client_sdk.connection import Connection, ForRobot, OnChange, Token
+from client_sdk.connection import Connection, ForRobot, OnChange
 from client_sdk.dialling import DialError
 from client_sdk.enrolment import read_enrolment
+from client_sdk.handshake import Token
 from client_sdk.local_services import LocalServices
 from client_sdk.offload import CloudFirst
 from client_sdk.recording import make_recorder, sdk_version
@@ -57,7 +58,7 @@ class Robot:
 
     def __init__(
         self,
-        url: str = "",
+        url: str | Sequence[str] = "",
         *,
         token: Token = None,
         enrolment: str | Path | None = None,
@@ -74,15 +75,18 @@ class Robot:
         """Describe a robot to be used as ``async with connect(...) as robot``, or awaited.
 
         Args:
-            url: ``ws://HOST:PORT/ws`` or ``wss://HOST/ws``.
+            url: ``ws://HOST:PORT/ws`` or ``wss://HOST/ws``; of several the robot uses the nearest,
+                and keeps a connection to each of the others.
             token: The robot's token, or an async callable that gives one (a run outlives a token).
-            enrolment: File of ``rse-pf robot enrol --out``, instead of *url* and *token*.
+            enrolment: File of ``rse-pf robot enrol --out``, instead of *url* and *token*; with a list of
+                addresses, these count and not the one of the file.
             codec: ``zlib`` (the paper's), ``json`` or ``bin``.
             settings: Limits and timeouts; None means the defaults.
             offload: `CloudFirst` lets the robot answer itself when the cloud cannot.
             clock: Seconds, monotonic.
             random: Source of the jitter of reconnects.
-            on_change: Called with ``link-lost``, ``link-back`` or ``moved``, and the reason or the server.
+            on_change: Called with ``link-lost``, ``link-back``, ``moved`` or ``stands-by``, and the reason or
+                the server.
             record: Folder for a recording of what this robot says and hears, for rse-pf replay.
             thumbnails: Whether small pictures of the frames of its `mapper` are recorded, too.
             burst_url: ``https://HOST/burst``, a function that answers while no server can, also before the
@@ -91,10 +95,12 @@ class Robot:
         Raises:
             UsageError: The address or the codec cannot be used, or there are an address and an enrolment.
         """
-        if bool(url) == (enrolment is not None) or (token is not None and enrolment is not None):
+        urls = [url] if isinstance(url, str) else list(url)
+        is_list = not isinstance(url, str)
+        if not (urls != [""] if enrolment is None else (is_list or not url) and token is None):
             raise UsageError(
                 "connect needs either an address or an enrolment",
-                hint="connect(url, token=...) or connect(enrolment=FILE)",
+                hint="connect(url, token=...), connect([url, url], token=...) or connect(enrolment=FILE)",
             )
         if codec not in CODECS:
             raise UsageError(f"no codec named {codec!r}", hint=f"choose one of {', '.join(CODECS)}")
@@ -104,7 +110,7 @@ class Robot:
         )
         self._recorder = make_recorder(record, thumbnails, settings)
         self._connection = Connection(
-            url,
+            urls,
             token=token,
             session=self._session,
             on_answer=self._answered,
@@ -113,7 +119,7 @@ class Robot:
             on_change=on_change,
             recorder=self._recorder,
         )
-        self._enrolment = enrolment
+        self._urls, self._enrolment = urls, enrolment
         self._offload = offload
         self._clock = clock
         self._local = None if offload is None else LocalServices(offload.registry, clock)
@@ -121,8 +127,8 @@ class Robot:
         self._keeper = StatsKeeper(random)
         self._burst = Burst(
             codec=self._session.codec, read_token=self._read_token, clock=clock, random=random,
-            own=lambda: (self._connection.url, self._connection.ssl_context),
-            max_answer_bytes=settings.max_message_bytes, url=checked_burst_url(burst_url, url),
+            own=lambda: (self._connection.url, self._connection.dialler.ssl_context),
+            max_answer_bytes=settings.max_message_bytes, url=checked_burst_url(burst_url, urls[0]),
         )  # fmt: skip
         self._asking = Asking(
             session=self._session, flush=self._connection.flush, keeper=self._keeper, clock=clock,
@@ -144,7 +150,8 @@ class Robot:
                 self._recorder.start()
             if self._enrolment is not None:
                 access = read_enrolment(self._enrolment)
-                self._connection.use(access.url, access.token, access.ssl_context)
+                urls = self._urls if self._urls != [""] else [access.url]
+                self._connection.use(urls, access.token, access.ssl_context)
             if self._local is not None:
                 await self._local.prepare()
             await self._connection.open(
@@ -403,6 +410,7 @@ class Robot:
             sent=keeper.sent,
             answered=keeper.answered,
             failed=sum(keeper.failures.values()),
+            sent_to_burst=self._burst.rules.spent,
             answered_by_burst=keeper.answered_by_burst,
             answered_by_robot=keeper.answered_by_robot,
             failures_by_code=dict(keeper.failures),
@@ -412,6 +420,7 @@ class Robot:
             duplicates=keeper.duplicates,
             reconnects=connection.reconnects,
             moves=connection.moves,
+            region_changes=connection.region_changes,
             bytes_out=connection.bytes_out,
             bytes_in=connection.bytes_in,
             payload_bytes_median=keeper.percentile("payload_bytes", 0.5),
@@ -426,6 +435,7 @@ class Robot:
             delay_up_s=delays[0] if delays else None,
             delay_down_s=delays[1] if delays else None,
             server=current.server if current else "",
+            region=connection.region if current else "",
             last_error=connection.last_error,
         )
 
@@ -450,7 +460,7 @@ class Robot:
 
     async def _read_token(self) -> str | None:
         try:
-            return await self._connection.read_token()
+            return await self._connection.dialler.read_token()
         except DialError as failed:
             raise failed.error from None
 

@@ -28,11 +28,16 @@ class Percentiles:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Stats:
-    """A snapshot; times in ms, clocks in s.  ``duplicates`` counts second answers to a command: 0."""
+    """A snapshot; times in ms, clocks in s.  ``duplicates`` counts second answers to a command: 0.
+
+    ``sent_to_burst`` counts the commands of the present 24 hours, also those that a server answered first.
+    ``region`` is the address of the platform that is used now.
+    """
 
     sent: int
     answered: int
     failed: int
+    sent_to_burst: int
     answered_by_burst: int
     answered_by_robot: int
     failures_by_code: Mapping[str, int]
@@ -42,6 +47,7 @@ class Stats:
     duplicates: int
     reconnects: int
     moves: int
+    region_changes: int
     bytes_out: int
     bytes_in: int
     payload_bytes_median: float | None
@@ -56,6 +62,7 @@ class Stats:
     delay_up_s: float | None
     delay_down_s: float | None
     server: str
+    region: str
     last_error: str
 
 

@@ -62,7 +62,10 @@ class FakeSocket:
             while True:
                 data = await self.websocket.recv(decode=False)
                 if not self.muted:
+                    was_open = self.is_welcomed
                     await self._apply(self.session.receive(data, self._platform.clock()))
+                    if not was_open:
+                        self._platform.noticed()
         except ConnectionClosed:
             return
 
@@ -107,6 +110,11 @@ class FakeSocket:
     def cut(self) -> None:
         """End the socket as kill -9 of its server does."""
         self.websocket.transport.abort()
+
+    @property
+    def is_welcomed(self) -> bool:
+        """Whether the robot said hello, and a Welcome was sent."""
+        return self.session.state == "open"
 
     @property
     def is_open(self) -> bool:

@@ -19,6 +19,7 @@ ORDER = (
     "pnp", "services.mapping", "live_map", "services.custom", "services",
     "recording", "recording.explain", "recording.replay",
     "aws", "aws.storage", "aws.fleet", "aws.money",
+    "batch",
     "backend", "backend.scheduling", "backend.sandbox", "backend.jobs", "backend.live_map", "backend.compute",
     "backend.rosbridge",
     "backend.gateway",
@@ -90,7 +91,11 @@ ONLY: dict[str, set[str]] = {
 PACKAGES: dict[str, tuple[str, ...]] = {
     "numpy": ("rse_pf/", "client_sdk/", "lambda_pnp/", "ros_bridge/"),
     "msgspec": ("rse_pf/", "client_sdk/", "lambda_pnp/"),
-    "websockets": ("client_sdk/connection.py",),
+    "websockets": (
+        "client_sdk/connection.py",
+        "client_sdk/handshake.py",
+        "client_sdk/region_sockets.py",
+    ),
     "cv2": (
         "rse_pf/pnp/engines.py",
         "client_sdk/frontend.py",
@@ -112,6 +117,7 @@ PACKAGES: dict[str, tuple[str, ...]] = {
     "jwt": ("rse_pf/auth/tokens.py",),
     "cryptography": ("rse_pf/auth/tokens.py", "rse_pf/auth/certificates.py"),
     "boto3": ("rse_pf/aws/",),
+    "distributed": ("rse_pf/batch/",),
     "botocore": ("rse_pf/aws/",),
     "aws_cdk": ("stacks/", "app.py"),
     "constructs": ("stacks/", "app.py"),
