@@ -27,7 +27,14 @@ from rse_pf.config import PlatformSettings
 from rse_pf.errors import Crashed, Disconnected, MissingExtra, error_from_code
 from rse_pf.object_store import ObjectStore
 
-__all__ = ["ClusterKey", "DaskEngine", "LocalCluster", "new_cluster_key"]
+__all__ = [
+    "ClusterKey",
+    "DaskEngine",
+    "LocalCluster",
+    "new_cluster_key",
+    "start_worker",
+    "stop_process",
+]
 
 _START_TIMEOUT_S = 60.0
 _POLL_S = 0.2
@@ -124,14 +131,14 @@ class LocalCluster:
                     f"{_MAX_WORKER_STARTS} workers ended",
                     hint="look at the memory of this machine; use fewer",
                 )
-            _close(self._workers[row])
+            stop_process(self._workers[row])
             self._workers[row] = self._start_worker()
         return len(dead)
 
     def stop(self) -> None:
         """Kill all processes and wait for them."""
         for each in [*self._workers, *([self._scheduler] if self._scheduler is not None else [])]:
-            _close(each)
+            stop_process(each)
         self._workers, self._scheduler = [], None
 
     def _order(self) -> dict[str, Any]:
@@ -141,16 +148,26 @@ class LocalCluster:
         return self._spawn("worker", NodeOrder(**self._order(), address=self.address))
 
     def _spawn(self, role: str, order: NodeOrder) -> subprocess.Popen[bytes]:
-        process = subprocess.Popen(
-            [sys.executable, "-m", "rse_pf.batch.node", role], stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE if role == "scheduler" else subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL, env={**os.environ, **self._environment},
-        )  # fmt: skip
-        assert process.stdin is not None
-        with contextlib.suppress(OSError):  # it has ended, which its exit code shows
-            process.stdin.write(msgspec.json.encode(order) + b"\n")
-            process.stdin.close()
-        return process
+        return _spawn(role, order, self._environment)
+
+
+def start_worker(certificate: str, key: str, address: str, *, parent: int) -> subprocess.Popen[bytes]:
+    """Start a worker of the scheduler at *address*; it ends with the process *parent*."""
+    order = NodeOrder(certificate=certificate, key=key, address=address, parent=parent)
+    return _spawn("worker", order, {**_ONE_THREAD, **_DASK})
+
+
+def _spawn(role: str, order: NodeOrder, environment: dict[str, str]) -> subprocess.Popen[bytes]:
+    process = subprocess.Popen(
+        [sys.executable, "-m", "rse_pf.batch.node", role], stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE if role == "scheduler" else subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL, env={**os.environ, **environment},
+    )  # fmt: skip
+    assert process.stdin is not None
+    with contextlib.suppress(OSError):  # it has ended, which its exit code shows
+        process.stdin.write(msgspec.json.encode(order) + b"\n")
+        process.stdin.close()
+    return process
 
 
 class DaskEngine:
@@ -318,7 +335,8 @@ def _first_line(process: subprocess.Popen[bytes], timeout_s: float) -> str:
     return line.strip()
 
 
-def _close(process: subprocess.Popen[bytes]) -> None:
+def stop_process(process: subprocess.Popen[bytes]) -> None:
+    """Kill a process of a cluster, and wait for its end."""
     process.kill()
     process.wait()
     for stream in (process.stdin, process.stdout):

@@ -6,8 +6,9 @@ killed is continued by the same call: parts that were finished are not computed 
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Sequence
+import time
+from collections import Counter, defaultdict
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -30,6 +31,7 @@ from rse_pf.services.mapping.optimise import (
     OptimisedGraph,
     OptimiseOptions,
     ignore_progress,
+    optimise_graph,
     robust_cost,
 )
 from rse_pf.services.mapping.place import map_limits
@@ -60,6 +62,8 @@ class BatchMergeResult:
     """Those that the alignment of clouds added."""
     computed: int
     found: int
+    seconds: Mapping[str, float]
+    """Time of each kind of part."""
 
 
 class BatchMerge:
@@ -73,6 +77,8 @@ class BatchMerge:
         *,
         options: MergeOptions | None = None,
         align_clouds: bool = True,
+        two_levels: bool = True,
+        clock: Callable[[], float] = time.monotonic,
         report: Report = ignore_progress,
     ) -> None:
         """Compute nothing yet.
@@ -83,6 +89,8 @@ class BatchMerge:
             settings: Limits of maps and the size of parts.
             options: How to merge; None means the defaults.
             align_clouds: Whether overlapping clouds are aligned, too.
+            two_levels: Whether each map's pose graph is optimised by itself before the whole one.
+            clock: Seconds, monotonic.
             report: Called with the progress; may raise Cancelled.
         """
         self._store = store
@@ -90,7 +98,10 @@ class BatchMerge:
         self._settings = settings
         self._options = options or MergeOptions()
         self._align_clouds = align_clouds
+        self._two_levels = two_levels
+        self._clock = clock
         self._report = report
+        self._seconds: defaultdict[str, float] = defaultdict(float)
         self._maps: tuple[str, ...] = ()
         self._own: list[str] = []
         self._tiles: list[LoopClosure] = []
@@ -117,7 +128,7 @@ class BatchMerge:
         merged = merge_versions(versions, self._options, report=self._whole_report, steps=steps)
         return BatchMergeResult(
             merged=merged, links=self._links, tiles=tuple(self._tiles), computed=self._computed,
-            found=self._found,
+            found=self._found, seconds=dict(self._seconds),
         )  # fmt: skip
 
     def forget(self) -> None:
@@ -164,7 +175,9 @@ class BatchMerge:
 
         on_done(0)
         self._own += [part.name for part in parts]
+        began = self._clock()
         self._engine.run(missing, on_done)
+        self._seconds[kind] += self._clock() - began
         self._computed += len(missing)
         self._found += known
         return [read_result(self._store, part.name) for part in parts]
@@ -283,6 +296,11 @@ class BatchMerge:
     def _optimise(
         self, graph: PoseGraph, of_map: npt.NDArray[np.int64], options: OptimiseOptions
     ) -> OptimisedGraph:
+        if not self._two_levels:
+            began = self._clock()
+            whole = optimise_graph(graph, options)
+            self._seconds["optimise"] += self._clock() - began
+            return whole
         within = graphs_within(graph, of_map)
         with_edges = [inner for _, inner in within if len(inner.a)]
         levels = iter(self._run([self._optimising(inner, options) for inner in with_edges]))

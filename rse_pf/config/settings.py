@@ -283,8 +283,8 @@ class LocalSettings:
 class BurstSettings:
     """Poses from a serverless function while the servers are busy, late or gone."""
 
-    url: str = setting("", doc="where robots send commands by HTTP when no server answers in time: an address, or a path at their own address, which is /burst on AWS; empty: nowhere")
-    robot_commands_per_day: int = setting(10000, unit="commands", doc="commands of one robot that go there in a day; more are refused, and the robot computes them itself", low=1)
+    url: str = setting("", doc="where robots send commands by HTTP when no server answers in time: an address, or a path at their own address; empty: /burst on AWS, and elsewhere nowhere")
+    robot_commands_per_day: int = setting(10000, unit="commands", doc="commands of one robot that go there in a day; more are refused, and the robot computes them itself; 0: none go there", low=0)
     commands_per_day: int = setting(500000, unit="commands", doc="commands of all robots that are answered there in a day; more are refused", low=1)
     commands_per_5_minutes: int = setting(50000, unit="commands", doc="WAF: commands of all robots in five minutes; more are refused with 429", low=100)
     address_commands_per_5_minutes: int = setting(20000, unit="commands", doc="WAF: the same for one address", low=100)

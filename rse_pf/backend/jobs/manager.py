@@ -8,8 +8,6 @@ at most twice a second.
 from __future__ import annotations
 
 import functools
-import hashlib
-import json
 import threading
 import time
 from asyncio import AbstractEventLoop
@@ -22,6 +20,7 @@ import msgspec
 from rse_pf.backend.jobs.fair_queue import job_to_displace
 from rse_pf.backend.jobs.lease import job_key
 from rse_pf.backend.jobs.process import JobRequest
+from rse_pf.backend.jobs.queue import settings_digest_of
 from rse_pf.backend.jobs.record_gc import RecordCollector
 from rse_pf.backend.jobs.runner import WAITING, JobContext, JobOutcome, JobSignals, run_job
 from rse_pf.backend.ports import Log
@@ -101,9 +100,7 @@ class JobManager:
             clock=context.clock,
             wall_clock=wall_clock,
         )
-        plain = context.settings.to_dict()
-        chosen = json.dumps([plain["services"], plain["pnp"]], sort_keys=True)
-        self._settings_digest = hashlib.sha256(chosen.encode()).hexdigest()
+        self._settings_digest = settings_digest_of(context.settings)
 
     @property
     def known(self) -> int:

@@ -18,6 +18,7 @@ from typing import Any, Literal
 
 from rse_pf.backend.jobs.lease import MAX_TRIES, JobLease, JobRecord, record_name, verdict_on
 from rse_pf.backend.jobs.process import JobProcess, JobRequest, inline_bytes, retry_store
+from rse_pf.backend.jobs.queue import JobQueue
 from rse_pf.backend.jobs.slots import JobSlots
 from rse_pf.backend.robot_store import store_within_quota
 from rse_pf.backend.sandbox.ipc import FrameReader, encode_message
@@ -57,6 +58,10 @@ class JobContext:
     server_id: str
     start: Callable[[JobRequest], JobProcess]
     clock: Callable[[], float]
+    queue: JobQueue | None = None
+    """Where jobs that wait are offered to job servers; None where there are none."""
+    finished: Callable[[JobRequest], None] | None = None
+    """Called when a job has an outcome; a job server withdraws the offer."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -132,9 +137,14 @@ def run_job(
     name = record_name(request.robot, request.key)
     lease = JobLease(context.store, name, owner, context.clock)
     try:
-        return _follow_or_run(request, context, signals, tell, lease)
+        outcome = _follow_or_run(request, context, signals, tell, lease)
     except RsePfError as error:
-        return JobOutcome(error=error)
+        outcome = JobOutcome(error=error)
+    finished = context.finished if context.queue is None else context.queue.withdraw
+    if finished is not None and not outcome.is_given_up:
+        with contextlib.suppress(StoreError):  # a job server finds that the job is done, and withdraws it
+            finished(request)
+    return outcome
 
 
 def _follow_or_run(
@@ -165,7 +175,7 @@ def _follow_or_run(
             if stored is not None:
                 return stored
         tell(0.0, WAITING)
-        if not context.slots.acquire(request.robot, signals.wait):
+        if not _get_slot(request, context, signals, lease):
             continue
         try:
             if lease.take():
@@ -174,6 +184,26 @@ def _follow_or_run(
                     return outcome
         finally:
             context.slots.release()
+
+
+def _get_slot(request: JobRequest, context: JobContext, signals: JobSignals, lease: JobLease) -> bool:
+    """Wait for a slot of this server; False after a signal, or when a job server changed the record."""
+    if context.queue is None:
+        return context.slots.acquire(request.robot, signals.wait)
+    context.queue.offer(request)
+    poll_s = context.settings.serving.job_heartbeat_s * _POLL_SHARE
+    due_s, before = context.clock() + poll_s, lease.record
+
+    def wait(seconds: float) -> bool:
+        nonlocal due_s
+        if not signals.wait(seconds):
+            return False
+        if context.clock() < due_s:
+            return True
+        due_s = context.clock() + poll_s
+        return lease.look() == before
+
+    return context.slots.acquire(request.robot, wait)
 
 
 def _stored_outcome(request: JobRequest, context: JobContext, record: JobRecord) -> JobOutcome | None:

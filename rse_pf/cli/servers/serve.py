@@ -70,8 +70,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--services", type=Path, metavar="DIR", help="run the services installed in DIR (services.folder)"
     )
     parser.add_argument(
+        "--follow-services", type=Path, metavar="LINK",
+        help="run the services in the folder that LINK leads to, and load them anew when the control port is "
+        "told to (services.follow); those that cannot be loaded are left out",
+    )  # fmt: skip
+    parser.add_argument(
         "--accept-weak-isolation", action="store_true",
         help="run them even if this kernel lacks a kind of isolation (services.accept_weak_isolation)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--jobs-only", action="store_true",
+        help="serve no robots: take long jobs that servers with serving.offer_jobs offer in --store",
     )  # fmt: skip
     parser.add_argument(
         "--conformance-echo", action="store_true", help="echo raw messages without tokens, loopback only"
@@ -81,8 +90,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     """Serve until a drain or a signal ends it."""
     services: dict[str, object] = {}
+    if args.services is not None and args.follow_services is not None:
+        raise UsageError("--services and --follow-services exclude each other", hint="leave one of them out")
     if args.services is not None:
         services["folder"] = str(args.services.absolute())
+    if args.follow_services is not None:
+        services.update(folder=str(args.follow_services.absolute()), follow=True)
     if args.accept_weak_isolation:
         services["accept_weak_isolation"] = True
     chosen = settings.replace(serving=_given(args, _SETTINGS), services=services)
@@ -97,6 +110,12 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
         raise UsageError(
             f"there is no folder {args.announce.absolute().parent}",
             hint="make it, or name another --announce",
+        )
+    if args.jobs_only:
+        from rse_pf.backend.supervisor.serve_jobs import serve_jobs
+
+        return serve_jobs(
+            chosen, placement=placement, server_id=server_id, announce=args.announce, control_token=token
         )
     trust = None if args.keys is None else _trust(args.keys)
     from rse_pf.backend.supervisor import serve

@@ -1,0 +1,308 @@
+"""Measure a merge in parts: copies of the red kitchen on two worker processes, with and without kills.
+
+Defends: links and aligned clouds equal to the bit to one process, poses within 0.1 mm, with one worker and
+the scheduler killed; links and alignment at least 1.6 times as fast on two idle cores.  The copies are moved
+as a whole, drift apart, and have noise in pixels, depths, descriptors and clouds.  ``two_processes`` says what
+two independent processes without any engine reach on this machine: no engine can be faster than they.
+
+    python -m benchmarks.cloud.batch --recordings ../shared/data --copies 20 --candidates 2 --out batch.json
+    python -m benchmarks.cloud.batch --recordings ../shared/data --copies 4 --frames 60
+
+With 20 copies of 250 keyframes it takes about an hour on two cores, with 4 copies of 60 about two minutes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rse_pf.batch.cluster import DaskEngine, LocalCluster, new_cluster_key
+from rse_pf.batch.merge import BatchMerge, BatchMergeResult
+from rse_pf.batch.tasks import InProcessEngine
+from rse_pf.config import PlatformSettings
+from rse_pf.geometry import Array, exp_se3, inverse
+from rse_pf.maps.format import Edge, Keyframe, MapVersion, decode_map, encode_map
+from rse_pf.object_store import DirectoryStore, digest_of
+from rse_pf.services.mapping.cloud_deform import deform_cloud
+from rse_pf.services.mapping.links import Atlas, MergeOptions, measure_pairs
+
+__all__ = ["kitchen", "main", "noisy_copy"]
+
+_ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+_STEP_M, _STEP_DEG = 0.002, 0.05
+"""Drift of a copy from one keyframe to the next."""
+_PIXEL, _DEPTH_M, _CLOUD_M, _FLIPPED_BITS = 0.3, 0.004, 0.003, 0.02
+_PARALLEL = ("vectors", "pairs", "links", "agree", "tiles")
+
+
+def kitchen(recordings: Path, frames: int) -> MapVersion:
+    """Return the red kitchen with every frame a keyframe, at tracked poses, and its cloud."""
+    from benchmarks.maps.recordings import cloud_of, drive, keyframe_of, red_kitchen
+
+    dataset = red_kitchen(recordings)
+    run = drive(dataset, dataset.rows[:frames], "kitchen")
+    keyframes = tuple(
+        keyframe_of(dataset, row, T, number)
+        for number, (row, T) in enumerate(zip(run.rows, run.T_world_camera, strict=True))
+    )
+    cloud, colours = cloud_of(dataset, run.rows[::10], run.T_world_camera[::10], 0.02).points()
+    return MapVersion(
+        keyframes=keyframes, points=cloud.astype(np.float32), colours=colours.astype(np.uint8)
+    )  # fmt: skip
+
+
+def noisy_copy(version: MapVersion, number: int) -> MapVersion:
+    """Return *version* as another robot would have mapped it: moved, drifted, with noise; seeded."""
+    rng = np.random.default_rng(number)
+    start = np.eye(4) if number == 0 else exp_se3(rng.normal(size=6) * np.array([2, 2, 0.2, 0.1, 0.1, 1.0]))
+    spread = np.array([_STEP_M] * 3 + [np.radians(_STEP_DEG)] * 3)
+    old = [each.T_world_camera for each in version.keyframes]
+    poses, edges = [start @ old[0]], []
+    for row in range(1, len(old)):
+        step = inverse(old[row - 1]) @ old[row] @ exp_se3(rng.normal(size=6) * spread)
+        poses.append(poses[-1] @ step)
+        edges.append(Edge(a=row - 1, b=row, T_a_b=step, information=np.diag(spread**-2.0)))
+    keyframes = tuple(_noisy(each, T, number, rng) for each, T in zip(version.keyframes, poses, strict=True))
+    points = deform_cloud(version.points, version.keyframes, np.array(poses))
+    points += rng.normal(size=points.shape) * _CLOUD_M
+    return MapVersion(
+        keyframes=keyframes, edges=tuple(edges), points=points.astype(np.float32), colours=version.colours
+    )  # fmt: skip
+
+
+def main() -> None:
+    """Print the figures, and write them to ``--out``; the exit code is 1 if a bar is not met."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--recordings", type=Path, required=True)
+    parser.add_argument("--copies", type=int, default=4)
+    parser.add_argument("--frames", type=int, default=250, help="of the recording; each is a keyframe")
+    parser.add_argument("--candidates", type=int, default=6)
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--folder", type=Path, help="where maps and parts are written (default: temporary)")
+    parser.add_argument("--out", type=Path)
+    parser.add_argument("--one", type=Path, help=argparse.SUPPRESS)
+    parser.add_argument("--pairs", type=Path, help=argparse.SUPPRESS)
+    args = parser.parse_args()
+    if args.one is not None:
+        _in_one_process(args.one, args.candidates)
+        return
+    if args.pairs is not None:
+        print(json.dumps({"seconds": _time_of_pairs(args.pairs)}))
+        return
+    if not args.recordings.is_dir():
+        sys.exit(
+            f"there is no folder {args.recordings}: the benchmark needs the recording 7scenes_redkitchen"
+        )
+    with tempfile.TemporaryDirectory(dir=args.folder) as folder:
+        report = _measure(args, Path(folder))
+    text = json.dumps(report, indent=2)
+    print(text)
+    if args.out is not None:
+        args.out.write_text(text + "\n", encoding="utf-8")
+    sys.exit(0 if report["bars"]["all"] else 1)
+
+
+def _measure(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
+    source = kitchen(args.recordings, args.frames)
+    names = []
+    store = DirectoryStore(folder / "one")
+    for number in range(args.copies):
+        data = encode_map(noisy_copy(source, number))
+        names.append(f"maps/{digest_of(data)}")
+        store.put(names[-1], data)
+    (folder / "names.json").write_text(json.dumps(names), encoding="utf-8")
+    _say(f"{args.copies} maps of {len(source.keyframes)} keyframes and {len(source.points)} points")
+    report: dict[str, Any] = {
+        "machine": platform.platform(), "cores": os.cpu_count(), "load_average": os.getloadavg(),
+        "copies": args.copies, "keyframes": args.copies * len(source.keyframes),
+        "points": args.copies * len(source.points), "candidates": args.candidates,
+        "two_processes": _two_processes(folder),
+    }  # fmt: skip
+    subprocess.run(_again(args, "--one", folder), env=_environment(), check=True)
+    one = json.loads((folder / "one.json").read_text(encoding="utf-8"))
+    _say(f"one process: {one['seconds']:.0f} s")
+    two, quiet = _in_workers(args, folder, names, "two", kills=False)
+    _say(f"{args.workers} workers: {quiet['seconds']:.0f} s")
+    killed, broken = _in_workers(args, folder, names, "killed", kills=True)
+    _say(f"with kills: {broken['seconds']:.0f} s, {broken['events']}")
+    report |= {"one_process": one, "workers": quiet, "workers_killed": broken}
+    speed_up = _seconds_of(one, *_PARALLEL) / _seconds_of(quiet, *_PARALLEL)
+    apart_m = _apart_m(killed.merged.version, _merged(folder, "one"))
+    single_m = _apart_m(_merged(folder, "one"), _merged(folder, "single"))
+    bars = {
+        "links_and_clouds_equal": one["digest"] == quiet["digest"] == broken["digest"],
+        "poses_within_0.1_mm_of_one_process": apart_m <= 1e-4,
+        "poses_within_0.1_mm_of_one_level": single_m <= 1e-4,
+        "all_joined": len(killed.merged.joined) == args.copies,
+        "links_and_icp_1.6_times_as_fast": speed_up >= 1.6,
+    }
+    report |= {
+        "links": len(two.links), "clouds_aligned": len(two.tiles),
+        "speed_up_links_and_icp": round(speed_up, 3),
+        "speed_up_whole": round(one["seconds"] / quiet["seconds"], 3),
+        "apart_mm": round(1e3 * apart_m, 6), "apart_of_one_level_mm": round(1e3 * single_m, 6),
+        "bars": {**bars, "all": all(bars.values())},
+    }  # fmt: skip
+    return report
+
+
+def _in_one_process(folder: Path, candidates: int) -> None:
+    """Merge in this process, and write what came out beside the maps."""
+    store = DirectoryStore(folder / "one")
+    names = json.loads((folder / "names.json").read_text(encoding="utf-8"))
+    options = MergeOptions(candidates=candidates)
+    began = time.monotonic()
+    found = BatchMerge(store, InProcessEngine(store), PlatformSettings(), options=options).run(names)
+    seconds = time.monotonic() - began
+    (folder / "one.map").write_bytes(encode_map(found.merged.version))
+    (folder / "one.json").write_text(json.dumps(_figures(found, seconds)), encoding="utf-8")
+    single = BatchMerge(
+        store, InProcessEngine(store), PlatformSettings(), options=options, two_levels=False
+    ).run(names)  # fmt: skip
+    (folder / "single.map").write_bytes(encode_map(single.merged.version))
+
+
+def _in_workers(
+    args: argparse.Namespace, folder: Path, names: list[str], called: str, *, kills: bool
+) -> tuple[BatchMergeResult, dict[str, Any]]:
+    """Merge on worker processes; kill a worker at a third of the links, and the scheduler at two thirds."""
+    store, source = DirectoryStore(folder / called), DirectoryStore(folder / "one")
+    for name in names:
+        store.put(name, source.get(name))
+    settings = PlatformSettings().replace(data={"store": f"dir:{folder / called}"})
+    key = new_cluster_key()
+    cluster = LocalCluster(key, args.workers)
+    events: list[str] = []
+    engine = DaskEngine(store, settings, cluster, key, on_event=events.append)
+    kill = _killer(cluster) if kills else _nothing
+    began = time.monotonic()
+    try:
+        engine.start()
+        up_s = time.monotonic() - began
+        options = MergeOptions(candidates=args.candidates)
+        found = BatchMerge(store, engine, settings, options=options, report=kill).run(names)
+    finally:
+        engine.close()
+        cluster.stop()
+    return found, {**_figures(found, time.monotonic() - began), "up_s": round(up_s, 2), "events": events}
+
+
+def _killer(cluster: LocalCluster) -> Callable[[float, str], None]:
+    killed: list[int] = []
+
+    def report(done: float, what: str) -> None:
+        if "parts of links" not in what:
+            return
+        share = int(what.split()[0]) / int(what.split()[2])
+        if share >= 1 / 3 and not killed:
+            killed.append(cluster.worker_pids[0])
+            os.kill(killed[-1], signal.SIGKILL)
+        elif share >= 2 / 3 and len(killed) == 1:
+            killed.append(cluster.scheduler_pid)
+            os.kill(killed[-1], signal.SIGKILL)
+
+    return report
+
+
+def _nothing(done: float, what: str) -> None:
+    """Do not care."""
+
+
+def _two_processes(folder: Path) -> dict[str, float]:
+    """Return how much two independent processes measure in the time of one, at best."""
+    alone = _times_of(folder, 1)[0]
+    both = max(_times_of(folder, 2))
+    return {"alone_s": round(alone, 3), "both_s": round(both, 3), "times_as_fast": round(2 * alone / both, 3)}
+
+
+def _times_of(folder: Path, count: int) -> list[float]:
+    command = [sys.executable, "-m", "benchmarks.cloud.batch", "--recordings", "-", "--pairs", str(folder)]
+    processes = [
+        subprocess.Popen(command, env=_environment(), stdout=subprocess.PIPE, text=True) for _ in range(count)
+    ]
+    return [float(json.loads(each.communicate()[0])["seconds"]) for each in processes]
+
+
+def _time_of_pairs(folder: Path, pairs: int = 600) -> float:
+    """Return the seconds in which this process measures neighbouring keyframes."""
+    names = json.loads((folder / "names.json").read_text(encoding="utf-8"))
+    atlas = Atlas.of([decode_map((DirectoryStore(folder / "one")).get(names[0]))])
+    count = len(atlas.keyframes)
+    rows = [(row % count, (row * 7 + 3) % count) for row in range(pairs)]
+    chosen = [(min(pair), max(pair)) for pair in rows if pair[0] != pair[1]]
+    measure_pairs(atlas, chosen[:20], MergeOptions())
+    began = time.monotonic()
+    measure_pairs(atlas, chosen, MergeOptions())
+    return time.monotonic() - began
+
+
+def _again(args: argparse.Namespace, option: str, folder: Path) -> list[str]:
+    return [
+        sys.executable, "-m", "benchmarks.cloud.batch", "--recordings", str(args.recordings),
+        "--candidates", str(args.candidates), option, str(folder),
+    ]  # fmt: skip
+
+
+def _environment() -> dict[str, str]:
+    return {**os.environ, **_ONE_THREAD}
+
+
+def _figures(found: BatchMergeResult, seconds: float) -> dict[str, Any]:
+    parts = b"".join(
+        each.T_a_b.tobytes() + each.information.tobytes() + bytes(f"{each.a} {each.b};", "ascii")
+        for each in (*found.links, *found.tiles)
+    )
+    return {
+        "seconds": round(seconds, 2), "by_step_s": {k: round(v, 2) for k, v in found.seconds.items()},
+        "parts": found.computed, "digest": digest_of(parts),
+    }  # fmt: skip
+
+
+def _seconds_of(figures: dict[str, Any], *steps: str) -> float:
+    return float(sum(figures["by_step_s"].get(step, 0.0) for step in steps))
+
+
+def _merged(folder: Path, name: str) -> MapVersion:
+    return decode_map((folder / f"{name}.map").read_bytes())
+
+
+def _apart_m(one: MapVersion, other: MapVersion) -> float:
+    """Return the largest distance of a keyframe's two positions."""
+
+    def places(version: MapVersion) -> Array:
+        return np.array([each.T_world_camera[:3, 3] for each in version.keyframes])
+
+    return float(np.linalg.norm(places(one) - places(other), axis=1).max())
+
+
+def _noisy(keyframe: Keyframe, T_world_camera: Array, number: int, rng: np.random.Generator) -> Keyframe:
+    count = len(keyframe.pixels)
+    points = keyframe.points_camera.astype(np.float64)
+    points *= 1.0 + (rng.normal(size=(count, 1)) * _DEPTH_M) / np.maximum(points[:, 2:], 0.3)
+    flips = np.packbits(rng.random((count, 256)) < _FLIPPED_BITS, axis=1)
+    return Keyframe(
+        id=keyframe.id, robot=f"copy-{number}", timestamp_s=keyframe.timestamp_s,
+        T_world_camera=T_world_camera, camera=keyframe.camera,
+        pixels=(keyframe.pixels + rng.normal(size=(count, 2)) * _PIXEL).astype(np.float32),
+        descriptors=keyframe.descriptors ^ flips, points_camera=points.astype(np.float32),
+    )  # fmt: skip
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,108 @@
+"""A job server: it takes jobs that wait in the store, runs them, and serves no robots.
+
+It keeps no state of its own: a job whose job server dies is taken by another after its lease has expired.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from rse_pf.backend.jobs.queue import JobOffer, JobQueue
+from rse_pf.backend.jobs.runner import JobContext, JobOutcome, JobSignals, run_job
+from rse_pf.backend.ports import Log
+from rse_pf.identity import RobotId
+
+__all__ = ["JobServer"]
+
+_CLOSE_TIMEOUT_S = 5.0
+
+
+@dataclass(eq=False, slots=True)
+class _Running:
+    signals: JobSignals = field(default_factory=JobSignals)
+    thread: threading.Thread | None = None
+
+
+class JobServer:
+    """Takes jobs of a queue as long as slots are free; `step` is called repeatedly."""
+
+    def __init__(
+        self, context: JobContext, queue: JobQueue, log: Log, new_owner: Callable[[], str], slots: int
+    ) -> None:
+        """Run nothing yet.
+
+        Args:
+            context: Store, slots, processes and settings.
+            queue: Where jobs wait.
+            log: Of this server.
+            new_owner: Returns a name that is unique among all servers.
+            slots: How many jobs run here at the same time.
+        """
+        self._context = context
+        self._queue = queue
+        self._log = log
+        self._new_owner = new_owner
+        self._slots = slots
+        self._jobs: dict[tuple[RobotId, str], _Running] = {}
+        self._lock = threading.Lock()
+        self._is_leaving = False
+
+    @property
+    def running(self) -> int:
+        """Jobs that run here, or that another server is watched with."""
+        with self._lock:
+            return len(self._jobs)
+
+    def step(self) -> None:
+        """Begin with jobs that wait; raises StoreError."""
+        if self._is_leaving:
+            return
+        for offer in self._queue.offers():
+            if self.running >= self._slots:
+                return
+            if (offer.request.robot, offer.request.key) not in self._jobs:
+                self._begin(offer)
+
+    def leave(self) -> None:
+        """Take no more jobs, and leave those that run to other servers."""
+        self._is_leaving = True
+        with self._lock:
+            jobs = list(self._jobs.values())
+        for job in jobs:
+            job.signals.give_up()
+        until = self._context.clock() + _CLOSE_TIMEOUT_S
+        for job in jobs:
+            if job.thread is not None:
+                job.thread.join(max(0.0, until - self._context.clock()))
+
+    def _begin(self, offer: JobOffer) -> None:
+        job, request = _Running(), offer.request
+        with self._lock:
+            self._jobs[request.robot, request.key] = job
+
+        def work() -> None:
+            outcome = JobOutcome()
+            try:
+                outcome = run_job(request, self._context, job.signals, _tell_nobody, self._new_owner())
+            except Exception as error:  # noqa: BLE001  a defect must not end the other jobs
+                self._log.error("job-defect", service=request.service, reason=repr(error))
+            finally:
+                with self._lock:
+                    del self._jobs[request.robot, request.key]
+                job.signals.close()
+            code = (
+                "given-up" if outcome.is_given_up else "ok" if outcome.error is None else outcome.error.code
+            )
+            self._log.info(
+                "job", robot=request.robot, service=request.service, job=request.key[:16], code=code,
+                object=outcome.object[:16], compute_ms=round(outcome.compute_ms, 3),
+            )  # fmt: skip
+
+        job.thread = threading.Thread(target=work, name=f"job-{request.key[:8]}", daemon=True)
+        job.thread.start()
+
+
+def _tell_nobody(done: float, what: str) -> None:
+    """Nobody waits here: the record has the progress."""

@@ -1,0 +1,138 @@
+"""The queue of jobs that wait: objects of the store, from which job servers take them.
+
+A server offers a job before it waits for a slot of its own; whoever has a free slot first takes the job's
+lease.  An offer is no lease: the same offer may be read by many, and the lease decides.  It stays until the
+job has an outcome, so that a job whose server died is found again.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import msgspec
+
+from rse_pf.backend.jobs.lease import decode_record, record_name
+from rse_pf.backend.jobs.process import JobRequest
+from rse_pf.config import PlatformSettings
+from rse_pf.errors import BadRequest, NotFound, StoreError
+from rse_pf.identity import RobotId
+from rse_pf.object_store import ObjectStore
+from rse_pf.wire.arrays import binary_encode_hook, extension_hook
+
+__all__ = ["JobOffer", "JobQueue", "has_jobs", "settings_digest_of"]
+
+_PREFIX = "job-queue/"
+_MAX_READ = 200
+"""Offers that are read at once; more wait until these are gone."""
+
+
+class _Stored(msgspec.Struct, frozen=True, kw_only=True):
+    service: str
+    payload: msgspec.Raw
+    robot: tuple[str, str, str]
+    key: str
+    quota_bytes: float
+    settings: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class JobOffer:
+    """A job that waits, and the digest of the settings on which its result depends."""
+
+    request: JobRequest
+    settings: str
+
+
+def has_jobs(settings: PlatformSettings) -> bool:
+    """Return whether long services are on: they run here, or job servers run them."""
+    return settings.serving.max_running_jobs > 0 or settings.serving.offer_jobs
+
+
+def settings_digest_of(settings: PlatformSettings) -> str:
+    """Return the digest of the settings that the result of a job depends on."""
+    plain = settings.to_dict()
+    chosen = json.dumps([plain["services"], plain["pnp"]], sort_keys=True)
+    return hashlib.sha256(chosen.encode()).hexdigest()
+
+
+class JobQueue:
+    """The jobs that wait in one store."""
+
+    def __init__(self, store: ObjectStore, settings: PlatformSettings) -> None:
+        """Read nothing yet; *settings* are those of this server."""
+        self._store = store
+        self._settings = settings_digest_of(settings)
+
+    def offer(self, request: JobRequest) -> None:
+        """Store that *request* waits; again is no error.
+
+        Raises:
+            BadRequest: The payload cannot be encoded.
+            StoreError: The store failed.
+        """
+        name = _name(request.robot, request.key)
+        try:
+            payload = msgspec.msgpack.encode(request.payload, enc_hook=binary_encode_hook)
+        except (TypeError, ValueError, OverflowError, RecursionError) as error:
+            raise BadRequest(
+                "the request cannot be encoded", hint="send numbers, strings and lists"
+            ) from error
+        stored = _Stored(
+            service=request.service, payload=msgspec.Raw(payload),
+            robot=(request.robot.tenant, request.robot.name, request.robot.enrolment),
+            key=request.key, quota_bytes=request.quota_bytes, settings=self._settings,
+        )  # fmt: skip
+        self._store.put(name, msgspec.msgpack.encode(stored))
+
+    def withdraw(self, request: JobRequest) -> None:
+        """Remove the offer of *request*, if there is one."""
+        self._store.delete(_name(request.robot, request.key))
+
+    def offers(self) -> Iterator[JobOffer]:
+        """Yield the jobs that servers with the same settings offer; raises StoreError."""
+        for name in self._names():
+            offer = self._read(name)
+            if offer is not None and offer.settings == self._settings:
+                yield offer
+
+    def waiting(self) -> int:
+        """Return how many offered jobs run nowhere; raises StoreError."""
+        return sum(not self._is_running(name) for name in self._names())
+
+    def _names(self) -> list[str]:
+        names = []
+        for info in self._store.list(_PREFIX):
+            names.append(info.name)
+            if len(names) == _MAX_READ:
+                break
+        return names
+
+    def _read(self, name: str) -> JobOffer | None:
+        """Return the offer *name*; None if it was withdrawn meanwhile."""
+        try:
+            stored = msgspec.msgpack.decode(self._store.get(name), type=_Stored)
+            payload: Any = msgspec.msgpack.decode(stored.payload, ext_hook=extension_hook)
+        except NotFound:
+            return None
+        except msgspec.MsgspecError as error:
+            raise StoreError(f"{name!r} is no offer of a job", hint="delete it") from error
+        request = JobRequest(
+            service=stored.service, payload=payload, robot=RobotId(*stored.robot), key=stored.key,
+            quota_bytes=stored.quota_bytes,
+        )  # fmt: skip
+        return JobOffer(request=request, settings=stored.settings)
+
+    def _is_running(self, name: str) -> bool:
+        record = f"jobs/{name.removeprefix(_PREFIX)}"
+        try:
+            return decode_record(record, self._store.get(record)).state == "running"
+        except NotFound:
+            return False
+
+
+def _name(robot: RobotId, key: str) -> str:
+    return f"{_PREFIX}{record_name(robot, key).partition('/')[2]}"

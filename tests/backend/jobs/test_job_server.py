@@ -1,0 +1,178 @@
+"""Jobs that wait are offered, taken by one job server, and withdrawn when they have an outcome."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections.abc import Callable, Iterator
+
+import msgspec
+import numpy as np
+import pytest
+
+from rse_pf.backend.jobs.job_server import JobServer
+from rse_pf.backend.jobs.lease import JobLease, record_name
+from rse_pf.backend.jobs.process import JobRequest
+from rse_pf.backend.jobs.queue import JobQueue
+from rse_pf.backend.jobs.runner import JobContext, JobOutcome, JobSignals, run_job
+from rse_pf.backend.jobs.slots import JobSlots, make_pipe
+from rse_pf.backend.log import JsonLog
+from rse_pf.config import PlatformSettings
+from rse_pf.errors import StoreError
+from rse_pf.identity import RobotId
+from rse_pf.object_store import MemoryStore
+from tests.backend.jobs.test_runner import FakeProcess
+
+SETTINGS = PlatformSettings.from_dict(
+    {"serving": {"job_heartbeat_s": 0.05, "job_lease_s": 0.3, "max_running_jobs": 0, "offer_jobs": True}}
+)
+DONE = ["done", 12.5, msgspec.msgpack.encode({"value": 1})]
+
+
+def a_request(number: int = 0) -> JobRequest:
+    return JobRequest(
+        service="long", payload={"n": number}, robot=RobotId("default", f"robot-{number}"),
+        key=f"{number:02d}" * 32, quota_bytes=1e6,
+    )  # fmt: skip
+
+
+class Bench:
+    """A store with a serving server that has no slots, and job servers whose processes follow a script."""
+
+    def __init__(self) -> None:
+        self.store = MemoryStore()
+        self.queue = JobQueue(self.store, SETTINGS)
+        self.log = JsonLog(
+            level="error", server="s", wall_clock=lambda: 0.0, fd=os.open(os.devnull, os.O_WRONLY)
+        )
+        self.started: list[FakeProcess] = []
+        self.signals = JobSignals()
+
+    def context(self, script: list[object], *, ends: bool = True, **of: object) -> JobContext:
+        def start(request: JobRequest) -> FakeProcess:
+            self.started.append(FakeProcess(script, ends=ends))
+            return self.started[-1]
+
+        return JobContext(
+            store=self.store, settings=SETTINGS, server_id="s", start=start, clock=time.monotonic, **of
+        )  # fmt: skip
+
+    def job_server(self, script: list[object], *, ends: bool = True, slots: int = 1) -> JobServer:
+        context = self.context(
+            script, ends=ends, slots=JobSlots(make_pipe(slots)), finished=self.queue.withdraw
+        )
+        return JobServer(context, self.queue, self.log, lambda: os.urandom(4).hex(), slots)
+
+    def ask(self, request: JobRequest) -> tuple[threading.Thread, list[JobOutcome]]:
+        """Ask a server without slots for a job."""
+        context = self.context([], slots=JobSlots(make_pipe(0)), queue=self.queue)
+        outcomes: list[JobOutcome] = []
+
+        def work() -> None:
+            outcomes.append(run_job(request, context, self.signals, lambda *_: None, "serving"))
+
+        thread = threading.Thread(target=work, daemon=True)
+        thread.start()
+        return thread, outcomes
+
+
+@pytest.fixture
+def bench() -> Iterator[Bench]:
+    bench = Bench()
+    yield bench
+    bench.signals.give_up()
+
+
+def wait_until(is_so: Callable[[], bool], within_s: float = 20.0) -> None:
+    until = time.monotonic() + within_s
+    while not is_so():
+        assert time.monotonic() < until, "it did not happen in time"
+        threading.Event().wait(0.005)
+
+
+def test_a_server_without_slots_gets_the_result_of_a_job_server(bench: Bench) -> None:
+    thread, outcomes = bench.ask(a_request())
+    wait_until(lambda: bench.queue.waiting() == 1)
+
+    bench.job_server([DONE]).step()
+    thread.join(20)
+
+    assert outcomes[0].error is None
+    assert msgspec.msgpack.decode(outcomes[0].reply or b"") == {"value": 1}
+    wait_until(lambda: not list(bench.store.list("job-queue/")))
+
+
+def test_a_job_server_takes_no_more_jobs_than_it_has_slots(bench: Bench) -> None:
+    for number in range(3):
+        bench.queue.offer(a_request(number))
+    server = bench.job_server([], ends=False, slots=2)
+
+    server.step()
+    wait_until(lambda: len(bench.started) == 2)
+    server.step()
+
+    assert server.running == 2
+    wait_until(lambda: bench.queue.waiting() == 1)
+    server.leave()
+    assert bench.queue.waiting() == 3
+
+
+def test_the_job_of_a_job_server_that_died_is_taken_after_its_lease(bench: Bench) -> None:
+    request = a_request()
+    bench.queue.offer(request)
+    dead = JobLease(bench.store, record_name(request.robot, request.key), "dead", time.monotonic)
+    dead.look()
+    assert dead.take()
+    server = bench.job_server([DONE])
+
+    server.step()
+
+    assert not bench.started
+    wait_until(lambda: server.running == 0)
+    assert len(bench.started) == 1
+    assert bench.queue.waiting() == 0
+
+
+def test_a_job_that_its_robot_cancels_is_offered_no_more(bench: Bench) -> None:
+    thread, outcomes = bench.ask(a_request())
+    wait_until(lambda: bench.queue.waiting() == 1)
+
+    bench.signals.cancel()
+    thread.join(20)
+
+    assert outcomes[0].error is not None
+    assert outcomes[0].error.code == "cancelled"
+    assert bench.queue.waiting() == 0
+
+
+def test_a_job_of_servers_with_other_settings_is_not_taken(bench: Bench) -> None:
+    other = SETTINGS.replace(pnp={"max_iterations": 17})
+    JobQueue(bench.store, other).offer(a_request())
+
+    assert list(bench.queue.offers()) == []
+
+
+def test_a_payload_with_arrays_comes_back_from_the_queue(bench: Bench) -> None:
+    request = with_payload(a_request(), {"points": np.arange(6.0), "map": b"bytes"})
+    bench.queue.offer(request)
+
+    (offer,) = bench.queue.offers()
+
+    assert np.array_equal(np.asarray(offer.request.payload["points"]), np.arange(6.0))
+    assert offer.request.payload["map"] == b"bytes"
+    assert offer.request.robot == request.robot
+
+
+def test_a_damaged_offer_is_a_named_error(bench: Bench) -> None:
+    bench.store.put("job-queue/default/robot/ab", b"what")
+
+    with pytest.raises(StoreError, match="no offer of a job"):
+        list(bench.queue.offers())
+
+
+def with_payload(request: JobRequest, payload: object) -> JobRequest:
+    return JobRequest(
+        service=request.service, payload=payload, robot=request.robot, key=request.key,
+        quota_bytes=request.quota_bytes,
+    )  # fmt: skip
