@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from datetime import datetime, timedelta, timezone
 from pathlib import Path
-from typing import Any
 
 import pytest
 from aws.fleet.fake_machine import FakeMachine
 
+from benchmarks.cloud.delayed_cloudwatch import DelayedCloudWatch
 from rse_pf.aws.clients import make_client
 from rse_pf.aws.fleet.agent import Agent, AgentConfig, AgentContext
 from rse_pf.aws.fleet.metrics import ROBOTS, dimensions_of
@@ -23,43 +22,6 @@ from rse_pf.scaling.alarms import CPU, NAMESPACE
 
 FAST = PlatformSettings.from_dict({"scaling": {"profile": "fast"}})
 PAPER = PlatformSettings()
-
-
-@dataclass
-class DelayedCloudWatch:
-    """Numbers can be read *delay_s* after they were published."""
-
-    clock: Callable[[], float]
-    delay_s: float = 5.0
-    data: list[tuple[float, dict[str, Any]]] = field(default_factory=list)
-    reads: int = 0
-
-    def put_metric_data(self, **arguments: Any) -> dict[str, Any]:
-        self.data += [(self.clock() + self.delay_s, each) for each in arguments["MetricData"]]
-        return {}
-
-    def get_metric_data(self, **arguments: Any) -> dict[str, Any]:
-        self.reads += 1
-        return {"MetricDataResults": [self._row(each, arguments) for each in arguments["MetricDataQueries"]]}
-
-    def _row(self, query: dict[str, Any], asked: dict[str, Any]) -> dict[str, Any]:
-        stat = query["MetricStat"]
-        series: dict[datetime, list[float]] = {}
-        for visible_s, datum in self.data:
-            if (
-                visible_s <= self.clock()
-                and (datum["MetricName"], datum["Dimensions"])
-                == (stat["Metric"]["MetricName"], stat["Metric"]["Dimensions"])
-                and asked["StartTime"] <= datum["Timestamp"] < asked["EndTime"]
-            ):
-                series.setdefault(datum["Timestamp"], []).append(datum["Value"])
-        times = sorted(series, reverse=True)
-        reduced = {"Sum": sum, "SampleCount": len}[stat["Stat"]]
-        return {
-            "Id": query["Id"],
-            "Timestamps": times,
-            "Values": [float(reduced(series[at])) for at in times],
-        }
 
 
 class FakeFleet:

@@ -160,6 +160,25 @@ def test_killed_and_stopped_servers_are_replaced_and_robots_lose_nothing(tmp_pat
     asyncio.run(run())
 
 
+@pytest.mark.slow
+def test_a_zone_that_fails_takes_half_of_the_servers_and_no_command(tmp_path: Path) -> None:
+    async def run() -> None:
+        news = News()
+        async with platform(tmp_path / "a", news, servers=4) as cloud:
+            async with asking(cloud) as tally:
+                for name in ("server-1", "server-3"):  # those of the pretended zone
+                    cloud.kill(name)
+                new = [(await news.heard("replace", server=name))["by"] for name in ("server-1", "server-3")]
+                for name in new:
+                    await news.heard("server-healthy", server=name)
+                before = tally.answered
+                await news.until(lambda: tally.answered > before + 2 * ROBOTS)
+            check(tally)
+            assert sorted(new) == ["server-5", "server-6"]
+
+    asyncio.run(run())
+
+
 def test_the_warm_standby_is_the_replacement_and_the_next_one_follows(tmp_path: Path) -> None:
     async def run() -> None:
         news = News()
