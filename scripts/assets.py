@@ -42,13 +42,22 @@ UNUSED = ("tests", "__pycache__", "f2py", "_pyinstaller", "include", "testing")
 UNUSED_ENDINGS = (".pyi", ".pxd", ".c", ".h", ".a")
 UNUSED_BY_SERVERS = ("tests", "__pycache__", "_pytest", "pytest", "pluggy", "pygments", "iniconfig")
 """The same for servers, whose own services may use more; gtsam asks for pytest and never imports it."""
+SAMPLES = ("gtsam/Data/", "gtsam_unstable/", "cv2/data/")
+"""Data of examples and what is built on them: 50 MB."""
+APIS = (
+    "autoscaling", "cloudwatch", "cloudformation", "ec2", "elbv2", "lambda", "logs", "s3", "secretsmanager",
+    "sns", "sqs", "ssm", "sts",
+)  # fmt: skip
+"""Of botocore's descriptions of 400 services those that a server may call; all are 30 MB in 2,000 files."""
 DEBIAN_12 = ("3.11", 36)
 AMAZON_2023 = ("3.13", 34)
 FUNCTION_FOLDER = "/var/task"
 """Where Lambda puts the function, for its tracebacks."""
 ENVIRONMENT = "/opt/rse-pf/venv"
 """Where a server unpacks its environment: stacks/boot/install.py."""
-LIBRARIES, PLATFORM, ENVIRONMENT_FILE = "libraries.tar.gz", "platform.tar.gz", "environment.json"
+LIBRARIES = ("libraries-0.tar.gz", "libraries-1.tar.gz")
+"""Two of about the same size: a server unpacks both at the same time."""
+PLATFORM, ENVIRONMENT_FILE = "platform.tar.gz", "environment.json"
 NATIVE_SOURCES = ("src/*.cpp", "src/*.hpp", "include/*.h", "wheel_builder/*.py", "Makefile", "*.toml", "*.md")
 
 
@@ -196,7 +205,8 @@ def _write_hashes(folder: Path) -> None:
 def _servers(folder: Path, ours: list[Path], downloads: Path) -> None:
     """Write the two archives of a server's environment into *folder*, and what they were made of and for."""
     _empty(folder)
-    shutil.copyfile(_libraries(downloads), folder / LIBRARIES)
+    for archive in _libraries(downloads):
+        shutil.copyfile(archive, folder / archive.name)
     with tempfile.TemporaryDirectory() as work:
         tree = Path(work)
         site = tree / "lib" / f"python{DEBIAN_12[0]}" / "site-packages"
@@ -220,23 +230,47 @@ def _servers(folder: Path, ours: list[Path], downloads: Path) -> None:
     (folder / ENVIRONMENT_FILE).write_text(json.dumps(about, sort_keys=True) + "\n", encoding="utf-8")
 
 
-def _libraries(downloads: Path) -> Path:
-    """Return the archive of what the lock of the servers names; it is made again only for another lock."""
-    archive, stamp = downloads / LIBRARIES, downloads / f"{LIBRARIES}.sha256"
+def _libraries(downloads: Path) -> list[Path]:
+    """Return the archives of what the lock of the servers names, made again only for another lock."""
+    archives, stamp = [downloads / name for name in LIBRARIES], downloads / "libraries.sha256"
     state = hashlib.sha256(Path(__file__).read_bytes() + (ROOT / "locks/boot.txt").read_bytes())
     state.update(f"{_python_of(DEBIAN_12[0]) is not None}".encode())
     wanted = state.hexdigest()
-    if archive.is_file() and stamp.is_file() and stamp.read_text(encoding="utf-8") == wanted:
-        return archive
+    have_all = all(archive.is_file() for archive in archives)
+    if have_all and stamp.is_file() and stamp.read_text(encoding="utf-8") == wanted:
+        return archives
     stamp.unlink(missing_ok=True)
     with tempfile.TemporaryDirectory() as work:
         site = Path(work) / "lib" / f"python{DEBIAN_12[0]}" / "site-packages"
         for wheel in sorted((downloads / "boot").glob("*.whl")):
             _unpack(wheel, site, None, UNUSED_BY_SERVERS)
+        _leave_out(site)
         _compile(Path(work), DEBIAN_12[0], ENVIRONMENT)
-        _pack(Path(work), archive)
+        for archive, part in zip(archives, _halves(Path(work)), strict=True):
+            _pack(Path(work), archive, part)
     stamp.write_text(wanted, encoding="utf-8")
-    return archive
+    return archives
+
+
+def _leave_out(site: Path) -> None:
+    """Delete from the libraries what no server uses."""
+    for name in SAMPLES:
+        shutil.rmtree(site / name, ignore_errors=True)
+    for api in (site / "botocore" / "data").iterdir():
+        if api.is_dir() and api.name not in APIS:
+            shutil.rmtree(api)
+
+
+def _halves(tree: Path) -> tuple[list[Path], list[Path]]:
+    """Return the files of *tree* in two lists of about the same size, in order."""
+    halves: tuple[list[Path], list[Path]] = ([], [])
+    sizes = [0, 0]
+    files = [path for path in tree.rglob("*") if path.is_file()]
+    for file in sorted(files, key=lambda each: (-each.stat().st_size, each)):
+        smaller = sizes.index(min(sizes))
+        halves[smaller].append(file)
+        sizes[smaller] += file.stat().st_size
+    return sorted(halves[0]), sorted(halves[1])
 
 
 def _write_scripts(site: Path, folder: Path) -> None:
@@ -254,8 +288,8 @@ def _write_scripts(site: Path, folder: Path) -> None:
             (folder / name).chmod(0o755)
 
 
-def _pack(tree: Path, archive: Path) -> None:
-    """Write *tree* into *archive*; the same tree gives the same bytes."""
+def _pack(tree: Path, archive: Path, paths: list[Path] | None = None) -> None:
+    """Write *tree*, or *paths* of it, into *archive*; the same tree gives the same bytes."""
     epoch = int(os.environ.get("SOURCE_DATE_EPOCH", EPOCH))
 
     def same(entry: tarfile.TarInfo) -> tarfile.TarInfo:
@@ -268,7 +302,7 @@ def _pack(tree: Path, archive: Path) -> None:
         gzip.GzipFile("", "wb", compresslevel=6, fileobj=file, mtime=epoch) as packed,
         tarfile.open(fileobj=packed, mode="w", format=tarfile.GNU_FORMAT) as made,
     ):
-        for path in sorted(tree.rglob("*")):
+        for path in sorted(tree.rglob("*")) if paths is None else paths:
             made.add(path, path.relative_to(tree).as_posix(), recursive=False, filter=same)
 
 

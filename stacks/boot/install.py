@@ -21,7 +21,7 @@ USER = "rse-pf"
 UNITS = pathlib.Path("/etc/systemd/system")
 CONFIGURATION = pathlib.Path("/etc/rse-pf")
 VENV = HOME / "venv"
-ARCHIVES = ("libraries.tar.gz", "platform.tar.gz")
+ARCHIVES = ("libraries-0.tar.gz", "libraries-1.tar.gz", "platform.tar.gz")
 ALWAYS = ("rse-pf.service", "rse-pf-agent.service")
 DATA = "rse-pf-data.service"
 

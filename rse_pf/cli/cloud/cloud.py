@@ -1,6 +1,9 @@
 """Run the platform on AWS: what a deployment lacks, what it costs, its health, and what was left behind.
 
 examples:
+  rse-pf cloud up
+  rse-pf cloud park --deep
+  rse-pf cloud down
   rse-pf cloud doctor
   rse-pf cloud cost --robots 20 --fps 5 --hours-per-day 8
   rse-pf cloud status
@@ -18,6 +21,11 @@ from rse_pf.config import PlatformSettings
 __all__ = ["ACTIONS", "add_arguments", "run"]
 
 ACTIONS = {
+    "up": "put the platform up, bring it up to date, or finish what was begun",
+    "upgrade": "replace the servers by those of the newest deployment, one by one, or return to the old ones",
+    "park": "end all servers until resume; the data and the load balancer stay",
+    "resume": "end parking, with as many servers as before",
+    "down": "destroy the platform, and prove that nothing is left but what is kept",
     "doctor": "check tools, packages, account, certificate and quotas before a deployment",
     "cost": "what a load costs a month, line by line, on the fleet and on the Lambda",
     "prices": "the prices of an estimate; --refresh reads them from AWS",

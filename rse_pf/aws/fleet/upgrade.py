@@ -1,0 +1,374 @@
+"""Replace the servers by those of the newest launch template, and take a bad release back.
+
+AWS replaces them by an instance refresh: a new server is in service before an old one is drained, an alarm or
+a launch that fails ends the refresh, and the group returns to the version before.  The version then goes into
+the stack's parameter, so that the next deployment names the same one.  Every step can be repeated: a run that
+was interrupted is followed or finished by the next.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from enum import Enum
+from typing import Any
+
+from rse_pf.aws.account import Account
+from rse_pf.config import PlatformSettings
+from rse_pf.config.resource_names import VERSION_PARAMETER, ResourceNames
+from rse_pf.errors import ConfigurationError, RsePfError
+
+__all__ = [
+    "Release",
+    "State",
+    "Step",
+    "Upgraded",
+    "failed_launch",
+    "next_step",
+    "preferences",
+    "read_state",
+    "state_of_refresh",
+    "upgrade",
+    "with_version",
+]
+
+WATCHED = ("errors", "unhealthy", "few-servers")
+"""Alarms that end an upgrade; one that fires already when it begins is left out."""
+MAX_HEALTHY_PERCENT = 110
+"""One new server more at a time, up to 19 servers: a bad release stops at the first."""
+POLL_S = 10.0
+_ACTIVE = ("Pending", "InProgress", "Baking", "Cancelling", "RollbackInProgress")
+_ABANDONED = ("Cancelled", "Failed")
+_LIFECYCLE = "Lifecycle Action"
+_LINES = 12
+_STACK_BUSY = "_IN_PROGRESS"
+_STACK_POLLS = 180
+
+
+class State(Enum):
+    """Where an instance refresh is."""
+
+    RUNNING = "running"
+    ROLLING_BACK = "rolling back"
+    DONE = "done"
+    ROLLED_BACK = "rolled back"
+    FAILED = "failed"
+
+
+class Step(Enum):
+    """What an upgrade has to do next."""
+
+    FOLLOW = "follow the refresh that runs"
+    REFRESH = "replace the servers"
+    RECORD = "write the version into the stack"
+    NOTHING = "nothing"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Release:
+    """Versions of the launch template: the newest, of the group, of each instance, and of the stack."""
+
+    newest: str
+    group: str
+    instances: tuple[str, ...]
+    recorded: str
+    refresh: Mapping[str, Any] | None
+    raw_group: Mapping[str, Any]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Upgraded:
+    """How an upgrade ended; *reason* is empty when every server runs *version*."""
+
+    version: str
+    replaced: bool
+    reason: str = ""
+    console: tuple[str, ...] = ()
+
+
+def next_step(release: Release) -> Step:
+    """Return what brings every server, and then the stack, to the newest version."""
+    if release.refresh is not None and release.refresh["Status"] in _ACTIVE:
+        return Step.FOLLOW
+    if release.group != release.newest or any(each != release.newest for each in release.instances):
+        return Step.REFRESH
+    return Step.NOTHING if release.recorded == release.newest else Step.RECORD
+
+
+def state_of_refresh(refresh: Mapping[str, Any]) -> State:
+    """Return the state of an instance refresh as AWS describes it."""
+    status = refresh["Status"]
+    if status == "RollbackInProgress":
+        return State.ROLLING_BACK
+    if status in _ACTIVE:
+        return State.RUNNING
+    return {"Successful": State.DONE, "RollbackSuccessful": State.ROLLED_BACK}.get(status, State.FAILED)
+
+
+def failed_launch(activities: Sequence[Mapping[str, Any]], since: datetime) -> Mapping[str, Any] | None:
+    """Return the first launch since *since* that was abandoned, None if there is none.
+
+    A launch that failed for want of capacity is none: AWS tries it again, and the release is not at fault.
+    """
+    failed = [
+        each
+        for each in activities
+        if each["StartTime"] >= since
+        and each["StatusCode"] in _ABANDONED
+        and each["Description"].startswith("Launching")
+        and _LIFECYCLE in each.get("StatusMessage", "")
+    ]
+    return min(failed, key=lambda each: each["StartTime"], default=None)
+
+
+def with_version(group: Mapping[str, Any], version: str) -> dict[str, Any]:
+    """Return the launch template or the mixed policy of *group* with *version*: a DesiredConfiguration."""
+    if "MixedInstancesPolicy" in group:
+        policy = copy.deepcopy(dict(group["MixedInstancesPolicy"]))
+        _id_only(policy["LaunchTemplate"]["LaunchTemplateSpecification"])["Version"] = version
+        return {"MixedInstancesPolicy": policy}
+    return {"LaunchTemplate": {**_id_only(dict(group["LaunchTemplate"])), "Version": version}}
+
+
+def preferences(settings: PlatformSettings, alarms: Sequence[str]) -> dict[str, Any]:
+    """Return how AWS replaces servers: one more before one less, watched by *alarms*, and taken back."""
+    made: dict[str, Any] = {
+        "MinHealthyPercentage": 100,
+        "MaxHealthyPercentage": MAX_HEALTHY_PERCENT,
+        "InstanceWarmup": settings.scaling.warm_up_s,
+        "AutoRollback": True,
+        "SkipMatching": True,
+        "ScaleInProtectedInstances": "Refresh",
+        "StandbyInstances": "Ignore",
+    }
+    return {**made, "AlarmSpecification": {"Alarms": list(alarms)}} if alarms else made
+
+
+def read_state(account: Account, settings: PlatformSettings) -> Release:
+    """Return the versions of a deployment; raises ConfigurationError where nothing is deployed."""
+    names = ResourceNames(settings.cloud.name)
+    found = account.pages(
+        "autoscaling",
+        "describe_auto_scaling_groups",
+        "AutoScalingGroups",
+        AutoScalingGroupNames=[names.group],
+    )
+    if not found:
+        raise ConfigurationError(f"no platform runs in {account.region}", hint="deploy it: rse-pf cloud up")
+    (group,) = found
+    specification = _specification(group)
+    template = account.change(
+        "ec2", "describe_launch_templates", LaunchTemplateIds=[specification["LaunchTemplateId"]]
+    )["LaunchTemplates"][0]
+    refreshes = account.pages(
+        "autoscaling", "describe_instance_refreshes", "InstanceRefreshes", AutoScalingGroupName=names.group
+    )
+    versions = [each.get("LaunchTemplate", {}).get("Version", "") for each in group["Instances"]]
+    return Release(
+        newest=str(template["LatestVersionNumber"]),
+        group=str(specification.get("Version", "")),
+        instances=tuple(versions),
+        recorded=_parameters(account, names).get(VERSION_PARAMETER, ""),
+        refresh=max(refreshes, key=lambda each: str(each.get("StartTime", "")), default=None),
+        raw_group=group,
+    )
+
+
+def upgrade(
+    account: Account,
+    settings: PlatformSettings,
+    *,
+    tell: Callable[[str], None],
+    sleep: Callable[[float], None],
+    now: Callable[[], datetime],
+) -> Upgraded:
+    """Bring every server to the newest version, or back to the one before; return which.
+
+    Args:
+        account: Whose deployment.
+        settings: Of the platform.
+        tell: Called with each line of progress.
+        sleep: Waits between two looks; it may raise KeyboardInterrupt, and AWS then goes on by itself.
+        now: The time in UTC.
+
+    Raises:
+        ConfigurationError: Nothing is deployed, or AWS refused.
+        StoreError: AWS does not answer.
+    """
+    release = read_state(account, settings)
+    step = next_step(release)
+    version, replaced = release.newest, False
+    if step in (Step.REFRESH, Step.FOLLOW):
+        begun = now()
+        if step is Step.FOLLOW and release.refresh is not None:
+            tell("a refresh runs already; following it")
+            begun = release.refresh.get("StartTime", begun)
+            version = _version_of(release.refresh) or version
+        elif release.raw_group["Instances"]:
+            _start(account, settings, release, tell)
+        else:
+            account.change(
+                "autoscaling", "update_auto_scaling_group",
+                AutoScalingGroupName=release.raw_group["AutoScalingGroupName"],
+                **with_version(release.raw_group, version),
+            )  # fmt: skip
+        if release.raw_group["Instances"]:
+            ended = _follow(account, settings, begun, tell, sleep)
+            if ended.reason:
+                return ended
+            replaced = True
+        step = Step.RECORD
+    if step is Step.RECORD:
+        _record(account, settings, version, sleep)
+        tell(f"the stack names version {version}")
+    return Upgraded(version=version, replaced=replaced)
+
+
+def _start(
+    account: Account, settings: PlatformSettings, release: Release, tell: Callable[[str], None]
+) -> None:
+    names = ResourceNames(settings.cloud.name)
+    wanted = {names.alarm(name): name for name in WATCHED}
+    rows = account.pages("cloudwatch", "describe_alarms", "MetricAlarms", AlarmNames=list(wanted))
+    firing = sorted(wanted[each["AlarmName"]] for each in rows if each["StateValue"] == "ALARM")
+    quiet = sorted(each["AlarmName"] for each in rows if each["StateValue"] != "ALARM")
+    for name in firing:
+        tell(f"alarm {name} fires already, so it does not end this upgrade")
+    tell(f"replacing servers: version {release.group} by {release.newest}")
+    account.change(
+        "autoscaling", "start_instance_refresh", AutoScalingGroupName=names.group, Strategy="Rolling",
+        DesiredConfiguration=with_version(release.raw_group, release.newest),
+        Preferences=preferences(settings, quiet),
+    )  # fmt: skip
+
+
+def _follow(
+    account: Account,
+    settings: PlatformSettings,
+    begun: datetime,
+    tell: Callable[[str], None],
+    sleep: Callable[[float], None],
+) -> Upgraded:
+    """Tell the progress until the refresh has ended; a failed launch takes it back at once."""
+    names = ResourceNames(settings.cloud.name)
+    told, cause = "", ""
+    console: tuple[str, ...] = ()
+    while True:
+        rows = account.pages(
+            "autoscaling", "describe_instance_refreshes", "InstanceRefreshes",
+            AutoScalingGroupName=names.group,
+        )  # fmt: skip
+        refresh = max(rows, key=lambda each: str(each.get("StartTime", "")))
+        state = state_of_refresh(refresh)
+        line = f"{state.value}: {refresh.get('PercentageComplete', 0)} %"
+        if line != told:
+            tell(line)
+            told = line
+        if state is State.DONE:
+            return Upgraded(version=_version_of(refresh), replaced=True)
+        if state in (State.ROLLED_BACK, State.FAILED):
+            reason = cause or str(refresh.get("StatusReason", "")) or "AWS gives no reason"
+            return Upgraded(
+                version=_version_of(refresh),
+                replaced=False,
+                reason=f"{state.value}: {reason}",
+                console=console,
+            )
+        if state is State.RUNNING and not cause:
+            failed = _failed_launch(account, names, begun)
+            if failed is not None:
+                cause = str(failed.get("StatusMessage") or failed["Description"])
+                console = _console(account, failed)
+                tell(f"a new server did not become ready: {cause}")
+                account.find("autoscaling", "rollback_instance_refresh", AutoScalingGroupName=names.group)
+        sleep(POLL_S)
+
+
+def _failed_launch(account: Account, names: ResourceNames, begun: datetime) -> Mapping[str, Any] | None:
+    found = account.find(
+        "autoscaling", "describe_scaling_activities", AutoScalingGroupName=names.group, MaxRecords=50
+    )
+    return failed_launch((found or {}).get("Activities", ()), begun)
+
+
+def _console(account: Account, activity: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return the last lines that the machine of *activity* wrote to its console, none if AWS has them not."""
+    words = [word.strip(".,") for word in str(activity["Description"]).split()]
+    instance = next((word for word in words if word.startswith("i-")), "")
+    if not instance:
+        return ()
+    try:
+        found = account.find("ec2", "get_console_output", InstanceId=instance, Latest=True) or {}
+    except RsePfError:
+        return ()  # the machine is gone, or this type of machine has no console
+    lines = [line.strip() for line in str(found.get("Output", "")).splitlines() if line.strip()]
+    ours = [line for line in lines if "rse-pf" in line]
+    return tuple((ours or lines)[-_LINES:])
+
+
+def _record(
+    account: Account, settings: PlatformSettings, version: str, sleep: Callable[[float], None]
+) -> None:
+    """Write *version* into the parameter of the stack, whose template stays as it is."""
+    names = ResourceNames(settings.cloud.name)
+    parameters = _parameters(account, names)
+    if VERSION_PARAMETER not in parameters:
+        raise ConfigurationError(
+            f"the stack {names.stack('Backend')} has no parameter {VERSION_PARAMETER}",
+            hint="it was deployed by an older release: deploy it again, then repeat rse-pf cloud upgrade",
+        )
+    if parameters[VERSION_PARAMETER] == version:
+        return
+    given: list[dict[str, Any]] = [
+        {"ParameterKey": name, "UsePreviousValue": True} for name in parameters if name != VERSION_PARAMETER
+    ]
+    account.change(
+        "cloudformation", "update_stack", StackName=names.stack("Backend"), UsePreviousTemplate=True,
+        Capabilities=["CAPABILITY_IAM", "CAPABILITY_NAMED_IAM"],
+        Parameters=[*given, {"ParameterKey": VERSION_PARAMETER, "ParameterValue": version}],
+    )  # fmt: skip
+    for _ in range(_STACK_POLLS):
+        stack = _stack(account, names)
+        if not stack["StackStatus"].endswith(_STACK_BUSY):
+            break
+        sleep(POLL_S)
+    if _parameters(account, names).get(VERSION_PARAMETER) != version:
+        raise ConfigurationError(
+            f"the servers run version {version}, and the stack does not name it: {stack['StackStatus']}",
+            hint="repeat rse-pf cloud upgrade before the next deployment",
+        )
+
+
+def _stack(account: Account, names: ResourceNames) -> dict[str, Any]:
+    found = account.change("cloudformation", "describe_stacks", StackName=names.stack("Backend"))
+    stack: dict[str, Any] = found["Stacks"][0]
+    return stack
+
+
+def _parameters(account: Account, names: ResourceNames) -> dict[str, str]:
+    rows = _stack(account, names).get("Parameters", ())
+    return {row["ParameterKey"]: row["ParameterValue"] for row in rows}
+
+
+def _specification(group: Mapping[str, Any]) -> Mapping[str, Any]:
+    if "MixedInstancesPolicy" in group:
+        found: Mapping[str, Any] = group["MixedInstancesPolicy"]["LaunchTemplate"][
+            "LaunchTemplateSpecification"
+        ]
+        return found
+    plain: Mapping[str, Any] = group["LaunchTemplate"]
+    return plain
+
+
+def _id_only(specification: dict[str, Any]) -> dict[str, Any]:
+    """Leave the name out: AWS takes the id or the name, and describes both."""
+    specification.pop("LaunchTemplateName", None)
+    return specification
+
+
+def _version_of(refresh: Mapping[str, Any]) -> str:
+    """Return the version that a refresh leads to; empty where it names none."""
+    desired = refresh.get("DesiredConfiguration") or {}
+    return str(_specification(desired).get("Version", "")) if desired else ""

@@ -1,0 +1,39 @@
+"""rse-pf cloud upgrade: replace the servers by those of the newest deployment, or return to the old ones."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from datetime import datetime, timezone
+
+from rse_pf.config import PlatformSettings
+from rse_pf.terminal import show
+
+__all__ = ["add_arguments", "run"]
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare nothing: the action has no options."""
+
+
+def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
+    """Follow the replacement of the servers; return 1 if it was taken back or failed."""
+    from rse_pf.aws.account import open_account
+    from rse_pf.aws.fleet.upgrade import upgrade
+
+    try:
+        ended = upgrade(
+            open_account(settings.cloud.region), settings, tell=lambda line: show(f"  {line}"),
+            sleep=time.sleep, now=lambda: datetime.now(timezone.utc),
+        )  # fmt: skip
+    except KeyboardInterrupt:
+        show("", "AWS goes on without this command; run it again to follow")
+        return 1
+    if ended.reason:
+        show(
+            f"not upgraded to version {ended.version}: {ended.reason}",
+            *(f"  | {line}" for line in ended.console),
+        )
+        return 1
+    show(f"all servers run version {ended.version}" + ("" if ended.replaced else ", as before"))
+    return 0
