@@ -12,7 +12,7 @@ from aws_cdk import aws_sns as sns
 from constructs import Construct
 
 from rse_pf.config import PlatformSettings
-from rse_pf.config.resource_names import DENY_NAME, KEYS_NAME, ROBOTS_NAME, ResourceNames
+from rse_pf.config.resource_names import DENY_NAME, KEYS_NAME, ROBOTS_NAME, SERVICES_PREFIX, ResourceNames
 from stacks.assets import SERVERS, staged, sums_digest
 from stacks.backend_servers import BackendServers
 from stacks.load_balancer import LoadBalancer
@@ -30,8 +30,9 @@ TRUSTED = (KEYS_NAME, ROBOTS_NAME, DENY_NAME)
 class BackendStack(cdk.Stack):
     """Everything that a release changes.
 
-    It reads the network and the buckets, and provides ``backend/topic``, ``backend/balancer`` and
-    ``backend/robots``: ARNs of the topic, the load balancer and the robots' target group.
+    It reads the network and the buckets, and provides ``backend/topic``, ``backend/balancer``,
+    ``backend/listener`` and ``backend/robots``: ARNs of the topic, the load balancer, its listener and the
+    robots' target group.
     """
 
     def __init__(
@@ -78,6 +79,11 @@ class BackendStack(cdk.Stack):
             self.servers.role, ["s3:GetObject"], [artifacts.arn_for_objects(name) for name in TRUSTED],
             used_by="rse_pf/aws/storage/s3_store.py:S3Store._get",
         )  # fmt: skip
+        allow(
+            self.servers.role, ["s3:GetObject"], [artifacts.arn_for_objects(f"{SERVICES_PREFIX}/*")],
+            used_by="rse_pf/aws/storage/s3_store.py:S3Store._get",
+            why="archives of published services are named by their digests; operators alone write them",
+        )  # fmt: skip
         group = self.servers.group
         # By name, not by reference: a reference would make a cycle with the group.
         allow(
@@ -98,19 +104,21 @@ class BackendStack(cdk.Stack):
         )  # fmt: skip
         provide(self, names, "backend/topic", self.topic.topic_arn)
         provide(self, names, "backend/balancer", self.balancer.alb.load_balancer_arn)
+        provide(self, names, "backend/listener", self.balancer.listener.listener_arn)
         provide(self, names, "backend/robots", self.balancer.targets["robots"].target_group_arn)
         self._outputs(settings)
 
     def _outputs(self, settings: PlatformSettings) -> None:
         cdk.CfnOutput(self, "Topic", value=self.topic.topic_arn, description="subscribe to be told of alarms")
-        name = self.balancer.alb.load_balancer_dns_name
-        path = settings.serving.path
-        if settings.cloud.allow_insecure:
+        name, domain = self.balancer.alb.load_balancer_dns_name, settings.cloud.domain_name
+        path, insecure = settings.serving.path, settings.cloud.allow_insecure
+        url = f"ws://{name}{path}" if insecure else f"wss://{domain}{path}"
+        cdk.CfnOutput(self, "Url", value=url)
+        provide(self, ResourceNames(settings.cloud.name), "backend/url", url)
+        if insecure:
             cdk.Annotations.of(self).add_warning_v2(
                 "rse-pf:allow-insecure",
                 "cloud.allow_insecure is true: robots and tokens travel without TLS; for trials only",
             )
-            cdk.CfnOutput(self, "Url", value=f"ws://{name}{path}")
-            return
-        cdk.CfnOutput(self, "Url", value=f"wss://{settings.cloud.domain_name}{path}")
-        cdk.CfnOutput(self, "Cname", value=f"{settings.cloud.domain_name} CNAME {name}")
+        else:
+            cdk.CfnOutput(self, "Cname", value=f"{domain} CNAME {name}")

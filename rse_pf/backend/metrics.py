@@ -154,6 +154,7 @@ def merge_isolation(snapshots: Iterable[Mapping[str, Any] | None]) -> dict[str, 
         "missing_isolation": sorted({name for each in told for name in each["missing_isolation"]}),
         "open_breakers": sorted({service for each in told for service in each["open_breakers"]}),
         "counts": dict(counts),
+        "services": sorted(set.intersection(*(set(each["services"]) for each in told)) if told else ()),
     }
 
 

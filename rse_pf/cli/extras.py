@@ -131,6 +131,7 @@ VERBS_NEED: dict[str, tuple[str, ...]] = {
     "token": ("keys",),
     "robot": ("keys",),
     "service": ("local",),
+    "service publish": ("aws",),
     "serve": ("backend",),
     "data": ("data",),
     "map": (),

@@ -30,6 +30,7 @@ from rse_pf.aws.fleet.tasks import (
     lifecycle,
     rebalancing,
     server_metrics,
+    services,
     spot_notice,
 )
 from rse_pf.aws.storage.audit_archive import Shipper
@@ -48,6 +49,7 @@ TASKS: tuple[Callable[[AgentContext], Task], ...] = (
     spot_notice.task,
     audit.task,
     access_control.task,
+    services.task,
 )
 """The table, in the order of a step: one row and one module for each task."""
 
@@ -85,6 +87,10 @@ class Agent:
     def run(self, name: str) -> None:
         """Run the task *name* once; raises what it raises."""
         self._tasks[name].call()
+
+    def attempt(self, name: str) -> None:
+        """Run the task *name* once; a failure is logged."""
+        self._try(self._tasks[name])
 
     def repeat(self, name: str, sleep: Callable[[float], None] = time.sleep) -> None:
         """Run the task *name* for ever, in a thread of its own."""
@@ -136,6 +142,7 @@ def main(arguments: list[str] | None = None) -> int:
         if args.once:
             agent.run("keys")
             agent.run("access-control")
+            agent.attempt("services")  # a server without them is better than none
             return 0
     except RsePfError as error:
         show_error(error)

@@ -67,6 +67,10 @@ class Instance:
         told = json.loads(self._ask(f"/move?robots={robots}&spread_s={spread_s:g}", "POST"))
         return int(told.get("robots", 0))
 
+    def reload_services(self) -> None:
+        """Have the server load the published services; raises Disconnected when no server runs."""
+        self._ask("/services", "POST")
+
     def cpu_times(self) -> tuple[float, float]:
         """Return how long the machine's processors worked, and how long they were there; in ticks."""
         return read_cpu_times(_STAT.read_text(encoding="ascii"))

@@ -65,6 +65,10 @@ class Answers:
         self._monotonic = context.clocks.monotonic
         self._logs_frequent = context.log.writes("debug")
 
+    def offer(self, services: frozenset[str]) -> None:
+        """Take the names of all services of this server anew."""
+        self._services = services
+
     def compute(self, queued: QueuedCommand) -> EncodedAnswer:
         """Call the service and encode its answer; runs in the loop or in a thread, and touches nothing
         shared."""

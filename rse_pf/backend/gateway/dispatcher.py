@@ -21,6 +21,7 @@ from rse_pf.backend.gateway.idle_timeouts import IdleTimeouts
 from rse_pf.backend.gateway.rate_limits import CUT_OFF, PendingHandshakes
 from rse_pf.backend.gateway.token_watch import TokenWatch
 from rse_pf.backend.jobs.manager import JobManager
+from rse_pf.backend.jobs.queue import has_jobs
 from rse_pf.backend.live_map.router import LIVE_SERVICES, LiveMapRouter
 from rse_pf.backend.metrics import LongestRecently
 from rse_pf.backend.ports import Wire, WorkerContext
@@ -29,7 +30,7 @@ from rse_pf.backend.rosbridge.codec import RosbridgeCodec
 from rse_pf.backend.rosbridge.session import RosbridgeSession
 from rse_pf.backend.rosbridge.topics import RosbridgeTopics
 from rse_pf.backend.rosbridge.waiting import AwaitedTokens
-from rse_pf.backend.sandbox.manager import SandboxManager
+from rse_pf.backend.sandbox.reloading import ReloadingSandboxes
 from rse_pf.backend.scheduling.cpu_throttle import BATCH_S, CpuThrottle
 from rse_pf.backend.scheduling.scheduler import (
     INLINE_BYTES,
@@ -98,7 +99,7 @@ class NoQueue:
 
 
 ComputeQueue = ComputeLane[EncodedAnswer] | NoQueue
-SandboxQueue = SandboxManager | NoQueue
+SandboxQueue = ReloadingSandboxes | NoQueue
 JobQueue = JobManager | NoQueue
 LiveMapQueue = LiveMapRouter | NoQueue
 TopicQueue = RosbridgeTopics | NoQueue
@@ -177,7 +178,7 @@ class Dispatcher:
         )
         of_kind = {
             "stateless": "scheduler",
-            "long": "jobs" if settings.serving.max_running_jobs else "refused",
+            "long": "jobs" if has_jobs(settings) else "refused",
         }
         self._queues = {
             service.name: "compute" if compute.offers(service.name) else of_kind.get(service.kind, "refused")

@@ -48,7 +48,7 @@ __all__ = ["SandboxManager"]
 
 
 class SandboxManager:
-    """The sandboxes of one worker; ``missing`` names the means of isolation that this machine lacks."""
+    """The sandboxes of one worker."""
 
     def __init__(
         self,
@@ -62,6 +62,7 @@ class SandboxManager:
         loop: AbstractEventLoop,
         log: Log,
         answer: Callable[[QueuedCommand, Result | Failure], None],
+        on_ready: Callable[[tuple[str, ...] | None], None] | None = None,
     ) -> None:
         """Start the zygote and wait until it is ready.
 
@@ -75,6 +76,8 @@ class SandboxManager:
             loop: Event loop of the worker.
             log: Log of the worker; gets what services print.
             answer: Called exactly once for each submitted command whose robot stays connected.
+            on_ready: As for `ZygoteClient`: if given, nothing blocks, and nothing may be submitted before it
+                was called.
 
         Raises:
             ConfigurationError: A means of isolation is missing and weak isolation was not accepted.
@@ -103,9 +106,14 @@ class SandboxManager:
         self._timer: TimerHandle | None = None
         self._timer_s = math.inf
         self._zygote = ZygoteClient(
-            services, settings, loop=loop, log=log, on_gone=self._on_gone, on_lost=self._on_lost
-        )
-        self.missing = self._zygote.missing
+            services, settings, loop=loop, log=log, on_gone=self._on_gone, on_lost=self._on_lost,
+            on_ready=on_ready,
+        )  # fmt: skip
+
+    @property
+    def missing(self) -> tuple[str, ...]:
+        """The means of isolation that this machine lacks."""
+        return self._zygote.missing
 
     def offers(self, service: str) -> bool:
         """Return whether *service* is an installed one."""
@@ -177,6 +185,13 @@ class SandboxManager:
         """End every sandbox and the zygote."""
         self._execute(self._policy.close())
         self._zygote.close()
+
+    def retire(self) -> None:
+        """Do the same without waiting for the zygote."""
+        self._execute(self._policy.close())
+        if self._timer is not None:
+            self._timer.cancel()
+        self._zygote.retire()
 
     # --- events ------------------------------------------------------------------------------------
 

@@ -39,6 +39,7 @@ class ZygoteClient:
         log: Log,
         on_gone: Callable[[int, str], None],
         on_lost: Callable[[], None],
+        on_ready: Callable[[tuple[str, ...] | None], None] | None = None,
     ) -> None:
         """Start it and wait until it is ready.
 
@@ -49,6 +50,8 @@ class ZygoteClient:
             log: Log of the worker.
             on_gone: Called with the number of a sandbox that ended, and how it ended.
             on_lost: Called when the zygote ended, and every sandbox with it; a new one is starting then.
+            on_ready: If given, nothing blocks: it is called once, with the means of isolation that are
+                missing, or with None if the zygote ended before.  Whoever gives it judges them.
 
         Raises:
             ConfigurationError: It did not start, or a means of isolation is missing and weak isolation
@@ -63,8 +66,11 @@ class ZygoteClient:
         self._handles: dict[int, int] = {}
         """Descriptors of the processes of sandboxes, by number."""
         self._paused: set[int] = set()
+        self._on_ready = on_ready
+        self.missing: tuple[str, ...] = ()
         self._launch()
-        self.missing = self._wait_until_ready()
+        if on_ready is None:
+            self.missing = self._wait_until_ready()
         self._listen()
 
     def create(self, number: int, channel: socket.socket, output: int) -> bool:
@@ -96,6 +102,13 @@ class ZygoteClient:
         """End the zygote, and with it every sandbox."""
         self._loop.remove_reader(self._channel.fileno())
         self._stop()
+
+    def retire(self) -> None:
+        """Do the same without waiting for it."""
+        self._loop.remove_reader(self._channel.fileno())
+        self._channel.close()
+        self._forget_all()
+        self._loop.run_in_executor(None, self._reap)
 
     def _signal(self, number: int, which: signal.Signals) -> None:
         """Send a signal; a descriptor never means another process, as a reused process id could."""
@@ -170,16 +183,29 @@ class ZygoteClient:
                 self._loop.remove_reader(self._channel.fileno())
                 self._stop()
                 self._log.error("zygote-lost")
+                if self._tell_ready(None):
+                    return
                 self._launch()
                 self._listen()
                 self._on_lost()
                 return
             report = json.loads(message)
-            if report["event"] == "created":
+            if report["event"] == "ready":
+                self._log.info("sandbox-limits", cgroup=", ".join(report["cgroup"]))
+                self.missing = tuple(report["missing"])
+                self._tell_ready(self.missing)
+            elif report["event"] == "created":
                 self._created(report["id"], *handles)
             elif report["event"] == "gone":
                 self._forget(report["id"])
                 self._on_gone(report["id"], report["how"])
+
+    def _tell_ready(self, missing: tuple[str, ...] | None) -> bool:
+        """Tell whoever waits for it, outside of this call; return whether somebody did."""
+        told, self._on_ready = self._on_ready, None
+        if told is not None:
+            self._loop.call_soon(told, missing)
+        return told is not None
 
     def _created(self, number: int, handle: int) -> None:
         self._handles[number] = handle
@@ -194,10 +220,16 @@ class ZygoteClient:
     def _stop(self) -> None:
         """End the zygote: it ends its sandboxes and removes their cgroups when the channel is closed."""
         self._channel.close()
+        self._reap()
+        self._forget_all()
+
+    def _reap(self) -> None:
         with contextlib.suppress(subprocess.TimeoutExpired):
             self._process.wait(_END_S)
         self._process.kill()
         self._process.wait()
+
+    def _forget_all(self) -> None:
         for number in list(self._handles):
             self._forget(number)
         self._paused.clear()

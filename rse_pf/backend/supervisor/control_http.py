@@ -7,12 +7,14 @@ from __future__ import annotations
 
 import asyncio
 import ipaddress
+import json
 from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass, field
 from http import HTTPStatus
+from typing import Any
 from urllib.parse import parse_qsl, urlsplit
 
-__all__ = ["ControlReply", "ControlRequest", "serve_control"]
+__all__ = ["ControlReply", "ControlRequest", "json_reply", "number_of", "refused_reply", "serve_control"]
 
 _MAX_HEAD_BYTES = 8192
 _MAX_BODY_BYTES = 65536
@@ -38,6 +40,24 @@ class ControlReply:
     body: bytes = b""
     content_type: str = "application/json"
     headers: Mapping[str, str] = field(default_factory=dict)
+
+
+def json_reply(value: Any, *, status: int = 200, headers: dict[str, str] | None = None) -> ControlReply:
+    """Return *value* as JSON."""
+    return ControlReply(status=status, body=json.dumps(value).encode() + b"\n", headers=headers or {})
+
+
+def refused_reply(status: int, code: str, hint: str) -> ControlReply:
+    """Return a refusal: a stable code, and what to do."""
+    return json_reply({"code": code, "hint": hint}, status=status)
+
+
+def number_of(ask: ControlRequest, name: str, default: float, maximum: float) -> float:
+    """Return a parameter of a request; raises ValueError if it is none from 0 to *maximum*."""
+    value = float(ask.query.get(name, default))
+    if not 0 <= value <= maximum:
+        raise ValueError(name)
+    return value
 
 
 async def serve_control(

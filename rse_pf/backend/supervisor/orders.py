@@ -5,7 +5,8 @@ from __future__ import annotations
 import msgspec
 
 __all__ = [
-    "BlocksOrder", "DrainOrder", "LeaveOrder", "MigrateOrder", "RecordOrder", "ReplaceOrder", "ReportOrder",
+    "BlocksOrder", "DrainOrder", "LeaveOrder", "MigrateOrder", "RecordOrder", "ReloadServicesOrder",
+    "ReplaceOrder", "ReportOrder",
     "RobotsOrder", "TakeRecordedOrder", "TrustOrder", "UnblockOrder", "WorkerOrder", "decode_order",
     "encode_order",
 ]  # fmt: skip
@@ -83,6 +84,10 @@ class TakeRecordedOrder(msgspec.Struct, tag="take-recorded", tag_field="do", fro
     max_bytes: int
 
 
+class ReloadServicesOrder(msgspec.Struct, tag="reload-services", tag_field="do", frozen=True):
+    """Load the services folder anew; what cannot be loaded changes nothing, and the log says why."""
+
+
 class LeaveOrder(msgspec.Struct, tag="leave", tag_field="do", frozen=True):
     """Wait at most *held_s* for commands that are held, close every socket, and end."""
 
@@ -100,6 +105,7 @@ WorkerOrder = (
     | UnblockOrder
     | RecordOrder
     | TakeRecordedOrder
+    | ReloadServicesOrder
     | LeaveOrder
 )
 

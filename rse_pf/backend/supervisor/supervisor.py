@@ -8,7 +8,6 @@ modifier replaces it.  A drain loses no command.
 from __future__ import annotations
 
 import asyncio
-import json
 import os
 import random
 import signal
@@ -30,13 +29,21 @@ from rse_pf.backend.jobs.slots import make_pipe
 from rse_pf.backend.log import JsonLog
 from rse_pf.backend.metrics import merge, merge_isolation, render
 from rse_pf.backend.rosbridge.peers import peer_channels
-from rse_pf.backend.supervisor.control_http import ControlReply, ControlRequest, serve_control
+from rse_pf.backend.supervisor.control_http import (
+    ControlReply,
+    ControlRequest,
+    json_reply,
+    number_of,
+    refused_reply,
+    serve_control,
+)
 from rse_pf.backend.supervisor.listener import bound_socket, check_authentication
 from rse_pf.backend.supervisor.orders import (
     BlocksOrder,
     DrainOrder,
     LeaveOrder,
     MigrateOrder,
+    ReloadServicesOrder,
     RobotsOrder,
     TakeRecordedOrder,
     UnblockOrder,
@@ -371,6 +378,7 @@ class _Supervisor:
             ("POST", "/unblock"): self._post_unblock,
             ("POST", "/record"): self._post_record,
             ("POST", "/record/take"): self._post_take_recorded,
+            ("POST", "/services"): self._post_services,
             ("POST", "/drain"): self._post_drain,
             ("POST", "/move"): self._post_move,
         }
@@ -381,15 +389,15 @@ class _Supervisor:
             and not carries_token(ask.authorization, token)
         ):
             self._control_refused += 1
-            return _json({"code": "unauthorized"}, status=401, headers={"WWW-Authenticate": "Bearer"})
+            return json_reply({"code": "unauthorized"}, status=401, headers={"WWW-Authenticate": "Bearer"})
         page = pages.get((ask.method, ask.path))
         if page is not None:
             return await page(ask)
         known = any(path == ask.path for _, path in pages)
-        return _json({"code": "not-found"}, status=405 if known else 404)
+        return json_reply({"code": "not-found"}, status=405 if known else 404)
 
     async def _healthz(self, ask: ControlRequest) -> ControlReply:
-        return _json(
+        return json_reply(
             {
                 "server": self._server_id,
                 "version": server_version(),
@@ -407,8 +415,8 @@ class _Supervisor:
                 missing_isolation=isolation["missing_isolation"], open_breakers=isolation["open_breakers"]
             )
         if self._state == "ready":
-            return _json(told)
-        return _json(told, status=503, headers={"x-envoy-immediate-health-check-fail": "1"})
+            return json_reply(told)
+        return json_reply(told, status=503, headers={"x-envoy-immediate-health-check-fail": "1"})
 
     async def _metrics(self, ask: ControlRequest) -> ControlReply:
         merged = await self._merged()
@@ -429,7 +437,7 @@ class _Supervisor:
         results: dict[str, int] = {}
         for _, result, n in merged["requests"]:
             results[result] = results.get(result, 0) + n
-        return _json(
+        return json_reply(
             {
                 **self._identity(),
                 "version": server_version(),
@@ -457,46 +465,46 @@ class _Supervisor:
         )
 
     async def _blocks(self, ask: ControlRequest) -> ControlReply:
-        return _json(await self._ask_rows("blocks", BlocksOrder, _MAX_BLOCKS))
+        return json_reply(await self._ask_rows("blocks", BlocksOrder, _MAX_BLOCKS))
 
     async def _robots(self, ask: ControlRequest) -> ControlReply:
         """Tell which robots are connected, at most `_MAX_ROBOTS` of them; ``count`` is of all."""
-        return _json(await self._ask_rows("robots", RobotsOrder, _MAX_ROBOTS))
+        return json_reply(await self._ask_rows("robots", RobotsOrder, _MAX_ROBOTS))
 
     async def _post_unblock(self, ask: ControlRequest) -> ControlReply:
         """Lift what is refused after crashes: all, or that of a service, a tenant, or a robot of a tenant."""
         wanted = {name: ask.query.get(name) for name in ("service", "tenant", "robot")}
         if not ask.is_local:
-            return _refused(403, "forbidden", "unblock from the server's own machine")
+            return refused_reply(403, "forbidden", "unblock from the server's own machine")
         if set(ask.query) - set(wanted) or (wanted["robot"] and not wanted["tenant"]):
-            return _refused(
+            return refused_reply(
                 400, "bad-request", "name a service, a tenant, a robot of that tenant, or nothing"
             )
         told = await self._ask_rows("blocks", lambda number: UnblockOrder(number, **wanted), _MAX_BLOCKS)
         self._log.info("unblock", **wanted, lifted=told["count"])
         self._records.note("server.unblock", **wanted, lifted=told["count"])
-        return _json(told)
+        return json_reply(told)
 
     async def _post_record(self, ask: ControlRequest) -> ControlReply:
         """Begin to record requests to an installed service, or end it."""
         if not may_record(ask, self._control_token):
-            return _refused(403, "forbidden", NOT_FOR_YOU)
+            return refused_reply(403, "forbidden", NOT_FOR_YOU)
         try:
             wanted = record_query(ask)
         except ValueError:
-            return _refused(400, "bad-request", WRONG_RECORDING)
+            return refused_reply(400, "bad-request", WRONG_RECORDING)
         told = await self._ask_rows("workers", wanted.order, len(self._workers))
         self._log.info("record", service=wanted.service, calls=wanted.calls, ends=wanted.ends)
         self._records.note("server.record", service=wanted.service, calls=wanted.calls, ends=wanted.ends)
-        return _json({**told, "recording": told["order"]})
+        return json_reply({**told, "recording": told["order"]})
 
     async def _post_take_recorded(self, ask: ControlRequest) -> ControlReply:
         """Tell the next bytes of a recording, once."""
         number, workers = ask.query.get("recording", ""), len(self._workers)
         if not may_record(ask, self._control_token) or not number.isdecimal():
-            return _refused(403, "forbidden", NOT_FOR_YOU)
+            return refused_reply(403, "forbidden", NOT_FOR_YOU)
         order = partial(TakeRecordedOrder, recording=int(number), max_bytes=_RECORDED_BYTES // workers)
-        return _json(await self._ask_rows("workers", order, workers))
+        return json_reply(await self._ask_rows("workers", order, workers))
 
     async def _ask_rows(self, what: str, make_order: Callable[[int], RowsOrder], most: int) -> dict[str, Any]:
         """Return what all workers tell; the same thing of several workers is listed several times."""
@@ -514,38 +522,47 @@ class _Supervisor:
             "silent_workers": len(told) - len(answers),
         }
 
+    async def _post_services(self, ask: ControlRequest) -> ControlReply:
+        """Load the services folder anew; /status shows the services that every worker runs."""
+        if not (ask.is_local and self._settings.services.follow):
+            return refused_reply(403, "forbidden", "only here, and with --follow-services")
+        for worker in self._workers:
+            worker.order(ReloadServicesOrder())
+        self._records.note("server.services")
+        return json_reply({"workers": len(self._workers)}, status=202)
+
     async def _post_drain(self, ask: ControlRequest) -> ControlReply:
         if not ask.is_local:
-            return _refused(403, "forbidden", "drain from the server's own machine")
+            return refused_reply(403, "forbidden", "drain from the server's own machine")
         try:
-            wait_s = _number(ask, "wait", self._settings.serving.drain_wait_s, _MAX_DRAIN_WAIT_S)
+            wait_s = number_of(ask, "wait", self._settings.serving.drain_wait_s, _MAX_DRAIN_WAIT_S)
         except ValueError:
-            return _refused(400, "bad-request", f"wait is 0 to {_MAX_DRAIN_WAIT_S:g} seconds")
+            return refused_reply(400, "bad-request", f"wait is 0 to {_MAX_DRAIN_WAIT_S:g} seconds")
         if self._state == "ready":
             self._state = "draining"
             self._keep(self._drain(wait_s))
-        return _json({"state": self._state}, status=202)
+        return json_reply({"state": self._state}, status=202)
 
     async def _post_move(self, ask: ControlRequest) -> ControlReply:
         """Ask robots to move; while an earlier migration is under way, no further robot is asked."""
         try:
             robots = int(ask.query["robots"])
-            spread_s = _number(ask, "spread_s", 0.0, _MAX_SPREAD_S)
+            spread_s = number_of(ask, "spread_s", 0.0, _MAX_SPREAD_S)
         except (KeyError, ValueError):
             robots, spread_s = -1, 0.0
         if not ask.is_local:
-            return _refused(403, "forbidden", "move from the server's own machine")
+            return refused_reply(403, "forbidden", "move from the server's own machine")
         if not 0 <= robots <= _MAX_MOVES:
-            return _refused(
+            return refused_reply(
                 400, "bad-request", f"robots is 0 to {_MAX_MOVES}, spread_s 0 to {_MAX_SPREAD_S:g} seconds"
             )
         if self._state != "ready":
-            return _refused(409, "draining", "all its robots move already")
+            return refused_reply(409, "draining", "all its robots move already")
         left_s = self._moving_until - time.monotonic()
         if left_s > 0:
-            return _json({"robots": 0, "spread_s": round(left_s, 3), "under_way": True}, status=202)
+            return json_reply({"robots": 0, "spread_s": round(left_s, 3), "under_way": True}, status=202)
         asked, last_s = self._migrate(robots, spread_s)
-        return _json({"robots": asked, "spread_s": last_s, "under_way": False}, status=202)
+        return json_reply({"robots": asked, "spread_s": last_s, "under_way": False}, status=202)
 
     def _migrate(self, robots: int, spread_s: float) -> tuple[int, float]:
         """Order the workers to ask *robots* to move; return how many are asked, and the time that takes."""
@@ -581,19 +598,3 @@ class _Supervisor:
 
 
 _load_of = attrgetter("load")
-
-
-def _json(value: Any, *, status: int = 200, headers: dict[str, str] | None = None) -> ControlReply:
-    return ControlReply(status=status, body=json.dumps(value).encode() + b"\n", headers=headers or {})
-
-
-def _refused(status: int, code: str, hint: str) -> ControlReply:
-    return _json({"code": code, "hint": hint}, status=status)
-
-
-def _number(ask: ControlRequest, name: str, default: float, maximum: float) -> float:
-    """Return a parameter of a request; raises ValueError if it is none from 0 to *maximum*."""
-    value = float(ask.query.get(name, default))
-    if not 0 <= value <= maximum:
-        raise ValueError(name)
-    return value

@@ -40,6 +40,7 @@ from rse_pf.backend.gateway.token_watch import TokenWatch
 from rse_pf.backend.gateway.websocket import RobotSockets
 from rse_pf.backend.jobs.manager import JobManager
 from rse_pf.backend.jobs.process import spawner
+from rse_pf.backend.jobs.queue import JobQueue, has_jobs
 from rse_pf.backend.jobs.runner import JobContext
 from rse_pf.backend.jobs.slots import JobSlots
 from rse_pf.backend.live_map.link import OwnerLinks
@@ -52,6 +53,7 @@ from rse_pf.backend.rosbridge.peers import NoPeers, PeerChannels, WorkerPeers
 from rse_pf.backend.rosbridge.topics import RosbridgeTopics
 from rse_pf.backend.sandbox.circuit_breaker import Block
 from rse_pf.backend.sandbox.manager import SandboxManager
+from rse_pf.backend.sandbox.reloading import Answer, OnReady, ReloadingSandboxes
 from rse_pf.backend.scheduling.cpu_throttle import CpuThrottle
 from rse_pf.backend.scheduling.scheduler import Scheduler
 from rse_pf.backend.supervisor.orders import (
@@ -60,6 +62,7 @@ from rse_pf.backend.supervisor.orders import (
     LeaveOrder,
     MigrateOrder,
     RecordOrder,
+    ReloadServicesOrder,
     ReplaceOrder,
     ReportOrder,
     RobotsOrder,
@@ -71,8 +74,8 @@ from rse_pf.backend.supervisor.orders import (
 )
 from rse_pf.backend.supervisor.robot_events import RobotEvents
 from rse_pf.backend.supervisor.robot_rows import MAX_ROBOT_ROWS, robot_rows
-from rse_pf.config import PlatformSettings
-from rse_pf.errors import MissingExtra
+from rse_pf.config import PlatformSettings, ServiceSettings
+from rse_pf.errors import ConfigurationError, MissingExtra, RsePfError, message_of
 from rse_pf.linux import die_with_parent, set_process_name
 from rse_pf.object_store import ObjectStore
 from rse_pf.recording.tap import RecordingTap, hand_pipe
@@ -182,8 +185,7 @@ class _Worker:
         self._log = JsonLog(level=settings.serving.log_level, server=plan.server_id, wall_clock=time.time)
         registry = load_services(plan.services, settings)
         chosen = settings.services
-        installed = installed_services(Path(chosen.folder)) if chosen.folder else []
-        installed += published_services() if chosen.published else []
+        installed = self._installed(chosen)
         context = WorkerContext(
             settings=settings,
             server_id=plan.server_id,
@@ -195,7 +197,8 @@ class _Worker:
         connections = set[RobotConnection]()
         store = open_data_store(settings) if is_shared(settings) else None
         registry.others = tuple(service.name for service in installed)
-        answers = Answers(
+        self._registry = registry
+        self._answers = answers = Answers(
             context,
             registry=registry,
             services=frozenset(service.name for service in (*registry, *installed)) | LIVE_SERVICES,
@@ -211,7 +214,7 @@ class _Worker:
             recorder=self._recorder,
         )
         self._sandboxes = (
-            self._make_sandboxes(plan, installed, answers) if chosen.folder or chosen.published else None
+            self._run_services(plan, installed, answers) if chosen.folder or chosen.published else None
         )
         self._live_maps = (
             None if store is None or not settings.live.max_owners else _live_maps(context, answers, store)
@@ -230,7 +233,7 @@ class _Worker:
             answers=answers,
             compute=self._compute(plan, context, registry, answers),
             sandboxes=self._sandboxes or NoQueue(),
-            jobs=self._jobs(plan, answers) if settings.serving.max_running_jobs else NoQueue(),
+            jobs=self._jobs(plan, answers) if has_jobs(settings) else NoQueue(),
             live_maps=self._live_maps or NoQueue(),
             topics=self._topics(plan, registry.names) if settings.serving.rosbridge else NoQueue(),
             token_watch=self._token_watch,
@@ -281,21 +284,76 @@ class _Worker:
             refuse=answers.send_refusal,
         )
 
-    def _make_sandboxes(
+    def _installed(self, chosen: ServiceSettings) -> list[InstalledService]:
+        """Return the services that are installed; of a folder that is followed, none if it is damaged."""
+        found = published_services() if chosen.published else []
+        if not chosen.folder:
+            return found
+        if not chosen.follow:
+            return installed_services(Path(chosen.folder)) + found
+        try:
+            return installed_services(Path(chosen.folder).resolve()) + found
+        except (RsePfError, OSError) as error:
+            self._log.error("services-refused", reason=message_of(error))
+            return found
+
+    def _run_services(
         self, plan: WorkerPlan, services: Sequence[InstalledService], answers: Answers
-    ) -> SandboxManager:
+    ) -> ReloadingSandboxes:
         settings = plan.settings
-        return SandboxManager(
-            services,
-            settings=settings,
-            max_sandboxes=-(-settings.services.max_sandboxes // plan.workers),
-            server_id=plan.server_id,
-            store=open_data_store(settings),
-            monotonic=time.monotonic,
-            loop=self._loop,
-            log=self._log,
-            answer=answers.send_message,
-        )
+        chosen = settings.services
+
+        def make(
+            services: Sequence[InstalledService], *, answer: Answer, on_ready: OnReady | None
+        ) -> SandboxManager:
+            return SandboxManager(
+                services,
+                settings=settings,
+                max_sandboxes=-(-chosen.max_sandboxes // plan.workers),
+                server_id=plan.server_id,
+                store=open_data_store(settings),
+                monotonic=time.monotonic,
+                loop=self._loop,
+                log=self._log,
+                answer=answer,
+                on_ready=on_ready,
+            )
+
+        def run(services: Sequence[InstalledService]) -> ReloadingSandboxes:
+            return ReloadingSandboxes(
+                make, services,
+                accepts_weak_isolation=chosen.accept_weak_isolation,
+                start_timeout_s=settings.local.start_timeout_s,
+                server_id=plan.server_id, loop=self._loop, log=self._log, answer=answers.send_message,
+                on_change=self._offer,
+            )  # fmt: skip
+
+        try:
+            return run(services)
+        except ConfigurationError as error:
+            if not chosen.follow:
+                raise
+            self._log.error("services-refused", reason=error.message)
+            self._offer(())
+            return run(())
+
+    def _offer(self, names: tuple[str, ...]) -> None:
+        """Offer the installed services *names* from now on."""
+        self._registry.others = names
+        self._answers.offer(frozenset((*names, *(each.name for each in self._registry))) | LIVE_SERVICES)
+
+    async def _reload_services(self) -> None:
+        """Load the services folder anew, which may take seconds: every file is compared with its pin."""
+        chosen = self._dispatcher.context.settings.services
+        if self._sandboxes is None or not chosen.follow:
+            return
+        folder = Path(chosen.folder).resolve()
+        try:
+            found = await self._loop.run_in_executor(None, installed_services, folder)
+        except (RsePfError, OSError) as error:
+            self._log.error("services-refused", reason=message_of(error))
+            return
+        self._sandboxes.replace(found + (published_services() if chosen.published else []))
 
     def _topics(self, plan: WorkerPlan, services: Sequence[str]) -> RosbridgeTopics:
         read, _ = plan.peers
@@ -310,13 +368,15 @@ class _Worker:
 
     def _jobs(self, plan: WorkerPlan, answers: Answers) -> JobManager:
         settings = plan.settings
+        store = open_data_store(settings)
         context = JobContext(
-            store=open_data_store(settings),
+            store=store,
             slots=JobSlots(plan.job_slots),
             settings=settings,
             server_id=plan.server_id,
             start=spawner(plan.services, settings),
             clock=time.monotonic,
+            queue=JobQueue(store, settings) if settings.serving.offer_jobs else None,
         )
         return JobManager(
             context, loop=self._loop, log=self._log, answer=answers.send_message,
@@ -369,6 +429,8 @@ class _Worker:
                 self._tell_blocks(number, lifted)
             case RecordOrder():
                 self._tell_rows(order.number, 1, [{"worker": self._index, "offers": self._record(order)}])
+            case ReloadServicesOrder():
+                self._keep(self._reload_services())
             case TakeRecordedOrder(number, recording, max_bytes):
                 self._tell_rows(number, 1, [self._recorded(recording, max_bytes)])
 

@@ -9,6 +9,9 @@ installs them once, and compiles C and C++; test, run and install build, too.  r
 robots send to a service of a running platform to a file, test --requests replays it, and debug calls the
 service with one of them outside of the sandbox, under a debugger.
 
+publish hands a service to all servers on AWS, pinned by its digest; they load it while robots are connected.
+publish --list shows what they run, publish NAME --remove takes it out.
+
 A server refuses a service or a request after crashes: to the robot whose sandboxes crashed, and to others if
 theirs crashed as well.  status shows what is refused to whom and for how long, unblock lifts it.
 
@@ -20,6 +23,8 @@ examples:
   rse-pf service record centroid --out live.jsonl --count 20
   rse-pf service test centroid --requests live.jsonl --compare
   rse-pf service debug centroid --request live.jsonl --number 3
+  rse-pf service publish centroid
+  rse-pf service publish --list
   rse-pf service status
   rse-pf service unblock centroid --robot robot-1
 """
@@ -46,6 +51,7 @@ from rse_pf.cli.local_platform.logs import LogFollower, LogLine
 from rse_pf.cli.services.blocks import add_block_arguments, chosen_servers, show_blocks, unblock
 from rse_pf.cli.services.building import build_service, built_service, changed_s, lock_service
 from rse_pf.cli.services.debugging import DebugOptions, debug_service
+from rse_pf.cli.services.publishing import add_publish_arguments, publish_service
 from rse_pf.cli.services.recorder import RecordLimits, record_service
 from rse_pf.cli.services.replaying import Recorded, plain, recorded_requests, replay, requests_of
 from rse_pf.config import PlatformSettings
@@ -60,6 +66,7 @@ __all__ = ["add_arguments", "run"]
 
 _ACTIONS = (
     "new", "test", "run", "lock", "build", "install", "list", "call", "record", "debug", "status", "unblock",
+    "publish",
 )  # fmt: skip
 _OF_A_NAME = ("new", "call", "record")
 _LANGUAGES = ("python", "cpp", "lua")
@@ -75,8 +82,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("action", choices=_ACTIONS, help="what to do")
     parser.add_argument(
         "what", nargs="?", metavar="NAME|FOLDER",
-        help="new, call, record: a name; test, run, lock, build, install, debug: the folder; unblock: only "
-        "this service",
+        help="new, call, record: a name; test, run, lock, build, install, debug, publish: the folder; "
+        "unblock: only this service; publish --remove: the name",
     )  # fmt: skip
     parser.add_argument(
         "--lang", choices=_LANGUAGES, default="python", help="new: language (default: python)"
@@ -92,6 +99,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="call, record, status, unblock: name of the local platform (default: default)",
     )  # fmt: skip
     add_block_arguments(parser)
+    add_publish_arguments(parser)
     parser.add_argument("--once", action="store_true", help="run: answer the recorded requests, then end")
     _add_recording_arguments(parser)
     _add_debug_arguments(parser)
@@ -143,6 +151,7 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
         "list": lambda: _list(args.services or _services_folder(settings)),
         "status": lambda: show_blocks(args),
         "unblock": lambda: unblock(args),
+        "publish": lambda: publish_service(args, settings),
     }
     if args.action in without_what:
         return without_what[args.action]()

@@ -30,9 +30,11 @@ from rse_pf.services.custom.dependencies import (
 )
 
 __all__ = [
+    "DEPENDENCIES_FOLDER",
     "ENTRY_POINTS",
     "LANGUAGES",
     "InstalledService",
+    "dependencies_of",
     "install",
     "installed_services",
     "published_services",
@@ -46,7 +48,7 @@ ENTRY_POINTS = "rse_pf.services"
 """Entry-point group by which Python packages publish services: ``name = "package.module"``."""
 
 _MANIFEST, _PINS, _DEPENDENCIES = "service.json", "pins.json", "dependencies.json"
-_STORE = ".dependencies"
+DEPENDENCIES_FOLDER = ".dependencies"
 """Folder beside the services: their packages, each set named by its digest."""
 _NAME = re.compile(r"[a-z][a-z0-9_-]{0,39}")
 _DIGEST = re.compile(r"[0-9a-f]{64}")
@@ -141,7 +143,7 @@ def install(folder: Path, into: Path, dependencies: Dependencies | None = None) 
     if dependencies is not None:
         others = {name: each for name, each in _dependencies_in(into) if name != service.name}
         check_together({**others, service.name: dependencies})
-        copy_dependencies(dependencies, into / _STORE)
+        copy_dependencies(dependencies, into / DEPENDENCIES_FOLDER)
     fresh, old, target = (into / f"{mark}{service.name}" for mark in (".new-", ".old-", ""))
     for leftover in (fresh, old):
         shutil.rmtree(leftover, ignore_errors=True)
@@ -209,7 +211,7 @@ def published_services() -> list[InstalledService]:
 
 
 def _read_installed(target: Path) -> InstalledService:
-    service, dependencies = read_service(target), _dependencies_of(target)
+    service, dependencies = read_service(target), dependencies_of(target)
     return replace(
         service,
         dependencies=None if dependencies is None else dependencies.folder,
@@ -220,12 +222,17 @@ def _read_installed(target: Path) -> InstalledService:
 def _dependencies_in(folder: Path) -> Iterator[tuple[str, Dependencies]]:
     """Yield name and packages of every installed service that has some."""
     for target in sorted(folder.iterdir()):
-        dependencies = None if target.name.startswith(".") else _dependencies_of(target)
+        dependencies = None if target.name.startswith(".") else dependencies_of(target)
         if dependencies is not None:
             yield target.name, dependencies
 
 
-def _dependencies_of(target: Path) -> Dependencies | None:
+def dependencies_of(target: Path) -> Dependencies | None:
+    """Return the packages of the service that is installed in *target*, None if it has none.
+
+    Raises:
+        ConfigurationError: The record of them is damaged.
+    """
     path = target / _DEPENDENCIES
     if not path.is_file() or not (target / _PINS).is_file():
         return None
@@ -234,7 +241,7 @@ def _dependencies_of(target: Path) -> Dependencies | None:
         digest = str(document["digest"])
         if not _DIGEST.fullmatch(digest):
             raise ValueError("its digest is none")
-        return Dependencies(**{**document, "folder": target.parent.absolute() / _STORE / digest})
+        return Dependencies(**{**document, "folder": target.parent.absolute() / DEPENDENCIES_FOLDER / digest})
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ConfigurationError(
             f"{path} is damaged: {error!r}", hint="install it again with: rse-pf service install FOLDER"

@@ -27,6 +27,7 @@ class FakeMachine:
         self.waits: list[float] = []
         self.moves: list[tuple[int, float]] = []
         self.notice = ""
+        self.reloads = 0
         self.cpu = (0.0, 0.0)
         self._ends_after_s = ends_after_s
         self._ended_at_s = float("inf")
@@ -60,6 +61,10 @@ class FakeMachine:
         self.page()
         self.moves.append((robots, spread_s))
         return robots
+
+    def reload_services(self) -> None:
+        self.page()
+        self.reloads += 1
 
     def page(self) -> str:
         if not self.runs or self.now_s >= self._ended_at_s:

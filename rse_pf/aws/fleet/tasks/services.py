@@ -1,0 +1,49 @@
+"""Follow the list of published services: fetch what it names, check it, and let the server load it.
+
+The agent only reads the bucket; operators write it with ``rse-pf service publish``.  A list that is refused
+changes nothing, and is tried again when it has changed.
+"""
+
+from __future__ import annotations
+
+import msgspec
+
+from rse_pf.aws.fleet.task import AgentContext, Task
+from rse_pf.errors import ConfigurationError, Disconnected, NotFound
+from rse_pf.services.custom.published_folder import PublishedFolder
+from rse_pf.services.custom.publishing import LIST_NAME, PublishedList, archive_name
+
+__all__ = ["FOLDER", "task"]
+
+FOLDER = "services"
+"""Beside the public keys; the units name it, too."""
+_PERIOD_S = 15.0
+_EMPTY = msgspec.json.encode(PublishedList())
+
+
+def task(context: AgentContext) -> Task:
+    """Install the services of the list if it changed, and have the server load them."""
+    folder = PublishedFolder(context.config.keys_file.parent / FOLDER)
+    refused, told = b"", b""
+
+    def follow() -> None:
+        nonlocal refused, told
+        try:
+            data = context.artifacts.get(LIST_NAME)
+        except NotFound:
+            data = _EMPTY
+        if not folder.holds(data) and data != refused:
+            try:
+                found = folder.install(data, lambda entry: context.artifacts.get(archive_name(entry.archive)))
+            except ConfigurationError:
+                refused = data
+                raise
+            context.log("services", names=[service.name for service in found])
+        if folder.holds(data) and data != told:
+            try:
+                context.machine.reload_services()
+            except Disconnected:
+                return  # a server that starts reads the folder itself
+            told = data
+
+    return Task(name="services", period_s=_PERIOD_S, call=follow, in_thread=True)

@@ -1,0 +1,301 @@
+"""The sandboxes of a worker whose services may be replaced while robots are connected.
+
+A replacement gets a zygote and sandboxes of its own.  It takes new commands once its zygote is ready and the
+isolation is complete; until then, and if that fails, the former ones go on.  The commands of one robot keep
+their order: one that arrives while an earlier one is with the former sandboxes waits for its answer.  State
+that a snapshot holds moves with the robot.
+"""
+
+from __future__ import annotations
+
+import functools
+from asyncio import AbstractEventLoop, TimerHandle
+from collections import Counter, deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+from rse_pf.backend.ports import Log
+from rse_pf.backend.sandbox.circuit_breaker import Block
+from rse_pf.backend.sandbox.manager import SandboxManager
+from rse_pf.backend.scheduling.scheduler import QueuedCommand
+from rse_pf.identity import RobotId
+from rse_pf.service import failure_of, unknown_service
+from rse_pf.services.custom.installed import InstalledService
+from rse_pf.wire import Failure, Result
+
+__all__ = ["Answer", "MakeSandboxes", "OnReady", "ReloadingSandboxes"]
+
+Answer = Callable[[QueuedCommand, Result | Failure], None]
+OnReady = Callable[[tuple[str, ...] | None], None]
+
+
+class MakeSandboxes(Protocol):
+    """Makes the sandboxes of some services; blocks until they are ready unless *on_ready* is given."""
+
+    def __call__(
+        self, services: Sequence[InstalledService], *, answer: Answer, on_ready: OnReady | None
+    ) -> SandboxManager: ...
+
+
+@dataclass(eq=False, slots=True)
+class _Generation:
+    """The services of one time, and how many commands of each robot have no answer yet."""
+
+    names: tuple[str, ...]
+    sandboxes: SandboxManager | None = None
+    unanswered: Counter[RobotId] = field(default_factory=Counter)
+
+
+class ReloadingSandboxes:
+    """What the dispatcher knows as the sandboxes of its worker."""
+
+    def __init__(
+        self,
+        make: MakeSandboxes,
+        services: Sequence[InstalledService],
+        *,
+        accepts_weak_isolation: bool,
+        start_timeout_s: float,
+        server_id: str,
+        loop: AbstractEventLoop,
+        log: Log,
+        answer: Answer,
+        on_change: Callable[[tuple[str, ...]], None],
+    ) -> None:
+        """Run *services*, and wait until they are ready; without any, start no process.
+
+        Args:
+            make: Makes the sandboxes.
+            services: As installed and checked.
+            accepts_weak_isolation: ``services.accept_weak_isolation``.
+            start_timeout_s: A replacement that is not ready after this is given up.
+            server_id: Goes into answers.
+            loop: Event loop of the worker.
+            log: Log of the worker.
+            answer: As for `SandboxManager`.
+            on_change: Called with the names of the services that run from now on.
+
+        Raises:
+            ConfigurationError: A means of isolation is missing and weak isolation was not accepted.
+        """
+        self._make = make
+        self._accepts_weak_isolation = accepts_weak_isolation
+        self._start_timeout_s = start_timeout_s
+        self._server_id = server_id
+        self._loop = loop
+        self._log = log
+        self._answer = answer
+        self._on_change = on_change
+        self._connections: Counter[RobotId] = Counter()
+        self._waiting: dict[RobotId, deque[QueuedCommand]] = {}
+        self._retiring: list[_Generation] = []
+        self._next: _Generation | None = None
+        self._give_up: TimerHandle | None = None
+        self._past: Counter[str] = Counter()
+        """What the sandboxes that are gone have counted."""
+        self._current = _Generation(tuple(service.name for service in services))
+        if services:
+            self._current.sandboxes = self._made(services, self._current, None)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the services that run."""
+        return self._current.names
+
+    # --- replacement ---------------------------------------------------------------------------------
+
+    def replace(self, services: Sequence[InstalledService]) -> None:
+        """Run *services* instead as soon as they are ready; a replacement that is not yet is dropped."""
+        self._drop_next()
+        fresh = _Generation(tuple(service.name for service in services))
+        if not services:
+            self._switch(fresh)
+            return
+        self._next = fresh
+        self._give_up = self._loop.call_later(self._start_timeout_s, self._refuse, fresh, "it did not start")
+        fresh.sandboxes = self._made(services, fresh, functools.partial(self._ready, fresh))
+
+    def _made(
+        self, services: Sequence[InstalledService], generation: _Generation, on_ready: OnReady | None
+    ) -> SandboxManager:
+        answer = functools.partial(self._answered, generation)
+        return self._make(services, answer=answer, on_ready=on_ready)
+
+    def _ready(self, fresh: _Generation, missing: tuple[str, ...] | None) -> None:
+        if fresh is not self._next:
+            return
+        if missing is None:
+            fresh.sandboxes = None  # its zygote has ended, so there is nothing to close
+            self._refuse(fresh, "its zygote ended")
+        elif missing and not self._accepts_weak_isolation:
+            self._refuse(fresh, f"this machine lacks {', '.join(missing)}")
+        else:
+            self._end_wait()
+            self._switch(fresh)
+
+    def _refuse(self, fresh: _Generation, why: str) -> None:
+        if fresh is self._next:
+            self._drop_next()
+            self._log.error("services-refused", services=", ".join(fresh.names), reason=why)
+
+    def _drop_next(self) -> None:
+        dropped = self._next
+        self._end_wait()
+        if dropped is not None and dropped.sandboxes is not None:
+            dropped.sandboxes.retire()
+
+    def _end_wait(self) -> None:
+        self._next = None
+        if self._give_up is not None:
+            self._give_up.cancel()
+            self._give_up = None
+
+    def _switch(self, fresh: _Generation) -> None:
+        former, self._current = self._current, fresh
+        if fresh.sandboxes is not None:
+            for robot, count in self._connections.items():
+                for _ in range(count):
+                    fresh.sandboxes.connected(robot)
+        if former.sandboxes is not None:
+            self._retiring.append(former)
+            self._loop.call_soon(self._end_if_idle, former)
+        self._log.info("services-loaded", services=", ".join(fresh.names))
+        self._on_change(fresh.names)
+
+    def _end_if_idle(self, former: _Generation) -> None:
+        """End sandboxes that have answered everything; each command is answered at its deadline at last."""
+        if former in self._retiring and not former.unanswered and former.sandboxes is not None:
+            self._retiring.remove(former)
+            self._past.update(former.sandboxes.report()["counts"])
+            former.sandboxes.retire()
+
+    # --- commands ------------------------------------------------------------------------------------
+
+    def offers(self, service: str) -> bool:
+        """Return whether *service* is one of those that run."""
+        return service in self._current.names
+
+    def submit(self, queued: QueuedCommand) -> None:
+        """Run *queued* in its robot's sandbox; the answer comes through the callback."""
+        if self._is_held(queued.robot):
+            self._waiting.setdefault(queued.robot, deque()).append(queued)
+        else:
+            self._run(queued)
+
+    def _run(self, queued: QueuedCommand) -> None:
+        sandboxes, service = self._current.sandboxes, queued.command.service
+        if sandboxes is None or not self.offers(service):
+            error = unknown_service(service, self._current.names)
+            self._answer(queued, failure_of(error, queued.command, server=self._server_id))
+            return
+        self._current.unanswered[queued.robot] += 1
+        sandboxes.submit(queued)
+
+    def _answered(self, generation: _Generation, queued: QueuedCommand, message: Result | Failure) -> None:
+        robot = queued.robot
+        if generation.unanswered[robot] > 1:
+            generation.unanswered[robot] -= 1
+        else:
+            del generation.unanswered[robot]
+        self._answer(queued, message)
+        if generation is not self._current:
+            self._loop.call_soon(self._go_on, robot)
+            self._loop.call_soon(self._end_if_idle, generation)
+
+    def _is_held(self, robot: RobotId) -> bool:
+        return robot in self._waiting or any(robot in each.unanswered for each in self._retiring)
+
+    def _go_on(self, robot: RobotId) -> None:
+        """Run what waited for the former sandboxes of *robot*."""
+        if any(robot in each.unanswered for each in self._retiring):
+            return
+        for queued in self._waiting.pop(robot, ()):
+            self._run(queued)
+
+    # --- robots --------------------------------------------------------------------------------------
+
+    def connected(self, robot: RobotId) -> None:
+        """Note a connection of *robot*."""
+        self._connections[robot] += 1
+        for sandboxes in self._all:
+            sandboxes.connected(robot)
+
+    def disconnected(self, robot: RobotId) -> None:
+        """Note the end of a connection; nobody waits for the commands of a robot that has none."""
+        self._connections[robot] -= 1
+        is_gone = self._connections[robot] <= 0
+        if is_gone:
+            del self._connections[robot]
+            self._waiting.pop(robot, None)
+        for sandboxes in self._all:
+            sandboxes.disconnected(robot)
+        if is_gone:
+            for each in (self._current, *self._retiring):
+                del each.unanswered[robot]
+                self._loop.call_soon(self._end_if_idle, each)
+
+    def close(self) -> None:
+        """End every sandbox and the zygotes."""
+        self._drop_next()
+        for sandboxes in self._all:
+            sandboxes.close()
+
+    @property
+    def _all(self) -> list[SandboxManager]:
+        found = (each.sandboxes for each in (self._current, *self._retiring))
+        return [each for each in found if each is not None]
+
+    # --- what is shown -------------------------------------------------------------------------------
+
+    @property
+    def held(self) -> int:
+        """Commands that wait or run."""
+        return sum(each.held for each in self._all) + sum(map(len, self._waiting.values()))
+
+    def waiting_of(self, robot: RobotId) -> int:
+        """Return how many commands of *robot* wait."""
+        return sum(each.waiting_of(robot) for each in self._all) + len(self._waiting.get(robot, ()))
+
+    def report(self) -> dict[str, Any]:
+        """Return what /readyz and /metrics show of this worker's sandboxes."""
+        reports = [each.report() for each in self._all]
+        counts = Counter(self._past)
+        for each in reports:
+            counts.update(each["counts"])
+        current = self._current.sandboxes
+        newest = {} if current is None else current.report()
+        return {
+            "sandboxes": sum(each["sandboxes"] for each in reports),
+            "missing_isolation": newest.get("missing_isolation", []),
+            "open_breakers": newest.get("open_breakers", []),
+            "counts": dict(counts),
+            "services": list(self.names),
+        }
+
+    def blocks(self) -> list[Block]:
+        """Return what is refused now after crashes, and to whom."""
+        current = self._current.sandboxes
+        return [] if current is None else current.blocks()
+
+    def unblock(self, service: str | None, tenant: str | None, robot: str | None) -> list[Block]:
+        """Lift what is refused (None stands for all), and return what it was."""
+        current = self._current.sandboxes
+        return [] if current is None else current.unblock(service, tenant, robot)
+
+    def record(self, number: int, service: str, *, calls: int, max_bytes: int, seconds: float) -> bool:
+        """Begin recording *number*; a replacement ends it.  Return False if *service* does not run."""
+        current = self._current.sandboxes
+        return current is not None and current.record(
+            number, service, calls=calls, max_bytes=max_bytes, seconds=seconds
+        )
+
+    def take_recorded(self, number: int, max_bytes: int) -> tuple[bytes, int, bool]:
+        """Return the next bytes of recording *number*, how many wait, and whether there will be no more."""
+        current = self._current.sandboxes
+        return (b"", 0, True) if current is None else current.take_recorded(number, max_bytes)
+
+    def end_recording(self, number: int) -> None:
+        """End recording *number* and forget what it holds."""
+        if self._current.sandboxes is not None:
+            self._current.sandboxes.end_recording(number)

@@ -1,0 +1,93 @@
+"""The action publish: hand a service to all servers on AWS, list what they run, take one out.
+
+Servers look for changes every 15 seconds and load them while robots are connected; nothing is restarted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+import time
+from pathlib import Path
+
+from rse_pf.cli.extras import require
+from rse_pf.cli.services.building import built_service
+from rse_pf.config import PlatformSettings
+from rse_pf.config.resource_names import ResourceNames
+from rse_pf.errors import UsageError
+from rse_pf.object_store import ObjectStore
+from rse_pf.services.custom.installed import install
+from rse_pf.services.custom.publishing import PublishedService, publish, read_list, remove
+from rse_pf.terminal import show, show_json
+
+__all__ = ["add_publish_arguments", "publish_service"]
+
+_WITHIN_S = 15
+
+
+def add_publish_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of publish."""
+    parser.add_argument("--list", action="store_true", help="publish: show the services that all servers run")
+    parser.add_argument(
+        "--remove", action="store_true", help="publish: take the service with this name out of the list"
+    )
+    parser.add_argument("--json", action="store_true", help="publish --list: as JSON")
+
+
+def publish_service(args: argparse.Namespace, settings: PlatformSettings) -> int:
+    """Publish the service in a folder, remove one, or list them."""
+    if args.list and (args.remove or args.what is not None):
+        raise UsageError("--list takes no service and no --remove", hint="rse-pf service publish --list")
+    if not args.list and args.what is None:
+        raise UsageError(
+            "rse-pf service publish needs the folder of a service",
+            hint="write rse-pf service publish FOLDER, or --list",
+        )
+    if args.json and not args.list:
+        raise UsageError("--json is for --list", hint="leave it out")
+    require("service publish")
+    if args.list:
+        return _list(_store(settings), as_json=args.json)
+    if args.remove:
+        remove(args.what, _store(settings))
+        show(f"{args.what} is removed: servers stop offering it within {_WITHIN_S} s")
+        return 0
+    built, dependencies = built_service(Path(args.what))
+    with tempfile.TemporaryDirectory(prefix="rse-pf-publish-") as folder:
+        service = install(built.folder, Path(folder), dependencies)
+        entry = publish(service, Path(folder), _store(settings), now_s=time.time())
+    show(
+        f"{entry.name} ({entry.language}) is published: {entry.size} bytes, sha256 {entry.archive[:16]}",
+        f"servers load it within {_WITHIN_S} s; rse-pf service publish {entry.name} --remove takes it out",
+    )
+    return 0
+
+
+def _list(store: ObjectStore, *, as_json: bool) -> int:
+    services = read_list(store).services
+    if as_json:
+        show_json([_row(each) for each in services])
+        return 0
+    for each in services:
+        at = time.strftime("%Y-%m-%d %H:%M", time.gmtime(each.published_s))
+        show(f"{each.name:<24} {each.language:<8} {each.size:>10} bytes  {each.identity[:12]}  {at} UTC")
+    if not services:
+        show("no service is published")
+    return 0
+
+
+def _row(each: PublishedService) -> dict[str, object]:
+    return {
+        "name": each.name, "language": each.language, "bytes": each.size, "identity": each.identity,
+        "archive": each.archive, "published_s": each.published_s, "packages": each.packages,
+    }  # fmt: skip
+
+
+def _store(settings: PlatformSettings) -> ObjectStore:
+    """Return the artifact bucket of the deployment; raises ConfigurationError if there is none."""
+    from rse_pf.aws.account import open_account
+    from rse_pf.aws.storage.s3_store import S3Store
+
+    account = open_account(settings.cloud.region)
+    stack = ResourceNames(settings.cloud.name).stack("Data")
+    return S3Store(account.client("s3"), account.resource(stack, "AWS::S3::Bucket", "Artifacts"))
