@@ -37,9 +37,9 @@ def build(app: cdk.App, settings: PlatformSettings, assets: Path) -> dict[str, c
     data = DataStack(app, names.stack("Data"), **common())
     backend = BackendStack(app, names.stack("Backend"), assets=assets, **common())
     serverless = ServerlessStack(app, names.stack("Serverless"), assets=assets, **common())
-    observability = ObservabilityStack(app, names.stack("Observability"), **common())
+    observability = ObservabilityStack(app, names.stack("Observability"), assets=assets, **common())
     for reader, providers in (
-        (backend, [network, data]), (serverless, [data]), (observability, [backend, data]),
+        (backend, [network, data]), (serverless, [data, backend]), (observability, [backend, data]),
     ):  # fmt: skip
         for provider in providers:
             reader.add_stack_dependency(provider)

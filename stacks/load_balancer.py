@@ -46,7 +46,7 @@ class LoadBalancer(Construct):
         self.alb.log_access_logs(logs, BALANCER_LOGS)
         self.targets = {"robots": self._targets("Robots", vpc, settings.serving.port, settings)}
         insecure = settings.cloud.allow_insecure
-        listener = self.alb.add_listener(
+        self.listener = listener = self.alb.add_listener(
             "Front", port=front_port(settings), open=False,
             protocol=elbv2.ApplicationProtocol.HTTP if insecure else elbv2.ApplicationProtocol.HTTPS,
             ssl_policy=None if insecure else elbv2.SslPolicy.TLS13_RES,

@@ -1,4 +1,8 @@
-"""Pose estimation without a server: `lambda_pnp` behind a Function URL, for robots with rare requests."""
+"""Pose estimation without a server: `lambda_pnp` behind the load balancer, for what the servers cannot take.
+
+Robots reach it at their own address, so that one name, one certificate and one web firewall are in front of
+servers and function alike; nobody else may invoke it.
+"""
 
 from __future__ import annotations
 
@@ -7,25 +11,30 @@ from pathlib import Path
 from typing import cast
 
 import aws_cdk as cdk
+from aws_cdk import aws_elasticloadbalancingv2 as elbv2
 from aws_cdk import aws_iam as iam
 from aws_cdk import aws_lambda as lambda_
 from aws_cdk import aws_logs as logs
 from constructs import Construct
 
 from rse_pf.config import PlatformSettings
-from rse_pf.config.resource_names import KEYS_NAME, ResourceNames
+from rse_pf.config.front_door import BURST_PATH
+from rse_pf.config.resource_names import BUDGET_NAME, KEYS_NAME, ResourceNames
 from rse_pf.scaling.operator_alarms import LAMBDA_TIMEOUT_S
 from stacks.assets import staged
 from stacks.backend_stack import TRUSTED
 from stacks.findings import acknowledge
 from stacks.permissions import BY_AWS, LOG_ACTIONS, allow, explain
-from stacks.values import imported_bucket
+from stacks.values import imported_bucket, read
 
 __all__ = ["ServerlessStack"]
 
+_PRIORITY = 20
+"""Of the rule of the listener; those of the data service come first."""
+
 
 class ServerlessStack(cdk.Stack):
-    """The function, its URL and its log; it reads the artifact bucket."""
+    """The function, its log, and its place behind the load balancer; it reads the artifact bucket."""
 
     def __init__(
         self,
@@ -44,23 +53,65 @@ class ServerlessStack(cdk.Stack):
         cast("logs.CfnLogGroup", log.node.default_child).retention_in_days = settings.cloud.log_days
         role = iam.Role(self, "Role", assumed_by=iam.ServicePrincipal("lambda.amazonaws.com"))
         allow(
-            role, ["s3:GetObject"], [artifacts.arn_for_objects(name) for name in TRUSTED],
-            used_by="lambda_pnp/keys.py:read_object",
+            role, ["s3:GetObject"], [artifacts.arn_for_objects(name) for name in (*TRUSTED, BUDGET_NAME)],
+            used_by=("lambda_pnp/keys.py:read_object", "lambda_pnp/day_budget.py:_sent"),
+        )  # fmt: skip
+        allow(
+            role, ["s3:PutObject"], [artifacts.arn_for_objects(BUDGET_NAME)],
+            used_by="lambda_pnp/day_budget.py:_sent",
         )  # fmt: skip
         log.grant_write(role)
         explain(role, LOG_ACTIONS, used_by=f"{BY_AWS}Lambda writes what the function prints")
         with tempfile.TemporaryDirectory() as folder:
             code = lambda_.Code.from_asset(str(staged(assets, "lambda", settings, Path(folder))))
             function = lambda_.Function(
-                self, "Pnp", function_name=names.function, runtime=lambda_.Runtime.PYTHON_3_13,
-                architecture=lambda_.Architecture.X86_64,
+                self, "Pnp", runtime=lambda_.Runtime.PYTHON_3_13, architecture=lambda_.Architecture.X86_64,
                 handler="lambda_pnp.handler.handler", code=code, role=role, log_group=log,
-                memory_size=settings.cloud.lambda_memory_mb,
+                function_name=names.function, memory_size=settings.cloud.lambda_memory_mb,
                 timeout=cdk.Duration.seconds(LAMBDA_TIMEOUT_S),
                 reserved_concurrent_executions=settings.cloud.lambda_concurrency,
                 environment={"RSE_PF_KEYS": f"{artifacts.bucket_name}/{KEYS_NAME}"},
             )  # fmt: skip
         acknowledge(function, "the newest runtime with wheels of every package in the lock", "L1")
-        # Robots carry our own tokens, which the handler checks; AWS's signatures are not for robots.
-        url = function.add_function_url(auth_type=lambda_.FunctionUrlAuthType.NONE)
-        cdk.CfnOutput(self, "Url", value=url.url)
+        self._behind_the_load_balancer(names, function)
+
+    def _behind_the_load_balancer(self, names: ResourceNames, function: lambda_.Function) -> None:
+        # By name: the target group takes a function only if it may invoke it already.
+        permission = lambda_.CfnPermission(
+            self, "OfLoadBalancer", action="lambda:InvokeFunction", function_name=function.function_arn,
+            principal="elasticloadbalancing.amazonaws.com", source_account=self.account,
+            source_arn=self.format_arn(
+                service="elasticloadbalancing", resource="targetgroup", resource_name=f"{names.function}/*"
+            ),
+        )  # fmt: skip
+        # No health checks, which would be calls that are paid for.
+        targets = elbv2.CfnTargetGroup(
+            self, "Targets", name=names.function, target_type="lambda", health_check_enabled=False,
+            targets=[elbv2.CfnTargetGroup.TargetDescriptionProperty(id=function.function_arn)],
+            target_group_attributes=[
+                # A header that comes twice is told as such, and not judged by one of its values.
+                elbv2.CfnTargetGroup.TargetGroupAttributeProperty(
+                    key="lambda.multi_value_headers.enabled", value="true"
+                )
+            ],
+        )  # fmt: skip
+        targets.add_dependency(permission)
+        elbv2.CfnListenerRule(
+            self, "Rule", listener_arn=read(self, names, "backend/listener"), priority=_PRIORITY,
+            conditions=[
+                elbv2.CfnListenerRule.RuleConditionProperty(
+                    field="path-pattern",
+                    path_pattern_config=elbv2.CfnListenerRule.PathPatternConfigProperty(values=[BURST_PATH]),
+                ),
+                elbv2.CfnListenerRule.RuleConditionProperty(
+                    field="http-request-method",
+                    http_request_method_config=elbv2.CfnListenerRule.HttpRequestMethodConfigProperty(
+                        values=["POST"]
+                    ),
+                ),
+            ],
+            actions=[elbv2.CfnListenerRule.ActionProperty(type="forward", target_group_arn=targets.ref)],
+        )  # fmt: skip
+        cdk.CfnOutput(
+            self, "Path", value=BURST_PATH, description="takes commands by POST, at the robots' address"
+        )

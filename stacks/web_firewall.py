@@ -2,6 +2,7 @@
 
 The limits come from `rse_pf.config.front_door`.  Blocked requests get 429 with ``Retry-After`` and never 403:
 a robot must be able to tell a firewall that it should wait for from a server that refuses it for good.
+Commands for the burst function must carry what looks like a token, because each call of it is paid.
 """
 
 from __future__ import annotations
@@ -12,7 +13,14 @@ from aws_cdk import aws_wafv2 as wafv2
 from constructs import Construct
 
 from rse_pf.config import PlatformSettings
-from rse_pf.config.front_door import RETRY_AFTER_S, STATUS, RateRule, rate_rules
+from rse_pf.config.front_door import (
+    BEARER_PATTERN,
+    BURST_PATH,
+    RETRY_AFTER_S,
+    STATUS,
+    RateRule,
+    rate_rules,
+)
 from rse_pf.config.resource_names import ResourceNames
 
 __all__ = ["WebFirewall"]
@@ -23,6 +31,11 @@ _TOLD = {
     "message": "too many requests of this address",
     "hint": f"wait {RETRY_AFTER_S} s; if many robots share the address, raise cloud.robots_per_site",
 }
+_NO_TOKEN, _NO_TOKEN_BODY, _NO_TOKEN_STATUS = "burst-needs-a-token", "no-token", 401
+_NO_TOKEN_TOLD = {
+    "code": "unauthorized", "message": "the token is missing or not valid",
+    "hint": "issue one with rse-pf token issue ROBOT",
+}  # fmt: skip
 
 
 class WebFirewall(Construct):
@@ -32,16 +45,22 @@ class WebFirewall(Construct):
         self, scope: Construct, construct_id: str, *, alb_arn: str, settings: PlatformSettings
     ) -> None:
         super().__init__(scope, construct_id)
-        names = ResourceNames(settings.cloud.name)
+        names, rates = ResourceNames(settings.cloud.name), rate_rules(settings)
         acl = wafv2.CfnWebACL(
             self, "Acl", scope="REGIONAL", visibility_config=_seen(names.firewall),
             default_action=wafv2.CfnWebACL.DefaultActionProperty(allow={}),
             custom_response_bodies={
                 _BODY: wafv2.CfnWebACL.CustomResponseBodyProperty(
                     content=json.dumps(_TOLD), content_type="APPLICATION_JSON"
-                )
+                ),
+                _NO_TOKEN_BODY: wafv2.CfnWebACL.CustomResponseBodyProperty(
+                    content=json.dumps(_NO_TOKEN_TOLD), content_type="APPLICATION_JSON"
+                ),
             },
-            rules=[_rule(names.prefix, place, rule) for place, rule in enumerate(rate_rules(settings))],
+            rules=[
+                *(_rule(names.prefix, place, rule) for place, rule in enumerate(rates)),
+                _burst_needs_a_token(names.prefix, len(rates)),
+            ],
         )  # fmt: skip
         wafv2.CfnWebACLAssociation(self, "OfAlb", resource_arn=alb_arn, web_acl_arn=acl.attr_arn)
 
@@ -64,6 +83,33 @@ def _rule(prefix: str, place: int, rule: RateRule) -> wafv2.CfnWebACL.RuleProper
                 aggregate_key_type="CONSTANT" if rule.of_all else "IP", limit=rule.limit,
                 evaluation_window_sec=rule.window_s, scope_down_statement=_scope(rule),
             )
+        ),
+    )  # fmt: skip
+
+
+def _burst_needs_a_token(prefix: str, place: int) -> wafv2.CfnWebACL.RuleProperty:
+    """Return the rule that keeps calls without a token away from the function, whose every call is paid."""
+    looks_right = wafv2.CfnWebACL.StatementProperty(
+        regex_match_statement=wafv2.CfnWebACL.RegexMatchStatementProperty(
+            field_to_match=wafv2.CfnWebACL.FieldToMatchProperty(single_header={"Name": "authorization"}),
+            regex_string=BEARER_PATTERN,
+            text_transformations=[wafv2.CfnWebACL.TextTransformationProperty(priority=0, type="NONE")],
+        )
+    )
+    other = wafv2.CfnWebACL.StatementProperty(
+        not_statement=wafv2.CfnWebACL.NotStatementProperty(statement=looks_right)
+    )
+    return wafv2.CfnWebACL.RuleProperty(
+        name=_NO_TOKEN, priority=place, visibility_config=_seen(f"{prefix}-{_NO_TOKEN}"),
+        action=wafv2.CfnWebACL.RuleActionProperty(
+            block=wafv2.CfnWebACL.BlockActionProperty(
+                custom_response=wafv2.CfnWebACL.CustomResponseProperty(
+                    response_code=_NO_TOKEN_STATUS, custom_response_body_key=_NO_TOKEN_BODY
+                )
+            )
+        ),
+        statement=wafv2.CfnWebACL.StatementProperty(
+            and_statement=wafv2.CfnWebACL.AndStatementProperty(statements=[_begins(BURST_PATH), other])
         ),
     )  # fmt: skip
 

@@ -76,7 +76,9 @@ def rules_of_template(template: Mapping[str, Any]) -> list[PlayedRule]:
     bodies = acl.get("CustomResponseBodies", {})
     made = []
     for rule in sorted(acl["Rules"], key=lambda each: int(each["Priority"])):
-        rate = rule["Statement"]["RateBasedStatement"]
+        rate = rule["Statement"].get("RateBasedStatement")
+        if rate is None:  # it judges what a request holds, and counts nothing
+            continue
         made.append(
             PlayedRule(
                 name=rule["Name"],

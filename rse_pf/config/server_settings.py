@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
+from rse_pf.config.front_door import BURST_PATH
 from rse_pf.config.settings import PlatformSettings
 
 __all__ = ["READ_BY_SERVERS", "server_settings"]
@@ -16,6 +17,7 @@ __all__ = ["READ_BY_SERVERS", "server_settings"]
 READ_BY_SERVERS: dict[str, tuple[str, ...]] = {
     "cloud": ("name", "region", "poll_s", "boot_s", "drain_s", "audit_ship_s", "journal_ship_s", "spot"),
     "scaling": ("period_s", "moves_per_s", "profile", "warm_up_s"),
+    "burst": ("url", "robot_commands_per_day", "commands_per_day"),
     "health": ("cloud_interval_s", "unhealthy_checks"),
     "local": ("start_timeout_s",),
 }
@@ -39,6 +41,7 @@ def server_settings(settings: PlatformSettings) -> dict[str, dict[str, Any]]:
         }
         for group in dataclasses.fields(PlatformSettings)
     }
+    chosen["burst"]["url"] = settings.burst.url or BURST_PATH  # the function is behind the load balancer
     # No server reads it, but it has to be a multiple of the period, whatever that is.
     chosen["scaling"]["idle_s"] = settings.scaling.period_s * 60
     PlatformSettings.from_dict(chosen)

@@ -332,6 +332,8 @@ class ServerSession:
         self.state = "open"
         self.hears_progress = PROGRESS in hello.capabilities
         self.hears_updates = UPDATES in hello.capabilities
+        burst = self._burst
+        has_burst = burst.url != "" and burst.robot_commands_per_day > 0
         welcome = Welcome(
             server=self._server,
             session=self._session,
@@ -342,11 +344,11 @@ class ServerSession:
                 max_in_flight=self._limits.max_in_flight,
                 max_commands_per_s=self._limits.max_commands_per_s,
                 command_burst=self._limits.command_burst if self._limits.max_commands_per_s else 0,
-                burst_commands_per_day=self._burst.robot_commands_per_day if self._burst.url else 0,
+                burst_commands_per_day=burst.robot_commands_per_day if has_burst else 0,
             ),
             clock_s=now,
             token_s=None if self.ends_s is None else max(0.0, self.ends_s - now),
-            burst_url=self._burst.url,
+            burst_url=burst.url if has_burst else "",
         )
         return [self._send(welcome)]
 

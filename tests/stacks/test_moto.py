@@ -32,7 +32,6 @@ IGNORED = {
     "AWS::EC2::NetworkAclEntry",
     "AWS::EC2::SecurityGroupEgress",
     "AWS::EC2::SubnetNetworkAclAssociation",
-    "AWS::Lambda::Url",
     "AWS::S3::BucketPolicy",
     "AWS::SNS::TopicPolicy",
     "AWS::SecretsManager::Secret",
@@ -149,7 +148,9 @@ def test_every_stack_is_created_and_what_moto_made_equals_the_settings(
     assert group["HealthCheckType"] == "ELB"
     assert group["HealthCheckGracePeriod"] == settings.health.grace_s
     elb = client("elbv2")
-    targets = elb.describe_target_groups()["TargetGroups"]
+    targets = [
+        each for each in elb.describe_target_groups()["TargetGroups"] if each.get("TargetType") != "lambda"
+    ]
     robots = next(each for each in targets if each["Port"] == settings.serving.port)
     assert robots["HealthCheckPath"] == READY_PATH
     assert robots["HealthCheckPort"] == str(settings.serving.control_port)

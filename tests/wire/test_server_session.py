@@ -256,6 +256,7 @@ def test_the_welcome_names_the_burst_only_if_there_is_one() -> None:
         return sent.data
 
     told, none = welcome(BurstSettings(url="/burst", robot_commands_per_day=7)), welcome(BurstSettings())
+    assert welcome(BurstSettings(url="/burst", robot_commands_per_day=0)) == none
     message = make_codec("json").decode_from_server(told)
 
     assert isinstance(message, Welcome)
