@@ -1,0 +1,92 @@
+"""A local platform of its own for a benchmark: started and stopped by the commands that users type."""
+
+from __future__ import annotations
+
+import json
+import os
+import secrets
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from rse_pf.config import PlatformSettings
+from rse_pf.local.firewall import key_file, read_key
+from rse_pf.local.state import state_folder
+
+__all__ = ["LocalPlatform"]
+
+_START_S = 180.0
+_COMMAND = [sys.executable, "-m", "rse_pf.cli.main"]
+
+
+class LocalPlatform:
+    """``rse-pf local`` under *name*, with files of its own in *folder*; use it with ``with``."""
+
+    def __init__(self, name: str, folder: Path, *, servers: int = 2) -> None:
+        self.name, self.servers = name, servers
+        self.folder = folder
+        self.port = 0
+        self._process: subprocess.Popen[bytes] | None = None
+        self._environment = {**os.environ, "XDG_STATE_HOME": str(folder / "state")}
+
+    def __enter__(self) -> LocalPlatform:
+        """Start it and wait until all its servers are ready."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        with (self.folder / f"{self.name}.log").open("wb") as log:
+            self._process = subprocess.Popen(
+                [
+                    *_COMMAND, "local", "start", "--name", self.name, "--port", "0", "--metrics-port", "0",
+                    "--no-page", "--no-data", "--servers", str(self.servers),
+                ],
+                stdout=log, stderr=log, env=self._environment, cwd=self.folder,
+            )  # fmt: skip
+        until = time.monotonic() + _START_S
+        while time.monotonic() < until and self._process.poll() is None:
+            state = self._state()
+            ready = [each for each in state.get("servers", []) if each["state"] == "ready"]
+            if len(ready) >= self.servers:
+                self.port = int(state["balancer"]["port"])
+                return self
+            time.sleep(0.5)
+        log_text = (self.folder / f"{self.name}.log").read_text(encoding="utf-8", errors="replace")
+        self.__exit__(None, None, None)
+        raise SystemExit(f"the platform did not start:\n{log_text[-2000:]}")
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        """Stop it."""
+        if self._process is not None and self._process.poll() is None:
+            self._process.send_signal(signal.SIGTERM)
+            self._process.wait(60)
+
+    def robot(self, action: str, name: str, *options: str) -> None:
+        """Run ``rse-pf robot`` for this platform."""
+        subprocess.run(
+            [*_COMMAND, "robot", action, name, "--name", self.name, *options],
+            check=True, capture_output=True, env=self._environment, cwd=self.folder,
+        )  # fmt: skip
+
+    def token(self, robot: str) -> str:
+        """Return a token of this platform for *robot*."""
+        key = read_key(key_file(state_folder(self.name, self._environment)))
+        auth = PlatformSettings().auth
+        return key.issue(robot, now=time.time(), token_id=secrets.token_hex(8), settings=auth)
+
+    def _state(self) -> dict[str, Any]:
+        done = subprocess.run(
+            [*_COMMAND, "local", "status", "--name", self.name, "--json"],
+            capture_output=True, env=self._environment, cwd=self.folder, check=False,
+        )  # fmt: skip
+        try:
+            found: dict[str, Any] = json.loads(done.stdout)
+        except ValueError:
+            return {}
+        return found
