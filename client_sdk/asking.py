@@ -118,7 +118,7 @@ class Asking:
     async def close(self) -> None:
         """End what still runs."""
         await cancel_all(self._tasks)
-        self._burst.close()
+        await self._burst.close()
 
     async def _race(self, turns: deque[_Turn], call: Call, why: str) -> Ended:
         """Ask each place in its turn, or as soon as nobody else is asked; return the first good answer."""

@@ -15,6 +15,7 @@ from urllib.parse import urlsplit
 
 from client_sdk.answers import Answer
 from client_sdk.burst_rules import BurstRules, burst_address
+from client_sdk.region_sockets import cancel_all
 from rse_pf.config import BurstSettings
 from rse_pf.errors import RsePfError
 from rse_pf.wire import SUBPROTOCOLS, Codec, Command, Failure, Result, Welcome
@@ -24,7 +25,7 @@ __all__ = ["BURST_SERVICES", "Burst"]
 BURST_SERVICES = frozenset({"pnp"})
 """What the burst function answers."""
 
-_SERVER = "lambda"
+_SERVER, _COLD = "lambda", "x-rse-pf-cold"
 _OK, _UNAUTHORIZED, _FORBIDDEN, _TOO_MANY = 200, 401, 403, 429
 _TOKEN_S = 60.0
 """A token from a callable is used for this long; it is signed for longer."""
@@ -32,7 +33,9 @@ _IDLE_S = 20.0
 _MAX_IDLE = 4
 _MAX_HEAD_BYTES = 16384
 _MAX_RETRY_AFTER_S = 86400.0
-_CONSUMED = frozenset({"busy", "quota", "unauthorized", "forbidden", "connect", "expired", "bad-message"})
+_LONGEST_S = 5.0
+"""A call that takes longer has failed."""
+_OF_THE_FUNCTION = frozenset({"busy", "quota", "unauthorized", "forbidden", "connect", "bad-message"})
 """Failures of the function, and not of the command; they count for the breaker."""
 
 
@@ -95,6 +98,7 @@ class Burst:
         self._default_context: ssl.SSLContext | None = None
         self._token: tuple[float, str] | None = None
         self._idle: dict[str, list[_Idle]] = {}
+        self._tasks: set[asyncio.Task[Result | Failure]] = set()
 
     def heard(self, welcome: Welcome) -> None:
         """Take over what a server says of the function."""
@@ -125,50 +129,65 @@ class Burst:
         except RsePfError as error:
             return _failure(error.code, error.message, hint=error.hint)
         self.rules.sent()
+        work = asyncio.get_running_loop().create_task(self._finish(address, body, began))
+        self._tasks.add(work)
+        work.add_done_callback(self._tasks.discard)
+        # It goes on without the caller, so that the time of a late answer is known to the next one.
+        done, _ = await asyncio.wait({work}, timeout=deadline_s)
+        if not done:
+            return _failure("expired", f"the burst function did not answer within {deadline_s:.3f} s")
+        ended = work.result()
+        if isinstance(ended, Failure):
+            return ended
+        return Answer(
+            reply=ended.reply, source="burst", server=ended.server,
+            round_trip_ms=(self._clock() - began) * 1e3, queue_ms=0.0, compute_ms=ended.compute_ms,
+            payload_bytes=len(body), why=why,
+        )  # fmt: skip
+
+    async def _finish(self, address: str, body: bytes, began: float) -> Result | Failure:
+        """Post *body* and tell the rules what came of it, whether or not somebody still waits for it."""
         try:
-            ended = await asyncio.wait_for(self._post(address, body), deadline_s)
+            ended, is_cold = await asyncio.wait_for(self._post(address, body), _LONGEST_S)
         except asyncio.TimeoutError:
-            ended = _failure("expired", f"the burst function did not answer within {deadline_s:.3f} s")
+            ended = _failure("connect", f"the burst function did not answer within {_LONGEST_S:g} s")
+            is_cold = False
         except BaseException:
             self.rules.withdrawn()
             raise
         now = self._clock()
-        took_s = now - began
-        if isinstance(ended, Failure) and ended.code in _CONSUMED:
+        if isinstance(ended, Failure) and ended.code in _OF_THE_FUNCTION:
             after_s = min(_MAX_RETRY_AFTER_S, max(0.0, (ended.retry_after_ms or 0.0) / 1e3))
-            self.rules.failed(now, took_s, retry_after_s=after_s, jitter=self._random.random())
-            return ended
-        self.rules.answered(now, took_s)
-        if isinstance(ended, Failure):
-            return ended
-        return Answer(
-            reply=ended.reply, source="burst", server=ended.server, round_trip_ms=took_s * 1e3, queue_ms=0.0,
-            compute_ms=ended.compute_ms, payload_bytes=len(body), why=why,
-        )  # fmt: skip
+            self.rules.failed(now, retry_after_s=after_s, jitter=self._random.random())
+        else:
+            self.rules.answered(now, None if is_cold else now - began)
+        return ended
 
-    def close(self) -> None:
-        """Close the idle connections."""
+    async def close(self) -> None:
+        """End what still runs, and close the idle connections."""
+        await cancel_all(self._tasks)
         for idle in self._idle.values():
             for each in idle:
                 each.writer.transport.abort()
         self._idle.clear()
 
-    async def _post(self, address: str, body: bytes) -> Result | Failure:
+    async def _post(self, address: str, body: bytes) -> tuple[Result | Failure, bool]:
+        """Return the answer, and whether an execution had to be started for it."""
         try:
             token = await self._fresh_token()
             if token is None:
-                return _failure("unauthorized", "the burst function takes no robot without a token")
+                return _failure("unauthorized", "the burst function takes no robot without a token"), False
             response = await self._send(address, token, body)
         except RsePfError as error:
-            return _failure(error.code, error.message, hint=error.hint)
+            return _failure(error.code, error.message, hint=error.hint), False
         except (OSError, EOFError, asyncio.LimitOverrunError, _BrokenHttp) as error:
             cause = getattr(error, "strerror", None) or str(error) or type(error).__name__
-            return _failure("connect", f"cannot reach the burst function: {cause}")
+            return _failure("connect", f"cannot reach the burst function: {cause}"), False
         if response.status == _OK:
-            return self._decoded(response)
+            return self._decoded(response), response.headers.get(_COLD) == "true"
         if response.status == _UNAUTHORIZED:
             self._token = None
-        return _refused(response)
+        return _refused(response), False
 
     async def _fresh_token(self) -> str | None:
         now = self._clock()

@@ -22,7 +22,7 @@ _FIRST_PAUSE_S, _MAX_PAUSE_S = 1.0, 60.0
 _MAX_IN_FLIGHT = 8
 _RECENT = 16
 _FRESH_S = 10.0
-"""After this an answer's time counts no more, so that one cold start does not end all attempts."""
+"""After this an answer's time counts no more, so that a slow one does not end all attempts."""
 _SHARE = 0.75
 
 
@@ -57,26 +57,32 @@ class BurstRules:
         self.spent += 1
         self.in_flight += 1
 
-    def answered(self, now: float, took_s: float) -> None:
-        """Record an answer that arrived at *now* after *took_s*: the function works."""
-        self.in_flight -= 1
-        self._failures = 0
-        self._recent.append((now, took_s))
-
-    def failed(self, now: float, took_s: float, *, retry_after_s: float = 0.0, jitter: float = 0.5) -> None:
-        """Record a failure of the function, or that no answer came within *took_s*.
+    def answered(self, now: float, took_s: float | None) -> None:
+        """Record an answer that arrived at *now*: the function works.
 
         Args:
             now: Seconds.
-            took_s: How long the robot waited.
-            retry_after_s: How long the function asked it to stay away.
+            took_s: How long it took; None where an execution was started for it, which says nothing of the
+                next one.
+        """
+        self.in_flight -= 1
+        self._failures = 0
+        if took_s is not None:
+            self._recent.append((now, took_s))
+
+    def failed(self, now: float, *, retry_after_s: float = 0.0, jitter: float = 0.5) -> None:
+        """Record a failure of the function.
+
+        Args:
+            now: Seconds.
+            retry_after_s: How long the function asked the robot to stay away.
             jitter: Uniform in 0..1; the pause is between its half and the whole.
         """
         self.in_flight -= 1
-        self._failures += 1
-        self._recent.append((now, took_s))
+        is_open = self._failures >= _FAILURES and now < self._closed_until
+        self._failures += not is_open  # several in flight fail by one cause
         pause_s = 0.0
-        if self._failures >= _FAILURES:
+        if self._failures >= _FAILURES and not is_open:
             doubled = min(self._failures - _FAILURES, 16)
             pause_s = min(_MAX_PAUSE_S, _FIRST_PAUSE_S * 2.0**doubled) * (0.5 + 0.5 * jitter)
         self._closed_until = max(self._closed_until, now + max(pause_s, retry_after_s))

@@ -1,6 +1,6 @@
 """Robots at a server that is too small, with and without the burst function.
 
-    python -m benchmarks.cloud.burst [--robots 50] [--seconds 30] [--rate 5] [--deadline 0.25]
+    python -m benchmarks.cloud.burst [--robots 50] [--seconds 30] [--rate 8] [--deadline 0.3]
         [--emulated-cores 0.2] [--matches 200] [--budget N] [--out FILE]
 
 One server with a fifth of a core, and the function behind `lambda_pnp.local_front`, which plays firewall,
@@ -224,8 +224,8 @@ def _options() -> argparse.Namespace:
     )
     parser.add_argument("--robots", type=int, default=50)
     parser.add_argument("--seconds", type=float, default=30.0)
-    parser.add_argument("--rate", type=float, default=5.0, help="frames of a robot in a second")
-    parser.add_argument("--deadline", type=float, default=0.25, help="s")
+    parser.add_argument("--rate", type=float, default=8.0, help="frames of a robot in a second")
+    parser.add_argument("--deadline", type=float, default=0.3, help="s")
     parser.add_argument("--emulated-cores", type=float, default=0.2)
     parser.add_argument("--matches", type=int, default=200)
     parser.add_argument("--codec", default="zlib")

@@ -19,7 +19,7 @@ def rules(budget: int = 1000) -> BurstRules:
 def fail(of: BurstRules, now: float, times: int = 1, **changes: float) -> None:
     for _ in range(times):
         of.sent()
-        of.failed(now, 0.1, **changes)
+        of.failed(now, **changes)
 
 
 def test_the_budget_of_a_day_is_spent_once_and_is_there_again_on_the_next():
@@ -43,7 +43,7 @@ def test_no_run_spends_more_than_the_budget_in_its_day(events: list[tuple[float,
             if works:
                 limited.answered(now, 0.1)
             else:
-                limited.failed(now, 0.1)
+                limited.failed(now)
 
     first = sent[0] if sent else 0.0
     assert sum(now < first + DAY_S for now in sent) <= budget
@@ -66,14 +66,18 @@ def test_three_failures_in_a_row_open_the_breaker_and_one_trial_closes_it():
 
 
 def test_the_pause_doubles_and_is_never_longer_than_a_minute():
-    breaker = rules()
-    breaker.may_send(0.0)
-    fail(breaker, 0.0, 4, jitter=1.0)
-    assert not breaker.may_send(1.9)
-    assert breaker.may_send(2.0)
-    fail(breaker, 2.0, 30, jitter=1.0)
-    assert not breaker.may_send(61.0)
-    assert breaker.may_send(62.0)
+    breaker, now, pauses_s = rules(), 0.0, []
+    breaker.may_send(now)
+    fail(breaker, now, 2)
+    for _ in range(8):
+        fail(breaker, now, jitter=1.0)
+        fail(breaker, now, 5)  # what was in flight fails by the same cause
+        opens = next(now + each for each in (1, 2, 4, 8, 16, 32, 60) if breaker.may_send(now + each))
+        assert not breaker.may_send(opens - 0.01)
+        pauses_s.append(opens - now)
+        now = opens
+
+    assert pauses_s == [1, 2, 4, 8, 16, 32, 60, 60]
 
 
 def test_a_function_that_asks_for_a_pause_gets_it():
@@ -85,7 +89,15 @@ def test_a_function_that_asks_for_a_pause_gets_it():
     assert breaker.may_send(30.0)
 
 
-def test_a_single_cold_start_is_forgotten_after_ten_seconds():
+def test_a_cold_start_says_nothing_of_the_next_answer():
+    warm = rules()
+    warm.sent()
+    warm.answered(1.0, None)
+
+    assert warm.expected_s(1.0) == warm.first_s
+
+
+def test_a_slow_answer_is_forgotten_after_ten_seconds():
     slow = rules()
     slow.may_send(0.0)
     slow.sent()
