@@ -424,6 +424,7 @@ _TEXTS = {
     "rebalance": "{robots} robots of {server} are asked to move",
     "replace": "{server} is replaced by {by}: {reason}",
     "roll-step": "{server} is replaced ({number} of {of})",
+    "roll-stopped": "{server} did not become healthy, so the old servers stay",
     "server-failed": "{server} did not start: {reason}",
     "server-gone": "{server} ended (exit code {exit_code})",
     "server-ready": "{server} is ready (pid {pid})",

@@ -52,8 +52,11 @@ _UNREADABLE = (RsePfError, OSError, ValueError, KeyError, TypeError)
 """A server of another version, or one that is just killed, may answer anything: it is asked again."""
 _TROUBLE = ("gone", "failed", "unhealthy", "crash", "silent", "down", "taken", "not-")
 _SCALING = frozenset(
-    ("grow", "shrink", "replace", "drain-start", "drain-over", "roll-step", "rebalance", "robot-moved")
-)
+    (
+        "grow", "shrink", "replace", "drain-start", "drain-over", "roll-step", "roll-stopped", "rebalance",
+        "robot-moved",
+    )
+)  # fmt: skip
 
 
 class LocalFeed:

@@ -158,6 +158,7 @@ _EVENTS = {
     "replace": "{server} is replaced by {by}: {reason}",
     "robot-moved": "{robot} moved from {before} to {server}",
     "roll-step": "{server} is replaced, one of {of}",
+    "roll-stopped": "{server} did not become healthy, so the old servers stay",
     "server-failed": "{server} did not start: {reason}",
     "server-gone": "{server} ended (exit code {exit_code})",
     "server-healthy": "{server} is healthy and takes robots",

@@ -23,7 +23,7 @@ from rse_pf.local.control.monitor import Observed, ServerPhase
 from rse_pf.local.processes import STOP_TIMEOUT_S
 from rse_pf.local.servers.backend_servers import BackendServer, LocalBackendServers
 from rse_pf.local.servers.control_client import ControlPort
-from rse_pf.scaling.health import Health, time_to_notice_s
+from rse_pf.scaling.health import HEALTHY_CHECKS, LOCAL_INTERVAL_S, Health, time_to_notice_s
 
 __all__ = ["Fleet", "Member", "ServerHealth"]
 
@@ -39,8 +39,8 @@ _MIN_UPTIME_S = 10.0
 
 @dataclass(slots=True, kw_only=True)
 class Member:
-    """One server.  ``leaving``: it drains; ``out``: it was replaced and is killed; it takes no robots before
-    ``held_until_s``.
+    """One server.  ``leaving``: it drains; ``out``: it was replaced and is killed; ``on_trial``: it is the
+    first of a release, and is not replaced until it was healthy; it takes no robots before ``held_until_s``.
 
     Times are monotonic seconds; those of ``health`` are compressed with the rest.
     """
@@ -54,6 +54,7 @@ class Member:
     over: asyncio.Event = field(default_factory=asyncio.Event)
     leaving: bool = False
     out: bool = False
+    on_trial: bool = False
     replaces_living: bool = False
     adopted: bool = False
     robots: int = 0
@@ -102,8 +103,11 @@ class Fleet:
         emit: Callable[..., None],
         changed: Callable[[], None],
     ) -> None:
-        """Make a fleet without members; later servers serve *launch_s* after their launch, compressed."""
-        self._launch_s = launch_s / compress
+        """Make a fleet without members; later servers serve *launch_s* after their launch, compressed.
+
+        The checks of the balancer on this machine are part of that time.
+        """
+        self._launch_s = launch_s / compress - HEALTHY_CHECKS * LOCAL_INTERVAL_S
         self.members: dict[str, Member] = {}
         self.dead: dict[str, bool] = {}
         self.launched = 0
@@ -251,14 +255,17 @@ class Fleet:
             warming=sum(self.is_warming(member, now_s) for member in there),
             healthy=sum(member.phase == "healthy" for member in there),
             replacing=sum(member.replaces_living and member.phase == "starting" for member in there),
-            broken=tuple(member.name for member in there if member.phase == "unhealthy"),
+            broken=tuple(
+                member.name for member in there if member.phase == "unhealthy" and not member.on_trial
+            ),
             dead=dict(self.dead),
         )
 
-    def grow(self, count: int, reason: str) -> Sequence[str]:
+    def grow(self, count: int, reason: str, *, on_trial: bool = False) -> Sequence[str]:
         """Launch *count* servers at once; return their names."""
         members = [self.launch() for _ in range(count)]
         for member in members:
+            member.on_trial = on_trial
             member.held_until_s = member.launched_s + self._launch_s
             self.start(member)
         return [member.name for member in members]
@@ -290,6 +297,14 @@ class Fleet:
             self._backend_servers.send(name, signal.SIGKILL)
         self.start(new)
         return new.name
+
+    def withdraw(self, name: str) -> None:
+        """End the new server *name*, which did not become healthy; it is not replaced."""
+        member = self.members.get(name)
+        if member is not None:
+            member.out = True
+            self._set_targets()
+            self._backend_servers.send(name, signal.SIGKILL)
 
     # --- drain -----------------------------------------------------------------------------------
 
@@ -369,7 +384,7 @@ class Fleet:
         member.healthy_s = time.monotonic()
         if member.health.state == "starting":
             member.health = dataclasses.replace(member.health, state="healthy")
-        member.replaces_living = False
+        member.replaces_living = member.on_trial = False
         member.healthy.set()
         self._emit("server-healthy", server=member.name, pid=server.pid)
         self.on_healthy()
@@ -394,6 +409,8 @@ class Fleet:
         self._changed()
 
     def _lost(self, member: Member) -> None:
+        if member.on_trial:
+            return
         young_since_s = time.monotonic() - _MIN_UPTIME_S
         self.dead[member.name] = member.healthy_s is None or member.healthy_s > young_since_s
         self.on_lost()

@@ -323,17 +323,30 @@ class LocalPlatform:
     async def roll(self) -> None:
         """Replace every server, one by one: the new one serves before the old one is drained.
 
+        A warm standby of before is ended first: it has the old release in its memory.
+
         Raises:
-            ConfigurationError: A new server did not become healthy; the old ones that are left serve on.
+            ConfigurationError: A new server did not become healthy, and was withdrawn; the roll has stopped
+                and the old servers that are left serve on.
         """
         self._control.hold = True
         try:
             servers = [server.name for server in self.servers]
+            self.backend_servers.standby.close()
             for number, old in enumerate(servers, 1):
                 self._emit("roll-step", server=old, number=number, of=len(servers))
                 await self.backend_servers.standby.wait_warm(self.settings.local.start_timeout_s)
-                names = list(self._fleet.grow(1, "rolling replacement"))
-                await self._until_healthy(names)
+                names = list(self._fleet.grow(1, "rolling replacement", on_trial=True))
+                try:
+                    await self._until_healthy(names)
+                except ConfigurationError as error:
+                    for name in names:
+                        self._fleet.withdraw(name)
+                    self._emit("roll-stopped", server=names[0], number=number, of=len(servers))
+                    raise ConfigurationError(
+                        f"the roll stopped at new server {number} of {len(servers)}: {error.message}",
+                        hint=f"the old ones serve on; look at the log {names[0]}.log, then roll again",
+                    ) from error
                 if old in self._fleet.members:
                     await self.drain(old, reason="rolling replacement")
         finally:

@@ -9,6 +9,7 @@ import os
 import pathlib
 import pwd
 import re
+import resource
 import shlex
 import signal
 import subprocess
@@ -89,7 +90,9 @@ def main():
     ORDERS.write_text("")
     began = time.monotonic()
     code = subprocess.run(["/usr/bin/python3", "/boot-test/user-data"]).returncode
-    say("user-data ended with", code, f"after {time.monotonic() - began:.1f} s")
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    spent = f"after {time.monotonic() - began:.1f} s, {used.ru_utime + used.ru_stime:.1f} s of CPU"
+    say("user-data ended with", code, spent)
     services, done = {}, 0
     while True:
         orders = ORDERS.read_text().splitlines()
