@@ -18,7 +18,7 @@ class DelayingProxy:
         self.delay_s = delay_s
         self.is_stalled = False
         self.accepted = 0
-        self._target = port
+        self.target = port
         self._server: asyncio.Server | None = None
         self._tasks: set[asyncio.Task[None]] = set()
         self._writers: set[asyncio.StreamWriter] = set()
@@ -63,7 +63,7 @@ class DelayingProxy:
         there: asyncio.StreamWriter | None = None
         try:
             await asyncio.sleep(2 * self.delay_s)
-            back, there = await asyncio.open_connection("127.0.0.1", self._target)
+            back, there = await asyncio.open_connection("127.0.0.1", self.target)
             self._writers.add(there)
             await asyncio.gather(self._pump(reader, there), self._pump(back, writer))
         except (OSError, asyncio.CancelledError):

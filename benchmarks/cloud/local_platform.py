@@ -14,7 +14,7 @@ from types import TracebackType
 from typing import Any
 
 from rse_pf.config import PlatformSettings
-from rse_pf.local.firewall import key_file, read_key
+from rse_pf.local.firewall import ensure_key, key_file, read_key
 from rse_pf.local.state import state_folder
 
 __all__ = ["LocalPlatform"]
@@ -26,8 +26,10 @@ _COMMAND = [sys.executable, "-m", "rse_pf.cli.main"]
 class LocalPlatform:
     """``rse-pf local`` under *name*, with files of its own in *folder*; use it with ``with``."""
 
-    def __init__(self, name: str, folder: Path, *, servers: int = 2) -> None:
+    def __init__(self, name: str, folder: Path, *, servers: int = 2, seed: bytes | None = None) -> None:
+        """Describe it; platforms with the same *seed* (32 bytes) accept the tokens of each other."""
         self.name, self.servers = name, servers
+        self._seed = seed
         self.folder = folder
         self.port = 0
         self._process: subprocess.Popen[bytes] | None = None
@@ -36,6 +38,10 @@ class LocalPlatform:
     def __enter__(self) -> LocalPlatform:
         """Start it and wait until all its servers are ready."""
         self.folder.mkdir(parents=True, exist_ok=True)
+        if self._seed is not None:
+            state_of_mine = state_folder(self.name, self._environment)
+            state_of_mine.mkdir(mode=0o700, parents=True, exist_ok=True)
+            ensure_key(state_of_mine, seed=self._seed, key_id="bench")
         with (self.folder / f"{self.name}.log").open("wb") as log:
             self._process = subprocess.Popen(
                 [
@@ -66,6 +72,15 @@ class LocalPlatform:
         if self._process is not None and self._process.poll() is None:
             self._process.send_signal(signal.SIGTERM)
             self._process.wait(60)
+
+    def kill(self) -> None:
+        """End all its processes by SIGKILL, the one that would replace them first."""
+        state = self._state()
+        boxes = [state["control_plane"], state["balancer"], *state["servers"]]
+        for box in boxes:
+            os.kill(int(box["pid"]), signal.SIGKILL)
+        assert self._process is not None
+        self._process.wait(60)
 
     def robot(self, action: str, name: str, *options: str) -> None:
         """Run ``rse-pf robot`` for this platform."""
