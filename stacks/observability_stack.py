@@ -7,6 +7,7 @@ The alarms here notify people; they do not scale the group.  What they measure i
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 
 import aws_cdk as cdk
 from aws_cdk import aws_budgets as budgets
@@ -17,6 +18,7 @@ from rse_pf.config import PlatformSettings
 from rse_pf.config.resource_names import ResourceNames
 from rse_pf.scaling.alarms import NAMESPACE
 from rse_pf.scaling.operator_alarms import OperatorAlarm, Series, operator_alarms
+from stacks.canary import Canary
 from stacks.values import read
 
 __all__ = ["ObservabilityStack"]
@@ -31,7 +33,7 @@ Dimensions = Mapping[str, str]
 
 
 class ObservabilityStack(cdk.Stack):
-    """Dashboard, operator alarms and budget; it reads what the backend and data stacks provide."""
+    """Dashboard, operator alarms, canary and budget; it reads what the backend and data stacks provide."""
 
     def __init__(
         self,
@@ -39,6 +41,7 @@ class ObservabilityStack(cdk.Stack):
         construct_id: str,
         *,
         settings: PlatformSettings,
+        assets: Path,
         env: cdk.Environment,
         synthesizer: cdk.IStackSynthesizer | None = None,
     ) -> None:
@@ -60,6 +63,10 @@ class ObservabilityStack(cdk.Stack):
         self._dashboard(names, settings)
         for alarm in operator_alarms(settings):
             self._alarm(alarm, names, topic)
+        if settings.cloud.canary:
+            Canary(
+                self, "Canary", settings=settings, assets=assets, url=read(self, names, "backend/url")
+            )  # fmt: skip
         if settings.cloud.budget_per_month:
             self._budget(names, settings.cloud.budget_per_month, topic)
 
@@ -157,7 +164,7 @@ class ObservabilityStack(cdk.Stack):
         )
         identity = "".join(word.capitalize() for word in alarm.name.split("-"))
         cloudwatch.CfnAlarm(
-            self, identity, alarm_name=names.alarm(alarm.name),
+            self, f"{identity}Alarm", alarm_name=names.alarm(alarm.name),
             alarm_description=f"{alarm.meaning}; runbook: docs/operations.md#{alarm.name}",
             metrics=[*queries, verdict], comparison_operator=alarm.comparison, threshold=alarm.threshold,
             evaluation_periods=alarm.periods, datapoints_to_alarm=alarm.datapoints,

@@ -27,11 +27,13 @@ ORDER = ("Network", "Data", "Backend", "Serverless", "Observability")
 IGNORED = {
     "AWS::AutoScaling::LifecycleHook",
     "AWS::AutoScaling::ScalingPolicy",
+    "AWS::Budgets::Budget",
     "AWS::CloudWatch::Alarm",
     "AWS::EC2::NetworkAcl",
     "AWS::EC2::NetworkAclEntry",
     "AWS::EC2::SecurityGroupEgress",
     "AWS::EC2::SubnetNetworkAclAssociation",
+    "AWS::Lambda::EventInvokeConfig",
     "AWS::S3::BucketPolicy",
     "AWS::SNS::TopicPolicy",
     "AWS::SecretsManager::Secret",
@@ -79,6 +81,9 @@ def adapted(template: dict[str, Any], image: str) -> dict[str, Any]:
         elif name == "BootstrapVersion":
             parameter.update(Type="String", Default="30")
     ignored = {name for name, each in made["Resources"].items() if each["Type"] in IGNORED}
+    for name, each in made["Resources"].items():
+        if each["Type"] == "AWS::SecretsManager::Secret":
+            made = _replaced(made, {"Ref": name}, "arn:aws:secretsmanager:ap-northeast-2:1:secret:it")
     for name, output in list(made.get("Outputs", {}).items()):
         read = set(references(output["Value"]))
         if any(resource in ignored or attribute == "TargetGroupFullName" for resource, attribute in read):
@@ -88,6 +93,15 @@ def adapted(template: dict[str, Any], image: str) -> dict[str, Any]:
         depends = [depends] if isinstance(depends, str) else depends
         resource["DependsOn"] = [name for name in depends if name not in ignored]
     return made
+
+
+def _replaced(value: Any, old: Any, new: Any) -> Any:
+    """Return *value* with *new* in place of each *old* in it."""
+    if value == old:
+        return new
+    if isinstance(value, dict):
+        return {name: _replaced(each, old, new) for name, each in value.items()}
+    return [_replaced(each, old, new) for each in value] if isinstance(value, list) else value
 
 
 @pytest.fixture
@@ -141,7 +155,7 @@ def test_every_stack_is_created_and_what_moto_made_equals_the_settings(
 ) -> None:
     settings, scaling = assembly.settings, assembly.settings.scaling
 
-    assert created.ignored == IGNORED, "the exact list of what moto does not make"
+    assert created.ignored == {each for each in IGNORED if assembly.all(each)}, "the exact list of what moto does not make"
     assert created.statuses == dict.fromkeys(ORDER, "CREATE_COMPLETE")
     (group,) = client("autoscaling").describe_auto_scaling_groups()["AutoScalingGroups"]
     assert (group["MinSize"], group["MaxSize"]) == (scaling.min_servers, scaling.max_servers)

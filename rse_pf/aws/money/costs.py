@@ -20,6 +20,8 @@ from rse_pf.scaling.alarms import alarms_of
 from rse_pf.scaling.operator_alarms import operator_alarms
 
 __all__ = [
+    "CANARY_MB",
+    "CANARY_PERIOD_S",
     "HOURS",
     "NOT_INCLUDED",
     "Bill",
@@ -50,7 +52,9 @@ _MB_OF_A_VCPU = 1769
 _DETAILED_METRICS = 7
 """That EC2 publishes each minute for a server with detailed monitoring."""
 _UNITS = "capacity units"
-_CANARY_MB, _CANARY_S, _CANARY_PERIOD_S = 256, 1.0, 60
+CANARY_MB, CANARY_PERIOD_S = 512, 60
+"""Memory of the canary's function, and the time between two calls."""
+_CANARY_S = 1.0
 
 Needs = Literal["servers", "front", "nothing"]
 """What a line is paid for: running servers, the front door (balancer, firewall, endpoints), or anyway."""
@@ -299,7 +303,7 @@ def _front_lines(settings: PlatformSettings, prices: Prices, load: Load) -> Iter
         ("load balancer", _UNITS, 0 if not units else units / prices.balancer_unit_per_hour * hours,
          "h", prices.balancer_unit_per_hour),
         ("firewall", "web ACL", 1, "", prices.firewall_per_month),
-        ("firewall", "its rules", len(rate_rules(settings)), "rules", prices.firewall_rule_per_month),
+        ("firewall", "its rules", len(rate_rules(settings)) + 1, "rules", prices.firewall_rule_per_month),
         *(
             (box, f"endpoint of {service}, in {zone_count(settings)} zone(s)",
              zone_count(settings) * HOURS, "h", prices.endpoint_per_hour)
@@ -326,8 +330,8 @@ def _monitor_lines(settings: PlatformSettings, prices: Prices) -> Iterable[CostL
     ):  # fmt: skip
         yield CostLine(box=box, what=what, count=count, unit="metrics", price=alarm)
     if settings.cloud.canary:
-        calls = _MONTH_S / _CANARY_PERIOD_S
-        gb_s = calls * _CANARY_S * _CANARY_MB / 1024
+        calls = _MONTH_S / CANARY_PERIOD_S
+        gb_s = calls * _CANARY_S * CANARY_MB / 1024
         yield CostLine(
             box="monitor", what="canary, each minute", count=gb_s, unit="GB-s",
             price=prices.lambda_per_gb_s + prices.lambda_per_million / 1e6 * calls / gb_s,

@@ -1,0 +1,128 @@
+"""The canary: ask for one known pose through the front door, as a robot does, and fail if it is not right.
+
+A schedule calls it each minute.  It is an enrolled robot with a key of its own in a secret that only it may
+read, and with the scope services:pnp; it can sign nothing for another robot.  A failed execution is a data
+point of the function's metric Errors, on which the alarm `canary` goes; one log line says what happened.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import secrets
+import sys
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lambda_pnp.websocket import WebSocket
+from rse_pf.auth.tokens import SigningKey
+from rse_pf.aws.clients import call_api, make_client
+from rse_pf.config import PlatformSettings, load_settings
+from rse_pf.errors import Expired, InternalError, RsePfError
+from rse_pf.pnp.problems import make_problem
+from rse_pf.service import Registry
+from rse_pf.services import pnp
+from rse_pf.wire import SUBPROTOCOLS, make_codec
+from rse_pf.wire.client_session import Answered, ClientSession, ConnectionLost, Notice, Welcomed
+from rse_pf.wire.codec import as_type
+from rse_pf.wire.messages import Failure
+
+__all__ = ["ask_known_pose", "handler", "read_key"]
+
+_ROOT = Path(__file__).resolve().parents[1]
+_CODEC = "zlib"
+_TIMEOUT_S = 10.0
+_SEED, _MAX_ERROR = 20260101, 0.02
+_KEYS: dict[str, SigningKey] = {}
+"""Read once in the life of an execution environment."""
+
+
+def handler(event: Mapping[str, Any], context: Any) -> dict[str, Any]:
+    """Ask once; raises RsePfError, so that Lambda counts an error, if there was no right pose in time."""
+    settings, trace = load_settings(_ROOT / "settings.json"), secrets.token_hex(16)
+    try:
+        told = _ask(os.environ, settings, trace)
+    except RsePfError as error:
+        _KEYS.clear()  # it may have been replaced
+        _log(event="canary-failed", trace=trace, code=error.code, error=error.message[:200])
+        raise
+    _log(event="canary-solved", trace=trace, **told)
+    return told
+
+
+def read_key(secret: str, region: str) -> SigningKey:
+    """Return the private key of the canary's robot from the secret; raises RsePfError."""
+    found = call_api(make_client("secretsmanager", region), "get_secret_value", SecretId=secret)
+    return SigningKey.from_json(str(found["SecretString"]))
+
+
+def ask_known_pose(
+    url: str, token: str, settings: PlatformSettings, *, trace: str, clock: Callable[[], float]
+) -> dict[str, Any]:
+    """Ask for the pose of one seeded problem at *url*; return the server, the time in ms and the error.
+
+    Args:
+        url: Of the front door, such as ``wss://robots.example.org/ws``.
+        token: Of the canary's robot.
+        settings: Limits of the session.
+        trace: Written to the server's log beside the command.
+        clock: Monotonic seconds.
+
+    Raises:
+        RsePfError: No server answers, it refuses, the answer is late, or the pose is wrong.
+    """
+    problem = make_problem(seed=_SEED, noise_px=0.5, outlier_ratio=0.3)
+    registry = Registry()
+    pnp.register(registry, settings.pnp)
+    codec = make_codec(_CODEC, settings.session, pnp=pnp.wire_types(registry))
+    session = ClientSession(codec=codec, settings=settings.session, sdk="rse-pf-canary")
+    began = clock()
+    request = pnp.make_request(problem.points_world, problem.pixels, problem.camera)
+    with WebSocket.dial(url, subprotocol=SUBPROTOCOLS[_CODEC], token=token, timeout_s=_TIMEOUT_S) as socket:
+        connection = session.open_connection(clock())
+        session.submit("pnp", request, now=clock(), deadline_s=_TIMEOUT_S, trace=trace)
+        while clock() - began < _TIMEOUT_S:
+            while connection.outgoing:
+                socket.send(connection.outgoing.pop(0))
+            for event in session.receive(connection, socket.receive(), clock()):
+                if isinstance(event, Welcomed):
+                    session.adopt(connection, clock())
+                elif isinstance(event, Answered):
+                    return _judged(event, problem.T_camera_world, (clock() - began) * 1e3)
+                elif isinstance(event, ConnectionLost | Notice):
+                    raise InternalError(f"the session failed: {event}", hint="read the server's journal")
+    raise Expired(f"no answer within {_TIMEOUT_S:g} s", hint="read the servers' journals")
+
+
+def _judged(event: Answered, expected: Any, took_ms: float) -> dict[str, Any]:
+    answer = event.answer
+    if isinstance(answer, Failure):
+        raise InternalError(f"{answer.server} answered {answer.code}: {answer.message}", hint=answer.hint)
+    pose = as_type(answer.reply, pnp.PnpReply).solution().T_camera_world
+    error = float(np.abs(pose - expected).max())
+    if not error < _MAX_ERROR:
+        raise InternalError(
+            f"the pose of {answer.server} is wrong by {error:.3g}, more than {_MAX_ERROR:g}",
+            hint="compare the release of the servers with the last good one",
+        )
+    return {"server": answer.server, "took_ms": round(took_ms, 1), "error": round(error, 6)}
+
+
+def _ask(environment: Mapping[str, str], settings: PlatformSettings, trace: str) -> dict[str, Any]:
+    secret, robot = environment["RSE_PF_CANARY_SECRET"], environment["RSE_PF_CANARY_ROBOT"]
+    if secret not in _KEYS:
+        _KEYS[secret] = read_key(secret, settings.cloud.region)
+    token = _KEYS[secret].issue(
+        robot, now=time.time(), token_id=secrets.token_hex(12), settings=settings.auth
+    )  # fmt: skip
+    return ask_known_pose(
+        environment["RSE_PF_CANARY_URL"], token, settings, trace=trace, clock=time.monotonic
+    )
+
+
+def _log(**fields: Any) -> None:
+    sys.stderr.write(json.dumps(fields) + "\n")
