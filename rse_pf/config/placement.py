@@ -15,7 +15,7 @@ from typing import Any
 from rse_pf.config.settings import LiveSettings, PlatformSettings
 from rse_pf.errors import SettingsError
 
-__all__ = ["ServerPlacement", "is_loopback", "live_ports"]
+__all__ = ["ServerPlacement", "fixed_live_ports", "is_loopback", "live_ports"]
 
 _ELSEWHERE = {"store": ("data", "store"), "live_host": ("live", "host")}
 """Fields that are no settings of the group serving: their groups and names there."""
@@ -82,6 +82,11 @@ def live_ports(live: LiveSettings) -> range:
     """
     if is_loopback(live.host) or not live.first_port:
         return range(1)
+    return fixed_live_ports(live)
+
+
+def fixed_live_ports(live: LiveSettings) -> range:
+    """Return the ports of `live_ports` where other machines connect; ``live.first_port`` is not 0."""
     return range(live.first_port, live.first_port + live.ports)
 
 

@@ -85,6 +85,7 @@ def test_a_contradiction_is_refused_with_both_numbers(overrides: dict[str, Any],
         ({"scaling": {"busy_cpu_percent": float("nan")}}, "not a finite number", "correct it"),
         ({"burst": {"url": "robots.example.org"}}, "no place to send commands to", "/burst"),
         ({"burst": {"url": "ftp://robots.example.org/burst"}}, "no place to send commands to", "/burst"),
+        ({"cloud": {"replica_maps": "maps s3://maps"}}, "'s3://maps', which is no name of a bucket", "s3://"),
         ({"session": {"max_inflate_ratio": float("inf")}}, "not a finite number", "correct it"),
         ({"session": {"max_inflate_ratio": 10**400}}, "not a finite number", "correct it"),
         ({"serving": {"max_robots": 10**5000}}, "not a finite number", "correct it"),
@@ -123,6 +124,8 @@ def test_the_digest_changes_with_every_setting(row: SettingRow) -> None:
         "schedule": {"schedule": "daily 08:00 min 3"},
         "time_zone": {"time_zone": "Asia/Seoul"},
         "other_instance_types": {"other_instance_types": "c6i.large"},
+        "replica_maps": {"replica_maps": "maps-in-virginia"},
+        "replica_artifacts": {"replica_artifacts": "artifacts-in-virginia"},
     }
     values = {row.name: other(row), **companions.get(row.name, {})}
 

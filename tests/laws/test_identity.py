@@ -20,6 +20,7 @@ MEANT = {
     # An operator names a robot by tenant and name, whatever key it was enrolled with.
     "rse_pf/backend/sandbox/circuit_breaker.py: robot: str | None",
     "rse_pf/backend/sandbox/manager.py: robot: str | None",
+    "rse_pf/backend/sandbox/reloading.py: robot: str | None",
     "rse_pf/backend/supervisor/orders.py: robot: str | None",
     "rse_pf/backend/live_map/owner/requests.py: robot: str",
     # Text of `RobotId.folder`, as the events of a live map have it.

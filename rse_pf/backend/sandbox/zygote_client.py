@@ -51,7 +51,7 @@ class ZygoteClient:
             on_gone: Called with the number of a sandbox that ended, and how it ended.
             on_lost: Called when the zygote ended, and every sandbox with it; a new one is starting then.
             on_ready: If given, nothing blocks: it is called once, with the means of isolation that are
-                missing, or with None if the zygote ended before.  Whoever gives it judges them.
+                missing, or with None if the zygote ended before.  The caller judges them.
 
         Raises:
             ConfigurationError: It did not start, or a means of isolation is missing and weak isolation
@@ -201,7 +201,7 @@ class ZygoteClient:
                 self._on_gone(report["id"], report["how"])
 
     def _tell_ready(self, missing: tuple[str, ...] | None) -> bool:
-        """Tell whoever waits for it, outside of this call; return whether somebody did."""
+        """Call `on_ready` once, outside of this call; return whether there was one."""
         told, self._on_ready = self._on_ready, None
         if told is not None:
             self._loop.call_soon(told, missing)

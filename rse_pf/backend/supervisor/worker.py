@@ -309,7 +309,7 @@ class _Worker:
             return SandboxManager(
                 services,
                 settings=settings,
-                max_sandboxes=-(-chosen.max_sandboxes // plan.workers),
+                max_sandboxes=-(-settings.services.max_sandboxes // plan.workers),
                 server_id=plan.server_id,
                 store=open_data_store(settings),
                 monotonic=time.monotonic,
