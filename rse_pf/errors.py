@@ -25,6 +25,7 @@ __all__ = [
     "ConnectError",
     "Crashed",
     "DegenerateGeometry",
+    "DeploymentFailed",
     "Disconnected",
     "Expired",
     "Forbidden",
@@ -424,6 +425,15 @@ class InvalidCamera(PnpError, code="invalid-camera"):
 
 
 # --- objects -----------------------------------------------------------------------------------
+
+
+class DeploymentFailed(RsePfError, code="deployment"):
+    """A step of rse-pf cloud up, park, resume, down or upgrade failed; what was done before it stays.
+
+    Cause: CloudFormation or the CDK refused a stack, or servers did not become healthy or end in time.
+    Check: Read the lines above the message, then rse-pf cloud status.
+    Fix: Remove the cause that the message names, then repeat the same command: it continues.
+    """
 
 
 class StoreError(RsePfError, code="store"):

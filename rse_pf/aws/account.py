@@ -64,6 +64,21 @@ class Account:
             ) from None
         return found
 
+    def change(self, service: str, method: str, **arguments: Any) -> dict[str, Any]:
+        """Return the answer of one call that changes something which must exist.
+
+        Raises:
+            ConfigurationError: AWS refused, or what the call names does not exist.
+            StoreError: AWS does not answer.
+        """
+        found = self.find(service, method, **arguments)
+        if found is None:
+            raise ConfigurationError(
+                f"AWS refuses {service} {method}: it is not there, or cannot be changed so",
+                hint="rse-pf cloud status shows what there is; then repeat the command",
+            )
+        return found
+
     def pages(self, service: str, method: str, rows: str, **arguments: Any) -> list[Any]:
         """Return *rows* of every page of a call; none if what it names does not exist.  Raises as `find`."""
         client = self.client(service)

@@ -104,8 +104,18 @@ def with_retries(
         sleep(pause_s)
         pause_s *= 2
     raise StoreError(
-        f"AWS does not answer: {last}", hint="check the endpoints of the VPC and status.aws.amazon.com"
+        f"AWS does not answer: {_in_words(last)}",
+        hint="check the endpoints of the VPC and status.aws.amazon.com",
     ) from last
+
+
+def _in_words(error: Any) -> str:
+    """Return *error* on one line, without the page of HTML that a proxy or a load balancer may have sent."""
+    text = str(error)
+    if "<" not in text and "\n" not in text:
+        return text
+    status = status_of(error) if hasattr(error, "response") else 0
+    return f"HTTP status {status}" if status else f"{type(error).__name__}, an answer that is none of AWS"
 
 
 def call_api(client: Any, method: str, **arguments: Any) -> dict[str, Any]:
@@ -128,7 +138,8 @@ def status_of(error: Any) -> int:
 
 def error_code(error: Any) -> str:
     """Return the AWS error code of a ClientError, such as ``AccessDenied``; empty when it has none."""
-    return str(error.response.get("Error", {}).get("Code", ""))
+    code = str(error.response.get("Error", {}).get("Code", ""))
+    return f"HTTP status {status_of(error)}" if "<" in code else code
 
 
 def _is_temporary(error: Any) -> bool:

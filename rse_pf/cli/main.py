@@ -40,7 +40,7 @@ VERBS = {
     "batch": "merge maps that outgrow one process, in parts that survive a crash",
     "replay": "explain a bad pose from a recording, and solve recorded commands again",
     "audit": "show the audit log of robots and changes, and check that it is unchanged",
-    "cloud": "check the platform on AWS: doctor, cost, status, leftovers",
+    "cloud": "run the platform on AWS: up, park, resume, down, status, cost, doctor",
     "settings": "show every setting: value, default, unit, source",
     "doctor": "check what this machine needs, and say how to fix it",
     "errors": "explain an error by its code: cause, check, fix",

@@ -14,6 +14,7 @@ __all__ = [
     "DENY_NAME",
     "DEPLOYMENT_TAG",
     "HEALTH_PATH",
+    "JOURNAL_PREFIX",
     "KEYS_NAME",
     "READY_PATH",
     "ROBOTS_NAME",
@@ -38,6 +39,8 @@ ROBOTS_NAME = "control/robots.json"
 """Of the roster beside it: who is enrolled."""
 DENY_NAME = "control/deny.json"
 """Of the deny-list beside it: who is refused."""
+JOURNAL_PREFIX = "journals"
+"""Of what servers logged, in the artifact bucket; one folder for each instance."""
 SERVICES_PREFIX = "services"
 """Of the published services in the artifact bucket: their list and their archives."""
 BUDGET_NAME = "burst/budget.json"
@@ -83,6 +86,21 @@ class ResourceNames:
     def launch_hook(self) -> str:
         """Return the name of the lifecycle hook that an instance completes when it is ready."""
         return f"{self.prefix}-launch"
+
+    @property
+    def job_group(self) -> str:
+        """Return the name of the Auto Scaling group of job servers."""
+        return f"{self.prefix}-jobs"
+
+    @property
+    def job_drain_hook(self) -> str:
+        """Return the name of the lifecycle hook that a job server completes when it has left its jobs."""
+        return f"{self.prefix}-jobs-drain"
+
+    @property
+    def job_launch_hook(self) -> str:
+        """Return the name of the lifecycle hook that a job server completes when it is ready."""
+        return f"{self.prefix}-jobs-launch"
 
     @property
     def dashboard(self) -> str:

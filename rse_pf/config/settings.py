@@ -258,6 +258,8 @@ class BatchSettings:
     workers: int = setting(2, unit="processes", doc="processes on this machine that compute parts; 0 leaves all parts to job servers", low=0, high=64)
     pairs_per_part: int = setting(500, unit="pairs", doc="keyframe pairs of one part; what a killed worker loses", source="5.3 ms for a pair of 1,000 features each: 2.7 s", low=10, high=100000)
     max_keyframes: int = setting(20000, unit="keyframes", doc="keyframes of all maps of one merge in parts", source="the largest map that is stored", low=1, high=20000)
+    first_port: int = setting(8790, doc="first of the ports of a batch with --host: of its scheduler; workers take the next ones", low=1024, high=65000)
+    ports: int = setting(100, unit="ports", doc="ports of a batch with --host, which the firewall opens between job servers", low=2, high=500)
     part_tries: int = setting(3, doc="a part whose workers ended this often is not tried again", low=1, high=10)
     scheduler_restarts: int = setting(3, doc="how often a lost scheduler on this machine is started again", low=0, high=10)
 
@@ -275,6 +277,7 @@ class LocalSettings:
     metrics_port: int = setting(9464, doc="port of the control plane on loopback: /metrics of all servers, for Prometheus; 0 takes a free one", source="OpenTelemetry's Prometheus exporter", low=0, high=65535)
     page_port: int = setting(8701, doc="port of the fleet page on loopback; 0 takes a free one, and so does a port that is taken", low=0, high=65535)
     foxglove_port: int = setting(8765, doc="port on loopback of the export to Foxglove (rse-pf local --foxglove); 0 takes a free one", low=0, high=65535)
+    burst_port: int = setting(8702, doc="port on loopback of the burst function (rse-pf local --burst)", low=1, high=65535)
     certificate: str = setting("", doc="file of the load balancer's certificate chain (PEM); robots then connect by wss://")
     private_key: str = setting("", doc="file of the private key of local.certificate (PEM)")
 
@@ -305,6 +308,9 @@ class CloudSettings:
     warm_servers: int = setting(0, unit="servers", doc="stopped servers that are ready to start; not together with spot or other_instance_types", source="warm pools of AWS Auto Scaling", low=0, high=50)
     spot: bool = setting(False, doc="servers above on_demand_servers are Spot instances, which AWS may take back within two minutes")
     on_demand_servers: int = setting(1, unit="servers", doc="servers that are never Spot instances", low=0, high=1000)
+    job_servers: int = setting(0, unit="servers", doc="most job servers: Spot instances that run long jobs of robots and batches; needs serving.offer_jobs; 0 is none", low=0, high=100)
+    job_instance_types: str = setting("c7i.large c6i.large m7i.large", doc="EC2 types of job servers (x86-64), with spaces between; the cheapest that is to be had is taken")
+    job_idle_s: int = setting(600, unit="s", doc="without any job for this long job servers end, one each minute", low=60, high=86400)
     image_parameter: str = setting("/aws/service/debian/release/12/latest/amd64", doc="SSM parameter that names the machine image", source="Debian's public parameter")
     profile: str = setting("standard", doc="small: one zone for servers and endpoints, and one server of a small type unless you set these; see docs/operations.md", choices=("standard", "small"))
     canary: bool = setting(True, doc="a function that asks for one known pose through the load balancer every minute, and an alarm")
@@ -314,7 +320,7 @@ class CloudSettings:
     robot_cidr: str = setting("0.0.0.0/0", doc="addresses that robots may connect from")
     robots_per_site: int = setting(100, unit="robots", doc="WAF: robots behind one address that may all connect, and send data, in the same minute", low=1, high=100000)
     data_requests_per_minute: int = setting(600, unit="requests/min", doc="WAF: data requests of one robot, averaged over the robots of a site; data.max_requests_per_s bounds each alone", low=10)
-    boot_s: int = setting(300, unit="s", doc="time that the launch hook gives a new server to become ready; then it is replaced", source="four times the estimate of docs/design.md", low=180, high=7200)
+    boot_s: int = setting(300, unit="s", doc="time that the launch hook gives a new server to become ready; then it is replaced", source="four times rse_pf/scaling/boot_time.py", low=180, high=7200)
     drain_s: int = setting(60, unit="s", doc="time that the termination hook gives a server to drain", low=30, high=7200)
     poll_s: int = setting(5, unit="s", doc="time between two reads of an instance's lifecycle state", low=1, high=60)
     lambda_memory_mb: int = setting(1769, unit="MB", doc="memory of the serverless PnP; 1769 is one vCPU", low=128, high=10240)
@@ -420,6 +426,11 @@ def _check_contradictions(s: PlatformSettings) -> None:
     for origin in s.serving.allowed_origins.split():
         check_origin("serving.allowed_origins", origin)
     check_elasticity(s.scaling, s.cloud)
+    if s.cloud.job_servers and not s.serving.offer_jobs:
+        raise SettingsError(
+            f"cloud.job_servers = {s.cloud.job_servers} without serving.offer_jobs",
+            hint=f"set serving.offer_jobs to true, or cloud.job_servers to 0 {WHERE}",
+        )
     check_deployment(s.cloud.name, s.cloud.bootstrap_qualifier)
     for name in ("replica_maps", "replica_artifacts"):
         check_buckets(f"cloud.{name}", getattr(s.cloud, name))

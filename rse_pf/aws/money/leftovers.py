@@ -101,7 +101,11 @@ def _all_of_ours(
 
 def _is_tagged(account: Account, of: ResourceNames, bucket: str) -> bool:
     found = account.find("s3", "get_bucket_tagging", Bucket=bucket) or {}
-    return _has_tag(of, found.get("TagSet", ()))
+    if not _has_tag(of, found.get("TagSet", ())):
+        return False
+    # Buckets of all regions are listed, and a deployment of this name may stand in another one.
+    where = account.find("s3", "get_bucket_location", Bucket=bucket) or {}
+    return (where.get("LocationConstraint") or "us-east-1") == account.region
 
 
 def _has_tag(of: ResourceNames, tags: Iterable[dict[str, Any]]) -> bool:

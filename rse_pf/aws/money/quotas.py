@@ -10,13 +10,18 @@ from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 from rse_pf.aws.account import Account
+from rse_pf.aws.money.costs import zone_count
 from rse_pf.aws.money.leftovers import living_stacks
 from rse_pf.aws.money.prices import load_prices
 from rse_pf.config import PlatformSettings
+from rse_pf.config.elasticity import instance_types
 from rse_pf.config.resource_names import ResourceNames
-from rse_pf.errors import ConfigurationError
+from rse_pf.errors import ConfigurationError, StoreError
 
-__all__ = ["Check", "check_account"]
+__all__ = ["NOT_BOOTSTRAPPED", "Check", "check_account"]
+
+NOT_BOOTSTRAPPED = "the CDK is not bootstrapped"
+"""What a check says for which `rse-pf cloud up` has a step."""
 
 _VCPUS, _EXECUTIONS, _VPCS = ("ec2", "L-1216C47A"), ("lambda", "L-B99A9384"), ("vpc", "L-F678F1CE")
 _ALWAYS_UNRESERVED = 100
@@ -33,11 +38,11 @@ class Check(NamedTuple):
 
 
 def check_account(account: Account, settings: PlatformSettings) -> Iterator[Check]:
-    """Yield the result of each check.
+    """Yield the result of each check; a service that does not answer ends none of the others.
 
     Raises:
         ConfigurationError: AWS does not accept the credentials.
-        StoreError: AWS does not answer.
+        StoreError: AWS does not even say whose they are.
     """
     who = account.find("sts", "get_caller_identity") or {}
     yield Check("ok", f"signed in as {who.get('Arn', '?')}, region {account.region}")
@@ -47,7 +52,7 @@ def check_account(account: Account, settings: PlatformSettings) -> Iterator[Chec
     for check in checks:
         try:
             yield check(account, settings)
-        except ConfigurationError as error:
+        except (ConfigurationError, StoreError) as error:
             yield Check("warn", f"not checked: {error.message}", error.hint)
 
 
@@ -55,7 +60,7 @@ def _bootstrap(account: Account, settings: PlatformSettings) -> Check:
     qualifier = settings.cloud.bootstrap_qualifier
     found = account.find("ssm", "get_parameter", Name=f"/cdk-bootstrap/{qualifier}/version")
     if found is None:
-        return Check("fail", f"the CDK is not bootstrapped in {account.region}", "npx cdk bootstrap")
+        return Check("fail", f"{NOT_BOOTSTRAPPED} in {account.region}", "rse-pf cloud up does it")
     return Check("ok", f"bootstrapped, version {found['Parameter']['Value']}")
 
 
@@ -95,14 +100,25 @@ def _covers(name: str, domain: str) -> bool:
 
 
 def _instance_type(account: Account, settings: PlatformSettings) -> Check:
-    kind = settings.cloud.instance_type
-    found = account.pages(
+    kinds = instance_types(settings.cloud)
+    rows = account.pages(
         "ec2", "describe_instance_type_offerings", "InstanceTypeOfferings",
-        Filters=[{"Name": "instance-type", "Values": [kind]}],
+        LocationType="availability-zone", Filters=[{"Name": "instance-type", "Values": list(kinds)}],
     )  # fmt: skip
-    if not found:
-        return Check("fail", f"{account.region} offers no {kind}", "choose another cloud.instance_type")
-    return Check("ok", f"{kind} is offered")
+    offered = {(str(row["InstanceType"]), str(row["Location"])) for row in rows}
+    told = account.pages("ec2", "describe_availability_zones", "AvailabilityZones")
+    # As Fn::GetAZs orders them, of which the stacks take the first.
+    zones = sorted(str(row["ZoneName"]) for row in told)[: zone_count(settings)]
+    lacking = [f"{kind} in {zone}" for kind in kinds for zone in zones if (kind, zone) not in offered]
+    if any(all((kind, zone) not in offered for kind in kinds) for zone in zones):
+        return Check("fail", f"AWS does not offer {', '.join(lacking)}", "choose another cloud.instance_type")
+    if lacking:
+        return Check(
+            "warn",
+            f"AWS does not offer {', '.join(lacking)}",
+            "change cloud.other_instance_types, or accept it",
+        )
+    return Check("ok", f"{', '.join(kinds)} is offered in {', '.join(zones)}")
 
 
 def _vcpus(account: Account, settings: PlatformSettings) -> Check:

@@ -30,6 +30,8 @@ ACTIONS = {
     "cost": "what a load costs a month, line by line, on the fleet and on the Lambda",
     "prices": "the prices of an estimate; --refresh reads them from AWS",
     "status": "servers, their health, alarms, robots",
+    "logs": "what a server logged, also one that is gone, and what a failed boot wrote",
+    "canary": "give the canary a new key, and enrol it",
     "leftovers": "resources in the account that belong to no stack",
 }
 """Action and one line of help.  Each is a module of this folder, with ``add_arguments`` and ``run``."""

@@ -1,0 +1,62 @@
+"""Run what builds and deploys: `scripts/assets.py`, and the pinned command line of the CDK by scripts/cdk.sh.
+
+Both belong to a checkout, not to the installed package.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from rse_pf.config import PlatformSettings
+from rse_pf.errors import DeploymentFailed, UsageError
+
+__all__ = ["CdkTools"]
+
+
+class CdkTools:
+    """The tools of the checkout in the folder *checkout*; their output goes to the terminal."""
+
+    def __init__(self, checkout: Path, settings: PlatformSettings, account_id: str) -> None:
+        self._checkout = checkout
+        self._cloud = settings.cloud
+        self._account_id = account_id
+
+    @property
+    def has_packages(self) -> bool:
+        """Whether packages were built; the synthesis refuses those of other sources."""
+        return all(any((self._checkout / "build" / name).glob("*")) for name in ("servers", "lambda"))
+
+    def build(self) -> None:
+        """Build the packages; raises DeploymentFailed."""
+        self._run("the build of the packages", [sys.executable, "scripts/assets.py"])
+
+    def bootstrap(self) -> None:
+        """Prepare the account and region for the CDK; raises DeploymentFailed."""
+        where = f"aws://{self._account_id}/{self._cloud.region}"
+        qualifier = ["--qualifier", self._cloud.bootstrap_qualifier]
+        self._cdk("the bootstrap", ["bootstrap", where, *qualifier])
+
+    def deploy(self, stack: str) -> None:
+        """Deploy one stack, and nothing that it depends on; raises DeploymentFailed."""
+        options = ["--exclusively", "--require-approval", "never", "--progress", "events"]
+        self._cdk(f"the deployment of {stack}", ["deploy", stack, *options])
+
+    def _cdk(self, what: str, words: Sequence[str]) -> None:
+        self._run(what, ["sh", "scripts/cdk.sh", *words])
+
+    def _run(self, what: str, command: Sequence[str]) -> None:
+        script = next(word for word in command if word.startswith("scripts/"))
+        if not (self._checkout / script).exists():
+            raise UsageError(
+                f"there is no {script} in {self._checkout}",
+                hint="call it in the folder of a checkout of RSE-PF",
+            )
+        code = subprocess.run(command, cwd=self._checkout, check=False).returncode
+        if code:
+            raise DeploymentFailed(
+                f"{what} failed with exit code {code}",
+                hint="read the lines above; when the cause is gone, the same command continues",
+            )

@@ -1,0 +1,119 @@
+"""Read what stands of a deployment: its stacks, its groups of servers, and whether it is parked.
+
+Nothing is changed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import msgspec
+
+from rse_pf.aws.account import Account
+from rse_pf.config import PlatformSettings
+from rse_pf.config.resource_names import DEPLOYMENT_TAG, STACKS, ResourceNames
+from rse_pf.errors import ConfigurationError
+
+__all__ = ["Deployment", "GroupSize", "ParkNote", "read_deployment", "read_note", "read_sizes"]
+
+_GONE = ("DELETE_COMPLETE", "REVIEW_IN_PROGRESS")
+
+
+class GroupSize(msgspec.Struct, frozen=True, kw_only=True):
+    """The bounds of one Auto Scaling group; ``instances`` counts those that are there in any state."""
+
+    min_servers: int
+    wanted_servers: int
+    max_servers: int
+    instances: int = 0
+
+
+class ParkNote(msgspec.Struct, frozen=True, kw_only=True):
+    """What a parked deployment was before; it is kept in the SSM parameter ``parked``."""
+
+    groups: dict[str, GroupSize]
+    """By name."""
+    since: str
+    """UTC, ISO 8601."""
+    by: str = "operator"
+    """Who parked it: operator or timer."""
+    deep: bool = False
+    """Whether the load balancer, the endpoints and all other stacks but Data went, too."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Deployment:
+    """What stands: status by box of each stack that exists, groups by name, and the note if it is parked."""
+
+    stacks: Mapping[str, str] = field(default_factory=dict)
+    groups: Mapping[str, GroupSize] = field(default_factory=dict)
+    note: ParkNote | None = None
+    is_bootstrapped: bool = False
+    url: str = ""
+
+    @property
+    def stage(self) -> str:
+        """Return absent, incomplete, up, parked or deeply parked, in this order of precedence."""
+        if self.note is not None:
+            return "deeply parked" if self.note.deep else "parked"
+        if not set(self.stacks) - {"Data"}:
+            return "absent"
+        complete = all(self.stacks.get(box, "").endswith("_COMPLETE") for box in STACKS)
+        return "up" if complete else "incomplete"
+
+
+def read_deployment(account: Account, settings: PlatformSettings) -> Deployment:
+    """Return what stands of the deployment ``cloud.name``.
+
+    Raises:
+        ConfigurationError: AWS refused.
+        StoreError: AWS does not answer.
+    """
+    names = ResourceNames(settings.cloud.name)
+    rows = account.pages("cloudformation", "describe_stacks", "Stacks")
+    ours = {
+        row["StackName"].removeprefix(names.stack_prefix): row
+        for row in rows
+        if names.owns_stack(row["StackName"]) and row["StackStatus"] not in _GONE
+    }
+    version = f"/cdk-bootstrap/{settings.cloud.bootstrap_qualifier}/version"
+    outputs = ours.get("Backend", {}).get("Outputs", ())
+    return Deployment(
+        stacks={box: str(ours[box]["StackStatus"]) for box in STACKS if box in ours},
+        groups=read_sizes(account, names),
+        note=read_note(account, names),
+        is_bootstrapped=account.find("ssm", "get_parameter", Name=version) is not None,
+        url=next((str(each["OutputValue"]) for each in outputs if each["OutputKey"] == "Url"), ""),
+    )
+
+
+def read_sizes(account: Account, names: ResourceNames) -> dict[str, GroupSize]:
+    """Return every Auto Scaling group of the deployment, found by its tag; raises as `read_deployment`."""
+    rows = account.pages(
+        "autoscaling", "describe_auto_scaling_groups", "AutoScalingGroups",
+        Filters=[{"Name": f"tag:{DEPLOYMENT_TAG}", "Values": [names.prefix]}],
+    )  # fmt: skip
+    return {str(row["AutoScalingGroupName"]): _size(row) for row in rows}
+
+
+def read_note(account: Account, names: ResourceNames) -> ParkNote | None:
+    """Return the note of a parked deployment; None if it is not parked.  Raises as `read_deployment`."""
+    found = account.find("ssm", "get_parameter", Name=names.parked)
+    if found is None:
+        return None
+    try:
+        return msgspec.json.decode(found["Parameter"]["Value"], type=ParkNote)
+    except msgspec.DecodeError as error:
+        raise ConfigurationError(
+            f"the SSM parameter {names.parked} does not say what was parked: {error}",
+            hint=f"delete it: aws ssm delete-parameter --name {names.parked}; then rse-pf cloud up",
+        ) from error
+
+
+def _size(row: Mapping[str, Any]) -> GroupSize:
+    return GroupSize(
+        min_servers=row["MinSize"], wanted_servers=row["DesiredCapacity"], max_servers=row["MaxSize"],
+        instances=len(row["Instances"]),
+    )  # fmt: skip

@@ -1,0 +1,258 @@
+"""Carry out the steps of a plan: thin effects on CloudFormation, Auto Scaling, alarms and parameters.
+
+Time is an argument.  The CDK's command line and the build of the packages are behind `Tools`.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from datetime import datetime, timezone
+from typing import Protocol
+
+import msgspec
+
+from rse_pf.aws.account import Account
+from rse_pf.aws.fleet.group import read_group
+from rse_pf.aws.lifecycle.deployment import GroupSize, ParkNote, read_note, read_sizes
+from rse_pf.aws.lifecycle.plan import Action, Step, restored
+from rse_pf.aws.lifecycle.removal import erase_data, sweep
+from rse_pf.config import PlatformSettings
+from rse_pf.config.resource_names import ResourceNames
+from rse_pf.errors import DeploymentFailed
+
+__all__ = ["SUSPENDED", "Tools", "World", "carry_out", "empty_group", "silence_alarms", "write_note"]
+
+SUSPENDED = ("AlarmNotification", "ScheduledActions")
+"""Processes of a parked group: neither an alarm nor a schedule starts a server."""
+
+_POLL_S = 5.0
+_STACK_S = 2400.0
+_EMPTY_S = 600.0
+"""Beside ``cloud.drain_s``."""
+_HEALTHY_S = 600.0
+_ALARMS_OF_A_CALL = 100
+
+
+class Tools(Protocol):
+    """What runs on this machine, and not in the account."""
+
+    def build(self) -> None:
+        """Build the packages."""
+
+    def bootstrap(self) -> None:
+        """Prepare the account and region for the CDK."""
+
+    def deploy(self, stack: str) -> None:
+        """Deploy one stack, and nothing that it depends on."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class World:
+    """What the steps act on."""
+
+    account: Account
+    settings: PlatformSettings
+    tools: Tools
+    tell: Callable[[str], None]
+    clock: Callable[[], float] = time.monotonic
+    sleep: Callable[[float], None] = time.sleep
+    now: Callable[[], datetime] = lambda: datetime.now(timezone.utc)
+
+    @property
+    def names(self) -> ResourceNames:
+        """Return the names of the deployment."""
+        return ResourceNames(self.settings.cloud.name)
+
+
+def carry_out(steps: Iterable[Step], world: World) -> None:
+    """Carry out *steps* in order, and tell each before it begins.
+
+    Raises:
+        DeploymentFailed: A stack could not be deployed or destroyed, or servers did not become healthy or
+            end in time.
+        ConfigurationError: AWS refused.
+        StoreError: AWS does not answer.
+    """
+    for step in steps:
+        world.tell(str(step))
+        _EFFECTS[step.action](step, world)
+
+
+def write_note(account: Account, names: ResourceNames, note: ParkNote) -> None:
+    """Write *note* over the one that is there; raises ConfigurationError."""
+    value = msgspec.json.encode(note).decode()
+    account.change("ssm", "put_parameter", Name=names.parked, Value=value, Type="String", Overwrite=True)
+
+
+def silence_alarms(account: Account, names: ResourceNames) -> None:
+    """Let no alarm of the deployment act or notify; raises as `Account.find`."""
+    for some in _alarms(account, names):
+        account.change("cloudwatch", "disable_alarm_actions", AlarmNames=some)
+
+
+def empty_group(account: Account, group: str) -> None:
+    """Suspend what starts servers in *group*, and end all of its servers; raises as `Account.find`."""
+    account.change(
+        "autoscaling", "suspend_processes", AutoScalingGroupName=group, ScalingProcesses=list(SUSPENDED)
+    )
+    account.change(
+        "autoscaling", "update_auto_scaling_group", AutoScalingGroupName=group,
+        MinSize=0, DesiredCapacity=0, MaxSize=0,
+    )  # fmt: skip
+
+
+def _build(step: Step, world: World) -> None:
+    world.tools.build()
+
+
+def _bootstrap(step: Step, world: World) -> None:
+    world.tools.bootstrap()
+
+
+def _deploy(step: Step, world: World) -> None:
+    world.tools.deploy(world.names.stack(step.box))
+
+
+def _settle(step: Step, world: World) -> None:
+    _await_stack(world, world.names.stack(step.box))
+
+
+def _destroy(step: Step, world: World) -> None:
+    stack = world.names.stack(step.box)
+    world.account.find("cloudformation", "delete_stack", StackName=stack)
+    status = _await_stack(world, stack)
+    if status not in ("", "DELETE_COMPLETE"):
+        raise DeploymentFailed(
+            f"the stack {stack} is {status}: {_reason(world.account, stack)}",
+            hint="remove what the reason names, then repeat the command",
+        )
+
+
+def _await_stack(world: World, stack: str) -> str:
+    """Return the status of *stack* when AWS no longer changes it; empty when it does not exist."""
+    deadline = world.clock() + _STACK_S
+    while True:
+        found = world.account.find("cloudformation", "describe_stacks", StackName=stack)
+        status = str(found["Stacks"][0]["StackStatus"]) if found and found["Stacks"] else ""
+        if not status.endswith("_IN_PROGRESS"):
+            return status
+        if world.clock() > deadline:
+            raise DeploymentFailed(
+                f"the stack {stack} is {status} after {_STACK_S:g} s",
+                hint="look at its events in the console, then repeat the command",
+            )
+        world.sleep(_POLL_S)
+
+
+def _reason(account: Account, stack: str) -> str:
+    """Return why CloudFormation failed: the first failure that names no other one."""
+    rows = account.pages("cloudformation", "describe_stack_events", "StackEvents", StackName=stack)
+    failed = [row for row in rows if str(row["ResourceStatus"]).endswith("_FAILED")]
+    told = [
+        f"{row['LogicalResourceId']}: {row.get('ResourceStatusReason', 'no reason given')}" for row in failed
+    ]
+    return told[-1] if told else "AWS gives no reason"
+
+
+def _note(step: Step, world: World) -> None:
+    """Write the sizes down before they are changed; sizes that were noted before are kept."""
+    known = read_note(world.account, world.names)
+    groups = known.groups if known is not None else read_sizes(world.account, world.names)
+    since = known.since if known is not None else world.now().isoformat(timespec="seconds")
+    write_note(world.account, world.names, ParkNote(groups=groups, since=since, deep=step.deep))
+
+
+def _silence(step: Step, world: World) -> None:
+    silence_alarms(world.account, world.names)
+
+
+def _empty(step: Step, world: World) -> None:
+    for group in read_sizes(world.account, world.names):
+        empty_group(world.account, group)
+
+
+def _await_empty(step: Step, world: World) -> None:
+    deadline = world.clock() + world.settings.cloud.drain_s + _EMPTY_S
+    while left := sum(each.instances for each in read_sizes(world.account, world.names).values()):
+        if world.clock() > deadline:
+            raise DeploymentFailed(
+                f"{left} servers did not end within {world.settings.cloud.drain_s + _EMPTY_S:g} s",
+                hint="rse-pf cloud status shows them; then repeat the command",
+            )
+        world.sleep(_POLL_S)
+
+
+def _fill(step: Step, world: World) -> None:
+    note = read_note(world.account, world.names)
+    for name, now in read_sizes(world.account, world.names).items():
+        saved = restored(note.groups.get(name) if note is not None else None, now)
+        if saved is not None:
+            _resize(world.account, name, saved)
+        world.account.change(
+            "autoscaling", "resume_processes", AutoScalingGroupName=name, ScalingProcesses=list(SUSPENDED)
+        )
+
+
+def _resize(account: Account, group: str, size: GroupSize) -> None:
+    account.change(
+        "autoscaling", "update_auto_scaling_group", AutoScalingGroupName=group, MinSize=size.min_servers,
+        DesiredCapacity=min(max(size.wanted_servers, size.min_servers), size.max_servers),
+        MaxSize=size.max_servers,
+    )  # fmt: skip
+
+
+def _alert(step: Step, world: World) -> None:
+    for some in _alarms(world.account, world.names):
+        world.account.change("cloudwatch", "enable_alarm_actions", AlarmNames=some)
+
+
+def _forget(step: Step, world: World) -> None:
+    world.account.find("ssm", "delete_parameter", Name=world.names.parked)
+
+
+def _await_healthy(step: Step, world: World) -> None:
+    limit_s = world.settings.health.grace_s + _HEALTHY_S
+    deadline = world.clock() + limit_s
+    while True:
+        group = read_group(world.account, world.settings, now=world.now(), asks_robots=False)
+        if group.is_healthy:
+            return
+        if world.clock() > deadline:
+            raise DeploymentFailed(
+                f"{group.wanted_servers} healthy servers are wanted, and are not there after {limit_s:g} s",
+                hint="rse-pf cloud status shows which are not; docs/operations.md says what to look at",
+            )
+        world.sleep(_POLL_S)
+
+
+def _unprotect(step: Step, world: World) -> None:
+    world.account.change(
+        "cloudformation", "update_termination_protection",
+        StackName=world.names.stack(step.box), EnableTerminationProtection=False,
+    )  # fmt: skip
+
+
+def _sweep(step: Step, world: World) -> None:
+    sweep(world.account, world.names)
+
+
+def _erase(step: Step, world: World) -> None:
+    for refused in erase_data(world.account, world.names, audit_days=world.settings.cloud.audit_days):
+        world.tell(refused)
+
+
+def _alarms(account: Account, names: ResourceNames) -> list[list[str]]:
+    """Return the names of the deployment's alarms, in portions that one call takes."""
+    rows = account.pages("cloudwatch", "describe_alarms", "MetricAlarms", AlarmNamePrefix=names.alarm_prefix)
+    found = [str(row["AlarmName"]) for row in rows]
+    return [found[at : at + _ALARMS_OF_A_CALL] for at in range(0, len(found), _ALARMS_OF_A_CALL)]
+
+
+_EFFECTS: dict[Action, Callable[[Step, World], None]] = {
+    "build": _build, "bootstrap": _bootstrap, "settle": _settle, "deploy": _deploy, "destroy": _destroy,
+    "note": _note, "silence": _silence, "empty": _empty, "await-empty": _await_empty, "fill": _fill,
+    "alert": _alert, "forget": _forget, "await-healthy": _await_healthy, "unprotect": _unprotect,
+    "sweep": _sweep, "erase": _erase,
+}  # fmt: skip

@@ -1,0 +1,137 @@
+"""Decide by which steps a deployment is put up, parked, resumed or taken down.
+
+The plan depends on what stands and on nothing else; a step that was done before does no harm when it is
+repeated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Literal
+
+from rse_pf.aws.lifecycle.deployment import Deployment, GroupSize
+from rse_pf.config.resource_names import STACKS
+from rse_pf.errors import ConfigurationError
+
+__all__ = ["KEPT", "Action", "Step", "plan_down", "plan_park", "plan_resume", "plan_up", "restored"]
+
+KEPT = "Data"
+"""The stack that `plan_down` keeps unless the data is to go, too: maps, logs and the signing key."""
+
+Action = Literal[
+    "build", "bootstrap", "settle", "deploy", "destroy", "note", "silence", "empty", "await-empty",
+    "fill", "alert", "forget", "await-healthy", "unprotect", "sweep", "erase",
+]  # fmt: skip
+
+_TEXTS: dict[Action, str] = {
+    "build": "build the packages",
+    "bootstrap": "prepare the account for the CDK (bucket and roles, once per region)",
+    "settle": "wait until AWS has finished with the stack {}",
+    "deploy": "deploy the stack {}",
+    "destroy": "destroy the stack {}",
+    "note": "note the sizes of the groups",
+    "silence": "stop alarms from acting, and schedules from starting servers",
+    "empty": "set the size of every group to 0",
+    "await-empty": "wait until the servers have drained and ended",
+    "fill": "restore the sizes of the groups",
+    "alert": "let alarms act and schedules start servers again",
+    "forget": "delete the note of the sizes",
+    "await-healthy": "wait until as many servers as wanted are healthy",
+    "unprotect": "allow the deletion of the stack {}",
+    "sweep": "delete log groups, alarms, volumes and interfaces that no stack owns",
+    "erase": "delete the buckets with all versions of all objects, and the signing key",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """One step; *box* names the stack that it concerns."""
+
+    action: Action
+    box: str = ""
+    deep: bool = False
+
+    def __str__(self) -> str:
+        """Return what the step does, as one line."""
+        return _TEXTS[self.action].format(self.box)
+
+
+def plan_up(deployment: Deployment, *, has_packages: bool) -> list[Step]:
+    """Return the steps that put up what is missing, bring the rest up to date, and end parking."""
+    steps = [] if has_packages else [Step("build")]
+    if not deployment.is_bootstrapped:
+        steps.append(Step("bootstrap"))
+    for box in STACKS:
+        steps += _settled(deployment, box)
+        steps.append(Step("deploy", box))
+    if deployment.note is not None:
+        steps += [Step("fill"), Step("alert"), Step("forget")]
+    return [*steps, Step("await-healthy")]
+
+
+def plan_park(deployment: Deployment, *, deep: bool) -> list[Step]:
+    """Return the steps that end all servers and, if *deep*, everything but the data.
+
+    Raises:
+        ConfigurationError: Nothing stands that could be parked.
+    """
+    stands = [box for box in STACKS if box in deployment.stacks and box != KEPT]
+    note = deployment.note
+    if note is None and "Backend" not in stands:
+        raise ConfigurationError("there is no platform to park", hint="put it up: rse-pf cloud up")
+    steps = [] if note is not None and (note.deep or not deep) else [Step("note", deep=deep)]
+    if deployment.groups:
+        busy = any(group.max_servers or group.instances for group in deployment.groups.values())
+        if note is None or busy:
+            steps += [Step("silence"), Step("empty"), Step("await-empty")]
+    if deep or (note is not None and note.deep):
+        steps += _destroyed(deployment)
+    return steps
+
+
+def plan_resume(deployment: Deployment, *, has_packages: bool) -> list[Step]:
+    """Return the steps that end parking.
+
+    Raises:
+        ConfigurationError: The deployment is not parked.
+    """
+    if deployment.note is None:
+        raise ConfigurationError(
+            "the platform is not parked", hint="rse-pf cloud status shows it; rse-pf cloud up puts it up"
+        )
+    if deployment.note.deep:
+        return plan_up(deployment, has_packages=has_packages)
+    return [Step("fill"), Step("alert"), Step("forget"), Step("await-healthy")]
+
+
+def plan_down(deployment: Deployment, *, delete_data: bool) -> list[Step]:
+    """Return the steps that destroy all stacks but `KEPT` and, if *delete_data*, that one and its data."""
+    steps = list(_destroyed(deployment))
+    if deployment.note is not None:
+        steps.append(Step("forget"))
+    if delete_data:
+        if KEPT in deployment.stacks:
+            steps += [*_settled(deployment, KEPT), Step("unprotect", KEPT), Step("destroy", KEPT)]
+        steps.append(Step("erase"))
+    return [*steps, Step("sweep")]
+
+
+def restored(saved: GroupSize | None, now: GroupSize) -> GroupSize | None:
+    """Return the size that a group gets back, or None if it keeps the one that it has.
+
+    A group whose maximum is not 0 was deployed anew, with newer settings, or has its size back already.
+    """
+    return saved if saved is not None and now.max_servers == 0 else None
+
+
+def _destroyed(deployment: Deployment) -> Iterator[Step]:
+    for box in reversed(STACKS):
+        if box != KEPT and box in deployment.stacks:
+            yield from _settled(deployment, box)
+            yield Step("destroy", box)
+
+
+def _settled(deployment: Deployment, box: str) -> list[Step]:
+    """Return a step that waits, if an earlier command was ended while AWS changed the stack."""
+    return [Step("settle", box)] if deployment.stacks.get(box, "").endswith("_IN_PROGRESS") else []

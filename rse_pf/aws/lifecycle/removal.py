@@ -1,0 +1,103 @@
+"""Delete what outlives the stacks: forgotten resources, and with the operator's consent the data.
+
+Object lock is respected: an audit log that is still locked stays, and so does its bucket.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from datetime import datetime, timedelta
+from typing import Any
+
+from rse_pf.aws.account import Account
+from rse_pf.aws.money.leftovers import Leftover, find_leftovers
+from rse_pf.config.resource_names import ResourceNames
+from rse_pf.errors import ConfigurationError
+
+__all__ = ["erase_data", "sweep"]
+
+_OBJECTS_OF_A_CALL = 1000
+
+
+def sweep(account: Account, names: ResourceNames) -> None:
+    """Delete what no stack owns and nobody keeps on purpose; raises as `Account.find`."""
+    for each in find_leftovers(account, names):
+        if each.kind in _SWEPT and not each.unread:
+            service, method, argument = _SWEPT[each.kind]
+            value: Any = [each.name] if argument == "AlarmNames" else each.name
+            account.find(service, method, **{argument: value})
+
+
+def erase_data(account: Account, names: ResourceNames, *, audit_days: int) -> list[str]:
+    """Delete the buckets and secrets that no stack owns; return a line for each bucket that has to stay.
+
+    Raises:
+        ConfigurationError: AWS refused.
+        StoreError: AWS does not answer.
+    """
+    refused = []
+    for each in sorted(find_leftovers(account, names), key=_access_logs_last):
+        if each.unread:
+            continue
+        if each.kind == "secret":
+            account.find("secretsmanager", "delete_secret", SecretId=each.name)
+        elif each.kind == "bucket":
+            locked, until = _empty_bucket(account, each.name, audit_days)
+            if locked:
+                logs = f"object lock keeps {locked} audit logs, the last until {until:%Y-%m-%d}"
+                refused.append(f"{each.name} stays: {logs}")
+            else:
+                account.find("s3", "delete_bucket", Bucket=each.name)
+    return refused
+
+
+_SWEPT = {
+    "log group": ("logs", "delete_log_group", "logGroupName"),
+    "alarm": ("cloudwatch", "delete_alarms", "AlarmNames"),
+    "volume": ("ec2", "delete_volume", "VolumeId"),
+    "network interface": ("ec2", "delete_network_interface", "NetworkInterfaceId"),
+}
+
+
+def _access_logs_last(each: Leftover) -> tuple[bool, str]:
+    """Return a key that sorts the bucket into which the others write to the end."""
+    return "accesslogs" in each.name, each.name
+
+
+def _empty_bucket(account: Account, bucket: str, audit_days: int) -> tuple[int, datetime]:
+    """Delete every version of every object; return how many are locked, and until when the last one is."""
+    locked, until = 0, datetime.min
+    for page in _pages_of_versions(account, bucket):
+        dates = {row["Key"]: row["LastModified"] for row in reversed(page)}
+        for at in range(0, len(page), _OBJECTS_OF_A_CALL):
+            some = [
+                {"Key": row["Key"], "VersionId": row["VersionId"]}
+                for row in page[at : at + _OBJECTS_OF_A_CALL]
+            ]
+            wanted = {"Objects": some, "Quiet": True}
+            told = account.find("s3", "delete_objects", Bucket=bucket, Delete=wanted)
+            for error in (told or {}).get("Errors", ()):
+                if error["Code"] not in _LOCKED:
+                    raise ConfigurationError(
+                        f"AWS refuses to delete objects of {bucket}: {error['Code']}",
+                        hint="check your account's permissions, or sign in again",
+                    )
+                locked += 1
+                kept = dates[error["Key"]] + timedelta(days=audit_days)
+                until = max(until, kept.replace(tzinfo=None))
+    return locked, until
+
+
+_LOCKED = ("AccessDenied", "AccessForbidden")
+
+
+def _pages_of_versions(account: Account, bucket: str) -> Iterator[list[dict[str, Any]]]:
+    marker: dict[str, str] = {}
+    while True:
+        page = account.find("s3", "list_object_versions", Bucket=bucket, **marker)
+        if page is None:
+            return
+        yield [*page.get("Versions", ()), *page.get("DeleteMarkers", ())]
+        if not page.get("IsTruncated"):
+            return
+        marker = {"KeyMarker": page["NextKeyMarker"], "VersionIdMarker": page["NextVersionIdMarker"]}

@@ -1,0 +1,96 @@
+"""rse-pf cloud down: destroy the platform, and prove that nothing is left but what is kept on purpose."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from datetime import datetime, timezone
+
+from rse_pf.aws.account import Account
+from rse_pf.aws.lifecycle.proof import Proof, prove
+from rse_pf.cli.cloud import changing
+from rse_pf.config import PlatformSettings
+from rse_pf.config.resource_names import ResourceNames
+from rse_pf.errors import UsageError
+from rse_pf.terminal import counted, show
+
+__all__ = ["add_arguments", "run"]
+
+_LISTED_LATE_S = 60.0
+"""The tagging service of AWS may still list for this long what is gone."""
+_POLL_S = 5.0
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare what becomes of the data, and the options of scripts."""
+    parser.add_argument(
+        "--delete-data", action="store_true",
+        help="delete maps, packages, logs and the signing key, too, as far as object lock allows",
+    )  # fmt: skip
+    parser.add_argument(
+        "--confirm", default="", metavar="NAME", help="the name that --delete-data asks for, in a script"
+    )
+    changing.add_yes(parser)
+
+
+def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
+    """Take the platform down; return 1 if something is left that nobody keeps, or the answer is no."""
+    from rse_pf.aws.account import open_account
+    from rse_pf.aws.lifecycle.deployment import read_deployment
+    from rse_pf.aws.lifecycle.plan import plan_down
+
+    account, names = open_account(settings.cloud.region), ResourceNames(settings.cloud.name)
+    plan = plan_down(read_deployment(account, settings), delete_data=args.delete_data)
+    changing.show_steps(plan)
+    costs = changing.deployment_costs(settings)
+    show(f"it cost {costs.line(costs.running)}, and more with robots", *costs.warnings(settings))
+    _show_kept(prove(account, names, costs.prices, now=datetime.now(timezone.utc)), is_over=False)
+    if not changing.confirmed(args) or (args.delete_data and not _confirmed_twice(args, names)):
+        return 1
+    changing.perform(plan, changing.open_world(account, settings, changing.make_tools(account, settings)))
+    proof = _last_proof(account, names, costs)
+    _show_kept(proof, is_over=True)
+    for each in proof.left:
+        show(f"LEFT OVER  {each}")
+    show(f"{len(proof.left)} left over, {counted(len(proof.kept), 'resource')} kept on purpose")
+    return 1 if proof.left else 0
+
+
+def _confirmed_twice(args: argparse.Namespace, names: ResourceNames) -> bool:
+    """Return whether the operator names the deployment whose data is to be deleted."""
+    if args.confirm:
+        if args.confirm != names.prefix:
+            raise UsageError(
+                f"--confirm {args.confirm} is not the name of this deployment", hint=f"it is {names.prefix}"
+            )
+        return True
+    if not sys.stdin.isatty():
+        raise UsageError("nobody can be asked a second time here", hint=f"add --confirm {names.prefix}")
+    show(f"maps, logs and the signing key cannot be brought back; type {names.prefix} to delete them")
+    return sys.stdin.readline().strip() == names.prefix
+
+
+def _last_proof(account: Account, names: ResourceNames, costs: changing.Costs) -> Proof:
+    """Return the proof, when AWS lists nothing any more that nobody keeps, or after a minute."""
+    deadline = time.monotonic() + _LISTED_LATE_S
+    while True:
+        proof = prove(account, names, costs.prices, now=datetime.now(timezone.utc))
+        if not proof.left or time.monotonic() > deadline:
+            return proof
+        time.sleep(_POLL_S)
+
+
+def _show_kept(proof: Proof, *, is_over: bool) -> None:
+    for each in proof.kept:
+        size = (
+            ""
+            if each.kind != "bucket"
+            else "  not measured yet"
+            if each.gb is None
+            else f"  {each.gb:.2f} GB"
+        )
+        verb = "kept" if is_over else "there is"
+        show(f"{verb}  {each.kind}  {each.name}{size}, {each.per_month:.2f} a month")
+    if proof.kept:
+        show(f"together {proof.per_month:.2f} a month")

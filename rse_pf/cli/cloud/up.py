@@ -1,0 +1,77 @@
+"""rse-pf cloud up: put the platform up on AWS, bring it up to date, or finish what was begun."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from pathlib import Path
+
+from rse_pf.aws.account import Account
+from rse_pf.cli.cloud import changing
+from rse_pf.cli.cloud.doctor import NO_PACKAGES, check_tools
+from rse_pf.cli.doctor import Finding
+from rse_pf.config import PlatformSettings
+from rse_pf.terminal import show
+
+__all__ = ["add_arguments", "finish", "lacks", "run"]
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the option of scripts."""
+    changing.add_yes(parser)
+
+
+def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
+    """Put the platform up; return 1 if something has to be fixed first, or the operator does not agree."""
+    from rse_pf.aws.account import open_account
+    from rse_pf.aws.lifecycle.deployment import read_deployment
+    from rse_pf.aws.lifecycle.plan import plan_up
+
+    account = open_account(settings.cloud.region)
+    tools = changing.make_tools(account, settings)
+    plan = plan_up(read_deployment(account, settings), has_packages=tools.has_packages)
+    if lacks(account, settings):
+        return 1
+    changing.show_steps(plan)
+    costs = changing.deployment_costs(settings)
+    show(f"it then costs {costs.line(costs.running)}, and more with robots: rse-pf cloud cost")
+    show(*costs.warnings(settings))
+    if not changing.confirmed(args):
+        return 1
+    changing.perform(plan, changing.open_world(account, settings, tools))
+    return finish(account, settings)
+
+
+def lacks(account: Account, settings: PlatformSettings) -> bool:
+    """Show what has to be fixed before a deployment; return whether there is anything."""
+    found = [each for each in _findings(account, settings) if each.grade == "fail"]
+    for each in found:
+        show(*each.lines())
+    return bool(found)
+
+
+def finish(account: Account, settings: PlatformSettings) -> int:
+    """Show the address and the next commands; return 0."""
+    from rse_pf.aws.lifecycle.deployment import read_deployment
+
+    cloud = settings.cloud
+    show(f"the platform is up: {read_deployment(account, settings).url}")
+    show("next: rse-pf token init --cloud             once: the key that signs tokens")
+    show("      rse-pf token issue robot-1 --cloud    a robot's token")
+    show("      rse-pf cloud status                   servers, robots, alarms, cost")
+    show("      rse-pf cloud park                     for the night; rse-pf cloud resume in the morning")
+    if cloud.idle_action == "park":
+        show(f"it parks itself after {cloud.idle_hours} hours without robots (cloud.idle_hours)")
+    return 0
+
+
+def _findings(account: Account, settings: PlatformSettings) -> Iterator[Finding]:
+    """Yield what the doctor finds, but for what `up` has a step for."""
+    from rse_pf.aws.money.quotas import NOT_BOOTSTRAPPED, check_account
+
+    for finding in check_tools(Path.cwd()):
+        if not finding.what.startswith(NO_PACKAGES):
+            yield finding
+    for check in check_account(account, settings):
+        if not check.what.startswith(NOT_BOOTSTRAPPED):
+            yield Finding(grade=check.grade, what=check.what, fix=check.fix)
