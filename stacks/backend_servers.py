@@ -27,12 +27,12 @@ from constructs import Construct
 
 from rse_pf.aws.fleet.launch_hook import retry_within_s
 from rse_pf.config import PlatformSettings
-from rse_pf.config.resource_names import AUDIT_PREFIX, VERSION_PARAMETER, ResourceNames
+from rse_pf.config.resource_names import AUDIT_PREFIX, JOURNAL_PREFIX, VERSION_PARAMETER, ResourceNames
 from rse_pf.scaling.alarms import NAMESPACE
 from stacks.capacity import Capacity
 from stacks.permissions import allow
 
-__all__ = ["BackendServers"]
+__all__ = ["BackendServers", "launch_template"]
 
 _BOOT = Path(__file__).parent / "boot" / "first_boot.py"
 _STORE = "rse_pf/aws/storage/s3_store.py:S3Store"
@@ -40,7 +40,7 @@ _GIB = 8
 
 
 class BackendServers(Construct):
-    """Role, launch template and group; ``group`` is what the scale modifier acts on."""
+    """Role, launch template and group; ``facts`` is what an instance is told at its boot."""
 
     def __init__(
         self,
@@ -65,20 +65,20 @@ class BackendServers(Construct):
         if maps is not None:
             self._allow_objects(maps)
         self._allow_audit(audit_logs)
+        self.facts = {
+            "package": package.s3_object_url, "sha256": package_sums, "region": settings.cloud.region,
+            "bucket": artifacts.bucket_name, "keys": key_set, "group": names.group,
+            "hook": names.drain_hook, "launch": names.launch_hook,
+            "retry_s": f"{retry_within_s(settings):g}",
+            "store": f"s3:{maps.bucket_name}" if maps is not None else settings.data.store,
+            "audit": audit_logs.bucket_name,
+        }  # fmt: skip
         self.group = autoscaling.AutoScalingGroup(
             self, "Group", auto_scaling_group_name=names.group, vpc=vpc,
             min_capacity=scaling.min_servers, max_capacity=scaling.max_servers,
             vpc_subnets=ec2.SubnetSelection(subnet_type=ec2.SubnetType.PRIVATE_ISOLATED),
-            launch_template=self._template(
-                firewall_group, settings,
-                {
-                    "package": package.s3_object_url, "sha256": package_sums, "region": settings.cloud.region,
-                    "bucket": artifacts.bucket_name, "keys": key_set, "group": names.group,
-                    "hook": names.drain_hook, "launch": names.launch_hook,
-                    "retry_s": f"{retry_within_s(settings):g}",
-                    "store": f"s3:{maps.bucket_name}" if maps is not None else settings.data.store,
-                    "audit": audit_logs.bucket_name,
-                },
+            launch_template=launch_template(
+                self, role=self.role, firewall_group=firewall_group, settings=settings, facts=self.facts
             ),
             health_checks=autoscaling.HealthChecks.with_additional_checks(
                 additional_types=[autoscaling.AdditionalHealthCheckType.ELB],
@@ -138,6 +138,10 @@ class BackendServers(Construct):
             used_by="rse_pf/aws/fleet/tasks/rebalancing.py:read_totals",
             why="GetMetricData knows neither resources nor conditions; it reads numbers only",
         )  # fmt: skip
+        allow(
+            role, ["s3:PutObject"], [artifacts.arn_for_objects(f"{JOURNAL_PREFIX}/*")],
+            used_by=f"{_STORE}._write", why="names hold the instance's id and a time",
+        )  # fmt: skip
         return role
 
     def _allow_objects(self, maps: s3.IBucket) -> None:
@@ -157,24 +161,38 @@ class BackendServers(Construct):
             why="names hold the instance's id and a digest; no name twice",
         )  # fmt: skip
 
-    def _template(
-        self,
-        firewall_group: ec2.ISecurityGroup,
-        settings: PlatformSettings,
-        facts: Mapping[str, str],
-    ) -> ec2.LaunchTemplate:
-        encrypted = ec2.BlockDeviceVolume.ebs(
-            _GIB, encrypted=True, volume_type=ec2.EbsDeviceVolumeType.GP3, delete_on_termination=True
-        )
-        script = _BOOT.read_text(encoding="utf-8")
-        commands = f"{script}\nmain({cdk.Stack.of(self).to_json_string(dict(facts))!s})\n"
-        return ec2.LaunchTemplate(
-            self, "Template", instance_type=ec2.InstanceType(settings.cloud.instance_type), role=self.role,
-            machine_image=ec2.MachineImage.from_ssm_parameter(
-                settings.cloud.image_parameter, os=ec2.OperatingSystemType.LINUX
-            ),
-            security_group=firewall_group, require_imdsv2=True, http_put_response_hop_limit=1,
-            http_endpoint=True, detailed_monitoring=True, associate_public_ip_address=False,
-            user_data=ec2.UserData.custom(commands),
-            block_devices=[ec2.BlockDevice(device_name="/dev/xvda", volume=encrypted)],
-        )  # fmt: skip
+
+def launch_template(
+    scope: Construct,
+    *,
+    role: iam.Role,
+    firewall_group: ec2.ISecurityGroup,
+    settings: PlatformSettings,
+    facts: Mapping[str, str],
+    kind: ec2.InstanceType | None = None,
+) -> ec2.LaunchTemplate:
+    """Return the launch template of a server; *facts* are what `stacks/boot/first_boot.py` is told.
+
+    Args:
+        scope: Has one template.
+        role: Of the instance.
+        firewall_group: The only security group of the instance.
+        settings: Image and instance type.
+        facts: Plain words by name.
+        kind: Instance type; None is that of the backend servers.
+    """
+    encrypted = ec2.BlockDeviceVolume.ebs(
+        _GIB, encrypted=True, volume_type=ec2.EbsDeviceVolumeType.GP3, delete_on_termination=True
+    )
+    script = _BOOT.read_text(encoding="utf-8")
+    commands = f"{script}\nmain({cdk.Stack.of(scope).to_json_string(dict(facts))!s})\n"
+    return ec2.LaunchTemplate(
+        scope, "Template", instance_type=kind or ec2.InstanceType(settings.cloud.instance_type), role=role,
+        machine_image=ec2.MachineImage.from_ssm_parameter(
+            settings.cloud.image_parameter, os=ec2.OperatingSystemType.LINUX
+        ),
+        security_group=firewall_group, require_imdsv2=True, http_put_response_hop_limit=1,
+        http_endpoint=True, detailed_monitoring=True, associate_public_ip_address=False,
+        user_data=ec2.UserData.custom(commands),
+        block_devices=[ec2.BlockDevice(device_name="/dev/xvda", volume=encrypted)],
+    )  # fmt: skip

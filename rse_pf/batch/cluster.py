@@ -151,9 +151,11 @@ class LocalCluster:
         return _spawn(role, order, self._environment)
 
 
-def start_worker(certificate: str, key: str, address: str, *, parent: int) -> subprocess.Popen[bytes]:
-    """Start a worker of the scheduler at *address*; it ends with the process *parent*."""
-    order = NodeOrder(certificate=certificate, key=key, address=address, parent=parent)
+def start_worker(
+    certificate: str, key: str, address: str, *, ports: str, parent: int
+) -> subprocess.Popen[bytes]:
+    """Start a worker of the scheduler at *address*, on one of *ports*; it ends with the process *parent*."""
+    order = NodeOrder(certificate=certificate, key=key, address=address, ports=ports, parent=parent)
     return _spawn("worker", order, {**_ONE_THREAD, **_DASK})
 
 

@@ -16,8 +16,9 @@ __all__ = ["BatchHelpers"]
 class BatchHelpers:
     """The workers of one machine for the batches of others."""
 
-    def __init__(self, store: ObjectStore, count: int) -> None:
-        """Start nothing yet; *count* workers help one batch at a time."""
+    def __init__(self, store: ObjectStore, count: int, *, ports: str = "") -> None:
+        """Start nothing yet; *count* workers help one batch at a time, on *ports* such as ``8791:8889``."""
+        self._ports = ports
         self._store = store
         self._count = count
         self._workers: list[subprocess.Popen[bytes]] = []
@@ -45,7 +46,9 @@ class BatchHelpers:
         invited = found[self._batch]
         while len(self._workers) < self._count:
             self._workers.append(
-                start_worker(invited.certificate, invited.key, invited.address, parent=os.getpid())
+                start_worker(
+                    invited.certificate, invited.key, invited.address, ports=self._ports, parent=os.getpid()
+                )
             )
 
     def close(self) -> None:

@@ -41,6 +41,8 @@ class NodeOrder(msgspec.Struct, frozen=True, kw_only=True):
     host: str = "127.0.0.1"
     port: int = 0
     address: str = ""
+    ports: str = ""
+    """Of a worker, such as ``8791:8889``; empty takes a free one."""
     parent: int = 0
     """The process with which it ends; 0 is none."""
 
@@ -106,7 +108,7 @@ async def _worker(order: NodeOrder) -> None:
     security = security_of(order.certificate, order.key)
     with tempfile.TemporaryDirectory(prefix="rse-pf-batch-") as folder:
         async with Worker(
-            order.address, nthreads=1, security=security, local_directory=folder, memory_limit=0,
+            order.address, port=order.ports or None, nthreads=1, security=security, local_directory=folder, memory_limit=0,
             death_timeout=_DEATH_TIMEOUT_S,
         ) as worker:  # fmt: skip
             await worker.finished()

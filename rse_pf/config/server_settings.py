@@ -15,7 +15,17 @@ from rse_pf.config.settings import PlatformSettings
 __all__ = ["READ_BY_SERVERS", "server_settings"]
 
 READ_BY_SERVERS: dict[str, tuple[str, ...]] = {
-    "cloud": ("name", "region", "poll_s", "boot_s", "drain_s", "audit_ship_s", "journal_ship_s", "spot"),
+    "cloud": (
+        "name",
+        "region",
+        "poll_s",
+        "boot_s",
+        "drain_s",
+        "audit_ship_s",
+        "journal_ship_s",
+        "spot",
+        "job_servers",
+    ),
     "scaling": ("period_s", "moves_per_s", "profile", "warm_up_s"),
     "burst": ("url", "robot_commands_per_day", "commands_per_day"),
     "health": ("cloud_interval_s", "unhealthy_checks"),

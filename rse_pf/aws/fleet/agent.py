@@ -22,10 +22,13 @@ from typing import Any
 from rse_pf.auth.control_token import ensure_control_token
 from rse_pf.aws.clients import make_client
 from rse_pf.aws.fleet.instance import Instance
+from rse_pf.aws.fleet.journal import read_journal
 from rse_pf.aws.fleet.task import AgentConfig, AgentContext, Phase, Task
 from rse_pf.aws.fleet.tasks import (
     access_control,
     audit,
+    job_metrics,
+    journals,
     keys,
     lifecycle,
     rebalancing,
@@ -36,6 +39,7 @@ from rse_pf.aws.fleet.tasks import (
 from rse_pf.aws.storage.audit_archive import Shipper
 from rse_pf.aws.storage.s3_store import open_bucket
 from rse_pf.config import load_settings
+from rse_pf.config.resource_names import ResourceNames
 from rse_pf.errors import RsePfError, message_of
 from rse_pf.terminal import show, show_error
 
@@ -48,8 +52,10 @@ TASKS: tuple[Callable[[AgentContext], Task], ...] = (
     rebalancing.task,
     spot_notice.task,
     audit.task,
+    journals.task,
     access_control.task,
     services.task,
+    job_metrics.task,
 )
 """The table, in the order of a step: one row and one module for each task."""
 
@@ -158,7 +164,8 @@ def _context(args: argparse.Namespace) -> AgentContext:
     if args.once and args.control_token is not None:
         ensure_control_token(args.control_token, seed=secrets.token_bytes(32))
     region = settings.cloud.region
-    data_port = settings.data.port if settings.data.enabled else 0
+    runs_jobs = args.group == ResourceNames(settings.cloud.name).job_group  # without a data service
+    data_port = settings.data.port if settings.data.enabled and not runs_jobs else 0
     machine = Instance(settings.serving.control_port, args.control_token, data_port)
     return AgentContext(
         machine=machine,
@@ -174,6 +181,7 @@ def _context(args: argparse.Namespace) -> AgentContext:
         settings=settings,
         log=_log,
         shipper=_shipper(args, region, machine),
+        journal=read_journal,
     )
 
 

@@ -61,6 +61,8 @@ class NoQueue:
     off."""
 
     held = 0
+    known = 0
+    waiting = 0
     max_delay_s = math.inf
 
     def offers(self, service: str) -> bool:
@@ -422,6 +424,8 @@ class Dispatcher:
             "loop_lag_s": self._lag_s,
             "cpu_s": self.context.clocks.cpu(),
             "log_lines_dropped": float(self.context.log.dropped),
+            "jobs": float(self._jobs.known),
+            "jobs_waiting": float(self._jobs.waiting),
             **self._compute.report(),
             **self._live_maps.report(),
             **self._topics.report(),

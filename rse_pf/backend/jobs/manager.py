@@ -107,6 +107,11 @@ class JobManager:
         """Jobs that run here, wait for a slot, or are followed while another server runs them."""
         return len(self._entries)
 
+    @property
+    def waiting(self) -> int:
+        """Jobs of these that run nowhere yet."""
+        return sum(entry.what == WAITING for entry in self._entries.values())
+
     def submit(self, queued: QueuedCommand) -> None:
         """Start the job of *queued*, unless it runs or is done already; the answer comes later.
 

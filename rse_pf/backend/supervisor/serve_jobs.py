@@ -90,7 +90,9 @@ class _Service:
         self._jobs = JobServer(
             context, self._queue, self._log, lambda: f"{server_id}-{secrets.token_hex(8)}", slots
         )  # fmt: skip
-        self._helpers = BatchHelpers(store, slots)
+        batch = settings.batch
+        ports = f"{batch.first_port + 1}:{batch.first_port + batch.ports - 1}"
+        self._helpers = BatchHelpers(store, slots, ports=ports)
         self._waiting = 0
         self._state = "starting"
         self._over = asyncio.Event()
@@ -154,7 +156,9 @@ class _Service:
         if self._token is not None and not carries_token(ask.authorization, self._token):
             return _json({"code": "unauthorized"}, status=401)
         if page == ("GET", "/metrics"):
-            lines = f"rsepf_jobs_running {self._jobs.running}\nrsepf_jobs_waiting {self._waiting}\n"
+            # A batch that works here is a job, too; jobs that wait are counted by the servers of their robots.
+            jobs = self._jobs.running + bool(self._helpers.pids)
+            lines = f"rse_pf_jobs {jobs}\nrse_pf_jobs_waiting 0\nrse_pf_job_offers {self._waiting}\n"
             return ControlReply(body=lines.encode(), content_type="text/plain; version=0.0.4")
         if page == ("POST", "/drain"):
             self._over.set()
