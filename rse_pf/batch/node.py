@@ -108,8 +108,8 @@ async def _worker(order: NodeOrder) -> None:
     security = security_of(order.certificate, order.key)
     with tempfile.TemporaryDirectory(prefix="rse-pf-batch-") as folder:
         async with Worker(
-            order.address, port=order.ports or None, nthreads=1, security=security, local_directory=folder, memory_limit=0,
-            death_timeout=_DEATH_TIMEOUT_S,
+            order.address, port=order.ports or None, nthreads=1, security=security, local_directory=folder,
+            memory_limit=0, death_timeout=_DEATH_TIMEOUT_S,
         ) as worker:  # fmt: skip
             await worker.finished()
 

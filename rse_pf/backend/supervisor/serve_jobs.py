@@ -156,7 +156,7 @@ class _Service:
         if self._token is not None and not carries_token(ask.authorization, self._token):
             return _json({"code": "unauthorized"}, status=401)
         if page == ("GET", "/metrics"):
-            # A batch that works here is a job, too; jobs that wait are counted by the servers of their robots.
+            # A batch that works here is a job, too; the servers of the robots count the jobs that wait.
             jobs = self._jobs.running + bool(self._helpers.pids)
             lines = f"rse_pf_jobs {jobs}\nrse_pf_jobs_waiting 0\nrse_pf_job_offers {self._waiting}\n"
             return ControlReply(body=lines.encode(), content_type="text/plain; version=0.0.4")
