@@ -14,7 +14,7 @@ from aws_cdk import region_info
 from constructs import Construct
 
 from rse_pf.config import PlatformSettings
-from rse_pf.config.resource_names import ResourceNames
+from rse_pf.config.resource_names import JOURNAL_PREFIX, ResourceNames
 from stacks.findings import acknowledge
 from stacks.replication import Replication
 from stacks.values import provide
@@ -25,6 +25,8 @@ BALANCER_LOGS = "alb"
 """Prefix of the load balancer's access logs in their bucket."""
 
 _DAY = cdk.Duration.days(1)
+_LEASES = ("live/", "jobs/")
+"""Prefixes of leases, which are renewed up to twice a second: each renewal leaves a former version."""
 _INFREQUENT_AFTER_DAYS = 30
 """The soonest that S3 takes an object there; ``data.glacier_after_days`` is not less."""
 
@@ -62,12 +64,17 @@ class DataStack(cdk.Stack):
                 )
             ],
         )
+        for prefix in _LEASES:
+            self.maps.add_lifecycle_rule(prefix=prefix, noncurrent_version_expiration=_DAY)
         self.artifacts = self._bucket("Artifacts", self.access_logs)
         for bucket in (self.maps, self.artifacts):
             bucket.add_lifecycle_rule(
                 noncurrent_version_expiration=deleted, expired_object_delete_marker=True,
                 abort_incomplete_multipart_upload_after=_DAY,
             )  # fmt: skip
+        self.artifacts.add_lifecycle_rule(
+            prefix=f"{JOURNAL_PREFIX}/", expiration=cdk.Duration.days(settings.cloud.log_days)
+        )  # fmt: skip
         self.audit_logs = self._bucket(
             "AuditLogs", self.access_logs, cdk.Duration.days(settings.cloud.audit_days)
         )

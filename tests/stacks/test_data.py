@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 
 from rse_pf.auth.trust_store import DENY_NAME, ROBOTS_NAME
+from rse_pf.backend.live_map.owner.lease import lease_name
 from rse_pf.config import PlatformSettings
 from rse_pf.config.resource_names import KEYS_NAME, SERVICES_PREFIX
 from rse_pf.errors import ConfigurationError
@@ -54,7 +55,7 @@ def test_what_nobody_can_see_is_deleted_in_every_bucket(assembly: Assembly) -> N
         former = [
             each["NoncurrentVersionExpiration"]["NoncurrentDays"]
             for each in rules(bucket)
-            if "NoncurrentVersionExpiration" in each
+            if "NoncurrentVersionExpiration" in each and "Prefix" not in each
         ]
         assert aborted == [{"DaysAfterInitiation": 1}], name
         assert former == [kept[name]], name
@@ -62,7 +63,11 @@ def test_what_nobody_can_see_is_deleted_in_every_bucket(assembly: Assembly) -> N
 
 def test_access_logs_end_and_maps_do_not(assembly: Assembly) -> None:
     ends = {
-        name: [each["ExpirationInDays"] for each in rules(bucket) if "ExpirationInDays" in each]
+        name: [
+            each["ExpirationInDays"]
+            for each in rules(bucket)
+            if "ExpirationInDays" in each and "Prefix" not in each
+        ]
         for name, bucket in buckets(assembly).items()
     }
 
@@ -70,6 +75,18 @@ def test_access_logs_end_and_maps_do_not(assembly: Assembly) -> None:
     assert ends == {
         "AccessLogs": [cloud.log_days], "AuditLogs": [cloud.audit_days + 1], "Maps": [], "Artifacts": [],
     }  # fmt: skip
+
+
+def test_former_versions_of_leases_do_not_pile_up(assembly: Assembly) -> None:
+    """A live map renews its lease twice a second: 172,800 versions in a day."""
+    short = {
+        each["Prefix"]: each["NoncurrentVersionExpiration"]["NoncurrentDays"]
+        for each in rules(buckets(assembly)["Maps"])
+        if "Prefix" in each
+    }
+
+    assert short == {"live/": 1, "jobs/": 1}
+    assert lease_name("default", "m").startswith("live/")
 
 
 def test_an_identity_and_maps_are_copied_to_other_regions_and_nothing_else(assembly: Assembly) -> None:
