@@ -16,7 +16,7 @@ __all__ = ["Account", "open_account"]
 _SIGN_IN = "set AWS_PROFILE, or sign in with aws sso login or aws configure"
 _ABSENT = (
     "ValidationError", "ResourceNotFoundException", "NoSuchResourceException", "ParameterNotFound",
-    "NoSuchBucket", "NoSuchTagSet",
+    "NoSuchBucket", "NoSuchTagSet", "InvalidInstanceID.NotFound", "InvalidInstanceID.Malformed",
 )  # fmt: skip
 
 

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from rse_pf.aws.fleet.instance import Instance
+from rse_pf.aws.fleet.journal import JournalReader
 from rse_pf.aws.storage.audit_archive import Shipper
 from rse_pf.config import PlatformSettings
 from rse_pf.object_store import ObjectStore
@@ -71,6 +72,7 @@ class AgentContext:
     settings: PlatformSettings
     log: Callable[..., None]
     shipper: Shipper | None = None
+    journal: JournalReader | None = None
     clock: Callable[[], float] = time.monotonic
     wall_clock: Callable[[], float] = time.time
     sleep: Callable[[float], None] = time.sleep

@@ -1,0 +1,91 @@
+"""Read this machine's journal: what the server, the agent, the data service and the boot wrote.
+
+Entries come as systemd exports them in JSON, one a line, and become lines of text.  The cursor of the last
+entry says where the next reading begins.
+"""
+
+from __future__ import annotations
+
+import subprocess
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from datetime import datetime, timezone
+
+import msgspec
+
+__all__ = ["UNITS", "Batch", "JournalReader", "batch_of", "read_journal"]
+
+UNITS = (
+    "rse-pf.service", "rse-pf-agent.service", "rse-pf-data.service", "rse-pf-jobs.service",
+    "cloud-init.service", "cloud-final.service",
+)  # fmt: skip
+"""Whose entries are read; the last two are the boot, with what first_boot.py and install.py print."""
+_MAX_BYTES = 1 << 22
+_FIELDS = "_SYSTEMD_UNIT,UNIT,MESSAGE"
+
+JournalReader = Callable[[str], Iterable[bytes]]
+"""Returns the entries after a cursor, as JSON lines; an empty cursor means the boot of the machine."""
+
+
+class _Entry(msgspec.Struct, frozen=True):
+    """One entry; a message that is no UTF-8 is exported as a list of its bytes."""
+
+    cursor: str = msgspec.field(name="__CURSOR")
+    realtime_us: str = msgspec.field(name="__REALTIME_TIMESTAMP")
+    message: str | list[int] | None = msgspec.field(name="MESSAGE", default=None)
+    unit: str = msgspec.field(name="_SYSTEMD_UNIT", default="")
+    about: str = msgspec.field(name="UNIT", default="")
+
+    @property
+    def line(self) -> str:
+        """Return ``2026-11-23T04:00:00.123Z rse-pf message`` for one line of output."""
+        at = datetime.fromtimestamp(int(self.realtime_us) / 1e6, timezone.utc)
+        text = (
+            bytes(self.message).decode("utf-8", "replace") if isinstance(self.message, list) else self.message
+        )
+        stamp = at.isoformat(timespec="milliseconds").replace("+00:00", "Z")
+        return f"{stamp} {(self.about or self.unit).removesuffix('.service')} {text or ''}\n"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Batch:
+    """Some lines of a journal in UTF-8, the Unix microseconds of the first, and the cursor of the last."""
+
+    first_us: int
+    text: bytes
+    cursor: str
+
+
+def batch_of(entries: Iterable[bytes], max_bytes: int = _MAX_BYTES) -> Batch | None:
+    """Return the first *entries* as one batch of about *max_bytes*; None if there are none.
+
+    An entry that cannot be read is left out; systemd writes none.
+    """
+    first_us, cursor, size = 0, "", 0
+    lines: list[bytes] = []
+    for each in entries:
+        try:
+            entry = msgspec.json.decode(each, type=_Entry)
+            line = entry.line.encode()
+        except (msgspec.DecodeError, ValueError, OverflowError):
+            continue
+        first_us = first_us or int(entry.realtime_us)
+        cursor = entry.cursor
+        lines.append(line)
+        size += len(line)
+        if size >= max_bytes:
+            break
+    return Batch(first_us=first_us, text=b"".join(lines), cursor=cursor) if lines else None
+
+
+def read_journal(cursor: str) -> Iterator[bytes]:
+    """Yield the entries of `UNITS` after *cursor* on this machine; raises OSError."""
+    command = ["/usr/bin/journalctl", "--output=json", f"--output-fields={_FIELDS}", "--no-pager", "--quiet"]
+    command += [f"--unit={unit}" for unit in UNITS]
+    command += [f"--after-cursor={cursor}"] if cursor else ["--boot"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) as process:
+        assert process.stdout is not None
+        try:
+            yield from process.stdout
+        finally:
+            process.kill()

@@ -1,0 +1,78 @@
+"""Show an operator what servers logged: pieces of their journals in the bucket, or the console of a boot.
+
+Reads only.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+from rse_pf.aws.account import Account
+from rse_pf.aws.storage.s3_store import S3Store
+from rse_pf.config.resource_names import JOURNAL_PREFIX, ResourceNames
+from rse_pf.object_store import ObjectStore
+
+__all__ = ["LoggedServer", "console_of", "last_lines", "logged_servers", "open_journals"]
+
+_PIECE = re.compile(rf"{JOURNAL_PREFIX}/(?P<server>[A-Za-z0-9-]{{1,64}})/(?P<first_us>\d{{20}})\.log")
+_MAX_PIECES = 200
+"""Read for one answer, the newest ones."""
+_CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LoggedServer:
+    """A server with journals in the bucket: its instance id, its pieces, and when the newest one begins."""
+
+    name: str
+    pieces: tuple[str, ...]
+    newest_s: float
+
+
+def open_journals(account: Account, names: ResourceNames) -> S3Store:
+    """Return the bucket that holds the journals; raises ConfigurationError if there is none."""
+    bucket = account.resource(names.stack("Data"), "AWS::S3::Bucket", "Artifacts")
+    return S3Store(account.client("s3"), bucket)
+
+
+def logged_servers(store: ObjectStore) -> list[LoggedServer]:
+    """Return the servers with journals in *store*, the one that wrote last first; raises StoreError."""
+    pieces: dict[str, list[str]] = {}
+    for info in store.list(f"{JOURNAL_PREFIX}/"):
+        match = _PIECE.fullmatch(info.name)
+        if match is not None:
+            pieces.setdefault(match["server"], []).append(info.name)
+    found = [
+        LoggedServer(name=server, pieces=tuple(sorted(names)), newest_s=_begin_s(max(names)))
+        for server, names in pieces.items()
+    ]
+    return sorted(found, key=lambda each: (-each.newest_s, each.name))
+
+
+def last_lines(store: ObjectStore, server: LoggedServer, count: int) -> list[str]:
+    """Return the last *count* lines of a server's journals, without control characters; raises StoreError."""
+    lines: list[str] = []
+    for name in reversed(server.pieces[-_MAX_PIECES:]):
+        lines = store.get(name).decode("utf-8", "replace").splitlines() + lines
+        if len(lines) >= count:
+            break
+    return [_CONTROL.sub("?", line) for line in lines[-count:]]
+
+
+def console_of(account: Account, server: str) -> list[str]:
+    """Return what an instance wrote to its console, which outlives it for an hour; empty if it is unknown.
+
+    Raises:
+        ConfigurationError: AWS refused.
+        StoreError: AWS does not answer.
+    """
+    told = account.find("ec2", "get_console_output", InstanceId=server, Latest=False)
+    text = str((told or {}).get("Output", ""))  # botocore has decoded it
+    return [_CONTROL.sub("?", line) for line in text.splitlines()]
+
+
+def _begin_s(piece: str) -> float:
+    match = _PIECE.fullmatch(piece)
+    assert match is not None
+    return int(match["first_us"]) / 1e6

@@ -1,0 +1,45 @@
+"""Ship the machine's journals to the artifact bucket, from where ``rse-pf cloud logs`` shows them.
+
+They would be lost with the machine.  The bucket is reached by the free gateway endpoint: shipping costs an
+object a minute, where CloudWatch Logs would cost an endpoint in each zone.
+"""
+
+from __future__ import annotations
+
+from rse_pf.aws.fleet.journal import batch_of
+from rse_pf.aws.fleet.task import AgentContext, Task
+from rse_pf.config.resource_names import JOURNAL_PREFIX
+from rse_pf.files import replace_file
+
+__all__ = ["piece_name", "task"]
+
+_CURSOR_FILE = "journal.cursor"
+_MAX_PIECES = 8
+"""In one call; what is left is shipped in the next ones."""
+
+
+def task(context: AgentContext) -> Task:
+    """Upload what the journals have since the last call; also before and after a drain."""
+    return Task(
+        name="journals", period_s=context.settings.cloud.journal_ship_s, call=lambda: _ship(context),
+        flushes=True,
+    )  # fmt: skip
+
+
+def piece_name(instance: str, first_us: int) -> str:
+    """Return the name of a piece that begins at *first_us*, Unix microseconds; names sort by time."""
+    return f"{JOURNAL_PREFIX}/{instance}/{first_us:020d}.log"
+
+
+def _ship(context: AgentContext) -> None:
+    if context.journal is None:
+        return
+    file = context.config.keys_file.with_name(_CURSOR_FILE)
+    for _ in range(_MAX_PIECES):
+        cursor = file.read_text(encoding="utf-8") if file.exists() else ""
+        batch = batch_of(context.journal(cursor))
+        if batch is None:
+            return
+        # A piece whose cursor was lost is written again, under the same name.
+        context.artifacts.put(piece_name(context.machine.instance_id(), batch.first_us), batch.text)
+        replace_file(file, batch.cursor.encode())

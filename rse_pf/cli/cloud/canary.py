@@ -1,0 +1,43 @@
+"""rse-pf cloud canary: give the canary's robot a new key, and enrol it; its old key is refused then."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import secrets
+import time
+
+from rse_pf.config import PlatformSettings
+from rse_pf.config.resource_names import ResourceNames
+from rse_pf.errors import UsageError
+from rse_pf.terminal import show
+
+__all__ = ["add_arguments", "run"]
+
+_SEED_BYTES = 32
+_SCOPES = ("services:pnp",)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare nothing: the canary has no options."""
+
+
+def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
+    """Write the private key into the canary's secret and the public one into the roster; return 0."""
+    from rse_pf.auth.roster import EnrolledRobot
+    from rse_pf.auth.tokens import SigningKey
+    from rse_pf.aws.account import open_account
+    from rse_pf.aws.storage.key_store import open_key_store
+
+    if not settings.cloud.canary:
+        raise UsageError("cloud.canary is off", hint='set it to true in cdk.json, context."rse-pf"')
+    account, names = open_account(settings.cloud.region), ResourceNames(settings.cloud.name)
+    access = open_key_store(account, names).access_control_store()
+    secret = account.resource(names.stack("Observability"), "AWS::SecretsManager::Secret", "CanaryKey")
+    key = SigningKey.of_robot(secrets.token_bytes(_SEED_BYTES))
+    public = json.loads(key.public_json())["x"]
+    robot = EnrolledRobot(robot=names.canary, x=public, scopes=_SCOPES, enrolled_s=round(time.time(), 3))
+    account.find("secretsmanager", "put_secret_value", SecretId=secret, SecretString=key.to_json())
+    access.change_roster(lambda roster: roster.enrolled(robot))
+    show(f"{names.canary} has a new key and the scope {_SCOPES[0]}; servers know it in a few seconds")
+    return 0
