@@ -94,8 +94,8 @@ EXTRAS: dict[str, Extra] = {
     "experiments": Extra(modules=_same("matplotlib"), enables="figures of experiments", includes=("local",)),
     "aws": Extra(modules=_same("boto3"), enables="everything with --cloud, stores in S3"),
     "boot": Extra(
-        modules=_same("pip"), enables="the first boot of a server on AWS",
-        includes=("backend", "data", "aws"), is_for_users=False,
+        modules={"cv2": "opencv-python-headless"}, enables="what a server on AWS runs: every service",
+        includes=("backend", "data", "aws", "maps", "services"), is_for_users=False,
     ),
     "infra": Extra(
         modules={

@@ -1,30 +1,22 @@
 """How long a new server takes on AWS from its launch to readiness: one table, step by step.
 
-Two steps are measured in a bare Debian root, the others are what is known of EC2 and marked so; the sum is an
-estimate until a deployment has been measured.  Every time limit of a boot is derived from it.
+The time limits of a launch follow from it: ``cloud.boot_s`` is four times `BOOT_S` by default.  What EC2
+takes is an estimate, shared with `rse_pf.scaling.cloud_delays`; the rest was measured in a bare Debian root.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from rse_pf.scaling.cloud_delays import DESIGNS, Delay
 
-__all__ = ["BOOT_S", "STEPS", "BootStep"]
+__all__ = ["BOOT_S", "STEPS"]
 
+_MEASURED = "python -m benchmarks.cloud.boot, on a loaded machine"
 
-@dataclass(frozen=True, slots=True)
-class BootStep:
-    """One step: its length in seconds, and where the number comes from."""
-
-    name: str
-    seconds: float
-    source: str
-
-
-STEPS = (
-    BootStep("EC2 from pending to running", 20.0, "knowledge of EC2: 10 to 20 s"),
-    BootStep("kernel, network and cloud-init", 35.0, "knowledge of Debian's cloud image: 25 to 35 s"),
-    BootStep("fetch, verify and unpack the environment", 10.0, "benchmarks.cloud.boot, rounded up"),
-    BootStep("agent and server until /readyz", 10.0, "benchmarks.cloud.boot, rounded up"),
+STEPS: tuple[Delay, ...] = (
+    *DESIGNS["0.1.0"].launch[:2],
+    Delay(step="fetch, verify and unpack the environment", low_s=3.0, high_s=10.0, source=_MEASURED),
+    Delay(step="agent and server until /readyz", low_s=3.0, high_s=10.0, source=_MEASURED),
 )
-BOOT_S = sum(step.seconds for step in STEPS)
-"""From the launch to /readyz, in seconds."""
+"""Pending to running; kernel and cloud-init; the package; the processes."""
+BOOT_S = sum(step.high_s for step in STEPS)
+"""From the launch to /readyz, in seconds, without luck."""

@@ -17,11 +17,14 @@ from rse_pf.errors import SettingsError
 
 ROWS = list(setting_rows())
 BASE = PlatformSettings()
-TOGETHER: dict[tuple[str, str], dict[str, Any]] = {
-    ("cloud", "allow_insecure"): {"certificate_arn": "arn:aws:acm:a:1:certificate/b", "domain_name": "a.org"},
-    ("local", "certificate"): {"private_key": "key.pem"},
-    ("local", "private_key"): {"certificate": "chain.pem"},
-    ("scaling", "period_s"): {"idle_s": 420},
+TOGETHER: dict[tuple[str, str], dict[str, dict[str, Any]]] = {
+    ("cloud", "allow_insecure"): {
+        "cloud": {"certificate_arn": "arn:aws:acm:a:1:certificate/b", "domain_name": "a.org"}
+    },
+    ("cloud", "job_servers"): {"serving": {"offer_jobs": True}},
+    ("local", "certificate"): {"local": {"private_key": "key.pem"}},
+    ("local", "private_key"): {"local": {"certificate": "chain.pem"}},
+    ("scaling", "period_s"): {"scaling": {"idle_s": 420}},
 }
 """Settings that are refused alone, with what they need."""
 SERVER_FOLDERS = (
@@ -31,8 +34,8 @@ SERVER_FOLDERS = (
 SERVER_FILES = ("aws/fleet/agent.py", "aws/fleet/drain_hook.py", "aws/fleet/launch_hook.py")
 
 
-def changed(row: SettingRow) -> PlatformSettings | None:
-    """Return the defaults with another value of one setting; None where no other one was found."""
+def changed(row: SettingRow) -> tuple[PlatformSettings, PlatformSettings] | None:
+    """Return settings without and with another value of one of them; None where no other one was found."""
     value = row.default
     tries: list[Any] = [*(row.choices or ())]
     if isinstance(value, bool):
@@ -43,17 +46,20 @@ def changed(row: SettingRow) -> PlatformSettings | None:
         tries += [value * 1.01 + 0.001, value * 0.99 - 0.001]
     else:
         tries += [
-            "other",
-            "https://robots.example.org", "https://robots.example.org/burst",
-            "weekdays 08:00 min 3",
-            "Asia/Seoul",
-            "m7i.large",
-        ]
+            "other", "https://robots.example.org", "https://robots.example.org/burst", "weekdays 08:00 min 3",
+            "Asia/Seoul", "m7i.large",
+        ]  # fmt: skip
+    companions = TOGETHER.get((row.group, row.name), {})
+    try:
+        before = BASE.replace(**companions)
+    except SettingsError:
+        before = BASE
     for other in tries:
         if other == value:
             continue
+        groups = {**companions, row.group: {**companions.get(row.group, {}), row.name: other}}
         try:
-            return BASE.replace(**{row.group: {row.name: other, **TOGETHER.get((row.group, row.name), {})}})
+            return before, BASE.replace(**groups)
         except SettingsError:
             continue
     return None
@@ -61,11 +67,12 @@ def changed(row: SettingRow) -> PlatformSettings | None:
 
 @pytest.mark.parametrize("row", ROWS, ids=[f"{row.group}.{row.name}" for row in ROWS])
 def test_a_setting_changes_the_package_exactly_when_a_server_reads_it(row: SettingRow) -> None:
-    other = changed(row)
-    assert other is not None, f"no other value found for {row.group}.{row.name}: add one to TOGETHER"
+    pair = changed(row)
+    assert pair is not None, f"no other value found for {row.group}.{row.name}: add one to TOGETHER"
+    before, after = map(server_settings, pair)
     travels = row.name in READ_BY_SERVERS.get(row.group, (row.name,))
 
-    assert (server_settings(other) != server_settings(BASE)) == travels
+    assert (after != before) == travels
 
 
 def test_the_listed_settings_exist_and_a_server_starts_with_what_travels() -> None:

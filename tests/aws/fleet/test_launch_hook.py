@@ -170,3 +170,4 @@ def test_retries_boot_and_readiness_fit_into_the_hook(boot_s: int) -> None:
     assert late_role_s + late_server_s + 0.2 * boot_s < boot_s
     assert late_role_s >= 2 * 20, "a role that comes 20 s late is no reason to end a machine"
     assert boot_s >= 2 * BOOT_S
+    assert SETTINGS.cloud.boot_s == 4 * BOOT_S

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from datetime import datetime, timedelta, timezone
 from typing import Any
 
@@ -34,6 +35,12 @@ BROKEN = "i-0broken"
 REASON = "Instance failed to complete user's Lifecycle Action: was abandoned"
 
 
+@functools.cache
+def model_of(service: str) -> Any:
+    """Return the API's own description."""
+    return botocore.session.get_session().get_service_model(service)
+
+
 class Interrupted(Exception):
     """The operator's machine went away."""
 
@@ -56,13 +63,12 @@ class FakeAws:
         self.least_serving = servers
         self.interrupt_at = -1
         self.waits = 0
-        self._models = botocore.session.get_session()
 
     def account(self) -> Account:
         return Account("ap-northeast-2", lambda service, region: FakeClient(self, service))
 
     def called(self, service: str, method: str, arguments: dict[str, Any]) -> dict[str, Any]:
-        model = self._models.get_service_model(service)
+        model = model_of(service)
         operation = "".join(word.capitalize() for word in method.split("_"))
         report = ParamValidator().validate(arguments, model.operation_model(operation).input_shape)
         assert not report.has_errors(), report.generate_report()
