@@ -32,7 +32,7 @@ def events(**times_s: float) -> Records:
         {"time": 1.0, "action": "server-healthy", "server": "server-1"},
     ]  # fmt: skip
     found += [{"time": at, "action": name.replace("_", "-")} for name, at in times_s.items()]
-    found.append({"time": 2.0, "action": "phase", "phase": "loaded"})
+    found += [{"time": at, "action": "robot-joined", "robot": f"robot-{at}"} for at in (2.0, 2.5)]
     return Records(folder=Path("none"), commands=[], samples=[], events=sorted(found, key=_time))
 
 

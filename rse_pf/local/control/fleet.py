@@ -23,7 +23,7 @@ from rse_pf.local.control.monitor import Observed, ServerPhase
 from rse_pf.local.processes import STOP_TIMEOUT_S
 from rse_pf.local.servers.backend_servers import BackendServer, LocalBackendServers
 from rse_pf.local.servers.control_client import ControlPort
-from rse_pf.scaling.health import HEALTHY_CHECKS, LOCAL_INTERVAL_S, Health, time_to_notice_s
+from rse_pf.scaling.health import Health, time_to_notice_s
 
 __all__ = ["Fleet", "Member", "ServerHealth"]
 
@@ -103,11 +103,8 @@ class Fleet:
         emit: Callable[..., None],
         changed: Callable[[], None],
     ) -> None:
-        """Make a fleet without members; later servers serve *launch_s* after their launch, compressed.
-
-        The checks of the balancer on this machine are part of that time.
-        """
-        self._launch_s = launch_s / compress - HEALTHY_CHECKS * LOCAL_INTERVAL_S
+        """Make a fleet without members; later servers serve *launch_s* after their launch, compressed."""
+        self._launch_s = launch_s / compress
         self.members: dict[str, Member] = {}
         self.dead: dict[str, bool] = {}
         self.launched = 0

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import dataclasses
 import functools
 import os
 import secrets
@@ -22,7 +21,7 @@ from typing import Any
 
 from rse_pf.auth.control_token import ensure_control_token
 from rse_pf.auth.tokens import SigningKey
-from rse_pf.config import PlatformSettings, ScalingSettings
+from rse_pf.config import PlatformSettings
 from rse_pf.errors import ConfigurationError, UsageError
 from rse_pf.files import replace_json
 from rse_pf.local.balancer.load_balancer import EnvoyLoadBalancer
@@ -32,6 +31,7 @@ from rse_pf.local.control.federation import service_discovery
 from rse_pf.local.control.fleet import Fleet, Member
 from rse_pf.local.control.operator_port import OperatorPort
 from rse_pf.local.control.platform_recording import PlatformRecording
+from rse_pf.local.control.scale_modifier import bounds_for
 from rse_pf.local.firewall import check_lan_settings, check_listener, ensure_key, key_file, robots_url
 from rse_pf.local.lan.listener import LanListener, authority_file
 from rse_pf.local.latest_file import LatestFile
@@ -155,7 +155,7 @@ class LocalPlatform:
             self, metrics=self.backend_servers.metrics, keep=self._fleet.keep, emit=self._emit
         )
         self._control = ControlPlane(
-            self._fleet, self.load_balancer, settings, _bounds(settings.scaling, self._count), control,
+            self._fleet, self.load_balancer, settings, bounds_for(settings.scaling, self._count), control,
             emit=self._emit, changed=self._write_state,
         )  # fmt: skip
 
@@ -595,10 +595,3 @@ class LocalPlatform:
         self._operator_port.heard(entry)
         if self._on_event is not None:
             self._on_event(entry)
-
-
-def _bounds(scaling: ScalingSettings, count: int) -> ScalingSettings:
-    """Return *scaling* with bounds that allow *count* servers."""
-    return dataclasses.replace(
-        scaling, min_servers=min(scaling.min_servers, count), max_servers=max(scaling.max_servers, count)
-    )

@@ -17,9 +17,16 @@ from rse_pf.config import ScalingSettings
 from rse_pf.local.control.fleet import Fleet, ServerHealth
 from rse_pf.scaling.policy import Action, FleetState, Sample, decide, holding_since
 
-__all__ = ["LocalScaleModifier", "may_start_s", "replace_now"]
+__all__ = ["LocalScaleModifier", "bounds_for", "may_start_s", "replace_now"]
 
 _MINUTE_S = 60.0
+
+
+def bounds_for(scaling: ScalingSettings, count: int) -> ScalingSettings:
+    """Return *scaling* with bounds that allow *count* servers."""
+    return dataclasses.replace(
+        scaling, min_servers=min(scaling.min_servers, count), max_servers=max(scaling.max_servers, count)
+    )
 
 
 def may_start_s(starts: Sequence[float], *, now_s: float, per_minute: int) -> float:
