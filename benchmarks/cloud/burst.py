@@ -121,7 +121,8 @@ def _start_front(args: argparse.Namespace, folder: Path, started: list[subproces
         )
     started.append(process)
     assert process.stdout is not None
-    line = process.stdout.readline()
+    with process.stdout:  # it says nothing more
+        line = process.stdout.readline()
     if not line:
         raise SystemExit(f"the function did not start: {(folder / 'front.log').read_text()}")
     url: str = json.loads(line)["url"]

@@ -9,6 +9,7 @@ examples:
   rse-pf local --servers 2
   rse-pf local --lan
   rse-pf local --record recordings
+  rse-pf local --burst
   rse-pf local status
   rse-pf local robots
   rse-pf local logs --server server-1 --follow
@@ -101,6 +102,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         f"(local.foxglove_port, default {defaults.foxglove_port})",
     )  # fmt: skip
     parser.add_argument(
+        "--burst", nargs="?", type=int, const=defaults.burst_port, metavar="P",
+        help="also run the burst function, at port P on loopback (local.burst_port, default "
+        f"{defaults.burst_port}): robots ask it while no server answers in time",
+    )  # fmt: skip
+    parser.add_argument(
         "--no-data", action="store_true", help="start no data service (large data by HTTP under /data/)"
     )
     parser.add_argument(
@@ -144,11 +150,29 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     page = not args.no_page
     if args.foxglove:
         require("local --foxglove")
+    if args.burst is not None:
+        chosen = _with_burst(chosen, args.burst, lan)
     return asyncio.run(
         _foreground(
-            args.name, folder, chosen, data=not args.no_data, lan=lan, page=page, foxglove=args.foxglove
+            args.name, folder, chosen, data=not args.no_data, lan=lan, page=page, foxglove=args.foxglove,
+            burst_port=args.burst,
         )
-    )
+    )  # fmt: skip
+
+
+def _with_burst(settings: PlatformSettings, port: int, lan: str) -> PlatformSettings:
+    """Return *settings* whose servers tell robots of the burst function at *port*."""
+    from rse_pf.config.front_door import BURST_PATH
+    from rse_pf.local.firewall import check_listener
+
+    if lan:
+        raise UsageError(
+            "--burst is for robots of this machine, and --lan for others", hint="leave one of them out"
+        )
+    if not 0 < port < 65536:
+        raise UsageError(f"--burst {port} is no port", hint="name one from 1 to 65535, or leave it out")
+    check_listener("127.0.0.1", port)
+    return settings.replace(burst={"url": f"http://127.0.0.1:{port}{BURST_PATH}"})
 
 
 def _with_services(settings: PlatformSettings, args: argparse.Namespace) -> PlatformSettings:
@@ -172,6 +196,8 @@ def _check(args: argparse.Namespace) -> None:
     if args.action not in _OF_A_SERVER and args.server is not None:
         hint = "name it with --server" if args.action == "logs" else "leave the name out"
         raise UsageError(f"rse-pf local {args.action} takes no server", hint=hint)
+    if args.action != "start" and args.burst is not None:
+        raise UsageError("--burst is for the start of a platform", hint="see rse-pf local --help")
     if args.action != "logs" and (args.of_server or args.follow):
         raise UsageError("--server and --follow are for logs", hint="see rse-pf local --help")
     of_start = (args.lan, args.metrics_port, args.record)
@@ -309,8 +335,9 @@ def _wait(end_s: float, seconds: float) -> bool:
 
 
 async def _foreground(
-    name: str, folder: Any, settings: PlatformSettings, *, data: bool, lan: str, page: bool, foxglove: bool
-) -> int:
+    name: str, folder: Any, settings: PlatformSettings, *, data: bool, lan: str, page: bool, foxglove: bool,
+    burst_port: int | None = None,
+) -> int:  # fmt: skip
     from rse_pf.cli.local_platform.page import page_beside, process_beside
     from rse_pf.local.control.control_plane import ControlOptions
     from rse_pf.local.control.platform import LocalPlatform
@@ -349,7 +376,13 @@ async def _foreground(
                 "rse_pf.fleet_page.foxglove_export", folder, settings.local.foxglove_port,
                 folder / "foxglove.log", lambda url: show(f"foxglove            {url}"),
             )  # fmt: skip
-            async with beside, export if foxglove else nullcontext():
+            burst = process_beside(
+                "lambda_pnp.local_front", folder, burst_port or 0, folder / "burst.log",
+                lambda url: show(f"burst function      {url}"),
+            )  # fmt: skip
+            async with (
+                beside, export if foxglove else nullcontext(), burst if burst_port else nullcontext(),
+            ):  # fmt: skip
                 await stopped.wait()
                 show("", "stopping")
     except asyncio.CancelledError:

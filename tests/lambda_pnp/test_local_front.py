@@ -1,0 +1,150 @@
+"""What plays firewall, load balancer and Lambda on one machine, and the real robot before it."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from random import Random
+from typing import Any
+
+import numpy as np
+import pytest
+from fake_platform import FakePlatform
+
+import client_sdk
+from lambda_pnp.local_front import LocalFront, answering_of, main
+from rse_pf.auth.tokens import SigningKey
+from rse_pf.config import BurstSettings, PlatformSettings
+from rse_pf.pnp.problems import make_problem
+from rse_pf.wire import Failure
+
+KEY = SigningKey.from_seed(bytes(range(32)), "key-1")
+SETTINGS = PlatformSettings()
+
+
+def token(robot: str = "robot-1") -> str:
+    return KEY.issue(robot, now=time.time(), token_id="t", settings=SETTINGS.auth)
+
+
+def with_front(
+    folder: Path, test: Callable[[LocalFront], Awaitable[None]], *, most: int = 4, **burst: int
+) -> None:
+    (folder / "keys.json").write_text(KEY.key_set().to_json(), encoding="utf-8")
+
+    async def run() -> None:
+        settings = SETTINGS.replace(burst=burst)
+        front = LocalFront(answering_of(settings, folder), most=most)
+        await front.start()
+        try:
+            await test(front)
+        finally:
+            await front.stop()
+
+    asyncio.run(asyncio.wait_for(run(), 30))
+
+
+async def said(front: LocalFront, request: bytes) -> int:
+    """Return the status that a raw request gets."""
+    host, _, port = front.url.removeprefix("http://").partition("/")[0].partition(":")
+    reader, writer = await asyncio.open_connection(host, int(port))
+    writer.write(request)
+    head = await reader.readuntil(b"\r\n\r\n")
+    writer.transport.abort()
+    return int(head.split()[1])
+
+
+@pytest.mark.parametrize(
+    ("request_line", "headers", "status"),
+    [
+        ("POST /burst HTTP/1.1", "", 401),
+        ("POST /burst HTTP/1.1", "authorization: Bearer x\r\n", 401),
+        ("POST /burst HTTP/1.1", "authorization: {token}\r\nauthorization: {token}\r\n", 400),
+        ("POST /burst HTTP/1.1", "authorization: {token}\r\n", 400),
+        ("GET /burst HTTP/1.1", "authorization: {token}\r\n", 404),
+        ("POST /burst/x HTTP/1.1", "authorization: {token}\r\n", 404),
+        ("POST /ws HTTP/1.1", "authorization: {token}\r\n", 404),
+        ("POST /burst HTTP/1.1", "content-length: 2000000\r\n", 413),
+        ("POST /burst HTTP/1.1", "content-length: x\r\n", 413),
+    ],
+)
+def test_a_wrong_request_gets_the_status_that_aws_would_give(
+    tmp_path: Path, request_line: str, headers: str, status: int
+) -> None:
+    async def test(front: LocalFront) -> None:
+        told = headers.format(token=f"Bearer {token()}")
+        assert await said(front, f"{request_line}\r\nhost: x\r\n{told}\r\n".encode()) == status
+
+    with_front(tmp_path, test)
+
+
+def test_more_than_the_reserved_executions_are_refused(tmp_path: Path) -> None:
+    async def test(front: LocalFront) -> None:
+        right = f"POST /burst HTTP/1.1\r\nhost: x\r\nauthorization: Bearer {token()}\r\n\r\n".encode()
+        assert await said(front, right) == 502
+        assert (front.answered, front.refused) == (0, 1)
+
+    def none_left(front: LocalFront) -> Awaitable[None]:
+        front._most = 0
+        return test(front)
+
+    with_front(tmp_path, none_left, most=1)
+
+
+def robots_of(front: LocalFront, platform: FakePlatform, budget: int) -> client_sdk.Robot:
+    async def busy(_: object, command: Any) -> Failure:
+        return Failure(id=command.id, code="busy", message="full", retry_after_ms=9e4)
+
+    platform.on_command = busy
+    platform.burst = BurstSettings(url=front.url, robot_commands_per_day=budget)
+    own = client_sdk.CloudFirst()
+    return client_sdk.connect(platform.url, token=token(), random=Random(1), offload=own)
+
+
+@pytest.mark.parametrize("codec", ["zlib", "json", "bin"])
+def test_a_robot_gets_the_pose_of_the_function(tmp_path: Path, codec: str) -> None:
+    problem = make_problem(seed=4)
+
+    async def test(front: LocalFront) -> None:
+        async with FakePlatform() as platform:
+            platform.refusals = [(503, None)] * 1000
+            robot = client_sdk.connect(
+                platform.url, token=token(), random=Random(1), codec=codec, burst_url=front.url
+            )
+            async with robot:
+                answer = await robot.solve_pnp(
+                    problem.points_world, problem.pixels, problem.camera, deadline_s=10.0
+                )
+        assert (answer.source, answer.server, front.executions) == ("burst", "lambda", 1)
+        np.testing.assert_allclose(answer.solution.T_camera_world, problem.T_camera_world, atol=0.05)
+
+    with_front(tmp_path, test)
+
+
+def test_a_robot_that_ignores_its_own_budget_is_stopped_by_the_function(tmp_path: Path) -> None:
+    problem = make_problem(seed=4)
+
+    async def test(front: LocalFront) -> None:
+        async with FakePlatform() as platform, robots_of(front, platform, budget=10**6) as robot:
+            sources = [
+                (
+                    await robot.solve_pnp(
+                        problem.points_world, problem.pixels, problem.camera, deadline_s=10.0
+                    )
+                ).source
+                for _ in range(6)
+            ]
+        assert sources == ["burst"] * 4 + ["robot"] * 2
+        assert front.answered == 5, "the first refusal closes the breaker until tomorrow"
+
+    with_front(tmp_path, test, robot_commands_per_day=4)
+
+
+def test_it_does_not_start_without_a_platform(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("sys.argv", ["local_front", str(tmp_path / "nothing")])
+
+    assert main() == 2
+    assert "hint" in capsys.readouterr().err
