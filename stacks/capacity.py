@@ -41,11 +41,12 @@ class Capacity(Construct):
         if settings.cloud.spot or len(instance_types(settings.cloud)) > 1:
             self._mix(raw, settings)
         if settings.cloud.warm_servers:
-            # The group prepares no more than its minimum, so that the pool has exactly its own minimum.
+            # "Only when MaxGroupPreparedCapacity and MinSize are set to the same value does the warm pool
+            # have an absolute size" (AWS, PutWarmPool); else it grows to what is missing to the maximum.
             autoscaling.CfnWarmPool(
                 self, "WarmPool", auto_scaling_group_name=group.auto_scaling_group_name, pool_state="Stopped",
                 min_size=settings.cloud.warm_servers,
-                max_group_prepared_capacity=settings.scaling.min_servers,
+                max_group_prepared_capacity=settings.cloud.warm_servers,
                 instance_reuse_policy=autoscaling.CfnWarmPool.InstanceReusePolicyProperty(
                     reuse_on_scale_in=False
                 ),

@@ -55,7 +55,7 @@ def test_a_warm_pool_holds_exactly_its_stopped_servers() -> None:
 
     del pool["AutoScalingGroupName"]
     assert pool == {
-        "InstanceReusePolicy": {"ReuseOnScaleIn": False}, "MaxGroupPreparedCapacity": 3, "MinSize": 2,
+        "InstanceReusePolicy": {"ReuseOnScaleIn": False}, "MaxGroupPreparedCapacity": 2, "MinSize": 2,
         "PoolState": "Stopped",
     }  # fmt: skip
 

@@ -62,10 +62,13 @@ class Instance:
         """Have the server ask *robots* of its robots to move within *spread_s*; return how many it asks.
 
         Raises:
-            Disconnected: No server runs, or it drains.
+            Disconnected: No server runs, it drains, or what answers is no server of ours.
         """
-        told = json.loads(self._ask(f"/move?robots={robots}&spread_s={spread_s:g}", "POST"))
-        return int(told.get("robots", 0))
+        text = self._ask(f"/move?robots={robots}&spread_s={spread_s:g}", "POST")
+        try:
+            return int(json.loads(text)["robots"])
+        except (ValueError, TypeError, KeyError) as error:
+            raise Disconnected(f"the answer to /move is {text[:40]!r}") from error
 
     def reload_services(self) -> None:
         """Have the server load the published services; raises Disconnected when no server runs."""
