@@ -12,7 +12,7 @@ import pytest
 
 from rse_pf.aws.account import Account
 from rse_pf.aws.clients import make_client
-from rse_pf.aws.money.costs import Load, compare
+from rse_pf.aws.money.costs import bill_of, parked
 from rse_pf.aws.money.prices import load_prices
 from rse_pf.cli.main import main
 from rse_pf.config import PlatformSettings
@@ -31,16 +31,37 @@ RUN_HERE = {
     "rse-pf audit verify --cloud": 2,
     "rse-pf audit show --cloud --only refused --out logs": 2,
     "rse-pf cloud leftovers": 1,
+    "rse-pf cloud logs": 1,
+    "rse-pf cloud canary": 2,
+    "rse-pf cloud cost --robots 20 --fps 5 --burst 100000": 0,
 }
 """Each with its exit code on an account that has the Data stack and nothing else."""
 NEEDS_AN_ACCOUNT = {
+    "rse-pf cloud prices --refresh",
+    "rse-pf cloud logs SERVER --lines 500",
+    "rse-pf cloud logs SERVER --console",
+    "aws autoscaling describe-scaling-activities --auto-scaling-group-name rse-pf --max-items 5",
+    "aws autoscaling terminate-instance-in-auto-scaling-group --instance-id SERVER"
+    " --no-should-decrement-desired-capacity",
+    "aws lambda get-function-configuration --function-name rse-pf-pnp --query LoggingConfig.LogGroup",
+    "aws lambda get-function-configuration --function-name rse-pf-canary --query LoggingConfig.LogGroup",
+    "aws logs tail GROUP --since 1h",
     "npx cdk bootstrap",
     "npx cdk deploy --all",
     "aws sns subscribe --topic-arn TOPIC --protocol email --notification-endpoint you@example.org",
     "make assets",
     "npx cdk diff",
     "npx cdk deploy RsePf-Backend",
-    "aws cloudformation cancel-update-stack --stack-name RsePf-Backend",
+    "rse-pf cloud upgrade",
+    "aws ec2 get-console-output --latest --output text --instance-id INSTANCE",
+    "aws autoscaling describe-scaling-activities --auto-scaling-group-name rse-pf-jobs --max-items 5",
+    "aws ssm get-parameter --region us-east-1 --name /rse-pf/data/maps --query Parameter.Value --output text",
+    "aws ssm get-parameter --region us-east-1 --name /rse-pf/data/artifacts --query Parameter.Value"
+    " --output text",
+    "aws s3 sync s3://HOME-MAPS/maps s3://REPLICA-MAPS/maps",
+    "aws s3 sync s3://HOME-ARTIFACTS/services s3://REPLICA-ARTIFACTS/services",
+    "aws s3 sync s3://HOME-ARTIFACTS/control s3://REPLICA-ARTIFACTS/control",
+    "aws s3 cp s3://HOME-ARTIFACTS/keys.json s3://REPLICA-ARTIFACTS/keys.json",
     "rse-pf map show kitchen --all --store s3:BUCKET",
     "rse-pf map rollback kitchen VERSION --store s3:BUCKET",
     "aws s3api list-object-versions --bucket BUCKET --prefix NAME",
@@ -59,10 +80,11 @@ def page(repository: Path) -> str:
 
 
 def blocks(page: str) -> list[tuple[str, list[str]]]:
-    """Return the paragraph before each fenced block, and the block's commands."""
+    """Return the paragraph before each fenced block, and the block's commands; JSON is no command."""
+    page = re.sub(r"^```json\n.*?^```$", "", page, flags=re.DOTALL | re.MULTILINE)
     found = re.findall(r"((?:[^\n]+\n)+)\n```\n(.*?)^```", page, re.DOTALL | re.MULTILINE)
     assert len(found) == page.count("```") // 2, "a block without a paragraph before it"
-    return [(before.lower(), block.splitlines()) for before, block in found]
+    return [(" ".join(before.lower().split()), block.splitlines()) for before, block in found]
 
 
 def test_every_command_is_run_here_or_marked_as_needing_an_account(page: str) -> None:
@@ -129,22 +151,19 @@ def test_what_runs_here_runs_in_the_order_of_the_page(
         assert "Traceback" not in told.err
 
 
-def test_the_floor_on_the_page_is_the_floor_of_the_prices(page: str) -> None:
-    nobody = Load(robots=1, fps=1e-9)
-    settings = PlatformSettings()
-    floor = compare(settings, load_prices(), nobody).floor
-    full = compare(settings.replace(cloud={"endpoints": "full"}), load_prices(), nobody).floor
-    prices = load_prices()
+def test_the_amounts_on_the_page_are_those_of_the_prices(page: str) -> None:
+    words = " ".join(page.split())
+    bill = bill_of(PlatformSettings(), load_prices())
+    small = bill_of(PlatformSettings.from_dict({"cloud": {"profile": "small"}}), load_prices())
 
-    assert f"about **{floor:.0f} USD**" in page
-    assert f"`full` adds {full - floor:.0f}." in page
-    parts = (
-        prices.server_per_hour * 730 * settings.scaling.min_servers,
-        prices.endpoint_per_hour * 730 * 6,
-        prices.balancer_per_hour * 730,
-    )
-    words = "two `c7i.large` {:.0f}, interface endpoints {:.0f}, the load balancer {:.0f}, the rest {:.0f}."
-    assert words.format(*parts, floor - sum(parts)) in " ".join(page.split())
+    for amount, text in (
+        (bill.total, "A platform without any robot costs about **{:.0f} USD** a month."),
+        (parked(bill, deep=False).total, "Parked it costs about **{:.0f} USD**,"),
+        (parked(bill, deep=True).total, "and the endpoints, about **{:.0f} USD**."),
+        (small.total, "`cloud.profile` = `small` costs about **{:.0f} USD** a month idle"),
+        (parked(small, deep=True).total, "idle and **{:.0f} USD** parked with `--deep`"),
+    ):
+        assert text.format(amount) in words
 
 
 def test_the_minutes_on_the_page_are_those_of_the_template(page: str, assembly: Any) -> None:
