@@ -128,8 +128,11 @@ def test_the_digest_changes_with_every_setting(row: SettingRow) -> None:
         "replica_artifacts": {"replica_artifacts": "artifacts-in-virginia"},
     }
     values = {row.name: other(row), **companions.get(row.name, {})}
+    elsewhere: dict[str, Any] = {"serving": {"offer_jobs": True}} if row.name == "job_servers" else {}
 
-    assert PlatformSettings.from_dict({row.group: values}).digest() != PlatformSettings().digest()
+    changed = PlatformSettings.from_dict({row.group: values, **elsewhere})
+
+    assert changed.digest() != PlatformSettings.from_dict(elsewhere).digest()
 
 
 def test_the_digest_is_the_same_wherever_the_settings_are() -> None:

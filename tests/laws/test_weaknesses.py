@@ -199,6 +199,7 @@ def test_every_locked_package_has_a_hash(repository: Path) -> None:
     assert {file.name: unhashed(file.read_text(encoding="utf-8")) for file in locks} == {
         f"{name}.txt": []
         for name in (
+            "batch",
             "boot",
             "browser",
             "demo",
