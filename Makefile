@@ -13,7 +13,7 @@ WORKERS ?= $(shell expr $$(nproc) + 1)
 export PYTHONDONTWRITEBYTECODE :=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup assets native sanitize synth demo test quick slow browser clients ros lint types bench docs site release lock fuzz sbom audit-deps clean
+.PHONY: help setup assets native sanitize synth demo test quick slow browser clients localstack ros lint types bench docs site release lock fuzz sbom audit-deps clean
 
 help: ## show these targets
 	@awk -F':.*## ' '/^[a-z-]+:.*## /{printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -66,6 +66,10 @@ browser: ## try the fleet page in Debian's Chromium, and save its pictures in do
 clients: ## run every client through one table against a real platform; writes out/clients.json
 	@PYTHON=$(PYTHON) sh scripts/clients.sh
 	@$(BIN)/python tests/clients/conformance.py $(ARGS)
+
+localstack: ## run the tests of AWS against LocalStack, without Docker and without an account
+	@$(SETUP) dev infra
+	@sh scripts/localstack.sh $(ARGS)
 
 ros: ## try the bridge of ROS with a real ROS 1 and over DDS
 	@PYTHON=$(PYTHON) sh scripts/ros.sh

@@ -23,13 +23,9 @@ fi
 rm -rf "$out"
 mkdir -p "$out"
 port=$("$python" -c 'import socket; s = socket.socket(); s.bind(("127.0.0.1", 0)); print(s.getsockname()[1])')
-# Nothing is downloaded, counted or resolved for it; it listens to this machine alone.  What the tests call is
-# loaded at the start: the first call of a service takes up to 7 s, and our clients wait 3.5 s.
-services=acm,cloudformation,cloudwatch,ec2,events,iam,kms,lambda,logs,resourcegroupstaggingapi,s3
-services=$services,scheduler,secretsmanager,sns,sqs,ssm,sts
+# Nothing is downloaded, counted or resolved for it; it listens to this machine alone.
 GATEWAY_LISTEN="127.0.0.1:$port" LOCALSTACK_HOST="localhost:$port" LOCALSTACK_VOLUME_DIR="$PWD/$out/volume" \
   DISABLE_EVENTS=1 SKIP_SSL_CERT_DOWNLOAD=1 DNS_ADDRESS=0 \
-  SERVICES=$services EAGER_SERVICE_LOADING=1 STRICT_SERVICE_LOADING=0 \
   "$env/bin/python" -m localstack.runtime.main > "$out/localstack.log" 2>&1 &
 localstack=$!
 trap 'kill "$localstack" 2> /dev/null || true; wait "$localstack" 2> /dev/null || true' EXIT INT TERM
@@ -51,4 +47,4 @@ if [ $# -eq 0 ]; then
   set -- tests/aws tests/test_object_store.py tests/cli/test_cloud.py tests/localstack
 fi
 # One after the other: names of buckets are global.
-LOCALSTACK_HOST="localhost:$port" .venv/bin/python -m pytest -q -rs -n 0 -m "not slow" "$@"
+PATH="$PWD/.venv/bin:$PATH" LOCALSTACK_HOST="localhost:$port" .venv/bin/python -m pytest -q -rs -n 0 -m "not slow" "$@"

@@ -46,6 +46,11 @@ for_platform() { # for_platform FILE PYTHON INPUT...
 for_platform boot 3.11 pyproject.toml --extra boot       # Debian 12
 for_platform lambda 3.13 lambda_pnp/requirements.txt     # the runtime of stacks/serverless_stack.py
 
+# LocalStack in an environment of its own: later releases of what it needs break it.
+.venv/bin/uv pip compile locks/localstack.in --quiet --universal --python-version 3.11 \
+  --exclude-newer 2025-10-25 --generate-hashes --no-emit-index-url --no-emit-find-links --no-annotate \
+  --custom-compile-command 'make lock' --output-file locks/localstack.txt
+
 # The compiler of the native core for aarch64: scripts/assets.py --arm.
 .venv/bin/uv pip compile --group native/pyproject.toml:cross --quiet --universal --python-version 3.10 \
   --generate-hashes --no-emit-index-url --no-emit-find-links --no-annotate \

@@ -8,6 +8,7 @@ the buckets of a test are deleted at its end.
 from __future__ import annotations
 
 import contextlib
+import functools
 import hashlib
 import os
 from collections.abc import Iterator
@@ -15,10 +16,18 @@ from typing import Any
 
 import pytest
 
-__all__ = ["REGION", "emulated_aws", "is_localstack", "localstack_url"]
+__all__ = ["REGION", "emulated_aws", "is_localstack", "load_services", "localstack_url"]
 
 REGION = "ap-northeast-2"
 _ENVIRONMENT = "LOCALSTACK_HOST"
+_FIRST_CALLS = {
+    "acm": "list_certificates", "cloudformation": "list_stacks", "cloudwatch": "list_metrics",
+    "ec2": "describe_vpcs", "iam": "list_roles", "lambda": "list_functions", "logs": "describe_log_groups",
+    "resourcegroupstaggingapi": "get_resources", "s3": "list_buckets", "scheduler": "list_schedules",
+    "secretsmanager": "list_secrets", "sns": "list_topics", "sqs": "list_queues",
+    "ssm": "describe_parameters", "sts": "get_caller_identity",
+}  # fmt: skip
+"""A service is loaded at its first call, which takes up to 7 s: longer than our clients wait."""
 
 
 def is_localstack() -> bool:
@@ -42,6 +51,7 @@ def emulated_aws(patch: pytest.MonkeyPatch, name: str) -> Iterator[None]:
         with moto.mock_aws():
             yield
         return
+    load_services()
     account = int(hashlib.sha256(name.encode()).hexdigest(), 16) % 10**12
     patch.setenv("AWS_ACCESS_KEY_ID", f"{account:012d}")
     patch.setenv("AWS_SECRET_ACCESS_KEY", "testing")
@@ -50,6 +60,15 @@ def emulated_aws(patch: pytest.MonkeyPatch, name: str) -> Iterator[None]:
         yield
     finally:
         _delete_buckets()
+
+
+@functools.cache
+def load_services() -> None:
+    """Let LocalStack load what tests call, once in a process."""
+    session = pytest.importorskip("localstack_client.session", reason="the infra extra is not installed")
+    for service, call in _FIRST_CALLS.items():
+        with contextlib.closing(session.Session().client(service)) as client:
+            getattr(client, call)()
 
 
 def _delete_buckets() -> None:

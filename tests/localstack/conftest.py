@@ -10,15 +10,18 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from emulated_aws import REGION, is_localstack, localstack_url
+from emulated_aws import REGION, is_localstack, load_services, localstack_url
 
 from rse_pf.config import PlatformSettings
 
 ACCOUNT = "000000000000"
 DEPLOYED = ("Network", "Data", "Backend")
 """Boxes that the community edition deploys; `test_deployment` says why the others fail."""
-SETTINGS = PlatformSettings().replace(cloud={"image_parameter": "/debian/image"})
-"""LocalStack lets nobody write parameters below /aws, where Debian's are."""
+SETTINGS = PlatformSettings().replace(
+    cloud={"image_parameter": "/debian/image"},
+    scaling={"profile": "fast", "max_robots_per_server": 50, "max_queue_ms": 40, "warm_up_s": 0},
+)
+"""All alarms; LocalStack lets nobody write parameters below /aws, where Debian's are."""
 _MINUTES = 5 * 60.0
 
 
@@ -60,6 +63,7 @@ def in_localstack() -> Any:
     with pytest.MonkeyPatch.context() as patch:
         for name, value in environment().items():
             patch.setenv(name, value)
+        load_services()
         yield
 
 

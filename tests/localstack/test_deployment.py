@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 from emulated_aws import REGION
-
 from localstack.conftest import DEPLOYED, Deployment
+
 from rse_pf.aws.account import Account
 from rse_pf.aws.clients import make_client
 
