@@ -161,7 +161,7 @@ SCALINGS = st.builds(
 
 
 @seed(20261121)
-@settings(max_examples=300)
+@settings(max_examples=200)
 @given(loads=walks(), scaling=SCALINGS, closed_loop=st.booleans())
 def test_the_policy_and_the_cloud_alarms_agree_on_any_load(
     loads: list[float | None], scaling: ScalingSettings, closed_loop: bool

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from aws.fleet.fake_machine import FakeMachine
 
-from benchmarks.cloud.delayed_cloudwatch import DelayedCloudWatch
+from benchmarks.cloud.delayed_cloudwatch import DELAY_S, DelayedCloudWatch
 from rse_pf.aws.clients import make_client
 from rse_pf.aws.fleet.agent import Agent, AgentConfig, AgentContext
 from rse_pf.aws.fleet.metrics import ROBOTS, dimensions_of
@@ -134,6 +134,12 @@ def test_fast_metrics_are_of_high_resolution_and_hold_the_cpu_after_the_warm_up(
     times = [int(datum["Timestamp"].timestamp()) for datum in cpu]
     assert [at % 10 for at in times] == [0] * len(times)
     assert len(set(times)) == len(times), "a period was published twice"
+    published = [
+        machine.wall_clock() - machine.clock() + visible_s - DELAY_S
+        for visible_s, datum in fleet.cloudwatch.data
+        if datum["MetricName"] == CPU
+    ]
+    assert all(0 <= at_s - begin_s - 10 < 2 for at_s, begin_s in zip(published, times, strict=True))
 
 
 def test_the_emulator_answers_the_agents_query(region: str) -> None:
