@@ -79,6 +79,25 @@ def test_a_busy_platform_grows_once_in_a_period() -> None:
     assert told == [{"event": "grow", "servers": 1, "names": ["server-11"], "reason": "CPU at 75 %"}]
 
 
+def test_in_the_fast_profile_a_busy_platform_grows_after_three_samples_and_then_each_minute() -> None:
+    servers = FakeServers(ServerHealth(servers=2, healthy=2))
+    modifier = LocalScaleModifier(
+        servers,  # type: ignore[arg-type]
+        ScalingSettings(profile="fast"),
+        max_restarts_per_minute=5,
+        emit=lambda event, **details: None,
+    )
+    grown = []
+    for period in range(1, 20):
+        before = len(servers.asked)
+        first = max(period - 5, 0)  # a short history, as that of the monitor
+        busy = [Sample(start_s=10.0 * each, cpu_percent=75.0, requests=1) for each in range(first, period)]
+        modifier.act(busy, now_s=10.0 * period, period_over=True)
+        grown += [10 * period] * (len(servers.asked) - before)
+
+    assert grown == [30, 90, 150]
+
+
 def test_an_idle_platform_drains_one_server() -> None:
     modifier, servers, told = made(ServerHealth(servers=3, healthy=3))
 
