@@ -151,6 +151,7 @@ export const connect = async (url, options = {}) => {
   let timer;
   let timerAt = Infinity;
   let attempt = 0;
+  let downAt = 0;
   let adoptedAt = -Infinity;
   let notBefore = 0;
   let isKeeping = false;
@@ -233,22 +234,29 @@ export const connect = async (url, options = {}) => {
   /** Ask why a handshake failed, where the answer may be read: in Node, and in pages of the same origin. */
   const isRefused = async (used) => {
     const address = new URL(url.replace(/^ws/, "http"));
-    if (globalThis.location && location.host !== address.host) return false;
+    // A request more for each attempt would double what a firewall counts.
+    if (attempt % 4 !== 1 || (globalThis.location && location.host !== address.host)) return false;
     try {
-      return (await fetch(address, { headers: bearer(used), signal: AbortSignal.timeout(1e3) })).status === 401;
+      const answer = await fetch(address, { headers: bearer(used), signal: AbortSignal.timeout(1e3) });
+      return answer.status === 401 && (await answer.json()).platform === "rse-pf";
     } catch {
       return false;
     }
   };
 
-  /** Keep one connection: reconnect with full jitter, and make before break (section 4, "Moving"). */
+  /** Keep one connection: reconnect ever more rarely (section 1), and make before break (section 4, "Moving"). */
   const keep = async () => {
     if (isKeeping) return;
     isKeeping = true;
-    if (moving || now() - adoptedAt > 1) attempt = 0;
+    if (moving || now() - adoptedAt > 10) {
+      attempt = 0;
+      downAt = now();
+    }
     while (!error && (!current || moving === current)) {
-      const longest = min(1, 0.1 * 2 ** min(9, attempt++));
-      await pause(max(0, notBefore - now()) + Math.random() * longest);
+      const longest = min(120, (now() - downAt) / 3);
+      const pauseS = longest > 1 ? longest * (1 + Math.random()) / 2 : Math.random() * min(1, 0.1 * 2 ** attempt);
+      attempt++;
+      await pause(max(0, notBefore - now()) + pauseS);
       if (error) break;
       if (moving && now() > moveUntil) moving = null;
       else {

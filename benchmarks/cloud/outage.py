@@ -160,26 +160,26 @@ async def drive(
         if len(back_after_s) == robots:
             all_back.set()
 
-    async with FrontDoor(local.port, PlayedFirewall(rules)) as door:
+    async with FrontDoor(local.port, PlayedFirewall(rules)) as front:
         fleet = [
-            client_sdk.connect(door.url, token=local.token(f"robot-{number}")) for number in range(robots)
+            client_sdk.connect(front.url, token=local.token(f"robot-{number}")) for number in range(robots)
         ]
-        disabled = client_sdk.connect([door.url], enrolment=enrolment)
+        disabled = client_sdk.connect([front.url], enrolment=enrolment)
         for robot in (*fleet, disabled):
             await robot
         asking = [asyncio.create_task(ask(number, robot)) for number, robot in enumerate(fleet)]
         await asyncio.sleep(BEFORE_S)
-        door.is_out, began = True, time.monotonic()
-        door.cut()
+        front.is_out, began = True, time.monotonic()
+        front.cut()
         await asyncio.to_thread(local.robot, "disable", "disabled")
         await asyncio.sleep(outage_s - (time.monotonic() - began))
-        ended_at, door.is_out = time.monotonic(), False
+        ended_at, front.is_out = time.monotonic(), False
         is_over.set()
         done, _ = await asyncio.wait({asyncio.create_task(all_back.wait())}, timeout=WAIT_S)
         ended_as = await _end_of(disabled, time.monotonic() + WAIT_S)
         for task in asking:
             task.cancel()
-        dials = sorted(each for each in door.dials if each >= began)
+        dials = sorted(each for each in front.dials if each >= began)
         await asyncio.gather(*(robot.close() for robot in (*fleet, disabled)))
         times = sorted(back_after_s.values())
         return {
@@ -192,8 +192,8 @@ async def drive(
             "most_dials_in_a_minute": _most_within(dials, 60.0),
             "limit_of_dials": rules[0].limit,
             "window_s": rules[0].window_s,
-            "answers_of_the_door": {str(status): n for status, n in sorted(door.answered.items())},
-            "blocked": door.firewall.blocked,
+            "answers_of_the_door": {str(status): n for status, n in sorted(front.answered.items())},
+            "blocked": front.firewall.blocked,
             "failures_of_calls": dict(failures),
             "disabled_robot_ended_as": ended_as,
         }

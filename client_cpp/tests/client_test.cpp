@@ -74,9 +74,30 @@ void nobody_listens() {
     expect_error("usage", [&] { client.connect(); }, "connected twice");
 }
 
+std::string answer_401(const std::string& body) {
+    return "HTTP/1.1 401 Unauthorized\r\nContent-Type: application/json\r\nContent-Length: " + std::to_string(body.size()) + "\r\n\r\n" + body;
+}
+
+const std::string refusal = answer_401(R"({"platform":"rse-pf","code":"unauthorized","message":"no","hint":"ask for a token"})");
+
+void a_refusal_without_the_mark_of_a_server_is_temporary() {
+    using rse_pf::detail::refused;
+    for (const unsigned status : {401U, 403U}) {
+        const auto firewall = refused("ws://host/ws", status, "60", "<html>Forbidden</html>");
+        expect(!firewall.is_final && firewall.after_s == 60, "a firewall");
+        expect(!refused("ws://host/ws", status, "", R"({"code":"forbidden"})").is_final, "a body without the mark");
+        expect(refused("ws://host/ws", status, "", R"({"platform":"rse-pf","code":"forbidden"})").is_final, "a server");
+    }
+    expect(!refused("ws://host/ws", 429, "60", "").is_final, "too fast");
+    Server server(answer_401(""));
+    Options quick = to(server.url());
+    quick.first_tries = 3;
+    expect_error("unauthorized", [&] { Client(quick).connect(); }, "not ours");
+    expect(server.connections == 3, "tried again");
+}
+
 void a_refusal_keeps_its_code_and_is_final() {
-    const std::string body = R"({"code":"unauthorized","message":"no","hint":"ask for a token"})";
-    Server server("HTTP/1.1 401 Unauthorized\r\nContent-Type: application/json\r\nContent-Length: " + std::to_string(body.size()) + "\r\n\r\n" + body);
+    Server server(refusal);
     Client client(to(server.url()));
     try {
         client.connect();
@@ -100,7 +121,7 @@ void another_program_answers() {
 }
 
 void a_token_source_is_asked_again_after_a_refusal() {
-    Server server("HTTP/1.1 401 Unauthorized\r\nContent-Length: 0\r\n\r\n");
+    Server server(refusal);
     Options options = to(server.url());
     std::atomic<int> asked{0};
     options.token_source = [&] { return "token-" + std::to_string(++asked); };
@@ -148,6 +169,7 @@ void digests_are_those_of_sha256() {
 int main() {
     addresses_are_checked_before_anything_is_opened();
     nobody_listens();
+    a_refusal_without_the_mark_of_a_server_is_temporary();
     a_refusal_keeps_its_code_and_is_final();
     another_program_answers();
     a_token_source_is_asked_again_after_a_refusal();

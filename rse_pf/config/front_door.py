@@ -1,4 +1,4 @@
-"""How many requests of one address the firewall of the front door lets pass.
+"""How many requests of one address the web firewall lets pass.
 
 Many robots may share an address: those of one site stand behind one router.  The limit of each rule is what
 the robots of a site do at the most, computed from the settings by which they bound themselves; so robots that

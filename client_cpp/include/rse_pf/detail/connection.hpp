@@ -31,6 +31,7 @@ struct Options {
     std::string sdk = "rse-pf-cpp/1";  ///< name and version of the program, for the server's log
     std::string ca_file{};         ///< authorities to trust, in PEM; empty: the machine's
     double connect_timeout_s = 2, reconnect_base_s = 0.1, reconnect_max_s = 1;
+    double reconnect_long_max_s = 120;  ///< longest pause after minutes without a connection
     double answer_timeout_s = 5;   ///< deadline of a command that sets none
     int first_tries = 4;           ///< attempts of `Client::connect` before it gives up
     OnChange on_change{};          ///< called on the client's thread
@@ -69,6 +70,7 @@ class Connection : public std::enable_shared_from_this<Connection> {
     /// Connect; *on_open* is called once: with nothing, or with why there is no connection.
     void open(std::function<void(std::optional<Failure>)> on_open) {
         on_open_ = std::move(on_open);
+        restart_pauses();
         tick();
         dial();
     }
@@ -226,12 +228,22 @@ class Connection : public std::enable_shared_from_this<Connection> {
         }
         if (channel_ && now_s() >= move_until_) return;
         const double spent = now_s() - dial_began_;
-        retry_in(std::max(failed.after_s, pause_s() - spent));
+        // Robots that are told the same time to wait do not come back at the same moment.
+        const double asked = failed.after_s * std::uniform_real_distribution<double>(1, 1.25)(random_);
+        retry_in(std::max(asked, pause_s() - spent));
     }
 
     double pause_s() {
+        // After the first seconds without a connection, ever more rarely: a firewall counts the attempts of an address.
+        const double longest = std::min(options_.reconnect_long_max_s, (now_s() - down_since_) / 3);
+        if (longest > options_.reconnect_max_s) return std::uniform_real_distribution<double>(longest / 2, longest)(random_);
         const double most = std::min(options_.reconnect_max_s, options_.reconnect_base_s * std::pow(2.0, std::min(attempt_, 20)));
         return std::uniform_real_distribution<double>(0, most)(random_);
+    }
+
+    void restart_pauses() {
+        attempt_ = 0;
+        down_since_ = now_s();
     }
 
     void retry_in(double seconds) {
@@ -295,7 +307,7 @@ class Connection : public std::enable_shared_from_this<Connection> {
             case Heard::move:
                 if (channel == channel_ && !shut_) {
                     move_until_ = now_s() + heard.within_s;
-                    attempt_ = 0;
+                    restart_pauses();
                     dial();
                 }
                 break;
@@ -362,7 +374,7 @@ class Connection : public std::enable_shared_from_this<Connection> {
         } else if (was_current) {
             session.stats.last_error = why;
             changed("lost", why);
-            if (now_s() - adopted_ > options_.reconnect_max_s) attempt_ = 0;
+            if (now_s() - adopted_ > 10) restart_pauses();
             retry_in(code == 4429 ? 6 : pause_s());
         }
         pump();
@@ -455,7 +467,7 @@ class Connection : public std::enable_shared_from_this<Connection> {
     std::vector<ChannelPtr> leaving_;
     std::function<void(std::optional<Failure>)> on_open_;
     std::thread token_thread_;
-    double next_tick_ = 0, dial_began_ = 0, adopted_ = 0, move_until_ = 0;
+    double next_tick_ = 0, dial_began_ = 0, adopted_ = 0, move_until_ = 0, down_since_ = 0;
     int attempt_ = 0;
     bool shut_ = false, token_pending_ = false, asked_again_ = false;
 };

@@ -59,9 +59,10 @@ inline DialFailure refused(const std::string& address, unsigned status, const st
     DialFailure out;
     out.failure = {field("code"), field("message"), field("hint")};
     if (!retry_after.empty() && retry_after.size() < 6 && retry_after.find_first_not_of("0123456789") == std::string::npos) {
-        out.after_s = std::min(30.0, std::stod(retry_after));
+        out.after_s = std::min(300.0, std::stod(retry_after));
     }
-    out.is_final = status == 401 || status == 403;
+    // Firewalls and login pages answer so, too: only the mark of a server ends a robot for good.
+    out.is_final = (status == 401 || status == 403) && field("platform") == "rse-pf";
     out.wrong_address = status == 400 || status == 404 || status == 426 || status == 200;
     if (out.failure.code.empty()) {
         out.failure.code = status == 401 ? "unauthorized" : status == 403 ? "forbidden" : out.wrong_address ? "unsupported" : "connect";
