@@ -31,6 +31,7 @@ __all__ = [
     "read_state",
     "state_of_refresh",
     "upgrade",
+    "versions_behind",
     "with_version",
 ]
 
@@ -149,31 +150,31 @@ def preferences(settings: PlatformSettings, alarms: Sequence[str]) -> dict[str, 
 def read_state(account: Account, settings: PlatformSettings) -> Release:
     """Return the versions of a deployment; raises ConfigurationError where nothing is deployed."""
     names = ResourceNames(settings.cloud.name)
-    found = account.pages(
-        "autoscaling",
-        "describe_auto_scaling_groups",
-        "AutoScalingGroups",
-        AutoScalingGroupNames=[names.group],
-    )
-    if not found:
-        raise ConfigurationError(f"no platform runs in {account.region}", hint="deploy it: rse-pf cloud up")
-    (group,) = found
-    specification = _specification(group)
-    template = account.change(
-        "ec2", "describe_launch_templates", LaunchTemplateIds=[specification["LaunchTemplateId"]]
-    )["LaunchTemplates"][0]
+    group = _group(account, names)
     refreshes = account.pages(
         "autoscaling", "describe_instance_refreshes", "InstanceRefreshes", AutoScalingGroupName=names.group
     )
     versions = [each.get("LaunchTemplate", {}).get("Version", "") for each in group["Instances"]]
     return Release(
-        newest=str(template["LatestVersionNumber"]),
-        group=str(specification.get("Version", "")),
+        newest=_newest(account, group),
+        group=str(_specification(group).get("Version", "")),
         instances=tuple(versions),
         recorded=_parameters(account, names).get(VERSION_PARAMETER, ""),
         refresh=max(refreshes, key=lambda each: str(each.get("StartTime", "")), default=None),
         raw_group=group,
     )
+
+
+def versions_behind(account: Account, settings: PlatformSettings) -> tuple[str, str] | None:
+    """Return the version that the group names and the newest one, None where they are the same.
+
+    Raises:
+        ConfigurationError: Nothing is deployed, or AWS refused.
+        StoreError: AWS does not answer.
+    """
+    group = _group(account, ResourceNames(settings.cloud.name))
+    newest, named = _newest(account, group), str(_specification(group).get("Version", ""))
+    return None if named == newest else (named, newest)
 
 
 def upgrade(
@@ -339,6 +340,26 @@ def _record(
             f"the servers run version {version}, and the stack does not name it: {stack['StackStatus']}",
             hint="repeat rse-pf cloud upgrade before the next deployment",
         )
+
+
+def _group(account: Account, names: ResourceNames) -> Mapping[str, Any]:
+    found = account.pages(
+        "autoscaling",
+        "describe_auto_scaling_groups",
+        "AutoScalingGroups",
+        AutoScalingGroupNames=[names.group],
+    )
+    if not found:
+        raise ConfigurationError(f"no platform runs in {account.region}", hint="deploy it: rse-pf cloud up")
+    group: Mapping[str, Any] = found[0]
+    return group
+
+
+def _newest(account: Account, group: Mapping[str, Any]) -> str:
+    found = account.change(
+        "ec2", "describe_launch_templates", LaunchTemplateIds=[_specification(group)["LaunchTemplateId"]]
+    )
+    return str(found["LaunchTemplates"][0]["LatestVersionNumber"])
 
 
 def _stack(account: Account, names: ResourceNames) -> dict[str, Any]:

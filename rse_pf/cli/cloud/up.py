@@ -52,10 +52,14 @@ def lacks(account: Account, settings: PlatformSettings) -> bool:
 
 def finish(account: Account, settings: PlatformSettings) -> int:
     """Show the address and the next commands; return 0."""
+    from rse_pf.aws.fleet.upgrade import versions_behind
     from rse_pf.aws.lifecycle.deployment import read_deployment
 
     cloud = settings.cloud
     show(f"the platform is up: {read_deployment(account, settings).url}")
+    behind = versions_behind(account, settings)
+    if behind is not None:
+        show(f"its servers run release {behind[0]}, and {behind[1]} is new: rse-pf cloud upgrade")
     show("next: rse-pf token init --cloud             once: the key that signs tokens")
     show("      rse-pf token issue robot-1 --cloud    a robot's token")
     show("      rse-pf cloud status                   servers, robots, alarms, cost")

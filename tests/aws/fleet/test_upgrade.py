@@ -21,6 +21,7 @@ from rse_pf.aws.fleet.upgrade import (
     read_state,
     state_of_refresh,
     upgrade,
+    versions_behind,
     with_version,
 )
 from rse_pf.cli.main import main
@@ -298,6 +299,15 @@ def test_a_parked_fleet_gets_the_version_without_a_refresh() -> None:
 
     assert (aws.group, aws.recorded, ended.reason) == ("2", "2", "")
     assert aws.refreshes == []
+
+
+def test_a_group_that_is_behind_is_told_with_both_versions() -> None:
+    aws = FakeAws()
+    assert versions_behind(aws.account(), SETTINGS) == ("1", "2")
+
+    run(aws)
+
+    assert versions_behind(aws.account(), SETTINGS) is None
 
 
 def test_one_server_of_an_older_version_is_reason_enough() -> None:
