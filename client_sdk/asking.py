@@ -18,6 +18,7 @@ from client_sdk.local_services import LocalServices
 from client_sdk.offload import CloudFirst, Plan
 from client_sdk.region_sockets import cancel_all
 from client_sdk.stats import StatsKeeper
+from client_sdk.tracing import current_trace
 from rse_pf.wire import Command, Failure, Result
 from rse_pf.wire.client_session import Answered, ClientSession, Progressed
 
@@ -185,6 +186,7 @@ class Asking:
             keep=call.keep,
             deadline_s=None if call.is_open_ended else call.deadline_s,
             is_open_ended=call.on_progress is not None,
+            trace=current_trace(),
         )
         future: asyncio.Future[Answered] = asyncio.get_running_loop().create_future()
         self.waiting[identity] = future
@@ -207,7 +209,7 @@ class Asking:
     async def _ask_burst(self, call: Call, left_s: float, why: str) -> Ended:
         command = Command(
             id=1, service=call.service, payload=call.request, stream=call.stream, keep=call.keep,
-            deadline_ms=left_s * 1e3,
+            deadline_ms=left_s * 1e3, trace=current_trace(),
         )  # fmt: skip
         return await self._burst.ask(command, deadline_s=left_s, why=why)
 

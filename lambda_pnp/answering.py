@@ -9,6 +9,7 @@ from __future__ import annotations
 import base64
 import json
 import os
+import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from datetime import datetime, timezone
@@ -31,7 +32,7 @@ from rse_pf.errors import (
 )
 from rse_pf.service import Registry, dispatch, failure_of
 from rse_pf.services import pnp
-from rse_pf.wire import SUBPROTOCOLS, Codec, Command, codec_for, make_codec
+from rse_pf.wire import SUBPROTOCOLS, Codec, Command, Failure, codec_for, make_codec
 
 __all__ = ["Answering", "LambdaAnswer", "load_answering"]
 
@@ -78,8 +79,16 @@ class LambdaAnswer:
 class Answering:
     """Keys, settings and budget of one execution, and the service that it offers."""
 
-    def __init__(self, settings: PlatformSettings, keys: KeyCache, claim: Claim) -> None:
+    def __init__(
+        self,
+        settings: PlatformSettings,
+        keys: KeyCache,
+        claim: Claim,
+        *,
+        log: Callable[..., None] | None = None,
+    ) -> None:
         self._settings = settings
+        self._log = log or _to_stderr
         self._keys = keys
         self._budget = DayBudget(settings.burst, claim)
         self._registry = Registry()
@@ -123,8 +132,14 @@ class Answering:
             )
             return self._encoded(codec, failure_of(forbidden, message, server=_SERVER))
         answer = dispatch(self._registry, message, clock, server=_SERVER)
-        late = (clock() - arrived) * 1e3 > allowed_ms
-        return self._encoded(codec, self._late(message) if late else answer)
+        if (clock() - arrived) * 1e3 > allowed_ms:
+            answer = self._late(message)
+        self._log(
+            event="command", robot=str(who.robot), service=message.service, id=message.id,
+            trace=message.trace, code=answer.code if isinstance(answer, Failure) else "ok",
+            took_ms=round((clock() - arrived) * 1e3, 3),
+        )  # fmt: skip
+        return self._encoded(codec, answer)
 
     def _codec(self, content_type: str) -> Codec:
         subprotocol = content_type.partition(";")[0].strip().removeprefix("application/")
@@ -158,6 +173,10 @@ class Answering:
         return LambdaAnswer(
             status=200, content_type=f"application/{SUBPROTOCOLS[codec.name]}", body=codec.encode(message)
         )
+
+
+def _to_stderr(**fields: Any) -> None:
+    sys.stderr.write(json.dumps(fields) + "\n")
 
 
 def _rejected(error: RsePfError) -> LambdaAnswer:

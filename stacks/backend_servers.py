@@ -26,6 +26,7 @@ from aws_cdk import aws_sns as sns
 from constructs import Construct
 
 from rse_pf.aws.fleet.launch_hook import retry_within_s
+from rse_pf.aws.money.costs import zone_count
 from rse_pf.config import PlatformSettings
 from rse_pf.config.resource_names import AUDIT_PREFIX, JOURNAL_PREFIX, VERSION_PARAMETER, ResourceNames
 from rse_pf.scaling.alarms import NAMESPACE
@@ -76,7 +77,7 @@ class BackendServers(Construct):
         self.group = autoscaling.AutoScalingGroup(
             self, "Group", auto_scaling_group_name=names.group, vpc=vpc,
             min_capacity=scaling.min_servers, max_capacity=scaling.max_servers,
-            vpc_subnets=ec2.SubnetSelection(subnet_type=ec2.SubnetType.PRIVATE_ISOLATED),
+            vpc_subnets=ec2.SubnetSelection(subnets=vpc.isolated_subnets[: zone_count(settings)]),
             launch_template=launch_template(
                 self, role=self.role, firewall_group=firewall_group, settings=settings, facts=self.facts
             ),

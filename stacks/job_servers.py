@@ -16,6 +16,7 @@ from aws_cdk import aws_iam as iam
 from aws_cdk import aws_sns as sns
 from constructs import Construct
 
+from rse_pf.aws.money.costs import zone_count
 from rse_pf.config import PlatformSettings
 from rse_pf.config.resource_names import ResourceNames
 from rse_pf.scaling.job_alarms import job_alarms_of
@@ -66,7 +67,7 @@ class JobServers(Construct):
         self.group = autoscaling.AutoScalingGroup(
             self, "Group", auto_scaling_group_name=names.job_group, vpc=vpc, min_capacity=0,
             max_capacity=cloud.job_servers,
-            vpc_subnets=ec2.SubnetSelection(subnet_type=ec2.SubnetType.PRIVATE_ISOLATED),
+            vpc_subnets=ec2.SubnetSelection(subnets=vpc.isolated_subnets[: zone_count(settings)]),
             mixed_instances_policy=autoscaling.MixedInstancesPolicy(
                 launch_template=template,
                 launch_template_overrides=[

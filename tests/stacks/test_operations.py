@@ -164,11 +164,3 @@ def test_the_amounts_on_the_page_are_those_of_the_prices(page: str) -> None:
         (parked(small, deep=True).total, "idle and **{:.0f} USD** parked with `--deep`"),
     ):
         assert text.format(amount) in words
-
-
-def test_the_minutes_on_the_page_are_those_of_the_template(page: str, assembly: Any) -> None:
-    resources = assembly.templates["RsePf-Backend"]["Resources"].values()
-    (group,) = [each for each in resources if each["Type"] == "AWS::AutoScaling::AutoScalingGroup"]
-
-    assert group["UpdatePolicy"]["AutoScalingRollingUpdate"]["PauseTime"] == "PT6M30S"
-    assert "six and a half minutes for each" in page

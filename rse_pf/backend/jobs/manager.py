@@ -137,6 +137,7 @@ class JobManager:
                 robot=queued.robot,
                 key=key,
                 quota_bytes=quota_bytes(queued.owner.claims, self._context.settings.data.quota_bytes),
+                trace=command.trace,
             )
             if not self._has_capacity(request):
                 self._fail(queued, _too_many())
@@ -249,7 +250,7 @@ class JobManager:
         code = "given-up" if outcome.is_given_up else "ok" if outcome.error is None else outcome.error.code
         self._log.info(
             "job", robot=request.robot, service=request.service, job=request.key[:16], code=code,
-            object=outcome.object[:16], compute_ms=round(outcome.compute_ms, 3),
+            object=outcome.object[:16], compute_ms=round(outcome.compute_ms, 3), trace=request.trace,
         )  # fmt: skip
         reply = None
         if outcome.reply is not None:

@@ -60,6 +60,8 @@ class JobRequest:
     robot: RobotId
     key: str
     quota_bytes: float
+    trace: str = ""
+    """Of the command that asked for it first."""
 
 
 class JobProcess:

@@ -36,6 +36,7 @@ class _Stored(msgspec.Struct, frozen=True, kw_only=True):
     robot: tuple[str, str, str]
     key: str
     quota_bytes: float
+    trace: str = ""
     settings: str
 
 
@@ -84,7 +85,7 @@ class JobQueue:
         stored = _Stored(
             service=request.service, payload=msgspec.Raw(payload),
             robot=(request.robot.tenant, request.robot.name, request.robot.enrolment),
-            key=request.key, quota_bytes=request.quota_bytes, settings=self._settings,
+            key=request.key, quota_bytes=request.quota_bytes, settings=self._settings, trace=request.trace,
         )  # fmt: skip
         self._store.put(name, msgspec.msgpack.encode(stored))
 
@@ -122,7 +123,7 @@ class JobQueue:
             raise StoreError(f"{name!r} is no offer of a job", hint="delete it") from error
         request = JobRequest(
             service=stored.service, payload=payload, robot=RobotId(*stored.robot), key=stored.key,
-            quota_bytes=stored.quota_bytes,
+            quota_bytes=stored.quota_bytes, trace=stored.trace,
         )  # fmt: skip
         return JobOffer(request=request, settings=stored.settings)
 
