@@ -1,0 +1,99 @@
+"""`rse-pf batch run merge`, killed in the middle, is continued by the same command."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rse_pf.maps.format import encode_map
+from rse_pf.maps.registry import MapRegistry
+from rse_pf.object_store import DirectoryStore
+from rse_pf.services.synthetic_maps import make_world
+
+pytestmark = pytest.mark.slow
+
+for package in ("distributed", "faiss", "gtsam"):
+    pytest.importorskip(package, reason="the extra batch is not installed")
+
+MERGE = ("run", "merge", "a", "b", "--out", "hall", "--workers", "1", "--json", "--store")
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Path:
+    folder = tmp_path / "store"
+    folder.mkdir()
+    world = make_world(1)
+    maps = MapRegistry(DirectoryStore(folder))
+    for name, first, last, seed in (("a", 0.0, 0.5, 1), ("b", 0.3, 0.8, 2)):
+        version, _ = world.walk(name, np.linspace(first, last, 13), seed=seed)
+        maps.commit(name, encode_map(version), parent=None, author="a test", created_s=1.0)
+    settings = {"context": {"rse-pf": {"batch": {"pairs_per_part": 10}}}}
+    (tmp_path / "settings.json").write_text(json.dumps(settings))
+    return folder
+
+
+def begun(store: Path) -> subprocess.Popen[str]:
+    settings = ["--settings", str(store.parent / "settings.json")]
+    return subprocess.Popen(
+        [sys.executable, "-m", "rse_pf.cli.main", "batch", *settings, *MERGE, f"dir:{store}"],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+
+
+def links_in(store: Path) -> int:
+    return sum("/links-" in each.name for each in DirectoryStore(store).list("batch/parts/"))
+
+
+def children_of(pid: int) -> list[int]:
+    return [int(word) for word in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+
+
+def wait_until(is_so: Callable[[], bool], within_s: float = 60.0) -> None:
+    until = time.monotonic() + within_s
+    while not is_so():
+        assert time.monotonic() < until, "it did not happen in time"
+        threading.Event().wait(0.01)
+
+
+def test_the_same_command_continues_after_a_kill(store: Path) -> None:
+    first = begun(store)
+    wait_until(lambda: links_in(store) >= 3)
+    children = children_of(first.pid)
+    first.kill()
+    first.communicate()
+    wait_until(lambda: not any(Path(f"/proc/{pid}/environ").exists() for pid in children))
+    kept = links_in(store)
+
+    second = begun(store)
+    told, errors = second.communicate(timeout=100)
+
+    assert second.returncode == 0, errors
+    answer = json.loads(told)
+    assert answer["joined"] == ["a", "b"]
+    assert answer["parts"]["found"] >= kept >= 3
+    assert MapRegistry(DirectoryStore(store)).head("hall").keyframes == 26
+    assert not list(DirectoryStore(store).list("batch/"))
+
+
+def test_ctrl_c_ends_the_command_and_its_processes_and_keeps_the_parts(store: Path) -> None:
+    process = begun(store)
+    wait_until(lambda: links_in(store) >= 1)
+    children = children_of(process.pid)
+
+    os.kill(process.pid, signal.SIGINT)
+    _, errors = process.communicate(timeout=60)
+
+    assert process.returncode == 130
+    assert "Traceback" not in errors
+    wait_until(lambda: not any(Path(f"/proc/{pid}").exists() for pid in children))
+    assert links_in(store) >= 1
