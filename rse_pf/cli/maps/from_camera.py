@@ -62,7 +62,10 @@ def add_drive_arguments(parser: argparse.ArgumentParser, out: Path) -> None:
     add("--rate", type=float, metavar="HZ", help="leave out frames beyond this rate")
     add("--frames", type=int, metavar="N", help="stop after so many frames")
     add("--out", type=Path, default=out, metavar="DIR", help="results (default: %(default)s)")
-    add("--url", help="use the platform at this address, with --token-file")
+    add(
+        "--url", action="append",
+        help="use the platform at this address, with --token-file; with several, the nearest of them",
+    )  # fmt: skip
     add("--token-file", type=Path, metavar="FILE", help="with --url: file that holds the robot's token")
     add("--enrolment", type=Path, metavar="FILE", help="use the platform of rse-pf robot enrol --out FILE")
 
@@ -132,8 +135,9 @@ def check_drive(args: argparse.Namespace) -> OdometryScale | MarkerScale | None:
         raise UsageError("--enrolment names address and key", hint="leave out --url and --token-file")
     if (args.url is None) != (args.token_file is None):
         raise UsageError("--url and --token-file need each other", hint="get a token: rse-pf token")
-    if args.url is not None and urlsplit(args.url).scheme not in ("ws", "wss"):
-        raise UsageError(f"{args.url!r} is not a WebSocket address", hint="write ws://HOST:PORT/ws")
+    for url in args.url or []:
+        if urlsplit(url).scheme not in ("ws", "wss"):
+            raise UsageError(f"{url!r} is not a WebSocket address", hint="write ws://HOST:PORT/ws")
     return _scale(args.scale)
 
 

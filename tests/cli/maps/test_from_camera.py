@@ -50,8 +50,9 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The working folder, with a video, intrinsics, a token, and a platform that answers at ws://p/ws."""
 
     @contextlib.asynccontextmanager
-    async def connect(url: str, **options: Any) -> AsyncIterator[SolvingRobot]:
-        assert (url, options["token"]) == ("ws://p/ws", "secret")
+    async def connect(urls: list[str], **options: Any) -> AsyncIterator[SolvingRobot]:
+        assert (urls[-1], options["token"]) == ("ws://p/ws", "secret")
+        Path("addresses").write_text(" ".join(urls))
         yield SolvingRobot()
 
     monkeypatch.setattr(client_sdk, "connect", connect, raising=False)
@@ -98,6 +99,16 @@ def test_a_video_becomes_a_map_in_metres_by_odometry(
     assert len(read_ply(Path("out-camera/map.ply"))[0]) > 300
     assert Path("out-camera/map.png").stat().st_size > 1000
     assert "9 frames, 0 lost" in out
+
+
+def test_several_addresses_are_given_to_the_robot_which_takes_the_nearest(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["v.avi", "--intrinsics", "i.json", "--frames", "7", "--url", "ws://q/ws", *PLATFORM]
+
+    assert main(["map", "from-camera", *words]) == 0, capsys.readouterr().out
+
+    assert Path("addresses").read_text() == "ws://q/ws ws://p/ws"
 
 
 def test_without_a_scale_the_command_says_so(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -195,6 +206,7 @@ def test_a_camera_that_does_not_move_is_no_map(folder: Path, capsys: pytest.Capt
         (["v.avi", "--intrinsics", "i.json", "--frames", "1"], "--frames 1 is below 2"),
         (["v.avi", "--intrinsics", "i.json", "--url", "ws://p/ws"], "need each other"),
         (["v.avi", "--url", "p", "--token-file", "token"], "is not a WebSocket address"),
+        (["v.avi", "--url", "q", *PLATFORM], "'q' is not a WebSocket address"),
         (["v.avi", "--enrolment", "e", *PLATFORM], "--enrolment names address and key"),
         (["v.avi", "--intrinsics", "i.json", "--out", "v.avi", *PLATFORM], "cannot make v.avi"),
         (
