@@ -20,7 +20,7 @@ from rse_pf.batch.two_levels import graph_between, graphs_within, poses_of_level
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import BadRequest, LimitExceeded
 from rse_pf.geometry import Array, inverse
-from rse_pf.maps.format import MapVersion, decode_map
+from rse_pf.maps.format import MapLimits, MapVersion, decode_map
 from rse_pf.object_store import ObjectStore
 from rse_pf.service import Report
 from rse_pf.services.mapping.cloud_deform import Colours, Points, joined_cloud
@@ -37,7 +37,7 @@ from rse_pf.services.mapping.optimise import (
 from rse_pf.services.mapping.place import map_limits
 from rse_pf.services.mapping.pose_graph import PoseGraph, components
 
-__all__ = ["BatchMerge", "BatchMergeResult"]
+__all__ = ["BatchMerge", "BatchMergeResult", "strongest"]
 
 _SHARES = {
     "words": 0.0, "vectors": 0.03, "pairs": 0.08, "links": 0.12, "agree": 0.70, "tiles": 0.76,
@@ -139,8 +139,9 @@ class BatchMerge:
         if not 1 <= len(self._maps) <= MAX_MAPS:
             raise BadRequest(f"{len(self._maps)} maps are not within 1..{MAX_MAPS}", hint="name one or more")
         limits = map_limits(self._settings.data.max_keyframe_features)
+        most = MapLimits()
         versions: list[MapVersion] = []
-        keyframes = 0
+        keyframes = features = 0
         for name in self._maps:
             versions.append(decode_map(self._store.get(name), limits=limits))
             keyframes += len(versions[-1].keyframes)
@@ -148,6 +149,12 @@ class BatchMerge:
                 raise LimitExceeded(
                     f"more than {self._settings.batch.max_keyframes} keyframes",
                     hint="merge fewer maps at once, or raise batch.max_keyframes",
+                )
+            features += sum(len(each.pixels) for each in versions[-1].keyframes)
+            if features > most.features:
+                raise LimitExceeded(
+                    f"more than {most.features} features, which no map may hold",
+                    hint="merge fewer maps at once, or maps with fewer keyframes",
                 )
         if not all(version.keyframes for version in versions):
             raise BadRequest("a map has no keyframes", hint="leave it out")
@@ -269,6 +276,8 @@ class BatchMerge:
             pair = self._pairs[number]
             accepted += [groups[pair][row] for row in result.arrays["rows"].tolist()]
             refused.update({(*pair, reason): count for reason, count in result.counts.items()})
+        accepted, surplus = strongest(atlas, accepted, self._settings.batch.max_links)
+        refused.update(surplus)
         return accepted, Counter({key: count for key, count in refused.items() if count})
 
     def _align(self, atlas: Atlas, placed: Array, links: Sequence[LoopClosure]) -> list[LoopClosure]:
@@ -347,6 +356,26 @@ class BatchMerge:
         ]
         clouds = [result.arrays["points"] for result in self._run(parts)]
         return joined_cloud(clouds, [versions[which].colours for which in joined])
+
+
+def strongest(atlas: Atlas, links: Sequence[LoopClosure], most: int) -> tuple[list[LoopClosure], Refused]:
+    """Return at most about *most* of *links*: of each pair of maps those with most inliers, in their order.
+
+    Every pair keeps the same number, or all that it has, so that no map loses its connection.
+    """
+    refused: Refused = Counter()
+    if len(links) <= most:
+        return list(links), refused
+    groups: dict[tuple[int, int], list[int]] = {}
+    for row, link in enumerate(links):
+        groups.setdefault(maps_of(atlas, link.a, link.b), []).append(row)
+    share = max(1, most // len(groups))
+    kept: list[int] = []
+    for pair, rows in groups.items():
+        best = sorted(rows, key=lambda row: (-links[row].inliers, row))[:share]
+        refused[pair[0], pair[1], "surplus"] += len(rows) - len(best)
+        kept += best
+    return [links[row] for row in sorted(kept)], refused
 
 
 def _moved(link: LoopClosure, pair: tuple[int, int], starts: npt.NDArray[np.int64]) -> LoopClosure:

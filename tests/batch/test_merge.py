@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from rse_pf.batch.merge import BatchMerge, BatchMergeResult
+from rse_pf.batch.merge import BatchMerge, BatchMergeResult, strongest
 from rse_pf.batch.parts import PREFIX, Part
 from rse_pf.batch.tasks import InProcessEngine
 from rse_pf.config import PlatformSettings
@@ -133,6 +134,19 @@ def test_too_many_keyframes_are_refused_before_any_work() -> None:
 
     with pytest.raises(LimitExceeded, match="20 keyframes"):
         BatchMerge(store, InProcessEngine(store), small).run(NAMES)
+
+
+def test_of_too_many_links_each_pair_of_maps_keeps_its_strongest() -> None:
+    atlas = Atlas.of(two_robots())
+    links = in_parts().links
+    within = [replace(each, a=0, b=1, inliers=row) for row, each in enumerate(links)]
+
+    kept, refused = strongest(atlas, [*within, *links], 10)
+
+    assert sum(refused.values()) == 2 * len(links) - 10
+    own = sorted(each.inliers for each in kept if each.b == 1)
+    assert own == sorted(each.inliers for each in within)[-5:]
+    assert strongest(atlas, links, len(links)) == (list(links), {})
 
 
 def test_an_unknown_kind_of_part_is_refused() -> None:
