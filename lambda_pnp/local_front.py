@@ -29,7 +29,7 @@ from rse_pf.config import PlatformSettings, load_settings
 from rse_pf.config.front_door import BEARER_PATTERN, BURST_PATH
 from rse_pf.errors import NotFound, RsePfError
 from rse_pf.linux import die_with_parent, set_process_name
-from rse_pf.terminal import show_json
+from rse_pf.terminal import show, show_error, show_json
 
 __all__ = ["LocalFront", "answering_of", "read_beside"]
 
@@ -47,7 +47,7 @@ _REASONS = {
 
 
 class LocalFront:
-    """The front door and the executions of one function.
+    """The firewall, the load balancer and the executions of one function.
 
     Attributes:
         url: Where commands are posted, once it listens.
@@ -203,6 +203,7 @@ async def _run(folder: Path, port: int) -> None:
     for number in (signal.SIGINT, signal.SIGTERM):
         asyncio.get_running_loop().add_signal_handler(number, stopped.set)
     show_json({"url": front.url})
+    sys.stdout = sys.stderr  # what the function logs; nobody reads more than the first line of the output
     await stopped.wait()
     await front.stop()
 
@@ -220,9 +221,11 @@ def main() -> int:
     try:
         with contextlib.suppress(KeyboardInterrupt):
             asyncio.run(_run(args.folder, args.port))
-    except (RsePfError, OSError) as error:
-        told = error.report() if isinstance(error, RsePfError) else f"cannot listen: {error}"
-        sys.stderr.write(f"{told}\n")
+    except RsePfError as error:
+        show_error(error)
+        return 2
+    except OSError as error:
+        show(f"cannot listen on port {args.port}: {error.strerror}", "  hint: name another port", error=True)
         return 2
     return 0
 

@@ -153,6 +153,7 @@ PURE = (
     "rse_pf/scaling/",
     "rse_pf/auth/tokens.py",
     "rse_pf/audit/chain.py",
+    "client_sdk/burst_rules.py",
     "client_sdk/offload.py",
 )
 IMPURE = {

@@ -102,7 +102,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         f"(local.foxglove_port, default {defaults.foxglove_port})",
     )  # fmt: skip
     parser.add_argument(
-        "--burst", nargs="?", type=int, const=defaults.burst_port, metavar="P",
+        "--burst", nargs="?", type=int, const=0, metavar="P",
         help="also run the burst function, at port P on loopback (local.burst_port, default "
         f"{defaults.burst_port}): robots ask it while no server answers in time",
     )  # fmt: skip
@@ -150,12 +150,13 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     page = not args.no_page
     if args.foxglove:
         require("local --foxglove")
-    if args.burst is not None:
-        chosen = _with_burst(chosen, args.burst, lan)
+    burst_port = None if args.burst is None else args.burst or chosen.local.burst_port
+    if burst_port is not None:
+        chosen = _with_burst(chosen, burst_port, lan)
     return asyncio.run(
         _foreground(
             args.name, folder, chosen, data=not args.no_data, lan=lan, page=page, foxglove=args.foxglove,
-            burst_port=args.burst,
+            burst_port=burst_port,
         )
     )  # fmt: skip
 
@@ -170,7 +171,7 @@ def _with_burst(settings: PlatformSettings, port: int, lan: str) -> PlatformSett
             "--burst is for robots of this machine, and --lan for others", hint="leave one of them out"
         )
     if not 0 < port < 65536:
-        raise UsageError(f"--burst {port} is no port", hint="name one from 1 to 65535, or leave it out")
+        raise UsageError(f"--burst {port} is not a port", hint="name one from 1 to 65535, or leave it out")
     check_listener("127.0.0.1", port)
     return settings.replace(burst={"url": f"http://127.0.0.1:{port}{BURST_PATH}"})
 
