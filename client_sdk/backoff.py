@@ -19,6 +19,7 @@ _SHARE = 1.0 / 3.0
 """Longest pause as a share of the time without a connection: after an outage of a minute, 20 seconds."""
 _OFFLINE_MAX_S = 5.0
 """Longest pause while attempts do not leave the robot: they cost nobody anything."""
+_KEPT = 0.5
 _SPREAD = 1.25
 """Robots that are told the same time to wait do not come back at the same moment."""
 
@@ -41,7 +42,9 @@ class Backoff:
         """Count an attempt that begins at *now*, seconds of the robot's clock."""
         self._bucket.spend(1.0, now)
 
-    def pause_s(self, now: float, after_s: float = 0.0, *, is_offline: bool = False) -> float:
+    def pause_s(
+        self, now: float, after_s: float = 0.0, *, is_offline: bool = False, is_move: bool = False
+    ) -> float:
         """Return how long to wait before the next attempt.
 
         Within the first seconds without a connection, exponential with full jitter up to
@@ -52,6 +55,7 @@ class Backoff:
             now: Seconds of the robot's clock.
             after_s: What the server asked for.
             is_offline: Whether the last attempt did not leave the robot.
+            is_move: Whether the robot has a connection; it then keeps half of its allowance for its loss.
         """
         s = self._settings
         if self._failing_since is None:
@@ -68,4 +72,8 @@ class Backoff:
             )
         self._attempt += 1
         asked_s = after_s * self._random.uniform(1.0, _SPREAD)
-        return max(asked_s + pause_s, self._bucket.wait_s(now))
+        wait_s = self._bucket.wait_s(now)
+        if is_move:
+            kept = _KEPT * self._bucket.burst
+            wait_s = max(wait_s, (kept + 1.0 - self._bucket.left) / self._bucket.rate)
+        return max(asked_s + pause_s, wait_s)

@@ -343,7 +343,7 @@ class Connection:
                     self._on_change("moved", fresh.state.server)
                     return
                 self._spawn(self._close_socket(fresh))
-            pause_s = min(self._pause_s(region, failed), max(0.0, until - self._clock()))
+            pause_s = min(self._pause_s(region, failed, is_move=True), max(0.0, until - self._clock()))
             await either(old.ended, pause_s)
 
     # --- one socket ------------------------------------------------------------------------------
@@ -537,9 +537,9 @@ class Connection:
         for region in self._regions:
             region.changed.set()
 
-    def _pause_s(self, region: Region, failed: DialError | None) -> float:
+    def _pause_s(self, region: Region, failed: DialError | None, *, is_move: bool = False) -> float:
         after_s, is_offline = (0.0, False) if failed is None else (failed.after_s, failed.is_offline)
-        return region.backoff.pause_s(self._clock(), after_s, is_offline=is_offline)
+        return region.backoff.pause_s(self._clock(), after_s, is_offline=is_offline, is_move=is_move)
 
     def _spawn(self, work: Coroutine[Any, Any, Any]) -> asyncio.Task[Any]:
         task = asyncio.get_running_loop().create_task(work)

@@ -100,6 +100,22 @@ def test_a_server_that_accepts_and_dies_again_and_again_does_not_empty_the_allow
     assert dials <= session.dial_burst + 10 * session.dials_per_minute + 1
 
 
+def test_a_move_that_does_not_succeed_leaves_half_of_the_allowance():
+    session = SessionSettings()
+    backoff, now = Backoff(session, Random(2)), 0.0
+    dials_until_s = []
+    while now < 30.0:
+        backoff.dialled(now)
+        dials_until_s.append(now)
+        now += backoff.pause_s(now, is_move=True)
+
+    assert len(dials_until_s) <= 0.5 * session.dial_burst + 0.5 * session.dials_per_minute + 1
+    backoff.restart()
+    for _ in range(session.dial_burst // 2):
+        assert backoff.pause_s(now) <= session.reconnect_max_s
+        backoff.dialled(now)
+
+
 def test_a_server_that_dies_is_dialled_again_within_a_second():
     for seed in range(50):
         assert Backoff(SessionSettings(), Random(seed)).pause_s(50.0) <= 0.1

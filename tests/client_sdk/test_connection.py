@@ -315,6 +315,22 @@ def test_a_final_refusal_is_not_retried(status, error):
     run(test())
 
 
+def test_what_a_firewall_refuses_ends_neither_a_connect_nor_a_robot():
+    async def test():
+        async with FakePlatform() as platform:
+            platform.refuses_as_firewall = True
+            platform.refusals = [(403, None), (401, None)]
+            async with robot(platform.url, token="mine") as a_robot:
+                platform.refusals = [(403, None), (401, None), (403, 1), (429, None)]
+                platform.sockets[0].cut()
+
+                assert (await ask(a_robot, 1, deadline_s=15)).reply == {"value": 1}
+
+            assert len(platform.handshakes) == 8
+
+    run(test())
+
+
 def test_a_missing_route_is_retried_once_the_robot_was_connected():
     async def test():
         async with FakePlatform() as platform, robot(platform.url) as a_robot:
