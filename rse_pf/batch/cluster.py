@@ -26,6 +26,7 @@ from rse_pf.batch.parts import Part, encode_part, is_done
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import Crashed, Disconnected, MissingExtra, error_from_code
 from rse_pf.object_store import ObjectStore
+from rse_pf.terminal import counted
 
 __all__ = [
     "ClusterKey",
@@ -300,7 +301,7 @@ class DaskEngine:
             raise _SchedulerLost
         replaced = self._cluster.replace_dead_workers()
         if replaced:
-            self._on_event(f"{replaced} worker{'s' * (replaced > 1)} ended and were replaced")
+            self._on_event(f"{counted(replaced, 'worker')} replaced, which had ended")
 
     def _restart(self) -> None:
         self.close()

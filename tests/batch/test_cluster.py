@@ -16,7 +16,7 @@ from rse_pf.batch.cluster import DaskEngine, LocalCluster, new_cluster_key
 from rse_pf.batch.merge import BatchMerge
 from rse_pf.batch.parts import Part
 from rse_pf.config import PlatformSettings
-from rse_pf.errors import BadRequest
+from rse_pf.errors import BadRequest, Crashed
 from rse_pf.maps.format import MapVersion, encode_map
 from rse_pf.object_store import DirectoryStore
 from rse_pf.services.mapping.map_merge import Atlas, MergeOptions, merge_versions, propose_links
@@ -86,6 +86,27 @@ def test_a_part_that_fails_is_one_error_with_a_hint(tmp_path: Path) -> None:
         engine.close()
         cluster.stop()
     assert caught.value.hint
+
+
+def test_a_part_that_ends_its_workers_ends_the_job_and_not_all_workers(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def compute(settings: bytes, part: bytes) -> None:
+        os._exit(3)
+
+    monkeypatch.setattr("rse_pf.batch.cluster.compute", compute)
+    settings = PlatformSettings().replace(data={"store": f"dir:{tmp_path}"}, batch={"part_tries": 2})
+    key, events = new_cluster_key(), []
+    cluster = LocalCluster(key, 1, part_tries=2)
+    engine = DaskEngine(DirectoryStore(tmp_path), settings, cluster, key, on_event=events.append)
+    try:
+        engine.start()
+        with pytest.raises(Crashed, match="ended 2 workers"):
+            engine.run([Part(kind="words", inputs=())], lambda _: None)
+    finally:
+        engine.close()
+        cluster.stop()
+    assert "1 worker replaced, which had ended" in events
 
 
 def test_who_has_not_the_key_is_refused() -> None:
