@@ -169,7 +169,7 @@ def operator_alarms(settings: PlatformSettings) -> tuple[OperatorAlarm, ...]:
         alarms.append(
             OperatorAlarm(
                 name="canary",
-                meaning="the canary gets no correct pose through the front door",
+                meaning="the canary gets no correct pose through the load balancer",
                 series=calls,
                 expression=f"IF(FILL(wanted, {floor}) > 0 AND FILL(calls, 0) - FILL(errors, 0) < 1, 1, 0)",
                 missing="breaching",

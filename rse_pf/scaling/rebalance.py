@@ -93,6 +93,9 @@ class MoveOrder:
 def order_of(mine: int, totals: Sequence[Totals], *, moves_per_s: float) -> MoveOrder | None:
     """Return what a server with *mine* robots orders; None if nothing, or if the sums still change.
 
+    A server that is above its share goes down to even, not to the border of the margin: some load balancers
+    send a part of the robots back, and no server can get more than it lacks while all go down to even.
+
     Args:
         mine: Robots of this server now.
         totals: Of whole periods, the newest first.
@@ -100,8 +103,11 @@ def order_of(mine: int, totals: Sequence[Totals], *, moves_per_s: float) -> Move
     """
     if len(totals) < 2 or not _is_steady(totals[0], totals[1]):
         return None
-    robots = share(mine, totals[0].robots, totals[0].servers)
-    return MoveOrder(robots=robots, spread_s=round(robots / moves_per_s, 3)) if robots else None
+    total, servers = totals[0].robots, totals[0].servers
+    if not share(mine, total, servers):
+        return None
+    robots = mine - math.ceil(total / servers)
+    return MoveOrder(robots=robots, spread_s=round(robots / moves_per_s, 3))
 
 
 def pause_after_s(order: MoveOrder, *, within_s: float, failures: int) -> float:

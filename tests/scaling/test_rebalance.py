@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rse_pf.scaling.rebalance import MARGIN, moves, share
+from rse_pf.scaling.rebalance import MARGIN, MoveOrder, Totals, moves, order_of, pause_after_s, share
 
 fleets = st.lists(st.integers(0, 400), min_size=2, max_size=12).map(
     lambda counts: {f"server-{i + 1}": n for i, n in enumerate(counts)}
@@ -118,6 +118,45 @@ def test_servers_that_know_only_the_sums_fill_up_an_empty_one_and_then_stop(robo
     assert all(share(n, total, servers) == 0 for n in after.values())
     even = total / servers
     assert min(after.values()) >= math.floor(even - 0.2 * even - (servers - 1) - 1e-9)
+
+
+def ordered(robots: dict[str, int]) -> dict[str, int]:
+    """Return what each server orders that knows its own robots and steady sums."""
+    sums = [Totals(start_s=at, robots=sum(robots.values()), servers=len(robots)) for at in (10.0, 0.0)]
+    found = {name: order_of(n, sums, moves_per_s=20.0) for name, n in robots.items()}
+    return {name: order.robots for name, order in found.items() if order is not None}
+
+
+@given(fleets)
+def test_orders_of_servers_that_know_only_the_sums_lead_to_even_and_never_past_it(
+    robots: dict[str, int],
+) -> None:
+    even = sum(robots.values()) / len(robots)
+
+    orders = ordered(robots)
+    after = settled(robots, orders)
+
+    assert all(robots[name] - n >= even for name, n in orders.items()), "a server gave too much away"
+    assert all(after[name] <= max(n, math.ceil(even)) for name, n in robots.items()), "one got too much"
+    assert ordered(after) == {}, "robots move on and on"
+
+
+def test_no_order_before_two_periods_agree() -> None:
+    steady, grown, joined = (
+        Totals(start_s=10.0, robots=robots, servers=servers)
+        for robots, servers in ((120, 3), (140, 3), (120, 2))
+    )
+
+    assert order_of(60, [steady], moves_per_s=20.0) is None
+    assert order_of(60, [steady, grown], moves_per_s=20.0) is None
+    assert order_of(60, [steady, joined], moves_per_s=20.0) is None
+    assert order_of(60, [steady, steady], moves_per_s=20.0) == MoveOrder(robots=20, spread_s=1.0)
+
+
+def test_a_pause_doubles_with_each_order_that_moved_nobody_up_to_ten_minutes() -> None:
+    order = MoveOrder(robots=20, spread_s=1.0)
+
+    assert [pause_after_s(order, within_s=5.0, failures=each) for each in (0, 1, 2, 9)] == [6, 12, 24, 600]
 
 
 def test_a_single_server_moves_no_robots() -> None:
