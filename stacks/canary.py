@@ -19,8 +19,8 @@ from aws_cdk import aws_logs as logs
 from aws_cdk import aws_secretsmanager as secretsmanager
 from constructs import Construct
 
-from rse_pf.aws.money.costs import CANARY_MB, CANARY_PERIOD_S
 from rse_pf.config import PlatformSettings
+from rse_pf.config.cloud_layout import CANARY_MB, CANARY_PERIOD_S
 from rse_pf.config.resource_names import ResourceNames
 from stacks.assets import staged
 from stacks.findings import acknowledge
@@ -29,7 +29,7 @@ from stacks.permissions import BY_AWS, LOG_ACTIONS, allow, explain
 __all__ = ["Canary"]
 
 _TIMEOUT_S = 30
-"""Longer than lambda_pnp/canary.py waits for an answer, so that its own error is told."""
+"""Longer than rse_pf/aws/canary/handler.py waits for an answer, so that its own error is told."""
 
 
 class Canary(Construct):
@@ -50,7 +50,7 @@ class Canary(Construct):
         role = iam.Role(self, "Role", assumed_by=iam.ServicePrincipal("lambda.amazonaws.com"))
         allow(
             role, ["secretsmanager:GetSecretValue"], [key.secret_arn],
-            used_by="lambda_pnp/canary.py:read_key",
+            used_by="rse_pf/aws/canary/handler.py:read_key",
         )  # fmt: skip
         log.grant_write(role)
         explain(role, LOG_ACTIONS, used_by=f"{BY_AWS}Lambda writes what the function prints")
@@ -58,8 +58,8 @@ class Canary(Construct):
             code = lambda_.Code.from_asset(str(staged(assets, "lambda", settings, Path(folder))))
             function = lambda_.Function(
                 self, "Function", function_name=names.canary, runtime=lambda_.Runtime.PYTHON_3_13,
-                architecture=lambda_.Architecture.X86_64, handler="lambda_pnp.canary.handler", code=code,
-                role=role, log_group=log, memory_size=CANARY_MB,
+                architecture=lambda_.Architecture.X86_64, code=code, role=role,
+                handler="rse_pf.aws.canary.handler.handler", log_group=log, memory_size=CANARY_MB,
                 timeout=cdk.Duration.seconds(_TIMEOUT_S),
                 environment={
                     "RSE_PF_CANARY_URL": url, "RSE_PF_CANARY_ROBOT": names.canary,

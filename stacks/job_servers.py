@@ -16,8 +16,8 @@ from aws_cdk import aws_iam as iam
 from aws_cdk import aws_sns as sns
 from constructs import Construct
 
-from rse_pf.aws.money.costs import zone_count
 from rse_pf.config import PlatformSettings
+from rse_pf.config.cloud_layout import zone_count
 from rse_pf.config.resource_names import ResourceNames
 from rse_pf.scaling.job_alarms import job_alarms_of
 from stacks.backend_servers import launch_template

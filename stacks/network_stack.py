@@ -11,8 +11,8 @@ from aws_cdk import aws_iam as iam
 from aws_cdk import aws_logs as logs
 from constructs import Construct
 
-from rse_pf.aws.money.costs import endpoint_services, zone_count
 from rse_pf.config import PlatformSettings
+from rse_pf.config.cloud_layout import endpoint_services, zone_count
 from rse_pf.config.resource_names import ResourceNames
 from stacks.findings import acknowledge
 from stacks.firewall import Firewall, front_port, inner_ports, live_range
@@ -28,6 +28,8 @@ ZONES = 2
 
 _FIRST_ANSWER_PORT, _LAST_PORT = 1024, 65535
 _HTTPS = 443
+_UNREACHABLE, _TOO_BIG = 3, 4
+"""ICMP type and code by which a router tells the largest packet that it forwards (RFC 1191)."""
 _WHY_LISTS = "the paper's firewall has access control lists (Sect. 3.1); they stand behind security groups"
 
 
@@ -114,6 +116,11 @@ class NetworkStack(cdk.Stack):
         self._entry(back, "Answers", 120, anywhere, answers, inward=True)
         self._entry(back, "Https", 100, anywhere, https, inward=False)
         self._entry(back, "ToInside", 110, inside, answers, inward=False)
+        # "Fragmentation needed": without it, large messages over a VPN or a cellular network just vanish.
+        too_big = ec2.AclTraffic.icmp(type=_UNREACHABLE, code=_TOO_BIG)
+        for of, peer in ((front, robots), (back, anywhere)):
+            self._entry(of, "MtuIn", 140, peer, too_big, inward=True)
+            self._entry(of, "MtuOut", 140, peer, too_big, inward=False)
 
     def _control_list(self, name: str, kind: ec2.SubnetType) -> ec2.NetworkAcl:
         where = ec2.SubnetSelection(subnet_type=kind)

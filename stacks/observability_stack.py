@@ -19,6 +19,7 @@ from rse_pf.config.resource_names import ResourceNames
 from rse_pf.scaling.alarms import NAMESPACE
 from rse_pf.scaling.operator_alarms import OperatorAlarm, Series, operator_alarms
 from stacks.canary import Canary
+from stacks.idle_timer import IdleTimer
 from stacks.values import read
 
 __all__ = ["ObservabilityStack"]
@@ -67,6 +68,8 @@ class ObservabilityStack(cdk.Stack):
             Canary(
                 self, "Canary", settings=settings, assets=assets, url=read(self, names, "backend/url")
             )  # fmt: skip
+        if settings.cloud.idle_action == "park":
+            IdleTimer(self, "IdleTimer", settings=settings, assets=assets, topic=topic)
         if settings.cloud.budget_per_month:
             self._budget(names, settings.cloud.budget_per_month, topic)
 

@@ -23,7 +23,7 @@ USED_BY = "rse-pf:used-by"
 BY_AWS = "aws: "
 """What ``used_by`` begins with where a service of AWS makes the call itself; the reason follows."""
 LOG_ACTIONS = ("logs:CreateLogStream", "logs:PutLogEvents")
-"""That the CDK grants to whoever writes to a log group."""
+"""That the CDK grants to the writers of a log group."""
 
 
 def allow(

@@ -25,7 +25,7 @@ RUN_HERE = {
     "rse-pf cloud doctor": 1,
     "rse-pf token init --cloud": 0,
     "rse-pf token issue robot-1 --cloud": 0,
-    "rse-pf cloud status": 2,
+    "rse-pf cloud status": 0,
     "rse-pf token rotate --cloud": 0,
     "rse-pf token retire --cloud --force": 0,
     "rse-pf audit verify --cloud": 2,
@@ -160,7 +160,7 @@ def test_the_amounts_on_the_page_are_those_of_the_prices(page: str) -> None:
         (bill.total, "A platform without any robot costs about **{:.0f} USD** a month."),
         (parked(bill, deep=False).total, "Parked it costs about **{:.0f} USD**,"),
         (parked(bill, deep=True).total, "and the endpoints, about **{:.0f} USD**."),
-        (small.total, "`cloud.profile` = `small` costs about **{:.0f} USD** a month idle"),
-        (parked(small, deep=True).total, "idle and **{:.0f} USD** parked with `--deep`"),
+        (small.total, "`cloud.profile` = `small` costs **{:.0f} USD** a month idle,"),
+        (parked(small, deep=True).total, "idle, and **{:.0f} USD** parked with `--deep`"),
     ):
         assert text.format(amount) in words

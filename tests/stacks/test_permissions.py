@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from rse_pf.aws.money.costs import endpoint_services
+from rse_pf.config.cloud_layout import endpoint_services
 
 Assembly = Any
 
@@ -21,7 +21,7 @@ USED_BY = "rse-pf:used-by"
 CALLS = {
     "s3:GetObject": ("get_object", "urlopen"),
     "s3:PutObject": ("put_object", "urlopen"),
-    # Without it S3 answers 403 for an object that does not exist, so whoever reads needs it.
+    # Without it S3 answers 403 for an object that does not exist, so every reader needs it.
     "s3:ListBucket": ("list_objects_v2", "get_object", "urlopen"),
     "secretsmanager:GetSecretValue": ("get_secret_value", "urlopen"),
 }

@@ -107,6 +107,15 @@ def test_no_role_may_do_anything_to_everything_but_publish_and_read_numbers(asse
     assert [(each["Action"], each.get("Condition")) for each in wide] == [
         ("cloudwatch:PutMetricData", {"StringEquals": {"cloudwatch:namespace": "RsePf"}}),
         ("cloudwatch:GetMetricData", None),
+        # The idle timer: reading, which knows no resources.
+        (
+            [
+                "autoscaling:DescribeAutoScalingGroups",
+                "cloudwatch:DescribeAlarms",
+                "cloudwatch:GetMetricData",
+            ],
+            None,
+        ),
     ]
     actions = [action for each in statements for action in _listed(each["Action"])]
     assert not [action for action in actions if "*" in action]
@@ -123,8 +132,8 @@ def _listed(value: str | list[str]) -> list[str]:
 
 def test_what_the_commands_look_for_is_what_the_stacks_call_it(assembly: Assembly) -> None:
     from rse_pf.auth.trust_store import DENY_NAME, ROBOTS_NAME
-    from rse_pf.aws.money.costs import endpoint_services, zone_count
     from rse_pf.aws.storage.key_store import KEYS_NAME
+    from rse_pf.config.cloud_layout import endpoint_services, zone_count
     from rse_pf.config.resource_names import ResourceNames
     from stacks import backend_stack
 
@@ -242,8 +251,17 @@ def test_only_the_front_door_is_open_to_the_world(assembly: Assembly) -> None:
     loose = [*assembly.all("AWS::EC2::SecurityGroupIngress"), *assembly.all("AWS::EC2::SecurityGroupEgress")]
     front = 80 if assembly.settings.cloud.allow_insecure else 443
 
-    assert [rule["FromPort"] for rule in inline if rule.get("CidrIp") == "0.0.0.0/0"] == [front]
+    open_to_all = [rule for rule in inline if rule.get("CidrIp") == "0.0.0.0/0"]
+    ports = [(rule["IpProtocol"], rule["FromPort"], rule["ToPort"]) for rule in open_to_all]
+    assert ports == [("tcp", front, front), ("icmp", 3, 4)], "the listener, and what a path's MTU needs"
     assert not [rule for rule in [*outward, *loose] if rule.get("CidrIp") == "0.0.0.0/0"]
+
+
+def test_routers_may_tell_the_largest_packet_through_every_control_list(assembly: Assembly) -> None:
+    entries = [each for each in assembly.all("AWS::EC2::NetworkAclEntry") if each["Protocol"] == 1]
+
+    assert [each["Icmp"] for each in entries] == [{"Type": 3, "Code": 4}] * 4
+    assert sorted(each.get("Egress", False) for each in entries) == [False, False, True, True]
 
 
 def test_instances_have_no_key_no_public_address_and_imdsv2_with_one_hop(assembly: Assembly) -> None:
@@ -293,12 +311,14 @@ def test_audit_logs_are_written_once_and_read_changed_or_deleted_by_no_server(as
     assert statement["Resource"]["Fn::Join"][1][-1] == "/audit/*"
 
 
-def test_packages_carry_the_merged_settings_and_one_digest(assembly: Assembly) -> None:
+def test_packages_carry_the_settings_of_a_server_and_the_function_all_of_them(assembly: Assembly) -> None:
     from rse_pf.config import load_settings
+    from rse_pf.config.server_settings import server_settings
 
+    server = PlatformSettings.from_dict(server_settings(assembly.settings))
     digests = {load_settings(path).digest() for path in assembly.folder.glob("asset.*/settings.json")}
 
-    assert digests == {assembly.settings.digest()}
+    assert digests == {assembly.settings.digest(), server.digest()}
     tag = {"Key": "rse-pf", "Value": "rse-pf"}
     assert tag in assembly.one("AWS::EC2::VPC")["Tags"]
 

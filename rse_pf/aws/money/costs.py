@@ -15,13 +15,12 @@ from typing import Literal
 from rse_pf.aws.fleet.metrics import ServerMetrics, datums
 from rse_pf.aws.money.prices import Prices
 from rse_pf.config import PlatformSettings
+from rse_pf.config.cloud_layout import CANARY_MB, CANARY_PERIOD_S, endpoint_services, zone_count
 from rse_pf.config.front_door import rate_rules
 from rse_pf.scaling.alarms import alarms_of
 from rse_pf.scaling.operator_alarms import operator_alarms
 
 __all__ = [
-    "CANARY_MB",
-    "CANARY_PERIOD_S",
     "HOURS",
     "NOT_INCLUDED",
     "Bill",
@@ -31,10 +30,8 @@ __all__ = [
     "bill_of",
     "compare",
     "crossing_commands_per_s",
-    "endpoint_services",
     "parked",
     "parked_at_night",
-    "zone_count",
 ]
 
 HOURS = 730.0
@@ -52,12 +49,10 @@ _MB_OF_A_VCPU = 1769
 _DETAILED_METRICS = 7
 """That EC2 publishes each minute for a server with detailed monitoring."""
 _UNITS = "capacity units"
-CANARY_MB, CANARY_PERIOD_S = 512, 60
-"""Memory of the canary's function, and the time between two calls."""
 _CANARY_S = 1.0
 
-Needs = Literal["servers", "front", "nothing"]
-"""What a line is paid for: running servers, the front door (balancer, firewall, endpoints), or anyway."""
+Needs = Literal["servers", "balancer", "nothing"]
+"""What a line is paid for: running servers, the load balancer with firewall and endpoints, or anyway."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -136,19 +131,6 @@ class Costs:
     crossing_commands_per_s: float | None
 
 
-def zone_count(settings: PlatformSettings) -> int:
-    """Return in how many zones servers and endpoints are; the load balancer always needs two."""
-    return 1 if settings.cloud.profile == "small" else 2
-
-
-def endpoint_services(settings: PlatformSettings) -> dict[str, str]:
-    """Return the interface endpoints of the VPC: the service of AWS, and the box of Fig. 2 that uses it.
-
-    Without them the agents reach neither the monitor nor the group; S3 has a gateway endpoint, which is free.
-    """
-    return {"monitoring": "monitor", "autoscaling": "scale modifier"}
-
-
 def bill_of(settings: PlatformSettings, prices: Prices, load: Load | None = None) -> Bill:
     """Return the bill of a month with *load*; without it, of a month without any robot.
 
@@ -167,14 +149,17 @@ def bill_of(settings: PlatformSettings, prices: Prices, load: Load | None = None
 
 
 def parked(bill: Bill, *, deep: bool) -> Bill:
-    """Return what is left of *bill* without servers and, if *deep*, without the front door either."""
-    gone: tuple[Needs, ...] = ("servers", "front") if deep else ("servers",)
+    """Return what is left of *bill* without servers.
+
+    If *deep*, load balancer, firewall and endpoints are gone, too.
+    """
+    gone: tuple[Needs, ...] = ("servers", "balancer") if deep else ("servers",)
     return Bill(tuple(line for line in bill.lines if line.needs not in gone))
 
 
 def parked_at_night(bill: Bill, load: Load, *, deep: bool) -> Bill:
     """Return *bill* of a platform that is parked outside the hours of *load*."""
-    gone: tuple[Needs, ...] = ("servers", "front") if deep else ("servers",)
+    gone: tuple[Needs, ...] = ("servers", "balancer") if deep else ("servers",)
     share = load.hours_per_day / _DAY_H
     return Bill(
         tuple(
@@ -312,7 +297,7 @@ def _front_lines(settings: PlatformSettings, prices: Prices, load: Load) -> Iter
     )  # fmt: skip
     for box, what, count, unit, price in rows:
         yield CostLine(
-            box=box, what=what, count=count, unit=unit, price=price, needs="front",
+            box=box, what=what, count=count, unit=unit, price=price, needs="balancer",
             all_day=what != _UNITS,
         )  # fmt: skip
 

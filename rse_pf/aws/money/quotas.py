@@ -10,10 +10,10 @@ from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 from rse_pf.aws.account import Account
-from rse_pf.aws.money.costs import zone_count
 from rse_pf.aws.money.leftovers import living_stacks
 from rse_pf.aws.money.prices import load_prices
 from rse_pf.config import PlatformSettings
+from rse_pf.config.cloud_layout import zone_count
 from rse_pf.config.elasticity import instance_types
 from rse_pf.config.resource_names import ResourceNames
 from rse_pf.errors import ConfigurationError, StoreError

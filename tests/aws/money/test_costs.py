@@ -76,7 +76,7 @@ def test_the_small_profile_costs_less_than_a_hundred_a_month_and_parked_less_tha
     assert parked(bill, deep=True).total < parked(bill, deep=False).total < bill.total
 
 
-def test_parked_there_is_no_server_and_deep_no_front_door() -> None:
+def test_parked_there_is_no_server_and_deep_no_load_balancer() -> None:
     bill = bill_of(PlatformSettings(), load_prices())
     shallow, deep = parked(bill, deep=False), parked(bill, deep=True)
 

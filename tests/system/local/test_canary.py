@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from lambda_pnp.canary import ask_known_pose
 from rse_pf.auth.roster import EnrolledRobot
 from rse_pf.auth.tokens import SigningKey
 from rse_pf.auth.trust_store import AccessControlStore
+from rse_pf.aws.canary.handler import ask_known_pose
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import ConnectError
 from rse_pf.local.control.platform import LocalPlatform

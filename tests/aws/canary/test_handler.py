@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 from fake_platform import FakePlatform
 
-from lambda_pnp import canary
-from lambda_pnp.canary import ask_known_pose, read_key
 from rse_pf.auth.tokens import SigningKey
+from rse_pf.aws.canary import handler as canary
+from rse_pf.aws.canary.handler import ask_known_pose, read_key
 from rse_pf.aws.clients import make_client
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import ConfigurationError, ConnectError, InternalError, UsageError

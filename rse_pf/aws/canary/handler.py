@@ -1,4 +1,4 @@
-"""The canary: ask for one known pose through the front door, as a robot does, and fail if it is not right.
+"""The canary: ask for one known pose through the load balancer, as a robot does, and fail if it is not right.
 
 A schedule calls it each minute.  It is an enrolled robot with a key of its own in a secret that only it may
 read, and with the scope services:pnp; it can sign nothing for another robot.  A failed execution is a data
@@ -18,8 +18,8 @@ from typing import Any
 
 import numpy as np
 
-from lambda_pnp.websocket import WebSocket
 from rse_pf.auth.tokens import SigningKey
+from rse_pf.aws.canary.websocket import WebSocket
 from rse_pf.aws.clients import call_api, make_client
 from rse_pf.config import PlatformSettings, load_settings
 from rse_pf.errors import Expired, InternalError, RsePfError
@@ -33,7 +33,7 @@ from rse_pf.wire.messages import Failure
 
 __all__ = ["ask_known_pose", "handler", "read_key"]
 
-_ROOT = Path(__file__).resolve().parents[1]
+_ROOT = Path(__file__).resolve().parents[3]
 _CODEC = "zlib"
 _TIMEOUT_S = 10.0
 _SEED, _MAX_ERROR = 20260101, 0.02
@@ -66,7 +66,7 @@ def ask_known_pose(
     """Ask for the pose of one seeded problem at *url*; return the server, the time in ms and the error.
 
     Args:
-        url: Of the front door, such as ``wss://robots.example.org/ws``.
+        url: Of the load balancer, such as ``wss://robots.example.org/ws``.
         token: Of the canary's robot.
         settings: Limits of the session.
         trace: Written to the server's log beside the command.
