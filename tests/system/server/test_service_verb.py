@@ -36,6 +36,6 @@ def test_every_command_of_the_page_works_in_an_empty_folder(tmp_path: Path) -> N
 
     printed = [rse_pf(words[1:], tmp_path) for words in found]
 
-    assert "1 of 1 recorded requests as expected" in printed[1]
+    assert "1 of 1 recorded request as expected" in printed[1]
     assert '"centroid": [1.0, 1.0, 1.0]' in printed[2]
     assert "centroid" in printed[-1], "what was installed is not listed"
