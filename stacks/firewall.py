@@ -58,6 +58,11 @@ class Firewall(Construct):
         self.balancer.add_ingress_rule(
             ec2.Peer.ipv4(settings.cloud.robot_cidr), ec2.Port.tcp(front_port(settings)), "robots"
         )
+        self.balancer.add_ingress_rule(
+            ec2.Peer.ipv4(settings.cloud.robot_cidr),
+            ec2.Port.icmp_type_and_code(3, 4),
+            "largest packet, RFC 1191",
+        )
         acknowledge(self.balancer, "robots come from anywhere; cloud.robot_cidr narrows it", "EC23")
         for port in inner_ports(settings):
             self.balancer.add_egress_rule(self.servers, ec2.Port.tcp(port), "to the servers")

@@ -49,7 +49,7 @@ VERSION_PARAMETER = "ServersVersion"
 """Of the backend stack: the version of the launch template that the servers run."""
 AUDIT_PREFIX = "audit"
 """Of the pieces of audit logs in their bucket."""
-STACKS = ("Network", "Data", "Serverless", "Backend", "Observability")
+STACKS = ("Network", "Data", "Backend", "Serverless", "Observability")
 """The boxes that are stacks, in an order in which they can be deployed."""
 
 

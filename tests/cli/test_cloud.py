@@ -13,9 +13,11 @@ from emulated_aws import emulated_aws
 from rse_pf.aws.account import Account
 from rse_pf.aws.clients import make_client
 from rse_pf.aws.fleet.group import AutoScalingGroup, Server
+from rse_pf.aws.lifecycle.deployment import Deployment
 from rse_pf.cli.cloud import doctor
 from rse_pf.cli.cloud.doctor import check_tools
 from rse_pf.cli.main import main
+from rse_pf.config.resource_names import STACKS
 
 REGION = "ap-northeast-2"
 
@@ -159,7 +161,7 @@ def test_the_doctor_asks_the_account(
 
     page = capsys.readouterr().out
     assert "ok    signed in as arn:aws:" in page
-    assert "      fix: npx cdk bootstrap" in page
+    assert "      fix: rse-pf cloud up does it" in page
     assert "fail  quota 0, needed 22" in page
 
 
@@ -222,6 +224,8 @@ def test_a_node_that_the_cdk_no_longer_supports_is_caught(
 def show(monkeypatch: pytest.MonkeyPatch, fleet: AutoScalingGroup) -> None:
     monkeypatch.setattr("rse_pf.aws.account.open_account", lambda region: Account(region))
     monkeypatch.setattr("rse_pf.aws.fleet.group.read_group", lambda *args, **named: fleet)
+    stands = Deployment(stacks=dict.fromkeys(STACKS, "CREATE_COMPLETE"), url="ws://robots/ws")
+    monkeypatch.setattr("rse_pf.aws.lifecycle.deployment.read_deployment", lambda *args: stands)
 
 
 def server(name: str, **changes: Any) -> Server:
@@ -242,6 +246,8 @@ def test_the_status_of_a_well_fleet(
     assert main(["cloud", "status"]) == 0
 
     page = capsys.readouterr().out
+    assert page.startswith("rse-pf in ap-northeast-2: up\ncosts 0.")
+    assert "ws://robots/ws\n" in page
     assert "1 server, wanted 1 of 1 to 4" in page
     assert "7 robots on 1 server, 7 to 7 on each" in page
     assert "alarm idle         OK\n" in page

@@ -83,8 +83,13 @@ def assembly(
     with (folder / "lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         if not (folder / "done").exists():
-            _synthesise(settings, folder, repository)
+            synthesise_into(settings, folder, repository)
             (folder / "done").touch()
+    return read_assembly(settings, folder)
+
+
+def read_assembly(settings: PlatformSettings, folder: Path) -> Assembly:
+    """Read what `synthesise_into` wrote into *folder*."""
     report = json.loads((folder / "out" / "validation-report.json").read_text(encoding="utf-8"))
     templates = {
         path.name.removesuffix(".template.json"): json.loads(path.read_text(encoding="utf-8"))
@@ -103,7 +108,7 @@ def synthesise(tmp_path: Path, repository: Path) -> Callable[[PlatformSettings],
     pytest.importorskip("cdk_nag", reason="the infra extra is not installed")
 
     def made(settings: PlatformSettings) -> dict[str, Any]:
-        _synthesise(settings, tmp_path, repository)
+        synthesise_into(settings, tmp_path, repository)
         return {
             path.name.removesuffix(".template.json"): json.loads(path.read_text(encoding="utf-8"))
             for path in sorted((tmp_path / "out").glob("*.template.json"))
@@ -112,7 +117,8 @@ def synthesise(tmp_path: Path, repository: Path) -> Callable[[PlatformSettings],
     return made
 
 
-def _synthesise(settings: PlatformSettings, folder: Path, repository: Path) -> None:
+def synthesise_into(settings: PlatformSettings, folder: Path, repository: Path) -> None:
+    """Write the assembly of *settings* into the folder ``out`` below *folder*, checked by cdk-nag."""
     import aws_cdk as cdk
     import cdk_nag
 

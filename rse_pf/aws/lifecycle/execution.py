@@ -11,28 +11,29 @@ from dataclasses import dataclass
 from datetime import datetime, timezone
 from typing import Protocol
 
-import msgspec
-
 from rse_pf.aws.account import Account
 from rse_pf.aws.fleet.group import read_group
 from rse_pf.aws.lifecycle.deployment import GroupSize, ParkNote, read_note, read_sizes
+from rse_pf.aws.lifecycle.parking import (
+    SUSPENDED,
+    alarms_of_deployment,
+    empty_group,
+    silence_alarms,
+    write_note,
+)
 from rse_pf.aws.lifecycle.plan import Action, Step, restored
 from rse_pf.aws.lifecycle.removal import erase_data, sweep
 from rse_pf.config import PlatformSettings
 from rse_pf.config.resource_names import ResourceNames
 from rse_pf.errors import DeploymentFailed
 
-__all__ = ["SUSPENDED", "Tools", "World", "carry_out", "empty_group", "silence_alarms", "write_note"]
-
-SUSPENDED = ("AlarmNotification", "ScheduledActions")
-"""Processes of a parked group: neither an alarm nor a schedule starts a server."""
+__all__ = ["Tools", "World", "carry_out"]
 
 _POLL_S = 5.0
 _STACK_S = 2400.0
 _EMPTY_S = 600.0
 """Beside ``cloud.drain_s``."""
 _HEALTHY_S = 600.0
-_ALARMS_OF_A_CALL = 100
 
 
 class Tools(Protocol):
@@ -78,29 +79,6 @@ def carry_out(steps: Iterable[Step], world: World) -> None:
     for step in steps:
         world.tell(str(step))
         _EFFECTS[step.action](step, world)
-
-
-def write_note(account: Account, names: ResourceNames, note: ParkNote) -> None:
-    """Write *note* over the one that is there; raises ConfigurationError."""
-    value = msgspec.json.encode(note).decode()
-    account.change("ssm", "put_parameter", Name=names.parked, Value=value, Type="String", Overwrite=True)
-
-
-def silence_alarms(account: Account, names: ResourceNames) -> None:
-    """Let no alarm of the deployment act or notify; raises as `Account.find`."""
-    for some in _alarms(account, names):
-        account.change("cloudwatch", "disable_alarm_actions", AlarmNames=some)
-
-
-def empty_group(account: Account, group: str) -> None:
-    """Suspend what starts servers in *group*, and end all of its servers; raises as `Account.find`."""
-    account.change(
-        "autoscaling", "suspend_processes", AutoScalingGroupName=group, ScalingProcesses=list(SUSPENDED)
-    )
-    account.change(
-        "autoscaling", "update_auto_scaling_group", AutoScalingGroupName=group,
-        MinSize=0, DesiredCapacity=0, MaxSize=0,
-    )  # fmt: skip
 
 
 def _build(step: Step, world: World) -> None:
@@ -204,7 +182,7 @@ def _resize(account: Account, group: str, size: GroupSize) -> None:
 
 
 def _alert(step: Step, world: World) -> None:
-    for some in _alarms(world.account, world.names):
+    for some in alarms_of_deployment(world.account, world.names):
         world.account.change("cloudwatch", "enable_alarm_actions", AlarmNames=some)
 
 
@@ -241,13 +219,6 @@ def _sweep(step: Step, world: World) -> None:
 def _erase(step: Step, world: World) -> None:
     for refused in erase_data(world.account, world.names, audit_days=world.settings.cloud.audit_days):
         world.tell(refused)
-
-
-def _alarms(account: Account, names: ResourceNames) -> list[list[str]]:
-    """Return the names of the deployment's alarms, in portions that one call takes."""
-    rows = account.pages("cloudwatch", "describe_alarms", "MetricAlarms", AlarmNamePrefix=names.alarm_prefix)
-    found = [str(row["AlarmName"]) for row in rows]
-    return [found[at : at + _ALARMS_OF_A_CALL] for at in range(0, len(found), _ALARMS_OF_A_CALL)]
 
 
 _EFFECTS: dict[Action, Callable[[Step, World], None]] = {

@@ -86,7 +86,7 @@ def plan_park(deployment: Deployment, *, deep: bool) -> list[Step]:
         if note is None or busy:
             steps += [Step("silence"), Step("empty"), Step("await-empty")]
     if deep or (note is not None and note.deep):
-        steps += _destroyed(deployment)
+        steps += [*_destroyed(deployment), Step("sweep")]
     return steps
 
 

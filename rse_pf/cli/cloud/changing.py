@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
-from datetime import date, datetime, timezone
+from datetime import datetime, timezone
 from pathlib import Path
 
 from rse_pf.aws.account import Account
@@ -48,10 +48,14 @@ class Costs:
         money = self.prices.currency
         return f"{bill.total / HOURS:.2f} {money} an hour, {bill.total:.0f} {money} a month"
 
+    def server_per_hour(self, settings: PlatformSettings) -> float:
+        """Return the price of one more server."""
+        return self.prices.server(settings.cloud.instance_type).per_hour
+
     def warnings(self, settings: PlatformSettings) -> list[str]:
         """Return what is wrong with the prices."""
         today = datetime.now(timezone.utc).date()
-        return self.prices.warnings(today=date.fromordinal(today.toordinal()), region=settings.cloud.region)
+        return self.prices.warnings(today=today, region=settings.cloud.region)
 
 
 def deployment_costs(settings: PlatformSettings) -> Costs:

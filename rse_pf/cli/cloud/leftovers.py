@@ -6,9 +6,12 @@ import argparse
 
 from rse_pf.config import PlatformSettings
 from rse_pf.config.resource_names import ResourceNames
-from rse_pf.terminal import show
+from rse_pf.errors import StoreError
+from rse_pf.terminal import show, show_error
 
 __all__ = ["add_arguments", "run"]
+
+_FAILED = 2
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -16,15 +19,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
-    """Print what is left over; return 1 if anything is."""
+    """Print what is left over; return 1 if anything is, 2 if AWS could not be asked."""
     from rse_pf.aws.account import open_account
     from rse_pf.aws.money.leftovers import find_leftovers, living_stacks
 
     account, names = open_account(settings.cloud.region), ResourceNames(settings.cloud.name)
-    stacks = living_stacks(account, names)
+    try:
+        stacks, found = living_stacks(account, names), find_leftovers(account, names)
+    except StoreError as error:  # its exit code is that of a finding
+        show_error(error)
+        return _FAILED
     if stacks:
         show(f"these stacks stand, and what they own is not listed: {', '.join(stacks)}")
-    found = find_leftovers(account, names)
     for each in found:
         show(f"{each.kind}  {each.name}", f"  {each.why}", f"  remove: {each.remove}")
     unread = sum(each.unread for each in found)

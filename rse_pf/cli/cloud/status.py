@@ -1,11 +1,15 @@
-"""rse-pf cloud status: servers, their health, alarms, robots."""
+"""rse-pf cloud status: stage and cost of the deployment, its servers, their health, alarms, robots."""
 
 from __future__ import annotations
 
 import argparse
 from datetime import datetime, timezone
 
+from rse_pf.aws.lifecycle.deployment import Deployment
+from rse_pf.aws.money.costs import HOURS
+from rse_pf.cli.cloud import changing
 from rse_pf.config import PlatformSettings
+from rse_pf.config.resource_names import ResourceNames
 from rse_pf.terminal import counted, show
 
 __all__ = ["add_arguments", "run"]
@@ -19,8 +23,13 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     """Print the state of the deployment; return 1 if it is not healthy."""
     from rse_pf.aws.account import open_account
     from rse_pf.aws.fleet.group import read_group
+    from rse_pf.aws.lifecycle.deployment import read_deployment
 
     account = open_account(settings.cloud.region)
+    deployment = read_deployment(account, settings)
+    _show_stage(deployment, settings)
+    if deployment.stage in ("absent", "deeply parked"):
+        return 0
     fleet = read_group(account, settings, now=datetime.now(timezone.utc))
     show(
         f"{counted(len(fleet.servers), 'server')}, wanted {fleet.wanted_servers}"
@@ -41,3 +50,23 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
         hint = f"  docs/operations.md#{name}" if state == "ALARM" else ""
         show(f"  alarm {name:<12} {state}{hint}")
     return 0 if fleet.is_healthy else 1
+
+
+def _show_stage(deployment: Deployment, settings: PlatformSettings) -> None:
+    """Show in one line what stands, and in one what that costs without robots."""
+    costs, note = changing.deployment_costs(settings), deployment.note
+    name = ResourceNames(settings.cloud.name).prefix
+    parked_by = f", by the {note.by} since {note.since}: rse-pf cloud resume" if note is not None else ""
+    show(f"{name} in {settings.cloud.region}: {deployment.stage}{parked_by}")
+    bills = {"up": costs.running, "incomplete": costs.running, "parked": costs.parked}
+    if deployment.stage in bills:
+        servers = sum(group.instances for group in deployment.groups.values())
+        more = max(0, servers - settings.scaling.min_servers)
+        hourly = bills[deployment.stage].total / HOURS + more * costs.server_per_hour(settings)
+        show(
+            f"costs {hourly:.2f} {costs.prices.currency} an hour now, beside robots' requests and stored data"
+        )
+    else:
+        show("costs nothing but stored data: rse-pf cloud down lists it")
+    if deployment.url and note is None:
+        show(deployment.url)

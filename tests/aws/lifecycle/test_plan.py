@@ -50,7 +50,7 @@ def test_the_sizes_are_noted_before_anything_changes() -> None:
 def test_parking_what_is_parked_does_nothing_and_deeper_goes_on() -> None:
     assert plan_park(PARKED, deep=False) == []
     assert actions(plan_park(PARKED, deep=True)) == [
-        "note", "destroy Observability", "destroy Backend", "destroy Serverless", "destroy Network",
+        "note", "destroy Observability", "destroy Serverless", "destroy Backend", "destroy Network", "sweep",
     ]  # fmt: skip
 
 
@@ -69,7 +69,7 @@ def test_what_does_not_stand_cannot_be_parked_and_what_is_not_parked_not_resumed
 
 def test_down_destroys_in_the_opposite_order_and_keeps_the_data() -> None:
     assert actions(plan_down(UP, delete_data=False)) == [
-        "destroy Observability", "destroy Backend", "destroy Serverless", "destroy Network", "sweep",
+        "destroy Observability", "destroy Serverless", "destroy Backend", "destroy Network", "sweep",
     ]  # fmt: skip
 
 

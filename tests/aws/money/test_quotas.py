@@ -78,7 +78,7 @@ def test_an_account_with_room_is_ready_and_every_complaint_has_a_fix(region: str
 def test_an_account_without_bootstrap_is_told_the_command(region: str) -> None:
     check = only("bootstrap", checks(region))
 
-    assert (check.grade, check.fix) == ("fail", "npx cdk bootstrap")
+    assert (check.grade, check.fix) == ("fail", "rse-pf cloud up does it")
 
 
 def test_too_few_vcpus_for_the_largest_fleet_fail(region: str) -> None:
@@ -107,7 +107,60 @@ def test_a_full_region_has_no_room_for_another_vpc(region: str) -> None:
 def test_an_instance_type_that_the_region_lacks_fails(region: str) -> None:
     found = checks(region, SETTINGS.replace(cloud={"instance_type": "x99.huge"}))
 
-    assert only("offers no x99.huge", found).grade == "fail"
+    assert (
+        only("does not offer x99.huge in ap-northeast-2a, x99.huge in ap-northeast-2b", found).grade == "fail"
+    )
+
+
+def test_a_type_that_one_zone_lacks_fails_unless_another_type_is_there(region: str) -> None:
+    class Zones:
+        """moto offers every type in every zone."""
+
+        def can_paginate(self, method: str) -> bool:
+            return False
+
+        def describe_availability_zones(self) -> dict[str, Any]:
+            return {"AvailabilityZones": [{"ZoneName": f"{region}{letter}"} for letter in "abc"]}
+
+        def describe_vpcs(self) -> dict[str, Any]:
+            return {"Vpcs": []}
+
+        def describe_instance_type_offerings(self, **asked: Any) -> dict[str, Any]:
+            assert asked["LocationType"] == "availability-zone"
+            rows = [("c7i.large", "a"), ("c7i.large", "c"), ("c6i.large", "a"), ("c6i.large", "b")]
+            wanted = asked["Filters"][0]["Values"]
+            return {
+                "InstanceTypeOfferings": [
+                    {"InstanceType": kind, "Location": f"{region}{zone}"}
+                    for kind, zone in rows
+                    if kind in wanted
+                ]
+            }
+
+    def told(cloud: dict[str, str]) -> Check:
+        made: dict[str, Any] = {"ec2": Zones(), "service-quotas": AMPLE}
+        of = Account(region, lambda name, at: made.get(name) or make_client(name, at))
+        checks = list(check_account(of, SETTINGS.replace(cloud=cloud)))
+        return next(each for each in checks if "large" in each.what)
+
+    alone, both = told({}), told({"other_instance_types": "c6i.large"})
+
+    assert (alone.grade, alone.what) == ("fail", f"AWS does not offer c7i.large in {region}b")
+    assert both.grade == "warn"
+
+
+def test_a_service_that_does_not_answer_is_a_warning_without_a_page_of_html(region: str) -> None:
+    from botocore.exceptions import ClientError
+
+    class Broken(Quotas):
+        def get_service_quota(self, *, ServiceCode: str, QuotaCode: str) -> dict[str, Any]:
+            page = {"Code": "502", "Message": "<html><body>Bad Gateway</body></html>"}
+            raise ClientError({"Error": page, "ResponseMetadata": {"HTTPStatusCode": 502}}, "GetServiceQuota")
+
+    found = checks(region, quotas=Broken())
+
+    assert [each.grade for each in found[-3:]] == ["warn"] * 3
+    assert all(each.what == "not checked: AWS does not answer: HTTP status 502" for each in found[-3:])
 
 
 def test_the_certificate_must_be_there_issued_of_the_region_and_for_the_name(region: str) -> None:

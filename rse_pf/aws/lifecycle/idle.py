@@ -1,0 +1,125 @@
+"""Park a deployment that nobody has used for hours: the rule, and the function that applies it each hour.
+
+The function runs in AWS Lambda.  It may read metrics, and end the servers of its own groups; it cannot delete
+anything, so that a mistake of the rule costs a ``rse-pf cloud resume`` and nothing else.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import datetime, timedelta, timezone
+from pathlib import Path
+from typing import Any
+
+from rse_pf.aws.account import Account
+from rse_pf.aws.fleet.metrics import ROBOTS, dimensions_of
+from rse_pf.aws.lifecycle.deployment import GroupSize, ParkNote, read_note, read_sizes
+from rse_pf.aws.lifecycle.parking import empty_group, silence_alarms, write_note
+from rse_pf.config import PlatformSettings, load_settings
+from rse_pf.config.resource_names import ResourceNames
+from rse_pf.scaling.alarms import NAMESPACE
+
+__all__ = ["Hour", "handler", "is_idle", "park_if_idle"]
+
+_log = logging.getLogger(__name__)
+_log.setLevel(logging.INFO)
+
+_HOUR_S = 3600
+_CANARY_REQUESTS = 120.0
+"""Of an hour, which are not counted: the canary asks once a minute, and may repeat a request."""
+_NOBODY = 0.5
+"""Robots on average; the canary is connected for a second of each minute."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Hour:
+    """What the agents told in one hour; None where none of them told anything."""
+
+    requests: float | None
+    robots: float | None
+    """Mean over the hour of the robots on all servers."""
+
+
+def is_idle(hours: Sequence[Hour], *, idle_hours: int, has_canary: bool) -> bool:
+    """Return whether nobody used the platform in any of the last *idle_hours* of *hours*, oldest first.
+
+    An hour of which nothing is known is not idle: silent agents are a failure, and a deployment that is
+    younger, or was resumed later, has not been idle for so long.
+    """
+    last = hours[-idle_hours:]
+    allowed = _CANARY_REQUESTS if has_canary else 0.0
+    return len(last) >= idle_hours and all(
+        each.requests is not None and each.requests <= allowed
+        and each.robots is not None and each.robots < _NOBODY
+        for each in last
+    )  # fmt: skip
+
+
+def park_if_idle(account: Account, settings: PlatformSettings, *, now: datetime, topic: str) -> str:
+    """Park the deployment if it is idle at *now*, in UTC; return a line that says what was done and why.
+
+    Raises:
+        ConfigurationError: AWS refused.
+        StoreError: AWS does not answer.
+    """
+    names, cloud = ResourceNames(settings.cloud.name), settings.cloud
+    groups, note = read_sizes(account, names), read_note(account, names)
+    if note is not None and (note.by != "timer" or not any(each.max_servers for each in groups.values())):
+        return f"{names.prefix} is parked since {note.since}"
+    hours = _read_hours(account, names, groups, cloud.idle_hours, now)
+    if not is_idle(hours, idle_hours=cloud.idle_hours, has_canary=cloud.canary):
+        return f"{names.prefix} was used within {cloud.idle_hours} hours, or nobody told"
+    if note is None:
+        since = now.isoformat(timespec="seconds")
+        write_note(account, names, ParkNote(groups=groups, since=since, by="timer"))
+    silence_alarms(account, names)
+    for group in groups:
+        empty_group(account, group)
+    told = f"{names.prefix} was idle for {cloud.idle_hours} hours and is parked now; rse-pf cloud resume"
+    account.change("sns", "publish", TopicArn=topic, Subject=f"{names.prefix} is parked", Message=told)
+    return told
+
+
+def handler(event: dict[str, Any], context: object) -> str:
+    """Apply the rule once; an event of EventBridge has nothing that is read."""
+    settings = load_settings(Path(__file__).parents[3] / "settings.json")
+    account = Account(settings.cloud.region)
+    told = park_if_idle(account, settings, now=datetime.now(timezone.utc), topic=os.environ["RSE_PF_TOPIC"])
+    _log.info(told)
+    return told
+
+
+def _read_hours(
+    account: Account, names: ResourceNames, groups: dict[str, GroupSize], count: int, now: datetime
+) -> list[Hour]:
+    """Return the last *count* whole hours before *now*, oldest first."""
+    end_s = int(now.timestamp()) // _HOUR_S * _HOUR_S
+    end = datetime.fromtimestamp(end_s, timezone.utc)
+    found: dict[str, dict[int, float]] = {"requests": {}, "robots": {}}
+    rows = account.pages(
+        "cloudwatch", "get_metric_data", "MetricDataResults",
+        MetricDataQueries=[
+            _query(names, "requests", "Requests", "Sum"), _query(names, "robots", ROBOTS, "Average"),
+        ],
+        StartTime=end - timedelta(hours=count), EndTime=end, ScanBy="TimestampAscending",
+    )  # fmt: skip
+    for row in rows:
+        for begin, value in zip(row["Timestamps"], row["Values"], strict=False):
+            found[row["Id"]][int(begin.timestamp()) // _HOUR_S] = float(value)
+    servers = max(1, groups[names.group].instances) if names.group in groups else 1
+    made = []
+    for hour in range(end_s // _HOUR_S - count, end_s // _HOUR_S):
+        mean = found["robots"].get(hour)
+        robots = None if mean is None else mean * servers
+        made.append(Hour(requests=found["requests"].get(hour), robots=robots))
+    return made
+
+
+def _query(names: ResourceNames, identity: str, metric: str, statistic: str) -> dict[str, Any]:
+    of_group = {"Namespace": NAMESPACE, "MetricName": metric, "Dimensions": dimensions_of(names.group)}
+    return {
+        "Id": identity, "MetricStat": {"Metric": of_group, "Period": _HOUR_S, "Stat": statistic},
+    }  # fmt: skip

@@ -1,0 +1,96 @@
+"""The idle timer on fake hours: what counts as idle, and what it does then."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from datetime import datetime, timedelta, timezone
+from typing import Any
+
+import pytest
+
+from rse_pf.aws.fleet.metrics import dimensions_of
+from rse_pf.aws.lifecycle.deployment import read_deployment
+from rse_pf.aws.lifecycle.idle import Hour, is_idle, park_if_idle
+from rse_pf.aws.lifecycle.plan import plan_park, plan_resume
+from tests.aws.lifecycle.account_on_moto import NAMES, SETTINGS, Formation, Killer, account_of
+
+SILENT = Hour(requests=None, robots=None)
+IDLE = Hour(requests=0.0, robots=0.0)
+CANARY = Hour(requests=60.0, robots=0.02)
+BUSY = Hour(requests=9000.0, robots=3.0)
+CONNECTED = Hour(requests=0.0, robots=1.0)
+NOW = datetime(2030, 1, 2, 18, 20, tzinfo=timezone.utc)
+
+
+@pytest.mark.parametrize(
+    ("hours", "idle"),
+    [
+        ([IDLE] * 3, True),
+        ([CANARY] * 3, True),
+        ([BUSY, IDLE, IDLE, IDLE], True),
+        ([IDLE, IDLE, BUSY], False),
+        ([IDLE, CONNECTED, IDLE], False),
+        ([IDLE, SILENT, IDLE], False),
+        ([IDLE] * 2, False),
+        ([], False),
+    ],
+)
+def test_idle_is_every_hour_of_which_it_is_known_that_nobody_came(hours: Sequence[Hour], idle: bool) -> None:
+    assert is_idle(hours, idle_hours=3, has_canary=True) is idle
+
+
+def test_without_a_canary_a_single_request_counts() -> None:
+    assert not is_idle([CANARY] * 3, idle_hours=3, has_canary=False)
+
+
+def publish(region: str, hours: dict[int, tuple[float, float]]) -> None:
+    """Publish requests and robots as agents do, so many hours before NOW."""
+    data: list[dict[str, Any]] = [
+        {
+            "MetricName": name, "Dimensions": dimensions_of(NAMES.group), "Value": value,
+            "Timestamp": NOW.replace(minute=10) - timedelta(hours=back),
+        }
+        for back, values in hours.items()
+        for name, value in zip(("Requests", "Robots"), values, strict=True)
+    ]  # fmt: skip
+    account_of(region, Killer()).client("cloudwatch").put_metric_data(Namespace="RsePf", MetricData=data)
+
+
+@pytest.fixture
+def topic(region: str) -> str:
+    """A deployment that is up, and its topic."""
+    tools = Formation(region, Killer())
+    tools.deploy(NAMES.stack("Backend"))
+    arn: str = account_of(region, Killer()).client("sns").create_topic(Name="events")["TopicArn"]
+    return arn
+
+
+def test_after_the_last_idle_hour_the_servers_end_and_resume_brings_them_back(
+    region: str, topic: str
+) -> None:
+    settings = SETTINGS.replace(cloud={"idle_hours": 2})
+    account = account_of(region, Killer())
+    publish(region, {3: (500.0, 2.0), 2: (50.0, 0.0), 1: (50.0, 0.0)})
+
+    early = park_if_idle(account, settings, now=NOW - timedelta(hours=1), topic=topic)
+    still_up = read_deployment(account, settings)
+    told = park_if_idle(account, settings, now=NOW, topic=topic)
+    again = park_if_idle(account, settings, now=NOW + timedelta(hours=1), topic=topic)
+
+    assert "was used" in early
+    assert still_up.note is None
+    assert "is parked now" in told
+    assert "is parked since 2030-01-02T18:20" in again
+    found = read_deployment(account, settings)
+    assert found.note is not None
+    assert (found.note.by, found.stage) == ("timer", "parked")
+    assert [(each.max_servers, each.instances) for each in found.groups.values()] == [(0, 0)]
+    assert found.note.groups[NAMES.group].max_servers == 10
+    assert plan_park(found, deep=False) == []
+    assert plan_resume(found, has_packages=True)[0].action == "fill"
+
+
+def test_a_deployment_whose_agents_are_silent_is_not_parked(region: str, topic: str) -> None:
+    told = park_if_idle(account_of(region, Killer()), SETTINGS, now=NOW, topic=topic)
+
+    assert "nobody told" in told
