@@ -23,7 +23,7 @@ from rse_pf.errors import ConfigurationError, RsePfError
 __all__ = [
     "Release",
     "State",
-    "Step",
+    "UpgradeStep",
     "Upgraded",
     "failed_launch",
     "next_step",
@@ -58,7 +58,7 @@ class State(Enum):
     FAILED = "failed"
 
 
-class Step(Enum):
+class UpgradeStep(Enum):
     """What an upgrade has to do next."""
 
     FOLLOW = "follow the refresh that runs"
@@ -89,13 +89,13 @@ class Upgraded:
     console: tuple[str, ...] = ()
 
 
-def next_step(release: Release) -> Step:
+def next_step(release: Release) -> UpgradeStep:
     """Return what brings every server, and then the stack, to the newest version."""
     if release.refresh is not None and release.refresh["Status"] in _ACTIVE:
-        return Step.FOLLOW
+        return UpgradeStep.FOLLOW
     if release.group != release.newest or any(each != release.newest for each in release.instances):
-        return Step.REFRESH
-    return Step.NOTHING if release.recorded == release.newest else Step.RECORD
+        return UpgradeStep.REFRESH
+    return UpgradeStep.NOTHING if release.recorded == release.newest else UpgradeStep.RECORD
 
 
 def state_of_refresh(refresh: Mapping[str, Any]) -> State:
@@ -201,9 +201,9 @@ def upgrade(
     release = read_state(account, settings)
     step = next_step(release)
     version, replaced = release.newest, False
-    if step in (Step.REFRESH, Step.FOLLOW):
+    if step in (UpgradeStep.REFRESH, UpgradeStep.FOLLOW):
         begun = now()
-        if step is Step.FOLLOW and release.refresh is not None:
+        if step is UpgradeStep.FOLLOW and release.refresh is not None:
             tell("a refresh runs already; following it")
             begun = release.refresh.get("StartTime", begun)
             version = _version_of(release.refresh) or version
@@ -220,8 +220,8 @@ def upgrade(
             if ended.reason:
                 return ended
             replaced = True
-        step = Step.RECORD
-    if step is Step.RECORD:
+        step = UpgradeStep.RECORD
+    if step is UpgradeStep.RECORD:
         _record(account, settings, version, sleep)
         tell(f"the stack names version {version}")
     return Upgraded(version=version, replaced=replaced)

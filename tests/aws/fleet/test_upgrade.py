@@ -14,7 +14,7 @@ from botocore.validate import ParamValidator
 from rse_pf.aws.account import Account
 from rse_pf.aws.fleet.upgrade import (
     State,
-    Step,
+    UpgradeStep,
     failed_launch,
     next_step,
     preferences,
@@ -314,7 +314,7 @@ def test_one_server_of_an_older_version_is_reason_enough() -> None:
     aws = FakeAws()
     aws.group, aws.servers = "2", ["2", "1", "2"]
 
-    assert next_step(read_state(aws.account(), SETTINGS)) is Step.REFRESH
+    assert next_step(read_state(aws.account(), SETTINGS)) is UpgradeStep.REFRESH
 
 
 def test_a_stack_of_an_older_release_says_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:

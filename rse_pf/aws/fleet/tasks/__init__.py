@@ -1,1 +1,4 @@
-"""The tasks of the agent, one module each; the table that names them is in `rse_pf.aws.fleet.agent`."""
+"""The tasks of the agent, one module each.
+
+What an instance repeats for its server belongs here; the table and the loop belong to `rse_pf.aws.fleet.agent`.
+"""
