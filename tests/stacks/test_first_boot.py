@@ -152,7 +152,7 @@ def test_a_server_that_was_drained_stays_down(repository: Path) -> None:
 
 def test_a_data_group_is_attached_exactly_when_the_data_unit_starts(assembly: Any) -> None:
     units = units_of(json.loads(json.dumps(assembly.settings.to_dict())))
-    ports = {each["Port"] for each in assembly.all("AWS::ElasticLoadBalancingV2::TargetGroup")}
+    ports = {each.get("Port") for each in assembly.all("AWS::ElasticLoadBalancingV2::TargetGroup")}
 
     assert ("rse-pf-data.service" in units) == (assembly.settings.data.port in ports)
     assert "rse-pf.service" in units
