@@ -33,7 +33,7 @@ GAUGE_HELP = {
     "compute_cpu_s": "processor time of the limited processes since the start, in seconds",
     "compute_blocked_robots": "robots that are refused limited services because their commands crashed",
     "jobs": "long jobs of connected robots that wait or run, here or elsewhere",
-    "jobs_waiting": "long jobs of connected robots that run nowhere yet",
+    "jobs_pending": "long jobs of connected robots that run nowhere yet",
     "sandboxes": "sandboxes of installed services that exist now",
     "moved": "robots that were asked to move to another server since the start",
     "resident_bytes": "memory of the server's processes that is resident, in bytes",

@@ -52,7 +52,7 @@ _MAX_WORKER_STARTS = 20
 
 @dataclass(frozen=True, slots=True)
 class ClusterKey:
-    """Certificate and key (PEM) of one cluster; whoever has them may run code in it."""
+    """Certificate and key (PEM) of one cluster; anybody who has them may run code in it."""
 
     certificate: str
     key: str

@@ -1,6 +1,6 @@
 """How job servers find a running batch: an object of the store with the scheduler's address and the key.
 
-Whoever can read it can read the maps and forge the parts anyway, because both are in the same store.
+Anybody who can read it can read the maps and forge the parts anyway, because both are in the same store.
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@
 
 The order is JSON on the standard input, because it has the key of the cluster.  A scheduler prints its
 address as one line.  Both speak TLS only, and only with those who have the cluster's key: what Dask sends is
-pickled, so that whoever may connect may run any code.  A robot's bytes are never among it: a part names
+pickled, so that anybody who may connect may run any code.  A robot's bytes are never among it: a part names
 objects of the store, and its result is an object of the store.
 """
 

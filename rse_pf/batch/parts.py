@@ -66,7 +66,7 @@ class PartResult:
 
 
 class Engine(Protocol):
-    """Whoever computes parts."""
+    """What computes parts: this process, or others."""
 
     def run(self, parts: Sequence[Part], on_done: Callable[[int], None]) -> None:
         """Compute *parts* and store their results; call *on_done* with how many are done.

@@ -425,7 +425,7 @@ class Dispatcher:
             "cpu_s": self.context.clocks.cpu(),
             "log_lines_dropped": float(self.context.log.dropped),
             "jobs": float(self._jobs.known),
-            "jobs_waiting": float(self._jobs.waiting),
+            "jobs_pending": float(self._jobs.waiting),
             **self._compute.report(),
             **self._live_maps.report(),
             **self._topics.report(),

@@ -1,6 +1,6 @@
 """The queue of jobs that wait: objects of the store, from which job servers take them.
 
-A server offers a job before it waits for a slot of its own; whoever has a free slot first takes the job's
+A server offers a job before it waits for a slot of its own; the first with a free slot takes the job's
 lease.  An offer is no lease: the same offer may be read by many, and the lease decides.  It stays until the
 job has an outcome, so that a job whose server died is found again.
 """

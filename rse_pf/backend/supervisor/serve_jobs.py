@@ -158,7 +158,7 @@ class _Service:
         if page == ("GET", "/metrics"):
             # A batch that works here is a job, too; the servers of the robots count the jobs that wait.
             jobs = self._jobs.running + bool(self._helpers.pids)
-            lines = f"rse_pf_jobs {jobs}\nrse_pf_jobs_waiting 0\nrse_pf_job_offers {self._waiting}\n"
+            lines = f"rse_pf_jobs {jobs}\nrse_pf_jobs_pending 0\nrse_pf_job_offers {self._waiting}\n"
             return ControlReply(body=lines.encode(), content_type="text/plain; version=0.0.4")
         if page == ("POST", "/drain"):
             self._over.set()

@@ -31,7 +31,7 @@ def published(settings: PlatformSettings, page: str) -> list[dict[str, Any]]:
 def test_the_counts_of_a_real_page_are_published_for_the_group_of_job_servers() -> None:
     metrics = pytest.importorskip("rse_pf.backend.metrics")
     worker = metrics.Metrics()
-    worker.gauges = {"jobs": 3.0, "jobs_waiting": 2.0}
+    worker.gauges = {"jobs": 3.0, "jobs_pending": 2.0}
     page = metrics.render(metrics.merge([worker.snapshot(), worker.snapshot()])).decode()
 
     found = {each["MetricName"]: each for each in published(PlatformSettings.from_dict(WITH), page)}

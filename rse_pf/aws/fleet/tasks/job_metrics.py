@@ -13,7 +13,7 @@ from rse_pf.scaling.job_alarms import JOB_PERIOD_S, JOBS, JOBS_WAITING
 
 __all__ = ["job_counts", "task"]
 
-_LINE = re.compile(r"^rse_pf_(jobs|jobs_waiting) (\S+)$", flags=re.M)
+_LINE = re.compile(r"^rse_pf_(jobs|jobs_pending) (\S+)$", flags=re.M)
 
 
 def task(context: AgentContext) -> Task:
@@ -40,4 +40,4 @@ def task(context: AgentContext) -> Task:
 def job_counts(page: str) -> tuple[float, float]:
     """Return the jobs of a server, and those of them that wait, from its page of metrics."""
     found = dict(_LINE.findall(page))
-    return float(found.get("jobs", 0.0)), float(found.get("jobs_waiting", 0.0))
+    return float(found.get("jobs", 0.0)), float(found.get("jobs_pending", 0.0))
