@@ -117,6 +117,10 @@ class RosbridgeTopics:
         self._resting: set[Subscription] = set()
         self._is_sending = self._is_retrying = False
 
+    def offer(self, services: Iterable[str]) -> None:
+        """Take the names of the services of this server anew."""
+        self._services = tuple(services)
+
     def report(self) -> dict[str, float]:
         """Return the gauges of this worker."""
         subscriptions = sum(len(topic.subscriptions) for topic in self._topics.values())

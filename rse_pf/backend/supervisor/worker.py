@@ -213,6 +213,7 @@ class _Worker:
             tell=self._robot_events.add,
             recorder=self._recorder,
         )
+        self._rosbridge: RosbridgeTopics | None = None
         self._sandboxes = (
             self._run_services(plan, installed, answers) if chosen.folder or chosen.published else None
         )
@@ -340,6 +341,7 @@ class _Worker:
     def _offer(self, names: tuple[str, ...]) -> None:
         """Offer the installed services *names* from now on."""
         self._registry.others = names
+        self._tell_topics(self._registry.names)
         self._answers.offer(frozenset((*names, *(each.name for each in self._registry))) | LIVE_SERVICES)
 
     async def _reload_services(self) -> None:
@@ -358,13 +360,17 @@ class _Worker:
     def _topics(self, plan: WorkerPlan, services: Sequence[str]) -> RosbridgeTopics:
         read, _ = plan.peers
         peers = WorkerPeers(plan.peers, plan.index, loop=self._loop, log=self._log) if read >= 0 else None
-        topics = RosbridgeTopics(
-            loop=self._loop, clock=time.monotonic, peers=peers or NoPeers(),
-            services=(*services, *(LIVE_SERVICES if self._live_maps else ())),
+        topics = self._rosbridge = RosbridgeTopics(
+            loop=self._loop, clock=time.monotonic, peers=peers or NoPeers(), services=(),
         )  # fmt: skip
+        self._tell_topics(services)
         if peers is not None:
             peers.begin(arrived=topics.arrived, wanted=topics.wanted)
         return topics
+
+    def _tell_topics(self, services: Sequence[str]) -> None:
+        if self._rosbridge is not None:
+            self._rosbridge.offer((*services, *(LIVE_SERVICES if self._live_maps else ())))
 
     def _jobs(self, plan: WorkerPlan, answers: Answers) -> JobManager:
         settings = plan.settings
