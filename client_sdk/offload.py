@@ -136,10 +136,7 @@ def _last_chance_s(latest_s: float, burst_s: float, expected_round_trip_s: float
     Source:
         Dean and Barroso 2013, "The tail at scale": a second request after the 95th percentile of the first.
     """
-    at_last_s = latest_s - burst_s
-    if expected_round_trip_s is None:
-        return at_last_s
-    return min(at_last_s, max(expected_round_trip_s, latest_s - _MARGIN * burst_s))
+    return min(latest_s - burst_s, max(expected_round_trip_s or 0.0, latest_s - _MARGIN * burst_s))
 
 
 def gains_from_cloud(*, robot_s: float, cloud_compute_s: float, transmission_s: float) -> bool:

@@ -15,6 +15,7 @@ from fake_platform import FakePlatform
 import client_sdk
 from rse_pf.config import BurstSettings, PlatformSettings, SessionSettings
 from rse_pf.errors import Busy, Expired, NoConsensus, UsageError
+from rse_pf.pnp import solve_pnp
 from rse_pf.pnp.problems import make_degenerate, make_problem
 from rse_pf.services.builtin import builtin_services
 from rse_pf.wire import Failure
@@ -87,6 +88,8 @@ def test_a_server_that_answers_is_never_replaced():
 
 
 def test_a_late_server_is_replaced_while_the_function_can_still_be_in_time():
+    solve_pnp(*FRAME)  # the first solution loads the solver
+
     async def test():
         async with FakeBurst() as burst, told_of(burst) as platform, robot(platform.url) as client:
             platform.hold = True

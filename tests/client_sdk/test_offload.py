@@ -98,7 +98,7 @@ def test_a_late_server_leaves_the_burst_function_its_time_before_the_robots_own(
     assert decided.burst_after_s == pytest.approx(0.16 - 2 * 0.03)
     assert plan(burst_s=0.03, expected_round_trip_s=0.12).burst_after_s == pytest.approx(0.12)
     assert plan(burst_s=0.03, expected_round_trip_s=0.19).burst_after_s == pytest.approx(0.13)
-    assert plan(burst_s=0.03, expected_round_trip_s=None).burst_after_s == pytest.approx(0.13)
+    assert plan(burst_s=0.03, expected_round_trip_s=None).burst_after_s == pytest.approx(0.10)
 
 
 @pytest.mark.parametrize("changes", [{"connected": False}, {"expected_round_trip_s": 0.3}])
