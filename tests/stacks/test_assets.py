@@ -5,14 +5,17 @@ from __future__ import annotations
 import hashlib
 import importlib.util
 import json
+import os
 import shutil
 import sys
+import tarfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from rse_pf.aws.fleet.agent import SERVICES
 from rse_pf.config import PlatformSettings, load_settings
 from rse_pf.config.server_settings import server_settings
 from rse_pf.errors import ConfigurationError
@@ -177,6 +180,69 @@ def test_without_a_python_of_the_functions_version_a_line_says_what_is_slower(
 
     assert "cold start" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
+
+
+def test_the_same_tree_gives_the_same_archive_whatever_its_times_and_owners(
+    repository: Path, tmp_path: Path
+) -> None:
+    builder = _builder(repository)
+    digests = []
+    for at, name in enumerate(("a", "b")):
+        tree = tmp_path / name
+        (tree / "bin").mkdir(parents=True)
+        (tree / "bin" / "rse-pf").write_text("#!/opt/rse-pf/venv/bin/python\n")
+        (tree / "bin" / "rse-pf").chmod(0o755 if at else 0o775)
+        (tree / "bin" / "python").symlink_to("/usr/bin/python3")
+        os.utime(tree / "bin" / "rse-pf", (1e9 + at, 1e9 + at))
+        archive = tmp_path / f"{name}.tar.gz"
+        builder._pack(tree, archive)
+        digests.append(hashlib.sha256(archive.read_bytes()).hexdigest())
+
+    assert digests[0] == digests[1]
+    with tarfile.open(tmp_path / "a.tar.gz") as packed:
+        entries = {entry.name: entry for entry in packed}
+    assert entries["bin/rse-pf"].mode == 0o755
+    assert entries["bin/python"].linkname == "/usr/bin/python3"
+    assert {(entry.uid, entry.gid, entry.mtime) for entry in entries.values()} == {(0, 0, 315532800)}
+
+
+def test_the_two_archives_of_libraries_hold_every_file_once_and_are_of_one_size(
+    repository: Path, tmp_path: Path
+) -> None:
+    for at in range(20):
+        (tmp_path / f"file-{at}").write_bytes(b"x" * (at * at + 1))
+
+    halves = _builder(repository)._halves(tmp_path)
+
+    assert sorted((*halves[0], *halves[1])) == sorted(tmp_path.iterdir())
+    sizes = [sum(file.stat().st_size for file in half) for half in halves]
+    assert abs(sizes[0] - sizes[1]) <= 0.1 * sum(sizes)
+
+
+def test_a_server_unpacks_what_the_builder_packs_where_it_was_compiled_for(repository: Path) -> None:
+    from stacks.boot import install
+
+    builder = _builder(repository)
+
+    assert (*builder.LIBRARIES, builder.PLATFORM) == install.ARCHIVES
+    assert builder.ENVIRONMENT == "/opt/rse-pf/venv"
+    assert builder.ENVIRONMENT_FILE == ENVIRONMENT_FILE
+    assert set(SERVICES) | {"s3"} <= set(builder.APIS), (
+        "the agent calls a service whose description is missing"
+    )
+
+
+def test_our_wheels_commands_start_with_the_environments_python(repository: Path, tmp_path: Path) -> None:
+    (tmp_path / "site" / "rse_pf-1.dist-info").mkdir(parents=True)
+    (tmp_path / "bin").mkdir()
+    points = "[console_scripts]\nrse-pf = rse_pf.cli.main:main\n[other]\nx = y:z\n"
+    (tmp_path / "site" / "rse_pf-1.dist-info" / "entry_points.txt").write_text(points)
+
+    _builder(repository)._write_scripts(tmp_path / "site", tmp_path / "bin")
+
+    (script,) = (tmp_path / "bin").iterdir()
+    assert script.read_text().splitlines()[0] == "#!/opt/rse-pf/venv/bin/python"
+    assert "from rse_pf.cli.main import main" in script.read_text()
 
 
 def _builder(repository: Path) -> Any:

@@ -44,6 +44,35 @@ def test_the_boot_script_signs_as_the_function_does() -> None:
     assert ours["authorization"] == theirs.get_header("Authorization")
 
 
+def test_the_call_that_abandons_a_launch_is_signed_as_the_sdk_does(monkeypatch: pytest.MonkeyPatch) -> None:
+    from botocore import auth
+    from botocore.awsrequest import AWSRequest
+    from botocore.credentials import Credentials
+
+    host, query = "autoscaling.ap-northeast-2.amazonaws.com", "Action=CompleteLifecycleAction&InstanceId=i-1"
+    ours = signed_headers(
+        host, "/", "ap-northeast-2", {"AccessKeyId": "AKID", "SecretAccessKey": "secret", "Token": "session"},
+        NOW, "autoscaling", query,
+    )  # fmt: skip
+    digest = {"X-Amz-Content-SHA256": ours["x-amz-content-sha256"], "host": host}
+    request = AWSRequest(method="GET", url=f"https://{host}/?{query}", headers=digest)
+
+    monkeypatch.setattr(auth, "get_current_datetime", lambda: NOW)
+    auth.SigV4Auth(Credentials("AKID", "secret", "session"), "autoscaling", "ap-northeast-2").add_auth(
+        request
+    )
+
+    assert ours["authorization"] == request.headers["Authorization"]
+
+
+def test_the_reason_of_a_failed_start_is_written_to_the_console(repository: Path) -> None:
+    after = unit(repository, "rse-pf.service")["Service"]["ExecStopPost"]
+
+    assert after.startswith("+"), "the user of the service may not write there"
+    assert "journalctl --unit=rse-pf" in after
+    assert "/dev/console" in after
+
+
 def test_the_script_with_its_facts_fits_into_the_user_data(assembly: Any) -> None:
     data = assembly.one("AWS::EC2::LaunchTemplate")["LaunchTemplateData"]["UserData"]["Fn::Base64"]
     parts = data["Fn::Join"][1]
