@@ -12,6 +12,7 @@ from aws_cdk import aws_sns as sns
 from constructs import Construct
 
 from rse_pf.config import PlatformSettings
+from rse_pf.config.cloud_layout import zone_count
 from rse_pf.config.resource_names import DENY_NAME, KEYS_NAME, ROBOTS_NAME, SERVICES_PREFIX, ResourceNames
 from stacks.assets import SERVERS, staged, sums_digest
 from stacks.backend_servers import BackendServers
@@ -48,7 +49,7 @@ class BackendStack(cdk.Stack):
     ) -> None:
         super().__init__(scope, construct_id, env=env, synthesizer=synthesizer)
         names = ResourceNames(settings.cloud.name)
-        vpc = imported_network(self, names, zones=ZONES, cidr=CIDR)
+        vpc = imported_network(self, names, zones=ZONES, server_zones=zone_count(settings), cidr=CIDR)
         artifacts = imported_bucket(self, names, "artifacts")
         self.topic = sns.Topic(self, "Events", enforce_ssl=True)
         # A topic with a policy of its own forgets the one that lets the account's alarms in.

@@ -7,8 +7,6 @@ may change or vanish at any time; the reader sees it at its own next update.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import aws_cdk as cdk
 from aws_cdk import aws_ec2 as ec2
 from aws_cdk import aws_s3 as s3
@@ -63,9 +61,16 @@ def provide_network(scope: Construct, names: ResourceNames, vpc: ec2.Vpc) -> Non
             provide(scope, names, f"network/{kind}-{at}", subnet.subnet_id)
 
 
-def imported_network(scope: Construct, names: ResourceNames, *, zones: int, cidr: str) -> ec2.IVpc:
-    """Return the VPC of the network stack, with one subnet of each kind in each of *zones* zones."""
-    front, servers = (_subnets(scope, names, kind, zones) for kind in ("front", "servers"))
+def imported_network(
+    scope: Construct, names: ResourceNames, *, zones: int, server_zones: int, cidr: str
+) -> ec2.IVpc:
+    """Return the VPC of the network stack, with a public subnet in each of *zones* zones.
+
+    Servers are in the first *server_zones* of them; the subnets beyond are those again, because the CDK wants
+    as many as zones, and a parameter that no resource reads is a finding.
+    """
+    front = [read(scope, names, f"network/front-{at}") for at in range(zones)]
+    servers = [read(scope, names, f"network/servers-{at % server_zones}") for at in range(zones)]
     vpc = ec2.Vpc.from_vpc_attributes(
         scope, "Network", vpc_id=read(scope, names, "network/vpc"), vpc_cidr_block=cidr,
         availability_zones=[cdk.Fn.select(at, cdk.Fn.get_azs()) for at in range(zones)],
@@ -74,10 +79,6 @@ def imported_network(scope: Construct, names: ResourceNames, *, zones: int, cidr
     # Nothing outside of the network stack adds a route.
     cdk.Annotations.of(vpc).acknowledge_warning("@aws-cdk/aws-ec2:noSubnetRouteTableId", "no route is added")
     return vpc
-
-
-def _subnets(scope: Construct, names: ResourceNames, kind: str, zones: int) -> Sequence[str]:
-    return [read(scope, names, f"network/{kind}-{at}") for at in range(zones)]
 
 
 def _identity(path: str) -> str:
