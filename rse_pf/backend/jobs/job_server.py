@@ -17,6 +17,8 @@ from rse_pf.identity import RobotId
 __all__ = ["JobServer"]
 
 _CLOSE_TIMEOUT_S = 5.0
+_MAX_SERVED = 1000
+"""Robots whose turn is remembered."""
 
 
 @dataclass(eq=False, slots=True)
@@ -45,6 +47,7 @@ class JobServer:
         self._log = log
         self._new_owner = new_owner
         self._slots = slots
+        self._served: dict[str, int] = {}
         self._jobs: dict[tuple[RobotId, str], _Running] = {}
         self._lock = threading.Lock()
         self._is_leaving = False
@@ -57,9 +60,9 @@ class JobServer:
 
     def step(self) -> None:
         """Begin with jobs that wait; raises StoreError."""
-        if self._is_leaving:
+        if self._is_leaving or self.running >= self._slots:
             return
-        for offer in self._queue.offers():
+        for offer in self._queue.offers(self._served):
             if self.running >= self._slots:
                 return
             if (offer.request.robot, offer.request.key) not in self._jobs:
@@ -79,6 +82,10 @@ class JobServer:
 
     def _begin(self, offer: JobOffer) -> None:
         job, request = _Running(), offer.request
+        latest = max(self._served.values(), default=0)
+        if len(self._served) >= _MAX_SERVED:
+            self._served.clear()
+        self._served[request.robot.folder] = latest + 1
         with self._lock:
             self._jobs[request.robot, request.key] = job
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,7 +23,7 @@ from rse_pf.identity import RobotId
 from rse_pf.object_store import ObjectStore
 from rse_pf.wire.arrays import binary_encode_hook, extension_hook
 
-__all__ = ["JobOffer", "JobQueue", "has_jobs", "settings_digest_of"]
+__all__ = ["JobOffer", "JobQueue", "has_jobs", "in_turn", "settings_digest_of"]
 
 _PREFIX = "job-queue/"
 _MAX_READ = 200
@@ -60,6 +60,21 @@ def settings_digest_of(settings: PlatformSettings) -> str:
     return hashlib.sha256(chosen.encode()).hexdigest()
 
 
+def in_turn(names: Sequence[str], served: Mapping[str, int]) -> list[str]:
+    """Return *names*, ``job-queue/TENANT/ROBOT/KEY``: one of each robot, then the second of each, and so on.
+
+    A robot that was served longer ago comes first.
+    """
+    of_robot: dict[str, list[str]] = {}
+    for name in names:
+        of_robot.setdefault(name.removeprefix(_PREFIX).rpartition("/")[0], []).append(name)
+    robots = sorted(of_robot, key=lambda robot: (served.get(robot, 0), robot))
+    rounds = max(map(len, of_robot.values()), default=0)
+    return [
+        of_robot[robot][turn] for turn in range(rounds) for robot in robots if turn < len(of_robot[robot])
+    ]
+
+
 class JobQueue:
     """The jobs that wait in one store."""
 
@@ -93,9 +108,16 @@ class JobQueue:
         """Remove the offer of *request*, if there is one."""
         self._store.delete(_name(request.robot, request.key))
 
-    def offers(self) -> Iterator[JobOffer]:
-        """Yield the jobs that servers with the same settings offer; raises StoreError."""
-        for name in self._names():
+    def offers(self, served: Mapping[str, int] | None = None) -> Iterator[JobOffer]:
+        """Yield the jobs that servers with the same settings offer, so that robots take turns.
+
+        Args:
+            served: When each robot's folder was served last, as a number that grows.
+
+        Raises:
+            StoreError: The store failed.
+        """
+        for name in in_turn(self._names(), served or {}):
             offer = self._read(name)
             if offer is not None and offer.settings == self._settings:
                 yield offer

@@ -14,7 +14,7 @@ import pytest
 from rse_pf.backend.jobs.job_server import JobServer
 from rse_pf.backend.jobs.lease import JobLease, record_name
 from rse_pf.backend.jobs.process import JobRequest
-from rse_pf.backend.jobs.queue import JobQueue
+from rse_pf.backend.jobs.queue import JobQueue, in_turn
 from rse_pf.backend.jobs.runner import JobContext, JobOutcome, JobSignals, run_job
 from rse_pf.backend.jobs.slots import JobSlots, make_pipe
 from rse_pf.backend.log import JsonLog
@@ -144,6 +144,13 @@ def test_a_job_that_its_robot_cancels_is_offered_no_more(bench: Bench) -> None:
     assert outcomes[0].error is not None
     assert outcomes[0].error.code == "cancelled"
     assert bench.queue.waiting() == 0
+
+
+def test_robots_take_turns_however_many_jobs_they_offer() -> None:
+    names = [f"job-queue/t/{robot}/{key}" for robot, keys in (("a", "123"), ("b", "1")) for key in keys]
+
+    assert [name[-3:] for name in in_turn(names, {})] == ["a/1", "b/1", "a/2", "a/3"]
+    assert in_turn(names, {"t/a": 7, "t/b": 5})[0] == names[-1]
 
 
 def test_a_job_of_servers_with_other_settings_is_not_taken(bench: Bench) -> None:
