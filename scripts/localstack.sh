@@ -47,4 +47,4 @@ if [ $# -eq 0 ]; then
   set -- tests/aws tests/test_object_store.py tests/cli/test_cloud.py tests/localstack
 fi
 # One after the other: names of buckets are global.
-PATH="$PWD/.venv/bin:$PATH" LOCALSTACK_HOST="localhost:$port" .venv/bin/python -m pytest -q -rs -n 0 -m "not slow" "$@"
+PATH="$PWD/.venv/bin:$PATH" LOCALSTACK_HOST="localhost:$port" .venv/bin/python -m pytest -q -rsfEx -n 0 -m "not slow" "$@"
