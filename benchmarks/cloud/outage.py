@@ -192,7 +192,7 @@ async def drive(
             "most_dials_in_a_minute": _most_within(dials, 60.0),
             "limit_of_dials": rules[0].limit,
             "window_s": rules[0].window_s,
-            "answers_of_the_door": {str(status): n for status, n in sorted(front.answered.items())},
+            "answers_without_a_server": {str(status): n for status, n in sorted(front.answered.items())},
             "blocked": front.firewall.blocked,
             "failures_of_calls": dict(failures),
             "disabled_robot_ended_as": ended_as,
