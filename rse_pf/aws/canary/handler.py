@@ -10,7 +10,6 @@ from __future__ import annotations
 import json
 import os
 import secrets
-import sys
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -26,6 +25,7 @@ from rse_pf.errors import Expired, InternalError, RsePfError
 from rse_pf.pnp.problems import make_problem
 from rse_pf.service import Registry
 from rse_pf.services import pnp
+from rse_pf.terminal import show
 from rse_pf.wire import SUBPROTOCOLS, make_codec
 from rse_pf.wire.client_session import Answered, ClientSession, ConnectionLost, Notice, Welcomed
 from rse_pf.wire.codec import as_type
@@ -125,4 +125,4 @@ def _ask(environment: Mapping[str, str], settings: PlatformSettings, trace: str)
 
 
 def _log(**fields: Any) -> None:
-    sys.stderr.write(json.dumps(fields) + "\n")
+    show(json.dumps(fields), error=True)

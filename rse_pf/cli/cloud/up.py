@@ -64,7 +64,7 @@ def finish(account: Account, settings: PlatformSettings) -> int:
     show("next: rse-pf token init --cloud             once: the key that signs tokens")
     show("      rse-pf token issue robot-1 --cloud    a robot's token")
     if cloud.canary:
-        show("      rse-pf cloud canary                   once: the canary's key; without it, its alarm fires")
+        show("      rse-pf cloud canary                   once: its key, or its alarm fires")
     show("      rse-pf cloud status                   servers, robots, alarms, cost")
     show("      rse-pf cloud park                     for the night; rse-pf cloud resume in the morning")
     if cloud.idle_action == "park":
