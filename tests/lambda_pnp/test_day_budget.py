@@ -1,4 +1,4 @@
-"""The budget of the burst function: exact over all executions, also when one dies, and closed when in doubt."""
+"""The budget of the burst function: exact over all executions, also if one dies, and closed when in doubt."""
 
 from __future__ import annotations
 
