@@ -48,6 +48,8 @@ _CONNECTIONS_OF_A_UNIT, _BYTES_OF_A_UNIT = 3000, 1e9
 _MB_OF_A_VCPU = 1769
 _DETAILED_METRICS = 7
 """That EC2 publishes each minute for a server with detailed monitoring."""
+_OTHER_RULES = 1
+"""Of the firewall: a burst without a token; tests/stacks/test_money.py counts those of the template."""
 _UNITS = "capacity units"
 _CANARY_S = 1.0
 
@@ -288,7 +290,7 @@ def _front_lines(settings: PlatformSettings, prices: Prices, load: Load) -> Iter
         ("load balancer", _UNITS, 0 if not units else units / prices.balancer_unit_per_hour * hours,
          "h", prices.balancer_unit_per_hour),
         ("firewall", "web ACL", 1, "", prices.firewall_per_month),
-        ("firewall", "its rules", len(rate_rules(settings)) + 1, "rules", prices.firewall_rule_per_month),
+        ("firewall", "its rules", len(rate_rules(settings)) + _OTHER_RULES, "rules", prices.firewall_rule_per_month),
         *(
             (box, f"endpoint of {service}, in {zone_count(settings)} zone(s)",
              zone_count(settings) * HOURS, "h", prices.endpoint_per_hour)
