@@ -2,13 +2,14 @@
 
 Defends: links and aligned clouds equal to the bit to one process, poses within 0.1 mm, with one worker and
 the scheduler killed; links and alignment at least 1.6 times as fast on two idle cores.  The copies are moved
-as a whole, drift apart, and have noise in pixels, depths, descriptors and clouds.  ``two_processes`` says what
-two independent processes without any engine reach on this machine: no engine can be faster than they.
+as a whole, drift apart, and have noise in pixels, depths, descriptors and clouds.  ``two_processes`` says
+what two independent processes without any engine reach on this machine: no engine can be faster than they.
 
     python -m benchmarks.cloud.batch --recordings ../shared/data --copies 20 --candidates 2 --out batch.json
     python -m benchmarks.cloud.batch --recordings ../shared/data --copies 4 --frames 60
 
-With 20 copies of 250 keyframes it takes about an hour on two cores, with 4 copies of 60 about two minutes.
+With 20 copies of 250 keyframes it takes more than an hour on two cores (an estimate), with 4 copies of 60
+about three minutes.
 """
 
 from __future__ import annotations

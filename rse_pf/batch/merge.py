@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rse_pf.batch.parts import Engine, Part, PartResult, delete_parts, is_done, put_input, read_result
-from rse_pf.batch.tasks import graph_arrays, links_of
+from rse_pf.batch.tasks import graph_arrays, links_of, strongest_rows
 from rse_pf.batch.two_levels import graph_between, graphs_within, poses_of_levels, stacked
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import BadRequest, LimitExceeded
@@ -248,7 +248,10 @@ class BatchMerge:
         for number, pair in enumerate(self._pairs):
             maps = self._names_of(pair)
             own = tuple(part.name for part, which in zip(parts, owner, strict=True) if which == number)
-            arguments = {"options": self._merge_options, "maps": len(maps), **self._limits}
+            arguments = {
+                "options": self._merge_options, "maps": len(maps), **self._limits,
+                "most": self._settings.batch.max_links_per_pair,
+            }  # fmt: skip
             self._agreeing.append(Part(kind="agree", inputs=(*maps, *own), arguments=arguments))
 
     def _proposals(self, atlas: Atlas, results: Sequence[PartResult], owner: Sequence[int]) -> LoopProposals:
@@ -359,7 +362,7 @@ class BatchMerge:
 
 
 def strongest(atlas: Atlas, links: Sequence[LoopClosure], most: int) -> tuple[list[LoopClosure], Refused]:
-    """Return at most about *most* of *links*: of each pair of maps those with most inliers, in their order.
+    """Return at most about *most* of *links*: of each pair of maps the best of its keyframes, in their order.
 
     Every pair keeps the same number, or all that it has, so that no map loses its connection.
     """
@@ -372,9 +375,9 @@ def strongest(atlas: Atlas, links: Sequence[LoopClosure], most: int) -> tuple[li
     share = max(1, most // len(groups))
     kept: list[int] = []
     for pair, rows in groups.items():
-        best = sorted(rows, key=lambda row: (-links[row].inliers, row))[:share]
+        best = strongest_rows([links[row] for row in rows], share)
         refused[pair[0], pair[1], "surplus"] += len(rows) - len(best)
-        kept += best
+        kept += [rows[place] for place in best]
     return [links[row] for row in sorted(kept)], refused
 
 

@@ -34,7 +34,15 @@ from rse_pf.services.mapping.optimise import OptimiseOptions, optimise_graph
 from rse_pf.services.mapping.place import SEED, WORDS, VectorIndex, map_limits, view_vectors
 from rse_pf.services.mapping.pose_graph import PoseGraph
 
-__all__ = ["InProcessEngine", "compute_part", "graph_arrays", "graph_of", "link_arrays", "links_of"]
+__all__ = [
+    "InProcessEngine",
+    "compute_part",
+    "graph_arrays",
+    "graph_of",
+    "link_arrays",
+    "links_of",
+    "strongest_rows",
+]
 
 _CACHED_MAPS = 4
 
@@ -87,6 +95,20 @@ def links_of(result: PartResult) -> list[LoopClosure]:
             of["inliers"].tolist(), of["matches"].tolist(), strict=True,
         )
     ]  # fmt: skip
+
+
+def strongest_rows(links: Sequence[LoopClosure], most: int) -> list[int]:
+    """Return the rows of at most *most* of *links*, sorted: of each keyframe the best before its second best.
+
+    So they are spread over the map, and not all of the one place with most features.
+    """
+    by_inliers = sorted(range(len(links)), key=lambda row: (-links[row].inliers, row))
+    seen: Counter[int] = Counter()
+    ranked = []
+    for row in by_inliers:
+        ranked.append((seen[links[row].a], -links[row].inliers, row))
+        seen[links[row].a] += 1
+    return sorted(row for _, _, row in sorted(ranked)[:most])
 
 
 def graph_arrays(graph: PoseGraph) -> dict[str, npt.NDArray[Any]]:
@@ -147,8 +169,12 @@ def _agree(store: ObjectStore, part: Part) -> PartResult:
     maps = part.arguments["maps"]
     atlas = _atlas(store, part, maps)
     links = [link for name in part.inputs[maps:] for link in links_of(read_result(store, name))]
-    rows, refused = agreeing_links((0, maps - 1), links, atlas.T_world_camera, atlas.order, _options(part))
-    return PartResult(arrays={"rows": np.array(rows, dtype=np.int64)}, counts=_by_reason(refused))
+    tried = strongest_rows(links, part.arguments["most"])
+    rows, refused = agreeing_links(
+        (0, maps - 1), [links[row] for row in tried], atlas.T_world_camera, atlas.order, _options(part)
+    )
+    counts = {**_by_reason(refused), "surplus": len(links) - len(tried)}
+    return PartResult(arrays={"rows": np.array([tried[row] for row in rows], dtype=np.int64)}, counts=counts)
 
 
 def _tiles(store: ObjectStore, part: Part) -> PartResult:

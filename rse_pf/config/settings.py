@@ -260,6 +260,7 @@ class BatchSettings:
     max_keyframes: int = setting(20000, unit="keyframes", doc="keyframes of all maps of one merge in parts", source="the largest map that is stored", low=1, high=20000)
     first_port: int = setting(8790, doc="first of the ports of a batch with --host: of its scheduler; workers take the next ones", low=1024, high=65000)
     ports: int = setting(100, unit="ports", doc="ports of a batch with --host, which the firewall opens between job servers", low=2, high=500)
+    max_links_per_pair: int = setting(300, unit="links", doc="measured links of two maps, or within one, that are compared with each other: of each keyframe the best first", source="comparing grows with the cube: 215 links take 0.4 s", low=10, high=2000)
     max_links: int = setting(30000, unit="links", doc="links of a merged map; where more agree, each pair of maps keeps its strongest", source="a map holds 100,000 edges; 24,701 take 16.5 s to optimise", low=100, high=90000)
     part_tries: int = setting(3, doc="a part whose workers ended this often is not tried again", low=1, high=10)
     scheduler_restarts: int = setting(3, doc="how often a lost scheduler on this machine is started again", low=0, high=10)

@@ -11,7 +11,7 @@ import pytest
 
 from rse_pf.batch.merge import BatchMerge, BatchMergeResult, strongest
 from rse_pf.batch.parts import PREFIX, Part
-from rse_pf.batch.tasks import InProcessEngine
+from rse_pf.batch.tasks import InProcessEngine, strongest_rows
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import BadRequest, Disconnected, LimitExceeded
 from rse_pf.geometry import Array
@@ -147,6 +147,27 @@ def test_of_too_many_links_each_pair_of_maps_keeps_its_strongest() -> None:
     own = sorted(each.inliers for each in kept if each.b == 1)
     assert own == sorted(each.inliers for each in within)[-5:]
     assert strongest(atlas, links, len(links)) == (list(links), {})
+
+
+def test_the_strongest_links_are_spread_over_the_keyframes() -> None:
+    one = in_parts().links[0]
+    inliers = {0: (90, 80, 70), 1: (50,), 2: (60, 40)}
+    links = [replace(one, a=a, inliers=count) for a, counts in inliers.items() for count in counts]
+
+    assert [(links[row].a, links[row].inliers) for row in strongest_rows(links, 4)] == [
+        (0, 90), (0, 80), (1, 50), (2, 60),
+    ]  # fmt: skip
+
+
+def test_links_that_are_not_compared_are_named() -> None:
+    store = a_store()
+    few = PlatformSettings().replace(batch={"max_links_per_pair": 10})
+
+    found = BatchMerge(store, InProcessEngine(store), few).run(NAMES)
+
+    assert len(found.links) == len(in_parts().links)
+    assert found.merged.refused[0, 1, "surplus"] == len(found.links) - 10
+    assert found.merged.merges <= 10
 
 
 def test_an_unknown_kind_of_part_is_refused() -> None:
