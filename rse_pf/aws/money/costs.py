@@ -290,7 +290,8 @@ def _front_lines(settings: PlatformSettings, prices: Prices, load: Load) -> Iter
         ("load balancer", _UNITS, 0 if not units else units / prices.balancer_unit_per_hour * hours,
          "h", prices.balancer_unit_per_hour),
         ("firewall", "web ACL", 1, "", prices.firewall_per_month),
-        ("firewall", "its rules", len(rate_rules(settings)) + _OTHER_RULES, "rules", prices.firewall_rule_per_month),
+        ("firewall", "its rules", len(rate_rules(settings)) + _OTHER_RULES, "rules",
+         prices.firewall_rule_per_month),
         *(
             (box, f"endpoint of {service}, in {zone_count(settings)} zone(s)",
              zone_count(settings) * HOURS, "h", prices.endpoint_per_hour)
