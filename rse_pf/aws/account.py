@@ -106,7 +106,7 @@ class Account:
                 return str(row["PhysicalResourceId"])
         raise ConfigurationError(
             f"there is no {prefix} in the stack {stack} in {self.region}",
-            hint="deploy it: npx cdk deploy --all",
+            hint="put it up: rse-pf cloud up",
         )
 
 

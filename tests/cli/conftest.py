@@ -44,9 +44,7 @@ class Formation:
 
 
 @pytest.fixture
-def cloud(
-    request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> Iterator[Any]:
+def cloud(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     """A deployment without keys; the S3 client that sees its buckets."""
     monkeypatch.chdir(tmp_path)
     with emulated_aws(monkeypatch, request.node.nodeid):

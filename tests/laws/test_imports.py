@@ -18,7 +18,7 @@ ORDER = (
     "object_store", "identity", "crash_record", "maps", "auth", "enrolment", "audit", "service",
     "pnp", "services.mapping", "live_map", "services.custom", "services",
     "recording", "recording.explain", "recording.replay",
-    "aws", "aws.storage", "aws.canary", "aws.fleet", "aws.money",
+    "aws", "aws.storage", "aws.canary", "aws.fleet", "aws.money", "aws.lifecycle",
     "batch",
     "backend", "backend.scheduling", "backend.sandbox", "backend.jobs", "backend.live_map", "backend.compute",
     "backend.rosbridge",

@@ -12,7 +12,7 @@ import pytest
 
 from rse_pf.aws.account import Account
 from rse_pf.aws.clients import make_client
-from rse_pf.aws.money.costs import bill_of, parked
+from rse_pf.aws.money.costs import HOURS, bill_of, parked
 from rse_pf.aws.money.prices import load_prices
 from rse_pf.cli.main import main
 from rse_pf.config import PlatformSettings
@@ -46,8 +46,12 @@ NEEDS_AN_ACCOUNT = {
     "aws lambda get-function-configuration --function-name rse-pf-pnp --query LoggingConfig.LogGroup",
     "aws lambda get-function-configuration --function-name rse-pf-canary --query LoggingConfig.LogGroup",
     "aws logs tail GROUP --since 1h",
-    "npx cdk bootstrap",
-    "npx cdk deploy --all",
+    "rse-pf cloud up",
+    "rse-pf cloud resume",
+    "rse-pf cloud park",
+    "rse-pf cloud park --deep",
+    "rse-pf cloud down",
+    "rse-pf cloud down --delete-data",
     "aws sns subscribe --topic-arn TOPIC --protocol email --notification-endpoint you@example.org",
     "make assets",
     "npx cdk diff",
@@ -66,10 +70,6 @@ NEEDS_AN_ACCOUNT = {
     "rse-pf map rollback kitchen VERSION --store s3:BUCKET",
     "aws s3api list-object-versions --bucket BUCKET --prefix NAME",
     "aws s3api copy-object --bucket BUCKET --key NAME --copy-source BUCKET/NAME?versionId=VERSION",
-    "npx cdk destroy RsePf-Observability RsePf-Serverless RsePf-Backend RsePf-Network",
-    "aws cloudformation update-termination-protection --no-enable-termination-protection"
-    " --stack-name RsePf-Data",
-    "npx cdk destroy RsePf-Data",
 }
 
 
@@ -164,3 +164,10 @@ def test_the_amounts_on_the_page_are_those_of_the_prices(page: str) -> None:
         (parked(small, deep=True).total, "idle, and **{:.0f} USD** parked with `--deep`"),
     ):
         assert text.format(amount) in words
+    up, parked_ = bill.total / HOURS, parked(bill, deep=False).total / HOURS
+    assert f"up | {up:.2f} an hour" in words
+    assert f"parked | {parked_:.2f} an hour" in words
+    assert (
+        f"a night parked cost {9 * up + 15 * parked_:.2f}; if it stays up, 24 hours cost {24 * up:.2f}."
+        in words
+    )

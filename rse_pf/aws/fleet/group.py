@@ -76,7 +76,7 @@ def read_group(
     )
     if not found:
         raise ConfigurationError(
-            f"no platform runs in {account.region}", hint="deploy it: npx cdk deploy --all"
+            f"no platform runs in {account.region}", hint="put it up: rse-pf cloud up"
         )
     group = found[0]
     health = [_target_health(account, arn) for arn in group["TargetGroupARNs"]]

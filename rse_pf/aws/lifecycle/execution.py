@@ -27,7 +27,7 @@ from rse_pf.config import PlatformSettings
 from rse_pf.config.resource_names import ResourceNames
 from rse_pf.errors import DeploymentFailed
 
-__all__ = ["Tools", "World", "carry_out"]
+__all__ = ["StepContext", "Tools", "carry_out"]
 
 _POLL_S = 5.0
 _STACK_S = 2400.0
@@ -50,7 +50,7 @@ class Tools(Protocol):
 
 
 @dataclass(frozen=True, kw_only=True)
-class World:
+class StepContext:
     """What the steps act on."""
 
     account: Account
@@ -67,7 +67,7 @@ class World:
         return ResourceNames(self.settings.cloud.name)
 
 
-def carry_out(steps: Iterable[Step], world: World) -> None:
+def carry_out(steps: Iterable[Step], world: StepContext) -> None:
     """Carry out *steps* in order, and tell each before it begins.
 
     Raises:
@@ -81,23 +81,23 @@ def carry_out(steps: Iterable[Step], world: World) -> None:
         _EFFECTS[step.action](step, world)
 
 
-def _build(step: Step, world: World) -> None:
+def _build(step: Step, world: StepContext) -> None:
     world.tools.build()
 
 
-def _bootstrap(step: Step, world: World) -> None:
+def _bootstrap(step: Step, world: StepContext) -> None:
     world.tools.bootstrap()
 
 
-def _deploy(step: Step, world: World) -> None:
+def _deploy(step: Step, world: StepContext) -> None:
     world.tools.deploy(world.names.stack(step.box))
 
 
-def _settle(step: Step, world: World) -> None:
+def _settle(step: Step, world: StepContext) -> None:
     _await_stack(world, world.names.stack(step.box))
 
 
-def _destroy(step: Step, world: World) -> None:
+def _destroy(step: Step, world: StepContext) -> None:
     stack = world.names.stack(step.box)
     world.account.find("cloudformation", "delete_stack", StackName=stack)
     status = _await_stack(world, stack)
@@ -108,7 +108,7 @@ def _destroy(step: Step, world: World) -> None:
         )
 
 
-def _await_stack(world: World, stack: str) -> str:
+def _await_stack(world: StepContext, stack: str) -> str:
     """Return the status of *stack* when AWS no longer changes it; empty when it does not exist."""
     deadline = world.clock() + _STACK_S
     while True:
@@ -134,7 +134,7 @@ def _reason(account: Account, stack: str) -> str:
     return told[-1] if told else "AWS gives no reason"
 
 
-def _note(step: Step, world: World) -> None:
+def _note(step: Step, world: StepContext) -> None:
     """Write the sizes down before they are changed; sizes that were noted before are kept."""
     known = read_note(world.account, world.names)
     groups = known.groups if known is not None else read_sizes(world.account, world.names)
@@ -142,16 +142,16 @@ def _note(step: Step, world: World) -> None:
     write_note(world.account, world.names, ParkNote(groups=groups, since=since, deep=step.deep))
 
 
-def _silence(step: Step, world: World) -> None:
+def _silence(step: Step, world: StepContext) -> None:
     silence_alarms(world.account, world.names)
 
 
-def _empty(step: Step, world: World) -> None:
+def _empty(step: Step, world: StepContext) -> None:
     for group in read_sizes(world.account, world.names):
         empty_group(world.account, group)
 
 
-def _await_empty(step: Step, world: World) -> None:
+def _await_empty(step: Step, world: StepContext) -> None:
     deadline = world.clock() + world.settings.cloud.drain_s + _EMPTY_S
     while left := sum(each.instances for each in read_sizes(world.account, world.names).values()):
         if world.clock() > deadline:
@@ -162,7 +162,7 @@ def _await_empty(step: Step, world: World) -> None:
         world.sleep(_POLL_S)
 
 
-def _fill(step: Step, world: World) -> None:
+def _fill(step: Step, world: StepContext) -> None:
     note = read_note(world.account, world.names)
     for name, now in read_sizes(world.account, world.names).items():
         saved = restored(note.groups.get(name) if note is not None else None, now)
@@ -181,16 +181,16 @@ def _resize(account: Account, group: str, size: GroupSize) -> None:
     )  # fmt: skip
 
 
-def _alert(step: Step, world: World) -> None:
+def _alert(step: Step, world: StepContext) -> None:
     for some in alarms_of_deployment(world.account, world.names):
         world.account.change("cloudwatch", "enable_alarm_actions", AlarmNames=some)
 
 
-def _forget(step: Step, world: World) -> None:
+def _forget(step: Step, world: StepContext) -> None:
     world.account.find("ssm", "delete_parameter", Name=world.names.parked)
 
 
-def _await_healthy(step: Step, world: World) -> None:
+def _await_healthy(step: Step, world: StepContext) -> None:
     limit_s = world.settings.health.grace_s + _HEALTHY_S
     deadline = world.clock() + limit_s
     while True:
@@ -205,23 +205,23 @@ def _await_healthy(step: Step, world: World) -> None:
         world.sleep(_POLL_S)
 
 
-def _unprotect(step: Step, world: World) -> None:
+def _unprotect(step: Step, world: StepContext) -> None:
     world.account.change(
         "cloudformation", "update_termination_protection",
         StackName=world.names.stack(step.box), EnableTerminationProtection=False,
     )  # fmt: skip
 
 
-def _sweep(step: Step, world: World) -> None:
+def _sweep(step: Step, world: StepContext) -> None:
     sweep(world.account, world.names)
 
 
-def _erase(step: Step, world: World) -> None:
+def _erase(step: Step, world: StepContext) -> None:
     for refused in erase_data(world.account, world.names, audit_days=world.settings.cloud.audit_days):
         world.tell(refused)
 
 
-_EFFECTS: dict[Action, Callable[[Step, World], None]] = {
+_EFFECTS: dict[Action, Callable[[Step, StepContext], None]] = {
     "build": _build, "bootstrap": _bootstrap, "settle": _settle, "deploy": _deploy, "destroy": _destroy,
     "note": _note, "silence": _silence, "empty": _empty, "await-empty": _await_empty, "fill": _fill,
     "alert": _alert, "forget": _forget, "await-healthy": _await_healthy, "unprotect": _unprotect,

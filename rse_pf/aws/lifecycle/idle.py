@@ -21,6 +21,7 @@ from rse_pf.aws.lifecycle.parking import empty_group, silence_alarms, write_note
 from rse_pf.config import PlatformSettings, load_settings
 from rse_pf.config.resource_names import ResourceNames
 from rse_pf.scaling.alarms import NAMESPACE
+from rse_pf.scaling.job_alarms import JOBS
 
 __all__ = ["Hour", "handler", "is_idle", "park_if_idle"]
 
@@ -41,6 +42,8 @@ class Hour:
     requests: float | None
     robots: float | None
     """Mean over the hour of the robots on all servers."""
+    jobs: float = 0.0
+    """More than 0 if long jobs waited or ran; only deployments with job servers tell it."""
 
 
 def is_idle(hours: Sequence[Hour], *, idle_hours: int, has_canary: bool) -> bool:
@@ -53,7 +56,7 @@ def is_idle(hours: Sequence[Hour], *, idle_hours: int, has_canary: bool) -> bool
     allowed = _CANARY_REQUESTS if has_canary else 0.0
     return len(last) >= idle_hours and all(
         each.requests is not None and each.requests <= allowed
-        and each.robots is not None and each.robots < _NOBODY
+        and each.robots is not None and each.robots < _NOBODY and each.jobs == 0
         for each in last
     )  # fmt: skip
 
@@ -98,11 +101,13 @@ def _read_hours(
     """Return the last *count* whole hours before *now*, oldest first."""
     end_s = int(now.timestamp()) // _HOUR_S * _HOUR_S
     end = datetime.fromtimestamp(end_s, timezone.utc)
-    found: dict[str, dict[int, float]] = {"requests": {}, "robots": {}}
+    found: dict[str, dict[int, float]] = {"requests": {}, "robots": {}, "jobs": {}}
     rows = account.pages(
         "cloudwatch", "get_metric_data", "MetricDataResults",
         MetricDataQueries=[
-            _query(names, "requests", "Requests", "Sum"), _query(names, "robots", ROBOTS, "Average"),
+            _query(names.group, "requests", "Requests", "Sum"),
+            _query(names.group, "robots", ROBOTS, "Average"),
+            _query(names.job_group, "jobs", JOBS, "Maximum"),
         ],
         StartTime=end - timedelta(hours=count), EndTime=end, ScanBy="TimestampAscending",
     )  # fmt: skip
@@ -114,12 +119,13 @@ def _read_hours(
     for hour in range(end_s // _HOUR_S - count, end_s // _HOUR_S):
         mean = found["robots"].get(hour)
         robots = None if mean is None else mean * servers
-        made.append(Hour(requests=found["requests"].get(hour), robots=robots))
+        jobs = found["jobs"].get(hour, 0.0)
+        made.append(Hour(requests=found["requests"].get(hour), robots=robots, jobs=jobs))
     return made
 
 
-def _query(names: ResourceNames, identity: str, metric: str, statistic: str) -> dict[str, Any]:
-    of_group = {"Namespace": NAMESPACE, "MetricName": metric, "Dimensions": dimensions_of(names.group)}
+def _query(group: str, identity: str, metric: str, statistic: str) -> dict[str, Any]:
+    of_group = {"Namespace": NAMESPACE, "MetricName": metric, "Dimensions": dimensions_of(group)}
     return {
         "Id": identity, "MetricStat": {"Metric": of_group, "Period": _HOUR_S, "Stat": statistic},
     }  # fmt: skip

@@ -15,7 +15,7 @@ from rse_pf.aws.money.leftovers import find_leftovers
 from rse_pf.aws.money.prices import Prices
 from rse_pf.config.resource_names import DEPLOYMENT_TAG, ResourceNames
 
-__all__ = ["Kept", "Proof", "prove"]
+__all__ = ["KeptResource", "Proof", "prove"]
 
 _CLASSES = (
     "StandardStorage", "StandardIAStorage", "GlacierInstantRetrievalStorage", "GlacierStorage",
@@ -28,7 +28,7 @@ _ENDED = ("terminated", "shutting-down")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Kept:
+class KeptResource:
     """What is kept on purpose; ``gb`` is None as long as AWS has not measured it (once a day)."""
 
     kind: str
@@ -41,7 +41,7 @@ class Kept:
 class Proof:
     """What is kept, and the names of what is left although nobody wants it."""
 
-    kept: tuple[Kept, ...]
+    kept: tuple[KeptResource, ...]
     left: tuple[str, ...]
 
     @property
@@ -64,7 +64,7 @@ def prove(account: Account, names: ResourceNames, prices: Prices, *, now: dateti
     for kind, name in kept:
         gb = _gigabytes(account, name, now) if kind == "bucket" else 0.0
         price = prices.stored_per_gb_month * (gb or 0.0) if kind == "bucket" else prices.secret_per_month
-        found.append(Kept(kind=kind, name=name, gb=gb, per_month=price))
+        found.append(KeptResource(kind=kind, name=name, gb=gb, per_month=price))
     return Proof(kept=tuple(found), left=tuple(sorted(left)))
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from rse_pf.aws.account import Account
 from rse_pf.aws.lifecycle.cdk_tools import CdkTools
-from rse_pf.aws.lifecycle.execution import Tools, World, carry_out
+from rse_pf.aws.lifecycle.execution import StepContext, Tools, carry_out
 from rse_pf.aws.lifecycle.plan import Step
 from rse_pf.aws.money.costs import HOURS, Bill, bill_of, parked
 from rse_pf.aws.money.prices import Prices, operators_prices
@@ -19,7 +19,7 @@ from rse_pf.errors import UsageError
 from rse_pf.terminal import show
 
 __all__ = [
-    "Costs",
+    "DeploymentCosts",
     "add_yes",
     "confirmed",
     "deployment_costs",
@@ -35,7 +35,7 @@ def add_yes(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--yes", action="store_true", help="do it without asking")
 
 
-class Costs:
+class DeploymentCosts:
     """What a deployment costs while no robot drives: running, parked, and deeply parked."""
 
     def __init__(self, settings: PlatformSettings, prices: Prices) -> None:
@@ -58,9 +58,9 @@ class Costs:
         return self.prices.warnings(today=today, region=settings.cloud.region)
 
 
-def deployment_costs(settings: PlatformSettings) -> Costs:
+def deployment_costs(settings: PlatformSettings) -> DeploymentCosts:
     """Return the costs by the operator's prices; raises ConfigurationError for an unknown EC2 type."""
-    return Costs(settings, operators_prices(None, Path.cwd()))
+    return DeploymentCosts(settings, operators_prices(None, Path.cwd()))
 
 
 def make_tools(account: Account, settings: PlatformSettings) -> CdkTools:
@@ -69,9 +69,9 @@ def make_tools(account: Account, settings: PlatformSettings) -> CdkTools:
     return CdkTools(Path.cwd(), settings, str(who.get("Account", "")))
 
 
-def open_world(account: Account, settings: PlatformSettings, tools: Tools) -> World:
+def open_world(account: Account, settings: PlatformSettings, tools: Tools) -> StepContext:
     """Return what steps act on."""
-    return World(account=account, settings=settings, tools=tools, tell=lambda text: show(f"  {text}"))
+    return StepContext(account=account, settings=settings, tools=tools, tell=lambda text: show(f"  {text}"))
 
 
 def show_steps(steps: Sequence[Step]) -> None:
@@ -90,7 +90,7 @@ def confirmed(args: argparse.Namespace, question: str = "go on?") -> bool:
     return sys.stdin.readline().strip().lower() in ("y", "yes")
 
 
-def perform(steps: Sequence[Step], world: World) -> None:
+def perform(steps: Sequence[Step], world: StepContext) -> None:
     """Carry out *steps*, and tell each."""
     show("doing:")
     carry_out(steps, world)

@@ -37,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     """Print one line for each finding; return 1 if one has to be fixed first."""
     findings = itertools.chain(check_tools(Path.cwd()), _account_findings(settings))
-    return report(findings, "ready: npx cdk deploy --all")
+    return report(findings, "ready: rse-pf cloud up")
 
 
 def _account_findings(settings: PlatformSettings) -> Iterator[Finding]:

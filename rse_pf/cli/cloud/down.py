@@ -71,7 +71,7 @@ def _confirmed_twice(args: argparse.Namespace, names: ResourceNames) -> bool:
     return sys.stdin.readline().strip() == names.prefix
 
 
-def _last_proof(account: Account, names: ResourceNames, costs: changing.Costs) -> Proof:
+def _last_proof(account: Account, names: ResourceNames, costs: changing.DeploymentCosts) -> Proof:
     """Return the proof, when AWS lists nothing any more that nobody keeps, or after a minute."""
     deadline = time.monotonic() + _LISTED_LATE_S
     while True:

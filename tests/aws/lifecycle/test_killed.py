@@ -9,7 +9,7 @@ import pytest
 
 from rse_pf.aws.account import Account
 from rse_pf.aws.lifecycle.deployment import Deployment, read_deployment
-from rse_pf.aws.lifecycle.execution import World, carry_out
+from rse_pf.aws.lifecycle.execution import StepContext, carry_out
 from rse_pf.aws.lifecycle.plan import Step, plan_down, plan_park, plan_resume, plan_up
 from rse_pf.aws.lifecycle.proof import prove
 from rse_pf.aws.money.prices import load_prices
@@ -48,7 +48,7 @@ def run(region: str, plan: Plan, killer: Killer) -> Account:
         polls.append(duration_s)
         assert len(polls) < MOST_POLLS, "it waits for what does not happen"
 
-    world = World(
+    world = StepContext(
         account=account,
         settings=SETTINGS,
         tools=Formation(region, killer),
@@ -149,7 +149,7 @@ def test_locked_audit_logs_stay_and_are_told_with_their_date(region: str) -> Non
     )  # fmt: skip
     told: list[str] = []
     account = account_of(region, Killer())
-    world = World(
+    world = StepContext(
         account=account, settings=SETTINGS, tools=Formation(region, Killer()), tell=told.append,
         sleep=lambda duration_s: None,
     )  # fmt: skip
