@@ -5,6 +5,7 @@ Everything here changes the Auto Scaling group that `stacks.backend_servers` mad
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import cast
 
 from aws_cdk import aws_autoscaling as autoscaling
@@ -39,8 +40,9 @@ class Capacity(Construct):
                 capacity_distribution_strategy="balanced-best-effort"
             )
         )
-        if settings.cloud.spot or len(instance_types(settings.cloud)) > 1:
-            self._mix(raw, settings)
+        types = instance_types(settings.cloud)
+        if settings.cloud.spot or len(types) > 1:
+            self._mix(raw, types, settings)
         if settings.cloud.warm_servers:
             # "Only when MaxGroupPreparedCapacity and MinSize are set to the same value does the warm pool
             # have an absolute size" (AWS, PutWarmPool); else it grows to what is missing to the maximum.
@@ -58,7 +60,9 @@ class Capacity(Construct):
                 min_size=entry.min_servers, recurrence=_cron(entry), time_zone=_zone(settings),
             )  # fmt: skip
 
-    def _mix(self, raw: autoscaling.CfnAutoScalingGroup, settings: PlatformSettings) -> None:
+    def _mix(
+        self, raw: autoscaling.CfnAutoScalingGroup, types: Sequence[str], settings: PlatformSettings
+    ) -> None:
         """Let the group take several instance types, and Spot instances above the servers on demand."""
         cloud, kind = settings.cloud, autoscaling.CfnAutoScalingGroup
         raw.mixed_instances_policy = kind.MixedInstancesPolicyProperty(
@@ -66,9 +70,7 @@ class Capacity(Construct):
                 launch_template_specification=cast(
                     "autoscaling.CfnAutoScalingGroup.LaunchTemplateSpecificationProperty", raw.launch_template
                 ),
-                overrides=[
-                    kind.LaunchTemplateOverridesProperty(instance_type=name) for name in instance_types(cloud)
-                ],
+                overrides=[kind.LaunchTemplateOverridesProperty(instance_type=name) for name in types],
             ),
             instances_distribution=kind.InstancesDistributionProperty(
                 on_demand_allocation_strategy="prioritized",

@@ -427,7 +427,7 @@ def _check_contradictions(s: PlatformSettings) -> None:
     check_burst_url("burst.url", s.burst.url)
     for origin in s.serving.allowed_origins.split():
         check_origin("serving.allowed_origins", origin)
-    check_elasticity(s.scaling, s.cloud)
+    check_elasticity(dataclasses.asdict(s.scaling), dataclasses.asdict(s.cloud))
     if s.cloud.job_servers and not s.serving.offer_jobs:
         raise SettingsError(
             f"cloud.job_servers = {s.cloud.job_servers} without serving.offer_jobs",

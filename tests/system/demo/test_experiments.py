@@ -20,7 +20,7 @@ def run(folder, *words):
 
 def test_elasticity_scales_out_replaces_scales_in_and_loses_nothing(tmp_path):
     code, report, differing = run(
-        tmp_path / "out", "elasticity", "--speed", "60", "--robots", "16", "--fps", "5"
+        tmp_path / "out", "elasticity", "--speed", "60", "--robots", "40", "--fps", "5"
     )
 
     assert differing == []
@@ -34,6 +34,21 @@ def test_elasticity_scales_out_replaces_scales_in_and_loses_nothing(tmp_path):
     assert report["crashes"] == 1
     assert report["replaced_in_s"] <= 10
     assert (tmp_path / "out" / "elasticity.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.timeout(500)
+def test_with_the_clouds_delays_the_new_design_serves_in_a_third_of_the_time(tmp_path):
+    code, report, differing = run(
+        tmp_path / "out", "elasticity", "--as-cloud", "--speed", "10", "--robots", "40", "--fps", "4"
+    )
+
+    assert (code, differing) == (0, [])
+    serving_s = {
+        design: sorted(each["serving_s"] for each in report["runs"].values() if each["design"] == design)
+        for design in report["delays"]
+    }
+    assert serving_s["now"][1] < serving_s["0.1.0"][1] / 3
+    assert all(each["commands"]["lost"] == 0 for each in report["runs"].values())
 
 
 def test_a_kill_under_load_loses_nothing(tmp_path):
