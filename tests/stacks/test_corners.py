@@ -22,7 +22,6 @@ CORNERS: dict[str, Mapping[str, Mapping[str, Any]]] = {
     "team-2": {"cloud": {"name": "team-2", "allow_insecure": True, "canary": False, "idle_action": "none"}},
     "small": {"cloud": {"profile": "small"}},
     "spot": {"cloud": {"spot": True, "other_instance_types": "c6i.large m7i.large"}},
-    "job servers": {"cloud": {"job_servers": 3}, "serving": {"offer_jobs": True}},
     "warm": {"cloud": {"warm_servers": 2}},
     "job servers": {"cloud": {"job_servers": 4}, "serving": {"offer_jobs": True, "max_running_jobs": 0}},
     "no data": {"data": {"enabled": False}},

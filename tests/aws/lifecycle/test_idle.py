@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import re
+import subprocess
+import sys
 from collections.abc import Sequence
 from datetime import datetime, timedelta, timezone
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -95,3 +99,20 @@ def test_a_deployment_whose_agents_are_silent_is_not_parked(region: str, topic: 
     told = park_if_idle(account_of(region, Killer()), SETTINGS, now=NOW, topic=topic)
 
     assert "nobody told" in told
+
+
+def test_the_function_needs_no_package_that_the_lock_of_the_function_lacks(repository: Path) -> None:
+    locked = set(re.findall(r"^([a-z0-9-]+)==", (repository / "locks/lambda.txt").read_text(), re.M))
+    code = (
+        "import sys, rse_pf.aws.lifecycle.idle\n"
+        "files = {name.partition('.')[0]: getattr(of, '__file__', '') for name, of in sys.modules.items()}\n"
+        "found = [name for name, file in files.items() if 'site-packages' in (file or '')]\n"
+        "print(*sorted(found))"
+    )
+    told = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60
+    )
+
+    optional = ("_", "rse_pf", "typing_extensions")  # msgspec works without the last one
+    loaded = {name for name in told.stdout.split() if not name.startswith(optional)}
+    assert loaded <= {name.replace("-", "_") for name in locked}, "the runtime itself has botocore only"

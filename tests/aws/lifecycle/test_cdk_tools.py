@@ -1,0 +1,60 @@
+"""The pinned command line builds and deploys, and its failures are one line and a hint."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from rse_pf.aws.lifecycle.cdk_tools import CdkTools
+from rse_pf.config import PlatformSettings
+from rse_pf.errors import DeploymentFailed, UsageError
+
+SETTINGS = PlatformSettings().replace(cloud={"bootstrap_qualifier": "lab1"})
+
+
+@pytest.fixture
+def checkout(tmp_path: Path) -> Path:
+    """A checkout whose CDK writes down what it is called with."""
+    (tmp_path / "scripts").mkdir()
+    (tmp_path / "scripts" / "cdk.sh").write_text('echo "$@" >> called\nexit "$(cat code)"\n')
+    (tmp_path / "code").write_text("0")
+    return tmp_path
+
+
+def test_the_cdk_gets_one_stack_the_region_and_the_qualifier(checkout: Path) -> None:
+    tools = CdkTools(checkout, SETTINGS, "123456789012")
+
+    tools.bootstrap()
+    tools.deploy("RsePf-Data")
+
+    first, second = (checkout / "called").read_text().splitlines()
+    assert first == "bootstrap aws://123456789012/ap-northeast-2 --qualifier lab1"
+    assert second.startswith("deploy RsePf-Data --exclusively --require-approval never")
+
+
+def test_a_deployment_that_fails_says_that_the_same_command_continues(checkout: Path) -> None:
+    (checkout / "code").write_text("1")
+
+    with pytest.raises(DeploymentFailed, match="deployment of RsePf-Data failed with exit code 1") as told:
+        CdkTools(checkout, SETTINGS, "1").deploy("RsePf-Data")
+
+    assert "the same command continues" in told.value.hint
+
+
+def test_outside_of_a_checkout_the_folder_is_named(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=r"no scripts/cdk\.sh in") as told:
+        CdkTools(tmp_path, SETTINGS, "1").bootstrap()
+
+    assert "checkout" in told.value.hint
+
+
+@pytest.mark.parametrize(
+    ("folders", "built"), [((), False), (("servers",), False), (("servers", "lambda"), True)]
+)
+def test_packages_are_there_when_both_are(tmp_path: Path, folders: tuple[str, ...], built: bool) -> None:
+    for name in folders:
+        (tmp_path / "build" / name).mkdir(parents=True)
+        (tmp_path / "build" / name / "file").touch()
+
+    assert CdkTools(tmp_path, SETTINGS, "1").has_packages is built
