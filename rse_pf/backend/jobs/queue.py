@@ -65,13 +65,16 @@ def in_turn(names: Sequence[str], served: Mapping[str, int]) -> list[str]:
 
     A robot that was served longer ago comes first.
     """
-    of_robot: dict[str, list[str]] = {}
+    of_folder: dict[str, list[str]] = {}
     for name in names:
-        of_robot.setdefault(name.removeprefix(_PREFIX).rpartition("/")[0], []).append(name)
-    robots = sorted(of_robot, key=lambda robot: (served.get(robot, 0), robot))
-    rounds = max(map(len, of_robot.values()), default=0)
+        of_folder.setdefault(name.removeprefix(_PREFIX).rpartition("/")[0], []).append(name)
+    folders = sorted(of_folder, key=lambda folder: (served.get(folder, 0), folder))
+    rounds = max(map(len, of_folder.values()), default=0)
     return [
-        of_robot[robot][turn] for turn in range(rounds) for robot in robots if turn < len(of_robot[robot])
+        of_folder[folder][turn]
+        for turn in range(rounds)
+        for folder in folders
+        if turn < len(of_folder[folder])
     ]
 
 
