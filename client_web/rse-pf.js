@@ -225,7 +225,7 @@ export const connect = async (url, options = {}) => {
       share = max(0.1, share / 2);
       notBefore = now() + 5;
     }
-    const failed = wrong(...(FINAL[code] || ["connect", "the connection ended with " + code, "is it running, and is the token valid?"]));
+    const failed = wrong(...(FINAL[code] || ["connect", "the connection ended with " + code, "is it running, the token valid, the origin allowed?"]));
     // An attempt that was given up may still replace the connection that came after it.
     const isOwn = code === 4409 && (moving || now() < lateUntil);
     lose(link, FINAL[code] && isUsed && !isOwn ? finally_(failed) : failed);

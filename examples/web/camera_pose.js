@@ -9,6 +9,9 @@ const JPEG_QUALITY = 0.8;
 // A server starts an isolated process for the first frame.
 const DEADLINE_MS = 5000;
 
+// No later frame would be answered: the platform has no such service, or the token no scope for it.
+const FINAL = ["unknown-service", "forbidden"];
+
 const form = document.forms[0];
 const said = document.querySelector("output");
 const shown = document.querySelector("pre");
@@ -29,10 +32,14 @@ form.onsubmit = async (event) => {
     const given = { tag_m: Number(form.tag.value), tags_only: !form.cover.checked };
     await run(form.url.value, form.token.value, Number(form.focal.value), given);
   } catch (error) {
-    said.textContent = error.hint ? `${error.message} (${error.hint})` : `${error.name}: ${error.message}`;
+    said.textContent = explained(error);
     form.querySelector("button").disabled = false;
   }
 };
+
+function explained(error) {
+  return error.hint ? `${error.message} (${error.hint})` : `${error.name}: ${error.message}`;
+}
 
 async function run(url, token, focalPx, given) {
   said.textContent = "asking for the camera";
@@ -66,8 +73,11 @@ async function look(robot, given) {
     tell(answer, { encodeMs, jpegBytes: image.length, bytes });
   } catch (error) {
     if (robot.error) return;
-    said.textContent = `${error.message} ${error.hint}`;
-    if (error.code === "unknown-service") robot.close();
+    said.textContent = explained(error);
+    if (FINAL.includes(error.code)) {
+      robot.close();
+      throw error;
+    }
   }
 }
 

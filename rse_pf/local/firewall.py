@@ -126,5 +126,5 @@ def read_key(path: Path) -> SigningKey:
     Raises:
         UsageError: There is no such file, others may read it, or it holds no signing key.
     """
-    hint = "start a platform with rse-pf local, or name a key with --key"
+    hint = "start a platform with rse-pf local, name the one that runs with --name, or a key with --key"
     return SigningKey.from_json(read_private_file(path, "the key", hint=hint))

@@ -5,6 +5,7 @@ Frame i of the film shows the tag i at a pose of its own, so every answer names 
 
 from __future__ import annotations
 
+import contextlib
 import json
 import re
 import shutil
@@ -67,6 +68,43 @@ def page(platform: ExamplePlatform) -> Iterator[str]:
     assert found is not None
     yield found[0].replace("127.0.0.1", "localhost")
     program.end()
+
+
+def test_the_first_pose_in_a_page_is_shown(platform: ExamplePlatform, tmp_path: Path) -> None:
+    sync_api = pytest.importorskip("playwright.sync_api", reason="no playwright: make browser installs it")
+    chromium = next(filter(None, map(shutil.which, ("chromium-headless-shell", "chromium"))), None)
+    if chromium is None:
+        pytest.skip("no Chromium: sudo apt-get install chromium-headless-shell")
+    text = (REPOSITORY / "docs" / "howto" / "browser_robot.md").read_text(encoding="utf-8")
+    found = re.search(r"```text\n(<!doctype html>.*?)```", text, re.DOTALL)
+    assert found is not None
+    (tmp_path / "pose.html").write_text(
+        found[1].replace("127.0.0.1:8700", f"127.0.0.1:{platform.cloud.port}")
+    )
+    shutil.copy(REPOSITORY / "client_web" / "rse-pf.js", tmp_path)
+    token = platform.cloud.issue_token("first-page", None)
+    server = subprocess.Popen(
+        [sys.executable, "-m", "http.server", str(PORT), "--bind", "127.0.0.1"],
+        cwd=tmp_path, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
+    )  # fmt: skip
+
+    try:
+        with sync_api.sync_playwright() as playwright:
+            browser = playwright.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
+            page = browser.new_page()
+            for _ in range(100):  # until the server of the page answers
+                with contextlib.suppress(sync_api.Error):
+                    page.goto(f"http://localhost:{PORT}/pose.html#{token}")
+                    break
+                page.wait_for_timeout(100)
+            page.wait_for_function("document.querySelector('pre').textContent !== ''", timeout=60_000)
+            shown = page.inner_text("pre")
+            browser.close()
+    finally:
+        server.kill()
+        server.wait()
+
+    assert shown.startswith(("ok by server-1", "weak by server-1")), shown
 
 
 def test_the_page_draws_the_poses_of_its_camera(platform: ExamplePlatform, page: str) -> None:
