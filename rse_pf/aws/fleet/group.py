@@ -75,9 +75,7 @@ def read_group(
         "autoscaling", "describe_auto_scaling_groups", "AutoScalingGroups", AutoScalingGroupNames=[of.group]
     )
     if not found:
-        raise ConfigurationError(
-            f"no platform runs in {account.region}", hint="put it up: rse-pf cloud up"
-        )
+        raise ConfigurationError(f"no platform runs in {account.region}", hint="put it up: rse-pf cloud up")
     group = found[0]
     health = [_target_health(account, arn) for arn in group["TargetGroupARNs"]]
     names = [each["InstanceId"] for each in group["Instances"]]
