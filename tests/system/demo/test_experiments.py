@@ -20,7 +20,7 @@ def run(folder, *words):
 
 def test_elasticity_scales_out_replaces_scales_in_and_loses_nothing(tmp_path):
     code, report, differing = run(
-        tmp_path / "out", "elasticity", "--speed", "60", "--robots", "40", "--fps", "5"
+        tmp_path / "out", "elasticity", "--speed", "60", "--robots", "40", "--fps", "10"
     )
 
     assert differing == []
