@@ -84,7 +84,7 @@ def test_a_release_whose_server_never_gets_ready_ends_the_launch(
 
     world.wait(lambda: bool(world.completed()), 120 + ready_within_s(SETTINGS), "completed hook")
     assert world.completed() == [(LAUNCH, "ABANDON")]
-    assert "agent-not-ready" in world.text()
+    world.wait(lambda: "agent-not-ready" in world.text(), 30, "line of the agent after its call")
     assert "--no-such-option" in world.text(), "the reason is in the unit's own lines"
 
 
