@@ -1,4 +1,4 @@
-// The pose of a camera that sees eight corners of a box. Arguments: the platform's address and a robot's token.
+// The pose of a camera that sees 27 points of a grid. Arguments: the platform's address and a robot's token.
 #include <cstdio>
 #include <rse_pf/client.hpp>
 
@@ -10,8 +10,8 @@ int main(int argc, char** argv) {
 
     rse_pf::PnpRequest request;
     request.camera = {525, 525, 319.5, 239.5, 640, 480};
-    for (int corner = 0; corner < 8; ++corner) {  // two metres ahead, looked at without a rotation
-        const double x = corner & 1 ? 0.4 : -0.4, y = corner & 2 ? 0.3 : -0.3, z = corner & 4 ? 2.6 : 2.0;
+    for (int at = 0; at < 27; ++at) {  // a grid two metres ahead, looked at without a rotation
+        const double x = 0.4 * (at % 3 - 1), y = 0.3 * (at / 3 % 3 - 1), z = 2.0 + 0.3 * (at / 9);
         request.points_world.push_back({x, y, z});
         request.pixels.push_back({525 * x / z + 319.5, 525 * y / z + 239.5});
     }
