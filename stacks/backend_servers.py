@@ -25,11 +25,11 @@ from aws_cdk import aws_s3_assets as s3_assets
 from aws_cdk import aws_sns as sns
 from constructs import Construct
 
-from rse_pf.aws.fleet.launch_hook import retry_within_s
 from rse_pf.config import PlatformSettings
 from rse_pf.config.cloud_layout import zone_count
 from rse_pf.config.resource_names import AUDIT_PREFIX, JOURNAL_PREFIX, VERSION_PARAMETER, ResourceNames
 from rse_pf.scaling.alarms import NAMESPACE
+from rse_pf.scaling.boot_time import retry_within_s
 from stacks.capacity import Capacity
 from stacks.permissions import allow
 

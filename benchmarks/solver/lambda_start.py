@@ -29,7 +29,8 @@ from lambda_pnp.keys import KeyCache
 from rse_pf.config import PlatformSettings
 imported = time.process_time()
 told = json.loads(sys.stdin.read())
-answering = Answering(PlatformSettings(), KeyCache(lambda: told["keys"], 60.0), lambda day, wanted, most: wanted)
+keys = KeyCache(lambda: told["keys"], 60.0)
+answering = Answering(PlatformSettings(), keys, lambda day, wanted, most: wanted)
 answered = answering.answer(told["event"], now_s=told["now_s"], left_ms=9e3, clock=time.monotonic)
 solved = time.process_time()
 assert answered.status == 200, answered

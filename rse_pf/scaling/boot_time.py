@@ -6,9 +6,10 @@ takes is an estimate, shared with `rse_pf.scaling.cloud_delays`; the rest was me
 
 from __future__ import annotations
 
+from rse_pf.config import PlatformSettings
 from rse_pf.scaling.cloud_delays import DESIGNS, Delay
 
-__all__ = ["BOOT_S", "STEPS"]
+__all__ = ["BOOT_S", "STEPS", "ready_within_s", "retry_within_s"]
 
 _MEASURED = "python -m benchmarks.cloud.boot, on a loaded machine"
 
@@ -20,3 +21,16 @@ STEPS: tuple[Delay, ...] = (
 """Pending to running; kernel and cloud-init; the package; the processes."""
 BOOT_S = sum(step.high_s for step in STEPS)
 """From the launch to /readyz, in seconds, without luck."""
+
+_RETRY_SHARE, _READY_SHARE = 0.4, 0.3
+"""Of ``cloud.boot_s``; the rest is for the machine's own start and for unpacking the environment."""
+
+
+def retry_within_s(settings: PlatformSettings) -> float:
+    """Return how long a new machine tries to get its role and its package, of ``cloud.boot_s``."""
+    return settings.cloud.boot_s * _RETRY_SHARE
+
+
+def ready_within_s(settings: PlatformSettings) -> float:
+    """Return how long the agent of a new machine waits for its server, of ``cloud.boot_s``."""
+    return settings.cloud.boot_s * _READY_SHARE

@@ -9,27 +9,12 @@ from enum import Enum
 from typing import Any
 
 from rse_pf.aws.clients import error_code, with_retries
-from rse_pf.config import PlatformSettings
 from rse_pf.errors import ConfigurationError
 
-__all__ = ["LaunchAction", "complete_hook", "launch_action", "ready_within_s", "retry_within_s"]
+__all__ = ["LaunchAction", "complete_hook", "launch_action"]
 
 _NOT_ACTIVE = "ValidationError"
 """What Auto Scaling answers where no lifecycle action waits for this instance."""
-
-
-_RETRY_SHARE, _READY_SHARE = 0.4, 0.3
-# The rest is for the machine's own start and for unpacking the environment.
-
-
-def retry_within_s(settings: PlatformSettings) -> float:
-    """Return how long a new machine tries to get its role and its package, of ``cloud.boot_s``."""
-    return settings.cloud.boot_s * _RETRY_SHARE
-
-
-def ready_within_s(settings: PlatformSettings) -> float:
-    """Return how long the agent of a new machine waits for its server, of ``cloud.boot_s``."""
-    return settings.cloud.boot_s * _READY_SHARE
 
 
 class LaunchAction(Enum):

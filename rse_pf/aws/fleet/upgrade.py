@@ -126,7 +126,7 @@ def failed_launch(activities: Sequence[Mapping[str, Any]], since: datetime) -> M
 
 def with_version(group: Mapping[str, Any], version: str) -> dict[str, Any]:
     """Return the launch template or the mixed policy of *group* with *version*: a DesiredConfiguration."""
-    if "MixedInstancesPolicy" in group:
+    if group.get("MixedInstancesPolicy"):
         policy = copy.deepcopy(dict(group["MixedInstancesPolicy"]))
         _id_only(policy["LaunchTemplate"]["LaunchTemplateSpecification"])["Version"] = version
         return {"MixedInstancesPolicy": policy}
@@ -374,7 +374,7 @@ def _parameters(account: Account, names: ResourceNames) -> dict[str, str]:
 
 
 def _specification(group: Mapping[str, Any]) -> Mapping[str, Any]:
-    if "MixedInstancesPolicy" in group:
+    if group.get("MixedInstancesPolicy"):
         found: Mapping[str, Any] = group["MixedInstancesPolicy"]["LaunchTemplate"][
             "LaunchTemplateSpecification"
         ]

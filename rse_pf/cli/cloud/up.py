@@ -60,7 +60,6 @@ def finish(account: Account, settings: PlatformSettings) -> int:
     behind = versions_behind(account, settings)
     if behind is not None:
         show(f"its servers run release {behind[0]}, and {behind[1]} is new: rse-pf cloud upgrade")
-    show("servers that ran before keep their release until rse-pf cloud upgrade")
     show("next: rse-pf token init --cloud             once: the key that signs tokens")
     show("      rse-pf token issue robot-1 --cloud    a robot's token")
     if cloud.canary:

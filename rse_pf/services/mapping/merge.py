@@ -15,7 +15,16 @@ from rse_pf.services.mapping.map_merge import MergedMap, MergeOptions, merge_ver
 from rse_pf.services.mapping.optimise import ignore_progress
 from rse_pf.services.mapping.place import MAX_KEYFRAMES, map_limits
 
-__all__ = ["MAX_MAPS", "MergeReply", "MergeRequest", "NotJoined", "Refusal", "merge_maps", "register", "reply_of"]
+__all__ = [
+    "MAX_MAPS",
+    "MergeReply",
+    "MergeRequest",
+    "NotJoined",
+    "Refusal",
+    "merge_maps",
+    "register",
+    "reply_of",
+]
 
 
 MAX_MAPS = 64

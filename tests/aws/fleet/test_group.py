@@ -245,7 +245,7 @@ def test_without_a_platform_the_hint_says_to_deploy(region: str, now: datetime) 
     with pytest.raises(ConfigurationError) as told:
         read_group(open_account("us-east-1"), SETTINGS, now=now)
 
-    assert "cdk deploy" in told.value.hint
+    assert "rse-pf cloud up" in told.value.hint
 
 
 @pytest.mark.parametrize(

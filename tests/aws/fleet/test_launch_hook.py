@@ -10,12 +10,12 @@ from aws.fleet.fake_machine import FakeMachine, FakeScaling
 from botocore.exceptions import ClientError
 
 from rse_pf.aws.fleet.agent import Agent, AgentConfig, AgentContext
-from rse_pf.aws.fleet.launch_hook import LaunchAction, launch_action, ready_within_s, retry_within_s
+from rse_pf.aws.fleet.launch_hook import LaunchAction, launch_action
 from rse_pf.aws.fleet.task import Phase, Task
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import ConfigurationError
 from rse_pf.object_store import MemoryStore
-from rse_pf.scaling.boot_time import BOOT_S
+from rse_pf.scaling.boot_time import BOOT_S, ready_within_s, retry_within_s
 
 SETTINGS = PlatformSettings()
 LAUNCH, DRAIN = "rse-pf-launch", "rse-pf-drain"

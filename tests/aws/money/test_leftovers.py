@@ -24,9 +24,7 @@ def fill(account: Account, region: str) -> dict[str, str]:
     for name in ("ours", "theirs"):
         s3.create_bucket(Bucket=f"maps-{name}", CreateBucketConfiguration={"LocationConstraint": region})
         account.client("logs").create_log_group(
-
             logGroupName={"ours": "RsePf-Data-Log", "theirs": "log"}[name]
-
         )
         account.client("cloudwatch").put_metric_alarm(
             AlarmName={"ours": "rse-pf/busy", "theirs": "busy"}[name], MetricName="m", Namespace="n",

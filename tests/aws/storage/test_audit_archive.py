@@ -304,4 +304,4 @@ def test_a_deployment_without_the_bucket_says_to_deploy() -> None:
 
     with pytest.raises(ConfigurationError) as told:
         open_audit_archive(Account("r", lambda service, region: NoLogs()), ResourceNames())
-    assert "cdk deploy" in told.value.hint
+    assert "rse-pf cloud up" in told.value.hint

@@ -195,4 +195,4 @@ def test_without_a_deployment_the_hint_says_to_deploy(region: str) -> None:
     with pytest.raises(ConfigurationError) as told:
         open_key_store(beside(region, Formation()), ResourceNames())
 
-    assert "cdk deploy" in told.value.hint
+    assert "rse-pf cloud up" in told.value.hint

@@ -11,8 +11,8 @@ import pytest
 from system.boot.test_boot import LAUNCH, SETTINGS, kept, package
 from system.boot.world import World
 
-from rse_pf.aws.fleet.launch_hook import ready_within_s
 from rse_pf.config.resource_names import READY_PATH
+from rse_pf.scaling.boot_time import ready_within_s
 
 pytestmark = [pytest.mark.slow, pytest.mark.system, pytest.mark.timeout(1800)]
 

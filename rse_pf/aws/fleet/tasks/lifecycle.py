@@ -9,8 +9,9 @@ from __future__ import annotations
 from rse_pf.audit.log import SYNC_S
 from rse_pf.aws.fleet.drain_hook import drain_server
 from rse_pf.aws.fleet.instance import IN_SERVICE, TERMINATED, WARMED
-from rse_pf.aws.fleet.launch_hook import LaunchAction, complete_hook, launch_action, ready_within_s
+from rse_pf.aws.fleet.launch_hook import LaunchAction, complete_hook, launch_action
 from rse_pf.aws.fleet.task import ALWAYS, AgentContext, Phase, Task
+from rse_pf.scaling.boot_time import ready_within_s
 
 __all__ = ["task"]
 
