@@ -24,9 +24,10 @@ from ros_bridge.options import BridgeOptions
 from rse_pf.errors import RsePfError
 from rse_pf.geometry import Camera
 
-__all__ = ["IncomingFrames", "PairedImages", "Role", "kind_of"]
+__all__ = ["NO_MESSAGE", "IncomingFrames", "PairedImages", "Role", "kind_of"]
 
 Role = Literal["colour", "depth", "info"]
+NO_MESSAGE = "no message yet"
 _FAULTS = (ArithmeticError, AttributeError, LookupError, TypeError, ValueError)
 _JUMP_NS = 1_000_000_000
 """A stamp that lies so far back is of a clock that was set, or of a bag that is played again."""
@@ -56,7 +57,8 @@ class IncomingFrames:
 
     def __init__(self, maker: MessageMaker, options: BridgeOptions) -> None:
         self.left_out: Counter[str] = Counter()
-        self.trouble = "no message yet"
+        self.received: Counter[str] = Counter({"colour": 0, "depth": 0, "info": 0})
+        self.trouble = NO_MESSAGE
         self._maker, self._options = maker, options
         self._bound_ns = round(1e9 * options.pair_within_s)
         self._kinds = {
@@ -69,11 +71,14 @@ class IncomingFrames:
         self._formats: dict[str, ImageFormat] = {}
         self._ready: deque[PairedImages] = deque()
         self._last_ns = -1
+        self._jump_ns = 0
+        self._stragglers: Counter[str] = Counter()
         self._camera: tuple[Camera, Rectifier] | None = None
 
     def add(self, role: Role, data: bytes | memoryview) -> bool:
         """Take the bytes of a message; return whether a frame became ready.  Nothing is raised."""
         with self._lock:
+            self.received[role] += 1
             try:
                 message = self._maker.decode(self._kinds[role], data)
                 if role == "info":
@@ -87,7 +92,10 @@ class IncomingFrames:
             stamp = message.header.stamp
             stamp_ns = int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
             if stamp_ns < self._last_ns - _JUMP_NS:
-                self._begin_again()
+                self._begin_again(role, stamp_ns)
+            elif self._is_straggler(role, stamp_ns):
+                self.left_out["before the clock jumped back"] += 1
+                return False
             elif stamp_ns <= self._last_ns:
                 self.left_out["too late"] += 1
                 return False
@@ -135,12 +143,26 @@ class IncomingFrames:
                 self.trouble = str(error)
             return None
 
-    def _begin_again(self) -> None:
-        """Forget what waits, and take stamps from before the last frame again."""
+    def _begin_again(self, role: Role, stamp_ns: int) -> None:
+        """Forget what waits, and take stamps from before the last frame again.
+
+        The other topic may lag behind: its next images, some at most, may still be from before the jump.
+        """
+        self._jump_ns = stamp_ns
+        self._stragglers = Counter({"colour": _WAITING, "depth": _WAITING})
+        self._stragglers[role] = 0
         self.left_out["before the clock jumped back"] += sum(map(len, self._waiting.values()))
         for waiting in self._waiting.values():
             waiting.clear()
         self._last_ns = -1
+
+    def _is_straggler(self, role: Role, stamp_ns: int) -> bool:
+        """Return whether an image is from before the clock jumped back: it would hide its successors."""
+        if not self._stragglers[role]:
+            return False
+        is_old = stamp_ns > self._jump_ns + _JUMP_NS // 2
+        self._stragglers[role] = self._stragglers[role] - 1 if is_old else 0
+        return is_old
 
     def _learn_camera(self, message: Any) -> None:
         """Take the camera of the first good message; later ones of the same camera cost nothing."""

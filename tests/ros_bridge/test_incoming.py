@@ -178,3 +178,20 @@ def test_a_lens_with_distortion_is_undistorted() -> None:
     frame = robot.frames.decode(images)
     assert frame is not None
     assert not np.array_equal(frame.rgb, SHOWN.colours[0])
+
+
+def test_a_topic_that_lags_behind_when_the_bag_begins_again_hides_no_partner() -> None:
+    robot = Robot(queue_frames=10)
+    for row in (0, 1, 20):
+        robot.colour(stamp_of(row))
+        robot.depth(stamp_of(row))
+    robot.colour(stamp_of(30))
+
+    robot.colour(stamp_of(0))  # the depth of row 30 comes only now
+    robot.depth(stamp_of(30))
+    robot.depth(stamp_of(0))
+    robot.colour(stamp_of(1))
+    robot.depth(stamp_of(1))
+
+    assert robot.taken() == [stamp_of(row) for row in (0, 1, 20, 0, 1)]
+    assert robot.frames.left_out["before the clock jumped back"] == 2
