@@ -25,7 +25,7 @@ from client_sdk.dialling import (
 )
 from client_sdk.token_text import checked_token
 from rse_pf.config import SessionSettings
-from rse_pf.errors import ConnectError, Unauthorized, UnsupportedProtocol
+from rse_pf.errors import ConnectError, RsePfError, Unauthorized, UnsupportedProtocol
 from rse_pf.wire import SUBPROTOCOLS
 
 __all__ = ["Dialler", "Token", "websocket_options"]
@@ -76,6 +76,8 @@ class Dialler:
         else:
             try:
                 token = await self.token()
+            except RsePfError as error:  # its message is written for users, unlike that of any other error
+                raise DialError(ConnectError(f"no token: {error.message}", hint=error.hint)) from error
             except Exception as error:
                 told = ConnectError(
                     f"no token: the token callable raised {type(error).__name__}",

@@ -9,6 +9,7 @@ import asyncio
 import contextlib
 import json
 import time
+from collections import Counter
 from collections.abc import AsyncIterator, Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,11 +23,12 @@ from client_sdk.frontend import Frame, TrackedFrame
 from client_sdk.live import LiveMapper
 from client_sdk.mapper import Mapper
 from client_sdk.robot import Robot, connect
-from ros_bridge.incoming import IncomingFrames, PairedImages, Role
+from ros_bridge.incoming import NO_MESSAGE, IncomingFrames, PairedImages, Role
 from ros_bridge.options import BridgeOptions
 from ros_bridge.outgoing import Message, OutgoingMessages
 from rse_pf.errors import RsePfError, UsageError
 from rse_pf.geometry import Array
+from rse_pf.terminal import show
 
 __all__ = ["Bridge", "CallReply", "Publish", "connected_bridge"]
 
@@ -184,9 +186,13 @@ class Bridge:
 
     async def _report(self) -> None:
         """Publish how the bridge is, each second, whether frames come or not."""
-        last = -1
+        last, received, logged = 0, Counter[str](), ""
         while True:
             connected = self._robot is None or self._robot.connected
+            cause = "" if self._robot is None or connected else self._robot.stats.last_error
+            if cause and cause != logged and not cause.startswith("connection lost"):  # told already
+                show(f"no connection to the platform: {cause}")
+            logged = cause
             values = {
                 "frames": str(self.frames),
                 "lost frames": str(self.lost_frames),
@@ -195,21 +201,32 @@ class Bridge:
                 "connected": str(connected).lower(),
                 **{f"left out: {why}": str(count) for why, count in sorted(self._incoming.left_out.items())},
             }
-            trouble = "" if connected else "no connection to the platform"
+            trouble = "" if connected else f"no connection to the platform{cause and f': {cause}'}"
             trouble = trouble or self._reason or self._incoming.trouble
             if isinstance(self._mapper, LiveMapper):
                 values |= {"map": self._mapper.name, "map state": self._mapper.state}
                 values["aligned"] = str(self._mapper.aligned).lower()
                 trouble = trouble or self._mapper.trouble or self._mapper.reason
-            if not trouble and self.frames == last:
-                trouble = f"no new frame of {self._options.named(self._options.colour)}"
-            last = self.frames
+            if trouble in ("", NO_MESSAGE) and self.frames == last:
+                trouble = self._silence(received)
+            last, received = self.frames, Counter(self._incoming.received)
             self._publish(
                 self._outgoing.diagnostics(
                     self._stamp_ns, trouble=trouble, is_working=connected and self.frames > 0, values=values
                 )
             )
             await asyncio.sleep(_DIAGNOSTICS_EVERY_S)
+
+    def _silence(self, before: Counter[str]) -> str:
+        """Return which topics of images sent nothing since *before*, where no frame came."""
+        topics = {"colour": self._options.colour, "depth": self._options.depth}
+        now = self._incoming.received
+        silent = [
+            self._options.named(name) for role, name in topics.items() if name and now[role] == before[role]
+        ]
+        if silent:
+            return f"no new message of {' and '.join(silent)}"
+        return f"no new frame of {self._options.named(self._options.colour)}"
 
 
 @contextlib.asynccontextmanager
@@ -219,7 +236,7 @@ async def connected_bridge(
     """Connect to the platform that the options name, join its live map if they name one, give a bridge.
 
     Raises:
-        UsageError: There is no address, or no token.
+        UsageError: There is no address, or no token that can be read.
         RsePfError: The platform refuses the robot.
     """
     async with _connect(options) as robot:
@@ -233,21 +250,44 @@ async def connected_bridge(
 
 def _connect(options: BridgeOptions) -> Robot:
     if options.enrolment:
-        return connect(enrolment=options.enrolment)
+        return connect(enrolment=options.enrolment, on_change=_log_change)
     if not (options.url and options.token_file):
         raise UsageError(
             "the bridge needs a platform: url and token_file, or enrolment",
-            hint="rse-pf local prints the address; rse-pf token ROBOT issues a token",
+            hint="rse-pf local prints the address; rse-pf token issue ROBOT issues a token",
         )
     file = Path(options.token_file)
+    _read_token(file)  # a file that cannot be read is told at once, not after several attempts
 
     async def token() -> str:
-        try:
-            return file.read_text(encoding="ascii").strip()
-        except (OSError, UnicodeDecodeError) as error:
-            raise UsageError(f"cannot read the token in {file}", hint="rse-pf token") from error
+        return _read_token(file)
 
-    return connect(options.url, token=token)
+    return connect(options.url, token=token, on_change=_log_change)
+
+
+def _read_token(file: Path) -> str:
+    """Return the token in a file; an error names the file and the cause, and nothing of what is in it."""
+    try:
+        token = file.read_text(encoding="ascii").strip()
+        cause = "" if token else "it is empty"
+    except OSError as error:
+        token, cause = "", error.strerror or type(error).__name__
+    except UnicodeDecodeError:
+        token, cause = "", "it holds other characters than ASCII"
+    if cause:
+        raise UsageError(
+            f"cannot read the token in {file.absolute()}: {cause}",
+            hint="give the whole path of a file that rse-pf token issue ROBOT wrote",
+        )
+    return token
+
+
+def _log_change(what: str, why: str) -> None:
+    """Say when the connection is lost and why, and when it is back."""
+    if what == "link-lost":
+        show(f"connection lost: {why}")
+    elif what == "link-back":
+        show(f"connected again, to {why}")
 
 
 def _plain(value: Any) -> Any:

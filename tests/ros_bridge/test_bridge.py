@@ -7,16 +7,21 @@ import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import pytest
 
+from client_sdk import connect
 from client_sdk.bags.message_maker import MessageMaker
 from client_sdk.bags.message_types import CAMERA_INFO, DIAGNOSTICS, IMAGE, POSE_WITH_COVARIANCE
 from client_sdk.frontend import Frame
 from client_sdk.mapper import Mapper
 from ros_bridge import Bridge, BridgeOptions
+from ros_bridge.bridge import connected_bridge
 from ros_bridge.outgoing import Message
+from rse_pf.errors import ConnectError, UsageError
 from tests.client_sdk.bags.small_bags import raw_image
 from tests.client_sdk.mapper.flat_world import frame_at
 from tests.client_sdk.mapper.test_mapper import solve
@@ -156,3 +161,72 @@ def test_a_frame_without_texture_is_counted_as_lost_and_the_next_one_goes_on() -
     assert (bridge.frames, bridge.lost_frames) == (5, 1)
     stamps = [each.header.stamp.nanosec for each in heard.of(POSE_WITH_COVARIANCE, maker)]
     assert stamps == [0, 100_000_000, 300_000_000, 400_000_000]
+
+
+def test_diagnostics_name_the_topic_of_depth_that_never_came() -> None:
+    heard, maker = Heard(), MessageMaker(is_ros1=True)
+
+    async def drive() -> None:
+        options = BridgeOptions.of({"depth": "/no/depth"})
+        bridge = Bridge(Mapper(ask=solve), options, heard.publish, is_ros1=True)
+        for role, data in messages_of(maker, frame_at(0, depth=True), 0)[:2]:
+            bridge.receive(role, data)  # type: ignore[arg-type]
+        running = asyncio.create_task(bridge.run())
+        await heard.until(lambda all_: any(m.kind == DIAGNOSTICS for m in all_))
+        running.cancel()
+        await asyncio.gather(running, return_exceptions=True)
+
+    asyncio.run(drive())
+    assert heard.of(DIAGNOSTICS, maker)[0].status[0].message == "no new message of /no/depth"
+
+
+@pytest.mark.parametrize(
+    ("content", "cause"), [(None, "No such file"), (b"", "it is empty"), (b"se\xffcret", "than ASCII")]
+)
+def test_a_token_file_that_cannot_be_read_is_named_with_the_cause(
+    tmp_path: Path, content: bytes | None, cause: str
+) -> None:
+    file = tmp_path / "robot.token"
+    if content is not None:
+        file.write_bytes(content)
+
+    async def drive() -> None:
+        options = BridgeOptions(url="ws://127.0.0.1:1/ws", token_file=str(file))
+        async with connected_bridge(options, lambda message: None, is_ros1=True):
+            pass
+
+    with pytest.raises(UsageError) as told:
+        asyncio.run(drive())
+    assert str(file) in told.value.message
+    assert cause in told.value.message
+    assert "cret" not in told.value.message
+
+
+def test_diagnostics_and_one_line_say_why_there_is_no_connection(capsys: pytest.CaptureFixture[str]) -> None:
+    heard = Heard()
+    robot: Any = SimpleNamespace(connected=False, stats=SimpleNamespace(last_error="the token has expired"))
+
+    async def drive() -> None:
+        mapper = Mapper(ask=solve)
+        bridge = Bridge(mapper, BridgeOptions(), heard.publish, is_ros1=True, robot=robot)
+        running = asyncio.create_task(bridge.run())
+        await heard.until(lambda all_: any(m.kind == DIAGNOSTICS for m in all_))
+        running.cancel()
+        await asyncio.gather(running, return_exceptions=True)
+
+    asyncio.run(drive())
+    said = "no connection to the platform: the token has expired"
+    assert heard.of(DIAGNOSTICS, MessageMaker(is_ros1=True))[0].status[0].message == said
+    assert said in "".join(capsys.readouterr())
+
+
+def test_an_error_that_a_token_callable_raises_for_its_user_is_told() -> None:
+    async def token() -> str:
+        raise UsageError("cannot read the token in /a: it is empty", hint="write it")
+
+    async def drive() -> None:
+        async with connect("ws://127.0.0.1:1/ws", token=token):
+            pass
+
+    with pytest.raises(ConnectError, match="no token: cannot read the token in /a: it is empty"):
+        asyncio.run(drive())
