@@ -9,7 +9,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from emulated_aws import is_localstack
 from hypothesis import settings
+from localstack.lacking import LACKING
 
 settings.register_profile("rse-pf", deadline=None)  # a crowded machine is no defect
 settings.load_profile("rse-pf")
@@ -53,6 +55,17 @@ def recordings() -> Path:
 
 
 _LEFT_OUT: dict[str, int] = {}
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Expect the tests to fail whose service LocalStack lacks."""
+    if not is_localstack():
+        return
+    for item in items:
+        service = LACKING.get((item.location[0], item.name))
+        if service is not None:
+            mark = pytest.mark.xfail(reason=f"LocalStack has no {service}", strict=True)
+            item.add_marker(mark)
 
 
 def pytest_deselected(items: list[pytest.Item]) -> None:

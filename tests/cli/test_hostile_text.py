@@ -34,6 +34,7 @@ SHOWS_NO_TEXT_OF_ROBOTS = {
     "camera": "shows what was typed, and figures of its images",
     "errors": "shows texts of this package",
     "fleet": "prints an address of this machine",
+    "batch": "shows names of the operator's own files, and figures",
     "demo": "its robots have names that it makes itself",
     "swarm": "the same",
     "settings": "shows the operator's own file",
