@@ -101,6 +101,8 @@ def test_what_a_living_stack_owns_is_no_leftover_until_it_is_gone(region: str) -
 
     kept = account.client("s3")
     formation.delete_stack(StackName="RsePf-Data")
+    soon = {"Delay": 1, "MaxAttempts": 60}
+    formation.get_waiter("stack_delete_complete").wait(StackName="RsePf-Data", WaiterConfig=soon)
     kept.create_bucket(Bucket="maps-of-a-stack", CreateBucketConfiguration={"LocationConstraint": region})
     kept.put_bucket_tagging(Bucket="maps-of-a-stack", Tagging={"TagSet": [TAG]})
     assert living_stacks(account, NAMES) == []
