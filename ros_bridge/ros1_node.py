@@ -246,7 +246,7 @@ def _import_rospy() -> Any:
     except ImportError as error:
         raise UsageError(
             f"rospy cannot be imported: {error}",
-            hint="apt install ros-core python3-yaml (Debian), or source the setup.bash of your ROS 1",
+            hint="install the packages that docs/ros.md names, or source the setup.bash of your ROS 1",
         ) from error
 
 

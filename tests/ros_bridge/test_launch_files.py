@@ -27,6 +27,8 @@ def test_the_launch_file_of_ros1_sets_parameters_of_the_bridge() -> None:
     assert set(params.values()) == {f"$(arg {name})" for name in params}
     same = {name: value for name, value in arguments.items() if name in ("colour", "depth", "info")}
     assert same == {name: OPTIONS[name] for name in same}
+    numbers = {name: float(arguments[name]) for name in ("queue_frames", "pair_within_s")}
+    assert numbers == {name: OPTIONS[name] for name in numbers}
     assert arguments["namespace"] == "/"  # roslaunch refuses an empty one
     assert node.attrib["ns"] == "$(arg namespace)"
 

@@ -18,6 +18,8 @@ ARGUMENTS = {
     "colour": "camera/color/image_raw",
     "depth": "camera/aligned_depth_to_color/image_raw",
     "info": "camera/color/camera_info",
+    "queue_frames": "5",
+    "pair_within_s": "0.02",
     "publish_odom": "true",
     "out": "",
 }
