@@ -32,6 +32,7 @@ CODES = {
     "ConnectError": "connect",
     "Crashed": "crashed",
     "DegenerateGeometry": "degenerate",
+    "DeploymentFailed": "deployment",
     "Disconnected": "disconnected",
     "Expired": "expired",
     "Forbidden": "forbidden",

@@ -131,7 +131,8 @@ def test_the_status_shows_what_a_running_agent_publishes(
     machine.sleep(60.0)
     agent.step()
 
-    group = read_group(open_account(region), SETTINGS, now=datetime.now(timezone.utc) + timedelta(minutes=1))
+    then = datetime.fromtimestamp(machine.wall_clock(), timezone.utc) + timedelta(minutes=1)
+    group = read_group(open_account(region), SETTINGS, now=then)
 
     assert [each.robots for each in group.servers] == [7, None]
 
