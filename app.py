@@ -10,7 +10,7 @@ from typing import Any
 import aws_cdk as cdk
 
 from rse_pf.config import PlatformSettings, load_settings
-from rse_pf.config.resource_names import DEPLOYMENT_TAG, ResourceNames
+from rse_pf.config.resource_names import DEPLOYMENT_TAG, SETTINGS_CONTEXT, ResourceNames
 from rse_pf.errors import RsePfError, SettingsError
 from stacks.backend_stack import BackendStack
 from stacks.data_stack import DataStack
@@ -60,14 +60,21 @@ def check_context(given: dict[str, Any], written: dict[str, Any]) -> None:
             raise SettingsError(f"context {name!r} of the command line is not used", hint=hint)
 
 
+def settings_file(given: dict[str, Any], root: Path) -> Path:
+    """Return the file that the context `SETTINGS_CONTEXT` names, or cdk.json beside this program."""
+    named = given.get(SETTINGS_CONTEXT)
+    return Path(named) if named else root / "cdk.json"
+
+
 def main() -> int:
     """Synthesise; print an error and its hint in two lines, and return 2, if that is not possible."""
     root = Path(__file__).parent
     try:
-        settings = load_settings(root / "cdk.json")
         written = json.loads((root / "cdk.json").read_text(encoding="utf-8")).get("context", {})
         app = cdk.App(context=written)
-        check_context(dict(app.node.get_all_context()), written)
+        given = dict(app.node.get_all_context())
+        check_context(given, written)
+        settings = load_settings(settings_file(given, root))
         build(app, settings, root / "build")
         app.synth()
     except RsePfError as error:

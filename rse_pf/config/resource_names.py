@@ -19,6 +19,7 @@ __all__ = [
     "READY_PATH",
     "ROBOTS_NAME",
     "ROSBRIDGE_PATH",
+    "SETTINGS_CONTEXT",
     "SERVICES_PREFIX",
     "STACKS",
     "VERSION_PARAMETER",
@@ -51,6 +52,9 @@ AUDIT_PREFIX = "audit"
 """Of the pieces of audit logs in their bucket."""
 STACKS = ("Network", "Data", "Backend", "Serverless", "Observability")
 """The boxes that are stacks, in an order in which they can be deployed."""
+
+SETTINGS_CONTEXT = "rse-pf:settings"
+"""Of the CDK's context: the file of settings, where that is not cdk.json."""
 
 
 @dataclass(frozen=True, slots=True)

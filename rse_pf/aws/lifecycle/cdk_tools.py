@@ -11,16 +11,23 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from rse_pf.config import PlatformSettings
+from rse_pf.config.resource_names import SETTINGS_CONTEXT
 from rse_pf.errors import DeploymentFailed, UsageError
 
 __all__ = ["CdkTools"]
 
 
 class CdkTools:
-    """The tools of the checkout in the folder *checkout*; their output goes to the terminal."""
+    """The tools of the checkout in the folder *checkout*; their output goes to the terminal.
 
-    def __init__(self, checkout: Path, settings: PlatformSettings, account_id: str) -> None:
+    *settings_file* is where the settings come from, None for the checkout's cdk.json.
+    """
+
+    def __init__(
+        self, checkout: Path, settings: PlatformSettings, account_id: str, settings_file: Path | None = None
+    ) -> None:
         self._checkout = checkout
+        self._settings_file = settings_file
         self._cloud = settings.cloud
         self._account_id = account_id
 
@@ -45,7 +52,9 @@ class CdkTools:
         self._cdk(f"the deployment of {stack}", ["deploy", stack, *options])
 
     def _cdk(self, what: str, words: Sequence[str]) -> None:
-        self._run(what, ["sh", "scripts/cdk.sh", *words])
+        file = self._settings_file
+        context = [] if file is None else ["--context", f"{SETTINGS_CONTEXT}={file.resolve()}"]
+        self._run(what, ["sh", "scripts/cdk.sh", *words, *context])
 
     def _run(self, what: str, command: Sequence[str]) -> None:
         script = next(word for word in command if word.startswith("scripts/"))

@@ -63,10 +63,10 @@ def deployment_costs(settings: PlatformSettings) -> DeploymentCosts:
     return DeploymentCosts(settings, operators_prices(None, Path.cwd()))
 
 
-def make_tools(account: Account, settings: PlatformSettings) -> CdkTools:
+def make_tools(account: Account, settings: PlatformSettings, args: argparse.Namespace) -> CdkTools:
     """Return the tools of the checkout in the working folder; tests put others in their place."""
     who = account.find("sts", "get_caller_identity") or {}
-    return CdkTools(Path.cwd(), settings, str(who.get("Account", "")))
+    return CdkTools(Path.cwd(), settings, str(who.get("Account", "")), args.settings)
 
 
 def open_world(account: Account, settings: PlatformSettings, tools: Tools) -> StepContext:

@@ -48,7 +48,8 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     _show_kept(prove(account, names, costs.prices, now=datetime.now(timezone.utc)), is_over=False)
     if not changing.confirmed(args) or (args.delete_data and not _confirmed_twice(args, names)):
         return 1
-    changing.perform(plan, changing.open_world(account, settings, changing.make_tools(account, settings)))
+    tools = changing.make_tools(account, settings, args)
+    changing.perform(plan, changing.open_world(account, settings, tools))
     proof = _last_proof(account, names, costs)
     _show_kept(proof, is_over=True)
     for each in proof.left:

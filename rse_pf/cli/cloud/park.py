@@ -40,6 +40,7 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     show("stored maps and logs are not in these prices", *costs.warnings(settings))
     if not changing.confirmed(args):
         return 1
-    changing.perform(plan, changing.open_world(account, settings, changing.make_tools(account, settings)))
+    tools = changing.make_tools(account, settings, args)
+    changing.perform(plan, changing.open_world(account, settings, tools))
     show("the platform is parked; rse-pf cloud resume ends that")
     return 0

@@ -23,7 +23,7 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     from rse_pf.aws.lifecycle.plan import plan_resume
 
     account = open_account(settings.cloud.region)
-    tools = changing.make_tools(account, settings)
+    tools = changing.make_tools(account, settings, args)
     deployment = read_deployment(account, settings)
     plan = plan_resume(deployment, has_packages=tools.has_packages)
     is_deep = deployment.note is not None and deployment.note.deep

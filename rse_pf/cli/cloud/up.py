@@ -28,7 +28,7 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     from rse_pf.aws.lifecycle.plan import plan_up
 
     account = open_account(settings.cloud.region)
-    tools = changing.make_tools(account, settings)
+    tools = changing.make_tools(account, settings, args)
     plan = plan_up(read_deployment(account, settings), has_packages=tools.has_packages)
     if lacks(account, settings):
         return 1

@@ -33,6 +33,20 @@ def test_the_cdk_gets_one_stack_the_region_and_the_qualifier(checkout: Path) -> 
     assert second.startswith("deploy RsePf-Data --exclusively --require-approval never")
 
 
+def test_the_file_of_settings_reaches_the_synthesis(
+    checkout: Path, tmp_path: Path, repository: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("aws_cdk", reason="the infra extra is not installed")
+    from app import settings_file
+
+    monkeypatch.chdir(tmp_path)
+    CdkTools(checkout, SETTINGS, "1", Path("lab.json")).deploy("RsePf-lab-Data")
+
+    name, _, value = (checkout / "called").read_text().split()[-1].partition("=")
+    assert settings_file({name: value}, repository) == tmp_path / "lab.json"
+    assert settings_file({}, repository) == repository / "cdk.json"
+
+
 def test_a_deployment_that_fails_says_that_the_same_command_continues(checkout: Path) -> None:
     (checkout / "code").write_text("1")
 
