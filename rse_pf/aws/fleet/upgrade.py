@@ -44,6 +44,8 @@ _ACTIVE = ("Pending", "InProgress", "Baking", "Cancelling", "RollbackInProgress"
 _ABANDONED = ("Cancelled", "Failed")
 _LIFECYCLE = "Lifecycle Action"
 _LINES = 12
+_NOT_LISTED: Mapping[str, Any] = {"Status": "Pending"}
+"""What a refresh counts as that AWS has just started and does not list yet."""
 _STACK_BUSY = "_IN_PROGRESS"
 _STACK_POLLS = 180
 
@@ -160,7 +162,7 @@ def read_state(account: Account, settings: PlatformSettings) -> Release:
         group=str(_specification(group).get("Version", "")),
         instances=tuple(versions),
         recorded=_parameters(account, names).get(VERSION_PARAMETER, ""),
-        refresh=max(refreshes, key=lambda each: str(each.get("StartTime", "")), default=None),
+        refresh=max(refreshes, key=_newness, default=None),
         raw_group=group,
     )
 
@@ -200,15 +202,16 @@ def upgrade(
     """
     release = read_state(account, settings)
     step = next_step(release)
-    version, replaced = release.newest, False
+    version, replaced, identity = release.newest, False, ""
     if step in (UpgradeStep.REFRESH, UpgradeStep.FOLLOW):
         begun = now()
         if step is UpgradeStep.FOLLOW and release.refresh is not None:
             tell("a refresh runs already; following it")
             begun = release.refresh.get("StartTime", begun)
             version = _version_of(release.refresh) or version
+            identity = release.refresh["InstanceRefreshId"]
         elif release.raw_group["Instances"]:
-            _start(account, settings, release, tell)
+            identity = _start(account, settings, release, tell)
         else:
             account.change(
                 "autoscaling", "update_auto_scaling_group",
@@ -216,7 +219,7 @@ def upgrade(
                 **with_version(release.raw_group, version),
             )  # fmt: skip
         if release.raw_group["Instances"]:
-            ended = _follow(account, settings, begun, tell, sleep)
+            ended = _follow(account, settings, identity, begun, tell, sleep)
             if ended.reason:
                 return ended
             replaced = True
@@ -229,7 +232,8 @@ def upgrade(
 
 def _start(
     account: Account, settings: PlatformSettings, release: Release, tell: Callable[[str], None]
-) -> None:
+) -> str:
+    """Start an instance refresh; return its id."""
     names = ResourceNames(settings.cloud.name)
     wanted = {names.alarm(name): name for name in WATCHED}
     rows = account.pages("cloudwatch", "describe_alarms", "MetricAlarms", AlarmNames=list(wanted))
@@ -238,30 +242,32 @@ def _start(
     for name in firing:
         tell(f"alarm {name} fires already, so it does not end this upgrade")
     tell(f"replacing servers: version {release.group} by {release.newest}")
-    account.change(
+    started = account.change(
         "autoscaling", "start_instance_refresh", AutoScalingGroupName=names.group, Strategy="Rolling",
         DesiredConfiguration=with_version(release.raw_group, release.newest),
         Preferences=preferences(settings, quiet),
     )  # fmt: skip
+    return str(started["InstanceRefreshId"])
 
 
 def _follow(
     account: Account,
     settings: PlatformSettings,
+    identity: str,
     begun: datetime,
     tell: Callable[[str], None],
     sleep: Callable[[float], None],
 ) -> Upgraded:
-    """Tell the progress until the refresh has ended; a failed launch takes it back at once."""
+    """Tell the progress until the refresh *identity* has ended; a failed launch takes it back at once."""
     names = ResourceNames(settings.cloud.name)
     told, cause = "", ""
     console: tuple[str, ...] = ()
     while True:
         rows = account.pages(
             "autoscaling", "describe_instance_refreshes", "InstanceRefreshes",
-            AutoScalingGroupName=names.group,
+            AutoScalingGroupName=names.group, InstanceRefreshIds=[identity],
         )  # fmt: skip
-        refresh = max(rows, key=lambda each: str(each.get("StartTime", "")))
+        refresh = rows[0] if rows else _NOT_LISTED
         state = state_of_refresh(refresh)
         line = f"{state.value}: {refresh.get('PercentageComplete', 0)} %"
         if line != told:
@@ -285,6 +291,11 @@ def _follow(
                 tell(f"a new server did not become ready: {cause}")
                 account.find("autoscaling", "rollback_instance_refresh", AutoScalingGroupName=names.group)
         sleep(POLL_S)
+
+
+def _newness(refresh: Mapping[str, Any]) -> tuple[bool, str]:
+    """Return a key that sorts the newest refresh to the end; one that waits may have no start yet."""
+    return refresh["Status"] in _ACTIVE, str(refresh.get("StartTime", ""))
 
 
 def _failed_launch(account: Account, names: ResourceNames, begun: datetime) -> Mapping[str, Any] | None:

@@ -63,6 +63,7 @@ class FakeAws:
         self.calls: list[str] = []
         self.least_serving = servers
         self.interrupt_at = -1
+        self.unlisted = 0
         self.waits = 0
 
     def account(self) -> Account:
@@ -128,8 +129,16 @@ class FakeAws:
     def describe_launch_templates(self, **_: Any) -> dict[str, Any]:
         return {"LaunchTemplates": [{"LatestVersionNumber": int(self.newest)}]}
 
-    def describe_instance_refreshes(self, **_: Any) -> dict[str, Any]:
-        return {"InstanceRefreshes": [dict(each) for each in self.refreshes]}
+    def describe_instance_refreshes(self, InstanceRefreshIds: Any = None, **_: Any) -> dict[str, Any]:
+        if InstanceRefreshIds and self.unlisted:
+            self.unlisted -= 1
+            return {"InstanceRefreshes": []}
+        wanted = InstanceRefreshIds or [each["InstanceRefreshId"] for each in self.refreshes]
+        found = [dict(each) for each in self.refreshes if each["InstanceRefreshId"] in wanted]
+        for each in found:
+            if each["Status"] == "Pending":
+                del each["StartTime"]
+        return {"InstanceRefreshes": found}
 
     def describe_alarms(self, AlarmNames: list[str], **_: Any) -> dict[str, Any]:
         states = {name: "ALARM" if name in self.firing else "OK" for name in AlarmNames}
@@ -144,13 +153,14 @@ class FakeAws:
 
     def start_instance_refresh(self, DesiredConfiguration: Any, Preferences: Any, **_: Any) -> dict[str, Any]:
         assert not self.refreshes or self.refreshes[-1]["Status"] not in ("Pending", "InProgress")
+        identity = f"refresh-{len(self.refreshes) + 1}"
         self.refreshes.append(
             {
-                "Status": "Pending", "StartTime": self.now, "DesiredConfiguration": DesiredConfiguration,
-                "Preferences": Preferences,
+                "InstanceRefreshId": identity, "Status": "Pending", "StartTime": self.now,
+                "DesiredConfiguration": DesiredConfiguration, "Preferences": Preferences,
             }
         )  # fmt: skip
-        return {}
+        return {"InstanceRefreshId": identity}
 
     def rollback_instance_refresh(self, **_: Any) -> dict[str, Any]:
         self.refreshes[-1]["Status"] = "RollbackInProgress"
@@ -280,6 +290,49 @@ def test_an_interrupted_upgrade_is_followed_and_finished_by_the_next(at: int) ->
     assert aws.servers == ["2", "2", "2"]
     assert (aws.group, aws.recorded) == ("2", "2")
     assert len(aws.refreshes) == 1, "a second refresh was started beside the first"
+
+
+def with_an_earlier_refresh(aws: FakeAws) -> FakeAws:
+    wanted = {"LaunchTemplate": {**TEMPLATE, "Version": "1"}}
+    started = START - timedelta(days=1)
+    aws.refreshes.append(
+        {
+            "InstanceRefreshId": "refresh-1", "Status": "Successful", "StartTime": started,
+            "PercentageComplete": 100, "DesiredConfiguration": wanted,
+        }
+    )  # fmt: skip
+    return aws
+
+
+def test_a_refresh_that_has_not_started_is_not_taken_for_the_successful_one_before() -> None:
+    aws = with_an_earlier_refresh(FakeAws())
+
+    ended, told = run(aws)
+
+    assert (ended.version, aws.servers, aws.recorded) == ("2", ["2", "2", "2"], "2")
+    assert told[1] == "running: 0 %"
+
+
+def test_a_refresh_that_waits_is_followed_and_no_second_one_started() -> None:
+    aws = with_an_earlier_refresh(FakeAws())
+    aws.interrupt_at = 1
+    with pytest.raises(Interrupted):
+        run(aws)
+
+    ended, told = run(aws)
+
+    assert told[0] == "a refresh runs already; following it"
+    assert (ended.version, aws.servers, len(aws.refreshes)) == ("2", ["2", "2", "2"], 2)
+
+
+@pytest.mark.parametrize("has_earlier", [False, True])
+def test_a_refresh_that_is_not_listed_yet_counts_as_running(has_earlier: bool) -> None:
+    aws = with_an_earlier_refresh(FakeAws()) if has_earlier else FakeAws()
+    aws.unlisted = 2
+
+    ended, _ = run(aws)
+
+    assert (ended.version, ended.reason, aws.servers) == ("2", "", ["2", "2", "2"])
 
 
 def test_nothing_is_done_when_every_server_runs_the_newest_version() -> None:
