@@ -55,7 +55,6 @@ NEEDS_AN_ACCOUNT = {
     "aws sns subscribe --topic-arn TOPIC --protocol email --notification-endpoint you@example.org",
     "make assets",
     "npx cdk diff",
-    "npx cdk deploy RsePf-Backend",
     "rse-pf cloud upgrade",
     "aws ec2 get-console-output --latest --output text --instance-id INSTANCE",
     "aws autoscaling describe-scaling-activities --auto-scaling-group-name rse-pf-jobs --max-items 5",
