@@ -41,6 +41,8 @@ _SERVER = "lambda"
 # How long a revoked token may still be accepted; there is no connection that could be closed.
 _MAX_STALE_S = 30.0
 _MAX_HEADERS = 200
+_RIGHT = "services:pnp"
+"""Without it a token gets nothing here, and nothing is counted."""
 _READ = ("authorization", "content-type")
 """Headers that mean something here."""
 
@@ -114,6 +116,8 @@ class Answering:
         except RsePfError as error:
             return _rejected(error)
         try:
+            if not scopes_allow(who.scopes, _RIGHT):
+                raise _forbidden(_RIGHT)
             self._budget.take(who.robot, now_s)
             message = codec.decode_from_robot(self._decoded(body))
             if not isinstance(message, Command):
@@ -127,9 +131,7 @@ class Answering:
         if (clock() - arrived) * 1e3 >= allowed_ms:
             return self._encoded(codec, self._late(message))
         if not scopes_allow(who.scopes, f"services:{message.service}"):
-            forbidden = Forbidden(
-                f"this token does not hold the scope services:{message.service}", hint="issue one that does"
-            )
+            forbidden = _forbidden(f"services:{message.service}")
             return self._encoded(codec, failure_of(forbidden, message, server=_SERVER))
         answer = dispatch(self._registry, message, clock, server=_SERVER)
         if (clock() - arrived) * 1e3 > allowed_ms:
@@ -177,6 +179,10 @@ class Answering:
 
 def _to_stderr(**fields: Any) -> None:
     sys.stderr.write(json.dumps(fields) + "\n")
+
+
+def _forbidden(right: str) -> Forbidden:
+    return Forbidden(f"this token does not hold the scope {right}", hint="issue one that does")
 
 
 def _rejected(error: RsePfError) -> LambdaAnswer:

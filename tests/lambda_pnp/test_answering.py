@@ -285,6 +285,24 @@ def test_the_budget_of_a_robot_counts_whatever_it_sends() -> None:
     assert codes == ["bad-message", "unknown-service", "quota"]
 
 
+@pytest.mark.parametrize("body", [b"nonsense", make_codec("zlib").encode(Command(id=1, service="pnp"))])
+def test_a_token_without_the_scope_spends_nothing_of_the_budget(body: bytes) -> None:
+    claimed: list[int] = []
+
+    def claim(day: str, wanted: int, most: int) -> int:
+        claimed.append(wanted)
+        return wanted
+
+    token = KEY.issue("robot-2", now=NOW_S, token_id="t", settings=SETTINGS.auth, scopes=("maps:read",))
+    told = Answering(SETTINGS, KEYS, claim).answer(
+        event(body, token=token), now_s=NOW_S, left_ms=9e3, clock=lambda: 0.0
+    )
+    message = make_codec("zlib").decode_from_server(told.body)
+
+    assert isinstance(message, Failure)
+    assert (told.status, message.code, claimed) == (200, "forbidden", [])
+
+
 def rejected(what: Any) -> tuple[int, str]:
     answered = answering().answer(what, now_s=NOW_S, left_ms=9e3, clock=lambda: 0.0)
     return answered.status, json.loads(answered.body)["code"]
