@@ -2,8 +2,9 @@
 
 Any number of executions run at the same time and share nothing but the artifact bucket.  Each takes a lease
 of a part of the day's commands there, by compare-and-swap, before it answers them.  What is lost with an
-execution that ends is not given again, so the commands of all robots never exceed the budget.  The count of
-one robot is kept by each execution alone.
+execution that ends is not given again, so the commands of all robots never exceed the budget; the first lease
+is small and each further one twice as large, so that executions which end early lose little.  The count of one
+robot is kept by each execution alone.
 """
 
 from __future__ import annotations
@@ -28,7 +29,9 @@ Claim = Callable[[str, int, int], int]
 
 _DAY_S = 86400.0
 _LEASES = 200
-"""A lease is this part of the day's commands."""
+"""A lease is at most this part of the day's commands."""
+_FIRST_LEASE = 50
+"""Commands; each further lease of an execution is twice as large as the one before."""
 _PAUSE_S = 5.0
 _TIMEOUT_S = 3.0
 _TRIES = 4
@@ -46,6 +49,7 @@ class DayBudget:
         self._claim = claim
         self._day = ""
         self._lease = 0
+        self._wanted = _FIRST_LEASE
         self._is_spent = False
         self._next_claim_s = float("-inf")
         self._robots: Counter[RobotId] = Counter()
@@ -59,7 +63,7 @@ class DayBudget:
         """
         day = datetime.fromtimestamp(now_s, timezone.utc).strftime("%Y-%m-%d")
         if day != self._day:
-            self._day, self._lease, self._is_spent = day, 0, False
+            self._day, self._lease, self._wanted, self._is_spent = day, 0, _FIRST_LEASE, False
             self._robots.clear()
         rest_ms = (_DAY_S - now_s % _DAY_S) * 1e3
         if self._robots[robot] >= self._settings.robot_commands_per_day:
@@ -76,12 +80,13 @@ class DayBudget:
             return
         if now_s < self._next_claim_s:
             raise _unknown(self._next_claim_s - now_s)
-        wanted = max(1, self._settings.commands_per_day // _LEASES)
+        wanted = min(self._wanted, max(1, self._settings.commands_per_day // _LEASES))
         try:
             self._lease = self._claim(self._day, wanted, self._settings.commands_per_day)
         except (OSError, RsePfError) as error:
             self._next_claim_s = now_s + _PAUSE_S
             raise _unknown(_PAUSE_S) from error
+        self._wanted = 2 * wanted
         self._is_spent = self._lease < 1
 
 

@@ -113,11 +113,28 @@ def test_executions_that_claim_at_the_same_moment_do_not_get_the_same_lease() ->
     assert json.loads(bucket.body)["granted"] == 6, "three leases of two"
 
 
-def test_a_lease_costs_two_requests_for_many_commands() -> None:
-    bucket = Bucket()
-    taken(budget(bucket, every=100_000), 1500)
+def test_a_lease_doubles_until_it_costs_two_requests_for_many_commands() -> None:
+    bucket, wanted = Bucket(), []
 
-    assert bucket.puts == 3
+    def claim(day: str, count: int, most: int) -> int:
+        wanted.append(count)
+        return bucket.claim(day, count, most)
+
+    each = DayBudget(BurstSettings(robot_commands_per_day=10**6, commands_per_day=100_000), claim)
+    taken(each, 2250)
+    assert wanted == [50, 100, 200, 400, 500, 500, 500]
+
+    taken(each, 1, now_s=NOON_S + 86400)
+    assert wanted[-1] == 50, "a new day begins with few commands"
+
+
+def test_executions_that_end_after_a_few_commands_leave_most_of_the_day_to_others() -> None:
+    bucket, settings = Bucket(), BurstSettings()
+    for _ in range(500):
+        assert taken(DayBudget(settings, bucket.claim), 3) == 3
+
+    assert bucket.body is not None
+    assert json.loads(bucket.body)["granted"] <= settings.commands_per_day * 0.05
 
 
 def test_a_robot_has_a_budget_of_its_own_and_tenants_are_apart() -> None:
