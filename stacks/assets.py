@@ -14,7 +14,7 @@ from rse_pf.config import PlatformSettings
 from rse_pf.config.server_settings import server_settings
 from rse_pf.errors import ConfigurationError
 
-__all__ = ["ENVIRONMENT_FILE", "SERVERS", "SETTINGS_FILE", "SUMS_FILE", "staged", "sums_digest"]
+__all__ = ["ENVIRONMENT_FILE", "SERVERS", "SETTINGS_FILE", "SUMS_FILE", "staged", "sums_digest", "sums_text"]
 
 SETTINGS_FILE = "settings.json"
 SUMS_FILE = "SHA256SUMS"
@@ -53,7 +53,7 @@ def staged(assets: Path, name: str, settings: PlatformSettings, into: Path) -> P
         for file in sorted(_BOOT.iterdir()):
             if file.is_file() and file.name != _IN_USER_DATA:
                 shutil.copyfile(file, target / file.name)
-        (target / SUMS_FILE).write_text(_sums(target), encoding="utf-8")
+        (target / SUMS_FILE).write_text(sums_text(target), encoding="utf-8")
     return target
 
 
@@ -92,7 +92,7 @@ def _digest(file: Path) -> str:
     return hashlib.sha256(file.read_bytes()).hexdigest()
 
 
-def _sums(folder: Path) -> str:
+def sums_text(folder: Path) -> str:
     """Return one line for each file, as sha256sum writes it."""
     files = sorted(file for file in folder.rglob("*") if file.is_file() and file.name != SUMS_FILE)
     return "".join(

@@ -12,7 +12,7 @@ from aws_cdk import aws_logs as logs
 from constructs import Construct
 
 from rse_pf.config import PlatformSettings
-from rse_pf.config.cloud_layout import endpoint_services, zone_count
+from rse_pf.config.cloud_layout import ENDPOINT_SERVICES, zone_count
 from rse_pf.config.resource_names import ResourceNames
 from stacks.findings import acknowledge
 from stacks.firewall import Firewall, front_port, inner_ports, live_range
@@ -69,7 +69,7 @@ class NetworkStack(cdk.Stack):
                 resources=["*"], conditions={"StringEquals": {"aws:ResourceAccount": self.account}},
             )
         )  # fmt: skip
-        for service in endpoint_services(settings):
+        for service in ENDPOINT_SERVICES:
             self.vpc.add_interface_endpoint(
                 service.capitalize(), service=ec2.InterfaceVpcEndpointAwsService(service), open=False,
                 security_groups=[self.firewall.endpoints],

@@ -2,7 +2,8 @@
 
 The limits come from `rse_pf.config.front_door`.  Blocked requests get 429 with ``Retry-After`` and never 403:
 a robot must be able to tell a firewall that it should wait for from a server that refuses it for good.
-Commands for the burst function must carry what looks like a token, because each call of it is paid.
+Commands for the burst function must carry what looks like a token, because each call of it is paid; this is
+judged first, so that what is blocked for want of a token does not count in the rate of all robots.
 """
 
 from __future__ import annotations
@@ -58,8 +59,8 @@ class WebFirewall(Construct):
                 ),
             },
             rules=[
-                *(_rule(names.prefix, place, rule) for place, rule in enumerate(rates)),
-                _burst_needs_a_token(names.prefix, len(rates)),
+                _burst_needs_a_token(names.prefix, 0),
+                *(_rule(names.prefix, place, rule) for place, rule in enumerate(rates, start=1)),
             ],
         )  # fmt: skip
         wafv2.CfnWebACLAssociation(self, "OfAlb", resource_arn=alb_arn, web_acl_arn=acl.attr_arn)

@@ -29,7 +29,7 @@ from system.boot.world import World, debian_root, missing  # noqa: E402
 
 from rse_pf.config import PlatformSettings  # noqa: E402
 from rse_pf.config.resource_names import READY_PATH  # noqa: E402
-from stacks.assets import SERVERS, SUMS_FILE, _sums, staged, sums_digest  # noqa: E402
+from stacks.assets import SERVERS, SUMS_FILE, staged, sums_digest, sums_text  # noqa: E402
 
 WAYS = ("pip", "archive")
 BAR = 5.0
@@ -117,7 +117,7 @@ def use_pip(package: Path, build: Path) -> None:
     script = package / "install.py"
     text = script.read_text(encoding="utf-8")
     script.write_text(text.replace('if __name__ == "__main__":', f'{PIP_UNPACK}if __name__ == "__main__":'))
-    (package / SUMS_FILE).write_text(_sums(package), encoding="utf-8")
+    (package / SUMS_FILE).write_text(sums_text(package), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from rse_pf.config.cloud_layout import endpoint_services
+from rse_pf.config.cloud_layout import ENDPOINT_SERVICES
 
 Assembly = Any
 
@@ -149,7 +149,7 @@ def test_every_endpoint_has_an_action_that_a_role_of_the_servers_uses(assembly: 
     (servers,) = [role for role in roles_of(assembly) if role.path.endswith("/Servers/Role/Resource")]
     used = {action.partition(":")[0] for action in servers.actions}
 
-    assert services == set(endpoint_services(assembly.settings))
+    assert services == set(ENDPOINT_SERVICES)
     assert {SERVICES_OF_ENDPOINTS[each] for each in services} <= used
 
 

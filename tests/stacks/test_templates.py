@@ -133,7 +133,7 @@ def _listed(value: str | list[str]) -> list[str]:
 def test_what_the_commands_look_for_is_what_the_stacks_call_it(assembly: Assembly) -> None:
     from rse_pf.auth.trust_store import DENY_NAME, ROBOTS_NAME
     from rse_pf.aws.storage.key_store import KEYS_NAME
-    from rse_pf.config.cloud_layout import endpoint_services, zone_count
+    from rse_pf.config.cloud_layout import ENDPOINT_SERVICES, zone_count
     from rse_pf.config.resource_names import ResourceNames
     from stacks import backend_stack
 
@@ -149,7 +149,7 @@ def test_what_the_commands_look_for_is_what_the_stacks_call_it(assembly: Assembl
     interfaces = [
         each for each in assembly.all("AWS::EC2::VPCEndpoint") if each["VpcEndpointType"] == "Interface"
     ]
-    assert len(interfaces) == len(endpoint_services(assembly.settings))
+    assert len(interfaces) == len(ENDPOINT_SERVICES)
     assert {len(each["SubnetIds"]) for each in interfaces} == {zone_count(assembly.settings)}
 
 

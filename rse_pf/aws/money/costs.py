@@ -15,7 +15,7 @@ from typing import Literal
 from rse_pf.aws.fleet.metrics import ServerMetrics, datums
 from rse_pf.aws.money.prices import Prices
 from rse_pf.config import PlatformSettings
-from rse_pf.config.cloud_layout import CANARY_MB, CANARY_PERIOD_S, endpoint_services, zone_count
+from rse_pf.config.cloud_layout import CANARY_MB, CANARY_PERIOD_S, ENDPOINT_SERVICES, zone_count
 from rse_pf.config.front_door import rate_rules
 from rse_pf.scaling.alarms import alarms_of
 from rse_pf.scaling.operator_alarms import operator_alarms
@@ -295,7 +295,7 @@ def _front_lines(settings: PlatformSettings, prices: Prices, load: Load) -> Iter
         *(
             (box, f"endpoint of {service}, in {zone_count(settings)} zone(s)",
              zone_count(settings) * HOURS, "h", prices.endpoint_per_hour)
-            for service, box in endpoint_services(settings).items()
+            for service, box in ENDPOINT_SERVICES.items()
         ),
     )  # fmt: skip
     for box, what, count, unit, price in rows:

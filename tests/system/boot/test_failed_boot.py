@@ -55,12 +55,12 @@ def test_a_package_that_was_changed_ends_the_launch_and_the_console_says_which_f
 def test_an_install_that_fails_ends_the_launch_and_the_console_has_its_last_lines(
     world: World, package: Path, tmp_path: Path
 ) -> None:
-    from stacks.assets import SUMS_FILE, _sums, sums_digest
+    from stacks.assets import SUMS_FILE, sums_digest, sums_text
 
     copy = damaged(package, tmp_path)
     about = copy / "environment.json"
     about.write_text(about.read_text().replace('"3.11"', '"3.12"'))
-    (copy / SUMS_FILE).write_text(_sums(copy))
+    (copy / SUMS_FILE).write_text(sums_text(copy))
 
     world.boot(copy, sums_digest(copy))
 
@@ -73,12 +73,12 @@ def test_an_install_that_fails_ends_the_launch_and_the_console_has_its_last_line
 def test_a_release_whose_server_never_gets_ready_ends_the_launch(
     world: World, package: Path, tmp_path: Path
 ) -> None:
-    from stacks.assets import SUMS_FILE, _sums, sums_digest
+    from stacks.assets import SUMS_FILE, sums_digest, sums_text
 
     copy = damaged(package, tmp_path)
     unit = copy / "rse-pf.service"
     unit.write_text(unit.read_text().replace("/bin/rse-pf serve", "/bin/rse-pf serve --no-such-option"))
-    (copy / SUMS_FILE).write_text(_sums(copy))
+    (copy / SUMS_FILE).write_text(sums_text(copy))
 
     world.boot(copy, sums_digest(copy))
 

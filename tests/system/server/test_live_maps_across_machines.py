@@ -78,7 +78,8 @@ class Machine:
         while not announce.exists():
             assert self.process.poll() is None, self.log
             assert time.monotonic() < end_s, self.log
-            os.sched_yield()
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                self.process.wait(0.05)
 
     def kill(self) -> None:
         """End all processes of the server at once, as a machine that fails ends them."""
