@@ -61,6 +61,13 @@ def test_a_call_without_what_looks_like_a_token_never_reaches_the_function(firew
     assert rule["Action"]["Block"]["CustomResponse"]["ResponseCode"] == 401
 
 
+def test_calls_without_what_looks_like_a_token_are_blocked_before_any_rate_counts_them(firewall: Any) -> None:
+    first = min(firewall, key=lambda each: int(each["Priority"]))
+
+    assert first["Name"] == "burst-needs-a-token", "strangers would use up the commands of all robots"
+    assert len({each["Priority"] for each in firewall}) == len(firewall)
+
+
 def test_calls_with_an_invented_token_are_bounded_by_address_and_in_all(
     assembly: Assembly, firewall: Any
 ) -> None:
