@@ -7,6 +7,7 @@ at most twice a second.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import threading
 import time
@@ -26,7 +27,7 @@ from rse_pf.backend.jobs.runner import WAITING, JobContext, JobOutcome, JobSigna
 from rse_pf.backend.ports import Log
 from rse_pf.backend.robot_store import quota_bytes
 from rse_pf.backend.scheduling.scheduler import QueuedCommand
-from rse_pf.errors import BadRequest, Busy, Cancelled, RsePfError
+from rse_pf.errors import BadRequest, Busy, Cancelled, RsePfError, StoreError
 from rse_pf.identity import RobotId
 from rse_pf.service import failure_of
 from rse_pf.wire import Failure, Progress, Result
@@ -56,6 +57,7 @@ class _Entry:
     done: float = 0.0
     what: str = WAITING
     thread: threading.Thread | None = None
+    is_displaced: bool = False
 
 
 class JobManager:
@@ -194,6 +196,7 @@ class JobManager:
         row = job_to_displace(known, request.robot)
         if row is None:
             return False
+        here[row].is_displaced = True
         here[row].signals.give_up()
         waiters, here[row].waiters = here[row].waiters, []
         for waiter in waiters:
@@ -214,6 +217,9 @@ class JobManager:
             except Exception as error:  # noqa: BLE001  a defect must not leave the robot without an answer
                 self._log.error("job-defect", service=entry.request.service, reason=repr(error))
                 outcome = JobOutcome(error=RsePfError("the job failed", hint="the server's log has it"))
+            if entry.is_displaced and self._context.queue is not None:
+                with contextlib.suppress(StoreError):  # a job server computes what nobody waits for
+                    self._context.queue.withdraw(entry.request)
             in_loop(self._on_outcome, entry, outcome)
             if not outcome.is_given_up:
                 self._collector.collect()
