@@ -9,14 +9,18 @@ import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
+from rse_pf.backend.jobs.lease import JobLease, record_name, verdict_on
 from rse_pf.backend.jobs.queue import JobOffer, JobQueue
-from rse_pf.backend.jobs.runner import JobContext, JobOutcome, JobSignals, run_job
+from rse_pf.backend.jobs.runner import WAITING, JobContext, JobOutcome, JobSignals, run_job
 from rse_pf.backend.ports import Log
+from rse_pf.errors import StoreError
 from rse_pf.identity import RobotId
 
 __all__ = ["JobServer"]
 
 _CLOSE_TIMEOUT_S = 5.0
+_DECIDE_TIMEOUT_S = 5.0
+"""For this long a look waits until it is known whether a job runs here; it takes a few requests."""
 _MAX_SERVED = 1000
 """Robots whose turn is remembered."""
 
@@ -24,6 +28,8 @@ _MAX_SERVED = 1000
 @dataclass(eq=False, slots=True)
 class _Running:
     signals: JobSignals = field(default_factory=JobSignals)
+    is_decided: threading.Event = field(default_factory=threading.Event)
+    """Set when the job runs here, or will not."""
     thread: threading.Thread | None = None
 
 
@@ -36,7 +42,7 @@ class JobServer:
         """Run nothing yet.
 
         Args:
-            context: Store, slots, processes and settings.
+            context: Store, slots, processes and settings; it does not follow.
             queue: Where jobs wait.
             log: Of this server.
             new_owner: Returns a name that is unique among all servers.
@@ -49,12 +55,13 @@ class JobServer:
         self._slots = slots
         self._served: dict[str, int] = {}
         self._jobs: dict[tuple[RobotId, str], _Running] = {}
+        self._watched: dict[str, tuple[JobLease, str]] = {}
         self._lock = threading.Lock()
         self._is_leaving = False
 
     @property
     def running(self) -> int:
-        """Jobs that run here, or that another server is watched with."""
+        """Jobs that run here."""
         with self._lock:
             return len(self._jobs)
 
@@ -62,11 +69,17 @@ class JobServer:
         """Begin with jobs that wait; raises StoreError."""
         if self._is_leaving or self.running >= self._slots:
             return
+        seen: set[str] = set()
         for offer in self._queue.offers(self._served):
             if self.running >= self._slots:
                 return
-            if (offer.request.robot, offer.request.key) not in self._jobs:
-                self._begin(offer)
+            name = record_name(offer.request.robot, offer.request.key)
+            seen.add(name)
+            if (offer.request.robot, offer.request.key) in self._jobs or not self._may_begin(name):
+                continue
+            self._begin(offer, *self._watched.pop(name)).is_decided.wait(_DECIDE_TIMEOUT_S)
+        for name in self._watched.keys() - seen:
+            del self._watched[name]
 
     def leave(self) -> None:
         """Take no more jobs, and leave those that run to other servers."""
@@ -80,7 +93,29 @@ class JobServer:
             if job.thread is not None:
                 job.thread.join(max(0.0, until - self._context.clock()))
 
-    def _begin(self, offer: JobOffer) -> None:
+    def _may_begin(self, name: str) -> bool:
+        """Return whether no other server has the lease of the job with the record *name*, or renews it."""
+        context = self._context
+        if name not in self._watched:
+            owner = self._new_owner()
+            self._watched[name] = (JobLease(context.store, name, owner, context.clock), owner)
+        lease, _ = self._watched[name]
+        try:
+            record = lease.look()
+        except StoreError as error:
+            self._log.warning("job-record", record=name, reason=error.message)
+            return False
+        verdict = verdict_on(
+            record,
+            unchanged_s=lease.unchanged_s,
+            lease_s=context.settings.serving.job_lease_s,
+            is_watched=lease.is_watched,
+        )
+        if verdict == "failed":  # the server that ran it withdraws the offer; a later one is a new job
+            del self._watched[name]
+        return verdict not in ("follow", "failed")
+
+    def _begin(self, offer: JobOffer, lease: JobLease, owner: str) -> _Running:
         job, request = _Running(), offer.request
         latest = max(self._served.values(), default=0)
         if len(self._served) >= _MAX_SERVED:
@@ -89,15 +124,20 @@ class JobServer:
         with self._lock:
             self._jobs[request.robot, request.key] = job
 
+        def tell(done: float, what: str) -> None:
+            if what != WAITING:
+                job.is_decided.set()
+
         def work() -> None:
             outcome = JobOutcome()
             try:
-                outcome = run_job(request, self._context, job.signals, _tell_nobody, self._new_owner())
+                outcome = run_job(request, self._context, job.signals, tell, owner, lease)
             except Exception as error:  # noqa: BLE001  a defect must not end the other jobs
                 self._log.error("job-defect", service=request.service, reason=repr(error))
             finally:
                 with self._lock:
                     del self._jobs[request.robot, request.key]
+                job.is_decided.set()
                 job.signals.close()
             code = (
                 "given-up" if outcome.is_given_up else "ok" if outcome.error is None else outcome.error.code
@@ -109,7 +149,4 @@ class JobServer:
 
         job.thread = threading.Thread(target=work, name=f"job-{request.key[:8]}", daemon=True)
         job.thread.start()
-
-
-def _tell_nobody(done: float, what: str) -> None:
-    """Nobody waits here: the record has the progress."""
+        return job

@@ -8,8 +8,9 @@ job has an outcome, so that a job whose server died is found again.
 from __future__ import annotations
 
 import hashlib
+import itertools
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,7 +19,7 @@ import msgspec
 from rse_pf.backend.jobs.lease import decode_record, record_name
 from rse_pf.backend.jobs.process import JobRequest
 from rse_pf.config import PlatformSettings
-from rse_pf.errors import BadRequest, NotFound, StoreError
+from rse_pf.errors import BadRequest, NotFound, RsePfError, StoreError
 from rse_pf.identity import RobotId
 from rse_pf.object_store import ObjectStore
 from rse_pf.wire.arrays import binary_encode_hook, extension_hook
@@ -26,8 +27,10 @@ from rse_pf.wire.arrays import binary_encode_hook, extension_hook
 __all__ = ["JobOffer", "JobQueue", "has_jobs", "in_turn", "settings_digest_of"]
 
 _PREFIX = "job-queue/"
+_MAX_NAMES = 10_000
+"""Offers that take turns; those after them in the order of names wait until some of these are gone."""
 _MAX_READ = 200
-"""Offers that are read at once; more wait until these are gone."""
+"""Offers that are read, or whose records are counted, at once."""
 
 
 class _Stored(msgspec.Struct, frozen=True, kw_only=True):
@@ -81,9 +84,23 @@ def in_turn(names: Sequence[str], served: Mapping[str, int]) -> list[str]:
 class JobQueue:
     """The jobs that wait in one store."""
 
-    def __init__(self, store: ObjectStore, settings: PlatformSettings) -> None:
-        """Read nothing yet; *settings* are those of this server."""
+    def __init__(
+        self,
+        store: ObjectStore,
+        settings: PlatformSettings,
+        on_damaged: Callable[[str], None] = lambda name: None,
+    ) -> None:
+        """Read nothing yet.
+
+        Args:
+            store: Shared by all servers.
+            settings: Those of this server.
+            on_damaged: Called once with the name of an object that is no offer.
+        """
         self._store = store
+        self._on_damaged = on_damaged
+        self._others: set[str] = set()
+        self._damaged: set[str] = set()
         self._settings = settings_digest_of(settings)
 
     def offer(self, request: JobRequest) -> None:
@@ -114,49 +131,61 @@ class JobQueue:
     def offers(self, served: Mapping[str, int] | None = None) -> Iterator[JobOffer]:
         """Yield the jobs that servers with the same settings offer, so that robots take turns.
 
+        An object that is no offer is skipped.
+
         Args:
             served: When each robot's folder was served last, as a number that grows.
 
         Raises:
             StoreError: The store failed.
         """
-        for name in in_turn(self._names(), served or {}):
+        names = self._names(_MAX_NAMES)
+        self._others.intersection_update(names)
+        self._damaged.intersection_update(names)
+        ours = [name for name in in_turn(names, served or {}) if name not in self._others]
+        for name in ours[:_MAX_READ]:
             offer = self._read(name)
             if offer is not None and offer.settings == self._settings:
                 yield offer
+            elif offer is not None:
+                self._others.add(name)  # its key depends on the settings, so it stays one of others
 
     def waiting(self) -> int:
-        """Return how many offered jobs run nowhere; raises StoreError."""
-        return sum(not self._is_running(name) for name in self._names())
+        """Return how many of the first 200 offered jobs run nowhere; raises StoreError."""
+        return sum(not self._is_running(name) for name in self._names(_MAX_READ))
 
-    def _names(self) -> list[str]:
-        names = []
-        for info in self._store.list(_PREFIX):
-            names.append(info.name)
-            if len(names) == _MAX_READ:
-                break
-        return names
+    def _names(self, most: int) -> list[str]:
+        return [info.name for info in itertools.islice(self._store.list(_PREFIX), most)]
 
     def _read(self, name: str) -> JobOffer | None:
-        """Return the offer *name*; None if it was withdrawn meanwhile."""
+        """Return the offer *name*; None if it was withdrawn meanwhile, or is damaged."""
         try:
-            stored = msgspec.msgpack.decode(self._store.get(name), type=_Stored)
-            payload: Any = msgspec.msgpack.decode(stored.payload, ext_hook=extension_hook)
+            data = self._store.get(name)
         except NotFound:
             return None
-        except msgspec.MsgspecError as error:
-            raise StoreError(f"{name!r} is no offer of a job", hint="delete it") from error
-        request = JobRequest(
-            service=stored.service, payload=payload, robot=RobotId(*stored.robot), key=stored.key,
-            quota_bytes=stored.quota_bytes, trace=stored.trace,
-        )  # fmt: skip
+        try:
+            stored = msgspec.msgpack.decode(data, type=_Stored)
+            payload: Any = msgspec.msgpack.decode(stored.payload, ext_hook=extension_hook)
+            request = JobRequest(
+                service=stored.service, payload=payload, robot=RobotId(*stored.robot), key=stored.key,
+                quota_bytes=stored.quota_bytes, trace=stored.trace,
+            )  # fmt: skip
+        except (msgspec.MsgspecError, RsePfError, TypeError, ValueError):
+            if name not in self._damaged:
+                self._damaged.add(name)
+                self._on_damaged(name)
+            return None
         return JobOffer(request=request, settings=stored.settings)
 
     def _is_running(self, name: str) -> bool:
         record = f"jobs/{name.removeprefix(_PREFIX)}"
         try:
-            return decode_record(record, self._store.get(record)).state == "running"
+            data = self._store.get(record)
         except NotFound:
+            return False
+        try:
+            return decode_record(record, data).state == "running"
+        except StoreError:  # it is no record: nobody runs the job
             return False
 
 

@@ -62,6 +62,8 @@ class JobContext:
     """Where jobs that wait are offered to job servers; None where there are none."""
     finished: Callable[[JobRequest], None] | None = None
     """Called when a job has an outcome; a job server withdraws the offer."""
+    follows: bool = True
+    """Whether `run_job` waits for a job that another server runs; else it gives such a job up."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -123,7 +125,12 @@ Tell = Callable[[float, str], None]
 
 
 def run_job(
-    request: JobRequest, context: JobContext, signals: JobSignals, tell: Tell, owner: str
+    request: JobRequest,
+    context: JobContext,
+    signals: JobSignals,
+    tell: Tell,
+    owner: str,
+    watched: JobLease | None = None,
 ) -> JobOutcome:
     """Run or follow the job and return its outcome; blocks until then.
 
@@ -133,11 +140,14 @@ def run_job(
         signals: Set by the event loop of the worker.
         tell: Called in this thread with the share that is done, and what is being done.
         owner: Name that is unique to this process and this call.
+        watched: View of the job's record under the name *owner*, if the caller has watched it before.
     """
     name = record_name(request.robot, request.key)
-    lease = JobLease(context.store, name, owner, context.clock)
+    lease = watched or JobLease(context.store, name, owner, context.clock)
     try:
         outcome = _follow_or_run(request, context, signals, tell, lease)
+    except StoreError as error:
+        return JobOutcome(error=error)  # nothing is known of the job: its offer stays
     except RsePfError as error:
         outcome = JobOutcome(error=error)
     finished = context.finished if context.queue is None else context.queue.withdraw
@@ -161,6 +171,8 @@ def _follow_or_run(
         verdict = verdict_on(
             record, unchanged_s=lease.unchanged_s, lease_s=serving.job_lease_s, is_watched=lease.is_watched
         )
+        if verdict == "follow" and not context.follows:
+            return JobOutcome()
         if verdict == "follow" and record is not None:
             tell(record.share, record.what)
             signals.wait(serving.job_heartbeat_s * _POLL_SHARE)

@@ -81,11 +81,13 @@ class _Service:
         self._token = control_token
         self._log = JsonLog(level=settings.serving.log_level, server=server_id, wall_clock=time.time)
         slots, store = settings.serving.job_server_slots, open_data_store(settings)
-        self._queue = JobQueue(store, settings)
+        self._queue = JobQueue(
+            store, settings, lambda name: self._log.warning("job-offer-damaged", offer=name, hint="delete it")
+        )
         context = JobContext(
             store=store, slots=JobSlots(make_pipe(slots)), settings=settings, server_id=server_id,
             start=spawner(services, settings), clock=time.monotonic,
-            finished=self._queue.withdraw,  # without `queue`: it offers nothing itself
+            finished=self._queue.withdraw, follows=False,  # without `queue`: it offers nothing itself
         )  # fmt: skip
         self._jobs = JobServer(
             context, self._queue, self._log, lambda: f"{server_id}-{secrets.token_hex(8)}", slots

@@ -18,6 +18,7 @@ from rse_pf.backend.jobs.queue import JobQueue, in_turn
 from rse_pf.backend.jobs.runner import JobContext, JobOutcome, JobSignals, run_job
 from rse_pf.backend.jobs.slots import JobSlots, make_pipe
 from rse_pf.backend.log import JsonLog
+from rse_pf.backend.sandbox.ipc import encode_message
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import StoreError
 from rse_pf.identity import RobotId
@@ -60,7 +61,7 @@ class Bench:
 
     def job_server(self, script: list[object], *, ends: bool = True, slots: int = 1) -> JobServer:
         context = self.context(
-            script, ends=ends, slots=JobSlots(make_pipe(slots)), finished=self.queue.withdraw
+            script, ends=ends, slots=JobSlots(make_pipe(slots)), finished=self.queue.withdraw, follows=False
         )
         return JobServer(context, self.queue, self.log, lambda: os.urandom(4).hex(), slots)
 
@@ -129,9 +130,75 @@ def test_the_job_of_a_job_server_that_died_is_taken_after_its_lease(bench: Bench
     server.step()
 
     assert not bench.started
+    assert server.running == 0
+    wait_until(lambda: server.step() or bench.started)
     wait_until(lambda: server.running == 0)
     assert len(bench.started) == 1
     assert bench.queue.waiting() == 0
+
+
+def test_a_job_that_another_job_server_runs_takes_no_slot_of_this_one(bench: Bench) -> None:
+    for number in range(3):
+        bench.queue.offer(a_request(number))
+    servers = [bench.job_server([], ends=False) for _ in range(2)]
+
+    for server in servers:
+        server.step()
+
+    assert [server.running for server in servers] == [1, 1]
+    wait_until(lambda: len(bench.started) == 2)
+    bench.started[0].theirs.sendall(encode_message(DONE))
+    wait_until(lambda: servers[0].running == 0)
+    servers[0].step()
+    wait_until(lambda: len(bench.started) == 3)
+    assert [server.running for server in servers] == [1, 1]
+    for server in servers:
+        server.leave()
+
+
+def test_two_job_servers_that_look_at_the_same_time_take_a_job_each(bench: Bench) -> None:
+    for number in range(2):
+        bench.queue.offer(a_request(number))
+    servers = [bench.job_server([], ends=False) for _ in range(2)]
+    threads = [threading.Thread(target=server.step) for server in servers]
+
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+
+    assert [server.running for server in servers] == [1, 1]
+    assert bench.queue.waiting() == 0
+    for server in servers:
+        server.leave()
+
+
+def test_the_offer_of_a_job_that_the_store_kept_from_running_stays(bench: Bench) -> None:
+    bench.queue.offer(a_request())
+    swap = bench.store.compare_and_swap
+    bench.store.compare_and_swap = fail  # type: ignore[method-assign]
+    server = bench.job_server([DONE])
+
+    server.step()
+    wait_until(lambda: server.running == 0)
+
+    assert bench.queue.waiting() == 1
+    bench.store.compare_and_swap = swap  # type: ignore[method-assign]
+    server.step()
+    wait_until(lambda: len(bench.started) == 1 and not list(bench.store.list("job-queue/")))
+
+
+def test_a_damaged_record_does_not_keep_other_jobs_waiting(bench: Bench) -> None:
+    for number in range(2):
+        bench.queue.offer(a_request(number))
+    bench.store.put(record_name(a_request(0).robot, a_request(0).key), b"what")
+    server = bench.job_server([], ends=False)
+
+    server.step()
+
+    assert server.running == 1
+    assert bench.queue.waiting() == 1
+    server.leave()
 
 
 def test_a_job_that_its_robot_cancels_is_offered_no_more(bench: Bench) -> None:
@@ -171,11 +238,39 @@ def test_a_payload_with_arrays_comes_back_from_the_queue(bench: Bench) -> None:
     assert offer.request.robot == request.robot
 
 
-def test_a_damaged_offer_is_a_named_error(bench: Bench) -> None:
+def test_a_damaged_offer_is_told_once_and_does_not_hide_the_others(bench: Bench) -> None:
+    told: list[str] = []
+    queue = JobQueue(bench.store, SETTINGS, told.append)
     bench.store.put("job-queue/default/robot/ab", b"what")
+    queue.offer(a_request())
 
-    with pytest.raises(StoreError, match="no offer of a job"):
-        list(bench.queue.offers())
+    found = [list(queue.offers()) for _ in range(2)]
+
+    assert [[offer.request.key for offer in each] for each in found] == [[a_request().key]] * 2
+    assert told == ["job-queue/default/robot/ab"]
+
+
+def test_many_offers_of_other_settings_and_of_one_robot_hide_no_job(bench: Bench) -> None:
+    others = JobQueue(bench.store, SETTINGS.replace(pnp={"max_iterations": 17}))
+    for number in range(250):
+        others.offer(a_job_of("a", number))
+        bench.queue.offer(a_job_of("b", number))
+    bench.queue.offer(a_job_of("z", 0))
+
+    list(bench.queue.offers())  # learns which are those of others
+    first = [offer.request.robot.name for offer in bench.queue.offers()][:2]
+
+    assert first == ["b", "z"]
+
+
+def a_job_of(robot: str, number: int) -> JobRequest:
+    return JobRequest(
+        service="long", payload={}, robot=RobotId("default", robot), key=f"{number:064x}", quota_bytes=1e6
+    )
+
+
+def fail(*_: object) -> None:
+    raise StoreError("the store does not answer")
 
 
 def with_payload(request: JobRequest, payload: object) -> JobRequest:
