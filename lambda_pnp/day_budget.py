@@ -3,8 +3,8 @@
 Any number of executions run at the same time and share nothing but the artifact bucket.  Each takes a lease
 of a part of the day's commands there, by compare-and-swap, before it answers them.  What is lost with an
 execution that ends is not given again, so the commands of all robots never exceed the budget; the first lease
-is small and each further one twice as large, so that executions which end early lose little.  The count of one
-robot is kept by each execution alone.
+is small and each further one twice as large, so that executions which end early lose little.  The count of
+one robot is kept by each execution alone.
 """
 
 from __future__ import annotations
