@@ -40,7 +40,7 @@ _TEXTS: dict[Action, str] = {
     "await-healthy": "wait until as many servers as wanted are healthy",
     "unprotect": "allow the deletion of the stack {}",
     "sweep": "delete log groups, alarms, volumes and interfaces that no stack owns",
-    "erase": "delete the buckets with all versions of all objects, and the signing key",
+    "erase": "delete the buckets with all versions, and the signing key, which AWS can restore for 30 days",
 }
 
 

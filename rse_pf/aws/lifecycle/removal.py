@@ -1,6 +1,7 @@
 """Delete what outlives the stacks: forgotten resources, and with the operator's consent the data.
 
-Object lock is respected: an audit log that is still locked stays, and so does its bucket.
+Object lock is respected: an audit log that is still locked stays, and so does its bucket.  AWS can restore a
+secret for 30 days after its deletion.
 """
 
 from __future__ import annotations
@@ -42,7 +43,8 @@ def erase_data(account: Account, names: ResourceNames, *, audit_days: int) -> li
         if each.kind == "secret":
             account.find("secretsmanager", "delete_secret", SecretId=each.name)
         elif each.kind == "bucket":
-            locked, until = _empty_bucket(account, each.name, audit_days)
+            has_lock = _AUDIT_LOGS in each.name.removeprefix(names.stack("Data").lower())
+            locked, until = _empty_bucket(account, each.name, audit_days, has_lock=has_lock)
             if locked:
                 logs = f"object lock keeps {locked} audit logs, the last until {until:%Y-%m-%d}"
                 refused.append(f"{each.name} stays: {logs}")
@@ -64,8 +66,11 @@ def _access_logs_last(each: Leftover) -> tuple[bool, str]:
     return "accesslogs" in each.name, each.name
 
 
-def _empty_bucket(account: Account, bucket: str, audit_days: int) -> tuple[int, datetime]:
-    """Delete every version of every object; return how many are locked, and until when the last one is."""
+def _empty_bucket(account: Account, bucket: str, audit_days: int, *, has_lock: bool) -> tuple[int, datetime]:
+    """Delete every version of every object; return how many are locked, and until when the last one is.
+
+    S3 answers for a locked object as for one that the account may not delete: only *has_lock* tells which.
+    """
     locked, until = 0, datetime.min
     for page in _pages_of_versions(account, bucket):
         dates = {row["Key"]: row["LastModified"] for row in reversed(page)}
@@ -77,7 +82,7 @@ def _empty_bucket(account: Account, bucket: str, audit_days: int) -> tuple[int, 
             wanted = {"Objects": some, "Quiet": True}
             told = account.find("s3", "delete_objects", Bucket=bucket, Delete=wanted)
             for error in (told or {}).get("Errors", ()):
-                if error["Code"] not in _LOCKED:
+                if not (has_lock and error["Code"] in _LOCKED):
                     raise ConfigurationError(
                         f"AWS refuses to delete objects of {bucket}: {error['Code']}",
                         hint="check your account's permissions, or sign in again",
@@ -89,6 +94,8 @@ def _empty_bucket(account: Account, bucket: str, audit_days: int) -> tuple[int, 
 
 
 _LOCKED = ("AccessDenied", "AccessForbidden")
+_AUDIT_LOGS = "auditlogs"
+"""In the name of the only bucket with object lock, after that of its stack."""
 
 
 def _pages_of_versions(account: Account, bucket: str) -> Iterator[list[dict[str, Any]]]:

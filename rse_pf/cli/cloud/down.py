@@ -68,7 +68,10 @@ def _confirmed_twice(args: argparse.Namespace, names: ResourceNames) -> bool:
         return True
     if not sys.stdin.isatty():
         raise UsageError("nobody can be asked a second time here", hint=f"add --confirm {names.prefix}")
-    show(f"maps, logs and the signing key cannot be brought back; type {names.prefix} to delete them")
+    show(
+        "maps and logs cannot be brought back, and the signing key only within 30 days; "
+        f"type {names.prefix} to delete them"
+    )
     return sys.stdin.readline().strip() == names.prefix
 
 
