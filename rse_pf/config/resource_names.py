@@ -19,8 +19,8 @@ __all__ = [
     "READY_PATH",
     "ROBOTS_NAME",
     "ROSBRIDGE_PATH",
-    "SETTINGS_CONTEXT",
     "SERVICES_PREFIX",
+    "SETTINGS_CONTEXT",
     "STACKS",
     "VERSION_PARAMETER",
     "ResourceNames",
@@ -61,7 +61,7 @@ SETTINGS_CONTEXT = "rse-pf:settings"
 class ResourceNames:
     """The names in AWS of one deployment; *deployment* is ``cloud.name``, empty for the only one.
 
-    No name of one deployment is a name of another, whatever they are called.
+    No name of one deployment is a name of another; therefore none may be called ``jobs`` or ``...-jobs``.
     """
 
     deployment: str = ""

@@ -11,6 +11,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from rse_pf.config import PlatformSettings, SettingRow, load_settings, setting_rows
+from rse_pf.config.resource_names import ResourceNames
 from rse_pf.errors import SettingsError
 
 ROWS = list(setting_rows())
@@ -97,6 +98,21 @@ def test_a_bad_setting_is_refused_with_a_hint(overrides: dict[str, Any], message
 
     assert message in caught.value.message
     assert hint in caught.value.hint
+
+
+@pytest.mark.parametrize("name", ["jobs", "lab-jobs", "jobs-jobs"])
+def test_a_deployment_is_not_called_like_the_job_servers_of_another(name: str) -> None:
+    another = ResourceNames(name.removesuffix("jobs").rstrip("-"))
+    assert another.job_group == ResourceNames(name).group
+
+    with pytest.raises(SettingsError, match=f"cloud.name = '{name}'") as told:
+        PlatformSettings.from_dict({"cloud": {"name": name}})
+    assert "does not end in -jobs" in told.value.hint
+
+
+@pytest.mark.parametrize("name", ["job", "jobs-2", "myjobs"])
+def test_other_names_of_deployments_may_hold_the_word_jobs(name: str) -> None:
+    assert PlatformSettings.from_dict({"cloud": {"name": name}}).cloud.name == name
 
 
 @pytest.mark.parametrize("row", [row for row in ROWS if row.low is not None], ids=lambda row: row.name)
