@@ -50,6 +50,17 @@ def test_the_canary_gets_a_key_and_is_enrolled_with_one_scope(
     assert json.loads(told)["d"] not in capsys.readouterr().out
 
 
+def test_a_canary_whose_secret_is_gone_is_not_enrolled(
+    account: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    account.client("secretsmanager").delete_secret(SecretId="canarykey", ForceDeleteWithoutRecovery=True)
+
+    assert main(["cloud", "canary"]) == 2
+
+    assert "put_secret_value: it is not there" in capsys.readouterr().err
+    assert AccessControlStore(S3Store(account.client("s3"), "artifacts")).roster().robots == ()
+
+
 def test_a_canary_that_is_off_is_not_enrolled(
     account: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

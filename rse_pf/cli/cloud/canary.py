@@ -37,7 +37,7 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     key = SigningKey.of_robot(secrets.token_bytes(_SEED_BYTES))
     public = json.loads(key.public_json())["x"]
     robot = EnrolledRobot(robot=names.canary, x=public, scopes=_SCOPES, enrolled_s=round(time.time(), 3))
-    account.find("secretsmanager", "put_secret_value", SecretId=secret, SecretString=key.to_json())
+    account.change("secretsmanager", "put_secret_value", SecretId=secret, SecretString=key.to_json())
     access.change_roster(lambda roster: roster.enrolled(robot))
     show(f"{names.canary} has a new key and the scope {_SCOPES[0]}; servers know it in a few seconds")
     return 0
