@@ -40,7 +40,7 @@ _OF_THE_FUNCTION = frozenset({"busy", "quota", "unauthorized", "forbidden", "con
 
 
 class _BrokenHttp(Exception):
-    """The peer sent something that is not the HTTP that a load balancer sends."""
+    """The peer sent what a load balancer does not send, or what we have cannot be sent by HTTP."""
 
 
 class _Stale(Exception):
@@ -214,11 +214,15 @@ class Burst:
         parts = urlsplit(address)
         host = parts.netloc.rpartition("@")[2]
         target = parts.path + (f"?{parts.query}" if parts.query else "")
-        head = (
+        text = (
             f"POST {target or '/'} HTTP/1.1\r\nHost: {host}\r\nAuthorization: Bearer {token}\r\n"
             f"Content-Type: application/{SUBPROTOCOLS[self._codec.name]}\r\n"
             f"Content-Length: {len(body)}\r\n\r\n"
-        ).encode("ascii")
+        )
+        try:
+            head = text.encode("ascii")
+        except UnicodeError as error:
+            raise _BrokenHttp("the token holds a letter that HTTP cannot carry") from error
         idle = self._idle.setdefault(f"{parts.scheme}://{host}", [])
         while idle:
             each = idle.pop()
@@ -229,10 +233,13 @@ class Burst:
                     continue
             each.writer.transport.abort()
         is_secure = parts.scheme == "https"
-        reader, writer = await asyncio.open_connection(
-            parts.hostname, parts.port or (443 if is_secure else 80), limit=_MAX_HEAD_BYTES,
-            ssl=self._context(host) if is_secure else None,
-        )  # fmt: skip
+        try:
+            reader, writer = await asyncio.open_connection(
+                parts.hostname, parts.port or (443 if is_secure else 80), limit=_MAX_HEAD_BYTES,
+                ssl=self._context(host) if is_secure else None,
+            )  # fmt: skip
+        except ValueError as error:  # such as a..b, which the encoding of names refuses
+            raise _BrokenHttp(f"{parts.hostname} cannot be the name of a host") from error
         return await self._exchange(reader, writer, head + body, idle, is_reused=False)
 
     async def _exchange(

@@ -252,6 +252,21 @@ def test_what_is_not_our_function_does_not_answer_commands(wrong: str):
     run(test())
 
 
+@pytest.mark.parametrize("host", ["a..b", "a" * 64 + ".example"])
+def test_a_host_that_cannot_be_a_name_is_as_a_function_that_fails(host: str):
+    async def test():
+        url = f"http://{host}/burst"
+        async with (
+            FakePlatform(registry=builtin_services(PLATFORM)) as platform,
+            robot(platform.url, burst_url=url) as client,
+        ):
+            platform.on_command = busy
+            with pytest.raises(Busy):
+                await client.solve_pnp(*FRAME, deadline_s=5.0)
+
+    run(test())
+
+
 def test_a_burst_address_that_cannot_be_used_is_refused_at_once():
     with pytest.raises(UsageError, match="burst_url"):
         client_sdk.connect("ws://127.0.0.1:8700/ws", burst_url="robots.example/burst")
