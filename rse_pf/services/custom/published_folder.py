@@ -7,6 +7,7 @@ disturbed and a machine that fails in the middle keeps it.
 
 from __future__ import annotations
 
+import gzip
 import hashlib
 import io
 import os
@@ -19,7 +20,7 @@ from pathlib import Path, PurePosixPath
 
 from rse_pf.object_store import digest_of
 from rse_pf.services.custom.installed import DEPENDENCIES_FOLDER, InstalledService, installed_services
-from rse_pf.services.custom.publishing import PublishedService, damaged, decode_list
+from rse_pf.services.custom.publishing import MAX_ARCHIVE_BYTES, PublishedService, damaged, decode_list
 
 __all__ = ["CURRENT", "PublishedFolder", "assemble", "unpack"]
 
@@ -27,6 +28,11 @@ CURRENT = "current"
 """The link to the folder of services that run."""
 _ARCHIVES, _LISTS = "archives", "lists"
 _MAX_UNPACKED_BYTES, _MAX_FILES = 1 << 30, 20_000
+_MAX_PATH, _MAX_PART = 2000, 200
+_DAMAGES = (
+    tarfile.TarError, EOFError, zlib.error, gzip.BadGzipFile, FileExistsError, NotADirectoryError, ValueError
+)  # fmt: skip
+"""What an archive can cause; a full disk is another error, after which the same list is tried again."""
 
 
 class PublishedFolder:
@@ -62,6 +68,8 @@ class PublishedFolder:
             folder.mkdir(parents=True, exist_ok=True)
         for entry in entries:
             if not (archives / entry.archive).is_dir():
+                if entry.size > MAX_ARCHIVE_BYTES:
+                    raise damaged(f"the archive of {entry.name} is {entry.size} bytes")
                 fresh = Path(tempfile.mkdtemp(prefix=".new-", dir=archives))
                 try:
                     unpack(entry, fetch(entry), fresh)
@@ -107,6 +115,8 @@ def unpack(entry: PublishedService, archive: bytes, into: Path) -> None:
                 files, size = files + 1, size + member.size
                 if not member.isreg() or not parts or parts[0] not in (entry.name, DEPENDENCIES_FOLDER):
                     raise damaged(f"the archive of {entry.name} holds {member.name[:80]!r}")
+                if len(os.fsencode(member.name)) > _MAX_PATH or max(map(len, parts)) > _MAX_PART:
+                    raise damaged(f"the archive of {entry.name} holds a name that is too long")
                 if ".." in parts or files > _MAX_FILES or size > _MAX_UNPACKED_BYTES:
                     raise damaged(f"the archive of {entry.name} leaves its folder, or is too large")
                 target = into.joinpath(*parts)
@@ -116,7 +126,7 @@ def unpack(entry: PublishedService, archive: bytes, into: Path) -> None:
                 with target.open("xb") as file:
                     shutil.copyfileobj(content, file)
                 target.chmod(0o644)
-    except (tarfile.TarError, EOFError, zlib.error, FileExistsError) as error:
+    except _DAMAGES as error:
         raise damaged(f"the archive of {entry.name} cannot be read: {error}") from error
 
 

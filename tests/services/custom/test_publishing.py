@@ -20,6 +20,7 @@ from rse_pf.services.custom.installed import InstalledService, install, installe
 from rse_pf.services.custom.published_folder import PublishedFolder, unpack
 from rse_pf.services.custom.publishing import (
     LIST_NAME,
+    MAX_ARCHIVE_BYTES,
     SERVER_PLATFORM,
     PublishedList,
     PublishedService,
@@ -150,6 +151,18 @@ def test_a_list_whose_archives_cannot_be_fetched_changes_nothing(
     assert server.holds(before)
 
 
+def test_an_archive_above_the_limit_is_not_even_fetched(author: Author, server: PublishedFolder) -> None:
+    author.publish()
+    document = json.loads(author.data())
+    document["services"][0]["size"] = MAX_ARCHIVE_BYTES + 1
+
+    def fetch(entry: PublishedService) -> bytes:
+        raise AssertionError("it was fetched")
+
+    with pytest.raises(ConfigurationError, match="bytes"):
+        server.install(json.dumps(document).encode(), fetch)
+
+
 def packed(*members: tuple[str, bytes, bytes]) -> bytes:
     made = io.BytesIO()
     with tarfile.open(fileobj=made, mode="w") as archive:
@@ -170,6 +183,10 @@ def packed(*members: tuple[str, bytes, bytes]) -> bytes:
         ([("adder/x", tarfile.LNKTYPE, b"")], "holds 'adder/x'"),
         ([("adder/x", tarfile.CHRTYPE, b"")], "holds 'adder/x'"),
         ([("adder/x", tarfile.REGTYPE, b"1")] * 2, "cannot be read"),
+        ([("adder/x", tarfile.REGTYPE, b"1"), ("adder/x/y/z", tarfile.REGTYPE, b"1")], "cannot be read"),
+        ([("adder/\u00e9\0y", tarfile.REGTYPE, b"1")], "cannot be read"),
+        ([("adder/" + "y" * 300, tarfile.REGTYPE, b"1")], "too long"),
+        ([("adder/" + "y/" * 3000 + "y", tarfile.REGTYPE, b"1")], "too long"),
     ],
 )
 def test_an_archive_that_no_publisher_makes_is_refused(
