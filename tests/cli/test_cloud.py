@@ -76,7 +76,7 @@ def test_the_costs_tell_other_ways_to_run_the_crossing_the_date_and_what_is_left
 
 
 def test_a_file_of_prices_replaces_ours(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    chosen = {"lambda_per_million": 1e6, "as_of": "2026-01-31", "currency": "EUR"}
+    chosen = {"lambda_per_million": 1e6, "firewall_per_million": 0, "as_of": "2026-01-31", "currency": "EUR"}
     (tmp_path / "prices.json").write_text(json.dumps(chosen), encoding="utf-8")
 
     assert main(["cloud", "cost", "--prices", "prices.json", "--robots", "1", "--fps", "1"]) == 0

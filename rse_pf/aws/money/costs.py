@@ -223,7 +223,8 @@ class _Tariff:
         # A warm execution; less memory is less of a vCPU.
         self.billed_ms = math.ceil(prices.command_cpu_ms * max(1.0, _MB_OF_A_VCPU / memory_mb))
         self.gb_s = memory_mb / 1024 * self.billed_ms / 1e3
-        self.serverless_per_command = prices.lambda_per_million / 1e6 + self.gb_s * prices.lambda_per_gb_s
+        inspected = (prices.lambda_per_million + prices.firewall_per_million) / 1e6
+        self.serverless_per_command = inspected + self.gb_s * prices.lambda_per_gb_s
 
 
 def _servers(settings: PlatformSettings, tariff: _Tariff, load: Load) -> int:

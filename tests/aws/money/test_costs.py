@@ -149,6 +149,20 @@ def test_a_small_function_is_slower_and_billed_longer() -> None:
     assert compare(small, PRICES, at(100, fps=10.0)).executions == pytest.approx(14.0)
 
 
+def test_the_lambda_alone_pays_for_a_command_what_a_burst_pays() -> None:
+    prices = replaced(lambda_per_gb_s=1e-5, firewall_per_million=0.6)
+    commands = 1e6
+    every = Load(robots=1, fps=commands / (730 * 3600))
+    burst = Load(robots=0, fps=0.0, burst_commands_per_day=commands * 24 / 730)
+
+    lines = [line for line in bill_of(SETTINGS, prices, burst).lines if line.box == "Lambda"]
+
+    assert {line.what.split()[0] for line in lines} == {"executions", "computing", "inspecting"}
+    assert compare(SETTINGS, prices, every).serverless == pytest.approx(
+        sum(each.amount for each in lines), abs=0.02
+    )
+
+
 @pytest.mark.parametrize("hours", [24.0, 8.0])
 def test_at_the_crossing_both_cost_the_same_and_before_it_the_lambda_less(hours: float) -> None:
     rate = crossing_commands_per_s(PlatformSettings(), load_prices(), 5.0, hours)
