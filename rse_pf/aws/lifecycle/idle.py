@@ -19,6 +19,7 @@ from rse_pf.aws.fleet.metrics import ROBOTS, dimensions_of
 from rse_pf.aws.lifecycle.deployment import GroupSize, ParkNote, read_note, read_sizes
 from rse_pf.aws.lifecycle.parking import empty_group, silence_alarms, write_note
 from rse_pf.config import PlatformSettings, load_settings
+from rse_pf.config.cloud_layout import CANARY_PERIOD_S
 from rse_pf.config.resource_names import ResourceNames
 from rse_pf.scaling.alarms import NAMESPACE
 from rse_pf.scaling.job_alarms import JOBS
@@ -29,9 +30,9 @@ _log = logging.getLogger(__name__)
 _log.setLevel(logging.INFO)
 
 _HOUR_S = 3600
-_CANARY_REQUESTS = 120.0
-"""Of an hour, which are not counted: the canary asks once a minute, and may repeat a request."""
-_NOBODY = 0.5
+_CANARY_REQUESTS = 2 * _HOUR_S / CANARY_PERIOD_S
+"""Of an hour, which are not counted: the canary may repeat each of its requests once."""
+_MAX_IDLE_ROBOTS = 0.5
 """Robots on average; the canary is connected for a second of each minute."""
 
 
@@ -56,7 +57,7 @@ def is_idle(hours: Sequence[Hour], *, idle_hours: int, has_canary: bool) -> bool
     allowed = _CANARY_REQUESTS if has_canary else 0.0
     return len(last) >= idle_hours and all(
         each.requests is not None and each.requests <= allowed
-        and each.robots is not None and each.robots < _NOBODY and each.jobs == 0
+        and each.robots is not None and each.robots < _MAX_IDLE_ROBOTS and each.jobs == 0
         for each in last
     )  # fmt: skip
 
@@ -75,14 +76,15 @@ def park_if_idle(account: Account, settings: PlatformSettings, *, now: datetime,
     hours = _read_hours(account, names, groups, cloud.idle_hours, now)
     if not is_idle(hours, idle_hours=cloud.idle_hours, has_canary=cloud.canary):
         return f"{names.prefix} was used within {cloud.idle_hours} hours, or nobody told"
+    told = f"{names.prefix} was idle for {cloud.idle_hours} hours and is parked now; rse-pf cloud resume"
+    # Told before it is done: once the groups are empty, a repetition finds the deployment parked and ends.
+    account.change("sns", "publish", TopicArn=topic, Subject=f"{names.prefix} is parked", Message=told)
     if note is None:
         since = now.isoformat(timespec="seconds")
         write_note(account, names, ParkNote(groups=groups, since=since, by="timer"))
     silence_alarms(account, names)
     for group in groups:
         empty_group(account, group)
-    told = f"{names.prefix} was idle for {cloud.idle_hours} hours and is parked now; rse-pf cloud resume"
-    account.change("sns", "publish", TopicArn=topic, Subject=f"{names.prefix} is parked", Message=told)
     return told
 
 

@@ -16,6 +16,7 @@ from rse_pf.aws.fleet.metrics import dimensions_of
 from rse_pf.aws.lifecycle.deployment import read_deployment
 from rse_pf.aws.lifecycle.idle import Hour, is_idle, park_if_idle
 from rse_pf.aws.lifecycle.plan import plan_park, plan_resume
+from rse_pf.errors import ConfigurationError
 from tests.aws.lifecycle.account_on_moto import NAMES, SETTINGS, Formation, Killer, account_of
 
 SILENT = Hour(requests=None, robots=None)
@@ -93,6 +94,22 @@ def test_after_the_last_idle_hour_the_servers_end_and_resume_brings_them_back(
     assert found.note.groups[NAMES.group].max_servers == 10
     assert plan_park(found, deep=False) == []
     assert plan_resume(found, has_packages=True)[0].action == "fill"
+
+
+def test_a_mail_that_cannot_be_sent_changes_nothing_and_the_next_hour_parks(region: str, topic: str) -> None:
+    account, settings = account_of(region, Killer()), SETTINGS.replace(cloud={"idle_hours": 1})
+    publish(region, {1: (0.0, 0.0), 0: (0.0, 0.0)})
+
+    with pytest.raises(ConfigurationError, match="sns publish"):
+        park_if_idle(account, settings, now=NOW, topic=topic + "-gone")
+    between = read_deployment(account, settings)
+    told = park_if_idle(account, settings, now=NOW + timedelta(hours=1), topic=topic)
+
+    assert between.note is None
+    assert [each.max_servers for each in between.groups.values()] == [10]
+    assert "is parked now" in told
+    found = read_deployment(account, settings)
+    assert (found.stage, found.note and found.note.groups[NAMES.group].max_servers) == ("parked", 10)
 
 
 def test_a_deployment_whose_agents_are_silent_is_not_parked(region: str, topic: str) -> None:
