@@ -20,7 +20,7 @@ STEPS: tuple[Delay, ...] = (
 )
 """Pending to running; kernel and cloud-init; the package; the processes."""
 BOOT_S = sum(step.high_s for step in STEPS)
-"""From the launch to /readyz, in seconds, without luck."""
+"""From the launch to /readyz, in seconds, at the slow end of each step."""
 
 _RETRY_SHARE, _READY_SHARE = 0.4, 0.3
 """Of ``cloud.boot_s``; the rest is for the machine's own start and for unpacking the environment."""

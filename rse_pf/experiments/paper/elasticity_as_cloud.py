@@ -36,7 +36,7 @@ _LOAD_SHARE = 0.6
 _PHASES = (0.15, 0.5, 0.85)
 """Where in a period the load begins; it decides how long the alarm takes."""
 _SERVERS = 2
-_PATIENCE = 3.0
+_TIMEOUT_FACTOR = 3.0
 
 
 def run_as_cloud(options: ElasticityOptions, settings: PlatformSettings) -> int:
@@ -171,7 +171,7 @@ async def _run(
                 grown = harness.events_since("grow", began_s)
                 return bool(grown and harness.events_since("server-healthy", grown[0]["time"]))
 
-            if not await harness.wait_for(serves, _PATIENCE * longest_s + 20.0):
+            if not await harness.wait_for(serves, _TIMEOUT_FACTOR * longest_s + 20.0):
                 raise CommandFailed(
                     f"{name}: no further server serves after {harness.now() - began_s:.0f} s",
                     hint=f"look at the events in {folder}; raise --robots or lower --speed",
