@@ -125,6 +125,8 @@ class Agent:
             task.call()
         except (RsePfError, OSError) as error:
             self._context.log("failed", task=task.name, error=message_of(error)[:200])
+        except Exception as error:  # noqa: BLE001  a defect of one task must not end the others, or its thread
+            self._context.log("failed", task=task.name, error=repr(error)[:200])
 
 
 def main(arguments: list[str] | None = None) -> int:

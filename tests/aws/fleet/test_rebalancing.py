@@ -162,13 +162,18 @@ def test_the_emulator_answers_the_agents_query(region: str) -> None:
     assert totals[0].start_s == end_s - timedelta(minutes=1).total_seconds()
 
 
-@pytest.mark.parametrize("notice", ["interruption", "rebalance"])
-def test_a_spot_notice_drains_the_server_within_five_seconds(tmp_path: Path, notice: str) -> None:
+@pytest.mark.parametrize(
+    ("notice", "spot", "group"),
+    [("interruption", True, "rse-pf"), ("rebalance", True, "rse-pf"), ("interruption", False, "rse-pf-jobs")],
+)
+def test_a_spot_notice_drains_the_server_within_five_seconds(
+    tmp_path: Path, notice: str, spot: bool, group: str
+) -> None:
     machine, log = FakeMachine(), []
-    settings = PlatformSettings.from_dict({"cloud": {"spot": True}})
+    settings = PlatformSettings.from_dict({"cloud": {"spot": spot}})
     context = AgentContext(
         machine=machine, clients={}, artifacts=MemoryStore(), settings=settings,
-        config=AgentConfig(group="rse-pf", hook="h", keys_name="k", keys_file=tmp_path / "k"),
+        config=AgentConfig(group=group, hook="h", keys_name="k", keys_file=tmp_path / "k"),
         log=lambda event, **fields: log.append((event, machine.now_s)), clock=machine.clock,
         sleep=machine.sleep, wall_clock=machine.wall_clock, state=AgentState(phase=Phase.SERVING),
     )  # fmt: skip

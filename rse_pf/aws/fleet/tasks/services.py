@@ -11,7 +11,13 @@ import msgspec
 from rse_pf.aws.fleet.task import AgentContext, Task
 from rse_pf.errors import ConfigurationError, Disconnected, NotFound
 from rse_pf.services.custom.published_folder import PublishedFolder
-from rse_pf.services.custom.publishing import LIST_NAME, PublishedList, archive_name
+from rse_pf.services.custom.publishing import (
+    LIST_NAME,
+    PublishedList,
+    PublishedService,
+    archive_name,
+    damaged,
+)
 
 __all__ = ["FOLDER", "task"]
 
@@ -26,15 +32,24 @@ def task(context: AgentContext) -> Task:
     folder = PublishedFolder(context.config.keys_file.parent / FOLDER)
     refused, told = b"", b""
 
+    def fetch(entry: PublishedService) -> bytes:
+        name = archive_name(entry.archive)
+        size = context.artifacts.head(name).size
+        if size != entry.size:  # before it is read into memory
+            raise damaged(f"the archive of {entry.name} is {size} bytes, the list says {entry.size}")
+        return context.artifacts.get(name)
+
     def follow() -> None:
         nonlocal refused, told
+        if context.runs_jobs:  # a job server runs no published services
+            return
         try:
             data = context.artifacts.get(LIST_NAME)
         except NotFound:
             data = _EMPTY
         if not folder.holds(data) and data != refused:
             try:
-                found = folder.install(data, lambda entry: context.artifacts.get(archive_name(entry.archive)))
+                found = folder.install(data, fetch)
             except ConfigurationError:
                 refused = data
                 raise

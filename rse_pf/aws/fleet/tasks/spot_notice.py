@@ -18,9 +18,10 @@ LOOK_EVERY_S = 2.0
 
 def task(context: AgentContext) -> Task:
     """Look for a notice every two seconds, where there are Spot instances, and drain once."""
+    is_spot = context.settings.cloud.spot or context.runs_jobs  # job servers always are
 
     def follow() -> None:
-        if not context.settings.cloud.spot:
+        if not is_spot:
             return
         notice = context.machine.spot_notice()
         if not notice:
