@@ -13,7 +13,7 @@ from datetime import datetime, timezone
 
 import msgspec
 
-__all__ = ["UNITS", "Batch", "JournalReader", "batch_of", "read_journal"]
+__all__ = ["UNITS", "Batch", "JournalReader", "batch_of", "journal_command", "read_journal"]
 
 UNITS = (
     "rse-pf.service", "rse-pf-agent.service", "rse-pf-data.service", "rse-pf-jobs.service",
@@ -78,12 +78,18 @@ def batch_of(entries: Iterable[bytes], max_bytes: int = _MAX_BYTES) -> Batch | N
     return Batch(first_us=first_us, text=b"".join(lines), cursor=cursor) if lines else None
 
 
-def read_journal(cursor: str) -> Iterator[bytes]:
-    """Yield the entries of `UNITS` after *cursor* on this machine; raises OSError."""
+def journal_command(cursor: str) -> list[str]:
+    """Return the command that prints the entries of `UNITS` after *cursor*, or of this boot."""
     command = ["/usr/bin/journalctl", "--output=json", f"--output-fields={_FIELDS}", "--no-pager", "--quiet"]
     command += [f"--unit={unit}" for unit in UNITS]
-    command += [f"--after-cursor={cursor}"] if cursor else ["--boot"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) as process:
+    return command + ([f"--after-cursor={cursor}"] if cursor else ["--boot"])
+
+
+def read_journal(cursor: str) -> Iterator[bytes]:
+    """Yield the entries of `UNITS` after *cursor* on this machine; raises OSError."""
+    with subprocess.Popen(
+        journal_command(cursor), stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
+    ) as process:
         assert process.stdout is not None
         try:
             yield from process.stdout

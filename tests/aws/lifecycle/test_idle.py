@@ -16,6 +16,7 @@ from rse_pf.aws.fleet.metrics import dimensions_of
 from rse_pf.aws.lifecycle.deployment import read_deployment
 from rse_pf.aws.lifecycle.idle import Hour, is_idle, park_if_idle
 from rse_pf.aws.lifecycle.plan import plan_park, plan_resume
+from rse_pf.config.cloud_layout import CANARY_PERIOD_S
 from rse_pf.errors import ConfigurationError
 from tests.aws.lifecycle.account_on_moto import NAMES, SETTINGS, Formation, Killer, account_of
 
@@ -43,6 +44,13 @@ NOW = datetime(2030, 1, 2, 18, 20, tzinfo=timezone.utc)
 )
 def test_idle_is_every_hour_of_which_it_is_known_that_nobody_came(hours: Sequence[Hour], idle: bool) -> None:
     assert is_idle(hours, idle_hours=3, has_canary=True) is idle
+
+
+def test_a_canary_that_repeats_each_request_once_is_nobody() -> None:
+    twice = 2 * 3600 / CANARY_PERIOD_S
+
+    assert is_idle([Hour(requests=twice, robots=0.0)], idle_hours=1, has_canary=True)
+    assert not is_idle([Hour(requests=twice + 1, robots=0.0)], idle_hours=1, has_canary=True)
 
 
 def test_without_a_canary_a_single_request_counts() -> None:
