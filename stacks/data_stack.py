@@ -25,8 +25,10 @@ BALANCER_LOGS = "alb"
 """Prefix of the load balancer's access logs in their bucket."""
 
 _DAY = cdk.Duration.days(1)
-_LEASES = ("live/", "jobs/")
+_LEASES = ("live/", "jobs/", "batch/schedulers/")
 """Prefixes of leases, which are renewed up to twice a second: each renewal leaves a former version."""
+_OFFERS, _OFFER_DAYS = "job-queue/", 7
+"""Offers of jobs that nobody withdrew, because their server was killed or its settings are gone."""
 _INFREQUENT_AFTER_DAYS = 30
 """The soonest that S3 takes an object there; ``data.glacier_after_days`` is not less."""
 
@@ -66,6 +68,9 @@ class DataStack(cdk.Stack):
         )
         for prefix in _LEASES:
             self.maps.add_lifecycle_rule(prefix=prefix, noncurrent_version_expiration=_DAY)
+        self.maps.add_lifecycle_rule(
+            prefix=_OFFERS, expiration=cdk.Duration.days(_OFFER_DAYS), noncurrent_version_expiration=_DAY
+        )
         self.artifacts = self._bucket("Artifacts", self.access_logs)
         for bucket in (self.maps, self.artifacts):
             bucket.add_lifecycle_rule(
