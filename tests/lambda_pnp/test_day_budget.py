@@ -113,6 +113,35 @@ def test_executions_that_claim_at_the_same_moment_do_not_get_the_same_lease() ->
     assert json.loads(bucket.body)["granted"] == 6, "three leases of two"
 
 
+@pytest.mark.parametrize(("others", "is_granted"), [(5, True), (6, False)])
+def test_an_execution_whose_lease_is_taken_by_others_waits_longer_each_time(
+    others: int, is_granted: bool
+) -> None:
+    bucket, left, waits = Bucket(), others, list[float]()
+
+    def meanwhile() -> None:
+        nonlocal left
+        if left:
+            left -= 1
+            with_others = {"day": "2026-11-23", "granted": others - left}
+            bucket.body = json.dumps(with_others).encode()
+
+    bucket.before_put = meanwhile
+
+    def claim() -> int:
+        return claim_in_bucket(
+            ENVIRONMENT, "2026-11-23", 50, 1000, now=lambda: NOON, send=bucket.send, sleep=waits.append,
+            random=lambda: 0.5,
+        )  # fmt: skip
+
+    if is_granted:
+        assert claim() == 50
+    else:
+        with pytest.raises(OSError, match="others keep changing"):
+            claim()
+    assert waits == pytest.approx([0.05, 0.1, 0.15, 0.2, 0.25])
+
+
 def test_a_lease_doubles_until_it_costs_two_requests_for_many_commands() -> None:
     bucket, wanted = Bucket(), []
 
