@@ -53,7 +53,8 @@ def test_the_canary_gets_a_key_and_is_enrolled_with_one_scope(
 def test_a_canary_whose_secret_is_gone_is_not_enrolled(
     account: Any, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    account.client("secretsmanager").delete_secret(SecretId="canarykey", ForceDeleteWithoutRecovery=True)
+    name = "canarykey"
+    account.client("secretsmanager").delete_secret(SecretId=name, ForceDeleteWithoutRecovery=True)
 
     assert main(["cloud", "canary"]) == 2
 
