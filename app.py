@@ -70,6 +70,7 @@ def main() -> int:
     """Synthesise; print an error and its hint in two lines, and return 2, if that is not possible."""
     root = Path(__file__).parent
     try:
+        load_settings(root / "cdk.json")  # it also tells in a line what is wrong with the file
         written = json.loads((root / "cdk.json").read_text(encoding="utf-8")).get("context", {})
         app = cdk.App(context=written)
         given = dict(app.node.get_all_context())
