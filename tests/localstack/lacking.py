@@ -8,6 +8,10 @@ from __future__ import annotations
 __all__ = ["LACKING"]
 
 LACKING = {
+    (
+        "tests/aws/lifecycle/test_idle.py",
+        "test_a_mail_that_cannot_be_sent_changes_nothing_and_the_next_hour_parks",
+    ): "autoscaling",
     ("tests/aws/fleet/test_group.py", "test_a_number_older_than_three_periods_is_unknown"): "elbv2",
     (
         "tests/aws/fleet/test_group.py",
