@@ -148,7 +148,7 @@ def _start_server(
     while not announce.exists():
         if time.monotonic() > deadline or process.poll() is not None:
             raise SystemExit(f"the server did not start: {(folder / 'server.log').read_text()}")
-        time.sleep(0.05)  # looks again, with a deadline
+        time.sleep(0.05)  # polls, with a deadline
     return process, int(json.loads(announce.read_text(encoding="utf-8"))["port"])
 
 

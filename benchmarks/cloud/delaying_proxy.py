@@ -62,7 +62,7 @@ class DelayingProxy:
         self.accepted += 1
         there: asyncio.StreamWriter | None = None
         try:
-            await asyncio.sleep(2 * self.delay_s)
+            await asyncio.sleep(2 * self.delay_s)  # the handshake of TCP takes a round trip
             back, there = await asyncio.open_connection("127.0.0.1", self.target)
             self._writers.add(there)
             await asyncio.gather(self._pump(reader, there), self._pump(back, writer))

@@ -57,7 +57,7 @@ class LocalPlatform:
             if len(ready) >= self.servers:
                 self.port = int(state["balancer"]["port"])
                 return self
-            time.sleep(0.5)
+            time.sleep(0.5)  # polls, with a deadline
         log_text = (self.folder / f"{self.name}.log").read_text(encoding="utf-8", errors="replace")
         self.__exit__(None, None, None)
         raise SystemExit(f"the platform did not start:\n{log_text[-2000:]}")

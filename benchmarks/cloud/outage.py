@@ -168,7 +168,7 @@ async def drive(
         for robot in (*fleet, disabled):
             await robot
         asking = [asyncio.create_task(ask(number, robot)) for number, robot in enumerate(fleet)]
-        await asyncio.sleep(BEFORE_S)
+        await asyncio.sleep(BEFORE_S)  # a quiet time before the outage
         front.is_out, began = True, time.monotonic()
         front.cut()
         await asyncio.to_thread(local.robot, "disable", "disabled")
@@ -209,7 +209,7 @@ async def _end_of(robot: client_sdk.Robot, until: float) -> str:
             return error.code
         except RsePfError as error:
             told = error.code
-        await asyncio.sleep(0.2)
+        await asyncio.sleep(0.2)  # polls, with a deadline
     return f"not ended: {told}"
 
 

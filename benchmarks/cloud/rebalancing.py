@@ -88,7 +88,7 @@ async def _measure(args: argparse.Namespace) -> dict[str, Any]:
                 agents = Agents(settings, cloudwatch, control_token_file(state))
                 with agents:
                     agents.follow(platform)
-                    await asyncio.sleep(2.0)
+                    await asyncio.sleep(2.0)  # all robots ask before the new server
                     before = await _robots(platform)
                     await platform.grow(1, "a new server")
                     began_s = time.monotonic()

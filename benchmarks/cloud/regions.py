@@ -47,6 +47,8 @@ ASK_EVERY_S = 0.1
 DEADLINE_S = 8.0
 CONNECT_BAR_S, CHANGE_BAR_S = 2.0, 5.0
 WAIT_S = 900.0
+BEFORE_S, AFTER_S = 2.0, 3.0
+"""Quiet times before a fault and after a change, so that gaps are seen."""
 
 
 class Asker:
@@ -129,7 +131,7 @@ class Site:
         while time.monotonic() - began < WAIT_S:
             if robot.stats.region == link.url:
                 return round(time.monotonic() - began, 3)
-            await asyncio.sleep(0.005)
+            await asyncio.sleep(0.005)  # polls, with a deadline
         return None
 
     async def restart_near(self) -> None:
@@ -150,14 +152,14 @@ async def connects(site: Site) -> dict[str, Any]:
 async def loses_near(site: Site, how: str) -> dict[str, Any]:
     """Take the near region away and give it back; return what the robot noticed of it."""
     async with site.robot() as robot, Asker(robot) as asker:
-        await asyncio.sleep(2.0)
+        await asyncio.sleep(BEFORE_S)
         began = time.monotonic()
         if how == "dies":
             await asyncio.to_thread(site.near.kill)
         else:
             site.near_link.is_stalled = True
         changed_s = await site.in_region(robot, site.far_link)
-        await asyncio.sleep(3.0)
+        await asyncio.sleep(AFTER_S)
         gap_s = asker.longest_gap_s(began)
         if how == "dies":
             await site.restart_near()
@@ -173,10 +175,10 @@ async def loses_near(site: Site, how: str) -> dict[str, Any]:
 async def gets_slow(site: Site) -> dict[str, Any]:
     """Make the near link slow for good, and fast again after the change."""
     async with site.robot() as robot, Asker(robot) as asker:
-        await asyncio.sleep(2.0)
+        await asyncio.sleep(BEFORE_S)
         began, site.near_link.delay_s = time.monotonic(), SLOW_S
         changed_s = await site.in_region(robot, site.far_link)
-        await asyncio.sleep(3.0)
+        await asyncio.sleep(AFTER_S)
         gap_s = asker.longest_gap_s(began)
         site.near_link.delay_s = NEAR_S
         back_s = await site.in_region(robot, site.near_link)

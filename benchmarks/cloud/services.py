@@ -124,7 +124,7 @@ async def _run(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
             while min(heard.versions.values(), default=0) < version:
                 if time.monotonic() - began_s > _AT_ALL_S:
                     raise SystemExit(f"version {version} did not reach every robot in {_AT_ALL_S:g} s")
-                await asyncio.sleep(0.01)
+                await asyncio.sleep(0.01)  # polls, with a deadline
             took.append(round(time.monotonic() - began_s, 3))
             heard.is_changing = False
         over.set()

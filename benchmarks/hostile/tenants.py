@@ -267,7 +267,7 @@ def main(arguments: Sequence[str]) -> int:
             while not announce.exists():
                 if server.poll() is not None or time.monotonic() > end:
                     raise SystemExit(log.read_text())
-                time.sleep(0.05)
+                time.sleep(0.05)  # polls, with a deadline
             port = json.loads(announce.read_text())["port"]
             tokens = {
                 tenant: KEY.issue(
