@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from client_sdk.mapping import MapOptions, PointMap, Trajectory
     from client_sdk.monocular.scale import MarkerScale, OdometryScale
     from client_sdk.monocular_tracker import MonocularOptions
-    from client_sdk.offload import CloudFirst
+    from client_sdk.offloading.offload import CloudFirst
     from client_sdk.robot import Robot, connect
     from client_sdk.stats import Stats
     from client_sdk.transfer.background_upload import BackgroundUploader
@@ -72,7 +72,7 @@ _HOMES = {
     "BlockingMapper": "mapper",
     "BlockingRobot": "blocking",
     "BlockingUpdates": "updates",
-    "CloudFirst": "offload",
+    "CloudFirst": "offloading.offload",
     "Correction": "live",
     "DataClient": "transfer.data_client",
     "DataOptions": "transfer.data_client",

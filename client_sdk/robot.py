@@ -15,15 +15,15 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from client_sdk.answers import Answer, PoseAnswer
-from client_sdk.asking import Asking, Call, OnProgress
-from client_sdk.burst import Burst
-from client_sdk.burst_rules import checked_burst_url
-from client_sdk.connection import Connection, ForRobot, OnChange
-from client_sdk.dialling import DialError
 from client_sdk.enrolment import read_enrolment
-from client_sdk.handshake import Token
 from client_sdk.local_services import LocalServices
-from client_sdk.offload import CloudFirst
+from client_sdk.network.connection import Connection, ForRobot, OnChange
+from client_sdk.network.dialling import DialError
+from client_sdk.network.handshake import Token
+from client_sdk.offloading.asking import Asking, Call, OnProgress
+from client_sdk.offloading.burst import Burst
+from client_sdk.offloading.burst_rules import checked_burst_url
+from client_sdk.offloading.offload import CloudFirst
 from client_sdk.recording import make_recorder, sdk_version
 from client_sdk.stats import Stats, StatsKeeper
 from client_sdk.updates import RobotSubscriptions, Updates

@@ -9,7 +9,7 @@ from random import Random
 import pytest
 
 from benchmarks.cloud.played_firewall import PlayedFirewall, rules_of_settings
-from client_sdk.backoff import Backoff
+from client_sdk.network.backoff import Backoff
 from rse_pf.config import PlatformSettings, SessionSettings
 
 SITE = "203.0.113.7"

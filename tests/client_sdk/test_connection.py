@@ -11,7 +11,7 @@ import pytest
 from fake_platform import FakePlatform
 
 import client_sdk
-from client_sdk.handshake import websocket_options
+from client_sdk.network.handshake import websocket_options
 from rse_pf.config import SessionSettings
 from rse_pf.errors import (
     Conflict,

@@ -7,7 +7,7 @@ import socket
 
 import pytest
 
-from client_sdk.dialling import dial_error_of, shown_address, unreachable
+from client_sdk.network.dialling import dial_error_of, shown_address, unreachable
 from rse_pf.auth.tokens import KeySet
 from rse_pf.backend.gateway.handshake import HandshakePolicy, Rejected
 from rse_pf.config import PlatformSettings

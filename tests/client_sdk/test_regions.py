@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from itertools import pairwise
 
-from client_sdk.regions import RegionChoice
+from client_sdk.network.regions import RegionChoice
 
 NEAR, FAR = 0, 1
 HOLD_S = 60.0

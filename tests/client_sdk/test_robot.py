@@ -14,7 +14,7 @@ import pytest
 from fakes import FakeRobot, FakeServer, answer_at_once, answer_nothing
 
 import client_sdk
-from client_sdk.connection import Connection
+from client_sdk.network.connection import Connection
 from rse_pf.config import PnpSettings, SessionSettings
 from rse_pf.errors import (
     Busy,

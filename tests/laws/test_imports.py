@@ -92,9 +92,9 @@ PACKAGES: dict[str, tuple[str, ...]] = {
     "numpy": ("rse_pf/", "client_sdk/", "lambda_pnp/", "ros_bridge/"),
     "msgspec": ("rse_pf/", "client_sdk/", "lambda_pnp/"),
     "websockets": (
-        "client_sdk/connection.py",
-        "client_sdk/handshake.py",
-        "client_sdk/region_sockets.py",
+        "client_sdk/network/connection.py",
+        "client_sdk/network/handshake.py",
+        "client_sdk/network/region_sockets.py",
     ),
     "cv2": (
         "rse_pf/pnp/engines.py",
@@ -153,8 +153,8 @@ PURE = (
     "rse_pf/scaling/",
     "rse_pf/auth/tokens.py",
     "rse_pf/audit/chain.py",
-    "client_sdk/burst_rules.py",
-    "client_sdk/offload.py",
+    "client_sdk/offloading/burst_rules.py",
+    "client_sdk/offloading/offload.py",
 )
 IMPURE = {
     "time", "datetime", "sched", "socket", "socketserver", "select", "selectors", "ssl", "threading",
@@ -272,7 +272,7 @@ def test_the_sources_keep_the_import_law(sources: Mapping[str, str]) -> None:
         ("client_sdk/robot.py", "def f():\n    from rse_pf import scaling"),
         ("client_sdk/robot.py", "import websockets"),
         ("client_sdk/frontend.py", "import cv2"),
-        ("client_sdk/offload.py", "def now():\n    import time"),
+        ("client_sdk/offloading/offload.py", "def now():\n    import time"),
         ("rse_pf/errors.py", "import rse_pf.config.settings"),
         ("rse_pf/geometry.py", "from rse_pf.wire import Command"),
         ("rse_pf/wire/codec.py", "from time import monotonic"),

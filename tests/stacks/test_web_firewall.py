@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from benchmarks.cloud.played_firewall import PlayedFirewall, rules_of_settings, rules_of_template
-from client_sdk.dialling import dial_error_of
+from client_sdk.network.dialling import dial_error_of
 from rse_pf.config.resource_names import ROSBRIDGE_PATH
 
 SITE = "203.0.113.7"

@@ -22,7 +22,7 @@ from client_sdk.frontend import Frame, FrontEndOptions, PoseQuery, TrackedFrame
 from client_sdk.live import LiveMapper, LiveOptions
 from client_sdk.mapper import Mapper, ask_robot
 from client_sdk.mapping import PointMap, Trajectory, write_ply, write_trajectory
-from client_sdk.offload import CloudFirst
+from client_sdk.offloading.offload import CloudFirst
 from client_sdk.robot import Robot
 from rse_pf.config import DataSettings, SessionSettings
 from rse_pf.errors import RsePfError, error_of_system

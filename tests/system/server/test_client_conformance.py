@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 import websockets
 
-from client_sdk.handshake import websocket_options
+from client_sdk.network.handshake import websocket_options
 from rse_pf.config import SessionSettings
 
 pytestmark = [pytest.mark.system, pytest.mark.slow]

@@ -1,4 +1,4 @@
-"""One address of a robot and the socket that is kept there; `client_sdk.connection` opens and reads it."""
+"""One address of a robot and the socket that is kept there; `connection` opens and reads it."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from typing import Any
 
 from websockets.asyncio.client import ClientConnection
 
-from client_sdk.backoff import Backoff
-from client_sdk.dialling import DialError, shown_address
+from client_sdk.network.backoff import Backoff
+from client_sdk.network.dialling import DialError, shown_address
 from rse_pf.wire.client_session import ConnectionState
 
 __all__ = ["Region", "RegionSocket", "cancel_all", "either"]

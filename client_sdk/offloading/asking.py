@@ -13,10 +13,10 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from client_sdk.answers import Answer
-from client_sdk.burst import Burst
 from client_sdk.local_services import LocalServices
-from client_sdk.offload import CloudFirst, Plan
-from client_sdk.region_sockets import cancel_all
+from client_sdk.network.region_sockets import cancel_all
+from client_sdk.offloading.burst import Burst
+from client_sdk.offloading.offload import CloudFirst, Plan
 from client_sdk.stats import StatsKeeper
 from client_sdk.tracing import current_trace
 from rse_pf.wire import Command, Failure, Result

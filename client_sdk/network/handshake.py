@@ -1,6 +1,6 @@
-"""Open one WebSocket to one address, with the token of the robot; `client_sdk.dialling` explains failures.
+"""Open one WebSocket to one address, with the token of the robot; `dialling` explains failures.
 
-This module and `client_sdk.connection` are the only ones that know the WebSocket library.
+This module and `client_sdk.network.connection` are the only ones that know the WebSocket library.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from websockets.asyncio.client import connect as websocket_connect
 from websockets.exceptions import InvalidStatus, WebSocketException
 from websockets.typing import Subprotocol
 
-from client_sdk.dialling import (
+from client_sdk.network.dialling import (
     CHECK_ADDRESS,
     DialError,
     dial_error_of,

@@ -1,7 +1,7 @@
 """The sockets of a robot: connect, read, write, ping, reconnect, move; `ClientSession` holds the rules.
 
 There is one current socket, a second one during a
-move, and one that stands by for each further address.  Reconnects are delayed (`client_sdk.backoff`).
+move, and one that stands by for each further address.  Reconnects are delayed (`client_sdk.network.backoff`).
 Commands survive the loss of a socket.
 """
 
@@ -15,11 +15,11 @@ from typing import TYPE_CHECKING, Any
 
 from websockets.exceptions import ConnectionClosed
 
-from client_sdk.backoff import Backoff
-from client_sdk.dialling import CHECK_ADDRESS, CHECK_RUNNING, ISSUE, DialError
-from client_sdk.handshake import Dialler, Token
-from client_sdk.region_sockets import Region, RegionSocket, cancel_all, either
-from client_sdk.regions import MAX_REGIONS, RegionChoice
+from client_sdk.network.backoff import Backoff
+from client_sdk.network.dialling import CHECK_ADDRESS, CHECK_RUNNING, ISSUE, DialError
+from client_sdk.network.handshake import Dialler, Token
+from client_sdk.network.region_sockets import Region, RegionSocket, cancel_all, either
+from client_sdk.network.regions import MAX_REGIONS, RegionChoice
 from rse_pf.errors import (
     Conflict,
     ConnectError,

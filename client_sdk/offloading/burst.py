@@ -1,7 +1,7 @@
 """Send a command to the burst function by HTTP: the bytes of the WebSocket, with the same token.
 
-This is the only module of the robot that speaks HTTP in its event loop; `client_sdk.burst_rules` decides
-whether it may.  A call ends with exactly one answer or failure, and never later than its deadline.
+This is the only module of the robot that speaks HTTP in its event loop; `burst_rules` decides whether it
+may.  A call ends with exactly one answer or failure, and never later than its deadline.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from random import Random
 from urllib.parse import urlsplit
 
 from client_sdk.answers import Answer
-from client_sdk.burst_rules import BurstRules, burst_address
-from client_sdk.region_sockets import cancel_all
+from client_sdk.network.region_sockets import cancel_all
+from client_sdk.offloading.burst_rules import BurstRules, burst_address
 from rse_pf.config import BurstSettings
 from rse_pf.errors import RsePfError
 from rse_pf.wire import SUBPROTOCOLS, Codec, Command, Failure, Result, Welcome

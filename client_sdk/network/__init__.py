@@ -1,0 +1,1 @@
+"""A robot's connection: which platform, when to dial, and the WebSocket."""

@@ -1,0 +1,1 @@
+"""Who computes a pose: a server, the burst function, or the robot itself."""
