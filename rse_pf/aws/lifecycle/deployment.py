@@ -12,13 +12,12 @@ from typing import Any
 import msgspec
 
 from rse_pf.aws.account import Account
+from rse_pf.aws.formation import bootstrap_version, living_stacks
 from rse_pf.config import PlatformSettings
 from rse_pf.config.resource_names import DEPLOYMENT_TAG, STACKS, ResourceNames
 from rse_pf.errors import ConfigurationError
 
 __all__ = ["Deployment", "GroupSize", "ParkNote", "read_deployment", "read_note", "read_sizes"]
-
-_GONE = ("DELETE_COMPLETE", "REVIEW_IN_PROGRESS")
 
 
 class GroupSize(msgspec.Struct, frozen=True, kw_only=True):
@@ -72,19 +71,14 @@ def read_deployment(account: Account, settings: PlatformSettings) -> Deployment:
         StoreError: AWS does not answer.
     """
     names = ResourceNames(settings.cloud.name)
-    rows = account.pages("cloudformation", "describe_stacks", "Stacks")
-    ours = {
-        row["StackName"].removeprefix(names.stack_prefix): row
-        for row in rows
-        if names.owns_stack(row["StackName"]) and row["StackStatus"] not in _GONE
-    }
-    version = f"/cdk-bootstrap/{settings.cloud.bootstrap_qualifier}/version"
+    stacks = living_stacks(account, names)
+    ours = {name.removeprefix(names.stack_prefix): row for name, row in stacks.items()}
     outputs = ours.get("Backend", {}).get("Outputs", ())
     return Deployment(
         stacks={box: str(ours[box]["StackStatus"]) for box in STACKS if box in ours},
         groups=read_sizes(account, names),
         note=read_note(account, names),
-        is_bootstrapped=account.find("ssm", "get_parameter", Name=version) is not None,
+        is_bootstrapped=bootstrap_version(account, settings) is not None,
         url=next((str(each["OutputValue"]) for each in outputs if each["OutputKey"] == "Url"), ""),
     )
 

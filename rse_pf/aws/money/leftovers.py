@@ -11,13 +11,13 @@ from dataclasses import dataclass
 from typing import Any
 
 from rse_pf.aws.account import Account
+from rse_pf.aws.formation import living_stacks
 from rse_pf.config.resource_names import DEPLOYMENT_TAG, ResourceNames
 from rse_pf.errors import ConfigurationError
 
-__all__ = ["Leftover", "find_leftovers", "living_stacks"]
+__all__ = ["Leftover", "find_leftovers"]
 
 _OF_FUNCTIONS = "/aws/lambda/"
-_GONE = ("DELETE_COMPLETE", "REVIEW_IN_PROGRESS")
 _KEPT = {
     "bucket": "kept on purpose: holds maps, packages, access logs or audit logs",
     "secret": "kept on purpose: the signing key",
@@ -36,13 +36,6 @@ class Leftover:
     why: str
     remove: str
     unread: bool = False
-
-
-def living_stacks(account: Account, of: ResourceNames) -> list[str]:
-    """Return the names of the stacks of the deployment *of* that exist."""
-    found = account.pages("cloudformation", "describe_stacks", "Stacks")
-    names = [row["StackName"] for row in found if row["StackStatus"] not in _GONE]
-    return sorted(name for name in names if of.owns_stack(name))
 
 
 def find_leftovers(account: Account, of: ResourceNames) -> list[Leftover]:

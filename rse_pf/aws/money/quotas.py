@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 from rse_pf.aws.account import Account
-from rse_pf.aws.money.leftovers import living_stacks
+from rse_pf.aws.formation import bootstrap_version, living_stacks
 from rse_pf.aws.money.prices import load_prices
 from rse_pf.config import PlatformSettings
 from rse_pf.config.cloud_layout import zone_count
@@ -57,11 +57,10 @@ def check_account(account: Account, settings: PlatformSettings) -> Iterator[Chec
 
 
 def _bootstrap(account: Account, settings: PlatformSettings) -> Check:
-    qualifier = settings.cloud.bootstrap_qualifier
-    found = account.find("ssm", "get_parameter", Name=f"/cdk-bootstrap/{qualifier}/version")
-    if found is None:
+    version = bootstrap_version(account, settings)
+    if version is None:
         return Check("fail", f"{NOT_BOOTSTRAPPED} in {account.region}", "rse-pf cloud up does it")
-    return Check("ok", f"bootstrapped, version {found['Parameter']['Value']}")
+    return Check("ok", f"bootstrapped, version {version}")
 
 
 def _certificate(account: Account, settings: PlatformSettings) -> Check:
