@@ -14,7 +14,15 @@ from rse_pf.config import PlatformSettings
 from rse_pf.config.resource_names import SETTINGS_CONTEXT
 from rse_pf.errors import DeploymentFailed, UsageError
 
-__all__ = ["CdkTools"]
+__all__ = ["PACKAGES", "CdkTools", "are_packages_built"]
+
+PACKAGES = Path("build")
+"""Where `scripts/assets.py` puts the packages, in a checkout."""
+
+
+def are_packages_built(checkout: Path) -> bool:
+    """Return whether packages were built; the synthesis refuses those of other sources."""
+    return all(any((checkout / PACKAGES / name).glob("*")) for name in ("servers", "lambda"))
 
 
 class CdkTools:
@@ -33,8 +41,8 @@ class CdkTools:
 
     @property
     def has_packages(self) -> bool:
-        """Whether packages were built; the synthesis refuses those of other sources."""
-        return all(any((self._checkout / "build" / name).glob("*")) for name in ("servers", "lambda"))
+        """Whether packages were built."""
+        return are_packages_built(self._checkout)
 
     def build(self) -> None:
         """Build the packages; raises DeploymentFailed."""

@@ -14,6 +14,7 @@ from collections.abc import Iterator
 from importlib import metadata
 from pathlib import Path
 
+from rse_pf.aws.lifecycle.cdk_tools import PACKAGES, are_packages_built
 from rse_pf.cli.doctor import Finding, report
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import MissingExtra, RsePfError
@@ -26,7 +27,6 @@ _OLDEST_NODE = 22
 _NODE_ANSWERS_S = 10.0
 _CLI = Path("node_modules", "aws-cdk", "package.json")
 _PINNED = Path("package.json")
-_PACKAGES = Path("build")
 _SCHEMA = "@aws-cdk/cloud-assembly-schema"
 
 
@@ -57,8 +57,8 @@ def check_tools(checkout: Path) -> Iterator[Finding]:
     yield _cli(checkout)
     yield (
         Finding(grade="ok", what="packages are built")
-        if all(any((checkout / _PACKAGES / name).glob("*")) for name in ("servers", "lambda"))
-        else Finding(grade="fail", what=f"{NO_PACKAGES} in {_PACKAGES}", fix="make assets")
+        if are_packages_built(checkout)
+        else Finding(grade="fail", what=f"{NO_PACKAGES} in {PACKAGES}", fix="make assets")
     )
 
 
