@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import pkgutil
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,14 @@ def test_no_old_setting_exists_and_every_new_one_does() -> None:
 @pytest.mark.parametrize("new", sorted(set(TABLE["imports"].values())))
 def test_every_new_module_exists(new: str) -> None:
     assert importlib.util.find_spec(new) is not None
+
+
+@pytest.mark.parametrize(
+    "new",
+    sorted(new for kind in ("classes", "members") for new in TABLE[kind].values() if "." in new),
+)
+def test_every_new_class_and_member_exists(new: str) -> None:
+    assert pkgutil.resolve_name(new.partition("(")[0]) is not None
 
 
 @pytest.mark.parametrize(
