@@ -10,7 +10,7 @@ from aws_cdk import aws_ec2 as ec2
 from constructs import Construct
 
 from rse_pf.config import PlatformSettings
-from rse_pf.config.placement import fixed_live_ports
+from rse_pf.config.placement import batch_ports, fixed_live_ports
 from rse_pf.errors import ConfigurationError
 from stacks.findings import acknowledge
 
@@ -82,8 +82,8 @@ class Firewall(Construct):
     def _job_servers(self, vpc: ec2.IVpc, settings: PlatformSettings) -> ec2.SecurityGroup:
         """Let job servers reach S3, the endpoints and, for batches, each other; nobody else reaches them."""
         jobs = self._group("Jobs", vpc, "job servers: each other in, S3 and endpoints out")
-        first = settings.batch.first_port
-        ports = ec2.Port.tcp_range(first, first + settings.batch.ports - 1)
+        batch = batch_ports(settings.batch)
+        ports = ec2.Port.tcp_range(batch[0], batch[-1])
         jobs.add_egress_rule(jobs, ports, "batches: scheduler and workers")
         jobs.add_ingress_rule(jobs, ports, "batches: scheduler and workers")
         jobs.add_egress_rule(ec2.Peer.prefix_list(s3_prefix_list(settings)), ec2.Port.tcp(_HTTPS), "S3")

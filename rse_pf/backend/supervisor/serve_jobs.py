@@ -26,7 +26,7 @@ from rse_pf.backend.supervisor.control_http import ControlReply, ControlRequest,
 from rse_pf.backend.supervisor.worker_handle import BUILTIN
 from rse_pf.batch.helpers import BatchHelpers
 from rse_pf.config import PlatformSettings
-from rse_pf.config.placement import ServerPlacement
+from rse_pf.config.placement import ServerPlacement, batch_ports
 from rse_pf.errors import ConfigurationError, RsePfError, UsageError
 from rse_pf.files import replace_json
 
@@ -92,9 +92,8 @@ class _Service:
         self._jobs = JobServer(
             context, self._queue, self._log, lambda: f"{server_id}-{secrets.token_hex(8)}", slots
         )  # fmt: skip
-        batch = settings.batch
-        ports = f"{batch.first_port + 1}:{batch.first_port + batch.ports - 1}"
-        self._helpers = BatchHelpers(store, slots, ports=ports)
+        _, *ports = batch_ports(settings.batch)
+        self._helpers = BatchHelpers(store, slots, ports=f"{ports[0]}:{ports[-1]}")
         self._waiting = 0
         self._state = "starting"
         self._over = asyncio.Event()

@@ -17,12 +17,10 @@ from rse_pf.config.resource_names import ResourceNames
 from rse_pf.errors import UsageError
 from rse_pf.object_store import ObjectStore
 from rse_pf.services.custom.installed import install
-from rse_pf.services.custom.publishing import PublishedService, publish, read_list, remove
+from rse_pf.services.custom.publishing import LOOK_PERIOD_S, PublishedService, publish, read_list, remove
 from rse_pf.terminal import show, show_json
 
 __all__ = ["add_publish_arguments", "publish_service"]
-
-_WITHIN_S = 15
 
 
 def add_publish_arguments(parser: argparse.ArgumentParser) -> None:
@@ -50,7 +48,7 @@ def publish_service(args: argparse.Namespace, settings: PlatformSettings) -> int
         return _list(_store(settings), as_json=args.json)
     if args.remove:
         remove(args.what, _store(settings))
-        show(f"{args.what} is removed: servers stop offering it within {_WITHIN_S} s")
+        show(f"{args.what} is removed: servers stop offering it within {LOOK_PERIOD_S} s")
         return 0
     built, dependencies = built_service(Path(args.what))
     with tempfile.TemporaryDirectory(prefix="rse-pf-publish-") as folder:
@@ -58,7 +56,8 @@ def publish_service(args: argparse.Namespace, settings: PlatformSettings) -> int
         entry = publish(service, Path(folder), _store(settings), now_s=time.time())
     show(
         f"{entry.name} ({entry.language}) is published: {entry.size} bytes, sha256 {entry.archive[:16]}",
-        f"servers load it within {_WITHIN_S} s; rse-pf service publish {entry.name} --remove takes it out",
+        f"servers load it within {LOOK_PERIOD_S} s; "
+        f"rse-pf service publish {entry.name} --remove takes it out",
     )
     return 0
 

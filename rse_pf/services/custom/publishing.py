@@ -23,6 +23,7 @@ from rse_pf.services.custom.installed import InstalledService, dependencies_of
 
 __all__ = [
     "LIST_NAME",
+    "LOOK_PERIOD_S",
     "MAX_ARCHIVE_BYTES",
     "SERVER_PLATFORM",
     "PublishedList",
@@ -39,6 +40,8 @@ __all__ = [
 
 LIST_NAME = f"{SERVICES_PREFIX}/list.json"
 """Of the list in the artifact bucket; `archive_name` gives those of the archives."""
+LOOK_PERIOD_S = 15
+"""How often servers look at the list."""
 SERVER_PLATFORM = "cp311-linux-x86_64"
 """What servers on AWS run: Debian 12 on x86-64."""
 MAX_ARCHIVE_BYTES = 128 << 20

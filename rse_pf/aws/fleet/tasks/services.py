@@ -13,6 +13,7 @@ from rse_pf.errors import ConfigurationError, Disconnected, NotFound
 from rse_pf.services.custom.published_folder import PublishedFolder
 from rse_pf.services.custom.publishing import (
     LIST_NAME,
+    LOOK_PERIOD_S,
     PublishedList,
     PublishedService,
     archive_name,
@@ -23,7 +24,6 @@ __all__ = ["FOLDER", "task"]
 
 FOLDER = "services"
 """Beside the public keys; the units name it, too."""
-_PERIOD_S = 15.0
 _EMPTY = msgspec.json.encode(PublishedList())
 
 
@@ -61,4 +61,4 @@ def task(context: AgentContext) -> Task:
                 return  # a server that starts reads the folder itself
             told = data
 
-    return Task(name="services", period_s=_PERIOD_S, call=follow, in_thread=True)
+    return Task(name="services", period_s=float(LOOK_PERIOD_S), call=follow, in_thread=True)
