@@ -50,9 +50,9 @@ COUNTED: dict[str, Callable[[Assembly], float]] = {
 @pytest.mark.parametrize("what", COUNTED)
 def test_a_line_of_the_bill_counts_what_the_templates_have(assembly: Assembly, what: str) -> None:
     bill = bill_of(assembly.settings, load_prices())
-    (line,) = [each for each in bill.lines if each.what == what]
+    lines = [each for each in bill.lines if each.what.removesuffix(", of 10 s") == what]
 
-    assert line.count == COUNTED[what](assembly)
+    assert sum(line.count for line in lines) == COUNTED[what](assembly) > 0
 
 
 def test_every_endpoint_is_paid_for_in_each_of_its_zones(assembly: Assembly) -> None:

@@ -18,7 +18,9 @@ from rse_pf.config import PlatformSettings
 from rse_pf.config.cloud_layout import CANARY_MB, CANARY_PERIOD_S, ENDPOINT_SERVICES, zone_count
 from rse_pf.config.front_door import rate_rules
 from rse_pf.scaling.alarms import alarms_of
+from rse_pf.scaling.job_alarms import JOB_PERIOD_S, JOBS, JOBS_WAITING, job_alarms_of
 from rse_pf.scaling.operator_alarms import operator_alarms
+from rse_pf.scaling.profile import cadence_of
 
 __all__ = [
     "HOURS",
@@ -37,7 +39,8 @@ __all__ = [
 HOURS = 730.0
 """Hours of a month, as in the calculator of AWS."""
 NOT_INCLUDED = (
-    "taxes, data out to the robots (the same for both), stored maps and logs, savings plans, the free tier"
+    "taxes, data out to the robots (the same for both), stored maps and logs, copies in other regions, live "
+    "maps (0.04 USD an hour each, in S3), savings plans, the free tier"
 )
 VOLUME_GB = 8
 """Of a server."""
@@ -50,8 +53,13 @@ _DETAILED_METRICS = 7
 """That EC2 publishes each minute for a server with detailed monitoring."""
 _OTHER_RULES = 1
 """Of the firewall: a burst without a token; tests/stacks/test_money.py counts those of the template."""
+_READ_METRICS = 2
+"""That the agent of a server with robots reads each period: robots and servers."""
+_FAST_BELOW_S = 60
+"""An alarm with a shorter period is priced higher."""
 _UNITS = "capacity units"
 _CANARY_S = 1.0
+_JOB_METRICS = (JOBS, JOBS_WAITING)
 
 Needs = Literal["servers", "balancer", "nothing"]
 """What a line is paid for: running servers, the load balancer with firewall and endpoints, or anyway."""
@@ -61,13 +69,15 @@ Needs = Literal["servers", "balancer", "nothing"]
 class Load:
     """How many robots send how many commands, and for how long each day.
 
-    ``burst_commands_per_day`` are answered by the Lambda beside the fleet.
+    ``burst_commands_per_day`` are answered by the Lambda beside the fleet; ``job_hours_per_day`` are the
+    hours of all job servers together.
     """
 
     robots: int
     fps: float
     hours_per_day: float = _DAY_H
     burst_commands_per_day: float = 0.0
+    job_hours_per_day: float = 0.0
 
     @property
     def commands_per_s(self) -> float:
@@ -137,7 +147,8 @@ def bill_of(settings: PlatformSettings, prices: Prices, load: Load | None = None
     """Return the bill of a month with *load*; without it, of a month without any robot.
 
     Raises:
-        ConfigurationError: The price of ``cloud.instance_type`` is not known.
+        ConfigurationError: The price of ``cloud.instance_type`` is not known, or that of every type of job
+            servers, and there are hours of job servers.
     """
     load = load or Load(robots=0, fps=0.0)
     lines = (
@@ -146,6 +157,7 @@ def bill_of(settings: PlatformSettings, prices: Prices, load: Load | None = None
         *_monitor_lines(settings, prices),
         *_data_lines(settings, prices),
         *_function_lines(settings, prices, load),
+        *_job_lines(settings, prices, load),
     )
     return Bill(tuple(line for line in lines if line.count))
 
@@ -197,7 +209,8 @@ def crossing_commands_per_s(
     saved = hours * (3600 * tariff.serverless_per_command - tariff.units_per_command)  # by 1 command/s
     if saved <= 0 or hours <= 0:
         return None
-    floor, floor_servers = bill_of(settings, prices).total, settings.scaling.min_servers
+    idle = bill_of(settings, prices, Load(robots=1, fps=0.0, hours_per_day=hours_per_day))
+    floor, floor_servers = idle.total, settings.scaling.min_servers
     most, below = min(tariff.capacity_per_s, settings.serving.max_robots * fps), 0.0
     for servers in range(floor_servers, settings.scaling.max_servers + 1):
         more = _more_servers(settings, prices, servers - floor_servers, hours)
@@ -241,6 +254,8 @@ def _server_lines(settings: PlatformSettings, prices: Prices, load: Load) -> Ite
     yield from _running(settings, prices, "always", 0, floor, HOURS)
     hours = HOURS * load.hours_per_day / _DAY_H
     yield from _more_servers(settings, prices, servers - floor, hours)
+    if load.robots:  # an agent without robots reads nothing
+        yield _reading(settings, prices, floor, hours)
     box, kept = "backend servers", settings.cloud.warm_servers
     yield CostLine(
         box=box, what="volumes of stopped warm servers", count=kept * VOLUME_GB, unit="GB",
@@ -252,7 +267,19 @@ def _more_servers(
     settings: PlatformSettings, prices: Prices, count: int, hours: float
 ) -> tuple[CostLine, ...]:
     floor = settings.scaling.min_servers
-    return tuple(_running(settings, prices, "in busy hours", floor, floor + count, hours))
+    lines = _running(settings, prices, "in busy hours", floor, floor + count, hours)
+    return (*lines, _reading(settings, prices, count, hours, "of further servers"))
+
+
+def _reading(
+    settings: PlatformSettings, prices: Prices, servers: int, hours: float, which: str = "of servers"
+) -> CostLine:
+    """Return what the agents of *servers* pay to see how many robots there are in all."""
+    reads = hours * 3600 / cadence_of(settings.scaling).period_s * _READ_METRICS
+    return CostLine(
+        box="monitor", what=f"reading metrics {which}, in busy hours", count=servers * reads / 1e3,
+        unit="thousand", price=prices.metric_calls_per_thousand, needs="servers", all_day=False,
+    )  # fmt: skip
 
 
 def _running(
@@ -273,6 +300,8 @@ def _running(
         ("backend servers", f"volumes, {when}", count * VOLUME_GB, "GB", prices.volume_per_gb_month),
         ("monitor", f"metrics of each server, {when}", count * _metrics_of_a_server(), "metrics",
          prices.metric_per_month),
+        ("monitor", f"publishing metrics, {when}", count * _published_by_a_server(settings), "thousand",
+         prices.metric_calls_per_thousand),
         ("data servers", f"audit logs and journals, {when}", count * _puts_of_a_server(settings),
          "thousand", prices.put_per_thousand),
     ):  # fmt: skip
@@ -307,17 +336,24 @@ def _front_lines(settings: PlatformSettings, prices: Prices, load: Load) -> Iter
 
 
 def _monitor_lines(settings: PlatformSettings, prices: Prices) -> Iterable[CostLine]:
-    alarm = prices.alarm_metric_per_month
     yield CostLine(
         box="monitor", what="metrics of the fleet", count=len(_metrics("")), unit="metrics",
         price=prices.metric_per_month, needs="servers",
     )  # fmt: skip
-    calling = sum(len(each.series) for each in operator_alarms(settings))
-    scaling = sum(len(each.metrics) for each in alarms_of(settings.scaling))
-    for box, what, count in (
+    calling = [(len(each.series), each.period_s) for each in operator_alarms(settings)]
+    scaling = [(len(each.metrics), each.period_s) for each in alarms_of(settings.scaling)]
+    jobs = [(len(each.metrics), each.period_s) for each in job_alarms_of(settings.cloud)]
+    for box, what, alarms in (
         ("monitor", "alarms for the operator", calling), ("scale modifier", "alarms that scale", scaling),
+        ("scale modifier", "alarms that scale job servers", jobs),
     ):  # fmt: skip
-        yield CostLine(box=box, what=what, count=count, unit="metrics", price=alarm)
+        for some, price, how in (
+            ([count for count, period_s in alarms if period_s >= _FAST_BELOW_S],
+             prices.alarm_metric_per_month, ""),
+            ([count for count, period_s in alarms if period_s < _FAST_BELOW_S],
+             prices.alarm_fast_metric_per_month, ", of 10 s"),
+        ):  # fmt: skip
+            yield CostLine(box=box, what=what + how, count=sum(some), unit="metrics", price=price)
     if settings.cloud.canary:
         calls = _MONTH_S / CANARY_PERIOD_S
         gb_s = calls * _CANARY_S * CANARY_MB / 1024
@@ -345,6 +381,34 @@ def _function_lines(settings: PlatformSettings, prices: Prices, load: Load) -> I
         yield CostLine(box="Lambda", what=what, count=count, unit=unit, price=price)
 
 
+def _job_lines(settings: PlatformSettings, prices: Prices, load: Load) -> Iterable[CostLine]:
+    """Yield what job servers cost: their metrics always, and Spot instances while there are jobs."""
+    if not settings.cloud.job_servers:
+        return
+    yield CostLine(
+        box="monitor", what="metrics of jobs", count=len(_JOB_METRICS), unit="metrics",
+        price=prices.metric_per_month, needs="servers",
+    )  # fmt: skip
+    if not load.job_hours_per_day:
+        return
+    hours = load.job_hours_per_day * HOURS / _DAY_H
+    kinds = settings.cloud.job_instance_types.split()
+    known = [kind for kind in kinds if kind in prices.servers]
+    cheapest = min(known or kinds, key=lambda kind: prices.server(kind).spot_per_hour)
+    for what, count, unit, price in (
+        (f"job servers, {cheapest} Spot", hours, "h", prices.server(cheapest).spot_per_hour),
+        ("volumes of job servers", VOLUME_GB * hours / HOURS, "GB", prices.volume_per_gb_month),
+        ("detailed metrics of job servers", _DETAILED_METRICS * hours / HOURS, "metrics",
+         prices.metric_per_month),
+        ("looks for jobs", hours * 3600 / settings.serving.job_poll_s / 1e3, "thousand",
+         prices.put_per_thousand),
+    ):  # fmt: skip
+        yield CostLine(
+            box="backend servers", what=what, count=count, unit=unit, price=price, needs="servers",
+            all_day=False,
+        )  # fmt: skip
+
+
 def _metrics(server: str) -> set[tuple[str, bool]]:
     """Return the metrics that an agent publishes: name, and whether it is of one server."""
     some = ServerMetrics(answers={1.0: 1.0})
@@ -354,6 +418,14 @@ def _metrics(server: str) -> set[tuple[str, bool]]:
 
 def _metrics_of_a_server() -> int:
     return _DETAILED_METRICS + sum(is_of_one for _, is_of_one in _metrics("server"))
+
+
+def _published_by_a_server(settings: PlatformSettings) -> float:
+    """Return the thousands of requests that publish the metrics of a server for a month."""
+    periods = [float(cadence_of(settings.scaling).period_s)]
+    if settings.cloud.job_servers:
+        periods.append(float(JOB_PERIOD_S))
+    return sum(_MONTH_S / period_s for period_s in periods) / 1e3
 
 
 def _puts_of_a_server(settings: PlatformSettings) -> float:

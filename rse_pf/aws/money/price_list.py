@@ -51,6 +51,15 @@ _QUESTIONS = (
         "alarm_metric_per_month", "AmazonCloudWatch", {"productFamily": "Alarm"}, r"CW:AlarmMonitorUsage"
     ),
     _Question(
+        "alarm_fast_metric_per_month",
+        "AmazonCloudWatch",
+        {"productFamily": "Alarm"},
+        r"CW:HighResAlarmMonitorUsage",
+    ),
+    _Question(
+        "metric_calls_per_thousand", "AmazonCloudWatch", {"productFamily": "API Request"}, r"CW:Requests", 1e3
+    ),
+    _Question(
         "balancer_per_hour", "AWSELB", {"productFamily": "Load Balancer-Application"}, "LoadBalancerUsage"
     ),
     _Question("balancer_unit_per_hour", "AWSELB", {"productFamily": "Load Balancer-Application"}, "LCUUsage"),

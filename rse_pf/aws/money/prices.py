@@ -64,6 +64,10 @@ class Prices(_Table, frozen=True, kw_only=True):
     """One detailed or custom metric."""
     alarm_metric_per_month: _Price
     """One metric in an alarm of standard resolution."""
+    alarm_fast_metric_per_month: _Price
+    """One metric in an alarm with a period below a minute."""
+    metric_calls_per_thousand: _Price
+    """A thousand requests that publish metrics, or metrics that are read."""
     balancer_per_hour: _Price
     """The load balancer without its addresses."""
     balancer_unit_per_hour: _Price

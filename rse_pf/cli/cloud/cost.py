@@ -34,6 +34,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="commands a day that the Lambda answers beside the fleet (default: none)",
     )  # fmt: skip
     parser.add_argument(
+        "--job-hours", type=float, default=0.0, metavar="H",
+        help="hours a day of all job servers together (default: none); needs cloud.job_servers",
+    )  # fmt: skip
+    parser.add_argument(
         "--prices", type=Path, metavar="FILE", help="JSON file of prices to use in place of ours, all or some"
     )
 
@@ -43,7 +47,7 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     from rse_pf.aws.money.costs import NOT_INCLUDED, bill_of, compare
     from rse_pf.aws.money.prices import operators_prices
 
-    load = _load(args)
+    load = _load(args, settings)
     prices = operators_prices(args.prices, Path.cwd())
     bill, costs = bill_of(settings, prices, load), compare(settings, prices, load)
     show(
@@ -58,10 +62,12 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     for line in prices.warnings(today=date.today(), region=settings.cloud.region):
         show(line)
     show(f"not included: {NOT_INCLUDED}")
+    if settings.cloud.job_servers and not load.job_hours_per_day:
+        show("without --job-hours no job server runs: each is paid while there are jobs")
     return 0
 
 
-def _load(args: argparse.Namespace) -> Load:
+def _load(args: argparse.Namespace, settings: PlatformSettings) -> Load:
     """Return the load that the options describe; raises UsageError."""
     if not 1 <= args.robots <= _MAX_ROBOTS:
         raise UsageError(
@@ -80,9 +86,17 @@ def _load(args: argparse.Namespace) -> Load:
             f"--burst {args.burst:g} is not within 0..{_MAX_BURST:g}",
             hint="name commands a day, such as 5000",
         )
+    most = 24 * settings.cloud.job_servers
+    if not 0 <= args.job_hours <= most:
+        raise UsageError(
+            f"--job-hours {args.job_hours:g} is not within 0..{most}, 24 for each of "
+            f"cloud.job_servers = {settings.cloud.job_servers}",
+            hint="name fewer hours, or set cloud.job_servers in cdk.json",
+        )
     return Load(
-        robots=args.robots, fps=args.fps, hours_per_day=args.hours_per_day, burst_commands_per_day=args.burst
-    )
+        robots=args.robots, fps=args.fps, hours_per_day=args.hours_per_day,
+        burst_commands_per_day=args.burst, job_hours_per_day=args.job_hours,
+    )  # fmt: skip
 
 
 def _show_bill(bill: Bill, prices: Prices) -> None:

@@ -26,7 +26,7 @@ SMALL = PlatformSettings.from_dict({"cloud": {"profile": "small"}})
 NOTHING = dict.fromkeys(
     ("volume_per_gb_month", "metric_per_month", "alarm_metric_per_month", "balancer_unit_per_hour",
      "firewall_per_month", "firewall_rule_per_month", "firewall_per_million", "secret_per_month",
-     "put_per_thousand", "lambda_per_gb_s"), 0.0,
+     "put_per_thousand", "lambda_per_gb_s", "alarm_fast_metric_per_month", "metric_calls_per_thousand"), 0.0,
 )  # fmt: skip
 PRICES = msgspec.structs.replace(
     load_prices(), **NOTHING,
@@ -188,6 +188,74 @@ def test_sockets_or_bytes_pay_the_balancers_units_whichever_is_more() -> None:
 
     assert by_sockets == pytest.approx(FLOOR + 730)
     assert by_bytes == pytest.approx(FLOOR + 730)
+
+
+def test_the_fast_profile_pays_for_its_alarms_and_for_six_times_as_many_requests() -> None:
+    prices = replaced(
+        metric_calls_per_thousand=1.0, alarm_metric_per_month=0.1, alarm_fast_metric_per_month=0.3
+    )
+    fast = SETTINGS.replace(scaling={"profile": "fast"})
+
+    paper_requests, fast_requests = (
+        {line.what: line.count for line in bill_of(settings, prices, at(1)).lines if line.unit == "thousand"}
+        for settings in (SETTINGS, fast)
+    )
+    alarms = {line.what: line for line in bill_of(fast, prices).lines if line.what.startswith("alarms")}
+
+    assert paper_requests["publishing metrics, always"] == pytest.approx(2 * 730 * 60 / 1e3)
+    assert fast_requests["publishing metrics, always"] == pytest.approx(2 * 730 * 360 / 1e3)
+    # Each agent reads the number of robots and that of servers.
+    assert fast_requests["reading metrics of servers, in busy hours"] == pytest.approx(4 * 730 * 360 / 1e3)
+    assert "alarms that scale" not in alarms
+    assert alarms["alarms that scale, of 10 s"].price == 0.3
+
+
+def test_nobody_reads_metrics_without_robots() -> None:
+    prices = replaced(metric_calls_per_thousand=1.0)
+
+    assert not [line for line in bill_of(SETTINGS, prices).lines if line.what.startswith("reading")]
+    night = bill_of(SETTINGS, prices, at(1, hours=6.0))
+    assert [line.count for line in night.lines if line.what.startswith("reading")] == [
+        pytest.approx(4 * 730 / 4 * 60 / 1e3)
+    ]
+
+
+def test_job_servers_are_paid_by_the_hour_and_the_cheapest_known_type_is_taken() -> None:
+    settings = SETTINGS.replace(
+        cloud={"job_servers": 3, "job_instance_types": "z1d.large c7i.xlarge c7i.large"},
+        serving={"offer_jobs": True, "job_poll_s": 5.0},
+    )
+    servers = {
+        "c7i.large": ServerPrice(vcpus=2, per_hour=0.1, spot_per_hour=0.04),
+        "c7i.xlarge": ServerPrice(vcpus=4, per_hour=0.2, spot_per_hour=0.08),
+    }
+    prices = replaced(servers=servers)
+
+    resting = bill_of(settings, prices)
+    at_work = bill_of(settings, prices, Load(robots=0, fps=0.0, job_hours_per_day=6.0))
+
+    assert resting.total == pytest.approx(bill_of(SETTINGS, prices).total)
+    assert at_work.total - resting.total == pytest.approx(0.04 * 730 / 4)
+    assert [line.count for line in at_work.lines if line.what == "looks for jobs"] == [
+        pytest.approx(730 / 4 * 720 / 1e3)
+    ]
+
+
+def test_a_group_of_job_servers_costs_its_alarms_and_metrics_at_rest() -> None:
+    prices = replaced(metric_per_month=0.3, alarm_metric_per_month=0.1)
+    with_jobs = SETTINGS.replace(cloud={"job_servers": 1}, serving={"offer_jobs": True})
+
+    assert bill_of(with_jobs, prices).total - bill_of(SETTINGS, prices).total == pytest.approx(0.8)
+
+
+def test_no_price_of_any_type_of_job_server_is_no_guess() -> None:
+    settings = SETTINGS.replace(
+        cloud={"job_servers": 1, "job_instance_types": "z1d.large"}, serving={"offer_jobs": True}
+    )
+
+    bill_of(settings, PRICES)
+    with pytest.raises(ConfigurationError, match=r"no price of z1d\.large"):
+        bill_of(settings, PRICES, Load(robots=0, fps=0.0, job_hours_per_day=1.0))
 
 
 def test_an_unknown_type_of_server_has_no_price_and_no_guess() -> None:

@@ -20,6 +20,7 @@ NOW = datetime(2026, 11, 23, 9, 0, tzinfo=timezone.utc)
 REGION = "eu-central-1"
 AMOUNTS = {
     "EBS:VolumeUsage.gp3": 0.0952, "CW:MetricMonitorUsage": 0.3, "CW:AlarmMonitorUsage": 0.1,
+    "CW:HighResAlarmMonitorUsage": 0.3, "CW:Requests": 1e-5,
     "LoadBalancerUsage": 0.027, "LCUUsage": 0.008, "PublicIPv4:InUseAddress": 0.005,
     "VpcEndpoint-Hours": 0.012, "WebACLV2": 5.0, "RuleV2": 1.0, "RequestV2-Tier1": 6e-7,
     "AWSSecretsManager-Secrets": 0.4, "TimedStorage-ByteHrs": 0.0245, "Requests-Tier1": 5.4e-6,
