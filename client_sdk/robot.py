@@ -85,8 +85,8 @@ class Robot:
             offload: `CloudFirst` lets the robot answer itself when the cloud cannot.
             clock: Seconds, monotonic.
             random: Source of the jitter of reconnects.
-            on_change: Called with ``link-lost``, ``link-back``, ``moved`` or ``stands-by``, and the reason or
-                the server.
+            on_change: Called with ``link-lost``, ``link-back``, ``moved``, ``stands-by`` or ``ended``, and
+                the reason or the server.
             record: Folder for a recording of what this robot says and hears, for rse-pf replay.
             thumbnails: Whether small pictures of the frames of its `mapper` are recorded, too.
             burst_url: ``https://HOST/burst``, a function that answers while no server can, also before the
@@ -355,6 +355,14 @@ class Robot:
     def connected(self) -> bool:
         """Whether there is a connection to a server now; without one, commands wait for the next."""
         return self._session.current is not None
+
+    @property
+    def failure(self) -> RsePfError | None:
+        """Why the robot has stopped reconnecting for good, such as `Unauthorized`; None while it has not.
+
+        Every command then raises this error at once, as long as the robot is open.
+        """
+        return self._connection.fatal
 
     def post(
         self,

@@ -26,7 +26,7 @@ from client_sdk.robot import Robot, connect
 from ros_bridge.incoming import NO_MESSAGE, IncomingFrames, PairedImages, Role
 from ros_bridge.options import BridgeOptions
 from ros_bridge.outgoing import Message, OutgoingMessages
-from rse_pf.errors import RsePfError, UsageError
+from rse_pf.errors import RsePfError, UsageError, error_from_code
 from rse_pf.geometry import Array
 from rse_pf.terminal import show
 
@@ -97,16 +97,18 @@ class Bridge:
                 self._loop.call_soon_threadsafe(self._has_frame.set)
 
     async def run(self) -> None:
-        """Track frames and publish, until cancelled."""
-        reporting = asyncio.create_task(self._report())
+        """Track frames and publish, until cancelled.
+
+        Raises:
+            RsePfError: The robot has stopped reconnecting: its token has expired, or another has its name.
+        """
+        running = [asyncio.create_task(self._take()), asyncio.create_task(self._report())]
         try:
-            while True:
-                await self._has_frame.wait()
-                self._has_frame.clear()
-                while (images := self._incoming.take()) is not None:
-                    await self._bridge(images)
+            done, _ = await asyncio.wait(running, return_when=asyncio.FIRST_COMPLETED)
+            for task in done:
+                task.result()
         finally:
-            ending = [reporting, *([self._cloud] if self._cloud is not None else [])]
+            ending = [*running, *([self._cloud] if self._cloud is not None else [])]
             for task in ending:
                 task.cancel()
             await asyncio.gather(*ending, return_exceptions=True)
@@ -134,6 +136,14 @@ class Bridge:
             return CallReply(ok=True, reply=json.dumps(answer.reply, default=_plain))
         except RsePfError as error:
             return CallReply(ok=False, code=error.code, message=error.message)
+
+    async def _take(self) -> None:
+        """Track each frame that comes."""
+        while True:
+            await self._has_frame.wait()
+            self._has_frame.clear()
+            while (images := self._incoming.take()) is not None:
+                await self._bridge(images)
 
     async def _bridge(self, images: PairedImages) -> None:
         frame = await asyncio.to_thread(self._incoming.decode, images)
@@ -185,7 +195,7 @@ class Bridge:
             self._publish(message)
 
     async def _report(self) -> None:
-        """Publish how the bridge is, each second, whether frames come or not."""
+        """Publish how the bridge is, each second, whether frames come or not; raise what ended the robot."""
         last, received, logged = 0, Counter[str](), ""
         while True:
             connected = self._robot is None or self._robot.connected
@@ -215,6 +225,9 @@ class Bridge:
                     self._stamp_ns, trouble=trouble, is_working=connected and self.frames > 0, values=values
                 )
             )
+            if self._robot is not None and self._robot.failure is not None:
+                failure = self._robot.failure
+                raise error_from_code(failure.code, failure.message, hint=failure.hint)
             await asyncio.sleep(_DIAGNOSTICS_EVERY_S)
 
     def _silence(self, before: Counter[str]) -> str:

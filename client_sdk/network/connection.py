@@ -534,6 +534,7 @@ class Connection:
         self.fatal = error
         self.last_error = error.message
         self._handle(None, self._session.abandon(error.code, error.message, error.hint))
+        self._on_change("ended", error.message)
         for region in self._regions:
             region.changed.set()
 

@@ -244,10 +244,14 @@ def test_a_token_that_is_refused_later_ends_the_robot_with_a_typed_error():
     async def test():
         async with FakePlatform() as platform:
             platform.token = "right"
-            async with robot(platform.url, token="right") as a_robot:
+            told = []
+            async with robot(
+                platform.url, token="right", on_change=lambda *change: told.append(change)
+            ) as a_robot:
                 platform.hold = True
                 waiting = ask(a_robot, 1, deadline_s=10)
                 await platform.until(lambda: platform.sockets[0].commands)
+                assert a_robot.failure is None
                 platform.token = "another"
                 platform.sockets[0].cut()
 
@@ -255,6 +259,9 @@ def test_a_token_that_is_refused_later_ends_the_robot_with_a_typed_error():
                     await waiting
                 with pytest.raises(Unauthorized):
                     await ask(a_robot, 2)
+                assert isinstance(a_robot.failure, Unauthorized)
+                assert [what for what, _ in told] == ["link-lost", "ended"]
+                assert told[-1][1] == a_robot.failure.message
 
     run(test())
 
