@@ -51,6 +51,15 @@ def test_the_page_of_metrics_has_what_a_server_gives(repository: Path) -> None:
     assert "`rse_pf_server_up`" in page
 
 
+def test_every_page_is_in_the_menu(repository: Path) -> None:
+    menu = (repository / "scripts/site/mkdocs.yml").read_text(encoding="utf-8").partition("\nnav:\n")[2]
+    listed = set(re.findall(r"(\S+\.md)$", menu, re.MULTILINE))
+    pages = {each.relative_to(repository / "docs").as_posix() for each in repository.glob("docs/**/*.md")}
+
+    # The page of the results leads to the reports.
+    assert {page for page in pages - listed if not page.startswith("results/")} == set()
+
+
 def test_links_of_the_readme_are_those_of_the_site() -> None:
     text = (
         "[a](docs/local.md#x) [b](CONTRIBUTING.md) ![c](docs/images/c.gif) [d](https://example.org/docs/x.md)"
