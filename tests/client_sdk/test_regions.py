@@ -82,6 +82,22 @@ def test_a_small_gain_is_no_reason_to_change_however_large_its_share():
     assert Drive().measure(12, 2, for_s=600).changes == []
 
 
+def test_a_small_share_is_no_reason_to_change_however_much_time_it_is():
+    assert Drive().measure(400, 310, for_s=600).changes == []
+    assert len(Drive().measure(400, 290, for_s=600).changes) == 1
+
+
+def test_a_change_begins_the_comparison_anew():
+    choice = RegionChoice(2, hold_s=HOLD_S)
+    chosen = []
+    for now in range(0, 2 * int(HOLD_S) + 2, 2):  # a robot that cannot follow stays in NEAR
+        choice.measured(NEAR, 0.4)
+        choice.measured(FAR, 0.13)
+        chosen.append(choice.better(NEAR, [NEAR, FAR], float(now)))
+
+    assert [2 * row for row, region in enumerate(chosen) if region is not None] == [HOLD_S]
+
+
 def test_two_regions_that_take_turns_every_minute_cause_at_most_one_change_a_minute():
     drive = Drive()
     for _ in range(30):

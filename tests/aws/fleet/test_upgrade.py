@@ -437,6 +437,31 @@ def test_a_launch_that_failed_for_want_of_capacity_does_not_take_the_release_bac
     assert failed_launch([{**launch, "StatusMessage": REASON}], START) is not None
 
 
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"StatusCode": "Successful"},
+        {"StatusCode": "InProgress"},
+        {"Description": "Terminating EC2 instance: i-1"},
+    ],
+)
+def test_only_a_launch_that_has_failed_takes_the_release_back(change: dict[str, str]) -> None:
+    launch = {
+        "Description": "Launching a new EC2 instance", "StartTime": START, "StatusCode": "Cancelled",
+        "StatusMessage": REASON,
+    }  # fmt: skip
+
+    assert failed_launch([launch, {**launch, "StartTime": START + timedelta(seconds=1)}], START) == launch
+    assert failed_launch([{**launch, **change}], START) is None
+
+
+def test_one_server_more_than_wanted_is_started_at_a_time_and_none_less_is_kept() -> None:
+    made = preferences(SETTINGS, ())
+
+    assert made["MinHealthyPercentage"] == 100
+    assert 0 < 19 * (made["MaxHealthyPercentage"] - 100) / 100 < 2
+
+
 def test_without_alarms_none_are_named() -> None:
     assert "AlarmSpecification" not in preferences(SETTINGS, ())
 
