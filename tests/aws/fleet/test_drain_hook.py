@@ -56,7 +56,9 @@ def test_the_hook_is_completed_before_its_timeout_when_the_server_does_not_end()
     assert not leave(machine, scaling)
 
     ((at_s, _),) = scaling.completed
-    assert at_s - 100.0 <= SETTINGS.cloud.drain_s - 10.0, "no time for the call and its retries"
+    waited_s, whole_s = at_s - 100.0, SETTINGS.cloud.drain_s
+    assert waited_s <= whole_s - 10.0, "no time for the call and its retries"
+    assert waited_s >= whole_s - 20.0, "robots had more time to move"
 
 
 def test_without_a_server_the_hook_is_completed_at_once() -> None:
@@ -74,6 +76,14 @@ def test_robots_move_only_after_the_load_balancer_has_noticed() -> None:
 
     health = SETTINGS.health
     assert machine.waits == [health.cloud_interval_s * health.unhealthy_checks + CLOUD_TIMEOUT_S]
+
+
+def test_a_short_hook_leaves_two_thirds_of_its_time_to_the_robots() -> None:
+    machine = FakeMachine()
+
+    leave(machine, FakeScaling(machine), SETTINGS.replace(cloud={"drain_s": 30}))
+
+    assert machine.waits == [10.0]
 
 
 def test_the_whole_drain_fits_into_the_hook_by_default() -> None:
