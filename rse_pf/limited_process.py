@@ -46,6 +46,7 @@ from rse_pf.errors import (
     error_from_code,
 )
 from rse_pf.linux import die_with_parent, set_process_name
+from rse_pf.one_thread import ONE_THREAD
 
 __all__ = ["DEFAULT_NICENESS", "Handler", "LimitedProcesses", "Overran", "main"]
 
@@ -66,7 +67,6 @@ _LENGTH = struct.Struct("<Q")
 _REPLY = struct.Struct("<BQd")
 """Kind and length of what follows, and the CPU seconds of the process so far."""
 _DONE, _REFUSED, _DEFECT = 0, 1, 2
-_ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 
 
 class Overran(Expired):
@@ -288,7 +288,7 @@ class _Template:
             self._process = subprocess.Popen(
                 [sys.executable, "-m", "rse_pf.limited_process", str(theirs.fileno())],
                 pass_fds=(theirs.fileno(),), stdin=subprocess.DEVNULL, stdout=2,
-                env={**os.environ, **_ONE_THREAD},
+                env={**os.environ, **ONE_THREAD},
             )  # fmt: skip
         self._generation += 1
         with contextlib.suppress(OSError):

@@ -35,12 +35,12 @@ from rse_pf.config import PlatformSettings
 from rse_pf.geometry import Array, exp_se3, inverse
 from rse_pf.maps.format import Edge, Keyframe, MapVersion, decode_map, encode_map
 from rse_pf.object_store import DirectoryStore, digest_of
+from rse_pf.one_thread import ONE_THREAD
 from rse_pf.services.mapping.cloud_deform import deform_cloud
 from rse_pf.services.mapping.links import Atlas, MergeOptions, measure_pairs
 
 __all__ = ["kitchen", "main", "noisy_copy"]
 
-_ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 _STEP_M, _STEP_DEG = 0.002, 0.05
 """Drift of a copy from one keyframe to the next."""
 _PIXEL, _DEPTH_M, _CLOUD_M, _FLIPPED_BITS = 0.3, 0.004, 0.003, 0.02
@@ -256,7 +256,7 @@ def _again(args: argparse.Namespace, option: str, folder: Path) -> list[str]:
 
 
 def _environment() -> dict[str, str]:
-    return {**os.environ, **_ONE_THREAD}
+    return {**os.environ, **ONE_THREAD}
 
 
 def _figures(found: BatchMergeResult, seconds: float) -> dict[str, Any]:

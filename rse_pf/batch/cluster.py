@@ -26,6 +26,7 @@ from rse_pf.batch.parts import Part, encode_part, is_done
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import Crashed, Disconnected, MissingExtra, error_from_code
 from rse_pf.object_store import ObjectStore
+from rse_pf.one_thread import ONE_THREAD
 from rse_pf.terminal import counted
 
 __all__ = [
@@ -39,8 +40,6 @@ __all__ = [
 
 _START_TIMEOUT_S = 60.0
 _POLL_S = 0.2
-_ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
-"""The same inputs give the same result in every process."""
 _DASK = {
     "DASK_DISTRIBUTED__COMM__TIMEOUTS__CONNECT": "10s",
     "DASK_DISTRIBUTED__ADMIN__LOG_LENGTH": "100",
@@ -87,7 +86,7 @@ class LocalCluster:
         self._key = key
         self._count = workers
         self._environment = {
-            **_ONE_THREAD, **_DASK, "DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": str(part_tries - 1)
+            **ONE_THREAD, **_DASK, "DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": str(part_tries - 1)
         }  # fmt: skip
         self._host, self._port = host, port
         self._scheduler: subprocess.Popen[bytes] | None = None
@@ -157,7 +156,7 @@ def start_worker(
 ) -> subprocess.Popen[bytes]:
     """Start a worker of the scheduler at *address*, on one of *ports*; it ends with the process *parent*."""
     order = NodeOrder(certificate=certificate, key=key, address=address, ports=ports, parent=parent)
-    return _spawn("worker", order, {**_ONE_THREAD, **_DASK})
+    return _spawn("worker", order, {**ONE_THREAD, **_DASK})
 
 
 def _spawn(role: str, order: NodeOrder, environment: dict[str, str]) -> subprocess.Popen[bytes]:

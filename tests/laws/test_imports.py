@@ -13,7 +13,7 @@ from collections.abc import Iterator, Mapping
 import pytest
 
 ORDER = (
-    "rse_pf", "errors", "terminal", "linux", "limited_process", "files", "geometry", "native",
+    "rse_pf", "errors", "terminal", "linux", "one_thread", "limited_process", "files", "geometry", "native",
     "native_buffers", "native_matcher", "token_bucket", "config", "budget", "wire", "scaling",
     "object_store", "identity", "crash_record", "maps", "auth", "enrolment", "audit", "service",
     "pnp", "services.mapping", "live_map", "services.custom", "services",

@@ -38,6 +38,7 @@ from rse_pf.errors import (
 )
 from rse_pf.identity import RobotId
 from rse_pf.linux import die_with_parent, run_when_idle
+from rse_pf.one_thread import ONE_THREAD
 from rse_pf.service import dispatch, failure_of
 from rse_pf.services.loading import load_services
 from rse_pf.wire import Command, Failure, Result
@@ -47,7 +48,6 @@ __all__ = ["JobProcess", "JobRequest", "inline_bytes", "main", "retry_store", "s
 
 _REPORT_INTERVAL_S = 0.5
 _STORE_TRIES = 3
-_ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 T = TypeVar("T")
 
 
@@ -75,7 +75,7 @@ class JobProcess:
         with theirs:
             self._process = subprocess.Popen(
                 [sys.executable, "-m", "rse_pf.backend.jobs.process", str(theirs.fileno())],
-                pass_fds=(theirs.fileno(),), stdin=subprocess.DEVNULL, env={**os.environ, **_ONE_THREAD},
+                pass_fds=(theirs.fileno(),), stdin=subprocess.DEVNULL, env={**os.environ, **ONE_THREAD},
             )  # fmt: skip
         self.pid = self._process.pid
         run_when_idle(self.pid)

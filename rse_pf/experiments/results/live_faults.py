@@ -8,30 +8,19 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
-from rse_pf.backend.live_map.owner.lease import map_folder
-from rse_pf.backend.live_map.owner.log import LiveLog, MapSnapshot
-from rse_pf.backend.live_map.owner.map_kind import LIVE_MAP
-from rse_pf.backend.live_map.owner.requests import shown_name
-from rse_pf.backend.live_map.owner.state import MapState
-from rse_pf.errors import RsePfError, UsageError
 from rse_pf.experiments.results.bars import with_bars
 from rse_pf.experiments.results.live_error import LiveDrive, live_figures, read_live_drives, read_live_map
+from rse_pf.experiments.results.log_replay import LoggedMap, read_log
 from rse_pf.experiments.results.markdown import number, slashed
 from rse_pf.experiments.results.records import CommandRecord, Event, Records, parameters_of
 from rse_pf.experiments.results.summary import summarise
-from rse_pf.identity import DEFAULT_TENANT
-from rse_pf.live_map.events import KeyframeAdded, decode_events
-from rse_pf.object_store import DirectoryStore
 
-__all__ = ["LIVE_FAULT_BARS", "LoggedMap", "fault_rows", "live_fault_figures", "read_log"]
+__all__ = ["LIVE_FAULT_BARS", "fault_rows", "live_fault_figures"]
 
-MAP_NAME = "demo"
 _NEW_OWNER = {"kill", "stop", "drain", "roll"}
 _NO_LOSS = {
     "keyframes/lost": (0.0, "<="),
@@ -49,51 +38,6 @@ LIVE_FAULT_BARS: dict[str, dict[str, tuple[float, str]]] = {
     "wifi": {**_NO_LOSS, "keyframes/ahead_of_poses": (0.0, "<=")},
 }
 """The target of each figure of each fault."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LoggedMap:
-    """What the log of a map holds up to a position: its keyframes in order, and the digest of a replay."""
-
-    keyframes: tuple[tuple[str, int, float], ...]
-    """Name of the robot, number, and time stamp (seconds)."""
-    epochs: int
-    digest: str
-    position: int
-
-
-class _WholeLog(LiveLog):
-    """A log that is read from its first entry."""
-
-    def snapshots(self) -> Iterator[MapSnapshot]:
-        """Yield none."""
-        return iter(())
-
-
-def read_log(objects: Path, position: int) -> LoggedMap:
-    """Replay the log of the map of the demo in *objects* up to *position*; raises UsageError."""
-    folder = map_folder(DEFAULT_TENANT, MAP_NAME)
-    log = _WholeLog(DirectoryStore(objects), folder, owner="", epoch=0)
-    state = MapState(LIVE_MAP.empty(), 0)
-    keyframes: list[tuple[str, int, float]] = []
-    epochs = set()
-    try:
-        for entry in log.entries():
-            events = decode_events(entry.events)
-            epochs.add(entry.epoch)
-            keyframes += [
-                (shown_name(each.robot), each.number, each.timestamp_s)
-                for each in events
-                if isinstance(each, KeyframeAdded)
-            ]
-            state.apply(log.position, events)
-            if log.position == position:
-                break
-    except RsePfError as error:
-        raise UsageError(f"cannot replay the log in {objects}: {error}", hint="run it again") from error
-    return LoggedMap(
-        keyframes=tuple(keyframes), epochs=len(epochs), digest=state.digest(), position=log.position
-    )
 
 
 def live_fault_figures(records: Records) -> dict[str, Any]:

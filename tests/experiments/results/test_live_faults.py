@@ -14,7 +14,8 @@ from rse_pf.backend.live_map.owner.lease import map_folder
 from rse_pf.backend.live_map.owner.log import LiveLog
 from rse_pf.errors import UsageError
 from rse_pf.experiments.results.live_error import LIVE_RECORDS, TRUTH
-from rse_pf.experiments.results.live_faults import fault_rows, live_fault_figures, read_log
+from rse_pf.experiments.results.live_faults import fault_rows, live_fault_figures
+from rse_pf.experiments.results.log_replay import read_log
 from rse_pf.experiments.results.records import CommandRecord, Records
 from rse_pf.geometry import exp_se3
 from rse_pf.identity import DEFAULT_TENANT

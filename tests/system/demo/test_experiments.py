@@ -36,11 +36,10 @@ def test_elasticity_scales_out_replaces_scales_in_and_loses_nothing(tmp_path):
     assert (tmp_path / "out" / "elasticity.png").read_bytes().startswith(b"\x89PNG")
 
 
-@pytest.mark.timeout(500)
+@pytest.mark.timeout(900)
 def test_with_the_clouds_delays_the_new_design_serves_in_a_third_of_the_time(tmp_path):
-    code, report, differing = run(
-        tmp_path / "out", "elasticity", "--as-cloud", "--speed", "10", "--robots", "40", "--fps", "4"
-    )
+    # Faster, and a sample of 10 s is a second here: too short to measure servers of a thirtieth of a core.
+    code, report, differing = run(tmp_path / "out", "elasticity", "--as-cloud", "--speed", "5")
 
     assert (code, differing) == (0, [])
     serving_s = {

@@ -48,12 +48,12 @@ from rse_pf.errors import StoreError
 from rse_pf.linux import die_with_parent, set_process_name
 from rse_pf.maps.registry import MapRegistry
 from rse_pf.object_store import ObjectStore
+from rse_pf.one_thread import ONE_THREAD
 
 __all__ = ["MAP_KIND", "OwnerOrder", "OwnerProcess", "advertised_address", "main"]
 
 MAP_KIND = "rse_pf.backend.live_map.owner.map_kind:LIVE_MAP"
 """Where the `MapKind` of real maps is, as ``module:name``."""
-_ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 _READ_BYTES = 1 << 16
 _RETRY_S = 0.1
 _CALM_NICE = 10
@@ -83,7 +83,7 @@ class OwnerProcess:
             self._process = subprocess.Popen(
                 [sys.executable, "-m", "rse_pf.backend.live_map.owner.start", str(theirs.fileno()),
                  str(_CALM_NICE if calmly else 0)],
-                pass_fds=(theirs.fileno(),), stdin=subprocess.DEVNULL, env={**os.environ, **_ONE_THREAD},
+                pass_fds=(theirs.fileno(),), stdin=subprocess.DEVNULL, env={**os.environ, **ONE_THREAD},
             )  # fmt: skip
         self.pid = self._process.pid
         self.say({"worker": os.getpid(), "settings": settings.to_dict(), "kind": kind})
