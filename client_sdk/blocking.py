@@ -15,7 +15,7 @@ from client_sdk.closing import Closing
 from client_sdk.robot import Robot, connect
 from client_sdk.stats import Stats
 from client_sdk.updates import BlockingUpdates, Updates
-from rse_pf.errors import Disconnected
+from rse_pf.errors import Disconnected, RsePfError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -125,6 +125,11 @@ class BlockingRobot(Closing):
     def connected(self) -> bool:
         """Whether there is a connection to a server now; without one, commands wait for the next."""
         return self._robot.connected
+
+    @property
+    def failure(self) -> RsePfError | None:
+        """Why the robot has stopped reconnecting for good; None while it has not."""
+        return self._robot.failure
 
     @property
     def stats(self) -> Stats:
