@@ -142,11 +142,11 @@ def test_a_job_that_another_job_server_runs_takes_no_slot_of_this_one(bench: Ben
         bench.queue.offer(a_request(number))
     servers = [bench.job_server([], ends=False) for _ in range(2)]
 
-    for server in servers:
+    for count, server in enumerate(servers, start=1):
         server.step()
+        wait_until(lambda count=count: len(bench.started) == count)  # the first process is the first server's
 
     assert [server.running for server in servers] == [1, 1]
-    wait_until(lambda: len(bench.started) == 2)
     bench.started[0].theirs.sendall(encode_message(DONE))
     wait_until(lambda: servers[0].running == 0)
     servers[0].step()
