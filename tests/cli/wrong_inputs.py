@@ -238,7 +238,7 @@ WRONG_INPUTS: tuple[WrongInput, ...] = (
     WrongInput("cloud cost --robots 0", USAGE, "--robots 0 is not within", "how many robots"),
     WrongInput("cloud cost --hours-per-day 25", USAGE, "--hours-per-day 25 is not within 0..24", "24 is all day"),
     WrongInput("cloud cost --prices broken.json", USAGE, "broken.json holds no prices", "a JSON object"),
-    WrongInput("cloud cost --job-hours 5", USAGE, "--job-hours 5 is not within 0..0", "set cloud.job_servers"),
+    WrongInput("cloud cost --job-hours 5", USAGE, "there are no job servers", "set cloud.job_servers"),
     WrongInput("cloud cost --burst -1", USAGE, "--burst -1 is not within 0..1e+09", "commands a day"),
     WrongInput("cloud prices --prices broken.json", USAGE, "broken.json holds no prices", "a JSON object"),
     WrongInput("cloud logs --console", USAGE, "--console needs a server", "rse-pf cloud logs lists them"),

@@ -87,11 +87,16 @@ def _load(args: argparse.Namespace, settings: PlatformSettings) -> Load:
             hint="name commands a day, such as 5000",
         )
     most = 24 * settings.cloud.job_servers
+    if args.job_hours > 0 == most:
+        raise UsageError(
+            f"--job-hours {args.job_hours:g}, but there are no job servers: cloud.job_servers is 0",
+            hint="leave the option out, or set cloud.job_servers in cdk.json",
+        )
     if not 0 <= args.job_hours <= most:
         raise UsageError(
-            f"--job-hours {args.job_hours:g} is not within 0..{most}, 24 for each of "
-            f"cloud.job_servers = {settings.cloud.job_servers}",
-            hint="name fewer hours, or set cloud.job_servers in cdk.json",
+            f"--job-hours {args.job_hours:g} is not within 0..{most}: "
+            f"cloud.job_servers is {settings.cloud.job_servers}, and a day has 24 hours",
+            hint="name fewer hours, or set more cloud.job_servers in cdk.json",
         )
     return Load(
         robots=args.robots, fps=args.fps, hours_per_day=args.hours_per_day,
