@@ -12,7 +12,7 @@ from typing import Any
 import msgspec
 
 from rse_pf.aws.account import Account
-from rse_pf.aws.formation import bootstrap_version, living_stacks
+from rse_pf.aws.cloudformation import bootstrap_version, living_stacks
 from rse_pf.config import PlatformSettings
 from rse_pf.config.resource_names import DEPLOYMENT_TAG, STACKS, ResourceNames
 from rse_pf.errors import ConfigurationError

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from rse_pf.aws.account import Account
-from rse_pf.aws.formation import living_stacks
+from rse_pf.aws.cloudformation import living_stacks
 from rse_pf.config.resource_names import DEPLOYMENT_TAG, ResourceNames
 from rse_pf.errors import ConfigurationError
 

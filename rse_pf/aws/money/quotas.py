@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 from rse_pf.aws.account import Account
-from rse_pf.aws.formation import bootstrap_version, living_stacks
+from rse_pf.aws.cloudformation import bootstrap_version, living_stacks
 from rse_pf.aws.money.prices import load_prices
 from rse_pf.config import PlatformSettings
 from rse_pf.config.cloud_layout import zone_count

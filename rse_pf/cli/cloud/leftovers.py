@@ -21,7 +21,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     """Print what is left over; return 1 if anything is, 2 if AWS could not be asked."""
     from rse_pf.aws.account import open_account
-    from rse_pf.aws.formation import living_stacks
+    from rse_pf.aws.cloudformation import living_stacks
     from rse_pf.aws.money.leftovers import find_leftovers
 
     account, names = open_account(settings.cloud.region), ResourceNames(settings.cloud.name)
