@@ -9,9 +9,9 @@ from typing import Any
 
 from rse_pf.aws.account import Account
 from rse_pf.config import PlatformSettings
-from rse_pf.config.resource_names import ResourceNames
+from rse_pf.config.resource_names import ResourceNames, toolkit_stack
 
-__all__ = ["bootstrap_version", "living_stacks"]
+__all__ = ["bootstrap_version", "foreign_qualifier", "living_stacks"]
 
 _GONE = ("DELETE_COMPLETE", "REVIEW_IN_PROGRESS")
 
@@ -28,3 +28,21 @@ def bootstrap_version(account: Account, settings: PlatformSettings) -> str | Non
     name = f"/cdk-bootstrap/{settings.cloud.bootstrap_qualifier}/version"
     found = account.find("ssm", "get_parameter", Name=name)
     return None if found is None else str(found["Parameter"]["Value"])
+
+
+def foreign_qualifier(account: Account, settings: PlatformSettings) -> str | None:
+    """Return the qualifier of the stack that a bootstrap would change, if it is another than ours.
+
+    None if there is no such stack, or it is ours; raises as `Account.find`.
+    """
+    ours = settings.cloud.bootstrap_qualifier
+    found = account.find("cloudformation", "describe_stacks", StackName=toolkit_stack(ours))
+    stacks = found["Stacks"] if found else ()
+    told = [
+        str(each["ParameterValue"])
+        for stack in stacks
+        if stack["StackStatus"] not in _GONE
+        for each in stack.get("Parameters", ())
+        if each["ParameterKey"] == "Qualifier"
+    ]
+    return told[0] if told and told[0] != ours else None

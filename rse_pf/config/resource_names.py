@@ -24,6 +24,7 @@ __all__ = [
     "STACKS",
     "VERSION_PARAMETER",
     "ResourceNames",
+    "toolkit_stack",
 ]
 
 DEPLOYMENT_TAG = "rse-pf"
@@ -55,6 +56,18 @@ STACKS = ("Network", "Data", "Backend", "Serverless", "Observability")
 
 SETTINGS_CONTEXT = "rse-pf:settings"
 """Of the CDK's context: the file of settings, where that is not cdk.json."""
+
+
+_DEFAULT_QUALIFIER, _DEFAULT_TOOLKIT = "hnb659fds", "CDKToolkit"
+
+
+def toolkit_stack(qualifier: str) -> str:
+    """Return the name of the stack that the CDK's bootstrap with *qualifier* makes.
+
+    The CDK's own name belongs to the CDK's own qualifier: a bootstrap under it with another one would delete
+    the roles by which the other applications of the account deploy.
+    """
+    return _DEFAULT_TOOLKIT if qualifier == _DEFAULT_QUALIFIER else f"{_DEFAULT_TOOLKIT}-{qualifier}"
 
 
 @dataclass(frozen=True, slots=True)

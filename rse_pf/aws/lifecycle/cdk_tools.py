@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from rse_pf.config import PlatformSettings
-from rse_pf.config.resource_names import SETTINGS_CONTEXT
+from rse_pf.config.resource_names import SETTINGS_CONTEXT, toolkit_stack
 from rse_pf.errors import DeploymentFailed, UsageError
 
 __all__ = ["PACKAGES", "CdkTools", "are_packages_built"]
@@ -49,10 +49,11 @@ class CdkTools:
         self._run("the build of the packages", [sys.executable, "scripts/assets.py"])
 
     def bootstrap(self) -> None:
-        """Prepare the account and region for the CDK; raises DeploymentFailed."""
+        """Prepare the account and region for the CDK, in the qualifier's stack; raises DeploymentFailed."""
         where = f"aws://{self._account_id}/{self._cloud.region}"
-        qualifier = ["--qualifier", self._cloud.bootstrap_qualifier]
-        self._cdk("the bootstrap", ["bootstrap", where, *qualifier])
+        qualifier = self._cloud.bootstrap_qualifier
+        options = ["--qualifier", qualifier, "--toolkit-stack-name", toolkit_stack(qualifier)]
+        self._cdk("the bootstrap", ["bootstrap", where, *options])
 
     def deploy(self, stack: str) -> None:
         """Deploy one stack, and nothing that it depends on; raises DeploymentFailed."""

@@ -10,12 +10,12 @@ from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 from rse_pf.aws.account import Account
-from rse_pf.aws.cloudformation import bootstrap_version, living_stacks
+from rse_pf.aws.cloudformation import bootstrap_version, foreign_qualifier, living_stacks
 from rse_pf.aws.money.prices import load_prices
 from rse_pf.config import PlatformSettings
 from rse_pf.config.cloud_layout import zone_count
 from rse_pf.config.elasticity import instance_types
-from rse_pf.config.resource_names import ResourceNames
+from rse_pf.config.resource_names import ResourceNames, toolkit_stack
 from rse_pf.errors import ConfigurationError, StoreError
 
 __all__ = ["NOT_BOOTSTRAPPED", "Check", "check_account"]
@@ -58,6 +58,12 @@ def check_account(account: Account, settings: PlatformSettings) -> Iterator[Chec
 
 def _bootstrap(account: Account, settings: PlatformSettings) -> Check:
     version = bootstrap_version(account, settings)
+    if version is None and (qualifier := foreign_qualifier(account, settings)) is not None:
+        stack = toolkit_stack(settings.cloud.bootstrap_qualifier)
+        return Check(
+            "fail", f"the stack {stack} is a bootstrap of other applications, qualifier {qualifier}",
+            f"set cloud.bootstrap_qualifier to {qualifier} to share it, or to a word of your own",
+        )  # fmt: skip
     if version is None:
         return Check("fail", f"{NOT_BOOTSTRAPPED} in {account.region}", "rse-pf cloud up does it")
     return Check("ok", f"bootstrapped, version {version}")

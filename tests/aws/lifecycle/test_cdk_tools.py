@@ -8,6 +8,7 @@ import pytest
 
 from rse_pf.aws.lifecycle.cdk_tools import CdkTools
 from rse_pf.config import PlatformSettings
+from rse_pf.config import resource_names
 from rse_pf.errors import DeploymentFailed, UsageError
 
 SETTINGS = PlatformSettings().replace(cloud={"bootstrap_qualifier": "lab1"})
@@ -29,8 +30,14 @@ def test_the_cdk_gets_one_stack_the_region_and_the_qualifier(checkout: Path) -> 
     tools.deploy("RsePf-Data")
 
     first, second = (checkout / "called").read_text().splitlines()
-    assert first == "bootstrap aws://123456789012/ap-northeast-2 --qualifier lab1"
+    options = "--qualifier lab1 --toolkit-stack-name CDKToolkit-lab1"
+    assert first == f"bootstrap aws://123456789012/ap-northeast-2 {options}"
     assert second.startswith("deploy RsePf-Data --exclusively --require-approval never")
+
+
+def test_the_qualifier_of_the_cdk_has_the_stack_of_the_cdk_and_any_other_one_of_its_own() -> None:
+    assert resource_names.toolkit_stack("hnb659fds") == "CDKToolkit"
+    assert resource_names.toolkit_stack("lab1") == "CDKToolkit-lab1"
 
 
 def test_the_file_of_settings_reaches_the_synthesis(

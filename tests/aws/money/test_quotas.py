@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import json
 from typing import Any
 
 import pytest
 
 from rse_pf.aws.account import Account, open_account
 from rse_pf.aws.clients import make_client
-from rse_pf.aws.money.quotas import Check, check_account
+from rse_pf.aws.money.quotas import NOT_BOOTSTRAPPED, Check, check_account
 from rse_pf.config import PlatformSettings
 
 SETTINGS = PlatformSettings()
@@ -79,6 +80,25 @@ def test_an_account_without_bootstrap_is_told_the_command(region: str) -> None:
     check = only("bootstrap", checks(region))
 
     assert (check.grade, check.fix) == ("fail", "rse-pf cloud up does it")
+
+
+def test_a_bootstrap_never_changes_the_stack_of_another_qualifier(region: str) -> None:
+    template = {
+        "Parameters": {"Qualifier": {"Type": "String"}},
+        "Resources": {"Log": {"Type": "AWS::Logs::LogGroup"}},
+    }
+    make_client("cloudformation", region).create_stack(
+        StackName="CDKToolkit", TemplateBody=json.dumps(template),
+        Parameters=[{"ParameterKey": "Qualifier", "ParameterValue": "theirs"}],
+    )  # fmt: skip
+
+    check = only("CDKToolkit", checks(region))
+    own = only("bootstrap", checks(region, SETTINGS.replace(cloud={"bootstrap_qualifier": "lab1"})))
+
+    assert check.grade == "fail"
+    assert "qualifier theirs" in check.what
+    assert not check.what.startswith(NOT_BOOTSTRAPPED), "rse-pf cloud up must not bootstrap"
+    assert own.what.startswith(NOT_BOOTSTRAPPED)
 
 
 def test_too_few_vcpus_for_the_largest_fleet_fail(region: str) -> None:
