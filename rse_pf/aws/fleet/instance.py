@@ -16,10 +16,13 @@ from rse_pf.aws.fleet.metrics import read_cpu_times
 from rse_pf.config.resource_names import READY_PATH
 from rse_pf.errors import Disconnected, UsageError
 
-__all__ = ["IN_SERVICE", "TERMINATED", "WARMED", "Instance"]
+__all__ = ["INTERRUPTION", "IN_SERVICE", "TERMINATED", "WARMED", "Instance"]
 
 IN_SERVICE, TERMINATED, WARMED = "InService", "Terminated", "Warmed:"
 """Target lifecycle states; the last is what those of a warm pool begin with."""
+
+INTERRUPTION = "interruption"
+"""The notice that a Spot instance is taken back within two minutes."""
 
 _STAT = Path("/proc/stat")
 _IMDS = "http://169.254.169.254/latest/"
@@ -79,13 +82,13 @@ class Instance:
         return read_cpu_times(_STAT.read_text(encoding="ascii"))
 
     def spot_notice(self) -> str:
-        """Return why AWS will take this instance back: ``interruption``, ``rebalance`` or nothing.
+        """Return `INTERRUPTION` if AWS takes this instance back, ``rebalance`` if it may, or nothing.
 
         Raises:
             Disconnected: The instance has no metadata.
         """
         if self._metadata("spot/instance-action") is not None:
-            return "interruption"
+            return INTERRUPTION
         return "" if self._metadata("events/recommendations/rebalance") is None else "rebalance"
 
     def _ask(self, target: str, method: str) -> str:

@@ -163,13 +163,19 @@ def test_the_emulator_answers_the_agents_query(region: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("notice", "spot", "group"),
-    [("interruption", True, "rse-pf"), ("rebalance", True, "rse-pf"), ("interruption", False, "rse-pf-jobs")],
+    ("notice", "spot", "group", "drains"),
+    [
+        ("interruption", True, "rse-pf", True),
+        ("interruption", False, "rse-pf-jobs", True),
+        ("rebalance", True, "rse-pf", False),
+        ("rebalance", False, "rse-pf-jobs", False),
+    ],
 )
-def test_a_spot_notice_drains_the_server_within_five_seconds(
-    tmp_path: Path, notice: str, spot: bool, group: str
+def test_an_interruption_drains_the_server_within_five_seconds_and_a_recommendation_is_noted_once(
+    tmp_path: Path, notice: str, spot: bool, group: str, drains: bool
 ) -> None:
-    machine, log = FakeMachine(), []
+    machine = FakeMachine()
+    log: list[tuple[str, float]] = []
     settings = PlatformSettings.from_dict({"cloud": {"spot": spot}})
     context = AgentContext(
         machine=machine, clients={}, artifacts=MemoryStore(), settings=settings,
@@ -183,10 +189,10 @@ def test_a_spot_notice_drains_the_server_within_five_seconds(
         agent.step()
         machine.sleep(1.0)
 
-    assert [event for event, _ in log] == ["spot-notice", "drained"]
+    assert [event for event, _ in log] == ["spot-notice", *(["drained"] if drains else [])]
     assert log[0][1] - 110 <= 5
-    assert len(machine.waits) == 1
-    assert context.state.phase is Phase.LEAVING
+    assert len(machine.waits) == drains
+    assert context.state.phase is (Phase.LEAVING if drains else Phase.SERVING)
 
 
 def test_without_spot_instances_no_notice_is_asked_for(tmp_path: Path) -> None:

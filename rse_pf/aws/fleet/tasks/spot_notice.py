@@ -1,13 +1,14 @@
-"""Drain the server when AWS announces that it takes the instance back: a Spot interruption or its forecast.
+"""Drain the server when AWS announces that it takes the instance back: a Spot interruption.
 
-The notice comes two minutes before the interruption, the recommendation to rebalance usually earlier; the
-group then starts another instance (`stacks.capacity`).  Robots move within seconds, and the machine stays
-idle until it is taken or the group ends it.
+The notice comes two minutes before the interruption: robots move within seconds, and the machine stays idle
+until it is taken.  A recommendation to rebalance may come earlier, to all servers of a pool at once, and is
+only noted: the group starts a replacement (`stacks.capacity`), and then ends this one by its drain hook.
 """
 
 from __future__ import annotations
 
 from rse_pf.aws.fleet.drain_hook import drain_server
+from rse_pf.aws.fleet.instance import INTERRUPTION
 from rse_pf.aws.fleet.task import AgentContext, Phase, Task
 
 __all__ = ["LOOK_EVERY_S", "task"]
@@ -19,14 +20,18 @@ LOOK_EVERY_S = 2.0
 def task(context: AgentContext) -> Task:
     """Look for a notice every two seconds, where there are Spot instances, and drain once."""
     is_spot = context.settings.cloud.spot or context.runs_jobs  # job servers always are
+    last = ""
 
     def follow() -> None:
+        nonlocal last
         if not is_spot:
             return
         notice = context.machine.spot_notice()
-        if not notice:
+        if notice and notice != last:
+            context.log("spot-notice", notice=notice)
+        last = notice
+        if notice != INTERRUPTION:
             return
-        context.log("spot-notice", notice=notice)
         context.state.phase = Phase.LEAVING
         context.state.flush()
         drained = drain_server(
