@@ -148,8 +148,9 @@ class BackendServers(Construct):
     def _allow_objects(self, maps: s3.IBucket) -> None:
         """Allow the servers and the data service beside them to read and write robots' objects and maps."""
         allow(
-            self.role, ["s3:GetObject", "s3:PutObject", "s3:DeleteObject"], [maps.arn_for_objects("*")],
-            used_by=(f"{_STORE}._get", f"{_STORE}._write", f"{_STORE}.delete"),
+            self.role, ["s3:GetObject", "s3:PutObject", "s3:DeleteObject", "s3:AbortMultipartUpload"],
+            [maps.arn_for_objects("*")],
+            used_by=(f"{_STORE}._get", f"{_STORE}._write", f"{_STORE}.delete", f"{_STORE}.put_pieces"),
             why="names of objects are digests, which nobody knows beforehand",
         )  # fmt: skip
         allow(self.role, ["s3:ListBucket"], [maps.bucket_arn], used_by=f"{_STORE}._pages")

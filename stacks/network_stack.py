@@ -65,7 +65,10 @@ class NetworkStack(cdk.Stack):
         self.s3.add_to_policy(
             iam.PolicyStatement(
                 principals=[iam.AnyPrincipal()],
-                actions=["s3:GetObject", "s3:PutObject", "s3:DeleteObject", "s3:ListBucket"],
+                actions=[
+                    "s3:GetObject", "s3:PutObject", "s3:DeleteObject", "s3:ListBucket",
+                    "s3:AbortMultipartUpload",
+                ],
                 resources=["*"], conditions={"StringEquals": {"aws:ResourceAccount": self.account}},
             )
         )  # fmt: skip

@@ -30,7 +30,8 @@ MAX_S = 10.0
 _CONNECT_S, _READ_S = 1.0, 3.5
 FIRST_PAUSE_S = 0.1
 _THROTTLED = 429
-# Error codes of AWS that ask for a retry; most of them come with status 400.
+# Error codes of AWS that ask for a retry; most of them come with status 400, the last two with 409: S3 did
+# nothing because of another write of the same name, which may fail, and then nothing is stored.
 _TEMPORARY = frozenset(
     {
         "Throttling", "ThrottlingException", "ThrottledException", "RequestThrottled",
@@ -38,6 +39,7 @@ _TEMPORARY = frozenset(
         "RequestLimitExceeded", "SlowDown", "BandwidthLimitExceeded",
         "ProvisionedThroughputExceededException", "PriorRequestNotComplete",
         "TransactionInProgressException", "RequestTimeout", "RequestTimeoutException",
+        "ConditionalRequestConflict", "OperationAborted",
     }
 )  # fmt: skip
 

@@ -169,7 +169,9 @@ def test_servers_reach_the_map_bucket_exactly_when_the_data_service_runs(assembl
         assert "Maps" not in script
         return
     (statement,) = statements
-    assert sorted(_listed(statement["Action"])) == ["s3:DeleteObject", "s3:GetObject", "s3:PutObject"]
+    assert sorted(_listed(statement["Action"])) == [
+        "s3:AbortMultipartUpload", "s3:DeleteObject", "s3:GetObject", "s3:PutObject",
+    ]  # fmt: skip
     assert "Maps" in json.dumps(statement["Resource"])
     assert named == ["store", "Maps"]
     (gate,) = [
@@ -178,7 +180,7 @@ def test_servers_reach_the_map_bucket_exactly_when_the_data_service_runs(assembl
         if each["VpcEndpointType"] == "Gateway"
     ]
     let_through = {action for one in gate for action in _listed(one["Action"])}
-    assert {"s3:DeleteObject", "s3:GetObject", "s3:PutObject", "s3:ListBucket"} <= let_through
+    assert {*_listed(statement["Action"]), "s3:ListBucket"} <= let_through
 
 
 def test_no_target_group_belongs_to_a_service_that_does_not_run(assembly: Assembly) -> None:

@@ -102,7 +102,8 @@ class Shipper:
                 if piece.problem:
                     self._on_broken(who, piece.problem)
                 name = piece_name(self._instance(), who, piece.first, piece.data)
-                with contextlib.suppress(Conflict):  # the same bytes arrived before, and their mark was lost
+                # Only the bytes of its digest take a name: they arrived before, and their mark was lost.
+                with contextlib.suppress(Conflict):
                     self._store.compare_and_swap(name, None, piece.data)
                 marks[who] = piece.after
                 replace_json(self._marks_file, {each: asdict(mark) for each, mark in marks.items()})

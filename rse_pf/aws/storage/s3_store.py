@@ -20,7 +20,7 @@ from rse_pf.object_store import ObjectInfo, ObjectStore, check_name, open_store
 
 __all__ = ["S3Store", "open_bucket", "open_data_store"]
 
-_NOT_FOUND, _PRECONDITION_FAILED, _CONFLICT, _RANGE_OUTSIDE = 404, 412, 409, 416
+_NOT_FOUND, _PRECONDITION_FAILED, _RANGE_OUTSIDE = 404, 412, 416
 _PART_BYTES = 8 << 20
 """Of a large object; S3 takes parts of 5 MiB or more."""
 _FULL = {"QuotaExceeded", "EntityTooLarge", "InsufficientStorage"}
@@ -231,7 +231,7 @@ def _as_store_errors(name: str) -> Iterator[None]:
             ) from error
         if status_of(error) == _NOT_FOUND:
             raise NotFound(f"no object named {name!r}") from error
-        if status_of(error) in (_PRECONDITION_FAILED, _CONFLICT):
+        if status_of(error) == _PRECONDITION_FAILED:
             raise _conflict(name) from error
         if code in _FULL:
             raise StoreFull(f"no space for {name!r}", hint="free some space") from error

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 from typing import Any
 
 import pytest
+from botocore.exceptions import ClientError
 
 from rse_pf.audit.log import AuditLog, files_of
 from rse_pf.audit.verify import Verdict, check_folder
 from rse_pf.aws.account import Account
-from rse_pf.aws.clients import make_client
+from rse_pf.aws.clients import MAX_TRIES, make_client
 from rse_pf.aws.storage.audit_archive import Shipper, fetch_audit, open_audit_archive, piece_name
 from rse_pf.aws.storage.s3_store import S3Store
 from rse_pf.config.resource_names import ResourceNames
@@ -291,6 +293,40 @@ def test_pieces_in_a_locked_bucket_are_kept_and_read_back(locked: Any, tmp_path:
     assert fetch_audit(bucket, tmp_path / "fetched") == []
     (verdict,) = check_folder(tmp_path / "fetched")
     assert (verdict.problem, verdict.head) == ("", setup.here()[INSTANCE].head)
+
+
+@pytest.mark.parametrize("times", [1, MAX_TRIES, 2 * MAX_TRIES])
+def test_a_piece_that_s3_answered_with_409_is_not_lost(locked: Any, tmp_path: Path, times: int) -> None:
+    class Undecided:
+        """S3 while another write of the same name is not finished; that one fails, and nothing is stored."""
+
+        left = times
+
+        def __getattr__(self, name: str) -> Any:
+            return getattr(locked, name)
+
+        def put_object(self, **arguments: Any) -> Any:
+            if self.left:
+                self.left -= 1
+                told = {"HTTPStatusCode": 409}
+                raise ClientError(
+                    {"Error": {"Code": "ConditionalRequestConflict"}, "ResponseMetadata": told}, "PutObject"
+                )  # fmt: skip
+            return locked.put_object(**arguments)
+
+    setup = ShipperSetup(tmp_path)
+    setup.write(8)
+    shipper = Shipper(
+        setup.folder, S3Store(Undecided(), "audit-logs"), marks_file=setup.marks, instance=lambda: INSTANCE,
+        on_broken=lambda chain, problem: None,
+    )  # fmt: skip
+    for _ in range(3):  # as the agent calls it
+        with contextlib.suppress(StoreError):
+            shipper.ship()
+
+    assert fetch_audit(S3Store(locked, "audit-logs"), tmp_path / "fetched") == []
+    (verdict,) = check_folder(tmp_path / "fetched")
+    assert (verdict.problem, verdict.entries) == ("", setup.here()[INSTANCE].entries)
 
 
 def test_a_deployment_without_the_bucket_says_to_deploy() -> None:

@@ -71,6 +71,9 @@ def test_a_failing_service_is_called_at_most_three_times_within_ten_seconds(
         ("RequestLimitExceeded", 400, 3),
         ("TooManyRequestsException", 400, 3),
         ("LimitExceededException", 400, 1),
+        ("ConditionalRequestConflict", 409, 3),
+        ("OperationAborted", 409, 3),
+        ("PreconditionFailed", 412, 1),
     ],
 )
 def test_only_temporary_errors_are_retried(code: str, status: int, tries: int) -> None:
@@ -127,6 +130,48 @@ def test_a_swap_after_another_writers_swap_is_a_conflict(store: S3Store, region:
     with pytest.raises(Conflict):
         S3Store(Overtaken(client), "maps").compare_and_swap("head", b"before", b"mine")
     assert store.get("head") == b"theirs"
+
+
+class Undecided:
+    """A bucket's client that answers the first *times* writes with 409, and does nothing."""
+
+    def __init__(self, client: Any, times: int) -> None:
+        self._client = client
+        self.left = times
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._client, name)
+
+    def put_object(self, **arguments: Any) -> Any:
+        if self.left:
+            self.left -= 1
+            raise refusal("ConditionalRequestConflict", 409)
+        return self._client.put_object(**arguments)
+
+
+def test_a_409_of_s3_is_retried_because_nothing_was_stored(store: S3Store, region: str) -> None:
+    undecided = Undecided(make_client("s3", region), times=MAX_TRIES - 1)
+
+    S3Store(undecided, "maps").compare_and_swap("head", None, b"mine")
+
+    assert store.get("head") == b"mine"
+
+
+def test_a_409_that_does_not_end_is_an_error_and_no_conflict(store: S3Store, region: str) -> None:
+    with pytest.raises(StoreError, match="ConditionalRequestConflict") as told:
+        S3Store(Undecided(make_client("s3", region), 9), "maps").compare_and_swap("head", None, b"mine")
+
+    assert not isinstance(told.value, Conflict)
+
+
+def test_after_a_409_the_object_that_is_there_decides(store: S3Store, region: str) -> None:
+    undecided = S3Store(Undecided(make_client("s3", region), times=1), "maps")
+    store.put("head", b"theirs")
+
+    with pytest.raises(Conflict):
+        undecided.compare_and_swap("head", None, b"mine")
+    store.put("other", b"mine")
+    S3Store(Undecided(make_client("s3", region), times=1), "maps").compare_and_swap("other", None, b"mine")
 
 
 def test_all_pages_of_a_listing_are_read_and_foreign_names_left_out(store: S3Store, region: str) -> None:
