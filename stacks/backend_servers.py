@@ -30,6 +30,7 @@ from rse_pf.config.cloud_layout import zone_count
 from rse_pf.config.resource_names import AUDIT_PREFIX, JOURNAL_PREFIX, VERSION_PARAMETER, ResourceNames
 from rse_pf.scaling.alarms import NAMESPACE
 from rse_pf.scaling.boot_time import retry_within_s
+from rse_pf.scaling.health import MAX_HEALTHY_PERCENT
 from stacks.capacity import Capacity
 from stacks.permissions import allow
 
@@ -92,6 +93,12 @@ class BackendServers(Construct):
         Capacity(self, "Capacity", group=self.group, settings=settings)
         resource = cast("autoscaling.CfnAutoScalingGroup", self.group.node.default_child)
         resource.target_group_arns = [each.target_group_arn for each in targets]
+        # A replacement is ready before an unhealthy server ends, as in an upgrade.
+        resource.instance_maintenance_policy = (
+            autoscaling.CfnAutoScalingGroup.InstanceMaintenancePolicyProperty(
+                min_healthy_percentage=100, max_healthy_percentage=MAX_HEALTHY_PERCENT
+            )
+        )
         # In the group itself: a hook of its own would come after the first instances.
         resource.lifecycle_hook_specification_list = [
             autoscaling.CfnAutoScalingGroup.LifecycleHookSpecificationProperty(

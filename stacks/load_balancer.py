@@ -10,7 +10,7 @@ from constructs import Construct
 
 from rse_pf.config import PlatformSettings
 from rse_pf.config.resource_names import READY_PATH
-from rse_pf.scaling.health import CLOUD_TIMEOUT_S, HEALTHY_CHECKS
+from rse_pf.scaling.health import CLOUD_TIMEOUT_S, HEALTHY_CHECKS, cloud_checks
 from stacks.data_stack import BALANCER_LOGS
 from stacks.firewall import front_port
 from stacks.web_firewall import WebFirewall
@@ -71,9 +71,7 @@ class LoadBalancer(Construct):
         self, name: str, vpc: ec2.IVpc, port: int, settings: PlatformSettings
     ) -> elbv2.ApplicationTargetGroup:
         health = settings.health
-        # The data service is checked at its own port, below /data; a backend server at its control port.
-        robots = name == "Robots"
-        asked, path = (settings.serving.control_port, READY_PATH) if robots else (port, f"/data{READY_PATH}")
+        asked, path = cloud_checks(settings)[name.lower()]
         return elbv2.ApplicationTargetGroup(
             self, name, vpc=vpc, port=port, protocol=elbv2.ApplicationProtocol.HTTP,
             target_type=elbv2.TargetType.INSTANCE,

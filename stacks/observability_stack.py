@@ -17,7 +17,7 @@ from constructs import Construct
 from rse_pf.config import PlatformSettings
 from rse_pf.config.resource_names import ResourceNames
 from rse_pf.scaling.alarms import NAMESPACE
-from rse_pf.scaling.operator_alarms import OperatorAlarm, Series, operator_alarms
+from rse_pf.scaling.operator_alarms import STORE_ERRORS, OperatorAlarm, Series, operator_alarms
 from stacks.canary import Canary
 from stacks.idle_timer import IdleTimer
 from stacks.values import read
@@ -128,6 +128,7 @@ class ObservabilityStack(cdk.Stack):
                 "Objects and maps, bytes": [
                     of("maps", _S3, "BucketSizeBytes", "Average", period=cdk.Duration.days(1))
                 ],
+                "Failed checks of the bucket": [of("group", NAMESPACE, STORE_ERRORS, "Sum")],
             },
         }  # fmt: skip
         if settings.cloud.canary:

@@ -30,9 +30,11 @@ __all__ = [
 DEPLOYMENT_TAG = "rse-pf"
 """Key of the tag of every resource; its value is `ResourceNames.prefix`."""
 HEALTH_PATH = "/healthz"
-"""At the robots' port; it tells everybody that robots are served, and nothing else."""
+"""At the robots' port, where it tells everybody that robots are served, and nothing else; below ``/data`` at
+the data service, where load balancers ask it whether the process is alive."""
 READY_PATH = "/readyz"
-"""At the control port, and below ``/data`` at the data service; load balancers ask it."""
+"""At the control port, where load balancers ask it; below ``/data`` at the data service, whether its store
+answers, which agents publish and for which no server is ended."""
 ROSBRIDGE_PATH = "/rosbridge"
 """At the robots' port, where ``serving.rosbridge`` is on."""
 KEYS_NAME = "keys.json"

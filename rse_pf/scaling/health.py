@@ -9,14 +9,17 @@ import dataclasses
 from dataclasses import dataclass
 from typing import Literal
 
-from rse_pf.config import HealthSettings
+from rse_pf.config import HealthSettings, PlatformSettings
+from rse_pf.config.resource_names import HEALTH_PATH, READY_PATH
 
 __all__ = [
     "CLOUD_TIMEOUT_S",
     "HEALTHY_CHECKS",
     "LOCAL_INTERVAL_S",
     "LOCAL_TIMEOUT_S",
+    "MAX_HEALTHY_PERCENT",
     "Health",
+    "cloud_checks",
     "observe",
     "time_to_notice_s",
 ]
@@ -28,6 +31,11 @@ LOCAL_INTERVAL_S, LOCAL_TIMEOUT_S = 0.25, 0.25
 CLOUD_TIMEOUT_S = 4
 """A check of the ALB that takes longer failed; below the least ``health.cloud_interval_s``."""
 
+MAX_HEALTHY_PERCENT = 110
+"""While servers are replaced: one new one more at a time, up to 19 servers, and never fewer than wanted.
+
+So a bad release, or a check that fails on every server at once, stops at the first."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Health:
@@ -37,6 +45,18 @@ class Health:
     state: Literal["starting", "healthy", "unhealthy"] = "starting"
     last_ok: bool = False
     row: int = 0
+
+
+def cloud_checks(settings: PlatformSettings) -> dict[str, tuple[int, str]]:
+    """Return port and path that the ALB asks, by target group: ``robots`` and, where it runs, ``data``.
+
+    A server that fails any of them is ended.  Therefore none may depend on what all servers share, such as
+    the bucket: it would end all servers at once.
+    """
+    checks = {"robots": (settings.serving.control_port, READY_PATH)}
+    if settings.data.enabled:
+        checks["data"] = (settings.data.port, f"/data{HEALTH_PATH}")
+    return checks
 
 
 def observe(health: Health, ok: bool, settings: HealthSettings, *, now_s: float) -> Health:

@@ -13,7 +13,15 @@ from rse_pf.config import PlatformSettings
 from rse_pf.scaling.alarms import NAMESPACE
 from rse_pf.scaling.profile import cadence_of
 
-__all__ = ["LAMBDA_TIMEOUT_S", "OperatorAlarm", "Series", "Source", "operator_alarms"]
+__all__ = [
+    "LAMBDA_TIMEOUT_S",
+    "STORE_ERRORS",
+    "STORE_PERIOD_S",
+    "OperatorAlarm",
+    "Series",
+    "Source",
+    "operator_alarms",
+]
 
 LAMBDA_TIMEOUT_S = 10
 """Of one execution of the serverless PnP."""
@@ -21,6 +29,11 @@ _SLOW_SHARE = 0.8
 """An execution that takes more of its time-out than this is slow."""
 _BLOCKED_PER_PERIOD = 100.0
 _PERIOD_S, _LONG_PERIOD_S = 60, 300
+STORE_ERRORS, STORE_PERIOD_S = "StoreErrors", 10
+"""What an agent publishes while the bucket does not answer its server, and how often it looks.
+
+Nothing is published while all is well, so the metric costs nothing then; agents that are silent for another
+reason have an alarm of their own."""
 
 Source = str
 """Of a series: ``group``, ``balancer``, ``targets``, ``firewall``, ``function`` or ``canary``."""
@@ -83,6 +96,9 @@ _TARGET_ERRORS = _balancer("errors", "HTTPCode_Target_5XX_Count", "Sum", "target
 _BALANCER_ERRORS = _balancer("errors", "HTTPCode_ELB_5XX_Count", "Sum")
 _REPORTS = Series(
     name="reports", namespace=NAMESPACE, metric="Robots", statistic="SampleCount", source="group"
+)  # fmt: skip
+_STORE_ERRORS = Series(
+    name="errors", namespace=NAMESPACE, metric=STORE_ERRORS, statistic="Sum", source="group"
 )  # fmt: skip
 _BLOCKED = Series(
     name="blocked", namespace="AWS/WAFV2", metric="BlockedRequests", statistic="Sum", source="firewall"
@@ -160,6 +176,17 @@ def operator_alarms(settings: PlatformSettings) -> tuple[OperatorAlarm, ...]:
             expression=f"IF(blocked >= {_BLOCKED_PER_PERIOD:g}, 1, 0)",
         ),
     ]
+    if settings.data.enabled:
+        alarms.append(
+            OperatorAlarm(
+                name="store",
+                meaning="the bucket of objects and maps does not answer servers",
+                series=(_STORE_ERRORS,),
+                expression="IF(errors >= 1, 1, 0)",
+                period_s=STORE_PERIOD_S,
+                datapoints=2,
+            )
+        )
     if settings.cloud.canary:
         calls = (
             _function("calls", "Invocations", "Sum", "canary"),

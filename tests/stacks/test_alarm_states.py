@@ -85,6 +85,7 @@ FAULTS: dict[str, list[dict[str, list[float] | None]]] = {
     "lambda-throttles": [{"Throttles": [3.0]}],
     "lambda-slow": [{"Duration": [9000.0, 9500.0]}],
     "blocked": [{"BlockedRequests": [500.0]}],
+    "store": [{"StoreErrors": [1.0, 1.0]}, {"StoreErrors": [1.0], "Robots": None}],
     "canary": [{"Errors": [1.0]}, {"Invocations": None, "Errors": None}, {"Invocations": None}],
     "busy": [{"CPUUtilization": [99.0], CPU: [99.0]}],
     "idle": [{"Requests": [0.0], "CPUUtilization": [2.0], CPU: [2.0]}],
@@ -93,7 +94,7 @@ FAULTS: dict[str, list[dict[str, list[float] | None]]] = {
     "queueing": [{"QueueMs": [1e4]}],
 }
 """Alarm to its faults: what a fault changes in a period; None is missing data."""
-QUIET_WHEN_PARKED = ("few-servers", "balancer-errors", "silent-agent", "canary", "unhealthy")
+QUIET_WHEN_PARKED = ("few-servers", "balancer-errors", "silent-agent", "canary", "unhealthy", "store")
 
 
 def broken(assembly: Assembly, name: str, fault: Mapping[str, Any], period_s: int) -> Period:

@@ -182,7 +182,7 @@ def test_every_stack_is_created_and_what_moto_made_equals_the_settings(
     assert robots["HealthCheckIntervalSeconds"] == settings.health.cloud_interval_s
     if settings.data.enabled:
         data = next(each for each in targets if each.get("Port") == settings.data.port)
-        assert data["HealthCheckPath"] == "/data/readyz"
+        assert data["HealthCheckPath"] == "/data/healthz"
     assert robots["UnhealthyThresholdCount"] == settings.health.unhealthy_checks
     assert len(targets) == len(group["TargetGroupARNs"]) == (2 if settings.data.enabled else 1)
     (balancer,) = elb.describe_load_balancers()["LoadBalancers"]

@@ -67,6 +67,7 @@ NEEDS_AN_ACCOUNT = {
     "aws s3 cp s3://HOME-ARTIFACTS/keys.json s3://REPLICA-ARTIFACTS/keys.json",
     "rse-pf map show kitchen --all --store s3:BUCKET",
     "rse-pf map rollback kitchen VERSION --store s3:BUCKET",
+    "aws s3api get-bucket-policy --bucket BUCKET",
     "aws s3api list-object-versions --bucket BUCKET --prefix NAME",
     "aws s3api copy-object --bucket BUCKET --key NAME --copy-source BUCKET/NAME?versionId=VERSION",
 }

@@ -35,6 +35,7 @@ from rse_pf.aws.fleet.tasks import (
     server_metrics,
     services,
     spot_notice,
+    store_errors,
 )
 from rse_pf.aws.storage.audit_archive import Shipper
 from rse_pf.aws.storage.s3_store import open_bucket
@@ -56,6 +57,7 @@ TASKS: tuple[Callable[[AgentContext], Task], ...] = (
     access_control.task,
     services.task,
     job_metrics.task,
+    store_errors.task,
 )
 """The table, in the order of a step: one row and one module for each task."""
 

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from rse_pf.auth.control_token import bearer, read_control_token
 from rse_pf.aws.fleet.metrics import read_cpu_times
-from rse_pf.config.resource_names import READY_PATH
+from rse_pf.config.resource_names import HEALTH_PATH, READY_PATH
 from rse_pf.errors import Disconnected, UsageError
 
 __all__ = ["INTERRUPTION", "IN_SERVICE", "TERMINATED", "WARMED", "Instance"]
@@ -44,11 +44,29 @@ class Instance:
         self._data_base = f"http://127.0.0.1:{data_port}/data" if data_port else ""
 
     def is_ready(self) -> bool:
-        """Return whether the server, and the data service where there is one, take work."""
+        """Return whether the server takes robots, and the data service, where there is one, answers.
+
+        An instance that is never ready is ended, so the store, which all servers share, is not asked.
+        """
         try:
             _ask(f"{self._base}{READY_PATH}", "GET", {})
             if self._data_base:
-                _ask(f"{self._data_base}{READY_PATH}", "GET", {})
+                _ask(f"{self._data_base}{HEALTH_PATH}", "GET", {})
+        except (Disconnected, FileNotFoundError):
+            return False
+        return True
+
+    def reaches_store(self) -> bool:
+        """Return whether the store of the data service answers within two seconds.
+
+        Raises:
+            Disconnected: The data service itself does not answer, or there is none.
+        """
+        if not self._data_base:
+            raise Disconnected("this instance has no data service")
+        _ask(f"{self._data_base}{HEALTH_PATH}", "GET", {})
+        try:
+            _ask(f"{self._data_base}{READY_PATH}", "GET", {})
         except (Disconnected, FileNotFoundError):
             return False
         return True

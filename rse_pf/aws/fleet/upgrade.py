@@ -19,6 +19,7 @@ from rse_pf.aws.account import Account
 from rse_pf.config import PlatformSettings
 from rse_pf.config.resource_names import VERSION_PARAMETER, ResourceNames
 from rse_pf.errors import ConfigurationError, RsePfError
+from rse_pf.scaling.health import MAX_HEALTHY_PERCENT
 from rse_pf.terminal import counted
 
 __all__ = [
@@ -36,10 +37,8 @@ __all__ = [
     "with_version",
 ]
 
-WATCHED = ("errors", "unhealthy", "few-servers")
+WATCHED = ("errors", "unhealthy", "few-servers", "store")
 """Alarms that end an upgrade; one that fires already when it begins is left out."""
-MAX_HEALTHY_PERCENT = 110
-"""One new server more at a time, up to 19 servers: a bad release stops at the first."""
 POLL_S = 10.0
 _ACTIVE = ("Pending", "InProgress", "Baking", "Cancelling", "RollbackInProgress")
 _ABANDONED = ("Cancelled", "Failed")

@@ -22,6 +22,7 @@ class FakeMachine:
         self.runs = runs
         self.leaving = False
         self.ready = True
+        self.reaches = True
         self.target = "InService"
         self.text = ""
         self.waits: list[float] = []
@@ -65,6 +66,9 @@ class FakeMachine:
     def reload_services(self) -> None:
         self.page()
         self.reloads += 1
+
+    def reaches_store(self) -> bool:
+        return self.reaches
 
     def page(self) -> str:
         if not self.runs or self.now_s >= self._ended_at_s:

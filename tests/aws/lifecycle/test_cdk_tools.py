@@ -7,8 +7,7 @@ from pathlib import Path
 import pytest
 
 from rse_pf.aws.lifecycle.cdk_tools import CdkTools
-from rse_pf.config import PlatformSettings
-from rse_pf.config import resource_names
+from rse_pf.config import PlatformSettings, resource_names
 from rse_pf.errors import DeploymentFailed, UsageError
 
 SETTINGS = PlatformSettings().replace(cloud={"bootstrap_qualifier": "lab1"})

@@ -1,0 +1,45 @@
+"""Publish that the bucket does not answer this server's data service: an alarm, and no server ends.
+
+All servers share the bucket, so a server that is replaced for it helps nobody, and its replacement could not
+even boot.  Robots get typed errors for their data meanwhile, and poses as ever.
+"""
+
+from __future__ import annotations
+
+from rse_pf.aws.clients import call_api
+from rse_pf.aws.fleet.metrics import dimensions_of
+from rse_pf.aws.fleet.task import AgentContext, Phase, Task
+from rse_pf.scaling.alarms import NAMESPACE
+from rse_pf.scaling.operator_alarms import STORE_ERRORS, STORE_PERIOD_S
+
+__all__ = ["task"]
+
+_HIGH_RESOLUTION = 1
+
+
+def task(context: AgentContext) -> Task:
+    """Look every ten seconds, in a thread: calls of the other tasks wait for a bucket that is silent."""
+    failing = False
+
+    def look() -> None:
+        nonlocal failing
+        if not context.settings.data.enabled or context.runs_jobs:
+            return
+        fails = not context.machine.reaches_store()
+        if fails != failing:
+            context.log("store-silent" if fails else "store-back")
+        failing = fails
+        if not fails:
+            return
+        datum = {
+            "MetricName": STORE_ERRORS, "Dimensions": dimensions_of(context.config.group), "Value": 1.0,
+            "Unit": "Count", "StorageResolution": _HIGH_RESOLUTION,
+        }  # fmt: skip
+        call_api(
+            context.clients["cloudwatch"], "put_metric_data", Namespace=NAMESPACE, MetricData=[datum]
+        )  # fmt: skip
+
+    return Task(
+        name="store-errors", period_s=float(STORE_PERIOD_S), call=look, phases=frozenset({Phase.SERVING}),
+        in_thread=True,
+    )  # fmt: skip
