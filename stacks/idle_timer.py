@@ -1,8 +1,14 @@
-"""The idle timer: each hour a function parks the deployment if nobody has used it for ``idle_hours``."""
+"""The function that parks the deployment if nobody used it for ``idle_hours``, and resumes it by schedule.
+
+It is called each hour where ``cloud.idle_action`` says so, and at the entries of ``scaling.schedule`` that do
+not lower the number of servers.
+"""
 
 from __future__ import annotations
 
+import json
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import cast
 
@@ -12,10 +18,13 @@ from aws_cdk import aws_events_targets as targets
 from aws_cdk import aws_iam as iam
 from aws_cdk import aws_lambda as lambda_
 from aws_cdk import aws_logs as logs
+from aws_cdk import aws_scheduler as scheduler
 from constructs import Construct
 
 from rse_pf.config import PlatformSettings
+from rse_pf.config.cloud_layout import RESUME_FIELD, parks_when_idle
 from rse_pf.config.resource_names import DEPLOYMENT_TAG, ResourceNames
+from rse_pf.config.schedule import DAYS, ScheduleEntry, parse_schedule, resuming
 from stacks.assets import staged
 from stacks.findings import acknowledge
 from stacks.permissions import BY_AWS, LOG_ACTIONS, allow, explain
@@ -25,10 +34,11 @@ __all__ = ["IdleTimer"]
 _TIMEOUT_S = 60
 _MB = 256
 _LIFECYCLE = "rse_pf/aws/lifecycle"
+_RETRIES, _RETRY_WITHIN_S = 5, 3600
 
 
 class IdleTimer(Construct):
-    """Function, its log and its schedule."""
+    """Function, its log and what calls it."""
 
     def __init__(
         self, scope: Construct, construct_id: str, *, settings: PlatformSettings, assets: Path, topic: str
@@ -51,13 +61,46 @@ class IdleTimer(Construct):
                 environment={"RSE_PF_TOPIC": topic},
             )  # fmt: skip
         acknowledge(function, "the newest runtime with wheels of every package in the lock", "L1")
-        events.Rule(
-            self, "EachHour", schedule=events.Schedule.rate(cdk.Duration.hours(1)),
-            targets=[targets.LambdaFunction(function, retry_attempts=1)],
+        if parks_when_idle(settings):
+            events.Rule(
+                self, "EachHour", schedule=events.Schedule.rate(cdk.Duration.hours(1)),
+                targets=[targets.LambdaFunction(function, retry_attempts=1)],
+            )  # fmt: skip
+        entries = resuming(parse_schedule(settings.scaling.schedule))
+        if entries:
+            self._resume(function, entries, settings)
+
+    def _resume(
+        self, function: lambda_.Function, entries: Sequence[ScheduleEntry], settings: PlatformSettings
+    ) -> None:
+        """Call the function at each of *entries*: a parked group takes no scheduled actions."""
+        account = cdk.Stack.of(self).account
+        caller = iam.Role(
+            self, "Caller", assumed_by=iam.ServicePrincipal(
+                "scheduler.amazonaws.com", conditions={"StringEquals": {"aws:SourceAccount": account}}
+            ),
         )  # fmt: skip
+        allow(
+            caller, ["lambda:InvokeFunction"], [function.function_arn],
+            used_by=f"{BY_AWS}EventBridge Scheduler calls the function",
+        )  # fmt: skip
+        for number, entry in enumerate(entries):
+            days = ",".join(DAYS[day].upper() for day in entry.days)
+            scheduler.CfnSchedule(
+                self, f"Resume{number}", schedule_expression_timezone=settings.scaling.time_zone,
+                schedule_expression=f"cron({entry.minute} {entry.hour} ? * {days} *)",
+                flexible_time_window=scheduler.CfnSchedule.FlexibleTimeWindowProperty(mode="OFF"),
+                target=scheduler.CfnSchedule.TargetProperty(
+                    arn=function.function_arn, role_arn=caller.role_arn,
+                    input=json.dumps({RESUME_FIELD: entry.min_servers}),
+                    retry_policy=scheduler.CfnSchedule.RetryPolicyProperty(
+                        maximum_retry_attempts=_RETRIES, maximum_event_age_in_seconds=_RETRY_WITHIN_S
+                    ),
+                ),
+            ).node.add_dependency(caller)  # fmt: skip
 
     def _allow(self, role: iam.Role, names: ResourceNames, topic: str) -> None:
-        """Allow to read, and to end servers; nothing can be deleted."""
+        """Allow to read, to end and to start servers; nothing but the note can be deleted."""
         stack = cdk.Stack.of(self)
         why = "reading knows no resources"
         allow(
@@ -73,26 +116,33 @@ class IdleTimer(Construct):
             arn_format=cdk.ArnFormat.COLON_RESOURCE_NAME,
         )  # fmt: skip
         allow(
-            role, ["autoscaling:SuspendProcesses", "autoscaling:UpdateAutoScalingGroup"], [groups],
-            used_by=f"{_LIFECYCLE}/parking.py:empty_group",
+            role,
+            [
+                "autoscaling:SuspendProcesses", "autoscaling:ResumeProcesses",
+                "autoscaling:UpdateAutoScalingGroup",
+            ],
+            [groups],
+            used_by=(f"{_LIFECYCLE}/parking.py:empty_group", f"{_LIFECYCLE}/parking.py:fill_groups"),
             conditions={"StringEquals": {f"aws:ResourceTag/{DEPLOYMENT_TAG}": names.prefix}},
             why="the ARN of a group holds an id that only AWS knows; the tag is of this deployment",
         )  # fmt: skip
         allow(
             role, ["cloudwatch:DescribeAlarms"], ["*"],
-            used_by=f"{_LIFECYCLE}/parking.py:alarms_of_deployment", why=why,
+            used_by=f"{_LIFECYCLE}/parking.py:_alarms_of_deployment", why=why,
         )  # fmt: skip
         alarms = stack.format_arn(
             service="cloudwatch", resource="alarm", resource_name=f"{names.alarm_prefix}*",
             arn_format=cdk.ArnFormat.COLON_RESOURCE_NAME,
         )  # fmt: skip
         allow(
-            role, ["cloudwatch:DisableAlarmActions"], [alarms],
-            used_by=f"{_LIFECYCLE}/parking.py:silence_alarms", why="all alarms of this deployment",
+            role, ["cloudwatch:DisableAlarmActions", "cloudwatch:EnableAlarmActions"], [alarms],
+            used_by=(f"{_LIFECYCLE}/parking.py:silence_alarms", f"{_LIFECYCLE}/parking.py:enable_alarms"),
+            why="all alarms of this deployment",
         )  # fmt: skip
         note = stack.format_arn(
             service="ssm", resource="parameter", resource_name=names.parked.removeprefix("/")
         )
         allow(role, ["ssm:GetParameter"], [note], used_by=f"{_LIFECYCLE}/deployment.py:read_note")
         allow(role, ["ssm:PutParameter"], [note], used_by=f"{_LIFECYCLE}/parking.py:write_note")
+        allow(role, ["ssm:DeleteParameter"], [note], used_by=f"{_LIFECYCLE}/parking.py:delete_note")
         allow(role, ["sns:Publish"], [topic], used_by=f"{_LIFECYCLE}/idle.py:park_if_idle")

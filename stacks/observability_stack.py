@@ -15,6 +15,7 @@ from aws_cdk import aws_cloudwatch as cloudwatch
 from constructs import Construct
 
 from rse_pf.config import PlatformSettings
+from rse_pf.config.cloud_layout import parks_when_idle
 from rse_pf.config.resource_names import ResourceNames
 from rse_pf.scaling.alarms import NAMESPACE
 from rse_pf.scaling.operator_alarms import STORE_ERRORS, OperatorAlarm, Series, operator_alarms
@@ -68,7 +69,7 @@ class ObservabilityStack(cdk.Stack):
             Canary(
                 self, "Canary", settings=settings, assets=assets, url=read(self, names, "backend/url")
             )  # fmt: skip
-        if settings.cloud.idle_action == "park":
+        if parks_when_idle(settings) or settings.scaling.schedule.strip():
             IdleTimer(self, "IdleTimer", settings=settings, assets=assets, topic=topic)
         if settings.cloud.budget_per_month:
             self._budget(names, settings.cloud.budget_per_month, topic)

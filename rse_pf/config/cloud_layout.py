@@ -4,7 +4,14 @@ from __future__ import annotations
 
 from rse_pf.config.settings import PlatformSettings
 
-__all__ = ["CANARY_MB", "CANARY_PERIOD_S", "ENDPOINT_SERVICES", "zone_count"]
+__all__ = [
+    "CANARY_MB",
+    "CANARY_PERIOD_S",
+    "ENDPOINT_SERVICES",
+    "RESUME_FIELD",
+    "parks_when_idle",
+    "zone_count",
+]
 
 CANARY_MB, CANARY_PERIOD_S = 512, 60
 """Memory of the canary's function, and the time between two calls."""
@@ -12,8 +19,20 @@ ENDPOINT_SERVICES = {"monitoring": "monitor", "autoscaling": "scale modifier"}
 """The interface endpoints of the VPC: the service of AWS, and the box of Fig. 2 that uses it.
 
 Without them the agents reach neither the monitor nor the group; S3 has a gateway endpoint, which is free."""
+RESUME_FIELD = "min_servers"
+"""In an event of the schedule for the function that parks: resume, with so many servers at least."""
 
 
 def zone_count(settings: PlatformSettings) -> int:
     """Return in how many zones servers and endpoints are; the load balancer always needs two."""
     return 1 if settings.cloud.profile == "small" else 2
+
+
+def parks_when_idle(settings: PlatformSettings) -> bool:
+    """Return whether the deployment ends its servers when nobody has used it for ``cloud.idle_hours``.
+
+    A platform for more than trials, which TLS or a schedule shows, does so only if its operator says so.
+    """
+    if settings.cloud.idle_action == "auto":
+        return settings.cloud.allow_insecure and not settings.scaling.schedule.strip()
+    return settings.cloud.idle_action == "park"

@@ -6,6 +6,7 @@ stacks write the same entries as scheduled actions of the Auto Scaling group.
 
 from __future__ import annotations
 
+import dataclasses
 import re
 import zoneinfo
 from collections.abc import Sequence
@@ -14,7 +15,7 @@ from datetime import datetime, timedelta, timezone, tzinfo
 
 from rse_pf.errors import SettingsError
 
-__all__ = ["DAYS", "ScheduleEntry", "minimum_at", "parse_schedule", "zone_named"]
+__all__ = ["DAYS", "ScheduleEntry", "minimum_at", "parse_schedule", "resuming", "zone_named"]
 
 DAYS = ("sun", "mon", "tue", "wed", "thu", "fri", "sat")
 """Names of the days; the index is the number of the day in cron."""
@@ -59,14 +60,26 @@ def minimum_at(entries: Sequence[ScheduleEntry], local: datetime, *, otherwise: 
 
     The entry that began last holds, that of a week ago included; *otherwise* if there is no entry.
     """
-    minute_of_week = _minute(int(local.strftime("%w")), local.hour, local.minute)
-    week = _minute(_WEEK_DAYS, 0, 0)
-    begun = [
-        ((minute_of_week - _minute(day, each.hour, each.minute)) % week, each.min_servers)
+    return _minimum(entries, _minute(int(local.strftime("%w")), local.hour, local.minute), otherwise)
+
+
+def resuming(entries: Sequence[ScheduleEntry]) -> tuple[ScheduleEntry, ...]:
+    """Return the entries that resume a parked platform, each on those of its days on which it does.
+
+    These do not lower the minimum: the one in the morning wants servers, and the one in the evening fewer.
+    """
+    found = (
+        dataclasses.replace(
+            each,
+            days=tuple(
+                day
+                for day in each.days
+                if each.min_servers >= _minimum(entries, _minute(day, each.hour, each.minute) - 1, 0)
+            ),
+        )
         for each in entries
-        for day in each.days
-    ]
-    return min(begun)[1] if begun else otherwise
+    )
+    return tuple(each for each in found if each.days)
 
 
 def zone_named(name: str) -> tzinfo:
@@ -129,6 +142,16 @@ def _days(text: str, name: str) -> tuple[int, ...]:
         at, end = DAYS.index(first), DAYS.index(last)
         chosen |= {(at + step) % _WEEK_DAYS for step in range((end - at) % _WEEK_DAYS + 1)}
     return tuple(sorted(chosen))
+
+
+def _minimum(entries: Sequence[ScheduleEntry], minute_of_week: int, otherwise: int) -> int:
+    week = _minute(_WEEK_DAYS, 0, 0)
+    begun = [
+        ((minute_of_week - _minute(day, each.hour, each.minute)) % week, each.min_servers)
+        for each in entries
+        for day in each.days
+    ]
+    return min(begun)[1] if begun else otherwise
 
 
 def _minute(day: int, hour: int, minute: int) -> int:

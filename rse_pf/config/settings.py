@@ -328,7 +328,7 @@ class CloudSettings:
     lambda_memory_mb: int = setting(1769, unit="MB", doc="memory of the serverless PnP; 1769 is one vCPU", low=128, high=10240)
     lambda_concurrency: int = setting(20, doc="concurrent executions of the serverless PnP", low=1)
     idle_hours: int = setting(24, unit="h", doc="hours without robots after which idle_action is taken", low=1, high=168)
-    idle_action: str = setting("park", doc="what a deployment does that has been idle for idle_hours: park ends its servers until rse-pf cloud resume; none", choices=("park", "none"))
+    idle_action: str = setting("auto", doc="what a deployment does that has been idle for idle_hours: park ends its servers until rse-pf cloud resume or scaling.schedule; none; auto: park a trial, and none with TLS (allow_insecure is false) or scaling.schedule", choices=("auto", "park", "none"))
     log_days: int = setting(30, unit="days", doc="retention of logs", low=1)
     audit_ship_s: int = setting(60, unit="s", doc="time between two uploads of a server's audit log; a machine that fails loses at most this much", low=5, high=3600)
     deleted_days: int = setting(30, unit="days", doc="an object of the map or artifact bucket that was overwritten or deleted can be restored for this long", low=1)

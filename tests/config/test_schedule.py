@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from rse_pf.config import PlatformSettings
-from rse_pf.config.schedule import ScheduleEntry, minimum_at, parse_schedule, zone_named
+from rse_pf.config.schedule import ScheduleEntry, minimum_at, parse_schedule, resuming, zone_named
 from rse_pf.errors import SettingsError
 
 OFFICE = parse_schedule("weekdays 08:00 min 4; weekdays 18:00 min 1; sat,sun 10:00 min 2")
@@ -83,3 +83,19 @@ def test_the_letter_g_alone_makes_no_arm_processor(name: str) -> None:
     else:
         with pytest.raises(SettingsError):
             PlatformSettings.from_dict({"cloud": {"instance_type": name}})
+
+
+@pytest.mark.parametrize(
+    ("text", "days"),
+    [
+        ("", []),
+        ("mon 08:00 min 8", [(1,)]),
+        ("weekdays 08:00 min 4; weekdays 18:00 min 1", [(1, 2, 3, 4, 5)]),
+        ("weekdays 08:00 min 4; fri 18:00 min 1; sat,sun 10:00 min 2", [(1, 2, 3, 4, 5), (0, 6)]),
+        ("mon 00:00 min 2; sat 00:00 min 1; sun 00:00 min 1", [(1,), (0,)]),
+    ],
+)
+def test_an_entry_resumes_a_parked_platform_unless_it_lowers_the_minimum(
+    text: str, days: list[tuple[int, ...]]
+) -> None:
+    assert [each.days for each in resuming(parse_schedule(text))] == days

@@ -27,6 +27,10 @@ CORNERS: dict[str, Mapping[str, Mapping[str, Any]]] = {
     "no data": {"data": {"enabled": False}},
     "min = max": {"scaling": {"min_servers": 3, "max_servers": 3}},
     "one server": {"scaling": {"min_servers": 1, "max_servers": 1}},
+    "parks and resumes": {
+        "cloud": {"idle_action": "park"},
+        "scaling": {"schedule": "weekdays 08:00 min 4; weekdays 18:00 min 1"},
+    },
     "budget": {"cloud": {"budget_per_month": 300.0}},
 }
 EXPECTED_WARNING = "Annotation::rse-pf:allow-insecure"

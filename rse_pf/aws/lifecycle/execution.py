@@ -13,18 +13,20 @@ from typing import Protocol
 
 from rse_pf.aws.account import Account
 from rse_pf.aws.fleet.group import read_group
-from rse_pf.aws.lifecycle.deployment import GroupSize, ParkNote, read_note, read_sizes
+from rse_pf.aws.lifecycle.deployment import ParkNote, read_note, read_sizes
 from rse_pf.aws.lifecycle.parking import (
-    SUSPENDED,
-    alarms_of_deployment,
+    delete_note,
     empty_group,
+    enable_alarms,
+    fill_groups,
     silence_alarms,
     write_note,
 )
-from rse_pf.aws.lifecycle.plan import Action, Step, restored
+from rse_pf.aws.lifecycle.plan import Action, Step
 from rse_pf.aws.lifecycle.removal import erase_data, sweep
 from rse_pf.config import PlatformSettings
 from rse_pf.config.resource_names import ResourceNames
+from rse_pf.config.schedule import minimum_at, parse_schedule, zone_named
 from rse_pf.errors import DeploymentFailed
 
 __all__ = ["StepContext", "Tools", "carry_out"]
@@ -163,31 +165,20 @@ def _await_empty(step: Step, world: StepContext) -> None:
 
 
 def _fill(step: Step, world: StepContext) -> None:
-    note = read_note(world.account, world.names)
-    for name, now in read_sizes(world.account, world.names).items():
-        saved = restored(note.groups.get(name) if note is not None else None, now)
-        if saved is not None:
-            _resize(world.account, name, saved)
-        world.account.change(
-            "autoscaling", "resume_processes", AutoScalingGroupName=name, ScalingProcesses=list(SUSPENDED)
-        )
-
-
-def _resize(account: Account, group: str, size: GroupSize) -> None:
-    account.change(
-        "autoscaling", "update_auto_scaling_group", AutoScalingGroupName=group, MinSize=size.min_servers,
-        DesiredCapacity=min(max(size.wanted_servers, size.min_servers), size.max_servers),
-        MaxSize=size.max_servers,
-    )  # fmt: skip
+    scaling = world.settings.scaling
+    local = world.now().astimezone(zone_named(scaling.time_zone))
+    # Scheduled actions that were due meanwhile are not made up for by AWS.
+    fill_groups(
+        world.account, world.names, least=minimum_at(parse_schedule(scaling.schedule), local, otherwise=0)
+    )
 
 
 def _alert(step: Step, world: StepContext) -> None:
-    for some in alarms_of_deployment(world.account, world.names):
-        world.account.change("cloudwatch", "enable_alarm_actions", AlarmNames=some)
+    enable_alarms(world.account, world.names)
 
 
 def _forget(step: Step, world: StepContext) -> None:
-    world.account.find("ssm", "delete_parameter", Name=world.names.parked)
+    delete_note(world.account, world.names)
 
 
 def _await_healthy(step: Step, world: StepContext) -> None:

@@ -1,7 +1,8 @@
-"""Park a deployment that nobody has used for hours: the rule, and the function that applies it each hour.
+"""Park a deployment that nobody has used for hours, and resume a parked one at the times of the schedule.
 
-The function runs in AWS Lambda.  It may read metrics, and end the servers of its own groups; it cannot delete
-anything, so that a mistake of the rule costs a ``rse-pf cloud resume`` and nothing else.
+The function runs in AWS Lambda: each hour where ``cloud.idle_action`` says so, and at the entries of
+``scaling.schedule``.  It may read metrics, and end and start the servers of its own groups.  It can delete
+nothing but the note that the deployment is parked, so that a mistake costs a ``rse-pf cloud resume``.
 """
 
 from __future__ import annotations
@@ -17,14 +18,21 @@ from typing import Any
 from rse_pf.aws.account import Account
 from rse_pf.aws.fleet.metrics import ROBOTS, dimensions_of
 from rse_pf.aws.lifecycle.deployment import GroupSize, ParkNote, read_note, read_sizes
-from rse_pf.aws.lifecycle.parking import empty_group, silence_alarms, write_note
+from rse_pf.aws.lifecycle.parking import (
+    delete_note,
+    empty_group,
+    enable_alarms,
+    fill_groups,
+    silence_alarms,
+    write_note,
+)
 from rse_pf.config import PlatformSettings, load_settings
-from rse_pf.config.cloud_layout import CANARY_PERIOD_S
+from rse_pf.config.cloud_layout import CANARY_PERIOD_S, RESUME_FIELD
 from rse_pf.config.resource_names import ResourceNames
 from rse_pf.scaling.alarms import NAMESPACE
 from rse_pf.scaling.job_alarms import JOBS
 
-__all__ = ["Hour", "handler", "is_idle", "park_if_idle"]
+__all__ = ["Hour", "handler", "is_idle", "park_if_idle", "resume_if_parked"]
 
 _log = logging.getLogger(__name__)
 _log.setLevel(logging.INFO)
@@ -88,11 +96,35 @@ def park_if_idle(account: Account, settings: PlatformSettings, *, now: datetime,
     return told
 
 
+def resume_if_parked(account: Account, settings: PlatformSettings, *, least: int, topic: str) -> str:
+    """Resume a parked deployment with *least* servers or more; return a line that says what was done.
+
+    Its operator or the timer may have parked it.  One that is parked deeply has no stacks to resume.
+
+    Raises:
+        ConfigurationError: AWS refused.
+        StoreError: AWS does not answer.
+    """
+    names = ResourceNames(settings.cloud.name)
+    note = read_note(account, names)
+    if note is None or note.deep:
+        return f"{names.prefix} is {'not parked' if note is None else 'parked deeply'}"
+    told = f"{names.prefix} was parked since {note.since}, and scaling.schedule resumes it: {least} servers"
+    fill_groups(account, names, least=least)
+    enable_alarms(account, names)
+    account.change("sns", "publish", TopicArn=topic, Subject=f"{names.prefix} is resumed", Message=told)
+    delete_note(account, names)  # at the end: what failed is repeated
+    return told
+
+
 def handler(event: dict[str, Any], context: object) -> str:
-    """Apply the rule once; an event of EventBridge has nothing that is read."""
+    """Do once what *event* asks for: resume, where it has `RESUME_FIELD`, else park if nobody came."""
     settings = load_settings(Path(__file__).parents[3] / "settings.json")
-    account = Account(settings.cloud.region)
-    told = park_if_idle(account, settings, now=datetime.now(timezone.utc), topic=os.environ["RSE_PF_TOPIC"])
+    account, topic = Account(settings.cloud.region), os.environ["RSE_PF_TOPIC"]
+    if RESUME_FIELD in event:
+        told = resume_if_parked(account, settings, least=int(event[RESUME_FIELD]), topic=topic)
+    else:
+        told = park_if_idle(account, settings, now=datetime.now(timezone.utc), topic=topic)
     _log.info(told)
     return told
 

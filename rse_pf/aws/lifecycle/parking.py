@@ -1,6 +1,7 @@
-"""End all servers of a deployment, and note what is needed to bring them back.
+"""End all servers of a deployment, note what is needed to bring them back, and bring them back.
 
-An operator's command and the idle timer use the same calls; the timer's role allows no others.
+An operator's commands, the idle timer and the schedule use the same calls; the role of the function allows no
+others.
 """
 
 from __future__ import annotations
@@ -8,13 +9,21 @@ from __future__ import annotations
 import msgspec
 
 from rse_pf.aws.account import Account
-from rse_pf.aws.lifecycle.deployment import ParkNote
+from rse_pf.aws.lifecycle.deployment import ParkNote, read_note, read_sizes
+from rse_pf.aws.lifecycle.plan import restored
 from rse_pf.config.resource_names import ResourceNames
 
-__all__ = ["SUSPENDED", "alarms_of_deployment", "empty_group", "silence_alarms", "write_note"]
+__all__ = [
+    "delete_note",
+    "empty_group",
+    "enable_alarms",
+    "fill_groups",
+    "silence_alarms",
+    "write_note",
+]
 
-SUSPENDED = ("AlarmNotification", "ScheduledActions")
-"""Processes of a parked group: neither an alarm nor a schedule starts a server."""
+_SUSPENDED = ("AlarmNotification", "ScheduledActions")
+"""Processes of a parked group: neither an alarm nor a scheduled action starts a server."""
 
 _ALARMS_OF_A_CALL = 100
 
@@ -25,16 +34,27 @@ def write_note(account: Account, names: ResourceNames, note: ParkNote) -> None:
     account.change("ssm", "put_parameter", Name=names.parked, Value=value, Type="String", Overwrite=True)
 
 
+def delete_note(account: Account, names: ResourceNames) -> None:
+    """Delete the note: the deployment is not parked any more.  Raises as `Account.find`."""
+    account.find("ssm", "delete_parameter", Name=names.parked)
+
+
 def silence_alarms(account: Account, names: ResourceNames) -> None:
     """Let no alarm of the deployment act or notify; raises as `Account.find`."""
-    for some in alarms_of_deployment(account, names):
+    for some in _alarms_of_deployment(account, names):
         account.change("cloudwatch", "disable_alarm_actions", AlarmNames=some)
+
+
+def enable_alarms(account: Account, names: ResourceNames) -> None:
+    """Let the alarms of the deployment act and notify again; raises as `Account.find`."""
+    for some in _alarms_of_deployment(account, names):
+        account.change("cloudwatch", "enable_alarm_actions", AlarmNames=some)
 
 
 def empty_group(account: Account, group: str) -> None:
     """Suspend what starts servers in *group*, and end all of its servers; raises as `Account.find`."""
     account.change(
-        "autoscaling", "suspend_processes", AutoScalingGroupName=group, ScalingProcesses=list(SUSPENDED)
+        "autoscaling", "suspend_processes", AutoScalingGroupName=group, ScalingProcesses=list(_SUSPENDED)
     )
     account.change(
         "autoscaling", "update_auto_scaling_group", AutoScalingGroupName=group,
@@ -42,7 +62,29 @@ def empty_group(account: Account, group: str) -> None:
     )  # fmt: skip
 
 
-def alarms_of_deployment(account: Account, names: ResourceNames) -> list[list[str]]:
+def fill_groups(account: Account, names: ResourceNames, *, least: int = 0) -> None:
+    """Give the groups their noted sizes back, and let them grow again.
+
+    The group of the backend servers gets a minimum of *least* or more.  A group whose maximum is not 0 keeps
+    its size.  Raises as `Account.find`.
+    """
+    note = read_note(account, names)
+    for name, now in read_sizes(account, names).items():
+        size = restored(note.groups.get(name) if note is not None else None, now)
+        if size is not None:
+            floor = max(size.min_servers, least) if name == names.group else size.min_servers
+            floor = min(floor, size.max_servers)
+            account.change(
+                "autoscaling", "update_auto_scaling_group", AutoScalingGroupName=name, MinSize=floor,
+                DesiredCapacity=min(max(size.wanted_servers, floor), size.max_servers),
+                MaxSize=size.max_servers,
+            )  # fmt: skip
+        account.change(
+            "autoscaling", "resume_processes", AutoScalingGroupName=name, ScalingProcesses=list(_SUSPENDED)
+        )
+
+
+def _alarms_of_deployment(account: Account, names: ResourceNames) -> list[list[str]]:
     """Return the names of the deployment's alarms, in portions that one call takes."""
     rows = account.pages("cloudwatch", "describe_alarms", "MetricAlarms", AlarmNamePrefix=names.alarm_prefix)
     found = [str(row["AlarmName"]) for row in rows]

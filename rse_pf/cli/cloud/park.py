@@ -38,6 +38,8 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     show(f"parked costs         {costs.line(costs.parked)}; back in about 2 minutes  {here[args.deep]}")
     show(f"parked --deep costs  {costs.line(costs.deep)}; back in about 10 minutes  {here[not args.deep]}")
     show("stored maps and logs are not in these prices", *costs.warnings(settings))
+    if settings.scaling.schedule.strip() and not args.deep:
+        show("the next entry of scaling.schedule that does not lower the minimum resumes it")
     if not changing.confirmed(args):
         return 1
     tools = changing.make_tools(account, settings, args)

@@ -11,6 +11,7 @@ from rse_pf.cli.cloud import changing
 from rse_pf.cli.cloud.doctor import NO_PACKAGES, check_tools
 from rse_pf.cli.doctor import Finding
 from rse_pf.config import PlatformSettings
+from rse_pf.config.cloud_layout import parks_when_idle
 from rse_pf.terminal import show
 
 __all__ = ["add_arguments", "finish", "lacks", "run"]
@@ -66,7 +67,7 @@ def finish(account: Account, settings: PlatformSettings) -> int:
         show("      rse-pf cloud canary                   once: its key, or its alarm fires")
     show("      rse-pf cloud status                   servers, robots, alarms, cost")
     show("      rse-pf cloud park                     for the night; rse-pf cloud resume in the morning")
-    if cloud.idle_action == "park":
+    if parks_when_idle(settings):
         show(f"it parks itself after {cloud.idle_hours} hours without robots (cloud.idle_hours)")
     return 0
 
