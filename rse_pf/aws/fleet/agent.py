@@ -41,7 +41,8 @@ from rse_pf.aws.storage.audit_archive import Shipper
 from rse_pf.aws.storage.s3_store import open_bucket
 from rse_pf.config import load_settings
 from rse_pf.config.resource_names import ResourceNames
-from rse_pf.errors import RsePfError, message_of
+from rse_pf.errors import RsePfError, StoreError, message_of
+from rse_pf.files import replace_file
 from rse_pf.terminal import show, show_error
 
 __all__ = ["SERVICES", "TASKS", "Agent", "AgentConfig", "AgentContext", "main"]
@@ -62,6 +63,7 @@ TASKS: tuple[Callable[[AgentContext], Task], ...] = (
 """The table, in the order of a step: one row and one module for each task."""
 
 _STEP_S = 1.0
+_BOOT, _FETCHED = Path("/proc/sys/kernel/random/boot_id"), "fetched"
 
 SERVICES = ("autoscaling", "cloudwatch")
 """The AWS services whose clients the tasks use, beside the buckets."""
@@ -150,8 +152,7 @@ def main(arguments: list[str] | None = None) -> int:
         context = _context(args)
         agent = Agent(context)
         if args.once:
-            agent.run("keys")
-            agent.run("access-control")
+            _fetch(agent, args.keys_file.with_name(_FETCHED))
             agent.attempt("services")  # a server without them is better than none
             return 0
     except RsePfError as error:
@@ -161,6 +162,27 @@ def main(arguments: list[str] | None = None) -> int:
     while True:
         agent.step()
         time.sleep(_STEP_S)
+
+
+def _fetch(agent: Agent, mark: Path) -> None:
+    """Fetch keys and access control before a start of the server; *mark* keeps in which boot that was done.
+
+    A server that starts again while S3 is away takes what was fetched since the machine has started, just
+    as running servers do.  Nothing older is taken: a machine of the warm pool may have been off for weeks.
+
+    Raises:
+        RsePfError: They could not be fetched in this boot.
+    """
+    boot = _BOOT.read_text(encoding="ascii").strip()
+    try:
+        agent.run("keys")
+        agent.run("access-control")
+    except StoreError as error:
+        if not mark.exists() or mark.read_text(encoding="ascii") != boot:
+            raise
+        _log("not-fetched", error=message_of(error)[:200])
+        return
+    replace_file(mark, boot)
 
 
 def _context(args: argparse.Namespace) -> AgentContext:

@@ -11,9 +11,11 @@ from typing import ClassVar
 import pytest
 
 from rse_pf.auth.control_token import bearer, ensure_control_token, read_control_token
+from rse_pf.aws.fleet import agent
 from rse_pf.aws.fleet.agent import main
 from rse_pf.aws.fleet.instance import Instance
-from rse_pf.errors import Disconnected
+from rse_pf.errors import Disconnected, StoreError
+from rse_pf.object_store import MemoryStore
 
 
 class _Port(BaseHTTPRequestHandler):
@@ -89,3 +91,39 @@ def test_the_unit_makes_the_token_before_any_request(tmp_path: Path, monkeypatch
     assert not token.exists()
     assert main([*command, "--once"]) == 2
     assert len(read_control_token(token)) == 64
+
+
+class Bucket(MemoryStore):
+    """A bucket that may be away."""
+
+    is_away = False
+
+    def get(self, name: str) -> bytes:
+        if self.is_away:
+            raise StoreError("AWS does not answer")
+        return super().get(name)
+
+
+def test_a_server_starts_again_without_the_bucket_but_only_with_what_this_boot_has_fetched(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bucket, boot = Bucket(), tmp_path / "boot_id"
+    boot.write_text("first\n")
+    monkeypatch.setattr(agent, "_BOOT", boot, raising=False)
+    monkeypatch.setattr(agent, "make_client", lambda *_: None)
+    monkeypatch.setattr(agent, "open_bucket", lambda *_: bucket)
+    (tmp_path / "settings.json").write_text('{"context": {"rse-pf": {}}}')
+    command = [
+        "--settings", str(tmp_path / "settings.json"), "--bucket", "b", "--keys-name", "keys.json",
+        "--group", "g", "--hook", "h", "--keys-file", str(tmp_path / "state" / "keys.json"), "--once",
+    ]  # fmt: skip
+    (tmp_path / "state").mkdir()
+    bucket.is_away = True
+    assert main(command) == 2, "a new machine has nothing"
+    bucket.is_away = False
+    assert main(command) == 0
+    bucket.is_away = True
+
+    assert main(command) == 0
+    boot.write_text("second\n")
+    assert main(command) == 2, "what an earlier boot fetched may be weeks old"
