@@ -33,6 +33,8 @@ __all__ = ["KeysFile", "serve_data"]
 _SWEEP_S = 3600.0
 _BACKLOG = 1024
 _STOP_TIMEOUT_S = 10
+_KEEP_ALIVE_S = 130
+"""Longer than the 120 s of the load balancer, which would else send a request into a closing connection."""
 _SWITCH_S = 0.0005
 """A PUT makes some twenty system calls, and after each it may wait this long for a thread that computes."""
 
@@ -85,7 +87,7 @@ def serve_data(
     config = uvicorn.Config(
         app, http=_one_request_protocol(), ws="none", lifespan="off", access_log=False, log_level="warning",
         backlog=_BACKLOG, server_header=False, date_header=False, proxy_headers=False,
-        timeout_keep_alive=30, timeout_graceful_shutdown=_STOP_TIMEOUT_S,
+        timeout_keep_alive=_KEEP_ALIVE_S, timeout_graceful_shutdown=_STOP_TIMEOUT_S,
     )  # fmt: skip
     for number in (signal.SIGTERM, signal.SIGINT):
         # uvicorn repeats the signal to itself when it has ended; the exit code is 0 all the same
