@@ -45,25 +45,27 @@ const unauthorized = () =>
 
 // --- codecs (section 1) ----------------------------------------------------------------------------------
 
-/** Return *data* after a compression stream; throws if that is more than *limit* bytes. */
-const through = async (stream, data, limit) => {
+/** Return *bytes* after a compression stream; throws if that is more than *limit* bytes, or the stream fails. */
+const through = async (stream, bytes, limit) => {
   const writer = stream.writable.getWriter();
   const reader = stream.readable.getReader();
-  // The reader throws the same errors.
-  writer.write(data).catch(nothing);
-  writer.close().catch(nothing);
-  let whole = new Uint8Array();
-  for (let step; !(step = await reader.read()).done; ) {
-    const joined = new Uint8Array(whole.length + step.value.length);
-    joined.set(whole);
-    joined.set(step.value, whole.length);
-    whole = joined;
-    if (whole.length > limit) {
-      reader.cancel().catch(nothing);
-      throw unreadable("a message is too large");
+  const read = async () => {
+    let whole = new Uint8Array();
+    for (let step; !(step = await reader.read()).done; ) {
+      const joined = new Uint8Array(whole.length + step.value.length);
+      joined.set(whole);
+      joined.set(step.value, whole.length);
+      whole = joined;
+      if (whole.length > limit) {
+        const failed = unreadable("a message is too large");
+        reader.cancel(failed).catch(nothing); // it is thrown here
+        throw failed;
+      }
     }
-  }
-  return whole;
+    return whole;
+  };
+  // A stream that refuses what is written gives its reader nothing, not even an error.
+  return (await Promise.all([read(), writer.write(bytes), writer.close()]))[0];
 };
 
 /** Name -> how the text of a message becomes the content of a WebSocket message, and how that is read. */
@@ -72,17 +74,28 @@ export const codecs = {
   "json+zlib": {
     encode: (text) => through(new CompressionStream("deflate"), new TextEncoder().encode(text)),
     decode: async (data) => {
-      const bytes = await through(new DecompressionStream("deflate"), data, MAX_INFLATED_BYTES);
+      const bytes = await through(new DecompressionStream("deflate"), new Uint8Array(data), MAX_INFLATED_BYTES);
       return JSON.parse(new TextDecoder("utf-8", { fatal: true }).decode(bytes));
     },
   },
 };
 
-/** Bytes are base64, arrays of numbers are lists (section 2). */
-const plain = (_, value) =>
-  value instanceof Uint8Array
+/** Bytes are base64, arrays of numbers are lists (section 2), and every number is finite. */
+const plain = (_, value) => {
+  if (value !== value || value === Infinity || value === -Infinity) throw TypeError(`it holds ${value}`);
+  return value instanceof Uint8Array
     ? btoa(Array.from(value, (byte) => String.fromCharCode(byte)).join(""))
     : ArrayBuffer.isView(value) ? Array.from(value) : value;
+};
+
+/** Return *value* as JSON; throws a typed error if it has none: BigInt, NaN, a cycle. */
+const textOf = (value) => {
+  try {
+    return JSON.stringify(value, plain) ?? "null";
+  } catch (failed) {
+    throw wrong("usage", "the command has no JSON: " + failed.message.split("\n")[0], "send finite numbers, texts, lists and objects");
+  }
+};
 
 const rounded = (values, scale) => Array.from(values, (value) => Math.round(value * scale) / scale);
 
@@ -358,18 +371,27 @@ export const connect = async (url, options = {}) => {
     const before = link._incoming;
     link._incoming = (async () => {
       let message;
+      let failed;
       try {
         message = await decode(data);
-      } catch {
-        // Counted below, after the messages before it.
+      } catch (problem) {
+        failed = unreadable("a message of the server cannot be read: " + problem.message);
       }
       await before;
+      if (failed) return misread(link, failed);
       try {
         receive(link, message);
       } catch {
-        if (++link._bad > MAX_BAD_MESSAGES) lose(link, unreadable("messages that cannot be read"));
+        misread(link);
       }
     })();
+  };
+
+  /** Count a message that is not understood; one that is not *failed* to decode may be of a newer server. */
+  const misread = (link, failed) => {
+    // It may have been the answer to any of them, and would not be readable when it came again.
+    if (failed) for (const each of [...pending.values()]) if (each._link === link) settle(each, failed);
+    if ((failed && !link._welcome) || ++link._bad > MAX_BAD_MESSAGES) lose(link, failed || unreadable("messages that cannot be read"));
   };
 
   const receive = (link, message) => {
@@ -647,8 +669,8 @@ export const connect = async (url, options = {}) => {
         const each = {
           _id: id, _stream: stream, _seq: seq, _keep: isKept, _onProgress: onProgress, _signal: signal,
           // As text, so that the caller may use the arrays again.
-          _head: JSON.stringify({ type: "command", id, service, stream, seq, keep: isKept, trace }).slice(0, -1),
-          _payload: JSON.stringify(payload, plain),
+          _head: textOf({ type: "command", id, service, stream, seq, keep: isKept, trace }).slice(0, -1),
+          _payload: textOf(payload),
           _from: time, _until: time + (deadlineMs ? deadlineMs / 1e3 : onProgress ? Infinity : ANSWER_S),
           _isDefault: !deadlineMs, _link: null, _at: 0, _notBefore: 0, _losses: 0,
           _resolve: resolve, _reject: reject, _cancel: () => cancel(each),
@@ -674,7 +696,7 @@ export const connect = async (url, options = {}) => {
     subscribe: (topic, onUpdate, onEnd = nothing) => {
       if (error) throw error;
       const id = ++lastId;
-      const each = { _id: id, _topic: topic, _onUpdate: onUpdate, _onEnd: onEnd };
+      const each = { _id: id, _topic: `${topic}`, _onUpdate: onUpdate, _onEnd: onEnd };
       subscriptions.set(id, each);
       ask(each);
       return () => {

@@ -24,6 +24,7 @@ from rse_pf.errors import (
     UnsupportedProtocol,
 )
 from rse_pf.wire.codec import Codec
+from rse_pf.wire.envelope import undecodable_id
 from rse_pf.wire.messages import (
     PROTOCOL_VERSION,
     Cancel,
@@ -64,6 +65,7 @@ __all__ = [
     "EndUpdates",
     "Renewal",
     "Send",
+    "SendRefusal",
     "ServerSession",
     "Submit",
     "Withdraw",
@@ -97,6 +99,12 @@ class Send(msgspec.Struct, frozen=True, gc=False):
     """Write this WebSocket message."""
 
     data: bytes
+
+
+class SendRefusal(Send, frozen=True, gc=False):
+    """Write this WebSocket message, which says why a message was refused undecoded."""
+
+    failure: Failure
 
 
 class Submit(msgspec.Struct, frozen=True, gc=False):
@@ -160,7 +168,9 @@ class ServerSession:
         hears_progress: Whether the robot announced the capability `PROGRESS`.
         hears_updates: Whether it announced the capability `UPDATES`.
         topics: The topic of each live subscription, by its id.
-        bad_messages: How many invalid messages arrived; a long one counts several times.
+        bad_messages: How many invalid messages arrived whose id could not be read; a long one counts several
+            times.
+        refused_commands: The same of those whose id could be read; each valid command takes one away.
         is_pinged: Whether the server asks a silent client by WebSocket pings, because it sends none itself.
         ends_when_idle: Whether the connection ends with the answer to its last command.
     """
@@ -189,8 +199,13 @@ class ServerSession:
         self._session = session
         self._limits = limits
         self._burst = burst or BurstSettings()
-        self.bad_messages = 0
+        self.bad_messages = self.refused_commands = 0
         self._next_renewal_s = float("-inf")
+
+    @property
+    def suspicion(self) -> int:
+        """How many messages could not be decoded: those of this robot are read after the others'."""
+        return self.bad_messages + self.refused_commands
 
     def receive(self, data: bytes, now: float) -> list[Decision]:
         """Return the decisions about one WebSocket message that arrived at *now* (server clock, s)."""
@@ -200,7 +215,7 @@ class ServerSession:
             message: FromRobot | ProtocolError = self.codec.decode_from_robot(data)
         except ProtocolError as error:
             message = error
-        return self.take(message, now, len(data))
+        return self.take(message, now, data)
 
     def receive_short(self, data: bytes, now: float, max_bytes: int) -> list[Decision] | None:
         """Return the same as `receive`, or None if the message is longer than *max_bytes*, inflated."""
@@ -209,18 +224,18 @@ class ServerSession:
         try:
             message = self.codec.decode_short_from_robot(data, max_bytes)
         except ProtocolError as error:
-            return self.take(error, now, len(data))
+            return self.take(error, now, data)
         if type(message) is Command and self.state == "open":
             return self._command(message)
         return None if message is None else self.take(message, now)
 
-    def take(self, message: FromRobot | ProtocolError, now: float, size_bytes: int = 0) -> list[Decision]:
-        """Return the decisions about one decoded message, or about the error of decoding *size_bytes*."""
+    def take(self, message: FromRobot | ProtocolError, now: float, data: bytes = b"") -> list[Decision]:
+        """Return the decisions about one decoded message, or about the error of decoding *data*."""
         if self.state == "closed":
             return []
         match message:
             case ProtocolError():
-                return self._count_bad_message(message, size_bytes)
+                return self._refuse_undecoded(message, data)
             case Hello():
                 return self._hello(message, now)
             case _ if self.state == "opening":
@@ -353,6 +368,8 @@ class ServerSession:
         return [self._send(welcome)]
 
     def _command(self, command: Command) -> list[Decision]:
+        if self.refused_commands:
+            self.refused_commands -= 1
         if self.in_flight >= self._limits.max_in_flight:
             busy = Busy(
                 f"{self.in_flight} commands of this robot are unanswered",
@@ -363,12 +380,23 @@ class ServerSession:
         self.in_flight += 1
         return [Submit(command)]
 
-    def _count_bad_message(self, error: ProtocolError, size_bytes: int) -> list[Decision]:
-        return self._count([self._send(self._failure(error))], size_bytes)
+    def _refuse_undecoded(self, error: ProtocolError, data: bytes) -> list[Decision]:
+        """Answer a message that cannot be decoded, as the answer to its command where its id can be read.
+
+        A client sends such a command by mistake of its program, which is told.  Without an id it is the
+        client that is broken, so that the connection ends after some.
+        """
+        identity = undecodable_id(self.codec, data) if self.state == "open" else None
+        failure = self._failure(error, identity=identity)
+        sent: list[Decision] = [SendRefusal(self.codec.encode(failure), failure)]
+        if identity is None:
+            return self._count(sent, len(data))
+        self.refused_commands += _weight(len(data))
+        return sent
 
     def _count(self, sent: list[Decision], size_bytes: int) -> list[Decision]:
         """Count a bad message that *sent* answers."""
-        self.bad_messages += 1 + size_bytes // _BAD_MESSAGE_BYTES
+        self.bad_messages += _weight(size_bytes)
         if self.bad_messages > self._limits.max_bad_messages:
             return [*sent, *self._close(CLOSE_PROTOCOL, "too many bad messages")]
         return sent
@@ -379,3 +407,8 @@ class ServerSession:
 
     def _send(self, message: FromServer) -> Send:
         return Send(self.codec.encode(message))
+
+
+def _weight(size_bytes: int) -> int:
+    """Return how often an undecodable message of *size_bytes* counts."""
+    return 1 + size_bytes // _BAD_MESSAGE_BYTES

@@ -192,6 +192,17 @@ class Answers:
                 bytes_out=len(data),
             )  # fmt: skip
 
+    def note_undecoded(self, connection: RobotConnection, failure: Failure, size_bytes: int) -> None:
+        """Count and log a message of *size_bytes* that was answered with *failure* instead of decoded."""
+        if failure.id is not None:
+            self._context.metrics.answered(_UNKNOWN, failure.code, 0.0)
+            connection.commands += 1
+            connection.last_result = failure.code
+        self._context.log.info(
+            "undecodable", robot=connection.robot, id=failure.id, code=failure.code, reason=failure.message,
+            bytes_in=size_bytes,
+        )  # fmt: skip
+
     def label(self, service: str) -> str:
         """Return the name of *service* for metrics and log, the same for all that this server does not
         offer."""

@@ -18,7 +18,7 @@ from rse_pf.backend.gateway.handshake import Accepted
 from rse_pf.backend.gateway.rate_limits import RobotRates
 from rse_pf.backend.ports import Wire, WorkerContext
 from rse_pf.errors import ProtocolError, RsePfError
-from rse_pf.wire import CODECS, Command, Progress
+from rse_pf.wire import CODECS, Command, Failure, Progress
 from rse_pf.wire.messages import FromRobot
 from rse_pf.wire.server_session import (
     CLOSE_GOING_AWAY,
@@ -29,6 +29,7 @@ from rse_pf.wire.server_session import (
     EndUpdates,
     Renewal,
     Send,
+    SendRefusal,
     ServerSession,
     Submit,
     Withdraw,
@@ -39,6 +40,9 @@ __all__ = ["CommandHandler", "RobotConnection"]
 _PONG = 10
 _BAD_MESSAGE_PAUSE_S = 0.1
 """After an undecodable message its socket is not read for this, times their number."""
+_MAX_REFUSED = 5
+"""So many of them count for the pause if their ids could be read: clients take 1 s of silence for a lost
+connection."""
 
 
 class CommandHandler(Protocol):
@@ -55,6 +59,9 @@ class CommandHandler(Protocol):
 
     def refuses_long(self, connection: RobotConnection, session: ServerSession, data: bytes) -> bool:
         """Refuse a message that is too long for the event loop; False if the decoder thread may take it."""
+
+    def note_undecoded(self, connection: RobotConnection, failure: Failure, size_bytes: int) -> None:
+        """Count and log a message of *size_bytes* that was answered with *failure* instead of decoded."""
 
     def submit(self, connection: RobotConnection, command: Command, size_bytes: int, now: float) -> None:
         """Take one command."""
@@ -262,7 +269,7 @@ class RobotConnection:
             return
         if session.state == "open" and handler.refuses_unread(self, session, data, now):
             return
-        state, bad_messages = session.state, session.bad_messages
+        state, suspicion = session.state, session.suspicion
         decoder, decisions = handler.decoder, None
         if len(data) <= decoder.short_bytes:
             decisions = session.receive_short(data, now, decoder.short_inflated_bytes)
@@ -273,18 +280,18 @@ class RobotConnection:
                 self.tap.is_plain(data, command.id, f"{command.stream} {command.trace}")
             handler.submit(self, command, len(data), now)
         elif decisions is not None:
-            self._follow(session, decisions, len(data), now, state, bad_messages)
+            self._follow(session, decisions, len(data), now, state, suspicion)
         elif not handler.refuses_long(self, session, data):
             self._decode_in_thread(session, data, now)
 
     def _decode_in_thread(self, session: ServerSession, data: bytes, now: float) -> None:
-        state, bad_messages = session.state, session.bad_messages
+        state, suspicion = session.state, session.suspicion
 
         def decoded(message: FromRobot | ProtocolError) -> None:
             deferred, self._deferred = self._deferred, None
             if self.is_connected and not self._assembler.closed:
-                decisions = session.take(message, now, len(data))
-                self._follow(session, decisions, len(data), now, state, bad_messages)
+                decisions = session.take(message, now, data)
+                self._follow(session, decisions, len(data), now, state, suspicion)
             for waiting, was_text, arrived in deferred or ():
                 if not self._assembler.closed:
                     self._take(waiting, was_text, arrived)
@@ -292,7 +299,7 @@ class RobotConnection:
 
         self._deferred = deque()
         self._wire.hold()
-        self._handler.decoder.begin(session.codec, data, suspicion=bad_messages, done=decoded)
+        self._handler.decoder.begin(session.codec, data, suspicion=suspicion, done=decoded)
 
     def _follow(
         self,
@@ -301,18 +308,20 @@ class RobotConnection:
         size_bytes: int,
         now: float,
         state: str,
-        bad_messages: int,
+        suspicion: int,
     ) -> None:
         """Execute what the session decided about one message; it was in *state* before."""
         self._execute(decisions, now, size_bytes)
         if session.bad_messages > self._context.settings.session.max_bad_messages:
+            self._context.log.warning("cut-off", robot=self.robot, reason="bad-messages")
             self._handler.rates.ban(self.robot, now)
         if self._assembler.closed:
             return
-        if session.bad_messages > bad_messages:
+        if session.suspicion > suspicion:
             # Refusing a bad message costs as much as reading it, so the socket is read more and more rarely.
             self._context.metrics.shed["bad-message"] += 1
-            self._wire.pause(session.bad_messages * _BAD_MESSAGE_PAUSE_S)
+            counted = session.bad_messages + min(session.refused_commands, _MAX_REFUSED)
+            self._wire.pause(counted * _BAD_MESSAGE_PAUSE_S)
         elif state == "opening" and session.state == "open" and not session.is_pinged:
             self._handler.opened(self, now)
 
@@ -323,6 +332,8 @@ class RobotConnection:
                 handler.submit(self, decision.command, size_bytes, now)
             elif isinstance(decision, Send):
                 self.write(decision.data)
+                if isinstance(decision, SendRefusal):
+                    handler.note_undecoded(self, decision.failure, size_bytes)
             elif isinstance(decision, Renewal):
                 handler.renew(self, decision.token)
             elif isinstance(decision, Withdraw):

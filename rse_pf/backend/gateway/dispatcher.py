@@ -44,7 +44,7 @@ from rse_pf.errors import NotFound, UnknownService
 from rse_pf.identity import RobotId
 from rse_pf.service import Registry
 from rse_pf.services.pnp import wire_types
-from rse_pf.wire import CODECS, Codec, Command, make_codec
+from rse_pf.wire import CODECS, Codec, Command, Failure, make_codec
 from rse_pf.wire.envelope import Envelope, peek
 from rse_pf.wire.server_session import CLOSE_GOING_AWAY, CLOSE_RATE, CLOSE_TOKEN_OVER, ServerSession
 
@@ -350,13 +350,17 @@ class Dispatcher:
 
     def refuses_long(self, connection: RobotConnection, session: ServerSession, data: bytes) -> bool:
         """Refuse a message that is too long for the event loop; False if the decoder thread may take it."""
-        may_wait = self._admission.may_wait(len(data), self.decoder.unread_bytes, session.bad_messages)
+        may_wait = self._admission.may_wait(len(data), self.decoder.unread_bytes, session.suspicion)
         if not may_wait:
             envelope = peek(session.codec, data)
             self._answers.send_unread_refusal(
                 connection, session.codec, envelope, DECODER_FULL, _DECODER_RETRY_MS, len(data)
             )
         return not may_wait
+
+    def note_undecoded(self, connection: RobotConnection, failure: Failure, size_bytes: int) -> None:
+        """Count and log a message of *size_bytes* that was answered with *failure* instead of decoded."""
+        self._answers.note_undecoded(connection, failure, size_bytes)
 
     def submit(self, connection: RobotConnection, command: Command, size_bytes: int, now: float) -> None:
         """Admit one command to the queue of its service, or refuse it."""

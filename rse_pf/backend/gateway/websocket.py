@@ -291,7 +291,7 @@ class RobotSockets:
         now = self._context.clocks.monotonic()
         source = self._sources.source(pending.peer, head.text(b"x-forwarded-for"))
         if self._sources.wait_s(source, now) > 0:
-            return self._handshake.too_fast
+            return replace(self._handshake.too_fast, reason="address-rate")
         authorization, offered = head.text(b"authorization"), head.words(b"sec-websocket-protocol")
         verdict = self._handshake.judge(
             path=head.path,
@@ -305,7 +305,7 @@ class RobotSockets:
         )
         if isinstance(verdict, Accepted):
             if self._dispatcher.rates.banned_s(verdict.robot, now) > 0:
-                verdict = self._handshake.too_fast
+                verdict = replace(self._handshake.too_fast, reason="robot-cut-off")
             elif not head.websocket_key:
                 verdict = self._handshake.no_request
             elif verdict.awaits_token:

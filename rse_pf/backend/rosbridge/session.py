@@ -58,24 +58,24 @@ class RosbridgeSession(ServerSession):
 
     def receive(self, data: bytes, now: float) -> list[Decision]:
         """Return the decisions about one WebSocket message that arrived at *now* (server clock, s)."""
-        return self.take(self._rosbridge.decode_from_robot(data), now, len(data))
+        return self.take(self._rosbridge.decode_from_robot(data), now, data)
 
     def receive_short(self, data: bytes, now: float, max_bytes: int) -> list[Decision] | None:
         """Return the same as `receive`, or None if the message is longer than *max_bytes*."""
         if self.state == "opening" and len(data) > _MAX_AUTH_BYTES:
             return self._close(CLOSE_PROTOCOL, "authenticate first")
         message = self._rosbridge.decode_short_from_robot(data, max_bytes)
-        return None if message is None else self.take(message, now, len(data))
+        return None if message is None else self.take(message, now, data)
 
-    def take(self, message: object, now: float, size_bytes: int = 0) -> list[Decision]:
-        """Return the decisions about one decoded `RosbridgeMessage` of *size_bytes*."""
+    def take(self, message: object, now: float, data: bytes = b"") -> list[Decision]:
+        """Return the decisions about *data*, decoded as a `RosbridgeMessage`."""
         if self.state == "closed" or not isinstance(message, RosbridgeMessage):
             return []
         op = message.op
         if self.state == "opening":
-            return self._before_token(op, message.error, size_bytes)
+            return self._before_token(op, message.error, len(data))
         if message.error is not None or op is None:
-            return self._refuse(op, message.error, size_bytes)
+            return self._refuse(op, message.error, len(data))
         if op.op == "call_service":
             return self._call(op, message.command)
         if op.op in _TOPIC_OPS:
@@ -150,7 +150,7 @@ class RosbridgeSession(ServerSession):
         if error is None:
             return []
         if op is None:
-            return self._count_bad_message(error, size_bytes)
+            return self._count([self._send(self._failure(error))], size_bytes)
         sent: list[Decision] = [*self.refuse(op, error)]
         is_harmless = isinstance(error, UnsupportedProtocol) and self.state == "open"
         return sent if is_harmless else self._count(sent, size_bytes)

@@ -1,0 +1,182 @@
+"""What the web client does with payloads that have no JSON, and with messages that it cannot read."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import shutil
+import sys
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from websockets.asyncio.server import ServerConnection, serve
+
+MODULE = Path(__file__).resolve().parents[2] / "client_web" / "rse-pf.js"
+WITHIN_S = 30.0
+WELCOME = {
+    "type": "welcome", "server": "s", "session": "x", "robot": "r", "protocol": 1, "clock_s": 1.0,
+    "limits": {"max_message_bytes": 262144, "max_in_flight": 8},
+}  # fmt: skip
+HEAD = """
+const { connect, codecs } = await import(process.argv[1]);
+const url = process.argv[2];
+const codeOf = (call) => call.then(() => "ok", (error) => error.code || error.name);
+const say = (value) => console.log(JSON.stringify(value));
+"""
+
+
+def node() -> str:
+    beside = Path(sys.executable).with_name("node")
+    found = str(beside) if beside.exists() else shutil.which("node")
+    if found is None:
+        pytest.skip("no Node.js: make setup installs it")
+    return found
+
+
+async def printed(program: str, url: str = "") -> Any:
+    """Return what *program* prints last; it is ended when it takes too long."""
+    process = await asyncio.create_subprocess_exec(
+        node(), "--input-type=module", "-e", HEAD + program + "\nprocess.exit(0);", str(MODULE), url,
+        stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE,
+    )  # fmt: skip
+    try:
+        out, errors = await asyncio.wait_for(process.communicate(), WITHIN_S)
+    except asyncio.TimeoutError:
+        process.kill()
+        await process.wait()
+        pytest.fail(f"not over within {WITHIN_S} s")
+    assert process.returncode == 0, errors.decode()
+    return json.loads(out.splitlines()[-1])
+
+
+Answers = Callable[[dict[str, Any]], bytes | None]
+
+
+def against(answers: Answers, program: str) -> Any:
+    """Return what *program* prints against a server that sends what *answers* returns for each message."""
+
+    async def serves(socket: ServerConnection) -> None:
+        async for data in socket:
+            assert isinstance(data, bytes)
+            sent = answers(json.loads(zlib.decompress(data)))
+            if sent is not None:
+                await socket.send(sent)
+
+    async def run() -> Any:
+        options: dict[str, Any] = {"subprotocols": ["rse-pf.v1.json+zlib"], "compression": None}
+        async with serve(serves, "127.0.0.1", 0, **options) as server:
+            port = next(iter(server.sockets)).getsockname()[1]
+            return await printed(program, f"ws://127.0.0.1:{port}/ws")
+
+    return asyncio.run(run())
+
+
+def said(message: dict[str, Any]) -> bytes:
+    return zlib.compress(json.dumps(message).encode())
+
+
+def echo(message: dict[str, Any]) -> bytes | None:
+    """Answer as a server does."""
+    if message["type"] == "hello":
+        return said(WELCOME)
+    if message["type"] == "ping":
+        return said({"type": "pong", "sent_s": message["sent_s"], "received_s": 1.0, "answered_s": 1.0})
+    return said({"type": "result", "id": message["id"], "reply": message["payload"]})
+
+
+def test_a_payload_that_has_no_json_is_a_typed_error_and_the_next_call_works() -> None:
+    program = """
+    const robot = await connect(url, { token: "t" });
+    const cycle = {};
+    cycle.itself = [cycle];
+    const wrong = [
+      10n, { deep: [1, 2n] }, new BigInt64Array(2), cycle, NaN, [1, -Infinity], new Float64Array([1, NaN]),
+      { toJSON() { throw new Error("of its own"); } },
+    ];
+    const codes = [];
+    for (const each of wrong) codes.push(await codeOf(robot.call("echo", each)));
+    for (const service of [10n, NaN]) codes.push(await codeOf(robot.call(service)));
+    codes.push((await robot.call("echo", { fine: [0.5, -0, 1e300], none: undefined })).reply.fine);
+    codes.push((await robot.call("echo", () => 1)).reply);
+    say([codes, robot.stats.unanswered, robot.error]);
+    """
+
+    assert against(echo, program) == [["usage"] * 10 + [[0.5, 0, 1e300], None], 0, None]
+
+
+def test_an_answer_that_cannot_be_read_ends_the_calls_that_wait_with_a_typed_error() -> None:
+    def answers(message: dict[str, Any]) -> bytes | None:
+        is_bad = message["type"] == "command" and message["payload"] == "bad"
+        return b"no zlib stream" if is_bad else echo(message)
+
+    program = """
+    const robot = await connect(url, { token: "t" });
+    const began = performance.now();
+    const first = await codeOf(robot.call("echo", "bad"));
+    const isSoon = performance.now() - began < 2000;
+    say([first, isSoon, await codeOf(robot.call("echo", 1)), robot.stats.unanswered]);
+    """
+
+    assert against(answers, program) == ["protocol", True, "ok", 0]
+
+
+def test_a_welcome_that_cannot_be_read_rejects_connect_with_a_typed_error() -> None:
+    program = """
+    const failed = await connect(url, { token: "t" }).catch((error) => error);
+    say([failed.code, failed.message.includes("cannot be read"), failed.hint !== ""]);
+    """
+
+    assert against(lambda _: b"no zlib stream", program) == ["protocol", True, True]
+
+
+STRICT = """
+// As in Node 22: what is no view of a buffer is refused where it is written, and the reader never hears it.
+const Stream = globalThis.DecompressionStream;
+globalThis.DecompressionStream = class {
+  constructor(format) {
+    const inner = new Stream(format);
+    const writer = inner.writable.getWriter();
+    this.readable = inner.readable;
+    this.writable = { getWriter: () => ({
+      write: async (chunk) => {
+        if (!ArrayBuffer.isView(chunk)) throw new TypeError("no view");
+        return writer.write(chunk);
+      },
+      close: () => writer.close(),
+    }) };
+  }
+};
+"""
+
+
+def test_a_message_in_an_array_buffer_is_read_where_streams_take_views_only() -> None:
+    data = list(said({"type": "move"}))
+    program = f"""{STRICT}
+    say(await codecs["json+zlib"].decode(Uint8Array.from({data}).buffer));
+    """
+
+    assert asyncio.run(printed(program)) == {"type": "move"}
+
+
+def test_a_stream_that_refuses_what_is_written_is_an_error_and_no_wait() -> None:
+    program = """
+    globalThis.DecompressionStream = class {
+      writable = { getWriter: () => ({ write: () => Promise.reject(TypeError("no")), close: async () => {} }) };
+      readable = { getReader: () => ({ read: () => new Promise(() => {}) }) };
+    };
+    const timer = setInterval(() => {}, 1000);
+    say(await codeOf(codecs["json+zlib"].decode(new Uint8Array(3))));
+    """
+
+    assert asyncio.run(printed(program)) == "TypeError"
+
+
+@pytest.mark.parametrize("size", [(1 << 20) + 1, 5_000_000])
+def test_a_message_that_inflates_to_more_than_a_megabyte_is_refused(size: int) -> None:
+    data = list(zlib.compress(b'"' + b"a" * size))
+    program = f"say(await codeOf(codecs['json+zlib'].decode(Uint8Array.from({data}))));"
+
+    assert asyncio.run(printed(program)) == "protocol"
