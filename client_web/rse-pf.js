@@ -20,10 +20,13 @@ const MAX_RETRIES = 5;
 // A client that uses a little less than its limits is not refused when a network bunches messages.
 const SHARE = 0.9;
 
-const { min, max } = Math;
+const { min, max, random, round } = Math;
+const { from } = Array;
 const now = () => performance.now() / 1e3;
 const pause = (s) => new Promise((done) => setTimeout(done, s * 1e3));
 const nothing = () => {};
+const bytesOf = (data) => new Uint8Array(data);
+const sizeOf = (data) => data.byteLength ?? data.length;
 /** Call a program's function so that its errors cannot disturb the session. */
 const later = (call, ...words) => queueMicrotask(() => call(...words));
 
@@ -46,27 +49,30 @@ const unauthorized = () =>
 // --- codecs (section 1) ----------------------------------------------------------------------------------
 
 /** Return *bytes* after a compression stream; throws if that is more than *limit* bytes, or the stream fails. */
-const through = async (stream, bytes, limit) => {
-  const writer = stream.writable.getWriter();
-  const reader = stream.readable.getReader();
+const through = async ({ writable, readable }, bytes, limit) => {
+  const writer = writable.getWriter();
+  const reader = readable.getReader();
+  let whole = bytesOf();
   const read = async () => {
-    let whole = new Uint8Array();
     for (let step; !(step = await reader.read()).done; ) {
-      const joined = new Uint8Array(whole.length + step.value.length);
+      const joined = bytesOf(whole.length + step.value.length);
       joined.set(whole);
       joined.set(step.value, whole.length);
       whole = joined;
-      if (whole.length > limit) {
-        const failed = unreadable("a message is too large");
-        reader.cancel(failed).catch(nothing); // it is thrown here
-        throw failed;
-      }
+      if (whole.length > limit) throw unreadable("a message is too large");
     }
-    return whole;
   };
   // A stream that refuses what is written gives its reader nothing, not even an error.
-  return (await Promise.all([read(), writer.write(bytes), writer.close()]))[0];
+  await Promise.all([read(), writer.write(bytes), writer.close()]);
+  return whole;
 };
+
+/** Begin *work* now, and call *then* with its result once *before* is over; rejects with what either throws. */
+const inOrder = (before, work, then) =>
+  Promise.allSettled([(async () => work())(), before]).then(([{ value, reason }]) => {
+    if (reason) throw reason;
+    then(value);
+  });
 
 /** Name -> how the text of a message becomes the content of a WebSocket message, and how that is read. */
 export const codecs = {
@@ -74,7 +80,7 @@ export const codecs = {
   "json+zlib": {
     encode: (text) => through(new CompressionStream("deflate"), new TextEncoder().encode(text)),
     decode: async (data) => {
-      const bytes = await through(new DecompressionStream("deflate"), new Uint8Array(data), MAX_INFLATED_BYTES);
+      const bytes = await through(new DecompressionStream("deflate"), bytesOf(data), MAX_INFLATED_BYTES);
       return JSON.parse(new TextDecoder("utf-8", { fatal: true }).decode(bytes));
     },
   },
@@ -82,10 +88,10 @@ export const codecs = {
 
 /** Bytes are base64, arrays of numbers are lists (section 2), and every number is finite. */
 const plain = (_, value) => {
-  if (value !== value || value === Infinity || value === -Infinity) throw TypeError(`it holds ${value}`);
+  if (typeof value == "number" && !isFinite(value)) throw TypeError(value);
   return value instanceof Uint8Array
-    ? btoa(Array.from(value, (byte) => String.fromCharCode(byte)).join(""))
-    : ArrayBuffer.isView(value) ? Array.from(value) : value;
+    ? btoa(from(value, (byte) => String.fromCharCode(byte)).join(""))
+    : ArrayBuffer.isView(value) ? from(value) : value;
 };
 
 /** Return *value* as JSON; throws a typed error if it has none: BigInt, NaN, a cycle. */
@@ -93,18 +99,18 @@ const textOf = (value) => {
   try {
     return JSON.stringify(value, plain) ?? "null";
   } catch (failed) {
-    throw wrong("usage", "the command has no JSON: " + failed.message.split("\n")[0], "send finite numbers, texts, lists and objects");
+    throw wrong("usage", "no JSON: " + failed.message, "send finite numbers");
   }
 };
 
-const rounded = (values, scale) => Array.from(values, (value) => Math.round(value * scale) / scale);
+const rounded = (values, scale) => from(values, (value) => round(value * scale) / scale);
 
 const sha256 = async (bytes) => {
-  if (!globalThis.crypto?.subtle) {
-    throw wrong("unsupported", "this page may not compute sha256", "serve it by https or from localhost");
+  if (!crypto.subtle) {
+    throw wrong("unsupported", "this page may not compute sha256", "serve it by https or localhost");
   }
-  const found = new Uint8Array(await crypto.subtle.digest("SHA-256", bytes));
-  return Array.from(found, (byte) => byte.toString(16).padStart(2, "0")).join("");
+  const found = bytesOf(await crypto.subtle.digest("SHA-256", bytes));
+  return from(found, (byte) => byte.toString(16).padStart(2, "0")).join("");
 };
 
 // --- a connection ----------------------------------------------------------------------------------------
@@ -144,13 +150,14 @@ const FINAL = {
 
 /** Connect a robot: resolves at the first Welcome, rejects with an RsePfError; see rse-pf.d.ts. */
 export const connect = async (url, options = {}) => {
+  const httpUrl = url.replace(/^ws/, "http");
   const {
     codec = "json+zlib", tokenIn = "protocol", sdk = "rse-pf-js/0.3.0", onChange = nothing, connectTimeoutMs = 4000,
-    stallTimeoutMs = 1000, dataUrl = url.replace(/^ws/, "http"), WebSocket = globalThis.WebSocket,
+    stallTimeoutMs = 1000, dataUrl = httpUrl, WebSocket = globalThis.WebSocket,
   } = options;
   const { encode, decode } = codecs[codec] || {};
   if (!encode) throw wrong("usage", `no codec named ${codec}`, `choose ${Object.keys(codecs)}`);
-  if (!WebSocket) throw wrong("unsupported", "there is no WebSocket here", "use Node 22 or newer");
+  if (!WebSocket) throw wrong("unsupported", "no WebSocket here", "use Node 22 or newer");
   const stallS = stallTimeoutMs / 1e3;
   const links = new Set();
   const pending = new Map();
@@ -179,7 +186,8 @@ export const connect = async (url, options = {}) => {
 
   // --- connect, reconnect, move --------------------------------------------------------------------------
 
-  const freshToken = async () => String((typeof token === "function" ? await token() : token) || "").trim();
+  const isSource = () => typeof token === "function";
+  const freshToken = async () => String((isSource() ? await token() : token) || "").trim();
 
   /** Open a WebSocket; resolves at its Welcome. */
   const dial = async () => {
@@ -187,8 +195,8 @@ export const connect = async (url, options = {}) => {
     const protocol = "rse-pf.v1." + codec;
     const time = now();
     const link = {
-      _token: used, _welcome: null, _limits: {}, _share: share, _left: 0, _filledAt: time, _heardAt: time, _checkedAt: time,
-      _pingedAt: -Infinity, _unansweredAt: null, _renewAt: Infinity, _outgoing: null, _incoming: null, _bad: 0,
+      _token: used, _limits: {}, _share: share, _left: 0, _filledAt: time, _heardAt: time, _checkedAt: time,
+      _pingedAt: -Infinity, _renewAt: Infinity, _bad: 0,
     };
     let socket;
     try {
@@ -231,7 +239,7 @@ export const connect = async (url, options = {}) => {
     const isUsed = link === current || !current;
     // A browser does not say why a handshake failed.
     if (code === 4401 || code === 4403 || (!link._welcome && (isExpired(link._token) || (await isRefused(link._token))))) {
-      const isSame = code === 4403 || (typeof token !== "function" && token === link._token);
+      const isSame = code === 4403 || (!isSource() && token === link._token);
       return lose(link, isUsed && isSame ? finally_(unauthorized()) : unauthorized());
     }
     if (code === 4429) {
@@ -246,7 +254,7 @@ export const connect = async (url, options = {}) => {
 
   /** Ask why a handshake failed, where the answer may be read: in Node, and in pages of the same origin. */
   const isRefused = async (used) => {
-    const address = new URL(url.replace(/^ws/, "http"));
+    const address = new URL(httpUrl);
     // A request more for each attempt would double what a firewall counts.
     if (attempt % 4 !== 1 || (globalThis.location && location.host !== address.host)) return false;
     try {
@@ -267,7 +275,7 @@ export const connect = async (url, options = {}) => {
     }
     while (!error && (!current || moving === current)) {
       const longest = min(120, (now() - downAt) / 3);
-      const pauseS = longest > 1 ? longest * (1 + Math.random()) / 2 : Math.random() * min(1, 0.1 * 2 ** attempt);
+      const pauseS = longest > 1 ? longest * (1 + random()) / 2 : random() * min(1, 0.1 * 2 ** attempt);
       attempt++;
       await pause(max(0, notBefore - now()) + pauseS);
       if (error) break;
@@ -306,7 +314,10 @@ export const connect = async (url, options = {}) => {
     if (!isFirst) later(onChange, before ? "moved" : "link-back", link._welcome.server);
   };
 
-  const leave = (link) => lose(link, wrong("disconnected", "the robot left this connection"));
+  const leave = (link) => lose(link, wrong("disconnected", "left"));
+
+  /** Return the commands that have no answer on *link*. */
+  const sentOn = (link) => [...pending.values()].filter((each) => each._link === link);
 
   /** Forget a connection; its commands wait for the next one. */
   const lose = (link, failed) => {
@@ -314,8 +325,7 @@ export const connect = async (url, options = {}) => {
     const { _socket: socket } = link;
     socket.onopen = socket.onmessage = socket.onclose = null;
     socket.close(1000);
-    for (const each of pending.values()) {
-      if (each._link !== link) continue;
+    for (const each of sentOn(link)) {
       each._link = null;
       if (each._isCancelled && !each._isLong) pending.delete(each._id);
     }
@@ -341,22 +351,17 @@ export const connect = async (url, options = {}) => {
 
   // --- messages ------------------------------------------------------------------------------------------
 
-  const say = (link, message) => send(link, JSON.stringify(message));
+  const say = (link, message) => send(link, textOf(message));
 
   /** Write a message after those before it; its *command*, if any, ends if it is too large. */
-  const send = async (link, text, command) => {
+  const send = (link, text, command) => {
     link._left--;
-    const data = encode(text);
-    const before = link._outgoing;
-    const written = (async () => {
-      await before;
-      write(link, data.then ? await data : data, text, command);
-    })();
-    link._outgoing = written;
+    link._outgoing = inOrder(link._outgoing, () => encode(text), (data) => write(link, data, text, command))
+      .catch((failed) => lose(link, wrong("unsupported", failed.message, "use another codec")));
   };
 
   const write = (link, data, text, command) => {
-    const size = data.byteLength ?? data.length;
+    const size = sizeOf(data);
     if (command && (size > link._limits.max_message_bytes || text.length > MAX_INFLATED_BYTES)) {
       settle(command, wrong("too-large", `a command of ${size} bytes is above the limit`, "upload large data, and name its digest"));
     } else if (links.has(link)) {
@@ -367,31 +372,18 @@ export const connect = async (url, options = {}) => {
 
   const hear = (link, data) => {
     link._heardAt = now();
-    counts.bytesDown += data.byteLength ?? data.length;
-    const before = link._incoming;
-    link._incoming = (async () => {
-      let message;
-      let failed;
-      try {
-        message = await decode(data);
-      } catch (problem) {
-        failed = unreadable("a message of the server cannot be read: " + problem.message);
-      }
-      await before;
-      if (failed) return misread(link, failed);
-      try {
-        receive(link, message);
-      } catch {
-        misread(link);
-      }
-    })();
+    counts.bytesDown += sizeOf(data);
+    link._incoming = inOrder(link._incoming, () => decode(data), (message) => receive(link, message))
+      .catch((problem) => misread(link, problem));
   };
 
-  /** Count a message that is not understood; one that is not *failed* to decode may be of a newer server. */
-  const misread = (link, failed) => {
+  /** Take that a message cannot be read; a *problem* that is no error is a type that is not known here. */
+  const misread = (link, problem) => {
+    const failed = unreadable("cannot read a message: " + problem);
+    const isDamaged = problem?.name;
     // It may have been the answer to any of them, and would not be readable when it came again.
-    if (failed) for (const each of [...pending.values()]) if (each._link === link) settle(each, failed);
-    if ((failed && !link._welcome) || ++link._bad > MAX_BAD_MESSAGES) lose(link, failed || unreadable("messages that cannot be read"));
+    if (isDamaged) for (const each of sentOn(link)) settle(each, failed);
+    if ((isDamaged && !link._welcome) || ++link._bad > MAX_BAD_MESSAGES) lose(link, failed);
   };
 
   const receive = (link, message) => {
@@ -505,7 +497,7 @@ export const connect = async (url, options = {}) => {
     if (each._link) say(each._link, { type: "cancel", id: each._id });
   };
 
-  const expired = (each, time) => wrong("expired", `no answer within ${Math.round((time - each._from) * 1e3)} ms`);
+  const expired = (each, time) => wrong("expired", `no answer within ${round((time - each._from) * 1e3)} ms`);
 
   const settle = (each, failed, result) => {
     pending.delete(each._id);
@@ -532,9 +524,7 @@ export const connect = async (url, options = {}) => {
     const needed = new Set();
     let room = current ? allowance(current, time) : 0;
     if (current) {
-      let inFlight = 0;
-      for (const each of pending.values()) if (each._link === current) inFlight++;
-      room = min(room, max(1, current._limits.max_in_flight) - inFlight);
+      room = min(room, max(1, current._limits.max_in_flight) - sentOn(current).length);
       // What does not leave the machine yet can still be replaced by a newer frame.
       if (current._socket.bufferedAmount > MAX_BUFFERED_BYTES) room = 0;
     }
@@ -578,7 +568,7 @@ export const connect = async (url, options = {}) => {
     }
     link._checkedAt = time;
     let first = Infinity;
-    for (const each of pending.values()) if (each._link === link && !each._isLong) first = min(first, each._at);
+    for (const each of sentOn(link)) if (!each._isLong) first = min(first, each._at);
     const isSilent = time - max(link._heardAt, first) >= stallS;
     if (isSilent || time - (link._unansweredAt ?? time) >= PONG_S) {
       return lose(link, wrong("connect", "the server does not answer"));
@@ -588,7 +578,7 @@ export const connect = async (url, options = {}) => {
       link._pingedAt = time;
       say(link, { type: "ping", sent_s: time });
     }
-    if (time >= link._renewAt && typeof token === "function") {
+    if (time >= link._renewAt && isSource()) {
       link._renewAt = time + max(1.5, (link._expiresAt - time) / 2);
       // Without a token in time the server closes the connection, and the next attempt asks again.
       freshToken().then((fresh) => links.has(link) && say(link, { type: "renew", token: fresh }), nothing);
@@ -629,14 +619,14 @@ export const connect = async (url, options = {}) => {
         const response = await fetch(address, { method, body, headers, signal });
         if (response.ok) return response;
         failed = told({ code: "store", message: "HTTP " + response.status, ...(await response.json().catch(nothing)) });
-        if (![408, 429, 500, 502, 503, 504].includes(response.status)) throw failed;
+        if (!/408|429|50[0234]/.test(response.status)) throw failed;
       } catch (problem) {
         if (problem === failed) throw failed;
         if (signal?.aborted) throw cancelled();
         failed = wrong("connect", "no data service answers: " + problem.name, "is this page's origin in serving.allowed_origins?");
       }
       if (tries > 4) throw failed;
-      await pause(Math.random() * 0.2 * 2 ** tries);
+      await pause(random() * 0.2 * 2 ** tries);
     }
   };
 
@@ -672,7 +662,7 @@ export const connect = async (url, options = {}) => {
           _head: textOf({ type: "command", id, service, stream, seq, keep: isKept, trace }).slice(0, -1),
           _payload: textOf(payload),
           _from: time, _until: time + (deadlineMs ? deadlineMs / 1e3 : onProgress ? Infinity : ANSWER_S),
-          _isDefault: !deadlineMs, _link: null, _at: 0, _notBefore: 0, _losses: 0,
+          _isDefault: !deadlineMs, _at: 0, _notBefore: 0, _losses: 0,
           _resolve: resolve, _reject: reject, _cancel: () => cancel(each),
         };
         signal?.addEventListener("abort", each._cancel);
@@ -706,7 +696,7 @@ export const connect = async (url, options = {}) => {
 
     renew: (fresh) =>
       new Promise((resolve, reject) => {
-        if (typeof token !== "function") token = fresh;
+        if (!isSource()) token = fresh;
         renewal?.(cancelled());
         if (!current) return resolve();
         const mine = (renewal = (failed) => {
@@ -719,24 +709,24 @@ export const connect = async (url, options = {}) => {
       }),
 
     upload: async (data, { onProgress = nothing, signal } = {}) => {
-      const bytes = new Uint8Array(data); // a copy: the caller may change its own
+      const bytes = bytesOf(data); // a copy: the caller may change its own
       const size = bytes.length;
       const digest = await sha256(bytes);
       const path = "uploads/" + digest;
-      const begin = () => http("PUT", path, JSON.stringify({ size }), signal);
+      const begin = async () => (await http("PUT", path, textOf({ size }), signal)).json();
       if (size <= MAX_PUT_BYTES) await http("PUT", "objects/" + digest, bytes, signal);
       else {
-        let state = await (await begin()).json();
+        let state = await begin();
         while (state.offset < size) {
           const { offset } = state;
           onProgress(offset, size);
           const part = bytes.subarray(offset, offset + min(state.part_bytes, MAX_PART_BYTES));
           try {
-            state = await (await http("PATCH", path, part, signal, { "Upload-Offset": String(offset) })).json();
+            state = await (await http("PATCH", path, part, signal, { "Upload-Offset": offset })).json();
           } catch (failed) {
             // The answer to this part was lost, or another program uploads the same object.
-            if (failed.code !== "conflict" && failed.code !== "not-found") throw failed;
-            state = await (await begin()).json();
+            if (!/conflict|not-found/.test(failed.code)) throw failed;
+            state = await begin();
           }
         }
       }
@@ -745,7 +735,7 @@ export const connect = async (url, options = {}) => {
     },
 
     download: async (digest, { signal } = {}) => {
-      const bytes = new Uint8Array(await (await http("GET", "objects/" + digest, undefined, signal)).arrayBuffer());
+      const bytes = bytesOf(await (await http("GET", "objects/" + digest, undefined, signal)).arrayBuffer());
       if ((await sha256(bytes)) !== digest) throw wrong("store", "the bytes do not match the digest", "try again");
       return bytes;
     },

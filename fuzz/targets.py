@@ -27,7 +27,7 @@ from rse_pf.errors import InternalError, ProtocolError, RsePfError
 from rse_pf.service import Service, dispatch, request_of
 from rse_pf.services.builtin import builtin_services
 from rse_pf.wire import Command, Failure, Result, make_codec
-from rse_pf.wire.envelope import peek
+from rse_pf.wire.envelope import peek, undecodable_id
 
 __all__ = ["TARGETS", "Target", "TargetFailure", "codec", "framed", "frames", "geometry", "stream"]
 
@@ -56,6 +56,7 @@ def codec(data: bytes, meter: Meter) -> None:
     if kind == 3:
         body = zlib.compress(body, 1)
     meter.call(lambda sent: peek(chosen, sent), body, ProtocolError)
+    meter.call(lambda sent: undecodable_id(chosen, sent), body, ProtocolError)
     # A robot trusts its server: the cost of decoding the server's messages is not limited.
     for decode, counted in ((chosen.decode_from_robot, meter), (chosen.decode_from_server, Meter())):
         message = counted.call(decode, body, ProtocolError)

@@ -15,6 +15,7 @@ FEATURES = {
     "golden": "reads every golden message",
     "pnp": "poses of the golden commands, within 1e-6",
     "typed-error": "typed errors with hints",
+    "undecodable": "the server's reason for commands that it cannot decode, within 1 s",
     "busy": "offers four times its limits: paced, nothing lost",
     "deadline": "deadlines while the servers are stalled",
     "newest": "the newest command of a stream wins",

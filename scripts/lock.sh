@@ -33,6 +33,10 @@ lock batch batch build
 .venv/bin/uv pip compile tests/clients/rosbridge.in --quiet --universal --python-version 3.10 \
   --generate-hashes --no-emit-index-url --no-emit-find-links --no-annotate $constraints \
   --custom-compile-command 'make lock' --output-file locks/rosbridge.txt
+# The oldest Node that the documentation names, beside the one of the extra infra.
+.venv/bin/uv pip compile tests/clients/oldest_node.in --quiet --universal --python-version 3.10 \
+  --generate-hashes --no-emit-index-url --no-emit-find-links --no-annotate \
+  --custom-compile-command 'make lock' --output-file locks/oldest-node.txt
 # What boots has one platform, so its locks have no conditions.
 for_platform() { # for_platform FILE PYTHON INPUT...
   file=$1 python=$2

@@ -109,7 +109,7 @@ class SessionSettings:
     max_json_lists: int = setting(7000, doc="lists and objects of a message, at any depth", low=16)
     max_json_values: int = setting(30000, doc="values of a robot's message outside of raw arrays; a list counts as three, an object as six", low=64)
     max_json_memory_bytes: int = setting(2000000, unit="bytes", doc="estimated memory of a decoded JSON message", low=65536)
-    max_bad_messages: int = setting(10, unit="messages", doc="undecodable messages of one socket before it is closed and its robot is refused for rate_ban_s", low=0)
+    max_bad_messages: int = setting(10, unit="messages", doc="undecodable messages without a readable id of one socket before it is closed and its robot is refused for rate_ban_s", low=0)
     max_control_per_s: float = setting(10.0, unit="frames/s", doc="control frames of one socket", low=1)
     max_in_flight: int = setting(8, unit="commands", doc="unanswered commands of one robot", low=1)
     max_commands_per_s: float = setting(20.0, unit="commands/s", doc="messages of one robot; more are refused; 0 is off", source="AWS IoT and Discord limit so", low=0)

@@ -7,6 +7,7 @@ A message that the codec refused is asked for its id only, from a bounded number
 
 from __future__ import annotations
 
+import itertools
 import re
 import zlib
 from collections.abc import Callable, Iterator
@@ -97,7 +98,8 @@ def undecodable_id(codec: Codec, data: bytes) -> int | None:
     decode: Callable[[bytes], Any] = msgspec.msgpack.decode if is_binary else msgspec.json.decode
     found: dict[str, Any] = {}
     try:
-        for name, value in _binary_fields(data) if is_binary else _json_fields(_text_head(codec, data)):
+        fields = _binary_fields(data) if is_binary else _json_fields(_text_head(codec, data))
+        for name, value in itertools.islice(fields, _MAX_FIELDS):
             if name in ("type", "id"):
                 found[name] = decode(value)
             if len(found) == 2:
@@ -141,7 +143,7 @@ def _binary_fields(data: bytes) -> Iterator[tuple[str, bytes]]:
     if not head or not (0x80 <= head[0] < 0x90 or head[0] in _MAP_HEAD_BYTES):
         return
     at = _MAP_HEAD_BYTES.get(head[0], 1)
-    for _ in range(min(announced_values(head, 0) // 2, _MAX_FIELDS)):
+    for _ in range(announced_values(head, 0) // 2):
         name, at = small_text(head, at)
         end = measure_msgpack(head, at, _SCALAR)
         yield name, head[at:end]

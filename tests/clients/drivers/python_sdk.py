@@ -11,6 +11,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[3]))
@@ -20,11 +21,12 @@ from rse_pf.errors import RsePfError
 from rse_pf.wire import SUBPROTOCOLS, make_codec
 
 CLAIMS = [
-    "golden", "pnp", "typed-error", "busy", "deadline", "newest", "stream", "renew", "expired", "revoked",
-    "updates", "progress", "data",
+    "golden", "pnp", "typed-error", "undecodable", "busy", "deadline", "newest", "stream", "renew",
+    "expired", "revoked", "updates", "progress", "data",
 ]  # fmt: skip
 PER_S = 10.0
 LATE_S = 30.0
+SOON_S = 1.0
 
 
 def say(**event: Any) -> None:
@@ -113,6 +115,21 @@ async def typed_error(run: Run) -> None:
     )
 
 
+async def undecodable(run: Run) -> dict[str, Any]:
+    """Send each kind, and a valid command behind it; the trace is not the program's to set."""
+    wrong, kinds = [], [each for each in run.given["undecodable"]["json"] if not each["trace"]]
+    for kind in kinds:
+        payload = msgspec.Raw(base64.b64decode(kind["payload"]))
+        began = time.monotonic()
+        found = await run.ask(kind["service"], payload, stream=kind["stream"])
+        took_s = time.monotonic() - began
+        is_typed = isinstance(found, RsePfError) and found.code in kind["codes"] and found.hint
+        valid = await run.ask("echo", {"value": 1})
+        if not is_typed or took_s > SOON_S or valid != {"value": 1}:
+            wrong.append([kind["name"], repr(found)[:100], round(took_s, 3), repr(valid)[:50]])
+    return {"kinds": len(kinds), "wrong": wrong}
+
+
 async def busy(run: Run) -> None:
     end_s, calls = time.monotonic() + float(os.environ["RSE_PF_SECONDS"]), []
     while time.monotonic() < end_s:
@@ -126,13 +143,13 @@ async def deadline(run: Run) -> None:
         await run.ask(*run.command(number), deadline_s=0.001)
 
 
-async def newest(run: Run) -> bool:
+async def newest(run: Run) -> dict[str, Any]:
     are_ok = []
     for _ in range(4):
         calls = [run.ask(*run.command(0), stream="front", deadline_s=LATE_S) for _ in range(8)]
         are_ok.append(not isinstance((await asyncio.gather(*calls))[-1], RsePfError))
         await asyncio.sleep(0.5)
-    return all(are_ok)
+    return {"newest_ok": all(are_ok)}
 
 
 async def stream(run: Run) -> None:
@@ -196,9 +213,9 @@ async def data(run: Run) -> None:
 
 
 SCENARIOS = {
-    "golden": golden, "pnp": pnp, "typed-error": typed_error, "busy": busy, "deadline": deadline,
-    "newest": newest, "stream": stream, "renew": stream, "expired": ended, "revoked": ended,
-    "updates": updates, "progress": progress, "data": data,
+    "golden": golden, "pnp": pnp, "typed-error": typed_error, "undecodable": undecodable, "busy": busy,
+    "deadline": deadline, "newest": newest, "stream": stream, "renew": stream, "expired": ended,
+    "revoked": ended, "updates": updates, "progress": progress, "data": data,
 }  # fmt: skip
 
 
@@ -207,7 +224,7 @@ async def main(name: str) -> None:
     async with run.robot:
         say(event="ready")
         found = await SCENARIOS[name](run)
-        run.done(**({} if found is None else {"newest_ok": found}))
+        run.done(**(found or {}))
 
 
 if sys.argv[1:] == ["--claims"]:

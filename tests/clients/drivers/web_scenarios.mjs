@@ -4,6 +4,7 @@
 const STREAM_PER_S = 10;
 const COUNT_MS = 250;
 const PATIENT_MS = 60_000;
+const SOON_MS = 1000;
 const pause = (ms) => new Promise((done) => setTimeout(done, ms));
 
 /** Counts what is sent and answered, and how long that took. */
@@ -96,6 +97,36 @@ async function typedError({ robot, input, tally }) {
   const { payload } = input.commands[0];
   const few = { ...payload, points_world: payload.points_world.slice(0, 9), pixels: payload.pixels.slice(0, 6) };
   await tally.call(robot, { service: "pnp", payload: few });
+}
+
+const MARK = "in-the-place-of-the-payload";
+
+/** Let the commands whose payload is *MARK* be sent with the bytes that *next* returns. */
+function replacing(codecs, next) {
+  const codec = codecs["json+zlib"];
+  const { encode } = codec;
+  codec.encode = (text) => {
+    const [head, tail] = text.split(JSON.stringify(MARK));
+    if (tail === undefined) return encode(text);
+    const encoded = new Blob([head, next(), tail]).stream().pipeThrough(new CompressionStream("deflate"));
+    return new Response(encoded).arrayBuffer();
+  };
+}
+
+/** Each kind, and a valid command behind it. */
+async function undecodable({ robot, input, tally, raw }) {
+  const wrong = [];
+  const kinds = input.undecodable.json;
+  for (const { name, payload, service, trace, stream, codes } of kinds) {
+    raw.bytes = bytesOf(payload);
+    const began = performance.now();
+    const failed = await tally.call(robot, { service, payload: MARK }, { trace, stream });
+    const took = performance.now() - began;
+    const valid = await tally.call(robot, { service: "echo", payload: { value: 1 } });
+    const isTyped = codes.includes(failed.code) && failed.hint;
+    if (!isTyped || took > SOON_MS || valid.reply?.value !== 1) wrong.push([name, failed.message, took, valid.message]);
+  }
+  return { kinds: kinds.length, wrong };
 }
 
 async function busy({ robot, input, tally, seconds }) {
@@ -196,7 +227,7 @@ async function roundTrips({ robot, input, tally, seconds }) {
 }
 
 const RUNS = {
-  golden, pnp, "typed-error": typedError, busy, deadline, newest, stream, renew: stream, expired: ended, revoked: ended,
+  golden, pnp, "typed-error": typedError, undecodable, busy, deadline, newest, stream, renew: stream, expired: ended, revoked: ended,
   updates, progress, data,
 };
 
@@ -210,16 +241,18 @@ export async function run(scenario, { module, url, token, codec, tokenIn, dataUr
     return 3;
   }
   const tally = new Tally();
+  const raw = {};
   let robot = null;
   try {
     if (scenario !== "golden") {
       const onChange = (what, server) => {
         if (what === "moved" || what === "link-back") say({ event: "moved", server });
       };
+      if (scenario === "undecodable") replacing(module.codecs, () => raw.bytes);
       robot = await module.connect(url, { token, codec, tokenIn, dataUrl, onChange });
       say({ event: "ready" });
     }
-    const more = await RUNS[scenario]({ module, robot, tally, say, ...rest });
+    const more = await RUNS[scenario]({ module, robot, tally, say, raw, ...rest });
     say({ event: "done", ...tally.figures(), ...more });
     return 0;
   } catch (error) {

@@ -43,7 +43,7 @@ namespace detail {
 inline Failure fatal_of(unsigned code, const std::string& reason) {
     const std::string why = reason.empty() ? "" : ": " + reason;
     switch (code) {
-        case 4403: return {"forbidden", "the robot was disabled, or its token revoked" + why, "ask the operator"};
+        case 4403: return {"unauthorized", "the robot was disabled, or its token revoked" + why, "ask the operator"};
         case 4406: return {"unsupported", "the server speaks another version of the protocol" + why, "update the client"};
         case 4409: return {"conflict", "the same robot opened a newer connection" + why, "give each robot a token of its own"};
         case 1002: case 1007: case 1008: case 1009: case 4400:

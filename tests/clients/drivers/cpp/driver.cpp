@@ -1,4 +1,5 @@
 // The C++ client in the conformance table: DRIVER SCENARIO, JSON lines on stdout and stdin (docs/clients.md).
+#include <algorithm>
 #include <atomic>
 #include <chrono>
 #include <condition_variable>
@@ -170,19 +171,24 @@ json plain(const json& value) {
     return out;
 }
 
+std::string bytes_of(const std::string& base64) {
+    static const std::string alphabet = "ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
+    std::string bytes;
+    int bits = 0, value = 0;
+    for (const char each : base64) {
+        const auto digit = alphabet.find(each);
+        if (digit == std::string::npos) continue;
+        value = (value << 6 | static_cast<int>(digit)) & 0xffff;
+        if ((bits += 6) >= 8) bytes.push_back(static_cast<char>(value >> (bits -= 8)));
+    }
+    return bytes;
+}
+
 void golden(Driver& driver) {
     const std::string path = driver.input.contains("golden") ? driver.input["golden"].get<std::string>() : variable("RSE_PF_GOLDEN");
     const json messages = read_json(path);
     for (const auto& [name, message] : messages.items()) {
-        std::string bytes;
-        int bits = 0, value = 0;
-        for (const char each : message["bytes"]["rse-pf.v1.bin"].get<std::string>()) {
-            static const std::string alphabet = "ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
-            const auto digit = alphabet.find(each);
-            if (digit == std::string::npos) continue;
-            value = (value << 6 | static_cast<int>(digit)) & 0xffff;
-            if ((bits += 6) >= 8) bytes.push_back(static_cast<char>(value >> (bits -= 8)));
-        }
+        const std::string bytes = bytes_of(message["bytes"]["rse-pf.v1.bin"]);
         require(plain(json::from_msgpack(bytes)) == message["meaning"], name + ": the codec of JSON reads something else");
         const auto read = rse_pf::detail::read_message(bytes);
         require(read.type == message["meaning"]["type"].get<std::string>(), name + ": another type");
@@ -235,6 +241,35 @@ void typed_error(Driver& driver) {
     payload["pixels"] = rse_pf::array(pixels);
     driver.client->call("pnp", payload, {}, driver.tally.next());
     driver.tally.outcome(1);
+}
+
+/// Send each kind, and a valid command behind it.
+void undecodable(Driver& driver, json& more) {
+    driver.connect();
+    std::size_t number = 0;
+    more["wrong"] = json::array();
+    const json& kinds = driver.input["undecodable"]["bin"];
+    for (const json& kind : kinds) {
+        rse_pf::CallOptions options;
+        options.trace = kind["trace"];
+        options.stream = kind["stream"];
+        const auto began = Clock::now();
+        const std::string payload = bytes_of(kind["payload"]);
+        // An empty payload of this client is a null.
+        if (payload.empty()) continue;
+        driver.client->send(kind["service"], payload, options, driver.tally.next());
+        const auto failed = driver.tally.outcome(number++);
+        const double took_s = std::chrono::duration<double>(Clock::now() - began).count();
+        driver.client->call("echo", {{"value", 1}}, {}, driver.tally.next());
+        const auto valid = driver.tally.outcome(number++);
+        const json& codes = kind["codes"];
+        const bool is_typed = !failed.ok() && !failed.failure().hint.empty() &&
+                              std::find(codes.begin(), codes.end(), failed.failure().code) != codes.end();
+        if (!is_typed || took_s > 1 || !valid.ok()) {
+            more["wrong"].push_back({kind["name"], failed.ok() ? "ok" : failed.failure().message, took_s, valid.ok()});
+        }
+    }
+    more["kinds"] = number / 2;
 }
 
 void busy(Driver& driver) {
@@ -351,7 +386,8 @@ void data(Driver&) {
 int main(int argc, char** argv) {
     json more = json::object();
     const std::map<std::string, std::function<void(Driver&)>> scenarios = {
-        {"golden", golden}, {"pnp", pnp}, {"typed-error", typed_error}, {"busy", busy}, {"deadline", deadline},
+        {"golden", golden}, {"pnp", pnp}, {"typed-error", typed_error},
+        {"undecodable", [&](Driver& driver) { undecodable(driver, more); }}, {"busy", busy}, {"deadline", deadline},
         {"newest", [&](Driver& driver) { newest(driver, more); }}, {"stream", stream}, {"renew", stream},
         {"expired", ended}, {"revoked", ended}, {"updates", [&](Driver& driver) { updates(driver, more); }},
         {"progress", progress}, {"data", data},
