@@ -23,11 +23,13 @@ from rse_pf.wire.messages import Failure
 __all__ = ["Envelope", "encode_refusal", "peek", "undecodable_id"]
 
 _MAX_PEEKED_BYTES = 512
-# The start of a command as the SDK writes it: type, id, and a service of at most 64 characters.
+# The start of a command as the SDK writes it: type, id, and a service of at most 64 characters.  Some encoders
+# put a space behind each mark.
 _INFLATED_BYTES = 160
 
 _HEAD = re.compile(
-    rb'\{"type":"command","id":(0|[1-9][0-9]{0,15}),"service":"([\x20-\x21\x23-\x5b\x5d-\x7e]{1,64})"[,}]'
+    rb'\{"type": ?"command", ?"id": ?(0|[1-9][0-9]{0,15}), ?"service": ?'
+    rb'"([\x20-\x21\x23-\x5b\x5d-\x7e]{1,64})"[,}]'
 )
 
 # One member of a JSON object whose value is no list and no object, and the mark behind it.

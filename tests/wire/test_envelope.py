@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import zlib
 
 import pytest
@@ -32,6 +33,13 @@ def test_preencoded_messages_are_recognised_too(name: str) -> None:
     message = encode_command(codec, Command(id=5, service="x" * 64, payload=prepared))
 
     assert peek(codec, message) == Envelope(5, "x" * 64)
+
+
+def test_the_spaces_of_other_encoders_are_allowed() -> None:
+    text = json.dumps({"type": "command", "id": 7, "service": "pnp", "payload": [1]}).encode()
+
+    assert peek(make_codec("json"), text) == Envelope(7, "pnp")
+    assert peek(make_codec("zlib"), zlib.compress(text)) == Envelope(7, "pnp")
 
 
 @pytest.mark.parametrize("name", CODECS)
