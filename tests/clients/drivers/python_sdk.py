@@ -117,17 +117,19 @@ async def typed_error(run: Run) -> None:
 
 async def undecodable(run: Run) -> dict[str, Any]:
     """Send each kind, and a valid command behind it; the trace is not the program's to set."""
-    wrong, kinds = [], [each for each in run.given["undecodable"]["json"] if not each["trace"]]
+    wrong, slowest_s = [], 0.0
+    kinds = [each for each in run.given["undecodable"]["json"] if not each["trace"]]
     for kind in kinds:
         payload = msgspec.Raw(base64.b64decode(kind["payload"]))
         began = time.monotonic()
         found = await run.ask(kind["service"], payload, stream=kind["stream"])
         took_s = time.monotonic() - began
+        slowest_s = max(slowest_s, took_s)
         is_typed = isinstance(found, RsePfError) and found.code in kind["codes"] and found.hint
         valid = await run.ask("echo", {"value": 1})
         if not is_typed or took_s > SOON_S or valid != {"value": 1}:
             wrong.append([kind["name"], repr(found)[:100], round(took_s, 3), repr(valid)[:50]])
-    return {"kinds": len(kinds), "wrong": wrong}
+    return {"kinds": len(kinds), "wrong": wrong, "slowest_s": round(slowest_s, 3)}
 
 
 async def busy(run: Run) -> None:

@@ -116,17 +116,19 @@ function replacing(codecs, next) {
 /** Each kind, and a valid command behind it. */
 async function undecodable({ robot, input, tally, raw }) {
   const wrong = [];
+  let slowest = 0;
   const kinds = input.undecodable.json;
   for (const { name, payload, service, trace, stream, codes } of kinds) {
     raw.bytes = bytesOf(payload);
     const began = performance.now();
     const failed = await tally.call(robot, { service, payload: MARK }, { trace, stream });
     const took = performance.now() - began;
+    slowest = Math.max(slowest, took);
     const valid = await tally.call(robot, { service: "echo", payload: { value: 1 } });
     const isTyped = codes.includes(failed.code) && failed.hint;
     if (!isTyped || took > SOON_MS || valid.reply?.value !== 1) wrong.push([name, failed.message, took, valid.message]);
   }
-  return { kinds: kinds.length, wrong };
+  return { kinds: kinds.length, wrong, slowest_s: slowest / 1e3 };
 }
 
 async function busy({ robot, input, tally, seconds }) {

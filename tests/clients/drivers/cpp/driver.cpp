@@ -247,6 +247,7 @@ void typed_error(Driver& driver) {
 void undecodable(Driver& driver, json& more) {
     driver.connect();
     std::size_t number = 0;
+    double slowest_s = 0;
     more["wrong"] = json::array();
     const json& kinds = driver.input["undecodable"]["bin"];
     for (const json& kind : kinds) {
@@ -260,6 +261,7 @@ void undecodable(Driver& driver, json& more) {
         driver.client->send(kind["service"], payload, options, driver.tally.next());
         const auto failed = driver.tally.outcome(number++);
         const double took_s = std::chrono::duration<double>(Clock::now() - began).count();
+        slowest_s = std::max(slowest_s, took_s);
         driver.client->call("echo", {{"value", 1}}, {}, driver.tally.next());
         const auto valid = driver.tally.outcome(number++);
         const json& codes = kind["codes"];
@@ -270,6 +272,7 @@ void undecodable(Driver& driver, json& more) {
         }
     }
     more["kinds"] = number / 2;
+    more["slowest_s"] = slowest_s;
 }
 
 void busy(Driver& driver) {
