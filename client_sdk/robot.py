@@ -66,6 +66,7 @@ class Robot:
         settings: SessionSettings | None = None,
         offload: CloudFirst | None = None,
         clock: Callable[[], float] = time.monotonic,
+        wall_clock: Callable[[], float] = time.time,
         random: random_module.Random | None = None,
         on_change: OnChange = None,
         record: str | Path | None = None,
@@ -73,6 +74,9 @@ class Robot:
         burst_url: str | None = None,
     ) -> None:
         """Describe a robot to be used as ``async with connect(...) as robot``, or awaited.
+
+        A first connect that is refused raises.  A robot that was connected once tries for ever, whatever the
+        servers say; `failure` tells what they say.
 
         Args:
             url: ``ws://HOST:PORT/ws`` or ``wss://HOST/ws``; of several the robot uses the nearest,
@@ -84,9 +88,10 @@ class Robot:
             settings: Limits and timeouts; None means the defaults.
             offload: `CloudFirst` lets the robot answer itself when the cloud cannot.
             clock: Seconds, monotonic.
+            wall_clock: Unix seconds: the clock by which *token* signs.
             random: Source of the jitter of reconnects.
-            on_change: Called with ``link-lost``, ``link-back``, ``moved``, ``stands-by`` or ``ended``, and
-                the reason or the server.
+            on_change: Called with ``link-lost``, ``refused``, ``link-back``, ``moved`` or ``stands-by``,
+                and the reason or the server.
             record: Folder for a recording of what this robot says and hears, for rse-pf replay.
             thumbnails: Whether small pictures of the frames of its `mapper` are recorded, too.
             burst_url: ``https://HOST/burst``, a function that answers while no server can, also before the
@@ -116,6 +121,7 @@ class Robot:
             on_answer=self._answered,
             clock=clock,
             random=random,
+            wall_clock=wall_clock,
             on_change=on_change,
             recorder=self._recorder,
         )
@@ -278,9 +284,9 @@ class Robot:
         )
         started = self._clock()
         try:
-            fatal = self._connection.fatal
-            if fatal is not None:
-                raise error_from_code(fatal.code, fatal.message, hint=fatal.hint)
+            refusal = self._connection.refusal
+            if refusal is not None and not (self._local is not None and self._local.offers(service)):
+                raise error_from_code(refusal.code, refusal.message, hint=refusal.hint)
             return self._typed(await self._asking.ask(call), reply_type, started)
         except RsePfError as error:
             self._keeper.failures[error.code] += 1
@@ -358,11 +364,12 @@ class Robot:
 
     @property
     def failure(self) -> RsePfError | None:
-        """Why the robot has stopped reconnecting for good, such as `Unauthorized`; None while it has not.
+        """Why the servers refuse this robot now, such as `Unauthorized`; None while they do not.
 
-        Every command then raises this error at once, as long as the robot is open.
+        Until it is connected again every command raises this error at once, unless the robot can answer it
+        itself.  It goes on trying: nothing that a server says ends a robot.
         """
-        return self._connection.fatal
+        return self._connection.refusal
 
     def post(
         self,
@@ -381,10 +388,10 @@ class Robot:
         answered by the robot itself.
 
         Raises:
-            Disconnected: The robot is not open, or has stopped reconnecting.
+            Disconnected: The robot is not open, or its servers refuse it.
             LimitExceeded: The message would be larger than the limit.
         """
-        if not self._open or self._connection.fatal is not None:
+        if not self._open or self._connection.refusal is not None:
             raise Disconnected("the robot is not connected", hint="use async with client_sdk.connect(...)")
         identity = self._session.submit(
             service, request, now=self._clock(), deadline_s=deadline_s, stream=stream, keep=keep
@@ -400,9 +407,9 @@ class Robot:
         one.  The subscription survives reconnects and moves.
 
         Raises:
-            Disconnected: The robot is not open, or has stopped reconnecting.
+            Disconnected: The robot is not open.
         """
-        if not self._open or self._connection.fatal is not None:
+        if not self._open:
             raise Disconnected("the robot is not connected", hint="use async with client_sdk.connect(...)")
         return self._subscriptions.begin(topic)
 

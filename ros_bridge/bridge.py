@@ -26,7 +26,7 @@ from client_sdk.robot import Robot, connect
 from ros_bridge.incoming import NO_MESSAGE, IncomingFrames, PairedImages, Role
 from ros_bridge.options import BridgeOptions
 from ros_bridge.outgoing import Message, OutgoingMessages
-from rse_pf.errors import RsePfError, UsageError, error_from_code
+from rse_pf.errors import RsePfError, UsageError
 from rse_pf.geometry import Array
 from rse_pf.terminal import show
 
@@ -195,7 +195,7 @@ class Bridge:
             self._publish(message)
 
     async def _report(self) -> None:
-        """Publish how the bridge is, each second, whether frames come or not; raise what ended the robot."""
+        """Publish how the bridge is, each second, whether frames come or not."""
         last, received, logged = 0, Counter[str](), ""
         while True:
             connected = self._robot is None or self._robot.connected
@@ -225,9 +225,6 @@ class Bridge:
                     self._stamp_ns, trouble=trouble, is_working=connected and self.frames > 0, values=values
                 )
             )
-            if self._robot is not None and self._robot.failure is not None:
-                failure = self._robot.failure
-                raise error_from_code(failure.code, failure.message, hint=failure.hint)
             await asyncio.sleep(_DIAGNOSTICS_EVERY_S)
 
     def _silence(self, before: Counter[str]) -> str:

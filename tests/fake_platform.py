@@ -127,7 +127,7 @@ class FakePlatform:
 
     ``token`` is the only one accepted (None accepts any); ``refusals`` are HTTP statuses (with a
     Retry-After in seconds or None) for the next handshakes, with the mark of a server unless it
-    ``refuses_as_firewall``; ``hold`` keeps commands unanswered.
+    ``refuses_as_firewall``, and with what is ``told`` in its body; ``hold`` keeps commands unanswered.
     """
 
     def __init__(
@@ -146,6 +146,7 @@ class FakePlatform:
         self.tokens_seen: list[str] = []
         self.refusals: list[tuple[int, int | None]] = []
         self.refuses_as_firewall = False
+        self.told: dict[str, Any] = {}
         self.hold = False
         self.welcomes = True
         self.on_command: Callable[[FakeSocket, Command], Awaitable[Answer | None]] | None = None
@@ -247,7 +248,7 @@ class FakePlatform:
         self.tokens_seen.append(given)
         if self.refusals:
             status, retry_after = self.refusals.pop(0)
-            return _refusal(status, retry_after, is_firewall=self.refuses_as_firewall)
+            return _refusal(status, retry_after, is_firewall=self.refuses_as_firewall, **self.told)
         if self.token is not None and given != self.token:
             return _refusal(401, None)
         if request.path != "/ws":
@@ -272,9 +273,9 @@ class FakePlatform:
         task.add_done_callback(self._tasks.discard)
 
 
-def _refusal(status: int, retry_after: int | None, *, is_firewall: bool = False) -> Response:
+def _refusal(status: int, retry_after: int | None, *, is_firewall: bool = False, **told: Any) -> Response:
     code = {401: "unauthorized", 403: "forbidden"}.get(status, "full")
-    body = b"<html>no</html>" if is_firewall else refusal_body(code, "refused", "")
+    body = b"<html>no</html>" if is_firewall else refusal_body(code, "refused", "", **told)
     headers = Headers({"Content-Length": str(len(body)), "Connection": "close"})
     if retry_after is not None:
         headers["Retry-After"] = str(retry_after)

@@ -1,27 +1,43 @@
-"""When a robot dials again: soon after a loss, and less and less often while nobody answers.
+"""When a robot dials again: soon after a loss, and less and less often while servers do not take it.
 
-The firewall in front of a platform counts the handshakes of an address, and many robots may share one.  So a
-robot bounds its handshakes by itself, whatever happens to its connections: a token bucket gives it
-``session.dial_burst`` attempts at once and ``session.dials_per_minute`` later.  The limit of the firewall is
-derived from the same two settings (`rse_pf.config.front_door`).  Nothing here dials or sleeps.
+Only what reaches a server is spared: an attempt that nobody answered costs nothing, and another one follows a
+second later.  The firewall in front of a platform counts the handshakes of an address, and many robots may
+share one.  So a robot bounds its handshakes by itself, whatever happens to its connections: a token bucket
+gives it ``session.dial_burst`` attempts at once and ``session.dials_per_minute`` later.  The limit of the
+firewall is derived from the same two settings (`rse_pf.config.front_door`).  Nothing here dials or sleeps.
 """
 
 from __future__ import annotations
 
+from enum import Enum
 from random import Random
 
 from rse_pf.config import SessionSettings
 from rse_pf.token_bucket import TokenBucket
 
-__all__ = ["Backoff"]
+__all__ = ["Backoff", "Last"]
 
 _SHARE = 1.0 / 3.0
-"""Longest pause as a share of the time without a connection: after an outage of a minute, 20 seconds."""
-_OFFLINE_MAX_S = 5.0
-"""Longest pause while attempts do not leave the robot: they cost nobody anything."""
+"""Longest pause as a share of the time in which attempts fail: after an outage of a minute, 20 seconds."""
+_UNANSWERED_S = (1.0, 1.25)
+"""Between the starts of two attempts that nobody answers; not all robots at once."""
+_CUT_OFF_JITTER_S = 0.5
 _KEPT = 0.5
 _SPREAD = 1.25
 """Robots that are told the same time to wait do not come back at the same moment."""
+
+
+class Last(Enum):
+    """How the last attempt to connect ended."""
+
+    NONE = "none"
+    """There was none since the connection was lost."""
+    UNANSWERED = "unanswered"
+    """Nobody accepted the TCP connection, or nothing left the robot."""
+    ANSWERED = "answered"
+    """Something accepted the TCP connection, or refused it; the robot may connect a little later."""
+    REFUSED = "refused"
+    """A server of ours refused the robot, and may refuse it for long."""
 
 
 class Backoff:
@@ -39,41 +55,52 @@ class Backoff:
         self._attempt, self._failing_since = 0, None
 
     def dialled(self, now: float) -> None:
-        """Count an attempt that begins at *now*, seconds of the robot's clock."""
+        """Count an attempt that was answered at *now*, seconds of the robot's clock."""
         self._bucket.spend(1.0, now)
 
     def pause_s(
-        self, now: float, after_s: float = 0.0, *, is_offline: bool = False, is_move: bool = False
+        self,
+        now: float,
+        after_s: float = 0.0,
+        *,
+        last: Last = Last.ANSWERED,
+        valid_in_s: float | None = None,
+        is_move: bool = False,
     ) -> float:
-        """Return how long to wait before the next attempt.
+        """Return how long to wait before the next attempt, from the start of the last one.
 
-        Within the first seconds without a connection, exponential with full jitter up to
-        ``session.reconnect_max_s``; then between a sixth and a third of the time without a connection, up to
-        ``session.reconnect_long_max_s``.
+        Within the first seconds of attempts that are answered, exponential with full jitter up to
+        ``session.reconnect_max_s``; then between a sixth and a third of that time, up to
+        ``session.reconnect_long_max_s``.  After a refusal, between the half and the whole of the latter.
 
         Args:
             now: Seconds of the robot's clock.
             after_s: What the server asked for.
-            is_offline: Whether the last attempt did not leave the robot.
+            last: How the last attempt ended.
+            valid_in_s: When a token that is signed then will be accepted, None if that is not known.
             is_move: Whether the robot has a connection; it then keeps half of its allowance for its loss.
         """
-        s = self._settings
-        if self._failing_since is None:
-            self._failing_since = now
-        longest_s = min(s.reconnect_long_max_s, _SHARE * (now - self._failing_since))
-        if is_offline:
-            longest_s = min(longest_s, _OFFLINE_MAX_S)
-            self._bucket.spend(-1.0, now)
-        if longest_s > s.reconnect_max_s:
-            pause_s = self._random.uniform(0.5 * longest_s, longest_s)
-        else:
-            pause_s = self._random.uniform(
-                0.0, min(s.reconnect_max_s, s.reconnect_base_s * 2.0 ** min(self._attempt, 16))
-            )
-        self._attempt += 1
         asked_s = after_s * self._random.uniform(1.0, _SPREAD)
         wait_s = self._bucket.wait_s(now)
         if is_move:
             kept = _KEPT * self._bucket.burst
             wait_s = max(wait_s, (kept + 1.0 - self._bucket.left) / self._bucket.rate)
-        return max(asked_s + pause_s, wait_s)
+        return max(asked_s + self._own_s(now, last, valid_in_s), wait_s)
+
+    def _own_s(self, now: float, last: Last, valid_in_s: float | None) -> float:
+        s, uniform = self._settings, self._random.uniform
+        if last is Last.UNANSWERED:
+            return uniform(*_UNANSWERED_S)
+        if last is Last.REFUSED:
+            pause_s = uniform(0.5 * s.reconnect_long_max_s, s.reconnect_long_max_s)
+            if valid_in_s is None:
+                return pause_s
+            return min(pause_s, max(0.0, valid_in_s) + uniform(0.0, _CUT_OFF_JITTER_S))
+        if self._failing_since is None and last is Last.ANSWERED:
+            self._failing_since = now
+        failing_s = 0.0 if self._failing_since is None else now - self._failing_since
+        longest_s = min(s.reconnect_long_max_s, _SHARE * failing_s)
+        attempt, self._attempt = self._attempt, self._attempt + 1
+        if longest_s > s.reconnect_max_s:
+            return uniform(0.5 * longest_s, longest_s)
+        return uniform(0.0, min(s.reconnect_max_s, s.reconnect_base_s * 2.0 ** min(attempt, 16)))

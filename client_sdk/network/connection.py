@@ -1,8 +1,9 @@
 """The sockets of a robot: connect, read, write, ping, reconnect, move; `ClientSession` holds the rules.
 
-There is one current socket, a second one during a
-move, and one that stands by for each further address.  Reconnects are delayed (`client_sdk.network.backoff`).
-Commands survive the loss of a socket.
+There is one current socket, a second one during a move, and one that stands by for each further address.
+Reconnects are delayed (`client_sdk.network.pauses`).  Commands survive the loss of a socket.  Nothing is
+final once the robot was connected: while its servers refuse it, commands end with the reason, and it goes on
+trying.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 import asyncio
 import random as random_module
 import ssl
+import time
 from collections.abc import Callable, Coroutine, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +20,7 @@ from websockets.exceptions import ConnectionClosed
 from client_sdk.network.backoff import Backoff
 from client_sdk.network.dialling import CHECK_ADDRESS, CHECK_RUNNING, ISSUE, DialError
 from client_sdk.network.handshake import Dialler, Token
+from client_sdk.network.pauses import Pauses
 from client_sdk.network.region_sockets import Region, RegionSocket, cancel_all, either
 from client_sdk.network.regions import MAX_REGIONS, RegionChoice
 from rse_pf.errors import (
@@ -56,8 +59,8 @@ ForRobot = Answered | Progressed | Updated | SubscriptionEnded
 """What concerns a command or a subscription, and not a connection."""
 
 OnChange = Callable[[str, str], None] | None
-"""Called with ``link-lost`` and a reason, or with ``link-back``, ``moved`` or, for a further region,
-``stands-by`` and the server's name."""
+"""Called with ``link-lost`` or ``refused`` and a reason, or with ``link-back``, ``moved`` or, for a further
+region, ``stands-by`` and the server's name."""
 
 _FIRST_TRIES = 4
 _MIN_TICK_S = 0.001
@@ -67,6 +70,8 @@ _OTHERS_TIMES, _OTHERS_MAX_S = 1.0, 0.7
 _DOUBLE_S = 5.0
 # How long a server that was stopped may take to accept a connection attempt that was given up.
 _LATE_WELCOME_S = 60.0
+# Tokens have whole seconds: one that is signed so much later than a cut-off is issued after it.
+_LATER_SECOND_S = 1.0
 
 
 class Connection:
@@ -81,6 +86,7 @@ class Connection:
         on_answer: Callable[[ForRobot], None],
         clock: Callable[[], float],
         random: random_module.Random,
+        wall_clock: Callable[[], float] = time.time,
         on_change: OnChange = None,
         recorder: RobotRecorder | None = None,
     ) -> None:
@@ -91,13 +97,14 @@ class Connection:
         self.bytes_in = 0
         self.bytes_out = 0
         self.last_error = ""
-        self.fatal: RsePfError | None = None
+        self.refusal: RsePfError | None = None
         self._session = session
         self._settings = session.settings
         self.dialler = Dialler(token, codec=session.codec.name, settings=session.settings)
         self._on_answer = on_answer
         self._on_change = on_change or (lambda what, why: None)
         self._clock = clock
+        self._pauses = Pauses(clock, wall_clock)
         self._sockets: list[RegionSocket] = []
         self._tasks: set[asyncio.Task[Any]] = set()
         self._wake = asyncio.Event()
@@ -125,7 +132,7 @@ class Connection:
         return self._current_region().address
 
     async def open(self, *, may_be_down: bool = False) -> None:
-        """Connect to a server, with a few attempts.
+        """Connect to a server, with a few attempts; a refusal ends this first connect.
 
         Args:
             may_be_down: Return after a first attempt that no server answered, and go on in the background.
@@ -141,15 +148,16 @@ class Connection:
             if best is not None:
                 self._adopt(self._usable()[best])
                 break
-            failed = min(failures, key=lambda each: each.is_final or each.is_wrong_address)
-            if failed.is_final or failed.is_wrong_address:
+            failed = min(failures, key=self._is_hopeless)
+            if self._is_hopeless(failed):
                 raise failed.error from None
             if may_be_down:
                 self._on_change("link-lost", failed.error.message)
                 break
             if attempt == _FIRST_TRIES:
                 raise failed.error from None
-            await asyncio.sleep(self._pause_s(self._regions[0], failed))
+            await asyncio.sleep(self._pauses.pause_s(self._regions[0].backoff, failed))
+        self._pauses.open()
         self._main_tasks = [self._spawn(self._tick()), *map(self._spawn, map(self._keep, self._regions))]
         for socket in self._usable().values():
             if socket.state is not self._session.current:
@@ -158,6 +166,7 @@ class Connection:
     async def close(self) -> None:
         """Close every socket and end every task."""
         self._closed = True
+        self._pauses.close()
         await cancel_all(self._main_tasks)
         await asyncio.gather(*(self._close_socket(socket) for socket in list(self._sockets)))
         await cancel_all(self._tasks)
@@ -189,6 +198,10 @@ class Connection:
         held = (each.region for each in self._sockets if each.state is current)
         return next(held, self._regions[0])
 
+    def _is_hopeless(self, failed: DialError) -> bool:
+        """Return whether further attempts of a first connect are of no use."""
+        return failed.is_wrong_address or self._pauses.is_lasting(failed)
+
     def _usable(self) -> dict[int, RegionSocket]:
         """Return the sockets that may carry the commands, by the number of their region."""
         usable = {region.number: region.usable for region in self._regions}
@@ -210,6 +223,7 @@ class Connection:
             raise
         for region, task in zip(self._regions, joining, strict=True):
             region.joining = task if task in waiting else None
+            region.failed = None if task in waiting else task.result()
         ended = (task.result() for task in joining if task not in waiting)
         lost = DialError(ConnectError(f"{self.region} closed at once", hint=CHECK_RUNNING))
         return [failed for failed in ended if failed is not None] or [lost]
@@ -232,7 +246,7 @@ class Connection:
         region = socket.region
         if not socket.ended.is_set():
             region.socket, region.since = socket, self._clock()
-            region.refused = region.is_double = False
+            region.failed, region.is_double = None, False
             if self._session.current is not None and self._main_tasks:
                 self._on_change("stands-by", socket.state.server)
 
@@ -255,7 +269,7 @@ class Connection:
         """Continue in the best region that stands by, if there is one."""
         usable = self._usable()
         best = self._choice.best(usable)
-        if best is not None and self._main_tasks and self.fatal is None:
+        if best is not None and self._main_tasks:
             self._choice.changed()
             self._reconnected(usable[best])
 
@@ -277,9 +291,9 @@ class Connection:
     async def _keep(self, region: Region) -> None:
         """Reconnect to *region* when there is no socket, and move when a server asks for it."""
         if region.joining is not None:
-            await region.joining
+            region.failed = await region.joining
             self._resume(region)
-        while self.fatal is None and not self._closed:
+        while not self._closed:
             if region.socket is None and not (region.is_double and self._usable()):
                 await self._reconnect(region)
             elif region.move_request is not None:
@@ -290,27 +304,32 @@ class Connection:
                 await region.changed.wait()
 
     async def _reconnect(self, region: Region) -> None:
-        """Connect to *region*, with pauses, until a server sends Welcome.
-
-        The pause counts from the start of the last attempt, so none is added after one that timed out.
-        """
+        """Connect to *region*, with pauses, until a server sends Welcome."""
         if self._clock() - region.since > self._settings.reconnect_max_s:
             region.backoff.restart()
-        failed: DialError | None = None
         began = self._clock()
-        while self.fatal is None:
-            asked_s = 0.0 if failed is None else failed.after_s
-            await asyncio.sleep(max(asked_s, self._pause_s(region, failed) - (self._clock() - began)))
+        while True:
+            failed = region.failed
+            spent_s = self._clock() - began
+            await self._pauses.wait(self._pauses.pause_s(region.backoff, failed, spent_s=spent_s), failed)
             began = self._clock()
-            failed = await self._join(region)
-            if failed is None:
+            region.failed = await self._join(region)
+            if region.failed is None:
                 self._resume(region)
                 return
-            region.refused = failed.is_final
-            if all(each.refused for each in self._regions):
-                self._end(failed.error)
-            elif failed.is_final:
-                failed.after_s = self._settings.reconnect_long_max_s
+            self._note_refusal()
+
+    def _note_refusal(self) -> None:
+        """End the commands with the reason if every region refuses this robot; it goes on trying."""
+        if not all(self._pauses.is_lasting(each.failed) for each in self._regions):
+            return
+        failed = self._regions[0].failed
+        assert failed is not None
+        error, before = failed.error, self.refusal
+        self.refusal, self.last_error = error, error.message
+        self._handle(None, self._session.end_commands(error.code, error.message, error.hint))
+        if before is None or (before.code, before.hint) != (error.code, error.hint):
+            self._on_change("refused", error.message)
 
     def _resume(self, region: Region) -> None:
         """Send the commands to *region* if no other one carries them."""
@@ -343,19 +362,20 @@ class Connection:
                     self._on_change("moved", fresh.state.server)
                     return
                 self._spawn(self._close_socket(fresh))
-            pause_s = min(self._pause_s(region, failed, is_move=True), max(0.0, until - self._clock()))
-            await either(old.ended, pause_s)
+            pause_s = self._pauses.pause_s(region.backoff, failed, is_move=True)
+            await either(old.ended, min(pause_s, max(0.0, until - self._clock())))
 
     # --- one socket ------------------------------------------------------------------------------
 
     async def _dial(self, region: Region) -> RegionSocket:
         """Open a socket through the load balancer and wait for the Welcome; raises DialError."""
-        region.backoff.dialled(self._clock())
         try:
-            websocket, token = await self.dialler.open(region.url)
+            websocket, token = await self.dialler.open(
+                region.url, lambda: region.backoff.dialled(self._clock())
+            )
         except DialError as failed:
             self.last_error = failed.error.message
-            if failed.is_unanswered:
+            if failed.is_late:
                 self._late_welcome_until = self._clock() + _LATE_WELCOME_S
             raise
         socket = RegionSocket(region, websocket, self._session.open_connection(self._clock()))
@@ -395,19 +415,32 @@ class Connection:
                     self._recorder.said(socket.recorded, "down", data)
                 self._receive(socket, data)
         except (ConnectionClosed, OSError):
-            if socket.websocket.close_code == CLOSE_RATE:
+            code = socket.websocket.close_code
+            if code == CLOSE_RATE:
                 self.last_error = "the server closed the connection: this robot exceeds its rate"
-            elif socket.websocket.close_code == CLOSE_REVOKED and not callable(self.dialler.token):
-                self._end(Unauthorized("the token was revoked, or the robot was disabled", hint=ISSUE))
-            is_replaced = socket.websocket.close_code == CLOSE_REPLACED
-            is_double = is_replaced and self._is_double(socket)
-            is_moving = socket.region.move_request is not None
-            by_itself = is_double or is_moving or self._clock() < self._late_welcome_until
-            if is_replaced and self._session.current is socket.state and not by_itself:
-                message = "another connection of this robot replaced this one"
-                self._end(Conflict(message, hint="give every robot a token of its own"))
+            elif socket.region.socket is socket and code == CLOSE_REVOKED:
+                socket.region.failed = self._cut_off()
+            elif socket.region.socket is socket and code == CLOSE_REPLACED:
+                socket.region.failed = self._replaced(socket)
         finally:
             self._forget(socket)
+
+    def _cut_off(self) -> DialError:
+        """Return what a cut-off means: a token of a later second may be accepted, the same one never."""
+        is_fresh = callable(self.dialler.token)
+        valid_from_s = self._pauses.wall_clock() + _LATER_SECOND_S if is_fresh else None
+        error = Unauthorized("the token was revoked, or the robot was disabled", hint=ISSUE)
+        return DialError(error, is_refusal=True, valid_from_s=valid_from_s)
+
+    def _replaced(self, socket: RegionSocket) -> DialError | None:
+        """Return the conflict with another program, None if this robot itself opened the newer connection."""
+        is_double = self._is_double(socket)
+        is_moving = socket.region.move_request is not None
+        by_itself = is_double or is_moving or self._clock() < self._late_welcome_until
+        if by_itself or self._session.current is not socket.state:
+            return None
+        message = "another connection of this robot replaced this one"
+        return DialError(Conflict(message, hint="give every robot a token of its own"), is_refusal=True)
 
     def _is_double(self, socket: RegionSocket) -> bool:
         """Note if two addresses lead to one platform, which keeps the newest connection of a robot only."""
@@ -468,7 +501,7 @@ class Connection:
                 self.last_error = failure.message
                 if not socket.welcome.done():
                     error = UnsupportedProtocol(failure.message, hint=failure.hint)
-                    socket.welcome.set_exception(DialError(error, is_final=failure.code == error.code))
+                    socket.welcome.set_exception(DialError(error, is_refusal=failure.code == error.code))
             case MoveRequested() if socket.state is self._session.current:
                 if socket.region.move_request is None:
                     socket.region.move_request = (socket, self._clock() + event.within_s)
@@ -480,6 +513,7 @@ class Connection:
         now = self._clock()
         if socket.ended.is_set():
             return
+        self.refusal = None
         self.region_changes += self._last_region not in (None, socket.region)
         self._last_region = socket.region
         self._handle(socket, self._session.adopt(socket.state, now))
@@ -526,21 +560,9 @@ class Connection:
                 self._choice.lost(region.number, self._clock())
         if self._session.current is None and not self._closed:
             self._use_standby()
+            self._note_refusal()
         for each in self._regions:
             each.changed.set()
-
-    def _end(self, error: RsePfError) -> None:
-        """Stop reconnecting: every command ends with *error*."""
-        self.fatal = error
-        self.last_error = error.message
-        self._handle(None, self._session.abandon(error.code, error.message, error.hint))
-        self._on_change("ended", error.message)
-        for region in self._regions:
-            region.changed.set()
-
-    def _pause_s(self, region: Region, failed: DialError | None, *, is_move: bool = False) -> float:
-        after_s, is_offline = (0.0, False) if failed is None else (failed.after_s, failed.is_offline)
-        return region.backoff.pause_s(self._clock(), after_s, is_offline=is_offline, is_move=is_move)
 
     def _spawn(self, work: Coroutine[Any, Any, Any]) -> asyncio.Task[Any]:
         task = asyncio.get_running_loop().create_task(work)

@@ -1,19 +1,18 @@
 """What a failed attempt to connect means for the next one, and how an address is shown.
 
 Nothing here opens a socket.  Between a robot and its servers stand firewalls, load balancers and login pages
-that answer with HTTP statuses of their own.  Only a refusal with the mark of our servers ends a robot for
-good; every other one is temporary.
+that answer with HTTP statuses of their own.  Only a refusal with the mark of our servers concerns the robot
+itself: it may last, so the robot is told, and tries again much later.  Nothing ends a robot for good.
 """
 
 from __future__ import annotations
 
 import errno
-import socket
 import ssl
 from urllib.parse import urlsplit
 
 from rse_pf.errors import ConnectError, Forbidden, RsePfError, Unauthorized, UsageError
-from rse_pf.wire.refusal import is_refusal_of_ours
+from rse_pf.wire.refusal import CUT_OFF, Refusal, refusal_in
 
 __all__ = [
     "CHECK_ADDRESS",
@@ -22,6 +21,7 @@ __all__ = [
     "DialError",
     "dial_error_of",
     "shown_address",
+    "unconnected",
     "unreachable",
     "untrusted",
 ]
@@ -35,14 +35,17 @@ ISSUE = (
 _MAX_RETRY_AFTER_S = 300.0
 _TIMES = (9, 10)
 """Of X509_verify_cert_error_string(3): not yet valid, expired."""
-_NOWHERE = (errno.ENETUNREACH, errno.EHOSTUNREACH, errno.ENETDOWN, errno.EHOSTDOWN)
+_ANSWERED = (errno.ECONNREFUSED, errno.ECONNRESET, errno.ECONNABORTED)
+_FOR_ANY_TOKEN = ("disabled", CUT_OFF, "not-yet-valid")
 
 
 class DialError(Exception):
-    """A failed connection attempt: its error, how long to wait, and whether a further attempt is of use.
+    """A failed connection attempt: its error, and what it means for the next one.
 
-    ``is_final`` means that no later attempt can succeed, ``is_wrong_address`` that the URL is probably wrong,
-    ``is_offline`` that nothing left this machine, and ``is_unanswered`` that a server may still accept it.
+    ``is_refusal`` means that a server refused this robot and may do so for long, ``is_wrong_address`` that
+    the URL is probably wrong, ``is_unanswered`` that nobody accepted the TCP connection or nothing left this
+    machine, ``is_late`` that a server may still accept it, and ``valid_from_s`` the Unix time from which
+    tokens are accepted.  ``refuses_any`` means that another token, signed now, would be refused as well.
     """
 
     def __init__(
@@ -51,25 +54,37 @@ class DialError(Exception):
         *,
         after_s: float = 0.0,
         is_wrong_address: bool = False,
-        is_final: bool = False,
-        is_offline: bool = False,
+        is_refusal: bool = False,
         is_unanswered: bool = False,
+        is_late: bool = False,
+        cause: str = "",
+        valid_from_s: float | None = None,
     ) -> None:
         super().__init__(error.message)
         self.error = error
         self.after_s = after_s
         self.is_wrong_address = is_wrong_address
-        self.is_final = is_final
-        self.is_offline = is_offline
+        self.is_refusal = is_refusal
         self.is_unanswered = is_unanswered
+        self.is_late = is_late
+        self.refuses_any = cause in _FOR_ANY_TOKEN
+        self.valid_from_s = valid_from_s
+
+
+def unconnected(address: str, error: OSError) -> DialError:
+    """Return the error of an attempt without a TCP connection to *address*."""
+    is_answered = error.errno in _ANSWERED
+    return DialError(_unreachable(address, error), is_unanswered=not is_answered)
 
 
 def unreachable(address: str, error: Exception) -> DialError:
-    """Return the error of an attempt that got no HTTP answer from *address*."""
+    """Return the error of an attempt that was connected and got no HTTP answer from *address*."""
+    return DialError(_unreachable(address, error), is_late=True)
+
+
+def _unreachable(address: str, error: Exception) -> ConnectError:
     cause = getattr(error, "strerror", None) or str(error) or type(error).__name__
-    is_offline = isinstance(error, socket.gaierror) or getattr(error, "errno", None) in _NOWHERE
-    told = ConnectError(f"cannot connect to {address}: {cause}", hint=CHECK_RUNNING)
-    return DialError(told, is_offline=is_offline, is_unanswered=True)
+    return ConnectError(f"cannot connect to {address}: {cause}", hint=CHECK_RUNNING)
 
 
 def untrusted(address: str, error: ssl.SSLCertVerificationError) -> DialError:
@@ -92,15 +107,19 @@ def dial_error_of(address: str, status: int, retry_after: str, body: bytes = b""
         address: The URL as shown to users.
         status: HTTP status of the handshake.
         retry_after: The header ``Retry-After``, empty if there was none.
-        body: Of the answer; 401 and 403 are final only with the mark of our servers in it.
+        body: Of the answer; 401 and 403 concern this robot only with the mark of our servers in it.
     """
     after_s = float(retry_after) if retry_after.isdecimal() else 0.0
     after_s = min(after_s, _MAX_RETRY_AFTER_S)
     if status in (401, 403):
-        code = Unauthorized.code if status == 401 else Forbidden.code
-        is_ours = is_refusal_of_ours(body, code)
-        return DialError(_refused(address, status, is_ours=is_ours), is_final=is_ours, after_s=after_s)
-    is_client_error = 400 <= status < 500 and status != 429
+        told = refusal_in(body, Unauthorized.code if status == 401 else Forbidden.code)
+        if told is None:
+            return DialError(_not_ours(address, status), after_s=after_s)
+        return DialError(
+            _refused(address, status, told),
+            is_refusal=True, after_s=after_s, cause=told.cause, valid_from_s=told.valid_from_s,
+        )  # fmt: skip
+    is_client_error = 300 <= status < 500 and status != 429
     hint = "check the URL: it ends with the path of the servers, /ws"
     error = ConnectError(
         f"{address} answers {status}", hint=hint if is_client_error else "it is full or not ready; try later"
@@ -108,15 +127,17 @@ def dial_error_of(address: str, status: int, retry_after: str, body: bytes = b""
     return DialError(error, after_s=after_s, is_wrong_address=status in (400, 404))
 
 
-def _refused(address: str, status: int, *, is_ours: bool) -> RsePfError:
-    if not is_ours:
-        hint = "a firewall or a login page between robot and platform answered: ask who runs the network"
-        return ConnectError(
-            f"{address} answers {status}, and it is not an RSE-PF server that says so", hint=hint
-        )
-    if status == 401:
-        return Unauthorized("the token is missing, wrong or expired", hint=ISSUE)
-    return Forbidden(f"{address} forbids this robot to connect", hint="ask the operator")
+def _not_ours(address: str, status: int) -> RsePfError:
+    hint = "a firewall or a login page between robot and platform answered: ask who runs the network"
+    return ConnectError(f"{address} answers {status}, and it is not an RSE-PF server that says so", hint=hint)
+
+
+def _refused(address: str, status: int, told: Refusal) -> RsePfError:
+    if status == 403:
+        return Forbidden(f"{address} forbids this robot to connect", hint="ask the operator")
+    if told.cause:
+        return Unauthorized(told.message, hint=told.hint)
+    return Unauthorized("the token is missing, wrong or expired", hint=ISSUE)
 
 
 def shown_address(url: str) -> str:

@@ -6,9 +6,11 @@ This module and `client_sdk.network.connection` are the only ones that know the 
 from __future__ import annotations
 
 import asyncio
+import socket
 import ssl
 from collections.abc import Awaitable, Callable
 from typing import Any
+from urllib.parse import urlsplit
 
 from websockets.asyncio.client import ClientConnection
 from websockets.asyncio.client import connect as websocket_connect
@@ -20,9 +22,11 @@ from client_sdk.network.dialling import (
     DialError,
     dial_error_of,
     shown_address,
+    unconnected,
     unreachable,
     untrusted,
 )
+from client_sdk.network.tcp import TcpDialler
 from client_sdk.token_text import checked_token
 from rse_pf.config import SessionSettings
 from rse_pf.errors import ConnectError, RsePfError, Unauthorized, UnsupportedProtocol
@@ -32,6 +36,10 @@ __all__ = ["Dialler", "Token", "websocket_options"]
 
 Token = str | Callable[[], Awaitable[str]] | None
 """A robot's token, or an async callable that returns a fresh one for each connect and each renewal."""
+
+
+_ANSWER_S = 1.0
+"""How long a TCP connection may take before another attempt begins."""
 
 
 def websocket_options(settings: SessionSettings) -> dict[str, Any]:
@@ -54,20 +62,25 @@ class Dialler:
         self.ssl_context: ssl.SSLContext | None = None
         self._subprotocol = SUBPROTOCOLS[codec]
         self._settings = settings
+        self._tcp = TcpDialler()
 
-    async def open(self, url: str) -> tuple[ClientConnection, str | None]:
+    async def open(self, url: str, on_answered: Callable[[], None]) -> tuple[ClientConnection, str | None]:
         """Return a WebSocket to *url* and the token that it was opened with; raises DialError.
 
-        A token that is refused is asked for once more, if it comes from a callable.
+        A token that is refused is asked for once more, if it comes from a callable and another one may help.
+
+        Args:
+            url: Of the servers.
+            on_answered: Called for each attempt that reached something: it accepted or refused a connection.
         """
         token = await self.read_token()
         try:
-            return await self._handshake(url, token), token
+            return await self._handshake(url, token, on_answered), token
         except DialError as failed:
-            if not callable(self.token) or not isinstance(failed.error, Unauthorized):
+            if not callable(self.token) or not isinstance(failed.error, Unauthorized) or failed.refuses_any:
                 raise
         token = await self.read_token()
-        return await self._handshake(url, token), token
+        return await self._handshake(url, token, on_answered), token
 
     async def read_token(self) -> str | None:
         """Return the token without white space around it, which files and shells add; raises DialError."""
@@ -89,10 +102,27 @@ class Dialler:
         try:
             return checked_token(token)
         except Unauthorized as error:
-            raise DialError(error, is_final=True) from None
+            raise DialError(error, is_refusal=True) from None
 
-    async def _handshake(self, url: str, token: str | None) -> ClientConnection:
+    async def _connect(self, url: str, on_answered: Callable[[], None]) -> socket.socket:
+        """Return a TCP connection to the host of *url*: what is tried is what dials."""
+        parts, within_s = urlsplit(url), min(_ANSWER_S, self._settings.connect_timeout_s)
+        port = parts.port or (443 if parts.scheme == "wss" else 80)
+        try:
+            made = await self._tcp.connect(parts.hostname or "", port, within_s)
+        except OSError as error:
+            failed = unconnected(shown_address(url), error)
+            if not failed.is_unanswered:
+                on_answered()
+            raise failed from error
+        on_answered()
+        return made
+
+    async def _handshake(
+        self, url: str, token: str | None, on_answered: Callable[[], None]
+    ) -> ClientConnection:
         address, options = shown_address(url), websocket_options(self._settings)
+        options["sock"] = await self._connect(url, on_answered)
         if self.ssl_context is not None and url.startswith("wss:"):
             options["ssl"] = self.ssl_context
         try:
@@ -106,6 +136,11 @@ class Dialler:
             told = error.response
             after = told.headers.get("Retry-After", "")
             raise dial_error_of(address, told.status_code, after, bytes(told.body or b"")) from error
+        except ValueError as error:
+            # The library follows no redirect on a connection that it did not open.
+            if not isinstance(error.__cause__, InvalidStatus):
+                raise
+            raise dial_error_of(address, error.__cause__.response.status_code, "") from error
         except ssl.SSLCertVerificationError as error:
             raise untrusted(address, error) from error
         except (OSError, asyncio.TimeoutError, WebSocketException, EOFError) as error:

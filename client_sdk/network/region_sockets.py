@@ -27,7 +27,9 @@ class Region:
         self.since = 0.0
         self.joining: asyncio.Task[DialError | None] | None = None
         self.move_request: tuple[RegionSocket, float] | None = None
-        self.refused = self.is_double = False
+        self.is_double = False
+        self.failed: DialError | None = None
+        """Why the last attempt failed, or the server ended the socket; None if it may be tried at once."""
         self.changed = asyncio.Event()
 
     @property

@@ -40,8 +40,10 @@ if TYPE_CHECKING:
 __all__ = [
     "Claims",
     "KeySet",
+    "ProvenRefusal",
     "SigningKey",
     "claims_problem",
+    "proven_refusal",
     "renewed_claims",
     "token_problem",
     "unverified_parts",
@@ -82,6 +84,19 @@ class _SignedClaims:
 
     claims: Claims
     starts_s: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ProvenRefusal:
+    """Why a token is refused that was signed with the key of an enrolled robot; the robot may be told so.
+
+    ``off_s`` is how far the token's time is from the server's: ahead of it if it is not yet valid, behind it
+    if it has expired.  ``valid_from_s`` is the Unix time from which tokens are accepted after a cut-off.
+    """
+
+    cause: str
+    off_s: float = 0.0
+    valid_from_s: float | None = None
 
 
 class SigningKey:
@@ -257,7 +272,11 @@ class KeySet:
             return "disabled"
         if (*robot, claims.token_id) in self._revoked:
             return "revoked"
-        return "issued-too-early" if claims.issued_s < self._not_before.get(robot, 0.0) else ""
+        return "issued-too-early" if claims.issued_s < self.valid_from_s(claims.robot) else ""
+
+    def valid_from_s(self, robot: RobotId) -> float:
+        """Return since when tokens of *robot* must have been issued, Unix seconds; 0 without a cut-off."""
+        return self._not_before.get((robot.tenant, robot.name), 0.0)
 
 
 def verify_token(token: str, *, keys: KeySet, now: float, settings: AuthSettings) -> Claims:
@@ -316,8 +335,16 @@ def token_problem(error: Unauthorized) -> str:
     return str(error.__cause__) if isinstance(error.__cause__, _TokenRefused) else "unknown"
 
 
+def proven_refusal(error: Unauthorized) -> ProvenRefusal | None:
+    """Return what the robot may be told of *error*; None for whoever did not prove the key of a robot."""
+    cause = error.__cause__
+    return cause.proven if isinstance(cause, _TokenRefused) else None
+
+
 class _TokenRefused(ValueError):
     """Why a token is refused; one of a fixed set of words."""
+
+    proven: ProvenRefusal | None = None
 
 
 def _checked(token: str, keys: KeySet, now: float, settings: AuthSettings) -> Claims:
@@ -327,18 +354,36 @@ def _checked(token: str, keys: KeySet, now: float, settings: AuthSettings) -> Cl
     remembered = keys.signed(digest)
     signed = remembered or _signed_claims(token, keys, settings)
     verified = signed.claims
-    _check_times(signed, now, settings)
     enrolled = keys.robot_of(verified.key_id)
-    if enrolled is not None:
-        if enrolled.robot != verified.robot.name:
-            raise _TokenRefused("wrong-robot")
-        verified = _as_enrolled(verified, enrolled)
-    denied = keys.denies(verified)
-    if denied:
-        raise _TokenRefused(denied)
+    is_proven = enrolled is not None and enrolled.robot == verified.robot.name
+    try:
+        _check_times(signed, now, settings)
+        if enrolled is not None:
+            if not is_proven:
+                raise _TokenRefused("wrong-robot")
+            verified = _as_enrolled(verified, enrolled)
+        denied = keys.denies(verified)
+        if denied:
+            raise _TokenRefused(denied)
+    except _TokenRefused as refused:
+        if enrolled is not None and is_proven:
+            refused.proven = _proven(str(refused), signed, enrolled, keys, now)
+        raise
     if remembered is None:
         keys.remember(digest, signed, verified.robot)
     return verified
+
+
+def _proven(
+    cause: str, signed: _SignedClaims, enrolled: EnrolledRobot, keys: KeySet, now: float
+) -> ProvenRefusal:
+    claims = signed.claims
+    off_s = max(claims.issued_s, signed.starts_s) - now
+    return ProvenRefusal(
+        cause=cause,
+        off_s=now - claims.expires_s if cause == "expired" else off_s,
+        valid_from_s=keys.valid_from_s(enrolled.id) if cause == "issued-too-early" else None,
+    )
 
 
 def _signed_claims(token: str, keys: KeySet, settings: AuthSettings) -> _SignedClaims:

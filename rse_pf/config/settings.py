@@ -121,7 +121,7 @@ class SessionSettings:
     connect_timeout_s: float = setting(2.0, unit="s", doc="time limit of one attempt to connect", low=0.1)
     reconnect_base_s: float = setting(0.1, unit="s", doc="first reconnect back-off; full jitter", source="AWS Architecture Blog, 2015", low=0.001)
     reconnect_max_s: float = setting(1.0, unit="s", doc="longest reconnect back-off in the first seconds without a connection", low=0.01)
-    reconnect_long_max_s: float = setting(120.0, unit="s", doc="longest reconnect back-off after minutes without a connection", low=0.01)
+    reconnect_long_max_s: float = setting(40.0, unit="s", doc="longest reconnect back-off after minutes without a connection; after a refusal half of it at least", low=0.01)
     dial_burst: int = setting(20, unit="dials", doc="attempts to connect that a robot may make at once; the firewall's limit follows", low=1)
     dials_per_minute: float = setting(10.0, unit="dials/min", doc="attempts to connect of a robot after the burst; the firewall's limit follows", low=1)
     region_hold_s: float = setting(60.0, unit="s", doc="a robot with several addresses changes to another region that has been clearly nearer for this long", low=0.1)

@@ -366,8 +366,12 @@ class ClientSession:
         return events + self._flush(now)
 
     def abandon(self, code: str, message: str, hint: str = "") -> list[Event]:
-        """End every command with a failure, because no further connection will be opened."""
-        events: list[Event] = [*self.subscriptions.abandon(code, message, hint)]
+        """End everything with a failure, because no further connection will be opened."""
+        return [*self.subscriptions.abandon(code, message, hint), *self.end_commands(code, message, hint)]
+
+    def end_commands(self, code: str, message: str, hint: str = "") -> list[Event]:
+        """End every command with a failure; the subscriptions wait for the next connection."""
+        events: list[Event] = []
         for identity, pending in list(self._pending.items()):
             failure = Failure(id=identity, code=code, message=message, hint=hint, trace=pending.command.trace)
             events += self._end(identity, failure)

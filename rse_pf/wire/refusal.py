@@ -1,32 +1,70 @@
 """The HTTP answer of a server that refuses a handshake, and the mark by which a robot knows that it is ours.
 
-Firewalls, load balancers and login pages answer with 401 and 403, too.  A robot that took theirs as final
-would stay away for ever after a minute in which somebody else answered.
+Firewalls, load balancers and login pages answer with 401 and 403, too.  A robot that took theirs for one of
+ours would believe for a while that its token is wrong, when somebody else answered.
 """
 
 from __future__ import annotations
 
 import json
+from dataclasses import dataclass
+from typing import Any
 
-__all__ = ["PLATFORM", "is_refusal_of_ours", "refusal_body"]
+__all__ = ["CUT_OFF", "PLATFORM", "Refusal", "refusal_body", "refusal_in"]
 
 PLATFORM = "rse-pf"
 """Value of the member ``platform`` in the body of each refusal."""
+CUT_OFF = "cut-off"
+"""The cause of a token that was issued before the time from which those of its robot are accepted."""
 _MAX_BODY_BYTES = 4096
+_MAX_TEXT = 300
+_MAX_UNIX_S = 1e11
 
 
-def refusal_body(code: str, message: str, hint: str) -> bytes:
-    """Return the JSON body of a refusal."""
-    told = {"platform": PLATFORM, "code": code, "message": message, "hint": hint}
-    return json.dumps(told, separators=(",", ":")).encode()
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Refusal:
+    """What a server said.
+
+    ``cause`` is empty unless the token was signed with the key of an enrolled robot; ``valid_from_s`` (Unix
+    seconds of the server) is the time from which tokens are accepted after a cut-off.
+    """
+
+    message: str
+    hint: str
+    cause: str = ""
+    valid_from_s: float | None = None
 
 
-def is_refusal_of_ours(body: bytes, code: str) -> bool:
-    """Return whether *body* is the refusal *code* of one of our servers."""
+def refusal_body(code: str, message: str, hint: str, **told: Any) -> bytes:
+    """Return the JSON body of a refusal; *told* are further members, for a robot that proved its key."""
+    body = {"platform": PLATFORM, "code": code, "message": message, "hint": hint, **told}
+    return json.dumps(body, separators=(",", ":")).encode()
+
+
+def refusal_in(body: bytes, code: str) -> Refusal | None:
+    """Return what *body* says if it is the refusal *code* of one of our servers, else None."""
     if len(body) > _MAX_BODY_BYTES:
-        return False
+        return None
     try:
         told = json.loads(body)
     except (ValueError, RecursionError):
-        return False
-    return isinstance(told, dict) and told.get("platform") == PLATFORM and told.get("code") == code
+        return None
+    if not isinstance(told, dict) or told.get("platform") != PLATFORM or told.get("code") != code:
+        return None
+    return Refusal(
+        message=_text(told.get("message")),
+        hint=_text(told.get("hint")),
+        cause=_text(told.get("cause")),
+        valid_from_s=_unix_s(told.get("valid_from_s")),
+    )
+
+
+def _text(value: object) -> str:
+    text = value[:_MAX_TEXT] if isinstance(value, str) else ""
+    return text if text.isprintable() else ""
+
+
+def _unix_s(value: object) -> float | None:
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 <= value < _MAX_UNIX_S:
+        return None
+    return float(value)

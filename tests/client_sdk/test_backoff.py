@@ -9,7 +9,7 @@ from random import Random
 import pytest
 
 from benchmarks.cloud.played_firewall import PlayedFirewall, rules_of_settings
-from client_sdk.network.backoff import Backoff
+from client_sdk.network.backoff import Backoff, Last
 from rse_pf.config import PlatformSettings, SessionSettings
 
 SITE = "203.0.113.7"
@@ -122,7 +122,7 @@ def test_a_server_that_dies_is_dialled_again_within_a_second():
         assert Backoff(SessionSettings(), Random(seed)).pause_s(50.0) <= 0.1
 
 
-def test_the_pauses_grow_to_minutes_and_not_beyond():
+def test_the_pauses_grow_to_a_bound_and_not_beyond():
     session = SessionSettings()
     backoff, now, pauses = Backoff(session, Random(5)), 0.0, []
     while now < 3600.0:
@@ -140,13 +140,58 @@ def test_robots_that_are_told_the_same_time_do_not_come_back_together():
     assert max(pauses) - min(pauses) >= 10.0
 
 
-def test_attempts_that_do_not_leave_the_robot_go_on_every_few_seconds_and_cost_no_allowance():
+def test_attempts_that_nobody_answers_go_on_once_a_second_and_cost_no_allowance():
     backoff, now = Backoff(SessionSettings(), Random(3)), 0.0
+    pauses = []
     for _ in range(200):
-        backoff.dialled(now)
-        pause_s = backoff.pause_s(now, is_offline=True)
-        assert pause_s <= 5.0
-        now += pause_s
-    assert now > 300.0
+        pauses.append(backoff.pause_s(now, last=Last.UNANSWERED))
+        now += pauses[-1]
 
-    assert backoff.pause_s(now, is_offline=True) <= 5.0
+    assert min(pauses) >= 1.0
+    assert 1.2 <= max(pauses) <= 1.25
+
+
+def test_pauses_grow_with_the_time_of_answers_and_not_with_that_of_silence():
+    session = SessionSettings()
+    for seed in range(20):
+        backoff, now = Backoff(session, Random(seed)), 0.0
+        backoff.pause_s(now, last=Last.NONE)
+        while now < 120.0:
+            now += backoff.pause_s(now, last=Last.UNANSWERED)
+
+        assert backoff.pause_s(now) <= session.reconnect_max_s
+
+
+def test_a_robot_that_is_refused_tries_again_every_20_to_40_s_for_ever():
+    backoff, now, pauses = Backoff(SessionSettings(), Random(4)), 0.0, []
+    while now < 7200.0:
+        backoff.dialled(now)
+        pauses.append(backoff.pause_s(now, last=Last.REFUSED))
+        now += pauses[-1]
+
+    assert min(pauses) >= 20.0
+    assert max(pauses) <= 40.0
+    assert max(pauses) - min(pauses) >= 15.0
+
+
+@pytest.mark.parametrize(("valid_in_s", "least_s"), [(-120.0, 0.0), (0.0, 0.0), (0.7, 0.7), (9.0, 9.0)])
+def test_after_a_cut_off_a_robot_is_back_half_a_second_after_its_tokens_are_late_enough(valid_in_s, least_s):
+    for seed in range(50):
+        pause_s = Backoff(SessionSettings(), Random(seed)).pause_s(
+            5.0, last=Last.REFUSED, valid_in_s=valid_in_s
+        )
+
+        assert least_s <= pause_s <= least_s + 0.5
+
+
+def test_a_cut_off_far_away_by_a_wrong_clock_does_not_keep_a_robot_from_trying():
+    assert Backoff(SessionSettings(), Random(1)).pause_s(0.0, last=Last.REFUSED, valid_in_s=1e6) <= 40.0
+
+
+def test_refusals_cost_the_allowance_of_the_firewall_like_every_other_answer():
+    session = SessionSettings()
+    backoff = Backoff(session, Random(1))
+    for _ in range(session.dial_burst):
+        backoff.dialled(0.0)
+
+    assert backoff.pause_s(0.0, last=Last.REFUSED, valid_in_s=0.0) >= 60.0 / session.dials_per_minute

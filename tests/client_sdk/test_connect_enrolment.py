@@ -70,4 +70,4 @@ def test_a_certificate_that_is_not_trusted_is_not_tried_again_at_once(
     assert isinstance(failed.error, ConnectError)
     assert message in failed.error.message
     assert hint in failed.error.hint
-    assert (failed.is_wrong_address, failed.is_final) == (True, False)
+    assert (failed.is_wrong_address, failed.is_refusal) == (True, False)

@@ -7,7 +7,7 @@ import socket
 
 import pytest
 
-from client_sdk.network.dialling import dial_error_of, shown_address, unreachable
+from client_sdk.network.dialling import dial_error_of, shown_address, unconnected, unreachable
 from rse_pf.auth.tokens import KeySet
 from rse_pf.backend.gateway.handshake import HandshakePolicy, Rejected
 from rse_pf.config import PlatformSettings
@@ -18,11 +18,11 @@ REFUSALS = [(401, "unauthorized", Unauthorized), (403, "forbidden", Forbidden)]
 
 
 @pytest.mark.parametrize(("status", "code", "error"), REFUSALS)
-def test_a_refusal_by_one_of_our_servers_is_final(status, code, error):
+def test_a_refusal_by_one_of_our_servers_concerns_the_robot(status, code, error):
     failed = dial_error_of("ws://host/ws", status, "", refusal_body(code, "no", "ask"))
 
     assert isinstance(failed.error, error)
-    assert failed.is_final
+    assert failed.is_refusal
 
 
 @pytest.mark.parametrize("status", [401, 403])
@@ -44,7 +44,7 @@ def test_a_refusal_of_whoever_stands_between_is_temporary(status, body):
     failed = dial_error_of("ws://host/ws", status, "60", body)
 
     assert isinstance(failed.error, ConnectError)
-    assert not failed.is_final
+    assert not failed.is_refusal
     assert not failed.is_wrong_address
     assert failed.after_s == 60.0
     assert "firewall" in failed.error.hint
@@ -68,17 +68,55 @@ def test_every_refusal_of_the_handshake_carries_the_mark():
 
     assert isinstance(refused, Rejected)
     assert isinstance(origin, Rejected)
-    assert dial_error_of("ws://host/ws", refused.status, "", refused.body).is_final
-    assert dial_error_of("ws://host/ws", origin.status, "", origin.body).is_final
+    assert dial_error_of("ws://host/ws", refused.status, "", refused.body).is_refusal
+    assert dial_error_of("ws://host/ws", origin.status, "", origin.body).is_refusal
 
 
-def test_what_does_not_leave_the_robot_is_told_from_what_a_firewall_counts():
-    away = OSError(errno.ENETUNREACH, "Network is unreachable")
+@pytest.mark.parametrize(
+    ("error", "is_unanswered"),
+    [
+        (OSError(errno.ENETUNREACH, "Network is unreachable"), True),
+        (OSError(errno.EHOSTUNREACH, "No route to host"), True),
+        (OSError(errno.ETIMEDOUT, "nobody answers"), True),
+        (socket.gaierror(-2, "Name or service not known"), True),
+        (ConnectionRefusedError(errno.ECONNREFUSED, "refused"), False),
+    ],
+)
+def test_what_reaches_nobody_is_told_from_what_a_firewall_counts(error, is_unanswered):
+    assert unconnected("ws://host/ws", error).is_unanswered is is_unanswered
 
-    assert unreachable("ws://host/ws", away).is_offline
-    assert unreachable("ws://host/ws", socket.gaierror(-2, "Name or service not known")).is_offline
-    assert not unreachable("ws://host/ws", ConnectionRefusedError(errno.ECONNREFUSED, "refused")).is_offline
-    assert not unreachable("ws://host/ws", TimeoutError()).is_offline
+
+def test_a_connection_that_was_accepted_counts_whatever_came_then():
+    assert not unreachable("ws://host/ws", TimeoutError()).is_unanswered
+    assert unreachable("ws://host/ws", TimeoutError()).is_late
+
+
+def test_the_cause_and_the_time_of_a_refusal_reach_the_robot():
+    body = refusal_body(
+        "unauthorized", "tokens issued before noon are revoked", "sign another one",
+        cause="cut-off", valid_from_s=1700000000.0,
+    )  # fmt: skip
+
+    failed = dial_error_of("ws://host/ws", 401, "", body)
+
+    assert (failed.error.message, failed.error.hint) == (
+        "tokens issued before noon are revoked", "sign another one"
+    )  # fmt: skip
+    assert failed.valid_from_s == 1700000000.0
+    assert failed.refuses_any
+
+
+@pytest.mark.parametrize("time", [True, "1700000000", -1, 1e12, float("nan"), None])
+def test_a_time_that_is_none_is_not_believed(time):
+    body = refusal_body("unauthorized", "no", "", cause="cut-off", valid_from_s=time)
+
+    assert dial_error_of("ws://host/ws", 401, "", body).valid_from_s is None
+
+
+def test_a_cause_with_line_breaks_is_not_shown():
+    body = refusal_body("unauthorized", "no\x1b[2J\nroot:", "", cause="disabled")
+
+    assert dial_error_of("ws://host/ws", 401, "", body).error.message == ""
 
 
 @pytest.mark.parametrize(
@@ -89,7 +127,7 @@ def test_other_statuses_allow_another_attempt_and_hint_at_the_cause(status, is_w
     failed = dial_error_of("ws://host/ws", status, "")
 
     assert isinstance(failed.error, ConnectError)
-    assert not failed.is_final
+    assert not failed.is_refusal
     assert failed.is_wrong_address is is_wrong_address
     assert hint in failed.error.hint
 

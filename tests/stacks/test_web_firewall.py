@@ -68,7 +68,7 @@ def test_what_is_blocked_is_told_when_to_come_back_and_never_ends_a_robot(templa
         failed = dial_error_of("ws://host/ws", reply.status, reply.headers["Retry-After"], reply.body)
 
         assert reply.status == 429
-        assert not failed.is_final
+        assert not failed.is_refusal
         assert failed.after_s == 60.0
 
 

@@ -1,6 +1,7 @@
 """Judge a WebSocket handshake: path, capacity, token and sub-protocol, before anything is accepted.
 
-Every rejection has a fixed body; the cause of a rejected token goes to the log only.  What a robot sent and
+Every rejection has a fixed body, and the cause of a rejected token goes to the log only; but a robot whose
+token was signed with its own enrolled key is told why.  What a robot sent and
 the time come in, `Accepted` or `Rejected` goes out.  The head of a request is read here, too: most refusals
 need no WebSocket library then.
 """
@@ -9,19 +10,27 @@ from __future__ import annotations
 
 import math
 import re
+import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from http import HTTPStatus
 
 from rse_pf.auth.origins import ORIGIN_HINT, AllowedOrigins, carried_token
-from rse_pf.auth.tokens import Claims, KeySet, token_problem, verify_token
+from rse_pf.auth.tokens import (
+    Claims,
+    KeySet,
+    ProvenRefusal,
+    proven_refusal,
+    token_problem,
+    verify_token,
+)
 from rse_pf.backend.rosbridge.codec import CODEC as ROSBRIDGE
 from rse_pf.config import PlatformSettings
 from rse_pf.config.resource_names import HEALTH_PATH, ROSBRIDGE_PATH
 from rse_pf.errors import Unauthorized
 from rse_pf.identity import DEFAULT_TENANT, RobotId
 from rse_pf.wire import SUBPROTOCOLS, codec_for
-from rse_pf.wire.refusal import refusal_body
+from rse_pf.wire.refusal import CUT_OFF, refusal_body
 
 __all__ = ["HEALTH", "Accepted", "HandshakePolicy", "Rejected", "RequestHead"]
 
@@ -29,6 +38,7 @@ HEALTH = "health"
 """Result of a request for the health page."""
 
 _RETRY_AFTER_S = 2
+_NO_KEYS = "no-keys"
 _JSON = {"Content-Type": "application/json"}
 _HEAD = re.compile(
     rb"GET ([\x21-\x7e\x80-\xff]+) HTTP/1\.1((?:\r\n[0-9A-Za-z!#$%&'*+.^_`|~-]+:[\t\x20-\x7e\x80-\xff]*)*)"
@@ -133,6 +143,35 @@ def _rejection(status: int, code: str, message: str, hint: str, **headers: str) 
     return _answered(status, code, body, {**_JSON, **{k.replace("_", "-"): v for k, v in headers.items()}})
 
 
+def _told(proven: ProvenRefusal, now_s: float) -> Rejected | None:
+    """Return the answer to a robot that proved its key; None where it is that of any other token."""
+    told: dict[str, float] = {"server_s": round(now_s, 3)}
+    cause = proven.cause
+    if cause == "disabled":
+        message, hint = "this robot is disabled", "the operator allows it again by rse-pf robot enable ROBOT"
+    elif cause == "revoked":
+        message, hint = "this token is revoked", "sign another one"
+    elif cause == "issued-too-early":
+        cause, told["valid_from_s"] = CUT_OFF, proven.valid_from_s or 0.0
+        message = f"tokens issued before {_utc(told['valid_from_s'])} are revoked"
+        message += f", and this one was issued {-proven.off_s:.0f} s before the server's present time"
+        hint = "sign another one; if it is refused, too, the clock of this robot is behind by so much: set it"
+    elif cause == "not-yet-valid":
+        message = f"the clock of this robot is {proven.off_s:.0f} s ahead of the server's"
+        hint = "set the clock of this robot"
+    elif cause == "expired":
+        message = f"the token expired {proven.off_s:.0f} s ago by the server's clock"
+        hint = "sign another one; if it is refused, too, the clock of this robot is behind: set it"
+    else:
+        return None
+    body = refusal_body(Unauthorized.code, message, hint, cause=cause, **told)
+    return _answered(401, Unauthorized.code, body, {**_JSON, "WWW-Authenticate": "Bearer"})
+
+
+def _utc(unix_s: float) -> str:
+    return time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime(unix_s))
+
+
 def _answered(status: int, result: str, body: bytes, headers: Mapping[str, str]) -> Rejected:
     lines = {**headers, "Content-Length": str(len(body)), "Connection": "close"}
     head = "".join(f"{name}: {value}\r\n" for name, value in lines.items())
@@ -230,9 +269,14 @@ class HandshakePolicy:
 
     def with_token(self, accepted: Accepted, token: str, now_s: float) -> Accepted | Rejected:
         """Return *accepted* as the robot that *token* names at *now_s*, Unix s, or the refusal."""
-        claims = self.verified(token, now_s)
-        if isinstance(claims, str):
-            return replace(self._no_token, reason=claims)
+        if self.keys is None:
+            return replace(self._no_token, reason=_NO_KEYS)
+        try:
+            claims = verify_token(token, keys=self.keys, now=now_s, settings=self._settings.auth)
+        except Unauthorized as error:
+            proven = proven_refusal(error)
+            refused = None if proven is None else _told(proven, now_s)
+            return replace(refused or self._no_token, reason=token_problem(error))
         return replace(
             accepted,
             robot=claims.robot,
@@ -249,7 +293,7 @@ class HandshakePolicy:
     def verified(self, token: str, now_s: float) -> Claims | str:
         """Return the claims of *token*, or why it is refused, which goes to the log only."""
         if self.keys is None:
-            return "no-keys"
+            return _NO_KEYS
         try:
             return verify_token(token, keys=self.keys, now=now_s, settings=self._settings.auth)
         except Unauthorized as error:

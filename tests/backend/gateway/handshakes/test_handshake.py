@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from picows import picows
 
+from rse_pf.auth.roster import DenyList, EnrolledRobot, Roster
 from rse_pf.auth.tokens import SigningKey
 from rse_pf.backend.gateway.handshake import HEALTH, Accepted, HandshakePolicy, Rejected, RequestHead
 from rse_pf.config import PlatformSettings
@@ -139,6 +140,97 @@ def test_all_causes_of_a_bad_token_get_the_same_bytes_but_the_log_knows():
 
     assert len({(v.status, v.body, tuple(v.headers.items())) for v in verdicts}) == 1
     assert len({v.reason for v in verdicts}) == 4
+
+
+# --- a robot that proved its key is told why ---------------------------------------------------------
+
+ROBOT_KEY = SigningKey.of_robot(b"r" * 32)
+OTHER_KEY = SigningKey.of_robot(b"o" * 32)
+ENROLLED = EnrolledRobot(robot="robot-1", tenant="lab", x=json.loads(ROBOT_KEY.public_json())["x"])
+UNTOLD = (
+    b"HTTP/1.1 401 Unauthorized\r\nContent-Type: application/json\r\nWWW-Authenticate: Bearer\r\n"
+    b"Content-Length: 138\r\nConnection: close\r\n\r\n"
+    b'{"platform":"rse-pf","code":"unauthorized","message":"the token is missing or not valid",'
+    b'"hint":"issue one with rse-pf token issue ROBOT"}'
+)
+"""What was answered, whatever was wrong, before robots were told why."""
+
+
+def with_deny_list(denied: DenyList) -> HandshakePolicy:
+    keys = KEY.key_set().with_access_control(Roster(robots=(ENROLLED,)), denied)
+    return HandshakePolicy(SETTINGS, keys)
+
+
+def own_token(
+    key: SigningKey = ROBOT_KEY, *, robot: str = "robot-1", now_s: float = NOW_S, token_id: str = "t"
+) -> str:
+    return key.issue(robot, now=now_s, token_id=token_id, settings=SETTINGS.auth, ttl_s=100)
+
+
+NOBODY_DENIED = DenyList()
+CAUSES = {
+    "disabled": (NOBODY_DENIED.with_robot("lab", "robot-1", NOW_S), {}),
+    "revoked": (NOBODY_DENIED.with_token("lab", "robot-1", "t", NOW_S + 100), {}),
+    "cut-off": (NOBODY_DENIED.with_tokens_before("lab", "robot-1", NOW_S + 1), {}),
+    "not-yet-valid": (NOBODY_DENIED, {"now_s": NOW_S + 120}),
+    "expired": (NOBODY_DENIED, {"now_s": NOW_S - 400}),
+}
+
+
+@pytest.mark.parametrize("cause", CAUSES)
+def test_a_robot_that_signed_with_its_enrolled_key_is_told_why_it_is_refused(cause):
+    denied, signed = CAUSES[cause]
+
+    refused = judge(with_deny_list(denied), authorization=f"Bearer {own_token(**signed)}")
+
+    told = json.loads(refused.body)
+    assert (refused.status, told["platform"], told["code"]) == (401, "rse-pf", "unauthorized")
+    assert (told["cause"], told["server_s"]) == (cause, NOW_S)
+    assert told.get("valid_from_s") == (NOW_S + 1 if cause == "cut-off" else None)
+    assert told["message"] != json.loads(UNTOLD.partition(b"\r\n\r\n")[2])["message"]
+    assert told["hint"]
+    assert refused.answer.endswith(refused.body)
+
+
+def test_a_clock_that_is_wrong_is_named_with_its_error():
+    ahead = judge(with_deny_list(NOBODY_DENIED), authorization=f"Bearer {own_token(now_s=NOW_S + 120)}")
+    behind = judge(
+        with_deny_list(CAUSES["cut-off"][0]), authorization=f"Bearer {own_token(now_s=NOW_S - 90)}"
+    )
+
+    assert "clock of this robot is 120 s ahead" in json.loads(ahead.body)["message"]
+    assert "issued 90 s before the server's present time" in json.loads(behind.body)["message"]
+
+
+@pytest.mark.parametrize("cause", CAUSES)
+@pytest.mark.parametrize(
+    "shown",
+    [
+        "nothing", "no token", "a key that nobody enrolled", "the key id of the robot with another signature",
+        "the robot's key with another name", "a cut signature", "the platform's key",
+    ],
+)  # fmt: skip
+def test_strangers_get_the_same_bytes_whatever_the_state_of_the_robot_is(cause, shown):
+    denied, signed = CAUSES[cause]
+    mine = own_token(**signed)
+    head, claims, _ = mine.split(".")
+    forged = f"{head}.{claims}.{own_token(OTHER_KEY, **signed).split('.')[2]}"
+    earlier_s = {"now_s": NOW_S - 1, **signed}["now_s"]
+    lab = KEY.issue("robot-1", now=earlier_s, token_id="t", settings=SETTINGS.auth, ttl_s=100, tenant="lab")
+    authorization = {
+        "nothing": "",
+        "no token": "Bearer x",
+        "a key that nobody enrolled": f"Bearer {own_token(OTHER_KEY, **signed)}",
+        "the key id of the robot with another signature": f"Bearer {forged}",
+        "the robot's key with another name": f"Bearer {own_token(robot='robot-2', **signed)}",
+        "a cut signature": f"Bearer {mine[:-2]}",
+        "the platform's key": f"Bearer {lab}",
+    }[shown]
+
+    refused = judge(with_deny_list(denied), authorization=authorization)
+
+    assert isinstance(refused, Rejected)
+    assert refused.answer == UNTOLD
 
 
 def test_without_keys_robots_are_anonymous_and_never_expire():
