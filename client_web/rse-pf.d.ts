@@ -12,8 +12,11 @@ export interface RobotOptions {
   codec?: "json+zlib" | "json";
   /** Name and version of the program, for the server's log. */
   sdk?: string;
-  /** Called with what happened to the connection, and the server's name or the reason. */
-  onChange?: (what: "link-lost" | "link-back" | "moved" | "ended", why: string) => void;
+  /**
+   * Called with what happened to the connection, and the server's name or the reason. `refused` says why its servers
+   * do not take the robot, which goes on trying; `ended` that it was closed, or that its first connect failed.
+   */
+  onChange?: (what: "link-lost" | "link-back" | "moved" | "refused" | "ended", why: string) => void;
   /** Time until the Welcome; default 4000. */
   connectTimeoutMs?: number;
   /** A connection with an unanswered command on which nothing arrives for so long is lost; default 1000. */
@@ -111,6 +114,8 @@ export interface Robot {
   readonly robot: string;
   /** The error with which the robot ended, or null while it lives. */
   readonly error: RsePfError | null;
+  /** Why its servers refuse the robot now; its calls end so at once, and it goes on trying. Null while they do not. */
+  readonly refusal: RsePfError | null;
   readonly stats: Stats;
   /** Call a service; rejects with an RsePfError. */
   call<Reply = any>(service: string, payload?: unknown, options?: CallOptions): Promise<Answer<Reply>>;

@@ -23,6 +23,7 @@ const SHARE = 0.9;
 const { min, max, random, round } = Math;
 const { from } = Array;
 const now = () => performance.now() / 1e3;
+const unixTime = () => Date.now() / 1e3;
 const pause = (s) => new Promise((done) => setTimeout(done, s * 1e3));
 const nothing = () => {};
 const bytesOf = (data) => new Uint8Array(data);
@@ -43,8 +44,8 @@ const wrong = (...words) => new RsePfError(...words);
 const told = (failure) => wrong(failure.code, failure.message, failure.hint, failure);
 const unreadable = (message) => wrong("protocol", message, "is it an RSE-PF server?");
 const cancelled = () => wrong("cancelled", "the robot took the command back");
-const unauthorized = () =>
-  wrong("unauthorized", "the token is missing, wrong, expired or revoked", "connect with a fresh token");
+const unauthorized = (message = "the token is missing, wrong, expired or revoked", hint = "connect with a fresh token") =>
+  wrong("unauthorized", message, hint);
 
 // --- codecs (section 1) ----------------------------------------------------------------------------------
 
@@ -137,8 +138,8 @@ const isExpired = (token) => {
 const bearer = (token) => (token ? { Authorization: "Bearer " + token } : {});
 
 const BROKEN = ["protocol", "the server says that this client breaks the protocol"];
-/** Close codes after which a robot does not connect again (section 6): code and sentence of its error. */
-const FINAL = {
+/** Close codes after which a robot connects again much later (section 6): code and sentence of its error. */
+const REFUSALS = {
   1002: BROKEN,
   1007: BROKEN,
   1008: BROKEN,
@@ -147,6 +148,15 @@ const FINAL = {
   4406: ["unsupported", "the server speaks another version", "update rse-pf.js"],
   4409: ["conflict", "another connection of this robot replaced this one", "give every robot its own token"],
 };
+
+/** Node's words for an attempt that reached nobody; a browser tells no more than whether it is online. */
+const NOWHERE = /^E(NET|HOST|AI_|NOTF|TIMED)/;
+
+/** Mark an error as the refusal of a server: the robot connects again in 20 to 40 s, or once its tokens are valid. */
+const refused = (failed, validFromS) => Object.assign(failed, { _isRefusal: true, _validFromS: validFromS });
+
+/** Return whether an error is a refusal, and not one that is known to be over soon. */
+const lasts = (failed) => !!failed._isRefusal && !(failed._validFromS - unixTime() <= 2);
 
 /** Connect a robot: resolves at the first Welcome, rejects with an RsePfError; see rse-pf.d.ts. */
 export const connect = async (url, options = {}) => {
@@ -171,7 +181,9 @@ export const connect = async (url, options = {}) => {
   let timer;
   let timerAt = Infinity;
   let attempt = 0;
-  let downAt = 0;
+  let failingAt = Infinity;
+  let trouble = null;
+  let refusal = null;
   let adoptedAt = -Infinity;
   let notBefore = 0;
   let isKeeping = false;
@@ -208,7 +220,7 @@ export const connect = async (url, options = {}) => {
       );
     } catch (failed) {
       // Its message may contain the token.
-      throw finally_(wrong("usage", "no WebSocket for this address and token: " + failed.name, "wss: from https pages"));
+      throw refused(wrong("usage", "no WebSocket for this address and token: " + failed.name, "wss: from https pages"));
     }
     link._socket = socket;
     links.add(link);
@@ -216,7 +228,7 @@ export const connect = async (url, options = {}) => {
     return new Promise((resolve, reject) => {
       const timeout = setTimeout(() => {
         lateUntil = now() + 60;
-        lose(link, unreadable("no Welcome"));
+        lose(link, Object.assign(unreadable("no Welcome"), { _isUnanswered: !socket.readyState }));
       }, connectTimeoutMs);
       link._settle = (failed) => {
         clearTimeout(timeout);
@@ -225,44 +237,59 @@ export const connect = async (url, options = {}) => {
       socket.onopen = () =>
         socket.protocol === protocol
           ? say(link, { type: "hello", sdk, capabilities: ["progress", "updates"] })
-          : lose(link, finally_(unreadable("the server does not speak " + protocol)));
+          : lose(link, refused(unreadable("the server does not speak " + protocol)));
       socket.onmessage = (event) => hear(link, event.data);
       socket.onerror = nothing; // the close event follows
       socket.onclose = (event) => closed(link, event.code);
     });
   };
 
-  /** Mark an error as one after which the robot does not connect again. */
-  const finally_ = (failed) => Object.assign(failed, { _isFinal: true });
-
   const closed = async (link, code) => {
     const isUsed = link === current || !current;
-    // A browser does not say why a handshake failed.
-    if (code === 4401 || code === 4403 || (!link._welcome && (isExpired(link._token) || (await isRefused(link._token))))) {
-      const isSame = code === 4403 || (!isSource() && token === link._token);
-      return lose(link, isUsed && isSame ? finally_(unauthorized()) : unauthorized());
-    }
+    const isStatic = !isSource() && token === link._token;
     if (code === 4429) {
       share = max(0.1, share / 2);
       notBefore = now() + 5;
     }
-    const failed = wrong(...(FINAL[code] || ["connect", "the connection ended with " + code, "is it running, the token valid, the origin allowed?"]));
+    let failed = wrong(...(REFUSALS[code] || ["connect", "the connection ended with " + code, "is it running, the token valid, the origin allowed?"]));
     // An attempt that was given up may still replace the connection that came after it.
     const isOwn = code === 4409 && (moving || now() < lateUntil);
-    lose(link, FINAL[code] && isUsed && !isOwn ? finally_(failed) : failed);
+    if (REFUSALS[code] && isUsed && !isOwn) refused(failed);
+    // Tokens have whole seconds: a fresh one has to be of a later second than the cut-off.
+    else if (code === 4403) failed = refused(unauthorized(), isStatic ? undefined : unixTime() + 1);
+    else if (code === 4401 || (!link._welcome && isExpired(link._token))) failed = isStatic ? refused(unauthorized()) : unauthorized();
+    else if (!link._welcome) failed = await reasonOf(link._token, failed);
+    lose(link, failed);
   };
 
   /** Ask why a handshake failed, where the answer may be read: in Node, and in pages of the same origin. */
-  const isRefused = async (used) => {
+  const reasonOf = async (used, failed) => {
+    const { location, navigator } = globalThis;
     const address = new URL(httpUrl);
+    if (navigator?.onLine === false) failed._isUnanswered = true;
     // A request more for each attempt would double what a firewall counts.
-    if (attempt % 4 !== 1 || (globalThis.location && location.host !== address.host)) return false;
-    try {
-      const answer = await fetch(address, { headers: bearer(used), signal: AbortSignal.timeout(1e3) });
-      return answer.status === 401 && (await answer.json()).platform === "rse-pf";
-    } catch {
-      return false;
+    else if ((attempt % 4 === 1 || refusal) && (!location || location.host === address.host)) {
+      try {
+        const answer = await fetch(address, { headers: bearer(used), signal: AbortSignal.timeout(1e3) });
+        const { platform, cause, message, hint, valid_from_s: validFromS } = await answer.json();
+        if (answer.status === 401 && platform === "rse-pf") return refused(cause ? unauthorized(message, hint) : unauthorized(), validFromS);
+      } catch (problem) {
+        failed._isUnanswered = NOWHERE.test(problem.cause?.code);
+      }
     }
+    return failed;
+  };
+
+  /** Return how long to wait before the next attempt (section 1), from the start of the last one, which took *spent*. */
+  const pauseAfter = (spent) => {
+    const jitter = random();
+    if (!trouble?._isRefusal) {
+      if (trouble?._isUnanswered) return 1 + jitter / 4 - spent;
+      const longest = min(40, (now() - failingAt) / 3);
+      return longest > 1 ? (longest * (1 + jitter)) / 2 - spent : jitter * min(1, 0.1 * 2 ** attempt);
+    }
+    const validIn = trouble._validFromS - unixTime();
+    return min(20 + 20 * jitter, validIn === validIn ? max(0, validIn) + jitter / 2 : 40);
   };
 
   /** Keep one connection: reconnect ever more rarely (section 1), and make before break (section 4, "Moving"). */
@@ -271,29 +298,46 @@ export const connect = async (url, options = {}) => {
     isKeeping = true;
     if (moving || now() - adoptedAt > 10) {
       attempt = 0;
-      downAt = now();
+      failingAt = Infinity;
     }
+    let spent = 0;
     while (!error && (!current || moving === current)) {
-      const longest = min(120, (now() - downAt) / 3);
-      const pauseS = longest > 1 ? longest * (1 + random()) / 2 : random() * min(1, 0.1 * 2 ** attempt);
-      attempt++;
-      await pause(max(0, notBefore - now()) + pauseS);
+      const failed = trouble;
+      const until = now() + max(notBefore - now(), pauseAfter(spent));
+      const offset = unixTime() - now();
+      // Not so long if the clock of this machine is set while tokens are refused, or if there is another token.
+      const isOver = () => error || trouble !== failed || (failed?._isRefusal && Math.abs(unixTime() - now() - offset) > 0.5);
+      while (now() < until && !isOver()) await pause(min(0.25, until - now()));
       if (error) break;
+      attempt++;
+      const began = now();
       if (moving && now() > moveUntil) moving = null;
       else {
         try {
           const link = await dial();
           const isBetter = !current || (current === moving && link._welcome.server !== current._welcome.server);
           isBetter && !error ? adopt(link) : leave(link);
-        } catch (failed) {
-          if (failed._isFinal || (adoptedAt < 0 && attempt >= FIRST_TRIES)) {
-            end(failed instanceof RsePfError ? failed : wrong("connect", "no token: " + failed.name, "correct its function"));
-          }
+        } catch (thrown) {
+          const failed = thrown instanceof RsePfError ? thrown : wrong("connect", "no token: " + thrown.name, "correct its function");
+          if (adoptedAt < 0 && (lasts(failed) || attempt >= FIRST_TRIES)) end(failed);
+          trouble = failed;
+          if (!current && lasts(failed)) refuse(failed);
+          if (!failed._isUnanswered) failingAt = min(failingAt, now());
+          else if (adoptedAt >= 0) attempt--;
         }
+        spent = now() - began;
       }
     }
     moving = null;
     isKeeping = false;
+  };
+
+  /** End the calls with the reason of the servers; the robot goes on trying. */
+  const refuse = (failed) => {
+    const isNews = refusal?.code !== failed.code || refusal.hint !== failed.hint;
+    refusal = failed;
+    for (const each of pending.values()) settle(each, failed);
+    if (isNews && !error) later(onChange, "refused", failed.message);
   };
 
   const adopt = (link) => {
@@ -302,6 +346,7 @@ export const connect = async (url, options = {}) => {
     const isFirst = adoptedAt < 0;
     current = link;
     adoptedAt = now();
+    trouble = refusal = null;
     if (before) {
       before._isLeaving = true;
       counts.moves++;
@@ -332,9 +377,10 @@ export const connect = async (url, options = {}) => {
     link._settle(failed);
     const wasCurrent = link === current;
     if (wasCurrent) current = null;
-    if (failed._isFinal) end(failed);
     if (wasCurrent && !error) {
       later(onChange, "link-lost", failed.message);
+      trouble = failed._isRefusal ? failed : null;
+      if (lasts(failed)) refuse(failed);
       keep();
     }
   };
@@ -446,7 +492,7 @@ export const connect = async (url, options = {}) => {
       link._filledAt = time + (message.retry_after_ms || 0) / 1e3;
     }
     renewal?.(failed);
-    if (!link._welcome) lose(link, message.code === "unsupported" ? finally_(failed) : failed);
+    if (!link._welcome) lose(link, message.code === "unsupported" ? refused(failed) : failed);
   };
 
   /** Send again where another server or a later time may help (section 5); return whether that happens. */
@@ -642,6 +688,9 @@ export const connect = async (url, options = {}) => {
     get error() {
       return error;
     },
+    get refusal() {
+      return refusal;
+    },
     get stats() {
       return { ...counts, unanswered: pending.size, roundTripMs };
     },
@@ -649,7 +698,7 @@ export const connect = async (url, options = {}) => {
     call: (service, payload = null, options = {}) =>
       new Promise((resolve, reject) => {
         const { deadlineMs, stream = "", keep: isKept = false, trace = "", onProgress, signal } = options;
-        if (error || signal?.aborted) throw error || cancelled();
+        if (error || refusal || signal?.aborted) throw error || refusal || cancelled();
         if (deadlineMs != null && !(deadlineMs > 0 && deadlineMs <= MAX_DEADLINE_MS)) {
           throw wrong("usage", `deadlineMs = ${deadlineMs} is not within 0..${MAX_DEADLINE_MS}`);
         }
@@ -698,6 +747,7 @@ export const connect = async (url, options = {}) => {
       new Promise((resolve, reject) => {
         if (!isSource()) token = fresh;
         renewal?.(cancelled());
+        trouble = null;
         if (!current) return resolve();
         const mine = (renewal = (failed) => {
           if (renewal === mine) renewal = null;

@@ -84,11 +84,11 @@ void a_refusal_without_the_mark_of_a_server_is_temporary() {
     using rse_pf::detail::refused;
     for (const unsigned status : {401U, 403U}) {
         const auto firewall = refused("ws://host/ws", status, "60", "<html>Forbidden</html>");
-        expect(!firewall.is_final && firewall.after_s == 60, "a firewall");
-        expect(!refused("ws://host/ws", status, "", R"({"code":"forbidden"})").is_final, "a body without the mark");
-        expect(refused("ws://host/ws", status, "", R"({"platform":"rse-pf","code":"forbidden"})").is_final, "a server");
+        expect(!firewall.is_refusal && firewall.after_s == 60, "a firewall");
+        expect(!refused("ws://host/ws", status, "", R"({"code":"forbidden"})").is_refusal, "a body without the mark");
+        expect(refused("ws://host/ws", status, "", R"({"platform":"rse-pf","code":"forbidden"})").is_refusal, "a server");
     }
-    expect(!refused("ws://host/ws", 429, "60", "").is_final, "too fast");
+    expect(!refused("ws://host/ws", 429, "60", "").is_refusal, "too fast");
     Server server(answer_401(""));
     Options quick = to(server.url());
     quick.first_tries = 3;
@@ -96,7 +96,7 @@ void a_refusal_without_the_mark_of_a_server_is_temporary() {
     expect(server.connections == 3, "tried again");
 }
 
-void a_refusal_keeps_its_code_and_is_final() {
+void a_refusal_keeps_its_code_and_ends_the_first_connect() {
     Server server(refusal);
     Client client(to(server.url()));
     try {
@@ -106,6 +106,15 @@ void a_refusal_keeps_its_code_and_is_final() {
         expect(error.code() == "unauthorized" && error.failure().hint == "ask for a token", error.what());
     }
     expect(server.connections == 1, "tried once");
+}
+
+void a_refusal_names_the_time_from_which_tokens_are_accepted() {
+    using rse_pf::detail::refused;
+    const std::string mark = R"({"platform":"rse-pf","code":"unauthorized","message":"m","hint":"h",)";
+    const auto cut_off = refused("a", 401, "", mark + R"("cause":"cut-off","valid_from_s":1700000000.0})");
+    expect(cut_off.refuses_any && cut_off.valid_from == 1700000000.0 && cut_off.failure.message == "m", "a cut-off");
+    expect(!refused("a", 401, "", mark + R"("cause":"cut-off","valid_from_s":-1})").valid_from, "no time");
+    expect(!refused("a", 401, "", mark + R"("cause":"expired"})").refuses_any, "a later token helps");
 }
 
 void another_program_answers() {
@@ -170,7 +179,8 @@ int main() {
     addresses_are_checked_before_anything_is_opened();
     nobody_listens();
     a_refusal_without_the_mark_of_a_server_is_temporary();
-    a_refusal_keeps_its_code_and_is_final();
+    a_refusal_keeps_its_code_and_ends_the_first_connect();
+    a_refusal_names_the_time_from_which_tokens_are_accepted();
     another_program_answers();
     a_token_source_is_asked_again_after_a_refusal();
     calls_of_many_threads_end_when_the_client_closes();

@@ -15,7 +15,7 @@ REPOSITORY = Path(__file__).resolve().parents[2]
 CLIENT = REPOSITORY / "client_web"
 TOOLS = Path(__file__).resolve().parent / "tools"
 MAX_BYTES = 12_000
-MINIFY = ("--minify", "--mangle-props=^_", "--format=esm", "--target=es2022")
+MINIFY = ("--minify", "--mangle-props=^_", "--format=esm", "--target=es2022", "--tree-shaking=true")
 
 
 def node() -> str:

@@ -27,7 +27,8 @@ class Client {
     Client(const Client&) = delete;
     Client& operator=(const Client&) = delete;
 
-    /// Connect and wait until a server answered; throws Error if none does, or if it refuses. Call it once.
+    /// Connect and wait until a server answered; throws Error if none does, or if it refuses. Call it once. A client that
+    /// was connected once connects again for ever, whatever its servers say; while they refuse it, calls end with the reason.
     void connect() {
         if (core_->started.exchange(true)) throw Error("usage", "connect was called twice", "make another client");
         auto opened = std::make_shared<std::promise<std::optional<Failure>>>();
@@ -83,8 +84,8 @@ class Client {
         auto command = std::make_shared<detail::Command>(detail::Command{id, service, std::move(payload), std::move(options), std::move(on_end)});
         const bool posted = core_->started && post([core = core_, command] {
             auto& connection = *core->connection;
-            if (connection.fatal) {
-                connection.session.refuse(*command, *connection.fatal);
+            if (const Failure* why = connection.reason()) {
+                connection.session.refuse(*command, *why);
                 return;
             }
             connection.session.submit(std::move(*command), detail::now_s());

@@ -184,8 +184,8 @@ async function stream({ robot, input, tally, orders, say }) {
 }
 
 async function ended({ robot, tally }) {
-  while (!robot.error) await pause(20);
-  tally.add(robot.error.code);
+  while (!robot.refusal) await pause(20);
+  tally.add(robot.refusal.code);
 }
 
 async function updates({ robot, map }) {

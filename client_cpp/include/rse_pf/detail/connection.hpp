@@ -20,7 +20,9 @@ namespace rse_pf {
 /// thread of its own, one call at a time; what it throws counts as "no token".
 using TokenSource = std::function<std::string()>;
 
-/// What changed: `connected`, `lost`, `moved` or `ended`, and the server's name or the reason.
+/// What changed: `connected`, `lost`, `moved`, `refused` or `ended`, and the server's name or the reason. A client that
+/// was connected once tries again for ever; `refused` says why its servers do not take it, and `ended` that it was closed
+/// or never connected.
 using OnChange = std::function<void(const std::string& what, const std::string& why)>;
 
 /// Where a client connects, and how.
@@ -31,7 +33,7 @@ struct Options {
     std::string sdk = "rse-pf-cpp/1";  ///< name and version of the program, for the server's log
     std::string ca_file{};         ///< authorities to trust, in PEM; empty: the machine's
     double connect_timeout_s = 2, reconnect_base_s = 0.1, reconnect_max_s = 1;
-    double reconnect_long_max_s = 120;  ///< longest pause after minutes without a connection
+    double reconnect_long_max_s = 40;  ///< longest pause after minutes without a connection; after a refusal half of it at least
     double answer_timeout_s = 5;   ///< deadline of a command that sets none
     int first_tries = 4;           ///< attempts of `Client::connect` before it gives up
     OnChange on_change{};          ///< called on the client's thread
@@ -39,8 +41,8 @@ struct Options {
 
 namespace detail {
 
-/// Return how a close code ends a robot's connections for good; an empty code: connect again.
-inline Failure fatal_of(unsigned code, const std::string& reason) {
+/// Return why a close code refuses a robot for a while; an empty code: connect again at once.
+inline Failure refusal_of(unsigned code, const std::string& reason) {
     const std::string why = reason.empty() ? "" : ": " + reason;
     switch (code) {
         case 4403: return {"unauthorized", "the robot was disabled, or its token revoked" + why, "ask the operator"};
@@ -56,7 +58,7 @@ class Connection : public std::enable_shared_from_this<Connection> {
   public:
     Connection(Options options, SessionTimes times)
         : session(times, options.sdk), options_(std::move(options)), address_(address_of(options_.url)),
-          tls_(tls_context(address_, {options_.ca_file})), token_(options_.token), tick_(io), retry_(io), random_(std::random_device{}()) {
+          tls_(tls_context(address_, {options_.ca_file})), token_(options_.token), tick_(io), retry_(io), resolver_(io), random_(std::random_device{}()) {
         if (address_.target.empty()) address_.target = "/ws";
     }
     ~Connection() {
@@ -65,7 +67,11 @@ class Connection : public std::enable_shared_from_this<Connection> {
 
     asio::io_context io{1};
     Session session;
-    std::optional<Failure> fatal;
+    std::optional<Failure> fatal;    ///< closed, or never connected
+    std::optional<Failure> refusal;  ///< what the servers say now, while they do not take this robot
+
+    /// Return why a command cannot be sent, null if it may wait for a connection.
+    const Failure* reason() const { return fatal ? &*fatal : refusal ? &*refusal : nullptr; }
 
     /// Connect; *on_open* is called once: with nothing, or with why there is no connection.
     void open(std::function<void(std::optional<Failure>)> on_open) {
@@ -92,6 +98,8 @@ class Connection : public std::enable_shared_from_this<Connection> {
             renewing_ = token;
             session.renew(*channel_->link, token, now_s());
             pump();
+        } else if (refusal) {
+            retry_in(0);
         }
     }
 
@@ -102,6 +110,7 @@ class Connection : public std::enable_shared_from_this<Connection> {
         session.abandon(*fatal);
         tick_.cancel();
         retry_.cancel();
+        resolver_.cancel();
         if (dialing_) drop(dialing_);
         const auto old = leaving_;
         for (const auto& each : old) close(each);
@@ -113,17 +122,19 @@ class Connection : public std::enable_shared_from_this<Connection> {
     bool connected() const { return channel_ != nullptr; }
 
   private:
+    /// How long a TCP connection may take: Linux repeats an unanswered attempt after 1, 3 and 7 s only.
+    static constexpr double answer_within_s = 1;
+
     /// One WebSocket.
     struct Channel {
-        Channel(asio::io_context& io, std::shared_ptr<asio::ssl::context> tls) : ws(io, std::move(tls)), resolver(io), timer(io) {}
+        Channel(asio::io_context& io, std::shared_ptr<asio::ssl::context> tls) : ws(io, std::move(tls)), timer(io), lookup_timer(io) {}
         websocket::stream<Transport, false> ws;
-        asio::ip::basic_resolver<tcp, asio::io_context::executor_type> resolver;
-        asio::steady_timer timer;
+        asio::steady_timer timer, lookup_timer;
         beast::flat_buffer buffer;
         websocket::response_type response;
         std::shared_ptr<Link> link;
         std::string sent, token, wrong;
-        bool writing = false, ended = false, closing = false, timed_out = false;
+        bool writing = false, ended = false, closing = false, timed_out = false, connecting = false, accepted = false;
         int bad_messages = 0;
     };
     using ChannelPtr = std::shared_ptr<Channel>;
@@ -148,24 +159,53 @@ class Connection : public std::enable_shared_from_this<Connection> {
         auto channel = std::make_shared<Channel>(io, tls_);
         channel->token = token;
         dialing_ = channel;
+        limit(channel, std::min(answer_within_s, options_.connect_timeout_s));
         const auto self = shared_from_this();
-        channel->timer.expires_after(std::chrono::duration_cast<std::chrono::milliseconds>(std::chrono::duration<double>(options_.connect_timeout_s)));
-        channel->timer.async_wait([self, channel](error_code stopped) {
-            if (stopped || channel->link) return;
-            channel->timed_out = true;
-            channel->resolver.cancel();
-            channel->ws.next_layer().close();
+        if (!std::exchange(looking_, true)) {
+            resolver_.async_resolve(address_.host, address_.port, [self](error_code failed, auto found) { self->looked_up(failed, found); });
+        }
+        if (known_.empty()) return;
+        // A lookup that takes longer goes on, for the next attempt.
+        channel->lookup_timer.expires_after(std::chrono::milliseconds(250));
+        channel->lookup_timer.async_wait([self, channel](error_code stopped) {
+            if (!stopped) self->connect_tcp(channel);
         });
-        channel->resolver.async_resolve(address_.host, address_.port, [self, channel](error_code failed, auto found) {
-            if (self->gone(channel, failed)) return;
-            asio::async_connect(channel->ws.next_layer().socket(), found, [self, channel](error_code unreachable, const tcp::endpoint&) {
-                if (self->gone(channel, unreachable)) return;
-                error_code ignored;
-                channel->ws.next_layer().socket().set_option(tcp::no_delay(true), ignored);
-                channel->ws.next_layer().async_secure(self->address_.host, [self, channel](error_code untrusted) {
-                    if (!self->gone(channel, untrusted)) self->handshake(channel);
-                });
+    }
+
+    void looked_up(error_code failed, const tcp::resolver::results_type& found) {
+        looking_ = false;
+        if (!failed) known_.assign(found.begin(), found.end());
+        if (shut_ || !dialing_ || dialing_->connecting) return;
+        if (!known_.empty()) connect_tcp(dialing_);
+        else gone(dialing_, failed);
+    }
+
+    /// Connect to the known addresses; what is tried is what dials.
+    void connect_tcp(const ChannelPtr& channel) {
+        if (channel != dialing_ || std::exchange(channel->connecting, true)) return;
+        channel->lookup_timer.cancel();
+        const auto self = shared_from_this();
+        asio::async_connect(channel->ws.next_layer().socket(), known_, [self, channel](error_code unreachable, const tcp::endpoint&) {
+            channel->accepted = !unreachable || unreachable == asio::error::connection_refused || unreachable == asio::error::connection_reset;
+            if (self->gone(channel, unreachable)) return;
+            self->limit(channel, self->options_.connect_timeout_s);
+            error_code ignored;
+            channel->ws.next_layer().socket().set_option(tcp::no_delay(true), ignored);
+            channel->ws.next_layer().async_secure(self->address_.host, [self, channel](error_code untrusted) {
+                if (!self->gone(channel, untrusted)) self->handshake(channel);
             });
+        });
+    }
+
+    /// End the attempt unless the next step is taken within *seconds*.
+    void limit(const ChannelPtr& channel, double seconds) {
+        const auto self = shared_from_this();
+        channel->timer.expires_after(std::chrono::duration_cast<std::chrono::milliseconds>(std::chrono::duration<double>(seconds)));
+        channel->timer.async_wait([self, channel](error_code stopped) {
+            if (stopped || channel->link || channel->ended) return;
+            channel->timed_out = true;
+            if (channel->connecting) channel->ws.next_layer().close();
+            else self->gone(channel, asio::error::timed_out);
         });
     }
 
@@ -210,40 +250,69 @@ class Connection : public std::enable_shared_from_this<Connection> {
         const std::string cause = channel->timed_out ? "no answer in time" : cause_of(failed);
         drop(channel);
         const std::string hint = cause == untrusted_certificate ? "name its authority in ca_file, or in the variable SSL_CERT_FILE" : "is the platform running? is the address right?";
-        dial_failed({{"connect", "cannot connect to " + address_.shown() + ": " + cause, hint}});
+        DialFailure failure{{"connect", "cannot connect to " + address_.shown() + ": " + cause, hint}};
+        failure.unanswered = !channel->accepted;
+        // The addresses are tried one after the other: the next attempt begins with another one.
+        if (failure.unanswered && known_.size() > 1) std::rotate(known_.begin(), known_.begin() + 1, known_.end());
+        dial_failed(failure);
         return true;
     }
 
     void dial_failed(DialFailure failed) {
         session.stats.last_error = failed.failure.message;
         if (shut_) return;
-        if (failed.is_final && options_.token_source && failed.failure.code == "unauthorized" && !std::exchange(asked_again_, true)) {
-            failed.is_final = false;
+        if (failed.is_refusal && !failed.refuses_any && options_.token_source && failed.failure.code == "unauthorized" && !std::exchange(asked_again_, true)) {
+            failed.is_refusal = false;
         }
-        ++attempt_;
         const bool first = on_open_ != nullptr;
-        if (failed.is_final || (first && (failed.wrong_address || attempt_ >= options_.first_tries))) {
+        if (!failed.unanswered || first) ++attempt_;
+        if (first && (lasts(failed) || failed.wrong_address || attempt_ >= options_.first_tries)) {
             end(failed.failure);
             return;
         }
         if (channel_ && now_s() >= move_until_) return;
+        if (failed.is_refusal) {
+            refused_now(failed);
+            return;
+        }
+        if (!failed.unanswered && failing_since_ == never) failing_since_ = now_s();
         const double spent = now_s() - dial_began_;
         // Robots that are told the same time to wait do not come back at the same moment.
-        const double asked = failed.after_s * std::uniform_real_distribution<double>(1, 1.25)(random_);
-        retry_in(std::max(asked, pause_s() - spent));
+        const double asked = failed.after_s * uniform(1, 1.25);
+        retry_in(std::max(asked, (failed.unanswered ? uniform(1, 1.25) : pause_s()) - spent));
     }
 
+    /// Return whether *failed* is a refusal, and not one that is known to be over soon.
+    static bool lasts(const DialFailure& failed) {
+        return failed.is_refusal && !(failed.valid_from && *failed.valid_from - wall_s() <= 2);
+    }
+
+    /// Go on later: when a token is late enough after a cut-off, or after 20 to 40 s; until then calls end with the reason.
+    void refused_now(const DialFailure& failed) {
+        double wait = uniform(options_.reconnect_long_max_s / 2, options_.reconnect_long_max_s);
+        if (failed.valid_from) wait = std::min(wait, std::max(0.0, *failed.valid_from - wall_s()) + uniform(0, 0.5));
+        clock_offset_ = wall_s() - now_s();
+        retry_in(std::max(wait, failed.after_s));
+        if (!lasts(failed) || channel_) return;
+        const bool is_news = !refusal || refusal->code != failed.failure.code || refusal->hint != failed.failure.hint;
+        refusal = failed.failure;
+        session.stats.last_error = failed.failure.message;
+        session.end_commands(failed.failure);
+        if (is_news) changed("refused", failed.failure.code + ": " + failed.failure.message);
+    }
+
+    double uniform(double least, double most) { return std::uniform_real_distribution<double>(least, most)(random_); }
+
     double pause_s() {
-        // After the first seconds without a connection, ever more rarely: a firewall counts the attempts of an address.
-        const double longest = std::min(options_.reconnect_long_max_s, (now_s() - down_since_) / 3);
-        if (longest > options_.reconnect_max_s) return std::uniform_real_distribution<double>(longest / 2, longest)(random_);
-        const double most = std::min(options_.reconnect_max_s, options_.reconnect_base_s * std::pow(2.0, std::min(attempt_, 20)));
-        return std::uniform_real_distribution<double>(0, most)(random_);
+        // After the first seconds of failing attempts, ever more rarely: a firewall counts the attempts of an address.
+        const double longest = std::min(options_.reconnect_long_max_s, failing_since_ == never ? 0 : (now_s() - failing_since_) / 3);
+        if (longest > options_.reconnect_max_s) return uniform(longest / 2, longest);
+        return uniform(0, std::min(options_.reconnect_max_s, options_.reconnect_base_s * std::pow(2.0, std::min(attempt_, 20))));
     }
 
     void restart_pauses() {
         attempt_ = 0;
-        down_since_ = now_s();
+        failing_since_ = never;
     }
 
     void retry_in(double seconds) {
@@ -258,6 +327,7 @@ class Connection : public std::enable_shared_from_this<Connection> {
         if (channel != dialing_) return;
         dialing_.reset();
         asked_again_ = false;
+        refusal.reset();
         if (channel_ && channel->link->server == channel_->link->server && now_s() < move_until_) {
             close(channel);  // the server that wants to be left
             ++attempt_;
@@ -346,7 +416,7 @@ class Connection : public std::enable_shared_from_this<Connection> {
     void drop(const ChannelPtr& channel) {
         channel->ended = true;
         channel->timer.cancel();
-        channel->resolver.cancel();
+        channel->lookup_timer.cancel();
         channel->ws.next_layer().close();
         if (channel->link) session.lose(channel->link);
         if (dialing_ == channel) dialing_.reset();
@@ -361,12 +431,18 @@ class Connection : public std::enable_shared_from_this<Connection> {
         if (shut_ || channel->closing) return;
         const auto code = channel->ws.reason().code;
         const std::string reason(channel->ws.reason().reason.data(), channel->ws.reason().reason.size());
-        Failure ends = fatal_of(code, reason);
+        DialFailure ends{refusal_of(code, reason)};
         if (code == 4401 && !options_.token_source && channel->token == token_) {
-            ends = {"unauthorized", "the token has expired", "give a token_source, or call renew in time"};
+            ends.failure = {"unauthorized", "the token has expired", "give a token_source, or call renew in time"};
         }
-        if (!ends.code.empty()) {
-            end(ends);
+        // Tokens have whole seconds: a fresh one has to be of a later second than the cut-off.
+        if (code == 4403 && options_.token_source) ends.valid_from = wall_s() + 1;
+        if (!ends.failure.code.empty() && (was_dialing || was_current)) {
+            ends.is_refusal = ends.refuses_any = true;
+            if (was_current) changed("lost", ends.failure.message);
+            if (was_current && now_s() - adopted_ > 10) restart_pauses();
+            dial_failed(ends);
+            pump();
             return;
         }
         if (was_dialing) {
@@ -404,6 +480,11 @@ class Connection : public std::enable_shared_from_this<Connection> {
         if (shut_) return;
         const double now = now_s();
         session.due(now);
+        // Somebody set the clock of this robot: the next token may be accepted.
+        if (refusal && std::abs(wall_s() - now - clock_offset_) > 0.5) {
+            clock_offset_ = wall_s() - now;
+            retry_in(0);
+        }
         auto all = leaving_;
         if (channel_) all.push_back(channel_);
         if (dialing_ && dialing_->link) all.push_back(dialing_);
@@ -462,14 +543,16 @@ class Connection : public std::enable_shared_from_this<Connection> {
     std::shared_ptr<asio::ssl::context> tls_;
     std::string token_, renewing_, token_error_;
     asio::steady_timer tick_, retry_;
+    asio::ip::basic_resolver<tcp, asio::io_context::executor_type> resolver_;
+    std::vector<tcp::endpoint> known_;
     std::mt19937_64 random_;
     ChannelPtr channel_, dialing_;
     std::vector<ChannelPtr> leaving_;
     std::function<void(std::optional<Failure>)> on_open_;
     std::thread token_thread_;
-    double next_tick_ = 0, dial_began_ = 0, adopted_ = 0, move_until_ = 0, down_since_ = 0;
+    double next_tick_ = 0, dial_began_ = 0, adopted_ = 0, move_until_ = 0, failing_since_ = never, clock_offset_ = 0;
     int attempt_ = 0;
-    bool shut_ = false, token_pending_ = false, asked_again_ = false;
+    bool shut_ = false, token_pending_ = false, asked_again_ = false, looking_ = false;
 };
 
 }  // namespace detail

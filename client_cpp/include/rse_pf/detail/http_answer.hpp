@@ -4,6 +4,7 @@
 #include <algorithm>
 #include <chrono>
 #include <map>
+#include <optional>
 #include <string>
 
 #include <nlohmann/json.hpp>
@@ -15,18 +16,26 @@ namespace rse_pf::detail {
 inline double now_s() {
     return std::chrono::duration<double>(std::chrono::steady_clock::now().time_since_epoch()).count();
 }
+/// Unix seconds, the clock by which a robot signs its tokens; it may be wrong, and be set.
+inline double wall_s() {
+    return std::chrono::duration<double>(std::chrono::system_clock::now().time_since_epoch()).count();
+}
 
 /// Why an attempt to connect failed.
 struct DialFailure {
     Failure failure;
     double after_s = 0;
-    bool is_final = false;       // whatever the robot does with this token
-    bool wrong_address = false;  // final for the first attempt
+    bool is_refusal = false;     // by a server, of this robot; it may last
+    bool wrong_address = false;  // ends the first connect
+    bool unanswered = false;     // nobody accepted the TCP connection
+    bool refuses_any = false;    // another token, signed now, would be refused, too
+    std::optional<double> valid_from{};  // Unix time from which tokens are accepted
 };
 
-/// The strings of a JSON object, without those in objects inside of it; a tree would make programs larger.
+/// The strings and numbers of a JSON object, without those in objects inside of it; a tree would make programs larger.
 struct Strings final : nlohmann::json_sax<nlohmann::json> {
     std::map<std::string, std::string> found;
+    std::map<std::string, double> numbers;
     std::string name;
     int level = 0;
 
@@ -44,9 +53,13 @@ struct Strings final : nlohmann::json_sax<nlohmann::json> {
     bool end_array() override { return --level >= 0; }
     bool null() override { return true; }
     bool boolean(bool) override { return true; }
-    bool number_integer(number_integer_t) override { return true; }
-    bool number_unsigned(number_unsigned_t) override { return true; }
-    bool number_float(number_float_t, const string_t&) override { return true; }
+    bool number_integer(number_integer_t value) override { return number(static_cast<double>(value)); }
+    bool number_unsigned(number_unsigned_t value) override { return number(static_cast<double>(value)); }
+    bool number_float(number_float_t value, const string_t&) override { return number(value); }
+    bool number(double value) {
+        if (level == 1) numbers[name] = value;
+        return true;
+    }
     bool binary(binary_t&) override { return true; }
     bool parse_error(std::size_t, const std::string&, const nlohmann::detail::exception&) override { return false; }
 };
@@ -61,8 +74,12 @@ inline DialFailure refused(const std::string& address, unsigned status, const st
     if (!retry_after.empty() && retry_after.size() < 6 && retry_after.find_first_not_of("0123456789") == std::string::npos) {
         out.after_s = std::min(300.0, std::stod(retry_after));
     }
-    // Firewalls and login pages answer so, too: only the mark of a server ends a robot for good.
-    out.is_final = (status == 401 || status == 403) && field("platform") == "rse-pf";
+    // Firewalls and login pages answer so, too: only what carries the mark of a server concerns this robot.
+    out.is_refusal = (status == 401 || status == 403) && field("platform") == "rse-pf";
+    const std::string cause = field("cause");
+    out.refuses_any = cause == "disabled" || cause == "cut-off" || cause == "not-yet-valid";
+    const auto from = told.numbers.find("valid_from_s");
+    if (from != told.numbers.end() && from->second >= 0 && from->second < 1e11) out.valid_from = from->second;
     out.wrong_address = status == 400 || status == 404 || status == 426 || status == 200;
     if (out.failure.code.empty()) {
         out.failure.code = status == 401 ? "unauthorized" : status == 403 ? "forbidden" : out.wrong_address ? "unsupported" : "connect";

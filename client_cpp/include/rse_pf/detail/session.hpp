@@ -277,13 +277,18 @@ class Session {
 
     /// End everything with *failure*, because no further connection will be opened.
     void abandon(const Failure& failure) {
+        end_commands(failure);
+        auto subscriptions = std::exchange(subscriptions_, {});
+        for (auto& [id, each] : subscriptions) tell(each.on_end, failure);
+    }
+
+    /// End every command with *failure*; the subscriptions wait for the next connection.
+    void end_commands(const Failure& failure) {
         auto pending = std::exchange(pending_, {});
         waiting_.clear();
         for (auto& [id, each] : pending) {
             if (!each.cancelled) finish(each.command, failure);
         }
-        auto subscriptions = std::exchange(subscriptions_, {});
-        for (auto& [id, each] : subscriptions) tell(each.on_end, failure);
     }
 
     /// End *command* with *failure* before it was sent.

@@ -115,9 +115,9 @@ class Driver {
         options.token = variable("RSE_PF_TOKEN");
         options.on_change = [this](const std::string& what, const std::string& why) {
             if (what == "moved") say({{"event", "moved"}, {"server", why}});
-            if (what == "ended") {
+            if (what == "refused") {
                 const std::lock_guard lock(mutex_);
-                ended_ = why;
+                ended_ = why.substr(0, why.find(':'));
                 over_.notify_all();
             }
         };
@@ -341,7 +341,7 @@ void stream(Driver& driver) {
 void ended(Driver& driver) {
     driver.connect();
     const std::string code = driver.ended(60);
-    require(!code.empty(), "the connection did not end");
+    require(!code.empty(), "the robot was not refused");
     driver.tally.count(code);
     wait(0.5);  // a client that connects again would do so now
 }
