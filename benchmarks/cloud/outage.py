@@ -29,7 +29,7 @@ from benchmarks.cloud.local_platform import LocalPlatform
 from benchmarks.cloud.played_firewall import PlayedFirewall, PlayedRule, Reply, rules_of_template
 from rse_pf.errors import Forbidden, RsePfError, Unauthorized
 
-__all__ = ["FrontDoor", "measure"]
+__all__ = ["FrontDoor", "measure", "most_within"]
 
 BAR_S = 30.0
 WAIT_S = 300.0
@@ -47,8 +47,9 @@ UNAVAILABLE = Reply(
 class FrontDoor:
     """A relay to a local platform that plays the firewall, and the load balancer in an outage."""
 
-    def __init__(self, port: int, firewall: PlayedFirewall) -> None:
+    def __init__(self, port: int, firewall: PlayedFirewall, host: str = "127.0.0.1") -> None:
         self.firewall = firewall
+        self._host = host
         self.is_out = False
         self.dials: list[float] = []
         self.answered: Counter[int] = Counter()
@@ -58,9 +59,9 @@ class FrontDoor:
         self.url = ""
 
     async def __aenter__(self) -> FrontDoor:
-        """Listen on a free port of loopback."""
-        self._server = await asyncio.start_server(self._serve, "127.0.0.1", 0, backlog=1024)
-        self.url = f"ws://127.0.0.1:{self._server.sockets[0].getsockname()[1]}/ws"
+        """Listen on a free port."""
+        self._server = await asyncio.start_server(self._serve, self._host, 0, backlog=1024)
+        self.url = f"ws://{self._host}:{self._server.sockets[0].getsockname()[1]}/ws"
         return self
 
     async def __aexit__(self, *_: object) -> None:
@@ -189,7 +190,7 @@ async def drive(
             "all_back_after_s": round(times[-1], 2) if done else None,
             "p50_back_after_s": round(times[len(times) // 2], 2) if times else None,
             "dials_in_outage": sum(each < ended_at for each in dials),
-            "most_dials_in_a_minute": _most_within(dials, 60.0),
+            "most_dials_in_a_minute": most_within(dials, 60.0),
             "limit_of_dials": rules[0].limit,
             "window_s": rules[0].window_s,
             "answers_without_a_server": {str(status): n for status, n in sorted(front.answered.items())},
@@ -213,7 +214,8 @@ async def _end_of(robot: client_sdk.Robot, until: float) -> str:
     return f"not ended: {told}"
 
 
-def _most_within(times: list[float], window_s: float) -> int:
+def most_within(times: list[float], window_s: float) -> int:
+    """Return the most of *times* (s, in order) in one window."""
     return max((sum(begin <= each < begin + window_s for each in times) for begin in times), default=0)
 
 

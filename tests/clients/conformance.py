@@ -43,6 +43,7 @@ def main() -> int:
     parser.add_argument("--only", default="", help="clients, with commas between (default: all)")
     parser.add_argument("--scenarios", default="", help="scenarios, with commas between (default: all)")
     parser.add_argument("--out", type=Path, default=REPOSITORY / "out" / "clients.json")
+    parser.add_argument("--away", type=float, default=20.0, metavar="S", help="of returns/away (default: 20)")
     parser.add_argument("--log", type=Path, help="folder for what the drivers wrote to stderr")
     args = parser.parse_args()
     only = [each for each in args.only.split(",") if each]
@@ -55,7 +56,7 @@ def main() -> int:
     clients = [client for client in CLIENTS if not only or client.name in only]
     rows: list[dict[str, Any]] = []
     try:
-        asyncio.run(run(clients, wanted, args.runs, args.log, rows))
+        asyncio.run(run(clients, wanted, args.runs, args.log, rows, args.away))
     except RsePfError as error:
         print(f"the platform did not start: {error}", file=sys.stderr)
         return 2
@@ -79,7 +80,12 @@ def write(out: Path, runs: int, rows: list[dict[str, Any]]) -> None:
 
 
 async def run(
-    clients: list[Client], wanted: list[str], runs: int, log: Path | None, rows: list[dict[str, Any]]
+    clients: list[Client],
+    wanted: list[str],
+    runs: int,
+    log: Path | None,
+    rows: list[dict[str, Any]],
+    away_s: float,
 ) -> None:
     """Append one row for each client, scenario and run to *rows*."""
     ready: list[tuple[Client, list[str]]] = []
@@ -93,6 +99,7 @@ async def run(
     if not ready:
         return
     async with platform() as bench:
+        bench.away_s = away_s
         for number in range(1, runs + 1):
             for client, claimed in ready:
                 for name in wanted:
@@ -124,8 +131,12 @@ async def one(bench: Bench, client: Client, name: str, number: int, log: Path | 
             async with bench.link() as link:
                 robot = f"{client.name}-{name.replace('/', '-')}-{number}-{os.urandom(2).hex()}"
                 env = bench.environment(robot, link, scenario, client.starts_s)
+                if scenario.driven == "returns":
+                    await asyncio.wait_for(bench.until_enrolled(), PATIENCE_S)
                 async with Driver(client.command, scenario.driven, env, errors) as driver:
-                    figures = await asyncio.wait_for(scenario.run(bench, driver, link, robot), PATIENCE_S)
+                    figures = await asyncio.wait_for(
+                        scenario.run(bench, driver, link, robot), PATIENCE_S + bench.away_s
+                    )
             made = row(client, name, number, True, figures=figures)
         except Missed as missed:
             made = row(client, name, number, False, why=str(missed))

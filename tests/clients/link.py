@@ -113,6 +113,18 @@ class Link:
         await asyncio.sleep(seconds)
         self._flows.set()
 
+    def drop(self) -> None:
+        """End every connection, as a load balancer that dies does."""
+        for task in list(self._tasks):
+            task.cancel()
+
+    async def away(self, seconds: float) -> None:
+        """End every connection, and refuse each new one for so long."""
+        self._server.close()
+        self.drop()
+        await asyncio.sleep(seconds)
+        self._server = await asyncio.start_server(self._serve, "127.0.0.1", self.port)
+
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         self.connections += 1
         task = asyncio.current_task()

@@ -6,6 +6,10 @@ import asyncio
 import hashlib
 import json
 import math
+import os
+import shutil
+import struct
+import subprocess
 import time
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
@@ -18,7 +22,10 @@ from undecodable import as_input
 
 import client_sdk
 from rse_pf.auth.control_token import bearer, read_control_token
+from rse_pf.auth.roster import EnrolledRobot
+from rse_pf.auth.tokens import SigningKey
 from rse_pf.auth.trust_store import AccessControlStore
+from rse_pf.errors import Unauthorized
 from rse_pf.local.control.platform import LocalPlatform
 from rse_pf.object_store import DirectoryStore
 
@@ -39,6 +46,12 @@ LEAST_KINDS = 40
 """Of commands that cannot be decoded."""
 STREAM_PER_S = 10
 GOES_ON_S = 30.0
+CUT_OFF_BACK_S, BACK_S = 5.0, 45.0
+"""When a robot is back after a cut-off or once its clock is right, and after all else."""
+CLOCK_S = 120.0
+ENROLLED_TIMES = 6
+"""So often in a row accepted: the load balancer asks both servers."""
+SHIFT_SOURCE = Path(__file__).parent / "clock_shift.c"
 
 
 class Bench:
@@ -50,6 +63,10 @@ class Bench:
         self._inputs = folder / "input.json"
         self._has_map = False
         self.token_ends_s = 0.0
+        self.away_s = 20.0
+        self._own_key: dict[str, str] = {}
+        self._access = AccessControlStore(DirectoryStore(folder / "p"))
+        self._clock, self._shift = folder / "clock", folder / "clock_shift.so"
 
     def link(self) -> Link:
         """Return a network to the load balancer."""
@@ -76,13 +93,61 @@ class Bench:
             "long": {"service": "optimise", "payload": {"g2o": ring(robot)}},
             "undecodable": as_input(),
         }
+        shifted = {}
+        if scenario.driven == "returns":
+            given["own_key"] = self.enrol(robot)
+            shifted = self.shifted_clock()
         self._inputs.write_text(json.dumps(given), encoding="utf-8")
         return {
             "RSE_PF_URL": f"ws://127.0.0.1:{link.port}/ws",
             "RSE_PF_TOKEN": self.token(robot, life_s),
             "RSE_PF_INPUT": str(self._inputs), "RSE_PF_SECONDS": str(BUSY_S), "RSE_PF_MAP": LIVE_MAP,
-            "RSE_PF_DATA_URL": f"http://127.0.0.1:{self.cloud.port}", "RSE_PF_ORIGIN": self.origin,
+            "RSE_PF_DATA_URL": f"http://127.0.0.1:{self.cloud.port}", "RSE_PF_ORIGIN": self.origin, **shifted,
         }  # fmt: skip
+
+    def enrol(self, robot: str) -> dict[str, str]:
+        """Enrol *robot* with a key of its own; return the key and the claims that its tokens have."""
+        auth, key = self.cloud.settings.auth, SigningKey.of_robot(os.urandom(32))
+        private = json.loads(key.to_json())
+        enrolled = EnrolledRobot(robot=robot, x=private["x"])
+        self._access.change_roster(lambda roster: roster.enrolled(enrolled))
+        self._own_key = {**private, "sub": robot, "iss": auth.issuer, "aud": auth.audience}
+        return self._own_key
+
+    async def until_enrolled(self) -> None:
+        """Wait until every server knows the robot that was enrolled last."""
+        own, accepted = self._own_key, 0
+        key, auth = SigningKey.from_json(json.dumps(own)), self.cloud.settings.auth
+        while accepted < ENROLLED_TIMES:
+            token = key.issue(own["sub"], now=time.time(), token_id=os.urandom(8).hex(), settings=auth)
+            try:
+                async with client_sdk.connect(self.cloud.url, token=token):
+                    accepted += 1
+            except Unauthorized:
+                accepted = 0
+                await asyncio.sleep(0.1)  # polls, with the deadline of the scenario
+
+    def shifted_clock(self) -> dict[str, str]:
+        """Return the environment of a program whose wall clock `set_clock` sets; raises Missed."""
+        compiler = shutil.which("cc")
+        if compiler is None:
+            raise Missed("no C compiler: sudo apt-get install gcc")
+        if not self._shift.exists():
+            words = [compiler, "-shared", "-fPIC", "-o", str(self._shift), str(SHIFT_SOURCE), "-ldl"]
+            subprocess.run(words, check=True, timeout=60)
+        self._clock.write_bytes(struct.pack("d", 0.0))
+        return {"LD_PRELOAD": str(self._shift), "RSE_PF_CLOCK": str(self._clock)}
+
+    def set_clock(self, shift_s: float) -> None:
+        """Set the clock of the driver to *shift_s* ahead of this machine's."""
+        with self._clock.open("r+b") as file:
+            file.write(struct.pack("d", shift_s))
+
+    def cut_off(self, robot: str) -> float:
+        """Revoke the tokens of *robot* as ``token revoke --all-of``; return from when later ones are valid."""
+        from_s = float(int(time.time()) + 1)
+        self._access.change_deny_list(lambda denied: denied.with_tokens_before("default", robot, from_s))
+        return from_s
 
     async def restore(self) -> None:
         """Have two servers that take robots again."""
@@ -114,8 +179,11 @@ class Bench:
 
     def revoke(self, robot: str) -> None:
         """Deny the robot, as rse-pf robot disable does."""
-        access = AccessControlStore(DirectoryStore(self._folder / "p"))
-        access.change_deny_list(lambda denied: denied.with_robot("default", robot, time.time()))
+        self._access.change_deny_list(lambda denied: denied.with_robot("default", robot, time.time()))
+
+    def enable(self, robot: str) -> None:
+        """Allow the robot again."""
+        self._access.change_deny_list(lambda denied: denied.without_robot("default", robot))
 
     async def live_map(self) -> None:
         """Start the live map that clients subscribe to, once."""
@@ -365,6 +433,69 @@ async def revoked(bench: Bench, driver: Driver, link: Link, robot: str) -> dict[
     must(bool(ends & set(figures["codes"])), f"codes {figures['codes']}")
     must(link.connections == 1, f"{link.connections} connections")
     return {**figures, "connections": link.connections}
+
+
+async def is_back(driver: Driver, from_s: float, within_s: float) -> dict[str, Any]:
+    """Wait for answers on another connection; return how long after *from_s*, monotonic, they came."""
+    await driver.until(lambda event: event.get("event") == "back", "connected again", within_s + 5.0)
+    back_s = time.monotonic() - from_s
+    await driver.until_answered(driver.answered + 3, "answers", 5)
+    must(back_s <= within_s, f"back after {back_s:.1f} s")
+    driver.say(do="stop")
+    return {**figures_of(await driver.done()), "back_s": round(back_s, 2)}
+
+
+async def is_refused(driver: Driver, word: str) -> None:
+    """Wait until it was told that it is refused, by a reason with *word*."""
+    event = await driver.until(lambda event: event.get("event") == "refused", "the reason of a refusal", 15)
+    must(word in event["why"], f"told {event['why']!r}")
+
+
+@scenario("returns/cut-off", "it signs its tokens and those until now are revoked: back within 5 s")
+async def cut_off(bench: Bench, driver: Driver, link: Link, robot: str) -> dict[str, Any]:
+    await driver.ready()
+    await driver.until_answered(3, "answers", 15)
+    await asyncio.sleep(os.urandom(1)[0] / 256)  # at any moment of a second
+    valid_s = bench.cut_off(robot)
+    return await is_back(driver, time.monotonic() + max(0.0, valid_s - time.time()), CUT_OFF_BACK_S)
+
+
+@scenario("returns/disabled", "disabled and told so, and enabled again: back within 45 s")
+async def disabled(bench: Bench, driver: Driver, link: Link, robot: str) -> dict[str, Any]:
+    await driver.ready()
+    bench.revoke(robot)
+    await is_refused(driver, "this robot is disabled")
+    bench.enable(robot)
+    return await is_back(driver, time.monotonic(), BACK_S)
+
+
+@scenario("returns/clock-ahead", "its clock is 120 s ahead: told so, and back within 5 s once it is set")
+async def clock_ahead(bench: Bench, driver: Driver, link: Link, robot: str) -> dict[str, Any]:
+    await driver.ready()
+    bench.set_clock(CLOCK_S)
+    link.drop()
+    await is_refused(driver, "ahead of the server")
+    bench.set_clock(0.0)
+    return await is_back(driver, time.monotonic(), CUT_OFF_BACK_S)
+
+
+@scenario(
+    "returns/clock-behind", "its clock is 120 s behind a cut-off: told so, and back within 5 s once it is set"
+)
+async def clock_behind(bench: Bench, driver: Driver, link: Link, robot: str) -> dict[str, Any]:
+    await driver.ready()
+    bench.set_clock(-CLOCK_S)
+    bench.cut_off(robot)
+    await is_refused(driver, "before the server's present time")
+    bench.set_clock(0.0)
+    return await is_back(driver, time.monotonic(), CUT_OFF_BACK_S)
+
+
+@scenario("returns/away", "the platform is away for a while: back within 45 s")
+async def away(bench: Bench, driver: Driver, link: Link, robot: str) -> dict[str, Any]:
+    await driver.ready()
+    await link.away(bench.away_s)
+    return await is_back(driver, time.monotonic(), BACK_S)
 
 
 @scenario("updates", "a subscription to a live map has its first update")

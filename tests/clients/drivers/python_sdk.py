@@ -17,12 +17,14 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[3]))
 
 from client_sdk import DataClient, connect
+from rse_pf.auth.tokens import SigningKey
+from rse_pf.config import AuthSettings
 from rse_pf.errors import RsePfError
 from rse_pf.wire import SUBPROTOCOLS, make_codec
 
 CLAIMS = [
     "golden", "pnp", "typed-error", "undecodable", "busy", "deadline", "newest", "stream", "renew",
-    "expired", "revoked", "updates", "progress", "data",
+    "expired", "revoked", "updates", "progress", "data", "returns",
 ]  # fmt: skip
 PER_S = 10.0
 LATE_S = 30.0
@@ -36,20 +38,32 @@ def say(**event: Any) -> None:
 class Run:
     """A robot, what it counted, and the token that it shows next."""
 
-    def __init__(self, *, is_renewed: bool) -> None:
+    def __init__(self, *, is_renewed: bool, is_own: bool) -> None:
         self.given = json.loads(Path(os.environ["RSE_PF_INPUT"]).read_text(encoding="utf-8"))
         self.token = os.environ["RSE_PF_TOKEN"]
         self.sent = self.answered = 0
         self.codes: dict[str, int] = {}
         self.times: list[float] = []
-        self.robot = connect(
-            os.environ["RSE_PF_URL"], token=self.fresh if is_renewed else self.token, on_change=self.changed
-        )
+        token = self.signed if is_own else self.fresh if is_renewed else self.token
+        self.robot = connect(os.environ["RSE_PF_URL"], token=token, on_change=self.changed)
 
     async def fresh(self) -> str:
         return self.token
 
+    async def signed(self) -> str:
+        """Return a token of the robot's own key."""
+        own = self.given["own_key"]
+        key, auth = (
+            SigningKey.from_json(json.dumps(own)),
+            AuthSettings(issuer=own["iss"], audience=own["aud"]),
+        )
+        return key.issue(own["sub"], now=time.time(), token_id=os.urandom(8).hex(), settings=auth)
+
     def changed(self, what: str, why: str) -> None:
+        if what == "link-back":
+            say(event="back")
+        if what == "refused":
+            say(event="refused", why=why)
         if what == "moved":
             say(event="moved", server=why)
 
@@ -186,6 +200,18 @@ async def ended(run: Run) -> None:
         await asyncio.sleep(0.1)
 
 
+async def returns(run: Run) -> None:
+    """Call until told to stop; a call may end with the reason of a refusal, or expire."""
+    lines = asyncio.StreamReader()
+    await asyncio.get_running_loop().connect_read_pipe(lambda: asyncio.StreamReaderProtocol(lines), sys.stdin)
+    stopped = asyncio.ensure_future(lines.readline())
+    while not stopped.done():
+        found = await run.ask("echo", {"value": 1}, deadline_s=1.0)
+        if not isinstance(found, RsePfError):
+            say(event="count", answered=run.codes["ok"])
+        await asyncio.sleep(1 / PER_S)
+
+
 async def updates(run: Run) -> None:
     async for _ in run.robot.subscribe(f"live/{os.environ['RSE_PF_MAP']}"):
         run.sent = run.answered = 1
@@ -217,12 +243,12 @@ async def data(run: Run) -> None:
 SCENARIOS = {
     "golden": golden, "pnp": pnp, "typed-error": typed_error, "undecodable": undecodable, "busy": busy,
     "deadline": deadline, "newest": newest, "stream": stream, "renew": stream, "expired": ended,
-    "revoked": ended, "updates": updates, "progress": progress, "data": data,
+    "revoked": ended, "returns": returns, "updates": updates, "progress": progress, "data": data,
 }  # fmt: skip
 
 
 async def main(name: str) -> None:
-    run = Run(is_renewed=name == "renew")
+    run = Run(is_renewed=name == "renew", is_own=name == "returns")
     async with run.robot:
         say(event="ready")
         found = await SCENARIOS[name](run)

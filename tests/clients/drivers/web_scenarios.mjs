@@ -188,6 +188,18 @@ async function ended({ robot, tally }) {
   tally.add(robot.refusal.code);
 }
 
+/** Call until told to stop; a call may end with the reason of a refusal, or expire. */
+async function returns({ robot, tally, orders, say }) {
+  let goesOn = true;
+  const listening = orders.next().then(() => (goesOn = false));
+  while (goesOn) {
+    const answer = await tally.call(robot, { service: "echo", payload: { value: 1 } }, { deadlineMs: 1000 });
+    if (answer.reply) say({ event: "count", answered: tally.codes.ok });
+    await pause(1000 / STREAM_PER_S);
+  }
+  await listening;
+}
+
 async function updates({ robot, map }) {
   const key = await new Promise((resolve, reject) => robot.subscribe(`live/${map}`, resolve, reject));
   return { key };
@@ -235,6 +247,7 @@ const RUNS = {
 
 export const claims = Object.keys(RUNS);
 RUNS["round-trips"] = roundTrips;
+RUNS.returns = returns; // claimed by what can sign tokens of the robot's own key
 
 /** Run *scenario*; `say` gets its events, the last one is `done` or `error`.  Returns the exit code. */
 export async function run(scenario, { module, url, token, codec, tokenIn, dataUrl, say, ...rest }) {
@@ -249,6 +262,8 @@ export async function run(scenario, { module, url, token, codec, tokenIn, dataUr
     if (scenario !== "golden") {
       const onChange = (what, server) => {
         if (what === "moved" || what === "link-back") say({ event: "moved", server });
+        if (what === "link-back") say({ event: "back" });
+        if (what === "refused") say({ event: "refused", why: server });
       };
       if (scenario === "undecodable") replacing(module.codecs, () => raw.bytes);
       robot = await module.connect(url, { token, codec, tokenIn, dataUrl, onChange });

@@ -15,6 +15,8 @@
 #include <thread>
 #include <vector>
 
+#include <openssl/evp.h>
+
 #include <rse_pf/rse_pf.hpp>
 
 namespace {
@@ -44,6 +46,53 @@ void wait(double seconds) { std::this_thread::sleep_for(std::chrono::duration<do
 json read_json(const std::string& path) {
     std::ifstream file(path);
     return json::parse(file);
+}
+
+std::string base64url(const std::string& bytes) {
+    const char* digits = "ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789-_";
+    std::string out;
+    for (std::size_t i = 0; i < bytes.size(); i += 3) {
+        const auto byte = [&](std::size_t at) { return at < bytes.size() ? static_cast<unsigned char>(bytes[at]) : 0U; };
+        const unsigned three = byte(i) << 16 | byte(i + 1) << 8 | byte(i + 2);
+        for (int k = 0; k < 4; ++k) out += digits[three >> (18 - 6 * k) & 63];
+    }
+    out.resize((bytes.size() * 4 + 2) / 3);
+    return out;
+}
+
+std::string from_base64url(const std::string& text) {
+    const std::string digits = "ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789-_";
+    std::string out;
+    unsigned held = 0;
+    int bits = 0;
+    for (const char c : text) {
+        held = held << 6 | static_cast<unsigned>(digits.find(c));
+        bits += 6;
+        if (bits >= 8) out += static_cast<char>(held >> (bits -= 8) & 255);
+    }
+    return out;
+}
+
+/// Return a token of the robot's own key.
+std::string signed_token(const json& own) {
+    static std::atomic<unsigned> number{0};
+    const auto now = std::chrono::duration_cast<std::chrono::seconds>(std::chrono::system_clock::now().time_since_epoch()).count();
+    const json head = {{"alg", "EdDSA"}, {"typ", "robot+jwt"}, {"kid", own["kid"]}};
+    const json claims = {{"iss", own["iss"]}, {"aud", own["aud"]}, {"sub", own["sub"]}, {"iat", now}, {"exp", now + 900},
+                         {"jti", "cpp-" + std::to_string(now) + "-" + std::to_string(++number)}};
+    const std::string text = base64url(head.dump()) + "." + base64url(claims.dump()), seed = from_base64url(own["d"]);
+    const auto* bytes = reinterpret_cast<const unsigned char*>(seed.data());
+    EVP_PKEY* key = EVP_PKEY_new_raw_private_key(EVP_PKEY_ED25519, nullptr, bytes, seed.size());
+    EVP_MD_CTX* context = EVP_MD_CTX_new();
+    std::size_t size = 64;
+    std::string signature(size, '\0');
+    const bool is_signed = EVP_DigestSignInit(context, nullptr, nullptr, nullptr, key) == 1 &&
+        EVP_DigestSign(context, reinterpret_cast<unsigned char*>(signature.data()), &size,
+                       reinterpret_cast<const unsigned char*>(text.data()), text.size()) == 1;
+    EVP_MD_CTX_free(context);
+    EVP_PKEY_free(key);
+    require(is_signed, "the token could not be signed");
+    return text + "." + base64url(signature);
 }
 
 /// Counts what was sent and answered; callbacks run on the client's thread.
@@ -109,21 +158,24 @@ class Tally {
 
 class Driver {
   public:
-    Driver() {
+    explicit Driver(bool signs_itself) {
+        const std::string path = variable("RSE_PF_INPUT");
+        if (!path.empty()) input = read_json(path);
         rse_pf::Options options;
         options.url = variable("RSE_PF_URL");
-        options.token = variable("RSE_PF_TOKEN");
+        if (signs_itself) options.token_source = [own = input["own_key"]] { return signed_token(own); };
+        else options.token = variable("RSE_PF_TOKEN");
         options.on_change = [this](const std::string& what, const std::string& why) {
             if (what == "moved") say({{"event", "moved"}, {"server", why}});
+            if (what == "connected" && was_connected_.exchange(true)) say({{"event", "back"}});
             if (what == "refused") {
+                say({{"event", "refused"}, {"why", why}});
                 const std::lock_guard lock(mutex_);
                 ended_ = why.substr(0, why.find(':'));
                 over_.notify_all();
             }
         };
         client = std::make_unique<rse_pf::Client>(options);
-        const std::string path = variable("RSE_PF_INPUT");
-        if (!path.empty()) input = read_json(path);
         for (auto& command : input["commands"]) command["payload"] = with_arrays(command["payload"]);
     }
     void connect() {
@@ -154,6 +206,7 @@ class Driver {
     std::mutex mutex_;
     std::condition_variable over_;
     std::string ended_;
+    std::atomic<bool> was_connected_{false};
 
   public:
     std::unique_ptr<rse_pf::Client> client;  // the last member: it ends first, and its callbacks with it
@@ -338,6 +391,26 @@ void stream(Driver& driver) {
     driver.tally.all_ended(20);
 }
 
+/// Call until told to stop; a call may end with the reason of a refusal, or expire.
+void returns(Driver& driver) {
+    driver.connect();
+    std::atomic<bool> stopped{false};
+    std::thread orders([&] {
+        std::string line;
+        std::getline(std::cin, line);
+        stopped = true;
+    });
+    std::size_t answered = 0;
+    rse_pf::CallOptions options;
+    options.deadline_s = 1;
+    for (std::size_t n = 0; !stopped; ++n) {
+        driver.client->call("echo", {{"value", 1}}, options, driver.tally.next());
+        if (driver.tally.outcome(n).ok()) say({{"event", "count"}, {"answered", ++answered}});
+        wait(0.1);
+    }
+    orders.join();
+}
+
 void ended(Driver& driver) {
     driver.connect();
     const std::string code = driver.ended(60);
@@ -392,7 +465,7 @@ int main(int argc, char** argv) {
         {"golden", golden}, {"pnp", pnp}, {"typed-error", typed_error},
         {"undecodable", [&](Driver& driver) { undecodable(driver, more); }}, {"busy", busy}, {"deadline", deadline},
         {"newest", [&](Driver& driver) { newest(driver, more); }}, {"stream", stream}, {"renew", stream},
-        {"expired", ended}, {"revoked", ended}, {"updates", [&](Driver& driver) { updates(driver, more); }},
+        {"returns", returns}, {"expired", ended}, {"revoked", ended}, {"updates", [&](Driver& driver) { updates(driver, more); }},
         {"progress", progress}, {"data", data},
     };
     const std::string scenario = argc > 1 ? argv[1] : "";
@@ -408,7 +481,7 @@ int main(int argc, char** argv) {
         return 3;
     }
     try {
-        Driver driver;
+        Driver driver(scenario == "returns");
         found->second(driver);
         json last = driver.tally.done();
         last.update(more);

@@ -1,0 +1,282 @@
+"""The network of a hundred robots is gone for a while: when each has an answer, and what the firewall saw.
+
+    python -m benchmarks.cloud.network_gone [--robots 100] [--gone 5,30,120] [--runs 1] [--out FILE]
+
+Three network namespaces, which are deleted at the end: robots, a router, and a server with a local platform
+behind a relay that plays the web firewall.  Two cases for each time: the link of the robots is down (``ip link
+set down``), or the router loses every packet with the link up.  Each robot asks echo twice a second; all have
+one address.  Needs root and ip(8), and says so otherwise.
+
+Defends: first answer p99 <= 2 s after the network is back; the firewall blocks nobody.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import json
+import os
+import platform
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+
+import client_sdk
+from benchmarks.cloud.local_platform import LocalPlatform
+from benchmarks.cloud.outage import FrontDoor, most_within
+from benchmarks.cloud.played_firewall import PlayedFirewall, rules_of_settings
+from rse_pf.config import PlatformSettings
+from rse_pf.errors import RsePfError
+
+__all__ = ["CASES", "measure"]
+
+CASES = ("link-down", "packets-lost")
+BAR_S = 2.0
+ASK_EVERY_S = 0.5
+BEFORE_S = 3.0
+WAIT_S = 60.0
+START_S = 240.0
+ROBOT_SIDE, SERVER_SIDE = "10.212.1", "10.212.2"
+TREE = Path(__file__).resolve().parents[2]
+
+
+class Machines:
+    """The namespaces of robots, router and server."""
+
+    def __init__(self, number: int) -> None:
+        self.robots, self.router, self.server = (f"rse-{number}-{role}" for role in "abc")
+        self.link = "up0"
+
+    def steps(self) -> list[tuple[str, ...]]:
+        """Return the commands that make them."""
+        made: list[tuple[str, ...]] = [
+            ("netns", "add", each) for each in (self.robots, self.router, self.server)
+        ]
+        for name, side, inside in ((self.robots, ROBOT_SIDE, "down0"), (self.server, SERVER_SIDE, "down1")):
+            made += [
+                (
+                    "-n",
+                    name,
+                    "link",
+                    "add",
+                    self.link,
+                    "type",
+                    "veth",
+                    "peer",
+                    "name",
+                    inside,
+                    "netns",
+                    self.router,
+                ),
+                ("-n", name, "address", "add", f"{side}.2/24", "dev", self.link),
+                ("-n", self.router, "address", "add", f"{side}.1/24", "dev", inside),
+                ("-n", self.router, "link", "set", inside, "up"),
+                ("-n", name, "link", "set", self.link, "up"),
+                ("-n", name, "link", "set", "lo", "up"),
+                ("-n", name, "route", "add", "default", "via", f"{side}.1"),
+            ]
+        return made
+
+    def forward(self, *, is_on: bool) -> None:
+        """Let the router carry packets, or lose each of them."""
+        self.run(self.router, "sh", "-c", f"echo {int(is_on)} > /proc/sys/net/ipv4/ip_forward")
+
+    def set_link(self, *, is_up: bool) -> None:
+        """Switch the interface of the robots; a route of one that is down is gone, as with Wi-Fi."""
+        self.run(self.robots, "ip", "link", "set", self.link, "up" if is_up else "down")
+        if is_up:
+            self.run(self.robots, "ip", "route", "add", "default", "via", f"{ROBOT_SIDE}.1")
+
+    @staticmethod
+    def run(space: str, *words: str) -> None:
+        """Run a command in a namespace."""
+        subprocess.run(["ip", "netns", "exec", space, *words], check=True)
+
+    @staticmethod
+    def python(space: str, *words: str) -> subprocess.Popen[str]:
+        """Start this module in a namespace, with pipes."""
+        return subprocess.Popen(
+            ["ip", "netns", "exec", space, sys.executable, "-m", "benchmarks.cloud.network_gone", *words],
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=TREE,
+        )  # fmt: skip
+
+
+@contextmanager
+def machines() -> Iterator[Machines]:
+    """Make the namespaces, and delete them at the end; SystemExit where that is not allowed."""
+    if os.geteuid() != 0 or shutil.which("ip") is None:
+        raise SystemExit("network namespaces need root and ip(8)")
+    made = Machines(os.getpid() % 10_000)
+    try:
+        for step in made.steps():
+            if subprocess.run(["ip", *step], check=False).returncode != 0:
+                raise SystemExit(f"not allowed here: ip {' '.join(step)}")
+        made.forward(is_on=True)
+        yield made
+    finally:
+        for each in (made.robots, made.router, made.server):
+            subprocess.run(["ip", "netns", "delete", each], check=False, capture_output=True)
+
+
+# --- in the namespace of the server ------------------------------------------------------------------
+
+
+async def serve(robots: int) -> None:
+    """Serve a platform behind the firewall; print its tokens, and for each line read what it saw."""
+    loop = asyncio.get_running_loop()
+    with tempfile.TemporaryDirectory(prefix="network-gone-") as folder, ExitStack() as ends:
+        local = await asyncio.to_thread(ends.enter_context, LocalPlatform("bench-gone", Path(folder)))
+        async with FrontDoor(
+            local.port, PlayedFirewall(rules_of_settings(PlatformSettings())), "0.0.0.0"
+        ) as front:
+            url = front.url.replace("0.0.0.0", f"{SERVER_SIDE}.2")
+            tokens = [local.token(f"robot-{number}") for number in range(robots)]
+            print(json.dumps({"url": url, "tokens": tokens}), flush=True)
+            while line := await loop.run_in_executor(None, sys.stdin.readline):
+                since = float(line)
+                dials = [each for each in front.dials if each >= since]
+                told = {"dials": len(dials), "most_in_a_minute": most_within(dials, 60.0)}
+                print(json.dumps({**told, "blocked": front.firewall.blocked}), flush=True)
+
+
+# --- in the namespace of the robots ------------------------------------------------------------------
+
+
+async def drive() -> None:
+    """Connect; then, for each line with a time, tell when each robot had its next answer."""
+    loop = asyncio.get_running_loop()
+    given = json.loads(await loop.run_in_executor(None, sys.stdin.readline))
+    fleet = [client_sdk.connect(given["url"], token=token) for token in given["tokens"]]
+    last_s = [0.0] * len(fleet)
+    for robot in fleet:
+        await robot
+
+    async def ask(number: int, robot: client_sdk.Robot) -> None:
+        while True:
+            began = time.monotonic()
+            try:
+                await robot.call("echo", {"value": number}, deadline_s=WAIT_S, stream="pose")
+                last_s[number] = time.monotonic()
+                first_s.setdefault(number, last_s[number])
+            except RsePfError:
+                pass
+            await asyncio.sleep(max(0.0, ASK_EVERY_S - (time.monotonic() - began)))
+
+    first_s: dict[int, float] = {}
+    asking = [asyncio.create_task(ask(number, robot)) for number, robot in enumerate(fleet)]
+    print("ready", flush=True)
+    while line := await loop.run_in_executor(None, sys.stdin.readline):
+        back_s, until = float(line), float(line) + WAIT_S
+        first_s.clear()
+        while len(first_s) < len(fleet) and time.monotonic() < until:
+            await asyncio.sleep(0.01)  # polls, with a deadline
+        reconnects = sum(robot.stats.reconnects for robot in fleet)
+        after = sorted(each - back_s for each in first_s.values())
+        print(json.dumps({"after_s": after, "reconnects": reconnects}), flush=True)
+    for task in asking:
+        task.cancel()
+    await asyncio.gather(*(robot.close() for robot in fleet))
+
+
+# --- outside -----------------------------------------------------------------------------------------
+
+
+def measure(*, robots: int, gone: list[float], runs: int) -> list[dict[str, Any]]:
+    """Return a row for each case, time and run."""
+    rows: list[dict[str, Any]] = []
+    with machines() as made, ExitStack() as ends:
+        server = made.python(made.server, "--serve", "--robots", str(robots))
+        ends.callback(_end, server)
+        told = _line(server)
+        fleet = made.python(made.robots, "--drive")
+        ends.callback(_end, fleet)
+        _say(fleet, told.strip())
+        assert _line(fleet).strip() == "ready"
+        for number in range(runs):
+            for case in CASES:
+                for gone_s in gone:
+                    row = one(made, server, fleet, case, gone_s)
+                    rows.append({"case": case, "gone_s": gone_s, "run": number + 1, "robots": robots, **row})
+                    print(json.dumps(rows[-1]), flush=True)
+    return rows
+
+
+def one(
+    made: Machines, server: subprocess.Popen[str], fleet: subprocess.Popen[str], case: str, gone_s: float
+) -> dict[str, Any]:
+    """Take the network away once, and return what came back when."""
+    time.sleep(BEFORE_S)  # a quiet time before it
+    began = time.monotonic()
+    is_link = case == "link-down"
+    made.set_link(is_up=False) if is_link else made.forward(is_on=False)
+    time.sleep(max(0.0, began + gone_s - time.monotonic()))
+    made.set_link(is_up=True) if is_link else made.forward(is_on=True)
+    back_s = time.monotonic()
+    _say(fleet, repr(back_s))
+    found = json.loads(_line(fleet))
+    _say(server, repr(began))
+    seen = json.loads(_line(server))
+    after = found.pop("after_s")
+    figures = {f"p{share}_s": round(after[int(share / 100 * (len(after) - 1))], 2) for share in (50, 99)}
+    figures |= {"max_s": round(after[-1], 2), "answered": len(after)} if after else {}
+    return {**figures, **seen, **found, "load_average": round(os.getloadavg()[0], 2)}
+
+
+def _say(process: subprocess.Popen[str], line: str) -> None:
+    assert process.stdin is not None
+    process.stdin.write(line + "\n")
+    process.stdin.flush()
+
+
+def _line(process: subprocess.Popen[str]) -> str:
+    assert process.stdout is not None
+    line = process.stdout.readline()
+    if not line:
+        raise SystemExit("a process in a namespace ended; its message is above")
+    return line
+
+
+def _end(process: subprocess.Popen[str]) -> None:
+    assert process.stdin is not None
+    process.stdin.close()
+    try:
+        process.wait(60)
+    except subprocess.TimeoutExpired:
+        process.kill()
+
+
+def main() -> int:
+    """Run it and print the rows; the exit code is 1 if a bar is missed."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--robots", type=int, default=100)
+    parser.add_argument("--gone", default="5,30,120", metavar="S,S", help="seconds (default: 5,30,120)")
+    parser.add_argument("--runs", type=int, default=1)
+    parser.add_argument("--out", type=Path)
+    parser.add_argument("--serve", action="store_true", help=argparse.SUPPRESS)
+    parser.add_argument("--drive", action="store_true", help=argparse.SUPPRESS)
+    args = parser.parse_args()
+    if args.serve or args.drive:
+        asyncio.run(serve(args.robots) if args.serve else drive())
+        return 0
+    gone = [float(each) for each in args.gone.split(",")]
+    rows = measure(robots=args.robots, gone=gone, runs=args.runs)
+    machine = f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}"
+    if args.out is not None:
+        args.out.write_text(json.dumps({"machine": machine, "rows": rows}, indent=1) + "\n", encoding="utf-8")
+    is_met = all(
+        row["answered"] == args.robots and row["p99_s"] <= BAR_S and not row["blocked"] for row in rows
+    )
+    print(f"{machine}; bar (p99 {BAR_S:g} s, none blocked): {'met' if is_met else 'MISSED'}")
+    return 0 if is_met else 1
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
