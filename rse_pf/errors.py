@@ -181,13 +181,15 @@ class AuthError(RsePfError, code="auth"):
 
 
 class Unauthorized(AuthError, code="unauthorized"):
-    """The token is missing, wrong or expired; the cause is only in the server's log.
+    """The token is missing, wrong or expired; only a robot that signs with its own key is told the cause.
 
-    Cause: There is no token, or it is expired, revoked, damaged or signed with another platform's key.
+    Cause: There is no token, or it is expired, revoked, damaged or signed with another platform's key; or the
+        robot is disabled, or its clock is wrong.
     Check: Run rse-pf token inspect TOKEN: it shows the seconds that are left, and whether the signature is
-        valid.
+        valid. For a robot with a key of its own the message names the cause, and the error of its clock.
     Fix: Issue a new token with rse-pf token issue ROBOT; for runs of over 15 minutes pass an async function
-        that returns a fresh token, such as RobotKey(FILE, ROBOT).token.
+        that returns a fresh token, such as RobotKey(FILE, ROBOT).token. A robot that was connected tries
+        again by itself.
     """
 
 

@@ -3,9 +3,9 @@
     python -m benchmarks.cloud.network_gone [--robots 100] [--gone 5,30,120] [--runs 1] [--out FILE]
 
 Three network namespaces, which are deleted at the end: robots, a router, and a server with a local platform
-behind a relay that plays the web firewall.  Two cases for each time: the link of the robots is down (``ip link
-set down``), or the router loses every packet with the link up.  Each robot asks echo twice a second; all have
-one address.  Needs root and ip(8), and says so otherwise.
+behind a relay that plays the web firewall.  Two cases for each time: the link of the robots is down, or the
+router loses every packet with the link up.  Each robot asks echo twice a second; all have one address.  Needs
+root and ip(8), and says so otherwise.
 
 Defends: first answer p99 <= 2 s after the network is back; the firewall blocks nobody.
 """
