@@ -14,8 +14,9 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
+from client_sdk.monocular.opencv import load_opencv
 from client_sdk.native_match import FrontEndCore, front_end_core
-from rse_pf.errors import MissingExtra, UsageError
+from rse_pf.errors import UsageError
 from rse_pf.geometry import Array, Camera, inverse, pose_difference
 
 __all__ = [
@@ -536,12 +537,3 @@ def _depth_at(depth_m: npt.NDArray[np.float32], pixels: Array, options: FrontEnd
         )
     found[inside] = np.where(trusted, median, np.nan)
     return found
-
-
-def load_opencv() -> Any:
-    """Return the module ``cv2``; raises MissingExtra."""
-    try:
-        import cv2
-    except ImportError as error:
-        raise MissingExtra("opencv-python-headless", "vision") from error
-    return cv2

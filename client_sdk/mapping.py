@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rse_pf.errors import UsageError
+from rse_pf.files import read_regular_file
 from rse_pf.geometry import Array, from_quaternion, to_quaternion, transform
 
 if TYPE_CHECKING:
@@ -28,6 +29,7 @@ __all__ = [
     "write_trajectory",
 ]
 
+_MAX_TRAJECTORY_BYTES = 256 << 20
 _EMPTY = -1
 # Voxels on either side of the origin: three signed indices of 21 bits fill one int64 key.
 _REACH = 1 << 20
@@ -315,7 +317,7 @@ def read_trajectory(path: Path) -> Trajectory:
         UsageError: The file is missing, or a line does not hold eight finite numbers.
     """
     try:
-        text = path.read_text(encoding="utf-8")
+        text = read_regular_file(path, _MAX_TRAJECTORY_BYTES).decode()
     except (OSError, UnicodeDecodeError) as error:
         raise UsageError(f"cannot read {path}: {error}", hint="name a trajectory in TUM format") from error
     timestamps_s: list[float] = []

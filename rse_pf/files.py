@@ -5,6 +5,7 @@ A reader of a replaced file sees the old content or the new one, never a part of
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import secrets
@@ -15,8 +16,8 @@ from typing import Any
 from rse_pf.errors import UsageError
 
 __all__ = [
-    "OWNER_ONLY", "TEMPORARY_PREFIX", "create_private_file", "read_private_file", "replace_file",
-    "replace_json", "sync_folder",
+    "OWNER_ONLY", "TEMPORARY_PREFIX", "create_private_file", "read_private_file", "read_regular_file",
+    "replace_file", "replace_json", "sync_folder",
 ]  # fmt: skip
 
 OWNER_ONLY = 0o600
@@ -58,6 +59,21 @@ def create_private_file(path: Path, text: str) -> None:
     """Write *text* durably to a new file that only its owner can read; raises OSError, also if it exists."""
     handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, OWNER_ONLY)
     _write(handle, text, True)
+
+
+def read_regular_file(path: Path, max_bytes: int) -> bytes:
+    """Return the content of a file that may come from a stranger.
+
+    Raises:
+        OSError: It cannot be read, is a pipe or a device, or is longer than *max_bytes*.
+    """
+    with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
+        if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+            raise OSError(errno.EINVAL, "it is not a regular file", str(path))
+        data = file.read(max_bytes + 1)
+    if len(data) > max_bytes:
+        raise OSError(errno.EFBIG, f"it is longer than {max_bytes} bytes", str(path))
+    return data
 
 
 def read_private_file(path: Path, what: str, *, hint: str) -> bytes:

@@ -20,6 +20,8 @@ from client_sdk.bags.poses import PoseTopic, TransformTree
 __all__ = ["BagIndex", "ImageStamps", "nearest_gap_s", "pair_stamps", "read_index"]
 
 Stamps = npt.NDArray[np.int64]
+_Times = npt.NDArray[Any]
+"""Of one unit, in whole numbers or not."""
 
 
 @dataclass(slots=True)
@@ -108,17 +110,17 @@ def read_index(file: BagFile, chosen: ChosenTopics, formats: dict[str, ImageForm
     )
 
 
-def pair_stamps(first: Stamps, second: Stamps, within_ns: int) -> list[tuple[int, int]]:
+def pair_stamps(first: _Times, second: _Times, within: float) -> list[tuple[int, int]]:
     """Return ``(row of first, row of second)``, nearest in time, each row at most once; both must ascend."""
     if not len(first) or not len(second):
         return []
     nearest = _nearest(first, second)
     apart = np.abs(second[nearest] - first)
-    best: dict[int, tuple[int, int]] = {}
-    for row in np.flatnonzero(apart <= within_ns):
+    best: dict[int, tuple[float, int]] = {}
+    for row in np.flatnonzero(apart <= within):
         partner = int(nearest[row])
         if partner not in best or apart[row] < best[partner][0]:
-            best[partner] = (int(apart[row]), int(row))
+            best[partner] = (apart[row], int(row))
     return sorted((row, partner) for partner, (_, row) in best.items())
 
 
@@ -127,7 +129,7 @@ def nearest_gap_s(first: Stamps, second: Stamps) -> float:
     return float(np.abs(second[_nearest(first, second)] - first).min()) / 1e9
 
 
-def _nearest(first: Stamps, second: Stamps) -> Stamps:
+def _nearest(first: _Times, second: _Times) -> Stamps:
     """Return for each of *first* the row of the nearest of *second*."""
     after = np.minimum(np.searchsorted(second, first), len(second) - 1)
     before = np.maximum(after - 1, 0)

@@ -7,6 +7,7 @@ images are read by `client_sdk.datasets`.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from client_sdk.cameras.source import RawFrame, colour_of
-from client_sdk.frontend import load_opencv
+from client_sdk.monocular.opencv import MAX_IMAGE_PIXELS, load_opencv, read_image
 from rse_pf.errors import UsageError
 
 __all__ = ["image_files", "is_image", "open_folder", "read_raw_image"]
@@ -58,11 +59,13 @@ def open_folder(folder: Path, depth_scale: float) -> tuple[Iterator[RawFrame], b
 def read_raw_image(path: Path) -> npt.NDArray[Any]:
     """Return an image as OpenCV reads it, unchanged; raises UsageError and MissingExtra."""
     cv2 = load_opencv()
-    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED) if path.is_file() else None
+    image = read_image(path, cv2.IMREAD_UNCHANGED)
     if image is None:
-        raise UsageError(f"cannot read the image {path}", hint="check that it is a whole image")
-    raw: npt.NDArray[Any] = image
-    return raw
+        raise UsageError(
+            f"cannot read the image {path}",
+            hint=f"check that it is a whole image of at most {MAX_IMAGE_PIXELS} pixels",
+        )
+    return image
 
 
 def _images(colours: list[Path], depths: dict[str, Path], depth_scale: float) -> Iterator[RawFrame]:
@@ -89,9 +92,11 @@ def _stamps(paths: list[Path]) -> list[float]:
     except ValueError:
         values = []
     is_time = any("." in path.stem for path in paths) and len(set(values)) == len(paths)
+    is_time = is_time and all(map(math.isfinite, values))
     return values if is_time else [row * _PERIOD_S for row in range(len(paths))]
 
 
 def _order(path: Path) -> tuple[float, str]:
-    digits = path.stem if path.stem.replace(".", "", 1).isdigit() else "".join(filter(str.isdigit, path.stem))
+    stem = path.stem
+    digits = stem if stem.replace(".", "", 1).isdecimal() else "".join(filter(str.isdecimal, stem))
     return (float(digits) if digits else 0.0, path.name)

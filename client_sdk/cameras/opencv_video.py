@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from client_sdk.cameras.source import RawFrame, colour_of
-from client_sdk.frontend import load_opencv
+from client_sdk.monocular.opencv import MAX_IMAGE_PIXELS, load_opencv
 from rse_pf.errors import UsageError
 
 __all__ = ["open_video"]
@@ -34,6 +34,10 @@ def open_video(
     is_file = not is_device and "://" not in source
     if is_file and not Path(source).is_file():
         raise UsageError(f"there is no video {source}", hint="name a device number, a video or a folder")
+    if is_file and _is_text(Path(source)):
+        raise UsageError(
+            f"{source} is a text, not a video", hint="a playlist names other files: name the video itself"
+        )
     _silence(cv2)
     capture = cv2.VideoCapture(int(source) if is_device else source)
     if not capture.isOpened():
@@ -44,10 +48,27 @@ def open_video(
                 hint="see ls /dev/video*; close other programs that use it; add yourself to the group video",
             )
         raise UsageError(f"{source} is not a video that OpenCV can read", hint="convert it, such as to mp4")
+    width, height = (int(capture.get(each)) for each in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
+    if width * height > MAX_IMAGE_PIXELS:
+        capture.release()
+        raise UsageError(
+            f"{source} has images of {width}x{height} px, above {MAX_IMAGE_PIXELS} pixels",
+            hint="make them smaller",
+        )
     if is_device:
         capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
     images = _file_images(cv2, capture, source) if is_file else _device_images(capture, source, clock)
     return images, capture.release
+
+
+def _is_text(path: Path) -> bool:
+    """Say whether a file begins as a text; of the formats of videos only YUV4MPEG2 does."""
+    try:
+        with path.open("rb") as file:
+            start = file.read(64)
+    except OSError as error:
+        raise UsageError(f"cannot read {path}: {error.strerror}", hint="name another video") from error
+    return all(32 <= each < 127 or each in b"\t\r\n" for each in start) and not start.startswith(b"YUV4MPEG2")
 
 
 def _silence(cv2: Any) -> None:

@@ -12,20 +12,25 @@ metre), ``rms_px`` and ``views`` (of the calibration) may be left out.
 from __future__ import annotations
 
 import json
-import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from client_sdk.frontend import load_opencv
 from client_sdk.image_map import ImageMap
+from client_sdk.monocular.opencv import MAX_IMAGE_PIXELS
 from rse_pf.errors import InvalidCamera, UsageError
+from rse_pf.files import read_regular_file
 from rse_pf.geometry import Camera
 
 __all__ = ["Intrinsics", "Undistortion", "read_intrinsics", "write_intrinsics"]
 
+_T = TypeVar("_T", int, float)
+_MAX_FILE_BYTES = 1 << 20
+_MAX_DISTORTION = 1e3
+_MIN_DEPTH_SCALE, _MAX_DEPTH_SCALE = 1e-2, 1e7
 _HINT = "it needs fx fy cx cy width height, and may have distortion [k1 k2 p1 p2 k3] and depth_scale"
 
 
@@ -46,13 +51,23 @@ class Intrinsics:
     views: int | None = None
 
     def __post_init__(self) -> None:
-        if len(self.distortion) not in (0, 4, 5) or not all(math.isfinite(each) for each in self.distortion):
+        if len(self.distortion) not in (0, 4, 5) or not all(
+            abs(each) <= _MAX_DISTORTION for each in self.distortion
+        ):
             raise UsageError(
-                f"{len(self.distortion)} distortion numbers, or one that is not finite", hint=_HINT
+                f"{len(self.distortion)} distortion numbers, or one that is not within {_MAX_DISTORTION:g}",
+                hint=_HINT,
             )
-        if not (math.isfinite(self.depth_scale) and self.depth_scale > 0):
+        if not _MIN_DEPTH_SCALE <= self.depth_scale <= _MAX_DEPTH_SCALE:
             raise UsageError(
-                f"depth_scale {self.depth_scale:g} is not above 0", hint="1000 for mm, 5000 for TUM"
+                f"depth_scale {self.depth_scale:g} is not within {_MIN_DEPTH_SCALE:g}..{_MAX_DEPTH_SCALE:g}",
+                hint="1000 for mm, 5000 for TUM",
+            )
+        pixels = self.camera.width * self.camera.height
+        if pixels > MAX_IMAGE_PIXELS:
+            raise UsageError(
+                f"images of {self.camera.width}x{self.camera.height} px are above {MAX_IMAGE_PIXELS} pixels",
+                hint="make the images smaller, and scale fx fy cx cy with them",
             )
 
 
@@ -68,7 +83,7 @@ def read_intrinsics(path: Path | str, *, with_depth_scale: bool = False) -> Intr
     """
     path = Path(path)
     try:
-        values = json.loads(path.read_text(encoding="utf-8"))
+        values = json.loads(read_regular_file(path, _MAX_FILE_BYTES))
         camera = Camera(
             **{name: float(values[name]) for name in ("fx", "fy", "cx", "cy")},
             width=int(values["width"]),
@@ -79,8 +94,8 @@ def read_intrinsics(path: Path | str, *, with_depth_scale: bool = False) -> Intr
             camera=camera,
             distortion=tuple(float(value) for value in values.get("distortion", ())),
             depth_scale=float(depth_scale),
-            rms_px=values.get("rms_px"),
-            views=values.get("views"),
+            rms_px=_optional(values.get("rms_px"), float),
+            views=_optional(values.get("views"), int),
         )
     except FileNotFoundError as error:
         raise UsageError(
@@ -90,8 +105,12 @@ def read_intrinsics(path: Path | str, *, with_depth_scale: bool = False) -> Intr
         raise UsageError(f"{path}: {error.message}", hint=error.hint) from error
     except KeyError as error:
         raise UsageError(f"{path} has no {error.args[0]}", hint=_HINT) from error
-    except (OSError, ValueError, TypeError, AttributeError) as error:
+    except (OSError, ValueError, TypeError, AttributeError, OverflowError, RecursionError) as error:
         raise UsageError(f"{path} is not a file of intrinsics", hint=_HINT) from error
+
+
+def _optional(value: Any, kind: type[_T]) -> _T | None:
+    return None if value is None else kind(value)
 
 
 def write_intrinsics(path: Path | str, intrinsics: Intrinsics) -> None:

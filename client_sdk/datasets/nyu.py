@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rse_pf.errors import MissingExtra, UsageError
+from rse_pf.files import read_regular_file
 from rse_pf.geometry import Array, Camera, transform
 
 __all__ = [
@@ -62,6 +63,17 @@ DEPTH_DISTORTION = (
     -0.51031725053400578,
 )
 _MAX_DEPTH_M = 10.0
+_MAX_PNM_BYTES = 16 << 20
+_PNM_HEAD = re.compile(rb"(P[56])\s+(?:#[^\n]*\n\s*)*(\d{1,5})\s+(\d{1,5})\s+(\d{1,5})\s")
+"""A comment ends with its line, so that there is one way to read a head."""
+_PIXELS = (COLOUR_CAMERA.width, COLOUR_CAMERA.height)
+_MAX_IMAGES, _MAX_LETTERS = 10_000, 256
+_MAX_CHUNK_VALUES = 1 << 26
+_MAT_HINT = "name nyu_depth_v2_labeled.mat as it was published"
+_DAMAGE = (OSError, RuntimeError, KeyError, TypeError, ValueError, OverflowError, MemoryError)
+"""What h5py raises where the bytes of a file make no sense."""
+_SHAPES = {"images": (3, *_PIXELS), "depths": _PIXELS, "rawDepths": _PIXELS}
+"""Of one image in the labelled file."""
 
 _STAMPED = re.compile(r"[dr]-(\d+(?:\.\d+)?)-\d+\.(?:pgm|ppm)$")
 
@@ -133,10 +145,10 @@ def read_pnm(path: Path) -> npt.NDArray[Any]:
         UsageError: The file cannot be read or is of another kind.
     """
     try:
-        content = path.read_bytes()
+        content = read_regular_file(path, _MAX_PNM_BYTES)
     except OSError as error:
         raise UsageError(f"cannot read {path}: {error.strerror}", hint="unpack the dump again") from error
-    head = re.match(rb"(P[56])\s+(?:#.*\s+)*(\d+)\s+(\d+)\s+(\d+)\s", content)
+    head = _PNM_HEAD.match(content)
     if head:
         width, height = int(head[2]), int(head[3])
         colours = 3 if head[1] == b"P6" else 1
@@ -169,7 +181,10 @@ class LabelledFile:
             count = len(file["images"])
             if scene is None:
                 return list(range(count))
-            names = _strings(file, "scenes")
+            try:
+                names = _strings(file, "scenes")
+            except _DAMAGE as error:
+                raise self._damaged() from error
         rows = [row for row, name in enumerate(names) if name == scene]
         if not rows:
             some = ", ".join(sorted(set(names))[:5]) or "none"
@@ -180,8 +195,11 @@ class LabelledFile:
         """Return colour ``(h, w, 3)`` and registered depth ``(h, w)`` in metres of one row."""
         with self._open() as file:
             depths = file["rawDepths"] if "rawDepths" in file else file["depths"]
-            rgb = np.ascontiguousarray(np.transpose(file["images"][row], (2, 1, 0)), dtype=np.uint8)
-            depth_m = np.ascontiguousarray(np.transpose(depths[row]), dtype=np.float32)
+            try:
+                rgb = np.ascontiguousarray(np.transpose(file["images"][row], (2, 1, 0)), dtype=np.uint8)
+                depth_m = np.ascontiguousarray(np.transpose(depths[row]), dtype=np.float32)
+            except _DAMAGE as error:
+                raise self._damaged() from error
         depth_m[~np.isfinite(depth_m) | (depth_m >= _MAX_DEPTH_M)] = 0.0
         return rgb, depth_m
 
@@ -190,20 +208,57 @@ class LabelledFile:
             import h5py
         except ImportError as error:
             raise MissingExtra("h5py", "vision") from error
-        hint = "name nyu_depth_v2_labeled.mat as it was published"
         try:
             file = h5py.File(self.path, "r")
         except OSError as error:
-            raise UsageError(f"{self.path} is not an HDF5 .mat file", hint=hint) from error
-        if "images" not in file or not ("rawDepths" in file or "depths" in file):
+            raise UsageError(f"{self.path} is not an HDF5 .mat file", hint=_MAT_HINT) from error
+        try:
+            is_complete = "images" in file and ("rawDepths" in file or "depths" in file)
+            fits = is_complete and _holds_images(h5py, file)
+        except _DAMAGE as error:
             file.close()
-            raise UsageError(f"{self.path} holds no images and depths", hint=hint)
+            raise self._damaged() from error
+        if not fits:
+            file.close()
+            what = (
+                f"images and depths of {_PIXELS[0]}x{_PIXELS[1]} px" if is_complete else "images and depths"
+            )
+            raise UsageError(f"{self.path} holds no {what}", hint=_MAT_HINT)
         return file
+
+    def _damaged(self) -> UsageError:
+        return UsageError(f"{self.path} is damaged", hint=_MAT_HINT)
+
+
+def _holds_images(h5py: Any, file: Any) -> bool:
+    """Say whether all images have the size of the data set, and lie in the file itself.
+
+    What lies in no file costs nothing there and memory here; what lies in another file may be any file of
+    this machine.
+    """
+    counts = set()
+    for name in _SHAPES.keys() & file.keys():
+        found = file[name] if isinstance(file.get(name, getlink=True), h5py.HardLink) else None
+        if not isinstance(found, h5py.Dataset) or found.shape[1:] != _SHAPES[name]:
+            return False
+        if found.external or found.is_virtual or found.dtype.kind not in "uif":
+            return False
+        chunk = found.chunks or (1,)
+        if np.prod(chunk, dtype=float) > _MAX_CHUNK_VALUES:
+            return False
+        counts.add(len(found))
+    return len(counts) == 1 and counts.pop() <= _MAX_IMAGES
 
 
 def _strings(file: Any, name: str) -> list[str]:
     """Return a MATLAB cell array of strings; an absent one is empty."""
     if name not in file:
         return []
-    cells = np.asarray(file[name]).ravel()
-    return ["".join(chr(code) for code in np.asarray(file[cell]).ravel()) for cell in cells]
+    if file[name].size > _MAX_IMAGES:
+        raise ValueError(f"{name} names more than {_MAX_IMAGES} images")
+    found = []
+    for cell in np.asarray(file[name]).ravel():
+        if file[cell].size > _MAX_LETTERS:
+            raise ValueError(f"{name} holds no short texts")
+        found.append("".join(chr(code) for code in np.asarray(file[cell]).ravel()))
+    return found

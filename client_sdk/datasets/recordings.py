@@ -16,15 +16,20 @@ import numpy as np
 import numpy.typing as npt
 
 from client_sdk.bags import Bag, is_bag, open_bag
+from client_sdk.bags.index import pair_stamps
 from client_sdk.datasets import nyu
 from client_sdk.datasets.intrinsics import Intrinsics, Undistortion, read_intrinsics
-from client_sdk.frontend import Frame, load_opencv
+from client_sdk.frontend import Frame
 from client_sdk.mapping import Trajectory, read_trajectory
+from client_sdk.monocular.opencv import MAX_IMAGE_PIXELS, load_opencv, read_image
 from rse_pf.errors import UsageError
+from rse_pf.files import read_regular_file
 from rse_pf.geometry import Camera
 
 __all__ = ["Dataset", "associate_stamps", "dataset_of_bag", "open_dataset", "read_colour"]
 
+_MAX_LIST_BYTES = 64 << 20
+"""Of ``rgb.txt`` and ``depth.txt``: a million images."""
 _MAX_STAMP_DIFFERENCE_S = 0.02
 # The raw dump's two streams run freely; the nearest images are at most half a period apart.
 _MAX_RAW_STAMP_DIFFERENCE_S = 0.05
@@ -147,16 +152,7 @@ def associate_stamps(
 
     Both must ascend.  If several rows are nearest to one partner, the closest of them gets it.
     """
-    wanted: dict[int, tuple[float, int]] = {}
-    stamps = np.asarray(second, dtype=np.float64)
-    for row, timestamp_s in enumerate(first):
-        if not len(stamps):
-            break
-        partner = int(np.argmin(np.abs(stamps - timestamp_s)))
-        difference_s = abs(float(stamps[partner]) - timestamp_s)
-        if difference_s <= max_difference_s and difference_s < wanted.get(partner, (math.inf, 0))[0]:
-            wanted[partner] = (difference_s, row)
-    return sorted((row, partner) for partner, (_, row) in wanted.items())
+    return pair_stamps(np.asarray(first, dtype=float), np.asarray(second, dtype=float), max_difference_s)
 
 
 # --- TUM layout --------------------------------------------------------------------------------
@@ -211,7 +207,7 @@ def _open_tum(folder: Path) -> Dataset:
 
 def _read_list(folder: Path, name: str) -> list[tuple[float, str]]:
     try:
-        text = (folder / name).read_text(encoding="utf-8")
+        text = read_regular_file(folder / name, _MAX_LIST_BYTES).decode()
     except (OSError, UnicodeDecodeError) as error:
         raise UsageError(
             f"no {name} in {folder}", hint="name a folder in TUM layout: rgb.txt, depth.txt, images"
@@ -222,11 +218,18 @@ def _read_list(folder: Path, name: str) -> list[tuple[float, str]]:
         if not words or words[0].startswith("#"):
             continue
         try:
-            entries.append((float(words[0]), words[1].strip()))
+            stamp, image = float(words[0]), words[1].strip()
         except (ValueError, IndexError) as error:
             raise UsageError(
                 f"{folder / name}, line {number} is not an image", hint="write: timestamp filename"
             ) from error
+        inside = Path(image)
+        if not math.isfinite(stamp) or inside.is_absolute() or ".." in inside.parts:
+            raise UsageError(
+                f"{folder / name}, line {number} names no time, or no image below its folder",
+                hint="write seconds, and a path such as rgb/1.png",
+            )
+        entries.append((stamp, image))
     return sorted(entries)
 
 
@@ -339,11 +342,12 @@ def _open_labelled(path: Path, scene: str | None) -> Dataset:
 
 def _read_image(path: Path, *, is_depth: bool) -> npt.NDArray[Any]:
     cv2 = load_opencv()
-    image = None
-    if path.is_file():  # OpenCV would print a warning otherwise
-        image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED if is_depth else cv2.IMREAD_COLOR)
+    image = read_image(path, cv2.IMREAD_UNCHANGED if is_depth else cv2.IMREAD_COLOR)
     if image is None:
-        raise UsageError(f"cannot read the image {path}", hint="unpack the recording again")
+        raise UsageError(
+            f"cannot read the image {path}",
+            hint=f"unpack the recording again; an image has at most {MAX_IMAGE_PIXELS} pixels",
+        )
     if not is_depth:
         rgb: npt.NDArray[Any] = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
         return rgb
@@ -352,5 +356,4 @@ def _read_image(path: Path, *, is_depth: bool) -> npt.NDArray[Any]:
             f"{path} is not a 16-bit depth image",
             hint="depth is one 16-bit channel, value / depth_scale in m",
         )
-    depth: npt.NDArray[Any] = image
-    return depth
+    return image

@@ -1,4 +1,5 @@
 """Geometry of one camera without depth: two-view start, triangulation, bundle adjustment, scale.
 
-Functions over arrays of pixels, points and poses belong here; frames, features and queries do not.
+Functions over arrays of pixels, points and poses belong here, and how OpenCV is loaded; frames, features and
+queries do not.
 """

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from client_sdk.monocular.two_view import load_opencv
+from client_sdk.monocular.opencv import load_opencv
 from rse_pf.geometry import Array
 
 __all__ = ["match_all", "match_near"]

@@ -6,15 +6,14 @@ The length of the translation is unknown to two views; it is 1 here.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from rse_pf.errors import MissingExtra
+from client_sdk.monocular.opencv import load_opencv
 from rse_pf.geometry import Array, Camera, inverse, transform
 
-__all__ = ["TwoViewStart", "load_opencv", "parallax_deg", "start_from_two_views", "triangulate"]
+__all__ = ["TwoViewStart", "parallax_deg", "start_from_two_views", "triangulate"]
 
 _CONFIDENCE = 0.9999
 _MIN_SHARE = 0.5
@@ -143,12 +142,3 @@ def parallax_deg(points: Array, first_centre: Array, second_centre: Array) -> Ar
 
 def _normalised(pixels: Array, camera: Camera) -> Array:
     return (pixels - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
-
-
-def load_opencv() -> Any:
-    """Return the module ``cv2``; raises MissingExtra."""
-    try:
-        import cv2
-    except ImportError as error:
-        raise MissingExtra("opencv-python-headless", "vision") from error
-    return cv2

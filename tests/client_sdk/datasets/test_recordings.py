@@ -59,7 +59,7 @@ def test_images_more_than_20_ms_apart_are_no_frame(tmp_path: Path):
 
 
 def test_each_image_is_used_once_by_its_nearest_partner():
-    assert associate_stamps([0.0, 0.01, 0.1], [0.009, 0.2, 0.119], 0.02) == [(1, 0), (2, 2)]
+    assert associate_stamps([0.0, 0.01, 0.1], [0.009, 0.119, 0.2], 0.02) == [(1, 0), (2, 1)]
     assert associate_stamps([0.0], [], 0.02) == []
 
 
