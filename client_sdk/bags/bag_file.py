@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from client_sdk.bags.decompression import Allowance, bound_reader, charge
 from client_sdk.bags.message_types import load_types
 from client_sdk.closing import Closing
 from rse_pf.errors import MissingExtra, UsageError
@@ -75,23 +76,26 @@ def open_bag_file(path: Path) -> BagFile:
     is_ros1 = path.suffix == ".bag" and path.is_file()
     store = load_types(is_ros1=is_ros1)
     reader = _reader(path, is_ros1)
+    size_bytes = _size_bytes(path)
     try:
+        charge(Allowance(size_bytes))
         reader.open()
     except _all_faults() as error:
         raise UsageError(
             f"{path} cannot be read as a bag: {_said(error)}", hint=_hint(path, error)
         ) from error
-    return BagFile(path, reader, store, is_ros1=is_ros1)
+    return BagFile(path, reader, store, size_bytes=size_bytes, is_ros1=is_ros1)
 
 
 class BagFile(Closing):
     """An open bag; close it, or use it in ``with``."""
 
-    def __init__(self, path: Path, reader: Any, store: Any, *, is_ros1: bool) -> None:
+    def __init__(self, path: Path, reader: Any, store: Any, *, size_bytes: int, is_ros1: bool) -> None:
         self.path = path
         self._reader = reader
         self._release = weakref.finalize(self, reader.close)
         self._store = store
+        self._size_bytes = size_bytes
         self._is_ros1 = is_ros1
         found: dict[tuple[str, str], int] = {}
         for each in reader.connections:
@@ -112,8 +116,15 @@ class BagFile(Closing):
         wanted = [each for each in self._reader.connections if each.topic in names]
         if not wanted:
             return
+        allowance = Allowance(self._size_bytes)
+        found = self._reader.messages(wanted, start=start_ns)
         try:
-            for connection, log_ns, data in self._reader.messages(wanted, start=start_ns):
+            while True:
+                charge(allowance)
+                message = next(found, None)
+                if message is None:
+                    return
+                connection, log_ns, data = message
                 yield RawMessage(topic=connection.topic, kind=connection.msgtype, log_ns=log_ns, data=data)
         except _all_faults() as error:
             raise BrokenMessage(_said(error)) from error
@@ -165,7 +176,14 @@ def _reader(path: Path, is_ros1: bool) -> Any:
         from rosbags.rosbag2 import Reader as Reader2
     except ImportError as error:
         raise MissingExtra("rosbags", "bags") from error
+    bound_reader()
     return Reader1(path) if is_ros1 else Reader2(path)
+
+
+def _size_bytes(path: Path) -> int:
+    """Return the size of a bag: of its file, or of the files in its folder."""
+    files = path.iterdir() if path.is_dir() else (path,)
+    return sum(each.stat().st_size for each in files if each.is_file())
 
 
 def _all_faults() -> tuple[type[Exception], ...]:
