@@ -42,7 +42,7 @@ _MAX_RATIO, _FREE_BYTES = 50.0, 1 << 20
 _DESCRIPTOR_BYTES = 32
 _MAX_ID = 2**63 - 1
 _MAX_NAME = 64
-_MAX_NUMBER, _MAX_TIME_S = 1e9, 1e12
+_MAX_NUMBER, _MAX_TIME_S, _MAX_PIXEL, _MAX_INFORMATION = 1e9, 1e12, 1e5, 1e18
 """Metres or pixels, and seconds: larger numbers overflow in what computes with them."""
 
 
@@ -96,7 +96,7 @@ class Keyframe:
                 f"the id {self.id} is not within 0..2**63-1, or the robot's name longer than {_MAX_NAME}",
                 hint="number keyframes from 0",
             )
-        if not (abs(self.timestamp_s) <= _MAX_TIME_S and _is_bounded(self.pixels)):
+        if not (abs(self.timestamp_s) <= _MAX_TIME_S and _is_bounded(self.pixels, _MAX_PIXEL)):
             raise BadRequest(
                 f"keyframe {self.id} holds a number that is not finite, or absurd", hint="leave it out"
             )
@@ -119,7 +119,7 @@ class Edge:
 
     def __post_init__(self) -> None:
         _check_pose(f"edge {self.a}-{self.b}", self.T_a_b)
-        if self.information.shape != (6, 6) or not np.isfinite(self.information).all():
+        if self.information.shape != (6, 6) or not (np.abs(self.information) <= _MAX_INFORMATION).all():
             raise BadRequest(f"edge {self.a}-{self.b} has no (6, 6) information", hint="invert a covariance")
 
 
@@ -359,11 +359,11 @@ def _array(raw: bytes | memoryview, kind: str, shape: tuple[int, ...]) -> npt.ND
     return np.frombuffer(raw, dtype=np.dtype(kind)).reshape(shape)
 
 
-def _is_bounded(values: npt.NDArray[np.float32]) -> bool:
+def _is_bounded(values: npt.NDArray[np.float32], most: float = _MAX_NUMBER) -> bool:
     """Return whether all *values* are finite and not absurd; a NaN makes both comparisons false."""
     if not values.size:
         return True
-    return bool(values.min() >= -_MAX_NUMBER and values.max() <= _MAX_NUMBER)
+    return bool(values.min() >= -most and values.max() <= most)
 
 
 def _check_pose(what: str, T: Array) -> None:

@@ -23,6 +23,9 @@ from rse_pf.wire.arrays import Array
 
 __all__ = ["LocaliseOptions", "LocaliseReply", "LocaliseRequest", "locate", "register"]
 
+_MAX_M = 1e6
+"""PnP refuses coordinates beyond it."""
+
 
 class LocaliseOptions(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     """How to localise.
@@ -157,6 +160,8 @@ def _candidate_pose(
     if len(rows) < options.min_inliers // 2:
         return None
     points_map = transform(keyframe.T_world_camera, points)
+    if not (np.abs(points_map) <= _MAX_M).all():  # too far from the origin of its map to be solved
+        return None
     solution = _solve(points_map, view.pixels[columns], view, options)
     return None if solution is None else _CandidatePose(row, points_map, view.pixels[columns], solution)
 

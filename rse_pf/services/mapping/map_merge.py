@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rse_pf.budget import PROVENANCE, check_msgpack
-from rse_pf.errors import LimitExceeded
+from rse_pf.errors import BadRequest, LimitExceeded
 from rse_pf.geometry import Array, inverse
 from rse_pf.maps.format import Edge, MapVersion
 from rse_pf.service import Report
@@ -37,7 +37,7 @@ from rse_pf.services.mapping.optimise import (
     ignore_progress,
     optimise_graph,
 )
-from rse_pf.services.mapping.pose_graph import PoseGraph
+from rse_pf.services.mapping.pose_graph import PoseGraph, is_positive_definite
 
 __all__ = [
     "Atlas",
@@ -225,6 +225,7 @@ def _odometry(
     edges: list[tuple[LoopClosure, str]] = []
     known: set[tuple[int, int]] = set()
     for which in sorted(joined):
+        _check_information(which, versions[which])
         for edge in versions[which].edges:
             a, b = atlas.row_of[which, edge.a], atlas.row_of[which, edge.b]
             edges.append((LoopClosure(a=a, b=b, T_a_b=edge.T_a_b, information=edge.information), edge.kind))
@@ -237,6 +238,19 @@ def _odometry(
             T_a_b = inverse(atlas.T_world_camera[a]) @ atlas.T_world_camera[b]
             edges.append((LoopClosure(a=a, b=b, T_a_b=T_a_b, information=np.diag(spread**-2.0)), "odometry"))
     return edges
+
+
+def _check_information(which: int, version: MapVersion) -> None:
+    """Name the map whose edges cannot be optimised; raises BadRequest."""
+    every = np.array([edge.information for edge in version.edges]).reshape(-1, 6, 6)
+    if is_positive_definite(every):
+        return
+    edge = next(edge for edge in version.edges if not is_positive_definite(edge.information[None]))
+    raise BadRequest(
+        f"map {which} (the first is 0): the information of edge {edge.a}-{edge.b} is not symmetric and "
+        "positive definite",
+        hint="leave that map out",
+    )
 
 
 def _graph(

@@ -17,7 +17,16 @@ import numpy.typing as npt
 from rse_pf.errors import BadRequest
 from rse_pf.geometry import Array, from_quaternion, to_quaternion
 
-__all__ = ["PoseGraph", "components", "inverses", "log_se3", "misfit", "read_g2o", "write_g2o"]
+__all__ = [
+    "PoseGraph",
+    "components",
+    "inverses",
+    "is_positive_definite",
+    "log_se3",
+    "misfit",
+    "read_g2o",
+    "write_g2o",
+]
 
 _UPPER = np.triu_indices(6)
 _MAX_ID = 2**53
@@ -69,7 +78,7 @@ class PoseGraph:
             raise BadRequest("two poses have one id", hint="give each pose its own id")
         _check_rigid("a pose", self.T_world_pose)
         _check_rigid("an edge", self.T_a_b)
-        if not _is_positive_definite(self.information):
+        if not is_positive_definite(self.information):
             raise BadRequest(
                 "an information matrix is not symmetric and positive definite", hint="invert a covariance"
             )
@@ -90,6 +99,17 @@ def misfit(measured: Array, predicted: Array, information: Array) -> Array:
     error = log_se3(inverses(measured) @ predicted)
     squares: Array = np.einsum("mi,mij,mj->m", error, information, error)
     return squares
+
+
+def is_positive_definite(information: Array) -> bool:
+    """Say whether ``(m, 6, 6)`` matrices are symmetric, positive definite and not absurdly large."""
+    if not len(information):
+        return True
+    if not (np.abs(information) <= _MAX_INFORMATION).all():
+        return False
+    scale = np.abs(information).max(axis=(1, 2))
+    skewed = np.abs(information - np.swapaxes(information, 1, 2)).max(axis=(1, 2)) > 1e-6 * scale
+    return not skewed.any() and bool((np.linalg.eigvalsh(information)[:, 0] > 0).all())
 
 
 def inverses(T_a_b: Array) -> Array:
@@ -276,13 +296,3 @@ def _check_rigid(what: str, T: Array) -> None:
     off = np.abs(rotation @ np.swapaxes(rotation, 1, 2) - np.eye(3)).max()
     if off > 1e-4 or np.linalg.det(rotation).min() < 0:
         raise BadRequest(f"{what} has a matrix that is not a rotation", hint="orthonormalise it")
-
-
-def _is_positive_definite(information: Array) -> bool:
-    if not len(information):
-        return True
-    if not (np.abs(information) <= _MAX_INFORMATION).all():
-        return False
-    scale = np.abs(information).max(axis=(1, 2))
-    skewed = np.abs(information - np.swapaxes(information, 1, 2)).max(axis=(1, 2)) > 1e-6 * scale
-    return not skewed.any() and bool((np.linalg.eigvalsh(information)[:, 0] > 0).all())

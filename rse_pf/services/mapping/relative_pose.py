@@ -26,6 +26,8 @@ __all__ = [
 ]
 
 # Depths that a depth camera may measure; the depth of anything else is left out.
+_MAX_POINT_M = 1e5
+"""No point of a keyframe is further away; PnP refuses all matches for one that is."""
 _NEAREST_M, _FARTHEST_M = 0.01, 100.0
 
 
@@ -121,7 +123,8 @@ def pose_of_view(
 
 def matched_points(reference: Keyframe, view: View, options: RelativePoseOptions) -> tuple[Array, Rows, Rows]:
     """Return the reference's ``(k, 3)`` matched points (its camera frame), and both row numbers."""
-    known = np.flatnonzero(np.isfinite(reference.points_camera).all(axis=1))
+    # Not a number is "no depth"; the rest is another's, and one row must not cost the whole request.
+    known = np.flatnonzero((np.abs(reference.points_camera) <= _MAX_POINT_M).all(axis=1))
     rows, columns = hamming_matches(reference.descriptors[known], view.descriptors, options.ratio)
     rows, columns = known[rows[: options.max_matches]], columns[: options.max_matches]
     return np.asarray(reference.points_camera[rows], dtype=np.float64), rows, columns
