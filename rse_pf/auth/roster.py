@@ -7,10 +7,12 @@ public keys, names and times, no secrets.
 from __future__ import annotations
 
 import base64
+import functools
 import hashlib
 import json
 import math
 import re
+import unicodedata
 from typing import Annotated, TypeVar
 
 import msgspec
@@ -19,6 +21,8 @@ from rse_pf.errors import ConfigurationError, UsageError
 from rse_pf.identity import RobotId
 
 __all__ = [
+    "MAX_ROBOTS_OF_TENANT",
+    "MAX_ROSTER_BYTES",
     "QUOTAS",
     "ROBOT_KEY",
     "DenyList",
@@ -48,6 +52,9 @@ _SCOPE = re.compile(
 )
 _X = re.compile(r"[A-Za-z0-9_-]{43}")
 _MAX_CHARACTERS, _MAX_SCOPES = 64, 64
+MAX_ROBOTS_OF_TENANT = 10_000
+MAX_ROSTER_BYTES = 16 << 20
+"""Every worker of every server reads the whole roster when it changes."""
 
 _T = TypeVar("_T", bound=msgspec.Struct)
 Word = Annotated[str, msgspec.Meta(min_length=1, max_length=_MAX_CHARACTERS)]
@@ -87,10 +94,23 @@ class Roster(_Value, frozen=True, kw_only=True):
         """Return the roster with *robot*, which replaces an entry of the same tenant and name.
 
         Raises:
-            UsageError: Another robot has this key.
+            UsageError: Another robot has this key, or a name that looks the same; or the tenant has as many
+                robots as it may have.
         """
         others = tuple(r for r in self.robots if (r.tenant, r.robot) != (robot.tenant, robot.robot))
+        seen = _as_seen(robot.robot)
+        count = sum(other.tenant == robot.tenant for other in others)
+        if count >= MAX_ROBOTS_OF_TENANT:
+            raise UsageError(
+                f"tenant {robot.tenant!r} has {count} robots already, which is the limit",
+                hint="remove robots that are gone: rse-pf robot remove",
+            )
         for other in others:
+            if other.tenant == robot.tenant and _as_seen(other.robot) == seen:
+                raise UsageError(
+                    f"robot {robot.robot!r} looks like {other.robot!r}, which is enrolled",
+                    hint="choose a name that differs in more than case, spaces or a form of its letters",
+                )
             if other.x == robot.x:
                 raise UsageError(
                     f"robot {other.robot!r} of tenant {other.tenant!r} has this key already",
@@ -193,6 +213,7 @@ def to_json(value: Roster | DenyList) -> bytes:
     return msgspec.json.format(msgspec.json.encode(value), indent=1) + b"\n"
 
 
+@functools.lru_cache(maxsize=1 << 17)
 def key_id_of(x: str) -> str:
     """Return the key id of a robot's public key.
 
@@ -239,6 +260,12 @@ def check_robot(name: str) -> str:
 def check_tenant(name: str) -> str:
     """Return *name*; raises UsageError if it cannot be the name of a tenant."""
     return _checked_name(name, "tenant")
+
+
+@functools.lru_cache(maxsize=1 << 17)
+def _as_seen(name: str) -> str:
+    """Return what names share that an operator can hardly tell apart."""
+    return " ".join(unicodedata.normalize("NFKC", name).casefold().split())
 
 
 def _checked_name(name: str, what: str) -> str:

@@ -12,10 +12,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar
 
-from rse_pf.auth.roster import DenyList, Roster, from_json, to_json
+from rse_pf.auth.roster import MAX_ROSTER_BYTES, DenyList, Roster, from_json, to_json
 from rse_pf.auth.tokens import KeySet
 from rse_pf.config.resource_names import DENY_NAME, ROBOTS_NAME
-from rse_pf.errors import ConfigurationError, Conflict, NotFound, RsePfError, message_of
+from rse_pf.errors import ConfigurationError, Conflict, NotFound, RsePfError, UsageError, message_of
 from rse_pf.object_store import DirectoryStore, ObjectStore
 
 __all__ = [
@@ -49,7 +49,11 @@ class AccessControlStore:
         return self._read(DENY_NAME, DenyList)[0]
 
     def change_roster(self, edit: Callable[[Roster], Roster]) -> None:
-        """Apply *edit* to the current roster; raises Conflict if others keep changing it."""
+        """Apply *edit* to the current roster; raises Conflict if others keep changing it.
+
+        Raises:
+            UsageError: The roster would grow above what servers read.
+        """
         self._change(ROBOTS_NAME, Roster, edit)
 
     def change_deny_list(self, edit: Callable[[DenyList], DenyList]) -> None:
@@ -72,6 +76,11 @@ class AccessControlStore:
         for attempt in range(1, _MAX_ATTEMPTS + 1):
             value, data = self._read(name, kind)
             changed = to_json(edit(value))
+            if kind is Roster and MAX_ROSTER_BYTES < len(changed) > len(data or b""):
+                raise UsageError(
+                    f"a roster of {len(changed)} bytes is above {MAX_ROSTER_BYTES}",
+                    hint="remove robots that are gone, or give them fewer scopes: services:* and the like",
+                )
             try:
                 if changed != data:
                     self._store.compare_and_swap(name, data, changed)
@@ -108,8 +117,8 @@ class TrustStore:
         parts = dict(self._parts)
         for name, read in (
             ("keys", self._read_keys),
-            ("robots", lambda: self._read(ROBOTS_NAME, Roster)),
-            ("denied", lambda: self._read(DENY_NAME, DenyList)),
+            ("robots", lambda: self._read("robots", ROBOTS_NAME, Roster)),
+            ("denied", lambda: self._read("denied", DENY_NAME, DenyList)),
         ):
             try:
                 parts[name] = read()
@@ -146,10 +155,12 @@ class TrustStore:
             KeySet.from_json(text)
         return text
 
-    def _read(self, name: str, kind: type[Roster] | type[DenyList]) -> str:
+    def _read(self, part: str, name: str, kind: type[Roster] | type[DenyList]) -> str:
         data = self._store.get(name)
-        from_json(data, kind)
-        return data.decode()
+        text = data.decode()
+        if text != self._parts.get(part):  # what is known was valid
+            from_json(data, kind)
+        return text
 
 
 def key_set_from_snapshot(snapshot: str) -> KeySet:
