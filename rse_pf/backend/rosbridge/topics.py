@@ -183,7 +183,7 @@ class RosbridgeTopics:
             self._publish(client, key, op)
 
     def _key(self, client: Client, topic: str) -> Key:
-        if not _NAME.fullmatch(topic):
+        if not _NAME.fullmatch(topic) or not {".", ".."}.isdisjoint(topic.split("/")):
             raise BadRequest(f"{topic[:80]!r} is no name of a topic", hint="use a ROS name such as /scan")
         return client.robot.tenant, topic.removeprefix("/")
 
