@@ -328,6 +328,8 @@ def recording_files(path: Path) -> tuple[Path, ...]:
         return files
     if not path.exists():
         raise UsageError(f"there is no file {path}", hint="give a file or a folder of rse-pf local --record")
+    if not path.is_file():  # nobody waits for what a pipe brings
+        raise _no_recording(path)
     with path.open("rb") as file:
         start = file.read(len(_MAGIC))
     if not start:

@@ -48,7 +48,7 @@ def _decoded(thumbnail: bytes) -> Array | None:
             if width * height > _MAX_PIXELS or min(width, height) < 16:
                 return None
             return np.asarray(picture.convert("L"), dtype=np.float64)
-    except (UnidentifiedImageError, OSError, ValueError, SyntaxError):
+    except (UnidentifiedImageError, OSError, ValueError, SyntaxError, kind.DecompressionBombError):
         return None
 
 

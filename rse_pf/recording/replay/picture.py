@@ -129,7 +129,7 @@ def _opened(thumbnail: bytes) -> Any:
         if image.width * image.height > MAX_THUMBNAIL_PX:
             raise BadRequest("a thumbnail is too large", hint="record smaller ones")
         image.load()
-    except (OSError, ValueError, SyntaxError, EOFError) as error:
+    except (OSError, ValueError, SyntaxError, EOFError, image_module.DecompressionBombError) as error:
         raise BadRequest("a thumbnail is no JPEG", hint="leave it out") from error
     return image
 

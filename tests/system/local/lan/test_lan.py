@@ -25,6 +25,7 @@ from system.local.lan.conftest import OtherMachine
 from rse_pf.auth.certificates import SERVER_S
 from rse_pf.auth.control_token import bearer, read_control_token
 from rse_pf.cli.main import main
+from rse_pf.config import PlatformSettings
 from rse_pf.local.lan.listener import LanListener
 from rse_pf.local.processes import send_signal
 from rse_pf.local.state import PlatformState, read_state
@@ -195,6 +196,110 @@ def test_only_the_port_of_the_robots_can_be_reached(lan: Lan, other_machine: Oth
     assert all(ports)
     assert said[0] == "0"
     assert set(said[1:]) == {"111"}, "connection refused"
+
+
+STRANGER = """
+import json, socket, ssl, sys, time
+host, port, limit_s = sys.argv[1], int(sys.argv[2]), float(sys.argv[3])
+hello = bytes.fromhex("1603010200010001fc0303") + bytes(32)
+silent, dribbling, halves = [], [], []
+for kept, first in ((silent, b""), (dribbling, hello[:1]), (halves, hello)):
+    for _ in range(100):
+        one = socket.create_connection((host, port), 5)
+        if first:
+            one.sendall(first)
+        kept.append(one)
+begin = time.monotonic()
+
+def relaxed():
+    made = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    made.check_hostname, made.verify_mode = False, ssl.CERT_NONE
+    return made
+
+def asked(text, name=None):
+    with socket.create_connection((host, port), 5) as plain:
+        with relaxed().wrap_socket(plain, server_hostname=name) as secure:
+            secure.settimeout(5)
+            secure.sendall(text.encode())
+            return secure.recv(4096).decode(errors="replace").split("\\r\\n")[0]
+
+def get(path, name=None):
+    return asked(f"GET {path} HTTP/1.1\\r\\nhost: x\\r\\nconnection: close\\r\\n\\r\\n", name)
+
+took = time.monotonic()
+page = get("/")
+took = time.monotonic() - took
+told = {"page": page, "took_s": took}
+for path in ("/metrics", "/status", "/robots", "/readyz", "/events", "/api/state", "/fleet", "/authority.pem",
+             "/tls.json", "/%2e%2e/authority.pem", "/..%2fauthority.pem", "/control/robots.json", "/ws",
+             "/data/v1/objects", "/rosbridge"):
+    told[path] = get(path)
+for name in ("other.example", ".".join(["a" * 60] * 4), "localhost"):
+    told["name " + name[:13]] = get("/", name)
+with socket.create_connection((host, port), 5) as plain:
+    plain.sendall(b"GET / HTTP/1.1\\r\\nhost: x\\r\\n\\r\\n")
+    plain.settimeout(5)
+    try:
+        told["plain"] = plain.recv(4096).decode(errors="replace")
+    except ConnectionResetError:
+        told["plain"] = ""
+closed = 0
+dribbled = time.monotonic()
+rest = hello[1:]
+waiting = [*silent, *dribbling, *halves]
+for one in waiting:
+    one.setblocking(False)
+while waiting and time.monotonic() - begin < limit_s:
+    for one in list(waiting):
+        try:
+            if one in dribbling and rest:
+                one.send(rest[:1])
+            if one.recv(4096) != b"":
+                continue
+        except BlockingIOError:
+            continue
+        except OSError:
+            pass
+        waiting.remove(one)
+        closed += 1
+    rest = rest[1:]
+    time.sleep(0.5)
+told["closed"], told["within_s"] = closed, time.monotonic() - begin
+print(json.dumps(told))
+"""
+
+
+@pytest.mark.slow
+def test_a_stranger_on_the_network_gets_one_page_and_holds_no_handshake_open(
+    lan: Lan, other_machine: OtherMachine
+) -> None:
+    """300 connections are silent, send their first message byte by byte, or half of it, and are closed."""
+    limit_s = 2 * PlatformSettings().serving.handshake_timeout_s
+
+    said = other_machine.python(STRANGER, other_machine.here, str(lan.state.port), str(limit_s))
+
+    told = json.loads(said)
+    assert told.pop("closed") == 300
+    assert told.pop("within_s") <= limit_s
+    assert told.pop("took_s") < 1.0, "another machine is served meanwhile"
+    assert told.pop("plain") == "", "plain HTTP gets no answer"
+    pages = {name: told.pop(name) for name in list(told) if name == "page" or name.startswith("name ")}
+    assert set(pages.values()) == {"HTTP/1.1 200 OK"}
+    assert set(told.values()) <= {
+        "HTTP/1.1 400 Bad Request", "HTTP/1.1 401 Unauthorized", "HTTP/1.1 404 Not Found",
+    }, told  # fmt: skip
+
+
+def test_no_file_with_a_secret_can_be_read_by_others(lan: Lan, enrolment: Path) -> None:
+    secret = {"authority.pem", "tls.json", "control.token", enrolment.name}
+    found = {path.name: path for path in (*lan.folder.rglob("*"), enrolment) if path.is_file()}
+
+    assert secret < found.keys()
+    for name in secret:
+        assert stat.S_IMODE(found[name].stat().st_mode) == 0o600, name
+    for path in found.values():
+        if b"PRIVATE KEY" in path.read_bytes() or b'"d":' in path.read_bytes():
+            assert not stat.S_IMODE(path.stat().st_mode) & 0o077, path
 
 
 def test_every_server_is_replaced_while_a_robot_works_and_nothing_is_lost(
