@@ -257,7 +257,8 @@ class Connection:
             return
         socket.exchange = exchange
         socket.measured.set()
-        self._choice.measured(socket.region.number, exchange.round_trip_s)
+        # By the robot's clock alone: a server may say that all of the time was its own.
+        self._choice.measured(socket.region.number, exchange.returned_s - exchange.sent_s)
         usable, current = self._usable(), self._current_region()
         if len(self._regions) > 1 and current.number in usable:
             better = self._choice.better(current.number, usable, self._clock())

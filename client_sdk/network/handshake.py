@@ -54,6 +54,14 @@ def websocket_options(settings: SessionSettings) -> dict[str, Any]:
     }
 
 
+class _StraightConnect(websocket_connect):
+    """The library's, which would follow a redirect, token and all, to whatever address it names."""
+
+    def process_redirect(self, exc: Exception) -> Exception:
+        """Take a redirect as the refusal that any other status is."""
+        return exc
+
+
 class Dialler:
     """Opens WebSockets as one robot; *codec* names the sub-protocol."""
 
@@ -126,7 +134,7 @@ class Dialler:
         if self.ssl_context is not None and url.startswith("wss:"):
             options["ssl"] = self.ssl_context
         try:
-            websocket = await websocket_connect(
+            websocket = await _StraightConnect(
                 url,
                 subprotocols=[Subprotocol(self._subprotocol)],
                 additional_headers={} if token is None else {"Authorization": f"Bearer {token}"},

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import random
 import time
 from contextlib import AsyncExitStack
 from dataclasses import replace
 
 import pytest
-from fake_platform import FakePlatform
+from fake_platform import FakePlatform, FakeSocket
 
 import client_sdk
 from benchmarks.cloud.delaying_proxy import DelayingProxy
@@ -93,6 +94,29 @@ def test_the_nearer_region_is_used_and_the_other_one_stands_by():
 
                 assert not list(regions.far.commands())
                 assert a_robot.stats.region_changes == 0
+
+    run(test())
+
+
+def test_a_region_is_no_nearer_for_saying_that_all_of_the_time_was_its_own():
+    async def test():
+        async with TwoRegions() as regions:
+            send = FakeSocket.send
+
+            async def sends(socket, data):
+                message = json.loads(data) if data[:1] == b"{" else {}
+                if message.get("type") == "pong" and socket.server == "far-1":
+                    data = json.dumps({**message, "received_s": message["answered_s"] - 1.0}).encode()
+                await send(socket, data)
+
+            with pytest.MonkeyPatch.context() as patched:
+                patched.setattr(FakeSocket, "send", sends)
+                regions.near_link.delay_s = 0.04
+                async with regions.robot(codec="json") as a_robot:
+                    await regions.both_joined()
+                    until = time.monotonic() + 3 * QUICK.region_hold_s
+                    while time.monotonic() < until:
+                        assert (await ask(a_robot, 1)).server == "near-1"
 
     run(test())
 
