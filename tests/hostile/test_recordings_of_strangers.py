@@ -148,7 +148,7 @@ def test_a_video_that_is_cut_off_gives_its_frames_or_one_line(tmp_path: Path, in
 
 
 @pytest.mark.parametrize(
-    "text", ["#EXTM3U\n#EXTINF:1.0,\nfile:///etc/passwd\n", "ffconcat version 1.0\nfile v.avi\n", "v=0\r\n"]
+    "text", ["#EXTM3U\n#EXTINF:1.0,\nv.avi\n", "ffconcat version 1.0\nfile v.avi\n", "v=0\r\n"]
 )
 def test_a_playlist_under_the_name_of_a_video_opens_no_other_file(tmp_path: Path, text: str):
     (tmp_path / "v.avi").write_bytes(video((64, 48), 3, (64, 48)))
