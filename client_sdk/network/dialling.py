@@ -12,7 +12,7 @@ import ssl
 from urllib.parse import urlsplit
 
 from rse_pf.errors import ConnectError, Forbidden, RsePfError, Unauthorized, UsageError
-from rse_pf.wire.refusal import CUT_OFF, Refusal, refusal_in
+from rse_pf.wire.refusal import CUT_OFF, RefusedHandshake, refusal_in
 
 __all__ = [
     "CHECK_ADDRESS",
@@ -132,7 +132,7 @@ def _not_ours(address: str, status: int) -> RsePfError:
     return ConnectError(f"{address} answers {status}, and it is not an RSE-PF server that says so", hint=hint)
 
 
-def _refused(address: str, status: int, told: Refusal) -> RsePfError:
+def _refused(address: str, status: int, told: RefusedHandshake) -> RsePfError:
     if status == 403:
         return Forbidden(f"{address} forbids this robot to connect", hint="ask the operator")
     if told.cause:

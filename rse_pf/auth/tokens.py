@@ -336,7 +336,7 @@ def token_problem(error: Unauthorized) -> str:
 
 
 def proven_refusal(error: Unauthorized) -> ProvenRefusal | None:
-    """Return what the robot may be told of *error*; None for whoever did not prove the key of a robot."""
+    """Return what the robot may be told of *error*; None for a stranger, who proved no key of a robot."""
     cause = error.__cause__
     return cause.proven if isinstance(cause, _TokenRefused) else None
 

@@ -2,8 +2,8 @@
 
 A `ClientSession` lives as long as the robot, a `ConnectionState` as long as one WebSocket.  Commands survive
 the end of a connection: they are sent again on the next one, under the same id.  Every command gets exactly
-one final answer, no stale answer is delivered as fresh, and no more commands are unanswered than the server
-accepts.  The caller passes the time as ``now``: seconds of the robot's monotonic clock.
+one final answer, no stale answer is delivered as fresh, and no more are unanswered than the server accepts.
+The caller passes the time as ``now``: seconds of the robot's monotonic clock.
 """
 
 from __future__ import annotations
@@ -54,8 +54,7 @@ __all__ = [
 ]
 
 _CAPABILITIES = ("move", PROGRESS, UPDATES)
-_MAX_TRIES_AFTER_LOSS = 2
-_RETRY_BURST = 5.0
+_MAX_TRIES_AFTER_LOSS, _RETRY_BURST = 2, 5.0
 _PINGS_PER_STALL_TIMEOUT = 3.0
 _MAX_DEADLINE_MS = 3.6e6
 RETRY_SHARE = 0.1
@@ -275,9 +274,7 @@ class ClientSession:
     def open_connection(self, now: float) -> ConnectionState:
         """Return the state of a WebSocket that was just opened, with a Hello to send."""
         connection = ConnectionState(opened=now, last_heard=now, last_checked=now)
-        connection.outgoing.append(
-            self.codec.encode(Hello(sdk=self._sdk, capabilities=("move", PROGRESS, UPDATES)))
-        )
+        connection.outgoing.append(self.codec.encode(Hello(sdk=self._sdk, capabilities=_CAPABILITIES)))
         return connection
 
     def close_connection(self, connection: ConnectionState) -> None:
@@ -373,8 +370,7 @@ class ClientSession:
         """End every command with a failure; the subscriptions wait for the next connection."""
         events: list[Event] = []
         for identity, pending in list(self._pending.items()):
-            failure = Failure(id=identity, code=code, message=message, hint=hint, trace=pending.command.trace)
-            events += self._end(identity, failure)
+            events += self._end(identity, _failure(pending.command, code, message, hint))
         return events
 
     def check(self, connection: ConnectionState, now: float) -> list[Event]:
@@ -600,5 +596,5 @@ def _is_frame(pending: _Pending) -> bool:
     return bool(pending.command.stream) and math.isfinite(pending.deadline)
 
 
-def _failure(command: Command, code: str, message: str) -> Failure:
-    return Failure(id=command.id, code=code, message=message, trace=command.trace)
+def _failure(command: Command, code: str, message: str, hint: str = "") -> Failure:
+    return Failure(id=command.id, code=code, message=message, hint=hint, trace=command.trace)

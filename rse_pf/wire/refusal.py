@@ -10,7 +10,7 @@ import json
 from dataclasses import dataclass
 from typing import Any
 
-__all__ = ["CUT_OFF", "PLATFORM", "Refusal", "refusal_body", "refusal_in"]
+__all__ = ["CUT_OFF", "PLATFORM", "RefusedHandshake", "refusal_body", "refusal_in"]
 
 PLATFORM = "rse-pf"
 """Value of the member ``platform`` in the body of each refusal."""
@@ -22,7 +22,7 @@ _MAX_UNIX_S = 1e11
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Refusal:
+class RefusedHandshake:
     """What a server said.
 
     ``cause`` is empty unless the token was signed with the key of an enrolled robot; ``valid_from_s`` (Unix
@@ -41,7 +41,7 @@ def refusal_body(code: str, message: str, hint: str, **told: Any) -> bytes:
     return json.dumps(body, separators=(",", ":")).encode()
 
 
-def refusal_in(body: bytes, code: str) -> Refusal | None:
+def refusal_in(body: bytes, code: str) -> RefusedHandshake | None:
     """Return what *body* says if it is the refusal *code* of one of our servers, else None."""
     if len(body) > _MAX_BODY_BYTES:
         return None
@@ -51,7 +51,7 @@ def refusal_in(body: bytes, code: str) -> Refusal | None:
         return None
     if not isinstance(told, dict) or told.get("platform") != PLATFORM or told.get("code") != code:
         return None
-    return Refusal(
+    return RefusedHandshake(
         message=_text(told.get("message")),
         hint=_text(told.get("hint")),
         cause=_text(told.get("cause")),

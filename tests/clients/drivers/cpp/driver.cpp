@@ -48,8 +48,17 @@ json read_json(const std::string& path) {
     return json::parse(file);
 }
 
+/// The 64 digits of RFC 4648, 5.
+std::string digits64() {
+    std::string out;
+    for (char c = 'A'; c <= 'Z'; ++c) out += c;
+    for (char c = 'a'; c <= 'z'; ++c) out += c;
+    for (char c = '0'; c <= '9'; ++c) out += c;
+    return out + "-_";
+}
+
 std::string base64url(const std::string& bytes) {
-    const char* digits = "ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789-_";
+    const std::string digits = digits64();
     std::string out;
     for (std::size_t i = 0; i < bytes.size(); i += 3) {
         const auto byte = [&](std::size_t at) { return at < bytes.size() ? static_cast<unsigned char>(bytes[at]) : 0U; };
@@ -61,7 +70,7 @@ std::string base64url(const std::string& bytes) {
 }
 
 std::string from_base64url(const std::string& text) {
-    const std::string digits = "ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789-_";
+    const std::string digits = digits64();
     std::string out;
     unsigned held = 0;
     int bits = 0;
