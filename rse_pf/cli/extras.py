@@ -81,7 +81,7 @@ EXTRAS: dict[str, Extra] = {
     "demo": Extra(
         modules={"cv2": "opencv-python-headless"}, enables="robots that track frames", includes=("local",)
     ),
-    "services": Extra(modules=_same("lupa"), enables="services in Lua"),
+    "services": Extra(modules=_same("lupa", "packaging"), enables="services in Lua, locks of services"),
     "maps": Extra(
         modules={"gtsam": "gtsam", "small_gicp": "small_gicp", "faiss": "faiss-cpu"},
         enables="merging maps, localising in maps, clouds",

@@ -138,6 +138,7 @@ PACKAGES: dict[str, tuple[str, ...]] = {
     "viser": ("rse_pf/experiments/plots/map_viewer.py",),
     "rich": ("rse_pf/cli/", "rse_pf/experiments/"),
     "lupa": ("rse_pf/services/",),
+    "packaging": ("rse_pf/services/custom/dependencies.py",),
     "gtsam": ("rse_pf/services/mapping/optimise.py",),
     "small_gicp": ("rse_pf/services/mapping/icp.py",),
     "faiss": ("rse_pf/services/mapping/descriptors.py", "rse_pf/services/mapping/place.py"),

@@ -134,9 +134,10 @@ class ZygoteClient:
         }  # fmt: skip
         # No credentials, and no threads of the linear algebra library: it will be forked.  Each arena of the
         # allocator takes 64 MiB of address space, which is limited; with one for each thread, 7 threads fit.
+        # Nothing is imported from the folder in which the server was started: it may be a stranger's service.
         variables = {
             "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "PYTHONDONTWRITEBYTECODE": "1",
-            "MALLOC_ARENA_MAX": "2",
+            "MALLOC_ARENA_MAX": "2", "PYTHONSAFEPATH": "1",
         }  # fmt: skip
         with theirs:
             self._process = subprocess.Popen(

@@ -1,7 +1,8 @@
 """Python packages of a service's own: locked by hashes, installed once from wheels, named by their content.
 
 ``requirements.txt`` in the folder of a service names every package with its version and hashes.  Only wheels
-are installed, so that no code of a package runs before it is inside the sandbox.
+are installed, so that no code of a package runs before it is inside the sandbox.  What an author wishes for
+is parsed here, and pip gets names and versions alone: it would build a folder, and follow an address.
 """
 
 from __future__ import annotations
@@ -21,8 +22,9 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from rse_pf.errors import CommandFailed, ConfigurationError, UsageError
+from rse_pf.errors import CommandFailed, ConfigurationError, MissingExtra, UsageError
 from rse_pf.files import replace_file, replace_json
+from rse_pf.services.custom.plain_files import read_plain
 
 __all__ = [
     "LOCK_FILE",
@@ -46,7 +48,7 @@ PROVIDED = ("msgspec", "numpy")
 
 _LINE = re.compile(
     r"(?P<name>[A-Za-z0-9](?:[\w.-]*[A-Za-z0-9])?)(?:\[[\w.,\s-]*\])?\s*==\s*(?P<version>[\w.!+-]+)"
-    r"(?P<marker>\s*;[^#]*?)?(?P<hashes>(?:\s+--hash=sha256:[0-9a-f]{64})+)"
+    r"(?P<marker>\s*;(?:(?!\s-)[^#$])*?)?(?P<hashes>(?:\s+--hash=sha256:[0-9a-f]{64})+)"
 )
 _PINNED = re.compile(r"[\w.\[\],-]+\s*==\s*[\w.!+-]+\s*(;.*)?")
 _SHA256 = re.compile(r"[0-9a-f]{64}")
@@ -97,12 +99,9 @@ def read_lock(folder: Path) -> list[LockedRequirement]:
         UsageError: A line is not one version with hashes, or names a package that every sandbox provides.
     """
     path = folder / LOCK_FILE
-    try:
-        text = path.read_text(encoding="utf-8")
-    except FileNotFoundError:
+    text = _text_of(path)
+    if text is None:
         return []
-    except (OSError, UnicodeDecodeError) as error:
-        raise UsageError(f"cannot read {path}: {error}", hint="write one package on each line") from error
     hint = f"lock the versions: rse-pf service lock {folder}"
     found: dict[str, LockedRequirement] = {}
     for number, line in _lines(text):
@@ -187,7 +186,7 @@ def copy_dependencies(built: Dependencies, store: Path) -> None:
         return
     store.mkdir(parents=True, exist_ok=True)
     fresh = Path(tempfile.mkdtemp(prefix=".new-", dir=store))
-    shutil.copytree(built.folder, fresh, dirs_exist_ok=True)
+    shutil.copytree(built.folder, fresh, dirs_exist_ok=True, symlinks=True)
     _settle(fresh, target)
 
 
@@ -210,28 +209,34 @@ def lock_dependencies(folder: Path) -> list[LockedRequirement]:
     interpreter are chosen.
 
     Raises:
-        UsageError: There is neither file, or pip is not installed.
+        UsageError: There is neither file, a line is more than a name with versions, or pip is not installed.
         CommandFailed: pip finds no versions that fit, or no wheel.
+        MissingExtra: The package that parses the lines is not installed.
     """
     wanted, lock = folder / _WANTED_FILE, folder / LOCK_FILE
-    source = wanted if wanted.is_file() else lock
-    if not source.is_file():
+    source, text = wanted, _text_of(wanted)
+    if text is None:
+        source, text = lock, _text_of(lock)
+    if text is None:
         raise UsageError(
             f"there is no {wanted}",
             hint="write the packages that the service imports there, one on each line",
         )
+    lines = [_wish(line, f"{source}, line {number}") for number, line in _lines(text)]
     with tempfile.TemporaryDirectory(prefix="rse-pf-lock-") as temporary:
         report, constraints = Path(temporary, "report.json"), Path(temporary, "constraints.txt")
+        wishes = Path(temporary, "wishes.txt")
+        wishes.write_text("".join(f"{line}\n" for line in lines), encoding="utf-8")
         provided = "".join(f"{name}=={metadata.version(name)}\n" for name in PROVIDED)
         constraints.write_text(provided, encoding="utf-8")
         _pip(
             "--dry-run", "--ignore-installed", "--report", str(report), "-c", str(constraints),
-            "-r", str(source),
+            "-r", str(wishes),
             hint=f"correct {source}; a package must have a wheel for {platform_tag()}",
         )  # fmt: skip
         document = json.loads(report.read_text(encoding="utf-8"))
     if source == lock:
-        replace_file(wanted, lock.read_bytes())
+        replace_file(wanted, text.encode())
     chosen = sorted(filter(None, map(_chosen, document["install"])), key=lambda each: each.name)
     write_lock(lock, chosen, f"Locked from {_WANTED_FILE} by rse-pf service lock, for {platform_tag()}.")
     return chosen
@@ -249,7 +254,8 @@ def _install(requirements: Sequence[LockedRequirement], folder: Path, store: Pat
     try:
         write_lock(lock, requirements, "one installation")
         _pip(
-            "--require-hashes", "--no-deps", "--no-compile", "--target", str(fresh), "-r", str(lock),
+            "--require-hashes", "--no-deps", "--no-compile", "--target", str(fresh.absolute()),
+            "-r", str(lock.absolute()),
             hint=f"only wheels with the hashes of the lock are installed: rse-pf service lock {folder}",
         )  # fmt: skip
         shutil.rmtree(fresh / "bin", ignore_errors=True)  # programs, which no sandbox can start
@@ -281,13 +287,45 @@ def _built(record: Path, store: Path) -> Dependencies | None:
     return built if is_whole and tree_digest(built.folder) == built.digest else None
 
 
+def _text_of(path: Path) -> str | None:
+    """Return the text of *path*, None if it is missing."""
+    try:
+        return read_plain(path).decode("utf-8")
+    except FileNotFoundError:
+        return None
+    except (OSError, UnicodeDecodeError) as error:
+        raise UsageError(f"cannot read {path}: {error}", hint="write one package on each line") from error
+
+
+def _wish(line: str, where: str) -> str:
+    """Return *line* as pip shall read it: a name, extras, versions, a marker, and the hashes of a lock."""
+    try:
+        from packaging.requirements import InvalidRequirement, Requirement
+    except ImportError as error:
+        raise MissingExtra("packaging", "services") from error
+    locked = _LINE.fullmatch(line)
+    hashes = "" if locked is None else locked["hashes"]
+    try:
+        parsed = Requirement(line.removesuffix(hashes))
+    except InvalidRequirement:
+        parsed = None
+    if parsed is None or parsed.url is not None or "$" in line:
+        raise UsageError(
+            f"{where}: {line[:80]!r} is not the name of a package with its versions",
+            hint="write lines such as scipy>=1.11: no path, no address, no option of pip, no variable",
+        )
+    parsed.name = _normalised(parsed.name)  # a name such as a.zip would be a file
+    return f"{parsed}{hashes}"
+
+
 def _pip(*arguments: str, hint: str) -> None:
     command = [
         sys.executable, "-m", "pip", "install", "--only-binary=:all:", "--quiet", "--no-input",
         "--disable-pip-version-check", *arguments,
     ]  # fmt: skip
     variables = {name: value for name, value in os.environ.items() if name not in _LEFT_OUT_VARIABLES}
-    done = subprocess.run(command, capture_output=True, text=True, check=False, env=variables)
+    with tempfile.TemporaryDirectory(prefix="rse-pf-pip-") as empty:  # python -m imports from where it runs
+        done = subprocess.run(command, capture_output=True, text=True, check=False, env=variables, cwd=empty)
     if done.returncode == 0:
         return
     if "No module named pip" in done.stderr:

@@ -28,6 +28,7 @@ from rse_pf.services.custom.dependencies import (
     copy_dependencies,
     read_lock,
 )
+from rse_pf.services.custom.plain_files import copy_plain, read_plain
 
 __all__ = [
     "DEPENDENCIES_FOLDER",
@@ -99,7 +100,7 @@ def read_service(folder: Path) -> InstalledService:
     """
     path = folder / _MANIFEST
     try:
-        manifest = msgspec.json.decode(path.read_bytes(), type=_Manifest)
+        manifest = msgspec.json.decode(read_plain(path), type=_Manifest)
     except OSError as error:
         raise UsageError(
             f"cannot read {path}: {error.strerror}", hint="make a service with: rse-pf service new NAME"
@@ -125,8 +126,8 @@ def install(folder: Path, into: Path, dependencies: Dependencies | None = None) 
         dependencies: The packages that `build_dependencies` installed for it; they are copied, too.
 
     Raises:
-        UsageError: The folder is not a service, its entry is missing (a library that was not built), or it
-            locks packages and *dependencies* is None.
+        UsageError: The folder is not a service, holds a link, its entry is missing (a library that was not
+            built), or it locks packages and *dependencies* is None.
         ConfigurationError: An installed service needs another version of one of the packages.
     """
     service = read_service(folder)
@@ -147,7 +148,11 @@ def install(folder: Path, into: Path, dependencies: Dependencies | None = None) 
     fresh, old, target = (into / f"{mark}{service.name}" for mark in (".new-", ".old-", ""))
     for leftover in (fresh, old):
         shutil.rmtree(leftover, ignore_errors=True)
-    shutil.copytree(folder, fresh, ignore=lambda _, names: _IGNORED & set(names))
+    try:
+        copy_plain(folder, fresh, _IGNORED)
+    except UsageError:
+        shutil.rmtree(fresh, ignore_errors=True)
+        raise
     if dependencies is not None:
         document = asdict(dependencies) | {"folder": None}
         (fresh / _DEPENDENCIES).write_text(
@@ -268,7 +273,7 @@ def _check_pins(target: Path) -> None:
 
 def _files(folder: Path) -> Iterator[str]:
     for path in sorted(folder.rglob("*")):
-        if path.is_file() and "__pycache__" not in path.parts:
+        if (path.is_file() or path.is_symlink()) and "__pycache__" not in path.parts:
             yield str(path.relative_to(folder))
 
 

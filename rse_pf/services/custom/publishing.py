@@ -20,6 +20,7 @@ from rse_pf.errors import ConfigurationError, Conflict, NotFound, StoreError, Us
 from rse_pf.object_store import ObjectStore, digest_of
 from rse_pf.services.custom.dependencies import Dependencies, check_together
 from rse_pf.services.custom.installed import InstalledService, dependencies_of
+from rse_pf.services.custom.plain_files import check_plain, read_plain
 
 __all__ = [
     "LIST_NAME",
@@ -163,17 +164,16 @@ def archive_of(root: Path) -> bytes:
     """Return all files below *root* as a compressed archive; equal files give equal bytes.
 
     Raises:
-        UsageError: One of them is a link.
+        UsageError: One of them is a link, or no file.
     """
+    check_plain(root)
     packed = io.BytesIO()
     with tarfile.open(fileobj=packed, mode="w", format=tarfile.PAX_FORMAT) as archive:
         for path in _files(root):
-            if path.is_symlink():
-                raise UsageError(f"{path.name} is a link", hint="put the file itself into the folder")
+            content = read_plain(path)
             about = tarfile.TarInfo(path.relative_to(root).as_posix())
-            about.size, about.mode = path.stat().st_size, 0o644
-            with path.open("rb") as content:
-                archive.addfile(about, content)
+            about.size, about.mode = len(content), 0o644
+            archive.addfile(about, io.BytesIO(content))
     return gzip.compress(packed.getvalue(), compresslevel=6, mtime=0)
 
 

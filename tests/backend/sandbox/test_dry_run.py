@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 
 import pytest
@@ -94,3 +95,18 @@ def test_what_a_script_prints_without_flushing_is_shown(tmp_path: Path):
     dry_run(read_service(folder), [{}, {}], PlatformSettings(), lines.append)
 
     assert lines == ["a line", "beguna line", "begun"]
+
+
+@pytest.mark.skipif(sys.version_info < (3, 11), reason="Python 3.10 always imports from where it runs")
+def test_a_sandbox_that_is_started_from_inside_the_folder_imports_nothing_of_it(
+    try_it, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mark = tmp_path / "ran"
+    for name in ("json.py", "socket.py", "rse_pf.py", "sitecustomize.py"):
+        (tmp_path / "counter" / name).write_text(f"open({str(mark)!r}, 'w')\nraise SystemExit(1)\n")
+    monkeypatch.chdir(tmp_path / "counter")
+
+    runs, _ = try_it({})
+
+    assert isinstance(runs[0].answer, Result)
+    assert not mark.exists()

@@ -117,6 +117,8 @@ def built(index: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, 
         (f"greeting==1.2 {HASH} --global-option=x", "has no sha256 hash"),
         ("greeting @ http://127.0.0.1/greeting.whl", "is an address"),
         ("./greeting", "is an address"),
+        (f"greeting==1.2 ; python_version > '3' --index-url=x {HASH}", "has no sha256 hash"),
+        (f"greeting==1.2 ; python_version > '${{HOME}}' {HASH}", "has no sha256 hash"),
         (f"numpy==1.26.0 {HASH}", "every sandbox has numpy"),
         (f"greeting==1.2 {HASH}\nGreeting==1.3 {HASH}", "locked twice"),
     ],
@@ -270,6 +272,93 @@ def test_what_has_no_wheel_or_another_hash_is_not_installed(index: Path, tmp_pat
     assert "only wheels with the hashes of the lock" in told.value.hint
     assert "\n" not in told.value.message
     assert list((tmp_path / "store").iterdir()) == []
+
+
+HOSTILE = [
+    "./evil", "evil/", "/evil", "../evil", "evil.zip/", "-e ./evil", "-e.", "--editable=./evil",
+    "-r more.txt", "-c more.txt", "--index-url http://127.0.0.1:1/", "--extra-index-url=http://127.0.0.1:1/",
+    "--find-links .", "--no-binary :all:", "--pre", "--trusted-host x", "evil @ file:///evil",
+    "evil @ ./evil", "evil@http://127.0.0.1:1/e.whl", "git+https://127.0.0.1:1/evil",
+    "http://127.0.0.1:1/evil-1-py3-none-any.whl", "file:evil", "evil===${HOME}", "${EVIL}",
+    "evil ; python_version > '${HOME}'", "evil --config-settings=x=y", "evil --global-option=x",
+    "evil \\\n-r more.txt", "evil extra", "[evil]", "\x00",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("line", HOSTILE)
+@pytest.mark.parametrize("name", ["requirements.in", "requirements.txt"])
+def test_a_wish_that_is_more_than_a_name_with_versions_is_refused_before_pip_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, line: str, name: str
+) -> None:
+    def run(*_: object, **__: object) -> None:
+        raise AssertionError("a program was started")
+
+    monkeypatch.setattr(subprocess, "run", run)
+    service = write_service(tmp_path, "rude")
+    (service / name).write_text(f"# a comment\nscipy\n{line}\n")
+
+    with pytest.raises(UsageError, match=f"{name}, line 3: ") as told:
+        lock_dependencies(service)
+    assert "scipy>=1.11" in told.value.hint
+    assert "\n" not in told.value.message
+
+
+def test_names_extras_versions_and_markers_reach_pip_from_a_folder_of_its_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[tuple[str, list[str]]] = []
+
+    def run(command: list[str], *, cwd: str, **_: object) -> subprocess.CompletedProcess[str]:
+        wishes = Path(command[command.index("-r") + 1]).read_text()
+        Path(command[command.index("--report") + 1]).write_text('{"install": []}')
+        seen.append((wishes, sorted(path.name for path in Path(cwd).iterdir())))
+        return subprocess.CompletedProcess(command, 0, "", "")
+
+    monkeypatch.setattr(subprocess, "run", run)
+    service = write_service(tmp_path, "tidy")
+    locked = f"pinned==1.0 {HASH}"
+    (service / "requirements.in").write_text(
+        f"SciPy >= 1.11 , < 2  # fast\na.zip\nb[fast]~=1.0; python_version>'3'\n{locked}\n"
+    )
+
+    lock_dependencies(service)
+
+    expected = ["scipy<2,>=1.11", "a-zip", 'b[fast]~=1.0; python_version > "3"', locked]
+    assert seen == [("".join(f"{line}\n" for line in expected), [])]
+
+
+def test_nothing_of_a_hostile_folder_runs_when_it_is_locked_from_inside(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mark = tmp_path / "ran"
+    hostile = f"open({str(mark)!r}, 'a').write(__name__)\nraise SystemExit(1)\n"
+    service = write_service(tmp_path, "rude", hostile)
+    for place in ("setup.py", "pip.py", "json.py", "evil/setup.py", "evil/backend.py", "sitecustomize.py"):
+        (service / place).parent.mkdir(exist_ok=True)
+        (service / place).write_text(hostile)
+    project = '[build-system]\nrequires = []\nbuild-backend = "backend"\nbackend-path = ["."]\n'
+    (service / "evil" / "pyproject.toml").write_text(project)
+    monkeypatch.chdir(service)
+    for name, value in (("PIP_NO_INDEX", "1"), ("PIP_CONFIG_FILE", "/dev/null")):
+        monkeypatch.setenv(name, value)
+
+    for wish in ("./evil", "evil"):
+        Path("requirements.in").write_text(f"{wish}\n")
+        with pytest.raises((UsageError, CommandFailed)):
+            lock_dependencies(Path())
+
+    assert not mark.exists()
+
+
+@pytest.mark.parametrize("name", ["requirements.in", "requirements.txt"])
+def test_a_wish_behind_a_link_is_not_read(tmp_path: Path, name: str) -> None:
+    service = write_service(tmp_path, "rude")
+    (tmp_path / "secret").write_text("a secret\n")
+    (service / name).symlink_to(tmp_path / "secret")
+
+    with pytest.raises(UsageError, match="is a link") as told:
+        lock_dependencies(service)
+    assert "a secret" not in told.value.message
 
 
 @pytest.mark.slow

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import socket
 
 import pytest
 
@@ -153,3 +155,64 @@ def test_a_published_service_with_a_bad_name_is_one_line(package):
 
     with pytest.raises(ConfigurationError, match="Doubling!"):
         published_services()
+
+
+def _link(path, target):
+    path.symlink_to(target)
+
+
+def _pipe(path, _):
+    os.mkfifo(path)
+
+
+def _socket(path, _):
+    with socket.socket(socket.AF_UNIX) as bound:
+        bound.bind(os.path.relpath(path))
+
+
+@pytest.mark.parametrize("make", [_link, _pipe, _socket])
+@pytest.mark.parametrize("name", ["more.py", "helper/deep/more.py", "service.py", "service.json"])
+def test_a_service_with_a_link_or_a_special_file_is_not_installed(folder, tmp_path, monkeypatch, make, name):
+    secret = tmp_path / "secret"
+    secret.write_text("of the operator")
+    monkeypatch.chdir(tmp_path)
+    path = folder / name
+    path.parent.mkdir(exist_ok=True)
+    path.unlink(missing_ok=True)
+    make(path, secret)
+
+    with pytest.raises(UsageError, match=r"regular files alone|is missing") as caught:
+        install(folder, tmp_path / "services")
+    assert str(path) in caught.value.message
+    assert list((tmp_path / "services").rglob("*")) == [] or not (tmp_path / "services").exists()
+
+
+def test_a_link_to_a_folder_is_not_followed(folder, tmp_path):
+    (tmp_path / "private").mkdir()
+    (tmp_path / "private" / "key.json").write_text("of the operator")
+    (folder / "data").symlink_to(tmp_path / "private")
+
+    with pytest.raises(UsageError, match="data is a link"):
+        install(folder, tmp_path / "services")
+    assert not list(tmp_path.rglob("services/**/key.json"))
+
+
+def test_a_folder_that_is_named_by_a_link_is_installed(folder, tmp_path):
+    (tmp_path / "name").symlink_to(folder)
+
+    assert install(tmp_path / "name", tmp_path / "services").name == "adder"
+
+
+def test_a_link_in_what_is_not_installed_is_no_matter(folder, tmp_path):
+    (folder / ".git").mkdir()
+    (folder / ".git" / "config").symlink_to("/etc/hostname")
+
+    assert install(folder, tmp_path / "services").name == "adder"
+
+
+def test_a_link_to_a_folder_that_was_added_after_the_installation_is_noticed(folder, tmp_path):
+    installed = install(folder, tmp_path / "services")
+    (installed.folder / "numpy").symlink_to("/usr")
+
+    with pytest.raises(ConfigurationError, match=r"numpy \(added\)"):
+        installed_services(tmp_path / "services")
