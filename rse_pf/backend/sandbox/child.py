@@ -18,7 +18,7 @@ import sysconfig
 import time
 import traceback
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -52,7 +52,8 @@ class SandboxPlan:
     """What every sandbox of a server has in common.
 
     ``readable`` is what `readable_paths` returned, ``max_bytes`` limits a reply, and ``missing`` names the
-    means of isolation that this kernel lacks.
+    means of isolation that this kernel lacks.  ``copies`` are the folders in whose places a sandbox sees a
+    `VerifiedCopy`, and ``refused`` says by name why a service is not loaded.
     """
 
     services: Mapping[str, InstalledService]
@@ -61,6 +62,8 @@ class SandboxPlan:
     scratch_bytes: int
     max_bytes: int
     missing: Sequence[str]
+    copies: Mapping[Path, Path] = field(default_factory=dict)
+    refused: Mapping[str, ConfigurationError] = field(default_factory=dict)
 
 
 def readable_paths(services: Sequence[InstalledService]) -> list[Path]:
@@ -148,7 +151,7 @@ def _unbuffer_output() -> None:
 def _isolate(plan: SandboxPlan, uid: int | None) -> None:
     owner = os.getuid() if uid is None else uid
     if "root" not in plan.missing:
-        isolation.make_root(plan.readable, plan.scratch_bytes, owner)
+        isolation.make_root(plan.readable, plan.scratch_bytes, owner, plan.copies)
     alone = uid is not None or "namespaces" not in plan.missing
     isolation.limit_resources(plan.memory_bytes, plan.scratch_bytes, alone=alone)
     if "privileges" not in plan.missing:
@@ -180,6 +183,8 @@ def _answer(plan: SandboxPlan, runtimes: dict[str, Runtime], kind: str, name: st
     runtime = runtimes.get(name)
     if runtime is None:
         try:
+            if name in plan.refused:
+                raise plan.refused[name]
             runtime = runtimes[name] = open_runtime(plan.services[name], Path.cwd())
         except ConfigurationError as error:
             sys.stderr.write(error.report() + "\n")

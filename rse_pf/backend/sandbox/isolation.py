@@ -11,7 +11,7 @@ import ctypes
 import os
 import resource
 import struct
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 
 from rse_pf.backend.sandbox.seccomp import LANGUAGES, MACHINES, filter_program
@@ -89,19 +89,25 @@ def enter_namespaces() -> None:
             raise IsolationUnavailable("namespaces", str(error)) from error
 
 
-def make_root(readable: Sequence[Path], scratch_bytes: int, owner: int) -> None:
+def make_root(
+    readable: Sequence[Path], scratch_bytes: int, owner: int, copies: Mapping[Path, Path] | None = None
+) -> None:
     """Make a root of *readable* paths (read-only), three devices and an empty ``/scratch``, and enter it.
 
     Args:
         readable: Files and folders that keep their names; missing ones are left out.
         scratch_bytes: Size of the scratch folder, in memory; it may hold one file per 4,096 bytes of that.
         owner: User of the scratch folder.
+        copies: Folders, and what is shown in their places (read-only).
     """
+    copies = copies or {}
     _mount(None, "/", None, _MS_REC | _MS_PRIVATE, None)
-    base = _free_mount_point(readable)
+    base = _free_mount_point([*readable, *copies, *copies.values()])
     _mount("root", base, "tmpfs", _MS_NOSUID | _MS_NODEV, f"size=1m,nr_inodes={_ROOT_INODES},mode=755")
     for path in (*_outermost(readable), *(Path("/dev") / name for name in ("null", "zero", "urandom"))):
-        _bind(path, base)
+        _bind(path, path, base)
+    for place, copy in copies.items():
+        _bind(copy, place, base)
     scratch = base + "/scratch"
     os.mkdir(scratch)
     inodes = max(1, scratch_bytes // _BYTES_PER_INODE)
@@ -202,8 +208,9 @@ def _outermost(paths: Sequence[Path]) -> list[Path]:
     return [Path(path) for path in chosen]
 
 
-def _bind(path: Path, base: str) -> None:
-    target = base + str(path)
+def _bind(path: Path, place: Path, base: str) -> None:
+    """Show *path* as *place* below *base*."""
+    target = base + str(place)
     if path.is_symlink():
         os.makedirs(os.path.dirname(target), mode=0o755, exist_ok=True)
         if not os.path.lexists(target):

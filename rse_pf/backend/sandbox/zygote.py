@@ -16,7 +16,8 @@ import signal
 import socket
 import sys
 import time
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,9 +25,10 @@ from rse_pf.backend.sandbox import isolation
 from rse_pf.backend.sandbox.cgroup import Cgroups, own_hierarchies
 from rse_pf.backend.sandbox.child import SandboxPlan, readable_paths, run_sandbox
 from rse_pf.backend.sandbox.watcher import MemoryWatcher
-from rse_pf.errors import MissingExtra
+from rse_pf.errors import ConfigurationError, MissingExtra
 from rse_pf.linux import PR_SET_CHILD_SUBREAPER, die_with_parent, prctl
 from rse_pf.services.custom.installed import InstalledService
+from rse_pf.services.custom.verified_copy import PrivateFolder, VerifiedCopy
 
 __all__ = ["main"]
 
@@ -67,14 +69,24 @@ class _Zygote:
         }
         _warm_up({service.language for service in services.values()})
         self._first_uid = _FIRST_UID + os.getpid() * _SLOTS if os.getuid() == 0 else None
-        readable = readable_paths(list(services.values()))
+        self._private = PrivateFolder(Path(config["temporary"]))
+        self._copies: dict[str, VerifiedCopy] = {}
+        self._refused: dict[str, ConfigurationError] = {}
+        self._copy([service for service in services.values() if service.identity])
+        readable = readable_paths([service for service in services.values() if not service.identity])
+        copies = self._places()
+        missing = self._missing_isolation(readable, copies, config["scratch_bytes"])
+        if "root" in missing and self._private.path is not None:  # a sandbox sees the copies where they are
+            self._private.path.chmod(0o755)
+            services |= {name: copy.service for name, copy in self._copies.items()}
         self._plan = SandboxPlan(
             services=services,
             readable=readable,
+            copies=copies,
             memory_bytes=config["memory_bytes"],
             scratch_bytes=config["scratch_bytes"],
             max_bytes=config["max_bytes"],
-            missing=self._missing_isolation(readable, config["scratch_bytes"]),
+            missing=missing,
         )
         total_bytes = config["total_bytes"]
         self._cgroups = Cgroups(
@@ -111,7 +123,33 @@ class _Zygote:
         while self._children:
             self._reap(wait=True)
         self._cgroups.close()
+        self._private.remove()
         os._exit(0)
+
+    def _copy(self, installed: list[InstalledService]) -> None:
+        """Copy and compare *installed*; what was changed since the worker looked is refused."""
+        for service in installed:
+            copy = VerifiedCopy(service, self._private.path or self._private.make())
+            try:
+                copy.make()
+                self._copies[service.name] = copy
+            except ConfigurationError as error:
+                self._refused[service.name] = error
+
+    def _places(self) -> dict[Path, Path]:
+        """Return the folders of installed services and of their packages, and the copies of both."""
+        places = {}
+        for copy in self._copies.values():
+            places[copy.original.folder] = copy.service.folder
+            if copy.original.dependencies is not None and copy.service.dependencies is not None:
+                places[copy.original.dependencies] = copy.service.dependencies
+        return places
+
+    def _plan_of_now(self) -> SandboxPlan:
+        """Return the plan of a sandbox that starts now: a service that somebody edited is refused."""
+        problems = {name: copy.problem() for name, copy in self._copies.items()}
+        edited = {name: error for name, error in problems.items() if error is not None}
+        return replace(self._plan, refused={**self._refused, **edited})
 
     def _wait_ms(self) -> float | None:
         """Return how long there is nothing to do without an event; None is forever."""
@@ -156,10 +194,11 @@ class _Zygote:
         uid = None if self._first_uid is None else self._first_uid + slot
         pid_read, pid_write = os.pipe()
         go_read, go_write = os.pipe()
+        plan = self._plan_of_now()
         first = os.fork()
         if first == 0:
             os.close(go_write)
-            self._fork_inside(channel, output, uid, pid_write, go_read)
+            self._fork_inside(plan, channel, output, uid, pid_write, go_read)
         os.close(pid_write)
         os.close(go_read)
         os.waitpid(first, 0)
@@ -178,7 +217,9 @@ class _Zygote:
             self._report(event="gone", id=number, how="it could not enter its namespaces")
         os.close(go_write)
 
-    def _fork_inside(self, channel: int, output: int, uid: int | None, pid_write: int, go_read: int) -> None:
+    def _fork_inside(
+        self, plan: SandboxPlan, channel: int, output: int, uid: int | None, pid_write: int, go_read: int
+    ) -> None:
         """Enter the namespaces, fork the sandbox, tell its pid and exit.
 
         A session of its own: Linux shares the processor between sessions (`sched_autogroup_enabled`), so that
@@ -187,11 +228,11 @@ class _Zygote:
         """
         try:
             os.setsid()
-            if "namespaces" not in self._plan.missing:
+            if "namespaces" not in plan.missing:
                 isolation.enter_namespaces()
             pid = os.fork()
             if pid == 0 and os.read(go_read, 1) == _GO:  # the zygote knows the pid
-                run_sandbox(self._plan, channel, output, uid)
+                run_sandbox(plan, channel, output, uid)
             elif pid:
                 os.write(pid_write, str(pid).encode())
         finally:
@@ -215,12 +256,14 @@ class _Zygote:
                 how = self._cgroups.remove(child.number) or how
                 self._report(event="gone", id=child.number, how=how)
 
-    def _missing_isolation(self, readable: list[Path], scratch_bytes: int) -> list[str]:
+    def _missing_isolation(
+        self, readable: list[Path], copies: Mapping[Path, Path], scratch_bytes: int
+    ) -> list[str]:
         uid = self._first_uid
 
         def make_root() -> None:
             isolation.enter_namespaces()
-            isolation.make_root(readable, scratch_bytes, os.getuid() if uid is None else uid)
+            isolation.make_root(readable, scratch_bytes, os.getuid() if uid is None else uid, copies)
 
         return isolation.missing_isolation(
             [

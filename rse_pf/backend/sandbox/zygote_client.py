@@ -12,6 +12,7 @@ import signal
 import socket
 import subprocess
 import sys
+import tempfile
 from asyncio import AbstractEventLoop
 from collections.abc import Callable, Sequence
 
@@ -120,11 +121,12 @@ class ZygoteClient:
         self._channel, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         limits = self._settings.services
         config = {
-            "worker": os.getpid(),
+            "worker": os.getpid(), "temporary": tempfile.gettempdir(),
             "services": [
                 {
                     "name": s.name, "language": s.language, "entry": s.entry, "kind": s.kind,
                     "folder": str(s.folder), "dependencies": s.dependencies and str(s.dependencies),
+                    "identity": s.identity,
                 }
                 for s in self._services
             ],

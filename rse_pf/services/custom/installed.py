@@ -35,7 +35,9 @@ __all__ = [
     "ENTRY_POINTS",
     "LANGUAGES",
     "InstalledService",
+    "check_installed",
     "dependencies_of",
+    "identity_of",
     "install",
     "installed_services",
     "published_services",
@@ -182,7 +184,7 @@ def installed_services(folder: Path) -> list[InstalledService]:
     found = []
     for target in sorted(folder.iterdir()):
         if target.is_dir() and not target.name.startswith("."):
-            _check_pins(target)
+            check_installed(target)
             found.append(_read_installed(target))
     built = dict(_dependencies_in(folder))
     for name, dependencies in built.items():
@@ -220,7 +222,7 @@ def _read_installed(target: Path) -> InstalledService:
     return replace(
         service,
         dependencies=None if dependencies is None else dependencies.folder,
-        identity=_sha256(target / _PINS),
+        identity=identity_of(target),
     )
 
 
@@ -253,7 +255,17 @@ def dependencies_of(target: Path) -> Dependencies | None:
         ) from error
 
 
-def _check_pins(target: Path) -> None:
+def identity_of(target: Path) -> str:
+    """Return the `InstalledService.identity` of what is installed in *target*; raises OSError."""
+    return _sha256(target / _PINS)
+
+
+def check_installed(target: Path) -> None:
+    """Check that *target* holds the files of an installed service, as they were installed.
+
+    Raises:
+        ConfigurationError: It was not installed, or a file was changed, added or removed.
+    """
     try:
         pins = json.loads((target / _PINS).read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:

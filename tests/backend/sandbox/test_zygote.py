@@ -8,6 +8,7 @@ import select
 import socket
 import subprocess
 import sys
+import tempfile
 from collections.abc import Iterator
 from typing import Any
 
@@ -18,7 +19,7 @@ WAIT_S = 20.0
 MIB = 1 << 20
 CONFIG = {
     "services": [], "memory_bytes": 512 * MIB, "total_bytes": 512 * MIB, "scratch_bytes": MIB,
-    "max_bytes": MIB,
+    "max_bytes": MIB, "temporary": tempfile.gettempdir(),
 }  # fmt: skip
 
 
