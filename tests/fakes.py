@@ -44,6 +44,7 @@ class FakeTimer:
 
     def cancel(self) -> None:
         self._is_cancelled = True
+        self._callback, self._args = int, ()  # as asyncio and uvloop do: what is cancelled holds nothing
 
     def cancelled(self) -> bool:
         return self._is_cancelled
@@ -74,6 +75,11 @@ class FakeLoop:
 
     def get_debug(self) -> bool:
         return False
+
+    @property
+    def timers(self) -> int:
+        """How many timers have not run and are not cancelled."""
+        return sum(not timer.cancelled() for _, _, timer in self._timers)
 
     def call_soon(self, callback: Callable[..., object], *args: Any, context: Any = None) -> FakeTimer:
         handle = FakeTimer(self.now, callback, args)

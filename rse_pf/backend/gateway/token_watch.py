@@ -49,6 +49,7 @@ class TokenWatch:
         self._recorder = recorder
         self._by_number: dict[int, RobotConnection] = {}
         self._timers: dict[RobotConnection, TimerHandle] = {}
+        self._stays: dict[RobotConnection, TimerHandle] = {}
 
     def trust(self, keys: KeySet) -> None:
         """Verify tokens with *keys* from now on, and end every connection whose token they do not allow.
@@ -85,6 +86,7 @@ class TokenWatch:
     def left(self, connection: RobotConnection) -> None:
         """Forget a connection."""
         self._end_at(connection, None)
+        self._end_stay(connection)
         if self._by_number.pop(connection.number, None) is not None:
             self._report("left", connection)
 
@@ -95,7 +97,7 @@ class TokenWatch:
             return
         left_s = connection.moving_until_s - self._context.clocks.monotonic()
         if left_s > 0:
-            self._context.loop.call_later(left_s, partial(self._report, "stays", connection))
+            self._stay(connection, left_s)
             return
         self._context.log.info("replaced", robot=connection.robot)
         connection.close(CLOSE_REPLACED, "replaced")
@@ -139,6 +141,18 @@ class TokenWatch:
         if expires_s is not None:
             left_s = max(0.0, expires_s - self._context.clocks.monotonic())
             self._timers[connection] = self._context.loop.call_later(left_s, partial(self._end, connection))
+
+    def _stay(self, connection: RobotConnection, left_s: float) -> None:
+        """Tell the supervisor after *left_s* that a connection which moved has not left."""
+        self._end_stay(connection)
+        self._stays[connection] = self._context.loop.call_later(
+            left_s, partial(self._report, "stays", connection)
+        )
+
+    def _end_stay(self, connection: RobotConnection) -> None:
+        timer = self._stays.pop(connection, None)
+        if timer is not None:
+            timer.cancel()
 
     def _revoke(self, connection: RobotConnection, claims: Claims, problem: str) -> None:
         if not connection.is_closing:

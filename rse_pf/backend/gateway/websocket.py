@@ -401,6 +401,9 @@ def listener_type(picows: Any, loop: asyncio.AbstractEventLoop, serving: Serving
             self._transport: Any = None
             self._connection: RobotConnection | None = None
             self._cut: asyncio.TimerHandle | None = None
+            self._pause: asyncio.TimerHandle | None = None
+            self._paused_until_s = 0.0
+            self._linger: asyncio.TimerHandle | None = None
             self._holds = 0
 
         def on_ws_connected(self, transport: Any) -> None:
@@ -416,8 +419,9 @@ def listener_type(picows: Any, loop: asyncio.AbstractEventLoop, serving: Serving
                 self._connection.frame(frame.msg_type, bool(frame.fin), rsv, payload)
 
         def on_ws_disconnected(self, transport: Any) -> None:
-            if self._cut is not None:
-                self._cut.cancel()
+            for timer in (self._cut, self._pause, self._linger):
+                if timer is not None:
+                    timer.cancel()
             if self._connection is not None:
                 self._connection.ended()
                 self._connection = None
@@ -456,8 +460,19 @@ def listener_type(picows: Any, loop: asyncio.AbstractEventLoop, serving: Serving
             self._transport.send_ping()
 
         def pause(self, seconds: float) -> None:
-            self.hold()
-            loop.call_later(seconds, self.read_on)
+            until_s = loop.time() + seconds
+            if self._pause is None:
+                self.hold()
+            elif self._paused_until_s >= until_s:
+                return
+            else:
+                self._pause.cancel()
+            self._paused_until_s = until_s
+            self._pause = loop.call_later(seconds, self._end_pause)
+
+        def _end_pause(self) -> None:
+            self._pause = None
+            self.read_on()
 
         def hold(self) -> None:
             self._holds += 1
@@ -473,7 +488,8 @@ def listener_type(picows: Any, loop: asyncio.AbstractEventLoop, serving: Serving
             # Closing with unread bytes would reset the connection, and the robot would not see the code.
             with contextlib.suppress(OSError):  # the robot reset it, and the loop has not heard of that yet
                 self._transport.underlying_transport.write_eof()
-            loop.call_later(_LINGER_S, self._transport.disconnect, False)
+            if self._linger is None:
+                self._linger = loop.call_later(_LINGER_S, self._transport.disconnect, False)
 
         def _cut_off(self) -> None:
             self._dispatcher.context.metrics.closed["slow-reader"] += 1

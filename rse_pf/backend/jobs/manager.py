@@ -8,10 +8,9 @@ at most twice a second.
 from __future__ import annotations
 
 import contextlib
-import functools
 import threading
 import time
-from asyncio import AbstractEventLoop
+from asyncio import AbstractEventLoop, TimerHandle
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
@@ -57,6 +56,7 @@ class _Entry:
     done: float = 0.0
     what: str = WAITING
     thread: threading.Thread | None = None
+    progress_timer: TimerHandle | None = None
     is_displaced: bool = False
 
 
@@ -241,18 +241,23 @@ class JobManager:
             self._progress(waiter.queued.owner, progress)
         elif not waiter.is_progress_due:
             waiter.is_progress_due = True
-            self._loop.call_later(wait_s, functools.partial(self._send_due_progress, entry, waiter))
+            if entry.progress_timer is None:
+                entry.progress_timer = self._loop.call_later(wait_s, self._send_due_progress, entry)
 
-    def _send_due_progress(self, entry: _Entry, waiter: _Waiter) -> None:
-        waiter.is_progress_due = False
-        if waiter in entry.waiters:
-            self._send_progress(entry, waiter)
+    def _send_due_progress(self, entry: _Entry) -> None:
+        entry.progress_timer = None
+        for waiter in entry.waiters:
+            if waiter.is_progress_due:
+                waiter.is_progress_due = False
+                self._send_progress(entry, waiter)
 
     def _on_outcome(self, entry: _Entry, outcome: JobOutcome) -> None:
         request = entry.request
         del self._entries[request.robot, request.key]
         waiters, entry.waiters = entry.waiters, []
         entry.signals.close()
+        if entry.progress_timer is not None:
+            entry.progress_timer.cancel()
         code = "given-up" if outcome.is_given_up else "ok" if outcome.error is None else outcome.error.code
         self._log.info(
             "job", robot=request.robot, service=request.service, job=request.key[:16], code=code,

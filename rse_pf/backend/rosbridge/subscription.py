@@ -64,6 +64,11 @@ class Subscription:
         """The pause between two messages: the shortest that was asked for."""
         return min(pause_s for pause_s, _ in self.requests.values())
 
+    def clear(self) -> None:
+        """Forget what waits: the subscription has ended."""
+        self._waiting.clear()
+        self._bytes = 0
+
     def put(self, message: TopicMessage) -> None:
         """Add *message*; the oldest ones are dropped above the longest queue that there is."""
         self._waiting.append(message)

@@ -7,7 +7,7 @@ the newest ones and delays nobody.  Other workers' clients are reached through `
 from __future__ import annotations
 
 import re
-from asyncio import AbstractEventLoop
+from asyncio import AbstractEventLoop, TimerHandle
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import Any, Protocol
@@ -114,7 +114,7 @@ class RosbridgeTopics:
         self._of_client: dict[Client, dict[Key, None]] = {}
         self._due: dict[Subscription, None] = {}
         self._slow: dict[Subscription, None] = {}
-        self._resting: set[Subscription] = set()
+        self._resting: dict[Subscription, TimerHandle] = {}
         self._is_sending = self._is_retrying = False
 
     def offer(self, services: Iterable[str]) -> None:
@@ -302,7 +302,10 @@ class RosbridgeTopics:
         self.replaced += subscription.replaced
         self._due.pop(subscription, None)
         self._slow.pop(subscription, None)
-        self._resting.discard(subscription)
+        resting = self._resting.pop(subscription, None)
+        if resting is not None:
+            resting.cancel()  # it would keep the messages that wait, for an hour
+        subscription.clear()
         if not topic.subscriptions:
             self._tell(topic)
 
@@ -363,8 +366,7 @@ class RosbridgeTopics:
             wait_s = subscription.wait_s(now)
             if wait_s > 0:
                 subscription.bound()
-                self._resting.add(subscription)
-                self._loop.call_later(wait_s, self._rested, subscription)
+                self._resting[subscription] = self._loop.call_later(wait_s, self._rested, subscription)
                 break
             if client.unsent_bytes > _MAX_UNSENT_BYTES:
                 subscription.bound()
@@ -381,9 +383,8 @@ class RosbridgeTopics:
         return max(1, count)
 
     def _rested(self, subscription: Subscription) -> None:
-        if subscription in self._resting:
-            self._resting.discard(subscription)
-            self._send_soon(subscription)
+        del self._resting[subscription]
+        self._send_soon(subscription)
 
     def _retry_later(self, subscription: Subscription) -> None:
         self._slow[subscription] = None
