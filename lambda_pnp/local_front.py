@@ -29,13 +29,13 @@ from rse_pf.config import PlatformSettings, load_settings
 from rse_pf.config.front_door import BEARER_PATTERN, BURST_PATH
 from rse_pf.errors import NotFound, RsePfError
 from rse_pf.linux import die_with_parent, set_process_name
+from rse_pf.silent_connections import FIRST_REQUEST_S, KEEP_ALIVE_S, SilentConnections
 from rse_pf.terminal import show, show_error, show_json
 
 __all__ = ["LocalFront", "answering_of", "read_beside"]
 
 _HOST = "127.0.0.1"
 _TIMEOUT_S = 10.0
-_IDLE_S = 120.0
 _MAX_HEAD_BYTES = 16384
 _MAX_BODY_BYTES = 1_048_576
 """Of a request that an ALB passes on to a function."""
@@ -55,24 +55,32 @@ class LocalFront:
         executions: How many were started.
     """
 
-    def __init__(self, make: Callable[[], Answering], *, most: int) -> None:
+    def __init__(
+        self, make: Callable[[], Answering], *, most: int, first_request_s: float = FIRST_REQUEST_S
+    ) -> None:
         """Describe the front; nothing listens yet.
 
         Args:
             make: Starts an execution.
             most: How many there may be at a time.
+            first_request_s: A connection whose first request is not complete by then is cut.
         """
         self.url = ""
         self.answered = self.refused = self.executions = 0
         self._make = make
         self._most = most
+        self._first_request_s = first_request_s
         self._idle: list[Answering] = []
         self._threads = ThreadPoolExecutor(most, "execution")
         self._writers: set[asyncio.StreamWriter] = set()
         self._server: asyncio.Server | None = None
+        self._silent: SilentConnections[asyncio.StreamWriter] | None = None
 
     async def start(self, port: int = 0) -> None:
         """Listen on loopback; port 0 takes a free one."""
+        self._silent = SilentConnections(
+            call_later=asyncio.get_running_loop().call_later, seconds=self._first_request_s
+        )
         self._server = await asyncio.start_server(self._serve, _HOST, port, limit=_MAX_HEAD_BYTES)
         self.url = f"http://{_HOST}:{self._server.sockets[0].getsockname()[1]}{BURST_PATH}"
 
@@ -86,15 +94,18 @@ class LocalFront:
         self._threads.shutdown(wait=False, cancel_futures=True)
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        assert self._silent is not None
         self._writers.add(writer)
+        self._silent.enter(writer, writer.transport.abort)
         try:
             while True:
-                head = await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), _IDLE_S)
+                head = await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), KEEP_ALIVE_S)
                 if not await self._exchange(head, reader, writer):
                     return
         except (OSError, EOFError, asyncio.LimitOverrunError, asyncio.TimeoutError):
             return
         finally:
+            self._silent.leave(writer)
             self._writers.discard(writer)
             writer.transport.abort()
 
@@ -113,6 +124,8 @@ class LocalFront:
             await _write(writer, 413, {"connection": "close"}, b"")
             return False
         body = await asyncio.wait_for(reader.readexactly(int(size)), _TIMEOUT_S)
+        assert self._silent is not None
+        self._silent.leave(writer)
         status, told, answer = await self._judged(first, headers, body)
         await _write(writer, status, told, answer)
         return True

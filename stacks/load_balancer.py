@@ -9,6 +9,7 @@ from aws_cdk import aws_s3 as s3
 from constructs import Construct
 
 from rse_pf.config import PlatformSettings
+from rse_pf.config.front_door import BALANCER_IDLE_TIMEOUT_S
 from rse_pf.config.resource_names import READY_PATH
 from rse_pf.scaling.health import CLOUD_TIMEOUT_S, HEALTHY_CHECKS, cloud_checks
 from stacks.data_stack import BALANCER_LOGS
@@ -17,8 +18,6 @@ from stacks.web_firewall import WebFirewall
 
 __all__ = ["LoadBalancer"]
 
-_IDLE_TIMEOUT_S = 120
-"""The ALB closes a connection without traffic after this; robots send pings far more often."""
 _DEREGISTRATION_S = 30
 """Time that a server gets to end its connections before it is removed."""
 
@@ -39,7 +38,7 @@ class LoadBalancer(Construct):
         super().__init__(scope, construct_id)
         self.alb = elbv2.ApplicationLoadBalancer(
             self, "Alb", vpc=vpc, internet_facing=True, security_group=group, drop_invalid_header_fields=True,
-            idle_timeout=cdk.Duration.seconds(_IDLE_TIMEOUT_S),
+            idle_timeout=cdk.Duration.seconds(BALANCER_IDLE_TIMEOUT_S),
             desync_mitigation_mode=elbv2.DesyncMitigationMode.STRICTEST,
         )  # fmt: skip
         # Their fields name no request header but Host and User-Agent (docs/security.md): no token is in them.

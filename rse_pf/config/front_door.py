@@ -13,7 +13,19 @@ from dataclasses import dataclass
 
 from rse_pf.config.settings import PlatformSettings
 
-__all__ = ["BEARER_PATTERN", "BURST_PATH", "DATA_PATH", "RETRY_AFTER_S", "STATUS", "RateRule", "rate_rules"]
+__all__ = [
+    "BALANCER_IDLE_TIMEOUT_S",
+    "BEARER_PATTERN",
+    "BURST_PATH",
+    "DATA_PATH",
+    "RETRY_AFTER_S",
+    "STATUS",
+    "RateRule",
+    "rate_rules",
+]
+
+BALANCER_IDLE_TIMEOUT_S = 120
+"""How long the load balancer on AWS keeps a silent connection; robots ping far more often."""
 
 DATA_PATH = "/data/"
 BURST_PATH = "/burst"

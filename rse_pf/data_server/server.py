@@ -25,6 +25,7 @@ from rse_pf.config import PlatformSettings
 from rse_pf.data_server.app import DataServer
 from rse_pf.errors import ConfigurationError, MissingExtra, StoreError
 from rse_pf.files import replace_json
+from rse_pf.http_connections import bounded_protocol
 from rse_pf.object_store import DirectoryStore, ObjectStore
 from rse_pf.terminal import json_line, show
 
@@ -33,8 +34,8 @@ __all__ = ["KeysFile", "serve_data"]
 _SWEEP_S = 3600.0
 _BACKLOG = 1024
 _STOP_TIMEOUT_S = 10
-_KEEP_ALIVE_S = 130
-"""Longer than the 120 s of the load balancer, which would else send a request into a closing connection."""
+_MAX_IDLE = 2048
+"""Connections that wait for their next request."""
 _SWITCH_S = 0.0005
 """A PUT makes some twenty system calls, and after each it may wait this long for a thread that computes."""
 
@@ -85,9 +86,9 @@ def serve_data(
     app = DataServer(settings, store, keys=keys, log=_write_line, audit=log)
     listening = _listen(settings)
     config = uvicorn.Config(
-        app, http=_one_request_protocol(), ws="none", lifespan="off", access_log=False, log_level="warning",
-        backlog=_BACKLOG, server_header=False, date_header=False, proxy_headers=False,
-        timeout_keep_alive=_KEEP_ALIVE_S, timeout_graceful_shutdown=_STOP_TIMEOUT_S,
+        app, http=bounded_protocol(most_idle=_MAX_IDLE), ws="none", lifespan="off", access_log=False,
+        log_level="warning", backlog=_BACKLOG, server_header=False, date_header=False, proxy_headers=False,
+        timeout_graceful_shutdown=_STOP_TIMEOUT_S,
     )  # fmt: skip
     for number in (signal.SIGTERM, signal.SIGINT):
         # uvicorn repeats the signal to itself when it has ended; the exit code is 0 all the same
@@ -100,25 +101,6 @@ def serve_data(
         if log is not None:
             log.close()
     return 0
-
-
-def _one_request_protocol() -> type[asyncio.Protocol]:
-    """Return uvicorn's HTTP/1.1 protocol with keep-alive and without pipelining.
-
-    Load balancers and our own clients wait for a response before the next request.  Bytes that follow a
-    request earlier than that are never taken for a request: they may be an attempt to make two readers
-    disagree about where a request ends (request smuggling).  The request is answered, then the connection is
-    closed.
-    """
-    from uvicorn.protocols.http.h11_impl import H11Protocol
-
-    class OneRequestProtocol(H11Protocol):
-        def on_response_complete(self) -> None:
-            if self.conn.trailing_data[0] and not self.transport.is_closing():
-                self.transport.close()  # after what was written, so that the robot gets its response
-            super().on_response_complete()
-
-    return OneRequestProtocol
 
 
 def _audit_log(folder: Path, settings: PlatformSettings) -> AuditLog:

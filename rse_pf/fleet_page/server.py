@@ -20,13 +20,16 @@ from rse_pf.fleet_page.app import FleetApp, PageActions
 from rse_pf.fleet_page.hub import MAX_PAGES, Hub
 from rse_pf.fleet_page.page_sessions import PageSessions
 from rse_pf.fleet_page.static_files import page_files
+from rse_pf.http_connections import bounded_protocol
 
 __all__ = ["ANNOUNCEMENT", "listen", "page_url", "serve_page"]
 
 ANNOUNCEMENT = "fleet_page.json"
 """Beside the platform's state: pid and port of its page."""
 _LOOPBACK = "127.0.0.1"
-_MAX_CONNECTIONS = 4 * MAX_PAGES
+_MAX_SILENT = 2 * MAX_PAGES
+"""Connections that have sent no request, and as many that wait for the next one."""
+_MAX_CONNECTIONS = 4 * MAX_PAGES + 2 * _MAX_SILENT
 _LONGEST_END_S = 1
 
 
@@ -80,9 +83,10 @@ def serve_page(
         admin_token=lambda: fallback if token_file is None else read_control_token(token_file),
     )  # fmt: skip
     config = uvicorn.Config(
-        app, http="h11", ws="none", lifespan="off", access_log=False, log_level="critical",
+        app, http=bounded_protocol(most=_MAX_SILENT, most_idle=_MAX_SILENT), ws="none", lifespan="off",
+        access_log=False, log_level="critical",
         limit_concurrency=_MAX_CONNECTIONS, server_header=False, date_header=False, proxy_headers=False,
-        timeout_keep_alive=10, timeout_graceful_shutdown=_LONGEST_END_S, h11_max_incomplete_event_size=16384,
+        timeout_graceful_shutdown=_LONGEST_END_S, h11_max_incomplete_event_size=16384,
     )  # fmt: skip
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda number, frame: None)  # uvicorn repeats it to itself when it has ended

@@ -14,7 +14,8 @@ import pytest
 
 ORDER = (
     "rse_pf", "errors", "terminal", "linux", "one_thread", "limited_process", "files", "geometry", "native",
-    "native_buffers", "native_matcher", "token_bucket", "config", "budget", "wire", "scaling",
+    "native_buffers", "native_matcher", "token_bucket", "config",
+    "silent_connections", "http_connections", "budget", "wire", "scaling",
     "object_store", "identity", "crash_record", "maps", "auth", "enrolment", "audit", "service",
     "pnp", "services.mapping", "live_map", "services.custom", "services",
     "recording", "recording.explain", "recording.replay",
@@ -61,6 +62,7 @@ ONLY: dict[str, set[str]] = {
         "files",
         "terminal",
         "recording",
+        "silent_connections",
     },
     "client_sdk": {
         "config",
@@ -113,7 +115,7 @@ PACKAGES: dict[str, tuple[str, ...]] = {
         "rse_pf/data_server/",
         "rse_pf/local/control/federation.py",
     ),
-    "uvicorn": ("rse_pf/data_server/server.py", "rse_pf/fleet_page/server.py"),
+    "uvicorn": ("rse_pf/http_connections.py", "rse_pf/data_server/server.py", "rse_pf/fleet_page/server.py"),
     "jwt": ("rse_pf/auth/tokens.py",),
     "cryptography": ("rse_pf/auth/tokens.py", "rse_pf/auth/certificates.py"),
     "boto3": ("rse_pf/aws/",),

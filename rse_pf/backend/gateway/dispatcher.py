@@ -18,7 +18,7 @@ from rse_pf.backend.gateway.connection import RobotConnection
 from rse_pf.backend.gateway.decoder_thread import DecoderThread
 from rse_pf.backend.gateway.handshake import Accepted
 from rse_pf.backend.gateway.idle_timeouts import IdleTimeouts
-from rse_pf.backend.gateway.rate_limits import CUT_OFF, PendingHandshakes
+from rse_pf.backend.gateway.rate_limits import CUT_OFF
 from rse_pf.backend.gateway.token_watch import TokenWatch
 from rse_pf.backend.jobs.manager import JobManager
 from rse_pf.backend.jobs.queue import has_jobs
@@ -44,6 +44,7 @@ from rse_pf.errors import NotFound, UnknownService
 from rse_pf.identity import RobotId
 from rse_pf.service import Registry
 from rse_pf.services.pnp import wire_types
+from rse_pf.silent_connections import PendingHandshakes
 from rse_pf.wire import CODECS, Codec, Command, Failure, make_codec
 from rse_pf.wire.envelope import Envelope, peek
 from rse_pf.wire.server_session import CLOSE_GOING_AWAY, CLOSE_RATE, CLOSE_TOKEN_OVER, ServerSession

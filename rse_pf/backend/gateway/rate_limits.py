@@ -1,4 +1,4 @@
-"""Limit the messages of each robot, the handshakes of each address, and the sockets without a token.
+"""Limit the messages of each robot, and the handshakes of each address.
 
 Times and names go in, decisions come out.  The memory is bounded whatever strangers send, and a robot that
 keeps to its rate is never refused.
@@ -11,13 +11,13 @@ import re
 from collections import deque
 from collections.abc import Hashable
 from dataclasses import dataclass, field
-from typing import Generic, TypeVar
+from typing import TypeVar
 
 from rse_pf.config import ServingSettings, SessionSettings
 from rse_pf.identity import RobotId
 from rse_pf.token_bucket import TokenBucket
 
-__all__ = ["CUT_OFF", "PendingHandshakes", "RobotRates", "SourceRates"]
+__all__ = ["CUT_OFF", "RobotRates", "SourceRates"]
 
 CUT_OFF = math.inf
 """The robot ignores refusals, so that its connection ends: it may not try again at all."""
@@ -146,48 +146,6 @@ class SourceRates:
         entries = [entry.strip() for entry in forwarded_for.split(",") if entry.strip()]
         told = entries[-trusted] if 0 < trusted <= len(entries) else peer
         return told if _ADDRESS.fullmatch(told) else peer
-
-
-class PendingHandshakes(Generic[Key]):
-    """Sockets that have not sent a token yet; when there are too many, the one that waited longest is cut.
-
-    A robot sends its token within milliseconds, so the socket that waited longest is least likely to be one.
-    If the newest were cut instead, a few silent sockets would lock the robots out.
-    """
-
-    def __init__(self, max_sockets: int, max_per_source: int) -> None:
-        self._max_sockets = max_sockets
-        self._max_per_source = max_per_source
-        self._sources: dict[Key, str] = {}
-        self._of_source: dict[str, dict[Key, None]] = {}
-
-    def __len__(self) -> int:
-        """Return how many wait."""
-        return len(self._sources)
-
-    def enter(self, key: Key, source: str) -> Key | None:
-        """Add *key*; return the one to cut for it, if there are too many."""
-        self._sources[key] = source
-        own = self._of_source.setdefault(source, {})
-        own[key] = None
-        leaving: Key | None = None
-        if self._max_per_source and len(own) > self._max_per_source:
-            leaving = next(iter(own))
-        elif len(self._sources) > self._max_sockets:
-            leaving = next(iter(self._sources))
-        if leaving is not None:
-            self.leave(leaving)
-        return leaving
-
-    def leave(self, key: Key) -> None:
-        """Forget one that sent a token, or is gone."""
-        source = self._sources.pop(key, None)
-        if source is None:
-            return
-        own = self._of_source[source]
-        del own[key]
-        if not own:
-            del self._of_source[source]
 
 
 def _half(names: dict[Key, Value], max_names: int) -> dict[Key, Value]:

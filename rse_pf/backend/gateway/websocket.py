@@ -20,10 +20,11 @@ from rse_pf.backend.gateway.connection import RobotConnection
 from rse_pf.backend.gateway.dispatcher import Dispatcher
 from rse_pf.backend.gateway.frames import CloseBorder
 from rse_pf.backend.gateway.handshake import HEALTH, Accepted, HandshakePolicy, Rejected, RequestHead
-from rse_pf.backend.gateway.rate_limits import PendingHandshakes, SourceRates
+from rse_pf.backend.gateway.rate_limits import SourceRates
 from rse_pf.backend.scheduling.deferred_work import DeferredWork
 from rse_pf.config import ServingSettings
 from rse_pf.errors import MissingExtra
+from rse_pf.silent_connections import PendingHandshakes
 
 __all__ = ["PendingSocket", "RobotSockets", "listener_type", "protocol_type"]
 

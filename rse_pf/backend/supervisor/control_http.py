@@ -1,6 +1,7 @@
 """Serve the control port: a very small HTTP/1.1 server for health checks, metrics and drain.
 
-A request has at most 8 KiB of head and no chunked body, and must be complete within a minute.
+A request has at most 8 KiB of head and no chunked body.  A connection's first one must be complete within
+`FIRST_REQUEST_S`, and each further one within `KEEP_ALIVE_S` of the answer before.
 """
 
 from __future__ import annotations
@@ -14,11 +15,12 @@ from http import HTTPStatus
 from typing import Any
 from urllib.parse import parse_qsl, urlsplit
 
+from rse_pf.silent_connections import FIRST_REQUEST_S, KEEP_ALIVE_S, SilentConnections
+
 __all__ = ["ControlReply", "ControlRequest", "json_reply", "number_of", "refused_reply", "serve_control"]
 
 _MAX_HEAD_BYTES = 8192
 _MAX_BODY_BYTES = 65536
-_IDLE_S = 60.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -61,26 +63,47 @@ def number_of(ask: ControlRequest, name: str, default: float, maximum: float) ->
 
 
 async def serve_control(
-    host: str, port: int, answer: Callable[[ControlRequest], Awaitable[ControlReply]]
+    host: str,
+    port: int,
+    answer: Callable[[ControlRequest], Awaitable[ControlReply]],
+    *,
+    first_request_s: float = FIRST_REQUEST_S,
 ) -> asyncio.Server:
-    """Listen on *host* and *port* (0 takes a free one) and answer each request with *answer*."""
+    """Listen on *host* and *port* (0 takes a free one) and answer each request with *answer*.
+
+    A connection is cut *first_request_s* after its beginning if its first request is not complete.
+    """
+    silent: SilentConnections[asyncio.StreamWriter] = SilentConnections(
+        call_later=asyncio.get_running_loop().call_later, seconds=first_request_s
+    )
+    idle: SilentConnections[asyncio.StreamWriter] = SilentConnections(
+        call_later=asyncio.get_running_loop().call_later, seconds=KEEP_ALIVE_S
+    )
 
     async def talk(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        silent.enter(writer, writer.transport.abort)
+
+        async def judged(ask: ControlRequest) -> ControlReply:
+            silent.leave(writer)
+            idle.leave(writer)
+            return await answer(ask)
+
         try:
-            while await asyncio.wait_for(_exchange(reader, writer, answer), _IDLE_S):
-                pass
+            while await _exchange(reader, writer, judged):
+                idle.enter(writer, writer.transport.abort)
         except (
             OSError,
             ValueError,
             asyncio.IncompleteReadError,
             asyncio.LimitOverrunError,
-            asyncio.TimeoutError,
             asyncio.CancelledError,
         ):
             # A malformed request ends its own connection only; at the end of the loop asyncio would log an
             # error for each connection that was kept alive.
             pass
         finally:
+            silent.leave(writer)
+            idle.leave(writer)
             writer.close()
 
     return await asyncio.start_server(talk, host, port, limit=_MAX_HEAD_BYTES)

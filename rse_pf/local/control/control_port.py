@@ -17,6 +17,7 @@ from urllib.parse import parse_qsl, urlsplit
 
 from rse_pf.auth.control_token import carries_token
 from rse_pf.errors import RsePfError
+from rse_pf.silent_connections import SilentConnections
 
 __all__ = ["METRICS_TYPE", "Page", "serve_control_port"]
 
@@ -41,6 +42,7 @@ async def serve_control_port(
     *,
     streams: Mapping[str, Operation] | None = None,
     port: int = 0,
+    first_request_s: float = _TIMEOUT_S,
 ) -> asyncio.Server:
     """Listen on loopback; *pages* are asked with GET, *operations* with POST, by their paths.
 
@@ -50,18 +52,26 @@ async def serve_control_port(
         token: That every request must carry.
         streams: What is told for as long as somebody listens; asked with GET.
         port: 0 takes a free one.
+        first_request_s: A connection whose request is not complete by then is cut.
 
     Raises:
         OSError: Something else listens on *port*.
     """
 
+    silent: SilentConnections[asyncio.StreamWriter] = SilentConnections(
+        call_later=asyncio.get_running_loop().call_later, seconds=first_request_s
+    )
+
     async def talk(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        silent.enter(writer, writer.transport.abort)
         try:
-            head = await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), _TIMEOUT_S)
+            head = await reader.readuntil(b"\r\n\r\n")
+            silent.leave(writer)
             await _answer(writer, head.decode("latin-1"), pages, operations, streams or {}, token)
         except (OSError, ValueError, EOFError, asyncio.LimitOverrunError, asyncio.TimeoutError):
             pass  # see above
         finally:
+            silent.leave(writer)
             writer.close()
 
     return await asyncio.start_server(talk, _LOOPBACK, port, limit=_MAX_HEAD_BYTES)

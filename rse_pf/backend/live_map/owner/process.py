@@ -251,7 +251,7 @@ class _Process:
             ),
             on_defect=traceback.print_exception,
         )
-        await server.open(listener, context)
+        server.open(listener, context)
         port = listener.getsockname()[1]
         if not await self._retry(self._threads.lease, lambda: self._lease.serve(address, port, certificate)):
             self._worker.sendall(encode_message(["lost"]))

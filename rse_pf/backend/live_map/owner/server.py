@@ -1,8 +1,8 @@
 """The socket of an owner: requests and updates of the workers of all servers, over TLS.
 
 A message is its length and a MessagePack list.  A worker says ``hello`` with a token, the owner ``welcome``;
-then requests are answered in any order.  A worker that reads slowly gets the newest update of each key, and
-no more than a bounded number of its requests is in work.
+then requests are answered in any order.  Who does not say it in time is cut.  A worker that reads slowly gets
+the newest update of each key, and no more than a bounded number of its requests is in work.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from rse_pf.backend.live_map.owner.requests import MapMoves
 from rse_pf.backend.sandbox.ipc import FrameReader, encode_message
 from rse_pf.errors import InternalError, RsePfError
 from rse_pf.identity import RobotId
+from rse_pf.silent_connections import FIRST_REQUEST_S, TlsListener
 
 __all__ = ["MAX_LINK_BYTES", "OwnerServer", "listen"]
 
@@ -25,7 +26,6 @@ MAX_LINK_BYTES = 4 << 20
 """One message between a worker and an owner."""
 _READ_BYTES = 1 << 18
 _MAX_IN_WORK = 256
-_HELLO_S = 5.0
 _FLUSH_S = 2.0
 
 
@@ -64,11 +64,12 @@ class OwnerServer:
         self._check = check
         self._on_defect = on_defect
         self._links: set[_Link] = set()
-        self._server: asyncio.Server | None = None
+        self._listener: TlsListener | None = None
 
-    async def open(self, listener: Any, context: ssl.SSLContext) -> None:
-        """Serve on the socket *listener*."""
-        self._server = await asyncio.start_server(self._serve, sock=listener, ssl=context)
+    def open(self, listener: Any, context: ssl.SSLContext, *, hello_s: float = FIRST_REQUEST_S) -> None:
+        """Serve on the socket *listener*; who has not said hello after *hello_s* is cut."""
+        self._listener = TlsListener(listener, context, self._serve, seconds=hello_s)
+        self._listener.open()
 
     def tell(self, payload: dict[str, Any]) -> None:
         """Send an update to every worker that watches the map."""
@@ -83,17 +84,20 @@ class OwnerServer:
 
     async def close(self) -> None:
         """Send what is left, for a short time, and let the workers look for the next owner."""
-        if self._server is not None:
-            self._server.close()
+        if self._listener is not None:
+            self._listener.close()
         if self._links:
             await asyncio.wait([asyncio.ensure_future(link.move()) for link in self._links], timeout=_FLUSH_S)
 
-    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    async def _serve(
+        self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, named: Callable[[], object]
+    ) -> None:
         link = _Link(self._owner, writer, self._on_defect)
         try:
             frames = FrameReader(MAX_LINK_BYTES)
-            hello, rest = await asyncio.wait_for(_first_message(reader, frames), _HELLO_S)
+            hello, rest = await _first_message(reader, frames)
             self._check(hello)
+            named()
             link.say(["welcome"])
             self._links.add(link)
             self._owner.users += 1

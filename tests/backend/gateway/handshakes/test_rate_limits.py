@@ -6,9 +6,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rse_pf.backend.gateway.rate_limits import CUT_OFF, PendingHandshakes, RobotRates, SourceRates
+from rse_pf.backend.gateway.rate_limits import CUT_OFF, RobotRates, SourceRates
 from rse_pf.config import ServingSettings, SessionSettings
 from rse_pf.identity import RobotId
+from rse_pf.silent_connections import PendingHandshakes
 from rse_pf.token_bucket import TokenBucket
 
 ROBOT = RobotId("default", "r")

@@ -1,0 +1,344 @@
+"""Connections that send no whole request are cheap and few, at every kind of listener."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import socket
+import time
+from collections.abc import AsyncIterator, Awaitable, Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from fakes import FakeLoop
+
+from lambda_pnp.local_front import LocalFront
+from rse_pf.backend.live_map.owner.link_security import client_context, server_context
+from rse_pf.backend.live_map.owner.server import listen
+from rse_pf.backend.supervisor.control_http import ControlReply, serve_control
+from rse_pf.config.front_door import BALANCER_IDLE_TIMEOUT_S
+from rse_pf.http_connections import bounded_protocol
+from rse_pf.local.control.control_port import serve_control_port
+from rse_pf.silent_connections import (
+    FIRST_REQUEST_S,
+    KEEP_ALIVE_S,
+    MAX_SILENT,
+    SilentConnections,
+    TlsListener,
+)
+
+COUNT, SECONDS, DEADLINE_S = 300, 1.0, 10.0
+TOKEN = "t" * 32
+
+
+class Line:
+    """`SilentConnections` on a loop whose time stands still."""
+
+    def __init__(self, **bounds: Any) -> None:
+        self.loop = FakeLoop()
+        self.ended: list[int] = []
+        self.silent: SilentConnections[int] = SilentConnections(
+            call_later=self.loop.call_later,  # type: ignore[arg-type]
+            **bounds,
+        )
+
+    def enter(self, key: int, source: str = "") -> None:
+        self.silent.enter(key, lambda: self.ended.append(key), source)
+
+
+def test_a_connection_without_a_request_is_cut_at_its_time_and_one_with_a_request_is_not() -> None:
+    line = Line()
+    line.enter(1)
+    line.enter(2)
+    line.loop.advance(FIRST_REQUEST_S - 0.1)
+    line.silent.leave(2)
+    line.silent.enter(1, lambda: None)  # does not begin anew
+    assert line.ended == []
+    line.loop.advance(0.2)
+
+    assert (line.ended, line.silent.cut, len(line.silent), line.loop.timers) == ([1], 1, 0, 0)
+
+
+def test_above_the_bound_the_one_that_waited_longest_is_cut_and_never_the_newest() -> None:
+    line = Line(most=3, most_per_source=2)
+    for key, source in enumerate("abacd"):
+        line.enter(key, source)
+    assert line.ended == [0, 1]  # of all, when there were four
+    line.enter(5, "d")
+    line.enter(6, "d")
+
+    assert line.ended == [0, 1, 2, 4]  # of all, and of its address
+    assert 6 in line.silent
+    line.silent.cut_all()
+    assert sorted(line.ended) == list(range(7))
+    assert line.loop.timers == 0
+
+
+def test_keep_alive_is_longer_than_the_balancer_keeps_a_connection() -> None:
+    assert KEEP_ALIVE_S > BALANCER_IDLE_TIMEOUT_S
+
+
+# --- listeners -------------------------------------------------------------------------------------
+
+Started = AsyncIterator[int]
+
+
+@contextlib.asynccontextmanager
+async def control_of_a_server(folder: Path, seconds: float) -> Started:
+    async def answer(_: Any) -> ControlReply:
+        return ControlReply(body=b"{}")
+
+    async with await serve_control("127.0.0.1", 0, answer, first_request_s=seconds) as server:
+        yield server.sockets[0].getsockname()[1]
+
+
+@contextlib.asynccontextmanager
+async def control_of_a_platform(folder: Path, seconds: float) -> Started:
+    async def page() -> tuple[str, bytes]:
+        return "text/plain", b"{}"
+
+    server = await serve_control_port({"/healthz": page}, {}, TOKEN, first_request_s=seconds)
+    async with server:
+        yield server.sockets[0].getsockname()[1]
+
+
+@contextlib.asynccontextmanager
+async def burst_front(folder: Path, seconds: float) -> Started:
+    front = LocalFront(lambda: None, most=1, first_request_s=seconds)  # type: ignore[arg-type, return-value]
+    await front.start()
+    try:
+        yield int(front.url.rpartition(":")[2].partition("/")[0])
+    finally:
+        await front.stop()
+
+
+@contextlib.asynccontextmanager
+async def http_service(folder: Path, seconds: float, **bounds: Any) -> Started:
+    import uvicorn
+
+    async def app(scope: Any, receive: Any, send: Any) -> None:
+        headers = [(b"content-length", b"2")]
+        await send({"type": "http.response.start", "status": 200, "headers": headers})
+        await send({"type": "http.response.body", "body": b"{}"})
+
+    listening = socket.create_server(("127.0.0.1", 0), backlog=1024)
+    protocol = bounded_protocol(seconds=seconds, **{"most_idle": 100, **bounds})
+    config = uvicorn.Config(app, http=protocol, ws="none", lifespan="off", log_level="critical")
+    server = uvicorn.Server(config)
+    server.install_signal_handlers = lambda: None  # type: ignore[attr-defined]
+    with contextlib.ExitStack() as stack:
+        stack.callback(listening.close)
+        serving = asyncio.ensure_future(server._serve([listening]))
+        while not server.started:
+            await asyncio.sleep(0)
+        try:
+            yield listening.getsockname()[1]
+        finally:
+            server.should_exit = server.force_exit = True
+            await serving
+
+
+@contextlib.asynccontextmanager
+async def owner_of_a_map(folder: Path, seconds: float) -> Started:
+    async def serve(
+        reader: asyncio.StreamReader, writer: asyncio.StreamWriter, named: Callable[[], Any]
+    ) -> None:
+        while line := await reader.readline():
+            if line == b"\r\n":
+                named()
+                writer.write(b"HTTP/1.1 200 OK\r\n\r\n")
+
+    context, _ = server_context("127.0.0.1", now_s=time.time())
+    listening = listen("127.0.0.1", range(1))
+    listener = TlsListener(listening, context, serve, seconds=seconds)
+    listener.open()
+    try:
+        yield listening.getsockname()[1]
+    finally:
+        listener.close()
+
+
+KINDS = [control_of_a_server, control_of_a_platform, burst_front, http_service, owner_of_a_map]
+BEGUN = (b"", b"G", b"GET /healthz HTTP/1.1\r\nHost: a\r\nContent-")
+"""What silent connections send before they fall silent."""
+
+
+class Honest:
+    """A connection that asks."""
+
+    def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        self._reader = reader
+        self._writer = writer
+
+    @classmethod
+    async def open(cls, port: int, *, is_owner: bool) -> Honest:
+        context = client_context() if is_owner else None
+        return cls(*await asyncio.open_connection("127.0.0.1", port, ssl=context))
+
+    async def ask(self) -> bytes:
+        """Return the status line of one answer."""
+        token = f"Authorization: Bearer {TOKEN}".encode()
+        self._writer.write(b"GET /healthz HTTP/1.1\r\nHost: a\r\n" + token + b"\r\n\r\n")
+        head = await self._reader.readuntil(b"\r\n\r\n")
+        length = [line for line in head.lower().split(b"\r\n") if line.startswith(b"content-length")]
+        await self._reader.readexactly(int(length[0].split(b":")[1]) if length else 0)
+        return head.split(b"\r\n")[0]
+
+    def close(self) -> None:
+        self._writer.close()
+
+
+async def silent_to(port: int, count: int, begun: tuple[bytes, ...] = BEGUN) -> list[socket.socket]:
+    """Open *count* connections that begin a request at the most."""
+    loop, opened = asyncio.get_running_loop(), []
+    for number in range(count):
+        each = socket.socket()
+        each.setblocking(False)
+        await loop.sock_connect(each, ("127.0.0.1", port))
+        with contextlib.suppress(OSError):  # it was cut for a newer one
+            await loop.sock_sendall(each, begun[number % len(begun)])
+        opened.append(each)
+    return opened
+
+
+async def ended(each: socket.socket) -> None:
+    """Wait until the server has closed *each*."""
+    with contextlib.suppress(ConnectionError):
+        while await asyncio.get_running_loop().sock_recv(each, 4096):
+            pass
+
+
+def run(kind: Any, folder: Path, test: Callable[[int], Awaitable[None]], seconds: float, **more: Any) -> None:
+    async def started() -> None:
+        async with kind(folder, seconds, **more) as port:
+            await asyncio.wait_for(test(port), DEADLINE_S)
+
+    asyncio.run(started())
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_hundreds_of_silent_connections_are_cut_in_time_and_who_asks_is_served(
+    kind: Any, tmp_path: Path
+) -> None:
+    is_owner = kind is owner_of_a_map
+
+    async def test(port: int) -> None:
+        first = await Honest.open(port, is_owner=is_owner)
+        answered = await first.ask()
+        silent = await silent_to(port, COUNT)
+        began = time.monotonic()
+        late = await Honest.open(port, is_owner=is_owner)
+        assert await late.ask() == answered
+        assert time.monotonic() - began < 1.0
+        await asyncio.gather(*map(ended, silent))
+        if kind is not control_of_a_platform:  # which closes each connection after its answer
+            assert await first.ask() == await late.ask() == answered
+        for each in (first, late, *silent):
+            each.close()
+
+    run(kind, tmp_path, test, SECONDS)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_above_the_bound_silent_connections_are_cut_at_once(kind: Any, tmp_path: Path) -> None:
+    async def test(port: int) -> None:
+        silent = await silent_to(port, MAX_SILENT + 20, (b"",))
+        await asyncio.gather(*map(ended, silent[:20]))
+        newest = asyncio.ensure_future(ended(silent[-1]))
+        first = await Honest.open(port, is_owner=kind is owner_of_a_map)
+        assert b" 200 " in await first.ask() or kind is burst_front
+        assert not newest.done()
+        newest.cancel()
+        for each in (first, *silent):
+            each.close()
+
+    run(kind, tmp_path, test, 60.0)
+
+
+def test_a_head_that_begins_after_an_answer_has_its_time_too(tmp_path: Path) -> None:
+    async def test(port: int) -> None:
+        (slow,) = await silent_to(port, 1, (b"GET / HTTP/1.1\r\nHost: a\r\n\r\n",))
+        assert b"200" in await asyncio.get_running_loop().sock_recv(slow, 4096)
+        await asyncio.get_running_loop().sock_sendall(slow, b"GET / HTTP/1.1\r\n")
+        await ended(slow)
+        slow.close()
+
+    run(http_service, tmp_path, test, SECONDS)
+
+
+def test_idle_connections_are_bounded_and_the_one_that_waited_longest_is_closed(tmp_path: Path) -> None:
+    async def test(port: int) -> None:
+        several = [await Honest.open(port, is_owner=False) for _ in range(6)]
+        for each in several:
+            await each.ask()
+        with pytest.raises((asyncio.IncompleteReadError, ConnectionError)):
+            await several[0].ask()
+        assert b" 200 " in await several[-1].ask()
+        for each in several:
+            each.close()
+
+    run(http_service, tmp_path, test, 60.0, most_idle=5)
+
+
+def test_a_served_connection_is_kept_longer_than_the_balancer_keeps_it() -> None:
+    loop = FakeLoop()
+    protocol, transport = _connected(loop)
+    for _ in range(2):
+        protocol.data_received(b"GET / HTTP/1.1\r\nHost: a\r\n\r\n")
+        protocol.cycle.response_complete = True
+        protocol.conn.send(_response())
+        protocol.conn.send(_end())
+        protocol.conn.start_next_cycle()
+        protocol.on_response_complete()
+        loop.advance(BALANCER_IDLE_TIMEOUT_S + 5.0)
+        assert transport.ended == ""
+    loop.advance(KEEP_ALIVE_S)
+
+    assert transport.ended == "closed"
+    protocol.connection_lost(ConnectionResetError())
+    assert loop.timers == 0
+
+
+class _Transport:
+    ended = ""
+
+    def get_extra_info(self, name: str, default: Any = None) -> Any:
+        return default
+
+    def is_closing(self) -> bool:
+        return bool(self.ended)
+
+    def close(self) -> None:
+        self.ended = "closed"
+
+    def abort(self) -> None:
+        self.ended = "cut"
+
+    def pause_reading(self) -> None: ...
+
+    resume_reading = pause_reading
+
+
+def _connected(loop: FakeLoop) -> tuple[Any, _Transport]:
+    import uvicorn
+    from uvicorn.server import ServerState
+
+    config = uvicorn.Config(lambda *_: None, lifespan="off", log_level="critical")  # type: ignore[arg-type]
+    made: Any = bounded_protocol(most_idle=10)
+    loop.create_task = lambda work, **_: (work.close(), asyncio.Future(loop=loop))[1]  # type: ignore[attr-defined]
+    protocol, transport = made(config, ServerState(), {}, _loop=loop), _Transport()
+    protocol.connection_made(transport)
+    return protocol, transport
+
+
+def _response() -> Any:
+    import h11
+
+    return h11.Response(status_code=200, headers=[("content-length", "0")])
+
+
+def _end() -> Any:
+    import h11
+
+    return h11.EndOfMessage()
