@@ -164,9 +164,9 @@ class DataServer:
             trace = uuid.uuid4().hex
             line |= {"code": InternalError.code, "trace": trace, "error": repr(error)[:500]}
             reply = failure_reply(InternalError("the data server failed", hint=f"search its log for {trace}"))
-        # A small body is drained, so that the robot reads the reply before the connection is closed.
+        # After a small body that is here the connection goes on; otherwise it ends with the reply.
         if not request.is_complete and (
-            reply.status == _REQUEST_TIMEOUT or not await request.drain(self._settings.data.part_bytes)
+            reply.status == _REQUEST_TIMEOUT or not await request.drain_soon(self._settings.data.part_bytes)
         ):
             reply = dataclasses.replace(reply, headers={**reply.headers, "Connection": "close"})
         return shared_reply(reply, shared_with)
@@ -259,5 +259,9 @@ async def _send(reply: HttpReply, request: HttpRequest, send: Send) -> int:
             sent += len(piece)
             await asyncio.sleep(0)  # lets other requests run where sending never waits
         body = b""
-    await send({"type": "http.response.body", "body": body, "more_body": False})
+    await send({"type": "http.response.body", "body": body, "more_body": not request.is_complete})
+    if not request.is_complete:  # the reply is complete for the robot, and the connection ends after it
+        if reply.status != _REQUEST_TIMEOUT:
+            await request.discard()
+        await send({"type": "http.response.body", "body": b"", "more_body": False})
     return sent + len(body)

@@ -7,6 +7,7 @@ limit is held in memory.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import re
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from dataclasses import dataclass, field
@@ -53,6 +54,8 @@ Receive = Callable[[], Awaitable[Mapping[str, Any]]]
 Send = Callable[[Mapping[str, Any]], Awaitable[None]]
 _MIN_BODY_BYTES_PER_S, _BODY_GRACE_S = 1024, 5.0
 """A body that has been slower than the first after the second is refused."""
+_DRAIN_S = 0.1
+_DISCARD_BYTES, _DISCARD_S = 8 << 20, 2.0
 
 
 class MethodNotAllowed(BadRequest):
@@ -149,6 +152,32 @@ class HttpRequest:
             if len(held) > max_bytes:
                 raise _too_long(len(held), max_bytes)
         return bytes(held)
+
+    async def drain_soon(self, max_bytes: int) -> bool:
+        """Do the same as `drain`, for `_DRAIN_S` at the most: what is on its way can still be read."""
+        try:
+            return await asyncio.wait_for(self.drain(max_bytes), _DRAIN_S)
+        except asyncio.TimeoutError:
+            return False
+
+    async def discard(self) -> None:
+        """Read and drop what a robot sends that has its reply: it reads the reply when it has sent.
+
+        Closing the connection instead would reset it, and the reply would be lost.  At most `_DISCARD_BYTES`
+        are read, and for `_DISCARD_S`.  A robot that waits to be told to go on sends nothing.
+        """
+        if "expect" in self.headers and not self.received_bytes:
+            return
+        with contextlib.suppress(asyncio.TimeoutError):
+            await asyncio.wait_for(self._drop(), _DISCARD_S)
+
+    async def _drop(self) -> None:
+        left = _DISCARD_BYTES
+        while left > 0:
+            message = await self._receive()
+            if message["type"] == "http.disconnect" or not message.get("more_body", False):
+                return
+            left -= len(message.get("body", b""))
 
     async def drain(self, max_bytes: int) -> bool:
         """Read and discard the rest, so that the robot reads the reply; return whether all was read."""

@@ -277,7 +277,7 @@ def test_what_has_no_wheel_or_another_hash_is_not_installed(index: Path, tmp_pat
 HOSTILE = [
     "./evil", "evil/", "/evil", "../evil", "evil.zip/", "-e ./evil", "-e.", "--editable=./evil",
     "-r more.txt", "-c more.txt", "--index-url http://127.0.0.1:1/", "--extra-index-url=http://127.0.0.1:1/",
-    "--find-links .", "--no-binary :all:", "--pre", "--trusted-host x", "evil @ file:///evil",
+    "--find-links .", "--no-binary :all:", "--pre", "--trusted-host x", "evil @ file:/evil",
     "evil @ ./evil", "evil@http://127.0.0.1:1/e.whl", "git+https://127.0.0.1:1/evil",
     "http://127.0.0.1:1/evil-1-py3-none-any.whl", "file:evil", "evil===${HOME}", "${EVIL}",
     "evil ; python_version > '${HOME}'", "evil --config-settings=x=y", "evil --global-option=x",

@@ -1,0 +1,75 @@
+"""A body that is too large gets its 413 also in a client that is already sending."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import shutil
+import socket
+import subprocess
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import pytest
+
+from rse_pf.config import PlatformSettings
+from rse_pf.local.control.platform import LocalPlatform
+
+pytestmark = [pytest.mark.system, pytest.mark.slow]
+
+MIB = 1 << 20
+SETTINGS = PlatformSettings().replace(local={"workers": 1})
+OBJECT = "/data/v1/objects/" + "a" * 64
+TIMES = 5
+
+
+def sent_first(address: tuple[str, int], size: int, token: str) -> tuple[int, str]:
+    """Send all of a body, and read the answer then, as httpx does; a write that fails ends the sending."""
+    with socket.create_connection(address, timeout=20) as connection:
+        head = f"PUT {OBJECT} HTTP/1.1\r\nHost: a\r\nAuthorization: Bearer {token}\r\n"
+        head += f"Content-Length: {size}\r\n\r\n"
+        with contextlib.suppress(BrokenPipeError, ConnectionResetError):
+            connection.sendall(head.encode())
+            for _ in range(size // MIB):
+                connection.sendall(b"x" * MIB)
+        answer = b""
+        while piece := connection.recv(65536):
+            answer += piece
+            found, _, body = answer.partition(b"\r\n\r\n")
+            if body.endswith(b"}"):
+                return int(found.split()[1]), json.loads(body)["code"]
+        raise AssertionError(f"no whole answer: {answer!r}")
+
+
+def by_curl(address: tuple[str, int], size: int, token: str) -> tuple[int, str]:
+    curl = shutil.which("curl") or pytest.skip("no curl")
+    done = subprocess.run(
+        [curl, "-sS", "-X", "PUT", "--data-binary", "@-", "-w", "\n%{http_code}", "-H", "Expect:",
+         "-H", f"Authorization: Bearer {token}", f"http://{address[0]}:{address[1]}{OBJECT}"],
+        input=b"x" * size, capture_output=True, check=False, timeout=60,
+    )  # fmt: skip
+    body, _, status = done.stdout.decode().rpartition("\n")
+    assert body, done.stderr
+    return int(status), json.loads(body)["code"]
+
+
+def data_port(folder: Path) -> int:
+    (announced,) = folder.glob("data-[0-9]*.json")
+    return int(json.loads(announced.read_text())["port"])
+
+
+def test_the_answer_arrives_directly_and_through_the_balancer(tmp_path: Path) -> None:
+    async def run() -> None:
+        state = tmp_path / "a"
+        async with LocalPlatform(SETTINGS, servers=1, port=0, state=state, data=True) as platform:
+            token = platform.issue_token("robot-1")
+            balancer = urlsplit(platform.url)
+            for address in ((balancer.hostname or "", balancer.port or 0), ("127.0.0.1", data_port(state))):
+                for send in (sent_first, by_curl):
+                    for size in (5 * MIB, 60 * MIB):
+                        for _ in range(TIMES):
+                            told = await asyncio.to_thread(send, address, size, token)
+                            assert told == (413, "too-large"), (address, send, size)
+
+    asyncio.run(run())
