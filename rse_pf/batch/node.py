@@ -4,8 +4,8 @@
 
 The order is JSON on the standard input, because it has the key of the cluster.  A scheduler prints its
 address as one line.  Both speak TLS only, and only with those who have the cluster's key: what Dask sends is
-pickled, so that anybody who may connect may run any code.  A robot's bytes are never among it: a part names
-objects of the store, and its result is an object of the store.
+pickled, so that anybody who may connect may run any code.  Each listens at one port, on one address.  A
+robot's bytes are never among it: a part names objects of the store, and its result is an object of the store.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from typing import Any
 import msgspec
 
 from rse_pf.aws.storage import open_data_store
+from rse_pf.batch.listening import bound_handshakes, without_pages
 from rse_pf.batch.parts import decode_part
 from rse_pf.batch.tasks import compute_part
 from rse_pf.config import PlatformSettings
@@ -95,7 +96,8 @@ async def _scheduler(order: NodeOrder) -> None:
     from distributed import Scheduler
 
     security = security_of(order.certificate, order.key)
-    async with Scheduler(
+    bound_handshakes()
+    async with without_pages(Scheduler)(
         host=order.host, port=order.port, protocol="tls", security=security, dashboard=False
     ) as scheduler:
         show(scheduler.address)
@@ -104,12 +106,16 @@ async def _scheduler(order: NodeOrder) -> None:
 
 async def _worker(order: NodeOrder) -> None:
     from distributed import Worker
+    from distributed.comm import get_address_host
+    from distributed.utils import get_ip
 
+    bound_handshakes()
+    host = get_ip(get_address_host(order.address))  # by which the scheduler is reached
     security = security_of(order.certificate, order.key)
     with tempfile.TemporaryDirectory(prefix="rse-pf-batch-") as folder:
-        async with Worker(
-            order.address, port=order.ports or None, nthreads=1, security=security, local_directory=folder,
-            memory_limit=0, death_timeout=_DEATH_TIMEOUT_S,
+        async with without_pages(Worker)(
+            order.address, host=host, port=order.ports or None, nthreads=1, security=security,
+            local_directory=folder, memory_limit=0, death_timeout=_DEATH_TIMEOUT_S,
         ) as worker:  # fmt: skip
             await worker.finished()
 

@@ -126,3 +126,55 @@ def test_who_has_not_the_key_is_refused() -> None:
         assert answer == b""
     finally:
         cluster.stop()
+
+
+def sockets_of(pid: int) -> list[tuple[str, int]]:
+    """Return address (hexadecimal, as the kernel shows it) and port of what the process *pid* listens at."""
+    inodes = set()
+    for name in os.listdir(f"/proc/{pid}/fd"):
+        with contextlib.suppress(OSError):
+            inodes.add(os.readlink(f"/proc/{pid}/fd/{name}"))
+    found = []
+    for family in ("tcp", "tcp6"):
+        for line in Path(f"/proc/{pid}/net/{family}").read_text().splitlines()[1:]:
+            fields = line.split()
+            if fields[3] == "0A" and f"socket:[{fields[9]}]" in inodes:
+                address, port = fields[1].split(":")
+                found.append((address, int(port, 16)))
+    return found
+
+
+def test_every_process_listens_at_one_port_on_the_given_host(tmp_path: Path) -> None:
+    key = new_cluster_key()
+    cluster = LocalCluster(key, 2)
+    engine = DaskEngine(DirectoryStore(tmp_path), PlatformSettings(), cluster, key)
+    try:
+        engine.start()
+        engine._connect()
+        engine._client.wait_for_workers(2, timeout=60)
+        listening = [sockets_of(pid) for pid in (cluster.scheduler_pid, *cluster.worker_pids)]
+    finally:
+        engine.close()
+        cluster.stop()
+
+    assert [len(each) for each in listening] == [1, 1, 1]
+    assert {address for each in listening for address, _ in each} == {"0100007F"}
+
+
+def test_connections_that_shake_no_hands_are_cut_and_a_client_is_served_meanwhile(tmp_path: Path) -> None:
+    key = new_cluster_key()
+    cluster = LocalCluster(key, 1)
+    engine = DaskEngine(DirectoryStore(tmp_path), PlatformSettings(), cluster, key)
+    with contextlib.ExitStack() as stack:
+        stack.callback(cluster.stop)
+        stack.callback(engine.close)
+        cluster.start()
+        host, _, port = cluster.address.removeprefix("tls://").rpartition(":")
+        silent = [
+            stack.enter_context(socket.create_connection((host, int(port)), timeout=20)) for _ in range(300)
+        ]
+        engine._connect()
+        for each in silent:
+            with contextlib.suppress(ConnectionError):
+                assert each.recv(1) == b""
+        engine._client.wait_for_workers(1, timeout=60)
