@@ -29,7 +29,7 @@ from rse_pf.config import PlatformSettings, load_settings
 from rse_pf.config.front_door import BEARER_PATTERN, BURST_PATH
 from rse_pf.errors import NotFound, RsePfError
 from rse_pf.linux import die_with_parent, set_process_name
-from rse_pf.silent_connections import FIRST_REQUEST_S, KEEP_ALIVE_S, SilentConnections
+from rse_pf.silent_connections import BACKLOG, FIRST_REQUEST_S, KEEP_ALIVE_S, SilentConnections
 from rse_pf.terminal import show, show_error, show_json
 
 __all__ = ["LocalFront", "answering_of", "read_beside"]
@@ -81,7 +81,9 @@ class LocalFront:
         self._silent = SilentConnections(
             call_later=asyncio.get_running_loop().call_later, seconds=self._first_request_s
         )
-        self._server = await asyncio.start_server(self._serve, _HOST, port, limit=_MAX_HEAD_BYTES)
+        self._server = await asyncio.start_server(
+            self._serve, _HOST, port, limit=_MAX_HEAD_BYTES, backlog=BACKLOG
+        )
         self.url = f"http://{_HOST}:{self._server.sockets[0].getsockname()[1]}{BURST_PATH}"
 
     async def stop(self) -> None:

@@ -16,10 +16,20 @@ from typing import Any, Generic, TypeVar
 
 from rse_pf.config.front_door import BALANCER_IDLE_TIMEOUT_S
 
-__all__ = ["FIRST_REQUEST_S", "KEEP_ALIVE_S", "PendingHandshakes", "SilentConnections", "TlsListener"]
+__all__ = [
+    "BACKLOG",
+    "FIRST_REQUEST_S",
+    "KEEP_ALIVE_S",
+    "PendingHandshakes",
+    "SilentConnections",
+    "TlsListener",
+]
 
-FIRST_REQUEST_S = 10.0
-"""Time from the connection to its first whole request, or hello."""
+FIRST_REQUEST_S = 8.0
+"""Time from the acceptance of a connection to its first whole request, or hello; with the time that it may
+wait to be accepted these are ten seconds."""
+BACKLOG = 1024
+"""Connections that wait to be accepted: above that the kernel drops them, also those of robots."""
 KEEP_ALIVE_S = BALANCER_IDLE_TIMEOUT_S + 10.0
 """How long a served connection may be idle: longer than load balancers keep theirs, which would otherwise
 send a request into a connection that is just being closed."""

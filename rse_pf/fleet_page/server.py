@@ -21,6 +21,7 @@ from rse_pf.fleet_page.hub import MAX_PAGES, Hub
 from rse_pf.fleet_page.page_sessions import PageSessions
 from rse_pf.fleet_page.static_files import page_files
 from rse_pf.http_connections import bounded_protocol
+from rse_pf.silent_connections import BACKLOG
 
 __all__ = ["ANNOUNCEMENT", "listen", "page_url", "serve_page"]
 
@@ -42,7 +43,7 @@ def listen(port: int) -> socket.socket:
     """Return a socket on loopback at *port*, or at a free one if that is taken or 0."""
     for wanted in (port, 0):
         with contextlib.suppress(OSError):
-            return socket.create_server((_LOOPBACK, wanted), backlog=64)
+            return socket.create_server((_LOOPBACK, wanted), backlog=BACKLOG)
     raise ConfigurationError("no port on loopback is free", hint="end other programs")
 
 

@@ -15,7 +15,7 @@ from http import HTTPStatus
 from typing import Any
 from urllib.parse import parse_qsl, urlsplit
 
-from rse_pf.silent_connections import FIRST_REQUEST_S, KEEP_ALIVE_S, SilentConnections
+from rse_pf.silent_connections import BACKLOG, FIRST_REQUEST_S, KEEP_ALIVE_S, SilentConnections
 
 __all__ = ["ControlReply", "ControlRequest", "json_reply", "number_of", "refused_reply", "serve_control"]
 
@@ -106,7 +106,7 @@ async def serve_control(
             idle.leave(writer)
             writer.close()
 
-    return await asyncio.start_server(talk, host, port, limit=_MAX_HEAD_BYTES)
+    return await asyncio.start_server(talk, host, port, limit=_MAX_HEAD_BYTES, backlog=BACKLOG)
 
 
 async def _exchange(

@@ -17,7 +17,7 @@ from urllib.parse import parse_qsl, urlsplit
 
 from rse_pf.auth.control_token import carries_token
 from rse_pf.errors import RsePfError
-from rse_pf.silent_connections import SilentConnections
+from rse_pf.silent_connections import BACKLOG, SilentConnections
 
 __all__ = ["METRICS_TYPE", "Page", "serve_control_port"]
 
@@ -74,7 +74,7 @@ async def serve_control_port(
             silent.leave(writer)
             writer.close()
 
-    return await asyncio.start_server(talk, _LOOPBACK, port, limit=_MAX_HEAD_BYTES)
+    return await asyncio.start_server(talk, _LOOPBACK, port, limit=_MAX_HEAD_BYTES, backlog=BACKLOG)
 
 
 async def _answer(

@@ -18,7 +18,7 @@ from rse_pf.backend.live_map.owner.requests import MapMoves
 from rse_pf.backend.sandbox.ipc import FrameReader, encode_message
 from rse_pf.errors import InternalError, RsePfError
 from rse_pf.identity import RobotId
-from rse_pf.silent_connections import FIRST_REQUEST_S, TlsListener
+from rse_pf.silent_connections import BACKLOG, FIRST_REQUEST_S, TlsListener
 
 __all__ = ["MAX_LINK_BYTES", "OwnerServer", "listen"]
 
@@ -40,7 +40,7 @@ def listen(host: str, ports: range) -> Any:
     failed: OSError | None = None
     for port in ports:
         try:
-            return socket.create_server((host, port), backlog=128)
+            return socket.create_server((host, port), backlog=BACKLOG)
         except OSError as error:
             failed = error
     assert failed is not None

@@ -1,0 +1,282 @@
+"""Silent connections to every port of a platform, and what connections that were used leave behind.
+
+    python -m benchmarks.hostile.connections silent [--count 5000] [--ports NAME ...]
+    python -m benchmarks.hostile.connections leave [--times 500]
+
+``silent`` starts a platform with its page, a live map and a cluster of Dask, and opens connections that
+send nothing to one port after the other.  For each port it shows in how many seconds the server had closed
+all of them (bar: 10), how much memory the processes of the platform took meanwhile (bar: 64 MiB), and how
+long a new robot took to connect and to get an answer (bar: 1 s).  ``leave`` lets robots, rosbridge clients
+and readers of a live map connect, use what there is, and leave; it shows descriptors, threads and memory of
+the worker, before and after (bars: as before; 1 KiB a cycle).
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import contextlib
+import json
+import os
+import random
+import resource
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from websockets.asyncio.client import connect as connect_socket
+
+import client_sdk
+from benchmarks.server.serving import machine
+from rse_pf.batch.cluster import LocalCluster, new_cluster_key
+
+_NAME = "silent-connections"
+_LONGEST_S = 40.0
+_WARM_UP = 100
+MIB = 1 << 20
+
+
+def family(root: int) -> list[int]:
+    """Return *root* and the processes below it."""
+    parents: dict[int, int] = {}
+    for each in Path("/proc").glob("[0-9]*"):
+        with contextlib.suppress(OSError, ValueError):
+            parents[int(each.name)] = int((each / "stat").read_text().rpartition(")")[2].split()[1])
+    found = [root]
+    for pid in found:
+        found += [child for child, parent in parents.items() if parent == pid]
+    return found
+
+
+def listening(pids: list[int]) -> dict[int, str]:
+    """Return the TCP ports at which *pids* listen, with the names of their processes."""
+    owners: dict[str, int] = {}
+    for pid in pids:
+        with contextlib.suppress(OSError):
+            for each in Path(f"/proc/{pid}/fd").iterdir():
+                with contextlib.suppress(OSError):
+                    owners.setdefault(os.readlink(each), pid)
+    found = {}
+    for line in Path("/proc/net/tcp").read_text().splitlines()[1:]:
+        fields = line.split()
+        pid = owners.get(f"socket:[{fields[9]}]")
+        if fields[3] == "0A" and pid is not None:
+            name = Path(f"/proc/{pid}/comm").read_text().strip()
+            found[int(fields[1].split(":")[1], 16)] = name
+    return found
+
+
+def rss_bytes(pids: list[int]) -> int:
+    total = 0
+    for pid in pids:
+        with contextlib.suppress(OSError):
+            total += int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * resource.getpagesize()
+    return total
+
+
+def open_at(port: int) -> int:
+    """Return how many connections the server's side of *port* has, those in its backlog included."""
+    local = f":{port:04X}"
+    rows = (line.split() for line in Path("/proc/net/tcp").read_text().splitlines()[1:])
+    return sum(row[1].endswith(local) and row[3] in ("01", "03") for row in rows)
+
+
+def open_silent(port: int, count: int) -> list[socket.socket]:
+    opened = []
+    for _ in range(count):
+        each = socket.socket()
+        each.setblocking(False)
+        each.connect_ex(("127.0.0.1", port))
+        opened.append(each)
+    return opened
+
+
+async def robot_s(url: str, token: str, name: str) -> float:
+    """Return how long a new robot takes to connect and to get an answer."""
+    began = time.monotonic()
+    async with client_sdk.connect(url, token=token, random=random.Random(name)) as robot:
+        await robot.call("echo", {"value": 1}, deadline_s=20.0)
+    return time.monotonic() - began
+
+
+def attack(port: int, count: int, pids: list[int], url: str, token: str) -> dict[str, float]:
+    """Open *count* silent connections to *port*; return what was seen."""
+    before, had = rss_bytes(pids), open_at(port)
+    began = time.monotonic()
+    opened = open_silent(port, count)
+    robot = asyncio.run(asyncio.wait_for(robot_s(url, token, str(port)), 60))
+    peak = rss_bytes(pids)
+    while (left := open_at(port) - had) > 0 and time.monotonic() - began < _LONGEST_S:
+        peak = max(peak, rss_bytes(pids))
+        time.sleep(0.1)
+    closed_s = time.monotonic() - began
+    for each in opened:
+        each.close()
+    memory_mib = (peak - before) / MIB
+    return {"closed_s": closed_s, "left": max(0, left), "memory_mib": memory_mib, "robot_s": robot}
+
+
+@contextlib.contextmanager
+def platform(folder: Path) -> Iterator[tuple[int, str, str]]:
+    """Yield pid, address and a token of a platform with a live map."""
+    environment = {**os.environ, "XDG_STATE_HOME": str(folder)}
+    command = [sys.executable, "-m", "rse_pf.cli.main"]
+    with (folder / "log").open("wb") as log:
+        process = subprocess.Popen(
+            [*command, "local", "--servers", "1", "--name", _NAME, "--port", "0"], env=environment,
+            stdout=log, stderr=log, cwd=folder,
+        )  # fmt: skip
+    try:
+        end = time.monotonic() + 60
+        while "robots connect to" not in (said := (folder / "log").read_text()):
+            if process.poll() is not None or time.monotonic() > end:
+                raise SystemExit(said)
+            time.sleep(0.1)
+        url = next(line.split()[-1] for line in said.splitlines() if "robots connect to" in line)
+        issued = subprocess.run(
+            [*command, "token", "issue", "robot-1", "--name", _NAME], env=environment, capture_output=True,
+            text=True, check=True,
+        )  # fmt: skip
+        yield process.pid, url, issued.stdout.split()[-1]
+    finally:
+        subprocess.run(
+            [*command, "local", "stop", "--name", _NAME], env=environment, capture_output=True, check=False
+        )
+        process.wait(60)
+
+
+def silent(count: int, only: list[str]) -> list[dict[str, Any]]:
+    """Attack every port of a platform, one after the other."""
+    limit = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
+    resource.setrlimit(resource.RLIMIT_NOFILE, (limit, limit))
+    rows = []
+    with (
+        tempfile.TemporaryDirectory() as name,
+        platform(Path(name)) as (pid, url, token),
+        contextlib.ExitStack() as stack,
+    ):
+        cluster = LocalCluster(new_cluster_key(), 1)
+        stack.callback(cluster.stop)
+        cluster.start()
+        watcher = subprocess.Popen(
+            [sys.executable, "-c", _WATCH, url, token], stdout=subprocess.PIPE, text=True
+        )
+        stack.callback(watcher.wait)
+        stack.callback(watcher.kill)
+        assert watcher.stdout is not None
+        watcher.stdout.readline()
+        pids = [*family(pid), cluster.scheduler_pid, *cluster.worker_pids]
+        for port, owner in sorted(listening(pids).items()):
+            if not only or owner in only:
+                row = {"port": port, "owner": owner, **attack(port, count, pids, url, token)}
+                print(
+                    json.dumps({k: round(v, 2) if isinstance(v, float) else v for k, v in row.items()}),
+                    flush=True,
+                )
+                rows.append(row)
+    return rows
+
+
+_WATCH = """
+import asyncio, random, sys, client_sdk
+async def main():
+    async with client_sdk.connect(sys.argv[1], token=sys.argv[2], random=random.Random(1)) as robot:
+        print(await robot.subscribe("live/m").next(), flush=True)
+        await asyncio.Event().wait()
+asyncio.run(main())
+"""
+
+
+async def cycle(url: str, tokens: tuple[str, str], number: int) -> None:
+    """Connect, use what there is, and leave."""
+    async with client_sdk.connect(url, token=tokens[0], random=random.Random(number)) as robot:
+        await robot.call("echo", {"value": number}, deadline_s=20.0)
+        updates = robot.subscribe("live/m")
+        await updates.next()
+    headers = {"Authorization": f"Bearer {tokens[1]}"}
+    address = url.replace("/ws", "/rosbridge")
+    async with connect_socket(address, additional_headers=headers, compression=None) as client:
+        for each in (
+            {"op": "subscribe", "topic": "/t", "id": "s", "throttle_rate": 3_600_000, "queue_length": 10},
+            *({"op": "publish", "topic": "/t", "msg": {"data": "x" * 50_000}} for _ in range(4)),
+            {"op": "call_service", "id": "e", "service": "/echo", "args": {"value": 1}},
+        ):
+            await client.send(json.dumps(each))
+        while "service_response" not in str(await asyncio.wait_for(client.recv(), 20)):
+            pass
+
+
+def held_by(pid: int) -> dict[str, int]:
+    status = dict(line.split(":", 1) for line in Path(f"/proc/{pid}/status").read_text().splitlines())
+    return {
+        "descriptors": len(list(Path(f"/proc/{pid}/fd").iterdir())), "threads": int(status["Threads"]),
+        "anonymous_kib": int(status["RssAnon"].split()[0]),
+    }  # fmt: skip
+
+
+def leave(times: int) -> dict[str, Any]:
+    """Let clients come and go *times* times, after a warm-up."""
+    from tests.guarded_server import GuardedServer
+
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        (folder / "store").mkdir()
+        groups: dict[str, Any] = {
+            "serving": {"rosbridge": True}, "session": {"max_commands_per_s": 0.0},
+            "data": {"store": f"dir:{folder / 'store'}"},
+        }  # fmt: skip
+        with GuardedServer(folder, workers=1, **groups) as server:
+            tokens = (server.token("r", ttl_s=900), server.token("s", ttl_s=900))
+
+            async def run(count: int) -> None:
+                for number in range(count):
+                    await asyncio.wait_for(cycle(server.url, tokens, number), 60)
+
+            asyncio.run(run(_WARM_UP))
+            root = server._process.pid  # type: ignore[union-attr]
+            (worker,) = (
+                each
+                for each in family(root)
+                if Path(f"/proc/{each}/comm").read_text().strip() == "rse-pf worker"
+            )
+            before = held_by(worker)
+            asyncio.run(run(times))
+            deadline = time.monotonic() + 10
+            while (after := held_by(worker))["descriptors"] > before[
+                "descriptors"
+            ] and time.monotonic() < deadline:
+                time.sleep(0.1)
+    grown = (after["anonymous_kib"] - before["anonymous_kib"]) / times
+    return {"times": times, "before": before, "after": after, "kib_per_cycle": round(grown, 3)}
+
+
+def main() -> int:
+    """Run a part, and say whether it kept its bars."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("part", choices=("silent", "leave"))
+    parser.add_argument("--count", type=int, default=5000)
+    parser.add_argument("--times", type=int, default=500)
+    parser.add_argument("--ports", nargs="*", default=[], help="names of processes")
+    args = parser.parse_args()
+    print(f"{machine()}, load {os.getloadavg()[0]:.1f}")
+    if args.part == "leave":
+        found = leave(args.times)
+        print(json.dumps(found))
+        same = all(found["after"][what] <= found["before"][what] for what in ("descriptors", "threads"))
+        return 0 if same and found["kib_per_cycle"] <= 1.0 else 1
+    rows = silent(args.count, args.ports)
+    kept = [
+        r["closed_s"] <= 10 and not r["left"] and r["memory_mib"] <= 64 and r["robot_s"] <= 1 for r in rows
+    ]
+    return 0 if all(kept) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
