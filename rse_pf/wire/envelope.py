@@ -23,10 +23,10 @@ from rse_pf.wire.messages import Failure
 __all__ = ["Envelope", "encode_refusal", "peek", "undecodable_id"]
 
 _MAX_PEEKED_BYTES = 512
-# The start of a command as the SDK writes it: type, id, and a service of at most 64 characters.  Some encoders
-# put a space behind each mark.
 _INFLATED_BYTES = 160
 
+# The start of a command as the SDK writes it: type, id, and a service of at most 64 characters.  Some
+# encoders put a space behind each mark.
 _HEAD = re.compile(
     rb'\{"type": ?"command", ?"id": ?(0|[1-9][0-9]{0,15}), ?"service": ?'
     rb'"([\x20-\x21\x23-\x5b\x5d-\x7e]{1,64})"[,}]'
