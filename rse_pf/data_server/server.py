@@ -180,4 +180,4 @@ def _listen(settings: PlatformSettings) -> socket.socket:
 
 
 def _write_line(fields: dict[str, Any]) -> None:
-    show(json_line({"t": round(time.time(), 3), **fields}, msgspec.json.encode).decode(), error=True)
+    show(json_line({"time": round(time.time(), 3), **fields}, msgspec.json.encode).decode(), error=True)

@@ -15,12 +15,13 @@ import shutil
 import signal
 import subprocess
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from rse_pf.errors import ConfigurationError
+from rse_pf.files import TEMPORARY_PREFIX
 from rse_pf.linux import die_with_parent
 
 __all__ = [
@@ -30,7 +31,9 @@ __all__ = [
     "ended",
     "is_alive",
     "last_line",
+    "log_size",
     "mark_of",
+    "remove_old_logs",
     "rotate_logs",
     "rotate_long_logs",
     "send_signal",
@@ -41,6 +44,8 @@ __all__ = [
 _TAIL_BYTES = 8192
 _LOOK_AGAIN_S = 0.01
 _ROTATE_EVERY_S = 5.0
+_MAX_LOGS, _MAX_LOGS_BYTES = 200, 1 << 30
+_FULL_BYTES = 1 << 16
 STOP_TIMEOUT_S = 10.0
 """A process that has not ended so long after it was asked to is killed."""
 
@@ -120,12 +125,11 @@ def spawn(
 
     Args:
         command: Program and arguments.
-        log: Where both of its output streams go; an earlier file is replaced.
+        log: Where both of its output streams go, behind what is there.
         folder: Its working directory.
         dies_with_parent: Whether Linux kills it when the calling thread ends, however that ends.
         stdin: Nothing, or ``subprocess.PIPE``.
     """
-    log.unlink(missing_ok=True)
     with log.open("ab") as output:  # it appends, so that the log may be cut short under it
         process = subprocess.Popen(
             command,
@@ -155,10 +159,16 @@ class ServerProcess:
         self.mark: ProcessMark | None = None
         self._folder = folder
         self._child: subprocess.Popen[bytes] | None = None
+        self._log_from = 0
+
+    def prepare(self) -> None:
+        """Forget the process before this one: its announcement, and which lines of the log are its own."""
+        self.announcement.unlink(missing_ok=True)
+        self._log_from = log_size(self.log)
 
     def start(self, command: Sequence[str], *, dies_with_parent: bool) -> None:
         """Start *command* as `spawn` does."""
-        self.announcement.unlink(missing_ok=True)
+        self.prepare()
         self.use(spawn(command, log=self.log, folder=self._folder, dies_with_parent=dies_with_parent))
 
     def use(self, child: subprocess.Popen[bytes]) -> None:
@@ -221,24 +231,43 @@ class ServerProcess:
             self._child.wait()
         self.announcement.unlink(missing_ok=True)
 
+    def last_line(self) -> str:
+        """Return the last line that this process logged; if it has none on a full disk, the cause."""
+        last = last_line(self.log, self._log_from)
+        return last or ("there is no space left on its disk" if _is_disk_full(self._folder) else "")
+
     def ending(self) -> str:
         """Return how the process ended, as part of a sentence."""
         code = None if self._child is None else self._child.poll()
         return "ended" if code is None else f"ended with exit code {code}"
 
     def failed(self, what: str) -> ConfigurationError:
-        """Return the error that says *what* happened, with the last line of the log."""
-        last = last_line(self.log)
+        """Return the error that says *what* happened, with the last line that the process logged."""
+        last = self.last_line()
         return ConfigurationError(
             f"{self.name} {what}{': ' if last else ''}{last}", hint=f"its log is {self.log}"
         )
 
 
-def last_line(log: Path) -> str:
-    """Return the last line of *log* that is not empty and no hint, shortened to 300 letters."""
+def log_size(log: Path) -> int:
+    """Return the length of *log* in bytes, 0 if it is missing."""
+    try:
+        return log.stat().st_size
+    except OSError:
+        return 0
+
+
+def last_line(log: Path, start: int = 0) -> str:
+    """Return the last line of *log* that is not empty and no hint, shortened to 300 letters.
+
+    Args:
+        log: The file.
+        start: Lines before this byte are those of an earlier process.
+    """
     try:
         with log.open("rb") as file:
-            file.seek(max(0, log.stat().st_size - _TAIL_BYTES))
+            size = log.stat().st_size
+            file.seek(max(start if start <= size else 0, size - _TAIL_BYTES))  # it may have been rotated
             text = file.read().decode("utf-8", "replace")
     except OSError:
         return ""
@@ -247,10 +276,17 @@ def last_line(log: Path) -> str:
     return (told or lines or [""])[-1][:300]
 
 
-async def rotate_logs(folder: Path, max_bytes: int) -> None:
-    """Rotate the logs of *folder* periodically, until cancelled."""
+async def rotate_logs(folder: Path, max_bytes: int, in_use: Collection[str]) -> None:
+    """Rotate the logs of *folder* periodically and remove the oldest of servers, until cancelled.
+
+    Args:
+        folder: With files ``NAME.log``.
+        max_bytes: Length from which a log is rotated.
+        in_use: Names of servers that run, as they come and go.
+    """
     while True:
         await asyncio.to_thread(rotate_long_logs, folder, max_bytes)
+        await asyncio.to_thread(remove_old_logs, folder, list(in_use))
         await asyncio.sleep(_ROTATE_EVERY_S)
 
 
@@ -259,18 +295,71 @@ def rotate_long_logs(folder: Path, max_bytes: int) -> list[Path]:
 
     Copies and truncates as copytruncate of logrotate(8): the process that writes keeps its descriptor, and
     the newest lines stay, in the log or in its one predecessor ``NAME.log.1``.  A line that is written
-    between the copy and the cut is lost.
+    between the end of the copy and the cut is lost.
     """
     longer: list[Path] = []
     for log in sorted(folder.glob("*.log")):
         with contextlib.suppress(OSError):  # it is gone, or the disk is full: try again next time
             if log.stat().st_size > max_bytes:
-                copy = log.with_name(f"{log.name}.1")
-                shutil.copyfile(log, copy)
-                copy.chmod(log.stat().st_mode)
-                os.truncate(log, 0)
+                _copy_and_cut(log, log.with_name(f"{log.name}.1"))
                 longer.append(log)
     return longer
+
+
+def remove_old_logs(
+    folder: Path,
+    in_use: Collection[str],
+    *,
+    max_logs: int = _MAX_LOGS,
+    max_bytes: int = _MAX_LOGS_BYTES,
+) -> list[Path]:
+    """Remove the oldest logs of servers that have ended, and return them.
+
+    A server's name is not used twice while a platform runs; all other processes have one log each.
+
+    Args:
+        folder: With files ``server-N.log`` and ``server-N.log.1``.
+        in_use: Names of servers that run; their logs stay.
+        max_logs: How many files stay at most.
+        max_bytes: How long they are together at most.
+    """
+    ages = []
+    for log in (*folder.glob("server-*.log"), *folder.glob("server-*.log.1")):
+        with contextlib.suppress(OSError):
+            about = log.stat()
+            ages.append((about.st_mtime, about.st_size, log))
+    removed, count, total = [], 0, 0
+    for _, size, log in sorted(ages, reverse=True):
+        count, total = count + 1, total + size
+        if (count > max_logs or total > max_bytes) and log.name.partition(".log")[0] not in in_use:
+            log.unlink(missing_ok=True)
+            removed.append(log)
+    return removed
+
+
+def _copy_and_cut(log: Path, copy: Path) -> None:
+    """Copy *log* to its end, also what is appended meanwhile, and cut it; the last copy stays until then."""
+    part = copy.with_name(f"{TEMPORARY_PREFIX}{copy.name}")
+    try:
+        with log.open("rb") as source, part.open("wb") as target:
+            os.fchmod(target.fileno(), os.fstat(source.fileno()).st_mode)
+            shutil.copyfileobj(source, target)
+            target.flush()
+            shutil.copyfileobj(source, target)  # what came during the first pass and its end
+            target.flush()
+            os.replace(part, copy)
+            os.truncate(log, 0)
+    except OSError:
+        part.unlink(missing_ok=True)
+        raise
+
+
+def _is_disk_full(folder: Path) -> bool:
+    try:
+        about = os.statvfs(folder)
+    except OSError:
+        return False
+    return about.f_bavail * about.f_frsize < _FULL_BYTES
 
 
 def _apart(parent: int | None) -> Callable[[], None]:

@@ -16,10 +16,12 @@ import pytest
 
 from rse_pf.local.processes import (
     ProcessMark,
+    ServerProcess,
     ended,
     is_alive,
     last_line,
     mark_of,
+    remove_old_logs,
     rotate_long_logs,
     send_signal,
     spawn,
@@ -226,3 +228,31 @@ def test_a_predecessor_is_as_private_as_the_log(tmp_path: Path, mode: int) -> No
     rotate_long_logs(tmp_path, 100)
 
     assert (tmp_path / "server-1.log.1").stat().st_mode & 0o777 == mode
+
+
+def test_a_process_that_is_started_again_appends_to_its_log_and_is_quoted_alone(tmp_path: Path) -> None:
+    process = ServerProcess("server-1", tmp_path)
+    for word, quoted in (("first", "first"), ("second", "second"), ("", "")):
+        process.start([sys.executable, "-c", f"print({word!r})"], dies_with_parent=True)
+        assert asyncio.run(process.wait_over()) == 0
+        assert process.last_line() == quoted
+
+    assert (tmp_path / "server-1.log").read_text().split() == ["first", "second"]
+
+
+def test_the_oldest_logs_of_ended_processes_are_removed_and_nothing_else(tmp_path: Path) -> None:
+    for number in range(6):
+        log = tmp_path / f"server-{number}.log"
+        log.write_text("x" * 100)
+        os.utime(log, (number, number))
+    audit = tmp_path / "server-0.000000000001.jsonl"
+    audit.write_text("{}")
+
+    removed = remove_old_logs(tmp_path, ["server-0"], max_logs=4, max_bytes=1000)
+    longest = remove_old_logs(tmp_path, ["server-0"], max_logs=4, max_bytes=250)
+
+    assert [path.name for path in removed] == ["server-1.log"]
+    assert [path.name for path in longest] == ["server-3.log", "server-2.log"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        audit.name, "server-0.log", "server-4.log", "server-5.log",
+    ]  # fmt: skip

@@ -127,8 +127,6 @@ def _document(text: str) -> dict[str, Any] | None:
         return None
     try:
         told = json.loads(text)
-        if "t" in told:  # as the data server calls it
-            told["time"] = told.pop("t")
         float(told["time"])
     except (ValueError, KeyError, TypeError, RecursionError):
         return None

@@ -60,7 +60,7 @@ def _row(line: bytes) -> dict[str, Any] | None:
     row: dict[str, Any] = {name: told[name] for name in _FIELDS if name in told}
     if row.get("code") in ("busy", "stale") or (row.get("code") == "ok" and row.get("verdict") != "weak"):
         return None
-    time_s = told.get("time", told.get("t", 0.0))
+    time_s = told.get("time", 0.0)
     row["time_s"] = time_s if isinstance(time_s, int | float) else 0.0
     return {
         name: value if isinstance(value, int | float) else printable(str(value)[:_MAX_TEXT])

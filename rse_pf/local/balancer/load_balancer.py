@@ -31,7 +31,7 @@ from rse_pf.local.balancer.envoy_config import (
 )
 from rse_pf.local.lan.listener import LanListener
 from rse_pf.local.latest_file import LatestFile
-from rse_pf.local.processes import ProcessMark, ServerProcess, last_line
+from rse_pf.local.processes import ProcessMark, ServerProcess
 
 __all__ = ["EnvoyLoadBalancer", "TargetStats", "envoy_binary"]
 
@@ -178,7 +178,7 @@ class EnvoyLoadBalancer:
     async def wait_over(self) -> str:
         """Wait until the process ends by itself; return the last line of its log."""
         await self.process.wait_over()
-        return last_line(self.process.log)
+        return self.process.last_line()
 
     async def stop(self, timeout_s: float) -> None:
         """End the process, which cuts every socket; kill it after *timeout_s*."""

@@ -429,7 +429,7 @@ class LocalPlatform:
         self.url = robots_url(self.settings, self.port, self.lan)
         await self._open_operator_port(token, 0 if left is None else left.status_port)
         self._fleet.keep(self._audit.watch())
-        self._fleet.keep(rotate_logs(self.state, _LOG_FILE_BYTES))
+        self._fleet.keep(rotate_logs(self.state, _LOG_FILE_BYTES, self._fleet.members))
         if self.lan is not None:
             renewed = functools.partial(self._emit, "certificate-renewed")
             self._fleet.keep(self.lan.keep_valid(self.name, renewed, self._not_written))

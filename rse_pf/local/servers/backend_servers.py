@@ -83,7 +83,7 @@ class LocalBackendServers:
     def launch(self, name: str) -> None:
         """Start the process of server *name*, and return before it listens."""
         server = self._processes[name] = ServerProcess(name, self._folder)
-        server.announcement.unlink(missing_ok=True)
+        server.prepare()
         command = ["serve", "--settings", str(settings_file(self._folder)), "--server-id", name]
         command += ["--keys", str(key_set_file(self._folder)), "--announce", str(server.announcement)]
         command += ["--audit", str(audit_folder(self._folder))]

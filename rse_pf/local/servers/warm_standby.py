@@ -18,7 +18,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from rse_pf.local.processes import spawn
+from rse_pf.local.processes import log_size, spawn
 
 __all__ = ["STANDBY", "WarmStandby"]
 
@@ -35,6 +35,7 @@ class WarmStandby:
         self._dies_with_parent = dies_with_parent
         self._program = tuple(program)
         self._process: subprocess.Popen[bytes] | None = None
+        self._log_from = 0
 
     @property
     def pid(self) -> int | None:
@@ -44,9 +45,7 @@ class WarmStandby:
     @property
     def is_warm(self) -> bool:
         """Whether the standby has imported everything."""
-        with contextlib.suppress(OSError):
-            return self.pid is not None and self._log.stat().st_size > 0
-        return False
+        return self.pid is not None and log_size(self._log) > self._log_from
 
     @property
     def _log(self) -> Path:
@@ -57,6 +56,7 @@ class WarmStandby:
         if self.pid is not None or not self._program:
             return False
         self.close()
+        self._log_from = log_size(self._log)
         self._process = spawn(
             self._program, log=self._log, folder=self._folder,
             dies_with_parent=self._dies_with_parent, stdin=subprocess.PIPE,
