@@ -2,6 +2,8 @@
 
 All stores follow one contract: once `put` returns, the object is complete and durable, whatever crashes
 next.  No name can refer to a file outside the folder of a store.
+
+More than 600 lines because the contract stands beside the two stores that show what it means.
 """
 
 from __future__ import annotations
@@ -22,6 +24,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO, Protocol, TypeVar, runtime_checkable
 
+from rse_pf.disk_reserve import SpareFiles, is_full
 from rse_pf.errors import Conflict, NotFound, StoreError, StoreFull, UsageError
 from rse_pf.files import OWNER_ONLY, TEMPORARY_PREFIX, replace_file, sync_folder
 
@@ -303,8 +306,10 @@ class DirectoryStore:
     wrote them to ``objects/TENANT/ROBOT``, where they are found, too.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, spares: SpareFiles | None = None) -> None:
+        """Describe the store; on a full disk `compare_and_swap` writes small JSON objects to *spares*."""
         self._folder = folder
+        self._spares = spares
         self._measured: dict[str, tuple[int, Usage, _Names]] = {}
 
     def get(self, name: str) -> bytes:
@@ -400,9 +405,16 @@ class DirectoryStore:
             check()
             lock = path.with_name(f"{_LOCK}{path.name}")
             # Written before it is locked: a process that is paused hardly ever holds the lock then.
-            with _temporary(path, [data]) as temporary, _locked(lock):
-                check()
-                os.replace(temporary, path)
+            try:
+                with _temporary(path, [data]) as temporary, _locked(lock):
+                    check()
+                    os.replace(temporary, path)
+            except OSError as error:
+                if self._spares is None or not is_full(error):
+                    raise
+                with _locked(lock):
+                    check()
+                    self._spares.replace(path, data)
             sync_folder(path.parent)
 
         self._write(name, swap)
@@ -594,6 +606,6 @@ def _as_store_errors(name: str) -> Iterator[None]:
     except OSError as error:
         if error.errno == errno.ELOOP:
             raise NotFound(f"no object named {name!r}") from error
-        if error.errno in (errno.ENOSPC, errno.EDQUOT):
+        if is_full(error):
             raise StoreFull(f"no space left for {name!r}", hint="free some space") from error
         raise StoreError(f"{name!r}: {error.strerror}", hint="check the folder of the store") from error

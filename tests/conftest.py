@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
-from collections.abc import Mapping
+import subprocess
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +33,38 @@ _SOURCES = ("rse_pf", "client_sdk", "lambda_pnp", "stacks")
 def repository() -> Path:
     """The checkout."""
     return _REPOSITORY
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Callable[[str], Path]]:
+    """Mount a disk of a size such as ``4m``; skips where that is not permitted."""
+    disk = tmp_path / "disk"
+
+    def mount(size: str) -> Path:
+        disk.mkdir()
+        command = ["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", str(disk)]
+        if os.geteuid() or subprocess.run(command, capture_output=True, check=False).returncode:
+            pytest.skip("this machine does not let us mount a tmpfs")
+        return disk
+
+    yield mount
+    if disk.is_mount():
+        subprocess.run(["umount", "--lazy", str(disk)], check=True)
+
+
+@pytest.fixture
+def fill() -> Callable[[Path], Path]:
+    """Take every block of a small disk, as another program would; return the file to remove."""
+
+    def take(disk: Path) -> Path:
+        hog = disk / "hog"
+        with hog.open("ab", buffering=0) as file, contextlib.suppress(OSError):
+            while os.statvfs(disk).f_bavail:
+                file.write(bytes(4096))
+        assert os.statvfs(disk).f_bavail == 0
+        return hog
+
+    return take
 
 
 @pytest.fixture(scope="session")

@@ -5,16 +5,21 @@ A chain alone does not show that its last entries were removed, or that it was r
 and overwrites only that line, after its entries are on the disk.  So no line is ahead of its chain, writers
 do not wait for each other, and a crash leaves old heads, not wrong ones.  An attacker has to forge this
 file, and the entries in which writers record each other's heads; see `rse_pf.audit.log`.
+
+A line also says how many entries its writer lost when it ended on a full disk: it is overwritten in place,
+which needs no space.
 """
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from rse_pf.audit.chain import GENESIS, Head, parse_head
+from rse_pf.disk_reserve import preallocate
 from rse_pf.files import replace_file
 
 __all__ = ["FILE", "HeadsFile", "read_heads", "write_heads"]
@@ -23,6 +28,9 @@ FILE = "heads"
 _LINE_BYTES = 256
 """A divisor of the size of a page, so that no line is written in two parts."""
 _MAX_BYTES = 1 << 24
+_AHEAD_BYTES = 64 << 10
+"""Blocks are taken for so much after the end, so that a chain can begin on a full disk."""
+_LOST = " lost="
 
 
 class HeadsFile:
@@ -41,6 +49,8 @@ class HeadsFile:
         self._present = present
         self._fd = -1
         self._offset = 0
+        self.lost_entries = 0
+        """How many entries the writer before this one could not write at its end."""
 
     def open(self) -> tuple[Head, bool]:
         """Find or add the line of the chain; return its head, and whether the file was lost.
@@ -55,6 +65,8 @@ class HeadsFile:
         fcntl.flock(self._fd, fcntl.LOCK_EX)  # held for some microseconds, and only while a log is opened
         try:
             data = os.pread(self._fd, _MAX_BYTES, 0)
+            with contextlib.suppress(OSError):  # the disk is full already, or cannot do it
+                preallocate(self._fd, len(data) + _AHEAD_BYTES)
             was_lost = False
             if not data:
                 heads = dict(self._present())
@@ -65,6 +77,7 @@ class HeadsFile:
                 found = _parsed(data[offset : offset + _LINE_BYTES])
                 if found is not None and found[0] == self._who:
                     self._offset = offset
+                    self.lost_entries = found[2]
                     return found[1], was_lost
             self._offset = -(-len(data) // _LINE_BYTES) * _LINE_BYTES
             os.pwrite(self._fd, _line(self._who, GENESIS), self._offset)
@@ -77,9 +90,10 @@ class HeadsFile:
         about = os.fstat(self._fd)
         return about.st_nlink == 0 or about.st_size <= self._offset
 
-    def write(self, head: Head) -> None:
-        """Write *head*, which is that of the chain on the disk; raises OSError."""
-        os.pwrite(self._fd, _line(self._who, head), self._offset)
+    def write(self, head: Head, lost_entries: int = 0) -> None:
+        """Write *head*, which is that of the chain on the disk, and what was lost; raises OSError."""
+        os.pwrite(self._fd, _line(self._who, head, lost_entries), self._offset)
+        self.lost_entries = lost_entries
 
     def close(self) -> None:
         """Close the file."""
@@ -111,11 +125,13 @@ def write_heads(folder: Path, heads: Mapping[str, Head]) -> None:
     replace_file(folder / FILE, b"".join(_line(who, heads[who]) for who in sorted(heads)), mode=0o600)
 
 
-def _line(who: str, head: Head) -> bytes:
-    return f"{who} {head}".ljust(_LINE_BYTES - 1).encode() + b"\n"
+def _line(who: str, head: Head, lost_entries: int = 0) -> bytes:
+    lost = f"{_LOST}{lost_entries}" if lost_entries else ""
+    return f"{who} {head}{lost}".ljust(_LINE_BYTES - 1).encode() + b"\n"
 
 
-def _parsed(line: bytes) -> tuple[str, Head] | None:
+def _parsed(line: bytes) -> tuple[str, Head, int] | None:
     who, _, rest = line.decode("ascii", "replace").partition(" ")
-    head = parse_head(rest.rstrip(" \n"))
-    return None if head is None or line != _line(who, head) else (who, head)
+    word, _, lost = rest.rstrip(" \n").partition(_LOST)
+    head, count = parse_head(word), int(lost) if lost.isdigit() else 0
+    return None if head is None or line != _line(who, head, count) else (who, head, count)

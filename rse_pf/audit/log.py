@@ -8,11 +8,16 @@ The head of each chain is kept twice more: in the file of heads, and in the chai
 control plane records the heads of all chains; each writer that runs records those of the control plane and of
 operators.  A writer whose chain lacks the head in the file of heads records that head, and so names what was
 removed.
+
+A log has blocks of the disk for its next entries, and so goes on when the disk is full.  It then records
+neither refusals nor, when little is left, connections; they are counted, and the gap is recorded once there
+is space again.
 """
 
 from __future__ import annotations
 
 import contextlib
+import errno
 import fcntl
 import os
 import re
@@ -37,6 +42,7 @@ from rse_pf.audit.chain import (
     next_entry,
 )
 from rse_pf.audit.heads import HeadsFile
+from rse_pf.disk_reserve import allocated_bytes, is_full, preallocate
 from rse_pf.errors import ConfigurationError
 from rse_pf.files import sync_folder
 
@@ -45,6 +51,7 @@ __all__ = [
     "HEADS_S",
     "MAX_FILE_BYTES",
     "OPERATOR",
+    "RESERVE_BYTES",
     "SYNC_S",
     "AuditLog",
     "audit_folder",
@@ -71,7 +78,10 @@ MAX_FILE_BYTES = 16 << 20
 """A file that has grown longer is set aside, and the chain goes on in the next."""
 SYNC_S = 0.1
 """An entry is on the disk after this."""
-
+RESERVE_BYTES = 256 << 10
+"""A log takes blocks for so many bytes of further entries, some 600; it asks for more when half are used."""
+_REFUSALS = ("auth.refused", "auth.renewal-refused")
+_CONNECTIONS = ("auth.accepted", "auth.renewed", *_REFUSALS)
 
 # How the current file of a chain ends.  Empty: it is missing or empty, because the writer stopped between
 # two files.  Torn: the last line, or the only one, is incomplete.  Unreadable: the last complete line is no
@@ -128,6 +138,8 @@ class AuditLog:
         self._lock = self._fd = -1
         self._size = 0
         self._first = 1
+        self._reserved = 0  # up to where the file has blocks
+        self._is_short = False
 
     def open(self, wait_s: float = 0.0) -> AuditLog:
         """Lock the log, and continue its chain.
@@ -146,7 +158,10 @@ class AuditLog:
                 self._write([self._own(HEADS, {self.who: str(known)})])
             if was_lost:
                 self._write([self._own(HEADS_LOST)])
+            self.dropped += self._heads.lost_entries
             self._keep_head()
+            if self.who in (CONTROL_PLANE, OPERATOR):
+                self._reserve()
         except OSError as error:
             self._release()
             raise ConfigurationError(
@@ -190,27 +205,36 @@ class AuditLog:
         with self._writing:
             with self._buffer_lock:
                 notes, self._buffered = self._buffered, []
-                dropped, self.dropped = self.dropped, 0
-            if dropped:
-                notes.append(self._own(GAP, {"entries": dropped}))
-            if not notes or self._fd < 0:
+            if self._fd < 0:
+                return
+            if self._is_short:
+                self._reserve()
+            if self._is_short:
+                notes = self._without_routine(notes)
+            else:
+                notes += self._gap()
+            if not notes:
                 return
             try:
-                self._write(notes)
+                while notes:  # one by one when space is short: a long batch leaves nothing for others
+                    count = 1 if self._is_short else len(notes)
+                    self._write(notes[:count])
+                    del notes[:count]
                 self._failed = False
             except OSError as error:
-                with self._buffer_lock:
-                    self._buffered = [note for note in notes if note.action != GAP] + self._buffered
-                    self.dropped += dropped + max(0, len(self._buffered) - self._max_buffered)
-                    del self._buffered[self._max_buffered :]
+                self._keep_for_later(notes)
                 if not self._failed:
                     self._failed = True
                     self.on_problem(f"the audit log of {self.who} cannot be written: {error.strerror}")
-                return
             try:
                 self._keep_head()
             except OSError as error:
                 self.on_problem(f"the head of the audit log of {self.who} cannot be kept: {error.strerror}")
+
+    @property
+    def waiting(self) -> int:
+        """How many entries are buffered."""
+        return len(self._buffered)
 
     def close(self) -> None:
         """Write the buffered entries, and unlock the log."""
@@ -220,6 +244,11 @@ class AuditLog:
             self._thread.join()
             self._record_others()
         self.flush()
+        if self._fd >= 0:
+            with contextlib.suppress(OSError):  # where no line can be overwritten, nothing can be kept
+                self._keep_head()
+            if self.who not in (CONTROL_PLANE, OPERATOR):
+                os.ftruncate(self._fd, self._size)  # this log may never go on: its reserve is given back
         self._release()
 
     # --- the disk --------------------------------------------------------------------------------
@@ -266,6 +295,8 @@ class AuditLog:
             head = entry.head
             lines.append(line_of(entry))
         data = b"".join(lines)
+        if self._is_short and len(data) > self._reserved - self._size:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))  # what is left stays for shorter ones
         try:
             view = memoryview(data)
             while view:
@@ -274,20 +305,52 @@ class AuditLog:
         except OSError:
             with contextlib.suppress(OSError):
                 os.ftruncate(self._fd, self._size)  # these entries were not reported as written
+            self._reserved = self._size
+            self._reserve()
             raise
         self.head, self._size = head, self._size + len(data)
-        if self._size > self._max_bytes:
-            os.close(self._fd)
-            self._set_aside(self._first)
-            self._open_file()
-            self._record_continued("rotated")
+        if 2 * (self._reserved - self._size) < RESERVE_BYTES:
+            self._reserve()
+        if self._size > self._max_bytes and not self._is_short:
+            self._rotate()
+
+    def _reserve(self) -> None:
+        """Take blocks for the next entries."""
+        try:
+            preallocate(self._fd, self._size + RESERVE_BYTES)
+            self._reserved, self._is_short = self._size + RESERVE_BYTES, False
+        except OSError as error:  # a file system that cannot do it has no reserve, and is never short
+            self._is_short = is_full(error)
+
+    def _gap(self) -> list[Note]:
+        with self._buffer_lock:
+            dropped, self.dropped = self.dropped, 0
+        return [self._own(GAP, {"entries": dropped})] if dropped else []
+
+    def _without_routine(self, notes: list[Note]) -> list[Note]:
+        """Drop what a flood of robots causes, and count it."""
+        left = self._reserved - self._size
+        routine = _CONNECTIONS if 4 * left < RESERVE_BYTES else _REFUSALS
+        kept = [note for note in notes if not note.action.startswith(routine)]
+        with self._buffer_lock:
+            self.dropped += len(notes) - len(kept)
+        return kept
+
+    def _keep_for_later(self, notes: list[Note]) -> None:
+        """Buffer *notes* again, before newer ones; a gap is counted again."""
+        with self._buffer_lock:
+            gaps = [note for note in notes if note.action == GAP]
+            self.dropped += sum(int(note.detail["entries"] or 0) for note in gaps)
+            self._buffered = [note for note in notes if note not in gaps] + self._buffered
+            self.dropped += max(0, len(self._buffered) - self._max_buffered)
+            del self._buffered[self._max_buffered :]
 
     def _keep_head(self) -> None:
         """Write the head into the file of heads; one that was lost is made again, and that is recorded."""
         if self._heads.is_lost():
             self._heads.open()
             self._write([self._own(HEADS_LOST)])
-        self._heads.write(self.head)
+        self._heads.write(self.head, self.dropped + (self.waiting if self._closed.is_set() else 0))
 
     def _record_others(self) -> None:
         grown = grown_heads(self._folder, self._others, self._recorded)
@@ -305,14 +368,30 @@ class AuditLog:
         os.fsync(self._fd)
         self.head, self._size = entry.head, self._size + len(line_of(entry))
 
-    def _set_aside(self, first: int) -> None:
+    def _rotate(self) -> None:
+        """Go on in a new file; on failure the chain stays in the present one."""
+        os.ftruncate(self._fd, self._size)
+        place, old = self._set_aside(self._first), self._fd
+        try:
+            self._open_file()
+        except OSError:
+            place.replace(self._current)
+            self._fd = old
+            return
+        os.close(old)
+        self._reserve()
+        with contextlib.suppress(OSError):  # the next entry goes on from the same head
+            self._record_continued("rotated")
+
+    def _set_aside(self, first: int) -> Path:
         while (place := self._folder / f"{self.who}.{first:012d}.jsonl").exists():
             first += 1  # only if the chain is broken already
-        self._current.replace(place)
+        return self._current.replace(place)
 
     def _open_file(self) -> None:
         self._fd = os.open(self._current, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o600)
         self._size = os.fstat(self._fd).st_size
+        self._reserved = max(self._size, allocated_bytes(self._fd))
         sync_folder(self._folder)
 
     def _release(self) -> None:
@@ -336,7 +415,7 @@ class AuditLog:
             self._closed.wait(self._sync_s)
             self._wake.clear()
             self.flush()
-            if self._failed:
+            if self._failed or self._is_short:
                 self._wake.set()  # retry after the same interval
 
 
@@ -349,11 +428,21 @@ def record_once(
     wall_clock: Callable[[], float],
     **detail: Value,
 ) -> None:
-    """Open the log, write one entry and close it; raises ConfigurationError."""
+    """Open the log, write one entry and close it.
+
+    Raises:
+        ConfigurationError: The entry could not be written; if the disk was full, the next writer records a
+            gap.
+    """
     log = AuditLog(folder, who, wall_clock=wall_clock, max_bytes=MAX_FILE_BYTES, sync_s=0.0)
     log.open(_LOCK_TIMEOUT_S)
     log.add([Note(time=wall_clock(), actor=who, action=action, subject=subject, detail=detail)])
     log.close()
+    if log.waiting:
+        raise ConfigurationError(
+            f"cannot write the audit log {who} in {folder}: the disk is full",
+            hint="free some space; the log then records that an entry is missing",
+        )
 
 
 def audit_folder(state: Path) -> Path:

@@ -276,6 +276,7 @@ class LocalSettings:
     start_timeout_s: float = setting(20.0, unit="s", doc="a server that is not ready by then has failed", low=1)
     warm_standby: bool = setting(True, doc="keep one started process, about 60 MB, that becomes the next server at once", source="warm pools of AWS Auto Scaling")
     max_restarts_per_minute: int = setting(5, unit="servers", doc="servers that failed soon after their start and are replaced within a minute", low=1)
+    disk_warning_bytes: int = setting(1 << 30, unit="bytes", doc="less free space than this on the disk of the state folder or of the store is reported", low=0)
     metrics_port: int = setting(9464, doc="port of the control plane on loopback: /metrics of all servers, for Prometheus; 0 takes a free one", source="OpenTelemetry's Prometheus exporter", low=0, high=65535)
     page_port: int = setting(8701, doc="port of the fleet page on loopback; 0 takes a free one, and so does a port that is taken", low=0, high=65535)
     foxglove_port: int = setting(8765, doc="port on loopback of the export to Foxglove (rse-pf local --foxglove); 0 takes a free one", low=0, high=65535)

@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 import threading
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -284,3 +285,66 @@ def test_a_writer_that_is_killed_leaves_a_chain_that_goes_on(tmp_path: Path):
     (verdict,) = check_folder(tmp_path)
     assert verdict.problem == ""
     assert verdict.entries > 300
+
+
+def test_on_a_full_disk_a_flood_of_refusals_leaves_the_reserve_to_what_matters_and_is_counted(
+    small_disk: Callable[[str], Path], fill: Callable[[Path], Path]
+):
+    folder = small_disk("4m")
+    log = log_in(folder, max_buffered=10**6).open()
+    log.record("auth.accepted", "robot-1")
+    log.flush()
+    hog = fill(folder)
+    for number in range(4000):
+        log.record("auth.refused", reason="bad-signature", source="10.0.0.9")
+        log.flush()
+        if number % 100 == 99:
+            log.record("auth.cut-off", f"robot-{number}")
+            log.flush()
+    assert log.waiting == 0
+    hog.unlink()
+    log.flush()
+    log.close()
+
+    entries = list(entries_of(files_of(folder, "server-1")))
+    refused = sum(entry.action == "auth.refused" for entry in entries)
+    gaps = [entry for entry in entries if entry.action == "log.gap"]
+    assert sum(entry.action == "auth.cut-off" for entry in entries) == 40
+    assert 100 < refused < 1000
+    assert [gap.detail["entries"] for gap in gaps] == [4000 - refused]
+    assert problem_of(folder) == ""
+
+
+def test_entries_that_a_full_disk_lost_at_the_end_of_a_writer_are_a_gap_of_the_next(
+    small_disk: Callable[[str], Path], fill: Callable[[Path], Path]
+):
+    folder = small_disk("4m")
+    write(folder, 1)
+    hog = fill(folder)
+    log = log_in(folder).open()
+    for number in range(30):
+        log.record("auth.cut-off", f"robot-{number}", detail="x" * 190)
+    log.close()
+    assert problem_of(folder) == ""
+    hog.unlink()
+
+    write(folder, 1)
+
+    entries = list(entries_of(files_of(folder, "server-1")))
+    lost = 30 - sum(entry.action == "auth.cut-off" for entry in entries)
+    assert lost > 0
+    assert [entry.detail["entries"] for entry in entries if entry.action == "log.gap"] == [lost]
+    assert problem_of(folder) == ""
+
+
+def test_an_operator_is_told_that_an_action_could_not_be_recorded(
+    small_disk: Callable[[str], Path], fill: Callable[[Path], Path]
+):
+    folder = small_disk("4m")
+    write(folder, 1)
+    (folder / ".operator.lock").touch()
+    (folder / "operator.jsonl").touch()
+    fill(folder)
+
+    with pytest.raises(ConfigurationError, match="the disk is full"):
+        record_once(folder, "operator", "robot.disabled", "robot-1", wall_clock=lambda: 1e9)

@@ -13,7 +13,8 @@ from collections.abc import Iterator, Mapping
 import pytest
 
 ORDER = (
-    "rse_pf", "errors", "terminal", "linux", "one_thread", "limited_process", "files", "geometry", "native",
+    "rse_pf", "errors", "terminal", "linux", "one_thread", "limited_process", "files", "disk_reserve",
+    "geometry", "native",
     "native_buffers", "native_matcher", "token_bucket", "config",
     "silent_connections", "http_connections", "budget", "wire", "scaling",
     "object_store", "identity", "crash_record", "maps", "auth", "enrolment", "audit", "service",
@@ -60,6 +61,7 @@ ONLY: dict[str, set[str]] = {
         "audit",
         "linux",
         "files",
+        "disk_reserve",
         "terminal",
         "recording",
         "silent_connections",

@@ -165,14 +165,14 @@ def open_access_control(args: argparse.Namespace, settings: PlatformSettings) ->
 
         account, names = open_account(settings.cloud.region), ResourceNames(settings.cloud.name)
         return open_key_store(account, names).access_control_store()
+    from rse_pf.local.disk_watch import access_control_store
     from rse_pf.local.firewall import key_set_file
     from rse_pf.local.state import state_folder
-    from rse_pf.object_store import DirectoryStore
 
     folder = state_folder(args.name, os.environ)
     if not key_set_file(folder).exists():
         raise UsageError(f"there is no platform {args.name!r}", hint="start one with rse-pf local")
-    return AccessControlStore(DirectoryStore(folder))
+    return access_control_store(folder)
 
 
 def record_action(

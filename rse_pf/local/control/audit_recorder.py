@@ -48,6 +48,8 @@ class PlatformAudit:
         """Begin to record; raises ConfigurationError."""
         self._log.open(_WAIT_S).start()
         self._is_open = True
+        with contextlib.suppress(ConfigurationError):  # a command of an operator is just writing it
+            AuditLog(self.folder, OPERATOR, wall_clock=time.time).open().close()  # takes its reserve
 
     def record(self, event: Mapping[str, Any]) -> None:
         """Record one event of the platform."""

@@ -140,6 +140,10 @@ class ControlPlane:
         """Take no further action."""
         self._elastic = False
 
+    def look_again(self) -> None:
+        """Replace now what had to wait."""
+        self._soon()
+
     def watch_spread(self) -> None:
         """Watch for half a minute whether robots are spread evenly."""
         if self._rebalancer is not None:
@@ -309,7 +313,8 @@ class ControlPlane:
             except ConfigurationError as error:
                 self._emit("balancer-failed", reason=error.message, wait_s=pause_s)
             await asyncio.sleep(pause_s)
-            pause_s = min(2 * pause_s, _MAX_PAUSE_S)
+            # What waits for space starts as soon as there is some.
+            pause_s = LOCAL_INTERVAL_S if self._fleet.is_full() else min(2 * pause_s, _MAX_PAUSE_S)
 
 
 def _scheduled(scaling: ScalingSettings) -> Callable[[], int] | None:

@@ -1,13 +1,13 @@
 """The metrics of all servers as one page for Prometheus, and the file by which Prometheus finds the servers.
 
 Every sample gets the label ``server``.  A server that does not answer is missing from the page, except for
-``rse_pf_server_up``, which is 0 for it.
+``rse_pf_server_up``, which is 0 for it.  The space on the disks of the platform is on the page, too.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from rse_pf.errors import MissingExtra
@@ -17,13 +17,15 @@ __all__ = ["federated", "service_discovery"]
 
 _LOOPBACK = "127.0.0.1"
 _LABEL = "server"
+_FOLDER = "folder"
 
 
-def federated(pages: Mapping[str, str | None]) -> bytes:
+def federated(pages: Mapping[str, str | None], disks: Sequence[Mapping[str, Any]] = ()) -> bytes:
     """Return one page in the text format of Prometheus.
 
     Args:
         pages: The page of each server by its name; None if it did not answer.
+        disks: Folder, free and total bytes of each file system that the platform writes to.
 
     Raises:
         MissingExtra: ``prometheus_client`` is not installed.
@@ -39,6 +41,13 @@ def federated(pages: Mapping[str, str | None]) -> bytes:
     up = GaugeMetricFamily(
         "rse_pf_server_up", "whether the server answered when it was asked for metrics", labels=[_LABEL]
     )
+    free = GaugeMetricFamily(
+        "rse_pf_disk_free_bytes", "bytes that the platform may still write there", labels=[_FOLDER]
+    )
+    total = GaugeMetricFamily("rse_pf_disk_total_bytes", "size of the file system", labels=[_FOLDER])
+    for disk in disks:
+        free.add_metric([disk["folder"]], disk["free_bytes"])
+        total.add_metric([disk["folder"]], disk["total_bytes"])
     families: dict[str, Metric] = {}
     for server, page in pages.items():
         up.add_metric([server], float(page is not None))
@@ -52,7 +61,7 @@ def federated(pages: Mapping[str, str | None]) -> bytes:
 
     class Families:
         def collect(self) -> Iterable[Any]:
-            return [up, *families.values()]
+            return [up, free, total, *families.values()]
 
     registry = CollectorRegistry()
     registry.register(Families())

@@ -102,8 +102,12 @@ class Fleet:
         launch_s: float = 0.0,
         emit: Callable[..., None],
         changed: Callable[[], None],
+        is_full: Callable[[], bool] = lambda: False,
     ) -> None:
-        """Make a fleet without members; later servers serve *launch_s* after their launch, compressed."""
+        """Make a fleet without members; later servers serve *launch_s* after their launch, compressed.
+
+        While the disk *is_full*, no server is to be launched: it could not announce itself.
+        """
         self._launch_s = launch_s / compress
         self.members: dict[str, Member] = {}
         self.dead: dict[str, bool] = {}
@@ -116,6 +120,7 @@ class Fleet:
         self._warm_up_s = settings.scaling.warm_up_s / compress
         self._emit = emit
         self._changed = changed
+        self.is_full = is_full
         self._tasks: set[asyncio.Task[Any]] = set()
         self._still_targets: set[str] = set()
         self.on_ready: Callable[[Member], None] = lambda member: None
@@ -195,7 +200,7 @@ class Fleet:
             self._backend_servers.send(member.name, signal.SIGKILL)
             code = await self._backend_servers.wait_over(member.name)
             self._forget(member)
-            self._emit("server-gone", server=member.name, pid=None, exit_code=code)
+            self._emit_gone(member.name, None, code)
             raise
         await asyncio.sleep(member.held_until_s - time.monotonic())
         end = time.monotonic() + timeout_s
@@ -392,11 +397,15 @@ class Fleet:
         unasked = not member.leaving and not member.out
         self._forget(member)
         self._set_targets()
-        self._emit("server-gone", server=server.name, pid=server.pid, exit_code=code)
+        self._emit_gone(server.name, server.pid, code)
         if unasked:
             self._lost(member)
         if not member.leaving and await self._load_balancer.wait_gone(server.name, STOP_TIMEOUT_S):
             self._emit("server-out", server=server.name)
+
+    def _emit_gone(self, name: str, pid: int | None, exit_code: int | None) -> None:
+        cause = "; the disk is full" if exit_code and self.is_full() else ""
+        self._emit("server-gone", server=name, pid=pid, exit_code=exit_code, cause=cause)
 
     def _forget(self, member: Member) -> None:
         self._backend_servers.forget(member.name)
@@ -409,7 +418,8 @@ class Fleet:
         if member.on_trial:
             return
         young_since_s = time.monotonic() - _MIN_UPTIME_S
-        self.dead[member.name] = member.healthy_s is None or member.healthy_s > young_since_s
+        is_young = member.healthy_s is None or member.healthy_s > young_since_s
+        self.dead[member.name] = is_young and not self.is_full()  # a full disk is no crash loop
         self.on_lost()
 
     def _set_targets(self) -> None:

@@ -60,6 +60,7 @@ class OperatorPort:
         platform: OperatedPlatform,
         *,
         metrics: Callable[[BackendServer], Coroutine[Any, Any, str | None]],
+        disks: Callable[[], Sequence[Mapping[str, Any]]] = lambda: (),
         keep: Callable[[Coroutine[Any, Any, None]], None],
         emit: Callable[..., None],
     ) -> None:
@@ -68,11 +69,13 @@ class OperatorPort:
         Args:
             platform: What it shows and operates.
             metrics: Returns the page of a server for Prometheus, None if it does not answer.
+            disks: Returns the file systems of the platform, see `DiskWatch.document`.
             keep: Lets work go on until it is done or the platform ends.
             emit: Called with an event and its details.
         """
         self._platform = platform
         self._metrics_of = metrics
+        self._disks = disks
         self._emit = emit
         self._token = ""
         self._operations = Operations(keep)
@@ -123,7 +126,7 @@ class OperatorPort:
         servers = list(self._platform.servers)
         pages = await asyncio.gather(*map(self._metrics_of, servers))
         return METRICS_TYPE, federated(
-            {server.name: page for server, page in zip(servers, pages, strict=True)}
+            {server.name: page for server, page in zip(servers, pages, strict=True)}, self._disks()
         )
 
     def _drain(self, query: Mapping[str, str]) -> AsyncGenerator[Event, None]:

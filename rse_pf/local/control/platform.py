@@ -32,6 +32,7 @@ from rse_pf.local.control.fleet import Fleet, Member
 from rse_pf.local.control.operator_port import OperatorPort
 from rse_pf.local.control.platform_recording import PlatformRecording
 from rse_pf.local.control.scale_modifier import bounds_for
+from rse_pf.local.disk_watch import DiskWatch
 from rse_pf.local.firewall import check_lan_settings, check_listener, ensure_key, key_file, robots_url
 from rse_pf.local.lan.listener import LanListener, authority_file
 from rse_pf.local.latest_file import LatestFile
@@ -115,6 +116,7 @@ class LocalPlatform:
         self.state = state.absolute()
         self.settings = settings
         self._placement = local_placement(settings, self.state)
+        self._disks = DiskWatch(self.state, self._placement.store, settings.local, emit=self._emit)
         self._count = settings.local.servers if servers is None else servers
         self._wanted_port = settings.local.port if port is None else port
         self._has_data = data
@@ -138,22 +140,18 @@ class LocalPlatform:
             on_problem=self._not_written, lan=self.lan,
         )  # fmt: skip
         self.data_servers = LocalDataServers(
-            settings,
-            folder=self.state,
-            store=self._placement.store,
-            dies_with_parent=not adoptable,
-            replaces=control.elastic,
-            program=program,
-            emit=self._data_changed,
-        )
+            settings, folder=self.state, store=self._placement.store, dies_with_parent=not adoptable,
+            replaces=control.elastic, program=program, is_full=self._disks.is_full, emit=self._data_changed,
+        )  # fmt: skip
         self._fleet = Fleet(
             self.backend_servers, self.load_balancer, settings,
             compress=control.compress, launch_s=control.delays.launch_s, emit=self._emit,
-            changed=self._write_state,
+            changed=self._write_state, is_full=self._disks.is_full,
         )  # fmt: skip
         self._operator_port = OperatorPort(
-            self, metrics=self.backend_servers.metrics, keep=self._fleet.keep, emit=self._emit
-        )
+            self, metrics=self.backend_servers.metrics, disks=self._disks.document, keep=self._fleet.keep,
+            emit=self._emit,
+        )  # fmt: skip
         self._control = ControlPlane(
             self._fleet, self.load_balancer, settings, bounds_for(settings.scaling, self._count), control,
             emit=self._emit, changed=self._write_state,
@@ -265,6 +263,7 @@ class LocalPlatform:
             },
             "servers": [{**read.get(str(each["name"]), {}), **each} for each in servers],
             "data_servers": self.data_servers.document(),
+            "disks": self._disks.document(),
             "sample": sample,
             "policy": self._control.document(),
             "events": [dict(event) for event in self.events[-_LAST_EVENTS:]],
@@ -421,6 +420,7 @@ class LocalPlatform:
         token = ensure_control_token(control_token_file(self.state), seed=secrets.token_bytes(32))
         replace_json(settings_file(self.state), self._placement.document(self.settings), indent=1)
         self._recording.begin()
+        self._disks.prepare()
         self._control.start_checks()
         if left is None:
             await self._begin(end)
@@ -429,6 +429,8 @@ class LocalPlatform:
         self.url = robots_url(self.settings, self.port, self.lan)
         await self._open_operator_port(token, 0 if left is None else left.status_port)
         self._fleet.keep(self._audit.watch())
+        self._disks.on_space = self._control.look_again
+        self._fleet.keep(self._disks.watch())
         self._fleet.keep(rotate_logs(self.state, _LOG_FILE_BYTES, self._fleet.members))
         if self.lan is not None:
             renewed = functools.partial(self._emit, "certificate-renewed")

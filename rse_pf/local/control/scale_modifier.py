@@ -115,6 +115,8 @@ class LocalScaleModifier:
         )
         if period_over:
             self._acted_s = now_s
+        if any(action.kind != "shrink" for action in actions) and self._servers.is_full():
+            return ()  # a new server could not start, and a broken one may recover
         for action in actions:
             if action.kind == "replace":
                 self._replace(standing, now_s)

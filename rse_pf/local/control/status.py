@@ -10,14 +10,19 @@ from __future__ import annotations
 import asyncio
 import time
 from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
 from rse_pf.auth.control_token import read_control_token
+from rse_pf.config import PlatformSettings
+from rse_pf.errors import ConfigurationError
+from rse_pf.local.disk_watch import DiskSpace, disk_line, disk_spaces, folders_of
 from rse_pf.local.processes import ProcessMark, is_alive
+from rse_pf.local.servers.backend_servers import local_placement
 from rse_pf.local.servers.control_client import ControlPort
-from rse_pf.local.state import PlatformState, ServerState
+from rse_pf.local.state import PlatformState, ServerState, platform_settings
 from rse_pf.terminal import printable
 
 __all__ = ["data_url", "platform_status", "status_table"]
@@ -40,6 +45,8 @@ async def platform_status(state: PlatformState, *, sample_s: float) -> dict[str,
         asyncio.gather(*map(_data_server, data)),
     )
     balancer = state.load_balancer
+    folder = Path(state.settings_file).parent
+    disks = await asyncio.to_thread(_disks, folder)
     return {
         "platform": state.name,
         "url": state.url,
@@ -51,6 +58,7 @@ async def platform_status(state: PlatformState, *, sample_s: float) -> dict[str,
         },
         "servers": list(servers),
         "data_servers": list(data_servers),
+        "disks": [{**asdict(space), "warning": disk_line(space)} for space in disks],
     }
 
 
@@ -69,6 +77,7 @@ def status_table(status: Mapping[str, Any]) -> str:
         lines.append(f"data server  {told['name']} is {told['state']} (pid {told['pid']})")
     for what, told in (("load balancer", status["balancer"]), ("control plane", status["control_plane"])):
         lines.append(f"{what}  {'runs' if told['running'] else 'does not run'} (pid {told['pid']})")
+    lines += [disk["warning"] for disk in status.get("disks", ()) if disk["warning"]]
     lines.append(f"robots connect to  {status['url'] or 'nothing yet'}")
     if status["data_servers"] and status["url"]:
         lines.append(f"large data goes to  {data_url(status['url'])}")
@@ -79,6 +88,15 @@ def data_url(url: str) -> str:
     """Return the address of the data service, from the address *url* that robots connect to."""
     parts = urlsplit(url)
     return f"{'https' if parts.scheme == 'wss' else 'http'}://{parts.netloc}/data/"
+
+
+def _disks(folder: Path) -> list[DiskSpace]:
+    try:
+        settings = platform_settings(folder) or PlatformSettings()
+    except ConfigurationError:  # of another version
+        settings = PlatformSettings()
+    folders = folders_of(folder, local_placement(settings, folder).store)
+    return disk_spaces(folders, settings.local.disk_warning_bytes)
 
 
 async def _data_server(server: ServerState) -> dict[str, Any]:

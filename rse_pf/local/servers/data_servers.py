@@ -31,6 +31,7 @@ DATA_CHECK_S = 1.0
 """Between two checks of the service, and how long one may take."""
 _READY, _ALIVE = "/data/readyz", "/data/healthz"
 _FIRST_PAUSE_S, _MAX_PAUSE_S = 0.1, 5.0
+_WAIT_FOR_SPACE_S = 0.5
 NICENESS = 10
 """Of the data server: on one machine poses go first."""
 
@@ -51,6 +52,7 @@ class LocalDataServers:
         dies_with_parent: bool = True,
         replaces: bool = True,
         program: Sequence[str] = RSE_PF,
+        is_full: Callable[[], bool] = lambda: False,
         emit: Callable[..., None] = lambda event, **details: None,
     ) -> None:
         """Remember what to start.
@@ -63,12 +65,14 @@ class LocalDataServers:
             dies_with_parent: Whether the process ends when this one does.
             replaces: Whether one that ends or hangs is replaced; else only the event is emitted.
             program: What to run; ``data`` and its options follow.
+            is_full: Whether the disk is full now; no process is started then.
             emit: Gets ``data-server-start`` with name and pid, ``data-server-up`` with port, too,
                 ``data-server-down`` with name and code, ``data-server-silent`` and ``data-server-failed``.
         """
         self._settings = settings
         self._dies_with_parent = dies_with_parent
         self._replaces = replaces
+        self._is_full = is_full
         self._emit = emit
         self.port = 0
         self.process = ServerProcess(name, folder)
@@ -148,6 +152,9 @@ class LocalDataServers:
             self._emit("data-server-down", name=self.process.name, code=code)
             if not self._replaces:
                 return
+            while self._is_full():
+                pause_s = _FIRST_PAUSE_S
+                await asyncio.sleep(_WAIT_FOR_SPACE_S)
             try:
                 await self._launch()
                 pause_s = _FIRST_PAUSE_S

@@ -62,3 +62,12 @@ def test_the_file_for_discovery_lists_the_servers_that_are_ready() -> None:
     assert json.loads(service_discovery("lab", servers)) == [
         {"targets": ["127.0.0.1:1001"], "labels": {"platform": "lab", "server": "server-1"}}
     ]
+
+
+def test_the_space_on_each_disk_is_on_the_page() -> None:
+    disk = {"folder": "/var/lib/rse-pf", "free_bytes": 4096, "total_bytes": 8192}
+
+    text = federated({}, [disk]).decode()
+
+    assert 'rse_pf_disk_free_bytes{folder="/var/lib/rse-pf"} 4096.0' in text
+    assert 'rse_pf_disk_total_bytes{folder="/var/lib/rse-pf"} 8192.0' in text

@@ -25,6 +25,10 @@ class FakeServers:
         self.now = standing
         self.asked: list[tuple[Any, ...]] = []
         self.number = 10
+        self.disk_is_full = False
+
+    def is_full(self) -> bool:
+        return self.disk_is_full
 
     def standing(self, now_s: float) -> ServerHealth:
         return self.now
@@ -208,3 +212,16 @@ def test_a_whole_fleet_that_fails_its_checks_loses_one_server_only_but_dead_ones
     modifier.act([], now_s=61.0, period_over=False)
 
     assert servers.asked == [("replace", "server-1"), ("replace", "server-2"), ("replace", "server-3")]
+
+
+def test_on_a_full_disk_nothing_is_started_and_waiting_is_no_crash_loop() -> None:
+    modifier, servers, told = made(ServerHealth(servers=2, healthy=1, dead={"server-2": True}))
+    servers.disk_is_full = True
+    for second in range(60):
+        modifier.act((), now_s=float(second), period_over=False)
+    assert (servers.asked, told) == ([], [])
+
+    servers.disk_is_full = False
+    modifier.act((), now_s=60.0, period_over=False)
+
+    assert servers.asked == [("replace", "server-2")]

@@ -1,0 +1,55 @@
+"""When a disk counts as nearly full, and what an operator is told."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from rse_pf.config import LocalSettings
+from rse_pf.local.disk_watch import DiskWatch, disk_level, disk_spaces, folders_of
+
+MIB = 1 << 20
+
+
+def test_a_disk_is_low_below_the_threshold_and_full_below_a_mebibyte():
+    assert [disk_level(free, 100 * MIB) for free in (200 * MIB, 99 * MIB, MIB - 1)] == ["ok", "low", "full"]
+
+
+def test_a_disk_at_the_threshold_does_not_change_its_level_with_every_write():
+    assert disk_level(105 * MIB, 100 * MIB, "low") == "low"
+    assert disk_level(111 * MIB, 100 * MIB, "low") == "ok"
+    assert disk_level(MIB + 1, 100 * MIB, "full") == "full"
+
+
+def test_folders_on_one_disk_are_one_disk_and_a_store_elsewhere_is_none(tmp_path: Path):
+    (space,) = disk_spaces(folders_of(tmp_path, f"dir:{tmp_path}/objects"), 0)
+
+    assert space.folder == str(tmp_path)
+    assert 0 < space.free_bytes <= space.total_bytes
+    assert folders_of(tmp_path, "s3:bucket") == [tmp_path]
+
+
+def test_each_change_is_one_event_that_names_folder_and_bytes(
+    small_disk: Callable[[str], Path], fill: Callable[[Path], Path]
+):
+    disk = small_disk("8m")
+    told: list[dict[str, object]] = []
+    back: list[bool] = []
+    watch = DiskWatch(
+        disk,
+        "memory:",
+        LocalSettings(disk_warning_bytes=4 * MIB),
+        emit=lambda event, **more: told.append({"event": event, **more}),
+    )
+    watch.on_space = lambda: back.append(watch.is_full())
+    watch.is_full()
+    hog = fill(disk)
+    assert watch.is_full()
+    assert watch.is_full()
+    hog.unlink()
+    assert not watch.is_full()
+
+    assert [event["event"] for event in told] == ["disk-full", "disk-ok"]
+    assert told[0]["free_bytes"] == 0
+    assert f"0 of 8 MiB are free on the disk of {disk}" in str(told[0]["reason"])
+    assert back == [False]
