@@ -17,6 +17,7 @@ from typing import Any
 
 from rse_pf.audit.chain import Note, RefusalLimiter
 from rse_pf.audit.log import AuditLog
+from rse_pf.auth.claimed import claimed_by, source_address
 from rse_pf.auth.origins import AllowedOrigins
 from rse_pf.auth.roster import scopes_allow
 from rse_pf.auth.tokens import Claims, KeySet, token_problem, verify_token
@@ -210,19 +211,24 @@ class DataServer:
 
     def _claims(self, request: HttpRequest, scope: str, name: str, line: dict[str, Any]) -> Claims:
         kind, _, token = request.headers.get("authorization", "").partition(" ")
+        token = token.strip() if kind.lower() == "bearer" else ""
         keys = self._keys()
         if keys is None:
             raise Busy("the service has no keys yet", hint="retry later", retry_after_ms=_RETRY_AFTER_MS)
         try:
-            claims = verify_token(
-                token.strip() if kind.lower() == "bearer" else "",
-                keys=keys, now=self._wall_clock(), settings=self._settings.auth,
-            )  # fmt: skip
+            claims = verify_token(token, keys=keys, now=self._wall_clock(), settings=self._settings.auth)
         except Unauthorized as error:
-            line["reason"] = token_problem(error)
+            source = source_address(
+                request.peer,
+                request.headers.get("x-forwarded-for", ""),
+                self._settings.serving.trusted_proxies,
+            )
+            about = {"reason": token_problem(error), "source": source, **claimed_by(token)}
+            line |= about
             if self._audit is not None and self._refusals.take(line["reason"], self._clock()):
                 self.record_counted()
-                self._audit.record("auth.refused", reason=line["reason"])
+                now, who = self._wall_clock(), self._audit.who
+                self._audit.add([Note(time=now, actor=who, action="auth.refused", detail=about)])
             raise
         line["tenant"], line["robot"] = claims.robot.tenant, claims.robot.name
         if not scopes_allow(claims.scopes, scope, name):

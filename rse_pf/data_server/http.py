@@ -105,6 +105,7 @@ class HttpRequest:
     ) -> None:
         self.method = str(scope["method"])
         self.path = str(scope["path"])
+        self.peer = str((scope.get("client") or ("",))[0])
         self.headers = {
             name.decode("latin-1").lower(): value.decode("latin-1") for name, value in scope["headers"]
         }

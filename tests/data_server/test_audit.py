@@ -91,3 +91,16 @@ def test_refused_tokens_are_recorded_and_a_flood_of_them_is_counted(recorded: Re
     assert [entry.action for entry in entries] == ["auth.refused"] * burst + ["auth.refused-many"]
     assert sum(int(str(count)) for count in entries[-1].detail.values()) == 30
     assert entries[0].detail["reason"] != ""
+
+
+def test_a_refused_token_is_recorded_with_its_address_and_what_it_claims(recorded: Recorded) -> None:
+    forged = recorded.token("robot-9", "acme")[:-4] + "AAAA"
+    headers = {"x-forwarded-for": "6.6.6.6, 192.0.2.7"}
+
+    assert recorded.ask("GET", "/data/v1/maps", token=forged, headers=headers).status == 401
+
+    (entry,) = recorded.entries()
+    claimed = {name: entry.detail[name] for name in ("source", "claimed_robot", "claimed_tenant")}
+    assert claimed == {"source": "192.0.2.7", "claimed_robot": "robot-9", "claimed_tenant": "acme"}
+    assert {name: recorded.lines[-1][name] for name in claimed} == claimed
+    assert "robot" not in recorded.lines[-1], "nobody verified the name"

@@ -7,17 +7,15 @@ what an unverified token says is recorded as claimed.
 
 from __future__ import annotations
 
-import base64
 import time
 from asyncio import AbstractEventLoop, TimerHandle
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
 
-import msgspec
-
 from rse_pf.audit.chain import Note, RefusalLimiter, Value
 from rse_pf.audit.log import SYNC_S, AuditLog
+from rse_pf.auth.claimed import claimed_by
 from rse_pf.auth.tokens import Claims
 from rse_pf.backend.gateway.handshake import Accepted, Rejected
 from rse_pf.backend.ports import Clocks
@@ -28,7 +26,6 @@ _MAX_NOTES = 500
 """Notes in one message; a line of the channel may have 1 MiB."""
 _SUM_UP_S = 10.0
 _UNAUTHORIZED = 401
-_MAX_CLAIM = 64
 
 _W = TypeVar("_W")
 
@@ -69,7 +66,7 @@ class AuditRecorder:
             if verdict.claims is not None:
                 self._note("auth.accepted", str(verdict.claims.robot), **_of(verdict.claims), source=source)
         elif verdict.status == _UNAUTHORIZED and self._may_record(verdict.reason):
-            self._note("auth.refused", "", reason=verdict.reason, source=source, **_claimed(token))
+            self._note("auth.refused", "", reason=verdict.reason, source=source, **claimed_by(token))
 
     def renewed(self, before: Claims, claims: Claims) -> None:
         """Record the fresh token of a live connection; the same token again is not recorded."""
@@ -155,22 +152,6 @@ class ServerAudit:
     def __exit__(self, *error: object) -> None:
         if self._log is not None:
             self._log.close()
-
-
-class _Claimed(msgspec.Struct):
-    """The claims of a token that nobody verified."""
-
-    sub: str = ""
-    jti: str = ""
-
-
-def _claimed(token: str) -> Mapping[str, str]:
-    try:
-        _, payload, _ = token.split(".")
-        claimed = msgspec.json.decode(base64.urlsafe_b64decode(payload + "=="), type=_Claimed)
-    except (ValueError, msgspec.MsgspecError, RecursionError):
-        return {}
-    return {"claimed_robot": claimed.sub[:_MAX_CLAIM], "claimed_token": claimed.jti[:_MAX_CLAIM]}
 
 
 def _of(claims: Claims) -> dict[str, str]:

@@ -7,12 +7,12 @@ keeps to its rate is never refused.
 from __future__ import annotations
 
 import math
-import re
 from collections import deque
 from collections.abc import Hashable
 from dataclasses import dataclass, field
 from typing import TypeVar
 
+from rse_pf.auth.claimed import source_address
 from rse_pf.config import ServingSettings, SessionSettings
 from rse_pf.identity import RobotId
 from rse_pf.token_bucket import TokenBucket
@@ -25,7 +25,6 @@ CUT_OFF = math.inf
 _MAX_NAMES = 20000
 """Robots or addresses remembered at a time; those that did nothing wrong are forgotten first."""
 _MIN_RETRY_MS = 1.0
-_ADDRESS = re.compile(r"[0-9a-fA-F.:]{2,45}|\[[0-9a-fA-F.:]{2,45}\]:\d{1,5}")
 """An IPv4 or IPv6 address, perhaps with a port, as load balancers append it."""
 
 Key = TypeVar("Key", bound=Hashable)
@@ -135,17 +134,8 @@ class SourceRates:
         return bucket.take(now)
 
     def source(self, peer: str, forwarded_for: str) -> str:
-        """Return the address that a handshake came from.
-
-        Args:
-            peer: The other end of the TCP connection.
-            forwarded_for: The ``x-forwarded-for`` headers, joined; each trusted proxy appended one entry, and
-                whatever stands before those may be a lie.  An entry that is no address is a lie, too.
-        """
-        trusted = self._serving.trusted_proxies
-        entries = [entry.strip() for entry in forwarded_for.split(",") if entry.strip()]
-        told = entries[-trusted] if 0 < trusted <= len(entries) else peer
-        return told if _ADDRESS.fullmatch(told) else peer
+        """Return the address that a handshake came from, see `source_address`."""
+        return source_address(peer, forwarded_for, self._serving.trusted_proxies)
 
 
 def _half(names: dict[Key, Value], max_names: int) -> dict[Key, Value]:

@@ -9,6 +9,7 @@ from asyncio import TimerHandle
 from collections.abc import Callable, Set
 from functools import partial
 
+from rse_pf.auth.claimed import claimed_by
 from rse_pf.auth.tokens import Claims, KeySet, claims_problem, renewed_claims
 from rse_pf.backend.gateway.audit_recorder import AuditRecorder
 from rse_pf.backend.gateway.connection import RobotConnection
@@ -112,7 +113,9 @@ class TokenWatch:
             metrics.handshakes["ok"] += 1
             return verdict
         metrics.handshakes[verdict.result] += 1
-        self._context.log.info("refused", result=verdict.result, reason=verdict.reason)
+        self._context.log.info(
+            "refused", result=verdict.result, reason=verdict.reason, source=source, **claimed_by(token)
+        )
         return None
 
     def renew(self, connection: RobotConnection, token: str) -> None:

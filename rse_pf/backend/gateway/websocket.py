@@ -14,6 +14,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
+from rse_pf.auth.claimed import claimed_by
 from rse_pf.auth.origins import carried_token
 from rse_pf.backend.gateway.audit_recorder import AuditRecorder
 from rse_pf.backend.gateway.connection import RobotConnection
@@ -245,18 +246,21 @@ class RobotSockets:
                 verdict = self._verdict(pending, head)
         except Exception as error:  # noqa: BLE001  the worker serves on
             self._context.log.error("defect", at="handshake", traceback=repr(error))
-            verdict = self._handshake.defect
-        if isinstance(verdict, Accepted):
-            assert head is not None
+            verdict, head = self._handshake.defect, None
+        if isinstance(verdict, Accepted) and head is not None:
             self._context.metrics.handshakes["no-token-yet" if verdict.awaits_token else "ok"] += 1
             self._serve(pending, verdict, (_UPGRADE % head.websocket_key, rest))
-        else:
-            self._refuse(pending, verdict)
+        elif isinstance(verdict, Rejected):
+            self._refuse(pending, verdict, head)
 
-    def _refuse(self, pending: PendingSocket, verdict: Rejected) -> None:
+    def _refuse(self, pending: PendingSocket, verdict: Rejected, head: RequestHead | None = None) -> None:
         self._context.metrics.handshakes[verdict.result] += 1
         if verdict.result != HEALTH:
-            self._context.log.info("refused", result=verdict.result, reason=verdict.reason)
+            about = {"source": pending.peer}
+            if head is not None:
+                token = carried_token(head.text(b"authorization"), head.words(b"sec-websocket-protocol"))
+                about = {"source": self._source(pending, head), **claimed_by(token)}
+            self._context.log.info("refused", result=verdict.result, reason=verdict.reason, **about)
         pending.close(verdict.answer)
 
     def _serve(self, pending: PendingSocket, verdict: Accepted, request: tuple[bytes, bytes]) -> None:
@@ -288,9 +292,12 @@ class RobotSockets:
 
         return read_later
 
+    def _source(self, pending: PendingSocket, head: RequestHead) -> str:
+        return self._sources.source(pending.peer, head.text(b"x-forwarded-for"))
+
     def _verdict(self, pending: PendingSocket, head: RequestHead) -> Accepted | Rejected:
         now = self._context.clocks.monotonic()
-        source = self._sources.source(pending.peer, head.text(b"x-forwarded-for"))
+        source = self._source(pending, head)
         if self._sources.wait_s(source, now) > 0:
             return replace(self._handshake.too_fast, reason="address-rate")
         authorization, offered = head.text(b"authorization"), head.words(b"sec-websocket-protocol")

@@ -61,6 +61,8 @@ async def test_a_server_records_accepted_and_refused_robots_and_no_token(tmp_pat
 
         await until(lambda: len(tokens()) >= 2, tokens)
         text = (audit / "guarded.jsonl").read_text()
+        await until(lambda: '"refused"' in server.log, lambda: server.log)
+        log = server.log
 
     written = {entry.action: entry for entry in entries(audit, "guarded")}
     assert next(iter(written)) == "server.ready"
@@ -73,6 +75,8 @@ async def test_a_server_records_accepted_and_refused_robots_and_no_token(tmp_pat
     )
     assert accepted.detail["source"] == "127.0.0.1"
     assert (refused.action, refused.detail["claimed_robot"]) == ("auth.refused", "robot-1")
+    lines = [json.loads(line) for line in log.splitlines() if '"refused"' in line]
+    assert [(line["source"], line["claimed_robot"]) for line in lines] == [("127.0.0.1", "robot-1")]
     assert good not in text
     assert good.split(".")[1] not in text
 

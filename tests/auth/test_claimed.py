@@ -1,0 +1,69 @@
+"""Names in tokens that nobody verified: bounded, of one line, and never believed."""
+
+from __future__ import annotations
+
+import base64
+import json
+from typing import Any
+
+import msgspec
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rse_pf.auth.claimed import claimed_by, source_address
+from rse_pf.terminal import json_line
+
+HOSTILE = [
+    "robot\n{\"event\":\"accepted\"}", "\x1b[31mrobot", "\u202erobot", "robot\x00", "r" * 1000,
+    "\r\nHTTP/1.1 200 OK", "../../etc/passwd", "\u2028robot\x9b",
+]  # fmt: skip
+
+
+def token_of(claims: Any) -> str:
+    text = json.dumps(claims).encode()
+    return f"eyJhbGciOiJFZERTQSJ9.{base64.urlsafe_b64encode(text).rstrip(b'=').decode()}.c2ln"
+
+
+def test_robot_tenant_and_token_are_told_as_claimed():
+    token = token_of({"sub": "robot-9", "tenant": "acme", "jti": "t-9", "exp": 1})
+
+    told = claimed_by(token)
+
+    assert told == {"claimed_robot": "robot-9", "claimed_tenant": "acme", "claimed_token": "t-9"}
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_a_hostile_name_is_cut_and_breaks_no_line_of_a_log(name: str):
+    told = claimed_by(token_of({"sub": name, "tenant": name, "jti": name}))
+
+    line = json_line(told, msgspec.json.encode)
+
+    assert set(told) == {"claimed_robot", "claimed_tenant", "claimed_token"}
+    assert all(len(value) <= 64 for value in told.values())
+    assert len(line.splitlines()) == len(line.decode().splitlines()) == 1
+    assert not any(sign in line.decode() for sign in "\x1b\x00\x9b\u202e\u2028")
+
+
+@pytest.mark.parametrize("claims", [[], 7, {"sub": ["robot"], "tenant": {"a": 1}, "jti": 7}, {"sub": ""}])
+def test_claims_of_a_wrong_type_are_left_out(claims: Any):
+    assert claimed_by(token_of(claims)) == {}
+
+
+@given(st.text())
+def test_no_text_raises(text: str):
+    claimed_by(text)
+    claimed_by(f"a.{text}.b")
+
+
+def test_a_deep_or_damaged_token_claims_nothing():
+    deep = base64.urlsafe_b64encode(b'{"sub":' + b"[" * 5000).decode()
+
+    assert claimed_by(f"a.{deep}.b") == claimed_by("a.!!!.b") == claimed_by("") == {}
+
+
+def test_an_address_that_the_sender_wrote_itself_is_not_believed():
+    assert source_address("10.0.0.1", "6.6.6.6, 192.0.2.7", 1) == "192.0.2.7"
+    assert source_address("10.0.0.1", "6.6.6.6", 0) == "10.0.0.1"
+    assert source_address("10.0.0.1", 'x"\n', 1) == "10.0.0.1"
+    assert source_address("10.0.0.1", "6.6.6.6", 2) == "10.0.0.1"
