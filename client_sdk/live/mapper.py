@@ -140,8 +140,8 @@ class LiveMapper:
             name: Of the map: small letters, digits and hyphens.
             ask: Answers pose queries.
             camera: Frames of another camera are refused; None takes that of the first frame.
-            spool: Folder of keyframes that wait for the map, which survive a restart of this program; None
-                keeps them in memory.
+            spool: Folder of keyframes that wait for the map, which survive a restart of this program, for
+                this robot alone; None keeps them in memory.
             options: Of the tracker.
             live: Of keyframes and their sending.
             map_options: Density of the robot's own cloud, to which keyframes are added.
@@ -187,9 +187,17 @@ class LiveMapper:
             Forbidden: The token has no scope for this map.
             UnknownService: The platform has no live maps.
             BadRequest: The name cannot be used.
-            UsageError: The spool cannot be used.
+            UsageError: The spool cannot be used, or another program uses it.
         """
         self._segment = await asyncio.to_thread(self._waiting.open)
+        try:
+            await self._join()
+        except BaseException:
+            self._waiting.close()
+            raise
+        return self
+
+    async def _join(self) -> None:
         self._sender = KeyframeSender(
             self._robot, self.name, self._waiting, deadline_s=self.options.deadline_s,
             bytes_per_s=self.options.bytes_per_s, clock=self._clock, on_known=self._known,
@@ -207,7 +215,6 @@ class LiveMapper:
             self._sender.added()
         self._is_open = True
         self._tasks = [asyncio.create_task(self._sender.run()), asyncio.create_task(self._follow())]
-        return self
 
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -229,6 +236,7 @@ class LiveMapper:
             for task in ending:
                 task.cancel()
             await asyncio.gather(*ending, return_exceptions=True)
+            self._waiting.close()
             self._is_over = True
             for listener in self._listeners:
                 listener.put_nowait(None)
@@ -391,7 +399,7 @@ class LiveMapper:
                 "keyframes_kept": len(self.sent_keyframes),
                 "keyframes_waiting": len(self._waiting),
                 "keyframes_dropped": self._dropped,
-                "keyframes_refused": self._sender.refused if self._is_open else 0,
+                "keyframes_refused": self._sender.refused if self._is_open or self._is_over else 0,
                 "relocalisations": dict(self._verdicts),
                 "others": sorted(self._alignments.others),
             },

@@ -1,13 +1,16 @@
 """The keyframes of a robot that a live map has not acknowledged: in order, none lost, none twice.
 
-They are kept in memory, or in a folder that survives a restart of the robot.  Numbers that the map knows are
+They are kept in memory, or in a folder that survives a restart of the robot.  One program at a time uses a
+folder: two would remove each other's keyframes.  Numbers that the map knows are
 given when a keyframe is sent: a robot that is offline does not know the first of them yet.
 """
 
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import json
+import os
 from collections import deque
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +24,7 @@ __all__ = ["Base", "KeyframeWaits", "WaitingKeyframes", "rebased"]
 
 _SUFFIX = ".keyframe"
 _STATE = "state.json"
+_LOCK = ".lock"
 _MEMORY_BYTES = 64 << 20
 _DISK_BYTES = 1 << 30
 
@@ -65,6 +69,7 @@ class WaitingKeyframes:
         self._next_index = 0
         self._first_segment = 0
         self._base: Base | None = None
+        self._lock = -1
 
     def __len__(self) -> int:
         return len(self._held)
@@ -88,13 +93,14 @@ class WaitingKeyframes:
         """Take over what an earlier run left; return the segment that this run begins with.
 
         Raises:
-            UsageError: The folder cannot be read or written.
+            UsageError: The folder cannot be read or written, or another program uses it.
         """
         folder = self._folder
         if folder is None:
             return 0
         try:
             folder.mkdir(parents=True, exist_ok=True)
+            self._take_lock(folder)
             for part in folder.glob(f"{TEMPORARY_PREFIX}*"):
                 part.unlink()
             for path in sorted(folder.glob(f"*{_SUFFIX}")):
@@ -108,10 +114,17 @@ class WaitingKeyframes:
                 self._base = Base(**json.loads((folder / _STATE).read_text(encoding="utf-8")))
             self._first_segment = self._read(self._held[-1][0], None).segment + 1
         except (OSError, ValueError, TypeError, msgspec.MsgspecError) as error:
+            self.close()
             raise UsageError(
                 f"cannot use the keyframes in {folder}: {error}", hint="name another folder as spool"
             ) from error
         return self._first_segment
+
+    def close(self) -> None:
+        """Let another program use the folder; what waits stays there."""
+        if self._lock >= 0:
+            os.close(self._lock)
+        self._lock = -1
 
     def add(self, keyframe: KeyframeWaits) -> bool:
         """Keep *keyframe*, whose index is `next_index`; return False if there is no space for it.
@@ -164,6 +177,17 @@ class WaitingKeyframes:
                 raise UsageError(
                     f"cannot write {self._folder}: {error.strerror}", hint="free space on this disk"
                 ) from error
+
+    def _take_lock(self, folder: Path) -> None:
+        """Lock the folder; Linux unlocks it however this program ends."""
+        self._lock = os.open(folder / _LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+        try:
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            self.close()
+            raise UsageError(
+                f"another program keeps its keyframes in {folder}", hint="give each robot a spool of its own"
+            ) from error
 
     def _read(self, index: int, data: bytes | None) -> KeyframeWaits:
         raw = self._path(index).read_bytes() if data is None else data

@@ -15,7 +15,7 @@ parser.add_argument("--intrinsics", type=Path, help="intrinsics.json of: rse-pf 
 parser.add_argument("--map", default="warehouse", help="name of the live map (default: warehouse)")
 
 
-async def main(args: argparse.Namespace) -> None:
+async def main(args: argparse.Namespace) -> str | None:
     with open_camera(args.source, intrinsics=args.intrinsics) as camera:
         async with connect(enrolment=args.enrolment) as robot, robot.live_map(args.map) as mapper:
             async for frame in camera:
@@ -23,11 +23,14 @@ async def main(args: argparse.Namespace) -> None:
                 if done.corrected:
                     print(f"the map corrected this robot: {mapper.aligned_by}, {mapper.reason}")
                 print(f"{done.status} {mapper.state}: {done.T_map_camera}")
+        if mapper.keyframes_waiting:
+            return f"{mapper.keyframes_waiting} keyframes did not reach the map"
+        return None
 
 
 if __name__ == "__main__":
     try:
-        asyncio.run(main(parser.parse_args()))
+        raise SystemExit(asyncio.run(main(parser.parse_args())))
     except KeyboardInterrupt:
         pass
     except RsePfError as error:

@@ -1,7 +1,12 @@
-"""Play a recording into a live map that other robots share, and print each place and each correction."""
+"""Play a recording into a live map that other robots share, and print each place and each correction.
+
+Keyframes that the map has not acknowledged wait in a folder that is named for the robot's enrolment.  If some
+are left at the end, the program says so and exits with 1; the next drive sends them first.
+"""
 
 import argparse
 import asyncio
+from pathlib import Path
 
 from client_sdk import LiveMapper, connect, open_dataset
 from rse_pf.errors import RsePfError
@@ -18,9 +23,10 @@ async def tell_corrections(mapper: LiveMapper) -> None:
         print(f"correction of segment {change.segment} by {change.by}, because of {change.cause}")
 
 
-async def main(args: argparse.Namespace) -> None:
+async def main(args: argparse.Namespace) -> str | None:
+    spool = Path("keyframes") / Path(args.enrolment).stem  # each robot has its own
     async with connect(enrolment=args.enrolment) as robot:
-        async with robot.live_map(args.map, spool="keyframes") as mapper:
+        async with robot.live_map(args.map, spool=spool) as mapper:
             telling = asyncio.create_task(tell_corrections(mapper))
             for frame in open_dataset(args.recording).thinned(args.rate):
                 done = await mapper.track(frame)
@@ -28,10 +34,15 @@ async def main(args: argparse.Namespace) -> None:
                 print(f"{done.status}; in the map: {place}; others: {', '.join(mapper.others) or 'none'}")
         await telling
         print(f"{mapper.frames} frames, {mapper.keyframes} keyframes, {mapper.keyframes_waiting} waiting")
+        drive = mapper.report()["live"]
+        lost = drive["keyframes_dropped"] + drive["keyframes_refused"]
+        if mapper.keyframes_waiting or lost:
+            return f"{mapper.keyframes_waiting} keyframes wait in {spool}, {lost} are lost"
+        return None
 
 
 if __name__ == "__main__":
     try:
-        asyncio.run(main(parser.parse_args()))
+        raise SystemExit(asyncio.run(main(parser.parse_args())))
     except RsePfError as error:
         raise SystemExit(str(error)) from None

@@ -29,7 +29,7 @@ from rse_pf.services.custom.installed import install
 from tests.examples.example_page import PAGE, REPOSITORY, listed
 
 T = TypeVar("T")
-ROBOTS = ("robot-1", "robot-2")
+ROBOTS = ("robot-1", "robot-2", "robot-4")
 OWN_KEY_ROBOT = "robot-3"
 SERVICE = REPOSITORY / "examples" / "robots" / "object_recognition_service"
 START_S, END_S = 60.0, 110.0
@@ -110,7 +110,7 @@ class ExamplePlatform:
 def platform(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[ExamplePlatform]:
-    """A platform of one server with the service of the examples; robots-1 to 3 are enrolled.
+    """A platform of one server with the service of the examples; robots-1 to 4 are enrolled.
 
     It has a data service if the module of the test says ``HAS_DATA``, and lets pages of its
     ``ALLOWED_ORIGINS`` connect.

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import asyncio
 import re
+import time
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
+from client_sdk import connect
 from tests.examples.conftest import ExamplePlatform
 
 pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
@@ -29,3 +33,41 @@ def test_two_robots_share_a_live_map(platform: ExamplePlatform) -> None:
     assert re.search(r"^16 frames, [1-9]\d* keyframes, 0 waiting$", first.stdout, re.MULTILINE), first.stdout
     assert (second.returncode, second.stderr) == (0, "")
     assert second.stdout.count("\n") >= 16
+
+
+async def keyframes_of(platform: ExamplePlatform, robot: str, name: str) -> int:
+    """Return how many keyframes the map took from *robot*: the number of its next one."""
+    file = platform.folder / f"{robot}.enrolment"
+    async with connect(enrolment=file) as connected, connected.live_map(name) as mapper:
+        end = time.monotonic() + 20.0
+        while not mapper.owner:
+            assert time.monotonic() < end, mapper.trouble
+            await asyncio.sleep(0.05)
+        answer = await connected.call("live-show", {"map": name}, keep=True)
+    return int(answer.reply["you"]["number"])
+
+
+def test_three_robots_that_drive_at_once_lose_no_keyframe(platform: ExamplePlatform) -> None:
+    robots = ("robot-1", "robot-2", "robot-4")
+    drives = [platform.folder / f"together-{name}" for name in robots]
+    write_drives(drives, frames=24)
+    commands = []
+    for name, drive in zip(robots, drives, strict=True):
+        for kind in ("rgb", "depth"):
+            lines = [f"{row / 10:.1f} {kind}/{row}.png\n" for row in range(24)]
+            (drive / f"{kind}.txt").write_text("".join(lines))
+        instead = {"robot-1.enrolment": f"{name}.enrolment", "drive-1": drive.name, "warehouse": "together"}
+        commands.append(platform.command("live_map_recording", **instead))
+
+    with ThreadPoolExecutor(3) as pool:
+        ended = list(pool.map(platform.run, commands))
+
+    assert [(each.returncode, each.stderr) for each in ended] == [(0, "")] * 3
+    told = [
+        re.search(r"^24 frames, (\d+) keyframes, 0 waiting$", each.stdout, re.MULTILINE) for each in ended
+    ]
+    made = {name: int(each[1]) for name, each in zip(robots, told, strict=True) if each}
+    kept = {name: platform.wait(keyframes_of(platform, name, "together")) for name in robots}
+    print(f"{sum(kept.values())} of {sum(made.values())} keyframes of three robots are in the map")
+    assert kept == made
+    assert sum(made.values()) >= 9

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import subprocess
+import sys
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Any
@@ -213,6 +215,52 @@ def test_a_program_that_starts_again_sends_what_waited_and_begins_a_new_segment(
     run(work)
 
 
+def test_a_spool_in_use_is_refused_in_one_line_and_free_again_when_its_program_ends(tmp_path: Path) -> None:
+    async def work(robot: FakeLiveRobot) -> None:
+        async with live_map(robot, spool=tmp_path) as mapper:
+            robot.connected = False
+            await drive(mapper, range(6))
+            left = list((tmp_path / "lab").glob("*.keyframe"))
+
+            with pytest.raises(UsageError, match="another program keeps its keyframes") as refused:
+                async with live_map(FakeLiveRobot(), spool=tmp_path):
+                    pass
+
+            assert refused.value.hint == "give each robot a spool of its own"
+            assert list((tmp_path / "lab").glob("*.keyframe")) == left != []
+        robot.connected = True
+        async with live_map(robot, spool=tmp_path) as mapper:
+            await robot.until(lambda: mapper.keyframes_waiting == 0)
+
+    run(work)
+
+
+def test_the_spool_of_a_program_that_was_killed_is_free(tmp_path: Path) -> None:
+    code = (
+        "import os, sys; from pathlib import Path\n"
+        "from client_sdk.live.waiting_keyframes import WaitingKeyframes\n"
+        "WaitingKeyframes(Path(sys.argv[1])).open()\n"
+        "os.kill(os.getpid(), 9)"
+    )
+    subprocess.run([sys.executable, "-c", code, str(tmp_path)], check=False)
+    assert (tmp_path / ".lock").exists()
+
+    waiting = WaitingKeyframes(tmp_path)
+    waiting.open()
+    waiting.close()
+
+
+def test_keyframes_that_were_refused_are_counted_after_the_drive_too(tmp_path: Path) -> None:
+    async def work(robot: FakeLiveRobot) -> None:
+        async with live_map(robot) as mapper:
+            await drive(mapper, range(6))
+            await robot.until(lambda: mapper.keyframes_waiting == 0)
+            mapper._sender.refused = 2
+        assert mapper.report()["live"]["keyframes_refused"] == 2
+
+    run(work)
+
+
 def test_a_program_that_starts_again_without_a_spool_asks_for_its_numbers() -> None:
     async def work(robot: FakeLiveRobot) -> None:
         for _ in range(2):
@@ -403,6 +451,7 @@ def test_a_full_spool_drops_the_newest_and_a_damaged_one_is_told(tmp_path: Path)
     waiting.open()
     assert waiting.next_index == 0
     assert not len(waiting)
+    waiting.close()
     (tmp_path / "000000000000.keyframe").write_bytes(b"no keyframe")
     with pytest.raises(UsageError, match="cannot use the keyframes in"):
         WaitingKeyframes(tmp_path).open()
