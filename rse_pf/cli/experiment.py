@@ -10,16 +10,18 @@ examples:
   rse-pf experiment live --only none,kill,drain --frames 310 --out live-faults
   rse-pf experiment robustness --only kill,stop --repeat 3 --out faults
   rse-pf experiment verify fig8
+  rse-pf experiment verify faults --rerun
 """
 
 from __future__ import annotations
 
 import argparse
 import math
+import tempfile
 from collections.abc import Collection
 from dataclasses import fields
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NoReturn, TypeVar
 
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import UsageError
@@ -42,6 +44,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "folder", nargs="?", type=Path, metavar="DIR", help="verify: results of one or more runs"
     )
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder of results (default: out-KIND)")
+    parser.add_argument(
+        "--rerun", action="store_true",
+        help="verify: also run the short form that each report holds, and name the figures it does not reach",
+    )  # fmt: skip
     parser.add_argument("--robots", type=int, metavar="N", help="robots (default: 100; map and live: 3)")
     parser.add_argument("--fps", type=float, default=5.0, help="frames per second of each robot (default: 5)")
     parser.add_argument("--speed", type=float, default=1.0, metavar="K", help="compress times (default: 1)")
@@ -78,7 +84,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     """Check the options and run the experiment."""
     if args.kind == "verify":
-        return _verify(args.folder if args.folder is not None else args.out)
+        folder = args.folder if args.folder is not None else args.out
+        return max(_verify(folder), _rerun(folder, settings) if args.rerun else 0)
+    if args.rerun:
+        raise UsageError("--rerun is for verify", hint="rse-pf experiment verify DIR --rerun")
     if args.folder is not None:
         raise UsageError(f"{args.kind} takes no folder", hint=f"name the results with --out {args.folder}")
     if args.out is None:
@@ -197,3 +206,40 @@ def _verify(folder: Path | None) -> int:
     skipped = f", {len(checks) - checked} skipped" if checked < len(checks) else ""
     show(f"{checked} figures and invariants checked, {differing} differ{skipped}")
     return int(differing > 0)
+
+
+def _rerun(folder: Path, settings: PlatformSettings) -> int:
+    """Run the short form of each experiment in *folder*; return 1 if a figure was not reached."""
+    from rse_pf.experiments.paper.verify import read_report, report_folders
+    from rse_pf.experiments.results.rerun import RERUN, rerun_arguments, rerun_figures
+
+    missed = 0
+    for part in report_folders(folder):
+        report = read_report(part)
+        if RERUN not in report:
+            show(f"skipped  {part.name}: the report has no short form")
+            continue
+        words = rerun_arguments(report)
+        show(f"rse-pf experiment {' '.join(words)}")
+        with tempfile.TemporaryDirectory(prefix="rse-pf-rerun-") as place:
+            out = Path(place) / "short"
+            run(_Parser.parsed([*words, "--out", str(out)]), settings)
+            figures = rerun_figures(report, read_report(out))
+        for figure in figures:
+            show(f"{part.name}: {figure}" if part != folder else str(figure))
+        missed += sum(not figure.is_reached for figure in figures)
+    show(f"{missed} figures of the reports are not reached by this version" if missed else "all are reached")
+    return int(missed > 0)
+
+
+class _Parser(argparse.ArgumentParser):
+    """The arguments in a report, which may be damaged."""
+
+    def error(self, message: str) -> NoReturn:
+        raise UsageError(f"the short form in the report is damaged: {message}", hint="restore it")
+
+    @classmethod
+    def parsed(cls, words: list[str]) -> argparse.Namespace:
+        parser = cls(add_help=False)
+        add_arguments(parser)
+        return parser.parse_args(words)

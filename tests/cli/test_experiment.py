@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import json
+
 import pytest
 
+from rse_pf.cli import experiment
 from rse_pf.cli.main import main
+from rse_pf.config import PlatformSettings
+from rse_pf.errors import UsageError
 
 
 @pytest.mark.parametrize(
@@ -24,6 +29,7 @@ from rse_pf.cli.main import main
         (["map", "--robots", "33"], "--robots 33 is not within 1..32"),
         (["latency", "somewhere"], "latency takes no folder"),
         (["verify"], "verify needs a folder"),
+        (["map", "--rerun"], "--rerun is for verify"),
         (["elasticty"], "'elasticty' is not one of"),
     ],
 )
@@ -50,3 +56,33 @@ def test_a_folder_with_other_files_is_not_touched(tmp_path, capsys):
 def test_verify_names_what_is_missing(tmp_path, capsys):
     assert main(["experiment", "verify", str(tmp_path)]) == 2
     assert "report.json" in capsys.readouterr().err
+
+
+def test_a_short_form_with_damaged_arguments_is_one_line(tmp_path):
+    report = {"experiment": "map", "rerun": {"arguments": ["--frmes", "7"], "slack": 1.5, "bars": {}}}
+    (tmp_path / "report.json").write_text(json.dumps(report))
+
+    with pytest.raises(UsageError, match="the short form in the report is damaged"):
+        experiment._rerun(tmp_path, PlatformSettings())
+
+
+def test_a_figure_that_a_short_run_misses_is_named_and_the_verb_fails(tmp_path, monkeypatch, capsys):
+    plan = {"arguments": ["--robots", "2"], "slack": 1.5, "bars": {"ate_cm": "<= 1", "lost_frames": "<= 0"}}
+    report = {"experiment": "map", "ate_cm": [0.9], "lost_frames": [0], "rerun": plan}
+    (tmp_path / "report.json").write_text(json.dumps(report))
+    ran = []
+
+    def run_short(args, settings):
+        ran.append((args.kind, args.robots))
+        args.out.mkdir()
+        (args.out / "report.json").write_text(json.dumps({"ate_cm": [1.2, 1.7], "lost_frames": [0, 0]}))
+        return 0
+
+    monkeypatch.setattr(experiment, "run", run_short)
+
+    assert experiment._rerun(tmp_path, PlatformSettings()) == 1
+    told = capsys.readouterr().out
+    assert ran == [("map", 2)]
+    assert "MISSED   ate_cm  1.7 now, must be <= 1.5; 0.9 in the report" in told
+    assert "reached  lost_frames" in told
+    assert "1 figures of the reports are not reached" in told

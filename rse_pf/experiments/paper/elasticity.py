@@ -21,8 +21,10 @@ from rse_pf.errors import CommandFailed
 from rse_pf.experiments.load.swarm import SwarmOptions
 from rse_pf.experiments.paper.harness import Harness, generator_of
 from rse_pf.experiments.plots.figures import draw_elasticity, require_matplotlib
+from rse_pf.experiments.results.bars import Bars
 from rse_pf.experiments.results.markdown import about_run, failures, number, page, slashed, table, three
 from rse_pf.experiments.results.records import Event, Records, parameters_of, read_records
+from rse_pf.experiments.results.rerun import RERUN, rerun_plan
 from rse_pf.experiments.results.result_folder import RUN_FILES, finish_report, fresh_folder, load_average
 from rse_pf.experiments.results.summary import PAPER, summarise, summary_of
 from rse_pf.local.control.monitor import MonitorSample
@@ -40,6 +42,11 @@ __all__ = [
     "unjustified_scale_outs",
 ]
 
+_SHORT_BARS: Bars = {
+    **{f"commands/{name}": (0.0, "<=") for name in ("lost", "twice", "failed")},
+    **dict.fromkeys(("scale_outs", "scale_ins", "crashes"), (1.0, ">=")),
+    "replaced_in_s": (5.0, "<="),
+}
 FIGURE = "elasticity.png"
 _JOIN_EVERY_S = 20.0  # the paper's Fig. 8
 _SERVERS_AT_FULL = 5
@@ -111,6 +118,8 @@ def run_elasticity(options: ElasticityOptions, settings: PlatformSettings) -> in
         "generator": {name: generator_of(each) for name, each in records.items()},
         "paper": PAPER,
     }
+    if not options.compare:
+        report[RERUN] = rerun_plan(["--speed", "30", "--robots", "40"], _SHORT_BARS)
     show_page(
         finish_report(folder, report, lambda whole: elasticity_page(whole, figures), chosen, load_before)
     )

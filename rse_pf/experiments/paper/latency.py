@@ -19,8 +19,10 @@ from rse_pf.config import PlatformSettings
 from rse_pf.experiments.load.swarm import SwarmOptions
 from rse_pf.experiments.paper.harness import Harness, generator_of
 from rse_pf.experiments.plots.figures import draw_latency, require_matplotlib
+from rse_pf.experiments.results.bars import Bars
 from rse_pf.experiments.results.markdown import about_run, number, page, slashed, table, three
 from rse_pf.experiments.results.records import CommandRecord, Records, parameters_of, read_records
+from rse_pf.experiments.results.rerun import RERUN, rerun_plan
 from rse_pf.experiments.results.result_folder import RUN_FILES, finish_report, fresh_folder, load_average
 from rse_pf.experiments.results.summary import PAPER, ROUND_TRIP_PARTS, answered_percent, summary_of
 from rse_pf.local.faults.network_emulator import profile_named
@@ -29,6 +31,7 @@ from rse_pf.terminal import show, show_page
 __all__ = ["LatencyOptions", "latency_figures", "latency_page", "run_latency"]
 
 FIGURE = "latency.png"
+_SHORT = ("--robots", "20", "--seconds", "5")
 _JOIN_TIMEOUT_S = 60.0
 
 
@@ -59,6 +62,7 @@ def run_latency(options: LatencyOptions, settings: PlatformSettings) -> int:
         **figures,
         "generator": {"": generator_of(records)},
         "paper": PAPER,
+        RERUN: rerun_plan([*_SHORT, "--link", options.link or "none"], _bars(figures)),
     }
     show_page(finish_report(folder, report, latency_page, settings, load_before))
     link = f"link profile {options.link}" if options.link else "no emulated link"
@@ -67,6 +71,15 @@ def run_latency(options: LatencyOptions, settings: PlatformSettings) -> int:
     )
     show(f"wrote {FIGURE}, report.json, report.md and the raw records to {options.out}")
     return int(figures["commands"]["lost"] > 0 or figures["commands"]["twice"] > 0)
+
+
+def _bars(figures: Mapping[str, Any]) -> Bars:
+    """Return what a short run must reach."""
+    return {
+        **{f"commands/{name}": (0.0, "<=") for name in ("lost", "twice", "failed")},
+        "round_trip_ms/p50": (figures["round_trip_ms"]["p50"], "<="),
+        "answered_within_150_ms_percent": (figures["answered_within_150_ms_percent"], ">="),
+    }
 
 
 async def _run(options: LatencyOptions, settings: PlatformSettings, folder: Path) -> None:

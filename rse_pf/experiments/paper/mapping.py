@@ -17,6 +17,7 @@ from client_sdk.mapping import Trajectory, read_ply, read_trajectory, write_traj
 from rse_pf.config import PlatformSettings
 from rse_pf.experiments.demo.run import DemoOptions, run_demo
 from rse_pf.experiments.paper.harness import policy_parameters
+from rse_pf.experiments.results.bars import Bars
 from rse_pf.experiments.results.markdown import about_run, number, page, table, three
 from rse_pf.experiments.results.records import (
     EVENTS,
@@ -27,13 +28,18 @@ from rse_pf.experiments.results.records import (
     read_records,
     run_sample,
 )
+from rse_pf.experiments.results.rerun import RERUN, rerun_plan
 from rse_pf.experiments.results.result_folder import finish_report, load_average
 from rse_pf.experiments.results.summary import PAPER, summarise
 from rse_pf.experiments.results.trajectory_error import trajectory_figures
 from rse_pf.local.control.monitor import MonitorSample, ServerSample
 from rse_pf.terminal import show_page
 
-__all__ = ["complete_records", "frames_of", "map_figures", "map_page", "run_map"]
+__all__ = ["CLOUD", "complete_records", "frames_of", "map_figures", "map_page", "run_map"]
+
+CLOUD = "map.ply"
+"""The cloud of one robot, which is long and may not be kept."""
+_SHORT_FRAMES = 40
 
 
 def run_map(options: DemoOptions, settings: PlatformSettings) -> int:
@@ -51,9 +57,19 @@ def run_map(options: DemoOptions, settings: PlatformSettings) -> int:
         "codec": options.codec,
         "seed": options.seed,
     }
-    report = {"experiment": "map", "asked": asked, **map_figures(read_records(folder)), "paper": PAPER}
+    figures = map_figures(read_records(folder))
+    report = {"experiment": "map", "asked": asked, **figures, "paper": PAPER}
+    if options.data is None:  # a recording may not be at hand where the report is read
+        arguments = ["--robots", "1", "--frames", str(min(options.frame_count, _SHORT_FRAMES))]
+        report[RERUN] = rerun_plan(arguments, _bars(figures))
     show_page(finish_report(folder, report, map_page, settings, load_before))
     return code
+
+
+def _bars(figures: Mapping[str, Any]) -> Bars:
+    """Return what a short run must reach: no frame fewer, and the error of the worst robot."""
+    bars = {f"commands/{name}": (0.0, "<=") for name in ("lost", "twice")}
+    return {**bars, **{name: (max(figures[name]), "<=") for name in ("lost_frames", "ate_cm")}}
 
 
 def _write_truth(options: DemoOptions, folder: Path) -> dict[str, int]:
@@ -184,5 +200,5 @@ def _robot(records: Records, name: str, parameters: Mapping[str, Any]) -> dict[s
         "lost_frames": frames - len(trajectory),
         "fps_per_robot": round((len(planned) - 1) / sending_s, 3) if sending_s > 0 else None,
         **trajectory_figures(trajectory, truth),
-        "map_points": len(read_ply(folder / "map.ply")[0]),
+        "map_points": len(read_ply(folder / CLOUD)[0]) if (folder / CLOUD).exists() else None,
     }

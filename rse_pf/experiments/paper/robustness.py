@@ -23,6 +23,7 @@ from rse_pf.experiments.plots.figures import draw_robustness, require_matplotlib
 from rse_pf.experiments.results.bars import with_bars
 from rse_pf.experiments.results.markdown import about_run, failures, number, page, slashed, table
 from rse_pf.experiments.results.records import CommandRecord, Event, Records, parameters_of, read_records
+from rse_pf.experiments.results.rerun import RERUN, rerun_plan
 from rse_pf.experiments.results.result_folder import RUN_FILES, finish_report, fresh_folder, load_average
 from rse_pf.experiments.results.summary import (
     PAPER,
@@ -49,6 +50,7 @@ FIGURE = "robustness.png"
 _BEFORE_FAULT_S = 4.0
 _JOIN_TIMEOUT_S = 60.0
 _NO_DELAY = "none"
+_SHORT, _SHORT_ROBOTS = ("kill", "wifi"), "20"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -89,11 +91,19 @@ def run_robustness(options: RobustnessOptions, settings: PlatformSettings) -> in
         "runs": runs,
         "generator": {name: generator_of(each) for name, each in records.items()},
         "paper": PAPER,
+        RERUN: _rerun_plan(options.only or tuple(SCENARIOS)),
     }
     finish_report(folder, report, robustness_page, settings, load_before)
     draw_robustness(folder / FIGURE, records, runs)
     show(f"wrote {FIGURE}, report.json, report.md and the raw records to {options.out}")
     return int(any(run["commands"]["lost"] or run["commands"]["twice"] for run in runs.values()))
+
+
+def _rerun_plan(faults: Sequence[str]) -> dict[str, Any]:
+    """Return the short form: two faults, or the first, with fewer robots."""
+    short = [name for name in _SHORT if name in faults] or [faults[0]]
+    bars = {f"{name}/{figure}": bar for name in short for figure, bar in BARS.get(name, _NO_LOSS).items()}
+    return rerun_plan(["--robots", _SHORT_ROBOTS, "--only", ",".join(short)], bars)
 
 
 async def _run(

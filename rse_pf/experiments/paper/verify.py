@@ -18,7 +18,7 @@ from rse_pf.experiments.paper.elasticity_as_cloud import KIND as AS_CLOUD
 from rse_pf.experiments.paper.elasticity_as_cloud import as_cloud_figures
 from rse_pf.experiments.paper.latency import latency_figures
 from rse_pf.experiments.paper.live_map import live_experiment_figures
-from rse_pf.experiments.paper.mapping import map_figures
+from rse_pf.experiments.paper.mapping import CLOUD, map_figures
 from rse_pf.experiments.paper.robustness import robustness_figures
 from rse_pf.experiments.results.live_faults import live_fault_figures
 from rse_pf.experiments.results.records import (
@@ -29,9 +29,18 @@ from rse_pf.experiments.results.records import (
     read_records,
 )
 
-__all__ = ["FigureCheck", "broken_invariants", "figures_of", "run_folders", "verify"]
+__all__ = [
+    "FigureCheck",
+    "broken_invariants",
+    "figures_of",
+    "read_report",
+    "report_folders",
+    "run_folders",
+    "verify",
+]
 
 _CLOCK_MS = 0.01
+_OF_CLOUDS = "map_points"
 _MAX_SHOWN = 60
 _OF_FRAMES = {"map", "live", "live-fault"}
 """Kinds whose robots plan frames, not commands."""
@@ -95,11 +104,10 @@ def verify(folder: Path) -> list[FigureCheck]:
     Raises:
         UsageError: The folder holds no run, or a record or the report cannot be read.
     """
-    if not (folder / "report.json").exists():
-        parts = [report.parent for report in sorted(folder.glob("*/report.json"))]
-        if parts:
-            return [_prefixed(part.name, check) for part in parts for check in verify(part)]
-    report = _read_report(folder)
+    parts = report_folders(folder)
+    if parts != [folder]:
+        return [_prefixed(part.name, check) for part in parts for check in verify(part)]
+    report = read_report(folder)
     found: list[FigureCheck] = []
     runs = run_folders(folder)
     for name, part in runs.items():
@@ -112,6 +120,12 @@ def verify(folder: Path) -> list[FigureCheck]:
         for name in sorted(set(report.get("runs", {})) - set(runs)):
             found.append(FigureCheck(what=f"{name}: run", agrees=False, detail="has no records"))
     return found
+
+
+def report_folders(folder: Path) -> list[Path]:
+    """Return the experiments in *folder*: itself, or those below it that have a report."""
+    below = [report.parent for report in sorted(folder.glob("*/report.json"))]
+    return [folder] if (folder / "report.json").exists() or not below else below
 
 
 def broken_invariants(records: Records) -> dict[str, str]:
@@ -143,6 +157,8 @@ def _verify_run(folder: Path, reported: Mapping[str, Any]) -> Iterator[FigureChe
     for path, value in _leaves(figures):
         if partial and path[0] in _FROM_COMMANDS:
             yield FigureCheck(what="/".join(path), agrees=None, detail=f"{COMMANDS} is not kept here")
+        elif path == (_OF_CLOUDS,) and None in value:
+            yield FigureCheck(what=_OF_CLOUDS, agrees=None, detail=f"{CLOUD} is not kept here")
         else:
             yield _compare(reported, path, value)
     for name, broken in broken_invariants(records).items():
@@ -201,7 +217,8 @@ def _leaves(
             yield path, value
 
 
-def _read_report(folder: Path) -> dict[str, Any]:
+def read_report(folder: Path) -> dict[str, Any]:
+    """Return the report in *folder*; raises UsageError."""
     path = folder / "report.json"
     try:
         report = json.loads(path.read_text(encoding="utf-8"))

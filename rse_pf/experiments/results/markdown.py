@@ -47,7 +47,7 @@ def failures(report: Mapping[str, Any]) -> str:
 
 
 def about_run(report: Mapping[str, Any]) -> str:
-    """Return the paragraph on load, machine, versions, settings and load generators of a run."""
+    """Return the paragraph on commit, load, machine, versions, settings and load generators of a run."""
     about = report["environment"]
     versions = ", ".join(f"{name} {version}" for name, version in about["versions"].items())
     generators = "".join(
@@ -55,8 +55,10 @@ def about_run(report: Mapping[str, Any]) -> str:
         f"core, {each['wrong_poses']} wrong poses."
         for name, each in (report.get("generator") or {}).items()
     )
+    commit = f"Commit {about['commit']}. " if about.get("commit") else ""
     return (
-        f"Load average before the run {about['load_average']}, after it {about['load_average_after']}; "
-        f"{about['cores']} cores, {about['system']}, Python {about['python']}; {versions}; settings digest "
+        f"{commit}Load average before the run {about['load_average']}, "
+        f"after it {about['load_average_after']}; {about['cores']} cores, {about['system']}, "
+        f"Python {about['python']}; {versions}; settings digest "
         f"{about['settings_digest']}.{generators}"
     )

@@ -9,6 +9,7 @@ import json
 import os
 import platform
 import shutil
+import subprocess
 from collections.abc import Callable, Mapping, Sequence
 from fnmatch import fnmatchcase
 from importlib import metadata
@@ -21,6 +22,7 @@ from rse_pf.experiments.results.records import COMMANDS, EVENTS, SAMPLES
 
 __all__ = [
     "RUN_FILES",
+    "commit_of",
     "environment",
     "finish_report",
     "fresh_folder",
@@ -31,6 +33,8 @@ __all__ = [
 
 RUN_FILES = ("report.json", "report.md", COMMANDS, EVENTS, SAMPLES, "platform")
 """What every experiment and the demo write."""
+_CHECKOUT = Path(__file__).resolve().parents[3]
+_GIT_S = 10.0
 _PACKAGES = (
     "rse-pf",
     "numpy",
@@ -92,7 +96,7 @@ def finish_report(
 
 
 def environment(settings: PlatformSettings) -> dict[str, Any]:
-    """Return what a reader needs to compare two runs: machine, versions, load and settings."""
+    """Return what a reader needs to compare two runs: commit, machine, versions, load and settings."""
     versions = {}
     for name in _PACKAGES:
         try:
@@ -100,6 +104,7 @@ def environment(settings: PlatformSettings) -> dict[str, Any]:
         except metadata.PackageNotFoundError:
             continue
     return {
+        "commit": commit_of(_CHECKOUT),
         "python": platform.python_version(),
         "system": f"{platform.system()} {platform.release()}",
         "cores": os.cpu_count(),
@@ -107,6 +112,20 @@ def environment(settings: PlatformSettings) -> dict[str, Any]:
         "settings_digest": settings.digest(),
         "versions": versions,
     }
+
+
+def commit_of(checkout: Path) -> str:
+    """Return the commit of *checkout*, with ``+changes`` if its files differ; empty if it is no checkout."""
+    if not (checkout / ".git").exists():
+        return ""
+    command = ["git", "-C", str(checkout), "describe", "--always", "--exclude=*", "--abbrev=40"]
+    try:
+        asked = subprocess.run(
+            [*command, "--dirty=+changes"], capture_output=True, text=True, timeout=_GIT_S, check=False
+        )
+    except (OSError, subprocess.TimeoutExpired):
+        return ""
+    return asked.stdout.strip() if asked.returncode == 0 else ""
 
 
 def load_average() -> list[float]:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -12,7 +14,7 @@ from rse_pf.errors import UsageError
 from rse_pf.experiments.demo.run import DemoOptions, run_demo
 from rse_pf.experiments.load.run import run_swarm
 from rse_pf.experiments.load.swarm import SwarmOptions
-from rse_pf.experiments.results.result_folder import RUN_FILES, finish_report, fresh_folder
+from rse_pf.experiments.results.result_folder import RUN_FILES, commit_of, finish_report, fresh_folder
 
 
 def test_all_results_of_an_earlier_run_are_removed(tmp_path):
@@ -106,3 +108,19 @@ def test_demo_and_swarm_refuse_a_folder_with_files_that_they_did_not_write(tmp_p
         start(tmp_path)
 
     assert sorted(each.name for each in tmp_path.iterdir()) == sorted(["events.jsonl", "report.json", other])
+
+
+def test_the_commit_of_a_checkout_is_named_and_whether_files_differ(tmp_path):
+    def git(*words):
+        subprocess.run(["git", "-C", str(tmp_path), *words], check=True, capture_output=True)
+
+    assert commit_of(tmp_path) == ""
+    git("init", "-q")
+    (tmp_path / "a").write_text("one")
+    git("add", "a")
+    git("-c", "user.name=n", "-c", "user.email=e", "commit", "-q", "-m", "First")
+    clean = commit_of(tmp_path)
+    (tmp_path / "a").write_text("two")
+
+    assert re.fullmatch("[0-9a-f]{40}", clean)
+    assert commit_of(tmp_path) == f"{clean}+changes"

@@ -1,0 +1,70 @@
+"""The short form in a report: which of its figures another run reaches, with the slack of the report."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from rse_pf.errors import UsageError
+from rse_pf.experiments.results.rerun import RERUN, rerun_arguments, rerun_figures, rerun_plan
+
+WIFI = "wifi/first_answer_after_heal_s/p99"
+
+
+def report(first_answer_s: float | None, lost: int = 0, **plan: Any) -> dict[str, Any]:
+    run = {"commands": {"lost": lost}, "first_answer_after_heal_s": {"p99": first_answer_s}}
+    bars = {WIFI: (2.0, "<="), "wifi/commands/lost": (0.0, "<=")}
+    made = rerun_plan(["--robots", "20", "--only", "wifi"], bars)
+    return {"experiment": "robustness", "runs": {"wifi": run}, RERUN: {**made, **plan}}
+
+
+def missed(shipped: dict[str, Any], short: dict[str, Any]) -> list[str]:
+    return [figure.name for figure in rerun_figures(shipped, short) if not figure.is_reached]
+
+
+def test_a_slower_machine_reaches_the_figures_with_slack_and_slower_code_does_not():
+    shipped = report(1.381)
+
+    assert missed(shipped, report(2.9)) == []
+    assert missed(shipped, report(7.2)) == [WIFI]
+
+
+def test_a_missed_figure_is_named_with_what_it_must_be_and_what_was_shipped():
+    (line, _) = map(str, rerun_figures(report(1.381), report(7.2)))
+
+    assert line == f"MISSED   {WIFI}  7.2 now, must be <= 3; 1.381 in the report"
+
+
+def test_slack_allows_no_lost_command_and_no_missing_figure():
+    assert missed(report(1.0), report(1.0, lost=1)) == ["wifi/commands/lost"]
+    assert missed(report(1.0), report(None)) == [WIFI]
+    assert missed(report(1.0), {"runs": {}}) == [WIFI, "wifi/commands/lost"]
+
+
+def test_of_a_figure_for_each_robot_the_worst_counts():
+    plan = rerun_plan([], {"ate_cm": (1.0, "<="), "scale_outs": (2.0, ">=")})
+    shipped = {"experiment": "map", "ate_cm": [0.8, 1.0], "scale_outs": 4, RERUN: plan}
+
+    assert missed(shipped, {"ate_cm": [0.5, 1.4], "scale_outs": 2}) == []
+    assert missed(shipped, {"ate_cm": [0.5, 1.6], "scale_outs": 1}) == ["ate_cm", "scale_outs"]
+    assert missed(shipped, {"ate_cm": [0.5, None], "scale_outs": 2}) == ["ate_cm"]
+
+
+def test_the_arguments_of_the_short_run_are_those_of_the_report():
+    assert rerun_arguments(report(1.0)) == ["robustness", "--robots", "20", "--only", "wifi"]
+
+
+@pytest.mark.parametrize(
+    "plan", [{"slack": 0.5}, {"slack": "much"}, {"bars": {WIFI: "< 2"}}, {"bars": 7}, {"bars": {WIFI: 2.0}}]
+)
+def test_a_damaged_plan_is_one_line(plan: dict[str, Any]):
+    with pytest.raises(UsageError, match="short form in the report is damaged"):
+        rerun_figures(report(1.0, **plan), report(1.0))
+
+
+def test_a_report_without_a_plan_says_what_to_do():
+    with pytest.raises(UsageError, match="no short form") as refused:
+        rerun_arguments({"experiment": "robustness"})
+
+    assert "run the experiment again" in str(refused.value.hint)
