@@ -79,28 +79,30 @@ class SpareFiles:
     def replace(self, path: Path, text: bytes) -> None:
         """Replace *path* by a spare file with *text* and perhaps spaces after it, in one step and durably.
 
+        Without a spare that is large enough, *path* is overwritten in the blocks that it has, which is not
+        one step: a reader may find a part of the text, and has to read again.
+
         Raises:
-            OSError: No spare is large enough; *path* is as it was.
+            OSError: The text is longer than these blocks, too; *path* is as it was.
         """
         with self._locked():
-            spare = max(self._folder.glob(f"{_SPARE}*"), key=_allocated, default=None)
-            if spare is None or _allocated(spare) < len(text):
+            spare = max(self._folder.glob(f"{_SPARE}*"), key=_allocated, default=path)
+            if _allocated(spare) < len(text):
+                spare = path
+            if _allocated(spare) < len(text):
                 raise OSError(errno.ENOSPC, "no space left, and none in the reserve")
-            with spare.open("r+b", buffering=0) as file:
-                length = os.fstat(file.fileno()).st_size
-                content = memoryview(text.ljust(length))
-                while content:
-                    content = content[file.write(content) :]
-                os.fsync(file.fileno())
-            _exchange(spare, path)
+            _overwrite(spare, text)
+            if spare != path:
+                _exchange(spare, path)
         sync_folder(path.parent)
 
     @contextlib.contextmanager
     def _locked(self) -> Iterator[None]:
         try:
             handle = os.open(self._folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-        except FileNotFoundError as error:
-            raise OSError(errno.ENOSPC, "no space left, and there is no reserve") from error
+        except FileNotFoundError:  # there never was a reserve: other writers hold the caller's lock
+            yield
+            return
         try:
             fcntl.flock(handle, fcntl.LOCK_EX)
             yield
@@ -128,6 +130,15 @@ def _allocated(path: Path) -> int:
         return path.stat().st_blocks * _BLOCK_BYTES
     except FileNotFoundError:
         return 0
+
+
+def _overwrite(path: Path, text: bytes) -> None:
+    """Write *text* over the content of *path*, and spaces over what is left of it."""
+    with path.open("r+b", buffering=0) as file:
+        content = memoryview(text.ljust(os.fstat(file.fileno()).st_size))
+        while content:
+            content = content[file.write(content) :]
+        os.fsync(file.fileno())
 
 
 def _exchange(spare: Path, path: Path) -> None:

@@ -38,17 +38,18 @@ def test_a_deny_list_can_be_changed_on_a_full_disk_as_often_as_an_operator_likes
     assert [each.robot for each in again.deny_list().disabled] == ["last"]
 
 
-def test_without_spare_files_a_full_disk_is_an_error_and_the_file_stays(small_disk: Disk, fill: Fill):
+def test_without_spare_files_a_robot_can_be_disabled_in_the_blocks_of_the_list(small_disk: Disk, fill: Fill):
     disk = small_disk("4m")
-    path = disk / "list.json"
-    path.write_text("[]")
+    access = AccessControlStore(DirectoryStore(disk, SpareFiles(disk / "reserve")))
+    access.create_missing()
     fill(disk)
 
-    with pytest.raises(OSError, match="no reserve") as caught:
-        SpareFiles(disk / "reserve").replace(path, b"[1]")
+    for number in range(10):
+        access.change_deny_list(lambda denied, name=f"r-{number}": denied.with_robot("t", name, 1.0))
+    access.change_deny_list(lambda denied: DenyList())
+    access.change_deny_list(lambda denied: denied.with_robot("t", "last", 1.0))
 
-    assert caught.value.errno == errno.ENOSPC
-    assert path.read_text() == "[]"
+    assert [each.robot for each in access.deny_list().disabled] == ["last"]
 
 
 def test_a_text_that_is_too_long_for_the_reserve_changes_nothing(small_disk: Disk, fill: Fill):
@@ -59,9 +60,10 @@ def test_a_text_that_is_too_long_for_the_reserve_changes_nothing(small_disk: Dis
     spares.refill(8192)
     fill(disk)
 
-    with pytest.raises(OSError, match="none in the reserve"):
+    with pytest.raises(OSError, match="none in the reserve") as caught:
         spares.replace(path, b" " * 8193)
 
+    assert caught.value.errno == errno.ENOSPC
     assert path.read_text() == "[]"
 
 

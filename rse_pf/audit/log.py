@@ -61,6 +61,7 @@ __all__ = [
     "lines_of",
     "newest_head",
     "record_once",
+    "release_reserves",
 ]
 
 CONTROL_PLANE, OPERATOR = "control-plane", "operator"
@@ -443,6 +444,21 @@ def record_once(
             f"cannot write the audit log {who} in {folder}: the disk is full",
             hint="free some space; the log then records that an entry is missing",
         )
+
+
+def release_reserves(folder: Path) -> list[str]:
+    """Give back the blocks behind logs whose writers were killed, and return the names of these logs."""
+    released = []
+    for who in set(chain_names(folder)) - {CONTROL_PLANE, OPERATOR}:
+        with contextlib.suppress(OSError), (folder / f"{who}.jsonl").open("r+b") as file:
+            size = os.fstat(file.fileno()).st_size
+            if allocated_bytes(file.fileno()) - size < RESERVE_BYTES // 4:
+                continue
+            with (folder / f".{who}.lock").open("r+b") as lock:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # raises while there is a writer
+                file.truncate(os.fstat(file.fileno()).st_size)
+                released.append(who)
+    return sorted(released)
 
 
 def audit_folder(state: Path) -> Path:

@@ -14,7 +14,15 @@ from typing import Any
 import pytest
 
 from rse_pf.audit.chain import HEADS, Head
-from rse_pf.audit.log import AuditLog, chain_names, files_of, newest_head, record_once
+from rse_pf.audit.log import (
+    RESERVE_BYTES,
+    AuditLog,
+    chain_names,
+    files_of,
+    newest_head,
+    record_once,
+    release_reserves,
+)
 from rse_pf.audit.verify import check_chain, check_folder, entries_of
 from rse_pf.errors import ConfigurationError
 
@@ -344,7 +352,42 @@ def test_an_operator_is_told_that_an_action_could_not_be_recorded(
     write(folder, 1)
     (folder / ".operator.lock").touch()
     (folder / "operator.jsonl").touch()
-    fill(folder)
+    hog = fill(folder)
 
     with pytest.raises(ConfigurationError, match="the disk is full"):
         record_once(folder, "operator", "robot.disabled", "robot-1", wall_clock=lambda: 1e9)
+    hog.unlink()
+    record_once(folder, "operator", "robot.enabled", "robot-1", wall_clock=lambda: 1e9)
+
+    entries = [(entry.action, entry.detail) for entry in entries_of(files_of(folder, "operator"))]
+    assert [action for action, _ in entries] == ["robot.enabled", "log.gap"]
+    assert entries[1][1] == {"entries": 1}
+    assert [verdict.problem for verdict in check_folder(folder)] == ["", ""]
+
+
+def test_the_blocks_behind_the_log_of_a_killed_writer_are_given_back_and_no_other(
+    small_disk: Callable[[str], Path],
+):
+    folder = small_disk("4m")
+    code = (
+        "import os, sys, time; from pathlib import Path; from rse_pf.audit.log import AuditLog\n"
+        "log = AuditLog(Path(sys.argv[1]), 'killed', wall_clock=time.time).open()\n"
+        "log.record('server.ready'); log.flush(); os.kill(os.getpid(), 9)"
+    )
+    subprocess.run([sys.executable, "-c", code, str(folder)], check=False)
+    write(folder, 1, who="operator")
+    log = log_in(folder, "living").open()
+    log.record("server.ready")
+    log.flush()
+
+    def reserved(who: str) -> bool:
+        return (folder / f"{who}.jsonl").stat().st_blocks * 512 > RESERVE_BYTES // 2
+
+    assert all(map(reserved, ("killed", "living", "operator")))
+
+    assert release_reserves(folder) == ["killed"]
+
+    assert [reserved(who) for who in ("killed", "living", "operator")] == [False, True, True]
+    log.close()
+    assert not reserved("living"), "a writer that ends in order gives them back itself"
+    assert [verdict.problem for verdict in check_folder(folder)] == [""] * 3

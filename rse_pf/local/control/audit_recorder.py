@@ -24,6 +24,7 @@ from rse_pf.audit.log import (
     chain_names,
     grown_heads,
     record_once,
+    release_reserves,
 )
 from rse_pf.errors import ConfigurationError
 
@@ -65,7 +66,8 @@ class PlatformAudit:
             await asyncio.to_thread(self.record_heads)
 
     def record_heads(self) -> None:
-        """Record the heads of the other chains that have grown."""
+        """Record the heads of the other chains that have grown; take the space of killed writers."""
+        release_reserves(self.folder)
         others = [who for who in chain_names(self.folder) if who != CONTROL_PLANE]
         grown = grown_heads(self.folder, others, self._recorded)
         names = list(grown)
