@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from rse_pf.audit.chain import REFUSAL_BURST, Entry
 from rse_pf.audit.log import AuditLog, files_of
 from rse_pf.audit.verify import check_folder, entries_of
 from rse_pf.data_server.app import DataServer
+from rse_pf.data_server.server import _write_line
 from rse_pf.maps.format import MapVersion, encode_map
 from rse_pf.object_store import MemoryStore, digest_of
 
@@ -104,3 +106,12 @@ def test_a_refused_token_is_recorded_with_its_address_and_what_it_claims(recorde
     assert claimed == {"source": "192.0.2.7", "claimed_robot": "robot-9", "claimed_tenant": "acme"}
     assert {name: recorded.lines[-1][name] for name in claimed} == claimed
     assert "robot" not in recorded.lines[-1], "nobody verified the name"
+
+
+def test_a_line_of_the_log_has_its_time_under_the_name_that_all_logs_use(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    _write_line({"event": "request"})
+
+    line = json.loads(capsys.readouterr().err)
+    assert (abs(line["time"] - time.time()) < 60, line["event"]) == (True, "request")
