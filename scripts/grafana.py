@@ -33,8 +33,10 @@ def all_metrics() -> list[Metric]:
     for counter in (worker.shed, worker.handshakes, worker.closed):
         counter["example"] += 1
     worker.gauges.update(dict.fromkeys(GAUGE_HELP, 0.0))
-    page = federated({"server-1": render(merge([worker.snapshot()])).decode("utf-8")}).decode("utf-8")
-    return sorted(text_string_to_metric_families(page), key=lambda each: (_ORDER[each.type], each.name))
+    disk = {"folder": "state", "free_bytes": 0, "total_bytes": 0}
+    page = federated({"server-1": render(merge([worker.snapshot()])).decode("utf-8")}, [disk])
+    families = text_string_to_metric_families(page.decode("utf-8"))
+    return sorted(families, key=lambda each: (_ORDER[each.type], each.name))
 
 
 def dashboard(metrics: Sequence[Metric]) -> dict[str, Any]:
@@ -106,7 +108,8 @@ def _queries(metric: Metric) -> tuple[list[tuple[str, str]], str]:
         # It only grows: its growth is worth seeing, and processor seconds in a second are a share.
         unit = "percentunit" if metric.name.endswith("_s") else "ops"
         return [(f"rate({metric.name}{_HERE}[$__rate_interval])", legend)], unit
-    return [(f"{metric.name}{_HERE}", legend)], _unit(metric.name)
+    here = _HERE if any("server" in sample.labels for sample in metric.samples) else ""  # or of the platform
+    return [(f"{metric.name}{here}", legend)], _unit(metric.name)
 
 
 def _labels(metric: Metric) -> list[str]:

@@ -58,3 +58,10 @@ def test_a_new_metric_gets_a_panel() -> None:
 
     assert panels[-1]["title"] == "visits"
     assert "rse_pf_visits_total" in panels[-1]["targets"][0]["expr"]
+
+
+def test_the_disks_of_the_platform_are_shown_whatever_server_is_chosen() -> None:
+    panels = {panel["title"]: panel for panel in dashboard(all_metrics())["panels"]}
+
+    (target,) = panels["disk_free_bytes"]["targets"]
+    assert (target["expr"], target["legendFormat"]) == ("rse_pf_disk_free_bytes", "{{folder}}")
