@@ -170,7 +170,15 @@ def silent(count: int, only: list[str]) -> list[dict[str, Any]]:
         stack.callback(watcher.kill)
         assert watcher.stdout is not None
         watcher.stdout.readline()
-        pids = [*family(pid), cluster.scheduler_pid, *cluster.worker_pids]
+        deadline = time.monotonic() + 20
+        while True:
+            pids = [*family(pid), cluster.scheduler_pid, *cluster.worker_pids]
+            late = {"rse-pf live map", "batch-worker"} - set(listening(pids).values())
+            if not late or time.monotonic() > deadline:
+                break
+            time.sleep(0.2)
+        if late:
+            print(f"not listening: {', '.join(sorted(late))}", flush=True)
         for port, owner in sorted(listening(pids).items()):
             if not only or owner in only:
                 row = {"port": port, "owner": owner, **attack(port, count, pids, url, token)}
