@@ -1,6 +1,6 @@
 """The network of a hundred robots is gone for a while: when each has an answer, and what the firewall saw.
 
-    python -m benchmarks.cloud.network_gone [--robots 100] [--gone 5,30,120] [--runs 1] [--out FILE]
+    python -m benchmarks.cloud.network_gone [--robots N] [--gone S,S] [--case CASE] [--runs N] [--out FILE]
 
 Three network namespaces, which are deleted at the end: robots, a router, and a server with a local platform
 behind a relay that plays the web firewall.  Two cases for each time: the link of the robots is down, or the
@@ -187,7 +187,7 @@ async def drive() -> None:
 # --- outside -----------------------------------------------------------------------------------------
 
 
-def measure(*, robots: int, gone: list[float], runs: int) -> list[dict[str, Any]]:
+def measure(*, robots: int, gone: list[float], runs: int, cases: list[str]) -> list[dict[str, Any]]:
     """Return a row for each case, time and run."""
     rows: list[dict[str, Any]] = []
     with machines() as made, ExitStack() as ends:
@@ -199,7 +199,7 @@ def measure(*, robots: int, gone: list[float], runs: int) -> list[dict[str, Any]
         _say(fleet, told.strip())
         assert _line(fleet).strip() == "ready"
         for number in range(runs):
-            for case in CASES:
+            for case in cases:
                 for gone_s in gone:
                     row = one(made, server, fleet, case, gone_s)
                     rows.append({"case": case, "gone_s": gone_s, "run": number + 1, "robots": robots, **row})
@@ -259,6 +259,7 @@ def main() -> int:
     parser.add_argument("--robots", type=int, default=100)
     parser.add_argument("--gone", default="5,30,120", metavar="S,S", help="seconds (default: 5,30,120)")
     parser.add_argument("--runs", type=int, default=1)
+    parser.add_argument("--case", choices=CASES, help="only this one")
     parser.add_argument("--out", type=Path)
     parser.add_argument("--serve", action="store_true", help=argparse.SUPPRESS)
     parser.add_argument("--drive", action="store_true", help=argparse.SUPPRESS)
@@ -267,7 +268,9 @@ def main() -> int:
         asyncio.run(serve(args.robots) if args.serve else drive())
         return 0
     gone = [float(each) for each in args.gone.split(",")]
-    rows = measure(robots=args.robots, gone=gone, runs=args.runs)
+    rows = measure(
+        robots=args.robots, gone=gone, runs=args.runs, cases=[args.case] if args.case else [*CASES]
+    )
     machine = f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}"
     if args.out is not None:
         args.out.write_text(json.dumps({"machine": machine, "rows": rows}, indent=1) + "\n", encoding="utf-8")
