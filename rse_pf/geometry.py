@@ -23,6 +23,8 @@ __all__ = [
     "from_quaternion",
     "inverse",
     "pose_difference",
+    "rigid",
+    "rigid_many",
     "rotation_angle_deg",
     "skew",
     "to_quaternion",
@@ -30,6 +32,13 @@ __all__ = [
 ]
 
 Array = npt.NDArray[np.float64]
+
+_ROTATION_TOLERANCE = 2e-3
+"""Of each number of R^T R - I: a rotation whose numbers have three decimals is off by up to 1.8e-3."""
+_EXACT = 1e-9
+"""A matrix that is off by less is left as it is, so that what was written is read to the byte."""
+_LAST_ROW_TOLERANCE = 1e-5
+_MAX_M = 1e9
 
 # No sensor of a robot is wider; a larger value is taken for a mistake in the unit.
 _MAX_IMAGE_PX = 16384
@@ -108,6 +117,57 @@ def inverse(T_a_b: Array) -> Array:
     T_b_a[:3, :3] = rotation
     T_b_a[:3, 3] = -rotation @ T_a_b[:3, 3]
     return T_b_a
+
+
+def rigid(T: Array, max_m: float = _MAX_M) -> Array | None:
+    """Return a ``(4, 4)`` matrix as a rigid motion, None if it is none.
+
+    The one rule of the platform for a rotation, applied where a pose arrives: no number of ``R^T R - I`` is
+    beyond 2e-3, and ``det R > 0``.  A matrix that is off by more than 1e-9 gets the nearest rotation, so that
+    nothing that is computed from accepted poses is refused later.
+
+    Args:
+        T: Any ``(4, 4)`` numbers, NaN and infinity included.
+        max_m: Largest number of the translation, metres.
+    """
+    if T.shape != (4, 4):
+        return None
+    # Twenty times faster than by arrays of this size; `rigid_many` decides the same.
+    (a, b, c, x), (d, e, f, y), (g, h, i, z), (s, t, u, v) = T.tolist()
+    off = max(
+        abs(a * a + d * d + g * g - 1.0), abs(b * b + e * e + h * h - 1.0), abs(c * c + f * f + i * i - 1.0),
+        abs(a * b + d * e + g * h), abs(a * c + d * f + g * i), abs(b * c + e * f + h * i),
+    )  # fmt: skip
+    if off <= _EXACT and s == t == u == 0.0 and v == 1.0 and abs(x) <= max_m and abs(y) <= max_m:
+        determinant = a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)
+        if abs(z) <= max_m and determinant > 0.0:
+            return T
+    found = rigid_many(T[None], max_m)
+    return None if found is None else found[0]
+
+
+def rigid_many(T: Array, max_m: float = _MAX_M) -> Array | None:
+    """Return what `rigid` does of each of ``(n, 4, 4)`` matrices; None if one of them is no rigid motion."""
+    rotations = T[:, :3, :3]
+    with np.errstate(over="ignore", invalid="ignore"):
+        gram = np.swapaxes(rotations, 1, 2) @ rotations
+        off = np.abs(gram - np.eye(3)).max(axis=(1, 2))
+        off_last = np.abs(T[:, 3] - (0.0, 0.0, 0.0, 1.0)).max(axis=1)
+    # A NaN makes each comparison false.
+    are_rigid = (
+        (off <= _ROTATION_TOLERANCE) & (off_last <= _LAST_ROW_TOLERANCE)
+        & (np.abs(T[:, :3, 3]) <= max_m).all(axis=1)
+    )  # fmt: skip
+    if not are_rigid.all() or (np.linalg.det(rotations) <= 0.0).any():
+        return None
+    rows = np.flatnonzero((off > _EXACT) | (off_last > 0.0))
+    if not len(rows):
+        return T
+    made = T.astype(np.float64)
+    U, _, Vt = np.linalg.svd(rotations[rows])
+    made[rows, :3, :3] = U @ Vt
+    made[rows, 3] = (0.0, 0.0, 0.0, 1.0)
+    return made
 
 
 def skew(v: npt.ArrayLike) -> Array:

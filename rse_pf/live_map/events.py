@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 
 from rse_pf.errors import BadRequest, message_of
-from rse_pf.geometry import Array
+from rse_pf.geometry import Array, rigid
 
 __all__ = [
     "Event",
@@ -26,11 +26,11 @@ __all__ = [
     "RobotLeft",
     "StartKeyframe",
     "StartLink",
-    "check_rigid",
     "decode_events",
     "encode_events",
     "matrix_bytes",
     "matrix_of",
+    "pose_bytes",
 ]
 
 _MAX_M = 1e6
@@ -177,12 +177,16 @@ def matrix_of(data: bytes, rows: int, columns: int) -> Array:
     return matrix
 
 
-def check_rigid(T: Array) -> None:
-    """Refuse a ``(4, 4)`` matrix that is no rigid motion of sensible size, metres; raises BadRequest."""
-    R = T[:3, :3]
-    is_rigid = (
-        bool((np.abs(T) <= _MAX_M).all()) and np.array_equal(T[3], (0.0, 0.0, 0.0, 1.0))
-        and float(np.abs(R @ R.T - np.eye(3)).max()) <= 1e-4 and float(np.linalg.det(R)) > 0
-    )  # fmt: skip
-    if not is_rigid:
-        raise BadRequest("T_odom_camera is not a rigid motion", hint="send a (4, 4) matrix of finite numbers")
+def pose_bytes(numbers: Array) -> bytes:
+    """Return 16 numbers, row-major, metres, as `matrix_bytes` of a rigid motion: with the nearest rotation.
+
+    Raises:
+        BadRequest: They are no rigid motion of sensible size, by `geometry.rigid`.
+    """
+    T = rigid(numbers.reshape(4, 4), _MAX_M) if numbers.size == 16 else None
+    if T is None:
+        raise BadRequest(
+            "T_odom_camera is no pose: it takes 16 numbers of a rotation and a translation",
+            hint="send it row after row with at least three decimals, the last row 0 0 0 1",
+        )
+    return matrix_bytes(T)

@@ -25,9 +25,9 @@ from rse_pf.live_map.events import (
     Optimised,
     RobotForgotten,
     RobotLeft,
-    check_rigid,
     matrix_bytes,
     matrix_of,
+    pose_bytes,
 )
 from rse_pf.live_map.feature_parts import FeatureParts, SnapshotParts
 from rse_pf.live_map.graph import Graph, LiveKeyframe, LiveLink, Segment, camera_of, variances_of
@@ -180,7 +180,7 @@ class LiveMap:
             )
         if not abs(event.timestamp_s) <= _MAX_TIME_S:
             raise BadRequest("the time of the keyframe is absurd", hint="send seconds since 1970")
-        check_rigid(matrix_of(event.T_odom_camera, 4, 4))
+        pose_bytes(matrix_of(event.T_odom_camera, 4, 4))
         try:
             camera = camera_of(event.camera)
         except InvalidCamera as error:

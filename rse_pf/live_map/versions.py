@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
+from collections.abc import Iterator
 from itertools import pairwise
 
 import numpy as np
 
+from rse_pf.errors import BadMessage, BadRequest, InternalError, LimitExceeded
 from rse_pf.geometry import Array, inverse
 from rse_pf.live_map.events import CameraNumbers, MapStarted, StartKeyframe, StartLink, matrix_bytes
 from rse_pf.live_map.graph import Graph, Segment
@@ -14,16 +17,38 @@ from rse_pf.live_map.keyframe_code import decode_features, encode_features
 from rse_pf.live_map.options import LiveMapOptions
 from rse_pf.live_map.smoother import edges_of
 from rse_pf.maps.format import Edge, EdgeKind, Keyframe, MapVersion
-from rse_pf.services.mapping.pose_graph import PoseGraph
+from rse_pf.services.mapping.pose_graph import PoseGraph, is_positive_definite
 
-__all__ = ["started_from", "version_of", "whole_graph"]
+__all__ = ["errors_of_maps", "started_from", "version_of", "whole_graph"]
+
+
+@contextlib.contextmanager
+def errors_of_maps(what: str) -> Iterator[None]:
+    """Raise what is wrong with a map that is kept as InternalError: who asks for it has not caused it.
+
+    Args:
+        what: Begin of the message, such as "the live map cannot be published".
+    """
+    try:
+        yield
+    except (BadRequest, BadMessage, LimitExceeded) as error:
+        raise InternalError(f"{what}: {error.message}", hint=error.hint) from error
 
 
 def started_from(version: MapVersion, source: str) -> MapStarted:
     """Return the event by which a live map starts from *version*, which is called *source*.
 
     Features without a depth are left out; the cloud of points is not taken over.
+
+    Raises:
+        InternalError: An edge of the version has no usable information.
     """
+    information = np.array([each.information for each in version.edges]).reshape(-1, 6, 6)
+    if not is_positive_definite(information):
+        raise InternalError(
+            f"{source} has an edge whose information is not positive definite",
+            hint="start from another version, or from an empty map",
+        )
     row = {keyframe.id: number for number, keyframe in enumerate(version.keyframes)}
     return MapStarted(
         source=source,
@@ -49,7 +74,15 @@ def version_of(graph: Graph, options: LiveMapOptions) -> MapVersion:
     """Return the keyframes that are connected with the map's frame and keep their features, and their edges.
 
     Odometry leads from each such keyframe of a segment to the next one.
+
+    Raises:
+        InternalError: Something that the map holds does not fit into a version.
     """
+    with errors_of_maps("the live map cannot be published"):
+        return _version_of(graph, options)
+
+
+def _version_of(graph: Graph, options: LiveMapOptions) -> MapVersion:
     ids = [i for i in _aligned(graph) if graph.held[i]]
     keyframes = []
     for i in ids:

@@ -29,7 +29,7 @@ from rse_pf.budget import (
     small_text,
 )
 from rse_pf.errors import BadMessage, BadRequest, LimitExceeded, RsePfError, message_of
-from rse_pf.geometry import Array, Camera
+from rse_pf.geometry import Array, Camera, rigid
 
 __all__ = ["Edge", "EdgeKind", "Keyframe", "MapLimits", "MapVersion", "decode_map", "encode_map"]
 
@@ -100,7 +100,8 @@ class Keyframe:
             raise BadRequest(
                 f"keyframe {self.id} holds a number that is not finite, or absurd", hint="leave it out"
             )
-        _check_pose(f"keyframe {self.id}", self.T_world_camera)
+        # Frozen from here on.
+        object.__setattr__(self, "T_world_camera", _rigid(f"keyframe {self.id}", self.T_world_camera))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -118,7 +119,7 @@ class Edge:
     kind: EdgeKind = "odometry"
 
     def __post_init__(self) -> None:
-        _check_pose(f"edge {self.a}-{self.b}", self.T_a_b)
+        object.__setattr__(self, "T_a_b", _rigid(f"edge {self.a}-{self.b}", self.T_a_b))
         if self.information.shape != (6, 6) or not (np.abs(self.information) <= _MAX_INFORMATION).all():
             raise BadRequest(f"edge {self.a}-{self.b} has no (6, 6) information", hint="invert a covariance")
 
@@ -366,19 +367,12 @@ def _is_bounded(values: npt.NDArray[np.float32], most: float = _MAX_NUMBER) -> b
     return bool(values.min() >= -most and values.max() <= most)
 
 
-def _check_pose(what: str, T: Array) -> None:
-    if T.shape != (4, 4):
-        raise BadRequest(f"{what} has no rigid pose", hint="send (4, 4) matrices of finite numbers")
-    # Twenty times faster than by arrays of this size.
-    (a, b, c, x), (d, e, f, y), (g, h, i, z), last = T.tolist()
-    moved = max(abs(x), abs(y), abs(z)) if x == x and y == y and z == z else float("inf")
-    off_last = max(abs(last[0]), abs(last[1]), abs(last[2]))
-    if not (moved <= _MAX_NUMBER and off_last <= 1e-8 and abs(last[3] - 1.0) <= 1e-5):
-        raise BadRequest(f"{what} has no rigid pose", hint="send (4, 4) matrices of finite numbers")
-    off = (
-        a * a + b * b + c * c - 1.0, d * d + e * e + f * f - 1.0, g * g + h * h + i * i - 1.0,
-        a * d + b * e + c * f, a * g + b * h + c * i, d * g + e * h + f * i,
-    )  # fmt: skip
-    determinant = a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)
-    if not (all(abs(each) <= 1e-4 for each in off) and determinant > 0):
-        raise BadRequest(f"{what} holds a matrix that is not a rotation", hint="orthonormalise it")
+def _rigid(what: str, T: Array) -> Array:
+    """Return a pose with a rotation; raises BadRequest."""
+    made = rigid(T)
+    if made is None:
+        raise BadRequest(
+            f"{what} has no rigid pose, or a matrix that is not a rotation",
+            hint="send (4, 4) matrices of a rotation with at least three decimals and a finite translation",
+        )
+    return made

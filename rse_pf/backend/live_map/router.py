@@ -33,6 +33,7 @@ from rse_pf.errors import (
     RsePfError,
 )
 from rse_pf.identity import RobotId
+from rse_pf.live_map.events import pose_bytes
 from rse_pf.live_map.keyframe_code import decode_features
 from rse_pf.service import failure_of
 from rse_pf.wire import Failure, Result, as_type
@@ -67,8 +68,6 @@ _MAX_HELD_BYTES = 64 << 20
 """Size of all messages that wait for owners; while a store is slow, robots keep the others."""
 _BUSY_RETRY_MS = 500.0
 _IS_GARBAGE = (BadRequest.code, BadMessage.code, LimitExceeded.code, InvalidCamera.code)
-_RIGID = 1e-3
-"""How far a rotation may be from one, in any number of R^T R - I; float32 and decimal digits stay below."""
 
 
 class MapOwners(Protocol):
@@ -327,7 +326,7 @@ def _payload_of(request: Any) -> dict[str, Any]:
     if isinstance(request, KeyframeRequest):
         if not math.isfinite(request.timestamp_s):
             raise BadRequest("timestamp_s is no finite number", hint="send seconds")
-        payload["T_odom_camera"] = _rigid(request.T_odom_camera)
+        payload["T_odom_camera"] = pose_bytes(request.T_odom_camera)
     if isinstance(request, KeyframeRequest | LiveRelocalise):
         camera = request.camera
         decode_features(request.features, camera)  # the owner, which others share, decodes no garbage
@@ -335,23 +334,6 @@ def _payload_of(request: Any) -> dict[str, Any]:
     if isinstance(request, LiveStart):
         payload["from"] = payload.pop("source")
     return payload
-
-
-def _rigid(numbers: Any) -> bytes:
-    """Return a pose as its 16 float64, little-endian; raises BadRequest if it is none."""
-    if numbers.size == 16:
-        T = numbers.reshape(4, 4)
-        turn = T[:3, :3]
-        if (
-            np.abs(turn.T @ turn - np.eye(3)).max() < _RIGID
-            and np.linalg.det(turn) > 0
-            and np.array_equal(T[3], (0.0, 0.0, 0.0, 1.0))
-        ):
-            return bytes(T.astype("<f8").tobytes())
-    raise BadRequest(
-        "T_odom_camera is no pose: it takes 16 numbers of a rotation and a translation",
-        hint="send it row after row, the last row 0 0 0 1",
-    )
 
 
 def _with_arrays(values: Mapping[str, Any]) -> dict[str, Any]:

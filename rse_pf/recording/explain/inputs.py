@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from rse_pf.geometry import Array
+from rse_pf.geometry import Array, rigid
 from rse_pf.pnp import PnpOptions
 from rse_pf.recording.explain.causes import MatchesLike, PastCommand, ReplyLike, Timing
 from rse_pf.recording.explain.fitting import Matches
@@ -25,7 +25,6 @@ _USUAL_WIDTH_PX = 640.0
 _MAX_ROWS, _BLOCK_ROWS = 1000, 100
 _MAX_ABS = 1e6
 _MAX_HISTORY = 20
-_RIGID = 1e-3
 _MAX_S = 1e11
 _LONGEST_S = 1e5
 
@@ -75,13 +74,7 @@ def checked_pose(pose: Any) -> Array | None:
     if pose is None:
         return None
     T = np.asarray(pose, dtype=np.float64)
-    if T.size != 16:
-        return None
-    T = T.reshape(4, 4)
-    rotation = T[:3, :3]
-    if not (np.abs(T) <= _MAX_ABS).all() or np.abs(rotation @ rotation.T - np.eye(3)).max() > _RIGID:
-        return None
-    return T if np.linalg.det(rotation) > 0.0 else None
+    return rigid(T.reshape(4, 4), _MAX_ABS) if T.size == 16 else None
 
 
 def checked_reply(reply: ReplyLike | None) -> ReplyLike | None:

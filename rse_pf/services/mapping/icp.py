@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from rse_pf.errors import BadRequest, LimitExceeded, MissingExtra
 from rse_pf.geometry import Array as Matrix
-from rse_pf.geometry import pose_difference, transform
+from rse_pf.geometry import pose_difference, rigid, transform
 from rse_pf.service import Registry
 from rse_pf.wire.arrays import Array, reshaped
 
@@ -165,10 +165,11 @@ def register(registry: Registry) -> None:
         if max(len(target), len(source)) > MAX_POINTS:
             raise LimitExceeded(f"a cloud has more than {MAX_POINTS} points", hint="thin it to voxels first")
         _check_extent(request)
-        guess = np.asarray(request.T_target_source, dtype=np.float64)
-        if guess.size != 16 or not _is_rigid(guess.reshape(4, 4)):
+        numbers = np.asarray(request.T_target_source, dtype=np.float64)
+        guess = rigid(numbers.reshape(4, 4)) if numbers.size == 16 else None
+        if guess is None:
             raise BadRequest("T_target_source is not a rigid motion", hint="send 16 numbers, row-major")
-        found = align(target, source, guess.reshape(4, 4), request.options)
+        found = align(target, source, guess, request.options)
         return msgspec.structs.replace(found, T_target_source=found.T_target_source.ravel())
 
 
@@ -251,15 +252,6 @@ def _refusal(
     if moved_m <= _UNMOVED_M and turned_deg <= _UNMOVED_DEG:
         return "" if after.misfit_m <= before.misfit_m * (1.0 + _MIN_GAIN) else "worse"
     return "" if after.misfit_m < before.misfit_m * (1.0 - _MIN_GAIN) else "worse"
-
-
-def _is_rigid(T: Matrix) -> bool:
-    rotation = T[:3, :3]
-    return (
-        bool(np.allclose(T[3], [0, 0, 0, 1]))
-        and bool(np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4))
-        and float(np.linalg.det(rotation)) > 0
-    )
 
 
 def _small_gicp() -> Any:

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rse_pf.errors import BadRequest
-from rse_pf.geometry import Array, from_quaternion, to_quaternion
+from rse_pf.geometry import Array, from_quaternion, rigid_many, to_quaternion
 
 __all__ = [
     "PoseGraph",
@@ -76,8 +76,9 @@ class PoseGraph:
             raise BadRequest("an edge connects a pose to itself", hint="leave it out")
         if len(np.unique(self.ids)) != n:
             raise BadRequest("two poses have one id", hint="give each pose its own id")
-        _check_rigid("a pose", self.T_world_pose)
-        _check_rigid("an edge", self.T_a_b)
+        # Frozen from here on.
+        object.__setattr__(self, "T_world_pose", _rigid("a pose", self.T_world_pose))
+        object.__setattr__(self, "T_a_b", _rigid("an edge", self.T_a_b))
         if not is_positive_definite(self.information):
             raise BadRequest(
                 "an information matrix is not symmetric and positive definite", hint="invert a covariance"
@@ -287,12 +288,11 @@ def _quaternions(rotation: Array) -> Array:
     return np.where(q[:, 3:] < 0, -q, q)
 
 
-def _check_rigid(what: str, T: Array) -> None:
-    if not len(T):
-        return
-    if not (np.abs(T) <= _MAX_M).all() or not np.allclose(T[:, 3], [0, 0, 0, 1]):
-        raise BadRequest(f"{what} is not a rigid motion", hint="send (4, 4) matrices of finite numbers")
-    rotation = T[:, :3, :3]
-    off = np.abs(rotation @ np.swapaxes(rotation, 1, 2) - np.eye(3)).max()
-    if off > 1e-4 or np.linalg.det(rotation).min() < 0:
-        raise BadRequest(f"{what} has a matrix that is not a rotation", hint="orthonormalise it")
+def _rigid(what: str, T: Array) -> Array:
+    made = rigid_many(T, _MAX_M)
+    if made is None:
+        raise BadRequest(
+            f"{what} is not a rigid motion, or has a matrix that is not a rotation",
+            hint="send (4, 4) matrices of finite numbers with at least three decimals",
+        )
+    return made

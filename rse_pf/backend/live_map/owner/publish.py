@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 
 from rse_pf.errors import Conflict, NotFound
+from rse_pf.live_map.versions import errors_of_maps
 from rse_pf.maps.format import MapVersion, encode_map
 from rse_pf.maps.registry import MapRecord, MapRegistry
 from rse_pf.object_store import digest_of
@@ -22,8 +23,16 @@ def publish_version(
 
     Raises:
         Conflict: Others move the head all the time.
+        InternalError: The registry takes no such map.
         StoreError: The store fails.
     """
+    with errors_of_maps("the live map cannot be published"):
+        return _publish(maps, name, version, author=author, created_s=created_s, note=note)
+
+
+def _publish(
+    maps: MapRegistry, name: str, version: MapVersion, *, author: str, created_s: float, note: str
+) -> MapRecord:
     data = encode_map(version)
     digest = digest_of(data)
     for tries_left in reversed(range(_TRIES)):
@@ -52,13 +61,15 @@ def version_to_start_from(maps: MapRegistry, map_name: str, source: str) -> tupl
             the head of *map_name*.
 
     Raises:
+        InternalError: The version is damaged.
         NotFound: There is no such map or version.
     """
     name, at, version = source.partition("@")
     if not at:
         name, version = (map_name, source or "head") if _is_version(source) else (source, "head")
     record = maps.record(name, version)
-    return maps.load(name, record.id), f"{name}@{record.id}"
+    with errors_of_maps(f"{name}@{record.id} cannot be read"):
+        return maps.load(name, record.id), f"{name}@{record.id}"
 
 
 def _is_version(source: str) -> bool:

@@ -12,7 +12,7 @@ import msgspec
 from rse_pf.errors import BadRequest, Busy, message_of
 from rse_pf.geometry import Camera
 from rse_pf.identity import RobotId
-from rse_pf.live_map.events import CameraNumbers, KeyframeAdded
+from rse_pf.live_map.events import CameraNumbers, KeyframeAdded, matrix_of, pose_bytes
 from rse_pf.object_store import name_segment
 
 __all__ = [
@@ -98,7 +98,8 @@ def keyframe_event(robot: RobotId, payload: Any) -> KeyframeAdded:
     request = to_request(payload, _KeyframeRequest)
     return KeyframeAdded(
         robot=robot.folder, segment=request.segment, number=request.number, timestamp_s=request.timestamp_s,
-        T_odom_camera=request.T_odom_camera, camera=request.camera, features=request.features,
+        T_odom_camera=pose_bytes(matrix_of(request.T_odom_camera, 4, 4)), camera=request.camera,
+        features=request.features,
     )  # fmt: skip
 
 
