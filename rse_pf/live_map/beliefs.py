@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
+from itertools import groupby
 
 import numpy as np
 
@@ -13,11 +15,11 @@ from rse_pf.live_map.agreement import (
     has_enough_ends,
     judge_within,
 )
-from rse_pf.live_map.graph import Graph
+from rse_pf.live_map.graph import Graph, Segment
 from rse_pf.live_map.options import LiveMapOptions
 from rse_pf.live_map.outcomes import Ambiguous, LinkBelieved, LinkRemoved, Outcome
 
-__all__ = ["Changes", "judge_links", "remove_doubted"]
+__all__ = ["Changes", "judge_again", "judge_links", "remove_doubted"]
 
 _DOUBTFUL = 30.0
 """Squared misfit of a link, six degrees of freedom: one true link in 25,000 has more."""
@@ -46,6 +48,24 @@ def judge_links(graph: Graph, keyframe: int, numbers: list[int], options: LiveMa
     for component in sorted({graph.component_of(i) for i in others.values()} - {here}):
         _try_join(graph, graph.component_of(keyframe), component, options, changes)
     return changes
+
+
+def judge_again(graph: Graph, options: LiveMapOptions) -> Iterator[Changes]:
+    """Judge all links that are not believed as if they came now, oldest first; yield what changed, in parts.
+
+    What was refuted, called ambiguous or taken for a lookalike is open again before, so what rests on links
+    that are gone is not believed any more.  The caller smooths around each part.
+    """
+    graph.reopen()
+    for segment in graph.segments:
+        if segment.told is None:
+            segment.reason = Segment(robot="", segment=0).reason
+    for keyframe, numbers in groupby(list(graph.open), lambda number: graph.links[number].a):
+        left = [number for number in numbers if number in graph.links and graph.links[number].state == "open"]
+        if left:
+            changes = judge_links(graph, keyframe, left, options)
+            if changes.outcomes or changes.moved:
+                yield changes
 
 
 def remove_doubted(

@@ -28,6 +28,7 @@ _VERSION = 1
 _MAX_WALK = 200.0
 """Steps of odometry beyond which two keyframes tell nothing about each other."""
 _MAX_VISITED = 250
+_MAX_REMOVED = 2000
 
 
 _FLOOR: Array = np.diag([0.02**2] * 3 + [math.radians(0.7) ** 2] * 3)
@@ -95,6 +96,7 @@ class Graph:
         held: ``(n,)``, whether its features are kept.
         links: By number, in the order in which they were measured; `open` are those not believed.
         equal_rooms_m: What joins robots must lie farther apart than this.
+        removed: The newest links that were taken out, by number: who refuted them may be forgotten.
         lookalikes: Keyframes at places of which the map knows another one that looks the same.
     """
 
@@ -103,6 +105,7 @@ class Graph:
         self.segments: list[Segment] = []
         self.links: dict[int, LiveLink] = {}
         self.open: list[int] = []
+        self.removed: dict[int, LiveLink] = {}
         self.agreements: dict[tuple[int, int], bool] = {}
         self.next_link = 0
         self.root = -1
@@ -196,7 +199,7 @@ class Graph:
         self._connect(number, link)
 
     def remove_link(self, number: int) -> None:
-        """Take a link out, believed or not."""
+        """Take a link out, believed or not; the newest of those taken out are kept for `reopen`."""
         link = self.links.pop(number)
         if link.state == "believed":
             self._links_of[link.a].remove(number)
@@ -204,6 +207,19 @@ class Graph:
         else:
             self.open.remove(number)
         link.state = "removed"
+        self.removed[number] = link
+        if len(self.removed) > _MAX_REMOVED:
+            del self.removed[next(iter(self.removed))]
+
+    def reopen(self) -> None:
+        """Take all that was believed of links that are not believed back: each has to be judged again."""
+        for number, link in self.removed.items():
+            link.state, link.doubts = "open", 0
+            self.links[number] = link
+        self.open = sorted([*self.open, *self.removed])
+        self.removed = {}
+        self.lookalikes = set()
+        self.agreements = {}
 
     def forget(self, robot: str) -> list[int]:
         """Take out the keyframes of *robot* with their links; return their ids."""
@@ -216,6 +232,10 @@ class Graph:
         members = set(gone)
         for number in [n for n, link in self.links.items() if link.a in members or link.b in members]:
             self.remove_link(number)
+        self.removed = {
+            number: link for number, link in self.removed.items()
+            if link.a not in members and link.b not in members
+        }  # fmt: skip
         for segment in self.segments:
             if segment.robot == robot and not segment.version:
                 segment.keyframes = []
@@ -223,8 +243,6 @@ class Graph:
         for i in gone:
             self.drop_features(i)
             self._of_segment[i] = -1
-        self.lookalikes -= members
-        self.forget_agreements()
         return gone
 
     def forget_agreements(self) -> None:
@@ -348,13 +366,8 @@ class Graph:
                 )
                 for s in self.segments
             ],
-            links=[
-                (
-                    number, link.a, link.b, link.T_a_b.tobytes(), link.information.tobytes(), link.inliers,
-                    link.matches, link.fixed, link.state, link.doubts,
-                )
-                for number, link in self.links.items()
-            ],
+            links=[_packed_link(number, link) for number, link in self.links.items()],
+            removed=[_packed_link(number, link) for number, link in self.removed.items()],
             open=self.open,
             agreements=[(*pair, agrees) for pair, agrees in self.agreements.items()],
             numbers=(self.next_link, self.root, self.events, self.optimised_at),
@@ -411,13 +424,7 @@ class Graph:
             )
             for robot, segment, keyframes, component, told, covariance, reason, version in packed.segments
         ]  # fmt: skip
-        stack = np.frombuffer(b"".join(each[4] for each in packed.links), dtype="<f8").reshape(-1, 6, 6)
-        for each, information, variances in zip(packed.links, stack, variances_of(stack), strict=True):
-            number, a, b, step, _, inliers, matches, fixed, state, doubts = each
-            graph.links[number] = LiveLink(
-                a=a, b=b, T_a_b=_matrix(step, 4), information=information, inliers=inliers,
-                matches=matches, variances=variances, fixed=fixed, state=state, doubts=doubts,
-            )  # fmt: skip
+        graph.links, graph.removed = _links_of(packed.links), _links_of(packed.removed)
         graph.open = packed.open
         graph.agreements = {(i, j): agrees for i, j, agrees in packed.agreements}
         graph.next_link, graph.root, graph.events, graph.optimised_at = packed.numbers
@@ -430,11 +437,14 @@ class Graph:
         return graph, dict(packed.extra)
 
 
+_PackedLink = tuple[int, int, int, bytes, bytes, int, int, bool, LinkState, int]
+
+
 class _Packed(msgspec.Struct, kw_only=True):
     version: int
     keyframes: list[tuple[str, int, int, float, CameraNumbers, bytes | None]]
     segments: list[tuple[str, int, list[int], int, bytes | None, bytes, str, bool]]
-    links: list[tuple[int, int, int, bytes, bytes, int, int, bool, LinkState, int]]
+    links: list[_PackedLink]
     open: list[int]
     agreements: list[tuple[int, int, bool]]
     numbers: tuple[int, int, int, int]
@@ -447,6 +457,26 @@ class _Packed(msgspec.Struct, kw_only=True):
     arrays: list[bytes]
     extra: list[tuple[str, bytes]]
     equal_rooms_m: float = 0.0
+    removed: list[_PackedLink] = []
+
+
+def _packed_link(number: int, link: LiveLink) -> _PackedLink:
+    return (
+        number, link.a, link.b, link.T_a_b.tobytes(), link.information.tobytes(), link.inliers, link.matches,
+        link.fixed, link.state, link.doubts,
+    )  # fmt: skip
+
+
+def _links_of(packed: list[_PackedLink]) -> dict[int, LiveLink]:
+    stack = np.frombuffer(b"".join(each[4] for each in packed), dtype="<f8").reshape(-1, 6, 6)
+    links = {}
+    for each, information, variances in zip(packed, stack, variances_of(stack), strict=True):
+        number, a, b, step, _, inliers, matches, fixed, state, doubts = each
+        links[number] = LiveLink(
+            a=a, b=b, T_a_b=_matrix(step, 4), information=information, inliers=inliers, matches=matches,
+            variances=variances, fixed=fixed, state=state, doubts=doubts,
+        )  # fmt: skip
+    return links
 
 
 def variances_of(information: Array) -> Array:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Callable, Collection
+from dataclasses import replace
 from functools import partial
 from typing import Literal
 
@@ -16,7 +17,7 @@ import numpy.typing as npt
 
 from rse_pf.errors import BadRequest, InvalidCamera
 from rse_pf.geometry import Array, Camera, inverse
-from rse_pf.live_map.beliefs import Changes, judge_links, remove_doubted
+from rse_pf.live_map.beliefs import Changes, judge_again, judge_links, remove_doubted
 from rse_pf.live_map.events import (
     Event,
     KeyframeAdded,
@@ -37,6 +38,7 @@ from rse_pf.live_map.options import LiveMapOptions
 from rse_pf.live_map.outcomes import (
     Added,
     Alignment,
+    Ambiguous,
     Corrected,
     Culled,
     Joined,
@@ -394,7 +396,24 @@ class LiveMap:
             alive = [row for row, each in enumerate(graph.segments) if each.keyframes]
             graph.root = next((row for row in alive if row in beside), alive[0] if alive else -1)
         graph.connect()
-        return self._tell(None)
+        return [*self._judge_again(), *self._tell(None)]
+
+    def _judge_again(self) -> list[Outcome]:
+        """Judge what rested on links that are gone, and bring the poses to where the others have them."""
+        graph = self._graph
+        outcomes: list[Outcome] = []
+        for changes in judge_again(graph, self.options):
+            self._smooth(changes)
+            outcomes += [each for each in changes.outcomes if isinstance(each, Ambiguous)]
+        anchors = {self._anchor(row) for row in range(len(graph.segments))}
+        largest = max(self.options.windows)
+        options = replace(self.options, windows=(largest,))
+        for segment in graph.segments:
+            for begin in range(0, len(segment.keyframes), largest):
+                smooth_around(graph, segment.keyframes[begin : begin + largest], anchors, options)
+        if graph.links:
+            outcomes.append(OptimiseWanted(misfit=0.0))
+        return outcomes
 
     def _start(self, event: MapStarted) -> list[Outcome]:
         graph = self._graph
