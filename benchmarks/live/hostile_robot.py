@@ -81,12 +81,12 @@ def scenario(attack: str, seed: int, rounds: float = 1.5) -> tuple[list[Event], 
 
 def _lying(world: GeneratedWorld, attack: str, positions: Array) -> GeneratedDrive:
     drive = world.drive(HOSTILE, positions)
-    odometry, half = drive.T_odom_camera.copy(), len(positions) // 2
+    odometry, half = drive.T_odom_camera.copy(), 3 * len(positions) // 4
     if attack == "random-odometry":
         for number in range(1, len(odometry)):
             step = np.r_[world.rng.uniform(-2.0, 2.0, 3), world.rng.uniform(-1.0, 1.0, 3)]
             odometry[number] = odometry[number - 1] @ exp_se3(step)
-    elif attack == "lookalikes":  # the views of the first half again, as if they lay 15 m away
+    elif attack == "lookalikes":  # its first views again, as if they lay 15 m away
         seen = drive.T_world_camera.copy()
         again = len(seen) - half
         seen[half:] = seen[:again]

@@ -19,11 +19,13 @@ from rse_pf.live_map.graph import Graph, Segment
 from rse_pf.live_map.options import LiveMapOptions
 from rse_pf.live_map.outcomes import Ambiguous, LinkBelieved, LinkRemoved, Outcome
 
-__all__ = ["Changes", "judge_again", "judge_links", "remove_doubted"]
+__all__ = ["Changes", "disbelieve_contradicting", "judge_again", "judge_links", "remove_doubted"]
 
 _DOUBTFUL = 30.0
 """Squared misfit of a link, six degrees of freedom: one true link in 25,000 has more."""
 _JUDGED_AFTER_JOIN = 48
+_CONTRADICTIONS = 16
+"""Of the last 32 keyframes of a segment; honest robots, also with 10 % of wheel slip, stay far below."""
 
 
 @dataclass(slots=True)
@@ -32,6 +34,8 @@ class Changes:
 
     outcomes: list[Outcome] = field(default_factory=list)
     moved: list[int] = field(default_factory=list)
+    verdicts: set[str] = field(default_factory=set)
+    """What links within one component were: "agrees", "vague", "contrary", or "lookalike"."""
 
     def touch(self, *keyframes: int) -> None:
         """Note keyframes to smooth around, each once."""
@@ -58,7 +62,7 @@ def judge_again(graph: Graph, options: LiveMapOptions) -> Iterator[Changes]:
     """
     graph.reopen()
     for segment in graph.segments:
-        if segment.told is None:
+        if segment.told is None and not segment.disbelieved:
             segment.reason = Segment(robot="", segment=0).reason
     for keyframe, numbers in groupby(list(graph.open), lambda number: graph.links[number].a):
         left = [number for number in numbers if number in graph.links and graph.links[number].state == "open"]
@@ -66,6 +70,28 @@ def judge_again(graph: Graph, options: LiveMapOptions) -> Iterator[Changes]:
             changes = judge_links(graph, keyframe, left, options)
             if changes.outcomes or changes.moved:
                 yield changes
+
+
+def disbelieve_contradicting(graph: Graph, keyframe: int, changes: Changes) -> bool:
+    """Note whether all links of *keyframe* contradict the map; say if its segment is disbelieved from now on.
+
+    Links of an honest robot contradict its odometry for a few keyframes, until they are believed, or prove
+    that two places look alike; places that are known to do so count for nothing here.
+    """
+    segment = graph.segments[int(graph.of_segment[keyframe])]
+    if not changes.verdicts or segment.disbelieved or segment.version:
+        return False
+    is_contrary = changes.verdicts == {"contrary"} and not any(
+        isinstance(each, LinkBelieved) for each in changes.outcomes
+    )
+    segment.contradictions = ((segment.contradictions << 1) | is_contrary) & 0xFFFFFFFF
+    count = segment.contradictions.bit_count()
+    if count < _CONTRADICTIONS:
+        return False
+    graph.disbelieve(int(graph.of_segment[keyframe]))
+    segment.reason = f"contradicting: {count} of the last 32 keyframes contradict their own odometry"
+    changes.outcomes.append(Ambiguous(robot=segment.robot, segment=segment.segment, reason=segment.reason))
+    return True
 
 
 def remove_doubted(
@@ -96,6 +122,10 @@ def _judge_within(graph: Graph, numbers: list[int], options: LiveMapOptions, cha
         return
     walked = [walks[graph.links[number].a][graph.links[number].b] for number in numbers]
     verdicts = judge_within(graph, numbers, walked, options)
+    changes.verdicts |= {
+        "lookalike" if _is_lookalike(graph, number) else verdict
+        for number, verdict in zip(numbers, verdicts, strict=True)
+    }
     _believe(graph, [n for n, verdict in zip(numbers, verdicts, strict=True) if verdict == "agrees"], changes)
     for number, verdict in zip(numbers, verdicts, strict=True):
         if verdict == "agrees" or number not in graph.links or graph.links[number].state != "open":

@@ -63,6 +63,10 @@ class Segment:
     reason: str = "no link of it is believed yet"
     version: bool = False
     """Whether these are keyframes of the version that the map started from."""
+    contradictions: int = 0
+    """A bit for each of the last 32 keyframes with links within the component: whether all contradict it."""
+    disbelieved: bool = False
+    """Whether its links are no longer taken, since it kept contradicting itself."""
 
 
 @dataclass(slots=True, eq=False)
@@ -211,6 +215,25 @@ class Graph:
         if len(self.removed) > _MAX_REMOVED:
             del self.removed[next(iter(self.removed))]
 
+    def drop_oldest_open(self, most: int) -> None:
+        """Take out the oldest links that are not believed, beyond the newest *most*."""
+        surplus = len(self.open) - most
+        if surplus > 0:
+            for number in self.open[:surplus]:
+                self.remove_link(number)
+            self.forget_agreements()
+
+    def segment_row(self, robot: str, number: int) -> int:
+        """Return the row of a robot's segment; it begins if there is none."""
+        newest = self.newest.get(robot)
+        for row in range(len(self.segments)) if newest is None else (newest,):
+            segment = self.segments[row]
+            if (segment.robot, segment.segment) == (robot, number) and not segment.version:
+                return row
+        row = len(self.segments)
+        self.segments.append(Segment(robot=robot, segment=number, component=row))
+        return row
+
     def reopen(self) -> None:
         """Take all that was believed of links that are not believed back: each has to be judged again."""
         for number, link in self.removed.items():
@@ -244,6 +267,35 @@ class Graph:
             self.drop_features(i)
             self._of_segment[i] = -1
         return gone
+
+    def disbelieve(self, row: int) -> None:
+        """Take out the links of segment *row* for good; its keyframes stay."""
+        self.segments[row].disbelieved = True
+        for number in [number for number, link in self.links.items() if self._is_at(row, link)]:
+            self.remove_link(number)
+        self.removed = {number: link for number, link in self.removed.items() if not self._is_at(row, link)}
+        if self.root == row:
+            component = self.segments[row].component
+            beside = (
+                other for other, each in enumerate(self.segments)
+                if other != row and each.component == component and each.keyframes
+            )  # fmt: skip
+            self.root = next(beside, row)
+        self.connect()
+
+    def _is_at(self, row: int, link: LiveLink) -> bool:
+        return bool(self._of_segment[link.a] == row or self._of_segment[link.b] == row)
+
+    def anchor(self, row: int) -> int:
+        """Return the keyframe that defines the frame of a segment's component, -1 if it is gone."""
+        root = self.segments[self.root].component if self.root >= 0 else -1
+        component = self.segments[row].component
+        ids = self.segments[self.root if component == root else component].keyframes
+        return ids[0] if ids else -1
+
+    def anchors(self) -> set[int]:
+        """Return the keyframes that define the frames of all components."""
+        return {self.anchor(row) for row in range(len(self.segments))}
 
     def forget_agreements(self) -> None:
         """Drop what is known of links that are no longer open."""
@@ -352,7 +404,7 @@ class Graph:
 
     def encode(self, extra: dict[str, bytes], with_features: bool = True) -> bytes:
         """Return everything as bytes, with *extra* byte strings beside it."""
-        believed = {str(i): numbers for i, numbers in self._links_of.items() if numbers}
+        believed = {str(i): numbers for i, numbers in sorted(self._links_of.items()) if numbers}
         packed = _Packed(
             version=_VERSION,
             keyframes=[
@@ -368,6 +420,7 @@ class Graph:
             ],
             links=[_packed_link(number, link) for number, link in self.links.items()],
             removed=[_packed_link(number, link) for number, link in self.removed.items()],
+            trust=[(each.contradictions, each.disbelieved) for each in self.segments],
             open=self.open,
             agreements=[(*pair, agrees) for pair, agrees in self.agreements.items()],
             numbers=(self.next_link, self.root, self.events, self.optimised_at),
@@ -424,6 +477,8 @@ class Graph:
             )
             for robot, segment, keyframes, component, told, covariance, reason, version in packed.segments
         ]  # fmt: skip
+        for segment, (contradictions, disbelieved) in zip(graph.segments, packed.trust, strict=False):
+            segment.contradictions, segment.disbelieved = contradictions, disbelieved
         graph.links, graph.removed = _links_of(packed.links), _links_of(packed.removed)
         graph.open = packed.open
         graph.agreements = {(i, j): agrees for i, j, agrees in packed.agreements}
@@ -458,6 +513,7 @@ class _Packed(msgspec.Struct, kw_only=True):
     extra: list[tuple[str, bytes]]
     equal_rooms_m: float = 0.0
     removed: list[_PackedLink] = []
+    trust: list[tuple[int, bool]] = []
 
 
 def _packed_link(number: int, link: LiveLink) -> _PackedLink:

@@ -8,7 +8,6 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Callable, Collection
-from dataclasses import replace
 from functools import partial
 from typing import Literal
 
@@ -17,7 +16,13 @@ import numpy.typing as npt
 
 from rse_pf.errors import BadRequest, InvalidCamera
 from rse_pf.geometry import Array, Camera, inverse
-from rse_pf.live_map.beliefs import Changes, judge_again, judge_links, remove_doubted
+from rse_pf.live_map.beliefs import (
+    Changes,
+    disbelieve_contradicting,
+    judge_again,
+    judge_links,
+    remove_doubted,
+)
 from rse_pf.live_map.events import (
     Event,
     KeyframeAdded,
@@ -48,7 +53,7 @@ from rse_pf.live_map.outcomes import (
 )
 from rse_pf.live_map.place_index import LivePlaceIndex
 from rse_pf.live_map.relocalise import Relocalised, RelocaliseOptions, relocalise, spread_candidates
-from rse_pf.live_map.smoother import SmoothedWindows, odometry_step, smooth_around
+from rse_pf.live_map.smoother import SmoothedWindows, odometry_step, smooth_all, smooth_around
 from rse_pf.live_map.versions import version_of, whole_graph
 from rse_pf.maps.format import MapVersion
 from rse_pf.services.mapping.optimise import OptimiseOptions, optimise_graph
@@ -224,7 +229,7 @@ class LiveMap:
         *candidates* than those of the options are for an owner that is behind.
         """
         stored = self._stored(keyframe)
-        if stored is None:
+        if stored is None or self._is_ignored(keyframe):
             return [lambda: LinksMeasured(keyframe=keyframe)]
         found = [self._stored(i) for i in self._candidates(keyframe, candidates)]
         others = [each for each in found if each is not None]
@@ -248,7 +253,7 @@ class LiveMap:
         *solve* returns the poses that `optimise_graph` does, in a process of its own for example.
         """
         graph, ids = whole_graph(self._graph, self.options)
-        anchor, up_to = ids.index(self._anchor(self._graph.root)), self._graph.events
+        anchor, up_to = ids.index(self._graph.anchor(self._graph.root)), self._graph.events
         options = OptimiseOptions(cauchy=self.options.cauchy)
 
         def fit() -> Optimised:
@@ -302,7 +307,7 @@ class LiveMap:
 
     def _add(self, event: KeyframeAdded) -> list[Outcome]:
         graph, options = self._graph, self.options
-        row = self._segment_of(event.robot, event.segment)
+        row = graph.segment_row(event.robot, event.segment)
         segment = graph.segments[row]
         T_odom = np.array(matrix_of(event.T_odom_camera, 4, 4))
         T, way = T_odom, 0.0
@@ -331,7 +336,10 @@ class LiveMap:
         graph, k = self._graph, event.keyframe
         if not self._exists(k):
             return []
-        kept = [link for link in event.links if link.other != k and self._exists(link.other)]
+        kept = [
+            link for link in event.links
+            if link.other != k and not self._is_ignored(k) and not self._is_ignored(link.other)
+        ]  # fmt: skip
         information = np.array([matrix_of(link.information, 6, 6) for link in kept]).reshape(-1, 6, 6)
         numbers = [
             graph.add_link(
@@ -343,11 +351,12 @@ class LiveMap:
             for link, each, variances in zip(kept, information, variances_of(information), strict=True)
         ]  # fmt: skip
         changes = judge_links(graph, k, numbers, self.options)
+        again = self._judge_again() if disbelieve_contradicting(graph, k, changes) else []
         window = self._smooth(changes)
-        self._forget_old_links()
+        graph.drop_oldest_open(self.options.open_links)
         mine = graph.keyframes[k]
         told = self._tell((mine.robot, mine.number), window)
-        return [*changes.outcomes, *told, *self._cull(k)]
+        return [*changes.outcomes, *again, *told, *self._cull(k)]
 
     def _take_poses(self, event: Optimised) -> list[Outcome]:
         graph = self._graph
@@ -405,12 +414,7 @@ class LiveMap:
         for changes in judge_again(graph, self.options):
             self._smooth(changes)
             outcomes += [each for each in changes.outcomes if isinstance(each, Ambiguous)]
-        anchors = {self._anchor(row) for row in range(len(graph.segments))}
-        largest = max(self.options.windows)
-        options = replace(self.options, windows=(largest,))
-        for segment in graph.segments:
-            for begin in range(0, len(segment.keyframes), largest):
-                smooth_around(graph, segment.keyframes[begin : begin + largest], anchors, options)
+        smooth_all(graph, self.options)
         if graph.links:
             outcomes.append(OptimiseWanted(misfit=0.0))
         return outcomes
@@ -454,10 +458,10 @@ class LiveMap:
         graph = self._graph
         if not changes.moved:
             return None
-        anchors = {self._anchor(row) for row in range(len(graph.segments))}
+        anchors = graph.anchors()
         window = smooth_around(graph, changes.moved, anchors, self.options)
         if remove_doubted(graph, window.squares, self.options, changes):
-            anchors = {self._anchor(row) for row in range(len(graph.segments))}
+            anchors = graph.anchors()
             window = smooth_around(graph, changes.moved, anchors, self.options)
         due = len(graph) - graph.optimised_at >= self.options.optimise_every
         if window.strained and due:
@@ -533,26 +537,6 @@ class LiveMap:
             self._places.remove(i)
         return [Culled(ids=gone)] if gone else []
 
-    def _forget_old_links(self) -> None:
-        graph = self._graph
-        surplus = len(graph.open) - self.options.open_links
-        if surplus > 0:
-            for number in graph.open[:surplus]:
-                graph.remove_link(number)
-            graph.forget_agreements()
-
-    def _segment_of(self, robot: str, number: int) -> int:
-        """Return the row of a robot's segment; it begins if there is none."""
-        graph = self._graph
-        newest = graph.newest.get(robot)
-        for row in range(len(graph.segments)) if newest is None else (newest,):
-            segment = graph.segments[row]
-            if (segment.robot, segment.segment) == (robot, number) and not segment.version:
-                return row
-        row = len(graph.segments)
-        graph.segments.append(Segment(robot=robot, segment=number, component=row))
-        return row
-
     def _place(self, i: int) -> None:
         """Add keyframe *i* to the index of places."""
         keyframe = self._graph.keyframes[i]
@@ -569,7 +553,8 @@ class LiveMap:
         vector = self._places.vector_of(k)
         component = np.array([segment.component for segment in graph.segments])[graph.of_segment]
         own = component == graph.component_of(k)
-        held = graph.held.copy()
+        disbelieved = np.array([segment.disbelieved for segment in graph.segments])[graph.of_segment]
+        held = graph.held & ~disbelieved
         held[k] = False
         close = graph.of_segment == graph.of_segment[k]
         apart = options.apart_steps if most is None else max(options.apart_steps, options.vague_steps)
@@ -586,16 +571,13 @@ class LiveMap:
         features = self._graph.keyframes[i].features
         return None if features is None else (i, features, self._graph.camera(i))
 
+    def _is_ignored(self, i: int) -> bool:
+        """Return whether links of a keyframe are not taken: it is gone, or its segment is not believed."""
+        graph = self._graph
+        return not self._exists(i) or graph.segments[int(graph.of_segment[i])].disbelieved
+
     def _exists(self, i: int) -> bool:
         return 0 <= i < len(self._graph) and bool(self._graph.of_segment[i] >= 0)
-
-    def _anchor(self, row: int) -> int:
-        """Return the keyframe that defines the frame of a segment's component, -1 if it is gone."""
-        graph = self._graph
-        root = graph.segments[graph.root].component if graph.root >= 0 else -1
-        component = graph.segments[row].component
-        ids = graph.segments[graph.root if component == root else component].keyframes
-        return ids[0] if ids else -1
 
     def _is_aligned(self, row: int) -> bool:
         graph = self._graph

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -28,6 +28,7 @@ __all__ = [
     "log_se3_many",
     "odometry_step",
     "smooth",
+    "smooth_all",
     "smooth_around",
 ]
 
@@ -135,6 +136,15 @@ def smooth_around(
                 break
     done.misfit = total / max(1, len(done.squares))
     return done
+
+
+def smooth_all(graph: Graph, options: LiveMapOptions) -> None:
+    """Smooth each segment of *graph* once, by the largest window; the graph changes."""
+    largest, anchors = max(options.windows), graph.anchors()
+    options = replace(options, windows=(largest,))
+    for segment in graph.segments:
+        for begin in range(0, len(segment.keyframes), largest):
+            smooth_around(graph, segment.keyframes[begin : begin + largest], anchors, options)
 
 
 def edges_of(graph: Graph, ids: Iterable[int], options: LiveMapOptions) -> Edges:

@@ -1,0 +1,79 @@
+"""A robot that lies in its own live map: it separates nobody for good, and is not believed for long."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import msgspec
+import numpy as np
+import pytest
+
+from benchmarks.live.generated_drives import GeneratedWorld, circle
+from benchmarks.live.hostile_robot import HOSTILE, error_cm, joins, play, scenario, without
+from rse_pf.geometry import inverse
+from rse_pf.live_map.events import RobotForgotten
+from rse_pf.live_map.live_map import LiveMap
+from rse_pf.live_map.outcomes import Ambiguous, LinkRemoved, Unaligned
+
+JOINED = {"a": True, "b": True, "c": True}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 1])
+def test_forgetting_a_robot_that_proved_false_lookalikes_joins_the_others_again(seed: int) -> None:
+    events, true = scenario("lookalikes", seed)
+    attacked, clean = play(events), play(without(events, HOSTILE))
+    assert joins(attacked.live_map) != JOINED
+    restored = LiveMap.restore(attacked.live_map.snapshot())
+
+    for live_map in (attacked.live_map, restored):
+        live_map.apply(RobotForgotten(robot=HOSTILE))
+
+    assert joins(attacked.live_map) == joins(clean.live_map) == JOINED
+    assert restored.digest() == attacked.live_map.digest()
+    assert not attacked.live_map._graph.lookalikes
+    assert abs(error_cm(attacked, true[attacked.ids]) - error_cm(clean, true[attacked.ids])) <= 0.1
+
+
+def test_a_robot_whose_odometry_is_random_is_disbelieved_and_told() -> None:
+    events, _ = scenario("random-odometry", seed=0, rounds=0.7)
+    live_map = LiveMap()
+    outcomes = [each for event in events for each in live_map.apply(event)]
+    [lying] = [each for each in live_map.alignments() if each.robot == HOSTILE]
+    measured_links = [len(each().links) for each in live_map.measuring(len(live_map._graph) - 1)]
+
+    assert joins(live_map) == JOINED
+    assert not lying.aligned
+    assert lying.reason.startswith("contradicting: 16 of the last 32 keyframes")
+    assert [each for each in outcomes if isinstance(each, Ambiguous | Unaligned) and each.robot == HOSTILE]
+    assert measured_links == [0]
+    assert LiveMap.restore(live_map.snapshot()).digest() == live_map.digest()
+
+
+@pytest.mark.parametrize("slip", [0.9, 1.1])
+def test_robots_whose_wheels_slip_are_believed(slip: float) -> None:
+    world = GeneratedWorld(seed=4, links=3)
+    drives = [world.drive(name, circle(1.2, 1.1, phase=phase)) for name, phase in (("a", 0.0), ("b", 2.0))]
+    for drive in drives:
+        steps = [inverse(one) @ other for one, other in pairwise(drive.T_odom_camera)]
+        for number, step in enumerate(steps):
+            step[:3, 3] *= slip
+            drive.T_odom_camera[number + 1] = drive.T_odom_camera[number] @ step
+    live_map = play([*world.play(drives, wrong=0.2)]).live_map
+
+    assert joins(live_map) == {"a": True, "b": True}
+    assert max(each.contradictions.bit_count() for each in live_map._graph.segments) <= 4
+
+
+def test_a_snapshot_of_an_earlier_release_is_read() -> None:
+    events, _ = scenario("scaled-rotations", seed=0, rounds=0.2)
+    live_map = play(events).live_map
+    packed = msgspec.msgpack.decode(live_map.snapshot())
+    for name in ("removed", "trust"):
+        del packed[name]
+
+    restored = LiveMap.restore(msgspec.msgpack.encode(packed))
+
+    assert np.array_equal(restored._graph.T, live_map._graph.T)
+    assert restored.links_believed == live_map.links_believed
+    assert not any(isinstance(each, LinkRemoved) for each in restored.apply(RobotForgotten(robot=HOSTILE)))
