@@ -503,3 +503,21 @@ def test_updates_name_the_cause_and_a_new_reader_gets_the_present_state():
         assert shown["robots"][0]["robot"] == ROBOT.name
 
     bench.run(test)
+
+
+@pytest.mark.parametrize("operation", ["live-publish", "live-stop"])
+def test_a_map_that_the_registry_refuses_is_an_internal_error_for_who_asks(operation, monkeypatch):
+    bench = Bench()
+
+    def refuse(*args: object, **named: object) -> None:
+        raise BadRequest("keyframe 1 has no rigid pose", hint="leave it out")
+
+    monkeypatch.setattr(MapRegistry, "commit", refuse)
+
+    async def test() -> None:
+        owner = await bench.own("a")
+        await owner.keyframe(0)
+        with pytest.raises(InternalError, match="the live map cannot be published: keyframe 1"):
+            await owner.ask(operation, {})
+
+    bench.run(test)
