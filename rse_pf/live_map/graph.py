@@ -263,6 +263,7 @@ class Graph:
             if segment.robot == robot and not segment.version:
                 segment.keyframes = []
                 segment.told = None
+                segment.contradictions, segment.disbelieved = 0, False
         for i in gone:
             self.drop_features(i)
             self._of_segment[i] = -1
