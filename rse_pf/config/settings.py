@@ -238,6 +238,7 @@ class LiveSettings:
     heartbeat_s: float = setting(0.5, unit="s", doc="time between two renewals of a live map's lease", low=0.05)
     lease_s: float = setting(1.5, unit="s", doc="another server takes a live map over when its lease was not renewed for this long", low=0.1)
     publish_s: float = setting(600.0, unit="s", doc="time between two versions that a live map publishes while it changes; 0: only when the last robot leaves, or on request", low=0)
+    publish_pause_s: float = setting(10.0, unit="s", doc="shortest time between two versions of a live map, whoever asks for them; a version that is asked for earlier comes then", source="a robot that left again and again wrote 959 MB in 45 s", low=0)
     idle_s: float = setting(60.0, unit="s", doc="the owner of a map that nobody uses for this long publishes it and ends", low=1)
     keep_log: bool = setting(False, doc="keep all entries of a live map's log, which experiments replay; else those before the older snapshot are deleted")
 

@@ -109,7 +109,7 @@ def _version_of(graph: Graph, options: LiveMapOptions) -> MapVersion:
             edges.append(
                 Edge(a=link.a, b=link.b, T_a_b=link.T_a_b, information=link.information, kind=kind)
             )  # fmt: skip
-    provenance = {"made_by": "live", "from": graph.source, "events": graph.events}
+    provenance = {"made_by": "live", "from": graph.source}
     return MapVersion(keyframes=tuple(keyframes), edges=tuple(edges), provenance=provenance)
 
 

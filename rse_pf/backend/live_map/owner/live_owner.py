@@ -50,6 +50,8 @@ __all__ = ["LiveOwner", "OwnerContext"]
 
 _SETTLED_S = 5.0
 """An owner that served for this long does not die of its map; nor one that has measured a keyframe."""
+_LAST_VERSION_S = 3.0
+"""A map that is released waits for its last version no longer; the next owner publishes it then."""
 _WAITING = "waiting for the store"
 _ALIGNING = (Joined, Corrected, Unaligned, Ambiguous, LinkRemoved)
 
@@ -108,7 +110,8 @@ class LiveOwner:
             name=context.map_name,
         )  # fmt: skip
         self._publisher = Publisher(
-            state, context.maps, threads=context.threads, wall_clock=context.wall_clock,
+            state, context.maps, threads=context.threads, clock=context.clock,
+            wall_clock=context.wall_clock, sleep=context.sleep, pause_s=context.settings.publish_pause_s,
             json_log=context.log, name=context.map_name, author=f"live map on {lease.record.server}",
         )  # fmt: skip
         self._adding: dict[tuple[str, int], asyncio.Task[None]] = {}
@@ -247,7 +250,8 @@ class LiveOwner:
             await asyncio.shield(self._writer.submit(RobotLeft(robot=robot.folder)))
         self._present.pop(robot.folder, None)
         if not self._present:
-            self._start(self._publisher.publish_quietly("the last robot left"))
+            self._publisher.ask("the last robot left")
+            self._start(self._publisher.publish_due())
         return {}
 
     async def _forget(self, request: requests.ForgetRequest) -> dict[str, Any]:
@@ -393,15 +397,20 @@ class LiveOwner:
             return
         if now >= self._publish_due_s:
             self._publish_due_s = now + self._context.settings.publish_s
-            self._start(self._publisher.publish_quietly("live map"))
+            self._publisher.ask("live map")
         if self.users:
             self._idle_since_s = now
         elif now - self._idle_since_s >= self._context.settings.idle_s:
             self._idle_since_s = now
             self._start(self._end_idle())
+        self._start(self._publisher.publish_due())
 
     async def _end_idle(self) -> None:
-        await self._publisher.publish_quietly("nobody used the live map")
+        """Publish the map, when it may be, and give it up; a version that fails is left to the next owner."""
+        self._publisher.ask("nobody used the live map")
+        while self._publisher.is_due and not self._publisher.has_failed and not self.users:
+            await self._publisher.publish_due()
+            await self._context.sleep(self._context.settings.heartbeat_s)
         if not self.users:
             await self.release()
 
@@ -420,6 +429,10 @@ class LiveOwner:
         snapshot = await self._snapshot()
         if how == "released" and snapshot.position > self._wrote_snapshot:
             await self._write_snapshot(snapshot)
+        if how == "released":  # the next owner may come late: what is due is published before its time
+            await asyncio.wait(
+                {asyncio.ensure_future(self._publisher.publish_now())}, timeout=_LAST_VERSION_S
+            )
         wait_s = FIRST_RETRY_S
         while not self._ended.done():
             try:
