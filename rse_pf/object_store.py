@@ -3,7 +3,7 @@
 All stores follow one contract: once `put` returns, the object is complete and durable, whatever crashes
 next.  No name can refer to a file outside the folder of a store.
 
-More than 600 lines because the contract stands beside the two stores that show what it means.
+More than 600 lines because the contract and the stores that keep it are read together.
 """
 
 from __future__ import annotations
@@ -39,6 +39,7 @@ __all__ = [
     "PresigningStore",
     "RangedStore",
     "ScratchStore",
+    "SizedStore",
     "Usage",
     "charge_of",
     "check_name",
@@ -135,6 +136,14 @@ class MeasuringStore(Protocol):
 
     def usage(self, prefix: str) -> Usage:
         """Return what the objects below the folder *prefix*, which ends with a slash, count for."""
+
+
+@runtime_checkable
+class SizedStore(Protocol):
+    """A store that can become full."""
+
+    def space(self) -> tuple[int, int]:
+        """Return how many bytes can still be stored, and how many all of it holds, by whomever."""
 
 
 @runtime_checkable
@@ -375,6 +384,15 @@ class DirectoryStore:
         for folder in known[2]:
             total += self.usage(f"{prefix}{folder}/")
         return total
+
+    def space(self) -> tuple[int, int]:
+        """Return the free bytes of the disk, and its size."""
+        folder = self._folder
+        while True:
+            with _as_store_errors(str(self._folder)), contextlib.suppress(FileNotFoundError):
+                found = os.statvfs(folder)
+                return found.f_bavail * found.f_frsize, found.f_blocks * found.f_frsize
+            folder = folder.parent
 
     def delete(self, name: str) -> None:
         """Remove the object, and its folder if nothing else lies there; a missing one is no error."""

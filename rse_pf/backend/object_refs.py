@@ -8,17 +8,17 @@ robot give the same error.  A service gets only bytes whose digest is right.
 from __future__ import annotations
 
 import functools
-import math
 import re
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import msgspec
 
+from rse_pf.accounts import Accounts
 from rse_pf.auth.tokens import Claims
 from rse_pf.backend.robot_store import quota_bytes, store_within_quota
-from rse_pf.config import ServingSettings
+from rse_pf.config import DataSettings, ServingSettings
 from rse_pf.errors import BadRequest, LimitExceeded, NotFound, QuotaExceeded, StoreError
 from rse_pf.identity import RobotId, object_name
 from rse_pf.object_store import ObjectStore, digest_of
@@ -104,8 +104,8 @@ class ObjectRefs:
 
     store: ObjectStore | None
     settings: ServingSettings
-    quota_bytes: float = math.inf
-    """Quota of a robot whose token names none."""
+    data: DataSettings = field(default_factory=DataSettings)
+    """Quotas of tenants, and of robots whose tokens name none."""
 
     def named_by(self, command: Command, service: Service) -> bool:
         """Return whether the store would have to be asked; cheap for services that take no ``bytes``."""
@@ -139,9 +139,10 @@ class ObjectRefs:
         reply = msgspec.msgpack.encode(answer.reply, enc_hook=binary_encode_hook)
         if len(reply) > self.settings.max_object_bytes_per_command:
             return sent
-        max_bytes = quota_bytes(who.claims, self.quota_bytes)
+        max_bytes = quota_bytes(who.claims, self.data.quota_bytes)
+        accounts = Accounts(self.store, self.data)
         try:
-            digest = store_within_quota(self.store, who.robot, reply, max_bytes)
+            digest = store_within_quota(self.store, accounts, who.robot, reply, max_bytes)
         except QuotaExceeded as error:
             return msgspec.structs.replace(sent, code=error.code, message=error.message, hint=error.hint)
         except StoreError:

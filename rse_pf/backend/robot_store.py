@@ -6,14 +6,14 @@ Nothing is removed to make an object fit.
 
 from __future__ import annotations
 
+from rse_pf.accounts import Accounts
 from rse_pf.auth.tokens import Claims
 from rse_pf.config import PlatformSettings
-from rse_pf.errors import NotFound, QuotaExceeded
+from rse_pf.errors import NotFound
 from rse_pf.identity import RobotId, object_name
-from rse_pf.maps.charges import charged_to
-from rse_pf.object_store import MIN_CHARGE_BYTES, ObjectStore, charge_of, digest_of, usage_of
+from rse_pf.object_store import ObjectStore, digest_of
 
-__all__ = ["check_quota", "is_shared", "quota_bytes", "store_within_quota"]
+__all__ = ["is_shared", "quota_bytes", "store_within_quota"]
 
 _PRIVATE_STORE = "memory:"
 
@@ -28,35 +28,22 @@ def quota_bytes(claims: Claims | None, default: float) -> float:
     return (claims.quota("data_bytes") if claims is not None else None) or default
 
 
-def check_quota(store: ObjectStore, robot: RobotId, size: int, max_bytes: float) -> None:
-    """Raise QuotaExceeded unless an object of *size* bytes fits; StoreError if the store fails.
-
-    Stored objects and committed versions of maps are counted, each with `MIN_CHARGE_BYTES` at least; the data
-    service counts uploads that have begun, too, and limits the number of objects.
-    """
-    used = (usage_of(store, object_name(robot, "")) + charged_to(store, robot)).charged_bytes
-    if used + charge_of(size) > max_bytes:
-        raise QuotaExceeded(
-            f"{used} + {charge_of(size)} bytes are more than the quota of {max_bytes:.0f}; a short object "
-            f"counts as {MIN_CHARGE_BYTES}",
-            hint="delete objects, or raise data.quota_bytes",
-        )
-
-
-def store_within_quota(store: ObjectStore, robot: RobotId, data: bytes, max_bytes: float) -> str:
+def store_within_quota(
+    store: ObjectStore, accounts: Accounts, robot: RobotId, data: bytes, max_bytes: float
+) -> str:
     """Store *data* durably as an object of the robot, and return its digest.
 
     An object that is stored already is not counted again.
 
     Raises:
-        QuotaExceeded: It does not fit.
-        StoreError: The store fails.
+        QuotaExceeded: It does not fit into the quota of the robot or of its tenant.
+        StoreError: The store fails, or is full.
     """
     digest = digest_of(data)
     name = object_name(robot, digest)
     try:
         store.head(name)
     except NotFound:
-        check_quota(store, robot, len(data), max_bytes)
-        store.put(name, data)
+        with accounts.reserved(robot, len(data), max_bytes):
+            store.put(name, data)
     return digest

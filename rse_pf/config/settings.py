@@ -182,6 +182,8 @@ class DataSettings:
     host: str = setting("127.0.0.1", doc="address the data service listens on")
     max_object_bytes: int = setting(268435456, unit="bytes", doc="size of one object", low=1024)
     quota_bytes: int = setting(10737418240, unit="bytes", doc="total size of the objects of one robot", low=1024)
+    tenant_quota_bytes: int = setting(107374182400, unit="bytes", doc="total size of what one tenant stores: objects, maps with all their versions, live maps, states of services and jobs that wait", low=1024)
+    reserve_percent: float = setting(10.0, unit="%", doc="share of the store's disk that no tenant alone may fill: when less is free, a tenant that holds more than its share is refused", low=0, high=50)
     max_objects: int = setting(100000, unit="objects", doc="objects, unfinished uploads and map versions of one robot", source="file systems run out of inodes", low=1)
     max_requests_per_s: float = setting(50.0, unit="requests/s", doc="requests of one robot; a list counts as 5, a commit of a map as 20; more are refused with 429", low=0.1)
     max_requests_per_robot: int = setting(8, unit="requests", doc="requests of one robot in progress; more are refused with 429", low=1)
@@ -238,7 +240,7 @@ class LiveSettings:
     heartbeat_s: float = setting(0.5, unit="s", doc="time between two renewals of a live map's lease", low=0.05)
     lease_s: float = setting(1.5, unit="s", doc="another server takes a live map over when its lease was not renewed for this long", low=0.1)
     publish_s: float = setting(600.0, unit="s", doc="time between two versions that a live map publishes while it changes; 0: only when the last robot leaves, or on request", low=0)
-    publish_pause_s: float = setting(10.0, unit="s", doc="shortest time between two versions of a live map, whoever asks for them; a version that is asked for earlier comes then", source="a robot that left again and again wrote 959 MB in 45 s", low=0)
+    publish_pause_s: float = setting(10.0, unit="s", doc="shortest time between two versions of a live map; a version that is asked for earlier comes then", source="a robot that left again and again wrote 959 MB in 45 s", low=0)
     idle_s: float = setting(60.0, unit="s", doc="the owner of a map that nobody uses for this long publishes it and ends", low=1)
     keep_log: bool = setting(False, doc="keep all entries of a live map's log, which experiments replay; else those before the older snapshot are deleted")
 

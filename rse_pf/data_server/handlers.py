@@ -219,12 +219,12 @@ class Handlers:
     def _charged(self, claims: Claims, map_name: str, record: MapRecord, size: int) -> Iterator[None]:
         """Charge a robot with a version while it is written; not if nothing of it was stored."""
         charge = charge_name(claims.robot, map_name, record.id, size)
-        with self.objects.ledger.reserved(claims, size):
+        with self.objects.reserved(claims, size):
             self._store.put(charge, b"")
             try:
                 yield
             except Conflict:  # the version is stored, another one is the head
-                self.objects.ledger.forget(claims.robot)
+                self.objects.accounts.forget(claims.robot)
                 raise
             except BaseException:
                 self._store.delete(charge)

@@ -13,11 +13,12 @@ import itertools
 import re
 import threading
 from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
 
+from rse_pf.accounts import Accounts
 from rse_pf.auth.tokens import Claims
 from rse_pf.config import DataSettings
-from rse_pf.data_server.fair_threads import while_wanted
-from rse_pf.data_server.quota import QuotaLedger
+from rse_pf.data_server.fair_threads import check_wanted, while_wanted
 from rse_pf.data_server.routes import Upload
 from rse_pf.errors import BadRequest, Conflict, LimitExceeded, NotFound, QuotaExceeded
 from rse_pf.identity import object_name
@@ -52,9 +53,13 @@ class Objects:
         self._store = store
         self._settings = settings
         self._wall_clock = wall_clock
-        self.ledger = QuotaLedger(store, settings, clock)
+        self.accounts = Accounts(store, settings, clock=clock, wall_clock=wall_clock, check=check_wanted)
         self._lock = threading.Lock()  # of the dictionary, never held during work
         self._writing: dict[str, tuple[threading.Lock, int]] = {}
+
+    def reserved(self, claims: Claims, size: int) -> AbstractContextManager[None]:
+        """Return the context in which a robot writes *size* bytes; it raises QuotaExceeded or StoreFull."""
+        return self.accounts.reserved(claims.robot, size, claims.quota("data_bytes") or None)
 
     def head(self, claims: Claims, digest: str) -> ObjectInfo:
         """Return size and name; raises NotFound, also for an object of another robot."""
@@ -89,7 +94,7 @@ class Objects:
         with self._exclusive(name):
             if self._find(name) is not None:
                 return False
-            with self.ledger.reserved(claims, len(data)):
+            with self.reserved(claims, len(data)):
                 self._store.put(name, data)
         return True
 
@@ -100,7 +105,7 @@ class Objects:
             found = self._find(name)
             if found is not None:
                 self._store.delete(name)
-                self.ledger.release(claims.robot, found.size)
+                self.accounts.release(claims.robot, found.size)
 
     def begin(self, claims: Claims, digest: str, size: int) -> Upload:
         """Open an upload of *size* bytes, or return the state of the open one.
@@ -124,7 +129,7 @@ class Objects:
             opened = self._opened(claims, digest)
             if opened is None:
                 self._check_open_uploads(claims)
-                with self.ledger.reserved(claims, size):
+                with self.reserved(claims, size):
                     self._store.put(
                         f"{self._parts(claims, digest)}size", f"{size} {self._wall_clock():.0f}".encode()
                     )
@@ -235,7 +240,7 @@ class Objects:
         self._drop(self._parts(claims, digest))
         if size is not None and not isinstance(self._store, PresigningStore):
             # else the robot may have a URL with which it can still store the object
-            self.ledger.release(claims.robot, size)
+            self.accounts.release(claims.robot, size)
 
     def _drop(self, prefix: str) -> None:
         """Remove an upload; ``size`` first, because without it no upload is open, whatever a crash leaves."""

@@ -123,8 +123,9 @@ class MapRegistry:
         return found
 
     def commit(
-        self, name: str, data: bytes, *, parent: str | None, author: str, created_s: float, note: str = ""
-    ) -> MapRecord:
+        self, name: str, data: bytes, *, parent: str | None, author: str, created_s: float, note: str = "",
+        charge: Callable[[int], None] = lambda size: None,
+    ) -> MapRecord:  # fmt: skip
         """Make *data* (of `encode_map`) the next version and the head of map *name*.
 
         Args:
@@ -133,6 +134,7 @@ class MapRegistry:
             author: Who made it.
             created_s: Unix seconds.
             note: What was done.
+            charge: Gets how many bytes are added to the store before they are written; refuses by an error.
 
         Raises:
             BadRequest: *data* is not a map, or *name* not a valid name.
@@ -142,7 +144,8 @@ class MapRegistry:
         return self._commit(
             name, describe_map(data, self._max_bytes), digest=digest_of(data), size=len(data), parent=parent,
             author=author, created_s=created_s, note=note,
-            write=lambda blob: self._store.put(blob, data), charged=lambda record, size: _free(),
+            write=lambda blob: self._store.put(blob, data),
+            charged=lambda record, size: _charged(charge, size),
         )  # fmt: skip
 
     def commit_object(
@@ -352,8 +355,9 @@ def difference(before: MapVersion, after: MapVersion) -> MapDiff:
 
 
 @contextlib.contextmanager
-def _free() -> Iterator[None]:
-    """Charge nobody: an operator commits."""
+def _charged(charge: Callable[[int], None], size: int) -> Iterator[None]:
+    """Charge the bytes once; what was charged and not written is found when they are counted again."""
+    charge(size)
     yield
 
 

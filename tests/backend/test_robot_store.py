@@ -7,11 +7,12 @@ from types import SimpleNamespace
 import msgspec
 import pytest
 
+from rse_pf.accounts import Accounts
 from rse_pf.auth.tokens import Claims
 from rse_pf.backend.jobs.process import JobRequest, store_reply
 from rse_pf.backend.object_refs import ObjectRefs
-from rse_pf.backend.robot_store import check_quota, quota_bytes, store_within_quota
-from rse_pf.config import PlatformSettings
+from rse_pf.backend.robot_store import quota_bytes, store_within_quota
+from rse_pf.config import DataSettings, PlatformSettings
 from rse_pf.errors import QuotaExceeded
 from rse_pf.identity import RobotId, object_name
 from rse_pf.maps.charges import charge_name
@@ -26,6 +27,10 @@ def claims(**quotas: float) -> Claims:
     return Claims(
         robot=ROBOT, token_id="t", issued_s=0.0, expires_s=1.0, key_id="k", quotas=tuple(quotas.items())
     )
+
+
+def accounts(store: MemoryStore) -> Accounts:
+    return Accounts(store, DataSettings())
 
 
 REQUEST = JobRequest(service="long", payload={}, robot=ROBOT, key="k", quota_bytes=4100.0)
@@ -52,15 +57,15 @@ def test_an_object_that_fits_exactly_is_stored_and_one_byte_more_is_not():
     store.put(object_name(ROBOT, "own"), bytes(6000))
 
     with pytest.raises(QuotaExceeded):
-        store_within_quota(store, ROBOT, bytes(4001), 10_000)
+        store_within_quota(store, accounts(store), ROBOT, bytes(4001), 10_000)
     with pytest.raises(QuotaExceeded):
-        store_within_quota(store, ROBOT, bytes(5001), 11_000)
-    digest = store_within_quota(store, ROBOT, bytes(5000), 11_000)
+        store_within_quota(store, accounts(store), ROBOT, bytes(5001), 11_000)
+    digest = store_within_quota(store, accounts(store), ROBOT, bytes(5000), 11_000)
 
     assert store.get(object_name(ROBOT, digest)) == bytes(5000)
-    assert store_within_quota(store, ROBOT, bytes(5000), 11_000) == digest
+    assert store_within_quota(store, accounts(store), ROBOT, bytes(5000), 11_000) == digest
     with pytest.raises(QuotaExceeded):
-        check_quota(store, ROBOT, 1, 11_000)
+        accounts(store).check_room(ROBOT, 1, 11_000)
 
 
 def test_short_objects_and_committed_maps_count():
@@ -69,14 +74,14 @@ def test_short_objects_and_committed_maps_count():
     store.put(charge_name(ROBOT, "kitchen", "a" * 64, 5000), b"")
     store.put(charge_name(RobotId("default", "robot-2"), "kitchen", "b" * 64, 5000), b"")
 
-    check_quota(store, ROBOT, 1, 4096 + 5000 + 4096)
+    accounts(store).check_room(ROBOT, 1, 4096 + 5000 + 4096)
     with pytest.raises(QuotaExceeded, match="9096"):
-        check_quota(store, ROBOT, 1, 4096 + 5000 + 4095)
+        accounts(store).check_room(ROBOT, 1, 4096 + 5000 + 4095)
 
 
 def test_a_large_reply_beyond_the_quota_is_refused_with_the_reason():
     store, settings = MemoryStore(), PlatformSettings()
-    gate = ObjectRefs(store, settings.serving, 4000)
+    gate = ObjectRefs(store, settings.serving, DataSettings(quota_bytes=4000))
     answer, sent = Result(id=1, reply=bytes(500)), Failure(id=1, code="too-large", message="too large")
     owner = SimpleNamespace(robot=ROBOT, claims=None)
 
@@ -87,7 +92,7 @@ def test_a_large_reply_beyond_the_quota_is_refused_with_the_reason():
     assert isinstance(refused, Failure)
     assert (refused.id, refused.code) == (1, "quota")
     assert isinstance(stored, Result)
-    assert [info.name for info in store.list()] == [object_name(ROBOT, stored.object)]
+    assert [info.name for info in store.list("objects/")] == [object_name(ROBOT, stored.object)]
 
 
 def test_a_jobs_process_stores_its_reply_and_sends_only_small_ones_along(tmp_path):

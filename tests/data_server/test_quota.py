@@ -9,16 +9,14 @@ from pathlib import Path
 import pytest
 from fake_data_service import Answer, Service, small_settings
 
-from rse_pf.auth.tokens import Claims
+from rse_pf.accounts import Accounts
 from rse_pf.config import DataSettings
-from rse_pf.data_server.quota import QuotaLedger
 from rse_pf.errors import QuotaExceeded, StoreFull
 from rse_pf.identity import RobotId, object_name
 from rse_pf.maps.format import MapVersion, encode_map
 from rse_pf.object_store import DirectoryStore, MemoryStore, ObjectStore, digest_of
 
 ROBOT = RobotId("default", "robot-1")
-CLAIMS = Claims(robot=ROBOT, token_id="t", issued_s=0.0, expires_s=1.0, key_id="k")
 
 
 def put(service: Service, data: bytes, robot: str = "robot-1") -> Answer:
@@ -36,12 +34,17 @@ def commit(service: Service, seed: int, parent: str | None, *, name: str = "kitc
     return answer
 
 
-def ledger(store: ObjectStore, now: list[float], **settings: int) -> QuotaLedger:
-    return QuotaLedger(store, DataSettings(**{"quota_bytes": 20_480, **settings}), lambda: now[0])
+def ledger(store: ObjectStore, now: list[float], **settings: int) -> Accounts:
+    return Accounts(
+        store,
+        DataSettings(**{"quota_bytes": 20_480, **settings}),
+        clock=lambda: now[0],
+        wall_clock=lambda: 1e9 + now[0],
+    )
 
 
-def write(made: QuotaLedger, store: ObjectStore, data: bytes) -> None:
-    with made.reserved(CLAIMS, len(data)):
+def write(made: Accounts, store: ObjectStore, data: bytes) -> None:
+    with made.reserved(ROBOT, len(data)):
         store.put(object_name(ROBOT, digest_of(data)), data)
 
 
@@ -115,7 +118,7 @@ def test_a_commit_that_finds_the_disk_full_charges_nothing() -> None:
     service = Service(small_settings(), FullAfterTheCharge())
 
     assert commit(service, 1, None).status == 507
-    assert list(service.store.list()) == []
+    assert [info.name for info in service.store.list()] == ["accounts/default"]
 
 
 def test_a_robot_has_a_limit_of_unfinished_uploads(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -176,14 +179,14 @@ def test_counting_again_reads_only_folders_that_changed(
     now[0] += 10.0
     write(made, store, b"second")
 
-    assert len([path for path in read if "+" in path]) <= 1, "the folder of the first write"
+    assert len({path for path in read if "+" in path}) <= 1, "the folder of the first write"
 
 
 def test_a_write_that_fails_counts_for_nothing() -> None:
     now, store = [0.0], MemoryStore()
     made = ledger(store, now, max_objects=1)
     for _ in range(3):
-        with pytest.raises(StoreFull), made.reserved(CLAIMS, 10):
+        with pytest.raises(StoreFull), made.reserved(ROBOT, 10):
             raise StoreFull("no space")
 
     write(made, store, b"x")
@@ -195,14 +198,14 @@ def test_a_write_that_fails_counts_for_nothing() -> None:
 def test_writes_in_progress_count() -> None:
     made = ledger(MemoryStore(), [0.0], max_objects=2)
 
-    with made.reserved(CLAIMS, 1), made.reserved(CLAIMS, 1), pytest.raises(QuotaExceeded):
-        made.reserved(CLAIMS, 1).__enter__()
+    with made.reserved(ROBOT, 1), made.reserved(ROBOT, 1), pytest.raises(QuotaExceeded):
+        made.reserved(ROBOT, 1).__enter__()
 
 
 def test_an_object_that_is_written_while_the_robot_is_counted_counts_once() -> None:
     now, store = [0.0], MemoryStore()
     made = ledger(store, now, max_objects=4)
-    with made.reserved(CLAIMS, 1):
+    with made.reserved(ROBOT, 1):
         store.put(object_name(ROBOT, "0" * 64), b"x")
         now[0] += 1000.0
         write(made, store, b"a")

@@ -79,14 +79,14 @@ def test_wrong_bytes_never_become_an_object_and_are_removed(service: Service) ->
 
     assert part(service, 8192, 10_000, wrong).status == 400
 
-    assert list(service.store.list()) == []
+    assert [info.name for info in service.store.list() if not info.name.startswith("accounts/")] == []
     assert service.ask("GET", UPLOAD).status == 404
 
 
 @pytest.mark.parametrize("size", [0, -1, 20_001])
 def test_an_impossible_size_is_refused(service: Service, size: int) -> None:
     assert begin(service, size).status in (400, 413)
-    assert list(service.store.list()) == []
+    assert [info.name for info in service.store.list() if not info.name.startswith("accounts/")] == []
 
 
 def test_more_bytes_than_announced_are_refused(service: Service) -> None:
@@ -162,7 +162,7 @@ def test_old_uploads_and_orphaned_parts_are_removed_and_new_uploads_are_not(serv
     assert service.ask("GET", UPLOAD).json["offset"] == 4096
     service.wall += service.settings.data.upload_ttl_s + 1
     assert service.app.handlers.objects.sweep() == 1
-    assert list(service.store.list()) == []
+    assert [info.name for info in service.store.list() if not info.name.startswith("accounts/")] == []
 
 
 class SwallowsTheLast(MemoryStore):

@@ -17,7 +17,7 @@ ORDER = (
     "geometry", "native",
     "native_buffers", "native_matcher", "token_bucket", "config",
     "silent_connections", "http_connections", "budget", "wire", "scaling",
-    "object_store", "identity", "crash_record", "maps", "auth", "enrolment", "audit", "service",
+    "object_store", "identity", "crash_record", "maps", "accounts", "auth", "enrolment", "audit", "service",
     "pnp", "services.mapping", "live_map", "services.custom", "services",
     "recording", "recording.explain", "recording.replay",
     "aws", "aws.storage", "aws.canary", "aws.fleet", "aws.money", "aws.lifecycle",

@@ -22,9 +22,10 @@ from typing import Any, TypeVar
 
 import msgspec
 
+from rse_pf.accounts import Accounts
 from rse_pf.aws.storage import open_data_store
 from rse_pf.backend.object_refs import named_in, resolve
-from rse_pf.backend.robot_store import check_quota, is_shared, store_within_quota
+from rse_pf.backend.robot_store import is_shared, store_within_quota
 from rse_pf.backend.sandbox.ipc import encode_message, receive
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import (
@@ -185,7 +186,7 @@ def _check_quota(request: JobRequest, settings: PlatformSettings) -> None:
     if is_shared(settings):
         store = open_data_store(settings)
         with contextlib.suppress(StoreError):  # the store is tried again when there is a result
-            check_quota(store, request.robot, 1, request.quota_bytes)
+            Accounts(store, settings.data).check_room(request.robot, 1, request.quota_bytes)
 
 
 def store_reply(answer: list[Any], request: JobRequest, settings: PlatformSettings) -> list[Any]:
@@ -197,7 +198,10 @@ def store_reply(answer: list[Any], request: JobRequest, settings: PlatformSettin
         if len(reply) > settings.data.max_object_bytes:
             raise LimitExceeded(f"a reply of {len(reply)} bytes is too large", hint="ask for less")
         store = open_data_store(settings)
-        digest = retry_store(lambda: store_within_quota(store, request.robot, reply, request.quota_bytes))
+        accounts = Accounts(store, settings.data)
+        digest = retry_store(
+            lambda: store_within_quota(store, accounts, request.robot, reply, request.quota_bytes)
+        )
     except RsePfError as error:
         return _encode_answer(failure_of(error))
     inline = reply if len(reply) <= inline_bytes(settings) else None

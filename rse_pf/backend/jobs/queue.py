@@ -16,6 +16,7 @@ from typing import Any
 
 import msgspec
 
+from rse_pf.accounts import Accounts
 from rse_pf.backend.jobs.lease import decode_record, record_name
 from rse_pf.backend.jobs.process import JobRequest
 from rse_pf.config import PlatformSettings
@@ -102,13 +103,15 @@ class JobQueue:
         self._others: set[str] = set()
         self._damaged: set[str] = set()
         self._settings = settings_digest_of(settings)
+        self._accounts = Accounts(store, settings.data)
 
     def offer(self, request: JobRequest) -> None:
         """Store that *request* waits; again is no error.
 
         Raises:
             BadRequest: The payload cannot be encoded.
-            StoreError: The store failed.
+            QuotaExceeded: The robot's tenant stores too much.
+            StoreError: The store failed, or is full.
         """
         name = _name(request.robot, request.key)
         try:
@@ -122,7 +125,9 @@ class JobQueue:
             robot=(request.robot.tenant, request.robot.name, request.robot.enrolment),
             key=request.key, quota_bytes=request.quota_bytes, settings=self._settings, trace=request.trace,
         )  # fmt: skip
-        self._store.put(name, msgspec.msgpack.encode(stored))
+        data = msgspec.msgpack.encode(stored)
+        self._accounts.tenant(request.robot.tenant).reserve(len(data))
+        self._store.put(name, data)
 
     def withdraw(self, request: JobRequest) -> None:
         """Remove the offer of *request*, if there is one."""

@@ -16,6 +16,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from rse_pf.accounts import Accounts
 from rse_pf.backend.jobs.lease import MAX_TRIES, JobLease, JobRecord, record_name, verdict_on
 from rse_pf.backend.jobs.process import JobProcess, JobRequest, inline_bytes, retry_store
 from rse_pf.backend.jobs.queue import JobQueue
@@ -335,7 +336,10 @@ class _JobRun:
         """Store the reply before it is reported; used where the process has no access to the store."""
         context, request, digest = self._context, self._request, digest_of(reply)
         try:
-            retry_store(lambda: store_within_quota(context.store, request.robot, reply, request.quota_bytes))
+            accounts = Accounts(context.store, context.settings.data)
+            retry_store(
+                lambda: store_within_quota(context.store, accounts, request.robot, reply, request.quota_bytes)
+            )
         except QuotaExceeded as error:
             return self._failed(error)
         inline = reply if len(reply) <= inline_bytes(context.settings) else None

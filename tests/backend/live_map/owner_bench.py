@@ -8,6 +8,7 @@ import random
 from collections.abc import Callable, Coroutine
 from typing import Any, TypeVar
 
+from rse_pf.accounts import TenantAccount
 from rse_pf.backend.live_map.owner.lease import LeaseRecord, OwnerLease, decode_lease, lease_name, map_folder
 from rse_pf.backend.live_map.owner.live_owner import LiveOwner, OwnerContext
 from rse_pf.backend.live_map.owner.log import LiveLog
@@ -116,7 +117,11 @@ class OwnerBench:
         context = OwnerContext(
             map_name=MAP, settings=bench.settings.live, kind=FAKE_MAP, threads=bench.threads,
             maps=MapRegistry(bench.store, TENANT), clock=bench.clock, wall_clock=lambda: 1000.0,
-            sleep=bench.clock.sleep, log=bench.log, tell=self.told.append, on_beat=self.beats.append,
+            sleep=bench.clock.sleep,
+            account=TenantAccount(
+                bench.store, TENANT, bench.settings.data, wall_clock=lambda: 1e9 + bench.clock()
+            ),
+            log=bench.log, tell=self.told.append, on_beat=self.beats.append,
         )  # fmt: skip
         self.owner = LiveOwner(context, self.state, self.log, self.lease)
         self.run = asyncio.ensure_future(self.owner.run())
@@ -138,10 +143,17 @@ class OwnerBench:
 class Bench:
     """A store, a clock, and the owners that a test makes."""
 
-    def __init__(self, store: ObjectStore | None = None, *, keeps_all: bool = False, **live: Any) -> None:
+    def __init__(
+        self,
+        store: ObjectStore | None = None,
+        *,
+        keeps_all: bool = False,
+        data: dict[str, Any] | None = None,
+        **live: Any,
+    ) -> None:
         self.store: ObjectStore = store or MemoryStore()
         self.clock = HandClock()
-        self.settings = PlatformSettings.from_dict({"live": live})
+        self.settings = PlatformSettings.from_dict({"live": live, "data": data or {}})
         self.keeps_all = keeps_all
         self.threads = InlineThreads()
         self._null = os.open(os.devnull, os.O_WRONLY)

@@ -17,6 +17,7 @@ from typing import Any
 
 import msgspec
 
+from rse_pf.accounts import TenantAccount
 from rse_pf.backend.live_map.owner import requests
 from rse_pf.backend.live_map.owner.lease import OwnerLease
 from rse_pf.backend.live_map.owner.log import LiveLog, MapSnapshot
@@ -24,7 +25,7 @@ from rse_pf.backend.live_map.owner.publish import version_to_start_from
 from rse_pf.backend.live_map.owner.replies import relocalise_reply, show_reply, version_reply
 from rse_pf.backend.live_map.owner.state import Applied, MapKind, MapState
 from rse_pf.backend.live_map.owner.updates import UpdateBook
-from rse_pf.backend.live_map.owner.work.entries import BUSY_RETRY_MS, EntryWriter, Submitted
+from rse_pf.backend.live_map.owner.work.entries import BUSY_RETRY_MS, SLOW_STORE_S, EntryWriter, Submitted
 from rse_pf.backend.live_map.owner.work.measuring import Measuring
 from rse_pf.backend.live_map.owner.work.publisher import Publisher
 from rse_pf.backend.live_map.owner.work.threads import Threads, Urgency
@@ -32,7 +33,7 @@ from rse_pf.backend.live_map.owner.work.waits import FIRST_RETRY_S, Sleep, next_
 from rse_pf.backend.live_map.owner.work.whole_fit import WholeFit, fit_here
 from rse_pf.backend.log import JsonLog
 from rse_pf.config import LiveSettings
-from rse_pf.errors import Conflict, InternalError, NotFound, StoreError, UnknownService
+from rse_pf.errors import Conflict, InternalError, NotFound, StoreError, StoreFull, UnknownService
 from rse_pf.identity import RobotId
 from rse_pf.live_map.events import Event, KeyframeAdded, MapStarted, RobotForgotten, RobotLeft
 from rse_pf.live_map.outcomes import (
@@ -52,6 +53,8 @@ _SETTLED_S = 5.0
 """An owner that served for this long does not die of its map; nor one that has measured a keyframe."""
 _LAST_VERSION_S = 3.0
 """A map that is released waits for its last version no longer; the next owner publishes it then."""
+_EVENT_BYTES = 512
+"""Of a keyframe's event in the log, without what it saw."""
 _WAITING = "waiting for the store"
 _ALIGNING = (Joined, Corrected, Unaligned, Ambiguous, LinkRemoved)
 
@@ -64,6 +67,7 @@ class OwnerContext:
         clock: Seconds, monotonic.
         wall_clock: Unix seconds.
         sleep: Waits for seconds.
+        account: Of the tenant, which is charged with what the map stores.
         tell: Gets each new payload.
         on_beat: Gets the number of each renewal of the lease.
         fit: Fits a whole graph.
@@ -77,6 +81,7 @@ class OwnerContext:
     clock: Callable[[], float]
     wall_clock: Callable[[], float]
     sleep: Sleep
+    account: TenantAccount
     log: JsonLog
     tell: Callable[[dict[str, Any]], None]
     on_beat: Callable[[int], None]
@@ -113,11 +118,12 @@ class LiveOwner:
             state, context.maps, threads=context.threads, clock=context.clock,
             wall_clock=context.wall_clock, sleep=context.sleep, pause_s=context.settings.publish_pause_s,
             json_log=context.log, name=context.map_name, author=f"live map on {lease.record.server}",
+            charge=lambda size, freed: context.account.reserve(size, freed=freed),
         )  # fmt: skip
         self._adding: dict[tuple[str, int], asyncio.Task[None]] = {}
         self._present: dict[str, None] = {}
         self._renewed = asyncio.Event()
-        self._wrote_snapshot = 0
+        self._wrote_snapshot = self._unsaved_bytes = 0
         self._publish_due_s = context.clock() + (context.settings.publish_s or float("inf"))
         self._untold = False
         self._is_waiting_for_store = self._is_closing = False
@@ -220,6 +226,7 @@ class LiveOwner:
             if verdict == "known":
                 return
             if verdict == "new":
+                await self._charge(len(event.features) + _EVENT_BYTES)
                 await asyncio.shield(self._writer.submit(event, len(event.features)))
                 return
             before = self._adding.get((event.robot, event.number - 1))
@@ -232,6 +239,26 @@ class LiveOwner:
                     f"keyframe {event.number} arrived, but {expected} is the next one",
                     hint=f"send keyframe {expected} first",
                 )
+
+    async def _charge(self, size: int) -> None:
+        """Charge the tenant with an entry of *size* bytes; raises QuotaExceeded and StoreFull.
+
+        A snapshot writes what keyframes saw once more, before the log is shortened: that must fit, too.
+        """
+        account = self._context.account
+        if not account.spends(size):
+            act = functools.partial(account.reserve, size, margin=self._unsaved_bytes + size)
+            reserving = asyncio.ensure_future(self._context.threads.store(act))
+            await asyncio.wait({reserving}, timeout=SLOW_STORE_S)
+            if not reserving.done():
+                self.note_store(is_waiting=True)
+            try:
+                await reserving
+            except StoreFull:
+                raise
+            except StoreError:  # the store fails: the entry waits for it, and is counted later
+                pass
+        self._unsaved_bytes += size
 
     async def _relocalise(self, payload: dict[str, Any]) -> dict[str, Any]:
         request = requests.to_request(payload, requests.RelocaliseRequest)
@@ -285,11 +312,15 @@ class LiveOwner:
             event = MapStarted(source="", keyframes=())
         if request.source or request.equal_rooms_m:
             event = msgspec.structs.replace(event, equal_rooms_m=request.equal_rooms_m)
+            await self._charge(sum(len(each.features) + _EVENT_BYTES for each in event.keyframes))
             await asyncio.shield(self._writer.submit(event))
         return {"keyframes": self._state.keyframes, "version": self._state.position}
 
     async def _stop(self) -> dict[str, Any]:
-        record = await self._publisher.publish("the live map was stopped") if self._state.keyframes else None
+        record = None
+        if self._state.keyframes:  # its log is deleted: over the quota, too, it becomes a version
+            freed = await self._context.threads.background(self._log.charged_bytes)
+            record = await self._publisher.publish("the live map was stopped", freed)
         await self._close(lambda: self._lease.stop(self._log.position), "stopped")
         with contextlib.suppress(StoreError):  # what is left is ignored, and deleted by the next owner
             await self._context.threads.background(
@@ -355,12 +386,14 @@ class LiveOwner:
         )
 
     async def _write_snapshot(self, snapshot: MapSnapshot) -> None:
+        unsaved_bytes = self._unsaved_bytes
         try:
             await self._context.threads.background(lambda: self._log.write_snapshot(snapshot))
         except StoreError as error:  # the next one is written later; a restart only takes longer
             self._context.log.warning("live-snapshot-failed", map=self._context.map_name, error=error.message)
         else:
             self._wrote_snapshot = snapshot.position
+            self._unsaved_bytes -= unsaved_bytes
 
     # --- the lease ----------------------------------------------------------------------------------
 

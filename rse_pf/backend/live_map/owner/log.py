@@ -18,7 +18,7 @@ from dataclasses import dataclass, field
 import msgspec
 
 from rse_pf.errors import Conflict, NotFound, StoreError
-from rse_pf.object_store import ObjectStore, digest_of
+from rse_pf.object_store import ObjectStore, digest_of, usage_of
 
 __all__ = ["LiveLog", "LogEntry", "MapSnapshot", "OwnershipLost", "snapshot_entries"]
 
@@ -171,6 +171,14 @@ class LiveLog:
         self.position = number
         return number
 
+    def holds_next(self) -> bool:
+        """Return whether the entry after `position` exists; raises StoreError."""
+        try:
+            self._store.head(self._entry_name(self.position + 1))
+        except NotFound:
+            return False
+        return True
+
     def write_snapshot(self, snapshot: MapSnapshot) -> None:
         """Write a snapshot durably, and delete what a restart no longer needs; raises StoreError."""
         parts: dict[str, str] = {}
@@ -192,6 +200,11 @@ class LiveLog:
         self._delete_parts(kept)
         if len(kept) == _KEPT_SNAPSHOTS:
             self._delete_entries(kept[0])
+
+    def charged_bytes(self) -> int:
+        """Return for how much of the tenant's quota log, snapshots and parts count; raises StoreError."""
+        areas = (self._entries, self._snapshots, self._parts)
+        return sum(usage_of(self._store, area).charged_bytes for area in areas)
 
     def delete_until(self, number: int) -> None:
         """Delete entries and snapshots up to *number*: the map was stopped there; raises StoreError."""

@@ -26,6 +26,7 @@ from typing import Any, TypeVar
 
 import msgspec
 
+from rse_pf.accounts import TenantAccount
 from rse_pf.aws.storage import open_data_store
 from rse_pf.backend.live_map.owner.lease import OwnerLease, lease_name, map_folder
 from rse_pf.backend.live_map.owner.link_security import (
@@ -274,7 +275,8 @@ class _Process:
         return OwnerContext(
             map_name=self._order.map_name, settings=self._settings.live, kind=self._kind,
             threads=self._threads, maps=maps, clock=time.monotonic, wall_clock=time.time,
-            sleep=asyncio.sleep, log=self._log, tell=tell, on_beat=on_beat, fit=fit_apart,
+            sleep=asyncio.sleep, account=TenantAccount(self._store, self._order.tenant, self._settings.data),
+            log=self._log, tell=tell, on_beat=on_beat, fit=fit_apart,
         )  # fmt: skip
 
     async def _obey(self, owner: LiveOwner) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 
 from rse_pf.errors import Conflict, NotFound
 from rse_pf.live_map.versions import errors_of_maps
@@ -17,11 +18,13 @@ _VERSION = re.compile(r"head|[0-9a-f]{6,64}")
 
 
 def publish_version(
-    maps: MapRegistry, name: str, version: MapVersion, *, author: str, created_s: float, note: str
-) -> MapRecord:
+    maps: MapRegistry, name: str, version: MapVersion, *, author: str, created_s: float, note: str,
+    charge: Callable[[int], None],
+) -> MapRecord:  # fmt: skip
     """Make *version* the head of map *name* and return its record; the head itself if it is the same map.
 
     Raises:
+        QuotaExceeded, StoreFull: What *charge* raises for the bytes that the version adds to the store.
         Conflict: Others move the head all the time.
         InternalError: The registry takes no such map.
         StoreError: The store fails.
@@ -44,7 +47,10 @@ def _publish(
             return head
         parent = None if head is None else head.id
         try:
-            return maps.commit(name, data, parent=parent, author=author, created_s=created_s, note=note)
+            return maps.commit(
+                name, data, parent=parent, author=author, created_s=created_s, note=note,
+                charge=charge,
+            )  # fmt: skip
         except Conflict:
             if not tries_left:
                 raise

@@ -1,4 +1,4 @@
-"""When a live map is published: at most once in an interval, whoever asks, and never twice the same map."""
+"""When a live map is published: at most once in an interval, and never twice the same map."""
 
 from __future__ import annotations
 

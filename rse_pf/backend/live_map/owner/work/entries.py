@@ -15,15 +15,15 @@ from rse_pf.backend.live_map.owner.log import LiveLog, OwnershipLost
 from rse_pf.backend.live_map.owner.work.threads import Threads
 from rse_pf.backend.live_map.owner.work.waits import FIRST_RETRY_S, Sleep, next_retry_s
 from rse_pf.backend.log import JsonLog
-from rse_pf.errors import Busy, RsePfError, StoreError
+from rse_pf.errors import Busy, RsePfError, StoreError, StoreFull
 from rse_pf.live_map.events import Event, KeyframeAdded, encode_events
 from rse_pf.live_map.outcomes import Outcome
 
-__all__ = ["BUSY_RETRY_MS", "EntryTaker", "EntryWriter", "Submitted"]
+__all__ = ["BUSY_RETRY_MS", "SLOW_STORE_S", "EntryTaker", "EntryWriter", "Submitted"]
 
 _MAX_ENTRY_EVENTS, _MAX_ENTRY_BYTES = 64, 4 << 20
 _MAX_WAITING_EVENTS = 1024
-_SLOW_STORE_S = 1.0
+SLOW_STORE_S = 1.0
 """A write that takes longer is told to the robots."""
 BUSY_RETRY_MS = 200.0
 
@@ -106,7 +106,13 @@ class EntryWriter:
             batch = self._next_batch()
             if not self._queue:
                 self._queued.clear()
-            position = await self._make_durable(encode_events([each.event for each in batch]))
+            try:
+                position = await self._make_durable(batch)
+            except StoreFull as error:
+                batch = _without_keyframes(batch, error)
+                if not batch:
+                    continue
+                position = await self._make_durable(batch)
             await self._taker.take_entry(position, batch)
 
     def _next_batch(self) -> list[Submitted]:
@@ -119,19 +125,27 @@ class EntryWriter:
             batch.append(self._queue.popleft())
         return batch
 
-    async def _make_durable(self, data: bytes) -> int:
-        """Write the next entry, however long the store fails; the same bytes each time."""
+    async def _make_durable(self, batch: list[Submitted]) -> int:
+        """Write the next entry, however long the store fails; the same bytes each time.
+
+        Raises:
+            StoreFull: There is no space for the keyframes in *batch*; the entry does not exist.
+        """
+        data = encode_events([each.event for each in batch])
+        has_keyframes = any(isinstance(each.event, KeyframeAdded) for each in batch)
         wait_s = FIRST_RETRY_S
         while True:
             write = asyncio.ensure_future(self._threads.store(lambda: self._log.write(data)))
             try:
-                await asyncio.wait({write}, timeout=_SLOW_STORE_S)
+                await asyncio.wait({write}, timeout=SLOW_STORE_S)
                 self._taker.note_store(is_waiting=not write.done())
                 position = await write
             except OwnershipLost as error:
                 self._taker.lose(error.message)
                 await asyncio.Event().wait()
             except StoreError as error:
+                if isinstance(error, StoreFull) and has_keyframes and await self._is_missing():
+                    raise
                 self._json_log.warning("live-log-retry", map=self._name, error=error.message)
                 self._taker.note_store(is_waiting=wait_s > FIRST_RETRY_S)
                 await self._sleep(wait_s)
@@ -139,3 +153,18 @@ class EntryWriter:
             else:
                 self._taker.note_store(is_waiting=False)
                 return position
+
+    async def _is_missing(self) -> bool:
+        """Return whether the next entry does surely not exist, so that it may hold something else."""
+        try:
+            return not await self._threads.store(self._log.holds_next)
+        except StoreError:
+            return False
+
+
+def _without_keyframes(batch: list[Submitted], error: StoreFull) -> list[Submitted]:
+    """Refuse the keyframes of *batch*, and return what is left: short events, which nothing can replace."""
+    for each in batch:
+        if isinstance(each.event, KeyframeAdded) and not each.done.done():
+            each.done.set_exception(error)
+    return [each for each in batch if not isinstance(each.event, KeyframeAdded)]

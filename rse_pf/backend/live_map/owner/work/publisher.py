@@ -35,7 +35,7 @@ class Publisher:
     def __init__(
         self, state: MapState, maps: MapRegistry, *, threads: Threads, clock: Callable[[], float],
         wall_clock: Callable[[], float], sleep: Sleep, pause_s: float, json_log: JsonLog, name: str,
-        author: str,
+        author: str, charge: Callable[[int, int], None],
     ) -> None:  # fmt: skip
         """Publish nothing yet.
 
@@ -50,10 +50,13 @@ class Publisher:
             json_log: Of the server.
             name: Of the map.
             author: Of the versions.
+            charge: Gets the bytes of a version before they are written, and how many are removed for them;
+                refuses by an error.
         """
         self._state, self._maps, self._threads = state, maps, threads
         self._clock, self._wall_clock, self._sleep, self._pause_s = clock, wall_clock, sleep, pause_s
         self._json_log, self._name, self._author = json_log, name, author
+        self._charge = charge
         self._lock = asyncio.Lock()
         self._published = _NEVER
         self._last_record: MapRecord | None = None
@@ -68,10 +71,15 @@ class Publisher:
         """Whether a version that was asked for waits for its time."""
         return bool(self._due) and self._is_changed
 
-    async def publish(self, note: str) -> MapRecord:
+    async def publish(self, note: str, freed: int = 0) -> MapRecord:
         """Publish the map unless its newest version was published already; return its record.
 
+        Args:
+            note: Why.
+            freed: Bytes of the map's log that are removed for the version.
+
         Raises:
+            QuotaExceeded, StoreFull: The version does not fit into what the tenant may store.
             Busy: The last version is too young; ``retry_after_ms`` says when to ask again.
             NotFound: The map is empty.
         """
@@ -88,7 +96,7 @@ class Publisher:
                 )  # fmt: skip
             if wait_s > 0:
                 await self._sleep(wait_s)
-            return await self._publish(note)
+            return await self._publish(note, freed)
 
     def ask(self, note: str) -> None:
         """Note that the map is to be published if it has changed, as soon as the interval allows it."""
@@ -122,12 +130,12 @@ class Publisher:
     def _is_changed(self) -> bool:
         return self._state.keyframes > 0 and self._state.changes != self._published
 
-    async def _publish(self, note: str) -> MapRecord:
+    async def _publish(self, note: str, freed: int = 0) -> MapRecord:
         changes = self._state.changes
         version = await self._threads.compute(Urgency.BACKGROUND, self._state.live_map.to_version)
         publish = functools.partial(
             publish_version, self._maps, self._name, version, author=self._author,
-            created_s=self._wall_clock(), note=note,
+            created_s=self._wall_clock(), note=note, charge=lambda size: self._charge(size, freed),
         )  # fmt: skip
         record = await self._threads.background(publish)
         self._free_s = self._clock() + self._pause_s
