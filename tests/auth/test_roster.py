@@ -187,6 +187,12 @@ def test_invalid_json_is_a_configuration_error(data: bytes):
         (("maps:write/kitchen",), "maps:read", "kitchen", False),
         (("maps:*/kitchen",), "maps:read", "kitchen", True),
         (("maps:write",), "maps:write", "kitchen", True),
+        (("maps:watch/kitchen",), "maps:watch", "kitchen", True),
+        (("maps:watch/kitchen",), "maps:watch", "garage", False),
+        (("maps:watch",), "maps:live", "kitchen", False),
+        (("maps:watch",), "maps:read", "kitchen", False),
+        (("maps:live",), "maps:watch", "kitchen", False),
+        (("maps:*",), "maps:watch", "kitchen", True),
     ],
 )
 def test_scopes_allow_what_they_say_and_nothing_else(scopes, right, name, allowed):

@@ -1,15 +1,22 @@
-"""The owner processes that a worker has started: each is prepared, claims one map, and ends."""
+"""The owner processes that a worker has started: each is prepared, claims one map, and ends.
+
+Tenants share them as `FairShare` says.  A map that is only watched gives its process up, the one that was not
+used for longest first, when a map that is used needs one.
+"""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
 import functools
+import time
+from collections import Counter
 from collections.abc import Callable
 from typing import Any, Literal, Protocol
 
 from rse_pf.backend.live_map.owner.process import OwnerOrder
 from rse_pf.backend.sandbox.ipc import FrameReader
+from rse_pf.backend.scheduling.fair_share import CLAIM_S, FairShare
 
 __all__ = ["ChildProcess", "OwnerChild", "OwnerChildren"]
 
@@ -37,8 +44,15 @@ class ChildProcess(Protocol):
 class OwnerChild:
     """One owner process, in the event loop of its worker."""
 
-    def __init__(self, process: ChildProcess) -> None:
-        """Read what the process says."""
+    def __init__(self, process: ChildProcess, clock: Callable[[], float] = time.monotonic) -> None:
+        """Read what the process says; *clock* returns seconds."""
+        self.tenant = ""
+        """Whose map it claims or serves."""
+        self.unused_s: float | None = None
+        """Since when its map is only watched; None while robots send it commands."""
+        self.is_leaving = False
+        """It gives its map up."""
+        self._clock = clock
         self.epoch: int | None = None
         """Of the owner, while it serves."""
         self.on_end: Callable[[OwnerChild, int], None] = lambda child, code: None
@@ -73,6 +87,7 @@ class OwnerChild:
 
     def release(self) -> None:
         """Let it release its map, and end."""
+        self.is_leaving = True
         self._process.release()
 
     def kill(self) -> None:
@@ -97,6 +112,8 @@ class OwnerChild:
             case ["serving", int(epoch)]:
                 self.epoch = epoch
                 self._outcome.set_result("serving")
+            case ["used", bool(is_used)]:
+                self.unused_s = None if is_used else self._clock()
             case ["lost"]:
                 self._outcome.set_result("lost")
 
@@ -116,20 +133,27 @@ class OwnerChild:
 class OwnerChildren:
     """The owner processes of one worker: those in use, and one that waits for a map."""
 
-    def __init__(self, spawn: Callable[[bool], ChildProcess], *, max_owners: int, keeps_spare: bool) -> None:
+    def __init__(
+        self, spawn: Callable[[bool], ChildProcess], *, max_owners: int, keeps_spare: bool,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:  # fmt: skip
         """Start none yet.
 
         Args:
             spawn: Starts a process; calmly, if nobody waits for it yet.
             max_owners: Of them are in use at the same time.
             keeps_spare: Whether one waits for a map as soon as `use` was called.
+            clock: Seconds, monotonic.
         """
         self.is_giving_up = False
         """The server drains: no further map is taken."""
         self._spawn = spawn
         self._max_owners = max_owners
         self._keeps_spare = keeps_spare
-        self._used: set[OwnerChild] = set()
+        self._clock = clock
+        self._share = FairShare(max_owners)
+        self._wanted_until_s = float("-inf")
+        self._used: dict[OwnerChild, None] = {}
         self._spare: OwnerChild | None = None
         self._timer: asyncio.TimerHandle | None = None
 
@@ -138,12 +162,33 @@ class OwnerChildren:
         """Those that claim or serve a map."""
         return list(self._used)
 
-    def take(self, on_end: Callable[[OwnerChild, int], None]) -> OwnerChild | None:
-        """Return a process that may claim a map, None if no more are allowed; *on_end* learns of its end."""
+    @property
+    def is_making_room(self) -> bool:
+        """Whether a process gives its map up, so that another map has one soon."""
+        return not self.is_giving_up and any(child.is_leaving for child in self._used)
+
+    def take(
+        self, tenant: str, on_end: Callable[[OwnerChild, int], None], *, only_watched: bool = False
+    ) -> OwnerChild | None:
+        """Return a process that may claim a map, None if no more are allowed now.
+
+        Args:
+            tenant: Whose map.
+            on_end: Learns of the end of the process.
+            only_watched: Nobody sends the map commands: it takes what no other map needs.
+        """
+        now, held = self._clock(), Counter(child.tenant for child in self._used)
+        if only_watched and now < self._wanted_until_s:
+            return None
+        if not self._share.takes(tenant, held, now):
+            if not only_watched:
+                self._make_room(tenant, held, now)
+            return None
         self.prepare()
         child, self._spare = self._spare, None
         if child is not None:
-            self._used.add(child)
+            child.tenant, child.unused_s = tenant, now if only_watched else None
+            self._used[child] = None
             child.on_end = functools.partial(self._lose, on_end)
             self._prepare_later()
         return child
@@ -151,7 +196,7 @@ class OwnerChildren:
     def prepare(self, *, calmly: bool = False) -> OwnerChild | None:
         """Return the process that waits for a map, which is started if one more may be used."""
         if self._spare is None and len(self._used) < self._max_owners and not self.is_giving_up:
-            self._spare = OwnerChild(self._spawn(calmly))
+            self._spare = OwnerChild(self._spawn(calmly), self._clock)
             self._spare.on_end = self._lose_spare
         return self._spare
 
@@ -177,8 +222,25 @@ class OwnerChildren:
         if self._spare is not None:
             self._spare.kill()
 
+    def _make_room(self, tenant: str, held: Counter[str], now: float) -> None:
+        """Let one process give its map up for a map of *tenant*, if a fair share allows that."""
+        self._share.claim(tenant, now)
+        self._wanted_until_s = now + CLAIM_S
+        if self.is_giving_up or self.is_making_room:
+            return
+        donors = self._share.donors(tenant, held)
+        unused = [
+            child
+            for child in self._used
+            if child.unused_s is not None and (child.tenant == tenant or held[child.tenant] > held[tenant])
+        ]
+        if unused:
+            min(unused, key=lambda child: (child.tenant not in donors, child.unused_s)).release()
+        elif donors:
+            [child for child in self._used if child.tenant == donors[0]][-1].release()
+
     def _lose(self, on_end: Callable[[OwnerChild, int], None], child: OwnerChild, code: int) -> None:
-        self._used.discard(child)
+        self._used.pop(child, None)
         on_end(child, code)
 
     def _lose_spare(self, child: OwnerChild, code: int) -> None:

@@ -78,8 +78,7 @@ class OwnerLinks:
             log=log,
             call=lambda act: loop.run_in_executor(self._threads, act),
             key=self._internal_key,
-            take_child=self._children.take,
-            prepare=self._children.prepare,
+            children=self._children,
             clock=time.monotonic,
             wall_clock=time.time,
         )
@@ -107,22 +106,32 @@ class OwnerLinks:
             Busy: The map has no owner in time; ``retry_after_ms`` says when to ask again.
             RsePfError: What the owner refused: Conflict, BadRequest, NotFound, Forbidden.
         """
-        return await self._link(tenant, map_name).request(robot, operation, payload, deadline_s)
+        link = self._link(tenant, map_name)
+        self._children.use(is_used=True)
+        return await link.request(robot, operation, payload, deadline_s)
 
     async def list_maps(self, tenant: str) -> list[dict[str, Any]]:
         """Return name, state, owner and server of each live map of *tenant*, from the store alone."""
         listed: list[dict[str, Any]] = await self._context.call(lambda: self._list(tenant))
         return listed
 
-    def watch(self, tenant: str, map_name: str) -> None:
-        """Ask for the updates of a map; the present state comes first, and again from each new owner."""
-        self._link(tenant, map_name).set_watched(True)
+    def watch(self, tenant: str, map_name: str, *, may_start: bool = True) -> None:
+        """Ask for the updates of a map; the present state comes first, and again from each new owner.
+
+        Args:
+            tenant: Whose map.
+            map_name: Its name.
+            may_start: Whether an owner is started for that if the map has none.
+        """
+        self._link(tenant, map_name).set_watched(True, may_start=may_start)
+        self._keep_spare()
 
     def unwatch(self, tenant: str, map_name: str) -> None:
         """Ask for no more updates of a map."""
         link = self._links.get((tenant, map_name))
         if link is not None:
             link.set_watched(False)
+            self._keep_spare()
 
     def give_up(self) -> None:
         """Let the owners that this worker started release their leases: the server drains."""
@@ -153,12 +162,15 @@ class OwnerLinks:
                 self._context, tenant, map_name,
                 on_update=lambda payload: self._on_update(tenant, map_name, payload), on_end=self._forget,
             )  # fmt: skip
-            self._children.use(is_used=True)
         return link
+
+    def _keep_spare(self) -> None:
+        """Keep a process ready while some map may need it."""
+        self._children.use(is_used=any(link.is_in_use for link in self._links.values()))
 
     def _forget(self, link: MapLink) -> None:
         self._links.pop((link.tenant, link.map_name), None)
-        self._children.use(is_used=bool(self._links))
+        self._keep_spare()
 
     def _internal_key(self) -> bytes:
         if self._key is None:

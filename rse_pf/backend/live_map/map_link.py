@@ -13,7 +13,7 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
-from rse_pf.backend.live_map.children import OwnerChild
+from rse_pf.backend.live_map.children import OwnerChild, OwnerChildren
 from rse_pf.backend.live_map.owner.lease import LeaseRecord, LeaseWatch, lease_name, verdict_on
 from rse_pf.backend.live_map.owner.link_security import (
     TOKEN_S,
@@ -47,6 +47,8 @@ _PREPARE_SHARE = 0.66
 """After this share of the lease without a renewal a process is started, so that it is ready in time."""
 _BUSY_RETRY_MS = 500.0
 _T = TypeVar("_T")
+_NO_MAP = {"kind": "map", "keyframes": 0, "version": 0, "owner": ""}
+"""What is told of a map whose owner has told nothing yet."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -56,9 +58,7 @@ class LinkContext:
     Attributes:
         call: Runs a blocking function in a thread.
         key: Returns the key of the tokens between servers; blocking.
-        take_child: Returns a process that may claim a map, None if this worker may start none; what is
-            passed is called when it ends.
-        prepare: Returns the process that `take_child` will return, which is started if there is none yet.
+        children: The owner processes of this worker.
         clock: Seconds, monotonic.
         wall_clock: Unix seconds.
         leeway_s: Of the clocks of two servers.
@@ -70,8 +70,7 @@ class LinkContext:
     log: JsonLog
     call: Callable[[Callable[[], Any]], Awaitable[Any]]
     key: Callable[[], bytes]
-    take_child: Callable[[Callable[[OwnerChild, int], None]], OwnerChild | None]
-    prepare: Callable[[], OwnerChild | None]
+    children: OwnerChildren
     clock: Callable[[], float]
     wall_clock: Callable[[], float]
 
@@ -113,7 +112,7 @@ class MapLink:
             BadRequest: The name is not valid.
         """
         self.tenant, self.map_name = tenant, map_name
-        self.is_watched = False
+        self.is_watched = self.may_start = False
         self.child: OwnerChild | None = None
         self._context = context
         self._on_update = on_update
@@ -126,7 +125,7 @@ class MapLink:
         self._welcomed = ""
         self._newest_map: dict[str, Any] = {}
         self._used_s = context.clock()
-        self._is_closed = False
+        self._is_closed = self._was_asked = False
         self._wake = asyncio.Event()
         self._task = asyncio.get_running_loop().create_task(self._run())
 
@@ -135,6 +134,7 @@ class MapLink:
     ) -> dict[str, Any]:
         """Return the answer of the owner; raises Busy after *deadline_s*, and what the owner refused."""
         number = next(self._numbers)
+        self._was_asked = True
         pending = _Pending(robot, operation, payload, asyncio.get_running_loop().create_future())
         self._pending[number] = pending
         self._send(number, pending)
@@ -151,12 +151,22 @@ class MapLink:
             del self._pending[number]
             self._used_s = self._context.clock()
 
-    def set_watched(self, is_watched: bool) -> None:
-        """Ask for updates from now on, or for none."""
-        self.is_watched = is_watched
+    def set_watched(self, is_watched: bool, *, may_start: bool = True) -> None:
+        """Ask for updates from now on, or for none.
+
+        Args:
+            is_watched: Whether somebody reads them.
+            may_start: Whether an owner is started for that if the map has none.
+        """
+        self.is_watched, self.may_start = is_watched, is_watched and may_start
         self._used_s = self._context.clock()
         self._say(["watch" if is_watched else "unwatch"])
         self._wake.set()
+
+    @property
+    def is_in_use(self) -> bool:
+        """Whether it may need an owner: it is not only watched by those who may start none."""
+        return self._was_asked or self.may_start
 
     async def close(self) -> None:
         """Close the connection; what is waited for ends with Busy."""
@@ -187,22 +197,23 @@ class MapLink:
         if record is None or record.state == "stopped":
             self._refuse_what_needs_a_map(is_stopped=record is not None)
             if not any(each.begins for each in self._pending.values()):
-                if self.is_watched and self._context.settings.warm_standby:
-                    self._context.prepare()  # robots join seconds before they drive
+                if self._context.settings.warm_standby:
+                    self._prepare()  # robots join seconds before they drive
                 await self._pause(_WATCH_POLL_S)
                 return
         is_dead = record is not None and record.epoch == self._dead_epoch
         unchanged_s = max(lease_s, self._watch.unchanged_s) if is_dead else self._watch.unchanged_s
         verdict = verdict_on(record, unchanged_s=unchanged_s, lease_s=lease_s)
-        if verdict == "claim" and not (self._pending or self.is_watched):
-            await self._pause(_WATCH_POLL_S)  # nobody needs an owner
+        if verdict == "claim" and not self._may_start:
+            self._tell_state("idle")
+            await self._pause(_WATCH_POLL_S)  # nobody who may start an owner needs one
         elif verdict == "claim":
             await self._take_over()
         elif verdict == "connect" and record is not None:
             if await self._use(record):
                 await asyncio.sleep(_RETRY_S)
             elif record.epoch != self._dead_epoch:
-                self._context.prepare()
+                self._prepare()
                 await self._pause(_POLL_S)
         else:
             self._tell_state("moving")
@@ -210,14 +221,20 @@ class MapLink:
 
     async def _take_over(self) -> None:
         """Let a process of this worker claim the map, unless another process is first."""
-        self._tell_state("moving")
-        spare = self._context.prepare()
+        children, only_watched = self._context.children, not self._pending
+        spare = children.prepare()
         if spare is not None and not spare.is_ready:
             await spare.wait_ready(_POLL_S)
             return  # the lease is read again: meanwhile another process may serve the map
-        child = self._context.take_child(self._note_end)
+        child = children.take(self.tenant, self._note_end, only_watched=only_watched)
+        if child is None and only_watched:
+            self._tell_state("idle")
+            await self._pause(_WATCH_POLL_S)  # when no other map needs a process, it is served again
+            return
+        self._tell_state("moving")
         if child is None:
-            self._refuse_all(lambda _: self._no_owner("this server takes no further live map"))
+            if not children.is_making_room:
+                self._refuse_all(lambda _: self._no_owner("this server takes no further live map"))
             await self._pause(_POLL_S)
             return
         order = OwnerOrder(
@@ -318,7 +335,7 @@ class MapLink:
                             continue
                     return
                 if self._watch.unchanged_s >= _PREPARE_SHARE * lease_s:
-                    self._context.prepare()
+                    self._prepare()
                     if await self._is_given_up(record):
                         return
         finally:
@@ -402,9 +419,19 @@ class MapLink:
 
     def _tell_state(self, state: str) -> None:
         """Tell the robots of this worker what they wait for, while there is no owner to tell it."""
-        if self.is_watched and self._newest_map and self._newest_map["state"] != state:
-            self._newest_map = {**self._newest_map, "state": state}
+        if self.is_watched and self._newest_map.get("state") != state:
+            self._newest_map = {**(self._newest_map or _NO_MAP), "state": state}
             self._on_update(self._newest_map)
+
+    @property
+    def _may_start(self) -> bool:
+        """Whether somebody needs an owner, and not only its updates if there is one."""
+        return bool(self._pending) or self.may_start
+
+    def _prepare(self) -> None:
+        """Start a process, so that it is ready in time, unless nobody may start an owner."""
+        if self._may_start:
+            self._context.children.prepare()
 
     def _is_needed(self) -> bool:
         if self._is_closed:

@@ -68,6 +68,8 @@ _MAX_HELD_BYTES = 64 << 20
 """Size of all messages that wait for owners; while a store is slow, robots keep the others."""
 _BUSY_RETRY_MS = 500.0
 _IS_GARBAGE = (BadRequest.code, BadMessage.code, LimitExceeded.code, InvalidCamera.code)
+_JUDGED_BY_OWNER = ("live-keyframe", "live-relocalise")
+"""Of these the owner judges the request; its other errors are those of the map, and count against nobody."""
 
 
 class MapOwners(Protocol):
@@ -87,8 +89,8 @@ class MapOwners(Protocol):
     async def list_maps(self, tenant: str) -> list[dict[str, Any]]:
         """Return the live maps of *tenant*; raises RsePfError."""
 
-    def watch(self, tenant: str, map_name: str) -> None:
-        """Ask for the updates of a map."""
+    def watch(self, tenant: str, map_name: str, *, may_start: bool) -> None:
+        """Ask for the updates of a map, which starts an owner only if *may_start*."""
 
     def unwatch(self, tenant: str, map_name: str) -> None:
         """Ask for no more updates of a map."""
@@ -126,8 +128,9 @@ class LiveMapRouter:
         self._held_bytes = 0
         self._waiting: dict[RobotId, int] = {}
         self._subscriptions = Subscriptions(
-            loop=context.loop, log=context.log, watch=self._owners.watch, unwatch=self._owners.unwatch
-        )
+            loop=context.loop, log=context.log, unwatch=self._owners.unwatch,
+            watch=lambda tenant, name, may_start: self._owners.watch(tenant, name, may_start=may_start),
+        )  # fmt: skip
 
     @property
     def held(self) -> int:
@@ -156,6 +159,8 @@ class LiveMapRouter:
                 )  # fmt: skip
             work = self._judged(queued, now)
         except RsePfError as error:
+            if error.code in _IS_GARBAGE:
+                self._garbage.note(queued.robot, now)
             self._fail(queued, error)
             return
         task = self._context.loop.create_task(self._follow(queued, work))
@@ -201,6 +206,8 @@ class LiveMapRouter:
             late = Expired("the live map did not answer in time", hint="send it again: nothing counts twice")
             self._fail(queued, late)
         except RsePfError as error:
+            if command.service in _JUDGED_BY_OWNER and error.code in _IS_GARBAGE:
+                self._garbage.note(queued.robot, self._monotonic())
             self._fail(queued, error)
         except Exception as error:  # noqa: BLE001  a defect must not leave the robot without an answer
             text = "".join(traceback.format_exception(type(error), error, error.__traceback__))
@@ -219,8 +226,6 @@ class LiveMapRouter:
             self._waiting[queued.robot] = left
 
     def _fail(self, queued: QueuedCommand, error: RsePfError) -> None:
-        if error.code in _IS_GARBAGE:
-            self._garbage.note(queued.robot, self._monotonic())
         self._answer(queued, failure_of(error, queued.command, server=self._context.server_id))
 
     def _check_garbage(self, robot: RobotId, now: float) -> None:
@@ -240,7 +245,7 @@ class LiveMapRouter:
         tenant, reader = connection.robot.tenant, connection
         try:
             map_name = map_of_topic(topic)
-            forbidden = _forbidden(connection.claims, "maps:live", map_name)
+            forbidden = _forbidden_to_read(connection.claims, map_name)
             if forbidden is not None:
                 raise forbidden
         except RsePfError as error:
@@ -253,10 +258,15 @@ class LiveMapRouter:
             if connection.claims is judged:
                 return None
             judged = connection.claims
-            return _forbidden(judged, "maps:live", map_name)
+            if _forbidden(judged, "maps:live", map_name) is not None:
+                self._subscriptions.stop_starting(reader, identity)
+            return _forbidden_to_read(judged, map_name)
 
         first = {"kind": "map", "keyframes": 0, "version": 0, "owner": "", "state": "moving"}
-        self._subscriptions.begin(reader, identity, tenant, map_name, first=first, may_go_on=may_go_on)
+        self._subscriptions.begin(
+            reader, identity, tenant, map_name, first=first, may_go_on=may_go_on,
+            may_start=_forbidden(judged, "maps:live", map_name) is None,
+        )  # fmt: skip
 
     def unsubscribe(self, connection: Reader, identity: int) -> None:
         """End a subscription."""
@@ -302,6 +312,13 @@ def _forbidden(claims: Claims | None, right: str, map_name: str) -> RsePfError |
     if claims is None or scopes_allow(claims.scopes, right, map_name):
         return None
     return Forbidden(f"this token does not hold the scope {right}/{map_name}", hint="issue one that does")
+
+
+def _forbidden_to_read(claims: Claims | None, map_name: str) -> RsePfError | None:
+    """Return why a token does not allow to subscribe to a map: who may drive there may, too."""
+    if _forbidden(claims, "maps:watch", map_name) is None:
+        return None
+    return _forbidden(claims, "maps:live", map_name)
 
 
 def _check_features(payload: Any) -> None:

@@ -60,6 +60,8 @@ class _Topic:
     map_name: str
     values: dict[str, _Value] = field(default_factory=dict)
     readers: dict[_Subscription, None] = field(default_factory=dict)
+    starters: set[_Subscription] = field(default_factory=set)
+    """Those for whom an owner is started."""
 
 
 @dataclass(eq=False, slots=True)
@@ -81,7 +83,7 @@ class Subscriptions:
         *,
         loop: AbstractEventLoop,
         log: Log,
-        watch: Callable[[str, str], None],
+        watch: Callable[[str, str, bool], None],
         unwatch: Callable[[str, str], None],
     ) -> None:
         """Serve no reader yet.
@@ -89,7 +91,8 @@ class Subscriptions:
         Args:
             loop: Event loop of the worker.
             log: Of the worker.
-            watch: Called with tenant and map when its first reader comes.
+            watch: Called with tenant and map when its first reader comes, and whether an owner may be
+                started for its readers; again when that changes.
             unwatch: Called when its last reader has left.
         """
         self.sent = self.replaced = 0
@@ -118,6 +121,7 @@ class Subscriptions:
         *,
         first: dict[str, Any],
         may_go_on: Callable[[], RsePfError | None],
+        may_start: bool = True,
     ) -> None:
         """Send the present values of a map to *reader*, and then each newer one.
 
@@ -128,6 +132,7 @@ class Subscriptions:
             map_name: A map of the tenant.
             first: The value of the key ``map`` as long as its owner has told none.
             may_go_on: Returns why the robot may read the map no longer; called before anything is sent.
+            may_start: Whether an owner is started for this reader if the map has none.
         """
         key = (tenant, map_name)
         topic = self._topics.get(key)
@@ -142,7 +147,22 @@ class Subscriptions:
         reader.bound_unsent(_MAX_UNSENT_BYTES)
         self._send_soon(subscription)
         if is_new:
-            self._watch(tenant, map_name)
+            self._watch(tenant, map_name, may_start)
+        if may_start:
+            self._set_starter(subscription, is_starter=True, is_told=is_new)
+
+    def stop_starting(self, reader: Reader, identity: int) -> None:
+        """Start no owner for this subscription any more: the reader may only watch from now on."""
+        subscription = self._of_reader.get(reader, {}).get(identity)
+        if subscription is not None:
+            self._set_starter(subscription, is_starter=False)
+
+    def _set_starter(self, subscription: _Subscription, *, is_starter: bool, is_told: bool = False) -> None:
+        topic = subscription.topic
+        before = bool(topic.starters)
+        (topic.starters.add if is_starter else topic.starters.discard)(subscription)
+        if topic.readers and bool(topic.starters) != before and not is_told:
+            self._watch(topic.tenant, topic.map_name, is_starter)
 
     def end(self, reader: Reader, identity: int) -> None:
         """Send no more to a subscription; does nothing if it has ended."""
@@ -156,6 +176,7 @@ class Subscriptions:
         self._slow.pop(subscription, None)
         topic = subscription.topic
         del topic.readers[subscription]
+        self._set_starter(subscription, is_starter=False)
         if not topic.readers:
             del self._topics[topic.tenant, topic.map_name]
             self._unwatch(topic.tenant, topic.map_name)

@@ -23,6 +23,7 @@ class FakeOwners:
         self.on_update = on_update
         self.asked: list[tuple[str, str, RobotId, str, dict[str, Any], float]] = []
         self.watched: list[tuple[str, str]] = []
+        self.may_start: dict[tuple[str, str], bool] = {}
         self.unwatched: list[tuple[str, str]] = []
         self.maps: dict[str, list[dict[str, Any]]] = {}
         self.answer: Callable[[str, dict[str, Any]], dict[str, Any] | RsePfError | None] | None = None
@@ -58,8 +59,9 @@ class FakeOwners:
     async def list_maps(self, tenant: str) -> list[dict[str, Any]]:
         return self.maps.get(tenant, [])
 
-    def watch(self, tenant: str, map_name: str) -> None:
+    def watch(self, tenant: str, map_name: str, *, may_start: bool) -> None:
         self.watched.append((tenant, map_name))
+        self.may_start[tenant, map_name] = may_start
 
     def unwatch(self, tenant: str, map_name: str) -> None:
         self.unwatched.append((tenant, map_name))

@@ -106,6 +106,7 @@ class OwnerBench:
     def __init__(self, bench: Bench, name: str) -> None:
         self.told: list[dict[str, Any]] = []
         self.beats: list[int] = []
+        self.used: list[bool] = []
         self.lease = OwnerLease(bench.store, LEASE, owner=name, server=name, clock=bench.clock)
         self.claimed = self.lease.claim(bench.lease_bytes())
         record = self.lease.record
@@ -122,6 +123,7 @@ class OwnerBench:
                 bench.store, TENANT, bench.settings.data, wall_clock=lambda: 1e9 + bench.clock()
             ),
             log=bench.log, tell=self.told.append, on_beat=self.beats.append,
+            on_use=self.used.append,
         )  # fmt: skip
         self.owner = LiveOwner(context, self.state, self.log, self.lease)
         self.run = asyncio.ensure_future(self.owner.run())

@@ -62,16 +62,17 @@ class Worker:
     def __init__(self) -> None:
         self.store = MemoryStore()
         self.started: list[PlayedProcess] = []
+        self.told: list[dict[str, Any]] = []
         self.children = OwnerChildren(self._spawn, max_owners=2, keeps_spare=False)
         self._null = os.open(os.devnull, os.O_WRONLY)
         self._log = JsonLog(level="error", server="test", wall_clock=time.time, fd=self._null)
         context = LinkContext(
             store=self.store, settings=PlatformSettings().live, server_id="here", log=self._log,
-            call=self._call, key=lambda: b"k" * 32, take_child=self.children.take,
-            prepare=self.children.prepare, clock=time.monotonic, wall_clock=time.time,
+            call=self._call, key=lambda: b"k" * 32, children=self.children,
+            clock=time.monotonic, wall_clock=time.time,
         )  # fmt: skip
         self.link = MapLink(
-            context, "default", "warehouse", on_update=lambda payload: None, on_end=lambda link: None
+            context, "default", "warehouse", on_update=self.told.append, on_end=lambda link: None
         )
 
     def lease(self) -> LeaseRecord | None:
@@ -182,6 +183,37 @@ def test_an_owner_whose_port_was_never_reached_keeps_its_lease() -> None:
         worker.started[0].say("ready")
         await asyncio.wait({sent})
         assert isinstance(sent.exception(), Busy)
+        assert decode_lease(LEASE, worker.store.get(LEASE)).epoch == 1
+
+    play(test)
+
+
+def test_who_may_only_watch_starts_no_process_and_is_told_that_the_map_is_idle() -> None:
+    async def test(worker: Worker) -> None:
+        lease = OwnerLease(worker.store, LEASE, owner="b", server="there", clock=time.monotonic)
+        assert lease.claim(None)
+        assert lease.release()
+        worker.link.set_watched(True, may_start=False)
+        await until(lambda: worker.told)
+        assert worker.told[-1]["state"] == "idle"
+        assert not worker.link.is_in_use
+
+        worker.link.set_watched(True, may_start=True)
+        await until(lambda: worker.started)
+        worker.started[0].say("ready")
+        await until(lambda: (found := worker.lease()) is not None and found.state == "serving")
+        assert worker.told[-1]["state"] == "moving"
+
+    play(test)
+
+
+def test_who_may_only_watch_a_map_that_is_driven_in_takes_no_part_in_a_takeover() -> None:
+    async def test(worker: Worker) -> None:
+        owner_on_a_closed_port(worker)
+        worker.link._welcomed = "b"
+        worker.link.set_watched(True, may_start=False)
+        await until(lambda: worker.told and worker.told[-1]["state"] == "idle")
+        assert worker.started == []
         assert decode_lease(LEASE, worker.store.get(LEASE)).epoch == 1
 
     play(test)

@@ -15,11 +15,20 @@ from backend.gateway.worker_parts import quiet_log
 from backend.live_map.fake_owners import FakeOwners, FakeReader
 
 from rse_pf.auth.tokens import Claims
-from rse_pf.backend.live_map.router import LiveMapRouter
+from rse_pf.backend.live_map.router import LIVE_SERVICES, LiveMapRouter
 from rse_pf.backend.ports import Clocks, WorkerContext
 from rse_pf.backend.scheduling.scheduler import QueuedCommand
 from rse_pf.config import PlatformSettings
-from rse_pf.errors import BadRequest, Busy
+from rse_pf.errors import (
+    BadRequest,
+    Busy,
+    InvalidCamera,
+    LimitExceeded,
+    QuotaExceeded,
+    RsePfError,
+    StoreError,
+    StoreFull,
+)
 from rse_pf.identity import RobotId
 from rse_pf.live_map.keyframe_code import encode_features
 from rse_pf.wire import Command, Failure, Result, Update
@@ -393,6 +402,107 @@ def test_a_right_that_a_fresh_token_does_not_give_ends_the_subscription() -> Non
         failure: Any = (await settled(reader, 2))[1]
         assert (failure.id, failure.code) == (9, "forbidden")
         assert parts.owners.unwatched == [("default", "m")]
+
+    with_router(test)
+
+
+def test_a_token_to_watch_a_map_subscribes_to_it_and_starts_no_owner() -> None:
+    async def test(parts: Parts) -> None:
+        viewer, driver = FakeReader("viewer"), FakeReader("driver")
+        viewer.claims = claims("maps:watch/m")
+        driver.claims = claims("maps:live/m")
+        parts.router.subscribe(viewer, 9, "live/m")
+        assert parts.owners.may_start == {("default", "m"): False}
+
+        parts.router.subscribe(driver, 3, "live/m")
+        assert parts.owners.may_start == {("default", "m"): True}
+        parts.router.left(driver)
+        assert parts.owners.may_start == {("default", "m"): False}
+        parts.owners.on_update("default", "m", {"kind": "map", "keyframes": 1})
+
+        [update] = [each for each in await settled(viewer, 1) if isinstance(each, Update)]
+        assert update.payload["keyframes"] == 1
+        parts.router.subscribe(viewer, 10, "live/other")
+        failure: Any = viewer.written[-1]
+        assert (failure.id, failure.code) == (10, "forbidden")
+        parts.router.unsubscribe(viewer, 9)
+        assert parts.owners.unwatched == [("default", "m")]
+
+    with_router(test)
+
+
+def test_a_driver_whose_fresh_token_only_allows_to_watch_goes_on_reading_and_starts_no_owner() -> None:
+    async def test(parts: Parts) -> None:
+        reader = FakeReader()
+        reader.claims = claims("maps:live/m")
+        parts.router.subscribe(reader, 9, "live/m")
+        await settled(reader, 1)
+        assert parts.owners.may_start == {("default", "m"): True}
+
+        reader.claims = claims("maps:watch/m")
+        parts.owners.on_update("default", "m", {"kind": "map", "keyframes": 1})
+
+        assert isinstance((await settled(reader, 2))[1], Update)
+        assert parts.owners.may_start == {("default", "m"): False}
+
+    with_router(test)
+
+
+@pytest.mark.parametrize("service", sorted(LIVE_SERVICES))
+@pytest.mark.parametrize("scope", ["maps:watch/m", "maps:watch"])
+def test_a_token_to_watch_a_map_gives_no_command_to_it(service: str, scope: str) -> None:
+    async def test(parts: Parts) -> None:
+        viewer = FakeReader()
+        viewer.claims = claims(scope)
+        parts.owners.maps = {"default": [{"name": "m"}]}
+        payload = {**keyframe(), "robot": "bob", "from": "m@ab12"}
+
+        answer = await parts.ask(service, payload, connection=viewer)
+
+        assert parts.owners.asked == []
+        if service == "live-list":
+            assert isinstance(answer, Result)
+            assert answer.reply == {"maps": []}
+        else:
+            assert isinstance(answer, Failure)
+            assert answer.code == "forbidden"
+
+    with_router(test)
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        BadRequest("the relative pose is no rotation"), LimitExceeded("too many versions"),
+        InvalidCamera("fx"), QuotaExceeded("the tenant is full"), StoreFull("the disk is full"),
+    ],
+    ids=lambda error: error.code,
+)  # fmt: skip
+@pytest.mark.parametrize("service", sorted(LIVE_SERVICES - {"live-keyframe", "live-relocalise", "live-list"}))
+def test_an_error_of_the_map_never_counts_against_who_asked(service: str, error: RsePfError) -> None:
+    async def test(parts: Parts) -> None:
+        parts.owners.answer = lambda operation, payload: error
+        payload = {"map": "m", "robot": "bob", "from": "m@ab12"}
+
+        for _ in range(15):
+            answer = await parts.ask(service, payload)
+            assert isinstance(answer, Failure)
+            assert answer.code == error.code
+
+    with_router(test)
+
+
+@pytest.mark.parametrize(
+    "error", [QuotaExceeded("full"), StoreFull("full"), Busy("moves"), StoreError("down")]
+)
+def test_a_keyframe_that_the_store_or_the_quota_refuses_is_no_garbage(error: RsePfError) -> None:
+    async def test(parts: Parts) -> None:
+        parts.owners.answer = lambda operation, payload: error
+
+        for _ in range(15):
+            answer = await parts.ask("live-keyframe", keyframe())
+            assert isinstance(answer, Failure)
+            assert answer.code == error.code
 
     with_router(test)
 

@@ -14,8 +14,12 @@ import pytest
 from guarded_server import KEY, GuardedServer
 
 import client_sdk
+from rse_pf.auth.roster import scopes_allow
+from rse_pf.backend.live_map.router import LIVE_SERVICES
+from rse_pf.data_server.routes import ROUTES
 from rse_pf.errors import Forbidden
 from rse_pf.live_map.keyframe_code import encode_features
+from rse_pf.services.builtin import builtin_services
 
 pytestmark = [pytest.mark.slow, pytest.mark.system]
 
@@ -89,5 +93,34 @@ def test_a_token_for_another_map_neither_reads_nor_writes(tmp_path: Path) -> Non
             with pytest.raises(Forbidden, match="maps:live/m"):
                 await a_robot.call("live-keyframe", keyframe(0))
             assert (await a_robot.subscribe("live/other").next())[0] == "map"
+
+    run(tmp_path, test)
+
+
+def test_a_token_to_watch_a_map_allows_to_subscribe_to_it_and_nothing_else(tmp_path: Path) -> None:
+    async def test(server: GuardedServer) -> None:
+        store = tmp_path / "store"
+        async with robot(server, "v", scopes=("maps:watch/m",)) as viewer, robot(server, "r") as driver:
+            updates = viewer.subscribe("live/m")
+            assert (await updates.next())[0] == "map"
+            for service in sorted(
+                {*LIVE_SERVICES, *(each.name for each in builtin_services(server.settings))}
+            ):
+                if service == "live-list":
+                    assert (await viewer.call(service, {})).reply == {"maps": []}
+                    continue
+                with pytest.raises(Forbidden):
+                    await viewer.call(service, keyframe(0) | {"robot": "r"})
+            with pytest.raises(Forbidden):
+                await viewer.subscribe("live/other").next()
+            assert not list(store.glob("live/default/*/lease")), "no owner was started"
+            await driver.call("live-keyframe", keyframe(0), deadline_s=20.0)
+            await value(updates, "pose/r", lambda pose: pose["timestamp_s"] == 0.0)
+        assert [
+            route.operation
+            for route in ROUTES
+            if route.scope and scopes_allow(("maps:watch/m",), route.scope)
+        ] == []
+        assert not any(scopes_allow(("maps:watch",), right) for right in ("topics:read", "topics:write"))
 
     run(tmp_path, test)

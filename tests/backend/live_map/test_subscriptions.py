@@ -37,7 +37,7 @@ class Parts:
         self.all = Subscriptions(
             loop=self.loop,  # type: ignore[arg-type]
             log=self.log,
-            watch=lambda *key: self.watched.append(key),
+            watch=lambda tenant, name, may_start: self.watched.append((tenant, name)),
             unwatch=lambda *key: self.watched.remove(key),
         )
 

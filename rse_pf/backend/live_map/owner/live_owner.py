@@ -53,6 +53,8 @@ _SETTLED_S = 5.0
 """An owner that served for this long does not die of its map; nor one that has measured a keyframe."""
 _LAST_VERSION_S = 3.0
 """A map that is released waits for its last version no longer; the next owner publishes it then."""
+_UNUSED_S = 10.0
+"""A map that got no command for so long is only watched."""
 _EVENT_BYTES = 512
 """Of a keyframe's event in the log, without what it saw."""
 _WAITING = "waiting for the store"
@@ -70,6 +72,7 @@ class OwnerContext:
         account: Of the tenant, which is charged with what the map stores.
         tell: Gets each new payload.
         on_beat: Gets the number of each renewal of the lease.
+        on_use: Gets whether the map is used: commands came, or none for a while.
         fit: Fits a whole graph.
     """
 
@@ -85,6 +88,7 @@ class OwnerContext:
     log: JsonLog
     tell: Callable[[dict[str, Any]], None]
     on_beat: Callable[[int], None]
+    on_use: Callable[[bool], None] = lambda is_used: None
     fit: WholeFit = fit_here
 
 
@@ -128,6 +132,7 @@ class LiveOwner:
         self._untold = False
         self._is_waiting_for_store = self._is_closing = False
         self._idle_since_s = self._began_s = context.clock()
+        self._is_used, self._used_s = False, float("-inf")
         self.users = 0
         """Connections; kept by the server."""
         self._ended: asyncio.Future[str] = asyncio.get_running_loop().create_future()
@@ -167,6 +172,7 @@ class LiveOwner:
         if self.is_over:
             raise self._moving()
         self._names[robot.folder] = robot.name
+        self._note_use(is_used=True)
         reply = await self._reply_to(robot, operation, payload)
         while (
             operation != requests.STOP and not self._is_owner()
@@ -431,12 +437,22 @@ class LiveOwner:
         if now >= self._publish_due_s:
             self._publish_due_s = now + self._context.settings.publish_s
             self._publisher.ask("live map")
+        if now - self._used_s >= _UNUSED_S:
+            self._note_use(is_used=False)
         if self.users:
             self._idle_since_s = now
         elif now - self._idle_since_s >= self._context.settings.idle_s:
             self._idle_since_s = now
             self._start(self._end_idle())
         self._start(self._publisher.publish_due())
+
+    def _note_use(self, *, is_used: bool) -> None:
+        """Take that a command came, or none for a while."""
+        if is_used:
+            self._used_s = self._context.clock()
+        if is_used != self._is_used:
+            self._is_used = is_used
+            self._context.on_use(is_used)
 
     async def _end_idle(self) -> None:
         """Publish the map, when it may be, and give it up; a version that fails is left to the next owner."""

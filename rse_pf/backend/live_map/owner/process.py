@@ -276,8 +276,13 @@ class _Process:
             map_name=self._order.map_name, settings=self._settings.live, kind=self._kind,
             threads=self._threads, maps=maps, clock=time.monotonic, wall_clock=time.time,
             sleep=asyncio.sleep, account=TenantAccount(self._store, self._order.tenant, self._settings.data),
-            log=self._log, tell=tell, on_beat=on_beat, fit=fit_apart,
+            log=self._log, tell=tell, on_beat=on_beat, on_use=self._tell_use, fit=fit_apart,
         )  # fmt: skip
+
+    def _tell_use(self, is_used: bool) -> None:
+        """Tell the worker, which may need the process for another map."""
+        with contextlib.suppress(OSError):  # it does not read: it ends
+            self._worker.sendall(encode_message(["used", is_used]))
 
     async def _obey(self, owner: LiveOwner) -> None:
         """Release the map when the worker says so."""

@@ -416,6 +416,24 @@ def test_a_map_that_changes_is_published_every_so_often():
     bench.run(test)
 
 
+def test_an_owner_tells_its_worker_whether_commands_come():
+    bench = Bench()
+
+    async def test() -> None:
+        owner = await bench.own("a")
+        owner.owner.users = 1
+        await bench.clock.advance(11.0)
+        assert owner.used == []
+        await owner.keyframe(0)
+        await owner.ask("live-show")
+        await bench.clock.advance(9.0)
+        assert owner.used == [True]
+        await bench.clock.advance(2.0)
+        assert owner.used == [True, False]
+
+    bench.run(test)
+
+
 def test_a_stopped_map_is_published_and_begins_anew_without_its_past():
     bench = Bench()
 

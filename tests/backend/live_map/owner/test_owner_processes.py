@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import os
 import signal
 import time
@@ -21,7 +22,7 @@ from rse_pf.backend.live_map.owner.log import LiveLog
 from rse_pf.backend.live_map.owner.state import MapState
 from rse_pf.backend.log import JsonLog
 from rse_pf.config import PlatformSettings
-from rse_pf.errors import Conflict, NotFound
+from rse_pf.errors import Conflict, NotFound, RsePfError
 from rse_pf.identity import RobotId
 from rse_pf.live_map.events import KeyframeAdded, decode_events
 from rse_pf.object_store import DirectoryStore
@@ -126,6 +127,50 @@ def test_a_server_that_dies_or_stands_still_loses_no_acknowledged_keyframe(
             assert numbers == list(range(number))
             assert state.keyframes == shown["keyframes"] == number
             assert max(took) < 10.0  # 3 s on a machine that does nothing else; see docs/live_maps.md
+
+    asyncio.run(test())
+
+
+@pytest.mark.parametrize("attackers_drive", [False, True])
+def test_a_tenant_that_holds_most_owners_gives_one_up_within_seconds(
+    tmp_path: Path, attackers_drive: bool
+) -> None:
+    hostile, victim = RobotId("acme", "robot-1"), RobotId("rival", "robot-1")
+
+    async def test() -> None:
+        async with servers(tmp_path, max_owners=4) as both:
+
+            async def drive(robot: RobotId, name: str, number: int) -> dict[str, Any]:
+                return await both.a.request(
+                    robot.tenant, name, robot, "live-keyframe", keyframe_payload(number), PATIENT_S
+                )
+
+            async def drive_on(name: str) -> None:
+                number = 1
+                while True:
+                    with contextlib.suppress(RsePfError):
+                        await both.a.request(
+                            "acme", name, hostile, "live-keyframe", keyframe_payload(number), 1.0
+                        )
+                        number += 1
+
+            for name in ("m1", "m2", "m3"):
+                both.a.watch("acme", name)
+                await drive(hostile, name, 0)
+            driving = [
+                asyncio.ensure_future(drive_on(name)) for name in ("m1", "m2", "m3")[: 3 * attackers_drive]
+            ]
+            await drive(victim, "v1", 0)
+            began_s = time.monotonic()
+            if not attackers_drive:  # they are only watched from here on
+                for child in both.a.children:
+                    child.unused_s = time.monotonic() if child.tenant == "acme" else None
+            assert (await drive(victim, "v2", 0))["number"] == 1
+            assert time.monotonic() - began_s < 10.0
+            assert (await drive(victim, "v1", 1))["number"] == 2
+            assert sorted(child.tenant for child in both.a.children).count("rival") == 2
+            for each in driving:
+                each.cancel()
 
     asyncio.run(test())
 

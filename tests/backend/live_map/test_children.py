@@ -1,0 +1,154 @@
+"""Which map of which tenant gets one of a worker's owner processes, and which one gives it up."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+from collections.abc import Awaitable, Callable
+
+from rse_pf.backend.live_map.children import OwnerChild, OwnerChildren
+from rse_pf.backend.live_map.owner.process import OwnerOrder
+from rse_pf.backend.sandbox.ipc import encode_message
+
+
+class PlayedProcess:
+    """A process that is ready at once, and ends when it is told to release its map."""
+
+    pid = 1
+
+    def __init__(self) -> None:
+        self.connection, self.theirs = socket.socketpair()
+        self.theirs.sendall(encode_message(["ready"]))
+
+    def claim(self, order: OwnerOrder) -> None: ...
+
+    def release(self) -> None:
+        self.theirs.close()
+
+    def kill(self) -> int:
+        self.connection.close()
+        self.theirs.close()
+        return 0
+
+
+class Worker:
+    """The processes of one worker, and time that the test sets."""
+
+    def __init__(self, max_owners: int) -> None:
+        self.now_s = 0.0
+        self.children = OwnerChildren(
+            lambda calmly: PlayedProcess(), max_owners=max_owners, keeps_spare=False, clock=lambda: self.now_s
+        )
+
+    def take(self, tenant: str, *, only_watched: bool = False) -> OwnerChild | None:
+        return self.children.take(tenant, lambda child, code: None, only_watched=only_watched)
+
+    def held(self) -> list[str]:
+        return sorted(child.tenant for child in self.children.used)
+
+    async def gets(self, tenant: str) -> OwnerChild:
+        """Return the process that a map of *tenant* gets, which asks again and again."""
+        while (child := self.take(tenant)) is None:
+            await asyncio.sleep(0)
+        return child
+
+
+def play(max_owners: int, test: Callable[[Worker], Awaitable[None]]) -> None:
+    async def run() -> None:
+        worker = Worker(max_owners)
+        try:
+            await asyncio.wait_for(test(worker), 10.0)
+        finally:
+            worker.children.drop_spare()
+            for child in worker.children.used:
+                child.kill()
+
+    asyncio.run(run())
+
+
+def test_a_tenant_that_holds_all_gives_one_up_and_does_not_get_it_back() -> None:
+    async def test(worker: Worker) -> None:
+        for _ in range(3):
+            await worker.gets("acme")
+        assert worker.take("acme") is None
+        assert not worker.children.is_making_room, "nobody else wants one"
+        await worker.gets("rival")
+        assert worker.held() == ["acme", "acme", "rival"]
+        for _ in range(20):
+            assert worker.take("acme") is None
+        await asyncio.sleep(0)
+        assert worker.held() == ["acme", "acme", "rival"]
+
+    play(3, test)
+
+
+def test_the_map_that_was_only_watched_for_longest_gives_up_first() -> None:
+    async def test(worker: Worker) -> None:
+        first, second, third = [await worker.gets("acme") for _ in range(3)]
+        second.unused_s, third.unused_s = 5.0, 4.0
+        await worker.gets("rival")
+        assert third not in worker.children.used
+        assert {first, second} < set(worker.children.used)
+
+    play(3, test)
+
+
+def test_a_map_that_is_only_watched_gives_up_for_another_one_of_its_tenant() -> None:
+    async def test(worker: Worker) -> None:
+        watched = await worker.gets("acme")
+        watched.unused_s = 1.0
+        driven = await worker.gets("acme")
+        assert worker.children.used == [driven]
+
+    play(1, test)
+
+
+def test_a_tenant_does_not_lose_its_only_map_to_one_that_holds_more() -> None:
+    async def test(worker: Worker) -> None:
+        for _ in range(2):
+            await worker.gets("acme")
+        watched = await worker.gets("rival")
+        watched.unused_s = 1.0
+        for _ in range(20):
+            assert worker.take("acme") is None
+            await asyncio.sleep(0)
+        assert watched in worker.children.used
+
+    play(3, test)
+
+
+def test_a_map_that_is_only_watched_takes_a_process_only_while_no_other_map_wants_one() -> None:
+    async def test(worker: Worker) -> None:
+        watched = await worker.gets("acme")
+        watched.unused_s = 1.0
+        assert worker.take("rival", only_watched=True) is None
+        assert not worker.children.is_making_room
+        assert worker.take("rival") is None
+        while worker.children.used:
+            await asyncio.sleep(0)
+        assert worker.take("acme", only_watched=True) is None, "the other one is about to ask again"
+        worker.now_s += 60.0
+        assert worker.take("acme", only_watched=True) is not None
+
+    play(1, test)
+
+
+def test_a_process_that_is_told_to_be_used_is_not_the_first_to_go() -> None:
+    async def test(worker: Worker) -> None:
+        child = worker.children.prepare()
+        assert child is not None
+        process = child._process
+        assert isinstance(process, PlayedProcess)
+        taken = worker.take("acme", only_watched=True)
+        assert taken is child
+        assert child.unused_s == 0.0
+        process.theirs.sendall(encode_message(["used", True]))
+        while child.unused_s is not None:
+            await asyncio.sleep(0)
+        worker.now_s = 7.0
+        process.theirs.sendall(encode_message(["used", False]))
+        while child.unused_s is None:
+            await asyncio.sleep(0)
+        assert child.unused_s == 7.0
+
+    play(1, test)
