@@ -66,6 +66,7 @@ LIVE_SERVICES = frozenset((*_REQUESTS, LIVE_LIST))
 _FOR_OPERATORS = frozenset(("live-publish", "live-stop", "live-forget", "live-start"))
 _MAX_HELD_BYTES = 64 << 20
 """Size of all messages that wait for owners; while a store is slow, robots keep the others."""
+_MAX_HELD_OF_TENANT_BYTES = _MAX_HELD_BYTES // 4
 _BUSY_RETRY_MS = 500.0
 _IS_GARBAGE = (BadRequest.code, BadMessage.code, LimitExceeded.code, InvalidCamera.code)
 _JUDGED_BY_OWNER = ("live-keyframe", "live-relocalise")
@@ -126,6 +127,7 @@ class LiveMapRouter:
         self._garbage = GarbageCounts()
         self._tasks: dict[asyncio.Task[None], QueuedCommand] = {}
         self._held_bytes = 0
+        self._held_of_tenant: dict[str, int] = {}
         self._waiting: dict[RobotId, int] = {}
         self._subscriptions = Subscriptions(
             loop=context.loop, log=context.log, unwatch=self._owners.unwatch,
@@ -152,7 +154,8 @@ class LiveMapRouter:
         now = self._monotonic()
         try:
             self._check_garbage(queued.robot, now)
-            if self._held_bytes + queued.size_bytes > _MAX_HELD_BYTES:
+            held = self._held_of_tenant.get(queued.robot.tenant, 0) + queued.size_bytes
+            if held > _MAX_HELD_OF_TENANT_BYTES or self._held_bytes + queued.size_bytes > _MAX_HELD_BYTES:
                 raise Busy(
                     "too many commands wait for live maps", hint="try again later",
                     retry_after_ms=_BUSY_RETRY_MS,
@@ -166,6 +169,7 @@ class LiveMapRouter:
         task = self._context.loop.create_task(self._follow(queued, work))
         self._tasks[task] = queued
         self._held_bytes += queued.size_bytes
+        self._held_of_tenant[queued.robot.tenant] = held
         self._waiting[queued.robot] = self._waiting.get(queued.robot, 0) + 1
         task.add_done_callback(self._done)
 
@@ -220,7 +224,11 @@ class LiveMapRouter:
 
     def _done(self, task: asyncio.Task[None]) -> None:
         queued = self._tasks.pop(task)
+        tenant = queued.robot.tenant
         self._held_bytes -= queued.size_bytes
+        self._held_of_tenant[tenant] -= queued.size_bytes
+        if not self._held_of_tenant[tenant]:
+            del self._held_of_tenant[tenant]
         left = self._waiting.pop(queued.robot) - 1
         if left:
             self._waiting[queued.robot] = left

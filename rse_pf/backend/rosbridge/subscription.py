@@ -10,11 +10,22 @@ from typing import Any
 
 from rse_pf.backend.rosbridge.codec import publication
 
-__all__ = ["MAX_QUEUE_LENGTH", "Subscription", "TopicMessage"]
+__all__ = ["MAX_HELD_BYTES", "MAX_QUEUE_LENGTH", "HeldBytes", "Subscription", "TopicMessage"]
 
 MAX_QUEUE_LENGTH = 100
+MAX_HELD_BYTES = 32 << 20
+"""Messages that wait for all subscriptions of a tenant in a worker; above it each keeps the newest only."""
 _MAX_QUEUE_BYTES = 1 << 20
 """Messages that wait for one subscription, all together; the newest is kept in any case."""
+
+
+class HeldBytes:
+    """How many bytes wait for the slow subscribers of one tenant in one worker."""
+
+    __slots__ = ("of_tenant",)
+
+    def __init__(self) -> None:
+        self.of_tenant = 0
 
 
 class TopicMessage:
@@ -44,20 +55,30 @@ class Subscription:
         replaced: How many messages newer ones replaced.
     """
 
-    __slots__ = ("_bytes", "_next_s", "_waiting", "owner", "replaced", "requests", "spelling")
+    __slots__ = ("_held", "_next_s", "_own_bytes", "_waiting", "owner", "replaced", "requests", "spelling")
 
-    def __init__(self, owner: Any, spelling: str) -> None:
+    def __init__(self, owner: Any, spelling: str, held: HeldBytes | None = None) -> None:
         self.owner = owner
         self.spelling = spelling
         self.requests: dict[str | int | None, tuple[float, int]] = {}
         self.replaced = 0
         self._waiting: deque[TopicMessage] = deque()
-        self._bytes = 0
+        self._own_bytes = 0
+        self._held = held or HeldBytes()
         self._next_s = float("-inf")
 
     def __len__(self) -> int:
         """Return how many messages wait."""
         return len(self._waiting)
+
+    @property
+    def _bytes(self) -> int:
+        return self._own_bytes
+
+    @_bytes.setter
+    def _bytes(self, size: int) -> None:
+        self._held.of_tenant += size - self._own_bytes
+        self._own_bytes = size
 
     @property
     def pause_s(self) -> float:
@@ -73,7 +94,7 @@ class Subscription:
         """Add *message*; the oldest ones are dropped above the longest queue that there is."""
         self._waiting.append(message)
         self._bytes += len(message.data)
-        self._bound(MAX_QUEUE_LENGTH)
+        self._bound(MAX_QUEUE_LENGTH if self._held.of_tenant <= MAX_HELD_BYTES else 1)
 
     def bound(self) -> None:
         """Drop the oldest messages above the queue that was asked for: the client has to wait now."""

@@ -19,7 +19,7 @@ from rse_pf.auth.tokens import Claims
 from rse_pf.backend.ports import SlowReader
 from rse_pf.backend.rosbridge.codec import RosbridgeOp
 from rse_pf.backend.rosbridge.session import RosbridgeSession
-from rse_pf.backend.rosbridge.subscription import MAX_QUEUE_LENGTH, Subscription, TopicMessage
+from rse_pf.backend.rosbridge.subscription import MAX_QUEUE_LENGTH, HeldBytes, Subscription, TopicMessage
 from rse_pf.errors import (
     BadRequest,
     Conflict,
@@ -111,6 +111,7 @@ class RosbridgeTopics:
         self._topics: dict[Key, _Topic] = {}
         self._per_tenant: dict[str, int] = {}
         self._latched_bytes: dict[str, int] = {}
+        self._held: dict[str, HeldBytes] = {}
         self._of_client: dict[Client, dict[Key, None]] = {}
         self._due: dict[Subscription, None] = {}
         self._slow: dict[Subscription, None] = {}
@@ -232,7 +233,8 @@ class RosbridgeTopics:
         is_first = not topic.subscriptions
         is_new = subscription is None
         if subscription is None:
-            subscription = topic.subscriptions[client] = Subscription(client, op.topic)
+            held = self._held.setdefault(key[0], HeldBytes())
+            subscription = topic.subscriptions[client] = Subscription(client, op.topic, held)
             client.bound_unsent(_MAX_UNSENT_BYTES)
         pause_s = min(_MAX_PAUSE_S, max(0.0, (op.throttle_rate or 0.0) / 1e3))
         subscription.requests[op.id] = pause_s, min(MAX_QUEUE_LENGTH, max(1, op.queue_length or 1))
@@ -289,6 +291,7 @@ class RosbridgeTopics:
         self._per_tenant[tenant] -= 1
         if not self._per_tenant[tenant]:
             del self._per_tenant[tenant]
+            self._held.pop(tenant, None)
         self._peers.tell(topic.key, topic.kind, exists=False, wanted=False)
 
     def _tell(self, topic: _Topic) -> None:

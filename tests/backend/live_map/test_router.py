@@ -314,15 +314,16 @@ def test_a_sender_of_garbage_loses_the_live_maps_for_a_while_and_the_others_do_n
 def test_more_bytes_than_one_worker_holds_are_busy() -> None:
     async def test(parts: Parts) -> None:
         parts.owners.answer = lambda operation, payload: None
-        for _ in range(2):
-            parts.submit("live-show", {"map": "m"}, size_bytes=30 << 20)
+        for tenant in "abcd":
+            reader = FakeReader("r", tenant=tenant)
+            parts.submit("live-show", {"map": "m"}, connection=reader, size_bytes=15 << 20)
 
-        answer = await parts.ask("live-show", {"map": "m"}, size_bytes=30 << 20)
+        answer = await parts.ask("live-show", {"map": "m"}, size_bytes=15 << 20)
 
         assert isinstance(answer, Failure)
         assert answer.code == "busy"
         assert answer.retry_after_ms
-        assert parts.router.held == 2
+        assert parts.router.held == 4
 
     with_router(test)
 
@@ -503,6 +504,22 @@ def test_a_keyframe_that_the_store_or_the_quota_refuses_is_no_garbage(error: Rse
             answer = await parts.ask("live-keyframe", keyframe())
             assert isinstance(answer, Failure)
             assert answer.code == error.code
+
+    with_router(test)
+
+
+def test_what_waits_for_owners_is_bounded_for_each_tenant() -> None:
+    async def test(parts: Parts) -> None:
+        parts.owners.answer = lambda operation, payload: None
+        hostile, good = FakeReader("r", tenant="acme"), FakeReader("r", tenant="rival")
+        for _ in range(20):
+            parts.submit("live-show", {"map": "m"}, connection=hostile, size_bytes=1 << 20)
+        assert [each.code for each in parts.answers if isinstance(each, Failure)] == ["busy"] * 4
+
+        parts.submit("live-show", {"map": "m"}, connection=good, size_bytes=1 << 20)
+
+        assert len(parts.answers) == 4
+        assert parts.router.held == 17
 
     with_router(test)
 

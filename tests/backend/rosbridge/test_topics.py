@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from backend.rosbridge.clients import Client, call, rosbridge_worker
+from backend.rosbridge.clients import UNLIMITED, Client, call, rosbridge_worker
 
+from rse_pf.backend.rosbridge import subscription as subscriptions
 from rse_pf.backend.rosbridge import topics as limits
 from rse_pf.backend.rosbridge.subscription import MAX_QUEUE_LENGTH
 
@@ -105,6 +106,42 @@ def test_what_waits_for_a_stalled_reader_is_bounded_in_bytes_and_number():
         told = heard(stalled)
         assert [each for each in told if isinstance(each, int)] == list(range(150 - MAX_QUEUE_LENGTH, 150))
         assert sum(isinstance(each, str) for each in told) == 5
+
+
+def test_what_waits_for_all_stalled_readers_of_a_tenant_is_bounded_and_other_tenants_keep_theirs(monkeypatch):
+    monkeypatch.setattr(subscriptions, "MAX_HELD_BYTES", 50_000)
+    with rosbridge_worker(session=UNLIMITED) as worker:
+        talker, rival = worker.client("a"), worker.client("b", tenant="other")
+        readers = [worker.client(f"r{number}") for number in range(5)]
+        other = worker.client("s", tenant="other")
+        for each in (*readers, other):
+            each.wire.unsent = 1 << 20
+            each.say(subscribe(queue_length=100))
+        for _ in range(40):
+            talker.say(publish(1000 * "x"))
+            rival.say(publish(1000 * "x"))
+        for each in (*readers, other):
+            each.wire.unsent = 0
+        worker.parts.loop.advance(0.1)
+
+        assert sum(len(heard(each)) for each in readers) <= 50 + len(readers)
+        assert len(heard(other)) == 40
+
+
+def test_a_subscription_that_ended_holds_nothing_for_its_tenant():
+    held = subscriptions.HeldBytes()
+    one = subscriptions.Subscription(None, "/chat", held)
+    for _ in range(3):
+        one.put(subscriptions.TopicMessage(bytes(1000)))
+    assert held.of_tenant == 3000
+    one.requests["s"] = 0.0, 2
+    one.bound()
+    one.take(0.0)
+    assert held.of_tenant == 1000
+
+    one.clear()
+
+    assert held.of_tenant == 0
 
 
 def test_a_latched_message_waits_for_its_first_subscriber_until_its_publisher_leaves():
