@@ -1,0 +1,473 @@
+"""A robot with every scope of its tenant attacks, while a robot of another tenant drives, asks and stores.
+
+    python -m benchmarks.hostile.one_tenant [--pairs 10] [--seconds 60] [--only NAME] [--out FILE]
+
+One local platform with two servers and a quota of 64 MiB for a tenant.  The measured robot asks for a pose
+(200 matches) ten times a second, sends a keyframe 2.5 times a second and stores 64 KiB once a second.  A pair
+is two windows of the same length: beside a neighbour that uses its full quota as it should (19 commands and
+20 requests a second, a live map of its own), and beside one that attacks; which one comes first alternates.
+Each neighbour is a process of its own, at the lowest priority: in the field it has its own machine.
+
+Attacks: ``leave`` (keyframe, live-leave, again and again), ``maps`` (a keyframe and a subscription to each of
+eight maps), ``keyframes`` (of one map, as fast as they are answered), ``topics`` (rosbridge: latched and
+throttled messages of 250 kB), ``objects`` (of eight bytes), ``versions`` (of one map), ``jobs`` (long ones).
+
+Defends: for each attack the median over the pairs of the ratio of p99 is at most 1.3 for poses, keyframes and
+objects; none of them is refused; what the attacker's tenant stores grows to its quota and 64 MiB at most; the
+servers and their owners of maps take at most 64 MiB more than beside the other neighbour, and the memory of
+the owners that an attack with several maps may have (2 of a server).
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import contextlib
+import functools
+import http.client
+import itertools
+import json
+import multiprocessing
+import os
+import secrets
+import statistics
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Awaitable, Callable, Sequence
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from websockets.asyncio.client import connect as connect_websocket
+from websockets.exceptions import WebSocketException
+
+from benchmarks.hostile.robots import resident_mib
+from client_sdk import connect
+from client_sdk.robot import Robot
+from rse_pf.accounts import stored_by_tenant
+from rse_pf.config import PlatformSettings
+from rse_pf.errors import RsePfError
+from rse_pf.geometry import exp_se3
+from rse_pf.live_map.keyframe_code import encode_features
+from rse_pf.local.control.platform import LocalPlatform
+from rse_pf.local.firewall import ensure_key
+from rse_pf.maps.format import MapVersion, encode_map
+from rse_pf.object_store import DirectoryStore, digest_of
+from rse_pf.pnp.problems import make_problem
+from rse_pf.services.pnp import make_request
+from rse_pf.wire.live_map import live_topic
+
+__all__ = ["ATTACKS", "main", "measure"]
+
+HOME, RIVAL = "home", "rival"
+QUOTA_BYTES = 64 << 20
+RATIO, GROWTH_MIB, OWNERS_MIB = 1.3, 64.0, 4 * 120.0
+POSE_HZ, KEYFRAME_HZ, PUT_HZ = 10.0, 2.5, 1.0
+FAIR_COMMANDS_HZ, FAIR_PUT_HZ = 19.0, 20.0
+_WARM_S, _REST_S = 5.0, 1.0
+_DEADLINE_S = 5.0
+_LOWEST_PRIORITY = 19
+_CAMERA = {"fx": 525.0, "fy": 525.0, "cx": 319.5, "cy": 239.5, "width": 640, "height": 480}
+_GRAPH = "VERTEX_SE3:QUAT 0 0 0 0 0 0 0 1\nVERTEX_SE3:QUAT 1 1 0 0 0 0 0 1\n" + (
+    "EDGE_SE3:QUAT 0 1 1 0 0 0 0 0 1 1 0 0 0 0 0 1 0 0 0 0 1 0 0 0 1 0 0 1 0 1\n"
+)
+
+
+def keyframe(name: str, number: int, features: int = 600) -> dict[str, Any]:
+    """Return the request with keyframe *number* of a robot that drives straight on; all features differ."""
+    rng = np.random.default_rng(number)
+    return {
+        "map": name, "segment": 0, "number": number, "timestamp_s": number / KEYFRAME_HZ,
+        "T_odom_camera": exp_se3([0.1 * number, 0, 0, 0, 0, 0]).ravel().tolist(), "camera": _CAMERA,
+        "features": encode_features(
+            rng.uniform([0, 0], [640, 480], (features, 2)), rng.uniform(0.5, 5.0, features),
+            rng.integers(0, 256, (features, 32), dtype=np.uint8),
+        ),
+    }  # fmt: skip
+
+
+class DataClient:
+    """One connection to the data service.  Blocking."""
+
+    def __init__(self, url: str, token: str) -> None:
+        self._at = url.split("/")[2]
+        self._headers = {"Authorization": f"Bearer {token}"}
+        self._connection = http.client.HTTPConnection(self._at, timeout=_DEADLINE_S)
+
+    def ask(self, method: str, path: str, body: bytes) -> tuple[int, bytes]:
+        """Return status and content; 0 if the connection failed."""
+        try:
+            self._connection.request(method, path, body, self._headers)
+            answer = self._connection.getresponse()
+            return answer.status, answer.read()
+        except (OSError, http.client.HTTPException):
+            self._connection.close()
+            return 0, b""
+
+    def put(self, data: bytes) -> int:
+        """Store an object; return the status."""
+        return self.ask("PUT", f"/data/v1/objects/{digest_of(data)}", data)[0]
+
+
+class Measured:
+    """The robot of the other tenant: when it asked, what for, how long it took (ms), and how it ended."""
+
+    def __init__(self, robot: Robot, data: DataClient) -> None:
+        self.rows: list[tuple[float, str, float, str]] = []
+        self._robot, self._data = robot, data
+        problem = make_problem(seed=1, n=200, outlier_ratio=0.3)
+        self._pose = make_request(problem.points_world, problem.pixels, problem.camera)
+        self._number = 0
+
+    async def drive(self) -> None:
+        """Work until cancelled."""
+        await asyncio.gather(
+            self._each(POSE_HZ, "pose", self._ask_pose),
+            self._each(KEYFRAME_HZ, "keyframe", self._send_keyframe),
+            self._each(PUT_HZ, "object", self._put),
+        )
+
+    async def _each(self, rate_hz: float, kind: str, act: Callable[[], Awaitable[str]]) -> None:
+        due = time.monotonic()
+        while True:
+            due = max(due + 1.0 / rate_hz, time.monotonic())
+            await asyncio.sleep(due - time.monotonic())
+            began = time.monotonic()
+            code = await act()
+            self.rows.append((began, kind, 1e3 * (time.monotonic() - began), code))
+
+    async def _ask_pose(self) -> str:
+        return await _code(self._robot.call("pnp", self._pose, deadline_s=_DEADLINE_S, keep=True))
+
+    async def _send_keyframe(self) -> str:
+        request = keyframe("victim", self._number)
+        code = await _code(self._robot.call("live-keyframe", request, deadline_s=_DEADLINE_S, keep=True))
+        self._number += code == "ok"
+        return code
+
+    async def _put(self) -> str:
+        status = await asyncio.to_thread(self._data.put, os.urandom(65_536))
+        return "ok" if status == 201 else str(status)
+
+
+async def _code(answer: Awaitable[Any]) -> str:
+    try:
+        await answer
+    except RsePfError as error:
+        return error.code
+    return "ok"
+
+
+# --- neighbours ----------------------------------------------------------------------------------
+
+Neighbour = Callable[[Robot, "_Place"], Awaitable[None]]
+
+
+class _Place:
+    """Where a neighbour is, and how often each of its requests ended how."""
+
+    def __init__(self, url: str, token: str) -> None:
+        self.url, self.token = url, token
+        self.codes: Counter[str] = Counter()
+        self.tag = secrets.token_hex(3)
+
+    async def call(self, robot: Robot, service: str, request: Any) -> str:
+        code = await _code(robot.call(service, request, deadline_s=_DEADLINE_S, keep=True))
+        self.codes[f"{service} {code}"] += 1
+        return code
+
+
+async def _fair(robot: Robot, place: _Place) -> None:
+    problem = make_problem(seed=2, n=200, outlier_ratio=0.3)
+    pose = make_request(problem.points_world, problem.pixels, problem.camera)
+    data, number = DataClient(place.url, place.token), 0
+
+    async def commands() -> None:
+        nonlocal number
+        for count in itertools.count():
+            if count % 8:
+                await place.call(robot, "pnp", pose)
+            else:
+                number += await place.call(robot, "live-keyframe", keyframe(place.tag, number)) == "ok"
+            await asyncio.sleep(1.0 / FAIR_COMMANDS_HZ)
+
+    async def puts() -> None:
+        while True:
+            place.codes[f"PUT {await asyncio.to_thread(data.put, os.urandom(8192))}"] += 1
+            await asyncio.sleep(1.0 / FAIR_PUT_HZ)
+
+    await asyncio.gather(commands(), puts())
+
+
+async def _leave(robot: Robot, place: _Place) -> None:
+    number = 0
+    while True:
+        number += await place.call(robot, "live-keyframe", keyframe(place.tag, number, 894)) == "ok"
+        await place.call(robot, "live-leave", {"map": place.tag})
+
+
+async def _maps(robot: Robot, place: _Place) -> None:
+    async def listen(name: str) -> None:
+        async for _ in robot.subscribe(live_topic(name)):
+            pass
+
+    listening = []
+    try:
+        for number in itertools.count():
+            name = f"{place.tag}-{number % 8}"
+            await place.call(robot, "live-keyframe", keyframe(name, number // 8))
+            if number < 8:
+                listening.append(asyncio.ensure_future(listen(name)))
+    finally:
+        for each in listening:
+            each.cancel()
+        await asyncio.gather(*listening, return_exceptions=True)
+
+
+async def _keyframes(robot: Robot, place: _Place) -> None:
+    number = 0
+    while True:
+        most = 8 if number else 1  # the first one begins the map
+        requests = [keyframe(place.tag, number + each, 894) for each in range(most)]
+        codes = await asyncio.gather(*(place.call(robot, "live-keyframe", each) for each in requests))
+        number += codes.count("ok")
+
+
+async def _topics(robot: Robot, place: _Place) -> None:
+    text = "x" * 250_000
+    headers = {"Authorization": f"Bearer {place.token}"}
+    address = f"{place.url.rpartition('/')[0]}/rosbridge"
+    for number in itertools.count():
+        try:
+            async with connect_websocket(address, additional_headers=headers, compression=None) as socket:
+                for topic in (f"/t{number}-{each}" for each in range(20)):
+                    asked = {
+                        "op": "subscribe",
+                        "topic": topic,
+                        "throttle_rate": 3_600_000,
+                        "queue_length": 100,
+                    }
+                    await socket.send(json.dumps(asked))
+                    for _ in range(4):
+                        said = {"op": "publish", "topic": topic, "latch": True, "msg": {"data": text}}
+                        await socket.send(json.dumps(said))
+                    await socket.send(json.dumps({"op": "unsubscribe", "topic": topic}))
+                    place.codes["topics"] += 1
+        except (WebSocketException, OSError) as error:
+            place.codes[f"closed: {error}"[:60]] += 1
+        await asyncio.sleep(0.1)
+
+
+async def _in_threads(place: _Place, act: Callable[[DataClient], int]) -> None:
+    async def work() -> None:
+        client = DataClient(place.url, place.token)
+        while True:
+            place.codes[f"HTTP {await asyncio.to_thread(act, client)}"] += 1
+
+    await asyncio.gather(*(work() for _ in range(8)))
+
+
+async def _objects(robot: Robot, place: _Place) -> None:
+    await _in_threads(place, lambda client: client.put(os.urandom(8)))
+
+
+async def _versions(robot: Robot, place: _Place) -> None:
+    head: str | None = None
+
+    def commit(client: DataClient) -> int:
+        nonlocal head
+        data = encode_map(MapVersion(keyframes=(), provenance={"filler": os.urandom(500_000).hex()}))
+        status = client.put(data)
+        if status != 201:
+            return status
+        body = json.dumps({"digest": digest_of(data), "parent": head}).encode()
+        status, answer = client.ask("POST", f"/data/v1/maps/{place.tag}/versions", body)
+        with contextlib.suppress(ValueError, KeyError):
+            head = json.loads(answer)["id"]
+        client.ask("DELETE", f"/data/v1/objects/{digest_of(data)}", b"")
+        return status
+
+    client = DataClient(place.url, place.token)
+    while True:
+        place.codes[f"HTTP {await asyncio.to_thread(commit, client)}"] += 1
+
+
+async def _jobs(robot: Robot, place: _Place) -> None:
+    async def work(lane: int) -> None:
+        for number in itertools.count():
+            graph = f"{_GRAPH}# {place.tag} {lane} {number}\n" + _GRAPH * 50
+            await place.call(robot, "optimise", {"g2o": graph, "options": {"max_iterations": 50}})
+
+    await asyncio.gather(*(work(lane) for lane in range(8)))
+
+
+FAIR = "fair"
+ATTACKS: dict[str, Neighbour] = {
+    "leave": _leave, "maps": _maps, "keyframes": _keyframes, "topics": _topics, "objects": _objects,
+    "versions": _versions, "jobs": _jobs,
+}  # fmt: skip
+
+
+def run_neighbour(name: str, url: str, token: str, seconds: float, pipe: Connection) -> None:
+    """Be a neighbour for *seconds* after each order of *pipe*; entry point of a process."""
+    os.nice(_LOWEST_PRIORITY)
+    work = {FAIR: _fair, **ATTACKS}[name]
+    while pipe.recv() == "go":
+        pipe.send(asyncio.run(_bounded(work, url, token, seconds)))
+
+
+async def _bounded(work: Neighbour, url: str, token: str, seconds: float) -> dict[str, int]:
+    place = _Place(url, token)
+    until = time.monotonic() + seconds
+    async with contextlib.AsyncExitStack() as stack:
+        robot = connect(url, token=token, codec="bin")
+        if work is not _topics:  # a second connection would end the first
+            await stack.enter_async_context(robot)
+        task = asyncio.ensure_future(work(robot, place))
+        await asyncio.wait({task}, timeout=until - time.monotonic())
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+        if task.done() and not task.cancelled() and task.exception() is not None:
+            place.codes[f"ended by {task.exception()!r}"[:100]] += 1
+    return dict(place.codes)
+
+
+# --- the measurement -----------------------------------------------------------------------------
+
+
+async def measure(names: Sequence[str], pairs: int, seconds: float, folder: Path) -> list[dict[str, Any]]:
+    """Return a row for each attack: ratios of p99, what was refused, and what grew."""
+    settings = PlatformSettings().replace(
+        data={"tenant_quota_bytes": QUOTA_BYTES}, serving={"rosbridge": True}
+    )
+    context = multiprocessing.get_context("spawn")
+    rows = []
+    for name in names:
+        state = folder / name
+        async with LocalPlatform(settings, servers=2, port=0, state=state, data=True) as platform:
+            key = ensure_key(platform.state, seed=secrets.token_bytes(32), key_id="unused")
+            issue = functools.partial(key.issue, settings=settings.auth)
+
+            def token(robot: str, tenant: str, issue: Any = issue) -> str:
+                return str(issue(robot, now=time.time(), token_id=secrets.token_hex(8), tenant=tenant))
+
+            neighbours = {}
+            for kind, tenant in ((FAIR, "fair"), (name, RIVAL)):
+                pipe, theirs = context.Pipe()
+                arguments = (kind, platform.url, token(kind, tenant), seconds, theirs)
+                process = context.Process(target=run_neighbour, args=arguments, daemon=True)
+                process.start()
+                neighbours[kind] = pipe, process
+            robot_token = token("robot-1", HOME)
+            async with connect(platform.url, token=robot_token, codec="bin") as robot:
+                measured = Measured(robot, DataClient(platform.url, robot_token))
+                driving = asyncio.ensure_future(measured.drive())
+                await asyncio.sleep(_WARM_S)
+                row = await _pairs(name, pairs, neighbours, measured, platform, state)
+                driving.cancel()
+                await asyncio.gather(driving, return_exceptions=True)
+            for pipe, process in neighbours.values():
+                pipe.send("end")
+                process.join(_DEADLINE_S)
+        rows.append(row)
+    return rows
+
+
+async def _pairs(
+    name: str, pairs: int, neighbours: dict[str, Any], measured: Measured, platform: LocalPlatform,
+    state: Path,
+) -> dict[str, Any]:  # fmt: skip
+    windows: list[dict[str, tuple[float, float]]] = []
+    codes: dict[str, Counter[str]] = {FAIR: Counter(), name: Counter()}
+    began_s = time.monotonic()
+    servers = [mark.pid for mark in platform.backend_servers.marks.values()]
+    most = dict.fromkeys((FAIR, name), 0.0)
+    for number in range(pairs):
+        found = {}
+        for kind in (FAIR, name) if number % 2 else (name, FAIR):
+            began = time.monotonic()
+            neighbours[kind][0].send("go")
+            codes[kind].update(await asyncio.to_thread(neighbours[kind][0].recv))
+            found[kind] = began, time.monotonic()
+            most[kind] = max(most[kind], resident_mib(servers))
+            await asyncio.sleep(_REST_S)
+        windows.append(found)
+    store = DirectoryStore(_store_of(state))
+    return {
+        "attack": name, "pairs": pairs, "load_average": round(os.getloadavg()[0], 2),
+        "ratios": {
+            what: _median_ratio(measured, windows, name, what) for what in ("pose", "keyframe", "object")
+        },
+        "p99_ms": {
+            what: [_p99(measured, [each[kind] for each in windows], what) for kind in (FAIR, name)]
+            for what in ("pose", "keyframe", "object")
+        },
+        "n": dict(Counter(what for _, what, _, _ in measured.rows)),
+        "refused": dict(
+            Counter(
+                f"{what} {code}"
+                for at, what, _, code in measured.rows
+                if code != "ok" and at >= began_s
+            )
+        ),
+        "neighbours": {kind: dict(each) for kind, each in codes.items()},
+        "stored_mib": round(stored_by_tenant(store, RIVAL).charged_bytes / 2**20, 1),
+        "memory_mib": round(most[name] - most[FAIR], 1),
+    }  # fmt: skip
+
+
+def _store_of(state: Path) -> Path:
+    """Return the folder of the platform's objects."""
+    return next(each.parent for each in state.rglob("accounts") if each.is_dir())
+
+
+def _p99(measured: Measured, spans: Sequence[tuple[float, float]], what: str) -> float:
+    values = [
+        ms
+        for at, kind, ms, _ in measured.rows
+        if kind == what and any(low <= at < high for low, high in spans)
+    ]
+    return round(float(np.percentile(values, 99)), 2) if values else float("nan")
+
+
+def _median_ratio(
+    measured: Measured, windows: Sequence[dict[str, tuple[float, float]]], name: str, what: str
+) -> float:
+    ratios = [_p99(measured, [each[name]], what) / _p99(measured, [each[FAIR]], what) for each in windows]
+    return round(statistics.median(ratios), 3)
+
+
+def verdict(row: dict[str, Any]) -> list[str]:
+    """Return which bars a row misses."""
+    missed = [f"{what} {ratio} times" for what, ratio in row["ratios"].items() if not ratio <= RATIO]
+    missed += [f"refused: {row['refused']}"] if row["refused"] else []
+    if row["stored_mib"] > QUOTA_BYTES / 2**20 + GROWTH_MIB:
+        missed.append(f"stored {row['stored_mib']} MiB")
+    if row["memory_mib"] > GROWTH_MIB + OWNERS_MIB * (row["attack"] == "maps"):
+        missed.append(f"memory {row['memory_mib']:+} MiB")
+    return missed
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Measure and print the figures."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.hostile.one_tenant")
+    parser.add_argument("--pairs", type=int, default=10)
+    parser.add_argument("--seconds", type=float, default=60.0)
+    parser.add_argument("--only", choices=sorted(ATTACKS), action="append")
+    parser.add_argument("--out", type=Path)
+    chosen = parser.parse_args(arguments)
+    names = chosen.only or list(ATTACKS)
+    with tempfile.TemporaryDirectory() as folder:
+        rows = asyncio.run(measure(names, chosen.pairs, chosen.seconds, Path(folder)))
+    text = json.dumps(rows, indent=1)
+    print(text)
+    if chosen.out is not None:
+        chosen.out.write_text(text + "\n", encoding="utf-8")
+    for row in rows:
+        print(f"{row['attack']}: {'; '.join(verdict(row)) or 'ok'}")
+
+
+if __name__ == "__main__":
+    main()
