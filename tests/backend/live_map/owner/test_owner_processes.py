@@ -5,10 +5,13 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import os
+import shutil
 import signal
+import subprocess
 import time
-from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
+from collections import Counter
+from collections.abc import AsyncIterator, Iterator
+from contextlib import asynccontextmanager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -173,6 +176,55 @@ def test_a_tenant_that_holds_most_owners_gives_one_up_within_seconds(
                 each.cancel()
 
     asyncio.run(test())
+
+
+@contextmanager
+def small_disk(folder: Path, size: str) -> Iterator[Path]:
+    """Yield a folder on a disk of its own."""
+    folder.mkdir()
+    mounted = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", folder], capture_output=True, check=False
+    )
+    if mounted.returncode:
+        pytest.skip("this test mounts a small disk, which takes the rights of root")
+    try:
+        yield folder
+    finally:
+        subprocess.run(["umount", folder], check=True)
+
+
+def test_one_tenant_fills_the_disk_and_is_told_so_while_the_other_ones_keyframes_are_kept(
+    tmp_path: Path,
+) -> None:
+    hostile, victim = RobotId("acme", "robot-1"), RobotId("rival", "robot-1")
+
+    async def test(disk: Path) -> None:
+        async with servers(disk, publish_pause_s=0.5) as both:
+
+            async def ask(robot: RobotId, operation: str, payload: dict[str, Any]) -> dict[str, Any]:
+                links = both.a if robot is hostile else both.b
+                return await links.request(robot.tenant, MAP, robot, operation, payload, PATIENT_S)
+
+            kept, number, refused = 0, 0, Counter[str]()
+            for turn in range(1500):
+                try:
+                    await ask(hostile, "live-keyframe", keyframe_payload(number, os.urandom(30_000)))
+                    number += 1
+                except RsePfError as error:
+                    refused[error.code] += 1
+                    if refused.total() > 50:
+                        break
+                await ask(hostile, "live-leave", {})
+                if not turn % 10 or refused:
+                    answer = await ask(victim, "live-keyframe", keyframe_payload(kept, os.urandom(30_000)))
+                    kept += 1
+                    assert answer["number"] == kept
+            assert set(refused) == {"store-full"}
+            assert kept >= 50
+            assert shutil.disk_usage(disk).free > 0
+
+    with small_disk(tmp_path / "disk", "24m") as disk:
+        asyncio.run(test(disk))
 
 
 def test_a_drained_server_gives_its_maps_to_the_next_one_at_once(tmp_path: Path) -> None:
