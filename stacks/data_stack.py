@@ -25,8 +25,8 @@ BALANCER_LOGS = "alb"
 """Prefix of the load balancer's access logs in their bucket."""
 
 _DAY = cdk.Duration.days(1)
-_LEASES = ("live/", "jobs/", "batch/schedulers/")
-"""Prefixes of leases, which are renewed up to twice a second: each renewal leaves a former version."""
+_LEASES = ("live/", "jobs/", "batch/schedulers/", "accounts/")
+"""Prefixes of leases and accounts, which change up to twice a second: each change leaves a former version."""
 _OFFERS, _OFFER_DAYS = "job-queue/", 7
 """Offers of jobs that nobody withdrew, because their server was killed or its settings are gone."""
 _INFREQUENT_AFTER_DAYS = 30
