@@ -30,12 +30,15 @@ def publish_version(
         StoreError: The store fails.
     """
     with errors_of_maps("the live map cannot be published"):
-        return _publish(maps, name, version, author=author, created_s=created_s, note=note)
+        return _publish(
+            maps, name, version, author=author, created_s=created_s, note=note, charge=charge
+        )  # fmt: skip
 
 
 def _publish(
-    maps: MapRegistry, name: str, version: MapVersion, *, author: str, created_s: float, note: str
-) -> MapRecord:
+    maps: MapRegistry, name: str, version: MapVersion, *, author: str, created_s: float, note: str,
+    charge: Callable[[int], None],
+) -> MapRecord:  # fmt: skip
     data = encode_map(version)
     digest = digest_of(data)
     for tries_left in reversed(range(_TRIES)):
