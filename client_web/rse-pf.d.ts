@@ -127,7 +127,7 @@ export interface Robot {
     onUpdate: (key: string, payload: any, seq: number) => void,
     onEnd?: (error: RsePfError) => void,
   ): () => void;
-  /** Use a fresh token from now on; resolves when the server has accepted it. */
+  /** Use a fresh token from now on; resolves when the server has accepted it, or at once without a connection. */
   renew(token: string): Promise<void>;
   /** Store bytes; resolves with their sha256 once they are durable. */
   upload(

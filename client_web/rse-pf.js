@@ -19,23 +19,42 @@ const MAX_BAD_MESSAGES = 10;
 const MAX_RETRIES = 5;
 // A client that uses a little less than its limits is not refused when a network bunches messages.
 const SHARE = 0.9;
+// A first connect and the calls wait for the end of a refusal that is so near.
+const SOON_S = 2;
+const CLOCK_SET_S = 0.5;
 
 const { min, max, random, round } = Math;
 const { from } = Array;
+const { parse } = JSON;
 const now = () => performance.now() / 1e3;
 const unixTime = () => Date.now() / 1e3;
+const clockOffset = () => unixTime() - now();
 const pause = (s) => new Promise((done) => setTimeout(done, s * 1e3));
 const nothing = () => {};
 const bytesOf = (data) => new Uint8Array(data);
 const sizeOf = (data) => data.byteLength ?? data.length;
+
+/** Return what ends a promise, with an error or a value; *late* is called if nothing has after *ms*. */
+const ending = (resolve, reject, ms, late) => {
+  const timeout = late && setTimeout(late, ms);
+  return (failed, value) => {
+    clearTimeout(timeout);
+    failed ? reject(failed) : resolve(value);
+  };
+};
+
 /** Call a program's function so that its errors cannot disturb the session. */
 const later = (call, ...words) => queueMicrotask(() => call(...words));
 
+// The codes that are used most.
+const CONNECT = "connect";
+const UNSUPPORTED = "unsupported";
+const USAGE = "usage";
+
 /** An error with a stable code of docs/protocol.md, section 5. */
 export class RsePfError extends Error {
-  constructor(code, message, hint = "", more = {}) {
+  constructor(code, message, hint = "", { retry_after_ms: retryAfterMs = null, server = "", trace = "" } = {}) {
     super(message);
-    const { retry_after_ms: retryAfterMs = null, server = "", trace = "" } = more;
     Object.assign(this, { name: "RsePfError", code, hint, retryAfterMs, server, trace });
   }
 }
@@ -77,12 +96,12 @@ const inOrder = (before, work, then) =>
 
 /** Name -> how the text of a message becomes the content of a WebSocket message, and how that is read. */
 export const codecs = {
-  json: { encode: (text) => text, decode: JSON.parse },
+  json: { encode: (text) => text, decode: parse },
   "json+zlib": {
     encode: (text) => through(new CompressionStream("deflate"), new TextEncoder().encode(text)),
     decode: async (data) => {
       const bytes = await through(new DecompressionStream("deflate"), bytesOf(data), MAX_INFLATED_BYTES);
-      return JSON.parse(new TextDecoder("utf-8", { fatal: true }).decode(bytes));
+      return parse(new TextDecoder("utf-8", { fatal: true }).decode(bytes));
     },
   },
 };
@@ -100,7 +119,7 @@ const textOf = (value) => {
   try {
     return JSON.stringify(value, plain) ?? "null";
   } catch (failed) {
-    throw wrong("usage", "no JSON: " + failed.message, "send finite numbers");
+    throw wrong(USAGE, "no JSON: " + failed.message, "send finite numbers");
   }
 };
 
@@ -108,7 +127,7 @@ const rounded = (values, scale) => from(values, (value) => round(value * scale) 
 
 const sha256 = async (bytes) => {
   if (!crypto.subtle) {
-    throw wrong("unsupported", "this page may not compute sha256", "serve it by https or localhost");
+    throw wrong(UNSUPPORTED, "this page may not compute sha256", "serve it by https or localhost");
   }
   const found = bytesOf(await crypto.subtle.digest("SHA-256", bytes));
   return from(found, (byte) => byte.toString(16).padStart(2, "0")).join("");
@@ -116,28 +135,36 @@ const sha256 = async (bytes) => {
 
 // --- a connection ----------------------------------------------------------------------------------------
 
-/** Return how many messages may be sent on *link* (section 4, "Rate"); adds what *time* has brought. */
+/** Return how many messages may be sent on *link* (section 4, "Rate"), and note when one more may. */
 const allowance = (link, time) => {
-  const { max_commands_per_s: rate, command_burst: burst } = link._limits;
-  if (!rate) return Infinity;
+  // What does not leave the machine yet can still be replaced by a newer frame.
+  if (link._socket.bufferedAmount > MAX_BUFFERED_BYTES) {
+    link._nextAt = time + 0.02;
+    return 0;
+  }
+  const { max_commands_per_s: limit, command_burst: burst } = link._limits;
+  if (!limit) return Infinity;
+  const rate = limit * link._share;
   const fresh = max(0, time - link._filledAt);
-  link._left = min(max(1, burst * link._share), link._left + fresh * rate * link._share);
+  link._left = min(max(1, burst * link._share), link._left + fresh * rate);
   link._filledAt += fresh;
+  link._nextAt = link._filledAt + (1 - link._left) / rate;
   return Math.floor(link._left);
 };
 
 /** Return whether the claims of a token say that it has expired; one that cannot be read has not. */
 const isExpired = (token) => {
   try {
-    return JSON.parse(atob(token.split(".")[1].replace(/-/g, "+").replace(/_/g, "/"))).exp * 1e3 < Date.now();
+    return parse(atob(token.split(".")[1].replace(/-/g, "+").replace(/_/g, "/"))).exp < unixTime();
   } catch {
     return false;
   }
 };
 
+const trimmed = (token) => String(token || "").trim();
 const bearer = (token) => (token ? { Authorization: "Bearer " + token } : {});
 
-const BROKEN = ["protocol", "the server says that this client breaks the protocol"];
+const BROKEN = ["protocol", "this client breaks the protocol"];
 /** Close codes after which a robot connects again much later (section 6): code and sentence of its error. */
 const REFUSALS = {
   1002: BROKEN,
@@ -145,7 +172,7 @@ const REFUSALS = {
   1008: BROKEN,
   1009: ["too-large", "a message is too large or in too many pieces"],
   4400: BROKEN,
-  4406: ["unsupported", "the server speaks another version", "update rse-pf.js"],
+  4406: [UNSUPPORTED, "the server speaks another version", "update rse-pf.js"],
   4409: ["conflict", "another connection of this robot replaced this one", "give every robot its own token"],
 };
 
@@ -153,10 +180,13 @@ const REFUSALS = {
 const NOWHERE = /^E(NET|HOST|AI_|NOTF|TIMED)/;
 
 /** Mark an error as the refusal of a server: the robot connects again in 20 to 40 s, or once its tokens are valid. */
-const refused = (failed, validFromS) => Object.assign(failed, { _isRefusal: true, _validFromS: validFromS });
+const refused = (failed, validInS = Infinity) => {
+  failed._validInS = validInS;
+  return failed;
+};
 
 /** Return whether an error is a refusal, and not one that is known to be over soon. */
-const lasts = (failed) => !!failed._isRefusal && !(failed._validFromS - unixTime() <= 2);
+const lasts = (failed) => failed._validInS > SOON_S;
 
 /** Connect a robot: resolves at the first Welcome, rejects with an RsePfError; see rse-pf.d.ts. */
 export const connect = async (url, options = {}) => {
@@ -166,8 +196,8 @@ export const connect = async (url, options = {}) => {
     stallTimeoutMs = 1000, dataUrl = httpUrl, WebSocket = globalThis.WebSocket,
   } = options;
   const { encode, decode } = codecs[codec] || {};
-  if (!encode) throw wrong("usage", `no codec named ${codec}`, `choose ${Object.keys(codecs)}`);
-  if (!WebSocket) throw wrong("unsupported", "no WebSocket here", "use Node 22 or newer");
+  if (!encode) throw wrong(USAGE, `no codec named ${codec}`, `choose ${Object.keys(codecs)}`);
+  if (!WebSocket) throw wrong(UNSUPPORTED, "no WebSocket here", "use Node 22 or newer");
   const stallS = stallTimeoutMs / 1e3;
   const links = new Set();
   const pending = new Map();
@@ -182,32 +212,37 @@ export const connect = async (url, options = {}) => {
   let timerAt = Infinity;
   let attempt = 0;
   let failingAt = Infinity;
-  let trouble = null;
+  let trouble = {};
   let refusal = null;
   let adoptedAt = -Infinity;
   let notBefore = 0;
   let isKeeping = false;
-  let moving = null;
-  let moveUntil;
   let lateUntil = 0;
   let share = SHARE;
   let retries = MAX_RETRIES;
-  let renewal = null;
+  let renewal = nothing;
   let error = null;
   let roundTripMs = null;
 
   // --- connect, reconnect, move --------------------------------------------------------------------------
 
-  const isSource = () => typeof token === "function";
-  const freshToken = async () => String((isSource() ? await token() : token) || "").trim();
+  const isSource = typeof token === "function";
+  const freshToken = async () => {
+    try {
+      return trimmed(isSource ? await token() : token);
+    } catch (failed) {
+      throw wrong(CONNECT, "no token: " + failed?.name, "correct its function");
+    }
+  };
 
   /** Open a WebSocket; resolves at its Welcome. */
   const dial = async () => {
     const used = await freshToken();
+    if (error) throw error;
     const protocol = "rse-pf.v1." + codec;
     const time = now();
     const link = {
-      _token: used, _limits: {}, _share: share, _left: 0, _filledAt: time, _heardAt: time, _checkedAt: time,
+      _token: used, _limits: {}, _share: share, _left: Infinity, _filledAt: time, _heardAt: time, _checkedAt: time,
       _pingedAt: -Infinity, _renewAt: Infinity, _bad: 0,
     };
     let socket;
@@ -220,23 +255,21 @@ export const connect = async (url, options = {}) => {
       );
     } catch (failed) {
       // Its message may contain the token.
-      throw refused(wrong("usage", "no WebSocket for this address and token: " + failed.name, "wss: from https pages"));
+      throw refused(wrong(USAGE, "no WebSocket for this address and token: " + failed.name, "wss: from https pages"));
     }
     link._socket = socket;
     links.add(link);
     socket.binaryType = "arraybuffer";
     return new Promise((resolve, reject) => {
-      const timeout = setTimeout(() => {
+      link._end = ending(resolve, reject, connectTimeoutMs, () => {
         lateUntil = now() + 60;
-        lose(link, Object.assign(unreadable("no Welcome"), { _isUnanswered: !socket.readyState }));
-      }, connectTimeoutMs);
-      link._settle = (failed) => {
-        clearTimeout(timeout);
-        failed ? reject(failed) : resolve(link);
-      };
+        const failed = unreadable("no Welcome");
+        failed._isUnanswered = !socket.readyState;
+        lose(link, failed);
+      });
       socket.onopen = () =>
         socket.protocol === protocol
-          ? say(link, { type: "hello", sdk, capabilities: ["progress", "updates"] })
+          ? say(link, "hello", { sdk, capabilities: ["progress", "updates"] })
           : lose(link, refused(unreadable("the server does not speak " + protocol)));
       socket.onmessage = (event) => hear(link, event.data);
       socket.onerror = nothing; // the close event follows
@@ -245,34 +278,42 @@ export const connect = async (url, options = {}) => {
   };
 
   const closed = async (link, code) => {
-    const isUsed = link === current || !current;
-    const isStatic = !isSource() && token === link._token;
+    if (!links.has(link)) return;
+    const isStatic = trimmed(token) === link._token;
+    const isOpening = !link._welcome;
+    const isRevoked = code === 4403;
     if (code === 4429) {
       share = max(0.1, share / 2);
       notBefore = now() + 5;
     }
-    let failed = wrong(...(REFUSALS[code] || ["connect", "the connection ended with " + code, "is it running, the token valid, the origin allowed?"]));
+    const refusalOfCode = REFUSALS[code];
+    let failed = wrong(...(refusalOfCode || [CONNECT, "the connection ended with " + code, "is it running, the token valid, the origin allowed?"]));
     // An attempt that was given up may still replace the connection that came after it.
-    const isOwn = code === 4409 && (moving || now() < lateUntil);
-    if (REFUSALS[code] && isUsed && !isOwn) refused(failed);
-    // Tokens have whole seconds: a fresh one has to be of a later second than the cut-off.
-    else if (code === 4403) failed = refused(unauthorized(), isStatic ? undefined : unixTime() + 1);
-    else if (code === 4401 || (!link._welcome && isExpired(link._token))) failed = isStatic ? refused(unauthorized()) : unauthorized();
-    else if (!link._welcome) failed = await reasonOf(link._token, failed);
+    const isOwn = code === 4409 && (current?._moveUntil || now() < lateUntil);
+    if (refusalOfCode && (link === current || !current) && !isOwn) refused(failed);
+    else if (isRevoked || code === 4401 || (isOpening && isExpired(link._token))) {
+      failed = unauthorized();
+      // Tokens have whole seconds: a fresh one has to be of a later second than the cut-off.
+      if (isStatic || isRevoked) refused(failed, isStatic ? Infinity : 1);
+    } else if (isOpening) failed = await reasonOf(link, failed, isStatic);
     lose(link, failed);
   };
 
   /** Ask why a handshake failed, where the answer may be read: in Node, and in pages of the same origin. */
-  const reasonOf = async (used, failed) => {
+  const reasonOf = async (link, failed, isStatic) => {
     const { location, navigator } = globalThis;
     const address = new URL(httpUrl);
     if (navigator?.onLine === false) failed._isUnanswered = true;
     // A request more for each attempt would double what a firewall counts.
     else if ((attempt % 4 === 1 || refusal) && (!location || location.host === address.host)) {
       try {
-        const answer = await fetch(address, { headers: bearer(used), signal: AbortSignal.timeout(1e3) });
-        const { platform, cause, message, hint, valid_from_s: validFromS } = await answer.json();
-        if (answer.status === 401 && platform === "rse-pf") return refused(cause ? unauthorized(message, hint) : unauthorized(), validFromS);
+        const answer = await fetch(address, { headers: bearer(link._token), signal: AbortSignal.timeout(1e3) });
+        const { platform, message, hint, valid_from_s: validFromS } = await answer.json();
+        if (answer.status === 401 && platform === "rse-pf") {
+          // The same token stays revoked, and so does a new one if the clock that signs is behind.
+          const validInS = validFromS - unixTime();
+          return refused(unauthorized(message, hint), !isStatic && validInS > -SOON_S ? validInS : Infinity);
+        }
       } catch (problem) {
         failed._isUnanswered = NOWHERE.test(problem.cause?.code);
       }
@@ -283,61 +324,58 @@ export const connect = async (url, options = {}) => {
   /** Return how long to wait before the next attempt (section 1), from the start of the last one, which took *spent*. */
   const pauseAfter = (spent) => {
     const jitter = random();
-    if (!trouble?._isRefusal) {
-      if (trouble?._isUnanswered) return 1 + jitter / 4 - spent;
-      const longest = min(40, (now() - failingAt) / 3);
-      return longest > 1 ? (longest * (1 + jitter)) / 2 - spent : jitter * min(1, 0.1 * 2 ** attempt);
-    }
-    const validIn = trouble._validFromS - unixTime();
-    return min(20 + 20 * jitter, validIn === validIn ? max(0, validIn) + jitter / 2 : 40);
+    const { _validInS: validInS, _isUnanswered: isUnanswered } = trouble;
+    if (validInS != null) return min(20 + 20 * jitter, max(0, validInS) + jitter / 2);
+    if (isUnanswered) return 1 + jitter / 4 - spent;
+    const longest = min(40, (now() - failingAt) / 3);
+    return longest > 1 ? (longest * (1 + jitter)) / 2 - spent : jitter * min(1, 0.1 * 2 ** attempt);
   };
 
   /** Keep one connection: reconnect ever more rarely (section 1), and make before break (section 4, "Moving"). */
   const keep = async () => {
     if (isKeeping) return;
     isKeeping = true;
-    if (moving || now() - adoptedAt > 10) {
+    if (current || now() - adoptedAt > 10) {
       attempt = 0;
       failingAt = Infinity;
     }
-    let spent = 0;
-    while (!error && (!current || moving === current)) {
-      const failed = trouble;
-      const until = now() + max(notBefore - now(), pauseAfter(spent));
-      const offset = unixTime() - now();
-      // Not so long if the clock of this machine is set while tokens are refused, or if there is another token.
-      const isOver = () => error || trouble !== failed || (failed?._isRefusal && Math.abs(unixTime() - now() - offset) > 0.5);
-      while (now() < until && !isOver()) await pause(min(0.25, until - now()));
+    let began = now();
+    while (!error && (!current || current._moveUntil)) {
+      const before = trouble;
+      const until = max(notBefore, now() + pauseAfter(now() - began));
+      const offset = clockOffset();
+      // Not so long if the clock of this machine is set, which may make tokens valid, or if there is another token.
+      while (now() < until && !error && trouble === before && Math.abs(clockOffset() - offset) < CLOCK_SET_S) {
+        await pause(min(0.25, until - now()));
+      }
       if (error) break;
       attempt++;
-      const began = now();
-      if (moving && now() > moveUntil) moving = null;
+      began = now();
+      if (began > current?._moveUntil) current._moveUntil = 0;
       else {
         try {
           const link = await dial();
-          const isBetter = !current || (current === moving && link._welcome.server !== current._welcome.server);
-          isBetter && !error ? adopt(link) : leave(link);
-        } catch (thrown) {
-          const failed = thrown instanceof RsePfError ? thrown : wrong("connect", "no token: " + thrown.name, "correct its function");
+          const isBetter = !current || (current._moveUntil && link._welcome.server !== current._welcome.server);
+          isBetter ? adopt(link) : lose(link);
+        } catch (failed) {
           if (adoptedAt < 0 && (lasts(failed) || attempt >= FIRST_TRIES)) end(failed);
-          trouble = failed;
-          if (!current && lasts(failed)) refuse(failed);
+          note(failed);
           if (!failed._isUnanswered) failingAt = min(failingAt, now());
           else if (adoptedAt >= 0) attempt--;
         }
-        spent = now() - began;
       }
     }
-    moving = null;
     isKeeping = false;
   };
 
-  /** End the calls with the reason of the servers; the robot goes on trying. */
-  const refuse = (failed) => {
+  /** Take why there is no connection; a refusal that lasts ends the calls, and the robot goes on trying. */
+  const note = (failed) => {
+    trouble = failed;
+    if (current || error || !lasts(failed)) return;
     const isNews = refusal?.code !== failed.code || refusal.hint !== failed.hint;
     refusal = failed;
-    for (const each of pending.values()) settle(each, failed);
-    if (isNews && !error) later(onChange, "refused", failed.message);
+    settleAll(pending, failed);
+    if (isNews) later(onChange, "refused", failed.message);
   };
 
   const adopt = (link) => {
@@ -346,90 +384,83 @@ export const connect = async (url, options = {}) => {
     const isFirst = adoptedAt < 0;
     current = link;
     adoptedAt = now();
-    trouble = refusal = null;
+    trouble = {};
+    refusal = null;
     if (before) {
       before._isLeaving = true;
       counts.moves++;
       // A job continues on any server, so the old connection can close now.
-      for (const each of pending.values()) if (each._isLong && !each._isCancelled) each._link = null;
+      pending.forEach((each) => {
+        if (each._isLong && !each._isCancelled) each._link = null;
+      });
     } else if (!isFirst) counts.reconnects++;
-    for (const each of subscriptions.values()) ask(each);
-    renewal?.(); // this connection was opened with a token that is valid
+    subscriptions.forEach(ask);
+    renewal(); // this connection was opened with a token that is valid
     tick();
     if (!isFirst) later(onChange, before ? "moved" : "link-back", link._welcome.server);
   };
 
-  const leave = (link) => lose(link, wrong("disconnected", "left"));
-
   /** Return the commands that have no answer on *link*. */
   const sentOn = (link) => [...pending.values()].filter((each) => each._link === link);
 
-  /** Forget a connection; its commands wait for the next one. */
+  /** Forget a connection, because it *failed* or is not needed; its commands wait for the next one. */
   const lose = (link, failed) => {
     if (!links.delete(link)) return;
-    const { _socket: socket } = link;
-    socket.onopen = socket.onmessage = socket.onclose = null;
-    socket.close(1000);
-    for (const each of sentOn(link)) {
+    link._socket.close(1000);
+    sentOn(link).forEach((each) => {
       each._link = null;
       if (each._isCancelled && !each._isLong) pending.delete(each._id);
-    }
-    link._settle(failed);
-    const wasCurrent = link === current;
-    if (wasCurrent) current = null;
-    if (wasCurrent && !error) {
-      later(onChange, "link-lost", failed.message);
-      trouble = failed._isRefusal ? failed : null;
-      if (lasts(failed)) refuse(failed);
-      keep();
-    }
+    });
+    link._end(failed);
+    if (link !== current) return;
+    current = null;
+    if (error) return;
+    later(onChange, "link-lost", failed.message);
+    note(failed);
+    keep();
   };
 
   const end = (failed) => {
     if (error) return;
     error = failed;
     clearTimeout(timer);
-    for (const each of pending.values()) settle(each, failed);
-    for (const each of subscriptions.values()) later(each._onEnd, failed);
-    for (const link of [...links]) lose(link, failed);
+    renewal(failed);
+    settleAll(pending, failed);
+    subscriptions.forEach((each) => later(each._onEnd, failed));
+    for (const link of links) lose(link, failed);
     later(onChange, "ended", failed.message);
   };
 
   // --- messages ------------------------------------------------------------------------------------------
 
-  const say = (link, message) => send(link, textOf(message));
+  const say = (link, type, fields) => send(link, textOf({ type, ...fields }));
 
   /** Write a message after those before it; its *command*, if any, ends if it is too large. */
   const send = (link, text, command) => {
     link._left--;
-    link._outgoing = inOrder(link._outgoing, () => encode(text), (data) => write(link, data, text, command))
-      .catch((failed) => lose(link, wrong("unsupported", failed.message, "use another codec")));
-  };
-
-  const write = (link, data, text, command) => {
-    const size = sizeOf(data);
-    if (command && (size > link._limits.max_message_bytes || text.length > MAX_INFLATED_BYTES)) {
-      settle(command, wrong("too-large", `a command of ${size} bytes is above the limit`, "upload large data, and name its digest"));
-    } else if (links.has(link)) {
-      counts.bytesUp += size;
-      link._socket.send(data);
-    }
+    const write = (data) => {
+      const size = sizeOf(data);
+      if (command && (size > link._limits.max_message_bytes || text.length > MAX_INFLATED_BYTES)) {
+        settle(command, wrong("too-large", `a command of ${size} bytes is above the limit`, "upload large data, and name its digest"));
+      } else if (links.has(link)) {
+        counts.bytesUp += size;
+        link._socket.send(data);
+      }
+    };
+    const stop = (failed) => lose(link, wrong(UNSUPPORTED, failed.message, "use another codec"));
+    link._outgoing = inOrder(link._outgoing, () => encode(text), write).catch(stop);
   };
 
   const hear = (link, data) => {
     link._heardAt = now();
     counts.bytesDown += sizeOf(data);
-    link._incoming = inOrder(link._incoming, () => decode(data), (message) => receive(link, message))
-      .catch((problem) => misread(link, problem));
-  };
-
-  /** Take that a message cannot be read; a *problem* that is no error is a type that is not known here. */
-  const misread = (link, problem) => {
-    const failed = unreadable("cannot read a message: " + problem);
-    const isDamaged = problem?.name;
-    // It may have been the answer to any of them, and would not be readable when it came again.
-    if (isDamaged) for (const each of sentOn(link)) settle(each, failed);
-    if ((isDamaged && !link._welcome) || ++link._bad > MAX_BAD_MESSAGES) lose(link, failed);
+    link._incoming = inOrder(link._incoming, () => decode(data), (message) => receive(link, message)).catch((problem) => {
+      const failed = unreadable("cannot read a message: " + problem);
+      const isDamaged = problem?.name; // otherwise it is a type that is not known here
+      // It may have been the answer to any of them, and would not be readable when it came again.
+      if (isDamaged) settleAll(sentOn(link), failed);
+      if ((isDamaged && !link._welcome) || ++link._bad > MAX_BAD_MESSAGES) lose(link, failed);
+    });
   };
 
   const receive = (link, message) => {
@@ -439,45 +470,54 @@ export const connect = async (url, options = {}) => {
     const each = pending.get(id);
     const subscription = subscriptions.get(id);
     const isHere = link === current;
-    if (type === "welcome") {
-      link._welcome = message;
-      link._limits = message.limits;
-      link._left = Infinity; // the burst, once it is bounded
-      expiresIn(link, message.token_s);
-      link._settle();
-    } else if (type === "pong") {
-      link._unansweredAt = null;
-      roundTripMs = (time - message.sent_s - (message.answered_s - message.received_s)) * 1e3;
-    } else if (type === "move") {
-      if (isHere) {
-        moving = link;
-        moveUntil = time + message.within_ms / 1e3;
+    const isOfLink = each?._link === link;
+    const take = {
+      __proto__: null,
+      welcome() {
+        link._welcome = message;
+        link._limits = message.limits;
+        expiresIn(link, message.token_s);
+        link._end(null, link);
+      },
+      pong() {
+        link._unansweredAt = null;
+        roundTripMs = (time - message.sent_s - (message.answered_s - message.received_s)) * 1e3;
+      },
+      move() {
+        if (!isHere) return;
+        link._moveUntil = time + message.within_ms / 1e3;
         keep();
-      }
-    } else if (type === "renewed") {
-      expiresIn(link, message.token_s);
-      renewal?.();
-    } else if (type === "update") {
-      if (isHere && subscription) later(subscription._onUpdate, message.key || "", message.payload ?? null, message.seq);
-    } else if (type === "progress") {
-      if (each?._link === link) progress(each, message);
-    } else if (type === "failure") {
-      if (id == null) notice(link, message, time);
-      else if (subscription && isHere) {
-        subscriptions.delete(id);
-        later(subscription._onEnd, told(message));
-      } else if (each?._link === link && !again(each, message, time)) settle(each, told(message));
-    } else if (type === "result") {
-      if (each) answer(each, message, time);
-    } else throw type;
+      },
+      renewed() {
+        expiresIn(link, message.token_s);
+        renewal();
+      },
+      update() {
+        if (isHere && subscription) later(subscription._onUpdate, message.key || "", message.payload ?? null, message.seq);
+      },
+      progress() {
+        if (isOfLink) progress(each, message);
+      },
+      failure() {
+        if (id == null) notice(link, message, time);
+        else if (subscription && isHere) {
+          subscriptions.delete(id);
+          later(subscription._onEnd, told(message));
+        } else if (isOfLink && !again(each, message, time)) settle(each, told(message));
+      },
+      result() {
+        if (each) answer(each, message, time);
+      },
+    }[type];
+    if (!take) throw type;
+    take();
     flush();
   };
 
   const answer = (each, message, time) => {
     const { _stream: stream, _seq: seq } = each;
     if (time >= each._until) settle(each, expired(each, time));
-    else if (stream && !each._keep && seq < delivered[stream]) settle(each, wrong("stale", "a newer answer came first"));
-    else {
+    else if (!isReplaced(each, delivered)) {
       if (!each._isCancelled) delivered[stream] = max(seq, delivered[stream] || 0);
       const { reply = null, object = "", server = "", queue_ms: queueMs = 0, compute_ms: computeMs = 0 } = message;
       settle(each, null, { id: each._id, reply, object, server, queueMs, computeMs, roundTripMs: (time - each._from) * 1e3 });
@@ -491,8 +531,8 @@ export const connect = async (url, options = {}) => {
       link._left = 0;
       link._filledAt = time + (message.retry_after_ms || 0) / 1e3;
     }
-    renewal?.(failed);
-    if (!link._welcome) lose(link, message.code === "unsupported" ? refused(failed) : failed);
+    renewal(failed);
+    if (!link._welcome) lose(link, message.code === UNSUPPORTED ? refused(failed) : failed);
   };
 
   /** Send again where another server or a later time may help (section 5); return whether that happens. */
@@ -501,46 +541,50 @@ export const connect = async (url, options = {}) => {
     const isLost = code === "worker-lost" && each._losses++ < 2;
     const isBusy = code === "busy" && after < each._until && retries >= 1;
     if (each._isCancelled || !(isLost || isBusy)) return false;
-    if (isBusy) {
-      retries--;
-      each._notBefore = after;
-    }
+    if (isBusy) retries--;
+    each._notBefore = after;
     each._link = null;
     return true;
   };
 
   const progress = (each, message) => {
+    const { _isLong: wasLong, _onProgress: onProgress } = each;
+    each._isLong = true;
     if (each._isCancelled) {
-      if (!each._isLong) cancelOnServer(each);
+      if (!wasLong) withdraw(each);
     } else {
       if (each._isDefault) each._until = Infinity;
-      if (each._onProgress) later(each._onProgress, min(1, max(0, message.done)), message.what || "");
+      if (onProgress) later(onProgress, min(1, max(0, message.done)), message.what || "");
     }
-    each._isLong = true;
   };
 
   const cancel = (each) => {
     if (each._isCancelled || each._isSettled) return;
-    if (each._isLong) cancelOnServer(each); // its answer says whether the job ended before
+    if (each._isLong) withdraw(each); // its answer says whether the job ended before
     else giveUp(each, cancelled());
     schedule();
   };
 
   /** End a command for its caller; it counts for the server until its answer comes. */
   const giveUp = (each, failed) => {
-    const { _link: link } = each;
     settle(each, failed);
-    if (!link) return;
+    if (!each._link) return;
     pending.set(each._id, each);
-    each._isCancelled = true;
-    each._until = now() + ANSWER_S;
-    if (each._isLong) cancelOnServer(each);
+    withdraw(each);
   };
 
-  const cancelOnServer = (each) => {
+  /** Cancel a command, on its server only if that has told of progress. */
+  const withdraw = (each) => {
     each._isCancelled = true;
     each._until = now() + ANSWER_S;
-    if (each._link) say(each._link, { type: "cancel", id: each._id });
+    if (each._isLong && each._link) say(each._link, "cancel", { id: each._id });
+  };
+
+  /** End a command if it comes before the one of its stream in *newest*; return whether it does. */
+  const isReplaced = (each, newest) => {
+    const isOlder = !each._keep && each._seq < newest[each._stream];
+    if (isOlder) settle(each, wrong("stale", "a newer frame took its place"));
+    return isOlder;
   };
 
   const expired = (each, time) => wrong("expired", `no answer within ${round((time - each._from) * 1e3)} ms`);
@@ -551,10 +595,12 @@ export const connect = async (url, options = {}) => {
     each._isSettled = true;
     counts.answered++;
     each._signal?.removeEventListener("abort", each._cancel);
-    failed ? each._reject(failed) : each._resolve(result);
+    each._end(failed, result);
   };
 
-  const ask = ({ _id: id, _topic: topic }) => current && say(current, { type: "subscribe", id, topic });
+  const settleAll = (commands, failed) => commands.forEach((each) => settle(each, failed));
+
+  const ask = ({ _id: id, _topic: topic }) => current && say(current, "subscribe", { id, topic });
 
   const expiresIn = (link, seconds) => {
     if (seconds == null) return;
@@ -567,40 +613,31 @@ export const connect = async (url, options = {}) => {
   /** Send the waiting commands, oldest first, as far as the server's limits allow. */
   const flush = () => {
     const time = now();
-    const needed = new Set();
-    let room = current ? allowance(current, time) : 0;
     if (current) {
-      room = min(room, max(1, current._limits.max_in_flight) - sentOn(current).length);
-      // What does not leave the machine yet can still be replaced by a newer frame.
-      if (current._socket.bufferedAmount > MAX_BUFFERED_BYTES) room = 0;
-    }
-    for (const each of pending.values()) {
-      if (each._link && !each._isCancelled) needed.add(each._link);
-      if (each._link || time < each._notBefore || !current) continue;
-      if (each._stream && !each._keep && each._seq < sequences[each._stream]) {
-        settle(each, wrong("stale", "a newer frame took its place"));
-      } else if (room-- > 0) {
+      let room = min(allowance(current, time), max(1, current._limits.max_in_flight) - sentOn(current).length);
+      pending.forEach((each) => {
+        if (each._link || time < each._notBefore || isReplaced(each, sequences) || room-- <= 0) return;
         if (each._at) counts.resent++;
         each._link = current;
         each._at = time;
         const left = max(0, min(MAX_DEADLINE_MS, (each._until - time) * 1e3));
         send(current, `${each._head},"deadline_ms":${left},"payload":${each._payload}}`, each);
-        if (each._isCancelled) cancelOnServer(each);
-      }
+        if (each._isCancelled) withdraw(each);
+      });
     }
-    for (const link of [...links]) if (link._isLeaving && !needed.has(link)) leave(link);
+    for (const link of links) if (link._isLeaving && sentOn(link).every((each) => each._isCancelled)) lose(link);
     schedule();
   };
 
   const tick = () => {
     timerAt = Infinity;
     const time = now();
-    for (const each of pending.values()) {
-      if (time < each._until) continue;
+    pending.forEach((each) => {
+      if (time < each._until) return;
       if (each._isCancelled) settle(each, cancelled());
       else giveUp(each, expired(each, time));
-    }
-    for (const link of [...links]) check(link, time);
+    });
+    for (const link of links) check(link, time);
     flush();
   };
 
@@ -613,40 +650,31 @@ export const connect = async (url, options = {}) => {
       link._unansweredAt &&= time;
     }
     link._checkedAt = time;
-    let first = Infinity;
-    for (const each of sentOn(link)) if (!each._isLong) first = min(first, each._at);
+    const first = min(...sentOn(link).map((each) => (each._isLong ? Infinity : each._at)));
     const isSilent = time - max(link._heardAt, first) >= stallS;
     if (isSilent || time - (link._unansweredAt ?? time) >= PONG_S) {
-      return lose(link, wrong("connect", "the server does not answer"));
+      return lose(link, wrong(CONNECT, "the server does not answer"));
     }
     if (time - link._pingedAt >= (first < time ? min(PING_S, stallS / 3) : PING_S)) {
       link._unansweredAt ??= time;
       link._pingedAt = time;
-      say(link, { type: "ping", sent_s: time });
+      say(link, "ping", { sent_s: time });
     }
-    if (time >= link._renewAt && isSource()) {
+    if (time >= link._renewAt && isSource) {
       link._renewAt = time + max(1.5, (link._expiresAt - time) / 2);
       // Without a token in time the server closes the connection, and the next attempt asks again.
-      freshToken().then((fresh) => links.has(link) && say(link, { type: "renew", token: fresh }), nothing);
+      freshToken().then((fresh) => links.has(link) && say(link, "renew", { token: fresh }), nothing);
     }
   };
 
   /** Set the timer for what is due next. */
   const schedule = () => {
     const time = now();
+    const readyAt = current && allowance(current, time) < 1 ? current._nextAt : Infinity;
     let due = time + stallS / 3;
-    let isWaiting = false;
-    for (const each of pending.values()) {
-      due = min(due, each._until);
-      if (each._link) continue;
-      if (each._notBefore > time) due = min(due, each._notBefore);
-      else isWaiting = true;
-    }
-    if (isWaiting && current) {
-      if (allowance(current, time) < 1) {
-        due = min(due, current._filledAt + (1 - current._left) / (current._limits.max_commands_per_s * current._share));
-      } else if (current._socket.bufferedAmount > MAX_BUFFERED_BYTES) due = min(due, time + 0.02);
-    }
+    pending.forEach((each) => {
+      due = min(due, each._until, each._link ? Infinity : each._notBefore > time ? each._notBefore : readyAt);
+    });
     if (error || due >= timerAt) return;
     clearTimeout(timer);
     timerAt = due;
@@ -660,18 +688,14 @@ export const connect = async (url, options = {}) => {
     const address = new URL("/data/v1/" + path, dataUrl);
     for (let tries = 0; ; tries++) {
       const headers = { ...bearer(await freshToken()), ...more };
-      let failed;
-      try {
-        const response = await fetch(address, { method, body, headers, signal });
-        if (response.ok) return response;
-        failed = told({ code: "store", message: "HTTP " + response.status, ...(await response.json().catch(nothing)) });
-        if (!/408|429|50[0234]/.test(response.status)) throw failed;
-      } catch (problem) {
-        if (problem === failed) throw failed;
-        if (signal?.aborted) throw cancelled();
-        failed = wrong("connect", "no data service answers: " + problem.name, "is this page's origin in serving.allowed_origins?");
-      }
-      if (tries > 4) throw failed;
+      const response = await fetch(address, { method, body, headers, signal }).catch((problem) => problem);
+      if (response?.ok) return response;
+      if (signal?.aborted) throw cancelled();
+      const { status, name } = response;
+      const failed = status
+        ? told({ code: "store", message: "HTTP " + status, ...(await response.json().catch(nothing)) })
+        : wrong(CONNECT, "no data service answers: " + name, "is this page's origin in serving.allowed_origins?");
+      if (tries > 4 || (status && !/408|429|50[0234]/.test(status))) throw failed;
       await pause(random() * 0.2 * 2 ** tries);
     }
   };
@@ -700,19 +724,19 @@ export const connect = async (url, options = {}) => {
         const { deadlineMs, stream = "", keep: isKept = false, trace = "", onProgress, signal } = options;
         if (error || refusal || signal?.aborted) throw error || refusal || cancelled();
         if (deadlineMs != null && !(deadlineMs > 0 && deadlineMs <= MAX_DEADLINE_MS)) {
-          throw wrong("usage", `deadlineMs = ${deadlineMs} is not within 0..${MAX_DEADLINE_MS}`);
+          throw wrong(USAGE, `deadlineMs = ${deadlineMs} is not within 0..${MAX_DEADLINE_MS}`);
         }
         const time = now();
         const id = ++lastId;
         const seq = (sequences[stream] || 0) + 1;
         const each = {
-          _id: id, _stream: stream, _seq: seq, _keep: isKept, _onProgress: onProgress, _signal: signal,
+          _id: id, _stream: stream, _seq: seq, _keep: isKept || !stream, _onProgress: onProgress, _signal: signal,
           // As text, so that the caller may use the arrays again.
           _head: textOf({ type: "command", id, service, stream, seq, keep: isKept, trace }).slice(0, -1),
           _payload: textOf(payload),
           _from: time, _until: time + (deadlineMs ? deadlineMs / 1e3 : onProgress ? Infinity : ANSWER_S),
           _isDefault: !deadlineMs, _at: 0, _notBefore: 0, _losses: 0,
-          _resolve: resolve, _reject: reject, _cancel: () => cancel(each),
+          _end: ending(resolve, reject), _cancel: () => cancel(each),
         };
         signal?.addEventListener("abort", each._cancel);
         sequences[stream] = seq;
@@ -739,23 +763,19 @@ export const connect = async (url, options = {}) => {
       subscriptions.set(id, each);
       ask(each);
       return () => {
-        if (subscriptions.delete(id) && current) say(current, { type: "unsubscribe", id });
+        if (subscriptions.delete(id) && current) say(current, "unsubscribe", { id });
       };
     },
 
     renew: (fresh) =>
       new Promise((resolve, reject) => {
-        if (!isSource()) token = fresh;
-        renewal?.(cancelled());
-        trouble = null;
+        if (!isSource) token = fresh;
+        if (error) throw error;
+        renewal(cancelled());
+        trouble = {};
         if (!current) return resolve();
-        const mine = (renewal = (failed) => {
-          if (renewal === mine) renewal = null;
-          clearTimeout(timeout);
-          failed ? reject(failed) : resolve();
-        });
-        const timeout = setTimeout(mine, ANSWER_S * 1e3, wrong("expired", "no answer to renew"));
-        say(current, { type: "renew", token: fresh });
+        renewal = ending(resolve, reject, ANSWER_S * 1e3, () => reject(wrong("expired", "no answer to renew")));
+        say(current, "renew", { token: fresh });
       }),
 
     upload: async (data, { onProgress = nothing, signal } = {}) => {
@@ -763,11 +783,10 @@ export const connect = async (url, options = {}) => {
       const size = bytes.length;
       const digest = await sha256(bytes);
       const path = "uploads/" + digest;
-      const begin = async () => (await http("PUT", path, textOf({ size }), signal)).json();
       if (size <= MAX_PUT_BYTES) await http("PUT", "objects/" + digest, bytes, signal);
       else {
-        let state = await begin();
-        while (state.offset < size) {
+        let state;
+        while ((state ??= await (await http("PUT", path, textOf({ size }), signal)).json()).offset < size) {
           const { offset } = state;
           onProgress(offset, size);
           const part = bytes.subarray(offset, offset + min(state.part_bytes, MAX_PART_BYTES));
@@ -776,7 +795,7 @@ export const connect = async (url, options = {}) => {
           } catch (failed) {
             // The answer to this part was lost, or another program uploads the same object.
             if (!/conflict|not-found/.test(failed.code)) throw failed;
-            state = await begin();
+            state = null;
           }
         }
       }

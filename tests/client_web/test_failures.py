@@ -132,6 +132,36 @@ def test_a_welcome_that_cannot_be_read_rejects_connect_with_a_typed_error() -> N
     assert against(lambda _: b"no zlib stream", program) == ["protocol", True, True]
 
 
+def test_a_renewal_that_nobody_answered_ends_with_the_robot() -> None:
+    def answers(message: dict[str, Any]) -> bytes | None:
+        return None if message["type"] == "renew" else echo(message)
+
+    program = """
+    const robot = await connect(url, { token: "t" });
+    const began = performance.now();
+    const renewed = codeOf(robot.renew("u"));
+    robot.close();
+    say([await renewed, performance.now() - began < 2000, await codeOf(robot.renew("v"))]);
+    """
+
+    assert against(answers, program) == ["disconnected", True, "disconnected"]
+
+
+def test_a_token_function_that_throws_is_a_typed_error_of_an_upload() -> None:
+    program = """
+    let isFirst = true;
+    const token = () => {
+      if (!isFirst) throw null;
+      isFirst = false;
+      return "t";
+    };
+    const robot = await connect(url, { token });
+    say(await codeOf(robot.upload(new Uint8Array(3))));
+    """
+
+    assert against(echo, program) == "connect"
+
+
 STRICT = """
 // As in Node 22: what is no view of a buffer is refused where it is written, and the reader never hears it.
 const Stream = globalThis.DecompressionStream;

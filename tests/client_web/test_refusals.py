@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 import threading
+import time
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
@@ -18,7 +19,8 @@ MODULE = Path(__file__).resolve().parents[2] / "client_web" / "rse-pf.js"
 PROGRAM = """
 const { connect } = await import(process.argv[1]);
 try {
-  await connect(process.argv[2], { token: "a.b.c", connectTimeoutMs: 1000 });
+  const token = process.argv[3] === "function" ? () => "a.b.c" : "a.b.c";
+  await connect(process.argv[2], { token, connectTimeoutMs: 1000 });
 } catch (error) {
   console.log(JSON.stringify({ code: error.code }));
 }
@@ -34,7 +36,7 @@ def node() -> str:
     return found
 
 
-def refused_with(status: int, body: bytes) -> tuple[str, int]:
+def refused_with(status: int, body: bytes, token: str = "string") -> tuple[str, int]:
     """Return the code of the error of `connect`, and how often it asked why a handshake failed."""
     asked: list[str] = []
 
@@ -54,7 +56,7 @@ def refused_with(status: int, body: bytes) -> tuple[str, int]:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         url = f"ws://127.0.0.1:{server.server_address[1]}/ws"
         done = subprocess.run(
-            [node(), "--input-type=module", "-e", PROGRAM, str(MODULE), url],
+            [node(), "--input-type=module", "-e", PROGRAM, str(MODULE), url, token],
             capture_output=True, text=True, timeout=60, check=True,
         )  # fmt: skip
         server.shutdown()
@@ -63,6 +65,16 @@ def refused_with(status: int, body: bytes) -> tuple[str, int]:
 
 def test_a_token_that_a_server_refuses_ends_connect_at_once() -> None:
     assert refused_with(401, refusal_body("unauthorized", "no", "")) == ("unauthorized", 1)
+
+
+@pytest.mark.parametrize(("token", "since_s"), [("string", 60.0), ("string", 0.0), ("function", 60.0)])
+def test_a_cut_off_that_another_attempt_would_not_pass_ends_connect_at_once(
+    token: str, since_s: float
+) -> None:
+    told = {"cause": "cut-off", "valid_from_s": time.time() - since_s}
+    body = refusal_body("unauthorized", "tokens are revoked", "sign another one", **told)
+
+    assert refused_with(401, body, token) == ("unauthorized", 1)
 
 
 @pytest.mark.parametrize("status", [401, 403, 429])
