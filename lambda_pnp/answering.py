@@ -16,6 +16,8 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
+from msgspec import structs
+
 from lambda_pnp.day_budget import Claim, DayBudget, claim_in_bucket
 from lambda_pnp.keys import KeyCache, read_object
 from rse_pf.auth.roster import scopes_allow
@@ -33,6 +35,7 @@ from rse_pf.errors import (
 from rse_pf.service import Registry, dispatch, failure_of
 from rse_pf.services import pnp
 from rse_pf.wire import SUBPROTOCOLS, Codec, Command, Failure, codec_for, make_codec
+from rse_pf.wire.envelope import undecodable_id
 
 __all__ = ["Answering", "LambdaAnswer", "load_answering"]
 
@@ -119,13 +122,18 @@ class Answering:
             if not scopes_allow(who.scopes, _RIGHT):
                 raise _forbidden(_RIGHT)
             self._budget.take(who.robot, now_s)
-            message = codec.decode_from_robot(self._decoded(body))
+            data = self._decoded(body)
+        except RsePfError as error:
+            return self._encoded(codec, failure_of(error, server=_SERVER))
+        try:
+            message = codec.decode_from_robot(data)
             if not isinstance(message, Command):
                 raise BadMessage(
                     "this is not a command", hint="send commands only; this function has no sessions"
                 )
         except RsePfError as error:
-            return self._encoded(codec, failure_of(error, server=_SERVER))
+            failure = failure_of(error, server=_SERVER)
+            return self._encoded(codec, structs.replace(failure, id=undecodable_id(codec, data)))
         allowed_ms = self._settings.session.answer_timeout_s * 1e3
         allowed_ms = min(left_ms, allowed_ms if message.deadline_ms is None else message.deadline_ms)
         if (clock() - arrived) * 1e3 >= allowed_ms:

@@ -144,11 +144,6 @@ class Dialler:
             told = error.response
             after = told.headers.get("Retry-After", "")
             raise dial_error_of(address, told.status_code, after, bytes(told.body or b"")) from error
-        except ValueError as error:
-            # The library follows no redirect on a connection that it did not open.
-            if not isinstance(error.__cause__, InvalidStatus):
-                raise
-            raise dial_error_of(address, error.__cause__.response.status_code, "") from error
         except ssl.SSLCertVerificationError as error:
             raise untrusted(address, error) from error
         except (OSError, asyncio.TimeoutError, WebSocketException, EOFError) as error:

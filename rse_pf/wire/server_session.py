@@ -171,6 +171,7 @@ class ServerSession:
         bad_messages: How many invalid messages arrived whose id could not be read; a long one counts several
             times.
         refused_commands: The same of those whose id could be read; each valid command takes one away.
+        suspicion: The sum of both; a robot with less is read first.
         is_pinged: Whether the server asks a silent client by WebSocket pings, because it sends none itself.
         ends_when_idle: Whether the connection ends with the answer to its last command.
     """
@@ -199,13 +200,8 @@ class ServerSession:
         self._session = session
         self._limits = limits
         self._burst = burst or BurstSettings()
-        self.bad_messages = self.refused_commands = 0
+        self.bad_messages = self.refused_commands = self.suspicion = 0
         self._next_renewal_s = float("-inf")
-
-    @property
-    def suspicion(self) -> int:
-        """How many messages could not be decoded: those of this robot are read after the others'."""
-        return self.bad_messages + self.refused_commands
 
     def receive(self, data: bytes, now: float) -> list[Decision]:
         """Return the decisions about one WebSocket message that arrived at *now* (server clock, s)."""
@@ -370,6 +366,7 @@ class ServerSession:
     def _command(self, command: Command) -> list[Decision]:
         if self.refused_commands:
             self.refused_commands -= 1
+            self.suspicion -= 1
         if self.in_flight >= self._limits.max_in_flight:
             busy = Busy(
                 f"{self.in_flight} commands of this robot are unanswered",
@@ -392,11 +389,13 @@ class ServerSession:
         if identity is None:
             return self._count(sent, len(data))
         self.refused_commands += _weight(len(data))
+        self.suspicion += _weight(len(data))
         return sent
 
     def _count(self, sent: list[Decision], size_bytes: int) -> list[Decision]:
         """Count a bad message that *sent* answers."""
         self.bad_messages += _weight(size_bytes)
+        self.suspicion += _weight(size_bytes)
         if self.bad_messages > self._limits.max_bad_messages:
             return [*sent, *self._close(CLOSE_PROTOCOL, "too many bad messages")]
         return sent

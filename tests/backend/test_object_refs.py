@@ -8,7 +8,7 @@ import msgspec
 import pytest
 
 from rse_pf.backend.object_refs import ObjectRefs, named_in, resolve, takes_objects
-from rse_pf.config import PlatformSettings
+from rse_pf.config import DataSettings, PlatformSettings
 from rse_pf.errors import BadRequest, LimitExceeded, NotFound, RsePfError, StoreError
 from rse_pf.identity import RobotId, object_name
 from rse_pf.object_store import MemoryStore, ObjectInfo, digest_of
@@ -165,7 +165,7 @@ def test_the_map_services_take_objects_and_pnp_takes_none(store: Counting) -> No
 
 
 def test_an_invalid_payload_is_left_to_the_service_to_refuse(store: Counting) -> None:
-    gate, registry = ObjectRefs(store, SERVING, 1e9), Registry()
+    gate, registry = ObjectRefs(store, SERVING, DataSettings()), Registry()
 
     @registry.service("asked")
     def asked(request: Asked) -> Asked:

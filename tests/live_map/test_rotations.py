@@ -136,7 +136,7 @@ def test_a_map_that_cannot_be_published_is_no_bad_request_of_who_asks() -> None:
         live_map.to_version()
 
 
-@pytest.mark.parametrize("wrong", [np.zeros((6, 6)), -INFORMATION, np.full((6, 6), 1e200)])
+@pytest.mark.parametrize("wrong", [np.zeros((6, 6)), -INFORMATION, np.full((6, 6), 1e17)])
 def test_a_version_with_absurd_information_begins_no_map(wrong: Array) -> None:
     world = GeneratedWorld(seed=1)
     drive = world.drive("a", straight(0.0, 1.2))

@@ -85,7 +85,7 @@ def test_former_versions_of_leases_do_not_pile_up(assembly: Assembly) -> None:
         if "Prefix" in each
     }
 
-    assert short == {"live/": 1, "jobs/": 1, "batch/schedulers/": 1, "job-queue/": 1}
+    assert short == {"live/": 1, "jobs/": 1, "batch/schedulers/": 1, "accounts/": 1, "job-queue/": 1}
     assert lease_name("default", "m").startswith("live/")
 
 

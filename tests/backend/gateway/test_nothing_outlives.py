@@ -123,7 +123,7 @@ def _watch_and_leave(quiet: JsonLog) -> None:
     subscriptions = Subscriptions(
         loop=loop,  # type: ignore[arg-type]
         log=quiet,
-        watch=lambda *key: watched.append(key),
+        watch=lambda tenant, map_name, _: watched.append((tenant, map_name)),
         unwatch=lambda *key: watched.remove(key),
     )
 

@@ -90,7 +90,7 @@ class WorkerParts:
             self.context,
             registry=self.registry,
             services=frozenset(service.name for service in self.registry),
-            objects=ObjectRefs(store, self.settings.serving, self.settings.data.quota_bytes),
+            objects=ObjectRefs(store, self.settings.serving, self.settings.data),
         )
         connections: set[RobotConnection] = set()
         self.token_watch = TokenWatch(

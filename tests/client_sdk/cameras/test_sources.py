@@ -272,7 +272,7 @@ def _of_an_empty_folder(folder: Path) -> None:
         (_with_a_broken_image, "cannot read the image"),
         (_without_intrinsics, "there is no .*intrinsics.json"),
         (_with_wrong_intrinsics, "has no fy"),
-        (_of_no_video, "is not a video"),
+        (_of_no_video, "is a text, not a video"),
         (_of_an_empty_folder, "holds no image"),
         (lambda folder: open_camera(folder / "none.mp4", intrinsics=INTRINSICS), "there is no video"),
         (lambda folder: open_camera(99, intrinsics=INTRINSICS), "camera 99 cannot be opened"),

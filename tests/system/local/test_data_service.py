@@ -170,7 +170,7 @@ def test_a_full_disk_is_reported_and_leaves_no_partial_object(tmp_path: Path) ->
             fill()
 
         assert len(kept) >= 10
-        files = [path for path in (disk / "store").rglob("*") if path.is_file()]
+        files = [path for path in (disk / "store" / "objects").rglob("*") if path.is_file()]
         assert len(files) == len(kept)
         assert client.download(kept[0]) == random.Random(0).randbytes(MIB // 4)
         client.delete(kept[0])
