@@ -11,6 +11,7 @@ import ssl
 import stat
 import subprocess
 import sys
+import threading
 import time
 import urllib.request
 from collections.abc import Iterator
@@ -94,6 +95,13 @@ class Lan:
             code = main(list(words))
         return code, out.getvalue(), err.getvalue()
 
+    def wait_for_trust(self) -> None:
+        """Wait until the server has read the roster, as it does twice a second."""
+        deadline = time.monotonic() + SOON_S
+        while '"event":"trust"' not in (self.folder / "server-1.log").read_text():
+            assert time.monotonic() < deadline, "the server has not read the roster"
+            threading.Event().wait(0.02)
+
     def metrics(self) -> dict[str, Any]:
         """Return the metric families of the one address."""
         token = read_control_token(self.folder / "control.token")
@@ -129,6 +137,7 @@ def lan(other_machine: OtherMachine, tmp_path_factory: pytest.TempPathFactory) -
 def enrolment(lan: Lan) -> Path:
     code, _, errors = lan.run("robot", "enrol", "robot-1", "--out", "robot-1.enrolment")
     assert (code, errors) == (0, "")
+    lan.wait_for_trust()
     return lan.folder.parents[1] / "robot-1.enrolment"
 
 
