@@ -1,8 +1,8 @@
-"""Decide which command runs next: fair between robots, newest frame of a stream first.
+"""Decide which command runs next: fair between tenants and robots, newest frame of a stream first.
 
-At most one command of a robot runs, and robots that wait take turns.  Within a stream the newest frame
-replaces the one that waits, unless it says ``keep``.  A command whose deadline passed never runs.  When
-robots wait longer for their turn than `QUEUE_TARGET_S` for a whole `QUEUE_INTERVAL_S`,
+At most one command of a robot runs; tenants that wait take turns, and so do the robots of each.  Within a
+stream the newest frame replaces the one that waits, unless it says ``keep``.  A command whose deadline passed
+never runs.  When robots wait longer for their turn than `QUEUE_TARGET_S` for a whole `QUEUE_INTERVAL_S`,
 the server is behind; `rse_pf.backend.gateway.admission` then refuses what cannot start in time.  The
 scheduler has no thread and no clock: commands and times go in, commands and refusals come out.
 """
@@ -16,6 +16,7 @@ from typing import Any
 
 import msgspec
 
+from rse_pf.backend.scheduling.turns import Turns
 from rse_pf.config import ServingSettings
 from rse_pf.errors import Busy, Expired, RsePfError, Stale
 from rse_pf.identity import RobotId
@@ -111,7 +112,7 @@ class Scheduler:
         """Average time between two starts while robots wait: threads and CPU throttle included."""
         self._is_serial = settings.solver_threads == 1 or 0 < settings.emulated_cores <= 1
         self._robots: dict[RobotId, _Robot] = {}
-        self._turns: deque[RobotId] = deque()
+        self._turns = Turns()
         self._late_since: float | None = None
         self._judged_s = 0.0
         self._started = self._refused = 0
@@ -136,10 +137,10 @@ class Scheduler:
         """
         robot = self._robots.get(queued.robot)
         if robot is None:
-            return 0, self._delay_s(None), self.turn_s
+            return 0, self._delay_s(queued.robot, None), self.turn_s
         if _replaceable(robot.waiting, queued) is not None:
             return 0, 0.0, 0.0
-        return len(robot.waiting), self._delay_s(robot), self.turn_s
+        return len(robot.waiting), self._delay_s(queued.robot, robot), self.turn_s
 
     def retry_unread_ms(self, robot_id: RobotId, allowed_s: float) -> float:
         """Return when a robot may try again whose next command, not decoded yet, would wait too long.
@@ -154,7 +155,7 @@ class Scheduler:
         if not self.is_behind:
             return 0.0
         robot = self._robots.get(robot_id)
-        delay_s = self._delay_s(robot)
+        delay_s = self._delay_s(robot_id, robot)
         if delay_s <= max_wait_s(allowed_s, self.max_delay_s):
             return 0.0
         if robot is not None and any(map(_is_replaceable, robot.waiting)):
@@ -248,7 +249,7 @@ class Scheduler:
         """Give up what expired or waited too long, without starting anything."""
         refusals: list[RefusedCommand] = []
         if self._turns:
-            first = self._robots[self._turns[0]]
+            first = self._robots[self._turns.first]
             self._note_turn_wait(_turn_wait(first, first.waiting[0], now), now)
         for robot_id, robot in list(self._robots.items()):
             kept: deque[QueuedCommand] = deque()
@@ -289,10 +290,10 @@ class Scheduler:
         saves_time = self.waiting == 0 or is_short or (self.is_behind and self._is_serial)
         return cheap and size_bytes <= INLINE_BYTES and saves_time and self.running <= 1
 
-    def _delay_s(self, robot: _Robot | None) -> float:
-        """How long the next command of *robot* will wait: a round for each of its own, at most for all."""
+    def _delay_s(self, robot_id: RobotId, robot: _Robot | None) -> float:
+        """How long the next command of a robot will wait: a round for each of its own, at most for all."""
         rounds = 1 + (len(robot.waiting) if robot is not None else 0)
-        return min(rounds * len(self._turns), self.waiting + 1) * self.turn_s
+        return min(rounds * self._turns.before(robot_id.tenant), self.waiting + 1) * self.turn_s
 
     @property
     def _wanted_s(self) -> float:

@@ -78,7 +78,7 @@ def test_new_robots_that_keep_coming_do_not_starve_one_that_waits():
     line.add("a1", A)
     served = ""
     for number in range(5):
-        line.add(f"n{number}", ("default", f"n{number}"))
+        line.add(f"n{number}", RobotId("default", f"n{number}"))
         served += order(line, 1)
 
     assert served.count("a") == 2
@@ -113,3 +113,23 @@ def test_no_job_is_displaced_for_a_robot_with_as_many_or_one_less():
     assert job_to_displace([(A, True), (A, True), (B, True)], B) is None
     assert job_to_displace([(A, True)], B) is None
     assert job_to_displace([(A, False), (A, False), (A, False)], B) is None
+
+
+def test_a_tenant_with_many_robots_gets_every_other_turn_while_another_tenant_waits():
+    line = FairQueue()
+    for number in range(6):
+        line.add(f"m{number}", RobotId("many", f"robot-{number}"))
+    for number in range(2):
+        line.add(f"f{number}", RobotId("few", "robot-1"))
+
+    assert order(line, 8) == "mfmfmmmm"
+    assert line.first() is None
+
+
+def test_a_full_queue_of_one_tenants_robots_gives_a_place_to_another_tenant():
+    jobs = [(RobotId("many", f"robot-{number}"), True) for number in range(4)]
+
+    assert job_to_displace(jobs, RobotId("few", "robot-1")) == 3
+    assert job_to_displace(jobs, RobotId("many", "robot-9")) is None
+    even = [*jobs[:2], *((RobotId("few", "robot-1"), True) for _ in range(2))]
+    assert job_to_displace(even, RobotId("many", "robot-9")) is None

@@ -10,11 +10,12 @@ from rse_pf.wire import Command
 
 
 def queued(
-    robot: str, identity: int = 0, *, at: float = 0.0, within: float = 10.0, **command: object
-) -> QueuedCommand:
+    robot: str, identity: int = 0, *, at: float = 0.0, within: float = 10.0, tenant: str = "default",
+    **command: object,
+) -> QueuedCommand:  # fmt: skip
     """Return a command of *robot* that arrives at *at* and has *within* seconds."""
     work = Command(id=identity, service="work", **command)
-    return QueuedCommand(robot, RobotId("default", robot), work, 100, at, at + within)
+    return QueuedCommand(robot, RobotId(tenant, robot), work, 100, at, at + within)
 
 
 class AdmittedScheduler(Scheduler):

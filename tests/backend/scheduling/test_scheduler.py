@@ -10,6 +10,7 @@ from backend.scheduling.admitted import AdmittedScheduler, fall_behind, measure_
 
 from rse_pf.backend.scheduling.scheduler import INLINE_BYTES, QueuedCommand, Scheduler
 from rse_pf.config import ServingSettings
+from rse_pf.identity import RobotId
 
 SETTINGS = ServingSettings(max_queue_per_robot=4)
 
@@ -34,6 +35,32 @@ def test_robots_take_turns_however_much_one_of_them_asks():
     assert run_order(scheduler, 6) == [
         ("flood", 0), ("a", 1), ("b", 1), ("flood", 1), ("flood", 2), ("flood", 3),
     ]  # fmt: skip
+
+
+def test_tenants_take_turns_however_many_robots_one_of_them_has():
+    scheduler = AdmittedScheduler(SETTINGS)
+    for number in range(6):
+        scheduler.submit(queued(f"many{number}", number, tenant="many"), 0.0)
+    for number in range(2):
+        scheduler.submit(queued(f"few{number}", number, tenant="few"), 0.0)
+
+    assert [name for name, _ in run_order(scheduler, 8)] == [
+        "many0", "few0", "many1", "few1", "many2", "many3", "many4", "many5",
+    ]  # fmt: skip
+    assert scheduler.waiting == 0
+
+
+def test_a_tenant_with_one_robot_is_served_while_another_tenants_robots_are_refused():
+    scheduler = AdmittedScheduler(SETTINGS)
+    fall_behind(scheduler, turn_s=0.05)
+    for number in range(200):
+        Scheduler.submit(scheduler, queued(f"many{number}", tenant="many"))
+
+    (refusal,) = scheduler.submit(queued("one-more", within=4.0, tenant="many"), 0.0)
+
+    assert refusal.reason == "behind"
+    assert scheduler.backlog(queued("alone", tenant="few"))[1] == pytest.approx(0.05)
+    assert scheduler.submit(queued("alone", within=4.0, tenant="few"), 0.0) == []
 
 
 def test_one_robot_never_has_two_commands_running():
@@ -396,11 +423,12 @@ def test_a_command_is_refused_before_decoding_if_its_turn_would_come_too_late():
     scheduler = Scheduler(SETTINGS)
     measure_turns(scheduler, 0.2, 0.0)
     scheduler.submit(queued("a", within=60.0))
-    assert scheduler.retry_unread_ms("b", 0.25) == 0, "the server is not behind"
+    robot = RobotId("default", "b")
+    assert scheduler.retry_unread_ms(robot, 0.25) == 0, "the server is not behind"
     fall_behind(scheduler, now=0.5)
 
-    assert scheduler.retry_unread_ms("b", 0.25) == pytest.approx(200.0)
-    assert scheduler.retry_unread_ms("b", 5.0) == 0, "it has more time than compute and network need"
+    assert scheduler.retry_unread_ms(robot, 0.25) == pytest.approx(200.0)
+    assert scheduler.retry_unread_ms(robot, 5.0) == 0, "it has more time than compute and network need"
 
 
 def test_a_frame_that_may_replace_a_waiting_one_is_always_decoded():
