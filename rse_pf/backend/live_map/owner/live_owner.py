@@ -53,8 +53,8 @@ _SETTLED_S = 5.0
 """An owner that served for this long does not die of its map; nor one that has measured a keyframe."""
 _LAST_VERSION_S = 3.0
 """A map that is released waits for its last version no longer; the next owner publishes it then."""
-_UNUSED_S = 10.0
-"""A map that got no command for so long is only watched."""
+_UNUSED_SHARE = 1.0 / 6.0
+"""A map that got no command for this share of ``live.idle_s`` is only watched."""
 _EVENT_BYTES = 512
 """Of a keyframe's event in the log, without what it saw."""
 _WAITING = "waiting for the store"
@@ -437,7 +437,7 @@ class LiveOwner:
         if now >= self._publish_due_s:
             self._publish_due_s = now + self._context.settings.publish_s
             self._publisher.ask("live map")
-        if now - self._used_s >= _UNUSED_S:
+        if now - self._used_s >= _UNUSED_SHARE * self._context.settings.idle_s:
             self._note_use(is_used=False)
         if self.users:
             self._idle_since_s = now
