@@ -32,6 +32,7 @@ import os
 import secrets
 import statistics
 import tempfile
+import threading
 import time
 from collections import Counter
 from collections.abc import Awaitable, Callable, Sequence
@@ -95,16 +96,23 @@ class DataClient:
         self._at = url.split("/")[2]
         self._headers = {"Authorization": f"Bearer {token}"}
         self._connection = http.client.HTTPConnection(self._at, timeout=_DEADLINE_S)
+        self._lock = threading.Lock()
 
     def ask(self, method: str, path: str, body: bytes) -> tuple[int, bytes]:
         """Return status and content; 0 if the connection failed."""
-        try:
-            self._connection.request(method, path, body, self._headers)
-            answer = self._connection.getresponse()
-            return answer.status, answer.read()
-        except (OSError, http.client.HTTPException):
+        with self._lock:
+            try:
+                self._connection.request(method, path, body, self._headers)
+                answer = self._connection.getresponse()
+                return answer.status, answer.read()
+            except (OSError, http.client.HTTPException):
+                self._connection.close()
+                return 0, b""
+
+    def close(self) -> None:
+        """Close the connection when the request that another thread makes has ended."""
+        with self._lock:
             self._connection.close()
-            return 0, b""
 
     def put(self, data: bytes) -> int:
         """Store an object; return the status."""
@@ -362,12 +370,14 @@ async def measure(names: Sequence[str], pairs: int, seconds: float, folder: Path
                 neighbours[kind] = pipe, process
             robot_token = token("robot-1", HOME)
             async with connect(platform.url, token=robot_token, codec="bin") as robot:
-                measured = Measured(robot, DataClient(platform.url, robot_token))
+                data = DataClient(platform.url, robot_token)
+                measured = Measured(robot, data)
                 driving = asyncio.ensure_future(measured.drive())
                 await asyncio.sleep(_WARM_S)
                 row = await _pairs(name, pairs, neighbours, measured, platform, state)
                 driving.cancel()
                 await asyncio.gather(driving, return_exceptions=True)
+                await asyncio.to_thread(data.close)
             for pipe, process in neighbours.values():
                 pipe.send("end")
                 process.join(_DEADLINE_S)

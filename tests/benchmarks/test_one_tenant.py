@@ -7,13 +7,13 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.hostile.one_tenant import ATTACKS, GROWTH_MIB, QUOTA_BYTES, measure
+from benchmarks.hostile.one_tenant import GROWTH_MIB, QUOTA_BYTES, measure
 
-pytestmark = [pytest.mark.slow, pytest.mark.system]
+pytestmark = [pytest.mark.slow, pytest.mark.system, pytest.mark.timeout(240)]
 PAIRS, SECONDS = 3, 15.0
 
 
-@pytest.mark.parametrize("attack", sorted(ATTACKS))
+@pytest.mark.parametrize("attack", ["leave", "topics"])  # 110 s each; the benchmark runs all of them
 def test_nothing_of_another_tenant_is_refused_and_no_store_is_filled(attack: str, tmp_path: Path) -> None:
     """Ratios of p99 need a machine that does nothing else: the benchmark prints them."""
     (row,) = asyncio.run(measure([attack], PAIRS, SECONDS, tmp_path))
