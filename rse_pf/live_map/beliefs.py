@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import groupby
 
 import numpy as np
@@ -18,14 +18,15 @@ from rse_pf.live_map.agreement import (
 from rse_pf.live_map.graph import Graph, Segment
 from rse_pf.live_map.options import LiveMapOptions
 from rse_pf.live_map.outcomes import Ambiguous, LinkBelieved, LinkRemoved, Outcome
+from rse_pf.live_map.smoother import SmoothedWindows, smooth_around
 
-__all__ = ["Changes", "disbelieve_contradicting", "judge_again", "judge_links", "remove_doubted"]
+__all__ = ["Changes", "disbelieve_contradicting", "judge_again", "judge_links", "smooth_changes"]
 
 _DOUBTFUL = 30.0
 """Squared misfit of a link, six degrees of freedom: one true link in 25,000 has more."""
 _JUDGED_AFTER_JOIN = 48
 _CONTRADICTIONS = 16
-"""Of the last 32 keyframes of a segment; honest robots, also with 10 % of wheel slip, stay far below."""
+"""Of the last 32 keyframes of a robot; honest robots, also with 10 % of wheel slip, stay far below."""
 
 
 @dataclass(slots=True)
@@ -86,7 +87,7 @@ def disbelieve_contradicting(graph: Graph, keyframe: int, changes: Changes) -> b
     )
     segment.contradictions = ((segment.contradictions << 1) | is_contrary) & 0xFFFFFFFF
     count = segment.contradictions.bit_count()
-    if count < _CONTRADICTIONS:
+    if count < _CONTRADICTIONS or not is_contrary:
         return False
     graph.disbelieve(int(graph.of_segment[keyframe]))
     segment.reason = f"contradicting: {count} of the last 32 keyframes contradict their own odometry"
@@ -94,7 +95,30 @@ def disbelieve_contradicting(graph: Graph, keyframe: int, changes: Changes) -> b
     return True
 
 
-def remove_doubted(
+def smooth_changes(
+    graph: Graph, changes: Changes, options: LiveMapOptions, robot: str | None = None
+) -> SmoothedWindows | None:
+    """Smooth around what changed, and remove links that contradict the graph for long; None if nothing moved.
+
+    *robot* is whose keyframe is the cause.  Where it caused too much before, the window is the smallest one,
+    and a whole optimisation does the rest.
+    """
+    used = graph.smoothing.get(robot, 0) if robot is not None else 0
+    if used >= options.smoothing_most:
+        options = replace(options, windows=options.windows[:1])
+    window, smoothed = None, 0
+    if changes.moved:
+        window = smooth_around(graph, changes.moved, graph.anchors(), options)
+        smoothed = window.keyframes
+        if _remove_doubted(graph, window.squares, options, changes):
+            window = smooth_around(graph, changes.moved, graph.anchors(), options)
+            smoothed += window.keyframes
+    if robot is not None and (used or smoothed > options.smoothing_each):
+        graph.smoothing[robot] = max(0, used + smoothed - options.smoothing_each)
+    return window
+
+
+def _remove_doubted(
     graph: Graph, squares: dict[int, float], options: LiveMapOptions, changes: Changes
 ) -> bool:
     """Count the updates in which links contradicted the graph, remove those with too many; say if there were.

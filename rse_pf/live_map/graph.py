@@ -29,6 +29,10 @@ _MAX_WALK = 200.0
 """Steps of odometry beyond which two keyframes tell nothing about each other."""
 _MAX_VISITED = 250
 _MAX_REMOVED = 2000
+_CARRIED = 0xFFFF
+"""Contradictions of the newest 16 keyframes count in the robot's next segment, too."""
+_DISBELIEVED_MOST = 3
+"""After so many segments that are not believed, no further one of the robot is, until it is forgotten."""
 
 
 _FLOOR: Array = np.diag([0.02**2] * 3 + [math.radians(0.7) ** 2] * 3)
@@ -101,6 +105,7 @@ class Graph:
         links: By number, in the order in which they were measured; `open` are those not believed.
         equal_rooms_m: What joins robots must lie farther apart than this.
         removed: The newest links that were taken out, by number: who refuted them may be forgotten.
+        smoothing: By robot, how many keyframes were smoothed because of it beyond what its own ones allow.
         lookalikes: Keyframes at places of which the map knows another one that looks the same.
     """
 
@@ -118,6 +123,7 @@ class Graph:
         self.newest: dict[str, int] = {}
         self.left: list[str] = []
         self.optimised_at = 0
+        self.smoothing: dict[str, int] = {}
         self.lookalikes: set[int] = set()
         self.source = ""
         self.equal_rooms_m = 0.0
@@ -231,7 +237,16 @@ class Graph:
             if (segment.robot, segment.segment) == (robot, number) and not segment.version:
                 return row
         row = len(self.segments)
-        self.segments.append(Segment(robot=robot, segment=number, component=row))
+        segment = Segment(robot=robot, segment=number, component=row)
+        own = [each for each in self.segments if each.robot == robot and not each.version]
+        if own:
+            segment.contradictions = own[-1].contradictions & _CARRIED
+        if sum(each.disbelieved for each in own) >= _DISBELIEVED_MOST:
+            segment.disbelieved = True
+            segment.reason = (
+                "contradicting: too many of its segments were; it has to be forgotten first"
+            )
+        self.segments.append(segment)
         return row
 
     def reopen(self) -> None:
@@ -264,6 +279,7 @@ class Graph:
                 segment.keyframes = []
                 segment.told = None
                 segment.contradictions, segment.disbelieved = 0, False
+        self.smoothing.pop(robot, None)
         for i in gone:
             self.drop_features(i)
             self._of_segment[i] = -1
@@ -421,6 +437,7 @@ class Graph:
             ],
             links=[_packed_link(number, link) for number, link in self.links.items()],
             removed=[_packed_link(number, link) for number, link in self.removed.items()],
+            smoothing=list(self.smoothing.items()),
             trust=[(each.contradictions, each.disbelieved) for each in self.segments],
             open=self.open,
             agreements=[(*pair, agrees) for pair, agrees in self.agreements.items()],
@@ -485,7 +502,7 @@ class Graph:
         graph.agreements = {(i, j): agrees for i, j, agrees in packed.agreements}
         graph.next_link, graph.root, graph.events, graph.optimised_at = packed.numbers
         graph.next_numbers = dict(packed.next_numbers)
-        graph.newest = dict(packed.newest)
+        graph.newest, graph.smoothing = dict(packed.newest), dict(packed.smoothing)
         graph.left, graph.source = packed.left, packed.source
         graph.equal_rooms_m = packed.equal_rooms_m
         graph.lookalikes = set(packed.lookalikes)
@@ -515,6 +532,7 @@ class _Packed(msgspec.Struct, kw_only=True):
     equal_rooms_m: float = 0.0
     removed: list[_PackedLink] = []
     trust: list[tuple[int, bool]] = []
+    smoothing: list[tuple[str, int]] = []
 
 
 def _packed_link(number: int, link: LiveLink) -> _PackedLink:

@@ -21,7 +21,7 @@ from rse_pf.live_map.beliefs import (
     disbelieve_contradicting,
     judge_again,
     judge_links,
-    remove_doubted,
+    smooth_changes,
 )
 from rse_pf.live_map.events import (
     Event,
@@ -53,7 +53,7 @@ from rse_pf.live_map.outcomes import (
 )
 from rse_pf.live_map.place_index import LivePlaceIndex
 from rse_pf.live_map.relocalise import Relocalised, RelocaliseOptions, relocalise, spread_candidates
-from rse_pf.live_map.smoother import SmoothedWindows, odometry_step, smooth_all, smooth_around
+from rse_pf.live_map.smoother import SmoothedWindows, odometry_step, smooth_all
 from rse_pf.live_map.versions import version_of, whole_graph
 from rse_pf.maps.format import MapVersion
 from rse_pf.services.mapping.optimise import OptimiseOptions, optimise_graph
@@ -352,9 +352,9 @@ class LiveMap:
         ]  # fmt: skip
         changes = judge_links(graph, k, numbers, self.options)
         again = self._judge_again() if disbelieve_contradicting(graph, k, changes) else []
-        window = self._smooth(changes)
-        graph.drop_oldest_open(self.options.open_links)
         mine = graph.keyframes[k]
+        window = self._smooth(changes, mine.robot)
+        graph.drop_oldest_open(self.options.open_links)
         told = self._tell((mine.robot, mine.number), window)
         return [*changes.outcomes, *again, *told, *self._cull(k)]
 
@@ -453,16 +453,12 @@ class LiveMap:
 
     # --- parts of events -------------------------------------------------------------------------------
 
-    def _smooth(self, changes: Changes) -> SmoothedWindows | None:
-        """Smooth around what changed; links that contradict the graph for long are removed."""
+    def _smooth(self, changes: Changes, robot: str | None = None) -> SmoothedWindows | None:
+        """Smooth around what changed, by a keyframe of *robot*; ask for a whole optimisation if due."""
         graph = self._graph
-        if not changes.moved:
+        window = smooth_changes(graph, changes, self.options, robot)
+        if window is None:
             return None
-        anchors = graph.anchors()
-        window = smooth_around(graph, changes.moved, anchors, self.options)
-        if remove_doubted(graph, window.squares, self.options, changes):
-            anchors = graph.anchors()
-            window = smooth_around(graph, changes.moved, anchors, self.options)
         due = len(graph) - graph.optimised_at >= self.options.optimise_every
         if window.strained and due:
             graph.optimised_at = len(graph)

@@ -27,6 +27,9 @@ class LiveMapOptions:
         cauchy: Width of the robust kernel on links, in standard deviations.
         windows: Numbers of keyframes that the smoother moves; the next larger one is taken if the border of
             the window would move by more than ``border_m`` or ``border_deg``.
+        smoothing_each: Keyframes in windows that a robot's keyframe may cause on average; what it causes
+            beyond that adds up over all of its segments,
+        smoothing_most: and from so many on only the smallest window is taken for it.
         told_m: A correction is told from this change of the alignment on,
         told_deg: or from this rotation.
         doubts: A link that contradicts the graph in so many updates is removed.
@@ -57,6 +60,8 @@ class LiveMapOptions:
     windows: tuple[int, ...] = (20, 50, 120)
     border_m: float = 0.002
     border_deg: float = 0.1
+    smoothing_each: int = 40
+    smoothing_most: int = 2_000
     told_m: float = 0.001
     told_deg: float = 0.05
     doubts: int = 8

@@ -73,12 +73,14 @@ class SmoothedWindows:
     """What `smooth_around` did.
 
     ``strained`` says that even the largest window was too small; ``misfit`` is the mean squared misfit of the
-    links; ``squares`` that of each believed link that was smoothed.
+    links; ``squares`` that of each believed link that was smoothed; ``keyframes`` counts those of all windows
+    that were tried.
     """
 
     strained: bool = False
     misfit: float = 0.0
     squares: dict[int, float] = field(default_factory=dict)
+    keyframes: int = 0
     _covariances: dict[int, Array] = field(default_factory=dict)
 
     def covariance(self, graph: Graph, keyframe: int) -> Array | None:
@@ -121,6 +123,7 @@ def smooth_around(
                 break
             inside = set(ids)
             told = [i for i in newest if i in inside]
+            done.keyframes += len(ids)
             found, border, rows = _fit(graph, ids, told, edges, options)
             is_strained = not is_whole and _is_moved(graph, border, found, rows, options)
             if not is_strained or size == options.windows[-1]:

@@ -11,8 +11,11 @@ import pytest
 from benchmarks.live.generated_drives import GeneratedWorld, circle
 from benchmarks.live.hostile_robot import HOSTILE, error_cm, joins, play, scenario, without
 from rse_pf.geometry import inverse
+from rse_pf.live_map.beliefs import Changes, smooth_changes
 from rse_pf.live_map.events import RobotForgotten
+from rse_pf.live_map.graph import Graph
 from rse_pf.live_map.live_map import LiveMap
+from rse_pf.live_map.options import LiveMapOptions
 from rse_pf.live_map.outcomes import Ambiguous, LinkRemoved, Unaligned
 
 JOINED = {"a": True, "b": True, "c": True}
@@ -65,11 +68,56 @@ def test_robots_whose_wheels_slip_are_believed(slip: float) -> None:
     assert max(each.contradictions.bit_count() for each in live_map._graph.segments) <= 4
 
 
+def test_smoothing_that_a_robot_causes_has_a_budget_of_its_own() -> None:
+    world = GeneratedWorld(seed=3, links=4)
+    drives = [
+        world.drive(name, circle(0.8, 0.6, phase=phase)) for name, phase in (("a", 0.0), (HOSTILE, 0.3))
+    ]
+    live_map = play([*world.play(drives)]).live_map
+    graph = live_map._graph
+    assert not graph.smoothing
+    # No window is large enough, as if the robot's links moved the graph each time.
+    options = LiveMapOptions(
+        windows=(5, 10, 20), border_m=0.0, border_deg=0.0, smoothing_each=10, smoothing_most=60
+    )
+
+    def smoothed(robot: str) -> int:
+        graph.T[:, :3, 3] *= 1.01
+        window = smooth_changes(graph, Changes(moved=[len(graph) // 2]), options, robot)
+        assert window is not None
+        return window.keyframes
+
+    assert [smoothed(HOSTILE) for _ in range(6)] == [35, 35, 35, 5, 5, 5]
+    restored = LiveMap.restore(live_map.snapshot())
+    assert restored._graph.smoothing == graph.smoothing == {HOSTILE: 60}
+    assert restored.digest() == live_map.digest()
+    assert smoothed("a") == 35
+    live_map.apply(RobotForgotten(robot=HOSTILE))
+    assert HOSTILE not in graph.smoothing
+
+
+def test_a_robot_that_opens_segments_is_not_believed_anew_each_time() -> None:
+    graph = Graph()
+    for number in range(3):
+        segment = graph.segments[graph.segment_row(HOSTILE, number)]
+        assert segment.contradictions == (0xFFFF if number else 0)
+        assert not segment.disbelieved
+        segment.contradictions, segment.disbelieved = 0xFFFFFFFF, True
+
+    refused = graph.segments[graph.segment_row(HOSTILE, 3)]
+    honest = graph.segments[graph.segment_row("a", 0)]
+
+    assert refused.disbelieved
+    assert refused.reason.startswith("contradicting")
+    assert not honest.disbelieved
+    assert honest.contradictions == 0
+
+
 def test_a_snapshot_of_an_earlier_release_is_read() -> None:
     events, _ = scenario("scaled-rotations", seed=0, rounds=0.2)
     live_map = play(events).live_map
     packed = msgspec.msgpack.decode(live_map.snapshot())
-    for name in ("removed", "trust"):
+    for name in ("removed", "trust", "smoothing"):
         del packed[name]
 
     restored = LiveMap.restore(msgspec.msgpack.encode(packed))
