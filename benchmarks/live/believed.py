@@ -1,7 +1,7 @@
 """How close honest robots of the recordings come to being disbelieved, with and without slipping wheels.
 
 Three robots drive through parts of the red kitchen, and four through unrelated recordings; the steps of their
-odometry are scaled by the slip.  Kitti's and EuRoC's recordings have no such odometry.
+odometry are scaled by the slip.
 
     python -m benchmarks.live.believed --recordings ../shared/data --runs 3
 """

@@ -31,8 +31,6 @@ _MAX_VISITED = 250
 _MAX_REMOVED = 2000
 _CARRIED = 0xFFFF
 """Contradictions of the newest 16 keyframes count in the robot's next segment, too."""
-_DISBELIEVED_MOST = 3
-"""After so many segments that are not believed, no further one of the robot is, until it is forgotten."""
 
 
 _FLOOR: Array = np.diag([0.02**2] * 3 + [math.radians(0.7) ** 2] * 3)
@@ -241,11 +239,6 @@ class Graph:
         own = [each for each in self.segments if each.robot == robot and not each.version]
         if own:
             segment.contradictions = own[-1].contradictions & _CARRIED
-        if sum(each.disbelieved for each in own) >= _DISBELIEVED_MOST:
-            segment.disbelieved = True
-            segment.reason = (
-                "contradicting: too many of its segments were; it has to be forgotten first"
-            )
         self.segments.append(segment)
         return row
 
