@@ -47,7 +47,7 @@ GAUGE_HELP = {
     "live_waiting": "commands that wait for the owner of a live map now",
     "recording_dropped": "messages that were not recorded because the recorder was too slow or has ended",
     "ready": "whether the server accepts robots: 1, or 0 while it starts or drains",
-    "accept_pauses": "pauses of accepting because sockets arrived faster than max_accepts_per_s",
+    "accept_pauses": "pauses because sockets began to send faster than max_accepts_per_s",
     "control_refused": "requests to the control port that were refused for lack of its token",
 }
 """What each gauge means; a new gauge needs a line here."""

@@ -67,7 +67,7 @@ class ServingSettings:
     max_handshake_bytes: int = setting(8192, unit="bytes", doc="request head of a handshake; a longer one is refused with 431", source="slowloris, OWASP", low=1024, high=16384)
     max_unauthenticated: int = setting(200, unit="sockets", doc="sockets without a verified token; the oldest one is closed when a new one exceeds the limit", low=1)
     max_unauthenticated_per_source: int = setting(50, unit="sockets", doc="the same for each source address; not counted behind trusted proxies; 0 is off", low=0)
-    max_accepts_per_s: float = setting(500.0, unit="sockets/s", doc="sockets accepted each second; more wait in the listen backlog; 0 is off", low=0)
+    max_accepts_per_s: float = setting(500.0, unit="sockets/s", doc="sockets that have begun to send and are passed to a worker each second; more wait; 0 is off", low=0)
     max_handshakes_per_source_per_s: float = setting(200.0, unit="handshakes/s", doc="handshakes of one source address; more are refused with 429; 0 is off", low=0)
     handshake_burst: int = setting(1000, unit="handshakes", doc="burst of max_handshakes_per_source_per_s and of max_accepts_per_s", low=1)
     trusted_proxies: int = setting(1, unit="proxies", doc="load balancers that append to x-forwarded-for; 0: robots connect directly", low=0, high=8)

@@ -29,7 +29,6 @@ LIVE_AS_LONG_AS_THE_PROCESS = {
     "rse_pf/backend/rosbridge/peers.py": {"WorkerPeers", "_Peers"},
     "rse_pf/backend/rosbridge/topics.py": {"RosbridgeTopics"},
     "rse_pf/backend/supervisor/robot_events.py": {"RobotEvents"},
-    "rse_pf/backend/supervisor/supervisor.py": {"_Supervisor"},
     "rse_pf/backend/supervisor/worker.py": {"_Worker"},
 }
 PLAIN = {"within_ms"}

@@ -1,8 +1,8 @@
 """One backend server: listener, worker processes, control port and drain; the body of `rse-pf serve`.
 
-The supervisor accepts each robot and passes the socket to the worker with the fewest robots.  It reads no
-byte of a robot and restarts no worker: the server ends with its first worker that is lost, and the scale
-modifier replaces it.  A drain loses no command.
+The supervisor accepts each robot and passes the socket, when it has begun to send, to the worker with the
+fewest robots.  It consumes no byte of a robot and restarts no worker: the server ends with its first worker
+that is lost, and the scale modifier replaces it.  A drain loses no command.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ from rse_pf.backend.jobs.slots import make_pipe
 from rse_pf.backend.log import JsonLog
 from rse_pf.backend.metrics import merge, merge_isolation, render
 from rse_pf.backend.rosbridge.peers import peer_channels
+from rse_pf.backend.supervisor.accepting import RobotAcceptor
 from rse_pf.backend.supervisor.control_http import (
     ControlReply,
     ControlRequest,
@@ -59,13 +60,9 @@ from rse_pf.config.placement import ServerPlacement
 from rse_pf.errors import ConfigurationError
 from rse_pf.files import replace_json
 from rse_pf.linux import cpu_seconds, raise_descriptor_limit, resident_bytes
-from rse_pf.token_bucket import TokenBucket
 
 __all__ = ["serve"]
 
-_ACCEPTS_AT_ONCE = 64
-_ACCEPT_PAUSE_S = 0.1
-_MIN_PAUSE_S = 0.01
 _FRESH_S = 0.25
 _REPORT_S = 0.3
 _ROWS_S = 2.0
@@ -79,8 +76,6 @@ _MAX_SPREAD_S = _MAX_DRAIN_WAIT_S = 3600.0
 _EXIT_OK, _EXIT_LOST = 0, 1
 _PUBLIC_PAGES = ("/healthz", "/readyz")
 """A load balancer asks for them, without a token."""
-_LISTEN_BACKLOG = 4096
-"""Connections that wait for accept; the kernel cuts it to net.core.somaxconn."""
 
 
 def serve(
@@ -175,7 +170,6 @@ class _Supervisor:
         self._server_id = server_id
         self._records = records
         self._announce = announce
-        self._listener = listener
         self._port = listener.getsockname()[1]
         self._state = "starting"
         self._began = time.monotonic()
@@ -187,12 +181,13 @@ class _Supervisor:
         self._control_port = 0
         self._moving_until = 0.0
         self._signals = 0
-        self._accepted = self._refused_full = 0
+        self._refused_full = 0
         self._trust = trust if settings.auth.required else None
-        self._accepts = TokenBucket(
-            settings.serving.max_accepts_per_s, float(settings.serving.handshake_burst)
-        )
-        self._accept_pauses = self._control_refused = 0
+        self._acceptor = RobotAcceptor(
+            listener, settings.serving, pass_on=self._pass_on,
+            on_refused=lambda reason: self._log.warning("accept-failed", reason=reason),
+        )  # fmt: skip
+        self._control_refused = 0
         self._control_token = control_token
         self._log = JsonLog(level=settings.serving.log_level, server=server_id, wall_clock=time.time)
         records.complain_to(lambda problem: self._log.error("audit", reason=problem))
@@ -208,7 +203,7 @@ class _Supervisor:
             await self._start(loop)
             return await self._over
         finally:
-            self._stop_accepting()
+            self._acceptor.close()
             control.close()
             for worker in self._workers:
                 worker.kill()
@@ -250,8 +245,7 @@ class _Supervisor:
                 await everything
             self._finish(_EXIT_LOST)
             return
-        self._listener.listen(_LISTEN_BACKLOG)
-        loop.add_reader(self._listener.fileno(), self._accept_some)
+        self._acceptor.open()
         self._state = "ready"
         if self._announce is not None:
             replace_json(self._announce, self._identity())
@@ -271,44 +265,12 @@ class _Supervisor:
 
     # --- robots --------------------------------------------------------------------------------
 
-    def _accept_some(self) -> None:
-        for _ in range(_ACCEPTS_AT_ONCE):
-            wait_s = self._accepts.take(time.monotonic()) if self._accepts.rate > 0 else 0.0
-            if wait_s > 0:
-                self._accept_pauses += 1
-                self._pause_accepting(max(wait_s, _MIN_PAUSE_S))
-                return
-            try:
-                # A descriptor is enough: `accept` would make an object that is closed at once.
-                fd, address = self._listener._accept()  # type: ignore[attr-defined]
-            except BlockingIOError:
-                return
-            except OSError as error:  # out of descriptors, or the robot is gone already
-                self._log.warning("accept-failed", reason=str(error))
-                self._pause_accepting(_ACCEPT_PAUSE_S)
-                return
-            self._accepted += 1
-            try:
-                self._pass_on(fd, address[0])
-            finally:
-                os.close(fd)
-
-    def _pass_on(self, fd: int, peer: str) -> None:
+    def _pass_on(self, fd: int, number: int, peer: str) -> None:
         """Send an accepted socket to the worker with the fewest."""
         for worker in sorted(self._workers, key=_load_of):
-            if worker.give(fd, self._accepted, peer):
+            if worker.give(fd, number, peer):
                 return
         self._refused_full += 1
-
-    def _pause_accepting(self, pause_s: float) -> None:
-        """Stop watching the listener for *pause_s*; it stays readable meanwhile."""
-        loop = asyncio.get_running_loop()
-        loop.remove_reader(self._listener.fileno())
-        loop.call_later(pause_s, self._resume_accepting)
-
-    def _resume_accepting(self) -> None:
-        if self._listener.fileno() >= 0:
-            asyncio.get_running_loop().add_reader(self._listener.fileno(), self._accept_some)
 
     # --- the end -------------------------------------------------------------------------------
 
@@ -342,18 +304,13 @@ class _Supervisor:
         if self._state == "leaving" and held_s > 0:
             return
         self._state = "leaving"
-        self._stop_accepting()
+        self._acceptor.close()
         for worker in self._workers:
             worker.order(LeaveOrder(held_s))
         gone = asyncio.gather(*(worker.gone.wait() for worker in self._workers))
         with suppress(asyncio.TimeoutError):
             await asyncio.wait_for(gone, held_s + _LEAVE_S)
         self._finish(_EXIT_OK)
-
-    def _stop_accepting(self) -> None:
-        if self._listener.fileno() >= 0:
-            asyncio.get_running_loop().remove_reader(self._listener.fileno())
-            self._listener.close()
 
     def _finish(self, code: int) -> None:
         self._state = "leaving"
@@ -425,7 +382,7 @@ class _Supervisor:
                 "cpu_s": self._cpu_s(merged["gauges"]),
                 "resident_bytes": float(sum(map(resident_bytes, self._pids()))),
                 "ready": float(self._state == "ready"),
-                "accept_pauses": float(self._accept_pauses),
+                "accept_pauses": float(self._acceptor.pauses),
                 "control_refused": float(self._control_refused),
             }
         )
@@ -587,6 +544,7 @@ class _Supervisor:
                 self._reported = time.monotonic()
         merged = merge(worker.report for worker in self._workers if worker.report is not None)
         merged["handshakes"]["no-worker"] = self._refused_full
+        merged["closed"]["unauthenticated"] = merged["closed"].get("unauthenticated", 0) + self._acceptor.cut
         return merged
 
     def _pids(self) -> list[int]:
