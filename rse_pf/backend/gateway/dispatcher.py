@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from asyncio import TimerHandle
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from rse_pf.backend.compute.lane import ComputeLane
@@ -29,7 +30,6 @@ from rse_pf.backend.rosbridge.codec import CODEC as ROSBRIDGE
 from rse_pf.backend.rosbridge.codec import RosbridgeCodec
 from rse_pf.backend.rosbridge.session import RosbridgeSession
 from rse_pf.backend.rosbridge.topics import RosbridgeTopics
-from rse_pf.backend.rosbridge.waiting import AwaitedTokens
 from rse_pf.backend.sandbox.reloading import ReloadingSandboxes
 from rse_pf.backend.scheduling.cpu_throttle import BATCH_S, CpuThrottle
 from rse_pf.backend.scheduling.scheduler import (
@@ -44,7 +44,7 @@ from rse_pf.errors import NotFound, UnknownService
 from rse_pf.identity import RobotId
 from rse_pf.service import Registry
 from rse_pf.services.pnp import wire_types
-from rse_pf.silent_connections import PendingHandshakes
+from rse_pf.silent_connections import SilentConnections
 from rse_pf.wire import CODECS, Codec, Command, Failure, make_codec
 from rse_pf.wire.envelope import Envelope, peek
 from rse_pf.wire.server_session import CLOSE_GOING_AWAY, CLOSE_RATE, CLOSE_TOKEN_OVER, ServerSession
@@ -55,6 +55,8 @@ _DECODER_RETRY_MS = 500.0
 _UNMEASURED_TURN_S = 0.125
 """Sandboxes and jobs do not measure their turns: a robot whose queue is full waits this long for each of
 them."""
+_TOKEN_S = 3.0
+"""Time from the handshake to the token of a rosbridge client that showed none in it."""
 
 
 class NoQueue:
@@ -170,10 +172,10 @@ class Dispatcher:
             name: make_codec(name, settings.session, pnp=wire_types(registry)) for name in CODECS
         }
         serving = settings.serving
-        line: PendingHandshakes[RobotConnection] = PendingHandshakes(
-            serving.max_unauthenticated, serving.max_unauthenticated_per_source
-        )
-        self._awaited = AwaitedTokens(line, loop=context.loop, close_code=CLOSE_TOKEN_OVER)
+        self._awaited: SilentConnections[RobotConnection] = SilentConnections(
+            call_later=context.loop.call_later, seconds=_TOKEN_S,
+            most=serving.max_unauthenticated, most_per_source=serving.max_unauthenticated_per_source,
+        )  # fmt: skip
         self._threads = SolverThreads(
             settings.serving.solver_threads,
             answers.compute,
@@ -236,7 +238,7 @@ class Dispatcher:
             session.ends_s = expires_s
         connection = RobotConnection(self, wire, session, accepted, now=now, number=number)
         if accepted.awaits_token:
-            self._awaited.enter(connection, accepted.source)
+            self._awaited.enter(connection, partial(_close_without_token, connection), accepted.source)
         else:
             self._connected(connection, expires_s, now)
         return connection
@@ -313,7 +315,7 @@ class Dispatcher:
         """Close every socket; what is held is lost, so wait for `held` to be 0 first."""
         for connection in list(self.connections):
             connection.close(CLOSE_GOING_AWAY, "leaving")
-        self._awaited.close_all()
+        self._awaited.cut_all()
         self._threads.close()
         self.decoder.close()
         self._jobs.close()
@@ -568,3 +570,8 @@ class Dispatcher:
         self._lag_s = max(self._lag_s, -self._idle_timeouts.left_s(now))
         self._idle_timeouts.look(self.connections, now)
         self.context.loop.call_later(self._idle_timeouts.left_s(now), self._tick)
+
+
+def _close_without_token(connection: RobotConnection) -> None:
+    if not connection.is_closing:
+        connection.close(CLOSE_TOKEN_OVER, "unauthenticated")
