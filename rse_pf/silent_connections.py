@@ -28,8 +28,9 @@ __all__ = [
 FIRST_REQUEST_S = 8.0
 """Time from the acceptance of a connection to its first whole request, or hello; with the time that it may
 wait to be accepted these are ten seconds."""
-BACKLOG = 1024
-"""Connections that wait to be accepted: above that the kernel drops them, also those of robots."""
+BACKLOG = 4096
+"""Connections that wait to be accepted: above that the kernel drops them, also those of robots, and they are
+tried again after 1 and 3 s.  The kernel cuts it to net.core.somaxconn."""
 KEEP_ALIVE_S = BALANCER_IDLE_TIMEOUT_S + 10.0
 """How long a served connection may be idle: longer than load balancers keep theirs, which would otherwise
 send a request into a connection that is just being closed."""

@@ -27,12 +27,12 @@ from rse_pf.errors import ConfigurationError, MissingExtra, StoreError
 from rse_pf.files import replace_json
 from rse_pf.http_connections import bounded_protocol
 from rse_pf.object_store import DirectoryStore, ObjectStore
+from rse_pf.silent_connections import BACKLOG
 from rse_pf.terminal import json_line, show
 
 __all__ = ["KeysFile", "serve_data"]
 
 _SWEEP_S = 3600.0
-_BACKLOG = 1024
 _STOP_TIMEOUT_S = 10
 _MAX_IDLE = 2048
 """Connections that wait for their next request."""
@@ -87,7 +87,7 @@ def serve_data(
     listening = _listen(settings)
     config = uvicorn.Config(
         app, http=bounded_protocol(most_idle=_MAX_IDLE), ws="none", lifespan="off", access_log=False,
-        log_level="warning", backlog=_BACKLOG, server_header=False, date_header=False, proxy_headers=False,
+        log_level="warning", backlog=BACKLOG, server_header=False, date_header=False, proxy_headers=False,
         timeout_graceful_shutdown=_STOP_TIMEOUT_S,
     )  # fmt: skip
     for number in (signal.SIGTERM, signal.SIGINT):
@@ -167,7 +167,7 @@ def _listen(settings: PlatformSettings) -> socket.socket:
     host, port = settings.data.host, settings.data.port
     try:
         listening = socket.create_server(
-            (host, port), backlog=_BACKLOG, family=socket.AF_INET6 if ":" in host else socket.AF_INET
+            (host, port), backlog=BACKLOG, family=socket.AF_INET6 if ":" in host else socket.AF_INET
         )
         # asyncio does this only for sockets that name their protocol; a reply is a head and a body, and
         # without it the body waits 40 ms for the delayed acknowledgement of the head.
