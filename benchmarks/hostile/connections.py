@@ -7,8 +7,9 @@
 send nothing to one port after the other.  For each port it shows in how many seconds the server had closed
 all of them (bar: 10), how much memory the processes of the platform took meanwhile (bar: 64 MiB), and how
 long a new robot took to connect and to get an answer (bar: 1 s).  ``leave`` lets robots, rosbridge clients
-and readers of a live map connect, use what there is, and leave; it shows descriptors, threads and memory of
-the worker, before and after (bars: as before; 1 KiB a cycle).
+and readers of a live map connect, use what there is, and leave, and then browsers of the page; it shows
+descriptors, threads and memory of the worker, and of the page, before and after (bars: as before; 1 KiB a
+cycle).
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from __future__ import annotations
 import argparse
 import asyncio
 import contextlib
+import http.client
 import json
 import os
 import random
@@ -25,17 +27,21 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 from websockets.asyncio.client import connect as connect_socket
 
 import client_sdk
 from benchmarks.server.serving import machine
 from rse_pf.batch.cluster import LocalCluster, new_cluster_key
+from rse_pf.cli.local_platform.page import new_address
+from rse_pf.fleet_page.server import ANNOUNCEMENT
 
 _NAME = "silent-connections"
+_OWNER = "rse-pf live map"
 _LONGEST_S = 40.0
 _WARM_UP = 100
 MIB = 1 << 20
@@ -64,9 +70,9 @@ def listening(pids: list[int]) -> dict[int, str]:
     found = {}
     for line in Path("/proc/net/tcp").read_text().splitlines()[1:]:
         fields = line.split()
-        pid = owners.get(f"socket:[{fields[9]}]")
-        if fields[3] == "0A" and pid is not None:
-            name = Path(f"/proc/{pid}/comm").read_text().strip()
+        owner = owners.get(f"socket:[{fields[9]}]")
+        if fields[3] == "0A" and owner is not None:
+            name = Path(f"/proc/{owner}/comm").read_text().strip()
             found[int(fields[1].split(":")[1], 16)] = name
     return found
 
@@ -173,14 +179,17 @@ def silent(count: int, only: list[str]) -> list[dict[str, Any]]:
         deadline = time.monotonic() + 20
         while True:
             pids = [*family(pid), cluster.scheduler_pid, *cluster.worker_pids]
-            late = {"rse-pf live map", "batch-worker"} - set(listening(pids).values())
+            late = {_OWNER, "batch-worker"} - set(listening(pids).values())
             if not late or time.monotonic() > deadline:
                 break
             time.sleep(0.2)
         if late:
             print(f"not listening: {', '.join(sorted(late))}", flush=True)
-        for port, owner in sorted(listening(pids).items()):
-            if not only or owner in only:
+        # A map that is only watched gives its owner up, so that owner comes first.
+        for port, owner in sorted(listening(pids).items(), key=lambda row: (row[1] != _OWNER, row[0])):
+            if port not in listening(pids):
+                print(f"listens no longer: {port} {owner}", flush=True)
+            elif not only or owner in only:
                 row = {"port": port, "owner": owner, **attack(port, count, pids, url, token)}
                 print(
                     json.dumps({k: round(v, 2) if isinstance(v, float) else v for k, v in row.items()}),
@@ -252,15 +261,55 @@ def leave(times: int) -> dict[str, Any]:
                 for each in family(root)
                 if Path(f"/proc/{each}/comm").read_text().strip() == "rse-pf worker"
             )
-            before = held_by(worker)
-            asyncio.run(run(times))
-            deadline = time.monotonic() + 10
-            while (after := held_by(worker))["descriptors"] > before[
-                "descriptors"
-            ] and time.monotonic() < deadline:
-                time.sleep(0.1)
+            return grown_by(worker, times, lambda count: asyncio.run(run(count)))
+
+
+def grown_by(pid: int, times: int, run: Callable[[int], None]) -> dict[str, Any]:
+    """Return what the process *pid* holds before and after *times* cycles."""
+    before = held_by(pid)
+    run(times)
+    deadline = time.monotonic() + 10
+    while (after := held_by(pid))["descriptors"] > before["descriptors"] and time.monotonic() < deadline:
+        time.sleep(0.1)
     grown = (after["anonymous_kib"] - before["anonymous_kib"]) / times
     return {"times": times, "before": before, "after": after, "kib_per_cycle": round(grown, 3)}
+
+
+def browse(folder: Path) -> None:
+    """Open the page with a key of its own, use it, and leave while it is being told what happens."""
+    address = urlsplit(new_address(folder, "view"))
+    key = address.fragment.rpartition("=")[2]
+    page = http.client.HTTPConnection(address.netloc, timeout=20)
+
+    def ask(method: str, path: str, body: str = "", session: str = "") -> http.client.HTTPResponse:
+        page.request(method, path, body, {"Authorization": f"Bearer {session}"} if session else {})
+        answer = page.getresponse()
+        if answer.status != 200:
+            raise SystemExit(f"{path}: {answer.status} {answer.read()!r}")
+        return answer
+
+    with contextlib.closing(page):
+        ask("GET", "/").read()
+        session = json.loads(ask("POST", "/session", json.dumps({"key": key})).read())["session"]
+        with contextlib.closing(
+            ask("GET", "/stream?topics=fleet,history,event,robots", session=session)
+        ) as told:
+            told.readline()
+
+
+def leave_page(times: int) -> dict[str, Any]:
+    """Let browsers of the page come and go *times* times, after a warm-up."""
+    with tempfile.TemporaryDirectory() as name, platform(Path(name)):
+        deadline = time.monotonic() + 20
+        while not (announced := list(Path(name).rglob(ANNOUNCEMENT))) and time.monotonic() < deadline:
+            time.sleep(0.1)
+
+        def run(count: int) -> None:
+            for _ in range(count):
+                browse(announced[0].parent)
+
+        run(_WARM_UP)
+        return grown_by(int(json.loads(announced[0].read_text())["pid"]), times, run)
 
 
 def main() -> int:
@@ -275,10 +324,12 @@ def main() -> int:
     args = parser.parse_args()
     print(f"{machine()}, load {os.getloadavg()[0]:.1f}")
     if args.part == "leave":
-        found = leave(args.times)
-        print(json.dumps(found))
-        same = all(found["after"][what] <= found["before"][what] for what in ("descriptors", "threads"))
-        return 0 if same and found["kib_per_cycle"] <= 1.0 else 1
+        kept = []
+        for who, found in (("worker", leave(args.times)), ("page", leave_page(args.times))):
+            print(json.dumps({"of": who, **found}), flush=True)
+            same = all(found["after"][what] <= found["before"][what] for what in ("descriptors", "threads"))
+            kept.append(same and found["kib_per_cycle"] <= 1.0)
+        return 0 if all(kept) else 1
     rows = silent(args.count, args.ports)
     kept = [
         r["closed_s"] <= 10 and not r["left"] and r["memory_mib"] <= 64 and r["robot_s"] <= 1 for r in rows
