@@ -6,11 +6,12 @@ Files are public and say nothing about the platform; everything else needs a ses
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import dataclasses
 import json
 import time
-from collections.abc import Awaitable, Callable, Mapping, MutableMapping
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, MutableMapping
 from typing import Any
 from urllib.parse import parse_qsl
 
@@ -177,10 +178,28 @@ class FleetApp:
             first = await messages.__anext__()  # refused before the answer begins
             await send(_start(200, b"text/event-stream", ((b"cache-control", b"no-store"),)))
             await send({"type": "http.response.body", "body": first, "more_body": True})
-            async for message in messages:
-                # uvicorn waits here for a slow browser, and raises nothing for one that left.
-                await send({"type": "http.response.body", "body": message, "more_body": True})
-                self._sessions.role_of(request.session, now_s=self._clock())
+            sending = asyncio.ensure_future(self._send_messages(request, messages, send))
+            leaving = asyncio.ensure_future(_until_left(receive))
+            try:
+                await asyncio.wait({sending, leaving}, return_when=asyncio.FIRST_COMPLETED)
+            finally:
+                for task in (sending, leaving):
+                    task.cancel()
+                await asyncio.wait({sending, leaving})
+        if not sending.cancelled():
+            sending.result()
+
+    async def _send_messages(self, request: _Request, messages: AsyncIterator[bytes], send: Send) -> None:
+        async for message in messages:
+            # uvicorn waits here for a slow browser, and raises nothing for one that left.
+            await send({"type": "http.response.body", "body": message, "more_body": True})
+            self._sessions.role_of(request.session, now_s=self._clock())
+
+
+async def _until_left(receive: Receive) -> None:
+    """Wait until the browser is gone, and not for the next message to it: its place is another page's."""
+    while (await receive())["type"] != "http.disconnect":
+        pass
 
 
 async def _body(receive: Receive) -> dict[str, Any]:

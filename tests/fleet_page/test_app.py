@@ -68,8 +68,12 @@ class Page:
         }  # fmt: skip
         sent: list[Any] = []
 
+        bodies = [raw]
+
         async def receive() -> Any:
-            return {"type": "http.request", "body": raw, "more_body": False}
+            if not bodies:
+                await asyncio.Event().wait()  # the browser stays
+            return {"type": "http.request", "body": bodies.pop(), "more_body": False}
 
         async def send(message: Any) -> None:
             sent.append(message)
@@ -228,7 +232,7 @@ def test_a_stream_ends_with_its_session() -> None:
             raise OSError("the browser left")
 
     async def receive() -> Any:
-        raise AssertionError("a stream has no body")
+        await asyncio.Event().wait()  # the browser stays
 
     scope = {
         "type": "http", "method": "GET", "path": "/stream", "query_string": b"topics=event",
@@ -239,3 +243,32 @@ def test_a_stream_ends_with_its_session() -> None:
 
     assert any(b"event-0" in each for each in seen)
     assert not any(b"event-1" in each or b"event-2" in each for each in seen)
+
+
+def test_a_browser_that_leaves_gives_its_place_up_before_the_next_message() -> None:
+    page = Page()
+    session = page.session()
+    begun, left = asyncio.Event(), asyncio.Event()
+
+    async def send(message: Any) -> None:
+        if message.get("more_body"):
+            begun.set()
+
+    async def receive() -> Any:
+        await left.wait()
+        return {"type": "http.disconnect"}
+
+    scope = {
+        "type": "http", "method": "GET", "path": "/stream", "query_string": b"topics=event",
+        "headers": [(b"host", HOST.encode()), (b"authorization", session["authorization"].encode())],
+    }  # fmt: skip
+
+    async def come_and_go() -> tuple[int, int]:
+        stream = asyncio.ensure_future(page.app(scope, receive, send))
+        await asyncio.wait_for(begun.wait(), 5)
+        open_pages = page.hub.pages
+        left.set()
+        await asyncio.wait_for(stream, 5)
+        return open_pages, page.hub.pages
+
+    assert asyncio.run(come_and_go()) == (1, 0)
