@@ -308,12 +308,12 @@ class Connection:
         """Connect to *region*, with pauses, until a server sends Welcome."""
         if self._clock() - region.since > self._settings.reconnect_max_s:
             region.backoff.restart()
-        began = self._clock()
+        began, offset_s = self._clock(), self._pauses.offset_s()
         while True:
             failed = region.failed
-            spent_s = self._clock() - began
-            await self._pauses.wait(self._pauses.pause_s(region.backoff, failed, spent_s=spent_s), failed)
-            began = self._clock()
+            pause_s = self._pauses.pause_s(region.backoff, failed, spent_s=self._clock() - began)
+            await self._pauses.wait(pause_s, failed, offset_s)
+            began, offset_s = self._clock(), self._pauses.offset_s()
             region.failed = await self._join(region)
             if region.failed is None:
                 self._resume(region)

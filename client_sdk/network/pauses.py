@@ -60,10 +60,20 @@ class Pauses:
         is_soon = valid_in_s is not None and valid_in_s <= _SOON_S
         return failed is not None and failed.is_refusal and not is_soon
 
-    async def wait(self, pause_s: float, failed: DialError | None) -> None:
-        """Wait for *pause_s*, or until something else than time makes another attempt worthwhile."""
+    def offset_s(self) -> float:
+        """Return the time of the wall clock over that of the event loop; it changes if the clock is set."""
+        return self.wall_clock() - asyncio.get_running_loop().time()
+
+    async def wait(self, pause_s: float, failed: DialError | None, offset_s: float) -> None:
+        """Wait for *pause_s*, or until something else than time makes another attempt worthwhile.
+
+        Args:
+            pause_s: From now.
+            failed: Of the last attempt.
+            offset_s: `offset_s` when the last attempt began: the clock may have been set since then.
+        """
         last, loop_time = last_of(failed), asyncio.get_running_loop().time
-        until, offset_s = loop_time() + pause_s, self.wall_clock() - loop_time()
+        until = loop_time() + pause_s
         while (left_s := until - loop_time()) > 0:
             if last is Last.UNANSWERED:
                 changed = self._has_changed
@@ -71,9 +81,9 @@ class Pauses:
                 if changed.is_set():
                     return
             elif last is Last.REFUSED:
-                await asyncio.sleep(min(left_s, _LOOK_S))
-                if abs(self.wall_clock() - loop_time() - offset_s) > _CLOCK_SET_S:
+                if abs(self.offset_s() - offset_s) > _CLOCK_SET_S:
                     return
+                await asyncio.sleep(min(left_s, _LOOK_S))
             else:
                 await asyncio.sleep(left_s)
 

@@ -94,6 +94,34 @@ def test_a_robot_whose_clock_is_set_right_is_tried_again_at_once():
     run(test())
 
 
+def test_a_clock_that_is_set_while_the_refusal_is_told_is_noticed():
+    async def test():
+        now_s = [1000.0]
+        settings = replace(QUICK, reconnect_long_max_s=1000.0)
+
+        async def token():
+            return "t"
+
+        def set_clock(event, detail):
+            if event == "refused":
+                now_s[0] -= 120.0
+
+        async with FakePlatform() as platform:
+            connecting = client_sdk.connect(
+                platform.url, token=token, settings=settings, random=random.Random(1), on_change=set_clock,
+                wall_clock=lambda: now_s[0] + time.monotonic(),
+            )  # fmt: skip
+            async with connecting as a_robot:
+                platform.told = {"cause": "not-yet-valid"}
+                platform.refusals = [(401, None)]
+                platform.sockets[0].cut()
+                await platform.until(lambda: not platform.refusals)
+
+                assert (await answered(a_robot)).reply == {"value": 3}
+
+    run(test())
+
+
 def test_subscriptions_outlive_a_refusal():
     async def test():
         async with FakePlatform() as platform:
