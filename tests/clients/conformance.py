@@ -42,6 +42,7 @@ def main() -> int:
     parser.add_argument("--runs", type=int, default=1, help="times that each scenario is run (default: 1)")
     parser.add_argument("--only", default="", help="clients, with commas between (default: all)")
     parser.add_argument("--scenarios", default="", help="scenarios, with commas between (default: all)")
+    parser.add_argument("--leave-out", default="", metavar="SCENARIOS", help="scenarios that are not run")
     parser.add_argument("--out", type=Path, default=REPOSITORY / "out" / "clients.json")
     parser.add_argument("--away", type=float, default=20.0, metavar="S", help="of returns/away (default: 20)")
     parser.add_argument("--log", type=Path, help="folder for what the drivers wrote to stderr")
@@ -50,9 +51,12 @@ def main() -> int:
     unknown = set(only) - {client.name for client in CLIENTS}
     if unknown:
         parser.error(f"unknown clients: {', '.join(sorted(unknown))}")
+    left_out = {each for each in args.leave_out.split(",") if each}
     wanted = [each for each in args.scenarios.split(",") if each] or list(SCENARIOS)
-    if set(wanted) - set(SCENARIOS):
-        parser.error(f"unknown scenarios: {', '.join(sorted(set(wanted) - set(SCENARIOS)))}")
+    unknown = {*wanted, *left_out} - set(SCENARIOS)
+    if unknown:
+        parser.error(f"unknown scenarios: {', '.join(sorted(unknown))}")
+    wanted = [each for each in wanted if each not in left_out]
     clients = [client for client in CLIENTS if not only or client.name in only]
     rows: list[dict[str, Any]] = []
     try:
