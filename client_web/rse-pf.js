@@ -272,7 +272,12 @@ export const connect = async (url, options = {}) => {
           ? say(link, "hello", { sdk, capabilities: ["progress", "updates"] })
           : lose(link, refused(unreadable("the server does not speak " + protocol)));
       socket.onmessage = (event) => hear(link, event.data);
-      socket.onerror = nothing; // the close event follows
+      // Node 22 has no close event for a handshake that failed; elsewhere it follows.
+      socket.onerror = () => {
+        if (link._welcome) return;
+        socket.onclose = nothing;
+        closed(link, 1006);
+      };
       socket.onclose = (event) => closed(link, event.code);
     });
   };
@@ -287,7 +292,7 @@ export const connect = async (url, options = {}) => {
       notBefore = now() + 5;
     }
     const refusalOfCode = REFUSALS[code];
-    let failed = wrong(...(refusalOfCode || [CONNECT, "the connection ended with " + code, "is it running, the token valid, the origin allowed?"]));
+    let failed = wrong(...(refusalOfCode || [CONNECT, "the connection ended: " + code, "is it running, the token valid, the origin allowed?"]));
     // An attempt that was given up may still replace the connection that came after it.
     const isOwn = code === 4409 && (current?._moveUntil || now() < lateUntil);
     if (refusalOfCode && (link === current || !current) && !isOwn) refused(failed);
