@@ -2,7 +2,7 @@
 
 It evaluates alarms of one metric.  One whose expression compares one metric with a number becomes such an
 alarm, with a period of 10 s; those that need metric math or a percentile are in `NOT_EVALUATED`, and are
-evaluated by tests/scaling/test_alarm_states.py alone.  What servers publish comes from the agent's own task.
+evaluated by tests/scaling/test_alarm_states.py alone.  What servers publish comes from the agent's own tasks.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from localstack.conftest import SETTINGS, Deployment
 
 from rse_pf.aws.clients import make_client
 from rse_pf.aws.fleet.task import AgentConfig, AgentContext
-from rse_pf.aws.fleet.tasks.server_metrics import task
+from rse_pf.aws.fleet.tasks import server_metrics, store_errors
 from rse_pf.object_store import MemoryStore
 from rse_pf.scaling.alarms import NAMESPACE
 
@@ -40,7 +40,7 @@ ONE_METRIC = re.compile(r"(?P<name>\w+)|IF\((?P<compared>\w+) >= (?P<threshold>[
 
 
 class Server(FakeMachine):
-    """A server whose load is what the test says, on the real clock."""
+    """A server whose load is what the test says, on the real clock; a busy one does not reach the bucket."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -50,6 +50,9 @@ class Server(FakeMachine):
         self._busy = busy
         robots, queue_s = (500, 5.0) if busy else (1, 0.0)
         self.text = f"rse_pf_robots {robots}\nrse_pf_queue_oldest_s {queue_s}\n"
+
+    def reaches_store(self) -> bool:
+        return not self._busy
 
     def clock(self) -> float:
         return time.monotonic()
@@ -140,7 +143,7 @@ def test_each_alarm_of_the_templates_fires_and_resolves(deployment: Deployment) 
 
 
 def agent_of(server: Server, cloudwatch: Any) -> Any:
-    """Return the task of the agent that publishes the metrics of *server*."""
+    """Return what calls the tasks of the agent that publish the metrics of *server*."""
     config = AgentConfig(
         group="rse-pf", hook="drain", launch_hook="launch", keys_name="keys.json", keys_file=Path("keys.json")
     )
@@ -149,4 +152,10 @@ def agent_of(server: Server, cloudwatch: Any) -> Any:
         shipper=None, config=config, clock=server.clock, sleep=server.sleep, wall_clock=server.wall_clock,
         log=lambda event, **fields: None,
     )  # fmt: skip
-    return task(context).call
+    calls = [server_metrics.task(context).call, store_errors.task(context).call]
+
+    def publish() -> None:
+        for call in calls:
+            call()
+
+    return publish
