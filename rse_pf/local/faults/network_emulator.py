@@ -2,7 +2,8 @@
 
 `EmulatedLink` relays TCP on loopback; `LinkProcess` does so in a process of its own, so that a busy robot
 does not stretch the link.  Bytes keep their order and none is lost.  A cut is silent:
-sockets stay open, and what was sent meanwhile arrives after it heals, when TCP would have sent it again.
+sockets stay open, and what was sent meanwhile arrives after it heals, when TCP would have sent it again;
+nobody answers a new connection, since its listener is full.
 """
 
 from __future__ import annotations
@@ -35,6 +36,9 @@ __all__ = [
 _LOOPBACK = "127.0.0.1"
 _MIN_S = 0.001
 _HELD_BYTES = 1 << 20
+_BACKLOG = 1024
+_FILLERS = 2
+"""Connections of its own that fill a listener's queue of one, with one to spare."""
 _FIRST_RETRY_S, _FIRST_DIAL_RETRY_S, _MAX_RETRY_S = 0.2, 1.0, 120.0
 _START_TIMEOUT_S = 20.0
 _TIMER_GRAIN_S = 0.0005
@@ -136,13 +140,16 @@ class EmulatedLink:
         self._accepted = 0
         self._cutting: set[str] = set()
         self._tasks: set[asyncio.Task[None]] = set()
-        self._server: asyncio.Server | None = None
+        self._listener: socket.socket | None = None
+        self._fillers: dict[Any, socket.socket] = {}
 
     async def __aenter__(self) -> EmulatedLink:
         """Listen on a free port of loopback."""
         self.loop = asyncio.get_running_loop()
-        self._server = await self.loop.create_server(lambda: _RobotEnd(self), _LOOPBACK, 0, backlog=1024)
-        self.port = self._server.sockets[0].getsockname()[1]
+        self._listener = socket.create_server((_LOOPBACK, 0), backlog=_BACKLOG)
+        self._listener.setblocking(False)
+        self.port = self._listener.getsockname()[1]
+        self.loop.add_reader(self._listener, self._accept)
         if self.profile.cut_every_s is not None:
             self._tasks.add(self.loop.create_task(self._cut_now_and_then(self.profile.cut_every_s)))
         return self
@@ -151,8 +158,11 @@ class EmulatedLink:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         """Stop listening and close every connection."""
-        assert self._server is not None
-        self._server.close()
+        assert self._listener is not None
+        self.loop.remove_reader(self._listener)
+        self._listener.close()
+        for filler in self._fillers.values():
+            filler.close()
         for task in self._tasks:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
@@ -163,8 +173,10 @@ class EmulatedLink:
     def cut(self, cause: str = "asked") -> None:
         """Drop everything in both directions, without closing a connection."""
         self._cutting.add(cause)
-        self.cuts += not self.is_cut
-        self.is_cut = True
+        if not self.is_cut:
+            self.cuts += 1
+            self.is_cut = True
+            self._stop_answering()
 
     def heal(self, cause: str = "asked") -> None:
         """Let through again what was and will be sent, unless another cause still cuts."""
@@ -172,8 +184,50 @@ class EmulatedLink:
         if self._cutting or not self.is_cut:
             return
         self.is_cut = False
+        self._answer_again()
         for way in list(self.ways):
             way.retry(self.loop.time())
+
+    def _accept(self) -> None:
+        assert self._listener is not None
+        while True:
+            try:
+                made, address = self._listener.accept()
+            except OSError:  # none waits, or the robot is gone already
+                return
+            filler = self._fillers.pop(address, None)
+            if filler is not None:
+                filler.close()
+                made.close()
+                continue
+            made.setblocking(False)
+            task = self.loop.create_task(self._serve(made))
+            self._tasks.add(task)
+            task.add_done_callback(self._tasks.discard)
+
+    async def _serve(self, made: socket.socket) -> None:
+        await self.loop.connect_accepted_socket(lambda: _RobotEnd(self), made)
+
+    def _stop_answering(self) -> None:
+        """Let Linux drop the SYN of each new connection: the listener's queue is full."""
+        assert self._listener is not None
+        self._accept()
+        self.loop.remove_reader(self._listener)
+        self._listener.listen(0)
+        for _ in range(_FILLERS):
+            filler = socket.socket()
+            filler.setblocking(False)
+            filler.connect_ex((_LOOPBACK, self.port))
+            self._fillers[filler.getsockname()] = filler
+
+    def _answer_again(self) -> None:
+        assert self._listener is not None
+        self._listener.listen(_BACKLOG)
+        self._accept()
+        for filler in self._fillers.values():
+            filler.close()
+        self._fillers.clear()
+        self.loop.add_reader(self._listener, self._accept)
 
     def lanes(self) -> tuple[Lane, Lane]:
         """Return the two directions of a new connection, up first."""
