@@ -370,7 +370,7 @@ def _announced(file: Path, processes: list[subprocess.Popen[bytes]], home: Path)
         if time.monotonic() > until_s or any(each.poll() is not None for each in processes):
             logs = "\n".join(path.read_text()[-2000:] for path in home.glob("*.log"))
             raise RuntimeError(f"{file.name} is not ready:\n{logs}")
-        time.sleep(0.05)
+        time.sleep(0.05)  # polls, with a deadline
     return dict(json.loads(file.read_text()))
 
 
