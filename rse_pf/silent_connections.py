@@ -25,9 +25,9 @@ __all__ = [
     "TlsListener",
 ]
 
-FIRST_REQUEST_S = 8.0
-"""Time from the acceptance of a connection to its first whole request, or hello; with the time that it may
-wait to be accepted these are ten seconds."""
+FIRST_REQUEST_S = 6.0
+"""Time from the acceptance of a connection to its first whole request, or hello.  With the time that it may
+wait to be accepted, and to be closed among 5,000 others, these are ten seconds."""
 BACKLOG = 4096
 """Connections that wait to be accepted: above that the kernel drops them, also those of robots, and they are
 tried again after 1 and 3 s.  The kernel cuts it to net.core.somaxconn."""

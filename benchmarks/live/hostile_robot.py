@@ -2,6 +2,8 @@
 
 Three honest robots drive through a generated building beside one that lies in one of several ways.  The same
 map without that robot has the same links between the others, so joins and errors can be compared exactly.
+What an honest keyframe costs is compared with the map in which the fourth robot drives as far, and tells the
+truth.
 
     python -m benchmarks.live.hostile_robot --seeds 20
     python -m benchmarks.live.hostile_robot --forget 1000
@@ -151,15 +153,16 @@ def error_cm(played: Played, true: Array) -> float:
 
 
 def judge(attack: str, seed: int) -> Judged:
-    """Play an attack, forget who made it, and compare with the map without it."""
+    """Play an attack, forget who made it, and compare: errors without it, times with an honest robot."""
     events, true = scenario(attack, seed)
     clean, attacked = play(without(events, HOSTILE)), play(events)
+    behaved = play(scenario("none", seed)[0])
     begin = time.process_time()
     attacked.live_map.apply(RobotForgotten(robot=HOSTILE))
     forget_s = time.process_time() - begin
     same = joins(attacked.live_map) == joins(clean.live_map)
     p50, p99 = (
-        float(np.percentile(attacked.honest_ms, q) / np.percentile(clean.honest_ms, q)) for q in (50, 99)
+        float(np.percentile(attacked.honest_ms, q) / np.percentile(behaved.honest_ms, q)) for q in (50, 99)
     )
     return Judged(
         same_joins=same, ate_cm=error_cm(attacked, true[attacked.ids]),

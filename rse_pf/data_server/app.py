@@ -193,7 +193,12 @@ class DataServer:
         admitted.callback(self._limits.end, claims.robot, has_body=has_body)
         if not has_body and not await request.drain(self._settings.data.part_bytes):
             raise BadRequest("this request takes no body", hint="leave it out")
-        return await handler(request, claims, path)
+        try:
+            return await handler(request, claims, path)
+        except RsePfError:
+            body_bytes = max(request.received_bytes, request.header_number("content-length") or 0)
+            self._limits.charge_refused(claims.robot, body_bytes, self._clock())
+            raise
 
     def _find(self, request: HttpRequest) -> tuple[Route, Handler, dict[str, str]]:
         for pattern, route, handler in self._routes:

@@ -23,6 +23,8 @@ _MAX_ROBOTS = 10_000
 _BODIES_PER_ROBOT, _BODIES_PER_TENANT = 0.25, 0.75
 """Shares of ``data.max_uploads``."""
 _RETRY_AFTER_MS = 1000.0
+_REFUSED_BYTES, _REFUSED_COST = 64 << 10, 32.0
+"""So many bytes of a refused body count as one request more, and one refusal never as more than the second."""
 
 
 @dataclass(slots=True)
@@ -80,6 +82,16 @@ class RequestLimits:
         if has_body:
             held.bodies += 1
             self._tenant_bodies[robot.tenant] += 1
+
+    def charge_refused(self, robot: RobotId, body_bytes: int, now: float) -> None:
+        """Count the body of a request that was refused: it is read and dropped, which takes time from others.
+
+        Args:
+            robot: Who sent it, whose request has begun.
+            body_bytes: How long the body is, or says that it is.
+            now: Monotonic seconds.
+        """
+        self._of(robot, now).bucket.spend(min(body_bytes / _REFUSED_BYTES, _REFUSED_COST), now)
 
     def end(self, robot: RobotId, *, has_body: bool) -> None:
         """Give back what `begin` took, except for the rate."""

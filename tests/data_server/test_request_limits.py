@@ -44,6 +44,21 @@ def test_a_dear_request_counts_for_several() -> None:
         ask(gate, ROBOT, now=0.0)
 
 
+def test_the_body_of_a_refused_request_counts_for_several_and_is_paid_off_within_seconds() -> None:
+    gate = admission()
+    for _ in range(2):  # 1 MiB counts for 16 more, and 1 GiB for no more than 32
+        ask(gate, ROBOT, now=0.0)
+        gate.charge_refused(ROBOT, 1 << 20, now=0.0)
+    gate.charge_refused(ROBOT, 1 << 30, now=0.0)
+
+    with pytest.raises(TooManyRequests) as refused:
+        ask(gate, ROBOT, now=0.0)
+
+    assert refused.value.retry_after_ms == pytest.approx(2700.0)  # 40 - 2 - 2 x 16 - 32 = -26
+    ask(gate, OTHER, now=0.0)
+    ask(gate, ROBOT, now=2.7)
+
+
 def test_a_robot_has_a_limit_of_requests_in_progress() -> None:
     gate = admission(max_requests_per_robot=2)
     for _ in range(2):
