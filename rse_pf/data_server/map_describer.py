@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from typing import Protocol
 
 import msgspec
 
@@ -21,7 +20,7 @@ from rse_pf.limited_process import Handler, LimitedProcesses
 from rse_pf.maps.describe import MapSummary, describe_map
 from rse_pf.object_store import ObjectStore
 
-__all__ = ["MapDescriber", "Processes", "make_handler", "max_map_bytes"]
+__all__ = ["MapDescriber", "make_handler", "max_map_bytes"]
 
 _TARGET = f"{__name__}:make_handler"
 _PRIVATE_STORE = "memory:"
@@ -36,16 +35,6 @@ def max_map_bytes(settings: PlatformSettings) -> int:
     return _MAX_INFLATED * settings.data.max_object_bytes
 
 
-class Processes(Protocol):
-    """What `LimitedProcesses` offers."""
-
-    def call(self, data: bytes, timeout_s: float) -> bytes:
-        """Return the reply of a process to *data*; raises Crashed if the data ended it."""
-
-    def close(self) -> None:
-        """End all processes."""
-
-
 class MapDescriber:
     """The process of one data server that reads maps; the first map starts it."""
 
@@ -54,7 +43,7 @@ class MapDescriber:
         settings: PlatformSettings,
         store: ObjectStore,
         clock: Callable[[], float],
-        processes: Processes | None = None,
+        processes: LimitedProcesses | None = None,
     ) -> None:
         """Remember what is needed; nothing is started.
 

@@ -12,39 +12,23 @@ import functools
 import time
 from collections import Counter
 from collections.abc import Callable
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
-from rse_pf.backend.live_map.owner.process import OwnerOrder
+from rse_pf.backend.live_map.owner.process import OwnerOrder, OwnerProcess
 from rse_pf.backend.sandbox.ipc import FrameReader
 from rse_pf.backend.scheduling.fair_share import CLAIM_S, FairShare
 
-__all__ = ["ChildProcess", "OwnerChild", "OwnerChildren"]
+__all__ = ["OwnerChild", "OwnerChildren"]
 
 _READ_BYTES = 1 << 16
 _NEXT_SPARE_S = 3.0
 """After a process was taken the next one is prepared so much later: a takeover needs the processors."""
 
 
-class ChildProcess(Protocol):
-    """What is needed of an `OwnerProcess`."""
-
-    connection: Any
-    pid: int
-
-    def claim(self, order: OwnerOrder) -> None:
-        """Let it claim a map."""
-
-    def release(self) -> None:
-        """Let it release its map, and end."""
-
-    def kill(self) -> int:
-        """Kill it unless it has ended, reap it and return the exit code."""
-
-
 class OwnerChild:
     """One owner process, in the event loop of its worker."""
 
-    def __init__(self, process: ChildProcess, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, process: OwnerProcess, clock: Callable[[], float] = time.monotonic) -> None:
         """Read what the process says; *clock* returns seconds."""
         self.tenant = ""
         """Whose map it claims or serves."""
@@ -134,7 +118,7 @@ class OwnerChildren:
     """The owner processes of one worker: those in use, and one that waits for a map."""
 
     def __init__(
-        self, spawn: Callable[[bool], ChildProcess], *, max_owners: int, keeps_spare: bool,
+        self, spawn: Callable[[bool], OwnerProcess], *, max_owners: int, keeps_spare: bool,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:  # fmt: skip
         """Start none yet.

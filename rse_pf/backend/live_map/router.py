@@ -10,7 +10,7 @@ import asyncio
 import math
 import traceback
 from collections.abc import Callable, Mapping
-from typing import Any, Protocol
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -18,6 +18,7 @@ import numpy as np
 from rse_pf.auth.roster import scopes_allow
 from rse_pf.auth.tokens import Claims
 from rse_pf.backend.live_map.garbage import GarbageCounts
+from rse_pf.backend.live_map.link import OwnerLinks
 from rse_pf.backend.live_map.subscriptions import Reader, Subscriptions
 from rse_pf.backend.ports import WorkerContext
 from rse_pf.backend.scheduling.scheduler import QueuedCommand
@@ -47,7 +48,7 @@ from rse_pf.wire.live_map import (
     map_of_topic,
 )
 
-__all__ = ["LIVE_LIST", "LIVE_SERVICES", "LiveMapRouter", "MapOwners"]
+__all__ = ["LIVE_LIST", "LIVE_SERVICES", "LiveMapRouter"]
 
 LIVE_LIST = "live-list"
 _REQUESTS: dict[str, type[Any]] = {
@@ -73,36 +74,6 @@ _JUDGED_BY_OWNER = ("live-keyframe", "live-relocalise")
 """Of these the owner judges the request; its other errors are those of the map, and count against nobody."""
 
 
-class MapOwners(Protocol):
-    """What is needed of the owners of maps; `rse_pf.backend.live_map.link.OwnerLinks` is one."""
-
-    async def request(
-        self,
-        tenant: str,
-        map_name: str,
-        robot: RobotId,
-        operation: str,
-        payload: dict[str, Any],
-        deadline_s: float,
-    ) -> dict[str, Any]:
-        """Return the owner's answer; raises RsePfError."""
-
-    async def list_maps(self, tenant: str) -> list[dict[str, Any]]:
-        """Return the live maps of *tenant*; raises RsePfError."""
-
-    def watch(self, tenant: str, map_name: str, *, may_start: bool) -> None:
-        """Ask for the updates of a map, which starts an owner only if *may_start*."""
-
-    def unwatch(self, tenant: str, map_name: str) -> None:
-        """Ask for no more updates of a map."""
-
-    def give_up(self) -> None:
-        """Release the maps of this server, which drains."""
-
-    async def close(self) -> None:
-        """End all connections to owners."""
-
-
 class LiveMapRouter:
     """The live maps as the robots of one worker see them."""
 
@@ -110,7 +81,7 @@ class LiveMapRouter:
         self,
         context: WorkerContext,
         *,
-        owners: Callable[[Callable[[str, str, dict[str, Any]], None]], MapOwners],
+        owners: Callable[[Callable[[str, str, dict[str, Any]], None]], OwnerLinks],
         answer: Callable[[QueuedCommand, Result | Failure], None],
     ) -> None:
         """Ask no owner yet.

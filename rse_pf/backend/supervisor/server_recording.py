@@ -9,6 +9,7 @@ import json
 import os
 import secrets
 import socket
+import subprocess
 import threading
 import time
 from collections import deque
@@ -17,7 +18,6 @@ from contextlib import suppress
 from dataclasses import asdict
 from importlib import metadata
 from pathlib import Path
-from typing import Protocol
 
 import msgspec
 
@@ -26,22 +26,11 @@ from rse_pf.recording.recorder_process import RecorderPlan, start_recorder
 from rse_pf.recording.redact import KEY_BYTES
 from rse_pf.wire import PROTOCOL_VERSION
 
-__all__ = ["RecorderProcess", "ServerRecording", "server_version"]
+__all__ = ["ServerRecording", "server_version"]
 
 _FINISH_S = 3.0
 """Time that the recorder has to finish its file when the workers are gone."""
 _MOST_RESTARTS, _WITHIN_S = 5, 600.0
-
-
-class RecorderProcess(Protocol):
-    """What is asked of a recorder's process."""
-
-    @property
-    def pid(self) -> int:
-        """Return its number."""
-
-    def wait(self) -> int:
-        """Return its exit code, negative for a signal, when it has ended."""
 
 
 def server_version() -> str:
@@ -66,7 +55,7 @@ class ServerRecording:
         server: str,
         key: Path | None = None,
         *,
-        start: Callable[[RecorderPlan, bytes], RecorderProcess] = start_recorder,
+        start: Callable[[RecorderPlan, bytes], subprocess.Popen[bytes]] = start_recorder,
         restart_s: float = 0.5,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
@@ -89,7 +78,7 @@ class ServerRecording:
         self._random_key = secrets.token_bytes(KEY_BYTES)
         self._from_workers: socket.socket | None = None
         self._to_recorder: socket.socket | None = None
-        self._process: RecorderProcess | None = None
+        self._process: subprocess.Popen[bytes] | None = None
         self._watching: threading.Thread | None = None
         self._is_over = threading.Event()
 
@@ -138,7 +127,7 @@ class ServerRecording:
         if self._from_workers is not None:
             self._from_workers.close()
 
-    def _watch(self, plan: RecorderPlan, process: RecorderProcess) -> None:
+    def _watch(self, plan: RecorderPlan, process: subprocess.Popen[bytes]) -> None:
         """Start the recorder again until the workers or this server end; *process* is the first one."""
         ends: deque[float] = deque()
         while process.wait() != 0 and not self._is_over.is_set():  # with 0 the workers are gone

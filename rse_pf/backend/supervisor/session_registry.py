@@ -6,32 +6,26 @@ moving keeps its old connection until the move is over; its worker reports ``sta
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from typing import Any
 
-from rse_pf.backend.supervisor.orders import ReplaceOrder, WorkerOrder
+from rse_pf.backend.supervisor.orders import ReplaceOrder
+from rse_pf.backend.supervisor.worker_handle import WorkerProcess
 from rse_pf.identity import RobotId
 
-__all__ = ["SessionRegistry", "WorkerHandle"]
-
-
-class WorkerHandle(Protocol):
-    """A worker that takes orders."""
-
-    def order(self, order: WorkerOrder) -> None:
-        """Send *order*."""
+__all__ = ["SessionRegistry"]
 
 
 class SessionRegistry:
     """The sockets of every robot that is connected to one server."""
 
     def __init__(self) -> None:
-        self._sockets: dict[RobotId, dict[int, WorkerHandle]] = {}
+        self._sockets: dict[RobotId, dict[int, WorkerProcess]] = {}
 
     def __len__(self) -> int:
         """Return the number of robots that are connected."""
         return len(self._sockets)
 
-    def handle(self, worker: WorkerHandle, message: dict[str, Any]) -> None:
+    def handle(self, worker: WorkerProcess, message: dict[str, Any]) -> None:
         """Handle what a worker reports of one socket: ``arrived``, ``stays`` or ``left``."""
         robot = RobotId(*message["robot"])
         number = int(str(message["number"]))

@@ -11,19 +11,19 @@ from collections.abc import Sequence
 from rse_pf.auth.trust_store import REFRESH_S, TrustStore
 from rse_pf.backend.ports import Log
 from rse_pf.backend.supervisor.orders import TrustOrder
-from rse_pf.backend.supervisor.session_registry import WorkerHandle
+from rse_pf.backend.supervisor.worker_handle import WorkerProcess
 
 __all__ = ["poll_trust", "update_workers"]
 
 
-async def poll_trust(trust: TrustStore, workers: Sequence[WorkerHandle], log: Log) -> None:
+async def poll_trust(trust: TrustStore, workers: Sequence[WorkerProcess], log: Log) -> None:
     """Call `update_workers` periodically until cancelled."""
     while True:
         await asyncio.sleep(REFRESH_S)
         await update_workers(trust, workers, log)
 
 
-async def update_workers(trust: TrustStore, workers: Sequence[WorkerHandle], log: Log) -> None:
+async def update_workers(trust: TrustStore, workers: Sequence[WorkerProcess], log: Log) -> None:
     """Read the store in a thread, log a problem that is new, and send the workers what is new."""
     known = trust.problem
     is_new = await asyncio.to_thread(trust.refresh)

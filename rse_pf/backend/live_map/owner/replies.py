@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 from rse_pf.backend.live_map.owner.lease import LeaseRecord
-from rse_pf.backend.live_map.owner.state import MapState, size_of
+from rse_pf.backend.live_map.owner.state import MapState
 from rse_pf.backend.live_map.owner.updates import upper_triangle
 from rse_pf.identity import RobotId
 from rse_pf.live_map.events import matrix_bytes
@@ -80,7 +80,7 @@ def show_reply(
         "server": lease.server,
         "epoch": lease.epoch,
         "version": state.position,
-        "links": size_of(state.live_map.links_believed),
+        "links": state.live_map.links_believed,
         "state": told_state,
         "digest": state.digest(),
         "you": {

@@ -9,12 +9,11 @@ import contextlib
 import functools
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol, TypeVar
+from typing import TypeVar
 
 from rse_pf.backend.live_map.owner.log import LiveLog, MapSnapshot, OwnershipLost, snapshot_entries
 from rse_pf.backend.live_map.owner.work.whole_fit import WholeFit
 from rse_pf.errors import BadRequest, NotFound
-from rse_pf.geometry import Camera
 from rse_pf.live_map.events import (
     Event,
     KeyframeAdded,
@@ -26,77 +25,22 @@ from rse_pf.live_map.events import (
     decode_events,
     encode_events,
 )
-from rse_pf.live_map.feature_parts import SnapshotParts
-from rse_pf.live_map.outcomes import Added, Alignment, Outcome
+from rse_pf.live_map.live_map import LiveMap
+from rse_pf.live_map.outcomes import Added, Outcome
 from rse_pf.maps.format import MapVersion
 
-__all__ = ["Applied", "MapKind", "MapLogic", "MapState", "restore", "size_of", "take_over"]
+__all__ = ["Applied", "MapKind", "MapState", "restore", "take_over"]
 
 _T = TypeVar("_T")
 _UNCHANGING = (OwnerChanged, RobotLeft)
-
-
-class MapLogic(Protocol):
-    """What the owner needs of `rse_pf.live_map.live_map.LiveMap`."""
-
-    def snapshot_parts(self, known: Collection[str] = ()) -> SnapshotParts:
-        """Return the whole state; parts that are *known* are not made again."""
-
-    def digest(self) -> str:
-        """Return the digest of the whole state."""
-
-    def judge(self, event: KeyframeAdded) -> Literal["new", "known", "ahead"]:
-        """Judge a keyframe before it is logged; raises BadRequest."""
-
-    def next_number(self, robot: str) -> int:  # a `RobotId.folder`
-        """Return the number of the next keyframe of a robot."""
-
-    def next_segment(self, robot: str) -> int:  # a `RobotId.folder`
-        """Return a number that no segment of the robot has; 0 if it has none."""
-
-    def apply(self, event: Event) -> list[Outcome]:
-        """Change the map by an event of the log."""
-
-    def measuring(
-        self, keyframe: int, pieces: int = 1, candidates: int | None = None
-    ) -> list[Callable[[], LinksMeasured]]:
-        """Return what looks for links of a keyframe, piece by piece, in any thread, while the map changes."""
-
-    def optimising(self, solve: WholeFit | None = None) -> Callable[[], Optimised]:
-        """Return what optimises the whole graph, in any thread, while the map changes."""
-
-    def relocalising(self, camera: Camera, features: bytes) -> Callable[[], Any]:
-        """Return what finds where an image was taken, in any thread, while the map changes."""
-
-    def alignments(self) -> list[Alignment]:
-        """Return where the newest segment of each robot lies."""
-
-    def to_version(self) -> MapVersion:
-        """Return the map for the registry."""
-
-    @property
-    def keyframes(self) -> Any:
-        """The keyframes, something with a length."""
-
-    @property
-    def robots(self) -> Any:
-        """`RobotId.folder` of each robot that drives."""
-
-    @property
-    def contributors(self) -> Any:
-        """`RobotId.folder` of each robot that contributed, also of those that left."""
-
-    @property
-    def links_believed(self) -> Any:
-        """Number of links that hold the poses together."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MapKind:
     """How a map is made: empty, from the head and parts of a snapshot, and from a version of the registry."""
 
-    empty: Callable[[], MapLogic]
-    restore: Callable[[bytes, Callable[[str], bytes]], MapLogic]
+    empty: Callable[[], LiveMap]
+    restore: Callable[[bytes, Callable[[str], bytes]], LiveMap]
     started_from: Callable[[MapVersion, str], MapStarted]
 
 
@@ -111,14 +55,14 @@ class Applied:
 class MapState:
     """The map, and which of its keyframes still have to be measured.  For one thread at a time."""
 
-    def __init__(self, live_map: MapLogic, position: int, unmeasured: Sequence[int] = ()) -> None:
+    def __init__(self, live_map: LiveMap, position: int, unmeasured: Sequence[int] = ()) -> None:
         """Begin with the map after the entry *position*."""
         self.live_map = live_map
         self.position = position
         self.unmeasured = dict.fromkeys(unmeasured)
         self.changes = 0
         """How many events have changed the map since this object was made."""
-        self.keyframes = size_of(live_map.keyframes)
+        self.keyframes = live_map.keyframes
         self._snapshot_at = position
 
     def apply(self, position: int, events: Sequence[Event]) -> Applied:
@@ -134,7 +78,7 @@ class MapState:
             outcomes.append(found)
             defects.append(defect)
         self.position = position
-        self.keyframes = size_of(self.live_map.keyframes)
+        self.keyframes = self.live_map.keyframes
         return Applied(outcomes=outcomes, defects=defects)
 
     def measuring(
@@ -201,11 +145,6 @@ def _guarded(act: Callable[[], _T]) -> _T | None:
 def _links(measure: Callable[[], LinksMeasured], otherwise: LinksMeasured) -> LinksMeasured:
     found = _guarded(measure)
     return otherwise if found is None else found
-
-
-def size_of(value: Any) -> int:
-    """Return a number as it is, and of anything else the length."""
-    return value if isinstance(value, int) else len(value)
 
 
 def restore(log: LiveLog, kind: MapKind) -> MapState:
