@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from rse_pf.config import load_settings
-from rse_pf.config.renames import hint_for_old_option
 from rse_pf.config.validation import did_you_mean
 from rse_pf.errors import ConfigurationError, RsePfError, SettingsError, UsageError, error_of_system
 from rse_pf.terminal import show, show_error, show_page
@@ -84,7 +83,7 @@ class Parser(argparse.ArgumentParser):
         known = [word for action in self._actions for word in action.option_strings]
         raise UsageError(
             f"{self.prog}: {message}",
-            hint=hint_for_old_option(option) or did_you_mean(option, known, f"see {self.prog} --help"),
+            hint=did_you_mean(option, known, f"see {self.prog} --help"),
         )
 
 

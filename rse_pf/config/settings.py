@@ -24,7 +24,7 @@ from rse_pf.config.validation import (
     check_deployment,
     check_origin,
     check_range,
-    hint_for_unknown,
+    did_you_mean,
     setting,
     typed,
 )
@@ -372,7 +372,7 @@ class PlatformSettings:
         made: dict[str, Any] = {}
         for name, values in with_profile(overrides).items():
             if name not in groups:
-                raise SettingsError(f"unknown group {name!r}", hint=hint_for_unknown(name, groups))
+                raise SettingsError(f"unknown group {name!r}", hint=did_you_mean(name, groups))
             if not isinstance(values, Mapping):
                 raise SettingsError(
                     f"{name} must be an object of settings, got {type(values).__name__}",
@@ -486,6 +486,6 @@ def _make_group(group: str, kind: type[Any], values: Mapping[str, Any]) -> Any:
     checked = {}
     for name, value in values.items():
         if name not in hints:
-            raise SettingsError(f"unknown setting {group}.{name}", hint=hint_for_unknown(name, hints, group))
+            raise SettingsError(f"unknown setting {group}.{name}", hint=did_you_mean(name, hints))
         checked[name] = typed(f"{group}.{name}", value, hints[name])
     return kind(**checked)

@@ -11,7 +11,6 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
-from rse_pf.config.renames import hint_for_old_setting
 from rse_pf.errors import SettingsError
 
 __all__ = [
@@ -23,7 +22,6 @@ __all__ = [
     "check_origin",
     "check_range",
     "did_you_mean",
-    "hint_for_unknown",
     "setting",
     "typed",
 ]
@@ -153,12 +151,6 @@ def check_deployment(name: str, qualifier: str) -> None:
             f"cloud.bootstrap_qualifier = {_shown(qualifier)} is no qualifier of the CDK",
             hint=f"use 1 to 10 small letters and digits, as at npx cdk bootstrap --qualifier, {WHERE}",
         )
-
-
-def hint_for_unknown(name: str, known: Iterable[str], group: str = "") -> str:
-    """Return what to write in place of *name*, which is unknown: its new name, or one close to it."""
-    full = f"{group}.{name}" if group else name
-    return hint_for_old_setting(full) or did_you_mean(name, known)
 
 
 def did_you_mean(name: str, known: Iterable[str], otherwise: str = "") -> str:

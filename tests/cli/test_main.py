@@ -48,7 +48,6 @@ def _alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         ("serve --port one", "argument --port: invalid int value: 'one'", "rse-pf serve --help"),
         ("serve --port", "argument --port: expected one argument", "rse-pf serve --help"),
         ("serve --port 99999", "serving.port = 99999 is above 65535", "lower --port"),
-        ("serve --size 0.25", "unrecognized arguments: --size", "write --emulated-cores"),
         ("serve --emulated-cores -1", "serving.emulated_cores = -1", "raise --emulated-cores"),
         ("serve --log-level inf", "'inf' is not one of debug, info", "did you mean info?"),
         ("serve --keys none.json", "cannot read the keys none.json: No such file", "JWKS"),

@@ -52,8 +52,6 @@ NO_SECRETS: Mapping[tuple[str, str], str] = {
     ("client_cpp/tests/client_test.cpp", "Hex High Entropy String"): "the SHA-256 of 'abc', of FIPS 180-4",
     ("tests/audit/test_chain.py", "JSON Web Token"): "made up, to be looked for in the audit log",
     ("tests/config/test_settings.py", "Secret Keyword"): "the name of a file",
-    ("rse_pf/config/renamed.json", "Secret Keyword"): "the name of a module",
-    ("tests/renamed.json", "Secret Keyword"): "the name of a test",
     ("tests/test_identity.py", "Base64 High Entropy String"): "the example of RFC 8037",
     ("tests/live_map/test_place_index.py", "Hex High Entropy String"): "the digest of a vector",
     (

@@ -125,7 +125,7 @@ async def _server(server: ServerState, token: str | None, sample_s: float) -> di
     finally:
         port.close()
     workers = len(second["workers"])
-    emulated = second.get("emulated_cores", second.get("size", 0.0))  # "size" at 0.1.0
+    emulated = second.get("emulated_cores", 0.0)
     cores = emulated * workers if emulated else workers
     return {
         **known,
