@@ -432,7 +432,8 @@ def check_json_containers(text: Text, budget: Budget) -> None:
 
     Brackets inside strings are told apart only if all brackets together exceed a limit.
     """
-    max_depth, max_lists = budget.depth, budget.containers
+    max_depth = budget.depth
+    max_lists = budget.containers
     count = text.count(b"[") + text.count(b"{")
     if count <= max_depth:
         return
@@ -471,7 +472,8 @@ def _more_values(pieces: Iterable[Text], enough: int) -> int:
     Decoders take 0.1 us for most numbers, 0.2 to 1 us for many digits and for the middle between two doubles,
     and up to 14 us near the smallest and the largest double.
     """
-    values, rest = 0, b""
+    values = 0
+    rest = b""
     for piece in itertools.chain(pieces, (b" ",)):
         marks = rest + piece.translate(_MARKS_OF_NUMBERS)
         # What may continue in the next piece is read there.
@@ -498,7 +500,8 @@ def _more_values(pieces: Iterable[Text], enough: int) -> int:
 def _values_of_digits(found: re.Match[bytes]) -> int:
     run, sign, exponent = found.groups()
     number = run.replace(b".", b"")
-    digits, significant = len(number), len(number.lstrip(b"0"))
+    digits = len(number)
+    significant = len(number.lstrip(b"0"))
     more = digits // 2 if significant >= _LONG_DIGITS or digits >= _WIDE_DIGITS else 0
     decimals = len(run) - 1 - run.find(b".") if digits < len(run) else 0
     if significant < _MIDDLE_DIGITS or (exponent is None and digits == len(run)):
@@ -513,7 +516,8 @@ def _check_memory(text: Text, max_bytes: int) -> None:
     """Check the memory that a message will take; estimate more exactly only above the limit."""
     if _MAX_BYTES_PER_BYTE * len(text) <= max_bytes:
         return
-    strings, width = text.count(b'"') // 2, 1 if text.isascii() and b"\\u" not in text else _WIDE
+    strings = text.count(b'"') // 2
+    width = 1 if text.isascii() and b"\\u" not in text else _WIDE
     numbers = text.count(b",") + text.count(b":")
     other = len(text) + _STRING_BYTES * strings + _NUMBER_BYTES * max(0, numbers - strings)
     if other + width * len(text) <= max_bytes:
@@ -525,7 +529,8 @@ def _check_memory(text: Text, max_bytes: int) -> None:
 
 def _characters(text: Text) -> int:
     """Return the number of characters between quotes, none of which is escaped."""
-    count, end = 0, -1
+    count = 0
+    end = -1
     while (begin := text.find(b'"', end + 1)) >= 0:
         end = text.find(b'"', begin + 1)
         if end < 0:

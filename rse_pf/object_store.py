@@ -2,8 +2,6 @@
 
 All stores follow one contract: once `put` returns, the object is complete and durable, whatever crashes
 next.  No name can refer to a file outside the folder of a store.
-
-More than 600 lines because the contract and the stores that keep it are read together.
 """
 
 from __future__ import annotations

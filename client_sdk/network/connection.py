@@ -119,7 +119,8 @@ class Connection:
     def use(self, urls: Sequence[str], token: Token, ssl_context: ssl.SSLContext | None) -> None:
         """Connect to *urls* from now on, trust what *ssl_context* trusts, and use *token*."""
         self._regions, self._choice = self._regions_of(urls)
-        self.dialler.token, self.dialler.ssl_context = token, ssl_context
+        self.dialler.token = token
+        self.dialler.ssl_context = ssl_context
 
     @property
     def url(self) -> str:
@@ -245,8 +246,10 @@ class Connection:
         """Keep *socket* for its region: it carries the commands, or stands by."""
         region = socket.region
         if not socket.ended.is_set():
-            region.socket, region.since = socket, self._clock()
-            region.failed, region.is_double = None, False
+            region.socket = socket
+            region.since = self._clock()
+            region.failed = None
+            region.is_double = False
             if self._session.current is not None and self._main_tasks:
                 self._on_change("stands-by", socket.state.server)
 
@@ -308,12 +311,14 @@ class Connection:
         """Connect to *region*, with pauses, until a server sends Welcome."""
         if self._clock() - region.since > self._settings.reconnect_max_s:
             region.backoff.restart()
-        began, offset_s = self._clock(), self._pauses.offset_s()
+        began = self._clock()
+        offset_s = self._pauses.offset_s()
         while True:
             failed = region.failed
             pause_s = self._pauses.pause_s(region.backoff, failed, spent_s=self._clock() - began)
             await self._pauses.wait(pause_s, failed, offset_s)
-            began, offset_s = self._clock(), self._pauses.offset_s()
+            began = self._clock()
+            offset_s = self._pauses.offset_s()
             region.failed = await self._join(region)
             if region.failed is None:
                 self._resume(region)
@@ -327,7 +332,8 @@ class Connection:
         failed = self._regions[0].failed
         assert failed is not None
         error, before = failed.error, self.refusal
-        self.refusal, self.last_error = error, error.message
+        self.refusal = error
+        self.last_error = error.message
         self._handle(None, self._session.end_commands(error.code, error.message, error.hint))
         if before is None or (before.code, before.hint) != (error.code, error.hint):
             self._on_change("refused", error.message)

@@ -178,7 +178,8 @@ class WireRecording:
             BadRequest: A file is no recording.
             UnsupportedProtocol: It is of a newer version.
         """
-        self.cut, self.left_out = [], 0
+        self.cut = []
+        self.left_out = 0
         waiting: OrderedDict[str, RecordedCommand] = OrderedDict()
         sights: dict[str, _Sights] = {}
         for sight in self._merged(wanted):
@@ -404,7 +405,8 @@ def _codec(name: str, session: SessionSettings) -> Codec:
 
 def _seen(command: RecordedCommand, image: bytes | None, pose: bytes | None) -> RecordedCommand:
     """Return *command* with what was seen; what cannot be read is left out."""
-    thumbnail, odometry = None, None
+    thumbnail = None
+    odometry = None
     try:
         if image is not None:
             thumbnail = base64.b64decode(_decode_image(image).data, validate=True)
@@ -498,7 +500,8 @@ def _flat(path: Path, cut: list[Path], plan: ChunkPlan | None) -> Iterator[Any]:
             continue
         try:
             data = _opened(record)
-            record.compression, record.data = "", data
+            record.compression = ""
+            record.data = data
             yield from cast("list[Any]", breakup_chunk(record))
         except (McapError, *_DAMAGE):
             cut.append(path)

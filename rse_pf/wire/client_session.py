@@ -476,7 +476,8 @@ class ClientSession:
         self, pending: _Pending, connection: ConnectionState, now: float, data: bytes | None = None
     ) -> None:
         self.resent += pending.sent_at is not None
-        pending.connection, pending.sent_at = connection, now
+        pending.connection = connection
+        pending.sent_at = now
         connection.rate_limiter.spend(now)
         connection.outgoing.append(
             encode_command(self.codec, _with_deadline(pending.command, pending.deadline - now))
@@ -505,7 +506,8 @@ class ClientSession:
             return self._end(command.id, stale) + self._flush(now)
         if not pending.cancelled:
             self._delivered[command.stream] = max(last, command.seq)
-        up_s, down_s = None, None
+        up_s = None
+        down_s = None
         if not elsewhere and pending.sent_at is not None:
             up_s, down_s = connection.clock_offset.split_s(
                 pending.sent_at, answer.received_s, answer.sent_s, now
@@ -524,7 +526,8 @@ class ClientSession:
         if failure.code != "busy" or not after < pending.deadline or self._retry_tokens < 1.0:
             return False
         self._retry_tokens -= 1.0
-        pending.connection, pending.not_before = None, after
+        pending.connection = None
+        pending.not_before = after
         return True
 
     def _progress(self, connection: ConnectionState, progress: Progress) -> list[Event]:
@@ -544,14 +547,16 @@ class ClientSession:
         return [Progressed(progress.id, share, progress.what)]
 
     def _cancel_on_server(self, pending: _Pending) -> None:
-        pending.cancelled, pending.deadline = True, math.inf
+        pending.cancelled = True
+        pending.deadline = math.inf
         if pending.connection is not None:
             pending.connection.outgoing.append(self.codec.encode(Cancel(id=pending.command.id)))
 
     def _welcome(self, connection: ConnectionState, welcome: Welcome, now: float) -> list[Event]:
         if connection.welcome is not None:
             return []
-        connection.welcome, connection.rate_limiter = welcome, RateLimiter(welcome.limits)
+        connection.welcome = welcome
+        connection.rate_limiter = RateLimiter(welcome.limits)
         if welcome.token_s is not None:
             connection.renewal.expires_in(welcome.token_s, now)
         return [Welcomed(welcome)]

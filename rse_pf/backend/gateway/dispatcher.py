@@ -151,7 +151,8 @@ class Dispatcher:
             topics: Of rosbridge clients.
             token_watch: Ends connections whose token is no longer valid.
         """
-        settings, monotonic = context.settings, context.clocks.monotonic
+        settings = context.settings
+        monotonic = context.clocks.monotonic
         self.context = context
         self.connections = connections
         self.rates = admission.rates
@@ -261,7 +262,8 @@ class Dispatcher:
     def authenticate(self, connection: RobotConnection, token: str) -> None:
         """Judge the token of a rosbridge client that showed none in its handshake."""
         source = self._awaited.leave(connection)
-        session, clocks = connection.session, self.context.clocks
+        session = connection.session
+        clocks = self.context.clocks
         if source is None or not isinstance(session, RosbridgeSession):
             return
         now = clocks.monotonic()
@@ -326,7 +328,8 @@ class Dispatcher:
         self, connection: RobotConnection, session: ServerSession, data: bytes, now: float
     ) -> bool:
         """Refuse the message *data* for a fraction of what decoding it costs; False if it must be decoded."""
-        answers, codec = self._answers, session.codec
+        answers = self._answers
+        codec = session.codec
         retry_ms = self.rates.retry_after_ms(connection.robot, now)
         if retry_ms == CUT_OFF:
             self.context.metrics.shed["rate"] += 1
@@ -450,7 +453,8 @@ class Dispatcher:
 
         The shortest way of a command.  It decides, counts and answers as `submit` does for any other.
         """
-        service, claims = queued.command.service, queued.owner.claims
+        service = queued.command.service
+        claims = queued.owner.claims
         if (
             self._ran_inline
             or service not in self._cheap
@@ -499,7 +503,8 @@ class Dispatcher:
 
         Otherwise a slow round would hide the queue in the kernel, where its length cannot be seen.
         """
-        command, answers = queued.command, self._answers
+        command = queued.command
+        answers = self._answers
         service = self._registry.get(command.service)
         asks_store = command.service in answers.with_objects and answers.objects.named_by(command, service)
         if not asks_store and self._scheduler.runs_inline(

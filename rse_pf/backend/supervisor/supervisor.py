@@ -165,7 +165,8 @@ class _Supervisor:
         control_token: str | None,
         others: list[int],
     ) -> None:
-        self._settings, self._others = settings, others
+        self._settings = settings
+        self._others = others
         self._digest = digest
         self._server_id = server_id
         self._records = records
@@ -506,7 +507,8 @@ class _Supervisor:
             robots = int(ask.query["robots"])
             spread_s = number_of(ask, "spread_s", 0.0, _MAX_SPREAD_S)
         except (KeyError, ValueError):
-            robots, spread_s = -1, 0.0
+            robots = -1
+            spread_s = 0.0
         if not ask.is_local:
             return refused_reply(403, "forbidden", "move from the server's own machine")
         if not 0 <= robots <= _MAX_MOVES:

@@ -240,7 +240,9 @@ class _Worker:
             token_watch=self._token_watch,
         )
         self._migration = Migration(connections, loop=loop, now=time.monotonic, choose=secrets.choice)
-        self._index, self._workers, self._named = plan.index, plan.workers, 0
+        self._index = plan.index
+        self._workers = plan.workers
+        self._named = 0
         self._sockets = RobotSockets(
             self._dispatcher,
             handshake,

@@ -240,7 +240,8 @@ class LocalPlatform:
 
     def status_document(self) -> dict[str, Any]:
         """Return everything the control plane knows, as plain JSON values."""
-        mark, sample = self.load_balancer.process.mark, self.sample
+        mark = self.load_balancer.process.mark
+        sample = self.sample
         servers = [
             {
                 "name": member.name,

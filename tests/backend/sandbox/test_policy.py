@@ -1,7 +1,4 @@
-"""Every rule about sandboxes: events and the time go in, actions come out, no process is started.
-
-More than 600 lines because every rule has a test of its own, and all of them need the same events.
-"""
+"""Every rule about sandboxes: events and the time go in, actions come out, no process is started."""
 
 from __future__ import annotations
 
