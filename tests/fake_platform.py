@@ -11,6 +11,7 @@ import time
 from collections.abc import Awaitable, Callable, Iterator
 from typing import Any
 
+import server_sessions
 from websockets.asyncio.server import Server, ServerConnection, serve
 from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed
@@ -63,7 +64,7 @@ class FakeSocket:
                 data = await self.websocket.recv(decode=False)
                 if not self.muted:
                     was_open = self.is_welcomed
-                    await self._apply(self.session.receive(data, self._platform.clock()))
+                    await self._apply(server_sessions.receive(self.session, data, self._platform.clock()))
                     if not was_open:
                         self._platform.noticed()
         except ConnectionClosed:
@@ -94,7 +95,7 @@ class FakeSocket:
 
     async def answer(self, message: Answer) -> None:
         """Send the final answer to a command, as the session would."""
-        await self.send(self.session.answer(message).data)
+        await self.send(server_sessions.answer(self.session, message).data)
 
     async def move(self, within_ms: float = 5000.0) -> None:
         """Ask the robot to leave this server."""

@@ -20,6 +20,7 @@ from dataclasses import dataclass, field
 from http import HTTPStatus
 from typing import Any
 
+import server_sessions
 from websockets.asyncio.server import Server, ServerConnection, serve
 from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed
@@ -318,7 +319,7 @@ class FakeServer:
                 if self.deaf:
                     continue
                 data = message.encode() if isinstance(message, str) else message
-                for decision in session.receive(data, time.monotonic()):
+                for decision in server_sessions.receive(session, data, time.monotonic()):
                     if not isinstance(decision, Submit):
                         await robot.send([decision])
                         continue
@@ -326,7 +327,7 @@ class FakeServer:
                     self.all_commands.append(decision.command)
                     answer = self.answer(self, robot, decision.command)
                     if answer is not None:
-                        await robot.send([session.answer(answer)])
+                        await robot.send([server_sessions.answer(session, answer)])
                 await self._notify()
         self.robots.remove(robot)
         await self._notify()

@@ -12,11 +12,8 @@ import msgspec
 
 from rse_pf.config import BurstSettings, SessionSettings
 from rse_pf.errors import (
-    BadMessage,
     BadRequest,
     Busy,
-    InternalError,
-    LimitExceeded,
     ProtocolError,
     QuotaExceeded,
     RsePfError,
@@ -38,7 +35,6 @@ from rse_pf.wire.messages import (
     Ping,
     Pong,
     Renewed,
-    Result,
     Subscribe,
     Unsubscribe,
     Welcome,
@@ -203,18 +199,11 @@ class ServerSession:
         self.bad_messages = self.refused_commands = self.suspicion = 0
         self._next_renewal_s = float("-inf")
 
-    def receive(self, data: bytes, now: float) -> list[Decision]:
-        """Return the decisions about one WebSocket message that arrived at *now* (server clock, s)."""
-        if self.state == "closed":
-            return []
-        try:
-            message: FromRobot | ProtocolError = self.codec.decode_from_robot(data)
-        except ProtocolError as error:
-            message = error
-        return self.take(message, now, data)
-
     def receive_short(self, data: bytes, now: float, max_bytes: int) -> list[Decision] | None:
-        """Return the same as `receive`, or None if the message is longer than *max_bytes*, inflated."""
+        """Return the decisions about one WebSocket message that arrived at *now* (server clock, s).
+
+        None means that the message has more than *max_bytes* inflated: decode it elsewhere, for `take`.
+        """
         if self.state == "closed":
             return []
         try:
@@ -251,24 +240,6 @@ class ServerSession:
 
     def answered(self, command_id: int) -> None:
         """Forget what only a rosbridge client's session keeps of a command that has its final answer."""
-
-    def answer(self, message: Result | Failure) -> Send:
-        """Return the message with the final answer to a command that was submitted.
-
-        A reply that cannot be encoded, or that exceeds the size limit of a message, becomes a failure.
-        """
-        self.in_flight -= 1
-        try:
-            send = self._send(message)
-            if len(send.data) <= self._limits.max_message_bytes:
-                return send
-            error: RsePfError = LimitExceeded(
-                f"the reply of {len(send.data)} bytes is above {self._limits.max_message_bytes}",
-                hint="ask for less, or fetch it from the data server",
-            )
-        except BadMessage as unencodable:
-            error = InternalError("the reply cannot be encoded", hint=unencodable.hint)
-        return self._send(self._failure(error, identity=message.id))
 
     def move(self, reason: str, within_ms: float) -> list[Decision]:
         """Ask the robot to connect to another server before it closes this connection."""

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import server_sessions
 from fakes import FakeRobot, FakeServer, answer_at_once, answer_nothing
 
 import client_sdk
@@ -119,7 +120,9 @@ def test_a_late_answer_of_an_old_socket_is_not_delivered_twice() -> None:
         def twice(server: FakeServer, robot: FakeRobot, command: Command) -> Result | Failure | None:
             answer = answer_at_once(server, robot, command)
             if answer is not None:
-                asyncio.get_running_loop().create_task(robot.send([robot.session.answer(answer)]))
+                asyncio.get_running_loop().create_task(
+                    robot.send([server_sessions.answer(robot.session, answer)])
+                )
             return answer
 
         async with FakeServer(answer=twice).running() as server, connect(server) as robot:
@@ -149,7 +152,7 @@ def test_an_older_answer_of_a_stream_is_stale() -> None:
             fake, command = held[0]
             answer = answer_at_once(server, fake, command)
             assert answer is not None
-            await fake.send([fake.session.answer(answer)])
+            await fake.send([server_sessions.answer(fake.session, answer)])
             with pytest.raises(Stale):
                 await old
 

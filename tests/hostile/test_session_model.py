@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections import Counter, deque
 
 import pytest
+import server_sessions
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
@@ -129,13 +130,13 @@ class Platform(RuleBasedStateMachine):
         socket = self._open()[0]
         for _ in range(min(count, len(socket.up))):
             if socket.is_open:
-                self._obey(socket, socket.server.receive(socket.up.popleft(), self.now))
+                self._obey(socket, server_sessions.receive(socket.server, socket.up.popleft(), self.now))
 
     @rule(data=st.sampled_from([b"", b"[]", b"\xff", b'{"type":"welcome"}', b"[" * 99]))
     @precondition(lambda self: self._open())
     def foreign_bytes(self, data: bytes) -> None:
         socket = self._open()[0]
-        self._obey(socket, socket.server.receive(data, self.now))
+        self._obey(socket, server_sessions.receive(socket.server, data, self.now))
 
     def _obey(self, socket: Socket, decisions: list) -> None:
         for decision in decisions:
@@ -166,7 +167,7 @@ class Platform(RuleBasedStateMachine):
         answer: Result | Failure = Result(id=job.id, reply=1)
         if code:
             answer = Failure(id=job.id, code=code, message="", retry_after_ms=10.0)
-        data = socket.server.answer(answer).data
+        data = server_sessions.answer(socket.server, answer).data
         if socket.is_open:
             socket.down.append(data)
 

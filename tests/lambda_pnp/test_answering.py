@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import server_sessions
 from hostile.hostile_maps import hostile_maps
 from hypothesis import given
 from hypothesis import settings as hypothesis_settings
@@ -156,8 +157,8 @@ def over_the_websocket(body: bytes) -> Failure:
     session = ServerSession(
         codec=codec, robot="robot-1", server="lambda", session="s", limits=SETTINGS.session
     )
-    session.receive(codec.encode(Hello()), 0.0)
-    decision = session.receive(body, 0.0)[0]
+    server_sessions.receive(session, codec.encode(Hello()), 0.0)
+    decision = server_sessions.receive(session, body, 0.0)[0]
     if isinstance(decision, Send):
         told = codec.decode_from_server(decision.data)
     else:

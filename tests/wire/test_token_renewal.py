@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 
 import pytest
+import server_sessions
 
 from rse_pf.config import SessionSettings
 from rse_pf.wire import Failure, Hello, Limits, Renew, Renewed, Welcome, make_codec
@@ -19,7 +20,7 @@ CODEC = make_codec("json", SETTINGS)
 def server_session(token_s: float | None = 100.0) -> tuple[ServerSession, Welcome]:
     session = ServerSession(codec=CODEC, robot="r", server="s", session="x", limits=SETTINGS)
     session.ends_s = token_s  # the session hears Hello at 0
-    (send,) = session.receive(CODEC.encode(Hello()), 0.0)
+    (send,) = server_sessions.receive(session, CODEC.encode(Hello()), 0.0)
     assert isinstance(send, Send)
     welcome = CODEC.decode_from_server(send.data)
     assert isinstance(welcome, Welcome)
@@ -56,7 +57,7 @@ def test_the_welcome_says_how_long_the_token_is_good():
 def test_a_fresh_token_is_returned_for_verification_and_the_result_is_sent():
     session, _ = server_session()
 
-    assert session.receive(CODEC.encode(Renew(token="t")), 5.0) == [Renewal("t")]
+    assert server_sessions.receive(session, CODEC.encode(Renew(token="t")), 5.0) == [Renewal("t")]
     (told,) = session.renewed(900.0)
     (refused,) = session.renewed(None)
 
@@ -71,15 +72,15 @@ def test_a_fresh_token_is_returned_for_verification_and_the_result_is_sent():
 def test_renewals_in_quick_succession_are_not_verified():
     session, _ = server_session()
     renew = CODEC.encode(Renew(token="t"))
-    session.receive(renew, 5.0)
+    server_sessions.receive(session, renew, 5.0)
 
-    (send,) = session.receive(renew, 5.0 + RENEWAL_PAUSE_S / 2)
+    (send,) = server_sessions.receive(session, renew, 5.0 + RENEWAL_PAUSE_S / 2)
 
     assert isinstance(send, Send)
     failure = CODEC.decode_from_server(send.data)
     assert isinstance(failure, Failure)
     assert failure.code == "busy"
-    assert session.receive(renew, 5.0 + RENEWAL_PAUSE_S) == [Renewal("t")]
+    assert server_sessions.receive(session, renew, 5.0 + RENEWAL_PAUSE_S) == [Renewal("t")]
 
 
 def test_a_renewal_is_due_after_four_fifths_of_the_ttl_and_then_more_often():

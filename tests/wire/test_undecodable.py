@@ -7,6 +7,7 @@ from typing import Any
 
 import msgspec
 import pytest
+import server_sessions
 from clients.undecodable import BINARY, JSON, Kind
 from hypothesis import given
 from hypothesis import strategies as st
@@ -35,7 +36,7 @@ def opened(codec: str, *, use_native: bool = True) -> ServerSession:
     made = ServerSession(
         codec=make_codec(codec, use_native=use_native), robot="r", server="s", session="x", limits=LIMITS
     )
-    made.receive(made.codec.encode(Hello()), 0.0)
+    server_sessions.receive(made, made.codec.encode(Hello()), 0.0)
     return made
 
 
@@ -57,14 +58,14 @@ def test_a_command_that_cannot_be_decoded_is_answered_with_its_id(
 ) -> None:
     server = opened(codec, use_native=use_native)
 
-    failure = refusal(server.receive(bytes_of(server.codec, kind, 7), 1.0))
+    failure = refusal(server_sessions.receive(server, bytes_of(server.codec, kind, 7), 1.0))
 
     assert (failure.id, failure.code in kind.codes) == (7, True), failure
     assert failure.message
     assert failure.hint
     assert server.in_flight == 0
     assert server.codec.decode_from_server(server.codec.encode(failure)) == failure
-    assert server.receive(server.codec.encode(GOOD), 2.0) == [Submit(GOOD)]
+    assert server_sessions.receive(server, server.codec.encode(GOOD), 2.0) == [Submit(GOOD)]
 
 
 @pytest.mark.parametrize("codec", CODECS)
@@ -72,12 +73,14 @@ def test_any_number_of_such_commands_leaves_the_connection_open(codec: str) -> N
     server = opened(codec)
     kind = (BINARY if codec == "bin" else JSON)[1]
 
-    answered = [refusal(server.receive(bytes_of(server.codec, kind, n), 1.0)).id for n in range(100)]
+    answered = [
+        refusal(server_sessions.receive(server, bytes_of(server.codec, kind, n), 1.0)).id for n in range(100)
+    ]
 
     assert answered == list(range(100))
     assert (server.state, server.suspicion) == ("open", 100)
     for number in range(100):
-        server.receive(server.codec.encode(Command(id=number, service="echo")), 2.0)
+        server_sessions.receive(server, server.codec.encode(Command(id=number, service="echo")), 2.0)
         server.in_flight = 0
     assert server.suspicion == 0
 
@@ -86,7 +89,9 @@ def test_any_number_of_such_commands_leaves_the_connection_open(codec: str) -> N
 def test_a_subscription_that_cannot_be_decoded_is_answered_with_its_id(codec: str) -> None:
     server = opened(codec)
 
-    failure = refusal(server.receive(server.codec.encode(Subscribe(id=9, topic="t" * 129)), 1.0))
+    failure = refusal(
+        server_sessions.receive(server, server.codec.encode(Subscribe(id=9, topic="t" * 129)), 1.0)
+    )
 
     assert (failure.id, failure.code) == (9, "bad-message")
 
@@ -161,7 +166,7 @@ def test_any_bytes_have_an_id_or_none(codec: str, data: bytes) -> None:
 def test_messages_without_an_id_still_close_the_connection() -> None:
     server = opened("json")
 
-    decisions = [server.receive(b"{", 1.0) for _ in range(LIMITS.max_bad_messages + 1)]
+    decisions = [server_sessions.receive(server, b"{", 1.0) for _ in range(LIMITS.max_bad_messages + 1)]
 
     assert [refusal(each).id for each in decisions[:-1]] == [None] * LIMITS.max_bad_messages
     assert isinstance(decisions[-1][-1], Close)
@@ -170,4 +175,9 @@ def test_messages_without_an_id_still_close_the_connection() -> None:
 def test_before_hello_no_id_is_read() -> None:
     server = ServerSession(codec=make_codec("json"), robot="r", server="s", session="x", limits=LIMITS)
 
-    assert refusal(server.receive(b'{"type":"command","id":7,"service":"x","payload":NaN}', 1.0)).id is None
+    assert (
+        refusal(
+            server_sessions.receive(server, b'{"type":"command","id":7,"service":"x","payload":NaN}', 1.0)
+        ).id
+        is None
+    )

@@ -56,12 +56,8 @@ class RosbridgeSession(ServerSession):
         self._rosbridge = codec
         self._level = _LEVELS["error"]
 
-    def receive(self, data: bytes, now: float) -> list[Decision]:
-        """Return the decisions about one WebSocket message that arrived at *now* (server clock, s)."""
-        return self.take(self._rosbridge.decode_from_robot(data), now, data)
-
     def receive_short(self, data: bytes, now: float, max_bytes: int) -> list[Decision] | None:
-        """Return the same as `receive`, or None if the message is longer than *max_bytes*."""
+        """Return the decisions about one message at *now* (s), or None if it is longer than *max_bytes*."""
         if self.state == "opening" and len(data) > _MAX_AUTH_BYTES:
             return self._close(CLOSE_PROTOCOL, "authenticate first")
         message = self._rosbridge.decode_short_from_robot(data, max_bytes)

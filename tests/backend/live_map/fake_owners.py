@@ -6,6 +6,8 @@ import asyncio
 from collections.abc import Callable
 from typing import Any
 
+import server_sessions
+
 from rse_pf.auth.tokens import Claims
 from rse_pf.config import SessionSettings
 from rse_pf.errors import Conflict, RsePfError
@@ -83,7 +85,7 @@ class FakeReader:
         self.session: ServerSession | None = ServerSession(
             codec=self.codec, robot=name, server="s", session="x", limits=SessionSettings()
         )
-        self.session.receive(self.codec.encode(Hello(capabilities=("updates",))), 0.0)
+        server_sessions.receive(self.session, self.codec.encode(Hello(capabilities=("updates",))), 0.0)
         self.is_connected = True
         self.unsent_bytes = 0
         self.max_unsent: int | None = None
