@@ -9,24 +9,16 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from rse_pf.errors import BadRequest, DegenerateGeometry, NoConsensus, PnpError, TooFewCorrespondences
+from rse_pf.errors import BadRequest, DegenerateGeometry
 from rse_pf.geometry import Array, Camera
 from rse_pf.pnp import evidence
 from rse_pf.pnp.engines import Engine, engine_for, native_evidence, usable_engine
 from rse_pf.pnp.options import PnpOptions, WeakLimits
-from rse_pf.pnp.planar_ambiguity import second_planar_pose
+from rse_pf.pnp.rules import PoseJudgement, too_few_matches
 
 __all__ = ["PnpSolution", "solve_pnp"]
 
 _MAX_ABS = 1e6
-# log10 of the false alarms at which chance is ruled out.
-_MAX_LOG10_FALSE_ALARMS = -5.0
-_COLLINEAR, _NEARLY_COLLINEAR = 0.02, 0.1
-# Variation of 1/z below which a plane may have two poses.
-_WEAK_PERSPECTIVE = 0.08
-# Differences of squared error, in units of the noise, that tell two poses apart: not, hardly.
-_SAME_FIT, _SIMILAR_FIT = 9.0, 40.0
-_NOISE_FLOOR_PX2 = 0.01
 # Enough where half of the matches agree: a whole world that is mirrored, not a part of it.
 _MIRROR_ITERATIONS = 50
 
@@ -100,40 +92,40 @@ def solve_pnp(
         return _solved_natively(points_world, pixels, camera, options, weak)  # which checks the numbers
     _check_numbers(points_world, pixels)
     propose = engine_for(engine)
-    n = len(pixels)
     T_camera_world = _proposed(propose, points_world, pixels, camera, options)
-    if T_camera_world is None:
-        raise _no_pose(points_world, pixels, 0, options)
-    view = evidence.view_of(T_camera_world, points_world, pixels, camera)
-    inliers = (view[evidence.ERROR2] <= options.inlier_px**2).nonzero()[0]
-    count = len(inliers)
-    if count < 4:
-        raise _no_pose(points_world, pixels, count, options)
-    view = view.take(inliers, axis=1)
-    error2 = view[evidence.ERROR2]
-    independent = evidence.independent_inliers(view, camera)
-    if _is_chance(n - (count - independent), independent, options.inlier_px**2, camera):
-        _refuse_chance(points_world, pixels, camera, options, count, independent, float(error2.max()))
-    shape = evidence.Shape(view, camera)
-    _refuse_degenerate(shape, options)
-    squares = float(np.add.reduce(error2))
-    variance = max(squares / max(1, 2 * count - 6), _NOISE_FLOOR_PX2)
-    covariance, variances = _covariance(shape.information, variance)
-    reason = _weakness(count, independent, n, shape, variances, weak)
-    if shape.depth_variation < _WEAK_PERSPECTIVE:
-        found = _ambiguity(T_camera_world, points_world[inliers], pixels[inliers], camera, squares, variance)
-        reason = found or reason
-    if count < weak.inlier_ratio * n:
+    judgement = PoseJudgement(
+        T_camera_world, points_world, pixels, camera, inlier_px=options.inlier_px, weak=weak
+    )
+    reason = _judge(judgement)
+    assert T_camera_world is not None
+    count = len(judgement.inliers)
+    if count < weak.inlier_ratio * len(pixels):
         _refuse_mirrored(propose, points_world, pixels, camera, options, count)
     return PnpSolution(
         T_camera_world=T_camera_world,
-        inliers=inliers,
-        rmse_px=math.sqrt(squares / count),
-        covariance=covariance,
+        inliers=judgement.inliers,
+        rmse_px=math.sqrt(judgement.squares_px2 / count),
+        covariance=judgement.covariance,
         verdict="weak" if reason else "ok",
         reason=reason,
         engine=engine,
     )
+
+
+def _judge(judgement: PoseJudgement) -> str:
+    """Return why the pose is weak, "" if it is not; raises PnpError at the first rule that refuses it.
+
+    The reason is the first weak rule that is broken, or ``ambiguous``, which outweighs the others.
+    """
+    reason = ""
+    for rule, refusal in judgement.ask():
+        if rule.is_kept:
+            continue
+        if refusal is not None:
+            raise refusal()
+        if not reason or rule.name == "ambiguous":
+            reason = rule.name
+    return reason
 
 
 def _solved_natively(
@@ -164,10 +156,7 @@ def _checked(points_world: Array, pixels: Array) -> tuple[Array, Array]:
             hint="send one pixel for each point",
         )
     if len(points) < 4:
-        raise TooFewCorrespondences(
-            f"got {len(points)} correspondences, a pose needs at least 4",
-            hint="loosen the matcher, or skip this frame",
-        )
+        raise too_few_matches(len(points))
     return points, pixels
 
 
@@ -192,114 +181,6 @@ def _proposed(
     T_camera_world: Array = _LAST_ROW.copy()
     T_camera_world[:3] = pose
     return T_camera_world
-
-
-def _is_chance(n: int, count: int, largest_error2_px2: float, camera: Camera) -> bool:
-    return evidence.log10_false_alarms(n, count, largest_error2_px2, camera) > _MAX_LOG10_FALSE_ALARMS
-
-
-def _refuse_chance(
-    points_world: Array,
-    pixels: Array,
-    camera: Camera,
-    options: PnpOptions,
-    count: int,
-    independent: int,
-    largest_error2_px2: float,
-) -> None:
-    """Repeat the test with the largest actual error instead of the largest allowed one."""
-    n = len(pixels)
-    if _is_chance(n - (count - independent), independent, largest_error2_px2, camera):
-        if not _is_chance(n, count, largest_error2_px2, camera):
-            raise DegenerateGeometry(
-                f"the {count} correspondences that agree lie in {independent} places of the image, "
-                "and may be copies of each other",
-                hint="match points all over the image, or skip this frame",
-            )
-        raise _no_pose(points_world, pixels, count, options)
-
-
-def _no_pose(points_world: Array, pixels: Array, count: int, options: PnpOptions) -> PnpError:
-    """Return the most specific error: degenerate input says more than "no consensus"."""
-    for rows in (points_world, pixels):
-        thinness = evidence.width_to_length(rows)
-        if thinness < _COLLINEAR:
-            return _collinear(thinness)
-    return NoConsensus(
-        f"the best pose agrees with {count} of {len(pixels)} correspondences within "
-        f"{options.inlier_px:g} px, no more than chance would give",
-        hint="tighten the matcher, or skip this frame",
-    )
-
-
-def _collinear(thinness: float) -> DegenerateGeometry:
-    return DegenerateGeometry(
-        f"the points that agree lie on one line or coincide (width/length {thinness:.3f} is below "
-        f"{_COLLINEAR})",
-        hint="match points all over the image, or skip this frame",
-    )
-
-
-def _refuse_degenerate(shape: evidence.Shape, options: PnpOptions) -> None:
-    if shape.thinness < _COLLINEAR:
-        raise _collinear(shape.thinness)
-    if shape.radius_px < options.inlier_px:
-        raise DegenerateGeometry(
-            f"the pixels that agree lie {shape.radius_px:.1f} px (rms) from their centre, "
-            f"less than {options.inlier_px:g} px",
-            hint="match points all over the image, or skip this frame",
-        )
-
-
-def _covariance(information: Array, variance_px2: float) -> tuple[Array, list[float]]:
-    """Return the covariance and its diagonal, all of which is positive."""
-    try:
-        covariance, variances = evidence.inverse_of_information(information, variance_px2)
-    except ZeroDivisionError:
-        variances = [-1.0]
-    if not all(value > 0.0 for value in variances):
-        raise DegenerateGeometry(
-            "the correspondences do not constrain some motion of the camera", hint="match more of the scene"
-        )
-    return covariance, variances
-
-
-def _weakness(
-    count: int, independent: int, n: int, shape: evidence.Shape, variances: list[float], weak: WeakLimits
-) -> str:
-    if count < weak.inliers:
-        return "few-inliers"
-    if count < weak.inlier_ratio * n:
-        return "low-inlier-ratio"
-    if shape.thinness < _NEARLY_COLLINEAR:
-        return "nearly-collinear"
-    if 2 * independent < weak.inliers:
-        return "clustered"
-    if sum(variances[:3]) > weak.translation_m**2 or sum(variances[3:]) > weak.rotation_rad**2:
-        return "poorly-constrained"
-    return ""
-
-
-def _ambiguity(
-    T_camera_world: Array,
-    points: Array,
-    pixels: Array,
-    camera: Camera,
-    squares_px2: float,
-    variance_px2: float,
-) -> str:
-    """Compare with the second pose of a plane by a likelihood ratio."""
-    second = second_planar_pose(T_camera_world, points, pixels, camera)
-    if second is None:
-        return ""
-    difference = (second[1] - squares_px2) / variance_px2
-    if difference < _SAME_FIT:
-        rmse, other = (math.sqrt(squares / len(pixels)) for squares in (squares_px2, second[1]))
-        raise DegenerateGeometry(
-            f"two poses fit alike ({rmse:.2f} and {other:.2f} px)",
-            hint="match points that do not lie in one far plane",
-        )
-    return "ambiguous" if difference < _SIMILAR_FIT else ""
 
 
 def _refuse_mirrored(

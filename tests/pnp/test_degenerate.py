@@ -16,7 +16,7 @@ from hypothesis.extra import numpy as hnp
 from rse_pf import native
 from rse_pf.errors import BadRequest, DegenerateGeometry, NoConsensus, PnpError, RsePfError
 from rse_pf.geometry import pose_difference, transform
-from rse_pf.pnp import PnpOptions, evidence, solve_pnp, solver
+from rse_pf.pnp import PnpOptions, evidence, rules, solve_pnp, solver
 from rse_pf.pnp.problems import DEGENERATE, KINECT, make_degenerate, make_problem
 
 NATIVE = pytest.param(
@@ -129,14 +129,14 @@ def test_points_behind_the_camera_say_so(engine):
 
 
 def test_without_the_rank_check_a_line_comes_back(monkeypatch):
-    monkeypatch.setattr(solver, "_COLLINEAR", -1.0)
-    monkeypatch.setattr(solver, "_NEARLY_COLLINEAR", -1.0)
+    monkeypatch.setattr(rules, "COLLINEAR", -1.0)
+    monkeypatch.setattr(rules, "NEARLY_COLLINEAR", -1.0)
 
     assert {"ok", "weak"} & outcomes("noisy-collinear")
 
 
 def test_without_the_chance_test_noise_comes_back(monkeypatch):
-    monkeypatch.setattr(solver, "_MAX_LOG10_FALSE_ALARMS", np.inf)
+    monkeypatch.setattr(rules, "MAX_LOG10_FALSE_ALARMS", np.inf)
 
     assert {"ok", "weak"} & outcomes("noise")
 
@@ -173,7 +173,7 @@ def test_without_the_second_pose_of_a_plane_a_flip_is_ok(monkeypatch):
 
     generous = solver.WeakLimits(translation_m=10.0, rotation_rad=10.0)
     guarded = wrong_and_ok()
-    monkeypatch.setattr(solver, "_WEAK_PERSPECTIVE", 0.0)
+    monkeypatch.setattr(rules, "WEAK_PERSPECTIVE", 0.0)
 
     assert guarded == 0
     assert wrong_and_ok() > 0

@@ -15,6 +15,7 @@ from rse_pf.geometry import Array, Camera, exp_se3, transform
 from rse_pf.pnp import PnpOptions, PnpSolution, solve_pnp, usable_engine
 from rse_pf.pnp.engines import engine_for
 from rse_pf.pnp.evidence import log10_false_alarms
+from rse_pf.pnp.rules import MAX_LOG10_FALSE_ALARMS
 
 __all__ = [
     "Fit",
@@ -33,7 +34,6 @@ _LAST_ROW = np.array([[0.0, 0.0, 0.0, 1.0]])
 _NEAR_M = 1e-6
 _ITERATIONS = 300
 _REFINEMENTS = 8
-_MAX_LOG10_FALSE_ALARMS = -5.0
 _LEAST_ROWS = 6
 
 Mask = npt.NDArray[np.bool_]
@@ -174,7 +174,7 @@ def robust_cost(matches: Matches, fit: Fit) -> float:
 
 def is_chance(n: int, count: int, tight_px: float, camera: Camera) -> bool:
     """Return whether *count* of *n* matches agree with some pose by chance."""
-    return count <= 3 or log10_false_alarms(n, count, tight_px**2, camera) > _MAX_LOG10_FALSE_ALARMS
+    return count <= 3 or log10_false_alarms(n, count, tight_px**2, camera) > MAX_LOG10_FALSE_ALARMS
 
 
 def solved(matches: Matches, options: PnpOptions) -> PnpSolution | RsePfError:

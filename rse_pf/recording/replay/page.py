@@ -12,8 +12,8 @@ import math
 from collections.abc import Sequence
 from datetime import datetime, timezone
 
+from rse_pf.pnp.rules import Rule
 from rse_pf.recording.replay.report import Attempt, CommandReport, Histogram
-from rse_pf.recording.replay.rules import Rule
 from rse_pf.recording.replay.run import Overview
 from rse_pf.terminal import counted, printable
 

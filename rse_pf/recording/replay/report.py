@@ -11,12 +11,13 @@ import numpy as np
 import numpy.typing as npt
 
 from rse_pf.errors import RsePfError
-from rse_pf.geometry import Array, pose_difference, transform
-from rse_pf.pnp import PnpOptions, evidence
+from rse_pf.geometry import Array, Camera, pose_difference, transform
+from rse_pf.pnp import PnpOptions, WeakLimits, evidence
+from rse_pf.pnp.engines import engine_for
+from rse_pf.pnp.rules import PoseJudgement, Rule
 from rse_pf.recording.explain import PastCommand, PoseExplanation, Timing, explain
 from rse_pf.recording.reader import RecordedCommand
 from rse_pf.recording.replay.picture import match_picture
-from rse_pf.recording.replay.rules import Rule, proposed_pose, rules_of
 from rse_pf.recording.replay.solving import Again, Overrides, Resolver, pnp_reply
 from rse_pf.services.pnp import PnpReply, PnpRequest
 from rse_pf.wire import Failure, Result
@@ -260,7 +261,7 @@ def _problem(command: RecordedCommand, resolver: Resolver, pose: PnpReply | None
         inliers = rows[(rows >= 0) & (rows < n)]
     else:
         engine = options.engine or resolver.default_engine
-        T_camera_world = proposed_pose(points, pixels, request.camera, options, engine) if n >= 4 else None
+        T_camera_world = _propose(points, pixels, request.camera, options, engine) if n >= 4 else None
         inliers = np.empty(0, dtype=np.intp)
         if T_camera_world is not None:
             view = evidence.view_of(T_camera_world, points, pixels, request.camera)
@@ -269,6 +270,21 @@ def _problem(command: RecordedCommand, resolver: Resolver, pose: PnpReply | None
         points=points, pixels=pixels, request=request, options=options, recorded=pose,
         T_camera_world=T_camera_world, inliers=inliers,
     )  # fmt: skip
+
+
+def _propose(
+    points_world: Array, pixels: Array, camera: Camera, options: PnpOptions, engine: str
+) -> Array | None:
+    """Return the ``(4, 4)`` pose that *engine* proposes before any rule is asked, None if it has none."""
+    try:
+        pose = engine_for(engine)(points_world, pixels, camera, options)
+    except RsePfError:
+        return None
+    if pose is None or not np.isfinite(pose).all():
+        return None
+    T_camera_world = np.eye(4)
+    T_camera_world[:3] = pose
+    return T_camera_world
 
 
 def _causes(
@@ -400,16 +416,18 @@ def _name_of(overrides: Overrides) -> str:
 def _finite_rules(problem: _Problem) -> tuple[Rule, ...]:
     with np.errstate(all="ignore"):
         try:
-            found = rules_of(
+            judgement = PoseJudgement(
                 problem.T_camera_world,
                 problem.points,
                 problem.pixels,
                 problem.request.camera,
-                problem.options,
+                inlier_px=problem.options.inlier_px,
+                weak=WeakLimits(),
             )
+            rules = [rule for rule, _ in judgement.ask()]
         except (RsePfError, ValueError, ArithmeticError, np.linalg.LinAlgError):
             return ()  # numbers that no pose has
-    return tuple(msgspec.structs.replace(each, measured=_plain(each.measured)) for each in found)
+    return tuple(msgspec.structs.replace(each, measured=_plain(each.measured)) for each in rules)
 
 
 def _view(problem: _Problem) -> Array | None:

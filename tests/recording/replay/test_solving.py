@@ -14,11 +14,10 @@ from recording.replay.made import START_NS, Made
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import BadRequest
 from rse_pf.geometry import exp_se3, transform
-from rse_pf.pnp import available_engines, solver
+from rse_pf.pnp import available_engines
 from rse_pf.pnp.problems import DEGENERATE, PnpProblem, make_degenerate, make_problem
 from rse_pf.recording.reader import RecordedCommand, open_recording
 from rse_pf.recording.replay import run
-from rse_pf.recording.replay.rules import LIMITS
 from rse_pf.recording.replay.solving import TIMES_AND_PLACES, Overrides, Resolver, pnp_reply
 from rse_pf.wire import Failure, Result, make_codec
 
@@ -127,11 +126,6 @@ def test_the_limits_of_the_server_that_recorded_hold_again(tmp_path: Path) -> No
     seen = run.overview(made.close(), SETTINGS, solve=True, explain=0)
 
     assert (seen.equal, seen.different) == (2, 0)
-
-
-def test_the_rules_have_the_limits_of_the_solver() -> None:
-    for name, limit in LIMITS.items():
-        assert getattr(solver, f"_{name}") == limit, name
 
 
 def test_what_went_wrong_is_listed_worst_first(tmp_path: Path) -> None:
