@@ -47,9 +47,9 @@ from rse_pf.config import PlatformSettings
 from rse_pf.errors import RsePfError
 from rse_pf.object_store import MemoryStore
 from rse_pf.pnp.problems import make_problem
-from rse_pf.scaling.alarm_states import AlarmRule, replay
 from rse_pf.scaling.health import CLOUD_TIMEOUT_S, Health, cloud_checks, observe
 from rse_pf.scaling.operator_alarms import STORE_PERIOD_S, operator_alarms
+from tests.alarm_states import AlarmRule, replay
 
 __all__ = ["Outage", "Report", "main", "measure"]
 

@@ -1,6 +1,6 @@
 """Every alarm of the templates, on replayed metrics: quiet while all is well, ALARM on its fault, then OK.
 
-The alarms are parsed from the templates, and evaluated by `rse_pf.scaling.alarm_states`.  A sample is what a
+The alarms are parsed from the templates, and evaluated by `tests.alarm_states`.  A sample is what a
 service of AWS or an agent publishes in one period; the statistic is made of the samples of a period.
 """
 
@@ -11,10 +11,10 @@ from typing import Any
 
 import pytest
 
-from rse_pf.scaling.alarm_states import AlarmRule, State, Value, replay, statistic
 from rse_pf.scaling.alarms import CPU
 from rse_pf.scaling.operator_alarms import operator_alarms
 from rse_pf.scaling.profile import cadence_of
+from tests.alarm_states import AlarmRule, State, Value, replay, statistic
 
 Assembly = Any
 Period = Mapping[str, Sequence[float]]
