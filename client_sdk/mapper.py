@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Awaitable, Callable, Coroutine
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -29,7 +29,6 @@ from rse_pf.pnp import PnpOptions
 
 __all__ = ["AskPose", "BlockingMapper", "FrameRecorder", "Mapper", "PoseSolver", "ask_robot"]
 
-T = TypeVar("T")
 
 AskPose = Callable[[PoseQuery], Awaitable[PoseAnswer]]
 """Answers one pose query, or raises an RsePfError, with which the query counts as not answered."""

@@ -12,7 +12,7 @@ from collections.abc import Callable, Generator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 from client_sdk.answers import Answer, PoseAnswer
 from client_sdk.enrolment import read_enrolment
@@ -48,7 +48,6 @@ if TYPE_CHECKING:
 
 __all__ = ["OnProgress", "Robot", "connect"]
 
-T = TypeVar("T")
 
 _MAX_DEADLINE_S = 3600.0
 

@@ -6,7 +6,6 @@ Each source collects what it needs frame by frame, and gives the scale once it i
 from __future__ import annotations
 
 from collections import defaultdict
-from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -17,24 +16,12 @@ from client_sdk.monocular.two_view import parallax_deg, triangulate
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Array, Camera, inverse
 
-__all__ = ["MarkerScale", "OdometryScale", "ScaleSource"]
+__all__ = ["MarkerScale", "OdometryScale"]
 
 _MAX_STAMP_DIFFERENCE_S = 0.05
 _MIN_ODOMETRY_FRAMES = 5
 _MIN_MARKER_VIEWS = 4
 _MIN_MARKER_PARALLAX_DEG = 5.0
-
-
-class ScaleSource(Protocol):
-    """A source of metres; ``name`` stands in reports."""
-
-    name: str
-
-    def observe(self, timestamp_s: float, rgb: npt.NDArray[np.uint8], position_m: Array | None) -> None:
-        """Take what one frame says."""
-
-    def metres_per_unit(self, timestamps_s: Array, T_world_camera: Array, camera: Camera) -> float | None:
-        """Return the scale of a trajectory ``(n, 4, 4)``, or None if it is not yet well determined."""
 
 
 class OdometryScale:

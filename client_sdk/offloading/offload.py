@@ -12,7 +12,7 @@ from typing import Literal
 
 from rse_pf.service import Registry
 
-__all__ = ["CloudFirst", "Plan", "gains_from_cloud"]
+__all__ = ["CloudFirst", "Plan"]
 
 # A fallback begins this many of its own expected times before the last moment at which it helps.
 _MARGIN = 2.0
@@ -137,12 +137,3 @@ def _last_chance_s(latest_s: float, burst_s: float, expected_round_trip_s: float
         Dean and Barroso 2013, "The tail at scale": a second request after the 95th percentile of the first.
     """
     return min(latest_s - burst_s, max(expected_round_trip_s or 0.0, latest_s - _MARGIN * burst_s))
-
-
-def gains_from_cloud(*, robot_s: float, cloud_compute_s: float, transmission_s: float) -> bool:
-    """Return whether the cloud saves time: more in computing than the transmission costs.
-
-    Source:
-        RSE-PF paper, Sect. 6.2.
-    """
-    return robot_s - cloud_compute_s > transmission_s

@@ -77,12 +77,6 @@ class BackgroundUploader:
         with self._condition:
             return len(self._held)
 
-    @property
-    def held_bytes(self) -> int:
-        """How much of ``max_spool_bytes`` is in use."""
-        with self._condition:
-            return sum(self._held.values())
-
     def add(self, data: bytes) -> str | None:
         """Spool a keyframe and return its digest; None if the spool is full and it was dropped."""
         digest = hashlib.sha256(data).hexdigest()

@@ -42,7 +42,6 @@ from rse_pf.wire.messages import (
 
 __all__ = [
     "CLOSE_GOING_AWAY",
-    "CLOSE_NORMAL",
     "CLOSE_PROTOCOL",
     "CLOSE_RATE",
     "CLOSE_REPLACED",
@@ -79,7 +78,6 @@ MAX_SUBSCRIPTIONS = 8
 RENEWAL_PAUSE_S = 1.0
 """Minimum pause between two renewals, because each one costs a signature check."""
 
-CLOSE_NORMAL = 1000
 CLOSE_GOING_AWAY = 1001
 CLOSE_PROTOCOL = 4400
 CLOSE_TOKEN_OVER = 4401

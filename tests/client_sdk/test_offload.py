@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from client_sdk.offloading.offload import CloudFirst, gains_from_cloud
+from client_sdk.offloading.offload import CloudFirst
 from rse_pf.errors import CommandFailed, ConnectError, Disconnected, PnpError
 
 seconds = st.floats(1e-4, 10)
@@ -57,21 +57,6 @@ def test_a_fallback_always_leaves_the_robot_its_time_or_starts_at_once(
     )
 
     assert decided.robot_after_s == 0.0 or decided.robot_after_s + mine_s < deadline_s
-
-
-@given(robot_s=seconds, compute_s=seconds, transmission_s=seconds)
-def test_the_papers_rule_is_that_the_cloud_must_be_faster_all_in_all(robot_s, compute_s, transmission_s):
-    gains = gains_from_cloud(robot_s=robot_s, cloud_compute_s=compute_s, transmission_s=transmission_s)
-
-    if abs(compute_s + transmission_s - robot_s) > 1e-9:
-        assert gains == (compute_s + transmission_s < robot_s)
-
-
-def test_the_papers_own_figures_do_not_gain_from_the_cloud_below_153_ms():
-    cloud = {"cloud_compute_s": 0.02982, "transmission_s": 0.12318}
-
-    assert not gains_from_cloud(robot_s=0.150, **cloud)
-    assert gains_from_cloud(robot_s=0.160, **cloud)
 
 
 def test_the_faster_side_is_taken_only_when_asked_for():

@@ -11,7 +11,7 @@ import contextlib
 import itertools
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any
 
 from rse_pf.backend.live_map.children import OwnerChild, OwnerChildren
 from rse_pf.backend.live_map.owner.lease import LeaseRecord, LeaseWatch, lease_name, verdict_on
@@ -46,7 +46,6 @@ _LINGER_S = 10.0
 _PREPARE_SHARE = 0.66
 """After this share of the lease without a renewal a process is started, so that it is ready in time."""
 _BUSY_RETRY_MS = 500.0
-_T = TypeVar("_T")
 _NO_MAP = {"kind": "map", "keyframes": 0, "version": 0, "owner": ""}
 """What is told of a map whose owner has told nothing yet."""
 

@@ -37,8 +37,6 @@ __all__ = [
 PERIOD_S = 0.04
 """One round of stopping and going on: long against a switch of processes, short against a health check."""
 
-_KERNEL = "the kernel needs nf_tables, and nft 1.0 or later"
-
 
 def find_server(state: PlatformState, name: str) -> ServerState:
     """Return the running server called *name*; raises UsageError, which names those that run."""

@@ -26,7 +26,6 @@ from rse_pf.local.state import ServerState, settings_file
 __all__ = ["DATA_CHECK_S", "NICENESS", "LocalDataServers"]
 
 _LOOPBACK = "127.0.0.1"
-_LOOK_AGAIN_S = 0.01
 DATA_CHECK_S = 1.0
 """Between two checks of the service, and how long one may take."""
 _READY, _ALIVE = "/data/readyz", "/data/healthz"

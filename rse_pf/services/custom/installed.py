@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from importlib import metadata
 from pathlib import Path
-from typing import Annotated, Literal, get_args
+from typing import Annotated, Literal
 
 import msgspec
 
@@ -33,7 +33,6 @@ from rse_pf.services.custom.plain_files import copy_plain, read_plain
 __all__ = [
     "DEPENDENCIES_FOLDER",
     "ENTRY_POINTS",
-    "LANGUAGES",
     "InstalledService",
     "check_installed",
     "dependencies_of",
@@ -45,7 +44,6 @@ __all__ = [
 ]
 
 _Language = Literal["python", "cpp", "lua"]
-LANGUAGES: tuple[str, ...] = get_args(_Language)
 
 ENTRY_POINTS = "rse_pf.services"
 """Entry-point group by which Python packages publish services: ``name = "package.module"``."""

@@ -71,7 +71,6 @@ def test_keyframes_are_uploaded_in_order_and_removed_from_the_spool(tmp_path: Pa
 def test_the_spool_is_bounded_and_dropped_keyframes_are_counted(tmp_path: Path) -> None:
     with started(FakeUploads(), tmp_path / "spool", is_busy=lambda: True) as uploader:
         kept = [uploader.add(bytes([n]) * 1000) for n in range(6)]
-        assert uploader.held_bytes == 4000
 
     assert [each is not None for each in kept] == [True] * 4 + [False] * 2
     assert uploader.dropped == 2
