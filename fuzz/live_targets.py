@@ -22,9 +22,9 @@ from rse_pf.live_map.keyframe_code import (
     encode_features,
 )
 from rse_pf.live_map.measure import measure_links
-from rse_pf.live_map.place_index import place_vector
 from rse_pf.live_map.relocalise import relocalise
 from rse_pf.services.synthetic_maps import make_world
+from rse_pf.slam.places import place_vector
 
 __all__ = ["live"]
 

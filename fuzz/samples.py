@@ -20,9 +20,9 @@ from rse_pf.backend.sandbox.ipc import encode_message
 from rse_pf.live_map.keyframe_code import encode_features
 from rse_pf.maps.format import Edge, MapVersion, decode_map, encode_map
 from rse_pf.pnp.problems import DEGENERATE, KINECT, make_degenerate, make_problem, make_two_views
-from rse_pf.services.mapping.pose_graph import write_g2o
 from rse_pf.services.pnp import make_request
 from rse_pf.services.synthetic_maps import make_room, make_sphere, make_world
+from rse_pf.slam.pose_graph import write_g2o
 from rse_pf.wire import Cancel, Command, Failure, Hello, Ping, Result, make_codec
 
 __all__ = ["CORPUS", "EXPENSIVE", "MAX_INPUT_BYTES", "samples"]

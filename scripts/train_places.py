@@ -1,4 +1,4 @@
-"""Train the vocabulary of `rse_pf.live_map.place_index` from rendered worlds, and write it to its file.
+"""Train the vocabulary of `rse_pf.slam.places` from rendered worlds, and write it to its file.
 
 No recording takes part, so the package carries nobody's images.  The worlds' seeds are used by no test and no
 benchmark.  It takes about two minutes on one core:
@@ -19,8 +19,8 @@ from client_sdk.frontend import Frame, FrontEndOptions, extract
 from client_sdk.simulator import SIMULATED_CAMERA, true_trajectory
 from client_sdk.simulator.camera import Painter, add_depth_noise, add_image_noise
 from client_sdk.simulator.world import make_world
-from rse_pf.live_map.place_index import PARTS, PLACE_WORDS_FILE, WORDS
-from rse_pf.services.mapping.descriptors import Descriptors, train_words
+from rse_pf.slam.descriptors import Descriptors, train_words
+from rse_pf.slam.places import PARTS, PLACE_WORDS_FILE, WORDS
 
 WORLDS = range(101, 107)
 FRAMES, EACH = 410, 8

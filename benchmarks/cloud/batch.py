@@ -36,8 +36,8 @@ from rse_pf.geometry import Array, exp_se3, inverse
 from rse_pf.maps.format import Edge, Keyframe, MapVersion, decode_map, encode_map
 from rse_pf.object_store import DirectoryStore, digest_of
 from rse_pf.one_thread import ONE_THREAD
-from rse_pf.services.mapping.cloud_deform import deform_cloud
-from rse_pf.services.mapping.links import Atlas, MergeOptions, measure_pairs
+from rse_pf.slam.cloud_deform import deform_cloud
+from rse_pf.slam.links import Atlas, MergeOptions, measure_pairs
 
 __all__ = ["kitchen", "main", "noisy_copy"]
 

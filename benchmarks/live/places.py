@@ -35,11 +35,11 @@ from client_sdk.simulator.world import make_world
 from rse_pf.geometry import Array, Camera, inverse, pose_difference, rotation_angle_deg, transform
 from rse_pf.live_map.keyframe_code import KeyframeFeatures, decode_features, encode_features
 from rse_pf.live_map.measure import measure_links
-from rse_pf.live_map.place_index import PLACE_NUMBERS, LivePlaceIndex, place_vector
 from rse_pf.live_map.relocalise import Relocalised, relocalise, spread_candidates
 from rse_pf.maps.format import Keyframe, MapVersion
-from rse_pf.services.mapping.descriptors import train_words, view_vector
-from rse_pf.services.mapping.map_merge import merge_versions
+from rse_pf.slam.descriptors import train_words, view_vector
+from rse_pf.slam.map_merge import merge_versions
+from rse_pf.slam.places import PLACE_NUMBERS, LivePlaceIndex, place_vector
 
 __all__ = ["main"]
 

@@ -30,8 +30,8 @@ from rse_pf.geometry import Array, inverse, pose_difference
 from rse_pf.pnp import PnpOptions, PnpSolution, refine_with_depth, solve_pnp
 from rse_pf.pnp.depth_refinement import refine_by_numpy
 from rse_pf.pnp.problems import make_two_views
-from rse_pf.services.mapping.map_merge import merge_versions
 from rse_pf.services.pnp import make_request
+from rse_pf.slam.map_merge import merge_versions
 from rse_pf.wire import CODECS, Command, make_codec
 
 __all__ = ["main"]

@@ -36,10 +36,12 @@ from benchmarks.maps.recordings import (
 from client_sdk.datasets import Dataset, open_dataset
 from rse_pf.geometry import Array, exp_se3, inverse, pose_difference
 from rse_pf.service import Report
-from rse_pf.services.mapping.icp import align
 from rse_pf.services.mapping.localise import locate
-from rse_pf.services.mapping.loop_consistency import LoopClosure
-from rse_pf.services.mapping.map_merge import (
+from rse_pf.services.mapping.wifi import Locator, fingerprint_of
+from rse_pf.services.synthetic_maps import make_building, make_room, make_sphere
+from rse_pf.slam.consistency import LoopClosure
+from rse_pf.slam.icp import align
+from rse_pf.slam.map_merge import (
     Atlas,
     LoopProposals,
     MergedMap,
@@ -47,11 +49,9 @@ from rse_pf.services.mapping.map_merge import (
     merge_versions,
     propose_links,
 )
-from rse_pf.services.mapping.optimise import optimise_graph
-from rse_pf.services.mapping.place import PlaceIndex
-from rse_pf.services.mapping.relative_pose import View
-from rse_pf.services.mapping.wifi import Locator, fingerprint_of
-from rse_pf.services.synthetic_maps import make_building, make_room, make_sphere
+from rse_pf.slam.optimise import optimise_graph
+from rse_pf.slam.relative_pose import View
+from rse_pf.slam.trained_places import PlaceIndex
 
 THREE_ROBOTS = ((0, 84), (84, 168), (168, 250))
 LOCALISE_INLIERS = 30

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 from client_sdk.answers import decode_reply
 from client_sdk.transfer.data_client import DataClient
-from rse_pf.services.mapping.map_merge import MergeOptions
 from rse_pf.services.mapping.merge import MergeReply
+from rse_pf.slam.map_merge import MergeOptions
 
 if TYPE_CHECKING:
     from client_sdk.robot import OnProgress, Robot

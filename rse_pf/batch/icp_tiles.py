@@ -15,11 +15,11 @@ import numpy.typing as npt
 
 from rse_pf.errors import BadRequest
 from rse_pf.geometry import Array, inverse, transform
-from rse_pf.services.mapping.cloud_deform import observers_of
-from rse_pf.services.mapping.icp import IcpOptions, align
-from rse_pf.services.mapping.links import Atlas
-from rse_pf.services.mapping.loop_consistency import LoopClosure
-from rse_pf.services.mapping.relative_pose import RelativePoseOptions
+from rse_pf.slam.cloud_deform import observers_of
+from rse_pf.slam.consistency import LoopClosure
+from rse_pf.slam.icp import IcpOptions, align
+from rse_pf.slam.links import Atlas
+from rse_pf.slam.relative_pose import RelativePoseOptions
 
 __all__ = ["TILE_M", "align_tiles"]
 

@@ -23,19 +23,19 @@ from rse_pf.geometry import Array, inverse
 from rse_pf.maps.format import MapLimits, MapVersion, decode_map
 from rse_pf.object_store import ObjectStore
 from rse_pf.service import Report
-from rse_pf.services.mapping.cloud_deform import Colours, Points, joined_cloud
-from rse_pf.services.mapping.links import Atlas, LoopProposals, MergeOptions, Refused, maps_of
-from rse_pf.services.mapping.loop_consistency import LoopClosure
-from rse_pf.services.mapping.map_merge import MergedMap, MergeSteps, merge_versions
-from rse_pf.services.mapping.optimise import (
+from rse_pf.services.mapping.place import map_limits
+from rse_pf.slam.cloud_deform import Colours, Points, joined_cloud
+from rse_pf.slam.consistency import LoopClosure
+from rse_pf.slam.links import Atlas, LoopProposals, MergeOptions, Refused, maps_of
+from rse_pf.slam.map_merge import MergedMap, MergeSteps, merge_versions
+from rse_pf.slam.optimise import (
     OptimisedGraph,
     OptimiseOptions,
     ignore_progress,
     optimise_graph,
     robust_cost,
 )
-from rse_pf.services.mapping.place import map_limits
-from rse_pf.services.mapping.pose_graph import PoseGraph, components
+from rse_pf.slam.pose_graph import PoseGraph, components
 
 __all__ = ["BatchMerge", "BatchMergeResult", "strongest"]
 

@@ -19,9 +19,11 @@ from rse_pf.batch.parts import Part, PartResult, encode_result, is_done, read_re
 from rse_pf.errors import BadRequest
 from rse_pf.maps.format import MapVersion, decode_map
 from rse_pf.object_store import ObjectStore
-from rse_pf.services.mapping.cloud_deform import deform_cloud
-from rse_pf.services.mapping.descriptors import train_words
-from rse_pf.services.mapping.links import (
+from rse_pf.services.mapping.place import map_limits
+from rse_pf.slam.cloud_deform import deform_cloud
+from rse_pf.slam.consistency import LoopClosure
+from rse_pf.slam.descriptors import train_words
+from rse_pf.slam.links import (
     Atlas,
     MergeOptions,
     Refused,
@@ -29,10 +31,9 @@ from rse_pf.services.mapping.links import (
     candidate_pairs,
     measure_pairs,
 )
-from rse_pf.services.mapping.loop_consistency import LoopClosure
-from rse_pf.services.mapping.optimise import OptimiseOptions, optimise_graph
-from rse_pf.services.mapping.place import SEED, WORDS, VectorIndex, map_limits, view_vectors
-from rse_pf.services.mapping.pose_graph import PoseGraph
+from rse_pf.slam.optimise import OptimiseOptions, optimise_graph
+from rse_pf.slam.pose_graph import PoseGraph
+from rse_pf.slam.trained_places import SEED, WORDS, VectorIndex, view_vectors
 
 __all__ = [
     "InProcessEngine",

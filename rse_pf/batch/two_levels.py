@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rse_pf.geometry import Array
-from rse_pf.services.mapping.pose_graph import PoseGraph, components, inverses
+from rse_pf.slam.pose_graph import PoseGraph, components, inverses
 
 __all__ = ["graph_between", "graphs_within", "poses_of_levels", "stacked"]
 

@@ -103,8 +103,8 @@ def _merge(args: argparse.Namespace, settings: PlatformSettings) -> int:
     from rse_pf.batch.cluster import DaskEngine, LocalCluster, new_cluster_key
     from rse_pf.batch.invitation import Invitation
     from rse_pf.batch.merge import BatchMerge
-    from rse_pf.services.mapping.links import MergeOptions
     from rse_pf.services.mapping.merge import reply_of
+    from rse_pf.slam.links import MergeOptions
 
     is_alone = _is_loopback(args.host)
     if is_alone and settings.batch.workers == 0:

@@ -16,9 +16,9 @@ import numpy.typing as npt
 from rse_pf.geometry import Array, inverse
 from rse_pf.live_map.graph import Graph, LiveLink
 from rse_pf.live_map.options import LiveMapOptions
-from rse_pf.live_map.smoother import log_se3_many
-from rse_pf.services.mapping.loop_consistency import largest_clique
-from rse_pf.services.mapping.pose_graph import inverses
+from rse_pf.slam.consistency import largest_clique
+from rse_pf.slam.pose_graph import inverses
+from rse_pf.slam.smoother import log_se3_many
 
 __all__ = ["agreeing_between", "agreeing_by_odometry", "has_enough_ends", "judge_within"]
 
@@ -32,7 +32,7 @@ def agreeing_between(
 ) -> list[int]:
     """Return the numbers of the largest set of open links between two components that agree pairwise.
 
-    Two links agree if the round trip over both is the identity, as in `loop_consistency.consistent`; the
+    Two links agree if the round trip over both is the identity, as in `consistency.consistent`; the
     poses within a component are those of the graph.  Links whose agreement is known are not compared again.
 
     Source:

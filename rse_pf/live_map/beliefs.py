@@ -18,7 +18,7 @@ from rse_pf.live_map.agreement import (
 from rse_pf.live_map.graph import Graph, Segment
 from rse_pf.live_map.options import LiveMapOptions
 from rse_pf.live_map.outcomes import Ambiguous, LinkBelieved, LinkRemoved, Outcome
-from rse_pf.live_map.smoother import SmoothedWindows, smooth_around
+from rse_pf.live_map.smoothing import SmoothedWindows, smooth_around
 
 __all__ = ["Changes", "disbelieve_contradicting", "judge_again", "judge_links", "smooth_changes"]
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from rse_pf.errors import BadRequest, message_of
 from rse_pf.live_map.graph import Graph
-from rse_pf.live_map.place_index import PLACE_NUMBERS, LivePlaceIndex
+from rse_pf.slam.places import PLACE_NUMBERS, LivePlaceIndex
 
 __all__ = ["FeatureParts", "SnapshotParts"]
 

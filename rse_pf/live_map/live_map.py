@@ -51,13 +51,13 @@ from rse_pf.live_map.outcomes import (
     Outcome,
     Unaligned,
 )
-from rse_pf.live_map.place_index import LivePlaceIndex
 from rse_pf.live_map.relocalise import Relocalised, RelocaliseOptions, relocalise, spread_candidates
-from rse_pf.live_map.smoother import SmoothedWindows, odometry_step, smooth_all
+from rse_pf.live_map.smoothing import SmoothedWindows, odometry_step, smooth_all
 from rse_pf.live_map.versions import version_of, whole_graph
 from rse_pf.maps.format import MapVersion
-from rse_pf.services.mapping.optimise import OptimiseOptions, optimise_graph
-from rse_pf.services.mapping.pose_graph import PoseGraph, inverses
+from rse_pf.slam.optimise import OptimiseOptions, optimise_graph
+from rse_pf.slam.places import LivePlaceIndex
+from rse_pf.slam.pose_graph import PoseGraph, inverses
 
 __all__ = ["LiveMap"]
 

@@ -20,7 +20,7 @@ from rse_pf.live_map.events import LinksMeasured, MeasuredLink, matrix_bytes
 from rse_pf.live_map.keyframe_code import KeyframeFeatures, decode_features
 from rse_pf.native_matcher import match_core
 from rse_pf.pnp import PnpOptions, PnpSolution, refine_with_depth, solve_pnp
-from rse_pf.services.mapping.descriptors import hamming_matches
+from rse_pf.slam.descriptors import hamming_matches
 
 __all__ = [
     "MeasureOptions",

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 from rse_pf.errors import ConfigurationError
 from rse_pf.live_map.measure import MeasureOptions
-from rse_pf.services.mapping.loop_consistency import OdometryNoise
+from rse_pf.slam.consistency import OdometryNoise
 
 __all__ = ["LiveMapOptions"]
 

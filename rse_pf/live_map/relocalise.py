@@ -16,7 +16,7 @@ import numpy as np
 from rse_pf.geometry import Array, Camera, exp_se3, inverse, pose_difference, skew
 from rse_pf.live_map.keyframe_code import KeyframeFeatures
 from rse_pf.live_map.measure import MeasuredPose, MeasureOptions, measure_pose
-from rse_pf.services.mapping.pose_graph import log_se3
+from rse_pf.slam.pose_graph import log_se3
 
 __all__ = ["RelocaliseOptions", "Relocalised", "relocalise", "spread_candidates"]
 

@@ -15,9 +15,9 @@ from rse_pf.live_map.events import CameraNumbers, MapStarted, StartKeyframe, Sta
 from rse_pf.live_map.graph import Graph, Segment
 from rse_pf.live_map.keyframe_code import decode_features, encode_features
 from rse_pf.live_map.options import LiveMapOptions
-from rse_pf.live_map.smoother import edges_of
+from rse_pf.live_map.smoothing import edges_of
 from rse_pf.maps.format import Edge, EdgeKind, Keyframe, MapVersion
-from rse_pf.services.mapping.pose_graph import PoseGraph, is_positive_definite
+from rse_pf.slam.pose_graph import PoseGraph, is_positive_definite
 
 __all__ = ["errors_of_maps", "started_from", "version_of", "whole_graph"]
 

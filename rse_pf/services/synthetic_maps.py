@@ -14,8 +14,8 @@ import numpy.typing as npt
 
 from rse_pf.geometry import Array, Camera, exp_se3, inverse, transform
 from rse_pf.maps.format import Keyframe, MapVersion
-from rse_pf.services.mapping.pose_graph import PoseGraph
 from rse_pf.services.mapping.wifi import AccessPointReading
+from rse_pf.slam.pose_graph import PoseGraph
 
 __all__ = ["Building", "SyntheticWorld", "make_building", "make_room", "make_sphere", "make_world"]
 

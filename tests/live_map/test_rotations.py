@@ -18,8 +18,8 @@ from rse_pf.live_map.events import KeyframeAdded, LinksMeasured, matrix_bytes, m
 from rse_pf.live_map.live_map import LiveMap
 from rse_pf.live_map.versions import started_from
 from rse_pf.maps.format import decode_map, encode_map
-from rse_pf.services.mapping.optimise import OptimiseOptions
-from rse_pf.services.mapping.pose_graph import PoseGraph
+from rse_pf.slam.optimise import OptimiseOptions
+from rse_pf.slam.pose_graph import PoseGraph
 from rse_pf.wire.live_map import KeyframeRequest
 
 ROBOT = RobotId("default", "raw")

@@ -10,9 +10,10 @@ from rse_pf.geometry import Array, exp_se3
 from rse_pf.live_map.graph import LiveLink, variances_of
 from rse_pf.live_map.live_map import LiveMap
 from rse_pf.live_map.options import LiveMapOptions
-from rse_pf.live_map.smoother import SmoothedPoses, exp_se3_many, log_se3_many, smooth, smooth_around
-from rse_pf.services.mapping.optimise import OptimiseOptions, optimise_graph
-from rse_pf.services.mapping.pose_graph import PoseGraph, inverses, log_se3
+from rse_pf.live_map.smoothing import smooth_around
+from rse_pf.slam.optimise import OptimiseOptions, optimise_graph
+from rse_pf.slam.pose_graph import PoseGraph, inverses, log_se3
+from rse_pf.slam.smoother import SmoothedPoses, exp_se3_many, log_se3_many, smooth
 
 FREE = 12
 

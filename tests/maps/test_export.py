@@ -9,7 +9,7 @@ from maps.sample_maps import make_map
 from rse_pf.errors import UsageError
 from rse_pf.geometry import transform
 from rse_pf.maps.export import export_map
-from rse_pf.services.mapping.pose_graph import read_g2o
+from rse_pf.slam.pose_graph import read_g2o
 
 
 def test_the_g2o_file_holds_the_pose_graph_of_the_map() -> None:

@@ -52,7 +52,7 @@ from rse_pf.terminal import at_work, counted, show, show_json
 
 if TYPE_CHECKING:
     from rse_pf.services.mapping.localise import LocaliseReply
-    from rse_pf.services.mapping.relative_pose import View
+    from rse_pf.slam.relative_pose import View
 
 __all__ = ["add_arguments", "run"]
 
@@ -435,7 +435,7 @@ def _frames(word: str, every: int) -> Iterator[_NamedFrame]:
 def _view_of(named: _NamedFrame, version: MapVersion, camera: str | None) -> View:
     from client_sdk.datasets import open_dataset, read_colour
     from client_sdk.frontend import Frame, FrontEndOptions, extract
-    from rse_pf.services.mapping.relative_pose import View
+    from rse_pf.slam.relative_pose import View
 
     if named.row is not None:
         recording = open_dataset(named.path)

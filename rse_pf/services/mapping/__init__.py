@@ -1,4 +1,4 @@
 """The mapping services: alignment, place recognition, localisation, map merge and pose graphs.
 
-Pure functions over maps and clouds belong here; storage belongs to `rse_pf.maps`.
+Requests, replies and their limits belong here; algorithms belong to `rse_pf.slam`, storage to `rse_pf.maps`.
 """

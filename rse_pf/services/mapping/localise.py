@@ -16,9 +16,10 @@ from rse_pf.geometry import Array as Matrix
 from rse_pf.geometry import Camera, inverse, pose_difference, transform
 from rse_pf.pnp import PnpOptions, PnpSolution, solve_pnp
 from rse_pf.service import Registry
-from rse_pf.services.mapping.descriptors import load_faiss
-from rse_pf.services.mapping.place import PlaceIndex, Within, check_comparisons, open_map, view_of
-from rse_pf.services.mapping.relative_pose import RelativePoseOptions, View, matched_points
+from rse_pf.services.mapping.place import check_comparisons, open_map, view_of
+from rse_pf.slam.descriptors import load_faiss
+from rse_pf.slam.relative_pose import RelativePoseOptions, View, matched_points
+from rse_pf.slam.trained_places import PlaceIndex, Within
 from rse_pf.wire.arrays import Array
 
 __all__ = ["LocaliseOptions", "LocaliseReply", "LocaliseRequest", "locate", "register"]

@@ -11,9 +11,9 @@ from rse_pf.config import DataSettings
 from rse_pf.errors import BadRequest, LimitExceeded
 from rse_pf.maps.format import MapVersion, decode_map, encode_map
 from rse_pf.service import Registry, Report
-from rse_pf.services.mapping.map_merge import MergedMap, MergeOptions, merge_versions
-from rse_pf.services.mapping.optimise import ignore_progress
 from rse_pf.services.mapping.place import MAX_KEYFRAMES, map_limits
+from rse_pf.slam.map_merge import MergedMap, MergeOptions, merge_versions
+from rse_pf.slam.optimise import ignore_progress
 
 __all__ = [
     "MAX_MAPS",

@@ -17,11 +17,11 @@ from rse_pf.errors import LimitExceeded
 from rse_pf.maps.format import decode_map, encode_map
 from rse_pf.service import dispatch
 from rse_pf.services.builtin import builtin_services
-from rse_pf.services.mapping import loop_consistency
 from rse_pf.services.mapping import place as place_service
-from rse_pf.services.mapping.loop_consistency import largest_clique
-from rse_pf.services.mapping.map_merge import merge_versions
 from rse_pf.services.synthetic_maps import make_room, make_world
+from rse_pf.slam import consistency
+from rse_pf.slam.consistency import largest_clique
+from rse_pf.slam.map_merge import merge_versions
 from rse_pf.wire import Command, Failure, Result, make_codec
 
 pytest.importorskip("faiss", reason="needs the extra 'maps'")
@@ -197,7 +197,7 @@ def test_the_largest_clique_does_not_depend_on_how_rows_are_coloured(
     agree = upper | upper.T
 
     one_by_one = largest_clique(agree)
-    monkeypatch.setattr(loop_consistency, "_MANY_ROWS", 1)
+    monkeypatch.setattr(consistency, "_MANY_ROWS", 1)
 
     np.testing.assert_array_equal(largest_clique(agree), one_by_one)
 

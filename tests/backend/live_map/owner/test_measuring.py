@@ -17,8 +17,8 @@ from rse_pf.backend.live_map.owner.work.whole_fit import fit_apart, fit_here
 from rse_pf.backend.log import JsonLog
 from rse_pf.geometry import Array, exp_se3, inverse
 from rse_pf.live_map.events import Event, LinksMeasured
-from rse_pf.services.mapping.optimise import OptimiseOptions
-from rse_pf.services.mapping.pose_graph import PoseGraph
+from rse_pf.slam.optimise import OptimiseOptions
+from rse_pf.slam.pose_graph import PoseGraph
 from tests.backend.live_map.fake_map import FakeMap
 from tests.backend.live_map.owner_bench import settle
 

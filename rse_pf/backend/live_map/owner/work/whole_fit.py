@@ -16,8 +16,8 @@ import numpy as np
 
 from rse_pf.geometry import Array
 from rse_pf.linux import die_with_parent
-from rse_pf.services.mapping.optimise import OptimiseOptions, optimise_graph
-from rse_pf.services.mapping.pose_graph import PoseGraph
+from rse_pf.slam.optimise import OptimiseOptions, optimise_graph
+from rse_pf.slam.pose_graph import PoseGraph
 
 __all__ = ["WholeFit", "fit_apart", "fit_here", "main"]
 

@@ -12,11 +12,12 @@ from rse_pf.geometry import Array, pose_difference
 from rse_pf.maps.format import Keyframe, MapVersion, encode_map
 from rse_pf.service import dispatch
 from rse_pf.services.builtin import builtin_services
-from rse_pf.services.mapping.descriptors import hamming_matches
 from rse_pf.services.mapping.localise import LocaliseOptions, LocaliseReply, LocaliseRequest, locate
-from rse_pf.services.mapping.place import PlaceIndex, PlaceReply, PlaceRequest, Within
-from rse_pf.services.mapping.relative_pose import View
+from rse_pf.services.mapping.place import PlaceReply, PlaceRequest
 from rse_pf.services.synthetic_maps import make_world
+from rse_pf.slam.descriptors import hamming_matches
+from rse_pf.slam.relative_pose import View
+from rse_pf.slam.trained_places import PlaceIndex, Within
 from rse_pf.wire import Command, Failure, Result
 
 pytest.importorskip("faiss", reason="the extra maps is not installed")

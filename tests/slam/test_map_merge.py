@@ -12,8 +12,10 @@ from rse_pf.errors import Cancelled, MissingExtra
 from rse_pf.geometry import Array, exp_se3, inverse, pose_difference
 from rse_pf.maps.format import MapVersion, decode_map, encode_map
 from rse_pf.service import Report
-from rse_pf.services.mapping.loop_consistency import LoopClosure, OdometryNoise, consistent, largest_clique
-from rse_pf.services.mapping.map_merge import (
+from rse_pf.services.mapping.merge import MergeRequest, merge_maps
+from rse_pf.services.synthetic_maps import make_world
+from rse_pf.slam.consistency import LoopClosure, OdometryNoise, consistent, largest_clique
+from rse_pf.slam.map_merge import (
     Atlas,
     LoopProposals,
     MergedMap,
@@ -21,9 +23,7 @@ from rse_pf.services.mapping.map_merge import (
     merge_versions,
     propose_links,
 )
-from rse_pf.services.mapping.merge import MergeRequest, merge_maps
-from rse_pf.services.mapping.optimise import ignore_progress
-from rse_pf.services.synthetic_maps import make_world
+from rse_pf.slam.optimise import ignore_progress
 
 for package in ("faiss", "gtsam"):
     pytest.importorskip(package, reason="the extra maps is not installed")

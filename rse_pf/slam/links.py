@@ -19,10 +19,10 @@ from rse_pf.errors import BadRequest, LimitExceeded
 from rse_pf.geometry import Array, inverse
 from rse_pf.maps.format import Keyframe, MapVersion
 from rse_pf.service import Report
-from rse_pf.services.mapping.loop_consistency import LoopClosure, OdometryNoise, consistent
-from rse_pf.services.mapping.optimise import ignore_progress
-from rse_pf.services.mapping.place import PlaceIndex, VectorIndex
-from rse_pf.services.mapping.relative_pose import RelativePoseOptions, measure_relative_pose
+from rse_pf.slam.consistency import LoopClosure, OdometryNoise, consistent
+from rse_pf.slam.optimise import ignore_progress
+from rse_pf.slam.relative_pose import RelativePoseOptions, measure_relative_pose
+from rse_pf.slam.trained_places import PlaceIndex, VectorIndex
 
 __all__ = [
     "Atlas",

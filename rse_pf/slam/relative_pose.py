@@ -12,7 +12,7 @@ from rse_pf.errors import PnpError
 from rse_pf.geometry import Array, Camera, inverse
 from rse_pf.maps.format import Keyframe
 from rse_pf.pnp import PnpOptions, PnpSolution, refine_with_depth, solve_pnp
-from rse_pf.services.mapping.descriptors import Descriptors, hamming_matches
+from rse_pf.slam.descriptors import Descriptors, hamming_matches
 
 Rows = npt.NDArray[np.int64]
 

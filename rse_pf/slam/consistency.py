@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rse_pf.geometry import Array
-from rse_pf.services.mapping.pose_graph import inverses, log_se3
+from rse_pf.slam.pose_graph import inverses, log_se3
 
 __all__ = ["LoopClosure", "OdometryNoise", "consistent", "largest_clique"]
 

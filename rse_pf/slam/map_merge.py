@@ -20,8 +20,9 @@ from rse_pf.errors import BadRequest, LimitExceeded
 from rse_pf.geometry import Array, inverse
 from rse_pf.maps.format import Edge, MapVersion
 from rse_pf.service import Report
-from rse_pf.services.mapping.cloud_deform import Colours, Points, deform_clouds
-from rse_pf.services.mapping.links import (
+from rse_pf.slam.cloud_deform import Colours, Points, deform_clouds
+from rse_pf.slam.consistency import LoopClosure, OdometryNoise
+from rse_pf.slam.links import (
     Atlas,
     LoopProposals,
     MergeOptions,
@@ -30,14 +31,13 @@ from rse_pf.services.mapping.links import (
     maps_of,
     propose_links,
 )
-from rse_pf.services.mapping.loop_consistency import LoopClosure, OdometryNoise
-from rse_pf.services.mapping.optimise import (
+from rse_pf.slam.optimise import (
     OptimisedGraph,
     OptimiseOptions,
     ignore_progress,
     optimise_graph,
 )
-from rse_pf.services.mapping.pose_graph import PoseGraph, is_positive_definite
+from rse_pf.slam.pose_graph import PoseGraph, is_positive_definite
 
 __all__ = [
     "Atlas",

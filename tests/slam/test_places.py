@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from rse_pf.errors import BadRequest
-from rse_pf.live_map.place_index import PLACE_NUMBERS, PLACE_WORDS_FILE, LivePlaceIndex, place_vector
 from rse_pf.services.synthetic_maps import make_world
+from rse_pf.slam.places import PLACE_NUMBERS, PLACE_WORDS_FILE, LivePlaceIndex, place_vector
 
 
 def unit_vectors(n: int, seed: int = 1):

@@ -15,7 +15,7 @@ from benchmarks.maps.services import (
     planted,
     robots_of,
 )
-from rse_pf.services.mapping.map_merge import MergeOptions, merge_versions
+from rse_pf.slam.map_merge import MergeOptions, merge_versions
 
 pytestmark = [pytest.mark.data, pytest.mark.slow]
 

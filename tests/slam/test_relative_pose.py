@@ -9,7 +9,7 @@ from rse_pf.geometry import Array, exp_se3, inverse, pose_difference, transform
 from rse_pf.maps.format import Keyframe
 from rse_pf.pnp import DepthNoise
 from rse_pf.pnp.problems import KINECT
-from rse_pf.services.mapping.relative_pose import RelativePose, RelativePoseOptions, measure_relative_pose
+from rse_pf.slam.relative_pose import RelativePose, RelativePoseOptions, measure_relative_pose
 
 pytest.importorskip("poselib")
 pytest.importorskip("faiss", reason="the extra maps is not installed")

@@ -1,0 +1,212 @@
+"""Smooth a live map around what changed: windows of keyframes that grow while their border moves."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from rse_pf.geometry import Array, rotation_angle_deg
+from rse_pf.live_map.graph import Graph
+from rse_pf.live_map.options import LiveMapOptions
+from rse_pf.slam.consistency import OdometryNoise
+from rse_pf.slam.pose_graph import inverses
+from rse_pf.slam.smoother import SmoothedPoses, adjoints, smooth
+
+__all__ = [
+    "Edges",
+    "SmoothedWindows",
+    "edges_of",
+    "odometry_step",
+    "smooth_all",
+    "smooth_around",
+]
+
+Rows = npt.NDArray[np.int64]
+
+_LEAST_STEP = 0.05
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Edges:
+    """Edges between keyframes ``a`` and ``b`` (ids); ``numbers`` are those of links, -1 for odometry."""
+
+    a: Rows
+    b: Rows
+    T_a_b: Array
+    information: Array
+    numbers: Rows
+
+
+@dataclass(slots=True, kw_only=True, eq=False)
+class SmoothedWindows:
+    """What `smooth_around` did.
+
+    ``strained`` says that even the largest window was too small; ``misfit`` is the mean squared misfit of the
+    links; ``squares`` that of each believed link that was smoothed; ``keyframes`` counts those of all windows
+    that were tried.
+    """
+
+    strained: bool = False
+    misfit: float = 0.0
+    squares: dict[int, float] = field(default_factory=dict)
+    keyframes: int = 0
+    _covariances: dict[int, Array] = field(default_factory=dict)
+
+    def covariance(self, graph: Graph, keyframe: int) -> Array | None:
+        """Return the ``(6, 6)`` covariance of the newest pose of a segment, if it moved, given those held.
+
+        It is of the twist (metres, radians) on the left of the pose, in the frame of the map.
+        """
+        right = self._covariances.get(keyframe)
+        if right is None:
+            return None
+        adjoint = adjoints(graph.T[keyframe][None])[0]
+        left: Array = adjoint @ (0.5 * (right + right.T)) @ adjoint.T
+        return left
+
+
+def smooth_around(
+    graph: Graph, moved: Sequence[int], anchors: Iterable[int], options: LiveMapOptions
+) -> SmoothedWindows:
+    """Smooth *graph* around the keyframes *moved*, one component after the other; the graph changes.
+
+    The window grows while its border moves.  *anchors* are keyframes that define the frame of a component.
+    """
+    done = SmoothedWindows()
+    held = set(anchors)
+    groups: dict[int, list[int]] = {}
+    for i in moved:
+        if graph.of_segment[i] >= 0:
+            groups.setdefault(graph.component_of(i), []).append(i)
+    total = 0.0
+    newest = [
+        graph.segments[row].keyframes[-1] for row in graph.newest.values() if graph.segments[row].keyframes
+    ]
+    for _, seeds in sorted(groups.items()):
+        for size in options.windows:
+            ids, is_whole = _window(graph, seeds, size, held)
+            if not ids:
+                break
+            edges = edges_of(graph, ids, options)
+            if not len(edges.a):
+                break
+            inside = set(ids)
+            told = [i for i in newest if i in inside]
+            done.keyframes += len(ids)
+            found, border, rows = _fit(graph, ids, told, edges, options)
+            is_strained = not is_whole and _is_moved(graph, border, found, rows, options)
+            if not is_strained or size == options.windows[-1]:
+                done.strained |= is_strained
+                graph.T[ids] = found.T[: len(ids)]
+                squares = {
+                    int(number): float(square)
+                    for number, square in zip(edges.numbers, found.squares, strict=True) if number >= 0
+                }  # fmt: skip
+                done.squares |= squares
+                total += sum(squares.values())
+                done._covariances |= dict(zip(told, found.covariances, strict=True))
+                break
+    done.misfit = total / max(1, len(done.squares))
+    return done
+
+
+def smooth_all(graph: Graph, options: LiveMapOptions) -> None:
+    """Smooth each segment of *graph* once, by the largest window; the graph changes."""
+    largest, anchors = max(options.windows), graph.anchors()
+    options = replace(options, windows=(largest,))
+    for segment in graph.segments:
+        for begin in range(0, len(segment.keyframes), largest):
+            smooth_around(graph, segment.keyframes[begin : begin + largest], anchors, options)
+
+
+def edges_of(graph: Graph, ids: Iterable[int], options: LiveMapOptions) -> Edges:
+    """Return odometry and believed links that touch one of the keyframes *ids*."""
+    links: set[int] = set()
+    steps: set[tuple[int, int]] = set()
+    for i in ids:
+        links.update(graph.links_at(i))
+        steps.update(graph.steps_at(i))
+    numbers = sorted(links)
+    pairs = np.array(sorted(steps), dtype=np.int64).reshape(-1, 2)
+    a, b = pairs[:, 0], pairs[:, 1]
+    walked = graph.way[b] - graph.way[a]
+    drift: OdometryNoise = options.drift
+    spread = np.array([drift.step_m] * 3 + [math.radians(drift.step_deg)] * 3) ** -2.0
+    chain = np.zeros((len(a), 6, 6))
+    chain[:, range(6), range(6)] = spread / walked[:, None]
+    measured = [graph.links[number] for number in numbers]
+    if not measured:
+        T_a_b, information = np.empty((0, 4, 4)), np.empty((0, 6, 6))
+    else:
+        T_a_b = np.array([link.T_a_b for link in measured])
+        information = np.array([link.information for link in measured])
+    return Edges(
+        a=np.concatenate([a, np.array([link.a for link in measured], dtype=np.int64)]),
+        b=np.concatenate([b, np.array([link.b for link in measured], dtype=np.int64)]),
+        T_a_b=np.concatenate([inverses(graph.T_odom[a]) @ graph.T_odom[b], T_a_b]),
+        information=np.concatenate([chain, information]),
+        numbers=np.concatenate([np.full(len(a), -1), np.array(numbers, dtype=np.int64)]),
+    )
+
+
+def odometry_step(T_from_to: Array, options: LiveMapOptions) -> float:
+    """Return how many steps of the odometry's noise a motion is."""
+    moved = float(np.sqrt((T_from_to[:3, 3] ** 2).sum())) / options.spacing_m
+    turned = rotation_angle_deg(T_from_to[:3, :3]) / options.spacing_deg
+    return max(moved, turned, _LEAST_STEP)
+
+
+def _window(graph: Graph, seeds: Sequence[int], size: int, held: set[int]) -> tuple[list[int], bool]:
+    """Return up to *size* keyframes around *seeds*, nearest first, and whether they are the whole component.
+
+    Where there are more seeds, the newest are taken.
+    """
+    front = [i for i in seeds if i not in held][-size:]
+    seen = set(front)
+    ids = list(front)
+    while front:
+        following: list[int] = []
+        for i in front:
+            for other, _ in graph.neighbours(i):
+                if other not in seen and other not in held:
+                    if len(ids) == size:
+                        return ids, False
+                    seen.add(other)
+                    ids.append(other)
+                    following.append(other)
+        front = following
+    return ids, len(front) == 0 and len(seeds) <= size
+
+
+def _fit(
+    graph: Graph, ids: list[int], told: list[int], edges: Edges, options: LiveMapOptions
+) -> tuple[SmoothedPoses, Rows, dict[int, int]]:
+    """Return the smoothed poses, the keyframes of the window that touch its border, and rows by id."""
+    row_of = np.full(len(graph), -1, dtype=np.int64)
+    row_of[ids] = np.arange(len(ids))
+    a_inside, b_inside = row_of[edges.a] >= 0, row_of[edges.b] >= 0
+    border = np.concatenate([edges.a[a_inside & ~b_inside], edges.b[b_inside & ~a_inside]])
+    beyond = np.unique(np.concatenate([edges.b[a_inside & ~b_inside], edges.a[b_inside & ~a_inside]]))
+    row_of[beyond] = len(ids) + np.arange(len(beyond))
+    found = smooth(
+        graph.T[np.concatenate([ids, beyond])], len(ids), row_of[edges.a], row_of[edges.b], edges.T_a_b,
+        edges.information, edges.numbers >= 0, cauchy=options.cauchy, wanted=row_of[told],
+    )  # fmt: skip
+    return found, np.unique(border), {i: row for row, i in enumerate(ids)}
+
+
+def _is_moved(
+    graph: Graph, border: Rows, found: SmoothedPoses, rows: dict[int, int], options: LiveMapOptions
+) -> bool:
+    """Return whether a keyframe at the border of the window moved by more than it may."""
+    if not len(border):
+        return False
+    old, new = graph.T[border], found.T[[rows[i] for i in border.tolist()]]
+    moved2_m2 = ((new[:, :3, 3] - old[:, :3, 3]) ** 2).sum(axis=1).max()
+    traces = (old[:, :3, :3] * new[:, :3, :3]).sum(axis=(1, 2))
+    least_trace = 1.0 + 2.0 * math.cos(math.radians(options.border_deg))
+    return bool(moved2_m2 > options.border_m**2 or traces.min() < least_trace)
