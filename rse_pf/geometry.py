@@ -19,9 +19,12 @@ from rse_pf.errors import InvalidCamera
 __all__ = [
     "Array",
     "Camera",
+    "adjoint",
     "exp_se3",
     "from_quaternion",
     "inverse",
+    "log_se3",
+    "median_pose",
     "pose_difference",
     "rigid",
     "rigid_many",
@@ -39,6 +42,8 @@ _EXACT = 1e-9
 """A matrix that is off by less is left as it is, so that what was written is read to the byte."""
 _LAST_ROW_TOLERANCE = 1e-5
 _MAX_M = 1e9
+_NEAR_HALF_A_TURN = -0.999
+"""Cosine of 177.4 degrees."""
 
 # No sensor of a robot is wider; a larger value is taken for a mistake in the unit.
 _MAX_IMAGE_PX = 16384
@@ -111,11 +116,12 @@ def transform(T_a_b: Array, points_b: Array) -> Array:
 
 
 def inverse(T_a_b: Array) -> Array:
-    """Return ``T_b_a`` of a rigid ``T_a_b``."""
-    T_b_a = np.eye(4)
-    rotation = T_a_b[:3, :3].T
-    T_b_a[:3, :3] = rotation
-    T_b_a[:3, 3] = -rotation @ T_a_b[:3, 3]
+    """Return ``T_b_a`` of rigid poses ``(..., 4, 4)``."""
+    T_b_a = np.zeros(T_a_b.shape)
+    rotation = np.swapaxes(T_a_b[..., :3, :3], -1, -2)
+    T_b_a[..., :3, :3] = rotation
+    T_b_a[..., :3, 3:] = -(rotation @ T_a_b[..., :3, 3:])
+    T_b_a[..., 3, 3] = 1.0
     return T_b_a
 
 
@@ -171,33 +177,81 @@ def rigid_many(T: Array, max_m: float = _MAX_M) -> Array | None:
 
 
 def skew(v: npt.ArrayLike) -> Array:
-    """Return the ``(3, 3)`` matrix of the cross product with *v*."""
-    x, y, z = np.asarray(v, dtype=np.float64)
-    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    """Return the ``(..., 3, 3)`` matrices of the cross product with *v* ``(..., 3)``."""
+    vectors = np.asarray(v, dtype=np.float64)
+    K = np.zeros((*vectors.shape, 3))
+    K[..., 0, 1], K[..., 0, 2], K[..., 1, 2] = -vectors[..., 2], vectors[..., 1], -vectors[..., 0]
+    K[..., 1, 0], K[..., 2, 0], K[..., 2, 1] = vectors[..., 2], -vectors[..., 1], vectors[..., 0]
+    return K
 
 
 def exp_se3(xi: npt.ArrayLike) -> Array:
-    """Return the pose of the twist ``xi = (rho, phi)``: metres, then radians.
+    """Return the ``(..., 4, 4)`` poses of twists ``xi = (rho, phi)`` ``(..., 6)``: metres, then radians.
 
     Source:
         Barfoot, State Estimation for Robotics (2017), eqs. 7.16 and 7.34.
     """
-    twist = np.asarray(xi, dtype=np.float64)
-    rho, phi = twist[:3], twist[3:]
-    angle = float(np.linalg.norm(phi))
+    twists = np.asarray(xi, dtype=np.float64)
+    rho, phi = twists[..., :3], twists[..., 3:]
+    angle2 = (phi**2).sum(axis=-1)
+    angle = np.sqrt(angle2)
+    small = angle < 1e-6
+    safe = np.where(small, 1.0, angle)
+    a = np.where(small, 1.0 - angle2 / 6.0, np.sin(safe) / safe)
+    # (1 - cos) / angle**2, without its cancellation.
+    b = np.where(small, 0.5 - angle2 / 24.0, 2.0 * (np.sin(0.5 * safe) / safe) ** 2)
+    c = np.where(small, 1.0 / 6.0, (1.0 - a) / safe**2)
+    a, b, c = a[..., None, None], b[..., None, None], c[..., None, None]
     K = skew(phi)
-    if angle < 1e-9:
-        rotation, jacobian = np.eye(3) + K, np.eye(3) + 0.5 * K
-    else:
-        a = math.sin(angle) / angle
-        b = 2.0 * (math.sin(0.5 * angle) / angle) ** 2  # (1 - cos) / angle**2, without its cancellation
-        c = (1.0 - a) / angle**2
-        rotation = np.eye(3) + a * K + b * K @ K
-        jacobian = np.eye(3) + b * K + c * K @ K
-    T = np.eye(4)
-    T[:3, :3] = rotation
-    T[:3, 3] = jacobian @ rho
+    KK = K @ K
+    T = np.zeros((*twists.shape[:-1], 4, 4))
+    T[..., :3, :3] = np.eye(3) + a * K + b * KK
+    T[..., :3, 3] = ((np.eye(3) + b * K + c * KK) @ rho[..., None])[..., 0]
+    T[..., 3, 3] = 1.0
     return T
+
+
+def log_se3(T: Array) -> Array:
+    """Return the ``(n, 6)`` twists ``(rho, phi)`` of ``(n, 4, 4)`` poses; the inverse of `exp_se3`.
+
+    Source:
+        Barfoot, State Estimation for Robotics (2017), eqs. 7.18 and 7.36.
+    """
+    R = T[:, :3, :3]
+    v = 0.5 * np.stack([R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], axis=1)
+    sine = np.sqrt((v * v).sum(axis=1))
+    cosine = 0.5 * (R[:, 0, 0] + R[:, 1, 1] + R[:, 2, 2] - 1.0)
+    angle = np.arctan2(sine, cosine)
+    phi = v * np.where(sine < 1e-5, 1.0, angle / np.maximum(sine, 1e-12))[:, None]
+    # The antisymmetric part vanishes at half a turn; the quaternion does not.
+    for row in np.flatnonzero(cosine < _NEAR_HALF_A_TURN).tolist():
+        q = to_quaternion(R[row])
+        half_sine = float(np.linalg.norm(q[:3]))
+        angle[row] = 2.0 * math.atan2(half_sine, q[3])
+        phi[row] = q[:3] * (angle[row] / half_sine)
+    half = np.where(angle < 1e-4, 1.0, 0.5 * angle)
+    c = np.where(angle < 1e-4, 1.0 / 12.0, (1.0 - half / np.tan(half)) / (4.0 * half**2))
+    K = skew(phi)
+    across = K @ T[:, :3, 3:]
+    rho = T[:, :3, 3:] - 0.5 * across + c[:, None, None] * (K @ across)
+    return np.concatenate([rho[:, :, 0], phi], axis=1)
+
+
+def adjoint(T_a_b: Array) -> Array:
+    """Return the ``(..., 6, 6)`` matrices that take a twist (rho, phi) of frame *b* to frame *a*."""
+    rotation = T_a_b[..., :3, :3]
+    matrices = np.zeros((*T_a_b.shape[:-2], 6, 6))
+    matrices[..., :3, :3] = matrices[..., 3:, 3:] = rotation
+    matrices[..., :3, 3:] = skew(T_a_b[..., :3, 3]) @ rotation
+    return matrices
+
+
+def median_pose(T_a_b: Array) -> Array:
+    """Return the one of ``(n, 4, 4)`` poses that differs least from the others, so that none is averaged."""
+    apart_m = np.sqrt(((T_a_b[:, None, :3, 3] - T_a_b[None, :, :3, 3]) ** 2).sum(axis=2))
+    turned = np.sqrt(((T_a_b[:, None, :3, :3] - T_a_b[None, :, :3, :3]) ** 2).sum(axis=(2, 3)))
+    median: Array = T_a_b[int(np.argmin((apart_m + turned).sum(axis=1)))]
+    return median
 
 
 def rotation_angle_deg(rotation: Array) -> float:

@@ -14,9 +14,12 @@ from hypothesis import strategies as st
 from rse_pf.errors import InvalidCamera
 from rse_pf.geometry import (
     Camera,
+    adjoint,
     exp_se3,
     from_quaternion,
     inverse,
+    log_se3,
+    median_pose,
     pose_difference,
     rotation_angle_deg,
     skew,
@@ -174,3 +177,37 @@ def test_any_numbers_are_a_camera_or_an_invalid_camera(numbers: list[float], wid
         return
     assert np.isfinite(camera.matrix).all()
     assert np.linalg.det(camera.matrix) > 0
+
+
+def test_many_twists_give_the_poses_of_each() -> None:
+    xi = np.random.default_rng(6).normal(size=(40, 6)) * np.repeat([1e-9, 1e-4, 0.3, 0.9], 10)[:, None]
+
+    T = exp_se3(xi)
+
+    np.testing.assert_array_equal(T, [exp_se3(twist) for twist in xi])
+    np.testing.assert_allclose(inverse(T), [inverse(pose) for pose in T], atol=1e-15)
+    np.testing.assert_array_equal(adjoint(T), [adjoint(pose) for pose in T])
+
+
+@pytest.mark.parametrize("largest_rad", [1e-12, 1e-7, 1e-4, 0.3, 2.0, math.pi - 1e-3, math.pi - 1e-7])
+def test_the_logarithm_is_the_inverse_of_the_exponential(largest_rad: float) -> None:
+    rng = np.random.default_rng(0)
+    xi = rng.normal(size=(200, 6))
+    xi[:, 3:] *= largest_rad / np.linalg.norm(xi[:, 3:], axis=1, keepdims=True)
+
+    np.testing.assert_allclose(log_se3(exp_se3(xi)), xi, atol=1e-8)
+
+
+def test_the_adjoint_takes_a_twist_from_one_side_of_a_pose_to_the_other() -> None:
+    T, xi = exp_se3([1.0, 2.0, 3.0, 0.3, -0.2, 0.1]), np.array([0.1, -0.2, 0.3, 0.02, 0.03, -0.01])
+
+    np.testing.assert_allclose(T @ exp_se3(xi), exp_se3(adjoint(T) @ xi) @ T, atol=1e-12)
+
+
+def test_the_median_pose_is_one_that_agrees_with_most() -> None:
+    right = exp_se3(1e-3 * np.random.default_rng(1).normal(size=(5, 6)))
+    wrong = exp_se3([[5.0, 0, 0, 0, 0, 0], [0, 0, 0, 0, 0, 2.0]])
+
+    median = median_pose(np.concatenate([wrong, right]))
+
+    assert any(np.array_equal(median, pose) for pose in right)

@@ -11,8 +11,8 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
-from rse_pf.geometry import Array
-from rse_pf.slam.pose_graph import PoseGraph, components, inverses
+from rse_pf.geometry import Array, adjoint, inverse
+from rse_pf.slam.pose_graph import PoseGraph, components
 
 __all__ = ["graph_between", "graphs_within", "poses_of_levels", "stacked"]
 
@@ -60,14 +60,14 @@ def graph_between(graph: PoseGraph, of_map: Rows, T_world_pose: Array) -> tuple[
     a, b = graph.a[outer], graph.b[outer]
     T_pose_b = T_world_pose[b]
     # log(inverse(M) inverse(A) B) = Ad(T_world_b) log(inverse(T_a_b) ...) with M = T_world_a T_a_b T_b_world.
-    adjoint = _adjoints(inverses(T_pose_b))
-    information = np.swapaxes(adjoint, 1, 2) @ graph.information[outer] @ adjoint
+    to_pose = adjoint(inverse(T_pose_b))
+    information = np.swapaxes(to_pose, 1, 2) @ graph.information[outer] @ to_pose
     count = int(body.max()) + 1
     condensed = PoseGraph(
         T_world_pose=np.tile(np.eye(4), (count, 1, 1)),
         a=body[a],
         b=body[b],
-        T_a_b=T_world_pose[a] @ graph.T_a_b[outer] @ inverses(T_pose_b),
+        T_a_b=T_world_pose[a] @ graph.T_a_b[outer] @ inverse(T_pose_b),
         information=0.5 * (information + np.swapaxes(information, 1, 2)),
         robust=graph.robust[outer],
         ids=np.arange(count),
@@ -79,22 +79,6 @@ def poses_of_levels(body: Rows, T_bodies: Array, T_world_pose: Array) -> Array:
     """Return ``(n, 4, 4)`` poses: each moved with its body."""
     moved: Array = T_bodies[body] @ T_world_pose
     return moved
-
-
-def _adjoints(T: Array) -> Array:
-    """Return the ``(m, 6, 6)`` adjoints of ``(m, 4, 4)`` poses for twists ``(rho, phi)``.
-
-    Source:
-        Barfoot, State Estimation for Robotics (2017), eq. 7.45.
-    """
-    rotation, t = T[:, :3, :3], T[:, :3, 3]
-    cross = np.zeros((len(T), 3, 3))
-    cross[:, 0, 1], cross[:, 0, 2], cross[:, 1, 2] = -t[:, 2], t[:, 1], -t[:, 0]
-    cross -= np.swapaxes(cross, 1, 2)
-    found = np.zeros((len(T), 6, 6))
-    found[:, :3, :3] = found[:, 3:, 3:] = rotation
-    found[:, :3, 3:] = cross @ rotation
-    return found
 
 
 def stacked(parts: Sequence[tuple[Rows, Array]], count: int) -> Array:

@@ -13,12 +13,10 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from rse_pf.geometry import Array, inverse
+from rse_pf.geometry import Array, inverse, log_se3
 from rse_pf.live_map.graph import Graph, LiveLink
 from rse_pf.live_map.options import LiveMapOptions
 from rse_pf.slam.consistency import largest_clique
-from rse_pf.slam.pose_graph import inverses
-from rse_pf.slam.smoother import log_se3_many
 
 __all__ = ["agreeing_between", "agreeing_by_odometry", "has_enough_ends", "judge_within"]
 
@@ -91,8 +89,8 @@ def judge_within(
     The graph is vague where the way between both ends, *walked* steps, is long.
     """
     links = [graph.links[number] for number in numbers]
-    predicted = inverses(graph.T[[link.a for link in links]]) @ graph.T[[link.b for link in links]]
-    off = log_se3_many(inverses(np.array([link.T_a_b for link in links])) @ predicted)
+    predicted = inverse(graph.T[[link.a for link in links]]) @ graph.T[[link.b for link in links]]
+    off = log_se3(inverse(np.array([link.T_a_b for link in links])) @ predicted)
     spread = np.array([link.variances for link in links])
     steps = np.maximum(np.array(walked), 1.0)
     # On a round way of a given length no point is farther than its diameter.
@@ -179,8 +177,8 @@ def _trips_close(
     steps = np.array([each[2] for each in ends])
     spread = np.array([each[3] for each in ends])
     way_b = inverse(T[last[1]]) @ T[b]
-    way_a = inverses(T[a]) @ T[last[0]]
-    trip = log_se3_many(last[2] @ way_b @ inverses(steps) @ way_a)
+    way_a = inverse(T[a]) @ T[last[0]]
+    trip = log_se3(last[2] @ way_b @ inverse(steps) @ way_a)
     if along_a is None or along_b is None:
         walked = np.abs(graph.way[a] - graph.way[last[0]]) + np.abs(graph.way[b] - graph.way[last[1]])
     else:

@@ -8,7 +8,7 @@ from itertools import groupby
 
 import numpy as np
 
-from rse_pf.geometry import Array, inverse
+from rse_pf.geometry import Array, inverse, median_pose
 from rse_pf.live_map.agreement import (
     agreeing_between,
     agreeing_by_odometry,
@@ -280,7 +280,7 @@ def _try_join(graph: Graph, one: int, other: int, options: LiveMapOptions, chang
         return
     root = graph.segments[graph.root].component if graph.root >= 0 else -1
     stay, moving = (other, one) if other == root or (one != root and other < one) else (one, other)
-    T_stay_moving = _median_pose([_proposed(graph, number, stay) for number in agreeing])
+    T_stay_moving = median_pose(np.array([_proposed(graph, number, stay) for number in agreeing]))
     for segment in graph.segments:
         if segment.component == moving and segment.keyframes:
             graph.T[segment.keyframes] = T_stay_moving @ graph.T[segment.keyframes]
@@ -306,7 +306,7 @@ def _ambiguity(graph: Graph, one: int, other: int, agreeing: list[int], options:
     rivals = agreeing_between(graph, one, other, options, frozenset(agreeing))
     if 2 * len(rivals) >= len(agreeing) and has_enough_ends(graph, rivals, options):
         first, second = (
-            _median_pose([_proposed(graph, n, one) for n in each]) for each in (agreeing, rivals)
+            median_pose(np.array([_proposed(graph, n, one) for n in each])) for each in (agreeing, rivals)
         )
         if float(np.sqrt(((first - second)[:3, 3] ** 2).sum())) > options.lookalike_m:
             return f"ambiguous: {len(agreeing)} links say one place, {len(rivals)} another"
@@ -365,14 +365,6 @@ def _proposed(graph: Graph, number: int, stay: int) -> Array:
         a, b, T_a_b = b, a, inverse(T_a_b)
     T_stay_moving: Array = graph.T[a] @ T_a_b @ inverse(graph.T[b])
     return T_stay_moving
-
-
-def _median_pose(poses: list[Array]) -> Array:
-    """Return the pose that differs least from the others."""
-    stack = np.array(poses)
-    apart_m = np.sqrt(((stack[:, None, :3, 3] - stack[None, :, :3, 3]) ** 2).sum(axis=2))
-    turned = np.sqrt(((stack[:, None, :3, :3] - stack[None, :, :3, :3]) ** 2).sum(axis=(2, 3)))
-    return poses[int(np.argmin((apart_m + turned).sum(axis=1)))]
 
 
 def _believe(graph: Graph, numbers: list[int], changes: Changes) -> None:

@@ -57,7 +57,7 @@ from rse_pf.live_map.versions import version_of, whole_graph
 from rse_pf.maps.format import MapVersion
 from rse_pf.slam.optimise import OptimiseOptions, optimise_graph
 from rse_pf.slam.places import LivePlaceIndex
-from rse_pf.slam.pose_graph import PoseGraph, inverses
+from rse_pf.slam.pose_graph import PoseGraph
 
 __all__ = ["LiveMap"]
 
@@ -502,7 +502,7 @@ class LiveMap:
         graph, options = self._graph, self.options
         rows = [row for row in graph.newest.values() if graph.segments[row].keyframes]
         newest = [graph.segments[row].keyframes[-1] for row in rows]
-        T = graph.T[newest] @ inverses(graph.T_odom[newest])
+        T = graph.T[newest] @ inverse(graph.T_odom[newest])
         told = T.copy()
         for place, row in enumerate(rows):
             T_told = graph.segments[row].told

@@ -13,10 +13,9 @@ from typing import Literal
 
 import numpy as np
 
-from rse_pf.geometry import Array, Camera, exp_se3, inverse, pose_difference, skew
+from rse_pf.geometry import Array, Camera, adjoint, exp_se3, inverse, log_se3, pose_difference
 from rse_pf.live_map.keyframe_code import KeyframeFeatures
 from rse_pf.live_map.measure import MeasuredPose, MeasureOptions, measure_pose
-from rse_pf.slam.pose_graph import log_se3
 
 __all__ = ["RelocaliseOptions", "Relocalised", "relocalise", "spread_candidates"]
 
@@ -190,9 +189,6 @@ def _fused(placements: Sequence[_Placement]) -> tuple[Array, Array]:
     information = np.array([np.linalg.inv(each.covariance) for each in placements])
     twist = np.linalg.solve(information.sum(axis=0), np.einsum("kij,kj->i", information, twists))
     T_map_camera: Array = best.T_map_camera @ exp_se3(twist)
-    moved = np.zeros((6, 6))
-    rotation = T_map_camera[:3, :3]
-    moved[:3, :3] = moved[3:, 3:] = rotation
-    moved[:3, 3:] = skew(T_map_camera[:3, 3]) @ rotation
-    covariance: Array = moved @ best.covariance @ moved.T
+    to_map = adjoint(T_map_camera)
+    covariance: Array = to_map @ best.covariance @ to_map.T
     return T_map_camera, 0.5 * (covariance + covariance.T)

@@ -9,12 +9,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import numpy.typing as npt
 
-from rse_pf.geometry import Array, rotation_angle_deg
+from rse_pf.geometry import Array, adjoint, inverse, rotation_angle_deg
 from rse_pf.live_map.graph import Graph
 from rse_pf.live_map.options import LiveMapOptions
 from rse_pf.slam.consistency import OdometryNoise
-from rse_pf.slam.pose_graph import inverses
-from rse_pf.slam.smoother import SmoothedPoses, adjoints, smooth
+from rse_pf.slam.smoother import SmoothedPoses, smooth
 
 __all__ = [
     "Edges",
@@ -64,8 +63,8 @@ class SmoothedWindows:
         right = self._covariances.get(keyframe)
         if right is None:
             return None
-        adjoint = adjoints(graph.T[keyframe][None])[0]
-        left: Array = adjoint @ (0.5 * (right + right.T)) @ adjoint.T
+        to_left = adjoint(graph.T[keyframe])
+        left: Array = to_left @ (0.5 * (right + right.T)) @ to_left.T
         return left
 
 
@@ -147,7 +146,7 @@ def edges_of(graph: Graph, ids: Iterable[int], options: LiveMapOptions) -> Edges
     return Edges(
         a=np.concatenate([a, np.array([link.a for link in measured], dtype=np.int64)]),
         b=np.concatenate([b, np.array([link.b for link in measured], dtype=np.int64)]),
-        T_a_b=np.concatenate([inverses(graph.T_odom[a]) @ graph.T_odom[b], T_a_b]),
+        T_a_b=np.concatenate([inverse(graph.T_odom[a]) @ graph.T_odom[b], T_a_b]),
         information=np.concatenate([chain, information]),
         numbers=np.concatenate([np.full(len(a), -1), np.array(numbers, dtype=np.int64)]),
     )

@@ -101,7 +101,7 @@ class Keyframe:
                 f"keyframe {self.id} holds a number that is not finite, or absurd", hint="leave it out"
             )
         # Frozen from here on.
-        object.__setattr__(self, "T_world_camera", _rigid(f"keyframe {self.id}", self.T_world_camera))
+        object.__setattr__(self, "T_world_camera", _checked_pose(f"keyframe {self.id}", self.T_world_camera))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -119,7 +119,7 @@ class Edge:
     kind: EdgeKind = "odometry"
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "T_a_b", _rigid(f"edge {self.a}-{self.b}", self.T_a_b))
+        object.__setattr__(self, "T_a_b", _checked_pose(f"edge {self.a}-{self.b}", self.T_a_b))
         if self.information.shape != (6, 6) or not (np.abs(self.information) <= _MAX_INFORMATION).all():
             raise BadRequest(f"edge {self.a}-{self.b} has no (6, 6) information", hint="invert a covariance")
 
@@ -367,7 +367,7 @@ def _is_bounded(values: npt.NDArray[np.float32], most: float = _MAX_NUMBER) -> b
     return bool(values.min() >= -most and values.max() <= most)
 
 
-def _rigid(what: str, T: Array) -> Array:
+def _checked_pose(what: str, T: Array) -> Array:
     """Return a pose with a rotation; raises BadRequest."""
     made = rigid(T)
     if made is None:

@@ -12,8 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from rse_pf.geometry import Array
-from rse_pf.slam.pose_graph import inverses, log_se3
+from rse_pf.geometry import Array, inverse, log_se3
 
 __all__ = ["LoopClosure", "OdometryNoise", "consistent", "largest_clique"]
 
@@ -78,7 +77,7 @@ def consistent(
     for k in range(m):
         along_b = np.linalg.inv(T_world_b[k]) @ T_world_b
         along_a = np.linalg.inv(T_world_a) @ T_world_a[k]
-        trip = log_se3(steps[k] @ along_b @ inverses(steps) @ along_a)
+        trip = log_se3(steps[k] @ along_b @ inverse(steps) @ along_a)
         walked = np.abs(order[a] - order[a[k]]) + np.abs(order[b] - order[b[k]])
         lever_m2 = (along_a[:, :3, 3] ** 2).sum(axis=1) + (along_b[:, :3, 3] ** 2).sum(axis=1)
         rad2 = variance_rad2 + variance_rad2[k] + walked * math.radians(noise.step_deg) ** 2

@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from rse_pf.budget import PROVENANCE, check_msgpack
 from rse_pf.errors import BadRequest, LimitExceeded
-from rse_pf.geometry import Array, inverse
+from rse_pf.geometry import Array, inverse, median_pose
 from rse_pf.maps.format import Edge, MapVersion
 from rse_pf.service import Report
 from rse_pf.slam.cloud_deform import Colours, Points, deform_clouds
@@ -195,8 +195,8 @@ def _place(atlas: Atlas, links: Sequence[LoopClosure], maps: int) -> tuple[Array
             return placed, joined
         pair = max(open_pairs, key=lambda each: (len(groups[each]), (-each[0], -each[1])))
         new = pair[0] if pair[1] in joined else pair[1]
-        T_world_new = _median_pose(
-            [_proposed(atlas, placed, link, new) for link in groups[pair]]
+        T_world_new = median_pose(
+            np.array([_proposed(atlas, placed, link, new) for link in groups[pair]])
         )  # fmt: skip
         rows = atlas.of_map == new
         placed[rows] = T_world_new @ atlas.T_world_camera[rows]
@@ -209,13 +209,6 @@ def _proposed(atlas: Atlas, placed: Array, link: LoopClosure, new: int) -> Array
         old, other, T_old_other = link.b, link.a, inverse(link.T_a_b)
     T_world_new: Array = placed[old] @ T_old_other @ inverse(atlas.T_world_camera[other])
     return T_world_new
-
-
-def _median_pose(poses: list[Array]) -> Array:
-    stack = np.array(poses)
-    apart_m = np.linalg.norm(stack[:, None, :3, 3] - stack[None, :, :3, 3], axis=2)
-    turned = np.linalg.norm(stack[:, None, :3, :3] - stack[None, :, :3, :3], axis=(2, 3))
-    return poses[int(np.argmin((apart_m + turned).sum(axis=1)))]
 
 
 def _odometry(

@@ -15,14 +15,12 @@ import numpy as np
 import numpy.typing as npt
 
 from rse_pf.errors import BadRequest
-from rse_pf.geometry import Array, from_quaternion, rigid_many, to_quaternion
+from rse_pf.geometry import Array, from_quaternion, inverse, log_se3, rigid_many, to_quaternion
 
 __all__ = [
     "PoseGraph",
     "components",
-    "inverses",
     "is_positive_definite",
-    "log_se3",
     "misfit",
     "read_g2o",
     "write_g2o",
@@ -77,8 +75,8 @@ class PoseGraph:
         if len(np.unique(self.ids)) != n:
             raise BadRequest("two poses have one id", hint="give each pose its own id")
         # Frozen from here on.
-        object.__setattr__(self, "T_world_pose", _rigid("a pose", self.T_world_pose))
-        object.__setattr__(self, "T_a_b", _rigid("an edge", self.T_a_b))
+        object.__setattr__(self, "T_world_pose", _checked_poses("a pose", self.T_world_pose))
+        object.__setattr__(self, "T_a_b", _checked_poses("an edge", self.T_a_b))
         if not is_positive_definite(self.information):
             raise BadRequest(
                 "an information matrix is not symmetric and positive definite", hint="invert a covariance"
@@ -91,13 +89,13 @@ class PoseGraph:
 
     def squared_residuals(self, T_world_pose: Array) -> Array:
         """Return the ``(m,)`` squared Mahalanobis norms of the residuals at *T_world_pose*."""
-        predicted = inverses(T_world_pose[self.a]) @ T_world_pose[self.b]
+        predicted = inverse(T_world_pose[self.a]) @ T_world_pose[self.b]
         return misfit(self.T_a_b, predicted, self.information)
 
 
 def misfit(measured: Array, predicted: Array, information: Array) -> Array:
     """Return the ``(m,)`` squared Mahalanobis norms between ``(m, 4, 4)`` poses."""
-    error = log_se3(inverses(measured) @ predicted)
+    error = log_se3(inverse(measured) @ predicted)
     squares: Array = np.einsum("mi,mij,mj->m", error, information, error)
     return squares
 
@@ -111,40 +109,6 @@ def is_positive_definite(information: Array) -> bool:
     scale = np.abs(information).max(axis=(1, 2))
     skewed = np.abs(information - np.swapaxes(information, 1, 2)).max(axis=(1, 2)) > 1e-6 * scale
     return not skewed.any() and bool((np.linalg.eigvalsh(information)[:, 0] > 0).all())
-
-
-def inverses(T_a_b: Array) -> Array:
-    """Return ``(m, 4, 4)`` inverse poses."""
-    T_b_a = np.zeros_like(T_a_b)
-    rotations = np.swapaxes(T_a_b[:, :3, :3], 1, 2)
-    T_b_a[:, :3, :3] = rotations
-    T_b_a[:, :3, 3] = -np.einsum("mij,mj->mi", rotations, T_a_b[:, :3, 3])
-    T_b_a[:, 3, 3] = 1.0
-    return T_b_a
-
-
-def log_se3(T: Array) -> Array:
-    """Return the ``(m, 6)`` twists ``(rho, phi)`` of ``(m, 4, 4)`` poses; the inverse of `exp_se3`.
-
-    Source:
-        Barfoot, State Estimation for Robotics (2017), eqs. 7.18 and 7.36.
-    """
-    rotation = T[:, :3, :3]
-    q = _quaternions(rotation)
-    sine = np.linalg.norm(q[:, :3], axis=1)
-    angle = 2.0 * np.arctan2(sine, q[:, 3])
-    scale = np.where(sine > 1e-9, angle / np.maximum(sine, 1e-300), 2.0)
-    phi = scale[:, None] * q[:, :3]
-    half = 0.5 * angle
-    small = angle < 1e-4
-    safe = np.where(small, 1.0, half)
-    c = np.where(small, 1.0 / 12.0, (1.0 - safe / np.tan(safe)) / (4.0 * safe**2))
-    K = np.zeros((len(T), 3, 3))
-    K[:, 0, 1], K[:, 0, 2], K[:, 1, 2] = -phi[:, 2], phi[:, 1], -phi[:, 0]
-    K -= np.swapaxes(K, 1, 2)
-    inverse_jacobian = np.eye(3) - 0.5 * K + c[:, None, None] * (K @ K)
-    rho = np.einsum("mij,mj->mi", inverse_jacobian, T[:, :3, 3])
-    return np.concatenate([rho, phi], axis=1)
 
 
 def components(n: int, a: npt.NDArray[np.int64], b: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
@@ -262,33 +226,7 @@ def _pose(words: list[str]) -> Array:
     return T
 
 
-def _quaternions(rotation: Array) -> Array:
-    """Return ``(m, 4)`` unit quaternions ``(x, y, z, w)``, ``w >= 0``; Shepperd 1978."""
-    m = rotation.transpose(1, 2, 0)
-    four = np.stack(
-        [
-            1 + m[0, 0] - m[1, 1] - m[2, 2],
-            1 - m[0, 0] + m[1, 1] - m[2, 2],
-            1 - m[0, 0] - m[1, 1] + m[2, 2],
-            1 + m[0, 0] + m[1, 1] + m[2, 2],
-        ]
-    )
-    xy, xz, yz = m[0, 1] + m[1, 0], m[0, 2] + m[2, 0], m[1, 2] + m[2, 1]
-    wx, wy, wz = m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]
-    rows = np.stack(
-        [
-            np.stack([four[0], xy, xz, wx]),
-            np.stack([xy, four[1], yz, wy]),
-            np.stack([xz, yz, four[2], wz]),
-            np.stack([wx, wy, wz, four[3]]),
-        ]
-    )
-    q: Array = rows[np.argmax(four, axis=0), :, np.arange(rotation.shape[0])]
-    q = q / np.linalg.norm(q, axis=1, keepdims=True)
-    return np.where(q[:, 3:] < 0, -q, q)
-
-
-def _rigid(what: str, T: Array) -> Array:
+def _checked_poses(what: str, T: Array) -> Array:
     made = rigid_many(T, _MAX_M)
     if made is None:
         raise BadRequest(

@@ -11,10 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from rse_pf.geometry import Array
-from rse_pf.slam.pose_graph import inverses
+from rse_pf.geometry import Array, adjoint, exp_se3, inverse, log_se3, skew
 
-__all__ = ["SmoothedPoses", "adjoints", "exp_se3_many", "log_se3_many", "smooth"]
+__all__ = ["SmoothedPoses", "smooth"]
 
 Rows = npt.NDArray[np.int64]
 
@@ -63,7 +62,7 @@ def smooth(
         Dellaert and Kaess, Factor Graphs for Robot Perception (2017), chapter 6.
     """
     T = T.copy()
-    back = inverses(T_a_b)
+    back = inverse(T_a_b)
     T_a_b_now, error, squares = _residuals(T, a, b, back, information)
     cost = _cost(squares, robust, cauchy)
     wanted = np.empty(0, dtype=np.int64) if wanted is None else wanted
@@ -77,7 +76,7 @@ def smooth(
         step = _bounded(solved[:, 0].reshape(free, 6))
         for _ in range(4):
             moved = T.copy()
-            moved[:free] = _orthonormal(T[:free] @ exp_se3_many(step))
+            moved[:free] = _orthonormal(T[:free] @ exp_se3(step))
             T_moved, new_error, new_squares = _residuals(moved, a, b, back, information)
             new_cost = _cost(new_squares, robust, cauchy)
             if new_cost <= cost:
@@ -95,48 +94,10 @@ def smooth(
     return SmoothedPoses(T=T, squares=squares, covariances=solved[rows[:, :, None], columns[:, None, :]])
 
 
-def exp_se3_many(xi: Array) -> Array:
-    """Return the ``(n, 4, 4)`` poses of ``(n, 6)`` twists (metres, radians); as `geometry.exp_se3`."""
-    rho, phi = xi[:, :3], xi[:, 3:]
-    angle = np.sqrt((phi**2).sum(axis=1))
-    small = angle < 1e-6
-    safe = np.where(small, 1.0, angle)
-    a = np.where(small, 1.0 - angle**2 / 6.0, np.sin(safe) / safe)
-    b = np.where(small, 0.5 - angle**2 / 24.0, 2.0 * (np.sin(0.5 * safe) / safe) ** 2)
-    c = np.where(small, 1.0 / 6.0, (1.0 - a) / safe**2)
-    K = _skews(phi)
-    KK = K @ K
-    T = np.zeros((len(xi), 4, 4))
-    T[:, :3, :3] = np.eye(3) + a[:, None, None] * K + b[:, None, None] * KK
-    jacobian = np.eye(3) + b[:, None, None] * K + c[:, None, None] * KK
-    T[:, :3, 3] = (jacobian @ rho[:, :, None])[:, :, 0]
-    T[:, 3, 3] = 1.0
-    return T
-
-
-def log_se3_many(T: Array) -> Array:
-    """Return the ``(n, 6)`` twists of ``(n, 4, 4)`` poses; as `pose_graph.log_se3`, in half the time.
-
-    Less exact where a rotation is within 0.1 degrees of half a turn.
-    """
-    R = T[:, :3, :3]
-    v = 0.5 * np.stack([R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], axis=1)
-    sine = np.sqrt((v * v).sum(axis=1))
-    angle = np.arctan2(sine, 0.5 * (R[:, 0, 0] + R[:, 1, 1] + R[:, 2, 2] - 1.0))
-    small = sine < 1e-5
-    phi = v * np.where(small & (angle < 1.0), 1.0, angle / np.maximum(sine, 1e-12))[:, None]
-    half = np.where(angle < 1e-4, 1.0, 0.5 * angle)
-    c = np.where(angle < 1e-4, 1.0 / 12.0, (1.0 - half / np.tan(half)) / (4.0 * half**2))
-    K = _skews(phi)
-    across = K @ T[:, :3, 3:]
-    rho = T[:, :3, 3:] - 0.5 * across + c[:, None, None] * (K @ across)
-    return np.concatenate([rho[:, :, 0], phi], axis=1)
-
-
 def _residuals(T: Array, a: Rows, b: Rows, back: Array, information: Array) -> tuple[Array, Array, Array]:
     """Return ``T_a_b`` by the poses, its twist from the measured one, and the squared norm of that."""
-    T_a_b = inverses(T[a]) @ T[b]
-    error = log_se3_many(back @ T_a_b)
+    T_a_b = inverse(T[a]) @ T[b]
+    error = log_se3(back @ T_a_b)
     weighted = (information @ error[:, :, None])[:, :, 0]
     return T_a_b, error, (error * weighted).sum(axis=1)
 
@@ -154,7 +115,7 @@ def _normal_equations(
 ) -> tuple[Array, Array]:
     """Return the matrix ``(6 f, 6 f)`` and the gradient ``(6 f,)`` of the free poses."""
     J_b = np.eye(6) + 0.5 * _small_adjoints(error)
-    J_a = -J_b @ adjoints(inverses(T_a_b))
+    J_a = -J_b @ adjoint(inverse(T_a_b))
     J = np.concatenate([J_a, J_b], axis=2)
     WJ = (weights[:, None, None] * information) @ J
     blocks = np.swapaxes(J, 1, 2) @ WJ
@@ -190,25 +151,9 @@ def _orthonormal(T: Array) -> Array:
     return T
 
 
-def _skews(v: Array) -> Array:
-    K = np.zeros((len(v), 3, 3))
-    K[:, 0, 1], K[:, 0, 2], K[:, 1, 2] = -v[:, 2], v[:, 1], -v[:, 0]
-    K[:, 1, 0], K[:, 2, 0], K[:, 2, 1] = v[:, 2], -v[:, 1], v[:, 0]
-    return K
-
-
-def adjoints(T: Array) -> Array:
-    """Return ``(n, 6, 6)``: what a twist (rho, phi) in the frame on the right is in that on the left."""
-    R = T[:, :3, :3]
-    adjoint = np.zeros((len(T), 6, 6))
-    adjoint[:, :3, :3] = adjoint[:, 3:, 3:] = R
-    adjoint[:, :3, 3:] = _skews(T[:, :3, 3]) @ R
-    return adjoint
-
-
 def _small_adjoints(xi: Array) -> Array:
     """Return ``(n, 6, 6)``: the commutator with a twist, for the first order of a Jacobian."""
     small = np.zeros((len(xi), 6, 6))
-    small[:, :3, :3] = small[:, 3:, 3:] = _skews(xi[:, 3:])
-    small[:, :3, 3:] = _skews(xi[:, :3])
+    small[:, :3, :3] = small[:, 3:, 3:] = skew(xi[:, 3:])
+    small[:, :3, 3:] = skew(xi[:, :3])
     return small
