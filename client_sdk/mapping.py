@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from rse_pf.errors import UsageError
+from rse_pf.errors import BadRequest, UsageError
 from rse_pf.files import read_regular_file
 from rse_pf.geometry import Array, from_quaternion, to_quaternion, transform
+from rse_pf.slam.ply import decode_ply, encode_ply
 
 if TYPE_CHECKING:
     from client_sdk.frontend import Frame
@@ -33,8 +34,6 @@ _MAX_TRAJECTORY_BYTES = 256 << 20
 _EMPTY = -1
 # Voxels on either side of the origin: three signed indices of 21 bits fill one int64 key.
 _REACH = 1 << 20
-
-_VERTEX = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -223,50 +222,21 @@ def write_ply(
 
     *is_metric* says whether the unit is metres, or arbitrary: the file says the same in a comment.
     """
-    vertices = np.empty(len(colours), dtype=_VERTEX)
-    positions = np.asarray(points, dtype=np.float32)
-    for column, name in enumerate(("x", "y", "z")):
-        vertices[name] = positions[:, column]
-    for column, name in enumerate(("red", "green", "blue")):
-        vertices[name] = colours[:, column]
-    with path.open("wb") as file:
-        file.write(_ply_header(len(vertices), is_metric))
-        file.write(vertices.tobytes())
+    path.write_bytes(encode_ply(points, colours, is_metric=is_metric))
 
 
 def read_ply(path: Path) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.uint8]]:
-    """Return the points and colours of a file that `write_ply` wrote.
+    """Return the points and colours of a binary PLY file.
 
     Raises:
         UsageError: The file is missing, is not of that form, or is cut short.
     """
     try:
-        content = path.read_bytes()
+        return decode_ply(path.read_bytes())
     except OSError as error:
         raise UsageError(f"cannot read {path}: {error.strerror}", hint="name a .ply file") from error
-    head, mark, body = content.partition(b"end_header\n")
-    count = next((int(line.split()[2]) for line in head.splitlines() if line[:15] == b"element vertex "), -1)
-    if (
-        count < 0
-        or head + mark not in (_ply_header(count), _ply_header(count, False))
-        or len(body) != count * _VERTEX.itemsize
-    ):
-        raise UsageError(f"{path} is not a map of this program", hint="name a .ply file that it wrote")
-    vertices = np.frombuffer(body, dtype=_VERTEX)
-    points = np.column_stack([vertices[name] for name in ("x", "y", "z")])
-    return points, np.column_stack([vertices[name] for name in ("red", "green", "blue")])
-
-
-def _unit(is_metric: bool) -> str:
-    return "metres" if is_metric else "up to scale: the unit is arbitrary"
-
-
-def _ply_header(count: int, is_metric: bool = True) -> bytes:
-    unit = _unit(is_metric)
-    lines = ["ply", "format binary_little_endian 1.0", f"comment {unit}", f"element vertex {count}"]
-    lines += [f"property float {name}" for name in ("x", "y", "z")]
-    lines += [f"property uchar {name}" for name in ("red", "green", "blue")]
-    return ("\n".join([*lines, "end_header"]) + "\n").encode("ascii")
+    except BadRequest as error:
+        raise UsageError(f"{path} is not a cloud: {error.message}", hint="name a binary .ply file") from error
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -303,7 +273,8 @@ def write_trajectory(path: Path, trajectory: Trajectory, *, is_metric: bool = Tr
 
     *is_metric* says whether the unit is metres, or arbitrary: the file says the same in a comment.
     """
-    lines = [f"# timestamp tx ty tz qx qy qz qw  (T_world_camera, {_unit(is_metric)})"]
+    unit = "metres" if is_metric else "up to scale: the unit is arbitrary"
+    lines = [f"# timestamp tx ty tz qx qy qz qw  (T_world_camera, {unit})"]
     for timestamp_s, pose in zip(trajectory.timestamps_s, trajectory.T_world_camera, strict=True):
         numbers = [*pose[:3, 3], *to_quaternion(pose[:3, :3])]
         lines.append(f"{timestamp_s:.6f} " + " ".join(f"{number:.9f}" for number in numbers))

@@ -24,7 +24,7 @@ from rse_pf.maps.format import MapLimits, MapVersion, decode_map
 from rse_pf.object_store import ObjectStore
 from rse_pf.service import Report
 from rse_pf.services.mapping.place import map_limits
-from rse_pf.slam.cloud_deform import Colours, Points, joined_cloud
+from rse_pf.slam.cloud_deform import joined_cloud
 from rse_pf.slam.consistency import LoopClosure
 from rse_pf.slam.links import Atlas, LoopProposals, MergeOptions, Refused, maps_of
 from rse_pf.slam.map_merge import MergedMap, MergeSteps, merge_versions
@@ -35,6 +35,7 @@ from rse_pf.slam.optimise import (
     optimise_graph,
     robust_cost,
 )
+from rse_pf.slam.ply import Colours, Points
 from rse_pf.slam.pose_graph import PoseGraph, components
 
 __all__ = ["BatchMerge", "BatchMergeResult", "strongest"]

@@ -9,16 +9,14 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-import numpy.typing as npt
 
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Array, to_quaternion
 from rse_pf.maps.format import MapVersion
+from rse_pf.slam.ply import encode_ply
+from rse_pf.slam.pose_graph import g2o_edge, g2o_vertex
 
 __all__ = ["FORMATS", "export_map"]
-
-# g2o's rotation error is the vector part of a quaternion, half of our phi.
-_TO_G2O = np.diag([1.0, 1.0, 1.0, 2.0, 2.0, 2.0])
 
 
 def export_map(version: MapVersion, kind: str, robot: str | None = None) -> bytes:
@@ -38,15 +36,7 @@ def export_map(version: MapVersion, kind: str, robot: str | None = None) -> byte
 
 
 def _ply(version: MapVersion, robot: str | None) -> bytes:
-    rows = np.empty(len(version.points), dtype=[("xyz", "<f4", (3,)), ("rgb", "u1", (3,))])  # 15 bytes each
-    rows["xyz"], rows["rgb"] = version.points, version.colours
-    header = (
-        "ply\nformat binary_little_endian 1.0\n"
-        f"element vertex {len(rows)}\n"
-        "property float x\nproperty float y\nproperty float z\n"
-        "property uchar red\nproperty uchar green\nproperty uchar blue\nend_header\n"
-    )
-    return header.encode("ascii") + rows.tobytes()
+    return encode_ply(version.points, version.colours)
 
 
 def _pcd(version: MapVersion, robot: str | None) -> bytes:
@@ -73,21 +63,16 @@ def _tum(version: MapVersion, robot: str | None) -> bytes:
 
 
 def _g2o(version: MapVersion, robot: str | None) -> bytes:
-    lines = [f"VERTEX_SE3:QUAT {k.id} {_pose(k.T_world_camera)}" for k in version.keyframes]
+    lines = [g2o_vertex(keyframe.id, keyframe.T_world_camera) for keyframe in version.keyframes]
     if version.keyframes:
         lines.append(f"FIX {version.keyframes[0].id}")
-    for edge in version.edges:
-        upper = (_TO_G2O @ edge.information @ _TO_G2O)[np.triu_indices(6)]
-        lines.append(f"EDGE_SE3:QUAT {edge.a} {edge.b} {_pose(edge.T_a_b)} {_numbers(upper)}")
+    lines += [g2o_edge(edge.a, edge.b, edge.T_a_b, edge.information) for edge in version.edges]
     return ("\n".join(lines) + "\n").encode("ascii")
 
 
 def _pose(T: Array) -> str:
-    return _numbers(np.concatenate([T[:3, 3], to_quaternion(T[:3, :3])]))
-
-
-def _numbers(values: npt.NDArray[np.float64]) -> str:
-    return " ".join(f"{value:.9g}" for value in values)
+    numbers = np.concatenate([T[:3, 3], to_quaternion(T[:3, :3])])
+    return " ".join(f"{number:.9g}" for number in numbers)
 
 
 FORMATS: dict[str, Callable[[MapVersion, str | None], bytes]] = {

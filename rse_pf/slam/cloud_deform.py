@@ -9,11 +9,9 @@ import numpy.typing as npt
 
 from rse_pf.geometry import Array, inverse, transform
 from rse_pf.maps.format import Keyframe, MapVersion
+from rse_pf.slam.ply import Colours, Points
 
-__all__ = ["Colours", "Points", "deform_cloud", "deform_clouds", "joined_cloud", "observers_of"]
-
-Points = npt.NDArray[np.float32]
-Colours = npt.NDArray[np.uint8]
+__all__ = ["deform_cloud", "deform_clouds", "joined_cloud", "observers_of"]
 
 _VOXEL_M = 0.01
 _MIN_DEPTH_M, _MAX_DEPTH_M = 0.2, 6.0

@@ -20,7 +20,7 @@ from rse_pf.errors import BadRequest, LimitExceeded
 from rse_pf.geometry import Array, inverse, median_pose
 from rse_pf.maps.format import Edge, MapVersion
 from rse_pf.service import Report
-from rse_pf.slam.cloud_deform import Colours, Points, deform_clouds
+from rse_pf.slam.cloud_deform import deform_clouds
 from rse_pf.slam.consistency import LoopClosure, OdometryNoise
 from rse_pf.slam.links import (
     Atlas,
@@ -37,6 +37,7 @@ from rse_pf.slam.optimise import (
     ignore_progress,
     optimise_graph,
 )
+from rse_pf.slam.ply import Colours, Points
 from rse_pf.slam.pose_graph import PoseGraph, is_positive_definite
 
 __all__ = [

@@ -20,6 +20,8 @@ from rse_pf.geometry import Array, from_quaternion, inverse, log_se3, rigid_many
 __all__ = [
     "PoseGraph",
     "components",
+    "g2o_edge",
+    "g2o_vertex",
     "is_positive_definite",
     "misfit",
     "read_g2o",
@@ -32,6 +34,7 @@ _MAX_M, _MAX_INFORMATION = 1e9, 1e18
 """Larger numbers overflow in what optimises a graph."""
 _FROM_G2O = np.diag([1.0, 1.0, 1.0, 0.5, 0.5, 0.5])
 """g2o's rotation error is the vector part of a quaternion, half of phi."""
+_TO_G2O = np.linalg.inv(_FROM_G2O)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -133,15 +136,31 @@ def write_g2o(graph: PoseGraph) -> str:
     The rotation error of g2o is the vector part of a quaternion, so the information matrices are written
     for ``phi / 2``.
     """
-    lines = []
-    for name, T in zip(graph.ids.tolist(), graph.T_world_pose, strict=True):
-        lines.append(f"VERTEX_SE3:QUAT {name} {_join(_pose_numbers(T))}")
-    to_g2o = np.linalg.inv(_FROM_G2O)
-    for k, (a, b) in enumerate(zip(graph.a.tolist(), graph.b.tolist(), strict=True)):
-        information = (to_g2o @ graph.information[k] @ to_g2o)[_UPPER]
-        ends = f"{graph.ids[a]} {graph.ids[b]}"
-        lines.append(f"EDGE_SE3:QUAT {ends} {_join(_pose_numbers(graph.T_a_b[k]))} {_join(information)}")
+    lines = [g2o_vertex(name, T) for name, T in zip(graph.ids.tolist(), graph.T_world_pose, strict=True)]
+    ids_a, ids_b = graph.ids[graph.a].tolist(), graph.ids[graph.b].tolist()
+    lines += [
+        g2o_edge(a, b, T_a_b, information)
+        for a, b, T_a_b, information in zip(ids_a, ids_b, graph.T_a_b, graph.information, strict=True)
+    ]
     return "\n".join(lines) + "\n"
+
+
+def g2o_vertex(name: int, T_world_pose: Array) -> str:
+    """Return the line of g2o for the pose of this id."""
+    return f"VERTEX_SE3:QUAT {name} {_join(_pose_numbers(T_world_pose))}"
+
+
+def g2o_edge(a: int, b: int, T_a_b: Array, information: Array) -> str:
+    """Return the line of g2o for an edge between the poses with ids *a* and *b*.
+
+    Args:
+        a: The id of the first pose.
+        b: The id of the second pose.
+        T_a_b: ``(4, 4)``, metres.
+        information: ``(6, 6)``, of the twist (metres, radians).
+    """
+    upper = (_TO_G2O @ information @ _TO_G2O)[_UPPER]
+    return f"EDGE_SE3:QUAT {a} {b} {_join(_pose_numbers(T_a_b))} {_join(upper)}"
 
 
 def read_g2o(text: str) -> PoseGraph:

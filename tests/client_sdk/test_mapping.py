@@ -122,22 +122,6 @@ def test_a_useless_map_option_is_refused(bad: dict[str, float]):
         MapOptions(**bad)
 
 
-def test_a_ply_file_comes_back_bit_by_bit(tmp_path: Path):
-    points, colours = random_points(5, 1000)
-    points = points.astype(np.float32)
-
-    write_ply(tmp_path / "map.ply", points, colours)
-
-    content = (tmp_path / "map.ply").read_bytes()
-    assert content.startswith(b"ply\nformat binary_little_endian 1.0\n")
-    assert b"property float x\n" in content
-    assert b"property uchar red\n" in content
-    assert len(content.partition(b"end_header\n")[2]) == 15 * 1000
-    again, again_colours = read_ply(tmp_path / "map.ply")
-    np.testing.assert_array_equal(again, points)
-    np.testing.assert_array_equal(again_colours, colours)
-
-
 def test_a_cut_or_missing_ply_file_is_told_in_one_line(tmp_path: Path):
     write_ply(tmp_path / "map.ply", *random_points(5, 10))
     (tmp_path / "map.ply").write_bytes((tmp_path / "map.ply").read_bytes()[:-1])

@@ -9,6 +9,7 @@ from maps.sample_maps import make_map
 from rse_pf.errors import UsageError
 from rse_pf.geometry import transform
 from rse_pf.maps.export import export_map
+from rse_pf.slam.ply import decode_ply
 from rse_pf.slam.pose_graph import read_g2o
 
 
@@ -26,11 +27,9 @@ def test_the_g2o_file_holds_the_pose_graph_of_the_map() -> None:
 def test_the_clouds_hold_every_point_with_its_colour() -> None:
     version = make_map()
 
-    head, _, body = export_map(version, "ply").partition(b"end_header\n")
-    rows = np.frombuffer(body, dtype=[("xyz", "<f4", (3,)), ("rgb", "u1", (3,))])
-    assert b"element vertex 20" in head
-    np.testing.assert_array_equal(rows["xyz"], version.points)
-    np.testing.assert_array_equal(rows["rgb"], version.colours)
+    points, colours = decode_ply(export_map(version, "ply"))
+    np.testing.assert_array_equal(points, version.points)
+    np.testing.assert_array_equal(colours, version.colours)
 
     head, _, body = export_map(version, "pcd").partition(b"DATA binary\n")
     packed = np.frombuffer(body, dtype=[("xyz", "<f4", (3,)), ("rgb", "<u4")])
