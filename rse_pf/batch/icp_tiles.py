@@ -6,7 +6,6 @@ other, because two clouds of drifted maps do not fit as a whole.  Deterministic.
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from typing import Any
 
@@ -50,8 +49,8 @@ def align_tiles(
     if len(target) < _MIN_POINTS or len(source) < _MIN_POINTS:
         return links, refused
     moved = transform(T_one_other, source)
-    options, floor = IcpOptions(), RelativePoseOptions()
-    spread = np.array([floor.floor_m] * 3 + [math.radians(floor.floor_deg)] * 3)
+    options = IcpOptions()
+    information = np.linalg.inv(RelativePoseOptions().floor()).astype(np.float64)
     rows = [np.flatnonzero(atlas.of_map == which) for which in (0, 1)]
     for low in _tiles(target, moved):
         near = _within(target, low - options.reach_m, TILE_M + 2.0 * options.reach_m)
@@ -68,7 +67,7 @@ def align_tiles(
         a = _observer(atlas, rows[0], centre)
         b = _observer(atlas, rows[1], transform(inverse(T_one_other), centre[None])[0])
         T_a_b = inverse(atlas.T_world_camera[a]) @ found.T_target_source @ atlas.T_world_camera[b]
-        links.append(LoopClosure(a=a, b=b, T_a_b=T_a_b, information=np.diag(spread**-2.0)))
+        links.append(LoopClosure(a=a, b=b, T_a_b=T_a_b, information=information))
     return links, refused
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from rse_pf.errors import ConfigurationError
-from rse_pf.live_map.measure import MeasureOptions
 from rse_pf.slam.consistency import OdometryNoise
+from rse_pf.slam.relative_pose import RelativePoseOptions
 
 __all__ = ["LiveMapOptions"]
 
@@ -66,7 +66,7 @@ class LiveMapOptions:
     told_deg: float = 0.05
     doubts: int = 8
     open_links: int = 400
-    measured: MeasureOptions = field(default_factory=lambda: MeasureOptions(min_inliers=30))
+    measured: RelativePoseOptions = field(default_factory=lambda: RelativePoseOptions(min_inliers=30))
     candidates: int = 12
     apart_steps: float = 0.8
     vague_steps: float = 12.0

@@ -15,7 +15,8 @@ import numpy as np
 
 from rse_pf.geometry import Array, Camera, adjoint, exp_se3, inverse, log_se3, pose_difference
 from rse_pf.live_map.keyframe_code import KeyframeFeatures
-from rse_pf.live_map.measure import MeasuredPose, MeasureOptions, measure_pose
+from rse_pf.live_map.measure import reference_of_features, view_of_features
+from rse_pf.slam.relative_pose import MeasuredPose, RelativePoseOptions, measure_pose
 
 __all__ = ["RelocaliseOptions", "Relocalised", "relocalise", "spread_candidates"]
 
@@ -39,7 +40,7 @@ class RelocaliseOptions:
             enough.
     """
 
-    measured: MeasureOptions = field(default_factory=lambda: MeasureOptions(min_inliers=30))
+    measured: RelativePoseOptions = field(default_factory=lambda: RelativePoseOptions(min_inliers=30))
     least_inliers: int = 15
     agree_m: float = 0.2
     agree_deg: float = 6.0
@@ -101,9 +102,10 @@ def relocalise(
     if not candidates:
         return Relocalised(verdict="none", reason="no-candidates")
     placements = []
+    view = view_of_features(features, camera)
     for number, known, known_camera, T_map_keyframe in candidates:
-        points = known.points_camera(known_camera)
-        found = measure_pose(points, known, features, camera, options.measured)
+        reference = reference_of_features(known, known_camera)
+        found = measure_pose(reference, view, options.measured)
         if isinstance(found, str) or found.inliers < options.least_inliers:
             continue
         placements.append(

@@ -21,7 +21,7 @@ from rse_pf.maps.format import Keyframe, MapVersion
 from rse_pf.service import Report
 from rse_pf.slam.consistency import LoopClosure, OdometryNoise, consistent
 from rse_pf.slam.optimise import ignore_progress
-from rse_pf.slam.relative_pose import RelativePoseOptions, measure_relative_pose
+from rse_pf.slam.relative_pose import RelativePoseOptions, measure_link, reference_of, view_of_keyframe
 from rse_pf.slam.trained_places import PlaceIndex, VectorIndex
 
 __all__ = [
@@ -181,7 +181,9 @@ def measure_pairs(
     for done, (a, b) in enumerate(pairs):
         if done % 16 == 0:
             report(done / len(pairs), f"{done} of {len(pairs)} keyframe pairs")
-        measured = measure_relative_pose(atlas.keyframes[a], atlas.keyframes[b], pose_options)
+        measured = measure_link(
+            reference_of(atlas.keyframes[a]), view_of_keyframe(atlas.keyframes[b]), pose_options
+        )  # fmt: skip
         if isinstance(measured, str):
             one, other = maps_of(atlas, a, b)
             failed[one, other, measured] += 1

@@ -5,13 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-import rse_pf.live_map.measure as measure
+import rse_pf.slam.relative_pose as relative_pose
 from rse_pf.geometry import inverse, pose_difference
 from rse_pf.live_map.events import LinksMeasured, matrix_of
 from rse_pf.live_map.keyframe_code import KeyframeFeatures, decode_features, encode_features
-from rse_pf.live_map.measure import MeasureOptions, joined_links, measure_links
+from rse_pf.live_map.measure import joined_links, measure_links
 from rse_pf.maps.format import Keyframe
 from rse_pf.services.synthetic_maps import make_world
+from rse_pf.slam.relative_pose import RelativePoseOptions
 
 WORLD, TRUTH = make_world(3, points=4000).walk("r", np.array([0.0, 0.02, 0.04, 0.5]), seed=1)
 CAMERA = WORLD.keyframes[0].camera
@@ -42,7 +43,7 @@ def test_a_link_is_the_pose_of_the_other_in_the_frame_of_the_keyframe():
 
 
 def test_the_information_is_that_of_an_edge_with_the_floor():
-    options = MeasureOptions()
+    options = RelativePoseOptions()
     (link,) = measure_links(numbered(0), [numbered(1)], options).links
 
     covariance = np.linalg.inv(matrix_of(link.information, 6, 6))
@@ -72,7 +73,7 @@ def test_candidates_that_are_measured_in_two_pieces_give_the_same_links_and_fail
 
 
 def test_too_few_inliers_are_no_link():
-    found = measure_links(numbered(0), [numbered(1)], MeasureOptions(min_inliers=700))
+    found = measure_links(numbered(0), [numbered(1)], RelativePoseOptions(min_inliers=700))
 
     assert found.links == ()
     assert sum(found.failed.values()) == 1
@@ -85,7 +86,7 @@ def test_a_pose_that_the_evidence_calls_weak_is_no_link():
         descriptors=FEATURES[0].descriptors[near],
     )  # fmt: skip
 
-    found = measure_links((0, narrow, CAMERA), [numbered(1)], MeasureOptions(min_inliers=8))
+    found = measure_links((0, narrow, CAMERA), [numbered(1)], RelativePoseOptions(min_inliers=8))
 
     assert found.links == ()
     assert found.failed == {"nearly-collinear": 1}
@@ -97,10 +98,10 @@ def test_the_same_keyframes_give_the_same_bytes():
     assert once == again
 
 
-@pytest.mark.skipif(measure.match_core() is None, reason="the native core is not built: make -C native")
+@pytest.mark.skipif(relative_pose.match_core() is None, reason="the native core is not built: make -C native")
 def test_without_the_native_core_the_links_are_the_same(monkeypatch):
     native = measure_links(numbered(0), [numbered(1), numbered(3)])
-    monkeypatch.setattr(measure, "match_core", lambda: None)
+    monkeypatch.setattr(relative_pose, "match_core", lambda: None)
 
     assert measure_links(numbered(0), [numbered(1), numbered(3)]) == native
 

@@ -9,12 +9,11 @@ from rse_pf.geometry import Array, exp_se3, inverse, pose_difference, transform
 from rse_pf.maps.format import Keyframe
 from rse_pf.pnp import DepthNoise
 from rse_pf.pnp.problems import KINECT
-from rse_pf.slam.relative_pose import RelativePose, RelativePoseOptions, measure_relative_pose
+from rse_pf.slam.relative_pose import RelativePose, measure_link, reference_of, view_of_keyframe
 
 pytest.importorskip("poselib")
 pytest.importorskip("faiss", reason="the extra maps is not installed")
 
-_OPTIONS = RelativePoseOptions()
 _NOISE = DepthNoise()
 
 
@@ -50,7 +49,7 @@ def with_depths(b: Keyframe, depth_m: Array | float) -> Keyframe:
 
 
 def measured(a: Keyframe, b: Keyframe) -> RelativePose:
-    found = measure_relative_pose(a, b, _OPTIONS)
+    found = measure_link(reference_of(a), view_of_keyframe(b))
     assert isinstance(found, RelativePose), found
     return found
 

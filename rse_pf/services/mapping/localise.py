@@ -18,7 +18,7 @@ from rse_pf.pnp import PnpOptions, PnpSolution, solve_pnp
 from rse_pf.service import Registry
 from rse_pf.services.mapping.place import check_comparisons, open_map, view_of
 from rse_pf.slam.descriptors import load_faiss
-from rse_pf.slam.relative_pose import RelativePoseOptions, View, matched_points
+from rse_pf.slam.relative_pose import RelativePoseOptions, View, match_points, reference_of
 from rse_pf.slam.trained_places import PlaceIndex, Within
 from rse_pf.wire.arrays import Array
 
@@ -157,14 +157,15 @@ def _candidate_pose(
     index: PlaceIndex, row: int, view: View, options: LocaliseOptions
 ) -> _CandidatePose | None:
     keyframe = index.keyframes[row]
-    points, rows, columns = matched_points(keyframe, view, RelativePoseOptions(inlier_px=options.inlier_px))
-    if len(rows) < options.min_inliers // 2:
+    reference = reference_of(keyframe)
+    points, pixels, _ = match_points(reference, view, RelativePoseOptions(inlier_px=options.inlier_px))
+    if len(points) < options.min_inliers // 2:
         return None
     points_map = transform(keyframe.T_world_camera, points)
     if not (np.abs(points_map) <= _MAX_M).all():  # too far from the origin of its map to be solved
         return None
-    solution = _solve(points_map, view.pixels[columns], view, options)
-    return None if solution is None else _CandidatePose(row, points_map, view.pixels[columns], solution)
+    solution = _solve(points_map, pixels, view, options)
+    return None if solution is None else _CandidatePose(row, points_map, pixels, solution)
 
 
 def _solve_jointly(

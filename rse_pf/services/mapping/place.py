@@ -16,7 +16,7 @@ from rse_pf.geometry import Camera
 from rse_pf.maps.format import Keyframe, MapLimits, MapVersion, decode_map
 from rse_pf.service import Registry
 from rse_pf.slam.descriptors import descriptors_of, load_faiss
-from rse_pf.slam.relative_pose import RelativePoseOptions, View, pose_of_view
+from rse_pf.slam.relative_pose import View, measure_pose, reference_of
 from rse_pf.slam.trained_places import PlaceIndex, Within
 from rse_pf.wire.arrays import Array, reshaped
 
@@ -148,6 +148,6 @@ def register(registry: Registry, data: DataSettings | None = None) -> None:
 def _candidate(keyframe: Keyframe, score: float, view: View, check: bool) -> Candidate:
     inliers = None
     if check:
-        pose = pose_of_view(keyframe, view, RelativePoseOptions())
-        inliers = 0 if isinstance(pose, str) else len(pose[0].inliers)
+        measured = measure_pose(reference_of(keyframe), view)
+        inliers = 0 if isinstance(measured, str) else measured.inliers
     return Candidate(keyframe=keyframe.id, robot=keyframe.robot, score=score, inliers=inliers)
