@@ -10,13 +10,13 @@ little-endian.
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 from rse_pf.errors import BadRequest
-from rse_pf.geometry import Array, Camera
+from rse_pf.geometry import Camera
+from rse_pf.slam.keyframe import KeyframeFeatures
 
 __all__ = ["MAX_FEATURES", "MAX_FEATURES_BYTES", "KeyframeFeatures", "decode_features", "encode_features"]
 
@@ -32,26 +32,6 @@ _FINEST, _COARSEST = 4, 2
 _NEAREST_MM, _FARTHEST_MM = 10, 65_535
 _BORDER_PX = 64
 """Undistorted pixels may lie so far beyond the image."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class KeyframeFeatures:
-    """Features of one image, all with depth.
-
-    ``pixels`` ``(n, 2)`` float32, undistorted; ``depths_m`` ``(n,)`` float32, metres along the optical axis,
-    above 0; ``descriptors`` ``(n, 32)`` uint8.
-    """
-
-    pixels: npt.NDArray[np.float32]
-    depths_m: npt.NDArray[np.float32]
-    descriptors: npt.NDArray[np.uint8]
-
-    def __len__(self) -> int:
-        return len(self.depths_m)
-
-    def points_camera(self, camera: Camera) -> Array:
-        """Return the ``(n, 3)`` points, metres, in the frame of *camera*, which took the image."""
-        return camera.back_project(self.pixels.astype(np.float64), self.depths_m.astype(np.float64))
 
 
 def encode_features(

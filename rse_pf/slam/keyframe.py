@@ -1,0 +1,322 @@
+"""A keyframe: where one image was taken, its camera, and its features with their depths.
+
+It has one form as bytes, which the robot makes once: these bytes wait on its disk, go over the wire, and are
+kept in the log and in the snapshots of a live map.  A fixed head is followed by typed blocks, so that later
+releases add blocks and no versions.  A reader keeps optional blocks that it does not know byte for byte, and
+refuses a keyframe with a required one.  Numbers and sizes are judged before an array is made.
+
+All numbers are little-endian::
+
+    head      108 bytes: "KF", version 2 (uint8), number of blocks (uint8), timestamp_s (float64),
+              the first three rows of T_odom_camera (12 float64)
+    block     8 bytes: kind (uint16), flags (uint16; 1: required), size of its content (uint32); the content
+    camera    kind 1: model (uint8; 1: pinhole), number in the rig (uint8; 0), width, height (uint16),
+              fx, fy, cx, cy (float64)
+    features  kind 2: detector (uint8; 1: ORB), metric (uint8; 1: Hamming), bytes of a descriptor
+              (uint16; 32), number n (uint16), f (uint8): pixels count in units of 2**-f, 0 (uint8);
+              n columns and n rows (uint16), n descriptors
+    geometry  kind 3: what it holds (uint8; 1: depths), 0 (uint8), n (uint16); n depths in mm (uint16)
+
+Blocks stand in the order of their kinds.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from rse_pf.errors import BadRequest
+from rse_pf.geometry import Array, Camera, rigid
+
+__all__ = [
+    "MAX_BLOCKS",
+    "MAX_FEATURES",
+    "MAX_KEYFRAME_BYTES",
+    "Keyframe",
+    "KeyframeFeatures",
+    "UnknownBlock",
+    "check_sent",
+    "decode_keyframe",
+    "encode_keyframe",
+    "make_features",
+]
+
+MAX_KEYFRAME_BYTES = 36_000
+"""Size of one keyframe; the features that a robot sends by default take 33.3 kB of it."""
+MAX_FEATURES = 894
+"""Number of features of one keyframe."""
+MAX_BLOCKS = 16
+
+_MAGIC, _VERSION = b"KF", 2
+_HEAD = struct.Struct("<2sBB13d")
+_BLOCK = struct.Struct("<HHI")
+_CAMERA = struct.Struct("<BBHH4d")
+_FEATURES = struct.Struct("<BBHHBB")
+_GEOMETRY = struct.Struct("<BBH")
+_CAMERA_KIND, _FEATURES_KIND, _GEOMETRY_KIND = 1, 2, 3
+_NAMES = {_CAMERA_KIND: "camera", _FEATURES_KIND: "features", _GEOMETRY_KIND: "geometry"}
+_REQUIRED = 1
+_PINHOLE, _ORB, _HAMMING, _DEPTH = 1, 1, 1, 1
+_DESCRIPTOR_BYTES = 32
+_FINEST, _COARSEST = 4, 2
+_NEAREST_MM, _FARTHEST_MM = 10, 65_535
+_BORDER_PX = 64
+"""Undistorted pixels may lie so far beyond the image."""
+_MAX_TIME_S = 1e12
+_MAX_ODOMETRY_M = 1e6
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class KeyframeFeatures:
+    """Features of one image, all with depth, rounded as they are encoded.
+
+    ``pixels`` ``(n, 2)`` float32, undistorted; ``depths_m`` ``(n,)`` float32, metres along the optical axis,
+    above 0; ``descriptors`` ``(n, 32)`` uint8 of ORB, which are compared by their Hamming distance.
+    """
+
+    pixels: npt.NDArray[np.float32]
+    depths_m: npt.NDArray[np.float32]
+    descriptors: npt.NDArray[np.uint8]
+
+    def __len__(self) -> int:
+        return len(self.depths_m)
+
+    def points_camera(self, camera: Camera) -> Array:
+        """Return the ``(n, 3)`` points, metres, in the frame of *camera*, which took the image."""
+        return camera.back_project(self.pixels.astype(np.float64), self.depths_m.astype(np.float64))
+
+
+@dataclass(frozen=True, slots=True)
+class UnknownBlock:
+    """An optional block of a kind that this release does not know, above 3, kept as it came."""
+
+    kind: int
+    content: bytes
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Keyframe:
+    """Where an image was taken and what it shows.
+
+    ``timestamp_s`` is in seconds since 1970.  ``T_odom_camera`` ``(4, 4)``, metres, maps the camera's frame
+    to the odometry frame of the robot's segment; for a keyframe of a version it is the pose in that map.
+    ``others`` are the blocks that this release does not know.
+    """
+
+    timestamp_s: float
+    T_odom_camera: Array
+    camera: Camera
+    features: KeyframeFeatures
+    others: tuple[UnknownBlock, ...] = ()
+
+
+def make_features(
+    pixels: npt.NDArray[np.floating],
+    depths_m: npt.NDArray[np.floating],
+    descriptors: npt.NDArray[np.uint8],
+) -> KeyframeFeatures:
+    """Return the features of a keyframe; rows without a usable depth are left out.
+
+    Pixels are rounded to 1/16 px (images wider than 4,095 px: 1/8, 1/4), depths to 1 mm.  Where there are
+    more than `MAX_FEATURES`, the first are kept: ORB gives those of the finest level first, which keep most
+    links.
+
+    Args:
+        pixels: ``(n, 2)``, undistorted; rows outside 0..16383 px are left out.
+        depths_m: ``(n,)`` metres along the optical axis; not finite or out of 0.01..65 m: none.
+        descriptors: ``(n, 32)``.
+
+    Raises:
+        BadRequest: The shapes do not fit.
+    """
+    n = len(depths_m)
+    if pixels.shape != (n, 2) or depths_m.shape != (n,) or descriptors.shape != (n, _DESCRIPTOR_BYTES):
+        raise BadRequest(
+            f"pixels {pixels.shape}, depths_m {depths_m.shape}, descriptors {descriptors.shape} do not fit",
+            hint="give one row for each feature",
+        )
+    with np.errstate(invalid="ignore", over="ignore"):
+        depths_mm = np.rint(np.asarray(depths_m, dtype=np.float64) * 1000.0)
+        largest_px = pixels.max(axis=1, initial=-1.0)
+        usable = (depths_mm >= _NEAREST_MM) & (depths_mm <= _FARTHEST_MM)
+        usable &= (pixels.min(axis=1, initial=np.inf) >= 0.0) & (largest_px <= _largest_px(_COARSEST))
+    rows = np.flatnonzero(usable)[:MAX_FEATURES]
+    scale = 2.0 ** _fraction_of(float(largest_px[rows].max(initial=0.0)))
+    return KeyframeFeatures(
+        pixels=(np.rint(pixels[rows].astype(np.float64) * scale) / scale).astype(np.float32),
+        depths_m=(depths_mm[rows] / 1000.0).astype(np.float32),
+        descriptors=np.ascontiguousarray(descriptors[rows], dtype=np.uint8),
+    )
+
+
+def encode_keyframe(keyframe: Keyframe) -> bytes:
+    """Return *keyframe* as bytes, its features rounded as `make_features` rounds them."""
+    camera, features = keyframe.camera, keyframe.features
+    n = len(features)
+    fraction = _fraction_of(float(features.pixels.max(initial=0.0)))
+    units = np.rint(features.pixels.T.astype(np.float64) * 2.0**fraction).astype("<u2")
+    depths_mm = np.rint(features.depths_m.astype(np.float64) * 1000.0).astype("<u2")
+    parts = [_HEAD.pack(
+        _MAGIC, _VERSION, 3 + len(keyframe.others), keyframe.timestamp_s,
+        *keyframe.T_odom_camera[:3].ravel().tolist(),
+    )]  # fmt: skip
+    camera_numbers = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
+    for kind, *contents in (
+        (_CAMERA_KIND, _CAMERA.pack(_PINHOLE, 0, *camera_numbers)),
+        (
+            _FEATURES_KIND, _FEATURES.pack(_ORB, _HAMMING, _DESCRIPTOR_BYTES, n, fraction, 0),
+            units.tobytes(), features.descriptors.tobytes(),
+        ),
+        (_GEOMETRY_KIND, _GEOMETRY.pack(_DEPTH, 0, n), depths_mm.tobytes()),
+    ):  # fmt: skip
+        parts += [_BLOCK.pack(kind, _REQUIRED, sum(map(len, contents))), *contents]
+    for block in keyframe.others:
+        parts += [_BLOCK.pack(block.kind, 0, len(block.content)), block.content]
+    return b"".join(parts)
+
+
+def decode_keyframe(data: bytes) -> Keyframe:
+    """Return the keyframe that `encode_keyframe` encoded; its arrays are read-only views where they can be.
+
+    Raises:
+        BadRequest: The bytes are too many or malformed, a required block is not known, a number is not finite
+            or absurd, or a feature lies outside the image.
+        InvalidCamera: The intrinsics are no camera.
+    """
+    if not _HEAD.size <= len(data) <= MAX_KEYFRAME_BYTES:
+        raise _refusal(f"{len(data)} bytes are not within {_HEAD.size}..{MAX_KEYFRAME_BYTES}")
+    magic, version, count, timestamp_s, *numbers = _HEAD.unpack_from(data)
+    if magic != _MAGIC or version != _VERSION:
+        raise _refusal("it does not begin as a keyframe of version 2")
+    if not abs(timestamp_s) <= _MAX_TIME_S:
+        raise _refusal("its time is absurd", "send seconds since 1970")
+    T_odom_camera = rigid(np.array([*numbers, 0.0, 0.0, 0.0, 1.0]).reshape(4, 4))
+    if T_odom_camera is None:
+        raise _refusal(
+            "T_odom_camera is no rigid motion", "send three rows of a rotation and a translation in metres"
+        )
+    known: dict[int, tuple[int, int]] = {}
+    others = []
+    for kind, begin, end in _blocks(data, count):
+        if kind in _NAMES:
+            known[kind] = begin, end
+        else:
+            others.append(UnknownBlock(kind, bytes(data[begin:end])))
+    for kind, name in _NAMES.items():
+        if kind not in known:
+            raise _refusal(f"it has no block of the {name}")
+    camera = _camera(data, *known[_CAMERA_KIND])
+    return Keyframe(
+        timestamp_s=timestamp_s, T_odom_camera=T_odom_camera, camera=camera,
+        features=_features(data, known[_FEATURES_KIND], known[_GEOMETRY_KIND], camera), others=tuple(others),
+    )  # fmt: skip
+
+
+def check_sent(keyframe: Keyframe) -> None:
+    """Raise BadRequest if a robot cannot have made *keyframe*: it is over 1,000 km from its start.
+
+    A keyframe of a version may be: its map can have the origin of a state's survey.
+    """
+    if not (np.abs(keyframe.T_odom_camera[:3, 3]) <= _MAX_ODOMETRY_M).all():
+        raise _refusal(
+            f"T_odom_camera is more than {_MAX_ODOMETRY_M:.0f} m from the start",
+            "send metres of the odometry",
+        )
+
+
+def _blocks(data: bytes, count: int) -> Iterator[tuple[int, int, int]]:
+    """Yield kind, begin and end of each block; raises BadRequest."""
+    if count > MAX_BLOCKS:
+        raise _refusal(f"{count} blocks are more than {MAX_BLOCKS}")
+    end, last = _HEAD.size, 0
+    for _ in range(count):
+        begin = end + _BLOCK.size
+        if begin > len(data):
+            raise _refusal("it ends within the head of a block")
+        kind, flags, size = _BLOCK.unpack_from(data, end)
+        end = begin + size
+        if end > len(data):
+            raise _refusal(f"a block of {size} bytes goes on beyond its end")
+        if kind < max(1, last) or (kind == last and kind in _NAMES) or flags > _REQUIRED:
+            raise _refusal(f"block {kind} stands twice, after a later one, or has unknown flags")
+        if kind not in _NAMES and flags & _REQUIRED:
+            raise _refusal(
+                f"it needs block {kind}, which this release does not know",
+                "update the server, or send the keyframe without this block",
+            )
+        if kind in _NAMES and not flags & _REQUIRED:
+            raise _refusal(f"the block of the {_NAMES[kind]} is not required")
+        last = kind
+        yield kind, begin, end
+    if end != len(data):
+        raise _refusal(f"{len(data) - end} bytes follow the last block")
+
+
+def _camera(data: bytes, begin: int, end: int) -> Camera:
+    if end - begin != _CAMERA.size:
+        raise _refusal(f"a camera has {_CAMERA.size} bytes, not {end - begin}")
+    model, number, width, height, fx, fy, cx, cy = _CAMERA.unpack_from(data, begin)
+    if (model, number) != (_PINHOLE, 0):
+        raise _refusal(
+            f"camera {number} of model {model} is not known", "send undistorted pixels of one pinhole camera"
+        )
+    return Camera(fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height)
+
+
+def _features(
+    data: bytes, features: tuple[int, int], geometry: tuple[int, int], camera: Camera
+) -> KeyframeFeatures:
+    """Return the features of the blocks that begin and end there; raises BadRequest."""
+    (begin, end), (depths_begin, depths_end) = features, geometry
+    if end - begin < _FEATURES.size or depths_end - depths_begin < _GEOMETRY.size:
+        raise _refusal("the block of the features or of the geometry is too short")
+    detector, metric, descriptor_bytes, n, fraction, zero = _FEATURES.unpack_from(data, begin)
+    if (detector, metric, descriptor_bytes) != (_ORB, _HAMMING, _DESCRIPTOR_BYTES):
+        raise _refusal(
+            f"features of kind {detector} with {descriptor_bytes} bytes, metric {metric}, are not known",
+            "send ORB of 32 bytes",
+        )
+    if zero or not _COARSEST <= fraction <= _FINEST:
+        raise _refusal(f"pixels in 2**-{fraction} are not known")
+    if n > MAX_FEATURES or end - begin != _FEATURES.size + n * (4 + _DESCRIPTOR_BYTES):
+        raise _refusal(f"{end - begin} bytes are not {n} features, of at most {MAX_FEATURES}")
+    what, zero, depth_count = _GEOMETRY.unpack_from(data, depths_begin)
+    if what != _DEPTH or zero:
+        raise _refusal(f"geometry of kind {what} is not known", "send a depth for each feature")
+    if depth_count != n or depths_end - depths_begin != _GEOMETRY.size + 2 * n:
+        raise _refusal(
+            f"{depth_count} depths in {depths_end - depths_begin} bytes are not those of {n} features"
+        )
+    units = np.frombuffer(data, dtype="<u2", count=2 * n, offset=begin + _FEATURES.size).reshape(2, n)
+    pixels = (units.T * np.float32(2.0**-fraction)).astype(np.float32)
+    depths_mm = np.frombuffer(data, dtype="<u2", count=n, offset=depths_begin + _GEOMETRY.size)
+    if n and (pixels.max(axis=0) > (camera.width + _BORDER_PX, camera.height + _BORDER_PX)).any():
+        raise _refusal(f"a pixel lies outside the image of {camera.width}x{camera.height} px")
+    if n and depths_mm.min() < _NEAREST_MM:
+        raise _refusal(f"a depth is below {_NEAREST_MM} mm")
+    descriptors = np.frombuffer(
+        data, dtype=np.uint8, count=n * _DESCRIPTOR_BYTES, offset=begin + _FEATURES.size + 4 * n
+    )
+    return KeyframeFeatures(
+        pixels=pixels,
+        depths_m=(depths_mm / 1000.0).astype(np.float32),
+        descriptors=descriptors.reshape(n, _DESCRIPTOR_BYTES),
+    )
+
+
+def _fraction_of(widest_px: float) -> int:
+    """Return the finest *f* for which uint16 holds *widest_px* in units of ``2**-f``."""
+    return next(f for f in range(_FINEST, _COARSEST - 1, -1) if widest_px <= _largest_px(f))
+
+
+def _largest_px(fraction: int) -> float:
+    """Return the largest pixel that uint16 holds in units of ``2**-fraction``."""
+    return 65_535 / 2.0**fraction
+
+
+def _refusal(why: str, hint: str = "send what encode_keyframe returned") -> BadRequest:
+    return BadRequest(f"the keyframe is refused: {why}", hint=hint)

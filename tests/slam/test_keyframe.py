@@ -1,0 +1,344 @@
+"""The bytes of a keyframe: what comes back, what is kept, and what is refused."""
+
+from __future__ import annotations
+
+import math
+import struct
+import time
+import tracemalloc
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from rse_pf.errors import BadRequest, InvalidCamera
+from rse_pf.geometry import Camera, exp_se3
+from rse_pf.slam.keyframe import (
+    MAX_BLOCKS,
+    MAX_FEATURES,
+    MAX_KEYFRAME_BYTES,
+    Keyframe,
+    UnknownBlock,
+    check_sent,
+    decode_keyframe,
+    encode_keyframe,
+    make_features,
+)
+from rse_pf.slam.keyframe_v1 import MAX_FEATURES_BYTES, keyframe_of_v1
+from tests.slam.v1_features import features_v1
+
+CAMERA = Camera(fx=525.0, fy=525.0, cx=319.5, cy=239.5, width=640, height=480)
+POSE = exp_se3([1.0, -2.0, 3.0, 0.1, 0.2, 0.3])
+HEAD, BLOCK = 108, 8
+CAMERA_AT = HEAD + BLOCK
+FEATURES_AT = CAMERA_AT + 38 + BLOCK
+
+
+def random_features(n: int, seed: int = 1, width: int = 640, height: int = 480):
+    rng = np.random.default_rng(seed)
+    return (
+        rng.uniform(0, [width, height], (n, 2)),
+        rng.uniform(0.3, 6.0, n),
+        rng.integers(0, 256, (n, 32), dtype=np.uint8),
+    )
+
+
+def keyframe(n: int = 20, camera: Camera = CAMERA) -> Keyframe:
+    features = make_features(*random_features(n, width=camera.width, height=camera.height))
+    return Keyframe(timestamp_s=1.8e9 + 0.25, T_odom_camera=POSE, camera=camera, features=features)
+
+
+def assert_equal(one: Keyframe, other: Keyframe) -> None:
+    assert (one.timestamp_s, one.camera, one.others) == (other.timestamp_s, other.camera, other.others)
+    assert np.array_equal(one.T_odom_camera, other.T_odom_camera)
+    for name in ("pixels", "depths_m", "descriptors"):
+        first, second = getattr(one.features, name), getattr(other.features, name)
+        assert np.array_equal(first, second)
+        assert first.dtype == second.dtype
+
+
+@pytest.mark.parametrize("n", [0, 1, 300, MAX_FEATURES])
+def test_a_keyframe_comes_back_as_it_was(n: int) -> None:
+    made = keyframe(n)
+    data = encode_keyframe(made)
+
+    found = decode_keyframe(data)
+
+    assert_equal(found, made)
+    assert encode_keyframe(found) == data
+    assert len(data) == 108 + 3 * 8 + 38 + 8 + 4 + n * 38
+
+
+def test_features_are_rounded_by_half_a_unit_at_most() -> None:
+    pixels, depths_m, descriptors = random_features(800)
+
+    found = make_features(pixels, depths_m, descriptors)
+
+    assert len(found) == 800
+    assert np.abs(found.pixels - pixels).max() <= 1 / 32 + 1e-5
+    assert np.abs(found.depths_m - depths_m).max() <= 0.0005 + 1e-6
+    assert np.array_equal(found.descriptors, descriptors)
+    assert (found.pixels.dtype, found.depths_m.dtype) == (np.float32, np.float32)
+
+
+def test_rows_without_a_usable_depth_or_pixel_are_left_out() -> None:
+    pixels, depths_m, descriptors = random_features(9)
+    depths_m[:5] = [np.nan, 0.0, -1.0, np.inf, 70.0]
+    pixels[5:7, 0] = [-3.0, np.nan]
+    pixels[7, 1] = 20_000.0
+
+    assert np.array_equal(make_features(pixels, depths_m, descriptors).descriptors, descriptors[8:])
+
+
+def test_the_first_features_are_kept_where_there_are_too_many() -> None:
+    pixels, depths_m, descriptors = random_features(2000)
+    depths_m[:10] = 0.0
+
+    found = make_features(pixels, depths_m, descriptors)
+
+    assert np.array_equal(found.descriptors, descriptors[10 : 10 + MAX_FEATURES])
+    assert len(encode_keyframe(replace(keyframe(), features=found))) < MAX_KEYFRAME_BYTES
+
+
+@pytest.mark.parametrize(("width", "step_px"), [(4000, 1 / 16), (8000, 1 / 8), (16_000, 1 / 4)])
+def test_wide_images_have_coarser_pixels(width: int, step_px: float) -> None:
+    pixels, depths_m, descriptors = random_features(200, width=width, height=3000)
+    camera = Camera(fx=9000.0, fy=9000.0, cx=width / 2, cy=1500.0, width=width, height=3000)
+    made = replace(keyframe(camera=camera), features=make_features(pixels, depths_m, descriptors))
+
+    found = decode_keyframe(encode_keyframe(made))
+
+    assert_equal(found, made)
+    assert step_px / 4 < np.abs(found.features.pixels - pixels).max() <= step_px / 2 + 1e-3
+
+
+def test_points_lie_on_the_rays_of_the_pixels() -> None:
+    features = keyframe(50).features
+
+    points = features.points_camera(CAMERA)
+
+    np.testing.assert_allclose(CAMERA.project(points), features.pixels, atol=1e-4)
+    np.testing.assert_allclose(points[:, 2], features.depths_m)
+
+
+def test_shapes_that_do_not_fit_are_refused() -> None:
+    pixels, depths_m, descriptors = random_features(5)
+    with pytest.raises(BadRequest, match="do not fit"):
+        make_features(pixels[:4], depths_m, descriptors)
+
+
+def test_optional_blocks_that_are_not_known_are_kept_byte_for_byte() -> None:
+    made = replace(
+        keyframe(), others=(UnknownBlock(6, b"imu"), UnknownBlock(6, b""), UnknownBlock(65_535, bytes(200)))
+    )
+    data = encode_keyframe(made)
+
+    found = decode_keyframe(data)
+
+    assert found.others == made.others
+    assert encode_keyframe(found) == data
+
+
+def test_a_required_block_that_is_not_known_is_refused_with_what_to_do() -> None:
+    data = bytearray(encode_keyframe(keyframe()))
+    data[3] += 1
+    data += struct.pack("<HHI", 9, 1, 3) + b"abc"
+
+    with pytest.raises(BadRequest, match="it needs block 9, which this release does not know") as refused:
+        decode_keyframe(bytes(data))
+
+    assert refused.value.hint == "update the server, or send the keyframe without this block"
+
+
+def test_a_rotation_that_was_rounded_becomes_the_nearest_one() -> None:
+    data = encode_keyframe(replace(keyframe(), T_odom_camera=POSE.round(3)))
+
+    found = decode_keyframe(data).T_odom_camera
+
+    np.testing.assert_allclose(found[:3, :3] @ found[:3, :3].T, np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(found, POSE, atol=2e-3)
+
+
+def test_a_robot_that_is_farther_than_any_way_is_refused_and_a_map_of_a_survey_is_not() -> None:
+    far = exp_se3([5.6e6, 0.0, 0.0, 0.0, 0.0, 0.0])
+    found = decode_keyframe(encode_keyframe(replace(keyframe(), T_odom_camera=far)))
+
+    check_sent(keyframe())
+    with pytest.raises(BadRequest, match="more than 1000000 m from the start"):
+        check_sent(found)
+
+
+GOOD = encode_keyframe(keyframe())
+
+
+def changed(at: int, form: str, value: float, data: bytes = GOOD) -> bytes:
+    damaged = bytearray(data)
+    struct.pack_into(form, damaged, at, value)
+    return bytes(damaged)
+
+
+def with_blocks(count: int, size: int = 0) -> bytes:
+    """Return a keyframe with *count* optional blocks more, each of *size* bytes."""
+    return changed(3, "<B", 3 + count) + count * (struct.pack("<HHI", 7, 0, size) + bytes(size))
+
+
+GEOMETRY_AT = FEATURES_AT + 8 + 20 * 36 + BLOCK
+
+
+@pytest.mark.parametrize(
+    ("data", "why"),
+    [
+        (b"", "0 bytes are not within"),
+        (GOOD + bytes(MAX_KEYFRAME_BYTES), "bytes are not within"),
+        (with_blocks(2, 18_000), "bytes are not within"),
+        (changed(0, "<B", 1), "does not begin as a keyframe of version 2"),
+        (changed(2, "<B", 3), "does not begin as a keyframe of version 2"),
+        (changed(3, "<B", 2), "bytes follow the last block"),
+        (changed(3, "<B", 4), "ends within the head of a block"),
+        (changed(3, "<B", 255), "255 blocks are more than 16"),
+        (with_blocks(MAX_BLOCKS - 2), "17 blocks are more than 16"),
+        (changed(4, "<d", math.nan), "its time is absurd"),
+        (changed(4, "<d", 1e13), "its time is absurd"),
+        (changed(12, "<d", math.nan), "no rigid motion"),
+        (changed(12 + 3 * 8, "<d", math.inf), "no rigid motion"),
+        (changed(12, "<d", 2.0), "no rigid motion"),
+        (changed(HEAD, "<H", 0), "block 0 stands twice"),
+        (changed(HEAD, "<H", 2), "block 2 stands twice"),
+        (changed(HEAD, "<H", 9), "block 9"),
+        (changed(HEAD + 2, "<H", 0), "block of the camera is not required"),
+        (changed(HEAD + 2, "<H", 2), "unknown flags"),
+        (changed(HEAD + 4, "<I", 2**32 - 1), "goes on beyond its end"),
+        (changed(HEAD + 4, "<I", 37), "goes on beyond its end"),
+        (changed(CAMERA_AT, "<B", 2), "camera 0 of model 2 is not known"),
+        (changed(CAMERA_AT + 1, "<B", 1), "camera 1 of model 1 is not known"),
+        (changed(FEATURES_AT, "<B", 2), "features of kind 2"),
+        (changed(FEATURES_AT + 1, "<B", 2), "metric 2"),
+        (changed(FEATURES_AT + 2, "<H", 64), "with 64 bytes"),
+        (changed(FEATURES_AT + 4, "<H", 65_535), "bytes are not 65535 features"),
+        (changed(FEATURES_AT + 6, "<B", 200), r"2\*\*-200 are not known"),
+        (changed(FEATURES_AT + 7, "<B", 1), "are not known"),
+        (changed(FEATURES_AT + 8, "<H", 65_535), "outside the image of 640x480"),
+        (changed(GEOMETRY_AT, "<B", 2), "geometry of kind 2 is not known"),
+        (changed(GEOMETRY_AT + 2, "<H", 19), "19 depths"),
+        (changed(GEOMETRY_AT + 4, "<H", 9), "below 10 mm"),
+    ],
+)
+def test_malformed_keyframes_are_refused_with_a_hint(data: bytes, why: str) -> None:
+    with pytest.raises(BadRequest, match=why) as refused:
+        decode_keyframe(data)
+    assert refused.value.hint
+    assert "\n" not in refused.value.message
+
+
+def test_intrinsics_that_are_no_camera_are_refused() -> None:
+    for at, form, value in ((2, "<H", 0), (6, "<d", math.nan), (6, "<d", -1.0), (22, "<d", 1e9)):
+        with pytest.raises(InvalidCamera):
+            decode_keyframe(changed(CAMERA_AT + at, form, value))
+
+
+def test_a_keyframe_without_one_of_its_blocks_is_refused() -> None:
+    with pytest.raises(BadRequest, match="no block of the camera"):
+        decode_keyframe(changed(3, "<B", 0)[:HEAD])
+
+
+def test_a_keyframe_that_ends_early_is_refused_wherever_it_ends() -> None:
+    for size in range(len(GOOD)):
+        with pytest.raises(BadRequest):
+            decode_keyframe(GOOD[:size])
+
+
+def mutants(data: bytes, count: int) -> list[bytes]:
+    """Return copies of *data* with one to eight changed bytes, most of them in the heads."""
+    rng = np.random.default_rng(5)
+    found = []
+    for _ in range(count):
+        damaged = bytearray(data)
+        end = len(data) if rng.uniform() < 0.3 else FEATURES_AT + 16
+        for at in rng.integers(0, end, rng.integers(1, 9)):
+            damaged[at] = int(rng.integers(0, 256))
+        found.append(bytes(damaged))
+    return found
+
+
+def test_damaged_bytes_give_a_keyframe_within_bounds_or_an_error_of_ours() -> None:
+    accepted = 0
+    for data in mutants(GOOD, 3000):
+        try:
+            found = decode_keyframe(data)
+        except (BadRequest, InvalidCamera):
+            continue
+        accepted += 1
+        assert math.isfinite(found.timestamp_s)
+        assert np.isfinite(found.T_odom_camera).all()
+        assert np.isfinite(found.features.points_camera(found.camera)).all()
+        assert_equal(decode_keyframe(encode_keyframe(found)), found)
+    assert accepted > 20
+
+
+def peak_of(act: Callable[[], object]) -> int:
+    """Return the most bytes that *act* holds at one time."""
+    tracemalloc.start()
+    try:
+        act()
+        return tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+
+
+def refused(data: bytes) -> None:
+    with pytest.raises(BadRequest):
+        decode_keyframe(data)
+
+
+def test_a_refusal_takes_little_memory_and_time_whatever_the_bytes_promise() -> None:
+    promising = [
+        changed(HEAD + 4, "<I", 2**32 - 1),
+        changed(FEATURES_AT + 4, "<H", 65_535),
+        with_blocks(MAX_BLOCKS - 3)[:-1],
+        changed(3, "<B", 255) + bytes(MAX_KEYFRAME_BYTES - len(GOOD)),
+    ]
+    for data in promising:
+        refused(data)
+        assert peak_of(lambda data=data: refused(data)) < 100_000
+    began_s = time.process_time()
+    for data in promising * 100:
+        refused(data)
+    assert time.process_time() - began_s < 2.0
+
+
+@pytest.mark.parametrize("fraction", [2, 3, 4])
+def test_features_of_version_1_are_the_same_numbers(fraction: int) -> None:
+    pixels, depths_m, descriptors = random_features(100)
+    old = features_v1(pixels, depths_m, descriptors, fraction)
+
+    found = decode_keyframe(keyframe_of_v1(7.5, POSE, CAMERA, old))
+
+    assert (found.timestamp_s, found.camera) == (7.5, CAMERA)
+    assert np.array_equal(found.T_odom_camera, POSE)
+    assert np.array_equal(found.features.pixels, np.rint(pixels * 2.0**fraction) / 2.0**fraction)
+    assert np.array_equal(found.features.depths_m, (np.rint(depths_m * 1e3) / 1e3).astype(np.float32))
+    assert np.array_equal(found.features.descriptors, descriptors)
+
+
+V1 = features_v1(*random_features(20))
+
+
+@pytest.mark.parametrize(
+    ("data", "why"),
+    [
+        (b"", "bytes are not within"),
+        (V1 + bytes(MAX_FEATURES_BYTES), "bytes are not within"),
+        (V1[:-1], "bytes are not 20 features"),
+        (V1 + b"\0", "bytes are not 20 features"),
+        (changed(2, "<H", 65_535, V1), "bytes are not 65535 features"),
+        (changed(0, "<B", 2, V1), "version 2"),
+        (changed(1, "<B", 200, V1), "is not known"),
+        (changed(4, "<H", 65_535, V1), "outside the image of 640x480"),
+        (changed(4 + 20 * 4, "<H", 9, V1), "below 10 mm"),
+    ],
+)
+def test_malformed_features_of_version_1_are_refused_with_a_hint(data: bytes, why: str) -> None:
+    with pytest.raises(BadRequest, match=why) as refusal:
+        keyframe_of_v1(7.5, POSE, CAMERA, data)
+    assert refusal.value.hint
