@@ -147,16 +147,18 @@ def merge(snapshots: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
 
 def merge_isolation(snapshots: Iterable[Mapping[str, Any] | None]) -> dict[str, Any]:
     """Return the workers' reports on sandboxes, added up; zero without installed services."""
-    told = [snapshot["isolation"] for snapshot in snapshots if snapshot and "isolation" in snapshot]
+    reports = [snapshot["isolation"] for snapshot in snapshots if snapshot and "isolation" in snapshot]
     counts: Counter[str] = Counter()
-    for each in told:
-        counts.update(each["counts"])
+    for report in reports:
+        counts.update(report["counts"])
     return {
-        "sandboxes": sum(each["sandboxes"] for each in told),
-        "missing_isolation": sorted({name for each in told for name in each["missing_isolation"]}),
-        "open_breakers": sorted({service for each in told for service in each["open_breakers"]}),
+        "sandboxes": sum(report["sandboxes"] for report in reports),
+        "missing_isolation": sorted({name for report in reports for name in report["missing_isolation"]}),
+        "open_breakers": sorted({service for report in reports for service in report["open_breakers"]}),
         "counts": dict(counts),
-        "services": sorted(set.intersection(*(set(each["services"]) for each in told)) if told else ()),
+        "services": sorted(
+            set.intersection(*(set(report["services"]) for report in reports)) if reports else ()
+        ),
     }
 
 

@@ -191,7 +191,7 @@ def _shape_of(kind: Any, depth: int) -> Any:
     if isinstance(kind, known.Metadata):
         return _shape_of(kind.type, depth)
     if isinstance(kind, known.UnionType):
-        shapes = [shape for each in kind.types if (shape := _shape_of(each, depth)) is not None]
+        shapes = [shape for member in kind.types if (shape := _shape_of(member, depth)) is not None]
         return shapes[0] if len(shapes) == 1 else None
     if isinstance(kind, (known.ListType, known.VarTupleType, known.DictType)):
         item = kind.value_type if isinstance(kind, known.DictType) else kind.item_type

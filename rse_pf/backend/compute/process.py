@@ -100,5 +100,5 @@ def _answer(registry: Registry, settings: PlatformSettings, store: ObjectStore |
 
 
 def _encode_failure(failure: Failure, defect: str = "") -> bytes:
-    told = [failure.code, failure.message, failure.hint, failure.retry_after_ms]
-    return _encode([0.0, None, told, defect])
+    fields = [failure.code, failure.message, failure.hint, failure.retry_after_ms]
+    return _encode([0.0, None, fields, defect])

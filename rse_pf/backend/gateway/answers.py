@@ -213,8 +213,8 @@ class Answers:
         answer = self._encoded(queued, message)
         if answer.message is message:
             return answer
-        kept = self.objects.kept(message, answer.message, queued.owner)
-        return answer if kept is answer.message else self._encoded(queued, kept)
+        stored = self.objects.kept(message, answer.message, queued.owner)
+        return answer if stored is answer.message else self._encoded(queued, stored)
 
     def _encoded(self, queued: QueuedCommand, message: Result | Failure) -> EncodedAnswer:
         codec, command = queued.owner.session.codec, queued.command

@@ -187,10 +187,10 @@ class CloseBorder:
         """Return how many of the next bytes, the first *n* of *data*, stand before the end of the CLOSE."""
         if self.shut:
             return 0
-        left = self._left
-        if left:
-            if n <= left and not self._is_close:
-                self._left = left - n
+        payload_left = self._left
+        if payload_left:
+            if n <= payload_left and not self._is_close:
+                self._left = payload_left - n
                 return n
         elif self.is_upgraded and not self._head and _is_one_data_frame(data, n):
             return n
@@ -199,10 +199,10 @@ class CloseBorder:
         return n if start < 0 else self._walk(data, start)
 
     def _end_of_request(self, data: memoryview) -> int:
-        seen = self._head + bytes(data)
-        blank = seen.find(b"\r\n\r\n")
+        head = self._head + bytes(data)
+        blank = head.find(b"\r\n\r\n")
         if blank < 0:
-            self._head = seen[-3:]
+            self._head = head[-3:]
             return -1
         start = blank + 4 - len(self._head)
         self._head, self.is_upgraded = b"", True

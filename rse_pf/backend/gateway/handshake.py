@@ -98,8 +98,8 @@ class RequestHead:
             RFC 9112, 3 and 5; RFC 6455, 4.2.1.
         """
         lines = data.split(b"\r\n")
-        found = _HEAD.fullmatch(data)
-        if found is None or len(lines) - 1 > _MAX_HEADERS:
+        request_line = _HEAD.fullmatch(data)
+        if request_line is None or len(lines) - 1 > _MAX_HEADERS:
             return None
         headers: dict[bytes, bytes] = {}
         for line in lines[1:]:
@@ -113,7 +113,7 @@ class RequestHead:
         length = headers.get(b"content-length", b"0")
         if b"transfer-encoding" in headers or not length or length.strip(b"0"):
             return None
-        return cls(found[1], headers)
+        return cls(request_line[1], headers)
 
     def text(self, name: bytes) -> str:
         """Return the header *name*, in lower case letters, "" if it is absent."""
@@ -145,15 +145,15 @@ def _rejection(status: int, code: str, message: str, hint: str, **headers: str) 
 
 def _told(proven: ProvenRefusal, now_s: float) -> Rejected | None:
     """Return the answer to a robot that proved its key; None where it is that of any other token."""
-    told: dict[str, float] = {"server_s": round(now_s, 3)}
+    members: dict[str, float] = {"server_s": round(now_s, 3)}
     cause = proven.cause
     if cause == "disabled":
         message, hint = "this robot is disabled", "the operator allows it again by rse-pf robot enable ROBOT"
     elif cause == "revoked":
         message, hint = "this token is revoked", "sign another one"
     elif cause == "issued-too-early":
-        cause, told["valid_from_s"] = CUT_OFF, proven.valid_from_s or 0.0
-        message = f"tokens issued before {_utc(told['valid_from_s'])} are revoked"
+        cause, members["valid_from_s"] = CUT_OFF, proven.valid_from_s or 0.0
+        message = f"tokens issued before {_utc(members['valid_from_s'])} are revoked"
         message += f", and this one was issued {-proven.off_s:.0f} s before the server's present time"
         hint = "sign another one; if it is refused, too, the clock of this robot is behind by so much: set it"
     elif cause == "not-yet-valid":
@@ -164,7 +164,7 @@ def _told(proven: ProvenRefusal, now_s: float) -> Rejected | None:
         hint = "sign another one; if it is refused, too, the clock of this robot is behind: set it"
     else:
         return None
-    body = refusal_body(Unauthorized.code, message, hint, cause=cause, **told)
+    body = refusal_body(Unauthorized.code, message, hint, cause=cause, **members)
     return _answered(401, Unauthorized.code, body, {**_JSON, "WWW-Authenticate": "Bearer"})
 
 
@@ -261,10 +261,10 @@ class HandshakePolicy:
         if self.keys is not None:
             if codec == ROSBRIDGE and not authorization and not token:
                 return replace(accepted, awaits_token=True)
-            judged = self.with_token(accepted, token, now_s)
-            if isinstance(judged, Rejected):
-                return judged
-            accepted = judged
+            verdict = self.with_token(accepted, token, now_s)
+            if isinstance(verdict, Rejected):
+                return verdict
+            accepted = verdict
         return self._no_subprotocol if codec is None else accepted
 
     def with_token(self, accepted: Accepted, token: str, now_s: float) -> Accepted | Rejected:

@@ -30,13 +30,13 @@ def plan(
         moves_per_s: Slots in a second, at most.
         random: Uniform numbers in ``[0, 1)``.
     """
-    left = list(loads)
+    remaining = list(loads)
     delays: list[list[float]] = [[] for _ in loads]
-    count = min(robots, sum(left))
+    count = min(robots, sum(remaining))
     slot_s = max(spread_s / count, 1 / moves_per_s) if count else 0.0
     for slot in range(count):
-        worker = max(range(len(left)), key=left.__getitem__)
-        left[worker] -= 1
+        worker = max(range(len(remaining)), key=remaining.__getitem__)
+        remaining[worker] -= 1
         delays[worker].append((slot + random()) * slot_s)
     return delays
 
@@ -73,7 +73,11 @@ class Migration:
 
     def _ask_one(self, within_ms: float) -> None:
         now = self._now()
-        candidates = [each for each in self._connections if each.may_move and each.moving_until_s <= now]
+        candidates = [
+            connection
+            for connection in self._connections
+            if connection.may_move and connection.moving_until_s <= now
+        ]
         if candidates:
             self.asked += 1
             self._choose(candidates).move("rebalance", within_ms, now)

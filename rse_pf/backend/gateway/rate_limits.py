@@ -96,12 +96,12 @@ class RobotRates:
 
     def _added(self, robot: RobotId, now: float) -> _Robot:
         if len(self._robots) >= self._max_names:
-            kept = {
-                name: each
-                for name, each in self._robots.items()
-                if each.violations or each.banned_until > now or not each.bucket.is_full(now)
+            remembered = {
+                name: state
+                for name, state in self._robots.items()
+                if state.violations or state.banned_until > now or not state.bucket.is_full(now)
             }
-            self._robots = _half(kept, self._max_names)
+            self._robots = _half(remembered, self._max_names)
         bucket = TokenBucket(self._limits.max_commands_per_s, float(self._limits.command_burst))
         known = self._robots[robot] = _Robot(bucket)
         return known
@@ -128,8 +128,10 @@ class SourceRates:
         bucket = self._sources.get(source)
         if bucket is None:
             if len(self._sources) >= self._max_names:
-                kept = {name: each for name, each in self._sources.items() if not each.is_full(now)}
-                self._sources = _half(kept, self._max_names)
+                remembered = {
+                    name: bucket for name, bucket in self._sources.items() if not bucket.is_full(now)
+                }
+                self._sources = _half(remembered, self._max_names)
             bucket = self._sources[source] = TokenBucket(rate, float(self._serving.handshake_burst))
         return bucket.take(now)
 

@@ -379,9 +379,9 @@ def protocol_type(picows: Any) -> Any:
             if self.transport is not None and self.transport.is_close_frame_sent:
                 return
             is_full = n == len(self._buffer)
-            wanted = self._border.wanted(self._buffer, n)
-            if wanted:
-                buffer_updated(self, wanted)
+            size = self._border.wanted(self._buffer, n)
+            if size:
+                buffer_updated(self, size)
             if is_full and self._is_made:
                 # The transport would read on up to 256 KiB, and then the next socket, in the same round.
                 self._read_later()

@@ -69,16 +69,16 @@ class JobServer:
         """Begin with jobs that wait; raises StoreError."""
         if self._is_leaving or self.running >= self._slots:
             return
-        seen: set[str] = set()
+        offered: set[str] = set()
         for offer in self._queue.offers(self._served):
             if self.running >= self._slots:
                 return
             name = record_name(offer.request.robot, offer.request.key)
-            seen.add(name)
+            offered.add(name)
             if (offer.request.robot, offer.request.key) in self._jobs or not self._may_begin(name):
                 continue
             self._begin(offer, *self._watched.pop(name)).is_decided.wait(_DECIDE_TIMEOUT_S)
-        for name in self._watched.keys() - seen:
+        for name in self._watched.keys() - offered:
             del self._watched[name]
 
     def leave(self) -> None:

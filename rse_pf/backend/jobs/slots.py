@@ -59,9 +59,9 @@ class JobSlots:
             if self._queue.first() is not ticket:
                 return False
             try:
-                taken = bool(os.read(self._read, 1))
+                is_taken = bool(os.read(self._read, 1))
             except BlockingIOError:
                 return False
-            if taken:
+            if is_taken:
                 self._queue.serve(ticket)
-            return taken
+            return is_taken

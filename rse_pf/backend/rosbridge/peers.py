@@ -59,8 +59,8 @@ def peer_channels(workers: int) -> list[PeerChannels]:
     pairs = [socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM) for _ in range(workers)]
     for _, write in pairs:
         write.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER_BYTES)
-    for each in (end for pair in pairs for end in pair):
-        each.setblocking(False)
+    for end in (end for pair in pairs for end in pair):
+        end.setblocking(False)
     writes = tuple(write.detach() for _, write in pairs)
     return [(read.detach(), writes) for read, _ in pairs]
 
@@ -155,18 +155,18 @@ class WorkerPeers:
 
     def topics(self, tenant: str) -> dict[str, str]:
         """Return the types of the others' topics of *tenant*, by their names."""
-        found: dict[str, str] = {}
+        kinds: dict[str, str] = {}
         for peer in self._peers.values():
             for (owner, name), kind in peer.kinds.items():
                 if owner == tenant:
-                    found[name] = kind or found.get(name, "")
-        return found
+                    kinds[name] = kind or kinds.get(name, "")
+        return kinds
 
     def close(self) -> None:
         """Close the channels of this worker; call it once."""
         self._loop.remove_reader(self._read.fileno())
-        for each in (self._read, *(peer.channel for peer in self._peers.values())):
-            each.close()
+        for channel in (self._read, *(peer.channel for peer in self._peers.values())):
+            channel.close()
 
     def _send(self, peer: _Peer, data: bytes) -> bool:
         """Send one datagram; return False if the other worker takes none now."""

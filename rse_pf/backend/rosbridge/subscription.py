@@ -39,10 +39,10 @@ class TopicMessage:
 
     def encoded(self, topic: str) -> bytes:
         """Return the WebSocket message for who spells the topic so."""
-        found = self._encoded.get(topic)
-        if found is None:
-            found = self._encoded[topic] = publication(topic, self.data)
-        return found
+        message = self._encoded.get(topic)
+        if message is None:
+            message = self._encoded[topic] = publication(topic, self.data)
+        return message
 
 
 class Subscription:

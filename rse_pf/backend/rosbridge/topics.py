@@ -192,7 +192,7 @@ class RosbridgeTopics:
         own = self._of_client.get(client, ())
         topic = self._topics.get(key)
         if topic is None or client not in topic.publishers:
-            count = sum(1 for each in own if client in self._topics[each].publishers)
+            count = sum(1 for own_key in own if client in self._topics[own_key].publishers)
             if count >= MAX_TOPICS:
                 raise QuotaExceeded(f"this client advertises {count} topics already", hint="unadvertise one")
         topic = self._known(client, key, op.type or "")
@@ -222,9 +222,9 @@ class RosbridgeTopics:
                 f"compression {op.compression[:20]!r} is not supported here", hint="subscribe with none"
             )
         count = sum(
-            len(self._topics[each].subscriptions[client].requests)
-            for each in self._of_client.get(client, ())
-            if client in self._topics[each].subscriptions
+            len(self._topics[own_key].subscriptions[client].requests)
+            for own_key in self._of_client.get(client, ())
+            if client in self._topics[own_key].subscriptions
         )
         if count >= MAX_SUBSCRIPTIONS:
             raise QuotaExceeded(f"this client has {count} subscriptions already", hint="unsubscribe one")
@@ -350,11 +350,11 @@ class RosbridgeTopics:
     def _send(self) -> None:
         """Send what is due, up to a bound; then the event loop serves the robots' commands first."""
         now = self._clock()
-        left = _MAX_SENT_AT_ONCE
-        while self._due and left > 0:
+        budget = _MAX_SENT_AT_ONCE
+        while self._due and budget > 0:
             subscription = next(iter(self._due))
             del self._due[subscription]
-            left -= self._send_to(subscription, now, left)
+            budget -= self._send_to(subscription, now, budget)
         self._is_sending = bool(self._due)
         if self._is_sending:
             self._loop.call_soon(self._send)
@@ -405,20 +405,20 @@ class RosbridgeTopics:
 
     def _answer(self, client: Client, session: RosbridgeSession, op: RosbridgeOp) -> None:
         """Answer one of the calls of ``rosapi`` that clients need to find services and topics."""
-        what = op.service.removeprefix("/").removeprefix("rosapi/")
-        if what == "services":
+        call = op.service.removeprefix("/").removeprefix("rosapi/")
+        if call == "services":
             values: dict[str, Any] = {"services": [f"/{name}" for name in self._allowed(client)]}
-        elif what == "topics":
-            found = self._seen(client)
-            values = {"topics": [f"/{name}" for name in found], "types": list(found.values())}
-        elif what == "service_type":
+        elif call == "topics":
+            kinds = self._seen(client)
+            values = {"topics": [f"/{name}" for name in kinds], "types": list(kinds.values())}
+        elif call == "service_type":
             name = _argument(op, "service").removeprefix("/")
             values = {"type": f"rse_pf/{name}" if name in self._allowed(client) else ""}
-        elif what == "topic_type":
+        elif call == "topic_type":
             values = {"type": self._seen(client).get(_argument(op, "topic").removeprefix("/"), "")}
         else:
             raise UnknownService(
-                f"rosapi offers no {what[:40]!r} here",
+                f"rosapi offers no {call[:40]!r} here",
                 hint="choose /rosapi/services, /rosapi/topics, /rosapi/service_type or /rosapi/topic_type",
             )
         client.write(session.respond(op, values))
@@ -432,9 +432,9 @@ class RosbridgeTopics:
         if client.claims is not None and not scopes_allow(client.claims.scopes, "topics:read"):
             return {}
         tenant = client.robot.tenant
-        found = self._peers.topics(tenant)
-        found |= {key[1]: topic.kind for key, topic in self._topics.items() if key[0] == tenant}
-        return dict(sorted(found.items()))
+        kinds = self._peers.topics(tenant)
+        kinds |= {key[1]: topic.kind for key, topic in self._topics.items() if key[0] == tenant}
+        return dict(sorted(kinds.items()))
 
 
 def _argument(op: RosbridgeOp, name: str) -> str:

@@ -47,7 +47,7 @@ def own_hierarchies(proc: Path = Path("/proc/self")) -> list[Hierarchy]:
         mounts = (proc / "mountinfo").read_text().splitlines()
     except OSError:
         return []
-    found: list[Hierarchy] = []
+    hierarchies: list[Hierarchy] = []
     for line in memberships:
         _, names, path = line.split(":", 2)
         version = 1 if names else 2
@@ -61,8 +61,8 @@ def own_hierarchies(proc: Path = Path("/proc/self")) -> list[Hierarchy]:
         offered = names.split(",") if version == 1 else _words(place / "cgroup.controllers")
         usable = tuple(name for name in CGROUP_CONTROLLERS if name in offered)
         if usable and os.access(place, os.W_OK):
-            found.append(Hierarchy(place, version, usable))
-    return found
+            hierarchies.append(Hierarchy(place, version, usable))
+    return hierarchies
 
 
 class Cgroups:
@@ -223,11 +223,11 @@ def _enable(hierarchy: Hierarchy) -> None:
 
 def _remove_leftovers(folder: Path) -> None:
     """Remove the empty cgroups of zygotes that are gone."""
-    for left in folder.glob(f"{_PREFIX}*-*"):
-        owner = left.name.removeprefix(_PREFIX).partition("-")[0]
+    for cgroup in folder.glob(f"{_PREFIX}*-*"):
+        owner = cgroup.name.removeprefix(_PREFIX).partition("-")[0]
         if owner.isdigit() and not Path("/proc", owner).exists():
             with contextlib.suppress(OSError):
-                left.rmdir()
+                cgroup.rmdir()
 
 
 def _oom_kills(folder: Path, version: int) -> int:

@@ -159,7 +159,9 @@ def _isolate(plan: SandboxPlan, uid: int | None) -> None:
     die_with_parent()  # after the change of the user, which would undo it
     if "seccomp" not in plan.missing:
         languages = {service.language for service in plan.services.values()}
-        isolation.forbid_system_calls({"python" if each == "package" else each for each in languages})
+        isolation.forbid_system_calls(
+            {"python" if language == "package" else language for language in languages}
+        )
 
 
 def _serve(plan: SandboxPlan, connection: socket.socket) -> None:

@@ -99,11 +99,12 @@ class CircuitBreaker:
             )
         if not self._breakers:
             return None
-        found = [self._breakers.get((service, scope)) for scope in _scopes_of(robot)]
-        breaker = max((each for each in found if each), key=lambda each: each.until_s, default=None)
-        if breaker is None or breaker.until_s <= now:
+        candidates = [self._breakers.get((service, scope)) for scope in _scopes_of(robot)]
+        present = (breaker for breaker in candidates if breaker)
+        last = max(present, key=lambda breaker: breaker.until_s, default=None)
+        if last is None or last.until_s <= now:
             return None
-        return _refusal_of(service, breaker, breaker.until_s - now)
+        return _refusal_of(service, last, last.until_s - now)
 
     def crashed(self, robot: RobotId, service: str, digest: str, now: float) -> None:
         """Note that a sandbox of *robot* crashed while it worked on this request."""
@@ -120,15 +121,15 @@ class CircuitBreaker:
 
     def open_services(self, now: float) -> list[str]:
         """Return the services that are refused now to more than one robot, sorted."""
-        shared = (key for key, each in self._breakers.items() if each.until_s > now)
+        shared = (key for key, breaker in self._breakers.items() if breaker.until_s > now)
         return sorted({service for service, scope in shared if not isinstance(scope, RobotId)})
 
     def blocks(self, now: float) -> list[Block]:
         """Return everything that is refused now: what concerns most robots first, then by name."""
         blocks = [
-            _block(service, scope, "overruns" if each.overruns else "crashes", 0, each.until_s - now)
-            for (service, scope), each in self._breakers.items()
-            if each.until_s > now
+            _block(service, scope, "overruns" if breaker.overruns else "crashes", 0, breaker.until_s - now)
+            for (service, scope), breaker in self._breakers.items()
+            if breaker.until_s > now
         ]
         poison: dict[tuple[str, Scope], list[float]] = {}
         for (service, _), ends in islice(reversed(self._ends_of_request.items()), _MAX_REQUESTS_LISTED):
@@ -138,7 +139,7 @@ class CircuitBreaker:
                     poison.setdefault((service, scope), []).append(until_s - now)
         blocks += [_block(*key, "poison", len(lefts), max(lefts)) for key, lefts in poison.items()]
         return sorted(
-            blocks, key=lambda each: (each.robot or "", each.tenant or "", each.service, each.reason)
+            blocks, key=lambda block: (block.robot or "", block.tenant or "", block.service, block.reason)
         )
 
     def unblock(
@@ -156,18 +157,18 @@ class CircuitBreaker:
         def matches(name: str, block_tenant: str | None, block_robot: str | None) -> bool:
             return service in (None, name) and tenant in (None, block_tenant) and robot in (None, block_robot)
 
-        lifted = [each for each in self.blocks(now) if matches(each.service, each.tenant, each.robot)]
+        lifted = [block for block in self.blocks(now) if matches(block.service, block.tenant, block.robot)]
 
-        def kept(name: str, ends: Iterable[_End]) -> list[_End]:
+        def without_lifted(name: str, ends: Iterable[_End]) -> list[_End]:
             return [end for end in ends if not matches(name, end.robot.tenant, end.robot.name)]
 
         for key in [key for key in self._breakers if matches(key[0], *_names(key[1]))]:
             del self._breakers[key]
         for name, service_ends in self._ends_of_service.items():
-            self._ends_of_service[name] = deque(kept(name, service_ends), _MAX_ENDS_OF_SERVICE)
+            self._ends_of_service[name] = deque(without_lifted(name, service_ends), _MAX_ENDS_OF_SERVICE)
         for request, request_ends in list(self._ends_of_request.items()):
-            if left := kept(request[0], request_ends):
-                self._ends_of_request[request] = tuple(left)
+            if remaining := without_lifted(request[0], request_ends):
+                self._ends_of_request[request] = tuple(remaining)
             else:
                 del self._ends_of_request[request]
         return lifted
@@ -188,9 +189,9 @@ class CircuitBreaker:
     def _open(self, service: str, scope: Scope, last: _End) -> None:
         now = last.at_s
         self._breakers = {
-            key: each
-            for key, each in self._breakers.items()
-            if max(each.until_s, each.opened_s + WINDOW_S) > now
+            key: breaker
+            for key, breaker in self._breakers.items()
+            if max(breaker.until_s, breaker.opened_s + WINDOW_S) > now
         }
         self._breakers.pop((service, scope), None)
         self._breakers[service, scope] = _Breaker(now, now + self._settings.breaker_open_s, not last.is_crash)
@@ -206,12 +207,12 @@ class CircuitBreaker:
 
 def _evidence_since(scope: Scope, ends: Sequence[_End], count: int) -> float:
     """Return when the shortest run of the latest *ends* begins that is evidence in *scope*; -inf for none."""
-    robots, found = set[RobotId](), 0
+    robots, ends_in_scope = set[RobotId](), 0
     for end in reversed(ends):
         if scope in _scopes_of(end.robot) and (end.is_crash or isinstance(scope, RobotId)):
-            found += 1
+            ends_in_scope += 1
             robots.add(end.robot)
-            if found >= count and _is_wide_enough(scope, robots):
+            if ends_in_scope >= count and _is_wide_enough(scope, robots):
                 return end.at_s
     return -math.inf
 
@@ -243,13 +244,13 @@ def _block(service: str, scope: Scope, reason: Reason, requests: int, left_s: fl
 
 def _refusal_of(service: str, breaker: _Breaker, left_s: float) -> WorkerLost:
     if breaker.overruns:
-        what = "was killed repeatedly, because it took more than twice the deadline,"
+        how = "was killed repeatedly, because it took more than twice the deadline,"
         hint = "allow it more time: send a longer deadline"
     else:
-        what = "crashed repeatedly"
+        how = "crashed repeatedly"
         hint = "tell the operator; the server's log has the crashes"
     return WorkerLost(
-        f"service {service!r} {what} and is refused for another {left_s:.0f} s",
+        f"service {service!r} {how} and is refused for another {left_s:.0f} s",
         hint=hint,
         retry_after_ms=left_s * 1e3,
     )

@@ -228,7 +228,9 @@ class SandboxPolicy:
     @property
     def held(self) -> int:
         """Commands that wait or run."""
-        return sum(len(each.waiting) + (each.running is not None) for each in self._sandboxes.values())
+        return sum(
+            len(sandbox.waiting) + (sandbox.running is not None) for sandbox in self._sandboxes.values()
+        )
 
     @property
     def sandboxes(self) -> int:
@@ -238,7 +240,9 @@ class SandboxPolicy:
     @property
     def wake_s(self) -> float:
         """When `tick` is due next; infinite if nothing is waited for."""
-        times = (min(each.kill_s, each.late_s, each.release_s) for each in self._sandboxes.values())
+        times = (
+            min(sandbox.kill_s, sandbox.late_s, sandbox.release_s) for sandbox in self._sandboxes.values()
+        )
         return min(times, default=math.inf)
 
     def waiting_of(self, robot: RobotId) -> int:
@@ -412,14 +416,14 @@ class SandboxPolicy:
         return takes
 
     def _spare(self, tenant: str) -> _Sandbox | None:
-        free = [each for each in self._sandboxes.values() if each.running is None]
-        in_grace = [each for each in free if each.release_s < math.inf]
+        free = [sandbox for sandbox in self._sandboxes.values() if sandbox.running is None]
+        in_grace = [sandbox for sandbox in free if sandbox.release_s < math.inf]
         if in_grace:
-            return max(in_grace, key=lambda each: self._held_by_tenant[each.robot.tenant])
+            return max(in_grace, key=lambda sandbox: self._held_by_tenant[sandbox.robot.tenant])
         for donor in self._shares.donors(tenant, self._held_by_tenant):
-            idle = [each for each in free if each.robot.tenant == donor and each.state == "idle"]
+            idle = [sandbox for sandbox in free if sandbox.robot.tenant == donor and sandbox.state == "idle"]
             if idle:
-                return min(idle, key=lambda each: each.idle_since_s)
+                return min(idle, key=lambda sandbox: sandbox.idle_since_s)
         return None
 
     def _full(self) -> Busy:

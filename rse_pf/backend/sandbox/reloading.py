@@ -204,11 +204,11 @@ class ReloadingSandboxes:
             self._loop.call_soon(self._end_if_idle, generation)
 
     def _is_held(self, robot: RobotId) -> bool:
-        return robot in self._waiting or any(robot in each.unanswered for each in self._retiring)
+        return robot in self._waiting or any(robot in generation.unanswered for generation in self._retiring)
 
     def _go_on(self, robot: RobotId) -> None:
         """Run what waited for the former sandboxes of *robot*."""
-        if any(robot in each.unanswered for each in self._retiring):
+        if any(robot in generation.unanswered for generation in self._retiring):
             return
         for queued in self._waiting.pop(robot, ()):
             self._run(queued)
@@ -231,9 +231,9 @@ class ReloadingSandboxes:
         for sandboxes in self._all:
             sandboxes.disconnected(robot)
         if is_gone:
-            for each in (self._current, *self._retiring):
-                del each.unanswered[robot]
-                self._loop.call_soon(self._end_if_idle, each)
+            for generation in (self._current, *self._retiring):
+                del generation.unanswered[robot]
+                self._loop.call_soon(self._end_if_idle, generation)
 
     def close(self) -> None:
         """End every sandbox and the zygotes."""
@@ -243,30 +243,30 @@ class ReloadingSandboxes:
 
     @property
     def _all(self) -> list[SandboxManager]:
-        found = (each.sandboxes for each in (self._current, *self._retiring))
-        return [each for each in found if each is not None]
+        managers = (generation.sandboxes for generation in (self._current, *self._retiring))
+        return [manager for manager in managers if manager is not None]
 
     # --- what is shown -------------------------------------------------------------------------------
 
     @property
     def held(self) -> int:
         """Commands that wait or run."""
-        return sum(each.held for each in self._all) + sum(map(len, self._waiting.values()))
+        return sum(manager.held for manager in self._all) + sum(map(len, self._waiting.values()))
 
     def waiting_of(self, robot: RobotId) -> int:
         """Return how many commands of *robot* wait."""
-        return sum(each.waiting_of(robot) for each in self._all) + len(self._waiting.get(robot, ()))
+        return sum(manager.waiting_of(robot) for manager in self._all) + len(self._waiting.get(robot, ()))
 
     def report(self) -> dict[str, Any]:
         """Return what /readyz and /metrics show of this worker's sandboxes."""
-        reports = [each.report() for each in self._all]
+        reports = [manager.report() for manager in self._all]
         counts = Counter(self._past)
-        for each in reports:
-            counts.update(each["counts"])
+        for report in reports:
+            counts.update(report["counts"])
         current = self._current.sandboxes
         newest = {} if current is None else current.report()
         return {
-            "sandboxes": sum(each["sandboxes"] for each in reports),
+            "sandboxes": sum(report["sandboxes"] for report in reports),
             "missing_isolation": newest.get("missing_isolation", []),
             "open_breakers": newest.get("open_breakers", []),
             "counts": dict(counts),

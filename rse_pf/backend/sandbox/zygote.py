@@ -62,10 +62,13 @@ class _Zygote:
     def __init__(self, worker: socket.socket, config: dict[str, Any]) -> None:
         self._worker = worker
         services = {
-            each["name"]: InstalledService(
-                **{**each, **{name: each[name] and Path(each[name]) for name in ("folder", "dependencies")}}
+            fields["name"]: InstalledService(
+                **{
+                    **fields,
+                    **{name: fields[name] and Path(fields[name]) for name in ("folder", "dependencies")},
+                }
             )
-            for each in config["services"]
+            for fields in config["services"]
         }
         _warm_up({service.language for service in services.values()})
         self._first_uid = _FIRST_UID + os.getpid() * _SLOTS if os.getuid() == 0 else None

@@ -205,10 +205,10 @@ class ZygoteClient:
 
     def _tell_ready(self, missing: tuple[str, ...] | None) -> bool:
         """Call `on_ready` once, outside of this call; return whether there was one."""
-        told, self._on_ready = self._on_ready, None
-        if told is not None:
-            self._loop.call_soon(told, missing)
-        return told is not None
+        on_ready, self._on_ready = self._on_ready, None
+        if on_ready is not None:
+            self._loop.call_soon(on_ready, missing)
+        return on_ready is not None
 
     def _created(self, number: int, handle: int) -> None:
         self._handles[number] = handle

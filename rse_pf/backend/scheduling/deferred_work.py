@@ -55,10 +55,10 @@ class DeferredWork:
 
     def _run(self) -> None:
         steps, until = self._steps, self._clock() + self._bound_s
-        left = len(steps) if self._max_steps is None else min(len(steps), self._max_steps)
+        steps_left = len(steps) if self._max_steps is None else min(len(steps), self._max_steps)
         try:
-            while left:
-                left -= 1
+            while steps_left:
+                steps_left -= 1
                 step, arguments = steps.popleft()
                 step(*arguments)
                 if self._clock() >= until:

@@ -252,7 +252,7 @@ class Scheduler:
             first = self._robots[self._turns.first]
             self._note_turn_wait(_turn_wait(first, first.waiting[0], now), now)
         for robot_id, robot in list(self._robots.items()):
-            kept: deque[QueuedCommand] = deque()
+            still_waiting: deque[QueuedCommand] = deque()
             for queued in robot.waiting:
                 too_late = queued.deadline_s <= now or (
                     robot.running is None and self._is_hopeless(robot, queued, now, len(self._turns) - 1)
@@ -260,8 +260,8 @@ class Scheduler:
                 if too_late:
                     refusals.append(self._refused_late(robot, queued, now))
                 else:
-                    kept.append(queued)
-            self._rewait(robot_id, robot, kept)
+                    still_waiting.append(queued)
+            self._rewait(robot_id, robot, still_waiting)
         return refusals
 
     def leave(self, owner: Any) -> list[QueuedCommand]:
@@ -269,8 +269,8 @@ class Scheduler:
         dropped: list[QueuedCommand] = []
         for robot_id, robot in list(self._robots.items()):
             dropped += [queued for queued in robot.waiting if queued.owner is owner]
-            kept = deque(queued for queued in robot.waiting if queued.owner is not owner)
-            self._rewait(robot_id, robot, kept)
+            still_waiting = deque(queued for queued in robot.waiting if queued.owner is not owner)
+            self._rewait(robot_id, robot, still_waiting)
         return dropped
 
     def oldest_wait_s(self, now: float) -> float:
@@ -349,12 +349,12 @@ class Scheduler:
             self.turn_s = _averaged(self.turn_s, now - self._last_start)
         self._last_start = now
 
-    def _rewait(self, robot_id: RobotId, robot: _Robot, kept: deque[QueuedCommand]) -> None:
-        if len(kept) == len(robot.waiting):
+    def _rewait(self, robot_id: RobotId, robot: _Robot, still_waiting: deque[QueuedCommand]) -> None:
+        if len(still_waiting) == len(robot.waiting):
             return
-        self.waiting -= len(robot.waiting) - len(kept)
-        robot.waiting = kept
-        if not kept and robot.running is None:
+        self.waiting -= len(robot.waiting) - len(still_waiting)
+        robot.waiting = still_waiting
+        if not still_waiting and robot.running is None:
             self._turns.remove(robot_id)
             del self._robots[robot_id]
 

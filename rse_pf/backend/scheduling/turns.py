@@ -57,5 +57,5 @@ class Turns:
         """Return how many turns, at most, come before that of one more robot of *tenant*."""
         own = len(self._tenants.get(tenant, ()))
         return own + sum(
-            min(len(robots), own + 1) for each, robots in self._tenants.items() if each != tenant
+            min(len(robots), own + 1) for other, robots in self._tenants.items() if other != tenant
         )

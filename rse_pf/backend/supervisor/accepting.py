@@ -108,7 +108,7 @@ class RobotAcceptor:
             if len(self._ready) >= _MAX_READY:
                 break
             try:
-                made, address = self._listener.accept()
+                connection, address = self._listener.accept()
             except BlockingIOError:
                 return
             except OSError as error:  # out of descriptors, or the robot is gone already
@@ -116,7 +116,7 @@ class RobotAcceptor:
                 self._pause_accepting(_REFUSED_PAUSE_S)
                 return
             self._accepted += 1
-            self._take((made, self._accepted, str(address[0])))
+            self._take((connection, self._accepted, str(address[0])))
         self._pause_accepting(_ACCEPT_PAUSE_S)
 
     def _pause_accepting(self, pause_s: float) -> None:
@@ -131,15 +131,15 @@ class RobotAcceptor:
 
     def _take(self, accepted: Accepted) -> None:
         assert self._silent is not None
-        made, _, address = accepted
-        made.setblocking(False)
+        connection, _, address = accepted
+        connection.setblocking(False)
         if self._has_begun(accepted):
             self._ready.append(accepted)
             self._serve_ready()
             return
-        if made.fileno() < 0:
+        if connection.fileno() < 0:
             return  # it has ended
-        self._loop.add_reader(made.fileno(), self._begin, accepted)
+        self._loop.add_reader(connection.fileno(), self._begin, accepted)
         self._silent.enter(accepted, functools.partial(self._drop, accepted), address)
 
     def _begin(self, accepted: Accepted) -> None:

@@ -106,10 +106,10 @@ class _Service:
         port = control.sockets[0].getsockname()[1]
         try:
             self._state = "ready"
-            told = {"server": self._server_id, "pid": os.getpid(), "control_port": port}
+            address = {"server": self._server_id, "pid": os.getpid(), "control_port": port}
             if self._announce is not None:
-                replace_json(self._announce, told)
-            self._log.info("job-server-ready", **told, settings=self._settings.digest())
+                replace_json(self._announce, address)
+            self._log.info("job-server-ready", **address, settings=self._settings.digest())
             while not self._over.is_set():
                 await asyncio.to_thread(self._step)
                 try:

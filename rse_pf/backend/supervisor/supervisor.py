@@ -365,16 +365,16 @@ class _Supervisor:
         )
 
     async def _readyz(self, ask: ControlRequest) -> ControlReply:
-        told: dict[str, Any] = {"state": self._state}
+        readiness: dict[str, Any] = {"state": self._state}
         if self._settings.services.folder or self._settings.services.published:
             await self._merged()
             isolation = merge_isolation(worker.report for worker in self._workers)
-            told.update(
+            readiness.update(
                 missing_isolation=isolation["missing_isolation"], open_breakers=isolation["open_breakers"]
             )
         if self._state == "ready":
-            return json_reply(told)
-        return json_reply(told, status=503, headers={"x-envoy-immediate-health-check-fail": "1"})
+            return json_reply(readiness)
+        return json_reply(readiness, status=503, headers={"x-envoy-immediate-health-check-fail": "1"})
 
     async def _metrics(self, ask: ControlRequest) -> ControlReply:
         merged = await self._merged()
@@ -431,30 +431,30 @@ class _Supervisor:
 
     async def _post_unblock(self, ask: ControlRequest) -> ControlReply:
         """Lift what is refused after crashes: all, or that of a service, a tenant, or a robot of a tenant."""
-        wanted = {name: ask.query.get(name) for name in ("service", "tenant", "robot")}
+        scope = {name: ask.query.get(name) for name in ("service", "tenant", "robot")}
         if not ask.is_local:
             return refused_reply(403, "forbidden", "unblock from the server's own machine")
-        if set(ask.query) - set(wanted) or (wanted["robot"] and not wanted["tenant"]):
+        if set(ask.query) - set(scope) or (scope["robot"] and not scope["tenant"]):
             return refused_reply(
                 400, "bad-request", "name a service, a tenant, a robot of that tenant, or nothing"
             )
-        told = await self._ask_rows("blocks", lambda number: UnblockOrder(number, **wanted), _MAX_BLOCKS)
-        self._log.info("unblock", **wanted, lifted=told["count"])
-        self._records.note("server.unblock", **wanted, lifted=told["count"])
-        return json_reply(told)
+        answer = await self._ask_rows("blocks", lambda number: UnblockOrder(number, **scope), _MAX_BLOCKS)
+        self._log.info("unblock", **scope, lifted=answer["count"])
+        self._records.note("server.unblock", **scope, lifted=answer["count"])
+        return json_reply(answer)
 
     async def _post_record(self, ask: ControlRequest) -> ControlReply:
         """Begin to record requests to an installed service, or end it."""
         if not may_record(ask, self._control_token):
             return refused_reply(403, "forbidden", NOT_FOR_YOU)
         try:
-            wanted = record_query(ask)
+            query = record_query(ask)
         except ValueError:
             return refused_reply(400, "bad-request", WRONG_RECORDING)
-        told = await self._ask_rows("workers", wanted.order, len(self._workers))
-        self._log.info("record", service=wanted.service, calls=wanted.calls, ends=wanted.ends)
-        self._records.note("server.record", service=wanted.service, calls=wanted.calls, ends=wanted.ends)
-        return json_reply({**told, "recording": told["order"]})
+        answer = await self._ask_rows("workers", query.order, len(self._workers))
+        self._log.info("record", service=query.service, calls=query.calls, ends=query.ends)
+        self._records.note("server.record", service=query.service, calls=query.calls, ends=query.ends)
+        return json_reply({**answer, "recording": answer["order"]})
 
     async def _post_take_recorded(self, ask: ControlRequest) -> ControlReply:
         """Tell the next bytes of a recording, once."""
@@ -464,20 +464,20 @@ class _Supervisor:
         order = partial(TakeRecordedOrder, recording=int(number), max_bytes=_RECORDED_BYTES // workers)
         return json_reply(await self._ask_rows("workers", order, workers))
 
-    async def _ask_rows(self, what: str, make_order: Callable[[int], RowsOrder], most: int) -> dict[str, Any]:
+    async def _ask_rows(self, key: str, make_order: Callable[[int], RowsOrder], most: int) -> dict[str, Any]:
         """Return what all workers tell; the same thing of several workers is listed several times."""
         async with self._asking_rows:
             self._asked_rows += 1
             order = make_order(self._asked_rows)
-            told = await asyncio.gather(*(worker.ask_rows(order, _ROWS_S) for worker in self._workers))
-        answers = [each for each in told if each is not None]
-        rows = [row for each in answers for row in each["rows"]]
+            replies = await asyncio.gather(*(worker.ask_rows(order, _ROWS_S) for worker in self._workers))
+        answers = [reply for reply in replies if reply is not None]
+        rows = [row for answer in answers for row in answer["rows"]]
         return {
             "server": self._server_id,
             "order": order.number,
-            what: rows[:most],
-            "count": sum(each["count"] for each in answers),
-            "silent_workers": len(told) - len(answers),
+            key: rows[:most],
+            "count": sum(answer["count"] for answer in answers),
+            "silent_workers": len(replies) - len(answers),
         }
 
     async def _post_services(self, ask: ControlRequest) -> ControlReply:
@@ -529,7 +529,8 @@ class _Supervisor:
             [worker.load for worker in self._workers], robots, spread_s=spread_s,
             moves_per_s=self._settings.scaling.moves_per_s, random=random.random,
         )  # fmt: skip
-        asked, last_s = sum(map(len, delays)), max((each[-1] for each in delays if each), default=0.0)
+        asked = sum(map(len, delays))
+        last_s = max((delays_s[-1] for delays_s in delays if delays_s), default=0.0)
         self._moving_until = time.monotonic() + last_s
         for worker, delays_s in zip(self._workers, delays, strict=True):
             if delays_s:

@@ -146,10 +146,10 @@ def run_in_loop(main: Coroutine[Any, Any, _T]) -> _T:
     try:
         return loop.run_until_complete(main)
     finally:
-        left = asyncio.all_tasks(loop)
-        for task in left:
+        tasks = asyncio.all_tasks(loop)
+        for task in tasks:
             task.cancel()
-        loop.run_until_complete(asyncio.gather(*left, return_exceptions=True))
+        loop.run_until_complete(asyncio.gather(*tasks, return_exceptions=True))
         asyncio.set_event_loop(None)
         loop.close()
 
@@ -289,16 +289,16 @@ class _Worker:
 
     def _installed(self, chosen: ServiceSettings) -> list[InstalledService]:
         """Return the services that are installed; of a folder that is followed, none if it is damaged."""
-        found = published_services() if chosen.published else []
+        published = published_services() if chosen.published else []
         if not chosen.folder:
-            return found
+            return published
         if not chosen.follow:
-            return installed_services(Path(chosen.folder)) + found
+            return installed_services(Path(chosen.folder)) + published
         try:
-            return installed_services(Path(chosen.folder).resolve()) + found
+            return installed_services(Path(chosen.folder).resolve()) + published
         except (RsePfError, OSError) as error:
             self._log.error("services-refused", reason=message_of(error))
-            return found
+            return published
 
     def _run_services(
         self, plan: WorkerPlan, services: Sequence[InstalledService], answers: Answers
@@ -344,7 +344,9 @@ class _Worker:
         """Offer the installed services *names* from now on."""
         self._registry.others = names
         self._tell_topics(self._registry.names)
-        self._answers.offer(frozenset((*names, *(each.name for each in self._registry))) | LIVE_SERVICES)
+        self._answers.offer(
+            frozenset((*names, *(service.name for service in self._registry))) | LIVE_SERVICES
+        )
 
     async def _reload_services(self) -> None:
         """Load the services folder anew, which may take seconds: every file is compared with its pin."""
@@ -353,11 +355,11 @@ class _Worker:
             return
         folder = Path(chosen.folder).resolve()
         try:
-            found = await self._loop.run_in_executor(None, installed_services, folder)
+            services = await self._loop.run_in_executor(None, installed_services, folder)
         except (RsePfError, OSError) as error:
             self._log.error("services-refused", reason=message_of(error))
             return
-        self._sandboxes.replace(found + (published_services() if chosen.published else []))
+        self._sandboxes.replace(services + (published_services() if chosen.published else []))
 
     def _topics(self, plan: WorkerPlan, services: Sequence[str]) -> RosbridgeTopics:
         read, _ = plan.peers
@@ -454,10 +456,10 @@ class _Worker:
         )
 
     def _recorded(self, recording: int, max_bytes: int) -> dict[str, Any]:
-        taken = (
+        recorded = (
             (b"", 0, True) if self._sandboxes is None else self._sandboxes.take_recorded(recording, max_bytes)
         )
-        data, waiting, is_over = taken
+        data, waiting, is_over = recorded
         text = base64.b64encode(data).decode("ascii")
         return {"worker": self._index, "data": text, "waiting": waiting, "is_over": is_over}
 

@@ -68,7 +68,7 @@ def fork_workers(plans: Sequence[WorkerPlan], *, listener: socket.socket) -> lis
     workers: list[WorkerProcess] = []
     try:
         for plan in plans:
-            channels = [end for each in workers for end in each.channels]
+            channels = [end for worker in workers for end in worker.channels]
             workers.append(WorkerProcess(plan, unshared=[listener, *channels]))
     except OSError:
         for worker in workers:
@@ -200,12 +200,12 @@ class WorkerProcess:
         elif message["event"] == "empty":
             self.empty.set()
         elif message["event"] == "rows":
-            told = self._told_rows
-            if told is not None and not told.done() and message["number"] == self._rows_number:
-                told.set_result(message)
+            waiting = self._told_rows
+            if waiting is not None and not waiting.done() and message["number"] == self._rows_number:
+                waiting.set_result(message)
         elif message["event"] == "robots":
-            for told in message["robots"]:
-                self._on_robot(self, told)
+            for event in message["robots"]:
+                self._on_robot(self, event)
         elif message["event"] != "report":
             self._on_robot(self, message)
         else:
@@ -229,8 +229,8 @@ def _be_worker(
 ) -> NoReturn:
     """Run the child until it exits; it never returns into the supervisor's code."""
     try:
-        for each in unshared:
-            each.close()
+        for inherited in unshared:
+            inherited.close()
         nothing = os.open(os.devnull, os.O_RDONLY)
         os.dup2(nothing, 0)
         os.close(nothing)
