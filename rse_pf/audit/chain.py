@@ -120,8 +120,8 @@ def line_of(entry: Entry) -> bytes:
 
 def parse_head(text: str) -> Head | None:
     """Return the head whose string form is *text*, None if it is not one."""
-    found = _HEAD.fullmatch(text)
-    return None if found is None else Head(int(found[1]), found[2])
+    match = _HEAD.fullmatch(text)
+    return None if match is None else Head(int(match[1]), match[2])
 
 
 class Chain:
@@ -173,8 +173,8 @@ def _plain(value: Value) -> Value:
 
 
 def _safe(text: str) -> str:
-    shown = text[: 4 * _MAX_CHARACTERS].encode("utf-8", "replace").decode()
-    return _TOKEN.sub("(a token)", shown)[:_MAX_CHARACTERS]
+    printable = text[: 4 * _MAX_CHARACTERS].encode("utf-8", "replace").decode()
+    return _TOKEN.sub("(a token)", printable)[:_MAX_CHARACTERS]
 
 
 def _hash_of(entry: Entry) -> str:

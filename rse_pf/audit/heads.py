@@ -74,11 +74,11 @@ class HeadsFile:
                 data = b"".join(_line(who, head) for who, head in heads.items())
                 os.pwrite(self._fd, data, 0)
             for offset in range(0, len(data), _LINE_BYTES):
-                found = _parsed(data[offset : offset + _LINE_BYTES])
-                if found is not None and found[0] == self._who:
+                line = _parsed(data[offset : offset + _LINE_BYTES])
+                if line is not None and line[0] == self._who:
                     self._offset = offset
-                    self.lost_entries = found[2]
-                    return found[1], was_lost
+                    self.lost_entries = line[2]
+                    return line[1], was_lost
             self._offset = -(-len(data) // _LINE_BYTES) * _LINE_BYTES
             os.pwrite(self._fd, _line(self._who, GENESIS), self._offset)
             return GENESIS, was_lost
@@ -112,11 +112,11 @@ def read_heads(folder: Path) -> tuple[dict[str, Head], list[str]] | None:
     heads: dict[str, Head] = {}
     problems = []
     for number in range(-(-len(data) // _LINE_BYTES)):
-        found = _parsed(data[number * _LINE_BYTES : (number + 1) * _LINE_BYTES])
-        if found is None or found[0] in heads:
+        line = _parsed(data[number * _LINE_BYTES : (number + 1) * _LINE_BYTES])
+        if line is None or line[0] in heads:
             problems.append(f"line {number + 1} was changed: it is not the head of a chain")
         else:
-            heads[found[0]] = found[1]
+            heads[line[0]] = line[1]
     return heads, problems
 
 

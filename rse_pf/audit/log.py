@@ -330,12 +330,12 @@ class AuditLog:
 
     def _without_routine(self, notes: list[Note]) -> list[Note]:
         """Drop what a flood of robots causes, and count it."""
-        left = self._reserved - self._size
-        routine = _CONNECTIONS if 4 * left < RESERVE_BYTES else _REFUSALS
-        kept = [note for note in notes if not note.action.startswith(routine)]
+        free_bytes = self._reserved - self._size
+        routine = _CONNECTIONS if 4 * free_bytes < RESERVE_BYTES else _REFUSALS
+        remaining = [note for note in notes if not note.action.startswith(routine)]
         with self._buffer_lock:
-            self.dropped += len(notes) - len(kept)
-        return kept
+            self.dropped += len(notes) - len(remaining)
+        return remaining
 
     def _keep_for_later(self, notes: list[Note]) -> None:
         """Buffer *notes* again, before newer ones; a gap is counted again."""
@@ -474,12 +474,12 @@ def chain_names(folder: Path) -> list[str]:
 
 def files_of(folder: Path, who: str) -> list[Path]:
     """Return the files of one chain, oldest first."""
-    found = []
+    paths = []
     for path in folder.iterdir() if folder.is_dir() else ():
         match = _FILE.fullmatch(path.name)
         if match and match["who"] == who:
-            found.append((match["first"] or "~", path))
-    return [path for _, path in sorted(found)]
+            paths.append((match["first"] or "~", path))
+    return [path for _, path in sorted(paths)]
 
 
 def lines_of(path: Path) -> Iterator[bytes]:

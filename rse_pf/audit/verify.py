@@ -62,15 +62,15 @@ def check_chain(who: str, files: Sequence[Path], *, from_genesis: bool = True) -
                 )
                 is_torn = True
                 break
-            found = chain.add(line)
-            if isinstance(found, str):
-                verdict.problem = found
+            entry = chain.add(line)
+            if isinstance(entry, str):
+                verdict.problem = entry
                 return verdict
-            if is_torn and (found.action, found.detail.get("reason")) != (CONTINUED, "torn"):
-                verdict.problem = f"entry {found.seq} does not say that the file before it was torn"
+            if is_torn and (entry.action, entry.detail.get("reason")) != (CONTINUED, "torn"):
+                verdict.problem = f"entry {entry.seq} does not say that the file before it was torn"
                 return verdict
             is_torn = False
-            _count(verdict, found)
+            _count(verdict, entry)
     if is_torn:
         verdict.problem = f"ended in the middle of a line, {verdict.entries} whole entries good"
     return verdict
@@ -88,10 +88,10 @@ def check_folder(folder: Path, *, known: Mapping[str, Head] | None = None) -> li
     Raises:
         OSError: A file cannot be read.
     """
-    kept = heads.read_heads(folder)  # before the logs, which may grow meanwhile
+    recorded = heads.read_heads(folder)  # before the logs, which may grow meanwhile
     verdicts = {who: check_chain(who, files_of(folder, who)) for who in chain_names(folder)}
-    lines, problems = ({}, [_NO_HEADS]) if kept is None else kept
-    _find_added(verdicts, lines, has_heads=kept is not None)
+    lines, problems = ({}, [_NO_HEADS]) if recorded is None else recorded
+    _find_added(verdicts, lines, has_heads=recorded is not None)
     claims = [
         (name, head, f"entry {seq} of {teller.who}")
         for teller in verdicts.values()
@@ -103,13 +103,17 @@ def check_folder(folder: Path, *, known: Mapping[str, Head] | None = None) -> li
         verdict = verdicts.setdefault(name, Verdict(who=name, file=f"{name}.jsonl"))
         if not verdict.problem and verdict.hashes.get(head.seq) != head.hash:
             verdict.problem = _contradiction(verdict, head, teller)
-    found = [verdicts[name] for name in sorted(verdicts)]
-    return found + [Verdict(who="heads", file=heads.FILE, problem=each) for each in problems[:1]]
+    checked = [verdicts[name] for name in sorted(verdicts)]
+    return checked + [Verdict(who="heads", file=heads.FILE, problem=problem) for problem in problems[:1]]
 
 
 def _find_added(verdicts: Mapping[str, Verdict], lines: Mapping[str, Head], *, has_heads: bool) -> None:
     """Name the chains that are a copy of another one, or that no writer has announced."""
-    own = {first: each.who for each in verdicts.values() if (first := each.first) and each.writer == each.who}
+    own = {
+        first: verdict.who
+        for verdict in verdicts.values()
+        if (first := verdict.first) and verdict.writer == verdict.who
+    }
     for verdict in verdicts.values():
         owner = own.get(verdict.first, verdict.who)
         if owner != verdict.who:
@@ -130,9 +134,9 @@ def entries_of(files: Sequence[Path]) -> Iterator[Entry]:
     """Yield the readable entries, also of a broken chain."""
     for path in files:
         for line in lines_of(path):
-            found = Chain(None).add(line)
-            if isinstance(found, Entry):
-                yield found
+            entry = Chain(None).add(line)
+            if isinstance(entry, Entry):
+                yield entry
 
 
 def _count(verdict: Verdict, entry: Entry) -> None:

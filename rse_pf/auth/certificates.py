@@ -50,9 +50,9 @@ class CertificateWithKey:
     def from_pem(cls, text: str) -> CertificateWithKey:
         """Return what `pem` wrote; raises UsageError."""
         certificate, marker, key = text.partition("-----BEGIN PRIVATE KEY-----")
-        made = cls(certificate=certificate, private_key=marker + key)
-        made._read()
-        return made
+        pair = cls(certificate=certificate, private_key=marker + key)
+        pair._read()
+        return pair
 
     @property
     def expires_s(self) -> float:
@@ -64,10 +64,10 @@ class CertificateWithKey:
         """The addresses and names that the certificate is for; empty for an authority."""
         x509, _, _ = _cryptography()
         try:
-            found = self._read()[0].extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+            extension = self._read()[0].extensions.get_extension_for_class(x509.SubjectAlternativeName)
         except x509.ExtensionNotFound:
             return ()
-        return tuple(str(each.value) for each in found)
+        return tuple(str(name.value) for name in extension.value)
 
     @property
     def fingerprint(self) -> str:

@@ -33,12 +33,12 @@ def claimed_by(token: str) -> dict[str, str]:
         claimed = msgspec.json.decode(base64.urlsafe_b64decode(payload + "=="), type=_Claimed)
     except (ValueError, msgspec.MsgspecError, RecursionError):
         return {}
-    told = {
+    claims = {
         "claimed_robot": claimed.sub,
         "claimed_tenant": claimed.tenant,
         "claimed_token": claimed.jti,
     }
-    return {name: value[:_MAX_CLAIM] for name, value in told.items() if isinstance(value, str) and value}
+    return {name: value[:_MAX_CLAIM] for name, value in claims.items() if isinstance(value, str) and value}
 
 
 def source_address(peer: str, forwarded_for: str, trusted_proxies: int) -> str:
@@ -51,5 +51,5 @@ def source_address(peer: str, forwarded_for: str, trusted_proxies: int) -> str:
         trusted_proxies: How many proxies stand in front.
     """
     entries = [entry.strip() for entry in forwarded_for.split(",") if entry.strip()]
-    told = entries[-trusted_proxies] if 0 < trusted_proxies <= len(entries) else peer
-    return told if _ADDRESS.fullmatch(told) else peer
+    address = entries[-trusted_proxies] if 0 < trusted_proxies <= len(entries) else peer
+    return address if _ADDRESS.fullmatch(address) else peer

@@ -29,8 +29,8 @@ def carries_token(authorization: str, token: str) -> bool:
 
     The comparison takes the same time wherever the two differ.
     """
-    scheme, _, given = authorization.partition(" ")
-    is_same = hmac.compare_digest(given.encode(), token.encode())
+    scheme, _, carried = authorization.partition(" ")
+    is_same = hmac.compare_digest(carried.encode(), token.encode())
     return is_same and scheme.lower() == "bearer"
 
 

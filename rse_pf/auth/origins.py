@@ -54,4 +54,5 @@ def carried_token(authorization: str, offered: list[str]) -> str:
     if authorization:
         scheme, _, token = authorization.partition(" ")
         return token.strip() if scheme.lower() == "bearer" else ""
-    return next((each[len(CARRIER_PREFIX) :] for each in offered if each.startswith(CARRIER_PREFIX)), "")
+    carriers = (subprotocol for subprotocol in offered if subprotocol.startswith(CARRIER_PREFIX))
+    return next(carriers, CARRIER_PREFIX)[len(CARRIER_PREFIX) :]

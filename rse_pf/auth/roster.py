@@ -98,7 +98,7 @@ class Roster(_Value, frozen=True, kw_only=True):
                 robots as it may have.
         """
         others = tuple(r for r in self.robots if (r.tenant, r.robot) != (robot.tenant, robot.robot))
-        seen = _as_seen(robot.robot)
+        shared_form = _as_seen(robot.robot)
         count = sum(other.tenant == robot.tenant for other in others)
         if count >= MAX_ROBOTS_OF_TENANT:
             raise UsageError(
@@ -106,7 +106,7 @@ class Roster(_Value, frozen=True, kw_only=True):
                 hint="remove robots that are gone: rse-pf robot remove",
             )
         for other in others:
-            if other.tenant == robot.tenant and _as_seen(other.robot) == seen:
+            if other.tenant == robot.tenant and _as_seen(other.robot) == shared_form:
                 raise UsageError(
                     f"robot {robot.robot!r} looks like {other.robot!r}, which is enrolled",
                     hint="choose a name that differs in more than case, spaces or a form of its letters",
@@ -163,9 +163,9 @@ class DenyList(_Value, frozen=True, kw_only=True):
             max_token_s: The longest time for which a token is valid, leeway included.
         """
         return DenyList(
-            tokens=tuple(each for each in self.tokens if each.expires_s + max_token_s >= now),
+            tokens=tuple(token for token in self.tokens if token.expires_s + max_token_s >= now),
             disabled=self.disabled,
-            not_before=tuple(each for each in self.not_before if each.at_s + max_token_s >= now),
+            not_before=tuple(limit for limit in self.not_before if limit.at_s + max_token_s >= now),
         )
 
     def with_token(self, tenant: str, robot: str, token_id: str, expires_s: float) -> DenyList:
@@ -249,7 +249,10 @@ def scopes_allow(scopes: tuple[str, ...], right: str, name: str = "") -> bool:
         return True
     area = right.partition(":")[0]
     wide = {right, f"{area}:*"}
-    return any(scope in wide or (name and scope in {f"{each}/{name}" for each in wide}) for scope in scopes)
+    return any(
+        scope in wide or (name and scope in {f"{area_or_right}/{name}" for area_or_right in wide})
+        for scope in scopes
+    )
 
 
 def check_robot(name: str) -> str:
@@ -268,10 +271,10 @@ def _as_seen(name: str) -> str:
     return " ".join(unicodedata.normalize("NFKC", name).casefold().split())
 
 
-def _checked_name(name: str, what: str) -> str:
+def _checked_name(name: str, owner: str) -> str:
     if not 0 < len(name) <= _MAX_CHARACTERS or not name.isprintable():
         raise UsageError(
-            f"{name[:80]!r} is not a valid name for a {what}", hint="use 1 to 64 printable characters"
+            f"{name[:80]!r} is not a valid name for a {owner}", hint="use 1 to 64 printable characters"
         )
     return name
 

@@ -196,9 +196,9 @@ class KeySet:
         self._keys = dict(keys)
         denied = denied or DenyList()
         self._robots = {robot.key_id: robot for robot in (roster or Roster()).robots}
-        self._revoked = {(each.tenant, each.robot, each.id) for each in denied.tokens}
-        self._disabled = {(each.tenant, each.robot) for each in denied.disabled}
-        self._not_before = {(each.tenant, each.robot): each.at_s for each in denied.not_before}
+        self._revoked = {(token.tenant, token.robot, token.id) for token in denied.tokens}
+        self._disabled = {(robot.tenant, robot.robot) for robot in denied.disabled}
+        self._not_before = {(limit.tenant, limit.robot): limit.at_s for limit in denied.not_before}
         self._signed: dict[bytes, _SignedClaims] = {}
         self._digests: dict[RobotId, bytes] = {}
 
@@ -423,7 +423,7 @@ def _is_for_us(claims: dict[str, Any], settings: AuthSettings) -> bool:
     return (
         all(claims.get(name) is not None for name in _REQUIRED)
         and isinstance(audience, list)
-        and all(isinstance(each, str) for each in audience)
+        and all(isinstance(name, str) for name in audience)
         and settings.audience in audience
         and claims["iss"] == settings.issuer
         and isinstance(claims["sub"], str)
@@ -441,7 +441,7 @@ def _claims_in(claims: dict[str, Any], key_id: str) -> _SignedClaims:
     robot, token_id = claims["sub"], claims["jti"]
     if not all(0 < len(word) <= 64 for word in (robot, token_id)):
         raise _TokenRefused("bad-subject")
-    found = Claims(
+    verified = Claims(
         robot=RobotId(str(claims.get("tenant", DEFAULT_TENANT)), robot),
         token_id=token_id,
         issued_s=float(issued),
@@ -449,7 +449,7 @@ def _claims_in(claims: dict[str, Any], key_id: str) -> _SignedClaims:
         key_id=key_id,
         scopes=tuple(str(claims.get("scope", "")).split()),
     )
-    return _SignedClaims(found, 0.0 if starts is None else float(starts))
+    return _SignedClaims(verified, 0.0 if starts is None else float(starts))
 
 
 def _check_times(signed: _SignedClaims, now: float, settings: AuthSettings) -> None:
