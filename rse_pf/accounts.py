@@ -169,8 +169,10 @@ class TenantAccount:
                     if ledger != _ledger(known):
                         self._store.compare_and_swap(self._name, known, _encode(ledger))
                 raise refused
-            left = min(self._settings.tenant_quota_bytes - ledger.used_bytes - margin, self._free_bytes())
-            drawn = max(charge, min(_MAX_DRAWN_BYTES, left // _DRAWN_SHARE))
+            free_bytes = min(
+                self._settings.tenant_quota_bytes - ledger.used_bytes - margin, self._free_bytes()
+            )
+            drawn = max(charge, min(_MAX_DRAWN_BYTES, free_bytes // _DRAWN_SHARE))
             try:
                 self._store.compare_and_swap(self._name, known, _encode(_granting(ledger, now, drawn)))
             except Conflict:
@@ -189,7 +191,7 @@ class TenantAccount:
         begun_s = self._wall_clock()
         charged = stored_by_tenant(self._store, self._folder, self._check).charged_bytes
         granted = () if before is None else before.granted
-        return _Ledger(begun_s, charged, tuple(each for each in granted if each[0] > begun_s - _WRITTEN_S))
+        return _Ledger(begun_s, charged, tuple(grant for grant in granted if grant[0] > begun_s - _WRITTEN_S))
 
     def _refusal(self, ledger: _Ledger, charge: int, margin: int) -> QuotaExceeded | StoreFull | None:
         used, most = ledger.used_bytes, self._settings.tenant_quota_bytes
@@ -227,7 +229,7 @@ class TenantAccount:
         folders = {self._folder}
         for area in ("objects", "maps", "live"):
             folders.update(self._store.folders(f"{area}/"))
-        held = sum(stored_by_tenant(self._store, each, self._check).charged_bytes for each in folders)
+        held = sum(stored_by_tenant(self._store, folder, self._check).charged_bytes for folder in folders)
         self._share_s, self._share_bytes = now, (held + self._store.space()[0]) / max(2, len(folders))
         return self._share_bytes
 
@@ -377,13 +379,13 @@ class Accounts:
 
     def _of(self, accounts: OrderedDict[_K, _T], key: _K, make: Callable[[], _T]) -> _T:
         with self._lock:
-            found = accounts.get(key)
-            if found is None:
-                found = accounts[key] = make()
+            account = accounts.get(key)
+            if account is None:
+                account = accounts[key] = make()
             accounts.move_to_end(key)
             if len(accounts) > _MAX_ACCOUNTS:
                 accounts.popitem(last=False)
-            return found
+            return account
 
     def _count_if_old(self, account: _RobotAccount, robot: RobotId) -> None:
         now = self._clock()

@@ -279,14 +279,14 @@ def measure_msgpack(data: Text, at: int, budget: Budget) -> int:
     end, steps, limit = len(data), _STEPS, budget.mixed_values
     values = containers = 0
     outer: list[int] = []  # of each list or map that is open: how many values follow this one in it
-    left = 1
+    values_left = 1
     while True:
-        while left:
+        while values_left:
             if at >= end:
                 raise _cut_off()
             first = data[at]
             step = steps[first]
-            left -= 1
+            values_left -= 1
             values += 1
             if step > 0:
                 at += step
@@ -304,8 +304,8 @@ def measure_msgpack(data: Text, at: int, budget: Budget) -> int:
                     limit = min(budget.values, limit + count)
                     count = 0
                 if count:
-                    outer.append(left)
-                    left = 2 * count if is_map else count
+                    outer.append(values_left)
+                    values_left = 2 * count if is_map else count
                 if len(outer) >= budget.depth or containers > budget.containers:
                     _check_containers(len(outer) + (not count), containers, budget)
             else:
@@ -316,7 +316,7 @@ def measure_msgpack(data: Text, at: int, budget: Budget) -> int:
                 raise _too_many_values(limit)
         if not outer:
             break
-        left = outer.pop()
+        values_left = outer.pop()
     if at > end:
         raise _cut_off()
     return at
@@ -448,16 +448,17 @@ def check_json_containers(text: Text, budget: Budget) -> None:
 
 def _check_values(text: Text, max_values: int) -> None:
     """Check the number of values before any is created; strings are told apart only above the limit."""
-    left = max_values - _values(text)
+    values_left = max_values - _values(text)
     # Many words may hold many digits: they are told apart at once.
-    if left > 0 and (
-        len(text) * _MOST_VALUES_PER_BYTE < left
-        or (text.count(b'"') < _FEW_STRINGS and _more_values(_pieces(text), left) < left)
+    if values_left > 0 and (
+        len(text) * _MOST_VALUES_PER_BYTE < values_left
+        or (text.count(b'"') < _FEW_STRINGS and _more_values(_pieces(text), values_left) < values_left)
     ):
         return
     outside = b"".join(_without_strings(text, _NOT_MARKS_OR_QUOTES))
-    left = max_values - _values(outside)
-    if left <= 0 or _more_values(_without_strings(text, b"", is_separated=True), left) >= left:
+    values_left = max_values - _values(outside)
+    numbers = _without_strings(text, b"", is_separated=True)
+    if values_left <= 0 or _more_values(numbers, values_left) >= values_left:
         raise _too_many_values(max_values)
 
 
@@ -479,8 +480,8 @@ def _more_values(pieces: Iterable[Text], enough: int) -> int:
         # What may continue in the next piece is read there.
         cut = marks.rfind(b" ") + 1
         whole, rest = marks[:cut], marks[cut:]
-        for found in _COSTLY_EXPONENT.finditer(whole):
-            values += _FAR_VALUES if found[1] else _MIDDLE_VALUES
+        for exponent in _COSTLY_EXPONENT.finditer(whole):
+            values += _FAR_VALUES if exponent[1] else _MIDDLE_VALUES
             if values >= enough:
                 return values
         if b"0" * _MIDDLE_DIGITS not in whole.translate(_DIGITS):
@@ -497,8 +498,8 @@ def _more_values(pieces: Iterable[Text], enough: int) -> int:
     return values
 
 
-def _values_of_digits(found: re.Match[bytes]) -> int:
-    run, sign, exponent = found.groups()
+def _values_of_digits(digits_and_exponent: re.Match[bytes]) -> int:
+    run, sign, exponent = digits_and_exponent.groups()
     number = run.replace(b".", b"")
     digits = len(number)
     significant = len(number.lstrip(b"0"))

@@ -110,8 +110,8 @@ class SpareFiles:
             os.close(handle)
 
     def _make(self, spare: Path, size: int) -> None:
-        for left in self._folder.glob(f"{TEMPORARY_PREFIX}*"):
-            left.unlink()
+        for temporary_left in self._folder.glob(f"{TEMPORARY_PREFIX}*"):
+            temporary_left.unlink()
         temporary = self._folder / f"{TEMPORARY_PREFIX}{secrets.token_hex(8)}"
         handle = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, OWNER_ONLY)
         try:

@@ -495,12 +495,12 @@ def error_from_code(
 
 def error_of_system(error: OSError) -> RsePfError:
     """Return what the operating system refused, with the file or address and a hint that fits."""
-    what = error.strerror or str(error) or type(error).__name__
+    cause = error.strerror or str(error) or type(error).__name__
     named = "" if error.filename is None else f": {str(error.filename)!r}"
     kind, hint = _OF_SYSTEM.get(
         error.errno or 0, (RsePfError, "see what the system says about this file or address")
     )
-    return kind(f"{what}{named}", hint=hint)
+    return kind(f"{cause}{named}", hint=hint)
 
 
 _OF_SYSTEM: dict[int, tuple[type[RsePfError], str]] = {

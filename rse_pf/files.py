@@ -76,12 +76,12 @@ def read_regular_file(path: Path, max_bytes: int) -> bytes:
     return data
 
 
-def read_private_file(path: Path, what: str, *, hint: str) -> bytes:
+def read_private_file(path: Path, content: str, *, hint: str) -> bytes:
     """Return the first MiB of a file that only its owner can read.
 
     Args:
         path: The file; a pipe or a device reads as empty.
-        what: What the file holds, for the error: "the key".
+        content: What the file holds, for the error: "the key".
         hint: What to do if the file cannot be read.
 
     Raises:
@@ -92,9 +92,9 @@ def read_private_file(path: Path, what: str, *, hint: str) -> bytes:
             mode = os.fstat(file.fileno()).st_mode
             data = file.read(_MAX_BYTES) if stat.S_ISREG(mode) else b""
     except OSError as error:
-        raise UsageError(f"cannot read {what} {path}: {error.strerror}", hint=hint) from error
+        raise UsageError(f"cannot read {content} {path}: {error.strerror}", hint=hint) from error
     if stat.S_IMODE(mode) & _OTHERS:
-        raise UsageError(f"others may read {what} {path}", hint=f"chmod 600 {path}")
+        raise UsageError(f"others may read {content} {path}", hint=f"chmod 600 {path}")
     return data
 
 

@@ -480,8 +480,8 @@ def _answer(connection: socket.socket, handler: Handler, cpu_s: float) -> bool:
     except MemoryError:
         raise
     except RsePfError as error:
-        told = [error.code, error.message, error.hint, error.retry_after_ms]
-        kind, reply = _REFUSED, json.dumps(told).encode()
+        fields = [error.code, error.message, error.hint, error.retry_after_ms]
+        kind, reply = _REFUSED, json.dumps(fields).encode()
     except BaseException:  # noqa: BLE001  the reason goes to the log, and the process answers the next call
         traceback.print_exc()
         kind, reply = _DEFECT, b""

@@ -117,5 +117,5 @@ def _kilobytes(file: str, *names: str) -> int:
         raise
     except OSError:
         return 0
-    wanted = {f"{name}:" for name in names}
-    return sum(int(words[1]) for words in map(str.split, lines) if words and words[0] in wanted)
+    labels = {f"{name}:" for name in names}
+    return sum(int(words[1]) for words in map(str.split, lines) if words and words[0] in labels)

@@ -371,13 +371,13 @@ def load_part(path: Path, part: str, abi: int, *functions: str) -> list[Any]:
     try:
         library = ctypes.CDLL(str(path))
         version = library[f"rse_pf_{part}_abi"]
-        found = [library[name] for name in functions]
+        loaded = [library[name] for name in functions]
     except (OSError, AttributeError) as error:
         raise ConfigurationError(f"{path} cannot be loaded: {error}", hint=again) from error
     version.restype = ctypes.c_uint32
     if version() != abi:
         raise ConfigurationError(f"{path} has the {part} ABI {version()}, not {abi}", hint=again)
-    return found
+    return loaded
 
 
 def open_found(open_part: Callable[[Path], Part]) -> Part | None:

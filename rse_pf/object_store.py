@@ -258,10 +258,10 @@ class MemoryStore:
     def get(self, name: str) -> bytes:
         """Return the object."""
         with self._lock:
-            found = self._objects.get(check_name(name))
-        if found is None:
+            data = self._objects.get(check_name(name))
+        if data is None:
             raise NotFound(f"no object named {name!r}")
-        return found
+        return data
 
     def get_range(self, name: str, start: int, length: int) -> bytes:
         """Return a part of the object."""
@@ -279,12 +279,12 @@ class MemoryStore:
     def list(self, prefix: str = "", after: str = "") -> Iterator[ObjectInfo]:
         """Yield the objects whose names begin with *prefix* and are greater than *after*."""
         with self._lock:
-            found = sorted(
+            sizes = sorted(
                 (name, len(data))
                 for name, data in self._objects.items()
                 if name.startswith(prefix) and name > after
             )
-        for name, size in found:
+        for name, size in sizes:
             yield ObjectInfo(name=name, size=size)
 
     def folders(self, prefix: str) -> Iterator[str]:
@@ -345,10 +345,10 @@ class DirectoryStore:
     def head(self, name: str) -> ObjectInfo:
         """Return size and name."""
         with _as_store_errors(name):
-            found = self._find(name, Path.lstat)
-        if not stat.S_ISREG(found.st_mode):
+            status = self._find(name, Path.lstat)
+        if not stat.S_ISREG(status.st_mode):
             raise NotFound(f"no object named {name!r}")
-        return ObjectInfo(name=name, size=found.st_size)
+        return ObjectInfo(name=name, size=status.st_size)
 
     def list(self, prefix: str = "", after: str = "") -> Iterator[ObjectInfo]:
         """Yield the objects whose names begin with *prefix* and are greater than *after*.
@@ -388,8 +388,8 @@ class DirectoryStore:
         folder = self._folder
         while True:
             with _as_store_errors(str(self._folder)), contextlib.suppress(FileNotFoundError):
-                found = os.statvfs(folder)
-                return found.f_bavail * found.f_frsize, found.f_blocks * found.f_frsize
+                disk = os.statvfs(folder)
+                return disk.f_bavail * disk.f_frsize, disk.f_blocks * disk.f_frsize
             folder = folder.parent
 
     def delete(self, name: str) -> None:
@@ -399,8 +399,8 @@ class DirectoryStore:
         with contextlib.suppress(NotFound), _as_store_errors(name):
             self.head(name)
             with _locked(lock) if lock.exists() else contextlib.nullcontext():
-                for each in paths:
-                    each.unlink(missing_ok=True)
+                for candidate in paths:
+                    candidate.unlink(missing_ok=True)
                 lock.unlink(missing_ok=True)
             if len(paths) == 1 and path.parent != self._folder:
                 with contextlib.suppress(OSError):  # it is not empty
@@ -561,15 +561,15 @@ def _make_folder(folder: Path) -> None:
     while not folder.is_dir():
         missing.append(folder)
         folder = folder.parent
-    for each in reversed(missing):
+    for parent in reversed(missing):
         try:
-            each.mkdir()
+            parent.mkdir()
         except FileExistsError as error:
-            if not stat.S_ISDIR(each.lstat().st_mode):
+            if not stat.S_ISDIR(parent.lstat().st_mode):
                 raise StoreError(
-                    f"{each.name!r} is an object, not a folder", hint="choose another name"
+                    f"{parent.name!r} is an object, not a folder", hint="choose another name"
                 ) from error
-        sync_folder(each.parent)
+        sync_folder(parent.parent)
 
 
 def _replace_by_pieces(path: Path, pieces: Iterator[bytes]) -> None:

@@ -112,10 +112,10 @@ class Registry:
 
     def get(self, name: str) -> Service:
         """Return the service called *name*, or raise UnknownService with what is offered."""
-        found = self._services.get(name)
-        if found is None:
+        service = self._services.get(name)
+        if service is None:
             raise unknown_service(name, self.names)
-        return found
+        return service
 
     @property
     def names(self) -> tuple[str, ...]:

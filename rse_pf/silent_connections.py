@@ -133,10 +133,10 @@ class SilentConnections(Generic[Key]):
 
     def leave(self, key: Key) -> str | None:
         """Forget one that sent its request, or is gone; return its address, None if it did not wait."""
-        found = self._waiting.pop(key, None)
-        if found is None:
+        entry = self._waiting.pop(key, None)
+        if entry is None:
             return None
-        timer, _, source = found
+        timer, _, source = entry
         timer.cancel()
         self._line.leave(key)
         return source

@@ -84,7 +84,7 @@ class Backoff:
         wait_s = self._bucket.wait_s(now)
         if is_move:
             kept = _KEPT * self._bucket.burst
-            wait_s = max(wait_s, (kept + 1.0 - self._bucket.left) / self._bucket.rate)
+            wait_s = max(wait_s, (kept + 1.0 - self._bucket.tokens) / self._bucket.rate)
         return max(asked_s + self._own_s(now, last, valid_in_s), wait_s)
 
     def _own_s(self, now: float, last: Last, valid_in_s: float | None) -> float:

@@ -308,7 +308,9 @@ class ClientSession:
                 if pending.connection is before and pending.is_long and not pending.cancelled:
                     pending.connection = None  # the job continues on any server; the old one can close now
         self._say(self.subscriptions.adopt(connection, now), now)
-        frames = [each for each in self._pending.values() if _is_frame(each) and each.connection is None]
+        frames = [
+            pending for pending in self._pending.values() if _is_frame(pending) and pending.connection is None
+        ]
         if (
             before is None
             and len(frames) > 1
@@ -424,12 +426,12 @@ class ClientSession:
             return []
         events: list[Event] = []
         capacity = self._capacity(connection, now)
-        waiting = [each for each in self._pending.items() if each[1].connection is None]
+        waiting = [item for item in self._pending.items() if item[1].connection is None]
         newest = 0 if connection.backlog is None else connection.backlog.newest
         if not any(identity <= newest and _is_frame(pending) for identity, pending in waiting):
             connection.backlog = None
         else:
-            waiting.sort(key=lambda each: send_order(each[0], each[1].command.stream))
+            waiting.sort(key=lambda item: send_order(item[0], item[1].command.stream))
         for identity, pending in waiting:
             if now < pending.not_before:
                 continue
@@ -446,7 +448,9 @@ class ClientSession:
     def _may_send(self, command: Command, connection: ConnectionState, capacity: int) -> bool:
         if capacity <= 0 or not command.stream or connection.backlog is None:
             return capacity > 0
-        in_flight = sum(_is_frame(each) and each.connection is connection for each in self._pending.values())
+        in_flight = sum(
+            _is_frame(pending) and pending.connection is connection for pending in self._pending.values()
+        )
         return in_flight < connection.backlog.max_in_flight
 
     def _capacity(self, connection: ConnectionState, now: float) -> int:

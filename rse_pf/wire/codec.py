@@ -197,11 +197,11 @@ class _JsonCodec:
     def decode_from_robot(self, data: bytes) -> FromRobot:
         check_size(data, self._budget)
         if self._reader is not None:
-            found = self._reader.read(data)
-            if isinstance(found, Command):
-                return found
-            if found is not None and not isinstance(found, str):
-                message: FromRobot = _guarded(self._from_robot, found)
+            message_or_text = self._reader.read(data)
+            if isinstance(message_or_text, Command):
+                return message_or_text
+            if message_or_text is not None and not isinstance(message_or_text, str):
+                message: FromRobot = _guarded(self._from_robot, message_or_text)
                 return message
         return self._read(self._open(data))
 
@@ -213,13 +213,13 @@ class _JsonCodec:
             if reader is None:
                 reader = NativeReader(self._native, self.name, self._budget, self._pnp, short_bytes=max_bytes)
                 self._short_readers[max_bytes] = reader
-            found = reader.read(data)
-            if isinstance(found, Command):
-                return found
-            if isinstance(found, str):
+            message_or_text = reader.read(data)
+            if isinstance(message_or_text, Command):
+                return message_or_text
+            if isinstance(message_or_text, str):
                 return None
-            if found is not None:
-                message: FromRobot = _guarded(self._from_robot, found)
+            if message_or_text is not None:
+                message: FromRobot = _guarded(self._from_robot, message_or_text)
                 return message
         text = inflate_short(data, max_bytes)
         return None if text is None or len(text) > max_bytes else self._read(text)
@@ -268,10 +268,10 @@ class _BinaryCodec:
             check_size(data, self._budget)
         is_checked = False
         if self._reader is not None and len(data) >= _SHORTEST_POSE_BYTES:
-            found = self._reader.read(data)
-            if isinstance(found, Command):
-                return found
-            is_checked = found is not None
+            command_or_data = self._reader.read(data)
+            if isinstance(command_or_data, Command):
+                return command_or_data
+            is_checked = command_or_data is not None
         is_checked = is_checked or check_msgpack(data, self._budget)
         try:
             message: FromRobot = self._from_robot(data)
@@ -330,10 +330,10 @@ def _check_nesting(value: Any, max_depth: int) -> None:
     layer = [value] if type(value) in _CONTAINERS else []
     for _ in range(max_depth - 1):
         layer = [
-            each
+            item
             for box in layer
-            for each in (itertools.chain(box, box.values()) if type(box) is dict else box)
-            if type(each) in _CONTAINERS
+            for item in (itertools.chain(box, box.values()) if type(box) is dict else box)
+            if type(item) in _CONTAINERS
         ]
         if not layer:
             return

@@ -83,10 +83,10 @@ def peek(codec: Codec, data: bytes) -> Envelope | None:
             head = zlib.decompressobj().decompress(head, _INFLATED_BYTES)
         except zlib.error:
             return None
-    found = _HEAD.match(head)
-    if found is None:
+    match = _HEAD.match(head)
+    if match is None:
         return None
-    identity, service = found.groups()
+    identity, service = match.groups()
     return Envelope(int(identity), service.decode()) if len(identity) < 16 or int(identity) < 2**53 else None
 
 
@@ -98,18 +98,18 @@ def undecodable_id(codec: Codec, data: bytes) -> int | None:
     """
     is_binary = codec.name == "bin"
     decode: Callable[[bytes], Any] = msgspec.msgpack.decode if is_binary else msgspec.json.decode
-    found: dict[str, Any] = {}
+    members: dict[str, Any] = {}
     try:
         fields = _binary_fields(data) if is_binary else _json_fields(_text_head(codec, data))
         for name, value in itertools.islice(fields, _MAX_FIELDS):
             if name in ("type", "id"):
-                found[name] = decode(value)
-            if len(found) == 2:
+                members[name] = decode(value)
+            if len(members) == 2:
                 break
     except (ProtocolError, msgspec.DecodeError, ValueError):
         return None
-    identity = found.get("id")
-    if found.get("type") not in _WITH_ANSWER or type(identity) is not int:
+    identity = members.get("id")
+    if members.get("type") not in _WITH_ANSWER or type(identity) is not int:
         return None
     return identity if 0 <= identity < 2**53 else None
 
@@ -121,11 +121,11 @@ def _text_head(codec: Codec, data: bytes) -> bytes:
         return head
     stream, text = zlib.decompressobj(), b""
     for at in range(0, len(head), _INFLATED_PIECE_BYTES):
-        left = _MAX_PEEKED_BYTES - len(text)
-        if left <= 0:
+        room_bytes = _MAX_PEEKED_BYTES - len(text)
+        if room_bytes <= 0:
             break
         try:
-            text += stream.decompress(head[at : at + _INFLATED_PIECE_BYTES], left)
+            text += stream.decompress(head[at : at + _INFLATED_PIECE_BYTES], room_bytes)
         except zlib.error:
             break
     return text
@@ -134,9 +134,9 @@ def _text_head(codec: Codec, data: bytes) -> bytes:
 def _json_fields(head: bytes) -> Iterator[tuple[str, bytes]]:
     """Yield name and text of the members at the start of an object, up to the first list or object."""
     at = 0
-    while found := _MEMBER.match(head, at):
-        at = found.end()
-        yield found[1].decode("utf-8", "replace"), found[2]
+    while member := _MEMBER.match(head, at):
+        at = member.end()
+        yield member[1].decode("utf-8", "replace"), member[2]
 
 
 def _binary_fields(data: bytes) -> Iterator[tuple[str, bytes]]:

@@ -159,16 +159,16 @@ class NativeReader:
             if self._short_bytes:
                 return "longer"
             status, text = self._with_more_room(data)
-        found = _FOUND_WITH_HEAD.unpack_from(buffers.call, _FOUND_AT)
+        sizes = _FOUND_WITH_HEAD.unpack_from(buffers.call, _FOUND_AT)
         if status == _READ and self._types is not None:
-            command = _command(buffers, found, text, self._types)
+            command = _command(buffers, sizes, text, self._types)
             if command is not None:
                 return command
         elif status == _UNKNOWN:
             return None
         elif status not in (_READ, _NOT_MINE):
-            raise self._refused(status, size, found[1])
-        return text[: found[0]] if self._is_deflated else data
+            raise self._refused(status, size, sizes[1])
+        return text[: sizes[0]] if self._is_deflated else data
 
     def _with_more_room(self, data: bytes) -> tuple[int, memoryview]:
         """Inflate again; a bomb shows itself in the first part, so that no more memory is taken for it."""
@@ -204,13 +204,13 @@ def _functions(library: ctypes.CDLL) -> _Calls:
 
 
 def _command(
-    buffers: CallBuffers, found: tuple[Any, ...], text: bytes | memoryview, types: PnpTypes
+    buffers: CallBuffers, numbers_found: tuple[Any, ...], text: bytes | memoryview, types: PnpTypes
 ) -> Command | None:
     """Return what a call has found; None if the camera or the options are refused by their types."""
     (
         _, _, points, pixels, depths, identity, seq, deadline_ms, fields,
         stream_at, stream_bytes, trace_at, trace_bytes, head,
-    ) = found  # fmt: skip
+    ) = numbers_found  # fmt: skip
     try:
         camera, options = _head(types, head)
     except (RsePfError, msgspec.ValidationError):
@@ -247,10 +247,10 @@ def _head(types: PnpTypes, head: bytes) -> tuple[Any, Any]:
     if not has & _HAS_OPTIONS:
         return camera, None
     numbers = dict(zip(_OPTION_FIELDS, (inlier_px, confidence, most, least), strict=True))
-    given: dict[str, Any] = {name: numbers[bit] for bit, name in _OPTION_FIELDS.items() if has & bit}
+    chosen: dict[str, Any] = {name: numbers[bit] for bit, name in _OPTION_FIELDS.items() if has & bit}
     if has & _HAS_ENGINE:
-        given["engine"] = engine.rstrip(b"\0").decode()
-    return camera, msgspec.convert(given, types.options)
+        chosen["engine"] = engine.rstrip(b"\0").decode()
+    return camera, msgspec.convert(chosen, types.options)
 
 
 def open_codec(path: Path) -> NativeCodec:

@@ -48,7 +48,7 @@ class RateLimiter:
         if self._bucket is None:
             return _UNLIMITED
         self._bucket.fill(now)
-        return max(0, int(self._bucket.left))
+        return max(0, int(self._bucket.tokens))
 
     def spend(self, now: float) -> None:
         """Count one message that is sent whatever the limit says."""

@@ -35,9 +35,9 @@ class RefusedHandshake:
     valid_from_s: float | None = None
 
 
-def refusal_body(code: str, message: str, hint: str, **told: Any) -> bytes:
-    """Return the JSON body of a refusal; *told* are further members, for a robot that proved its key."""
-    body = {"platform": PLATFORM, "code": code, "message": message, "hint": hint, **told}
+def refusal_body(code: str, message: str, hint: str, **members: Any) -> bytes:
+    """Return the JSON body of a refusal; *members* are further members, for a robot that proved its key."""
+    body = {"platform": PLATFORM, "code": code, "message": message, "hint": hint, **members}
     return json.dumps(body, separators=(",", ":")).encode()
 
 
@@ -46,16 +46,16 @@ def refusal_in(body: bytes, code: str) -> RefusedHandshake | None:
     if len(body) > _MAX_BODY_BYTES:
         return None
     try:
-        told = json.loads(body)
+        members = json.loads(body)
     except (ValueError, RecursionError):
         return None
-    if not isinstance(told, dict) or told.get("platform") != PLATFORM or told.get("code") != code:
+    if not isinstance(members, dict) or members.get("platform") != PLATFORM or members.get("code") != code:
         return None
     return RefusedHandshake(
-        message=_text(told.get("message")),
-        hint=_text(told.get("hint")),
-        cause=_text(told.get("cause")),
-        valid_from_s=_unix_s(told.get("valid_from_s")),
+        message=_text(members.get("message")),
+        hint=_text(members.get("hint")),
+        cause=_text(members.get("cause")),
+        valid_from_s=_unix_s(members.get("valid_from_s")),
     )
 
 
