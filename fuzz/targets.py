@@ -154,7 +154,7 @@ def stream(data: bytes, meter: Meter) -> None:
 
     def taken(pieces: list[memoryview]) -> int:
         border = CloseBorder(upgraded=True)
-        return sum(border.wanted(piece, len(piece)) for piece in pieces)
+        return sum(border.bytes_to_close(piece, len(piece)) for piece in pieces)
 
     whole = meter.call(lambda sent: taken([memoryview(sent)]), body, ProtocolError)
     cut = [memoryview(body)[i : i + step] for i in range(0, len(body), step)]

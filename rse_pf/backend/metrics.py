@@ -69,7 +69,7 @@ class Metrics:
         self.bytes_out = 0
         self.gauges: dict[str, float] = {}
 
-    def answered(self, service: str, result: str, duration_s: float) -> None:
+    def count_answer(self, service: str, result: str, duration_s: float) -> None:
         """Count a final answer; *result* is ``ok`` or a failure code."""
         self.requests[service, result] += 1
         buckets = self.durations.get(service)

@@ -63,8 +63,8 @@ def resolve(
     Args:
         request_type: What the service takes, a msgspec Struct.
         payload: As decoded from the wire: plain dicts and lists; not changed.
-        robot: Of the token.
-        store: Of the platform.
+        robot: The robot that the token names.
+        store: The store of the platform.
         settings: ``max_objects_per_command`` and ``max_object_bytes_per_command``.
 
     Raises:
@@ -88,7 +88,7 @@ def resolve(
             hint="put them into fewer commands",
         )
     held = {digest: _read(store, object_name(robot, digest), digest) for digest in digests}
-    return _walk(_shape(request_type), payload, held.__getitem__)
+    return _replace(_shape(request_type), payload, held.__getitem__)
 
 
 class Owner(Protocol):
@@ -107,31 +107,52 @@ class ObjectRefs:
     data: DataSettings = field(default_factory=DataSettings)
     """Quotas of tenants, and of robots whose tokens name none."""
 
-    def named_by(self, command: Command, service: Service) -> bool:
-        """Return whether the store would have to be asked; cheap for services that take no ``bytes``."""
+    def has_references(self, command: Command, service: Service) -> bool:
+        """Return whether *command* refers to stored objects; cheap for services that take no ``bytes``.
+
+        Without a store, no reference is looked for.
+        """
         shape = None if self.store is None else _shape(service.request_type)
         return shape is not None and any(True for _ in _references(shape, command.payload))
 
-    def put_in(self, command: Command, registry: Registry, who: Owner) -> Command:
+    def resolve_references(self, command: Command, registry: Registry, who: Owner) -> Command:
         """Return *command* with the bytes that its payload refers to; blocks for the store.
+
+        Args:
+            command: As decoded from the wire; not changed.
+            registry: Knows the request type of the service.
+            who: The robot, whose own objects alone are read.
 
         Raises:
             UnknownService: The registry does not know the service.
-            RsePfError: As `resolve` says.
+            BadRequest: A reference is no sha256 in hex.
+            NotFound: The robot has no such object.
+            LimitExceeded: The command refers to more objects, or bytes in them, than it may.
+            StoreError: The store fails, or holds other bytes than the digest says.
         """
         service = registry.get(command.service)
-        if self.store is None or not self.named_by(command, service):
+        if self.store is None or not self.has_references(command, service):
             return command
         payload = resolve(
             service.request_type, command.payload, who.robot, self.store, settings=self.settings
         )
         return msgspec.structs.replace(command, payload=payload)
 
-    def kept(self, answer: Result | Failure, sent: Result | Failure, who: Owner) -> Result | Failure:
-        """Return *answer* with its reply stored, if *sent* says that the reply is too large; blocks for the
-        store.
+    def store_large_reply(
+        self, answer: Result | Failure, sent: Result | Failure, who: Owner
+    ) -> Result | Failure:
+        """Store the reply of *answer* if it is too large for a message; blocks for the store.
 
-        If the reply is beyond the robot's quota, return the failure that says so.
+        Args:
+            answer: The answer of the service.
+            sent: The message that would be sent to the robot: *answer*, or the failure that takes its place.
+                A failure with the code of `LimitExceeded` says that the reply is too large.
+            who: The robot, whose quota the stored reply counts for.
+
+        Returns:
+            *answer* with the digest of the stored reply in its place; *sent* if nothing has to be stored, if
+            there is no store or it fails, or if the reply is too large for the store as well; the failure of
+            the quota if the reply is beyond that of the robot or of its tenant.
         """
         is_too_large = isinstance(sent, Failure) and sent.code == LimitExceeded.code
         if self.store is None or not isinstance(answer, Result) or not is_too_large:
@@ -182,7 +203,7 @@ def _cached_shape(request_type: type[Any]) -> Any:
 
 
 def _shape_of(kind: Any, depth: int) -> Any:
-    """Return where below *kind* bytes are declared; None if they are not."""
+    """Return the places below *kind* where bytes are declared, None if there are none."""
     known = msgspec.inspect
     if depth == 0:
         return None
@@ -205,7 +226,7 @@ def _shape_of(kind: Any, depth: int) -> Any:
 
 
 def _references(shape: Any, value: Any) -> Iterator[dict[str, Any]]:
-    """Yield what stands in the place of bytes and looks like a reference."""
+    """Yield each dict in *value* that has the form of a reference and stands where *shape* has bytes."""
     if isinstance(shape, _Bytes):
         if isinstance(value, dict) and _KEY in value:
             yield value
@@ -218,17 +239,19 @@ def _references(shape: Any, value: Any) -> Iterator[dict[str, Any]]:
                 yield from _references(below, value[name])
 
 
-def _walk(shape: Any, value: Any, put: Callable[[Any], Any]) -> Any:
-    """Return *value* with what *put* returns for each named digest; shares what it does not change."""
+def _replace(shape: Any, value: Any, read: Callable[[Any], Any]) -> Any:
+    """Return *value* with `read(digest)` in the place of each reference; unchanged parts are shared."""
     if isinstance(shape, _Bytes):
-        return put(_digest(value)) if isinstance(value, dict) and _KEY in value else value
+        return read(_digest(value)) if isinstance(value, dict) and _KEY in value else value
     if isinstance(shape, _Each) and isinstance(value, dict):
-        return {key: _walk(shape.below, item, put) for key, item in value.items()}
+        return {key: _replace(shape.below, item, read) for key, item in value.items()}
     if isinstance(shape, _Each) and isinstance(value, (list, tuple)):
-        return [_walk(shape.below, item, put) for item in value]
+        return [_replace(shape.below, item, read) for item in value]
     if isinstance(shape, _Fields) and isinstance(value, dict):
         below = shape.below
-        return {key: _walk(below[key], item, put) if key in below else item for key, item in value.items()}
+        return {
+            key: _replace(below[key], item, read) if key in below else item for key, item in value.items()
+        }
     return value
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import secrets
 from asyncio import AbstractEventLoop
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -25,7 +26,7 @@ class Wire(Protocol):
         """Return how many bytes wait in this process, because the kernel does not take more."""
 
     def bound_unsent(self, max_bytes: int) -> None:
-        """Let the kernel take no more than *max_bytes* that the network has not taken."""
+        """Limit the bytes that the kernel holds for the network to *max_bytes*."""
 
     def send_pong(self, data: bytes) -> None:
         """Write one pong frame."""
@@ -56,7 +57,7 @@ class SlowReader(Protocol):
         """How much was written that the kernel has not taken."""
 
     def bound_unsent(self, max_bytes: int) -> None:
-        """Let the kernel take no more than *max_bytes* that the network has not taken."""
+        """Limit the bytes that the kernel holds for the network to *max_bytes*."""
 
     def write(self, data: bytes) -> None:
         """Write one message."""
@@ -66,10 +67,10 @@ class Log(Protocol):
     """Where events go; `rse_pf.backend.log.JsonLog` is one."""
 
     def info(self, event: str, **fields: Any) -> None:
-        """Write what happened."""
+        """Write an event of normal operation."""
 
     def warning(self, event: str, **fields: Any) -> None:
-        """Write what an operator should look at."""
+        """Write an event that an operator should look at."""
 
     def error(self, event: str, **fields: Any) -> None:
         """Write a defect."""
@@ -84,11 +85,24 @@ class Clocks:
     cpu: Callable[[], float]
 
 
+def make_session_id() -> str:
+    """Return a random id of a session, 16 hexadecimal digits."""
+    return secrets.token_hex(8)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WorkerContext:
-    """What all parts of one worker share; ``server_id`` goes into welcomes and answers.
+    """The values that all parts of one worker share.
 
-    ``tap`` takes the messages of all connections for a recording; None where nothing is recorded.
+    Attributes:
+        settings: The settings of the platform.
+        server_id: The name of the server in welcomes and answers.
+        clocks: The clocks of the worker.
+        loop: The event loop of the worker.
+        log: The log of the worker.
+        metrics: The counters of the worker.
+        tap: Takes the messages of all connections for a recording; None where nothing is recorded.
+        new_session_id: Makes the id of a session, which goes into its welcome.
     """
 
     settings: PlatformSettings
@@ -98,3 +112,4 @@ class WorkerContext:
     log: JsonLog
     metrics: Metrics = field(default_factory=Metrics)
     tap: RecordingTap | None = None
+    new_session_id: Callable[[], str] = make_session_id

@@ -236,14 +236,14 @@ class ServerSession:
             case _:
                 return self._renew(message.token, now)
 
-    def answered(self, command_id: int) -> None:
+    def forget_command(self, command_id: int) -> None:
         """Forget what only a rosbridge client's session keeps of a command that has its final answer."""
 
     def move(self, reason: str, within_ms: float) -> list[Decision]:
         """Ask the robot to connect to another server before it closes this connection."""
         return [self._send(Move(reason=reason, within_ms=within_ms))] if self.state == "open" else []
 
-    def renewed(self, token_s: float | None) -> list[Decision]:
+    def answer_renewal(self, token_s: float | None) -> list[Decision]:
         """Answer a `Renewal`: the connection lasts *token_s* longer, or (None) the token was refused.
 
         A refusal tells no cause, as in the handshake, and the connection keeps its previous expiry.

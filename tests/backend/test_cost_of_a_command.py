@@ -161,13 +161,13 @@ def calls_of_a_command(worker: WorkerParts, command: Command) -> list[str]:
     data = worker.codec.encode(command)
     opcode = 1 if worker.codec.is_text else 2
     for _ in range(3):
-        connection.frame(opcode, True, False, data)
+        connection.receive_frame(opcode, True, False, data)
         worker.loop.turn()
     heard = len(wire.sent)
     wire.send = lambda data, is_text: wire.sent.append(data)  # type: ignore[method-assign]
 
     def one() -> None:
-        connection.frame(opcode, True, False, data)
+        connection.receive_frame(opcode, True, False, data)
         worker.loop.turn()
 
     calls = calls_of(one)

@@ -10,7 +10,7 @@ from rse_pf.backend.metrics import GAUGE_HELP, Metrics, merge, render
 def worker(answers: list[tuple[str, str, float]], **gauges: float) -> dict:
     metrics = Metrics()
     for service, result, duration_s in answers:
-        metrics.answered(service, result, duration_s)
+        metrics.count_answer(service, result, duration_s)
     metrics.shed["behind"] += 1
     metrics.bytes_in += 10
     metrics.gauges = {"robots": 2.0, "queue_oldest_s": 0.0, **gauges}

@@ -172,7 +172,7 @@ def test_an_invalid_payload_is_left_to_the_service_to_refuse(store: Counting) ->
         return request
 
     def looks_into_the_store(payload: Any) -> bool:
-        return gate.named_by(Command(id=1, service="asked", payload=payload), registry.get("asked"))
+        return gate.has_references(Command(id=1, service="asked", payload=payload), registry.get("asked"))
 
     wrong: list[Any] = [None, 7, [], {"one": [name(MAP)]}, {"many": name(MAP)}, {"part": [1]}]
 

@@ -85,9 +85,9 @@ def test_a_large_reply_beyond_the_quota_is_refused_with_the_reason():
     answer, sent = Result(id=1, reply=bytes(500)), Failure(id=1, code="too-large", message="too large")
     owner = SimpleNamespace(robot=ROBOT, claims=None)
 
-    refused = gate.kept(answer, sent, owner)
+    refused = gate.store_large_reply(answer, sent, owner)
     owner.claims = claims(data_bytes=5000.0)
-    stored = gate.kept(answer, sent, owner)
+    stored = gate.store_large_reply(answer, sent, owner)
 
     assert isinstance(refused, Failure)
     assert (refused.id, refused.code) == (1, "quota")

@@ -12,6 +12,7 @@ from typing import Generic, Protocol, TypeVar
 from rse_pf.backend.compute.limited_services import LimitedServices
 from rse_pf.backend.scheduling.scheduler import (
     QUEUE_TARGET_S,
+    QueueBacklog,
     QueuedCommand,
     RefusedCommand,
     Scheduler,
@@ -75,7 +76,7 @@ class ComputeLane(Generic[Answer]):
         self._threads = SolverThreads(
             threads,
             self._compute,
-            lambda answer: loop.call_soon_threadsafe(self._computed, answer),
+            lambda answer: loop.call_soon_threadsafe(self._on_computed, answer),
             name="compute",
         )
 
@@ -93,8 +94,8 @@ class ComputeLane(Generic[Answer]):
         """Return whether *service* is a limited one."""
         return service in self._names
 
-    def backlog(self, queued: QueuedCommand) -> tuple[int, float, float]:
-        """Return what `Scheduler.backlog` returns."""
+    def backlog(self, queued: QueuedCommand) -> QueueBacklog:
+        """Return the commands that would delay *queued*, see `Scheduler.backlog`."""
         return self._scheduler.backlog(queued)
 
     def note_refused(self, now: float) -> None:
@@ -143,7 +144,7 @@ class ComputeLane(Generic[Answer]):
         started = self._monotonic()
         return self._encode(queued, self._limited.compute(queued), started)
 
-    def _computed(self, answer: Answer) -> None:
+    def _on_computed(self, answer: Answer) -> None:
         now = self._monotonic()
         self._scheduler.done(answer.queued, now)
         self._send(answer, now)

@@ -16,6 +16,7 @@ from rse_pf.backend.gateway.rate_limits import RobotRates
 from rse_pf.backend.scheduling.scheduler import (
     BEHIND,
     BEHIND_HINT,
+    QueueBacklog,
     QueuedCommand,
     RefusedCommand,
     expired,
@@ -80,18 +81,16 @@ class Admission:
         self,
         queued: QueuedCommand,
         claims: Claims | None,
-        backlog: tuple[int, float, float],
+        backlog: QueueBacklog,
         max_delay_s: float,
     ) -> RefusedCommand | None:
         """Return why a decoded command is refused; None if it is admitted.
 
         Args:
             queued: The command, with the times of its arrival and of its deadline.
-            claims: What the robot's token says; None where no token is required.
-            backlog: How many commands of the robot wait in the queue that *queued* would join, how long it
-            would
-                wait for its turn, and how long each turn takes, in seconds.
-            max_delay_s: How long commands may wait now; see `Scheduler.max_delay_s`.
+            claims: The claims of the robot's token; None where no token is required.
+            backlog: The commands that would delay *queued* in the queue that it would join.
+            max_delay_s: The longest time that commands may wait now; see `Scheduler.max_delay_s`.
         """
         service = queued.command.service
         if claims is not None and not self.is_in_scope(service, claims):
@@ -102,15 +101,14 @@ class Admission:
         allowed_s = queued.deadline_s - queued.received_s
         if allowed_s <= 0:
             return RefusedCommand(queued, expired(queued, queued.received_s), "expired")
-        waiting, delay_s, turn_s = backlog
-        if waiting >= self._max_queue:
+        if backlog.waiting >= self._max_queue:
             busy = Busy(
-                f"{waiting} commands of this robot wait already",
+                f"{backlog.waiting} commands of this robot wait already",
                 hint="send slower, or let newer frames replace older ones",
-                retry_after_ms=retry_after_ms(waiting * turn_s),
+                retry_after_ms=retry_after_ms(backlog.waiting * backlog.turn_s),
             )
             return RefusedCommand(queued, busy, "robot-queue")
-        if delay_s > max_wait_s(allowed_s, max_delay_s):
-            busy = Busy(BEHIND, hint=BEHIND_HINT, retry_after_ms=retry_after_ms(delay_s))
+        if backlog.delay_s > max_wait_s(allowed_s, max_delay_s):
+            busy = Busy(BEHIND, hint=BEHIND_HINT, retry_after_ms=retry_after_ms(backlog.delay_s))
             return RefusedCommand(queued, busy, "behind")
         return None

@@ -44,10 +44,10 @@ class Answers:
     def __init__(
         self, context: WorkerContext, *, registry: Registry, services: frozenset[str], objects: ObjectRefs
     ) -> None:
-        """Keep what answers are made of.
+        """Answer no command yet.
 
         Args:
-            context: Of the worker.
+            context: The clocks, log, metrics and settings of the worker.
             registry: The services that `compute` calls.
             services: Names of all services of this server, installed ones included; others share one label.
             objects: Puts stored objects into payloads, and large replies into the store.
@@ -70,8 +70,10 @@ class Answers:
         self._services = services
 
     def compute(self, queued: QueuedCommand) -> EncodedAnswer:
-        """Call the service and encode its answer; runs in the loop or in a thread, and touches nothing
-        shared."""
+        """Call the service and encode its answer.
+
+        It may run in the event loop or in a thread, because it changes nothing that they share.
+        """
         command = queued.command
         if command.service in self.with_objects:
             return self._compute_with_objects(queued)
@@ -80,23 +82,23 @@ class Answers:
             on_defect=self._log_defect, received_s=queued.received_s,
         )  # fmt: skip
         if isinstance(message, Failure) and message.code == UnknownService.code:
-            return self._failed(queued, self._unknown(queued))
-        return self._fitting(queued, message)
+            return self._encode_failure(queued, self._unknown_service(queued))
+        return self._encode_fitting(queued, message)
 
-    def _unknown(self, queued: QueuedCommand) -> RsePfError:
-        """Return the error of a service that is not there; it names what the robot's token allows."""
+    def _unknown_service(self, queued: QueuedCommand) -> RsePfError:
+        """Return the error of a service that is not offered; it names the services that the token allows."""
         owner: RobotConnection = queued.owner
         scopes = () if owner.claims is None else owner.claims.scopes
         offered = [name for name in self._registry.names if scopes_allow(scopes, f"services:{name}")]
         return unknown_service(queued.command.service, offered)
 
     def _compute_with_objects(self, queued: QueuedCommand) -> EncodedAnswer:
-        """Do the same for a service whose payload may name stored objects."""
+        """Compute the answer of a service whose payload may refer to stored objects; it may block."""
         started = self._monotonic()
         try:
-            command = self.objects.put_in(queued.command, self._registry, queued.owner)
+            command = self.objects.resolve_references(queued.command, self._registry, queued.owner)
         except RsePfError as error:
-            return self._failed(queued, error)
+            return self._encode_failure(queued, error)
         message = dispatch(
             self._registry,
             command,
@@ -118,14 +120,14 @@ class Answers:
                 received_s=queued.received_s,
                 sent_s=self._monotonic(),
             )
-        return self._fitting(queued, message)
+        return self._encode_fitting(queued, message)
 
     def send(self, answer: EncodedAnswer, now: float) -> None:
         """Write *answer*, unless its robot is gone; count and log it in any case."""
         queued, message = answer.queued, answer.message
         code = "ok" if isinstance(message, Result) else message.code
         service = self.label(queued.command.service)
-        self._context.metrics.answered(service, code, now - queued.received_s)
+        self._context.metrics.count_answer(service, code, now - queued.received_s)
         connection: RobotConnection = queued.owner
         connection.answer(answer.data, queued.command.id)
         if connection.tap is not None and isinstance(queued.command.payload, msgspec.Struct):
@@ -147,7 +149,7 @@ class Answers:
             )  # fmt: skip
 
     def send_message(self, queued: QueuedCommand, message: Result | Failure) -> None:
-        """Send what a sandbox or a job answered."""
+        """Send the answer of a sandbox or a job."""
         now = self._context.clocks.monotonic()
         if isinstance(message, Result):
             # A job does not say when it began, only how long it took.
@@ -156,12 +158,12 @@ class Answers:
             message = msgspec.structs.replace(
                 message, queue_ms=queue_ms, received_s=queued.received_s, sent_s=now
             )
-        self.send(self._encoded(queued, message), now)
+        self.send(self._encode(queued, message), now)
 
     def send_refusal(self, refusal: RefusedCommand, now: float) -> None:
         """Answer a command that ends without compute."""
         self._context.metrics.shed[refusal.reason] += 1
-        self.send(self._failed(refusal.queued, refusal.error), now)
+        self.send(self._encode_failure(refusal.queued, refusal.error), now)
 
     def send_unread_refusal(
         self,
@@ -184,7 +186,7 @@ class Answers:
         if envelope is None:
             return
         service = self.label(envelope.service)
-        context.metrics.answered(service, Busy.code, 0.0)
+        context.metrics.count_answer(service, Busy.code, 0.0)
         if context.log.writes("debug"):
             context.log.debug(
                 "command", robot=connection.robot, service=service, id=envelope.id,
@@ -195,7 +197,7 @@ class Answers:
     def note_undecoded(self, connection: RobotConnection, failure: Failure, size_bytes: int) -> None:
         """Count and log a message of *size_bytes* that was answered with *failure* instead of decoded."""
         if failure.id is not None:
-            self._context.metrics.answered(_UNKNOWN, failure.code, 0.0)
+            self._context.metrics.count_answer(_UNKNOWN, failure.code, 0.0)
             connection.commands += 1
             connection.last_result = failure.code
         self._context.log.info(
@@ -208,31 +210,31 @@ class Answers:
         offer."""
         return service if service in self._services else _UNKNOWN
 
-    def _fitting(self, queued: QueuedCommand, message: Result | Failure) -> EncodedAnswer:
+    def _encode_fitting(self, queued: QueuedCommand, message: Result | Failure) -> EncodedAnswer:
         """Encode *message*; blocks for the store if the reply is too large for a message."""
-        answer = self._encoded(queued, message)
+        answer = self._encode(queued, message)
         if answer.message is message:
             return answer
-        stored = self.objects.kept(message, answer.message, queued.owner)
-        return answer if stored is answer.message else self._encoded(queued, stored)
+        stored = self.objects.store_large_reply(message, answer.message, queued.owner)
+        return answer if stored is answer.message else self._encode(queued, stored)
 
-    def _encoded(self, queued: QueuedCommand, message: Result | Failure) -> EncodedAnswer:
+    def _encode(self, queued: QueuedCommand, message: Result | Failure) -> EncodedAnswer:
         codec, command = queued.owner.session.codec, queued.command
         try:
             data = codec.encode(message)
         except Exception as error:  # noqa: BLE001  the reply of a service may hold anything
             self._log_defect(command, error)
             defect = InternalError(f"the reply of {command.service!r} cannot be encoded")
-            return self._failed(queued, defect)
+            return self._encode_failure(queued, defect)
         max_bytes = self._context.settings.session.max_message_bytes
         if len(data) <= max_bytes:
             return EncodedAnswer(queued, message, data)
         if isinstance(message, Result) and message.object and message.reply is not None:
-            return self._encoded(queued, msgspec.structs.replace(message, reply=None))
+            return self._encode(queued, msgspec.structs.replace(message, reply=None))
         too_large = LimitExceeded(f"the reply has {len(data)} bytes, above {max_bytes}", hint="ask for less")
-        return self._failed(queued, too_large)
+        return self._encode_failure(queued, too_large)
 
-    def _failed(self, queued: QueuedCommand, error: RsePfError) -> EncodedAnswer:
+    def _encode_failure(self, queued: QueuedCommand, error: RsePfError) -> EncodedAnswer:
         failure = failure_of(error, queued.command, server=self._context.server_id)
         return EncodedAnswer(queued, failure, queued.owner.session.codec.encode(failure))
 
@@ -244,14 +246,14 @@ class Answers:
 
 
 def _tell_pose(tap: RecordingTap, message: Result | Failure, data: bytes) -> None:
-    """Tell a recording the pose in *data*, the answer to a command that the native core read."""
+    """Pass to a recording the pose in *data*, the answer to a command that the native core read."""
     pose = getattr(message.reply, "T_camera_world", None) if isinstance(message, Result) else None
     if isinstance(message, Result) and isinstance(pose, np.ndarray) and pose.dtype == np.float64:
         tap.has_pose(data, message.id, pose.tobytes())
 
 
 def _weakness(message: Result | Failure) -> dict[str, str]:
-    """Return what the log says of a weak pose; empty for every other answer."""
+    """Return the log fields of a weak pose; empty for every other answer."""
     reply = message.reply if isinstance(message, Result) else None
     if getattr(reply, "verdict", "") != "weak":
         return {}

@@ -60,30 +60,31 @@ class AuditRecorder:
         self._next: TimerHandle | None = None
         self._sum: TimerHandle | None = None
 
-    def judged(self, verdict: Accepted | Rejected, source: str, token: str) -> None:
+    def record_verdict(self, verdict: Accepted | Rejected, source: str, token: str) -> None:
         """Record the verdict on a handshake with *token* from the address *source*."""
         if isinstance(verdict, Accepted):
             if verdict.claims is not None:
-                self._note("auth.accepted", str(verdict.claims.robot), **_of(verdict.claims), source=source)
+                fields = _token_fields(verdict.claims)
+                self._note("auth.accepted", str(verdict.claims.robot), **fields, source=source)
         elif verdict.status == _UNAUTHORIZED and self._may_record(verdict.reason):
             self._note("auth.refused", "", reason=verdict.reason, source=source, **claimed_by(token))
 
-    def renewed(self, before: Claims, claims: Claims) -> None:
+    def record_renewal(self, before: Claims, claims: Claims) -> None:
         """Record the fresh token of a live connection; the same token again is not recorded."""
         if claims.token_id != before.token_id:
-            self._note("auth.renewed", str(claims.robot), **_of(claims))
+            self._note("auth.renewed", str(claims.robot), **_token_fields(claims))
 
-    def renewal_refused(self, before: Claims | None, reason: str) -> None:
+    def record_refused_renewal(self, before: Claims | None, reason: str) -> None:
         """Record that the fresh token of a live connection was refused."""
         if self._may_record(reason):
             self._note("auth.renewal-refused", "" if before is None else str(before.robot), reason=reason)
 
-    def cut_off(self, claims: Claims, reason: str) -> None:
+    def record_cut_off(self, claims: Claims, reason: str) -> None:
         """Record that a live connection was ended because its token is no longer valid."""
-        self._note("auth.cut-off", str(claims.robot), **_of(claims), reason=reason)
+        self._note("auth.cut-off", str(claims.robot), **_token_fields(claims), reason=reason)
 
     def flush(self) -> None:
-        """Send what is held, now."""
+        """Send the notes that are held, now."""
         self._sum_up()
         self._send()
 
@@ -129,20 +130,25 @@ class ServerAudit:
             self._log.on_problem = say
 
     def note(self, action: str, **detail: Value) -> None:
-        """Record what this server did."""
+        """Record an action of this server."""
         if self._log is not None:
             self._log.record(action, **detail)  # type: ignore[arg-type]
 
-    def heard(self, otherwise: Callable[[_W, dict[str, Any]], None]) -> Callable[[_W, dict[str, Any]], None]:
-        """Return what takes the messages of workers: notes are recorded, the rest goes on to *otherwise*."""
+    def message_handler(
+        self, otherwise: Callable[[_W, dict[str, Any]], None]
+    ) -> Callable[[_W, dict[str, Any]], None]:
+        """Return the function that handles the messages of workers.
 
-        def hear(worker: _W, message: dict[str, Any]) -> None:
+        It records the notes in them, and passes every other message to *otherwise*.
+        """
+
+        def handle(worker: _W, message: dict[str, Any]) -> None:
             if message["event"] != "audit":
                 otherwise(worker, message)
             elif self._log is not None:
                 self._log.add(Note(actor=self._log.who, **note) for note in message["notes"])
 
-        return hear
+        return handle
 
     def __enter__(self) -> ServerAudit:
         if self._log is not None:
@@ -154,5 +160,5 @@ class ServerAudit:
             self._log.close()
 
 
-def _of(claims: Claims) -> dict[str, str]:
+def _token_fields(claims: Claims) -> dict[str, str]:
     return {"token": claims.token_id, "key": claims.key_id}

@@ -46,25 +46,25 @@ connection."""
 
 
 class CommandHandler(Protocol):
-    """What a connection needs of the dispatcher."""
+    """The part of the dispatcher that a connection uses."""
 
     context: WorkerContext
     decoder: DecoderThread
     rates: RobotRates
 
-    def refuses_unread(
+    def refuse_unread(
         self, connection: RobotConnection, session: ServerSession, data: bytes, now: float
     ) -> bool:
         """Refuse the message *data* before it is decoded; False if it must be decoded."""
 
-    def refuses_long(self, connection: RobotConnection, session: ServerSession, data: bytes) -> bool:
+    def refuse_long(self, connection: RobotConnection, session: ServerSession, data: bytes) -> bool:
         """Refuse a message that is too long for the event loop; False if the decoder thread may take it."""
 
     def note_undecoded(self, connection: RobotConnection, failure: Failure, size_bytes: int) -> None:
         """Count and log a message of *size_bytes* that was answered with *failure* instead of decoded."""
 
     def submit(self, connection: RobotConnection, command: Command, size_bytes: int, now: float) -> None:
-        """Take one command."""
+        """Admit one command, or refuse it."""
 
     def withdraw(self, connection: RobotConnection, command_id: int) -> None:
         """Cancel a long command."""
@@ -84,11 +84,11 @@ class CommandHandler(Protocol):
     def ask_topics(self, connection: RobotConnection, op: Any) -> None:
         """Execute an operation of a rosbridge client on its topics."""
 
-    def opened(self, connection: RobotConnection, now: float) -> None:
-        """Take that the robot said Hello."""
+    def greet(self, connection: RobotConnection, now: float) -> None:
+        """Note that the robot said Hello."""
 
     def disconnect(self, connection: RobotConnection) -> None:
-        """Take that the socket ended."""
+        """Forget a connection whose socket ended."""
 
 
 class RobotConnection:
@@ -116,13 +116,13 @@ class RobotConnection:
             handler: Takes the commands.
             wire: The socket.
             session: The rules of the protocol; None echoes messages, for the conformance test of WebSocket.
-            accepted: What the handshake says of the robot.
-            now: Seconds, monotonic, as all times here.
+            accepted: The robot, its claims and its codec, as the handshake gave them.
+            now: Monotonic time in seconds, as all times here.
             number: Which socket of the server this is, in the order of acceptance.
         """
         self.robot = accepted.robot
         self.claims: Claims | None = accepted.claims
-        """What the robot's token says; None where no token is required."""
+        """The claims of the robot's token; None where no token is required."""
         self.session = session
         self.number = number
         self.opened_s = self.last_heard_s = self.pinged_s = now
@@ -161,8 +161,8 @@ class RobotConnection:
         """Whether the robot said Hello and can be asked to leave for another server."""
         return self.session is not None and self.session.state == "open" and not self._assembler.closed
 
-    def frame(self, opcode: int, fin: bool, rsv: bool, payload: bytes) -> None:
-        """Take one unmasked frame."""
+    def receive_frame(self, opcode: int, fin: bool, rsv: bool, payload: bytes) -> None:
+        """Receive one unmasked frame."""
         now = self._context.clocks.monotonic()
         if self._assembler.is_whole(opcode, fin, rsv, len(payload)):
             self._take(payload, False, now)
@@ -184,7 +184,7 @@ class RobotConnection:
         if self.is_connected and session is not None:
             session.in_flight -= 1
             if session.is_pinged:
-                session.answered(command_id)
+                session.forget_command(command_id)
             if not self._assembler.closed:
                 self._context.metrics.bytes_out += len(data)
                 self._wire.send(data, session.codec.is_text)
@@ -212,7 +212,7 @@ class RobotConnection:
         return self._wire.unsent_bytes()
 
     def bound_unsent(self, max_bytes: int) -> None:
-        """Let the kernel take no more than *max_bytes* that the network has not taken."""
+        """Limit the bytes that the kernel holds for the network to *max_bytes*."""
         self._wire.bound_unsent(max_bytes)
 
     def refuse_updates(self, identity: int, error: RsePfError) -> None:
@@ -234,10 +234,10 @@ class RobotConnection:
         if not self.is_closing:
             self._wire.send_ping()
 
-    def renewed(self, token_s: float | None, now: float) -> None:
-        """Tell the robot for how many seconds its fresh token is valid; None: it was refused."""
+    def answer_renewal(self, token_s: float | None, now: float) -> None:
+        """Tell the robot that its fresh token is valid for *token_s*, s, or with None that it was refused."""
         if self.session is not None:
-            self._execute(self.session.renewed(token_s), now)
+            self._execute(self.session.answer_renewal(token_s), now)
 
     def close(self, code: int, reason: str) -> None:
         """Close the socket and take nothing more from it."""
@@ -245,8 +245,8 @@ class RobotConnection:
         self._assembler.closed = True
         self._wire.close(code, reason)
 
-    def ended(self) -> None:
-        """Note that the socket is gone."""
+    def on_socket_end(self) -> None:
+        """Note that the socket has ended, and leave the dispatcher."""
         self.is_connected = False
         if self.tap is not None:
             self.tap.closed(self.recorded)
@@ -267,7 +267,7 @@ class RobotConnection:
             metrics.bytes_out += len(data)
             self._wire.send(data, is_text)
             return
-        if session.state == "open" and handler.refuses_unread(self, session, data, now):
+        if session.state == "open" and handler.refuse_unread(self, session, data, now):
             return
         state, suspicion = session.state, session.suspicion
         decoder, decisions = handler.decoder, None
@@ -281,13 +281,13 @@ class RobotConnection:
             handler.submit(self, command, len(data), now)
         elif decisions is not None:
             self._follow(session, decisions, len(data), now, state, suspicion)
-        elif not handler.refuses_long(self, session, data):
+        elif not handler.refuse_long(self, session, data):
             self._decode_in_thread(session, data, now)
 
     def _decode_in_thread(self, session: ServerSession, data: bytes, now: float) -> None:
         state, suspicion = session.state, session.suspicion
 
-        def decoded(message: FromRobot | ProtocolError) -> None:
+        def follow_decoded(message: FromRobot | ProtocolError) -> None:
             deferred, self._deferred = self._deferred, None
             if self.is_connected and not self._assembler.closed:
                 decisions = session.take(message, now, data)
@@ -299,7 +299,7 @@ class RobotConnection:
 
         self._deferred = deque()
         self._wire.hold()
-        self._handler.decoder.begin(session.codec, data, suspicion=suspicion, done=decoded)
+        self._handler.decoder.begin(session.codec, data, suspicion=suspicion, done=follow_decoded)
 
     def _follow(
         self,
@@ -323,7 +323,7 @@ class RobotConnection:
             counted = session.bad_messages + min(session.refused_commands, _MAX_REFUSED)
             self._wire.pause(counted * _BAD_MESSAGE_PAUSE_S)
         elif state == "opening" and session.state == "open" and not session.is_pinged:
-            self._handler.opened(self, now)
+            self._handler.greet(self, now)
 
     def _execute(self, decisions: list[Decision], now: float, size_bytes: int = 0) -> None:
         handler = self._handler

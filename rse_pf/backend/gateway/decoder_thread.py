@@ -46,7 +46,7 @@ class DecoderThread:
         """Decode *data* and call *done* once, in the event loop.
 
         Args:
-            codec: Of the robot.
+            codec: The codec of the robot.
             data: One whole message, which `Admission.may_wait` let pass.
             suspicion: How many messages of the robot could not be decoded; robots with fewer come first.
             done: Takes the message, or why it is none.

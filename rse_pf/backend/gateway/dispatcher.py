@@ -1,14 +1,15 @@
 """Bring the commands of all connections of one worker to a service, and their answers back.
 
-Frames come in through `RobotConnection.frame`, bytes leave through a `Wire`; no socket library is known here.
-Nothing but the computation of an answer (`Answers.compute`) runs outside of the event loop.
+Frames come in through `RobotConnection.receive_frame`, and bytes leave through a `Wire`: no socket library
+is known here.  Nothing but the computation of an answer (`Answers.compute`) runs outside of the event
+loop.
 """
 
 from __future__ import annotations
 
 import math
 from asyncio import TimerHandle
-from collections.abc import Callable
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
@@ -35,6 +36,7 @@ from rse_pf.backend.scheduling.cpu_throttle import BATCH_S, CpuThrottle
 from rse_pf.backend.scheduling.scheduler import (
     INLINE_BYTES,
     QUEUE_TARGET_S,
+    QueueBacklog,
     QueuedCommand,
     RefusedCommand,
     Scheduler,
@@ -49,7 +51,16 @@ from rse_pf.wire import CODECS, Codec, Command, Failure, make_codec
 from rse_pf.wire.envelope import Envelope, peek
 from rse_pf.wire.server_session import CLOSE_GOING_AWAY, CLOSE_RATE, CLOSE_TOKEN_OVER, ServerSession
 
-__all__ = ["ComputeQueue", "Dispatcher", "JobQueue", "LiveMapQueue", "NoQueue", "SandboxQueue", "TopicQueue"]
+__all__ = [
+    "CommandQueues",
+    "ComputeQueue",
+    "Dispatcher",
+    "JobQueue",
+    "LiveMapQueue",
+    "NoQueue",
+    "SandboxQueue",
+    "TopicQueue",
+]
 
 _DECODER_RETRY_MS = 500.0
 _UNMEASURED_TURN_S = 0.125
@@ -76,9 +87,9 @@ class NoQueue:
         """Return 0."""
         return 0
 
-    def backlog(self, queued: QueuedCommand) -> tuple[int, float, float]:
+    def backlog(self, queued: QueuedCommand) -> QueueBacklog:
         """Return zeros."""
-        return 0, 0.0, 0.0
+        return QueueBacklog()
 
     def leave(self, owner: object) -> list[QueuedCommand]:
         """Return nothing."""
@@ -99,8 +110,8 @@ class NoQueue:
     def ignore(self, *_: Any) -> None:
         """Do nothing."""
 
-    submit = connected = disconnected = left = withdraw = give_up = close = note_refused = ignore
-    unsubscribe = ignore
+    submit = withdraw = give_up = close = note_refused = unsubscribe = ignore
+    add_connection = remove_connection = forget_connection = forget_client = left = ignore
 
 
 ComputeQueue = ComputeLane[EncodedAnswer] | NoQueue
@@ -108,6 +119,27 @@ SandboxQueue = ReloadingSandboxes | NoQueue
 JobQueue = JobManager | NoQueue
 LiveMapQueue = LiveMapRouter | NoQueue
 TopicQueue = RosbridgeTopics | NoQueue
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CommandQueues:
+    """Where the commands of one worker wait, and who takes the operations on topics.
+
+    Attributes:
+        scheduler: The queue of stateless commands.
+        compute: Runs limited services.
+        sandboxes: Runs installed services.
+        jobs: Runs long services.
+        live_maps: Takes commands and subscriptions to live maps.
+        topics: Takes the operations of rosbridge clients.
+    """
+
+    scheduler: Scheduler
+    compute: ComputeQueue = field(default_factory=NoQueue)
+    sandboxes: SandboxQueue = field(default_factory=NoQueue)
+    jobs: JobQueue = field(default_factory=NoQueue)
+    live_maps: LiveMapQueue = field(default_factory=NoQueue)
+    topics: TopicQueue = field(default_factory=NoQueue)
 
 
 class Dispatcher:
@@ -118,56 +150,37 @@ class Dispatcher:
         context: WorkerContext,
         *,
         registry: Registry,
-        connections: set[RobotConnection],
-        new_session_id: Callable[[], str],
         admission: Admission,
-        scheduler: Scheduler,
-        throttle: CpuThrottle,
-        decoder: DecoderThread,
+        queues: CommandQueues,
         answers: Answers,
-        compute: ComputeQueue,
-        sandboxes: SandboxQueue,
-        jobs: JobQueue,
-        live_maps: LiveMapQueue,
-        topics: TopicQueue,
         token_watch: TokenWatch,
     ) -> None:
         """Take no connection yet; start the solver threads and the timer of idle connections.
 
         Args:
-            context: Of the worker.
+            context: The settings, clocks, event loop and log of the worker.
             registry: The stateless and long services.
-            connections: The live ones; shared with *token_watch*.
-            new_session_id: Makes the id of a session.
             admission: Decides which commands are taken.
-            scheduler: Queue of stateless commands.
-            throttle: Emulates a server with fewer cores.
-            decoder: Decodes long messages.
+            queues: Where the taken commands wait.
             answers: Computes and sends answers.
-            compute: Runs limited services.
-            sandboxes: Runs installed services.
-            jobs: Runs long services.
-            live_maps: Takes commands and subscriptions to live maps.
-            topics: Of rosbridge clients.
-            token_watch: Ends connections whose token is no longer valid.
+            token_watch: Ends connections whose token is no longer valid; the connections are shared with it.
         """
         settings = context.settings
         monotonic = context.clocks.monotonic
         self.context = context
-        self.connections = connections
+        self.connections = token_watch.connections
         self.rates = admission.rates
-        self.decoder = decoder
+        self.decoder = DecoderThread(context.loop.call_soon_threadsafe)
         self._registry = registry
-        self._new_session_id = new_session_id
         self._admission = admission
-        self._scheduler = scheduler
-        self._throttle = throttle
+        self._scheduler = queues.scheduler
+        self._throttle = CpuThrottle(settings.serving.emulated_cores, now=monotonic(), cpu=context.clocks.cpu)
         self._answers = answers
-        self._compute = compute
-        self._sandboxes = sandboxes
-        self._jobs = jobs
-        self._live_maps = live_maps
-        self._topics = topics
+        self._compute = queues.compute
+        self._sandboxes = queues.sandboxes
+        self._jobs = queues.jobs
+        self._live_maps = queues.live_maps
+        self._topics = queues.topics
         self._token_watch = token_watch
         self._codecs: dict[str, Codec] = {
             name: make_codec(name, settings.session, pnp=wire_types(registry)) for name in CODECS
@@ -180,17 +193,19 @@ class Dispatcher:
         self._threads = SolverThreads(
             settings.serving.solver_threads,
             answers.compute,
-            lambda answer: context.loop.call_soon_threadsafe(self._computed, answer),
+            lambda answer: context.loop.call_soon_threadsafe(self._on_computed, answer),
         )
         of_kind = {
             "stateless": "scheduler",
             "long": "jobs" if has_jobs(settings) else "refused",
         }
         self._queues = {
-            service.name: "compute" if compute.offers(service.name) else of_kind.get(service.kind, "refused")
+            service.name: "compute"
+            if queues.compute.offers(service.name)
+            else of_kind.get(service.kind, "refused")
             for service in registry
         }
-        self._queues |= {name: "live-maps" for name in LIVE_SERVICES if live_maps.offers(name)}
+        self._queues |= {name: "live-maps" for name in LIVE_SERVICES if queues.live_maps.offers(name)}
         self._cheap = frozenset(
             service.name
             for service in registry
@@ -210,7 +225,7 @@ class Dispatcher:
         self._move: tuple[str, float] | None = None
         self._idle_timeouts = IdleTimeouts(settings.session, monotonic())
         self._lag_s = 0.0
-        context.loop.call_later(self._idle_timeouts.left_s(monotonic()), self._tick)
+        context.loop.call_later(self._idle_timeouts.until_tick_s(monotonic()), self._tick)
 
     @property
     def held(self) -> int:
@@ -219,7 +234,7 @@ class Dispatcher:
         return held + self._compute.held + self._sandboxes.held + self._live_maps.held
 
     def connect(self, wire: Wire, accepted: Accepted, number: int = 0) -> RobotConnection:
-        """Return the connection of a robot whose handshake is done; *number* says which socket it is."""
+        """Return a new connection for a robot whose handshake is done; *number* says which socket it is."""
         now = self.context.clocks.monotonic()
         expires_s = (
             None if accepted.expires_s is None else now + accepted.expires_s - self.context.clocks.wall()
@@ -232,7 +247,7 @@ class Dispatcher:
                 codec=self._codecs[accepted.codec],
                 robot=accepted.robot.name,
                 server=self.context.server_id,
-                session=self._new_session_id(),
+                session=self.context.new_session_id(),
                 limits=self.context.settings.session,
                 burst=self.context.settings.burst,
             )
@@ -241,7 +256,7 @@ class Dispatcher:
         if accepted.awaits_token:
             self._awaited.enter(connection, partial(_close_without_token, connection), accepted.source)
         else:
-            self._connected(connection, expires_s, now)
+            self._add_connection(connection, expires_s, now)
         return connection
 
     def _rosbridge_session(self, accepted: Accepted) -> RosbridgeSession:
@@ -251,13 +266,13 @@ class Dispatcher:
             server=self.context.server_id, limits=limits, is_open=not accepted.awaits_token,
         )  # fmt: skip
 
-    def _connected(self, connection: RobotConnection, expires_s: float | None, now: float) -> None:
-        """Take a connection whose robot is known; its token ends at *expires_s*, s, monotonic."""
+    def _add_connection(self, connection: RobotConnection, expires_s: float | None, now: float) -> None:
+        """Add a connection whose robot is known; its token ends at *expires_s* (monotonic clock, s)."""
         self.connections.add(connection)
-        self._token_watch.connected(connection, expires_s)
-        self._sandboxes.connected(connection.robot)
+        self._token_watch.watch(connection, expires_s)
+        self._sandboxes.add_connection(connection.robot)
         if connection.may_move:  # a rosbridge client says no Hello
-            self.opened(connection, now)
+            self.greet(connection, now)
 
     def authenticate(self, connection: RobotConnection, token: str) -> None:
         """Judge the token of a rosbridge client that showed none in its handshake."""
@@ -269,14 +284,14 @@ class Dispatcher:
         now = clocks.monotonic()
         accepted = self._token_watch.judge(token, connection.robot, source)
         if accepted is None or self.rates.banned_s(accepted.robot, now) > 0:
-            for send in session.refused():
+            for send in session.token_refusal():
                 connection.write(send.data)
             connection.close(CLOSE_TOKEN_OVER if accepted is None else CLOSE_RATE, "unauthenticated")
             return
         connection.robot, connection.claims = accepted.robot, accepted.claims
-        session.opened()
+        session.open()
         ends_s = accepted.expires_s
-        self._connected(connection, None if ends_s is None else now + ends_s - clocks.wall(), now)
+        self._add_connection(connection, None if ends_s is None else now + ends_s - clocks.wall(), now)
 
     def ask_topics(self, connection: RobotConnection, op: Any) -> None:
         """Execute an operation of a rosbridge client on its topics."""
@@ -286,21 +301,21 @@ class Dispatcher:
     def disconnect(self, connection: RobotConnection) -> None:
         """Forget a connection whose socket ended, and what it still waited for."""
         if connection in self.connections:
-            self._sandboxes.disconnected(connection.robot)
+            self._sandboxes.remove_connection(connection.robot)
         self.connections.discard(connection)
-        self._token_watch.left(connection)
-        self._jobs.left(connection)
+        self._token_watch.forget(connection)
+        self._jobs.forget_connection(connection)
         self._live_maps.left(connection)
-        self._topics.left(connection)
+        self._topics.forget_client(connection)
         self._awaited.leave(connection)
         for queued in self._scheduler.leave(connection) + self._compute.leave(connection):
             self.context.metrics.requests[self._answers.label(queued.command.service), "disconnected"] += 1
         self.context.log.debug("disconnected", robot=connection.robot)
 
-    def opened(self, connection: RobotConnection, now: float) -> None:
-        """Take that a robot said Hello; while the server leaves, ask the robot to move at once."""
+    def greet(self, connection: RobotConnection, now: float) -> None:
+        """Note that a robot said Hello; while the server leaves, ask the robot to move at once."""
         self.context.log.debug("connected", robot=connection.robot)
-        self._token_watch.arrived(connection)
+        self._token_watch.report_hello(connection)
         if self._move is not None:
             connection.move(*self._move, now)
 
@@ -324,7 +339,7 @@ class Dispatcher:
         self._compute.close()
         self._sandboxes.close()
 
-    def refuses_unread(
+    def refuse_unread(
         self, connection: RobotConnection, session: ServerSession, data: bytes, now: float
     ) -> bool:
         """Refuse the message *data* for a fraction of what decoding it costs; False if it must be decoded."""
@@ -354,7 +369,7 @@ class Dispatcher:
             self._batched.append((connection, codec, envelope, TOO_LATE, retry_ms, len(data)))
         return True
 
-    def refuses_long(self, connection: RobotConnection, session: ServerSession, data: bytes) -> bool:
+    def refuse_long(self, connection: RobotConnection, session: ServerSession, data: bytes) -> bool:
         """Refuse a message that is too long for the event loop; False if the decoder thread may take it."""
         may_wait = self._admission.may_wait(len(data), self.decoder.unread_bytes, session.suspicion)
         if not may_wait:
@@ -475,7 +490,7 @@ class Dispatcher:
         return True
 
     def _begin_inline(self) -> None:
-        """Let no other command run in this round of the event loop."""
+        """Keep every other command from running in this round of the event loop."""
         self._ran_inline = True
         self.context.loop.call_soon(self._next_round)
 
@@ -506,7 +521,8 @@ class Dispatcher:
         command = queued.command
         answers = self._answers
         service = self._registry.get(command.service)
-        asks_store = command.service in answers.with_objects and answers.objects.named_by(command, service)
+        may_refer = command.service in answers.with_objects
+        asks_store = may_refer and answers.objects.has_references(command, service)
         if not asks_store and self._scheduler.runs_inline(
             cheap=service.cheap,
             size_bytes=queued.size_bytes,
@@ -516,7 +532,7 @@ class Dispatcher:
         else:
             self._threads.run(queued)
 
-    def _computed(self, answer: EncodedAnswer) -> None:
+    def _on_computed(self, answer: EncodedAnswer) -> None:
         self._finish(answer)
         self._start()
 
@@ -532,11 +548,11 @@ class Dispatcher:
     # --- where a command waits -----------------------------------------------------------------
 
     def _queue_of(self, service: str) -> str:
-        """Return where the commands of *service* wait; nowhere if this server does not offer it."""
+        """Return the name of the queue of *service*, "" if this server does not offer the service."""
         return "sandboxes" if self._sandboxes.offers(service) else self._queues.get(service, "")
 
-    def _backlog(self, queued: QueuedCommand, queue: str) -> tuple[int, float, float]:
-        """Return what `Admission.judge` has to know about the queue that *queued* would join."""
+    def _backlog(self, queued: QueuedCommand, queue: str) -> QueueBacklog:
+        """Return the commands that would delay *queued* in the queue that it would join."""
         if queue == "scheduler":
             return self._scheduler.backlog(queued)
         if queue == "compute":
@@ -546,7 +562,8 @@ class Dispatcher:
             "jobs": self._jobs.waiting_of,
             "live-maps": self._live_maps.waiting_of,
         }.get(queue)
-        return (0 if waiting_of is None else waiting_of(queued.robot), 0.0, _UNMEASURED_TURN_S)
+        waiting = 0 if waiting_of is None else waiting_of(queued.robot)
+        return QueueBacklog(waiting, turn_s=_UNMEASURED_TURN_S)
 
     # --- timers --------------------------------------------------------------------------------
 
@@ -572,9 +589,9 @@ class Dispatcher:
 
     def _tick(self) -> None:
         now = self.context.clocks.monotonic()
-        self._lag_s = max(self._lag_s, -self._idle_timeouts.left_s(now))
-        self._idle_timeouts.look(self.connections, now)
-        self.context.loop.call_later(self._idle_timeouts.left_s(now), self._tick)
+        self._lag_s = max(self._lag_s, -self._idle_timeouts.until_tick_s(now))
+        self._idle_timeouts.close_idle(self.connections, now)
+        self.context.loop.call_later(self._idle_timeouts.until_tick_s(now), self._tick)
 
 
 def _close_without_token(connection: RobotConnection) -> None:

@@ -95,7 +95,7 @@ class FrameAssembler:
         )
 
     def receive(self, opcode: int, fin: bool, rsv: bool, payload: bytes, now: float) -> FrameDecision | None:
-        """Return what one frame, unmasked, that arrived at *now* (s) means; None: wait for more."""
+        """Return the decision about one unmasked frame that arrived at *now* (s); None waits for more."""
         if self.closed:
             return None
         if rsv:
@@ -183,8 +183,8 @@ class CloseBorder:
         self._left = 0
         self._is_close = False
 
-    def wanted(self, data: memoryview, n: int) -> int:
-        """Return how many of the next bytes, the first *n* of *data*, stand before the end of the CLOSE."""
+    def bytes_to_close(self, data: memoryview, n: int) -> int:
+        """Return how many of the next bytes, the first *n* of *data*, are not behind a CLOSE."""
         if self.shut:
             return 0
         payload_left = self._left

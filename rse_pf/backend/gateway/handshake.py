@@ -140,11 +140,11 @@ class RequestHead:
 
 def _rejection(status: int, code: str, message: str, hint: str, **headers: str) -> Rejected:
     body = refusal_body(code, message, hint)
-    return _answered(status, code, body, {**_JSON, **{k.replace("_", "-"): v for k, v in headers.items()}})
+    return _http_answer(status, code, body, {**_JSON, **{k.replace("_", "-"): v for k, v in headers.items()}})
 
 
-def _told(proven: ProvenRefusal, now_s: float) -> Rejected | None:
-    """Return the answer to a robot that proved its key; None where it is that of any other token."""
+def _proven_rejection(proven: ProvenRefusal, now_s: float) -> Rejected | None:
+    """Return the rejection of a robot that proved its key; None if the cause is kept from it, too."""
     members: dict[str, float] = {"server_s": round(now_s, 3)}
     cause = proven.cause
     if cause == "disabled":
@@ -165,14 +165,14 @@ def _told(proven: ProvenRefusal, now_s: float) -> Rejected | None:
     else:
         return None
     body = refusal_body(Unauthorized.code, message, hint, cause=cause, **members)
-    return _answered(401, Unauthorized.code, body, {**_JSON, "WWW-Authenticate": "Bearer"})
+    return _http_answer(401, Unauthorized.code, body, {**_JSON, "WWW-Authenticate": "Bearer"})
 
 
 def _utc(unix_s: float) -> str:
     return time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime(unix_s))
 
 
-def _answered(status: int, result: str, body: bytes, headers: Mapping[str, str]) -> Rejected:
+def _http_answer(status: int, result: str, body: bytes, headers: Mapping[str, str]) -> Rejected:
     lines = {**headers, "Content-Length": str(len(body)), "Connection": "close"}
     head = "".join(f"{name}: {value}\r\n" for name, value in lines.items())
     answer = f"HTTP/1.1 {status} {HTTPStatus(status).phrase}\r\n{head}\r\n".encode() + body
@@ -192,7 +192,7 @@ class HandshakePolicy:
         self._path = path.encode()
         self._rosbridge = ROSBRIDGE_PATH.encode() if settings.serving.rosbridge else None
         self._origins = AllowedOrigins(settings.serving.allowed_origins)
-        self._healthy = _answered(200, HEALTH, b'{"status":"ok"}', _JSON)
+        self._healthy = _http_answer(200, HEALTH, b'{"status":"ok"}', _JSON)
         self.defect = _rejection(500, "internal", "the handshake failed", "try again")
         self._not_found = _rejection(404, "not-found", "nothing is served here", f"connect to {path}")
         self._full = _rejection(
@@ -234,7 +234,7 @@ class HandshakePolicy:
         """Return which robot is accepted, or the HTTP answer that rejects it.
 
         Args:
-            path: As requested, with its query.
+            path: The path of the request, with its query.
             authorization: The header, "" if absent.
             offered: Sub-protocols, in the robot's order.
             is_full: Whether the worker has as many robots as it may.
@@ -268,14 +268,14 @@ class HandshakePolicy:
         return self._no_subprotocol if codec is None else accepted
 
     def with_token(self, accepted: Accepted, token: str, now_s: float) -> Accepted | Rejected:
-        """Return *accepted* as the robot that *token* names at *now_s*, Unix s, or the refusal."""
+        """Return *accepted* with the robot that *token* names, or the rejection; *now_s* is Unix time."""
         if self.keys is None:
             return replace(self._no_token, reason=_NO_KEYS)
         try:
             claims = verify_token(token, keys=self.keys, now=now_s, settings=self._settings.auth)
         except Unauthorized as error:
             proven = proven_refusal(error)
-            refused = None if proven is None else _told(proven, now_s)
+            refused = None if proven is None else _proven_rejection(proven, now_s)
             return replace(refused or self._no_token, reason=token_problem(error))
         return replace(
             accepted,
@@ -290,8 +290,8 @@ class HandshakePolicy:
         leeway_s = self._settings.auth.leeway_s
         return claims.expires_s if now_s < claims.expires_s else claims.expires_s + leeway_s
 
-    def verified(self, token: str, now_s: float) -> Claims | str:
-        """Return the claims of *token*, or why it is refused, which goes to the log only."""
+    def claims_or_problem(self, token: str, now_s: float) -> Claims | str:
+        """Return the claims of *token*, or the cause of its refusal, which goes to the log only."""
         if self.keys is None:
             return _NO_KEYS
         try:

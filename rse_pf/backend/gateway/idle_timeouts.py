@@ -29,7 +29,7 @@ def max_silence_s(settings: SessionSettings) -> float:
 
 
 class IdleTimeouts:
-    """Looks at all connections of a worker, again and again."""
+    """The timeouts of all connections of a worker, checked at each tick."""
 
     def __init__(self, settings: SessionSettings, now: float) -> None:
         self._hello_s = settings.hello_timeout_s
@@ -39,13 +39,14 @@ class IdleTimeouts:
         self._next_s = now + self._tick_s
         self._suspects: set[RobotConnection] = set()
 
-    def left_s(self, now: float) -> float:
-        """Return when to look again, in seconds; negative if it is late already."""
+    def until_tick_s(self, now: float) -> float:
+        """Return the seconds until the next tick is due; negative if it is late already."""
         return self._next_s - now
 
-    def look(self, connections: Iterable[RobotConnection], now: float) -> None:
-        """Close what is idle at *now*, and note what to look at again once the sockets were read.
+    def close_idle(self, connections: Iterable[RobotConnection], now: float) -> None:
+        """Close the connections that are idle at *now*, s; call it at each tick.
 
+        A connection that seems idle is closed only at the next tick, after the sockets were read once more.
         A robot that sends no pings of its own is asked by one before.
         """
         late_s = now - self._next_s

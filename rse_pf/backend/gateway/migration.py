@@ -18,7 +18,7 @@ __all__ = ["Migration", "plan"]
 def plan(
     loads: Sequence[int], robots: int, *, spread_s: float, moves_per_s: float, random: Callable[[], float]
 ) -> list[list[float]]:
-    """Return for each worker after how many seconds it asks one robot each, in order.
+    """Return for each worker the delays in seconds after which it asks one robot each, in order.
 
     The most loaded worker asks next.  Each request to move comes at a random time within a time slot of its
     own, so that neither robots nor servers act at the same time.
@@ -52,13 +52,13 @@ class Migration:
         now: Callable[[], float],
         choose: Callable[[Sequence[RobotConnection]], RobotConnection],
     ) -> None:
-        """Keep what is needed.
+        """Ask no robot yet.
 
         Args:
-            connections: The live ones of this worker, now and later.
+            connections: The live connections of this worker; others add and remove them.
             loop: Event loop of the worker.
             now: The worker's monotonic clock, s.
-            choose: Picks one, at random.
+            choose: Picks one of several connections, at random.
         """
         self.asked = 0
         self._connections = connections
@@ -69,9 +69,9 @@ class Migration:
     def begin(self, delays_s: Iterable[float], within_ms: float) -> None:
         """Ask one robot after each of *delays_s*; each gets *within_ms* to leave."""
         for delay_s in delays_s:
-            self._loop.call_later(delay_s, partial(self._ask_one, within_ms))
+            self._loop.call_later(delay_s, partial(self._ask, within_ms))
 
-    def _ask_one(self, within_ms: float) -> None:
+    def _ask(self, within_ms: float) -> None:
         now = self._now()
         candidates = [
             connection

@@ -65,7 +65,7 @@ class RobotRates:
         """
         if self._limits.max_commands_per_s <= 0:
             return 0.0
-        known = self._robots.get(robot) or self._added(robot, now)
+        known = self._robots.get(robot) or self._add(robot, now)
         wait_s = known.bucket.take(now)
         if wait_s == 0.0:
             return 0.0
@@ -77,7 +77,7 @@ class RobotRates:
 
     def ban(self, robot: RobotId, now: float) -> None:
         """Refuse the handshakes of *robot*, cut off at *now* (s), for ``session.rate_ban_s``."""
-        known = self._robots.get(robot) or self._added(robot, now)
+        known = self._robots.get(robot) or self._add(robot, now)
         known.banned_until = now + self._limits.rate_ban_s
 
     def banned_s(self, robot: RobotId, now: float) -> float:
@@ -94,7 +94,7 @@ class RobotRates:
             known.violations.popleft()
         return len(known.violations)
 
-    def _added(self, robot: RobotId, now: float) -> _Robot:
+    def _add(self, robot: RobotId, now: float) -> _Robot:
         if len(self._robots) >= self._max_names:
             remembered = {
                 name: state

@@ -6,7 +6,7 @@ A robot learns no reason beyond the close code.  Keys that cannot be read leave 
 from __future__ import annotations
 
 from asyncio import TimerHandle
-from collections.abc import Callable, Set
+from collections.abc import Callable
 from functools import partial
 
 from rse_pf.auth.claimed import claimed_by
@@ -28,7 +28,7 @@ class TokenWatch:
     def __init__(
         self,
         context: WorkerContext,
-        connections: Set[RobotConnection],
+        connections: set[RobotConnection],
         handshake: HandshakePolicy,
         *,
         tell: Callable[..., None],
@@ -37,13 +37,13 @@ class TokenWatch:
         """Watch *connections*.
 
         Args:
-            context: Of the worker.
-            connections: The live ones of this worker, now and later.
+            context: The clocks, event loop, log and metrics of the worker.
+            connections: The live connections of this worker; the dispatcher adds and removes them.
             handshake: Judges fresh tokens, and gets new keys.
             tell: Sends a message to the supervisor.
             recorder: Records fresh tokens, and connections that are ended.
         """
-        self._connections = connections
+        self.connections = connections
         self._handshake = handshake
         self._context = context
         self._tell = tell
@@ -58,7 +58,7 @@ class TokenWatch:
         Open connections of enrolled robots take the scopes and quotas of the present roster.
         """
         self._handshake.keys = keys
-        for connection in list(self._connections):
+        for connection in list(self.connections):
             claims = connection.claims
             if claims is None or connection.is_closing:
                 continue
@@ -68,8 +68,8 @@ class TokenWatch:
             else:
                 connection.claims = renewed_claims(claims, keys)
 
-    def connected(self, connection: RobotConnection, expires_s: float | None) -> None:
-        """Know a connection whose handshake is done; its token ends at *expires_s*, s, monotonic."""
+    def watch(self, connection: RobotConnection, expires_s: float | None) -> None:
+        """Watch a connection whose handshake is done; its token ends at *expires_s* (monotonic clock, s)."""
         claims, keys = connection.claims, self._handshake.keys
         if claims is not None:
             self._by_number[connection.number] = connection
@@ -80,11 +80,11 @@ class TokenWatch:
                 connection.claims = renewed_claims(claims, keys)
         self._end_at(connection, expires_s)
 
-    def arrived(self, connection: RobotConnection) -> None:
-        """Tell the supervisor that a robot said Hello; its older connections end."""
+    def report_hello(self, connection: RobotConnection) -> None:
+        """Report to the supervisor that a robot said Hello, so that its older connections end."""
         self._report("arrived", connection)
 
-    def left(self, connection: RobotConnection) -> None:
+    def forget(self, connection: RobotConnection) -> None:
         """Forget a connection."""
         self._end_at(connection, None)
         self._end_stay(connection)
@@ -108,7 +108,7 @@ class TokenWatch:
         metrics, now_s = self._context.metrics, self._context.clocks.wall()
         waiting = Accepted(robot=unnamed, codec=ROSBRIDGE, subprotocol="", source=source)
         verdict = self._handshake.with_token(waiting, token, now_s)
-        self._recorder.judged(verdict, source, token)
+        self._recorder.record_verdict(verdict, source, token)
         if isinstance(verdict, Accepted):
             metrics.handshakes["ok"] += 1
             return verdict
@@ -122,11 +122,11 @@ class TokenWatch:
         """Judge a fresh token of a live connection, and move the connection's end or leave it."""
         before, clocks = connection.claims, self._context.clocks
         now, wall_s = clocks.monotonic(), clocks.wall()
-        claims = self._handshake.verified(token, wall_s)
+        claims = self._handshake.claims_or_problem(token, wall_s)
         token_s = None
         if isinstance(claims, Claims) and before is not None and before.robot == claims.robot:
             connection.claims = claims
-            self._recorder.renewed(before, claims)
+            self._recorder.record_renewal(before, claims)
             token_s = self._handshake.ends_s(claims, wall_s) - wall_s
             self._end_at(connection, now + token_s)
             self._context.metrics.handshakes["renewed"] += 1
@@ -134,8 +134,8 @@ class TokenWatch:
             self._context.metrics.handshakes["renewal-refused"] += 1
             reason = claims if isinstance(claims, str) else "wrong-robot"
             self._context.log.info("renewal-refused", robot=connection.robot, reason=reason)
-            self._recorder.renewal_refused(before, reason)
-        connection.renewed(token_s, now)
+            self._recorder.record_refused_renewal(before, reason)
+        connection.answer_renewal(token_s, now)
 
     def _end_at(self, connection: RobotConnection, expires_s: float | None) -> None:
         timer = self._timers.pop(connection, None)
@@ -146,7 +146,7 @@ class TokenWatch:
             self._timers[connection] = self._context.loop.call_later(left_s, partial(self._end, connection))
 
     def _stay(self, connection: RobotConnection, left_s: float) -> None:
-        """Tell the supervisor after *left_s* that a connection which moved has not left."""
+        """Report to the supervisor after *left_s* that a connection which was asked to move has not left."""
         self._end_stay(connection)
         self._stays[connection] = self._context.loop.call_later(
             left_s, partial(self._report, "stays", connection)
@@ -160,7 +160,7 @@ class TokenWatch:
     def _revoke(self, connection: RobotConnection, claims: Claims, problem: str) -> None:
         if not connection.is_closing:
             self._context.log.info("revoked", robot=connection.robot, reason=problem)
-            self._recorder.cut_off(claims, problem)
+            self._recorder.record_cut_off(claims, problem)
             connection.close(CLOSE_REVOKED, "revoked")
 
     def _end(self, connection: RobotConnection) -> None:
@@ -169,5 +169,5 @@ class TokenWatch:
 
     def _report(self, event: str, connection: RobotConnection) -> None:
         claims = connection.claims
-        if claims is not None and (event == "left" or connection in self._connections):
+        if claims is not None and (event == "left" or connection in self.connections):
             self._tell(event=event, robot=claims.robot, number=connection.number)

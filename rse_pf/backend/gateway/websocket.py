@@ -27,14 +27,14 @@ from rse_pf.config import ServingSettings
 from rse_pf.errors import MissingExtra
 from rse_pf.silent_connections import PendingHandshakes
 
-__all__ = ["PendingSocket", "RobotSockets", "listener_type", "protocol_type"]
+__all__ = ["PendingSocket", "RobotSockets", "listener_type", "protocol_options", "protocol_type"]
 
 _MAX_CLOSE_REASON_BYTES = 123
 _UPGRADE = (
     b"GET / HTTP/1.1\r\nUpgrade: websocket\r\nConnection: upgrade\r\n"
     b"Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: %b\r\n\r\n"
 )
-"""What picows reads of a request that was judged before: it keeps what it reads as long as the connection."""
+"""The request that picows gets in place of the judged one; it holds it as long as the connection lives."""
 _SWITCHING = 101
 _NO_HEADERS: dict[str, str] = {}
 _MAX_READ_BYTES = 16384
@@ -68,19 +68,19 @@ class PendingSocket:
     Attributes:
         peer: Address of the other end of the TCP connection.
         number: Which socket of the server it is.
-        ended: Called once, at the end of the socket.
-        seen: What was read of its request.
-        timeout: Ends it; None while nobody had to wait for its request.
+        on_end: Called once, at the end of the socket.
+        seen: The bytes of its request that have arrived.
+        timeout: The timer that ends it; None while nobody had to wait for its request.
     """
 
-    __slots__ = ("accepted", "ended", "number", "peer", "seen", "timeout")
+    __slots__ = ("accepted", "number", "on_end", "peer", "seen", "timeout")
 
     def __init__(
-        self, accepted: socket.socket, peer: str, ended: Callable[[], None], number: int = 0
+        self, accepted: socket.socket, peer: str, on_end: Callable[[], None], number: int = 0
     ) -> None:
         self.accepted = accepted
         self.peer = peer
-        self.ended = ended
+        self.on_end = on_end
         self.number = number
         self.seen = b""
         self.timeout: asyncio.TimerHandle | None = None
@@ -92,7 +92,7 @@ class PendingSocket:
             with contextlib.suppress(OSError):
                 self.accepted.send(answer)
         self.accepted.close()
-        self.ended()
+        self.on_end()
 
 
 class _Upgrade:
@@ -150,30 +150,26 @@ class RobotSockets:
         )
         self._protocol = protocol_type(picows)
         self._listener = listener_type(picows, self._context.loop, serving)
-        self._arguments = (
-            _NoLogger(), True, None,
-            False, 20.0, 20.0, picows.WSAutoPingStrategy.PING_WHEN_IDLE, False,
-            self._context.settings.session.max_message_bytes, None, _READ_BUFFER_BYTES,
-        )  # fmt: skip
+        self._protocol_options = protocol_options(picows, self._context.settings.session.max_message_bytes)
 
     @property
     def is_behind(self) -> bool:
         """Whether so many handshakes wait that no further socket should be taken in this round."""
         return len(self._steps) >= _MAX_WAITING
 
-    def take(self, fd: int, ended: Callable[[], None], number: int, peer: str) -> None:
+    def take(self, fd: int, on_end: Callable[[], None], number: int, peer: str) -> None:
         """Serve the accepted socket *fd*.
 
         Args:
             fd: The descriptor, which belongs to this object from now on.
-            ended: Called once, at the end of the socket.
+            on_end: Called once, at the end of the socket.
             number: Which socket of the server it is, in the order of acceptance.
             peer: Address of the other end of the TCP connection.
         """
         family = socket.AF_INET6 if ":" in peer else socket.AF_INET
         accepted = socket.socket(family, socket.SOCK_STREAM, 0, fileno=fd)
         accepted.setblocking(False)
-        self._steps.add(self._read_first, PendingSocket(accepted, peer, ended, number))
+        self._steps.add(self._read_first, PendingSocket(accepted, peer, on_end, number))
 
     def _read_first(self, pending: PendingSocket) -> None:
         if self._read(pending):
@@ -216,7 +212,7 @@ class RobotSockets:
             self._context.loop.add_reader(pending.accepted.fileno(), self._on_readable, pending)
 
     def _read(self, pending: PendingSocket) -> bool:
-        """Read of the request what is there; return whether the socket is no longer pending."""
+        """Read the part of the request that has arrived; return whether the socket is no longer pending."""
         max_bytes = self._context.settings.serving.max_handshake_bytes
         try:
             # Closing with unread bytes would reset the connection, and its answer would be lost.
@@ -272,14 +268,11 @@ class RobotSockets:
             # Otherwise the kernel buffers megabytes for a slow reader, unnoticed.
             accepted.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, serving.write_buffer_bytes)
             protocol = self._protocol(
-                pending.ended,
+                pending.on_end,
                 request,
                 self._read_later(listener),
-                None,
-                None,
-                False,
-                lambda _: answer,
-                *self._arguments,
+                ws_listener_factory=lambda _: answer,
+                **self._protocol_options,
             )
             self._transport(self._context.loop, accepted, protocol)
         except OSError:
@@ -318,7 +311,7 @@ class RobotSockets:
                 verdict = self._handshake.no_request
             elif verdict.awaits_token:
                 verdict = replace(verdict, source=source)
-        self._recorder.judged(verdict, source, carried_token(authorization, offered))
+        self._recorder.record_verdict(verdict, source, carried_token(authorization, offered))
         return verdict
 
 
@@ -332,6 +325,29 @@ def _libraries() -> tuple[Any, Any]:
     return picows, SelectorSocketTransport
 
 
+def protocol_options(picows: Any, max_frame_bytes: int) -> dict[str, Any]:
+    """Return what picows' protocol takes for each robot's socket, but for the factory of its listener.
+
+    picows itself sends no pings and answers none: `RobotConnection` does.
+    """
+    return {
+        "host_port": None,
+        "ws_path": None,
+        "is_client_side": False,
+        "logger": _NoLogger(),
+        "disconnect_on_exception": True,
+        "websocket_handshake_timeout": None,
+        "enable_auto_ping": False,
+        "auto_ping_idle_timeout": 20.0,
+        "auto_ping_reply_timeout": 20.0,
+        "auto_ping_strategy": picows.WSAutoPingStrategy.PING_WHEN_IDLE,
+        "enable_auto_pong": False,
+        "max_frame_size": max_frame_bytes,
+        "extra_headers": None,
+        "read_buffer_init_size": _READ_BUFFER_BYTES,
+    }
+
+
 def protocol_type(picows: Any) -> Any:
     """Return the subclass of picows' protocol that one robot's socket uses."""
     base = picows.WSProtocol
@@ -339,20 +355,20 @@ def protocol_type(picows: Any) -> Any:
     connection_made = base.connection_made
 
     class Protocol(base):  # type: ignore[misc, valid-type]
-        """Passes nothing behind the first CLOSE to picows, and tells when the socket is gone."""
+        """Passes nothing behind the first CLOSE to picows, and calls *on_end* when the socket is gone."""
 
         def __init__(
             self,
-            ended: Callable[[], None],
+            on_end: Callable[[], None],
             request: tuple[bytes, bytes],
             read_later: Callable[[], None],
-            *arguments: Any,
+            **options: Any,
         ) -> None:
-            super().__init__(*arguments)
+            super().__init__(**options)
             self._request = request
             self._read_later = read_later
             self._is_made = False
-            self._ended = ended
+            self._on_end = on_end
             self._border = CloseBorder(upgraded=True)
             self._buffer = memoryview(b"")
 
@@ -379,7 +395,7 @@ def protocol_type(picows: Any) -> Any:
             if self.transport is not None and self.transport.is_close_frame_sent:
                 return
             is_full = n == len(self._buffer)
-            size = self._border.wanted(self._buffer, n)
+            size = self._border.bytes_to_close(self._buffer, n)
             if size:
                 buffer_updated(self, size)
             if is_full and self._is_made:
@@ -390,7 +406,7 @@ def protocol_type(picows: Any) -> Any:
             try:
                 connection_lost(self, error)
             finally:
-                self._ended()
+                self._on_end()
 
     return Protocol
 
@@ -424,14 +440,14 @@ def listener_type(picows: Any, loop: asyncio.AbstractEventLoop, serving: Serving
             if self._connection is not None:
                 rsv = bool(frame.rsv1 or frame.rsv2 or frame.rsv3)
                 payload = frame.get_payload_as_bytes()
-                self._connection.frame(frame.msg_type, bool(frame.fin), rsv, payload)
+                self._connection.receive_frame(frame.msg_type, bool(frame.fin), rsv, payload)
 
         def on_ws_disconnected(self, transport: Any) -> None:
             for timer in (self._cut, self._pause, self._linger):
                 if timer is not None:
                     timer.cancel()
             if self._connection is not None:
-                self._connection.ended()
+                self._connection.on_socket_end()
                 self._connection = None
 
         def pause_writing(self) -> None:

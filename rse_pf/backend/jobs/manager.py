@@ -167,7 +167,7 @@ class JobManager:
                     self._fail(waiter.queued, Cancelled("the robot cancelled the command"))
                     return
 
-    def left(self, connection: Any) -> None:
+    def forget_connection(self, connection: Any) -> None:
         """Forget the commands of a connection that ended; their jobs go on until the robot reconnects."""
         for entry in self._entries.values():
             entry.waiters = [waiter for waiter in entry.waiters if waiter.queued.owner is not connection]

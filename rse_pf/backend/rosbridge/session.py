@@ -82,18 +82,18 @@ class RosbridgeSession(ServerSession):
             self._level = _LEVELS.get(op.level, self._level)
         return []  # a status of the client is for a log that nobody reads
 
-    def opened(self) -> None:
+    def open(self) -> None:
         """Take that the client's token was accepted."""
         self.state = "open"
 
-    def refused(self) -> list[Send]:
+    def token_refusal(self) -> list[Send]:
         """Return what tells a client that its token was refused; the connection ends then."""
         error = Unauthorized(
             "the token is missing or not valid", hint="issue one with rse-pf token issue ROBOT"
         )
         return [Send(status_of(self._failure(error)))]
 
-    def answered(self, command_id: int) -> None:
+    def forget_command(self, command_id: int) -> None:
         """Forget the client's id of a call that has its final answer."""
         self._rosbridge.calls.pop(command_id, None)
 
@@ -102,11 +102,11 @@ class RosbridgeSession(ServerSession):
         self.ends_when_idle = True
         return self._status("warning", f"this server leaves ({reason}): connect again")
 
-    def renewed(self, token_s: float | None) -> list[Decision]:
+    def answer_renewal(self, token_s: float | None) -> list[Decision]:
         """Answer an ``auth`` of an open connection."""
         if token_s is not None:
             return self._status("info", f"the fresh token lasts {token_s:.0f} s")
-        return super().renewed(token_s)
+        return super().answer_renewal(token_s)
 
     def refuse(self, op: RosbridgeOp, error: RsePfError) -> list[Send]:
         """Tell the client why *op* is not executed: as the answer to a call, else as a status."""

@@ -92,7 +92,7 @@ async def _dry_run(
         log=_Printer(say),
         answer=lambda queued, answer: answers[queued.command.id].set_result(answer),
     )
-    sandboxes.connected(_ROBOT)
+    sandboxes.add_connection(_ROBOT)
     runs = []
     try:
         for number, payload in enumerate(payloads):

@@ -166,13 +166,13 @@ class SandboxManager:
         if self._recording is not None and self._recording[0] == number:
             self._recording = None
 
-    def connected(self, robot: RobotId) -> None:
+    def add_connection(self, robot: RobotId) -> None:
         """Note a connection of *robot*."""
-        self._policy.connected(robot)
+        self._policy.add_connection(robot)
 
-    def disconnected(self, robot: RobotId) -> None:
+    def remove_connection(self, robot: RobotId) -> None:
         """Note the end of a connection; after the last one and a grace period the sandbox is released."""
-        self._policy.disconnected(robot, self._monotonic())
+        self._policy.remove_connection(robot, self._monotonic())
         self._execute([])
 
     def submit(self, queued: QueuedCommand) -> None:

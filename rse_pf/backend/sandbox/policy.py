@@ -252,13 +252,13 @@ class SandboxPolicy:
 
     # --- events from the gateway -------------------------------------------------------------------
 
-    def connected(self, robot: RobotId) -> None:
+    def add_connection(self, robot: RobotId) -> None:
         """A connection of *robot* was opened: its sandbox, if it still has one, is kept."""
         self._connections[robot] += 1
         if robot in self._by_robot:
             self._by_robot[robot].release_s = math.inf
 
-    def disconnected(self, robot: RobotId, now: float) -> None:
+    def remove_connection(self, robot: RobotId, now: float) -> None:
         """A connection of *robot* was closed; after the last one the grace period of its sandbox begins."""
         self._connections[robot] -= 1
         if self._connections[robot] > 0:

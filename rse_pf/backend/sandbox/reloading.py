@@ -156,7 +156,7 @@ class ReloadingSandboxes:
         if fresh.sandboxes is not None:
             for robot, count in self._connections.items():
                 for _ in range(count):
-                    fresh.sandboxes.connected(robot)
+                    fresh.sandboxes.add_connection(robot)
         if former.sandboxes is not None:
             self._retiring.append(former)
             self._loop.call_soon(self._end_if_idle, former)
@@ -215,13 +215,13 @@ class ReloadingSandboxes:
 
     # --- robots --------------------------------------------------------------------------------------
 
-    def connected(self, robot: RobotId) -> None:
+    def add_connection(self, robot: RobotId) -> None:
         """Note a connection of *robot*."""
         self._connections[robot] += 1
         for sandboxes in self._all:
-            sandboxes.connected(robot)
+            sandboxes.add_connection(robot)
 
-    def disconnected(self, robot: RobotId) -> None:
+    def remove_connection(self, robot: RobotId) -> None:
         """Note the end of a connection; nobody waits for the commands of a robot that has none."""
         self._connections[robot] -= 1
         is_gone = self._connections[robot] <= 0
@@ -229,7 +229,7 @@ class ReloadingSandboxes:
             del self._connections[robot]
             self._waiting.pop(robot, None)
         for sandboxes in self._all:
-            sandboxes.disconnected(robot)
+            sandboxes.remove_connection(robot)
         if is_gone:
             for generation in (self._current, *self._retiring):
                 del generation.unanswered[robot]

@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 
@@ -28,6 +28,7 @@ __all__ = [
     "INLINE_BYTES",
     "QUEUE_INTERVAL_S",
     "QUEUE_TARGET_S",
+    "QueueBacklog",
     "QueuedCommand",
     "RefusedCommand",
     "Scheduler",
@@ -85,6 +86,20 @@ class QueuedCommand(msgspec.Struct, eq=False):
     started_s: float = 0.0
 
 
+class QueueBacklog(NamedTuple):
+    """The commands that would delay one more command of a robot.
+
+    Attributes:
+        waiting: How many commands of the robot wait in the same queue.
+        delay_s: The time until the command's turn.
+        turn_s: The time that each turn takes; 0 where it is not measured and nothing waits.
+    """
+
+    waiting: int = 0
+    delay_s: float = 0.0
+    turn_s: float = 0.0
+
+
 @dataclass(frozen=True, slots=True)
 class RefusedCommand:
     """A command that ends without compute; ``reason`` is a label of the metric ``rse_pf_shed_total``."""
@@ -129,18 +144,17 @@ class Scheduler:
         """
         return max(QUEUE_TARGET_S / 2, self._service_s) if self.is_behind else math.inf
 
-    def backlog(self, queued: QueuedCommand) -> tuple[int, float, float]:
-        """Return how many commands of the robot wait, and how long *queued* and each turn would take, in
-        seconds.
+    def backlog(self, queued: QueuedCommand) -> QueueBacklog:
+        """Return the commands that would delay *queued*.
 
-        All are 0 for a frame that replaces another one, which does not make the queue longer.
+        All numbers are 0 for a frame that replaces another one, which does not make the queue longer.
         """
         robot = self._robots.get(queued.robot)
         if robot is None:
-            return 0, self._delay_s(queued.robot, None), self.turn_s
+            return QueueBacklog(0, self._delay_s(queued.robot, None), self.turn_s)
         if _replaceable(robot.waiting, queued) is not None:
-            return 0, 0.0, 0.0
-        return len(robot.waiting), self._delay_s(queued.robot, robot), self.turn_s
+            return QueueBacklog()
+        return QueueBacklog(len(robot.waiting), self._delay_s(queued.robot, robot), self.turn_s)
 
     def retry_unread_ms(self, robot_id: RobotId, allowed_s: float) -> float:
         """Return when a robot may try again whose next command, not decoded yet, would wait too long.

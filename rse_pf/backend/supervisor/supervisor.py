@@ -228,7 +228,7 @@ class _Supervisor:
         return control
 
     async def _start(self, loop: asyncio.AbstractEventLoop) -> None:
-        on_robot = self._records.heard(SessionRegistry().handle)
+        on_robot = self._records.message_handler(SessionRegistry().handle)
         readiness = [
             loop.create_task(worker.connect(on_lost=self._on_lost, on_robot=on_robot))
             for worker in self._workers

@@ -32,8 +32,7 @@ from rse_pf.backend.gateway.admission import Admission
 from rse_pf.backend.gateway.answers import Answers, EncodedAnswer
 from rse_pf.backend.gateway.audit_recorder import AuditRecorder
 from rse_pf.backend.gateway.connection import RobotConnection
-from rse_pf.backend.gateway.decoder_thread import DecoderThread
-from rse_pf.backend.gateway.dispatcher import Dispatcher, NoQueue
+from rse_pf.backend.gateway.dispatcher import CommandQueues, Dispatcher, NoQueue
 from rse_pf.backend.gateway.handshake import HandshakePolicy
 from rse_pf.backend.gateway.migration import Migration
 from rse_pf.backend.gateway.token_watch import TokenWatch
@@ -54,7 +53,6 @@ from rse_pf.backend.rosbridge.topics import RosbridgeTopics
 from rse_pf.backend.sandbox.circuit_breaker import Block
 from rse_pf.backend.sandbox.manager import SandboxManager
 from rse_pf.backend.sandbox.reloading import Answer, OnReady, ReloadingSandboxes
-from rse_pf.backend.scheduling.cpu_throttle import CpuThrottle
 from rse_pf.backend.scheduling.scheduler import Scheduler
 from rse_pf.backend.supervisor.orders import (
     BlocksOrder,
@@ -223,20 +221,16 @@ class _Worker:
         self._dispatcher = Dispatcher(
             context,
             registry=registry,
-            connections=connections,
-            new_session_id=lambda: secrets.token_hex(8),
             admission=Admission(settings.session, settings.serving),
-            scheduler=Scheduler(settings.serving),
-            throttle=CpuThrottle(
-                settings.serving.emulated_cores, now=time.monotonic(), cpu=time.process_time
+            queues=CommandQueues(
+                scheduler=Scheduler(settings.serving),
+                compute=self._compute(plan, context, registry, answers),
+                sandboxes=self._sandboxes or NoQueue(),
+                jobs=self._jobs(plan, answers) if has_jobs(settings) else NoQueue(),
+                live_maps=self._live_maps or NoQueue(),
+                topics=self._topics(plan, registry.names) if settings.serving.rosbridge else NoQueue(),
             ),
-            decoder=DecoderThread(loop.call_soon_threadsafe),
             answers=answers,
-            compute=self._compute(plan, context, registry, answers),
-            sandboxes=self._sandboxes or NoQueue(),
-            jobs=self._jobs(plan, answers) if has_jobs(settings) else NoQueue(),
-            live_maps=self._live_maps or NoQueue(),
-            topics=self._topics(plan, registry.names) if settings.serving.rosbridge else NoQueue(),
             token_watch=self._token_watch,
         )
         self._migration = Migration(connections, loop=loop, now=time.monotonic, choose=secrets.choice)

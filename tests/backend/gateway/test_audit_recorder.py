@@ -48,7 +48,7 @@ class Recording:
 def test_an_accepted_handshake_is_recorded_with_robot_token_key_and_source():
     recording = Recording()
 
-    recording.recorder.judged(ACCEPTED, "10.0.0.7", CLAIMED)
+    recording.recorder.record_verdict(ACCEPTED, "10.0.0.7", CLAIMED)
     assert recording.told == [], "a handshake never waits for the log"
     recording.loop.advance(0.1)
 
@@ -61,7 +61,7 @@ def test_a_robot_of_another_tenant_is_named_with_it():
     recording = Recording()
     claims = Claims(robot=RobotId("acme", "r"), token_id="t", issued_s=1.0, expires_s=9.0, key_id="k")
 
-    recording.recorder.judged(
+    recording.recorder.record_verdict(
         Accepted(robot=claims.robot, codec="bin", subprotocol="x", claims=claims), "", ""
     )
     recording.loop.advance(1.0)
@@ -72,7 +72,7 @@ def test_a_robot_of_another_tenant_is_named_with_it():
 def test_a_refused_token_is_recorded_with_its_reason_and_its_claims():
     recording = Recording()
 
-    recording.recorder.judged(REJECTED, "10.0.0.7", CLAIMED)
+    recording.recorder.record_verdict(REJECTED, "10.0.0.7", CLAIMED)
     recording.loop.advance(0.1)
 
     (note,) = recording.notes
@@ -86,7 +86,7 @@ def test_a_refused_token_is_recorded_with_its_reason_and_its_claims():
 def test_a_handshake_with_a_wrong_path_is_not_recorded():
     recording = Recording()
 
-    recording.recorder.judged(Rejected(status=404, body=b"", result="not-found"), "10.0.0.7", CLAIMED)
+    recording.recorder.record_verdict(Rejected(status=404, body=b"", result="not-found"), "10.0.0.7", CLAIMED)
     recording.loop.advance(60.0)
 
     assert recording.notes == []
@@ -96,7 +96,7 @@ def test_a_handshake_with_a_wrong_path_is_not_recorded():
 def test_a_refusal_is_recorded_whatever_the_header_holds(header: str):
     recording = Recording()
 
-    recording.recorder.judged(REJECTED, "", header)
+    recording.recorder.record_verdict(REJECTED, "", header)
     recording.loop.advance(0.1)
 
     assert len(recording.notes) == 1
@@ -106,7 +106,7 @@ def test_a_flood_of_refusals_is_counted():
     recording = Recording(refusals=RefusalLimiter(per_s=0.01, burst=10.0))
 
     for _ in range(3000):
-        recording.recorder.judged(REJECTED, "10.0.0.7", CLAIMED)
+        recording.recorder.record_verdict(REJECTED, "10.0.0.7", CLAIMED)
     recording.loop.advance(11.0)
 
     assert [note["action"] for note in recording.notes] == ["auth.refused"] * 10 + ["auth.refused-many"]
@@ -119,7 +119,7 @@ def test_many_notes_travel_in_several_messages():
     recording = Recording()
 
     for _ in range(1200):
-        recording.recorder.judged(ACCEPTED, "", "")
+        recording.recorder.record_verdict(ACCEPTED, "", "")
     recording.loop.advance(0.1)
 
     assert [len(message["notes"]) for message in recording.told] == [500, 500, 200]
@@ -129,10 +129,10 @@ def test_a_renewal_with_the_same_token_is_not_recorded():
     recording = Recording()
     fresh = Claims(robot=ROBOT, token_id="t-2", issued_s=1.0, expires_s=900.0, key_id="k-1")
 
-    recording.recorder.renewed(CLAIMS, CLAIMS)
-    recording.recorder.renewed(CLAIMS, fresh)
-    recording.recorder.renewal_refused(CLAIMS, "expired")
-    recording.recorder.cut_off(fresh, "disabled")
+    recording.recorder.record_renewal(CLAIMS, CLAIMS)
+    recording.recorder.record_renewal(CLAIMS, fresh)
+    recording.recorder.record_refused_renewal(CLAIMS, "expired")
+    recording.recorder.record_cut_off(fresh, "disabled")
     recording.loop.advance(0.1)
 
     assert [(note["action"], note["detail"].get("token")) for note in recording.notes] == [
@@ -143,8 +143,8 @@ def test_a_renewal_with_the_same_token_is_not_recorded():
 def test_a_server_without_an_audit_log_records_nothing():
     recording = Recording(is_on=False)
 
-    recording.recorder.judged(ACCEPTED, "", "")
-    recording.recorder.judged(REJECTED, "", "")
+    recording.recorder.record_verdict(ACCEPTED, "", "")
+    recording.recorder.record_verdict(REJECTED, "", "")
     recording.loop.advance(60.0)
     recording.recorder.flush()
 
@@ -153,11 +153,11 @@ def test_a_server_without_an_audit_log_records_nothing():
 
 def test_the_supervisor_writes_the_notes_of_workers_and_passes_other_messages_on(tmp_path: Path):
     recording, others = Recording(), []
-    recording.recorder.judged(ACCEPTED, "10.0.0.7", "")
+    recording.recorder.record_verdict(ACCEPTED, "10.0.0.7", "")
     recording.recorder.flush()
 
     with ServerAudit(tmp_path, "server-1") as records:
-        hear = records.heard(lambda worker, message: others.append(message))
+        hear = records.message_handler(lambda worker, message: others.append(message))
         hear("worker", recording.told[0])
         hear("worker", {"event": "left", "robot": "robot-1"})
         records.note("server.over", exit_code=0)
@@ -176,6 +176,6 @@ def test_without_a_folder_notes_are_dropped(
 ):
     monkeypatch.chdir(tmp_path)
     with ServerAudit(None, "server-1") as records:
-        records.heard(lambda worker, other: None)("worker", message)
+        records.message_handler(lambda worker, other: None)("worker", message)
         records.note("server.over")
     assert list(tmp_path.iterdir()) == []

@@ -292,7 +292,7 @@ def test_a_robot_that_sends_undecodable_messages_is_read_more_and_more_rarely(wo
     connection, wire = worker.join()
 
     for _ in range(3):
-        connection.frame(BINARY, True, False, b"garbage")
+        connection.receive_frame(BINARY, True, False, b"garbage")
 
     assert wire.pauses == pytest.approx([0.1, 0.2, 0.3])
     assert [message.code for message in wire.sent[1:]] == ["bad-message"] * 3
@@ -347,9 +347,9 @@ class Queue:
     def report(self) -> dict[str, Any]:
         return {}
 
-    def connected(self, robot: Any) -> None: ...
+    def add_connection(self, robot: Any) -> None: ...
 
-    disconnected = left = connected
+    remove_connection = forget_connection = add_connection
 
     def close(self) -> None: ...
 
@@ -385,7 +385,7 @@ def test_a_connection_that_ends_drops_its_waiting_commands(worker: WorkerParts):
     worker.say(other, echo(1))
     worker.say(connection, echo(2))
 
-    connection.ended()
+    connection.on_socket_end()
     worker.loop.advance()
 
     assert worker.metrics.requests["echo", "disconnected"] == 1

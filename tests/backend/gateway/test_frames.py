@@ -158,7 +158,7 @@ def test_the_stream_is_read_alike_wherever_it_is_cut(sent, cuts, junk):
 
     for start, end in itertools.pairwise(borders):
         piece = memoryview(stream)[start:end]
-        taken += bytes(piece[: border.wanted(piece, len(piece))])
+        taken += bytes(piece[: border.bytes_to_close(piece, len(piece))])
 
     assert taken == request + talk
     assert border.shut
@@ -171,4 +171,4 @@ def test_long_frames_are_walked_over_even_when_their_head_is_cut(size, cut):
     border = CloseBorder(upgraded=True)
     pieces = [memoryview(data)[:cut], memoryview(data)[cut:]]
 
-    assert sum(border.wanted(piece, len(piece)) for piece in pieces) == len(data) - 4
+    assert sum(border.bytes_to_close(piece, len(piece)) for piece in pieces) == len(data) - 4

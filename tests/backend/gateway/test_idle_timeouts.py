@@ -51,9 +51,9 @@ class Worker:
 
     def run(self, until_s: float, *, late_s: float = 0.0) -> None:
         """Look as often as is due, each time *late_s* late."""
-        while self.now + max(0.0, self.timeouts.left_s(self.now)) + late_s <= until_s:
-            self.now += max(0.0, self.timeouts.left_s(self.now)) + late_s
-            self.timeouts.look(self.sockets, self.now)
+        while self.now + max(0.0, self.timeouts.until_tick_s(self.now)) + late_s <= until_s:
+            self.now += max(0.0, self.timeouts.until_tick_s(self.now)) + late_s
+            self.timeouts.close_idle(self.sockets, self.now)
             self.looks += 1
             self.read()
         self.now = until_s
@@ -61,7 +61,7 @@ class Worker:
     def sleep(self, seconds: float) -> None:
         """Do nothing for so long; then the timers come first, as in libuv, and the sockets after them."""
         self.now += seconds
-        self.timeouts.look(self.sockets, self.now)
+        self.timeouts.close_idle(self.sockets, self.now)
         self.read()
 
     def read(self) -> None:
@@ -95,8 +95,8 @@ def test_a_busy_loop_notices_a_silent_robot_within_the_limit():
     worker = Worker(robot)
 
     while not robot.closed:
-        worker.now += max(0.0, worker.timeouts.left_s(worker.now)) + 0.15
-        worker.timeouts.look(worker.sockets, worker.now)
+        worker.now += max(0.0, worker.timeouts.until_tick_s(worker.now)) + 0.15
+        worker.timeouts.close_idle(worker.sockets, worker.now)
 
     assert worker.now <= BAR_S
 

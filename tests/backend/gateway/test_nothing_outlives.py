@@ -43,8 +43,8 @@ def use_rosbridge(worker: Worker) -> None:
     client.say({"op": "subscribe", "topic": "/slow", "id": "s"})
     other.say({"op": "publish", "topic": "/slow", "msg": {"data": 1}})
     client.say(call(), {"op": "unsubscribe", "topic": f"/t{HOUR_MS}_1"}, b"\xff")
-    client.connection.ended()
-    other.connection.ended()
+    client.connection.on_socket_end()
+    other.connection.on_socket_end()
 
 
 def test_a_rosbridge_client_that_left_is_held_by_nothing() -> None:
@@ -99,7 +99,7 @@ def test_a_robot_that_left_is_held_by_nothing(leave: Callable[[WorkerParts, Robo
         def cycle() -> None:
             connection, _ = parts.join("r", expires_s=2e6)
             leave(parts, connection)
-            connection.ended()
+            connection.on_socket_end()
 
         cycle()
         parts.loop.advance(1.0)

@@ -4,23 +4,24 @@ from __future__ import annotations
 
 import asyncio
 import errno
-import logging
 from types import SimpleNamespace
 
 from fakes import FakeLoop
 from picows import picows
 
-from rse_pf.backend.gateway.websocket import listener_type, protocol_type
+from rse_pf.backend.gateway.websocket import listener_type, protocol_options, protocol_type
 from rse_pf.config import ServingSettings
 
 
-def test_the_protocol_takes_the_fifteen_arguments_that_we_give_it():
+def test_the_protocol_takes_the_options_that_we_give_it():
     async def make() -> object:
         return protocol_type(picows)(
-            lambda: None, (b"", b""), lambda: None, None, None, False, lambda request: None,
-            logging.getLogger("t"), True, None, False, 20.0, 20.0, picows.WSAutoPingStrategy.PING_WHEN_IDLE,
-            False, 1000, None, 2048,
-        )  # fmt: skip
+            lambda: None,
+            (b"", b""),
+            lambda: None,
+            ws_listener_factory=lambda request: None,
+            **protocol_options(picows, 1000),
+        )
 
     protocol = asyncio.run(make())
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any
 
 from fakes import FakeLoop, FakeWire
@@ -16,8 +17,8 @@ from rse_pf.backend.gateway.admission import Admission
 from rse_pf.backend.gateway.answers import Answers, EncodedAnswer
 from rse_pf.backend.gateway.audit_recorder import AuditRecorder
 from rse_pf.backend.gateway.connection import RobotConnection
-from rse_pf.backend.gateway.decoder_thread import DecoderThread
 from rse_pf.backend.gateway.dispatcher import (
+    CommandQueues,
     Dispatcher,
     JobQueue,
     LiveMapQueue,
@@ -30,7 +31,6 @@ from rse_pf.backend.gateway.token_watch import TokenWatch
 from rse_pf.backend.log import JsonLog
 from rse_pf.backend.object_refs import ObjectRefs
 from rse_pf.backend.ports import Clocks, WorkerContext
-from rse_pf.backend.scheduling.cpu_throttle import CpuThrottle
 from rse_pf.backend.scheduling.scheduler import Scheduler
 from rse_pf.config import PlatformSettings
 from rse_pf.identity import RobotId
@@ -63,7 +63,10 @@ class WorkerParts:
         processes: LimitedProcesses | None = None,
         emulated_cores: float = 0.0,
     ) -> None:
-        self.settings = settings or PlatformSettings()
+        settings = settings or PlatformSettings()
+        if emulated_cores:
+            settings = replace(settings, serving=replace(settings.serving, emulated_cores=emulated_cores))
+        self.settings = settings
         self.loop = FakeLoop()
         self.codec: Codec = make_codec(codec)
         self.told: list[dict[str, Any]] = []
@@ -81,9 +84,13 @@ class WorkerParts:
         self.scheduler = Scheduler(self.settings.serving)
         self.admission = Admission(self.settings.session, self.settings.serving)
         self.handshake = HandshakePolicy(self.settings, keys)
-        self.decoder = DecoderThread(self.loop.call_soon_threadsafe)
         self.context = WorkerContext(
-            settings=self.settings, server_id="s-1", clocks=self.clocks, loop=self.loop, log=log
+            settings=self.settings,
+            server_id="s-1",
+            clocks=self.clocks,
+            loop=self.loop,
+            log=log,
+            new_session_id=lambda: "session-1",
         )
         self.metrics = self.context.metrics
         self.answers = Answers(
@@ -92,10 +99,9 @@ class WorkerParts:
             services=frozenset(service.name for service in self.registry),
             objects=ObjectRefs(store, self.settings.serving, self.settings.data),
         )
-        connections: set[RobotConnection] = set()
         self.token_watch = TokenWatch(
             self.context,
-            connections,
+            set(),
             self.handshake,
             tell=lambda **message: self.told.append(message),
             recorder=AuditRecorder(self.clocks, loop=self.loop, tell=self.told.append, is_on=False),
@@ -103,20 +109,19 @@ class WorkerParts:
         self.dispatcher = Dispatcher(
             self.context,
             registry=self.registry,
-            connections=connections,
-            new_session_id=lambda: "session-1",
             admission=self.admission,
-            scheduler=self.scheduler,
-            throttle=CpuThrottle(emulated_cores, now=self.loop.now, cpu=self.clocks.cpu),
-            decoder=self.decoder,
+            queues=CommandQueues(
+                scheduler=self.scheduler,
+                compute=NoQueue() if processes is None else self._lane(processes),
+                sandboxes=sandboxes or NoQueue(),
+                jobs=jobs or NoQueue(),
+                live_maps=NoQueue() if live_maps is None else live_maps(self.context, self.answers),
+                topics=NoQueue() if topics is None else topics(self.context),
+            ),
             answers=self.answers,
-            compute=NoQueue() if processes is None else self._lane(processes),
-            sandboxes=sandboxes or NoQueue(),
-            jobs=jobs or NoQueue(),
-            live_maps=NoQueue() if live_maps is None else live_maps(self.context, self.answers),
-            topics=NoQueue() if topics is None else topics(self.context),
             token_watch=self.token_watch,
         )
+        self.decoder = self.dispatcher.decoder
 
     def _lane(self, processes: LimitedProcesses) -> ComputeLane[EncodedAnswer]:
         return ComputeLane(
@@ -150,7 +155,7 @@ class WorkerParts:
     def say(self, connection: RobotConnection, message: Any) -> None:
         """Let *connection* receive *message*; bytes are sent as they are."""
         data = message if isinstance(message, bytes) else self.codec.encode(message)
-        connection.frame(BINARY, True, False, data)
+        connection.receive_frame(BINARY, True, False, data)
 
 
 @contextmanager

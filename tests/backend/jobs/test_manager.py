@@ -266,7 +266,7 @@ def test_a_job_goes_on_without_its_robot_which_finds_it_after_reconnecting(make)
     bench, owner = make(), robot()
     ask(bench, owner, 1)
     process = bench.process()
-    bench.jobs.left(owner)
+    bench.jobs.forget_connection(owner)
     assert bench.jobs.known == 1
 
     again = robot()

@@ -121,7 +121,7 @@ def test_the_end_of_a_connection_ends_its_subscriptions(worker: Worker) -> None:
     connection, _ = worker.subscriber()
     worker.say(connection, Subscribe(id=4, topic="live/m"))
 
-    connection.ended()
+    connection.on_socket_end()
 
     assert worker.owners.unwatched == [("default", "m")]
     worker.tell(1)
@@ -170,7 +170,7 @@ def test_without_live_maps_topics_and_services_are_unknown() -> None:
 def test_a_subscription_before_hello_closes_the_connection(worker: Worker) -> None:
     connection, wire = worker.join(hello=False)
 
-    connection.frame(BINARY, True, False, worker.codec.encode(Subscribe(id=1, topic="live/m")))
+    connection.receive_frame(BINARY, True, False, worker.codec.encode(Subscribe(id=1, topic="live/m")))
 
     assert wire.closed is not None
     assert wire.closed[0] == 4400

@@ -43,7 +43,7 @@ class Client:
         """Send operations, as values or as bytes; return what was told until then."""
         for each in operations:
             data = each if isinstance(each, bytes) else json.dumps(each).encode()
-            self.connection.frame(TEXT if _is_text(data) else BINARY, True, False, data)
+            self.connection.receive_frame(TEXT if _is_text(data) else BINARY, True, False, data)
         self.parts.loop.advance(0.01)
         return self.told()
 

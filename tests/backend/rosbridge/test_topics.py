@@ -151,7 +151,7 @@ def test_a_latched_message_waits_for_its_first_subscriber_until_its_publisher_le
         talker.say(publish("new", "/map"))
         early = worker.client("b")
         (told,) = early.say(subscribe("/map"))
-        talker.connection.ended()
+        talker.connection.on_socket_end()
         late = worker.client("c")
 
         assert told["msg"] == {"data": "new"}
@@ -167,7 +167,7 @@ def test_limits_are_typed_and_leave_nothing_behind():
         assert code(client.say({"op": "advertise", "topic": "/more"})) == "quota"
         assert code(client.say(publish(1, "/another"))) == "quota"
         assert not client.closed
-        client.connection.ended()
+        client.connection.on_socket_end()
 
         gauges = worker.parts.dispatcher.snapshot()["gauges"]
         assert (gauges["rosbridge_topics"], gauges["rosbridge_subscriptions"]) == (0.0, 0.0)

@@ -119,7 +119,7 @@ def serve(services: list[InstalledService], use: Callable[[Ask], Awaitable[None]
 
         async def ask(robot: str) -> Result | Failure:
             name, number = RobotId("fleet", robot), len(answers)
-            sandboxes.connected(name)
+            sandboxes.add_connection(name)
             answers[number] = loop.create_future()
             now = time.monotonic()
             command = Command(id=number, service=services[0].name, payload={}, keep=True)

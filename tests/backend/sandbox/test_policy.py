@@ -43,7 +43,7 @@ def make_policy(*, max_sandboxes: int = 4, keeps_snapshots: bool = True, **servi
         KINDS, settings.services, max_sandboxes=max_sandboxes, keeps_snapshots=keeps_snapshots
     )
     for robot in (A, B, C):
-        policy.connected(robot)
+        policy.add_connection(robot)
     return policy
 
 
@@ -338,7 +338,7 @@ def test_the_deadline_of_a_robot_is_no_evidence_for_others_and_its_request_no_po
         for robot in (A, B, C):
             overrun(policy, make_call(robot, now=100.0 * i, deadline_s=0.06), 100.0 * i)
     another = RobotId("acme", "d")
-    policy.connected(another)
+    policy.add_connection(another)
 
     assert policy.counts == {"created": 9, "overran": 9}
     assert created(policy.submit(make_call(A, now=300.0), 300.0)) == 10
@@ -437,12 +437,12 @@ def test_a_command_for_an_idle_sandbox_that_is_being_killed_waits_for_the_next_o
 
 def test_a_sandbox_is_released_a_grace_period_after_the_last_connection_of_its_robot():
     policy = make_policy()
-    policy.connected(A)
+    policy.add_connection(A)
     start(policy, make_call())
     policy.replied(1, OK, 1.0)
-    policy.disconnected(A, 2.0)
+    policy.remove_connection(A, 2.0)
     assert policy.wake_s == math.inf, "one connection is left"
-    policy.disconnected(A, 3.0)
+    policy.remove_connection(A, 3.0)
 
     assert policy.tick(3.0 + GRACE_S - 0.1) == []
     assert policy.tick(3.0 + GRACE_S) == [ReleaseSandbox(1)]
@@ -453,8 +453,8 @@ def test_a_robot_that_reconnects_within_the_grace_period_keeps_its_sandbox():
     policy = make_policy()
     start(policy, make_call())
     policy.replied(1, OK, 1.0)
-    policy.disconnected(A, 2.0)
-    policy.connected(A)
+    policy.remove_connection(A, 2.0)
+    policy.add_connection(A)
 
     assert policy.tick(100.0) == []
     assert policy.submit(make_call(payload="2", now=100.0), 100.0) == [SendMessage(1, b"2")]
@@ -464,7 +464,7 @@ def test_commands_that_wait_for_a_robot_that_left_are_dropped_and_not_moved():
     policy = make_policy()
     start(policy, make_call(payload="1"))
     policy.submit(make_call(payload="2"), 0.0)
-    policy.disconnected(A, 1.0)
+    policy.remove_connection(A, 1.0)
     assert policy.held == 1
 
     assert not any(isinstance(each, CreateSandbox) for each in policy.gone(1, "exit code 1", 1.5))
@@ -485,7 +485,7 @@ def test_an_idle_sandbox_in_its_grace_period_gives_its_place_to_another_robot():
     policy = make_policy(max_sandboxes=1)
     start(policy, make_call(A))
     policy.replied(1, OK, 1.0)
-    policy.disconnected(A, 1.0)
+    policy.remove_connection(A, 1.0)
 
     assert policy.submit(make_call(B), 1.5) == [ReleaseSandbox(1), CreateSandbox(2, B)]
 
@@ -495,7 +495,7 @@ def test_a_sandbox_that_works_or_whose_robot_is_connected_keeps_its_place():
     start(policy, make_call(A))
     start(policy, make_call(B, payload="y"))
     policy.replied(2, OK, 0.5)
-    policy.disconnected(A, 1.0)
+    policy.remove_connection(A, 1.0)
     call = make_call(C)
 
     assert outcomes(policy.submit(call, 1.5)) == [(call, "busy")]
@@ -508,7 +508,7 @@ def taken_by_rivals(*, idle: bool) -> tuple[SandboxPolicy, list[SandboxCall]]:
     """Return a policy whose four places one tenant holds: all run, or became idle at 4, 3, 2 and 1 s."""
     policy, calls = make_policy(), [make_call(rival) for rival in RIVALS]
     for i, call in enumerate(calls):
-        policy.connected(call.queued.robot)
+        policy.add_connection(call.queued.robot)
         number = start(policy, call)
         if idle:
             policy.replied(number, OK, 4.0 - i)

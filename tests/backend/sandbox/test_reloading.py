@@ -48,10 +48,10 @@ class Sandboxes:
         queued = self.queued.pop(0)
         self.answer(queued, Result(id=queued.command.id, reply={}))
 
-    def connected(self, robot: RobotId) -> None:
+    def add_connection(self, robot: RobotId) -> None:
         self.robots.append(robot)
 
-    def disconnected(self, robot: RobotId) -> None:
+    def remove_connection(self, robot: RobotId) -> None:
         self.robots.remove(robot)
 
     def waiting_of(self, robot: RobotId) -> int:
@@ -104,7 +104,7 @@ def services(*names: str) -> list[InstalledService]:
 
 def test_the_former_services_answer_until_the_new_ones_are_ready() -> None:
     parts = Parts("a")
-    parts.sandboxes.connected(ROBOT)
+    parts.sandboxes.add_connection(ROBOT)
     parts.sandboxes.replace(services("a", "b"))
 
     parts.call(1)
@@ -187,13 +187,13 @@ def test_services_that_never_get_ready_are_given_up_and_a_newer_list_replaces_th
 
 def test_nobody_waits_for_a_robot_that_has_left() -> None:
     parts = Parts("a")
-    parts.sandboxes.connected(ROBOT)
+    parts.sandboxes.add_connection(ROBOT)
     parts.call(1)
     parts.sandboxes.replace(services("a"))
     parts.made[1].on_ready(())
     parts.call(2)
 
-    parts.sandboxes.disconnected(ROBOT)
+    parts.sandboxes.remove_connection(ROBOT)
     parts.settle()
 
     assert parts.made[0].is_retired

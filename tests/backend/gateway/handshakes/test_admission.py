@@ -11,12 +11,13 @@ from backend.scheduling.admitted import queued
 from rse_pf.auth.tokens import Claims
 from rse_pf.backend.gateway.admission import Admission
 from rse_pf.backend.gateway.rate_limits import CUT_OFF
+from rse_pf.backend.scheduling.scheduler import QueueBacklog
 from rse_pf.config import ServingSettings, SessionSettings
 from rse_pf.identity import RobotId
 
 SERVING = ServingSettings(max_queue_per_robot=4, max_unread_bytes=1_000_000)
 ADMITTED: dict[str, Any] = {
-    "queued": queued("r", within=1.0), "claims": None, "backlog": (0, 0.0, 0.0), "max_delay_s": math.inf,
+    "queued": queued("r", within=1.0), "claims": None, "backlog": QueueBacklog(), "max_delay_s": math.inf,
 }  # fmt: skip
 
 
@@ -39,7 +40,7 @@ def reason(admission: Admission, **changed: object) -> str:
 def test_a_command_that_breaks_no_limit_is_admitted(admission: Admission):
     assert reason(admission) == ""
     assert reason(admission, claims=claims("services:*")) == ""
-    assert reason(admission, backlog=(3, 0.4, 0.1)) == ""
+    assert reason(admission, backlog=QueueBacklog(3, 0.4, 0.1)) == ""
 
 
 @pytest.mark.parametrize(
@@ -47,9 +48,9 @@ def test_a_command_that_breaks_no_limit_is_admitted(admission: Admission):
     [
         ({"claims": claims("services:other", "data:read")}, "scope", "forbidden"),
         ({"queued": queued("r", within=0.0)}, "expired", "expired"),
-        ({"backlog": (4, 0.0, 0.3)}, "robot-queue", "busy"),
-        ({"backlog": (0, 0.6, 0.1)}, "behind", "busy"),
-        ({"backlog": (0, 0.5, 0.1), "max_delay_s": 0.025}, "behind", "busy"),
+        ({"backlog": QueueBacklog(4, 0.0, 0.3)}, "robot-queue", "busy"),
+        ({"backlog": QueueBacklog(0, 0.6, 0.1)}, "behind", "busy"),
+        ({"backlog": QueueBacklog(0, 0.5, 0.1), "max_delay_s": 0.025}, "behind", "busy"),
     ],
 )
 def test_a_command_beyond_a_limit_is_refused_for_its_reason(
@@ -66,12 +67,14 @@ def test_a_command_beyond_a_limit_is_refused_for_its_reason(
 
 def test_of_several_reasons_the_first_in_order_is_told(admission: Admission):
     everything = {
-        "queued": queued("r", within=0.0), "claims": claims("data:read"), "backlog": (9, 9.0, 1.0),
-    }  # fmt: skip
+        "queued": queued("r", within=0.0),
+        "claims": claims("data:read"),
+        "backlog": QueueBacklog(9, 9.0, 1.0),
+    }
 
     assert reason(admission, **everything) == "scope"
     assert reason(admission, **{**everything, "claims": None}) == "expired"
-    assert reason(admission, backlog=(9, 9.0, 1.0)) == "robot-queue"
+    assert reason(admission, backlog=QueueBacklog(9, 9.0, 1.0)) == "robot-queue"
 
 
 def test_a_robot_above_its_rate_is_refused_and_then_cut_off(admission: Admission):

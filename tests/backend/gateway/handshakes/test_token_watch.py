@@ -35,7 +35,7 @@ class Worker(WorkerParts):
         now = self.clocks.wall()
         return KEY.issue(robot, now=now, token_id=token_id, settings=SETTINGS.auth, ttl_s=ttl_s, **more)
 
-    def judged(self, token: str) -> Accepted:
+    def record_verdict(self, token: str) -> Accepted:
         """Judge a handshake that is good."""
         accepted = self.handshake.judge(
             path=b"/ws", authorization=f"Bearer {token}", offered=[SUBPROTOCOLS["bin"]], is_full=False,
@@ -47,7 +47,7 @@ class Worker(WorkerParts):
 
     def robot(self, token: str) -> tuple[RobotConnection, FakeWire]:
         """Connect a robot and let it say Hello."""
-        accepted = self.judged(token)
+        accepted = self.record_verdict(token)
         wire = FakeWire()
         connection = self.dispatcher.connect(wire, accepted, self._number)
         self.say(connection, Hello())
@@ -112,7 +112,7 @@ def test_a_token_of_another_robot_does_not_move_the_end(worker: Worker, wrong: s
 
 
 def test_a_revocation_between_handshake_and_connection_ends_the_connection(worker: Worker):
-    mine, other = worker.judged(worker.token("r")), worker.judged(worker.token("s"))
+    mine, other = worker.record_verdict(worker.token("r")), worker.record_verdict(worker.token("s"))
     worker.deny(DenyList().with_robot("default", "r", UNIX_S + 1))
     wires = FakeWire(), FakeWire()
 
@@ -129,7 +129,7 @@ def test_a_revocation_ends_the_connections_of_its_robot_and_no_other(worker: Wor
     worker.deny(DenyList().with_robot("default", "r", 0.0))
 
     assert (mine.closed, other.closed) == ((4403, "revoked"), None)
-    assert worker.handshake.verified(worker.token("r"), worker.clocks.wall()) == "disabled"
+    assert worker.handshake.claims_or_problem(worker.token("r"), worker.clocks.wall()) == "disabled"
 
 
 def test_a_replaced_connection_ends_and_one_that_is_moving_may_finish_first(worker: Worker):
