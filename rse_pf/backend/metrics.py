@@ -217,7 +217,7 @@ def render(merged: Mapping[str, Any]) -> bytes:
                 labels=["service"],
             )
             for service, buckets in merged["durations"].items():
-                histogram.add_metric([service], _cumulated(buckets), merged["duration_sum_s"][service])
+                histogram.add_metric([service], _cumulate(buckets), merged["duration_sum_s"][service])
             yield histogram
 
     registry = CollectorRegistry()
@@ -225,6 +225,6 @@ def render(merged: Mapping[str, Any]) -> bytes:
     return generate_latest(registry)
 
 
-def _cumulated(buckets: list[int]) -> list[tuple[str, float]]:
+def _cumulate(buckets: list[int]) -> list[tuple[str, float]]:
     bounds = [*map(str, BUCKETS_S), "+Inf"]
     return list(zip(bounds, map(float, accumulate(buckets)), strict=True))

@@ -74,7 +74,7 @@ def test_a_recorder_that_is_killed_is_started_again_five_times_with_the_same_key
     with recording(tmp_path, recorders) as recorded:
         assert recorded.to_recorder is not None
         worker = os.dup(recorded.to_recorder)
-        recorded.handed_over()
+        recorded.hand_over()
         for count in range(1, 7):
             recorders.wait_for(count).end(-9)
         watching = next(each for each in threading.enumerate() if each.name == "recorder")
@@ -94,7 +94,7 @@ def test_a_recorder_that_ended_because_the_workers_are_gone_is_not_started_again
     recorders = FakeRecorders()
 
     with recording(tmp_path, recorders) as recorded:
-        recorded.handed_over()
+        recorded.hand_over()
         recorders.wait_for(1).end(0)
 
     assert len(recorders.plans) == 1
@@ -104,7 +104,7 @@ def test_without_a_folder_nothing_is_started():
     recorders = FakeRecorders()
 
     with ServerRecording(PlatformSettings(), "server-1", start=recorders.start) as recorded:
-        recorded.handed_over()
+        recorded.hand_over()
 
     assert recorders.plans == []
     assert recorded.to_recorder is None

@@ -202,7 +202,7 @@ class RosbridgeCodec:
     def _read(self, data: bytes, max_bytes: int | None) -> RosbridgeMessage:
         try:
             check_size(data, self._budget)
-            op = _parsed(data)
+            op = _parse(data)
         except ProtocolError as error:
             return RosbridgeMessage(None, error=error)
         try:
@@ -283,7 +283,7 @@ def _response(call: ServiceCall | None, values: Any, *, is_result: bool) -> byte
     return _encode(_Response("service_response", service, values, is_result, identity))
 
 
-def _parsed(data: bytes) -> RosbridgeOp:
+def _parse(data: bytes) -> RosbridgeOp:
     """Return the operation in *data*; raises BadMessage."""
     try:
         if not data.isascii():

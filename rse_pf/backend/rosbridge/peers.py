@@ -38,7 +38,7 @@ class _State(msgspec.Struct, frozen=True, tag="s", array_like=True):
     topic: str
     kind: str
     exists: bool
-    wanted: bool
+    is_wanted: bool
 
 
 class _Published(msgspec.Struct, frozen=True, tag="p", array_like=True):
@@ -68,7 +68,7 @@ def peer_channels(workers: int) -> list[PeerChannels]:
 class NoPeers:
     """Stands for the other workers where there are none."""
 
-    def tell(self, key: Key, kind: str, *, exists: bool, wanted: bool) -> None:
+    def tell(self, key: Key, kind: str, *, exists: bool, is_wanted: bool) -> None:
         """Do nothing."""
 
     def publish(self, key: Key, data: bytes) -> None:
@@ -81,7 +81,7 @@ class NoPeers:
 
 @dataclass(slots=True)
 class _Peer:
-    """Another worker, what it has, and what waits for it."""
+    """Another worker, its topics, and the messages that wait for it."""
 
     channel: socket.socket
     kinds: dict[Key, str] = field(default_factory=dict)
@@ -104,10 +104,10 @@ class WorkerPeers:
         """Take the channels; `begin` reads them.
 
         Args:
-            channels: Of this worker, from `peer_channels`.
-            index: Of this worker.
-            loop: Its event loop.
-            log: Of the worker.
+            channels: The channels of this worker, from `peer_channels`.
+            index: The number of this worker.
+            loop: The event loop of this worker.
+            log: The log of this worker.
         """
         read, writes = channels
         self.dropped = 0
@@ -121,19 +121,19 @@ class WorkerPeers:
         }
         self._is_retrying = False
 
-    def begin(self, *, arrived: Callable[[Key, bytes], None], wanted: Callable[[Key], None]) -> None:
+    def begin(self, *, on_message: Callable[[Key, bytes], None], on_wanted: Callable[[Key], None]) -> None:
         """Read what the others send.
 
         Args:
-            arrived: Takes a message and its topic.
-            wanted: Called when another worker begins to want a topic.
+            on_message: Takes a message and its topic.
+            on_wanted: Called when another worker begins to want a topic.
         """
-        self._arrived, self._wanted = arrived, wanted
+        self._on_message, self._on_wanted = on_message, on_wanted
         self._loop.add_reader(self._read.fileno(), self._on_readable)
 
-    def tell(self, key: Key, kind: str, *, exists: bool, wanted: bool) -> None:
-        """Tell the others whether a topic exists here, and whether somebody subscribes to it."""
-        data = _encode(_State(self._index, *key, kind, exists, wanted))
+    def tell(self, key: Key, kind: str, *, exists: bool, is_wanted: bool) -> None:
+        """Report to the others whether a topic exists here, and whether somebody subscribes to it."""
+        data = _encode(_State(self._index, *key, kind, exists, is_wanted))
         for peer in self._peers.values():
             if peer.states or not self._send(peer, data):
                 peer.states[key] = data  # the newest state of a topic is enough
@@ -210,15 +210,15 @@ class WorkerPeers:
     def _take(self, message: _State | _Published) -> None:
         key = message.tenant, message.topic
         if isinstance(message, _Published):
-            self._arrived(key, message.data)
+            self._on_message(key, message.data)
             return
         peer = self._peers[message.sender]
         if message.exists:
             peer.kinds[key] = message.kind
         else:
             peer.kinds.pop(key, None)
-        if not message.wanted:
+        if not message.is_wanted:
             peer.wants.discard(key)
         elif key not in peer.wants:
             peer.wants.add(key)
-            self._wanted(key)
+            self._on_wanted(key)

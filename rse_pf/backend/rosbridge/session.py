@@ -83,11 +83,11 @@ class RosbridgeSession(ServerSession):
         return []  # a status of the client is for a log that nobody reads
 
     def open(self) -> None:
-        """Take that the client's token was accepted."""
+        """Open the session, because the client's token was accepted."""
         self.state = "open"
 
     def token_refusal(self) -> list[Send]:
-        """Return what tells a client that its token was refused; the connection ends then."""
+        """Return the messages that tell a client that its token was refused; the connection ends then."""
         error = Unauthorized(
             "the token is missing or not valid", hint="issue one with rse-pf token issue ROBOT"
         )
@@ -109,7 +109,7 @@ class RosbridgeSession(ServerSession):
         return super().answer_renewal(token_s)
 
     def refuse(self, op: RosbridgeOp, error: RsePfError) -> list[Send]:
-        """Tell the client why *op* is not executed: as the answer to a call, else as a status."""
+        """Return the refusal of *op*, as the answer to a call or else as a status."""
         failure = self._failure(error)
         if op.op == "call_service":
             number = self._rosbridge.new_call(op.id, op.service, is_unread=True)
@@ -134,7 +134,7 @@ class RosbridgeSession(ServerSession):
     def _before_token(
         self, op: RosbridgeOp | None, error: ProtocolError | None, size_bytes: int
     ) -> list[Decision]:
-        """Hear nothing but ``auth``; what else comes counts as a bad message."""
+        """Accept ``auth`` only; any other operation counts as a bad message."""
         if op is not None and op.op == "auth" and error is None:
             return [Authenticate(op.mac)]
         if error is None:

@@ -37,8 +37,8 @@ class TopicMessage:
         self.data = data
         self._encoded: dict[str, bytes] = {}
 
-    def encoded(self, topic: str) -> bytes:
-        """Return the WebSocket message for who spells the topic so."""
+    def encode_for(self, topic: str) -> bytes:
+        """Return the WebSocket message for a subscriber that spells the topic as *topic*."""
         message = self._encoded.get(topic)
         if message is None:
             message = self._encoded[topic] = publication(topic, self.data)
@@ -86,7 +86,7 @@ class Subscription:
         return min(pause_s for pause_s, _ in self.requests.values())
 
     def clear(self) -> None:
-        """Forget what waits: the subscription has ended."""
+        """Forget the waiting messages, because the subscription has ended."""
         self._waiting.clear()
         self._bytes = 0
 
@@ -94,11 +94,11 @@ class Subscription:
         """Add *message*; the oldest ones are dropped above the longest queue that there is."""
         self._waiting.append(message)
         self._bytes += len(message.data)
-        self._bound(MAX_QUEUE_LENGTH if self._held.of_tenant <= MAX_HELD_BYTES else 1)
+        self._drop_beyond(MAX_QUEUE_LENGTH if self._held.of_tenant <= MAX_HELD_BYTES else 1)
 
-    def bound(self) -> None:
+    def drop_surplus(self) -> None:
         """Drop the oldest messages above the queue that was asked for: the client has to wait now."""
-        self._bound(max(length for _, length in self.requests.values()))
+        self._drop_beyond(max(length for _, length in self.requests.values()))
 
     def wait_s(self, now: float) -> float:
         """Return 0 if a message may be sent at *now* (s), else the seconds until then."""
@@ -109,9 +109,9 @@ class Subscription:
         message = self._waiting.popleft()
         self._bytes -= len(message.data)
         self._next_s = now + self.pause_s
-        return message.encoded(self.spelling)
+        return message.encode_for(self.spelling)
 
-    def _bound(self, length: int) -> None:
+    def _drop_beyond(self, length: int) -> None:
         waiting = self._waiting
         while len(waiting) > length or (len(waiting) > 1 and self._bytes > _MAX_QUEUE_BYTES):
             self._bytes -= len(waiting.popleft().data)

@@ -63,8 +63,8 @@ class Client(SlowReader, Protocol):
 class TopicPeers(Protocol):
     """What is needed of the way to other workers; `rse_pf.backend.rosbridge.peers.WorkerPeers` is one."""
 
-    def tell(self, key: Key, kind: str, *, exists: bool, wanted: bool) -> None:
-        """Tell the others whether a topic exists here, and whether somebody subscribes to it."""
+    def tell(self, key: Key, kind: str, *, exists: bool, is_wanted: bool) -> None:
+        """Report to the others whether a topic exists here, and whether somebody subscribes to it."""
 
     def publish(self, key: Key, data: bytes) -> None:
         """Send a message to the others that want the topic."""
@@ -98,7 +98,7 @@ class RosbridgeTopics:
 
         Args:
             loop: Event loop of the worker.
-            clock: Monotonic, in s.
+            clock: The monotonic clock, s.
             services: Names of the services of this server.
             peers: The way to other workers.
         """
@@ -119,7 +119,7 @@ class RosbridgeTopics:
         self._is_sending = self._is_retrying = False
 
     def offer(self, services: Iterable[str]) -> None:
-        """Take the names of the services of this server anew."""
+        """Replace the names of the services of this server."""
         self._services = tuple(services)
 
     def report(self) -> dict[str, float]:
@@ -152,14 +152,14 @@ class RosbridgeTopics:
             self._end(topic, client)
             self._settle(topic, client)
 
-    def arrived(self, key: Key, data: bytes) -> None:
-        """Take a message that a client of another worker published."""
+    def deliver(self, key: Key, data: bytes) -> None:
+        """Deliver a message that a client of another worker published."""
         topic = self._topics.get(key)
         if topic is not None:
-            self._put(topic, TopicMessage(data))
+            self._queue_message(topic, TopicMessage(data))
 
-    def wanted(self, key: Key) -> None:
-        """Take that another worker has its first subscriber to a topic: it gets what is latched."""
+    def send_latched(self, key: Key) -> None:
+        """Send the latched messages of a topic to another worker, which has its first subscriber."""
         topic = self._topics.get(key)
         for message in () if topic is None else topic.latched.values():
             self._peers.publish(key, message.data)
@@ -195,7 +195,7 @@ class RosbridgeTopics:
             count = sum(1 for own_key in own if client in self._topics[own_key].publishers)
             if count >= MAX_TOPICS:
                 raise QuotaExceeded(f"this client advertises {count} topics already", hint="unadvertise one")
-        topic = self._known(client, key, op.type or "")
+        topic = self._use_topic(client, key, op.type or "")
         topic.publishers[client] = bool(op.latch) or topic.publishers.get(client, False)
         return topic
 
@@ -213,7 +213,7 @@ class RosbridgeTopics:
         message = TopicMessage(data)
         if op.latch or topic.publishers[client]:
             self._latch(topic, client, message)
-        self._put(topic, message)
+        self._queue_message(topic, message)
         self._peers.publish(key, data)
 
     def _subscribe(self, client: Client, key: Key, op: RosbridgeOp) -> None:
@@ -228,7 +228,7 @@ class RosbridgeTopics:
         )
         if count >= MAX_SUBSCRIPTIONS:
             raise QuotaExceeded(f"this client has {count} subscriptions already", hint="unsubscribe one")
-        topic = self._known(client, key, op.type or "")
+        topic = self._use_topic(client, key, op.type or "")
         subscription = topic.subscriptions.get(client)
         is_first = not topic.subscriptions
         is_new = subscription is None
@@ -258,7 +258,7 @@ class RosbridgeTopics:
 
     # --- topics --------------------------------------------------------------------------------
 
-    def _known(self, client: Client, key: Key, kind: str) -> _Topic:
+    def _use_topic(self, client: Client, key: Key, kind: str) -> _Topic:
         """Return the topic *key*, which *client* uses from now on as one of messages of type *kind*."""
         topic = self._topics.get(key)
         present = self._peers.topics(key[0]).get(key[1], "") if topic is None else topic.kind
@@ -278,7 +278,7 @@ class RosbridgeTopics:
         return topic
 
     def _settle(self, topic: _Topic, client: Client) -> None:
-        """Forget a topic that nobody uses any more, and that *client* uses it."""
+        """Forget that *client* uses a topic, if it does not, and a topic that nobody uses any more."""
         if client in topic.publishers or client in topic.subscriptions:
             return
         own = self._of_client.get(client, {})
@@ -292,10 +292,10 @@ class RosbridgeTopics:
         if not self._per_tenant[tenant]:
             del self._per_tenant[tenant]
             self._held.pop(tenant, None)
-        self._peers.tell(topic.key, topic.kind, exists=False, wanted=False)
+        self._peers.tell(topic.key, topic.kind, exists=False, is_wanted=False)
 
     def _tell(self, topic: _Topic) -> None:
-        self._peers.tell(topic.key, topic.kind, exists=True, wanted=bool(topic.subscriptions))
+        self._peers.tell(topic.key, topic.kind, exists=True, is_wanted=bool(topic.subscriptions))
 
     def _end(self, topic: _Topic, client: Client) -> None:
         """End a subscription."""
@@ -333,11 +333,11 @@ class RosbridgeTopics:
 
     # --- sending -------------------------------------------------------------------------------
 
-    def _put(self, topic: _Topic, message: TopicMessage) -> None:
+    def _queue_message(self, topic: _Topic, message: TopicMessage) -> None:
         for subscription in topic.subscriptions.values():
             subscription.put(message)
             if subscription in self._slow or subscription in self._resting:
-                subscription.bound()
+                subscription.drop_surplus()
             else:
                 self._send_soon(subscription)
 
@@ -348,7 +348,7 @@ class RosbridgeTopics:
             self._loop.call_soon(self._send)
 
     def _send(self) -> None:
-        """Send what is due, up to a bound; then the event loop serves the robots' commands first."""
+        """Send the messages that are due, up to a bound; the event loop then serves commands first."""
         now = self._clock()
         budget = _MAX_SENT_AT_ONCE
         while self._due and budget > 0:
@@ -368,11 +368,13 @@ class RosbridgeTopics:
         while subscription:
             wait_s = subscription.wait_s(now)
             if wait_s > 0:
-                subscription.bound()
-                self._resting[subscription] = self._loop.call_later(wait_s, self._rested, subscription)
+                subscription.drop_surplus()
+                self._resting[subscription] = self._loop.call_later(
+                    wait_s, self._send_after_rest, subscription
+                )
                 break
             if client.unsent_bytes > _MAX_UNSENT_BYTES:
-                subscription.bound()
+                subscription.drop_surplus()
                 self._retry_later(subscription)
                 break
             if count >= most:
@@ -385,7 +387,7 @@ class RosbridgeTopics:
         subscription.replaced = 0
         return max(1, count)
 
-    def _rested(self, subscription: Subscription) -> None:
+    def _send_after_rest(self, subscription: Subscription) -> None:
         del self._resting[subscription]
         self._send_soon(subscription)
 
@@ -407,15 +409,15 @@ class RosbridgeTopics:
         """Answer one of the calls of ``rosapi`` that clients need to find services and topics."""
         call = op.service.removeprefix("/").removeprefix("rosapi/")
         if call == "services":
-            values: dict[str, Any] = {"services": [f"/{name}" for name in self._allowed(client)]}
+            values: dict[str, Any] = {"services": [f"/{name}" for name in self._allowed_services(client)]}
         elif call == "topics":
-            kinds = self._seen(client)
+            kinds = self._readable_topics(client)
             values = {"topics": [f"/{name}" for name in kinds], "types": list(kinds.values())}
         elif call == "service_type":
             name = _argument(op, "service").removeprefix("/")
-            values = {"type": f"rse_pf/{name}" if name in self._allowed(client) else ""}
+            values = {"type": f"rse_pf/{name}" if name in self._allowed_services(client) else ""}
         elif call == "topic_type":
-            values = {"type": self._seen(client).get(_argument(op, "topic").removeprefix("/"), "")}
+            values = {"type": self._readable_topics(client).get(_argument(op, "topic").removeprefix("/"), "")}
         else:
             raise UnknownService(
                 f"rosapi offers no {call[:40]!r} here",
@@ -423,11 +425,11 @@ class RosbridgeTopics:
             )
         client.write(session.respond(op, values))
 
-    def _allowed(self, client: Client) -> list[str]:
+    def _allowed_services(self, client: Client) -> list[str]:
         scopes = () if client.claims is None else client.claims.scopes
         return sorted(name for name in self._services if scopes_allow(scopes, f"services:{name}"))
 
-    def _seen(self, client: Client) -> dict[str, str]:
+    def _readable_topics(self, client: Client) -> dict[str, str]:
         """Return the types of the tenant's topics, by their names, if the client may read topics."""
         if client.claims is not None and not scopes_allow(client.claims.scopes, "topics:read"):
             return {}

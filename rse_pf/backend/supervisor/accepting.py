@@ -143,7 +143,7 @@ class RobotAcceptor:
         self._silent.enter(accepted, functools.partial(self._drop, accepted), address)
 
     def _begin(self, accepted: Accepted) -> None:
-        """Let *accepted* wait for its turn: its first bytes have come, or its end."""
+        """Queue *accepted* for its turn, because its first bytes have come, or its end."""
         assert self._silent is not None
         self._loop.remove_reader(accepted[0].fileno())
         self._silent.leave(accepted)

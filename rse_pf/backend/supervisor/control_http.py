@@ -83,13 +83,13 @@ async def serve_control(
     async def talk(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         silent.enter(writer, writer.transport.abort)
 
-        async def judged(ask: ControlRequest) -> ControlReply:
+        async def answer_in_time(ask: ControlRequest) -> ControlReply:
             silent.leave(writer)
             idle.leave(writer)
             return await answer(ask)
 
         try:
-            while await _exchange(reader, writer, judged):
+            while await _exchange(reader, writer, answer_in_time):
                 idle.enter(writer, writer.transport.abort)
         except (
             OSError,

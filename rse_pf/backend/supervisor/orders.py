@@ -42,13 +42,13 @@ class ReplaceOrder(msgspec.Struct, tag="replace", tag_field="do", frozen=True):
 
 
 class BlocksOrder(msgspec.Struct, tag="blocks", tag_field="do", frozen=True):
-    """Tell in an answer with this *number* what circuit breakers and poison requests are refused."""
+    """Order an answer with this *number* that lists the blocks of circuit breakers and poison requests."""
 
     number: int
 
 
 class RobotsOrder(msgspec.Struct, tag="robots", tag_field="do", frozen=True):
-    """Tell in an answer with this *number* which robots are connected."""
+    """Order an answer with this *number* that lists the connected robots."""
 
     number: int
 
@@ -77,7 +77,7 @@ class RecordOrder(msgspec.Struct, tag="record", tag_field="do", frozen=True):
 
 
 class TakeRecordedOrder(msgspec.Struct, tag="take-recorded", tag_field="do", frozen=True):
-    """Tell in an answer with this *number* the next bytes of *recording*, at most *max_bytes*."""
+    """Order an answer with this *number* and the next bytes of *recording*, at most *max_bytes*."""
 
     number: int
     recording: int

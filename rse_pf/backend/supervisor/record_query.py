@@ -42,7 +42,7 @@ def may_record(ask: ControlRequest, token: str | None) -> bool:
 
 
 def record_query(ask: ControlRequest) -> RecordQuery:
-    """Return what *ask* wants; raises ValueError if a number is none, or too large."""
+    """Return the query in *ask*; raises ValueError if a parameter is no number, or too large."""
     query = RecordQuery(
         service=ask.query.get("service", ""),
         calls=int(ask.query.get("count", "0")),

@@ -106,7 +106,7 @@ class ServerRecording:
         )
         return self
 
-    def handed_over(self) -> None:
+    def hand_over(self) -> None:
         """Leave the socket to the workers, so that the recorder sees their end, and watch the recorder.
 
         Nothing may be forked afterwards: there is a thread.
@@ -121,7 +121,7 @@ class ServerRecording:
         """Wait until the recorder has finished its file; all workers are gone."""
         if self._watching is None:
             return
-        self.handed_over()
+        self.hand_over()
         self._is_over.set()
         self._watching.join(_FINISH_S)
         if self._from_workers is not None:

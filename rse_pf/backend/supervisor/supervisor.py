@@ -136,7 +136,7 @@ def serve(
         ]  # fmt: skip
         with bound_socket(settings.serving.host, settings.serving.port) as listener:
             workers = fork_workers(plans, listener=listener)
-            recording.handed_over()
+            recording.hand_over()
             try:
                 with ServerAudit(audit, server_id) as records:
                     supervisor = _Supervisor(
@@ -367,7 +367,7 @@ class _Supervisor:
     async def _readyz(self, ask: ControlRequest) -> ControlReply:
         readiness: dict[str, Any] = {"state": self._state}
         if self._settings.services.folder or self._settings.services.published:
-            await self._merged()
+            await self._merge_reports()
             isolation = merge_isolation(worker.report for worker in self._workers)
             readiness.update(
                 missing_isolation=isolation["missing_isolation"], open_breakers=isolation["open_breakers"]
@@ -377,7 +377,7 @@ class _Supervisor:
         return json_reply(readiness, status=503, headers={"x-envoy-immediate-health-check-fail": "1"})
 
     async def _metrics(self, ask: ControlRequest) -> ControlReply:
-        merged = await self._merged()
+        merged = await self._merge_reports()
         merged["gauges"].update(
             {
                 "cpu_s": self._cpu_s(merged["gauges"]),
@@ -390,7 +390,7 @@ class _Supervisor:
         return ControlReply(body=render(merged), content_type="text/plain; version=0.0.4; charset=utf-8")
 
     async def _status(self, ask: ControlRequest) -> ControlReply:
-        merged = await self._merged()
+        merged = await self._merge_reports()
         gauges = merged["gauges"]
         results: dict[str, int] = {}
         for _, result, n in merged["requests"]:
@@ -426,7 +426,7 @@ class _Supervisor:
         return json_reply(await self._ask_rows("blocks", BlocksOrder, _MAX_BLOCKS))
 
     async def _robots(self, ask: ControlRequest) -> ControlReply:
-        """Tell which robots are connected, at most `_MAX_ROBOTS` of them; ``count`` is of all."""
+        """Return the connected robots, at most `_MAX_ROBOTS` of them; ``count`` is the number of all."""
         return json_reply(await self._ask_rows("robots", RobotsOrder, _MAX_ROBOTS))
 
     async def _post_unblock(self, ask: ControlRequest) -> ControlReply:
@@ -457,7 +457,7 @@ class _Supervisor:
         return json_reply({**answer, "recording": answer["order"]})
 
     async def _post_take_recorded(self, ask: ControlRequest) -> ControlReply:
-        """Tell the next bytes of a recording, once."""
+        """Return the next bytes of a recording; they are returned once only."""
         number, workers = ask.query.get("recording", ""), len(self._workers)
         if not may_record(ask, self._control_token) or not number.isdecimal():
             return refused_reply(403, "forbidden", NOT_FOR_YOU)
@@ -465,7 +465,7 @@ class _Supervisor:
         return json_reply(await self._ask_rows("workers", order, workers))
 
     async def _ask_rows(self, key: str, make_order: Callable[[int], RowsOrder], most: int) -> dict[str, Any]:
-        """Return what all workers tell; the same thing of several workers is listed several times."""
+        """Return the rows of all workers under *key*; a row that several workers report is repeated."""
         async with self._asking_rows:
             self._asked_rows += 1
             order = make_order(self._asked_rows)
@@ -539,7 +539,7 @@ class _Supervisor:
         self._records.note("server.move", robots=asked, spread_s=round(last_s, 3))
         return asked, round(last_s, 3)
 
-    async def _merged(self) -> dict[str, Any]:
+    async def _merge_reports(self) -> dict[str, Any]:
         """Return the numbers of all workers, at most a quarter second old; a silent worker's are older."""
         async with self._reporting:
             if time.monotonic() - self._reported >= _FRESH_S:

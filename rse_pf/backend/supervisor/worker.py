@@ -121,7 +121,7 @@ class WorkerPlan:
 
 
 def event_loop_maker() -> Callable[[], asyncio.AbstractEventLoop]:
-    """Return what makes the event loop of a worker; raises MissingExtra."""
+    """Return the function that makes the event loop of a worker; raises MissingExtra."""
     try:
         import uvloop
     except ImportError as error:
@@ -138,7 +138,7 @@ def repeat_for(seconds: float, step: Callable[[], bool], clock: Callable[[], flo
 
 
 def run_in_loop(main: Coroutine[Any, Any, _T]) -> _T:
-    """Return what *main* returns, run like by `asyncio.run` in an event loop of `event_loop_maker`."""
+    """Run *main* as `asyncio.run` does, in an event loop of `event_loop_maker`, and return its result."""
     loop = event_loop_maker()()
     asyncio.set_event_loop(loop)
     try:
@@ -183,7 +183,7 @@ class _Worker:
         self._log = JsonLog(level=settings.serving.log_level, server=plan.server_id, wall_clock=time.time)
         registry = load_services(plan.services, settings)
         chosen = settings.services
-        installed = self._installed(chosen)
+        installed = self._installed_services(chosen)
         context = WorkerContext(
             settings=settings,
             server_id=plan.server_id,
@@ -281,7 +281,7 @@ class _Worker:
             refuse=answers.send_refusal,
         )
 
-    def _installed(self, chosen: ServiceSettings) -> list[InstalledService]:
+    def _installed_services(self, chosen: ServiceSettings) -> list[InstalledService]:
         """Return the services that are installed; of a folder that is followed, none if it is damaged."""
         published = published_services() if chosen.published else []
         if not chosen.folder:
@@ -363,7 +363,7 @@ class _Worker:
         )  # fmt: skip
         self._tell_topics(services)
         if peers is not None:
-            peers.begin(arrived=topics.arrived, wanted=topics.wanted)
+            peers.begin(on_message=topics.deliver, on_wanted=topics.send_latched)
         return topics
 
     def _tell_topics(self, services: Sequence[str]) -> None:
@@ -436,7 +436,7 @@ class _Worker:
             case ReloadServicesOrder():
                 self._keep(self._reload_services())
             case TakeRecordedOrder(number, recording, max_bytes):
-                self._tell_rows(number, 1, [self._recorded(recording, max_bytes)])
+                self._tell_rows(number, 1, [self._take_recorded(recording, max_bytes)])
 
     def _record(self, order: RecordOrder) -> bool:
         """Begin or end a recording; return whether its service is an installed one."""
@@ -449,7 +449,7 @@ class _Worker:
             order.number, order.service, calls=order.calls, max_bytes=order.max_bytes, seconds=order.seconds
         )
 
-    def _recorded(self, recording: int, max_bytes: int) -> dict[str, Any]:
+    def _take_recorded(self, recording: int, max_bytes: int) -> dict[str, Any]:
         recorded = (
             (b"", 0, True) if self._sandboxes is None else self._sandboxes.take_recorded(recording, max_bytes)
         )

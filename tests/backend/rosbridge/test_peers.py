@@ -23,10 +23,10 @@ class Peer:
         self.wanted: list[tuple[str, str]] = []
 
     def begin(self) -> None:
-        self.peers.begin(arrived=lambda key, data: self.heard.append(data), wanted=self.wanted.append)
+        self.peers.begin(on_message=lambda key, data: self.heard.append(data), on_wanted=self.wanted.append)
 
     def wants(self, *, wanted: bool = True, exists: bool = True) -> None:
-        self.peers.tell(KEY, "std_msgs/String", exists=exists, wanted=wanted)
+        self.peers.tell(KEY, "std_msgs/String", exists=exists, is_wanted=wanted)
 
 
 @pytest.fixture

@@ -135,7 +135,7 @@ def test_a_subscription_that_ended_holds_nothing_for_its_tenant():
         one.put(subscriptions.TopicMessage(bytes(1000)))
     assert held.of_tenant == 3000
     one.requests["s"] = 0.0, 2
-    one.bound()
+    one.drop_surplus()
     one.take(0.0)
     assert held.of_tenant == 1000
 
