@@ -44,7 +44,7 @@ class CrashRecord:
             retry_after_ms=rest_s * 1e3,
         )
 
-    def crashed(self, robot: RobotId, now: float) -> bool:
+    def note_crash(self, robot: RobotId, now: float) -> bool:
         """Note that a command of *robot* ended a process; return whether the robot is blocked from now on."""
         with self._lock:
             crashes = self._crashes.pop(robot, None) or deque(maxlen=self._settings.poison_crashes)
@@ -59,7 +59,7 @@ class CrashRecord:
                 self._crashes.popitem(last=False)
             return False
 
-    def blocked(self, now: float) -> int:
+    def count_blocked(self, now: float) -> int:
         """Return how many robots are refused now."""
         with self._lock:
             return sum(until_s > now for until_s in self._blocked_until.values())

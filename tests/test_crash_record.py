@@ -14,7 +14,7 @@ REST_S = SETTINGS.breaker_open_s
 def test_the_second_crash_keeps_a_robot_out_for_a_while():
     record = CrashRecord(SETTINGS)
 
-    blocks = [record.crashed(ALICE, 0.0), record.crashed(ALICE, 1.0)]
+    blocks = [record.note_crash(ALICE, 0.0), record.note_crash(ALICE, 1.0)]
 
     assert blocks == [False, True]
     refusal = record.refusal(ALICE, 1.0)
@@ -25,25 +25,25 @@ def test_the_second_crash_keeps_a_robot_out_for_a_while():
 
 def test_a_robot_of_that_name_in_another_tenant_is_not_kept_out():
     record = CrashRecord(SETTINGS)
-    record.crashed(ALICE, 0.0)
+    record.note_crash(ALICE, 0.0)
 
-    assert not record.crashed(NAMESAKE, 0.0)
-    assert record.crashed(ALICE, 0.0)
+    assert not record.note_crash(NAMESAKE, 0.0)
+    assert record.note_crash(ALICE, 0.0)
     assert record.refusal(NAMESAKE, 0.0) is None
-    assert record.blocked(0.0) == 1
+    assert record.count_blocked(0.0) == 1
 
 
 def test_crashes_that_lie_far_apart_do_not_count_together():
     record = CrashRecord(SETTINGS)
 
-    assert not any(record.crashed(ALICE, number * (WINDOW_S + 1.0)) for number in range(5))
+    assert not any(record.note_crash(ALICE, number * (WINDOW_S + 1.0)) for number in range(5))
 
 
 def test_after_its_rest_a_robot_needs_as_many_crashes_again():
     record = CrashRecord(SETTINGS)
-    record.crashed(ALICE, 0.0)
-    record.crashed(ALICE, 0.0)
+    record.note_crash(ALICE, 0.0)
+    record.note_crash(ALICE, 0.0)
 
-    assert not record.crashed(ALICE, REST_S)
+    assert not record.note_crash(ALICE, REST_S)
     assert record.refusal(ALICE, REST_S) is None
-    assert record.crashed(ALICE, REST_S)
+    assert record.note_crash(ALICE, REST_S)

@@ -80,7 +80,7 @@ class MapDescriber:
         try:
             reply = self._processes.call(msgspec.msgpack.encode([name, data]), self._timeout_s)
         except Crashed:
-            self._crashes.crashed(robot, self._clock())
+            self._crashes.note_crash(robot, self._clock())
             raise
         return msgspec.msgpack.decode(reply, type=MapSummary)
 

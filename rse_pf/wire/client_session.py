@@ -308,9 +308,7 @@ class ClientSession:
                 if pending.connection is before and pending.is_long and not pending.cancelled:
                     pending.connection = None  # the job continues on any server; the old one can close now
         self._say(self.subscriptions.adopt(connection, now), now)
-        frames = [
-            pending for pending in self._pending.values() if _is_frame(pending) and pending.connection is None
-        ]
+        frames = [frame for frame in self._pending.values() if _is_frame(frame) and frame.connection is None]
         if (
             before is None
             and len(frames) > 1
@@ -448,9 +446,7 @@ class ClientSession:
     def _may_send(self, command: Command, connection: ConnectionState, capacity: int) -> bool:
         if capacity <= 0 or not command.stream or connection.backlog is None:
             return capacity > 0
-        in_flight = sum(
-            _is_frame(pending) and pending.connection is connection for pending in self._pending.values()
-        )
+        in_flight = sum(_is_frame(sent) and sent.connection is connection for sent in self._pending.values())
         return in_flight < connection.backlog.max_in_flight
 
     def _capacity(self, connection: ConnectionState, now: float) -> int:

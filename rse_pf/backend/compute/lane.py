@@ -103,7 +103,7 @@ class ComputeLane(Generic[Answer]):
         self._scheduler.note_refused(now)
 
     def submit(self, queued: QueuedCommand, now: float) -> None:
-        """Let *queued*, which was admitted, wait for its turn, unless its robot is kept out for a while."""
+        """Queue *queued*, which was admitted, or refuse it while its robot is blocked after crashes."""
         refusal = self._limited.refusal(queued, now)
         if refusal is not None:
             self._refuse(RefusedCommand(queued, refusal, "blocked"), now)

@@ -64,7 +64,7 @@ class LimitedServices:
 
     def blocked_robots(self, now: float) -> int:
         """Return how many robots are refused now."""
-        return self._crashes.blocked(now)
+        return self._crashes.count_blocked(now)
 
     def cpu_s(self) -> float:
         """Return the CPU seconds of all processes so far; less again after a template was lost."""
@@ -99,7 +99,7 @@ class LimitedServices:
 
     def _note_crash(self, queued: QueuedCommand, reason: str) -> None:
         context, command = self._context, queued.command
-        is_blocked = self._crashes.crashed(queued.robot, context.clocks.monotonic())
+        is_blocked = self._crashes.note_crash(queued.robot, context.clocks.monotonic())
         context.log.warning(
             "compute-crashed", robot=queued.robot, service=command.service, id=command.id,
             trace=command.trace, reason=reason, blocked=is_blocked,

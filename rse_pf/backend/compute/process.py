@@ -39,7 +39,7 @@ def configuration_of(services: str, settings: PlatformSettings) -> str:
 
 
 def encode_request(command: Command, robot: RobotId) -> bytes:
-    """Return what the handler of a process takes; raises BadRequest for a payload that cannot be encoded."""
+    """Return the request for the handler of a process; raises BadRequest if it cannot be encoded."""
     try:
         return _encode([command.service, command.payload, command.trace, list(robot)])
     except (RsePfError, TypeError, ValueError, OverflowError, RecursionError) as error:

@@ -19,7 +19,7 @@ from rse_pf.backend.scheduling.scheduler import (
     QueueBacklog,
     QueuedCommand,
     RefusedCommand,
-    expired,
+    expired_error,
     max_wait_s,
     retry_after_ms,
 )
@@ -100,7 +100,7 @@ class Admission:
             return RefusedCommand(queued, forbidden, "scope")
         allowed_s = queued.deadline_s - queued.received_s
         if allowed_s <= 0:
-            return RefusedCommand(queued, expired(queued, queued.received_s), "expired")
+            return RefusedCommand(queued, expired_error(queued, queued.received_s), "expired")
         if backlog.waiting >= self._max_queue:
             busy = Busy(
                 f"{backlog.waiting} commands of this robot wait already",

@@ -479,13 +479,13 @@ class Dispatcher:
         ):
             return False
         now = self._monotonic()
-        if not self._scheduler.start_alone(queued, now):
+        if not self._scheduler.start_unqueued(queued, now):
             return False
         self._waits.note(now - queued.received_s, now)
         self._begin_inline()
         answer = self._answers.compute(queued)
         now = self._monotonic()
-        self._scheduler.done_alone(queued, now)
+        self._scheduler.finish_unqueued(queued, now)
         self._answers.send(answer, now)
         return True
 

@@ -101,7 +101,7 @@ class JobServer:
             self._watched[name] = (JobLease(context.store, name, owner, context.clock), owner)
         lease, _ = self._watched[name]
         try:
-            record = lease.look()
+            record = lease.read()
         except StoreError as error:
             self._log.warning("job-record", record=name, reason=error.message)
             return False

@@ -91,7 +91,7 @@ def record_name(robot: RobotId, key: str) -> str:
 
 
 def verdict_on(record: JobRecord | None, *, unchanged_s: float, lease_s: float, is_watched: bool) -> Verdict:
-    """Return what to do about a job that a robot asked for.
+    """Return the action that follows from the record of a job that a robot asked for.
 
     Args:
         record: As it stands in the store; None if there is none.
@@ -136,7 +136,7 @@ class JobLease:
 
     @property
     def unchanged_s(self) -> float:
-        """For how long the record is unchanged, in seconds."""
+        """The time since the record changed last, in seconds."""
         return self._clock() - self._changed_s
 
     @property
@@ -144,7 +144,7 @@ class JobLease:
         """Whether this process held the lease when it last read the record."""
         return self.record is not None and self.record.owner == self._owner
 
-    def look(self) -> JobRecord | None:
+    def read(self) -> JobRecord | None:
         """Read the record; raises StoreError."""
         try:
             data: bytes | None = self._store.get(self._name)
@@ -180,7 +180,7 @@ class JobLease:
         return False
 
     def ask_to_cancel(self) -> None:
-        """Tell the owner that the robot cancelled the job."""
+        """Ask the owner of the lease to cancel the job, because the robot cancelled it."""
         while self.record is not None and self.record.state == "running" and not self.record.cancel:
             if self._swap(msgspec.structs.replace(self.record, cancel=True)):
                 return
@@ -190,7 +190,7 @@ class JobLease:
         try:
             self._store.compare_and_swap(self._name, self._data, data)
         except Conflict:
-            self.look()
+            self.read()
             return False
         self._note(data)
         return True

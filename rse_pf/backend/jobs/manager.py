@@ -142,7 +142,7 @@ class JobManager:
                 trace=command.trace,
             )
             if not self._has_capacity(request):
-                self._fail(queued, _too_many())
+                self._fail(queued, _too_many_error())
                 return
             entry = self._entries[name] = _Entry(request, JobSignals())
             self._begin(entry)
@@ -200,7 +200,7 @@ class JobManager:
         here[row].signals.give_up()
         waiters, here[row].waiters = here[row].waiters, []
         for waiter in waiters:
-            self._fail(waiter.queued, _too_many())
+            self._fail(waiter.queued, _too_many_error())
         return True
 
     def _begin(self, entry: _Entry) -> None:
@@ -282,5 +282,5 @@ class JobManager:
         self._answer(queued, failure_of(error, queued.command, server=self._context.server_id))
 
 
-def _too_many() -> Busy:
+def _too_many_error() -> Busy:
     return Busy("too many jobs wait", hint="try again later", retry_after_ms=_BUSY_RETRY_MS)

@@ -102,7 +102,7 @@ def inline_bytes(settings: PlatformSettings) -> int:
 
 
 def retry_store(act: Callable[[], T]) -> T:
-    """Return what *act* returns; it is repeated twice if the store fails."""
+    """Call *act* and return its result; a failure of the store repeats it, at most twice."""
     for _ in range(_STORE_TRIES - 1):
         with contextlib.suppress(StoreError):
             return act()
@@ -158,7 +158,7 @@ def _work(
     try:
         registry = load_services(services, settings)
         _check_quota(request, settings)
-        payload = _resolved(request, registry.get(request.service).request_type, settings)
+        payload = _resolve_payload(request, registry.get(request.service).request_type, settings)
         command = Command(id=0, service=request.service, payload=payload)
         answer = dispatch(registry, command, time.monotonic, on_defect=on_defect, report=report)
     except RsePfError as error:
@@ -173,7 +173,7 @@ def _work(
     return _encode_answer(answer)
 
 
-def _resolved(request: JobRequest, kind: type[Any], settings: PlatformSettings) -> Any:
+def _resolve_payload(request: JobRequest, kind: type[Any], settings: PlatformSettings) -> Any:
     """Return the payload with the robot's objects in place of their names."""
     if not named_in(kind, request.payload):
         return request.payload

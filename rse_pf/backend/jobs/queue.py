@@ -25,7 +25,7 @@ from rse_pf.identity import RobotId
 from rse_pf.object_store import ObjectStore
 from rse_pf.wire.arrays import binary_encode_hook, extension_hook
 
-__all__ = ["JobOffer", "JobQueue", "has_jobs", "in_turn", "settings_digest_of"]
+__all__ = ["JobOffer", "JobQueue", "has_jobs", "interleave", "settings_digest_of"]
 
 _PREFIX = "job-queue/"
 _MAX_NAMES = 10_000
@@ -64,7 +64,7 @@ def settings_digest_of(settings: PlatformSettings) -> str:
     return hashlib.sha256(chosen.encode()).hexdigest()
 
 
-def in_turn(names: Sequence[str], served: Mapping[str, int]) -> list[str]:
+def interleave(names: Sequence[str], served: Mapping[str, int]) -> list[str]:
     """Return *names*, ``job-queue/TENANT/ROBOT/KEY``: one of each robot, then the second of each, and so on.
 
     A robot that was served longer ago comes first.
@@ -147,7 +147,7 @@ class JobQueue:
         names = self._names(_MAX_NAMES)
         self._others.intersection_update(names)
         self._damaged.intersection_update(names)
-        ours = [name for name in in_turn(names, served or {}) if name not in self._others]
+        ours = [name for name in interleave(names, served or {}) if name not in self._others]
         for name in ours[:_MAX_READ]:
             offer = self._read(name)
             if offer is not None and offer.settings == self._settings:

@@ -165,10 +165,10 @@ def _follow_or_run(
     while True:
         if signals.giving_up:
             return JobOutcome()
-        record = lease.look()
+        record = lease.read()
         if signals.cancelled:
             lease.ask_to_cancel()
-            return JobOutcome(error=_cancelled())
+            return JobOutcome(error=_cancelled_error())
         verdict = verdict_on(
             record, unchanged_s=lease.unchanged_s, lease_s=serving.job_lease_s, is_watched=lease.is_watched
         )
@@ -214,7 +214,7 @@ def _get_slot(request: JobRequest, context: JobContext, signals: JobSignals, lea
         if context.clock() < due_s:
             return True
         due_s = context.clock() + poll_s
-        return lease.look() == before
+        return lease.read() == before
 
     return context.slots.acquire(request.robot, wait)
 
@@ -263,17 +263,21 @@ class _JobRun:
             self._end_lease(JobRecord(state="given-up", owner=""))
             return JobOutcome()
         if why == "cancelled":
-            return self._failed(_cancelled())
+            return self._store_failure(_cancelled_error())
         if why == "late":
             max_s = self._context.settings.serving.max_job_s
-            return self._failed(Expired(f"the job took longer than {max_s:g} s", hint="send less at once"))
+            return self._store_failure(
+                Expired(f"the job took longer than {max_s:g} s", hint="send less at once")
+            )
         if self._end is None:
-            return self._failed(_crashed(exit_code))
+            return self._store_failure(_crash_error(exit_code))
         if self._end[0] == "stored":
             return self._report_stored(*self._end[1:])
         if self._end[0] == "done":
             return self._store_reply(*self._end[1:])
-        return self._failed(error_from_code(str(self._end[1]), str(self._end[2]), hint=str(self._end[3])))
+        return self._store_failure(
+            error_from_code(str(self._end[1]), str(self._end[2]), hint=str(self._end[3]))
+        )
 
     def _supervise(self, process: JobProcess) -> Literal["over", "lost", "given-up", "cancelled", "late"]:
         """Read from the process and renew the lease until the run ends."""
@@ -341,7 +345,7 @@ class _JobRun:
                 lambda: store_within_quota(context.store, accounts, request.robot, reply, request.quota_bytes)
             )
         except QuotaExceeded as error:
-            return self._failed(error)
+            return self._store_failure(error)
         inline = reply if len(reply) <= inline_bytes(context.settings) else None
         return self._report_stored(compute_ms, digest, len(reply), inline)
 
@@ -355,7 +359,7 @@ class _JobRun:
         )  # fmt: skip
         return JobOutcome(object=digest, reply=reply, compute_ms=compute_ms)
 
-    def _failed(self, error: RsePfError) -> JobOutcome:
+    def _store_failure(self, error: RsePfError) -> JobOutcome:
         self._end_lease(
             JobRecord(state="failed", owner="", code=error.code, message=error.message, hint=error.hint)
         )
@@ -365,11 +369,11 @@ class _JobRun:
         retry_store(lambda: self._lease.end(record))
 
 
-def _cancelled() -> RsePfError:
+def _cancelled_error() -> RsePfError:
     return Cancelled("the robot cancelled the command")
 
 
-def _crashed(code: int) -> RsePfError:
+def _crash_error(code: int) -> RsePfError:
     how = f"exit code {code}"
     if code < 0:
         how = signal.Signals(-code).name if -code in set(signal.Signals) else f"signal {-code}"

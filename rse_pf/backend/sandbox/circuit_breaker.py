@@ -106,7 +106,7 @@ class CircuitBreaker:
             return None
         return _refusal_of(service, last, last.until_s - now)
 
-    def crashed(self, robot: RobotId, service: str, digest: str, now: float) -> None:
+    def note_crash(self, robot: RobotId, service: str, digest: str, now: float) -> None:
         """Note that a sandbox of *robot* crashed while it worked on this request."""
         end, key = _End(now, robot), (service, digest)
         self._count(service, end)
@@ -115,7 +115,7 @@ class CircuitBreaker:
         while len(self._ends_of_request) > _MAX_REQUESTS or self._oldest_s() <= now - POISON_S:
             self._ends_of_request.popitem(last=False)
 
-    def overran(self, robot: RobotId, service: str, now: float) -> None:
+    def note_overrun(self, robot: RobotId, service: str, now: float) -> None:
         """Note that a sandbox was killed because *robot*'s own deadline had passed."""
         self._count(service, _End(now, robot, is_crash=False))
 
@@ -125,7 +125,7 @@ class CircuitBreaker:
         return sorted({service for service, scope in shared if not isinstance(scope, RobotId)})
 
     def blocks(self, now: float) -> list[Block]:
-        """Return everything that is refused now: what concerns most robots first, then by name."""
+        """Return all blocks of now, those of most robots first, and then by name."""
         blocks = [
             _block(service, scope, "overruns" if breaker.overruns else "crashes", 0, breaker.until_s - now)
             for (service, scope), breaker in self._breakers.items()
@@ -145,7 +145,7 @@ class CircuitBreaker:
     def unblock(
         self, now: float, *, service: str | None = None, tenant: str | None = None, robot: str | None = None
     ) -> list[Block]:
-        """Lift what is refused, forget the evidence for it, and return what was lifted.
+        """Lift the matching blocks, forget the evidence for them, and return them.
 
         Args:
             now: The time.
@@ -162,7 +162,7 @@ class CircuitBreaker:
         def without_lifted(name: str, ends: Iterable[_End]) -> list[_End]:
             return [end for end in ends if not matches(name, end.robot.tenant, end.robot.name)]
 
-        for key in [key for key in self._breakers if matches(key[0], *_names(key[1]))]:
+        for key in [key for key in self._breakers if matches(key[0], *_tenant_and_name(key[1]))]:
             del self._breakers[key]
         for name, service_ends in self._ends_of_service.items():
             self._ends_of_service[name] = deque(without_lifted(name, service_ends), _MAX_ENDS_OF_SERVICE)
@@ -230,13 +230,13 @@ def _scopes_of(robot: RobotId) -> tuple[Scope, ...]:
     return robot, robot.tenant, None
 
 
-def _names(scope: Scope) -> tuple[str | None, str | None]:
+def _tenant_and_name(scope: Scope) -> tuple[str | None, str | None]:
     """Return tenant and name of the robots of *scope*, None where they are any."""
     return (scope.tenant, scope.name) if isinstance(scope, RobotId) else (scope, None)
 
 
 def _block(service: str, scope: Scope, reason: Reason, requests: int, left_s: float) -> Block:
-    tenant, robot = _names(scope)
+    tenant, robot = _tenant_and_name(scope)
     return Block(
         service=service, reason=reason, tenant=tenant, robot=robot, requests=requests, left_s=round(left_s, 3)
     )

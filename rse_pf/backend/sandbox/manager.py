@@ -129,7 +129,7 @@ class SandboxManager:
         return self._policy.waiting_of(robot)
 
     def report(self) -> dict[str, Any]:
-        """Return what /readyz and /metrics show of this worker's sandboxes."""
+        """Return the state and the counts of this worker's sandboxes for /readyz and /metrics."""
         return {
             "sandboxes": self._policy.sandboxes,
             "missing_isolation": list(self.missing),
@@ -138,11 +138,11 @@ class SandboxManager:
         }
 
     def blocks(self) -> list[Block]:
-        """Return what is refused now after crashes, and to whom."""
+        """Return the services and requests that are refused now after crashes, with their robots."""
         return self._policy.breaker.blocks(self._monotonic())
 
     def unblock(self, service: str | None, tenant: str | None, robot: str | None) -> list[Block]:
-        """Lift what is refused (None stands for all), and return what it was."""
+        """Lift the matching blocks (None matches everything), and return them."""
         return self._policy.breaker.unblock(self._monotonic(), service=service, tenant=tenant, robot=robot)
 
     def record(self, number: int, service: str, *, calls: int, max_bytes: int, seconds: float) -> bool:
@@ -187,7 +187,7 @@ class SandboxManager:
         self._zygote.close()
 
     def retire(self) -> None:
-        """Do the same without waiting for the zygote."""
+        """End every sandbox, and the zygote without waiting for it."""
         self._execute(self._policy.close())
         if self._timer is not None:
             self._timer.cancel()
@@ -196,13 +196,13 @@ class SandboxManager:
     # --- events ------------------------------------------------------------------------------------
 
     def _on_gone(self, number: int, how: str) -> None:
-        self._execute(self._policy.gone(number, how, self._monotonic()))
+        self._execute(self._policy.on_exit(number, how, self._monotonic()))
 
     def _on_lost(self) -> None:
-        self._execute(self._policy.all_gone("the zygote ended", self._monotonic()))
+        self._execute(self._policy.on_all_exited("the zygote ended", self._monotonic()))
 
     def _on_fault(self, number: int, why: str) -> None:
-        self._execute(self._policy.broken(number, why))
+        self._execute(self._policy.on_violation(number, why))
 
     def _on_message(self, number: int, message: Any) -> None:
         self._working.discard(number)
@@ -212,14 +212,14 @@ class SandboxManager:
 
     def _follow_message(self, number: int, message: Any, now: float) -> None:
         if is_ready(message):
-            self._execute(self._policy.ready(number, now))
+            self._execute(self._policy.on_ready(number, now))
             return
         try:
             outcome = outcome_of(message)
         except BadMessage as error:
             self._on_fault(number, error.message)
         else:
-            self._execute(self._policy.replied(number, outcome, now))
+            self._execute(self._policy.on_reply(number, outcome, now))
 
     def _on_timer(self) -> None:
         self._timer, self._timer_s = None, math.inf
@@ -311,11 +311,11 @@ class SandboxManager:
     # --- snapshots ---------------------------------------------------------------------------------
 
     def _ask_store(self, number: int, call: SandboxCall, function: Callable[..., Any], *args: Any) -> None:
-        """Run a function of the store in a thread and tell the policy what came of it."""
+        """Run a function of the store in a thread, and pass its result or error to the policy."""
 
         def done(future: Any) -> None:
             outcome = future.exception() or future.result()
-            self._execute(self._policy.store_replied(number, call, outcome, self._monotonic()))
+            self._execute(self._policy.on_store_reply(number, call, outcome, self._monotonic()))
 
         work = functools.partial(function, self._store, call.queued.robot, call.service, *args)
         self._loop.run_in_executor(None, work).add_done_callback(done)

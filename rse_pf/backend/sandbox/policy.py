@@ -81,7 +81,7 @@ class SandboxReply:
 
 @dataclass(frozen=True, slots=True)
 class CreateSandbox:
-    """Start a process for *robot* and report `ready` or `gone`."""
+    """Start a process for *robot* and report `on_ready` or `on_exit`."""
 
     number: int
     robot: RobotId
@@ -89,7 +89,7 @@ class CreateSandbox:
 
 @dataclass(frozen=True, slots=True)
 class SendMessage:
-    """Send *data* to the sandbox and report what it `replied`."""
+    """Send *data* to the sandbox and report what it `on_reply`."""
 
     number: int
     data: bytes
@@ -97,7 +97,7 @@ class SendMessage:
 
 @dataclass(frozen=True, slots=True)
 class KillSandbox:
-    """Kill the process; `gone` follows."""
+    """Kill the process; `on_exit` follows."""
 
     number: int
 
@@ -111,7 +111,7 @@ class ReleaseSandbox:
 
 @dataclass(frozen=True, slots=True)
 class LoadSnapshot:
-    """Read the last snapshot of the service and report `store_replied`."""
+    """Read the last snapshot of the service and report `on_store_reply`."""
 
     number: int
     call: SandboxCall
@@ -119,7 +119,7 @@ class LoadSnapshot:
 
 @dataclass(frozen=True, slots=True)
 class SaveSnapshot:
-    """Replace the snapshot *expected* by *data* and report `store_replied`."""
+    """Replace the snapshot *expected* by *data* and report `on_store_reply`."""
 
     number: int
     call: SandboxCall
@@ -239,7 +239,7 @@ class SandboxPolicy:
 
     @property
     def wake_s(self) -> float:
-        """When `tick` is due next; infinite if nothing is waited for."""
+        """The time at which `tick` is due next; infinite if nothing is waited for."""
         times = (
             min(sandbox.kill_s, sandbox.late_s, sandbox.release_s) for sandbox in self._sandboxes.values()
         )
@@ -253,13 +253,13 @@ class SandboxPolicy:
     # --- events from the gateway -------------------------------------------------------------------
 
     def add_connection(self, robot: RobotId) -> None:
-        """A connection of *robot* was opened: its sandbox, if it still has one, is kept."""
+        """Count one more connection of *robot*: its sandbox, if it still has one, is not released."""
         self._connections[robot] += 1
         if robot in self._by_robot:
             self._by_robot[robot].release_s = math.inf
 
     def remove_connection(self, robot: RobotId, now: float) -> None:
-        """A connection of *robot* was closed; after the last one the grace period of its sandbox begins."""
+        """Count one connection of *robot* less; after the last one the grace period of its sandbox begins."""
         self._connections[robot] -= 1
         if self._connections[robot] > 0:
             return
@@ -270,11 +270,11 @@ class SandboxPolicy:
             sandbox.release_s = now + self._settings.grace_s
 
     def submit(self, call: SandboxCall, now: float) -> list[Action]:
-        """A robot sent a command."""
+        """Begin or queue the command of a robot."""
         refusal = self._refusal(call, now)
         sandbox = self._by_robot.get(call.queued.robot)
         if refusal is None and sandbox is None and not self._gets_place(call.queued.robot.tenant, now):
-            refusal = self._full()
+            refusal = self._no_place_error()
         if refusal is not None:
             self._answer(call, refusal)
             return self._take_actions()
@@ -285,25 +285,25 @@ class SandboxPolicy:
 
     # --- events from processes and the store -------------------------------------------------------
 
-    def ready(self, number: int, now: float) -> list[Action]:
-        """A sandbox has started and takes requests."""
+    def on_ready(self, number: int, now: float) -> list[Action]:
+        """Follow the report that a sandbox has started and takes requests."""
         sandbox = self._sandboxes.get(number)
         if sandbox is None or sandbox.fault:
             return []
         if sandbox.state != "starting":
-            return self.broken(number, "it reported its start twice")
+            return self.on_violation(number, "it reported its start twice")
         sandbox.state, sandbox.kill_s, sandbox.idle_since_s = "idle", math.inf, now
         self._start_next(sandbox, now)
         return self._take_actions()
 
-    def replied(self, number: int, outcome: SandboxReply | RsePfError, now: float) -> list[Action]:
-        """A sandbox answered the last message; what it says while it is being killed is too late."""
+    def on_reply(self, number: int, outcome: SandboxReply | RsePfError, now: float) -> list[Action]:
+        """Follow the answer of a sandbox to its last message; one that is being killed answers too late."""
         sandbox = self._sandboxes.get(number)
         if sandbox is None or sandbox.fault:
             return []
         call = sandbox.running
         if call is None or sandbox.state not in ("restoring", "running"):
-            return self.broken(number, "it replied without a request")
+            return self.on_violation(number, "it replied without a request")
         if sandbox.state == "restoring" and isinstance(outcome, SandboxReply):
             self._send(sandbox, call)
         elif sandbox.state == "restoring":
@@ -322,10 +322,10 @@ class SandboxPolicy:
             self._actions.append(SaveSnapshot(number, call, expected, outcome.snapshot))
         return self._take_actions()
 
-    def store_replied(
+    def on_store_reply(
         self, number: int, call: SandboxCall, outcome: bytes | BaseException | None, now: float
     ) -> list[Action]:
-        """The store has read a snapshot (None: there is none), has saved one (None), or failed.
+        """Follow the store: it read a snapshot (None if there is none), saved one (None), or failed.
 
         A Conflict means that it holds a newer snapshot: the robot's state was changed on another server.
         """
@@ -334,7 +334,7 @@ class SandboxPolicy:
             return []
         if isinstance(outcome, Conflict):
             self._release(sandbox)
-            self._answer(call, _lost(call.service, "its state was changed on another server"))
+            self._answer(call, _worker_lost(call.service, "its state was changed on another server"))
             self._move_waiting(sandbox, now)
         elif isinstance(outcome, BaseException):
             hint = outcome.hint if isinstance(outcome, RsePfError) else ""
@@ -354,27 +354,27 @@ class SandboxPolicy:
                 self._actions.append(SendMessage(number, message))
         return self._take_actions()
 
-    def broken(self, number: int, why: str) -> list[Action]:
-        """A sandbox violated the protocol or closed its channel ("")."""
+    def on_violation(self, number: int, why: str) -> list[Action]:
+        """Kill a sandbox that violated the protocol, or closed its channel (*why* is "")."""
         sandbox = self._sandboxes.get(number)
         if sandbox is not None and not sandbox.fault:
             self._kill(sandbox, why)
         return self._take_actions()
 
-    def gone(self, number: int, how: str, now: float) -> list[Action]:
-        """The process of a sandbox ended."""
+    def on_exit(self, number: int, how: str, now: float) -> list[Action]:
+        """Follow the end of the process of a sandbox."""
         if number in self._sandboxes:
-            self._ended(self._sandboxes[number], how, now)
+            self._release_ended(self._sandboxes[number], how, now)
         return self._take_actions()
 
-    def all_gone(self, how: str, now: float) -> list[Action]:
-        """Every sandbox ended, because the zygote did: evidence against no service and no request."""
+    def on_all_exited(self, how: str, now: float) -> list[Action]:
+        """Follow the end of all sandboxes with their zygote: it is evidence against no service or request."""
         for sandbox in list(self._sandboxes.values()):
-            self._ended(sandbox, how, now, is_evidence=False)
+            self._release_ended(sandbox, how, now, is_evidence=False)
         return self._take_actions()
 
     def tick(self, now: float) -> list[Action]:
-        """Time has passed: answer calls at their deadline, kill and release what is due."""
+        """Answer the calls whose deadline has passed, and kill and release the sandboxes that are due."""
         for sandbox in list(self._sandboxes.values()):
             call = sandbox.running
             if sandbox.release_s <= now:
@@ -390,7 +390,7 @@ class SandboxPolicy:
         return self._take_actions()
 
     def close(self) -> list[Action]:
-        """The worker ends: release everything, answer nothing."""
+        """Release every sandbox and answer no command, because the worker ends."""
         for sandbox in list(self._sandboxes.values()):
             self._release(sandbox)
         return self._take_actions()
@@ -426,7 +426,7 @@ class SandboxPolicy:
                 return min(idle, key=lambda sandbox: sandbox.idle_since_s)
         return None
 
-    def _full(self) -> Busy:
+    def _no_place_error(self) -> Busy:
         return Busy(
             f"all {self._max_sandboxes} sandboxes of this server are in use",
             hint="try again later",
@@ -443,7 +443,7 @@ class SandboxPolicy:
             and self.breaker.refusal(call.queued.robot, call.service, call.digest, now) is None
         )
 
-    def _ended(self, sandbox: _Sandbox, how: str, now: float, *, is_evidence: bool = True) -> None:
+    def _release_ended(self, sandbox: _Sandbox, how: str, now: float, *, is_evidence: bool = True) -> None:
         """Release a sandbox whose process ended by itself or was killed; retry or answer its command."""
         call, why = sandbox.running, sandbox.fault or how
         self._release(sandbox)
@@ -456,22 +456,22 @@ class SandboxPolicy:
             self._actions.append(LogCrash(sandbox.robot, service, reason))
         if call is not None:
             if sandbox.is_overrun:
-                self.breaker.overran(sandbox.robot, service, now)
+                self.breaker.note_overrun(sandbox.robot, service, now)
             elif is_evidence:
-                self.breaker.crashed(sandbox.robot, service, call.digest, now)
+                self.breaker.note_crash(sandbox.robot, service, call.digest, now)
             call.tries += 1
             if self._may_retry(call, sandbox, now):
                 sandbox.waiting.appendleft(call)
             else:
-                self._answer(call, self._refusal(call, now) or _lost(service, why))
+                self._answer(call, self._refusal(call, now) or _worker_lost(service, why))
         if sandbox.state == "starting":
             while sandbox.waiting:
                 waiting = sandbox.waiting.popleft()
-                self._answer(waiting, _lost(waiting.service, why))
+                self._answer(waiting, _worker_lost(waiting.service, why))
         self._move_waiting(sandbox, now)
 
     def _move_waiting(self, sandbox: _Sandbox, now: float) -> None:
-        """Let the commands that waited for a released sandbox wait for a new one."""
+        """Move the commands that waited for a released sandbox to a new one."""
         if not sandbox.waiting or self._connections[sandbox.robot] == 0:
             return
         if self._shares.takes(sandbox.robot.tenant, self._held_by_tenant, now):
@@ -481,7 +481,7 @@ class SandboxPolicy:
 
     def _refuse_waiting(self, sandbox: _Sandbox) -> None:
         while sandbox.waiting:
-            self._answer(sandbox.waiting.popleft(), self._full())
+            self._answer(sandbox.waiting.popleft(), self._no_place_error())
 
     # --- steps -------------------------------------------------------------------------------------
 
@@ -558,7 +558,7 @@ class SandboxPolicy:
         return actions
 
 
-def _lost(service: str, why: str) -> WorkerLost:
+def _worker_lost(service: str, why: str) -> WorkerLost:
     return WorkerLost(
         f"service {service!r} ended while it worked on this command: {why}",
         hint="the server's log has what it printed last",

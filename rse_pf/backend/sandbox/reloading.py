@@ -96,7 +96,7 @@ class ReloadingSandboxes:
         """What the sandboxes that are gone have counted."""
         self._current = _Generation(tuple(service.name for service in services))
         if services:
-            self._current.sandboxes = self._made(services, self._current, None)
+            self._current.sandboxes = self._make_manager(services, self._current, None)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -114,15 +114,15 @@ class ReloadingSandboxes:
             return
         self._next = fresh
         self._give_up = self._loop.call_later(self._start_timeout_s, self._refuse, fresh, "it did not start")
-        fresh.sandboxes = self._made(services, fresh, functools.partial(self._ready, fresh))
+        fresh.sandboxes = self._make_manager(services, fresh, functools.partial(self._on_ready, fresh))
 
-    def _made(
+    def _make_manager(
         self, services: Sequence[InstalledService], generation: _Generation, on_ready: OnReady | None
     ) -> SandboxManager:
-        answer = functools.partial(self._answered, generation)
+        answer = functools.partial(self._on_answer, generation)
         return self._make(services, answer=answer, on_ready=on_ready)
 
-    def _ready(self, fresh: _Generation, missing: tuple[str, ...] | None) -> None:
+    def _on_ready(self, fresh: _Generation, missing: tuple[str, ...] | None) -> None:
         if fresh is not self._next:
             return
         if missing is None:
@@ -192,7 +192,7 @@ class ReloadingSandboxes:
         self._current.unanswered[queued.robot] += 1
         sandboxes.submit(queued)
 
-    def _answered(self, generation: _Generation, queued: QueuedCommand, message: Result | Failure) -> None:
+    def _on_answer(self, generation: _Generation, queued: QueuedCommand, message: Result | Failure) -> None:
         robot = queued.robot
         if generation.unanswered[robot] > 1:
             generation.unanswered[robot] -= 1
@@ -258,7 +258,7 @@ class ReloadingSandboxes:
         return sum(manager.waiting_of(robot) for manager in self._all) + len(self._waiting.get(robot, ()))
 
     def report(self) -> dict[str, Any]:
-        """Return what /readyz and /metrics show of this worker's sandboxes."""
+        """Return the state and the counts of this worker's sandboxes for /readyz and /metrics."""
         reports = [manager.report() for manager in self._all]
         counts = Counter(self._past)
         for report in reports:
@@ -274,7 +274,7 @@ class ReloadingSandboxes:
         }
 
     def blocks(self) -> list[Block]:
-        """Return what is refused now after crashes, and to whom."""
+        """Return the services and requests that are refused now after crashes, with their robots."""
         current = self._current.sandboxes
         return [] if current is None else current.blocks()
 

@@ -24,7 +24,7 @@ def is_ready(message: object) -> bool:
 
 
 def outcome_of(message: object) -> SandboxReply | RsePfError:
-    """Return what *message* says became of a request: a reply, or the typed failure of the service.
+    """Return the outcome of a request in *message*: a reply, or the typed failure of the service.
 
     Raises:
         BadMessage: It is no message of this kind: its parts have other types, or its time is not a number

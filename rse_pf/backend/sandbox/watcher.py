@@ -37,8 +37,8 @@ class MemoryWatcher:
         """Time until the next look: short when a sandbox of the last look was close to its limit."""
         return self._next_s
 
-    def look(self, pids: list[int]) -> dict[int, str]:
-        """Measure the sandboxes whose first processes are *pids*; return why some of them must be ended."""
+    def find_excess(self, pids: list[int]) -> dict[int, str]:
+        """Return the reason for each of *pids*, first processes of sandboxes, that uses too much memory."""
         reasons = {}
         least = self._limit
         for pid in pids:
@@ -63,7 +63,7 @@ class MemoryWatcher:
         return proportional_bytes(pid) + scratch
 
     def _scratch_bytes(self, pid: int) -> int:
-        """Return what the scratch folder holds; 0 where only its own limit is known, for plain users."""
+        """Return the bytes in the scratch folder; 0 for plain users, where only its own limit is known."""
         try:
             state = os.statvfs(self._proc / str(pid) / "root/scratch")
         except OSError:

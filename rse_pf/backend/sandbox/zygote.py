@@ -164,7 +164,7 @@ class _Zygote:
         """End the sandboxes that use too much memory in all."""
         if self._watcher is None or not self._children or time.monotonic() < self._look_s:
             return
-        for pid, reason in self._watcher.look(list(self._children)).items():
+        for pid, reason in self._watcher.find_excess(list(self._children)).items():
             self._reasons[pid] = reason
             os.kill(pid, signal.SIGKILL)
         self._look_s = time.monotonic() + self._watcher.interval_s

@@ -94,7 +94,7 @@ class ZygoteClient:
         self._signal(number, signal.SIGSTOP)
 
     def resume(self, number: int) -> None:
-        """Let sandbox *number* run again; one that is not paused is no error."""
+        """Resume sandbox *number*; one that is not paused is no error."""
         if number in self._paused:
             self._paused.discard(number)
             self._signal(number, signal.SIGCONT)
@@ -198,7 +198,7 @@ class ZygoteClient:
                 self.missing = tuple(report["missing"])
                 self._tell_ready(self.missing)
             elif report["event"] == "created":
-                self._created(report["id"], *handles)
+                self._on_created(report["id"], *handles)
             elif report["event"] == "gone":
                 self._forget(report["id"])
                 self._on_gone(report["id"], report["how"])
@@ -210,7 +210,7 @@ class ZygoteClient:
             self._loop.call_soon(on_ready, missing)
         return on_ready is not None
 
-    def _created(self, number: int, handle: int) -> None:
+    def _on_created(self, number: int, handle: int) -> None:
         self._handles[number] = handle
         if number in self._paused:
             self._signal(number, signal.SIGSTOP)

@@ -32,7 +32,7 @@ __all__ = [
     "QueuedCommand",
     "RefusedCommand",
     "Scheduler",
-    "expired",
+    "expired_error",
     "max_wait_s",
     "retry_after_ms",
 ]
@@ -216,7 +216,7 @@ class Scheduler:
                 self._started += 1
                 self._measure_turn(turn_wait_s, now)
                 return queued, refusals
-            refusals.append(self._refused_late(robot, queued, now))
+            refusals.append(self._refuse_late(robot, queued, now))
             if robot.waiting:
                 self._turns.append(robot_id)
             else:
@@ -224,11 +224,11 @@ class Scheduler:
         self._note_turn_wait(0.0, now)
         return None, refusals
 
-    def start_alone(self, queued: QueuedCommand, now: float) -> bool:
+    def start_unqueued(self, queued: QueuedCommand, now: float) -> bool:
         """Start *queued*, which was admitted, without a place in the queue; False if others wait or run.
 
-        Decides and counts as `submit` and `start` do for a command that finds the server idle; `done_alone`
-        ends it.
+        The decision and the counts are those of `submit` and `start` for a command that finds the server
+        idle.  `finish_unqueued` ends the command.
         """
         if self._robots or queued.deadline_s <= now:
             return False
@@ -243,8 +243,8 @@ class Scheduler:
         self._started += 1
         return True
 
-    def done_alone(self, queued: QueuedCommand, now: float) -> None:
-        """Note that the compute of a command that `start_alone` had started ended."""
+    def finish_unqueued(self, queued: QueuedCommand, now: float) -> None:
+        """Note the end of the compute of a command that `start_unqueued` started."""
         self.running -= 1
         self._note_service(now - queued.started_s)
 
@@ -260,7 +260,7 @@ class Scheduler:
             del self._robots[queued.robot]
 
     def sweep(self, now: float) -> list[RefusedCommand]:
-        """Give up what expired or waited too long, without starting anything."""
+        """Refuse the commands that expired or waited too long, and start none."""
         refusals: list[RefusedCommand] = []
         if self._turns:
             first = self._robots[self._turns.first]
@@ -272,10 +272,10 @@ class Scheduler:
                     robot.running is None and self._is_hopeless(robot, queued, now, len(self._turns) - 1)
                 )
                 if too_late:
-                    refusals.append(self._refused_late(robot, queued, now))
+                    refusals.append(self._refuse_late(robot, queued, now))
                 else:
                     still_waiting.append(queued)
-            self._rewait(robot_id, robot, still_waiting)
+            self._replace_waiting(robot_id, robot, still_waiting)
         return refusals
 
     def leave(self, owner: Any) -> list[QueuedCommand]:
@@ -284,7 +284,7 @@ class Scheduler:
         for robot_id, robot in list(self._robots.items()):
             dropped += [queued for queued in robot.waiting if queued.owner is owner]
             still_waiting = deque(queued for queued in robot.waiting if queued.owner is not owner)
-            self._rewait(robot_id, robot, still_waiting)
+            self._replace_waiting(robot_id, robot, still_waiting)
         return dropped
 
     def oldest_wait_s(self, now: float) -> float:
@@ -293,8 +293,9 @@ class Scheduler:
         return max(0.0, now - min(received)) if received else 0.0
 
     def runs_inline(self, *, cheap: bool, size_bytes: int) -> bool:
-        """Whether the command just started may run in the event loop: it is small, and no thread would save
-        time.
+        """Return whether the command just started may run in the event loop.
+
+        It may if it is small and no thread would save time.
 
         While the server is behind, a single solver thread and a server of one core have nothing to overlap
         with but refusals, which cost less than passing the command to the thread.  So it is with services
@@ -305,30 +306,32 @@ class Scheduler:
         return cheap and size_bytes <= INLINE_BYTES and saves_time and self.running <= 1
 
     def _delay_s(self, robot_id: RobotId, robot: _Robot | None) -> float:
-        """How long the next command of a robot will wait: a round for each of its own, at most for all."""
+        """Return the seconds that the next command of a robot waits: a round for each of its own commands."""
         rounds = 1 + (len(robot.waiting) if robot is not None else 0)
         return min(rounds * self._turns.before(robot_id.tenant), self.waiting + 1) * self.turn_s
 
     @property
-    def _wanted_s(self) -> float:
+    def _accepted_wait_s(self) -> float:
         """The target, or twice the present compute time: a slow service alone is no overload."""
         return max(QUEUE_TARGET_S, 2 * self._service_s)
 
     def _is_hopeless(self, robot: _Robot, queued: QueuedCommand, now: float, others: int) -> bool:
-        """Whether to give *queued* up: serving the oldest first would serve those that are about to be
-        late."""
+        """Return whether to give *queued* up.
+
+        Serving the oldest first would serve the commands that are about to be late.
+        """
         allowed_s = queued.deadline_s - queued.received_s
         if others and self.is_behind:
-            longest_s = max(_MAX_TARGETS_WAITED * self._wanted_s, _spare_s(allowed_s))
+            longest_s = max(_MAX_TARGETS_WAITED * self._accepted_wait_s, _spare_s(allowed_s))
             if _turn_wait(robot, queued, now) > min(longest_s, _MAX_SHARE_WAITED * allowed_s):
                 return True
         newer_waits = bool(robot.waiting) and robot.waiting[-1] is not queued
         return newer_waits and now - queued.received_s > allowed_s / 2
 
-    def _refused_late(self, robot: _Robot, queued: QueuedCommand, now: float) -> RefusedCommand:
+    def _refuse_late(self, robot: _Robot, queued: QueuedCommand, now: float) -> RefusedCommand:
         self._refused += 1
         if queued.deadline_s <= now:
-            return RefusedCommand(queued, expired(queued, now), "expired")
+            return RefusedCommand(queued, expired_error(queued, now), "expired")
         retry_ms = retry_after_ms(_turn_wait(robot, queued, now))
         return RefusedCommand(queued, Busy(BEHIND, hint=BEHIND_HINT, retry_after_ms=retry_ms), "behind")
 
@@ -336,7 +339,7 @@ class Scheduler:
         """Enter *behind* after an interval above the target."""
         if self.is_behind:
             self._judge(now)
-        elif wait_s <= QUEUE_TARGET_S or wait_s <= self._wanted_s:
+        elif wait_s <= QUEUE_TARGET_S or wait_s <= self._accepted_wait_s:
             self._late_since = None
         elif self._late_since is None:
             self._late_since = now
@@ -355,15 +358,15 @@ class Scheduler:
 
     def _note_service(self, spent_s: float) -> None:
         self._short_share += _SMOOTHING * ((spent_s <= _SHORT_COMPUTE_S) - self._short_share)
-        self._service_s = _averaged(self._service_s, spent_s) if self._service_s else spent_s
+        self._service_s = _smooth(self._service_s, spent_s) if self._service_s else spent_s
 
     def _measure_turn(self, waited_s: float, now: float) -> None:
         """Average the time between two starts while robots wait."""
         if waited_s > _IMMEDIATE_S and self._last_start > -math.inf:
-            self.turn_s = _averaged(self.turn_s, now - self._last_start)
+            self.turn_s = _smooth(self.turn_s, now - self._last_start)
         self._last_start = now
 
-    def _rewait(self, robot_id: RobotId, robot: _Robot, still_waiting: deque[QueuedCommand]) -> None:
+    def _replace_waiting(self, robot_id: RobotId, robot: _Robot, still_waiting: deque[QueuedCommand]) -> None:
         if len(still_waiting) == len(robot.waiting):
             return
         self.waiting -= len(robot.waiting) - len(still_waiting)
@@ -378,7 +381,7 @@ def retry_after_ms(delay_s: float) -> float:
     return 1e3 * min(_MAX_RETRY_S, max(QUEUE_INTERVAL_S, delay_s))
 
 
-def expired(queued: QueuedCommand, now: float) -> Expired:
+def expired_error(queued: QueuedCommand, now: float) -> Expired:
     """Return the error of a command whose deadline passed before its turn."""
     waited_ms = (now - queued.received_s) * 1e3
     return Expired(
@@ -386,7 +389,7 @@ def expired(queued: QueuedCommand, now: float) -> Expired:
     )
 
 
-def _averaged(average_s: float, measured_s: float) -> float:
+def _smooth(average_s: float, measured_s: float) -> float:
     believed_s = min(measured_s, _MAX_JUMP * max(average_s, _MIN_TURN_S))
     return average_s + _SMOOTHING * (believed_s - average_s)
 

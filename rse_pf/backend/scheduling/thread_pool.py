@@ -33,7 +33,7 @@ class SolverThreads(Generic[Outcome]):
             threading.Thread(target=self._work, name=f"{name}-{number}", daemon=True).start()
 
     def run(self, queued: QueuedCommand) -> None:
-        """Let the next free thread compute *queued*."""
+        """Give *queued* to the next free thread."""
         self._commands.put(queued)
 
     def close(self) -> None:

@@ -30,7 +30,7 @@ class Turns:
         return next(iter(self._tenants.values()))[0]
 
     def append(self, robot: RobotId) -> None:
-        """Let *robot* wait behind the others of its tenant."""
+        """Append *robot* behind the others of its tenant."""
         self._tenants.setdefault(robot.tenant, deque()).append(robot)
         self._count += 1
 
@@ -46,7 +46,7 @@ class Turns:
         return robot
 
     def remove(self, robot: RobotId) -> None:
-        """Let *robot* wait no more."""
+        """Remove *robot* from the queue."""
         robots = self._tenants[robot.tenant]
         robots.remove(robot)
         self._count -= 1

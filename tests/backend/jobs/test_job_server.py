@@ -14,7 +14,7 @@ import pytest
 from rse_pf.backend.jobs.job_server import JobServer
 from rse_pf.backend.jobs.lease import JobLease, record_name
 from rse_pf.backend.jobs.process import JobRequest
-from rse_pf.backend.jobs.queue import JobQueue, in_turn
+from rse_pf.backend.jobs.queue import JobQueue, interleave
 from rse_pf.backend.jobs.runner import JobContext, JobOutcome, JobSignals, run_job
 from rse_pf.backend.jobs.slots import JobSlots, make_pipe
 from rse_pf.backend.log import JsonLog
@@ -123,7 +123,7 @@ def test_the_job_of_a_job_server_that_died_is_taken_after_its_lease(bench: Bench
     request = a_request()
     bench.queue.offer(request)
     dead = JobLease(bench.store, record_name(request.robot, request.key), "dead", time.monotonic)
-    dead.look()
+    dead.read()
     assert dead.take()
     server = bench.job_server([DONE])
 
@@ -216,8 +216,8 @@ def test_a_job_that_its_robot_cancels_is_offered_no_more(bench: Bench) -> None:
 def test_robots_take_turns_however_many_jobs_they_offer() -> None:
     names = [f"job-queue/t/{robot}/{key}" for robot, keys in (("a", "123"), ("b", "1")) for key in keys]
 
-    assert [name[-3:] for name in in_turn(names, {})] == ["a/1", "b/1", "a/2", "a/3"]
-    assert in_turn(names, {"t/a": 7, "t/b": 5})[0] == names[-1]
+    assert [name[-3:] for name in interleave(names, {})] == ["a/1", "b/1", "a/2", "a/3"]
+    assert interleave(names, {"t/a": 7, "t/b": 5})[0] == names[-1]
 
 
 def test_a_job_of_servers_with_other_settings_is_not_taken(bench: Bench) -> None:

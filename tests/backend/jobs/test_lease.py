@@ -33,13 +33,13 @@ def store() -> MemoryStore:
 
 def looked(store: MemoryStore, owner: str, clock: Clock) -> JobLease:
     lease = JobLease(store, NAME, owner, clock)
-    lease.look()
+    lease.read()
     return lease
 
 
 def verdict(lease: JobLease) -> str:
     return verdict_on(
-        lease.look(), unchanged_s=lease.unchanged_s, lease_s=LEASE_S, is_watched=lease.is_watched
+        lease.read(), unchanged_s=lease.unchanged_s, lease_s=LEASE_S, is_watched=lease.is_watched
     )
 
 
@@ -123,7 +123,7 @@ def test_crashes_of_owners_are_counted_but_not_orderly_ends(store, clock):
 def test_the_owner_learns_that_a_follower_cancels_the_job(store, clock):
     owner, follower = looked(store, "owner", clock), looked(store, "follower", clock)
     owner.take()
-    follower.look()
+    follower.read()
 
     follower.ask_to_cancel()
 

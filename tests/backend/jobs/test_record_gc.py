@@ -28,7 +28,7 @@ class Bench:
 
     def lease(self) -> JobLease:
         lease = JobLease(self.store, NAME, "us", lambda: self.now)
-        lease.look()
+        lease.read()
         return lease
 
     def after(self, seconds: float) -> int:
@@ -77,7 +77,7 @@ def test_a_request_between_tombstone_and_deletion_waits_and_then_gets_a_new_run(
     class Watched(MemoryStore):
         def delete(self, name: str) -> None:
             reader = JobLease(self, NAME, "reader", lambda: bench.now)
-            record = reader.look()
+            record = reader.read()
             asked.append(verdict_on(record, unchanged_s=0.0, lease_s=LEASE_S, is_watched=reader.is_watched))
             super().delete(name)
 

@@ -114,7 +114,7 @@ def code(outcome: JobOutcome) -> str:
 
 def another(bench: Bench) -> JobLease:
     lease = JobLease(bench.store, NAME, "another", Clock())
-    lease.look()
+    lease.read()
     return lease
 
 

@@ -33,7 +33,7 @@ def crashing(robots: Iterable[RobotId], *, apart_s: float = 0.1, digest: str = "
     """Return a breaker that saw a crash of icp for each of *robots*: of *digest*, or of others."""
     breaker = CircuitBreaker(SETTINGS)
     for i, robot in enumerate(robots):
-        breaker.crashed(robot, "icp", digest or str(i), i * apart_s)
+        breaker.note_crash(robot, "icp", digest or str(i), i * apart_s)
     return breaker
 
 
@@ -47,9 +47,9 @@ def refused(breaker: CircuitBreaker, *robots: RobotId, digest: str = "new", now:
 
 def test_a_request_that_crashed_twice_is_poison_for_its_robot_alone():
     breaker = CircuitBreaker(SETTINGS)
-    breaker.crashed(ONE, "icp", "a", 0.0)
+    breaker.note_crash(ONE, "icp", "a", 0.0)
     assert refused(breaker, ONE, digest="a") == [""]
-    breaker.crashed(ONE, "icp", "a", 100.0)
+    breaker.note_crash(ONE, "icp", "a", 100.0)
 
     assert refused(breaker, ONE, TWO, NAMESAKE, digest="a", now=200.0) == ["poison", "", ""]
     assert refused(breaker, ONE, digest="b", now=200.0) == [""]
@@ -60,7 +60,7 @@ def test_a_poison_request_is_tried_again_ten_minutes_after_its_crashes():
 
     assert refused(breaker, ONE, digest="a", now=POISON_S - 0.1) == ["poison"]
     assert refused(breaker, ONE, digest="a", now=POISON_S) == [""]
-    breaker.crashed(ONE, "icp", "a", POISON_S)
+    breaker.note_crash(ONE, "icp", "a", POISON_S)
     assert refused(breaker, ONE, digest="a", now=POISON_S) == [""], "one new crash is not enough"
 
 
@@ -68,7 +68,7 @@ def test_three_crashes_in_half_a_minute_open_the_breaker_of_a_service_for_a_minu
     breaker = CircuitBreaker(SETTINGS)
     for now, digest in ((0.0, "a"), (20.0, "b"), (30.0, "c")):
         assert refused(breaker, ONE, now=now) == [""]
-        breaker.crashed(ONE, "icp", digest, now)
+        breaker.note_crash(ONE, "icp", digest, now)
 
     assert refused(breaker, ONE, TWO, NAMESAKE, now=30.1) == ["worker-lost", "", ""]
     assert breaker.refusal(ONE, "other", "d", 30.1) is None
@@ -86,11 +86,11 @@ def test_crashes_further_apart_do_not_open_the_breaker():
 
 def test_after_it_closed_the_breaker_needs_as_many_crashes_again():
     breaker = crashing([ONE] * 3, apart_s=1.0)
-    breaker.crashed(ONE, "icp", "late", 62.0)
-    breaker.crashed(ONE, "icp", "later", 63.0)
+    breaker.note_crash(ONE, "icp", "late", 62.0)
+    breaker.note_crash(ONE, "icp", "later", 63.0)
     assert refused(breaker, ONE, now=64.0) == [""]
 
-    breaker.crashed(ONE, "icp", "last", 64.0)
+    breaker.note_crash(ONE, "icp", "last", 64.0)
     assert refused(breaker, ONE, now=64.0) == ["worker-lost"]
 
 
@@ -98,7 +98,7 @@ def test_crashes_before_the_breaker_opened_are_not_counted_twice_if_it_is_open_f
     settings = PlatformSettings.from_dict({"services": {"breaker_crashes": 3, "breaker_open_s": 1}}).services
     breaker = CircuitBreaker(settings)
     for now in (0.0, 1.0, 2.0, 3.5):
-        breaker.crashed(ONE, "icp", str(now), now)
+        breaker.note_crash(ONE, "icp", str(now), now)
 
     assert refused(breaker, ONE, now=3.5) == [""]
 
@@ -111,7 +111,7 @@ def deadlines_of_a_robot_are_no_evidence(new_breaker: Callable[[], CircuitBreake
     breaker = new_breaker()
     for i in range(600):
         for robot in (ONE, TWO, THREE, RIVAL, RIVAL_2, OTHER):
-            breaker.overran(robot, "icp", float(i))
+            breaker.note_overrun(robot, "icp", float(i))
 
     assert refused(breaker, FOUR, RobotId("rival", "x"), RobotId("new", "x"), now=600.0) == ["", "", ""]
     assert breaker.open_services(600.0) == []
@@ -124,9 +124,9 @@ def test_the_deadlines_of_robots_are_evidence_neither_against_a_service_nor_agai
 
 def test_that_test_fails_where_a_deadline_counts_as_a_crash(monkeypatch: pytest.MonkeyPatch):
     def counts(breaker: CircuitBreaker, robot: RobotId, service: str, now: float) -> None:
-        breaker.crashed(robot, service, "same", now)
+        breaker.note_crash(robot, service, "same", now)
 
-    monkeypatch.setattr(CircuitBreaker, "overran", counts)
+    monkeypatch.setattr(CircuitBreaker, "note_overrun", counts)
     with pytest.raises(AssertionError):
         deadlines_of_a_robot_are_no_evidence(lambda: CircuitBreaker(SETTINGS))
 
@@ -134,7 +134,7 @@ def test_that_test_fails_where_a_deadline_counts_as_a_crash(monkeypatch: pytest.
 def test_a_robot_whose_deadline_is_overrun_again_and_again_is_refused_the_service_and_told_why():
     breaker = CircuitBreaker(SETTINGS)
     for i in range(3):
-        breaker.overran(ONE, "icp", float(i))
+        breaker.note_overrun(ONE, "icp", float(i))
 
     assert refused(breaker, ONE, TWO, NAMESAKE, now=3.0) == ["worker-lost", "", ""]
     refusal = breaker.refusal(ONE, "icp", "a", 3.0)
@@ -166,8 +166,8 @@ def no_tenant_takes_a_service_from_another(new_breaker: Callable[[], CircuitBrea
     breaker = new_breaker()
     for i in range(100):
         for request in ("same", str(i)):
-            breaker.crashed(RobotId("hostile", f"robot-{i}"), "icp", request, i * 0.01)
-    breaker.crashed(ONE, "icp", "same", 1.0)
+            breaker.note_crash(RobotId("hostile", f"robot-{i}"), "icp", request, i * 0.01)
+    breaker.note_crash(ONE, "icp", "same", 1.0)
 
     assert refused(breaker, ONE, TWO, RIVAL, now=1.1) == ["", "", ""]
     assert refused(breaker, ONE, TWO, RIVAL, digest="same", now=1.1) == ["", "", ""]
@@ -224,9 +224,9 @@ def test_a_name_that_was_enrolled_again_has_nothing_of_its_predecessor():
 
 def test_blocks_are_listed_with_reason_robots_and_time_and_those_of_most_robots_first():
     breaker = crashing([ONE, TWO, THREE], digest="a")
-    breaker.crashed(ONE, "icp", "a", 0.2)
+    breaker.note_crash(ONE, "icp", "a", 0.2)
     for _ in range(3):
-        breaker.overran(NAMESAKE, "pose", 0.2)
+        breaker.note_overrun(NAMESAKE, "pose", 0.2)
 
     assert breaker.blocks(0.2) == [
         Block(service="icp", reason="crashes", tenant="acme", robot=None, requests=0, left_s=60.0),
@@ -244,14 +244,14 @@ def test_an_operator_lifts_everything_and_the_evidence_is_forgotten():
     assert {(block.reason, block.robot) for block in lifted} >= {("crashes", None), ("poison", "robot-1")}
     assert breaker.blocks(1.0) == []
     assert refused(breaker, ONE, digest="a") == [""]
-    breaker.crashed(ONE, "icp", "a", 1.0)
+    breaker.note_crash(ONE, "icp", "a", 1.0)
     assert refused(breaker, ONE, TWO, digest="a") == ["", ""]
 
 
 def test_an_operator_lifts_what_concerns_one_service():
     breaker = crashing([ONE] * 3)
     for i in range(3):
-        breaker.crashed(ONE, "pose", str(i), 1.0)
+        breaker.note_crash(ONE, "pose", str(i), 1.0)
 
     assert [block.service for block in breaker.unblock(1.0, service="pose")] == ["pose"]
     assert [block.service for block in breaker.blocks(1.0)] == ["icp"]
@@ -283,7 +283,7 @@ def poison_expires(new_breaker: Callable[[], CircuitBreaker]) -> None:
     """Assert that a request of long ago is tried again."""
     breaker = new_breaker()
     for now in (0.0, 0.0, 1e6):
-        breaker.crashed(ONE, "icp", "old" if now == 0.0 else "new", now)
+        breaker.note_crash(ONE, "icp", "old" if now == 0.0 else "new", now)
 
     assert refused(breaker, ONE, digest="old", now=1e6) == [""]
 
@@ -301,12 +301,12 @@ def test_that_test_fails_where_poison_does_not_expire(monkeypatch: pytest.Monkey
 def test_the_oldest_requests_are_forgotten_when_ten_thousand_crashed():
     breaker = CircuitBreaker(SETTINGS)
     for i in range(12_000):
-        breaker.crashed(ONE, f"service-{i % 1000}", str(i), i * 0.001)
-    breaker.crashed(ONE, "icp", "new", 12.0)
-    breaker.crashed(ONE, "icp", "new", 12.0)
+        breaker.note_crash(ONE, f"service-{i % 1000}", str(i), i * 0.001)
+    breaker.note_crash(ONE, "icp", "new", 12.0)
+    breaker.note_crash(ONE, "icp", "new", 12.0)
 
     assert refused(breaker, ONE, digest="new", now=13.0) == ["poison"]
-    breaker.crashed(ONE, "service-0", "0", 12.0)
+    breaker.note_crash(ONE, "service-0", "0", 12.0)
     assert breaker.refusal(ONE, "service-0", "0", 100.0) is None, "its first crash is forgotten by now"
 
 

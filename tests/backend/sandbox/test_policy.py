@@ -65,7 +65,7 @@ def start(policy: SandboxPolicy, call: SandboxCall, now: float = 0.0) -> int:
     """Submit *call* to a sandbox that is created for it, let it start, and return its number."""
     (create,) = policy.submit(call, now)
     assert isinstance(create, CreateSandbox)
-    policy.ready(create.number, now)
+    policy.on_ready(create.number, now)
     return create.number
 
 
@@ -94,9 +94,9 @@ def test_the_first_command_of_a_robot_creates_its_sandbox_and_runs_once_that_is_
     policy, call = make_policy(), make_call()
 
     assert policy.submit(call, 0.0) == [CreateSandbox(1, A)]
-    assert policy.ready(1, 0.5) == [SendMessage(1, b"x")]
+    assert policy.on_ready(1, 0.5) == [SendMessage(1, b"x")]
     assert call.queued.started_s == 0.5
-    assert policy.replied(1, OK, 1.0) == [AnswerCall(call, OK)]
+    assert policy.on_reply(1, OK, 1.0) == [AnswerCall(call, OK)]
     assert policy.held == 0
 
 
@@ -106,7 +106,7 @@ def test_a_second_command_waits_for_the_first_and_uses_the_same_sandbox():
 
     assert policy.submit(second, 0.0) == []
     assert policy.held == 2
-    assert policy.replied(1, OK, 1.0) == [AnswerCall(first, OK), SendMessage(1, b"2")]
+    assert policy.on_reply(1, OK, 1.0) == [AnswerCall(first, OK), SendMessage(1, b"2")]
 
 
 def test_each_robot_has_a_sandbox_of_its_own():
@@ -121,7 +121,7 @@ def test_an_error_of_the_service_is_answered_and_costs_no_sandbox():
     start(policy, call)
     error = BadRequest("too few points")
 
-    assert policy.replied(1, error, 1.0) == [AnswerCall(call, error)]
+    assert policy.on_reply(1, error, 1.0) == [AnswerCall(call, error)]
     assert policy.sandboxes == 1
 
 
@@ -132,22 +132,22 @@ def test_a_stateless_command_whose_sandbox_crashed_is_tried_once_more_in_a_new_o
     policy, call = make_policy(), make_call()
     start(policy, call)
 
-    actions = policy.gone(1, "signal SIGSEGV", 1.0)
+    actions = policy.on_exit(1, "signal SIGSEGV", 1.0)
 
     assert actions == [
         ReleaseSandbox(1), LogCrash(A, "icp", "signal SIGSEGV (signal SIGSEGV)"), CreateSandbox(2, A)
     ]  # fmt: skip
-    assert policy.ready(2, 1.5) == [SendMessage(2, b"x")]
-    assert outcomes(policy.replied(2, OK, 2.0)) == [(call, "ok")]
+    assert policy.on_ready(2, 1.5) == [SendMessage(2, b"x")]
+    assert outcomes(policy.on_reply(2, OK, 2.0)) == [(call, "ok")]
 
 
 def test_a_command_is_tried_twice_and_no_more():
     policy, call = make_policy(poison_crashes=10), make_call()
     start(policy, call)
-    number = created(policy.gone(1, "exit code 1", 1.0))
-    policy.ready(number, 1.0)
+    number = created(policy.on_exit(1, "exit code 1", 1.0))
+    policy.on_ready(number, 1.0)
 
-    actions = policy.gone(number, "exit code 1", 2.0)
+    actions = policy.on_exit(number, "exit code 1", 2.0)
 
     assert outcomes(actions) == [(call, "worker-lost")]
     assert policy.sandboxes == 0
@@ -156,9 +156,9 @@ def test_a_command_is_tried_twice_and_no_more():
 def test_a_request_that_crashed_so_many_sandboxes_of_a_robot_is_poison_for_that_robot():
     policy, call = make_policy(poison_crashes=2), make_call(A)
     start(policy, call)
-    number = created(policy.gone(1, "exit code 1", 1.0))
-    policy.ready(number, 1.0)
-    assert outcomes(policy.gone(number, "exit code 1", 2.0)) == [(call, "poison")]
+    number = created(policy.on_exit(1, "exit code 1", 1.0))
+    policy.on_ready(number, 1.0)
+    assert outcomes(policy.on_exit(number, "exit code 1", 2.0)) == [(call, "poison")]
 
     again, other, same_of_b = make_call(A), make_call(A, payload="y"), make_call(B)
 
@@ -172,7 +172,7 @@ def test_an_open_circuit_breaker_refuses_the_service_until_it_closes():
     policy = make_policy(breaker_crashes=2, poison_crashes=1)
     for i in range(2):
         number = start(policy, make_call(payload=str(i)), now=i)
-        policy.gone(number, "exit code 1", i)
+        policy.on_exit(number, "exit code 1", i)
 
     refused = make_call(payload="new")
     (answer,) = policy.submit(refused, 2.0)
@@ -188,7 +188,7 @@ def test_a_circuit_breaker_that_is_open_for_several_robots_is_reported():
     policy = make_policy(breaker_crashes=2, poison_crashes=1)
     for robot in (A, B, C):
         number = start(policy, make_call(robot, payload=robot.name))
-        policy.gone(number, "exit code 1", 1.0)
+        policy.on_exit(number, "exit code 1", 1.0)
         assert policy.breaker.open_services(1.0) == (["icp"] if robot == C else [])
 
     assert policy.breaker.open_services(OPEN_S + 1.0) == []
@@ -200,18 +200,18 @@ def test_an_open_circuit_breaker_refuses_what_waits_as_well():
     start(policy, first)
     policy.submit(second, 0.0)
     policy.submit(waiting, 0.0)
-    number = created(policy.gone(1, "exit code 1", 1.0))
-    policy.ready(number, 1.0)
-    number = created(policy.gone(number, "exit code 1", 1.0))
+    number = created(policy.on_exit(1, "exit code 1", 1.0))
+    policy.on_ready(number, 1.0)
+    number = created(policy.on_exit(number, "exit code 1", 1.0))
 
-    assert outcomes(policy.ready(number, 1.5)) == [(waiting, "worker-lost")]
+    assert outcomes(policy.on_ready(number, 1.5)) == [(waiting, "worker-lost")]
 
 
 def test_a_command_whose_deadline_has_passed_is_not_tried_again():
     policy, call = make_policy(), make_call(deadline_s=1.0)
     start(policy, call)
 
-    assert outcomes(policy.gone(1, "exit code 1", 1.0)) == [(call, "worker-lost")]
+    assert outcomes(policy.on_exit(1, "exit code 1", 1.0)) == [(call, "worker-lost")]
     assert policy.sandboxes == 0
 
 
@@ -219,18 +219,18 @@ def test_a_command_to_state_that_no_snapshot_holds_is_not_tried_again():
     policy, call = make_policy(keeps_snapshots=False), make_call(service="counter")
     start(policy, call)
 
-    assert outcomes(policy.gone(1, "exit code 1", 1.0)) == [(call, "worker-lost")]
+    assert outcomes(policy.on_exit(1, "exit code 1", 1.0)) == [(call, "worker-lost")]
 
 
 def test_a_command_to_state_in_a_snapshot_is_restored_and_tried_again():
     policy, call = make_policy(), make_call(service="counter")
     start(policy, call)
-    policy.store_replied(1, call, b"7", 0.1)
-    policy.replied(1, SandboxReply(True, 0.1), 0.2)
+    policy.on_store_reply(1, call, b"7", 0.1)
+    policy.on_reply(1, SandboxReply(True, 0.1), 0.2)
 
-    number = created(policy.gone(1, "exit code 1", 1.0))
+    number = created(policy.on_exit(1, "exit code 1", 1.0))
 
-    assert policy.ready(number, 1.0) == [LoadSnapshot(number, call)]
+    assert policy.on_ready(number, 1.0) == [LoadSnapshot(number, call)]
 
 
 def test_commands_that_wait_move_to_the_new_sandbox_in_order():
@@ -240,12 +240,12 @@ def test_commands_that_wait_move_to_the_new_sandbox_in_order():
     policy.submit(second, 0.0)
     policy.submit(third, 0.0)
 
-    actions = policy.gone(1, "exit code 1", 1.0)
+    actions = policy.on_exit(1, "exit code 1", 1.0)
     number = created(actions)
 
     assert outcomes(actions) == [(running, "poison")]
-    assert policy.ready(number, 1.0) == [SendMessage(number, b"2")]
-    assert policy.replied(number, OK, 1.0) == [AnswerCall(second, OK), SendMessage(number, b"3")]
+    assert policy.on_ready(number, 1.0) == [SendMessage(number, b"2")]
+    assert policy.on_reply(number, OK, 1.0) == [AnswerCall(second, OK), SendMessage(number, b"3")]
 
 
 def test_the_retried_command_runs_before_those_that_waited_for_it():
@@ -253,9 +253,9 @@ def test_the_retried_command_runs_before_those_that_waited_for_it():
     start(policy, running)
     policy.submit(second, 0.0)
 
-    number = created(policy.gone(1, "exit code 1", 1.0))
+    number = created(policy.on_exit(1, "exit code 1", 1.0))
 
-    assert policy.ready(number, 1.0) == [SendMessage(number, b"1")]
+    assert policy.on_ready(number, 1.0) == [SendMessage(number, b"1")]
 
 
 def test_a_sandbox_that_ends_before_it_is_ready_fails_all_that_wait_and_is_not_replaced():
@@ -263,7 +263,7 @@ def test_a_sandbox_that_ends_before_it_is_ready_fails_all_that_wait_and_is_not_r
     policy.submit(first, 0.0)
     policy.submit(second, 0.0)
 
-    actions = policy.gone(1, "exit code 1", 0.5)
+    actions = policy.on_exit(1, "exit code 1", 0.5)
 
     assert outcomes(actions) == [(first, "worker-lost"), (second, "worker-lost")]
     assert policy.sandboxes == 0
@@ -274,7 +274,7 @@ def test_the_end_of_the_zygote_is_a_crash_of_every_sandbox():
     start(policy, one)
     start(policy, two)
 
-    actions = policy.all_gone("the zygote ended", 1.0)
+    actions = policy.on_all_exited("the zygote ended", 1.0)
 
     assert [each.robot for each in actions if isinstance(each, CreateSandbox)] == [A, B]
     assert policy.counts["crashed"] == 2
@@ -285,11 +285,11 @@ def test_the_end_of_the_zygote_is_evidence_against_no_service_and_no_request():
     for i in range(3):
         for robot in (A, B, C):
             start(policy, make_call(robot, now=i), now=i)
-        policy.all_gone("the zygote ended", i)
+        policy.on_all_exited("the zygote ended", i)
         for number in range(6 * i + 4, 6 * i + 7):
-            policy.ready(number, i)
-            policy.replied(number, OK, i)
-        policy.all_gone("the zygote ended", i)
+            policy.on_ready(number, i)
+            policy.on_reply(number, OK, i)
+        policy.on_all_exited("the zygote ended", i)
 
     assert created(policy.submit(make_call(now=3.0), 3.0))
 
@@ -297,12 +297,12 @@ def test_the_end_of_the_zygote_is_evidence_against_no_service_and_no_request():
 def test_what_is_reported_of_a_sandbox_that_was_released_changes_nothing():
     policy, call = make_policy(), make_call()
     start(policy, call)
-    policy.gone(1, "exit code 1", 1.0)
+    policy.on_exit(1, "exit code 1", 1.0)
 
-    assert policy.ready(1, 2.0) == []
-    assert policy.replied(1, OK, 2.0) == []
-    assert policy.gone(1, "exit code 1", 2.0) == []
-    assert policy.broken(1, "") == []
+    assert policy.on_ready(1, 2.0) == []
+    assert policy.on_reply(1, OK, 2.0) == []
+    assert policy.on_exit(1, "exit code 1", 2.0) == []
+    assert policy.on_violation(1, "") == []
 
 
 # --- deadlines and kills ---------------------------------------------------------------------------
@@ -319,7 +319,7 @@ def test_a_command_is_answered_at_its_deadline_and_its_sandbox_killed_at_a_facto
     assert policy.tick(6.9) == []
     assert policy.tick(7.0) == [KillSandbox(1)]
     assert policy.tick(8.0) == [], "once is enough"
-    assert policy.gone(1, "signal SIGKILL", 8.0) == [
+    assert policy.on_exit(1, "signal SIGKILL", 8.0) == [
         ReleaseSandbox(1), LogOverrun(A, "icp", "it took too long (signal SIGKILL)")
     ]  # fmt: skip
 
@@ -329,7 +329,7 @@ def overrun(policy: SandboxPolicy, call: SandboxCall, now: float) -> None:
     number = start(policy, call, now)
     policy.tick(call.queued.deadline_s)
     policy.tick(2 * call.queued.deadline_s - call.queued.received_s)
-    policy.gone(number, "signal SIGKILL", 2 * call.queued.deadline_s - call.queued.received_s)
+    policy.on_exit(number, "signal SIGKILL", 2 * call.queued.deadline_s - call.queued.received_s)
 
 
 def test_the_deadline_of_a_robot_is_no_evidence_for_others_and_its_request_no_poison():
@@ -362,13 +362,13 @@ def test_what_a_sandbox_says_while_it_is_being_killed_is_too_late():
     policy.tick(1.0)
     assert policy.tick(2.0) == [KillSandbox(1)]
 
-    assert policy.replied(1, OK, 2.0) == []
-    assert policy.ready(1, 2.0) == []
-    assert policy.broken(1, "it sent an invalid message") == []
-    actions = policy.gone(1, "signal SIGKILL", 2.1)
+    assert policy.on_reply(1, OK, 2.0) == []
+    assert policy.on_ready(1, 2.0) == []
+    assert policy.on_violation(1, "it sent an invalid message") == []
+    actions = policy.on_exit(1, "signal SIGKILL", 2.1)
 
     assert LogOverrun(A, "icp", "it took too long (signal SIGKILL)") in actions
-    assert policy.ready(created(actions), 2.2) == [SendMessage(2, b"2")]
+    assert policy.on_ready(created(actions), 2.2) == [SendMessage(2, b"2")]
 
 
 def test_a_late_reply_is_not_answered_again_and_lets_the_next_command_run():
@@ -377,7 +377,7 @@ def test_a_late_reply_is_not_answered_again_and_lets_the_next_command_run():
     policy.submit(second, 0.5)
     assert outcomes(policy.tick(1.0)) == [(call, "expired")]
 
-    assert policy.replied(1, OK, 1.5) == [SendMessage(1, b"2")]
+    assert policy.on_reply(1, OK, 1.5) == [SendMessage(1, b"2")]
     assert policy.tick(1e9) != [], "the deadline of the second holds"
 
 
@@ -386,7 +386,7 @@ def test_a_command_that_waited_beyond_its_deadline_costs_no_compute():
     start(policy, running)
     policy.submit(late, 0.0)
 
-    actions = policy.replied(1, OK, 1.0)
+    actions = policy.on_reply(1, OK, 1.0)
 
     assert outcomes(actions) == [(running, "ok"), (late, "expired")]
     assert not any(isinstance(each, SendMessage) for each in actions)
@@ -398,7 +398,7 @@ def test_a_sandbox_that_does_not_start_in_time_is_killed():
     assert policy.wake_s == START_S
 
     assert policy.tick(START_S) == [KillSandbox(1)]
-    actions = policy.gone(1, "signal SIGKILL", START_S)
+    actions = policy.on_exit(1, "signal SIGKILL", START_S)
 
     assert outcomes(actions) == [(call, "worker-lost")]
     assert LogCrash(A, "", "it did not start in time (signal SIGKILL)") in actions
@@ -407,28 +407,28 @@ def test_a_sandbox_that_does_not_start_in_time_is_killed():
 def test_a_sandbox_that_violates_the_protocol_is_killed():
     policy = make_policy()
     start(policy, make_call())
-    assert policy.broken(1, "it sent an invalid message") == [KillSandbox(1)]
+    assert policy.on_violation(1, "it sent an invalid message") == [KillSandbox(1)]
 
     policy = make_policy()
     start(policy, make_call())
-    policy.replied(1, OK, 1.0)
-    assert policy.replied(1, OK, 1.0) == [KillSandbox(1)], "a reply that nobody asked for"
+    policy.on_reply(1, OK, 1.0)
+    assert policy.on_reply(1, OK, 1.0) == [KillSandbox(1)], "a reply that nobody asked for"
 
     policy = make_policy()
     start(policy, make_call())
-    assert policy.ready(1, 1.0) == [KillSandbox(1)], "ready for the second time"
+    assert policy.on_ready(1, 1.0) == [KillSandbox(1)], "ready for the second time"
 
 
 def test_a_command_for_an_idle_sandbox_that_is_being_killed_waits_for_the_next_one():
     policy, second = make_policy(), make_call(payload="2")
     start(policy, make_call())
-    policy.replied(1, OK, 1.0)
-    policy.broken(1, "")
+    policy.on_reply(1, OK, 1.0)
+    policy.on_violation(1, "")
 
     assert policy.submit(second, 1.0) == []
-    number = created(policy.gone(1, "exit code 0", 1.1))
+    number = created(policy.on_exit(1, "exit code 0", 1.1))
 
-    assert policy.ready(number, 1.2) == [SendMessage(number, b"2")]
+    assert policy.on_ready(number, 1.2) == [SendMessage(number, b"2")]
     assert second.tries == 0
 
 
@@ -439,7 +439,7 @@ def test_a_sandbox_is_released_a_grace_period_after_the_last_connection_of_its_r
     policy = make_policy()
     policy.add_connection(A)
     start(policy, make_call())
-    policy.replied(1, OK, 1.0)
+    policy.on_reply(1, OK, 1.0)
     policy.remove_connection(A, 2.0)
     assert policy.wake_s == math.inf, "one connection is left"
     policy.remove_connection(A, 3.0)
@@ -452,7 +452,7 @@ def test_a_sandbox_is_released_a_grace_period_after_the_last_connection_of_its_r
 def test_a_robot_that_reconnects_within_the_grace_period_keeps_its_sandbox():
     policy = make_policy()
     start(policy, make_call())
-    policy.replied(1, OK, 1.0)
+    policy.on_reply(1, OK, 1.0)
     policy.remove_connection(A, 2.0)
     policy.add_connection(A)
 
@@ -467,7 +467,7 @@ def test_commands_that_wait_for_a_robot_that_left_are_dropped_and_not_moved():
     policy.remove_connection(A, 1.0)
     assert policy.held == 1
 
-    assert not any(isinstance(each, CreateSandbox) for each in policy.gone(1, "exit code 1", 1.5))
+    assert not any(isinstance(each, CreateSandbox) for each in policy.on_exit(1, "exit code 1", 1.5))
 
 
 def test_a_robot_beyond_the_capacity_is_told_when_to_try_again():
@@ -484,7 +484,7 @@ def test_a_robot_beyond_the_capacity_is_told_when_to_try_again():
 def test_an_idle_sandbox_in_its_grace_period_gives_its_place_to_another_robot():
     policy = make_policy(max_sandboxes=1)
     start(policy, make_call(A))
-    policy.replied(1, OK, 1.0)
+    policy.on_reply(1, OK, 1.0)
     policy.remove_connection(A, 1.0)
 
     assert policy.submit(make_call(B), 1.5) == [ReleaseSandbox(1), CreateSandbox(2, B)]
@@ -494,7 +494,7 @@ def test_a_sandbox_that_works_or_whose_robot_is_connected_keeps_its_place():
     policy = make_policy(max_sandboxes=2)
     start(policy, make_call(A))
     start(policy, make_call(B, payload="y"))
-    policy.replied(2, OK, 0.5)
+    policy.on_reply(2, OK, 0.5)
     policy.remove_connection(A, 1.0)
     call = make_call(C)
 
@@ -511,7 +511,7 @@ def taken_by_rivals(*, idle: bool) -> tuple[SandboxPolicy, list[SandboxCall]]:
         policy.add_connection(call.queued.robot)
         number = start(policy, call)
         if idle:
-            policy.replied(number, OK, 4.0 - i)
+            policy.on_reply(number, OK, 4.0 - i)
     return policy, calls
 
 
@@ -530,13 +530,13 @@ def test_a_tenant_whose_sandboxes_all_work_gives_up_the_first_that_ends_its_comm
     policy.submit(waiting, 1.0)
     assert outcomes(policy.submit(call, 1.0)) == [(call, "busy")]
 
-    actions = policy.replied(1, OK, 1.5)
+    actions = policy.on_reply(1, OK, 1.5)
 
     assert outcomes(actions) == [(calls[0], "ok"), (waiting, "busy")]
     assert ReleaseSandbox(1) in actions
     more = make_call(RIVALS[0], payload="3")
     assert outcomes(policy.submit(more, 1.6)) == [(more, "busy")], "the place is kept for who asked first"
-    assert outcomes(policy.replied(2, OK, 1.7)) == [(calls[1], "ok")]
+    assert outcomes(policy.on_reply(2, OK, 1.7)) == [(calls[1], "ok")]
     assert policy.submit(make_call(A), 2.0) == [CreateSandbox(5, A)]
 
 
@@ -545,7 +545,7 @@ def test_a_crash_does_not_help_a_tenant_to_keep_a_place_that_another_one_claims(
     policy.submit(make_call(RIVALS[0], payload="2"), 1.0)
     policy.submit(make_call(A), 1.0)
 
-    actions = policy.gone(1, "exit code 1", 1.5)
+    actions = policy.on_exit(1, "exit code 1", 1.5)
 
     assert not any(isinstance(each, CreateSandbox) for each in actions)
     assert [code for _, code in outcomes(actions)] == ["busy", "busy"]
@@ -577,9 +577,9 @@ def run_counter(policy: SandboxPolicy, stored: bytes | None = b"1") -> SandboxCa
     """Submit a command to a service with state, and bring it to where it runs."""
     call = make_call(service="counter")
     start(policy, call)
-    policy.store_replied(1, call, stored, 0.1)
+    policy.on_store_reply(1, call, stored, 0.1)
     if stored is not None:
-        policy.replied(1, SandboxReply(True, 0.1), 0.2)
+        policy.on_reply(1, SandboxReply(True, 0.1), 0.2)
     return call
 
 
@@ -587,12 +587,12 @@ def test_the_last_snapshot_is_restored_before_the_first_command_and_only_once():
     policy, call = make_policy(), make_call(service="counter")
     policy.submit(call, 0.0)
 
-    assert policy.ready(1, 0.0) == [LoadSnapshot(1, call)]
-    assert policy.store_replied(1, call, b"7", 0.1) == [
+    assert policy.on_ready(1, 0.0) == [LoadSnapshot(1, call)]
+    assert policy.on_store_reply(1, call, b"7", 0.1) == [
         SendMessage(1, encode_message(["restore", "counter", b"7"]))
     ]
-    assert policy.replied(1, SandboxReply(True, 0.1), 0.2) == [SendMessage(1, b"x")]
-    policy.replied(1, SandboxReply("done", 1.0, b"7"), 0.3)
+    assert policy.on_reply(1, SandboxReply(True, 0.1), 0.2) == [SendMessage(1, b"x")]
+    policy.on_reply(1, SandboxReply("done", 1.0, b"7"), 0.3)
     assert policy.submit(make_call(service="counter", payload="2"), 1.0) == [SendMessage(1, b"2")]
 
 
@@ -600,25 +600,25 @@ def test_a_robot_without_a_snapshot_begins_with_fresh_state():
     policy, call = make_policy(), make_call(service="counter")
     start(policy, call)
 
-    assert policy.store_replied(1, call, None, 0.1) == [SendMessage(1, b"x")]
+    assert policy.on_store_reply(1, call, None, 0.1) == [SendMessage(1, b"x")]
 
 
 def test_a_reply_is_sent_only_after_the_state_that_belongs_to_it_is_stored():
     policy = make_policy()
     call, reply = run_counter(policy, b"1"), SandboxReply("done", 1.0, b"2")
 
-    assert policy.replied(1, reply, 1.0) == [SaveSnapshot(1, call, b"1", b"2")]
-    assert policy.store_replied(1, call, None, 1.1) == [AnswerCall(call, reply)]
+    assert policy.on_reply(1, reply, 1.0) == [SaveSnapshot(1, call, b"1", b"2")]
+    assert policy.on_store_reply(1, call, None, 1.1) == [AnswerCall(call, reply)]
 
 
 def test_the_next_snapshot_replaces_the_one_that_was_stored_last():
     policy = make_policy()
     call, second = run_counter(policy, b"1"), make_call(service="counter", payload="2")
-    policy.replied(1, SandboxReply("done", 1.0, b"2"), 1.0)
-    policy.store_replied(1, call, None, 1.1)
+    policy.on_reply(1, SandboxReply("done", 1.0, b"2"), 1.0)
+    policy.on_store_reply(1, call, None, 1.1)
     policy.submit(second, 2.0)
 
-    actions = policy.replied(1, SandboxReply("done", 1.0, b"3"), 2.1)
+    actions = policy.on_reply(1, SandboxReply("done", 1.0, b"3"), 2.1)
 
     assert actions == [SaveSnapshot(1, second, b"2", b"3")]
 
@@ -627,15 +627,15 @@ def test_state_that_did_not_change_is_not_stored_again():
     policy = make_policy()
     call, reply = run_counter(policy, b"1"), SandboxReply("done", 1.0, b"1")
 
-    assert policy.replied(1, reply, 1.0) == [AnswerCall(call, reply)]
+    assert policy.on_reply(1, reply, 1.0) == [AnswerCall(call, reply)]
 
 
 def test_a_store_that_fails_is_answered_as_such_and_the_sandbox_goes_on():
     policy = make_policy()
     call = run_counter(policy)
-    policy.replied(1, SandboxReply("done", 1.0, b"2"), 1.0)
+    policy.on_reply(1, SandboxReply("done", 1.0, b"2"), 1.0)
 
-    assert outcomes(policy.store_replied(1, call, StoreError("503"), 1.1)) == [(call, "store")]
+    assert outcomes(policy.on_store_reply(1, call, StoreError("503"), 1.1)) == [(call, "store")]
     assert policy.submit(make_call(service="counter", payload="2"), 1.2) == [SendMessage(1, b"2")]
 
 
@@ -643,20 +643,20 @@ def test_a_newer_snapshot_in_the_store_ends_the_sandbox_and_moves_what_waits():
     policy = make_policy()
     call, second = run_counter(policy), make_call(service="counter", payload="2")
     policy.submit(second, 0.5)
-    policy.replied(1, SandboxReply("done", 1.0, b"2"), 1.0)
+    policy.on_reply(1, SandboxReply("done", 1.0, b"2"), 1.0)
 
-    actions = policy.store_replied(1, call, Conflict("changed"), 1.1)
+    actions = policy.on_store_reply(1, call, Conflict("changed"), 1.1)
 
     assert outcomes(actions) == [(call, "worker-lost")]
     assert actions[0] == ReleaseSandbox(1)
-    assert policy.ready(created(actions), 1.2) == [LoadSnapshot(2, second)]
+    assert policy.on_ready(created(actions), 1.2) == [LoadSnapshot(2, second)]
 
 
 def test_a_restore_that_failed_is_repeated_before_the_next_command():
     policy, call = make_policy(), make_call(service="counter")
     start(policy, call)
-    policy.store_replied(1, call, b"7", 0.1)
-    assert outcomes(policy.replied(1, BadRequest("not a count"), 0.2)) == [(call, "bad-request")]
+    policy.on_store_reply(1, call, b"7", 0.1)
+    assert outcomes(policy.on_reply(1, BadRequest("not a count"), 0.2)) == [(call, "bad-request")]
 
     second = make_call(service="counter", payload="2")
 
@@ -666,7 +666,7 @@ def test_a_restore_that_failed_is_repeated_before_the_next_command():
 def test_what_the_store_says_after_the_sandbox_crashed_changes_nothing():
     policy = make_policy(poison_crashes=1)
     call = run_counter(policy)
-    policy.replied(1, SandboxReply("done", 1.0, b"2"), 1.0)
-    policy.gone(1, "exit code 1", 1.1)
+    policy.on_reply(1, SandboxReply("done", 1.0, b"2"), 1.0)
+    policy.on_exit(1, "exit code 1", 1.1)
 
-    assert policy.store_replied(1, call, None, 1.2) == []
+    assert policy.on_store_reply(1, call, None, 1.2) == []

@@ -58,7 +58,7 @@ def test_a_sandbox_above_its_limit_is_named_with_both_numbers(holding: Start) ->
     within, above = holding(10 * MIB), holding(60 * MIB)
     watcher = MemoryWatcher(50 * MIB)
 
-    reasons = watcher.look([within, above])
+    reasons = watcher.find_excess([within, above])
 
     assert list(reasons) == [above]
     reason = reasons[above]
@@ -68,22 +68,22 @@ def test_a_sandbox_above_its_limit_is_named_with_both_numbers(holding: Start) ->
 
 
 def test_pages_that_processes_share_count_in_proportion(holding: Start) -> None:
-    assert MemoryWatcher(50 * MIB).look([holding(60 * MIB, shares=True)]) == {}
+    assert MemoryWatcher(50 * MIB).find_excess([holding(60 * MIB, shares=True)]) == {}
 
 
 def test_page_tables_count_even_of_pages_that_are_not_resident(holding: Start) -> None:
     pid = holding(4096, pages=8000)
 
-    assert list(MemoryWatcher(60 * MIB).look([pid])) == [pid]
-    assert MemoryWatcher(60 * MIB).look([holding(4096)]) == {}
+    assert list(MemoryWatcher(60 * MIB).find_excess([pid])) == [pid]
+    assert MemoryWatcher(60 * MIB).find_excess([holding(4096)]) == {}
 
 
 def test_it_looks_more_often_when_a_sandbox_is_near_its_limit(holding: Start) -> None:
     pid = holding(60 * MIB)
     far, near = MemoryWatcher(1024 * MIB), MemoryWatcher(100 * MIB)
 
-    far.look([pid])
-    near.look([pid])
+    far.find_excess([pid])
+    near.find_excess([pid])
 
     assert near.interval_s == pytest.approx(0.02)
     assert far.interval_s == pytest.approx(0.25)
@@ -102,4 +102,4 @@ def test_a_sandbox_that_is_gone_uses_nothing() -> None:
     child = subprocess.Popen([sys.executable, "-c", ""])
     child.wait()
 
-    assert MemoryWatcher(50 * MIB).look([child.pid]) == {}
+    assert MemoryWatcher(50 * MIB).find_excess([child.pid]) == {}

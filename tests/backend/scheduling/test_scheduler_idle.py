@@ -22,8 +22,8 @@ def compute(scheduler: Scheduler, wait_s: float, spent_s: float, now: float, *, 
     """Let one command arrive *wait_s* before *now*, start at *now* and take *spent_s*."""
     work = queued("a", at=now - wait_s)
     if alone:
-        assert scheduler.start_alone(work, now)
-        scheduler.done_alone(work, now + spent_s)
+        assert scheduler.start_unqueued(work, now)
+        scheduler.finish_unqueued(work, now + spent_s)
     else:
         scheduler.submit(work)
         started, refusals = scheduler.start(now)
@@ -51,15 +51,15 @@ def test_a_command_that_starts_alone_leaves_the_scheduler_as_the_queue_would(see
 
 def test_nothing_starts_alone_while_another_command_waits_or_runs_or_when_it_is_too_late() -> None:
     scheduler, first, second = Scheduler(SETTINGS), queued("a"), queued("b")
-    assert not scheduler.start_alone(queued("a", within=1.0), 1.0), "its deadline has passed"
+    assert not scheduler.start_unqueued(queued("a", within=1.0), 1.0), "its deadline has passed"
 
     scheduler.submit(first)
-    assert not scheduler.start_alone(second, 0.0), "the other one waits"
+    assert not scheduler.start_unqueued(second, 0.0), "the other one waits"
     scheduler.start(0.0)
-    assert not scheduler.start_alone(second, 0.0), "the other one runs"
+    assert not scheduler.start_unqueued(second, 0.0), "the other one runs"
 
     scheduler.done(first, 0.1)
-    assert scheduler.start_alone(second, 0.1)
+    assert scheduler.start_unqueued(second, 0.1)
 
 
 def test_services_that_answer_within_a_millisecond_stay_in_the_loop_although_others_wait() -> None:
