@@ -103,10 +103,10 @@ def next_entry(head: Head, note: Note) -> Entry:
     unsealed = Entry(
         seq=head.seq + 1,
         time=round(float(note.time), 3),
-        actor=_safe(note.actor),
-        action=_safe(note.action),
-        subject=_safe(note.subject),
-        detail={_safe(key): _plain(value) for key, value in details},
+        actor=_mask(note.actor),
+        action=_mask(note.action),
+        subject=_mask(note.subject),
+        detail={_mask(key): _plain(value) for key, value in details},
         previous=head.hash,
         hash="",
     )
@@ -169,10 +169,10 @@ class RefusalLimiter:
 
 def _plain(value: Value) -> Value:
     is_number = isinstance(value, int | float) and math.isfinite(value) and abs(value) < _MAX_NUMBER
-    return value if value is None or is_number else _safe(str(value))
+    return value if value is None or is_number else _mask(str(value))
 
 
-def _safe(text: str) -> str:
+def _mask(text: str) -> str:
     printable = text[: 4 * _MAX_CHARACTERS].encode("utf-8", "replace").decode()
     return _TOKEN.sub("(a token)", printable)[:_MAX_CHARACTERS]
 

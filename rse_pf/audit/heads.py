@@ -74,7 +74,7 @@ class HeadsFile:
                 data = b"".join(_line(who, head) for who, head in heads.items())
                 os.pwrite(self._fd, data, 0)
             for offset in range(0, len(data), _LINE_BYTES):
-                line = _parsed(data[offset : offset + _LINE_BYTES])
+                line = _parse_line(data[offset : offset + _LINE_BYTES])
                 if line is not None and line[0] == self._who:
                     self._offset = offset
                     self.lost_entries = line[2]
@@ -112,7 +112,7 @@ def read_heads(folder: Path) -> tuple[dict[str, Head], list[str]] | None:
     heads: dict[str, Head] = {}
     problems = []
     for number in range(-(-len(data) // _LINE_BYTES)):
-        line = _parsed(data[number * _LINE_BYTES : (number + 1) * _LINE_BYTES])
+        line = _parse_line(data[number * _LINE_BYTES : (number + 1) * _LINE_BYTES])
         if line is None or line[0] in heads:
             problems.append(f"line {number + 1} was changed: it is not the head of a chain")
         else:
@@ -130,7 +130,7 @@ def _line(who: str, head: Head, lost_entries: int = 0) -> bytes:
     return f"{who} {head}{lost}".ljust(_LINE_BYTES - 1).encode() + b"\n"
 
 
-def _parsed(line: bytes) -> tuple[str, Head, int] | None:
+def _parse_line(line: bytes) -> tuple[str, Head, int] | None:
     who, _, rest = line.decode("ascii", "replace").partition(" ")
     word, _, lost = rest.rstrip(" \n").partition(_LOST)
     head, count = parse_head(word), int(lost) if lost.isdigit() else 0

@@ -156,9 +156,9 @@ class AuditLog:
             known, was_lost = self._heads.open()
             self._continue()
             if known.seq > self.head.seq or (known.seq and not _holds(self._folder, self.who, known)):
-                self._write([self._own(HEADS, {self.who: str(known)})])
+                self._write([self._own_note(HEADS, {self.who: str(known)})])
             if was_lost:
-                self._write([self._own(HEADS_LOST)])
+                self._write([self._own_note(HEADS_LOST)])
             self.dropped += self._heads.lost_entries
             self._keep_head()
             if self.who in (CONTROL_PLANE, OPERATOR):
@@ -284,7 +284,7 @@ class AuditLog:
         if ending in ("torn", "unreadable"):  # an unreadable file stays in the chain, to be noticed
             self._set_aside(self._first)
         elif ending == "torn-first-line":
-            current.replace(_free(self._folder / f"{self.who}.{self._first:012d}.torn"))
+            current.replace(_free_name(self._folder / f"{self.who}.{self._first:012d}.torn"))
         self._open_file()
         if ending != "complete" and (older or ending != "empty"):
             self._record_continued(_REASONS.get(ending, ending))
@@ -326,7 +326,7 @@ class AuditLog:
     def _gap(self) -> list[Note]:
         with self._buffer_lock:
             dropped, self.dropped = self.dropped, 0
-        return [self._own(GAP, {"entries": dropped})] if dropped else []
+        return [self._own_note(GAP, {"entries": dropped})] if dropped else []
 
     def _without_routine(self, notes: list[Note]) -> list[Note]:
         """Drop what a flood of robots causes, and count it."""
@@ -350,20 +350,20 @@ class AuditLog:
         """Write the head into the file of heads; one that was lost is made again, and that is recorded."""
         if self._heads.is_lost():
             self._heads.open()
-            self._write([self._own(HEADS_LOST)])
+            self._write([self._own_note(HEADS_LOST)])
         self._heads.write(self.head, self.dropped + (self.waiting if self._closed.is_set() else 0))
 
     def _record_others(self) -> None:
         grown = grown_heads(self._folder, self._others, self._recorded)
         if grown:
-            self.add([self._own(HEADS, grown)])
+            self.add([self._own_note(HEADS, grown)])
 
-    def _own(self, action: str, detail: Mapping[str, Value] | None = None) -> Note:
+    def _own_note(self, action: str, detail: Mapping[str, Value] | None = None) -> Note:
         return Note(time=self._wall_clock(), actor=self.who, action=action, detail=detail or {})
 
     def _record_continued(self, reason: str) -> None:
         self._first = self.head.seq + 1
-        note = self._own(CONTINUED, {"reason": reason, "head": str(self.head)})
+        note = self._own_note(CONTINUED, {"reason": reason, "head": str(self.head)})
         entry = next_entry(self.head, note)
         os.write(self._fd, line_of(entry))
         os.fsync(self._fd)
@@ -562,7 +562,7 @@ def _ending_of(path: Path) -> _Ending:
         return "complete" if file.read() == b"\n" else "torn"
 
 
-def _free(path: Path) -> Path:
+def _free_name(path: Path) -> Path:
     number = 0
     while path.exists():
         number += 1

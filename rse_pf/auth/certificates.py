@@ -48,7 +48,7 @@ class CertificateWithKey:
 
     @classmethod
     def from_pem(cls, text: str) -> CertificateWithKey:
-        """Return what `pem` wrote; raises UsageError."""
+        """Return the certificate and key in *text*, which `pem` made; raises UsageError."""
         certificate, marker, key = text.partition("-----BEGIN PRIVATE KEY-----")
         pair = cls(certificate=certificate, private_key=marker + key)
         pair._read()
@@ -119,7 +119,7 @@ def make_authority(name: str, *, now_s: float) -> CertificateWithKey:
             x509.NameConstraints(permitted_subtrees=permitted, excluded_subtrees=None), critical=True
         )
     )
-    return _signed(builder, key, key)
+    return _sign(builder, key, key)
 
 
 def issue_server_certificate(
@@ -150,7 +150,7 @@ def issue_server_certificate(
             x509.AuthorityKeyIdentifier.from_issuer_public_key(signing_key.public_key()), critical=False
         )
     )
-    return _signed(builder, key, signing_key)
+    return _sign(builder, key, signing_key)
 
 
 def _builder(subject: Any, issuer: Any, key: Any, now_s: float, valid_s: float) -> Any:
@@ -168,7 +168,7 @@ def _builder(subject: Any, issuer: Any, key: Any, now_s: float, valid_s: float) 
     )
 
 
-def _signed(builder: Any, key: Any, signing_key: Any) -> CertificateWithKey:
+def _sign(builder: Any, key: Any, signing_key: Any) -> CertificateWithKey:
     _, _, serialization = _cryptography()
     from cryptography.hazmat.primitives import hashes
 

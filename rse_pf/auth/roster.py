@@ -98,7 +98,7 @@ class Roster(_Value, frozen=True, kw_only=True):
                 robots as it may have.
         """
         others = tuple(r for r in self.robots if (r.tenant, r.robot) != (robot.tenant, robot.robot))
-        shared_form = _as_seen(robot.robot)
+        shared_form = _shared_form(robot.robot)
         count = sum(other.tenant == robot.tenant for other in others)
         if count >= MAX_ROBOTS_OF_TENANT:
             raise UsageError(
@@ -106,7 +106,7 @@ class Roster(_Value, frozen=True, kw_only=True):
                 hint="remove robots that are gone: rse-pf robot remove",
             )
         for other in others:
-            if other.tenant == robot.tenant and _as_seen(other.robot) == shared_form:
+            if other.tenant == robot.tenant and _shared_form(other.robot) == shared_form:
                 raise UsageError(
                     f"robot {robot.robot!r} looks like {other.robot!r}, which is enrolled",
                     hint="choose a name that differs in more than case, spaces or a form of its letters",
@@ -257,21 +257,21 @@ def scopes_allow(scopes: tuple[str, ...], right: str, name: str = "") -> bool:
 
 def check_robot(name: str) -> str:
     """Return *name*; raises UsageError if it cannot be the name of a robot."""
-    return _checked_name(name, "robot")
+    return _check_name(name, "robot")
 
 
 def check_tenant(name: str) -> str:
     """Return *name*; raises UsageError if it cannot be the name of a tenant."""
-    return _checked_name(name, "tenant")
+    return _check_name(name, "tenant")
 
 
 @functools.lru_cache(maxsize=1 << 17)
-def _as_seen(name: str) -> str:
-    """Return what names share that an operator can hardly tell apart."""
+def _shared_form(name: str) -> str:
+    """Return a form of *name* that all names share which an operator can hardly tell apart."""
     return " ".join(unicodedata.normalize("NFKC", name).casefold().split())
 
 
-def _checked_name(name: str, owner: str) -> str:
+def _check_name(name: str, owner: str) -> str:
     if not 0 < len(name) <= _MAX_CHARACTERS or not name.isprintable():
         raise UsageError(
             f"{name[:80]!r} is not a valid name for a {owner}", hint="use 1 to 64 printable characters"

@@ -248,8 +248,8 @@ class KeySet:
         """Return the enrolled robot whose key is *key_id*."""
         return self._robots.get(key_id)
 
-    def signed(self, digest: bytes) -> _SignedClaims | None:
-        """Return what the token with this *digest* says, if its signature was verified with these keys."""
+    def find_verified(self, digest: bytes) -> _SignedClaims | None:
+        """Return the claims of the token with this *digest*, None if these keys have not verified it yet."""
         return self._signed.get(digest)
 
     def remember(self, digest: bytes, signed: _SignedClaims, robot: RobotId) -> None:
@@ -292,7 +292,7 @@ def verify_token(token: str, *, keys: KeySet, now: float, settings: AuthSettings
         Unauthorized: Always with the same message; see `token_problem` for the cause.
     """
     try:
-        return _checked(token, keys, now, settings)
+        return _check(token, keys, now, settings)
     except _TokenRefused as refused:
         raise Unauthorized(
             "the token is missing or not valid", hint="issue one with rse-pf token issue ROBOT"
@@ -336,7 +336,7 @@ def token_problem(error: Unauthorized) -> str:
 
 
 def proven_refusal(error: Unauthorized) -> ProvenRefusal | None:
-    """Return what the robot may be told of *error*; None for a stranger, who proved no key of a robot."""
+    """Return the refusal that the robot may learn from *error*; None if it proved no enrolled key."""
     cause = error.__cause__
     return cause.proven if isinstance(cause, _TokenRefused) else None
 
@@ -347,11 +347,11 @@ class _TokenRefused(ValueError):
     proven: ProvenRefusal | None = None
 
 
-def _checked(token: str, keys: KeySet, now: float, settings: AuthSettings) -> Claims:
+def _check(token: str, keys: KeySet, now: float, settings: AuthSettings) -> Claims:
     if not token or len(token) > _MAX_TOKEN_BYTES or not token.isascii():
         raise _TokenRefused("missing-or-too-long")
     digest = hashlib.sha256(f"{settings.issuer}\n{settings.audience}\n{token}".encode()).digest()
-    remembered = keys.signed(digest)
+    remembered = keys.find_verified(digest)
     signed = remembered or _signed_claims(token, keys, settings)
     verified = signed.claims
     enrolled = keys.robot_of(verified.key_id)
@@ -367,14 +367,14 @@ def _checked(token: str, keys: KeySet, now: float, settings: AuthSettings) -> Cl
             raise _TokenRefused(denied)
     except _TokenRefused as refused:
         if enrolled is not None and is_proven:
-            refused.proven = _proven(str(refused), signed, enrolled, keys, now)
+            refused.proven = _proven_refusal(str(refused), signed, enrolled, keys, now)
         raise
     if remembered is None:
         keys.remember(digest, signed, verified.robot)
     return verified
 
 
-def _proven(
+def _proven_refusal(
     cause: str, signed: _SignedClaims, enrolled: EnrolledRobot, keys: KeySet, now: float
 ) -> ProvenRefusal:
     claims = signed.claims
@@ -387,12 +387,12 @@ def _proven(
 
 
 def _signed_claims(token: str, keys: KeySet, settings: AuthSettings) -> _SignedClaims:
-    """Return what *token* says if its form, signature, issuer and audience are right.
+    """Return the claims of *token* if its form, signature, issuer and audience are right.
 
     Source:
         RFC 7515, 5.2; RFC 7519, 7.2; RFC 8725, 3.
     """
-    header_part, payload, signature = _decoded_parts(token)
+    header_part, payload, signature = _decode_parts(token)
     header = _document(header_part)
     if header is None or not isinstance(header.get("kid", ""), str):
         raise _TokenRefused("malformed")
@@ -469,7 +469,7 @@ def _as_enrolled(claims: Claims, enrolled: EnrolledRobot) -> Claims:
     return replace(claims, robot=robot, scopes=enrolled.scopes, quotas=quotas)
 
 
-def _decoded_parts(token: str) -> list[bytes]:
+def _decode_parts(token: str) -> list[bytes]:
     """Return header, claims and signature; unused bits are 0, so that a token has one encoding only."""
     parts = token.split(".")
     try:
