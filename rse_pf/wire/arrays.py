@@ -32,7 +32,7 @@ def json_encode_hook(value: Any) -> Any:
     """Return *value* as JSON can represent it: arrays become flat lists."""
     if isinstance(value, np.ndarray) and value.dtype.kind in "fiu":
         return value.tolist() if value.ndim == 1 else value.ravel().tolist()
-    raise _unknown(value)
+    raise _unknown_type_error(value)
 
 
 def binary_encode_hook(value: Any) -> Any:
@@ -45,7 +45,7 @@ def binary_encode_hook(value: Any) -> Any:
             kind = _U4 if _fits_uint32(value) else _F8
         if kind is not None:
             return msgspec.msgpack.Ext(kind, value.astype(_EXTENSIONS[kind], copy=False).tobytes())
-    raise _unknown(value)
+    raise _unknown_type_error(value)
 
 
 def extension_hook(kind: int, data: memoryview) -> npt.NDArray[Any]:
@@ -110,5 +110,5 @@ def _fits_uint32(value: npt.NDArray[Any]) -> bool:
     return value.dtype.kind != "f" and value.min(initial=0) >= 0 and bool(value.max(initial=0) < 2**32)
 
 
-def _unknown(value: Any) -> BadMessage:
+def _unknown_type_error(value: Any) -> BadMessage:
     return BadMessage(f"{type(value).__name__} cannot be encoded in a message")

@@ -492,7 +492,7 @@ class ClientSession:
             self.dropped_answers += 1
             return []
         if connection.backlog is not None:
-            connection.backlog.answered(answer.queue_ms if isinstance(answer, Result) else math.inf)
+            connection.backlog.note_answer(answer.queue_ms if isinstance(answer, Result) else math.inf)
         if isinstance(answer, Failure):
             ended = [] if self._retry(pending, answer, now) else self._end(pending.command.id, answer)
             return ended + self._flush(now)

@@ -76,7 +76,7 @@ class ClientSubscriptions:
         return [self._ask(identity, now) for identity in self._live]
 
     def lose(self, connection: Hashable) -> None:
-        """Take that a connection ended; the subscriptions wait for the next one."""
+        """Suspend the subscriptions, because *connection* ended; they wait for the next one."""
         if self._connection is connection:
             self._connection = None
 
@@ -98,7 +98,7 @@ class ClientSubscriptions:
         return [SubscriptionEnded(failure.id, failure)]
 
     def due(self, now: float) -> tuple[list[Message], list[SubscriptionEnded]]:
-        """Return what to send again, and the subscriptions that no server answered."""
+        """Return the messages to send again, and the ends of subscriptions that no server answered."""
         again: list[Message] = []
         ended: list[SubscriptionEnded] = []
         for identity, subscription in list(self._live.items()):

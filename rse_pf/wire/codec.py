@@ -75,13 +75,13 @@ class Codec(Protocol):
         """Return the WebSocket message of *message*; raises BadMessage if it cannot be encoded."""
 
     def decode_from_robot(self, data: bytes) -> FromRobot:
-        """Return what a robot sent; raises BadMessage or LimitExceeded."""
+        """Return the message of a robot in *data*; raises BadMessage or LimitExceeded."""
 
     def decode_short_from_robot(self, data: bytes, max_bytes: int) -> FromRobot | None:
-        """Return what a robot sent, None if it is longer than *max_bytes*, inflated; raises the same."""
+        """Return the message of a robot, None above *max_bytes*, inflated; raises as `decode_from_robot`."""
 
     def decode_from_server(self, data: bytes) -> FromServer:
-        """Return what a server sent; raises BadMessage or LimitExceeded."""
+        """Return the message of a server in *data*; raises BadMessage or LimitExceeded."""
 
 
 def make_codec(
@@ -119,7 +119,7 @@ def as_type(value: Any, kind: type[T]) -> T:
     except RsePfError:
         raise
     except _UNDECODABLE as error:
-        raise _undecodable(error) from error
+        raise _undecodable_error(error) from error
 
 
 def codec_for(offered: list[str]) -> str | None:
@@ -182,7 +182,7 @@ class _JsonCodec:
         try:
             data = self._encode(message)
         except _UNENCODABLE as error:
-            raise _unencodable(message, error) from error
+            raise _unencodable_error(message, error) from error
         if not self._compressed:
             return data
         if self._native is not None and self._is_pose(message):
@@ -201,7 +201,7 @@ class _JsonCodec:
             if isinstance(message_or_text, Command):
                 return message_or_text
             if message_or_text is not None and not isinstance(message_or_text, str):
-                message: FromRobot = _guarded(self._from_robot, message_or_text)
+                message: FromRobot = _decode_guarded(self._from_robot, message_or_text)
                 return message
         return self._read(self._open(data))
 
@@ -219,7 +219,7 @@ class _JsonCodec:
             if isinstance(message_or_text, str):
                 return None
             if message_or_text is not None:
-                message: FromRobot = _guarded(self._from_robot, message_or_text)
+                message: FromRobot = _decode_guarded(self._from_robot, message_or_text)
                 return message
         text = inflate_short(data, max_bytes)
         return None if text is None or len(text) > max_bytes else self._read(text)
@@ -227,7 +227,7 @@ class _JsonCodec:
     def decode_from_server(self, data: bytes) -> FromServer:
         text = self._open(data)
         check_json_containers(text, self._budget)
-        message: FromServer = _guarded(self._from_server, text)
+        message: FromServer = _decode_guarded(self._from_server, text)
         return message
 
     def _is_pose(self, message: Message) -> bool:
@@ -238,7 +238,7 @@ class _JsonCodec:
     def _read(self, text: bytes | bytearray) -> FromRobot:
         if self._reader is None or not self._reader.check(text):
             check_json(text, self._budget)
-        message: FromRobot = _guarded(self._from_robot, text)
+        message: FromRobot = _decode_guarded(self._from_robot, text)
         return message
 
     def _open(self, data: bytes) -> bytes | bytearray:
@@ -261,7 +261,7 @@ class _BinaryCodec:
         try:
             return self._encode(message)
         except _UNENCODABLE as error:
-            raise _unencodable(message, error) from error
+            raise _unencodable_error(message, error) from error
 
     def decode_from_robot(self, data: bytes) -> FromRobot:
         if len(data) > self._budget.wire_bytes:
@@ -278,7 +278,7 @@ class _BinaryCodec:
         except RsePfError:
             raise
         except _UNDECODABLE as error:
-            raise _undecodable(error) from error
+            raise _undecodable_error(error) from error
         if not is_checked and type(message) is Command and type(message.payload) in _CONTAINERS:
             _check_nesting(message.payload, self._budget.depth)
         return message
@@ -288,23 +288,23 @@ class _BinaryCodec:
 
     def decode_from_server(self, data: bytes) -> FromServer:
         check_size(data, self._budget)
-        message: FromServer = _guarded(self._from_server, data)
+        message: FromServer = _decode_guarded(self._from_server, data)
         _check_nesting(getattr(message, "reply", None), self._budget.depth)
         return message
 
 
-def _guarded(decode: Callable[[Any], Any], data: Any) -> Any:
+def _decode_guarded(decode: Callable[[Any], Any], data: Any) -> Any:
     """Decode *data*, turning every exception of the decoder into `BadMessage`."""
     try:
         return decode(data)
     except RsePfError:
         raise
     except _UNDECODABLE as error:
-        raise _undecodable(error) from error
+        raise _undecodable_error(error) from error
 
 
-def _undecodable(error: Exception) -> BadMessage:
-    """Return what an exception of a decoder means."""
+def _undecodable_error(error: Exception) -> BadMessage:
+    """Return the error that an exception of a decoder stands for."""
     if isinstance(error, msgspec.ValidationError):
         return BadMessage(str(error)[:200], hint="compare it with docs/protocol.md")
     if isinstance(error, (msgspec.DecodeError, UnicodeDecodeError)):
@@ -316,7 +316,7 @@ def _undecodable(error: Exception) -> BadMessage:
     )
 
 
-def _unencodable(message: Message, error: Exception) -> BadMessage:
+def _unencodable_error(message: Message, error: Exception) -> BadMessage:
     return BadMessage(
         f"a {type(message).__name__} cannot be encoded: {str(error)[:150]}",
         hint="send numbers, strings, lists, arrays and structs",

@@ -130,7 +130,7 @@ class NativeReader:
         encoding = _ENCODINGS["json" if self._is_json else "bin"]
         status = calls.check(data, len(data), self._limits, encoding)
         if status not in (_NOT_MINE, _UNKNOWN):
-            raise self._refused(status, len(data), 0)
+            raise self._refusal(status, len(data), 0)
         return bool(status == _NOT_MINE)
 
     def read(self, data: bytes) -> Command | bytes | memoryview | Literal["longer"] | None:
@@ -167,7 +167,7 @@ class NativeReader:
         elif status == _UNKNOWN:
             return None
         elif status not in (_READ, _NOT_MINE):
-            raise self._refused(status, size, sizes[1])
+            raise self._refusal(status, size, sizes[1])
         return text[: sizes[0]] if self._is_deflated else data
 
     def _with_more_room(self, data: bytes) -> tuple[int, memoryview]:
@@ -183,7 +183,7 @@ class NativeReader:
         buffers.lend(buffers.text)
         return status, memoryview(text)  # type: ignore[arg-type]
 
-    def _refused(self, status: int, size: int, limit: int) -> RsePfError:
+    def _refusal(self, status: int, size: int, limit: int) -> RsePfError:
         reason = (_JSON_REFUSALS if self._is_json else _MSGPACK_REFUSALS)[status]
         return refusal(reason, self._budget, size=size, max_bytes=limit)
 
@@ -206,7 +206,7 @@ def _functions(library: ctypes.CDLL) -> _Calls:
 def _command(
     buffers: CallBuffers, numbers_found: tuple[Any, ...], text: bytes | memoryview, types: PnpTypes
 ) -> Command | None:
-    """Return what a call has found; None if the camera or the options are refused by their types."""
+    """Return the command that a call has read; None if the camera or the options have invalid values."""
     (
         _, _, points, pixels, depths, identity, seq, deadline_ms, fields,
         stream_at, stream_bytes, trace_at, trace_bytes, head,

@@ -70,7 +70,7 @@ class Backlog:
     newest: int
     max_in_flight: int = 1
 
-    def answered(self, queue_ms: float) -> None:
+    def note_answer(self, queue_ms: float) -> None:
         """Allow one more frame in flight if the server's queue is short; otherwise restart with one."""
         self.max_in_flight = self.max_in_flight + 1 if queue_ms <= _SHORT_QUEUE_MS else 1
 

@@ -42,7 +42,7 @@ def refusal_body(code: str, message: str, hint: str, **members: Any) -> bytes:
 
 
 def refusal_in(body: bytes, code: str) -> RefusedHandshake | None:
-    """Return what *body* says if it is the refusal *code* of one of our servers, else None."""
+    """Return the refusal in *body* if it has this *code* and is of one of our servers, else None."""
     if len(body) > _MAX_BODY_BYTES:
         return None
     try:

@@ -1,4 +1,4 @@
-"""When a connection expires, and when its robot sends a fresh token; times go in, decisions come out."""
+"""Decide when a robot sends a fresh token, before its connection expires; times in, decisions out."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _MAX_TTL_S = 3600.0
 
 @dataclass(slots=True)
 class RenewalTimer:
-    """When a connection expires and when to renew its token; seconds of the robot's clock.
+    """The times at which a connection expires and its token is renewed; seconds of the robot's clock.
 
     A renewal without a reply is repeated, but never faster than the server accepts renewals.
     """
