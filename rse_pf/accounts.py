@@ -90,10 +90,10 @@ class TenantAccount:
         """Count nothing yet.
 
         Args:
-            store: Shared by all processes.
-            tenant: Whose account it is.
-            settings: With the quota and the reserve of the disk.
-            wall_clock: Unix seconds.
+            store: The store that all processes share.
+            tenant: The name of the tenant.
+            settings: The quota of the tenant, and the reserve of the disk.
+            wall_clock: The clock, Unix seconds.
             check: Called between two reads; ends the work by the error that it raises.
         """
         self._store, self._settings, self._wall_clock, self._check = store, settings, wall_clock, check
@@ -104,13 +104,13 @@ class TenantAccount:
         self._drawn_bytes, self._drawn_s = 0, _NEVER
         self._share_bytes, self._share_s = 0.0, _NEVER
 
-    def spends(self, size: int) -> bool:
-        """Charge an object of *size* bytes if that takes no access to the store; return whether it does."""
+    def try_charge(self, size: int) -> bool:
+        """Charge an object of *size* bytes unless that needs the store; return whether it was charged."""
         charge = charge_of(size)
         if not self._lock.acquire(blocking=False):
             return False
         try:
-            return self._spends(charge)
+            return self._spend_drawn(charge)
         finally:
             self._lock.release()
 
@@ -129,7 +129,7 @@ class TenantAccount:
         """
         charge = charge_of(size)
         with self._lock:
-            if not self._spends(charge):
+            if not self._spend_drawn(charge):
                 drawn = self._draw(charge, margin - freed)
                 self._drawn_bytes += drawn - charge
                 self._drawn_s = self._wall_clock()
@@ -146,7 +146,7 @@ class TenantAccount:
             self._drawn_bytes = 0
         return is_drawn
 
-    def _spends(self, charge: int) -> bool:
+    def _spend_drawn(self, charge: int) -> bool:
         if not self._is_drawn() or self._drawn_bytes < charge:
             return False
         self._drawn_bytes -= charge
@@ -159,10 +159,10 @@ class TenantAccount:
             now = self._wall_clock()
             ledger = _ledger(known)
             if ledger is None or not 0.0 <= now - ledger.counted_s < self._recount_s:
-                ledger = self._counted(ledger)
+                ledger = self._recount(ledger)
             refused = self._refusal(ledger, charge, margin)
             if refused and now - ledger.counted_s >= _REFUSED_RECOUNT_SHARE * self._recount_s:
-                ledger = self._counted(ledger)
+                ledger = self._recount(ledger)
                 refused = self._refusal(ledger, charge, margin)
             if refused is not None:
                 with contextlib.suppress(StoreError):  # what was counted saves others the same work
@@ -174,7 +174,7 @@ class TenantAccount:
             )
             drawn = max(charge, min(_MAX_DRAWN_BYTES, free_bytes // _DRAWN_SHARE))
             try:
-                self._store.compare_and_swap(self._name, known, _encode(_granting(ledger, now, drawn)))
+                self._store.compare_and_swap(self._name, known, _encode(_with_grant(ledger, now, drawn)))
             except Conflict:
                 continue
             return drawn
@@ -186,7 +186,7 @@ class TenantAccount:
         except NotFound:
             return None
 
-    def _counted(self, before: _Ledger | None) -> _Ledger:
+    def _recount(self, before: _Ledger | None) -> _Ledger:
         """Count what lies in the store; grants that may not be written yet stay."""
         begun_s = self._wall_clock()
         charged = stored_by_tenant(self._store, self._folder, self._check).charged_bytes
@@ -235,13 +235,13 @@ class TenantAccount:
 
 
 def _ledger(data: bytes | None) -> _Ledger | None:
-    """Return what *data* says; None if there is none or it is damaged: then all is counted."""
+    """Return the ledger in *data*; None without data and for damaged data, so that all is counted."""
     with contextlib.suppress(msgspec.MsgspecError):
         return None if data is None else _decode(data)
     return None
 
 
-def _granting(ledger: _Ledger, now: float, size: int) -> _Ledger:
+def _with_grant(ledger: _Ledger, now: float, size: int) -> _Ledger:
     """Return *ledger* with a grant; grants of the same 10 s are one, as if made at their end."""
     at = now // _RECOUNT_S * _RECOUNT_S + _RECOUNT_S
     before = ledger.granted
@@ -251,7 +251,7 @@ def _granting(ledger: _Ledger, now: float, size: int) -> _Ledger:
 
 
 def stored_by_tenant(store: ObjectStore, folder: str, check: Callable[[], None] = lambda: None) -> Usage:
-    """Return what the tenant with this folder is charged with."""
+    """Return the usage that the tenant with this folder is charged with."""
     total = Usage()
     for area in _OF_TENANT:
         check()
@@ -262,7 +262,7 @@ def stored_by_tenant(store: ObjectStore, folder: str, check: Callable[[], None] 
 
 
 def _uploads(store: ObjectStore, folder: str, check: Callable[[], None]) -> Usage:
-    """Return what the unfinished uploads of a robot count for: what they shall have in the end."""
+    """Return the usage of the unfinished uploads of a robot, counted with their final sizes."""
     total = Usage()
     for upload in store.folders(f"uploads/{folder}"):
         check()
@@ -310,7 +310,7 @@ class Accounts:
         self._tenants: OrderedDict[str, TenantAccount] = OrderedDict()
 
     @contextlib.contextmanager
-    def reserved(self, robot: RobotId, size: int, max_bytes: float | None = None) -> Iterator[None]:
+    def reservation(self, robot: RobotId, size: int, max_bytes: float | None = None) -> Iterator[None]:
         """Count one object of *size* bytes for a robot while it is written; take it back if that fails.
 
         Args:
@@ -339,14 +339,14 @@ class Accounts:
             if is_charged and not is_stored:
                 tenant.release(size)
             with account.lock:
-                account.writing = _less(account.writing, charge)
+                account.writing = _subtract(account.writing, charge)
                 if account.counted_s != counted_s:
                     account.counted_s = _NEVER  # a count meanwhile may have seen the object, or not
                 elif is_stored:
                     account.stored += charge
 
     def check_room(self, robot: RobotId, size: int, max_bytes: float | None = None) -> None:
-        """Raise what `reserved` would raise for the robot now; nothing is reserved."""
+        """Raise what `reservation` would raise for the robot now; nothing is reserved."""
         account = self._account(robot)
         with account.lock:
             self._count_if_old(account, robot)
@@ -356,7 +356,7 @@ class Accounts:
         """Count one object of *size* bytes less."""
         account = self._account(robot)
         with account.lock:
-            account.stored = _less(account.stored, Usage(1, charge_of(size)))
+            account.stored = _subtract(account.stored, Usage(1, charge_of(size)))
         self.tenant(robot.tenant).release(size)
 
     def forget(self, robot: RobotId) -> None:
@@ -367,7 +367,7 @@ class Accounts:
 
     def tenant(self, tenant: str) -> TenantAccount:
         """Return the account of a tenant."""
-        return self._of(
+        return self._get_or_make(
             self._tenants, tenant,
             lambda: TenantAccount(
                 self._store, tenant, self._settings, wall_clock=self._wall_clock, check=self._check
@@ -375,9 +375,9 @@ class Accounts:
         )  # fmt: skip
 
     def _account(self, robot: RobotId) -> _RobotAccount:
-        return self._of(self._robots, robot, _RobotAccount)
+        return self._get_or_make(self._robots, robot, _RobotAccount)
 
-    def _of(self, accounts: OrderedDict[_K, _T], key: _K, make: Callable[[], _T]) -> _T:
+    def _get_or_make(self, accounts: OrderedDict[_K, _T], key: _K, make: Callable[[], _T]) -> _T:
         with self._lock:
             account = accounts.get(key)
             if account is None:
@@ -414,5 +414,5 @@ def _recount_s(store: ObjectStore) -> float:
     return _RECOUNT_S if isinstance(store, MeasuringStore) else _SLOW_RECOUNT_S
 
 
-def _less(usage: Usage, charge: Usage) -> Usage:
+def _subtract(usage: Usage, charge: Usage) -> Usage:
     return Usage(max(0, usage.objects - charge.objects), max(0, usage.charged_bytes - charge.charged_bytes))

@@ -56,11 +56,27 @@ _FLAT_FROM = 32
 _NOT_BRACKETS = bytes(set(range(256)) - set(b"[]{}"))
 _NOT_BRACKETS_OR_QUOTES = bytes(set(range(256)) - set(b'[]{}"'))
 _NOT_MARKS_OR_QUOTES = bytes(set(range(256)) - set(b',:[]{}"'))
-# How many values a number counts as beyond its own, because decoders need longer for it: many digits, the
-# middle between two doubles, and what is about as small or large as a double can be.
-_LONG_DIGITS, _WIDE_DIGITS, _MIDDLE_DIGITS, _MIDDLE_WHOLE_DIGITS, _MIDDLE_POWER = 19, 32, 16, 12, -4
-_MIDDLE_VALUES, _FAR_VALUES, _MOST_VALUES_PER_BYTE = 10, 160, 40
-_EXPONENT_DIGITS, _MOST_EXPONENT = 9, 10**9
+# A number counts as more than one value if decoders need longer for it: because it has many digits, lies in
+# the middle between two doubles, or is about as small or large as a double can be.
+_LONG_DIGITS = 19
+"""Significant digits from which a number counts as one more value for every two of its digits."""
+_WIDE_DIGITS = 32
+"""Digits, leading zeros included, from which a number counts as long, too."""
+_MIDDLE_DIGITS = 16
+"""Significant digits from which a number can lie in the middle between two doubles."""
+_MIDDLE_WHOLE_DIGITS = 12
+"""A number below `_LONG_DIGITS` with fewer digits before its point is never such a middle."""
+_MIDDLE_POWER = -4
+"""Power of ten of the last digit from which a number can be such a middle."""
+_MIDDLE_VALUES = 10
+"""Values that a possible middle counts as, beyond its own."""
+_FAR_VALUES = 160
+"""Values that a number counts as, beyond its own, if it is about as small or large as a double can be."""
+_MOST_VALUES_PER_BYTE = 40
+"""Upper bound of the values that the numbers of a text count as, for each byte of the text."""
+_EXPONENT_DIGITS = 9
+"""Longest exponent that is read as a number; a longer one counts as `_MOST_EXPONENT`."""
+_MOST_EXPONENT = 10**9
 _COSTLY_EXPONENT = re.compile(rb"e(?<=[0-9.]e)(?:[+-]?0*([1-9][0-9]{2})|\+?0*[2-9][0-9](?![0-9]))")
 _MANY_DIGITS = re.compile(rb"([0-9.]{16,})(?=(?:e([+-]?)([0-9]+))?)")
 _DIGITS = bytes(ord("0") if k in b"0123456789." else ord(" ") for k in range(256))
@@ -108,7 +124,7 @@ class Budget:
         )  # fmt: skip
 
 
-def _plain(*, size: int, depth: int, containers: int, values: int, mixed_values: int) -> Budget:
+def _plain_budget(*, size: int, depth: int, containers: int, values: int, mixed_values: int) -> Budget:
     """Return the budget of bytes that are not deflated."""
     return Budget(
         wire_bytes=size, inflated_bytes=size, inflate_ratio=1.0, free_bytes=size, depth=depth,
@@ -133,26 +149,26 @@ def refusal(reason: Refusal, budget: Budget, *, size: int, max_bytes: int) -> Rs
         max_bytes: What a bomb inflates to more than.
     """
     errors: dict[Refusal, Callable[[], RsePfError]] = {
-        "json-containers": lambda: _too_many_json_containers(budget.containers),
-        "json-depth": lambda: _too_deep_json(budget.depth),
-        "containers": lambda: _too_many_containers(budget.containers),
-        "depth": lambda: _too_deep(budget.depth),
-        "values": lambda: _too_many_values(budget.values),
-        "memory": lambda: _too_much_memory(budget.memory_bytes),
-        "cut-off": _cut_off,
-        "followed": _followed,
-        "not-zlib": _not_zlib,
-        "not-one-stream": _not_one_stream,
-        "bomb": lambda: _bomb(size, max_bytes),
-        "blocks": _too_many_blocks,
+        "json-containers": lambda: _too_many_json_containers_error(budget.containers),
+        "json-depth": lambda: _too_deep_json_error(budget.depth),
+        "containers": lambda: _too_many_containers_error(budget.containers),
+        "depth": lambda: _too_deep_error(budget.depth),
+        "values": lambda: _too_many_values_error(budget.values),
+        "memory": lambda: _too_much_memory_error(budget.memory_bytes),
+        "cut-off": _cut_off_error,
+        "followed": _trailing_bytes_error,
+        "not-zlib": _not_zlib_error,
+        "not-one-stream": _not_one_stream_error,
+        "bomb": lambda: _bomb_error(size, max_bytes),
+        "blocks": _too_many_blocks_error,
     }
     return errors[reason]()
 
 
-PROVENANCE = _plain(size=1 << 20, depth=64, containers=40_000, values=150_000, mixed_values=150_000)
+PROVENANCE = _plain_budget(size=1 << 20, depth=64, containers=40_000, values=150_000, mixed_values=150_000)
 """Where a map comes from, as its author wrote it."""
 
-SERVICE_REPLY = _plain(size=1 << 26, depth=32, containers=7000, values=150_000, mixed_values=30_000)
+SERVICE_REPLY = _plain_budget(size=1 << 26, depth=32, containers=7000, values=150_000, mixed_values=30_000)
 """What an installed service answers, with its snapshot; the size is that of the channel."""
 
 
@@ -169,7 +185,7 @@ def check_size(data: bytes, budget: Budget) -> None:
 
 
 def inflate_within(data: bytes, budget: Budget) -> Text:
-    """Return what the zlib stream *data* inflates to.
+    """Return the inflated bytes of the zlib stream *data*.
 
     Raises:
         LimitExceeded: It is longer than *budget* allows; no more than that was inflated.
@@ -184,21 +200,21 @@ def inflate_within(data: bytes, budget: Budget) -> Text:
         # A decompression bomb is detected here, at a quarter of the cost of inflating all that is allowed.
         head = stream.decompress(data[:first], min(plain, max_bytes) + 1)
         if len(head) > min(plain, max_bytes):
-            raise _bomb(len(data), min(plain, max_bytes))
+            raise _bomb_error(len(data), min(plain, max_bytes))
         text: Text = head
         if len(data) > first:
-            text = _rest(stream, head, data, first, max_bytes)
+            text = _inflate_rest(stream, head, data, first, max_bytes)
     except zlib.error as error:
-        raise _not_zlib() from error
+        raise _not_zlib_error() from error
     if len(text) > max_bytes:
-        raise _bomb(len(data), max_bytes)
+        raise _bomb_error(len(data), max_bytes)
     if not stream.eof or stream.unused_data:
-        raise _not_one_stream()
+        raise _not_one_stream_error()
     return text
 
 
 def inflate_short(data: bytes, max_bytes: int) -> bytes | None:
-    """Return what the zlib stream *data* inflates to, None if that is longer than *max_bytes*.
+    """Return the inflated bytes of the zlib stream *data*, None if they are more than *max_bytes*.
 
     Raises:
         BadMessage: It is not one complete zlib stream.
@@ -207,15 +223,15 @@ def inflate_short(data: bytes, max_bytes: int) -> bytes | None:
     try:
         text = stream.decompress(data, max_bytes + 1)
     except zlib.error as error:
-        raise _not_zlib() from error
+        raise _not_zlib_error() from error
     if len(text) > max_bytes:
         return None
     if not stream.eof or stream.unused_data:
-        raise _not_one_stream()
+        raise _not_one_stream_error()
     return text
 
 
-def _rest(stream: Any, head: bytes, data: bytes, first: int, max_bytes: int) -> bytearray:
+def _inflate_rest(stream: Any, head: bytes, data: bytes, first: int, max_bytes: int) -> bytearray:
     """Inflate *data* from *first* piece by piece, because zlib would hold the text twice otherwise."""
     text = bytearray(head)
     piece = stream.unconsumed_tail
@@ -227,23 +243,23 @@ def _rest(stream: Any, head: bytes, data: bytes, first: int, max_bytes: int) -> 
         text += stream.decompress(piece, min(_PIECE_BYTES, max_bytes + 1 - len(text)))
         piece = stream.unconsumed_tail
     if stream.eof and first < len(data):
-        raise _not_one_stream()
+        raise _not_one_stream_error()
     return text
 
 
-def _not_zlib() -> BadMessage:
+def _not_zlib_error() -> BadMessage:
     return BadMessage("not a zlib stream", hint="is this the sub-protocol that was agreed?")
 
 
-def _not_one_stream() -> BadMessage:
+def _not_one_stream_error() -> BadMessage:
     return BadMessage("the zlib stream does not end with the message", hint="one stream for each message")
 
 
-def _bomb(size: int, max_bytes: int) -> LimitExceeded:
+def _bomb_error(size: int, max_bytes: int) -> LimitExceeded:
     return LimitExceeded(f"{size} bytes inflate to more than {max_bytes}", hint="send smaller messages")
 
 
-def _too_many_blocks() -> LimitExceeded:
+def _too_many_blocks_error() -> LimitExceeded:
     return LimitExceeded("a zlib stream of many tiny blocks", hint="deflate a message as a whole")
 
 
@@ -265,7 +281,7 @@ def check_msgpack(data: Text, budget: Budget) -> bool:
     if end <= budget.containers and end * MAP_VALUES <= budget.mixed_values:
         return False
     if measure_msgpack(data, 0, budget) != end:
-        raise _followed()
+        raise _trailing_bytes_error()
     return True
 
 
@@ -283,7 +299,7 @@ def measure_msgpack(data: Text, at: int, budget: Budget) -> int:
     while True:
         while values_left:
             if at >= end:
-                raise _cut_off()
+                raise _cut_off_error()
             first = data[at]
             step = steps[first]
             values_left -= 1
@@ -297,7 +313,7 @@ def measure_msgpack(data: Text, at: int, budget: Budget) -> int:
                 containers += 1
                 values += _MORE[first]
                 if count > end - at:  # each value takes a byte
-                    raise _cut_off()
+                    raise _cut_off_error()
                 if count >= _FLAT_FROM and not is_map and (flat := _flat_bytes(data, at, count)):
                     at += flat
                     values += count
@@ -313,12 +329,12 @@ def measure_msgpack(data: Text, at: int, budget: Budget) -> int:
                 values += 1
                 at += head + int.from_bytes(data[at + 1 : at + 1 + width], "big")
             if values > limit:
-                raise _too_many_values(limit)
+                raise _too_many_values_error(limit)
         if not outer:
             break
         values_left = outer.pop()
     if at > end:
-        raise _cut_off()
+        raise _cut_off_error()
     return at
 
 
@@ -329,7 +345,7 @@ def announced_values(data: Text, at: int) -> int:
         BadMessage: *data* ends before.
     """
     if at >= len(data):
-        raise _cut_off()
+        raise _cut_off_error()
     first = data[at]
     step = _STEPS[first]
     if step >= 0:
@@ -352,9 +368,9 @@ def small_text(data: Text, at: int) -> tuple[str, int]:
 
 def _check_containers(depth: int, containers: int, budget: Budget) -> None:
     if containers > budget.containers:
-        raise _too_many_containers(budget.containers)
+        raise _too_many_containers_error(budget.containers)
     if depth > budget.depth:
-        raise _too_deep(budget.depth)
+        raise _too_deep_error(budget.depth)
 
 
 def _flat_bytes(data: Text, at: int, count: int) -> int:
@@ -394,26 +410,26 @@ _STEPS = _steps()
 _MORE = tuple((MAP_VALUES if k < 0x90 or k >= 0xDE else LIST_VALUES) - 1 for k in range(256))
 
 
-def _cut_off() -> BadMessage:
+def _cut_off_error() -> BadMessage:
     return BadMessage("the message ends within a value", hint="send whole messages")
 
 
-def _too_many_values(max_values: int) -> LimitExceeded:
+def _too_many_values_error(max_values: int) -> LimitExceeded:
     return LimitExceeded(
         f"more than {max_values} values in one message",
         hint="send large data to the data server, and numbers of at most 18 digits",
     )
 
 
-def _too_many_containers(most: int) -> LimitExceeded:
+def _too_many_containers_error(most: int) -> LimitExceeded:
     return LimitExceeded(f"more than {most} lists and maps", hint="send arrays, raw")
 
 
-def _too_deep(most: int) -> LimitExceeded:
+def _too_deep_error(most: int) -> LimitExceeded:
     return LimitExceeded(f"a message is nested deeper than {most}", hint="send flat lists")
 
 
-def _followed() -> BadMessage:
+def _trailing_bytes_error() -> BadMessage:
     return BadMessage("bytes follow the message", hint="one value for each message")
 
 
@@ -441,9 +457,9 @@ def check_json_containers(text: Text, budget: Budget) -> None:
         return
     brackets = b"".join(_without_strings(text, _NOT_BRACKETS_OR_QUOTES))
     if brackets.count(b"[") + brackets.count(b"{") > max_lists:
-        raise _too_many_json_containers(max_lists)
+        raise _too_many_json_containers_error(max_lists)
     if _depth(brackets) > max_depth:
-        raise _too_deep_json(max_depth)
+        raise _too_deep_json_error(max_depth)
 
 
 def _check_values(text: Text, max_values: int) -> None:
@@ -459,7 +475,7 @@ def _check_values(text: Text, max_values: int) -> None:
     values_left = max_values - _values(outside)
     numbers = _without_strings(text, b"", is_separated=True)
     if values_left <= 0 or _more_values(numbers, values_left) >= values_left:
-        raise _too_many_values(max_values)
+        raise _too_many_values_error(max_values)
 
 
 def _pieces(text: Text) -> Iterator[Text]:
@@ -525,7 +541,7 @@ def _check_memory(text: Text, max_bytes: int) -> None:
         return
     characters = len(text) if strings > _FEW_STRINGS or b'\\"' in text else _characters(text)
     if other + width * characters > max_bytes:
-        raise _too_much_memory(max_bytes)
+        raise _too_much_memory_error(max_bytes)
 
 
 def _characters(text: Text) -> int:
@@ -567,15 +583,15 @@ def _without_strings(text: Text, dropped: bytes, *, is_separated: bool = False) 
         is_inside = bool(inside[-1])
 
 
-def _too_many_json_containers(most: int) -> LimitExceeded:
+def _too_many_json_containers_error(most: int) -> LimitExceeded:
     return LimitExceeded(f"JSON of more than {most} lists and objects", hint="send flat lists of numbers")
 
 
-def _too_deep_json(most: int) -> LimitExceeded:
+def _too_deep_json_error(most: int) -> LimitExceeded:
     return LimitExceeded(f"JSON is nested deeper than {most}", hint="send flat lists")
 
 
-def _too_much_memory(max_bytes: int) -> LimitExceeded:
+def _too_much_memory_error(max_bytes: int) -> LimitExceeded:
     return LimitExceeded(
         f"a message that would take more than {max_bytes} bytes of memory",
         hint="send arrays of numbers, or large data to the data server",

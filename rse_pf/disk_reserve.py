@@ -70,7 +70,7 @@ class SpareFiles:
             OSError: The disk is full, or the file system cannot preallocate; the earlier spares stay.
         """
         self._folder.mkdir(mode=0o700, exist_ok=True)
-        with self._locked():
+        with self._hold_lock():
             for number in range(SPARE_FILES):
                 spare = self._folder / f"{_SPARE}{number}"
                 if _allocated(spare) < size:
@@ -85,7 +85,7 @@ class SpareFiles:
         Raises:
             OSError: The text is longer than these blocks, too; *path* is as it was.
         """
-        with self._locked():
+        with self._hold_lock():
             spare = max(self._folder.glob(f"{_SPARE}*"), key=_allocated, default=path)
             if _allocated(spare) < len(text):
                 spare = path
@@ -97,7 +97,7 @@ class SpareFiles:
         sync_folder(path.parent)
 
     @contextlib.contextmanager
-    def _locked(self) -> Iterator[None]:
+    def _hold_lock(self) -> Iterator[None]:
         try:
             handle = os.open(self._folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
         except FileNotFoundError:  # there never was a reserve: other writers hold the caller's lock
@@ -142,7 +142,7 @@ def _overwrite(path: Path, text: bytes) -> None:
 
 
 def _exchange(spare: Path, path: Path) -> None:
-    """Let the two files exchange their names in one step; a missing *path* leaves one spare less."""
+    """Exchange the names of the two files in one step; a missing *path* leaves one spare less."""
     result = _LIBC.renameat2(_HERE, os.fsencode(spare), _HERE, os.fsencode(path), _EXCHANGE)
     if result and ctypes.get_errno() == errno.ENOENT:
         os.replace(spare, path)

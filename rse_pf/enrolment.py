@@ -88,7 +88,7 @@ class EnrolmentFile:
         self._clock = clock
 
     def read(self) -> Enrolment:
-        """Return what the file holds; raises UsageError."""
+        """Return the enrolment in the file; raises UsageError."""
         return Enrolment.read(self._path)
 
     def fresh_token(self) -> str:

@@ -494,7 +494,7 @@ def error_from_code(
 
 
 def error_of_system(error: OSError) -> RsePfError:
-    """Return what the operating system refused, with the file or address and a hint that fits."""
+    """Return the error of a refused system call, with its file or address and a fitting hint."""
     cause = error.strerror or str(error) or type(error).__name__
     named = "" if error.filename is None else f": {str(error.filename)!r}"
     kind, hint = _OF_SYSTEM.get(
@@ -520,7 +520,7 @@ _OF_SYSTEM: dict[int, tuple[type[RsePfError], str]] = {
 
 
 def message_of(error: BaseException) -> str:
-    """Return what *error* says in one sentence, without the hint and the address of an `RsePfError`."""
+    """Return the message of *error* in one sentence, without the hint and address of an `RsePfError`."""
     return error.message if isinstance(error, RsePfError) else str(error)
 
 

@@ -120,7 +120,7 @@ class LimitedProcesses:
         self.close()
 
     def call(self, data: bytes, timeout_s: float) -> bytes:
-        """Return what the handler returns for *data*; blocks for at most *timeout_s* seconds, and some ms.
+        """Return the handler's reply to *data*; blocks for at most *timeout_s* seconds, and some ms.
 
         A call whose process ends, although it had answered other calls before, is repeated once in a new
         process: what others left there may have been the cause.
@@ -137,7 +137,7 @@ class LimitedProcesses:
         try:
             slot = self._free.get(timeout=max(0.0, timeout_s))
         except queue.Empty:
-            raise _busy("no process was free in time") from None
+            raise _busy_error("no process was free in time") from None
         try:
             while True:
                 process = slot.process
@@ -240,7 +240,7 @@ class _Template:
             Busy: The template was not ready in time; it goes on starting.
             WorkerLost: It cannot start, or was closed.
         """
-        with self._locked(until):
+        with self._hold_lock(until):
             if self._is_closed:
                 raise WorkerLost("the processes were closed", hint="try again elsewhere")
             try:
@@ -274,9 +274,9 @@ class _Template:
             self._stop()
 
     @contextlib.contextmanager
-    def _locked(self, until: float) -> Any:
+    def _hold_lock(self, until: float) -> Any:
         if not self._lock.acquire(timeout=max(0.0, until - time.monotonic())):
-            raise _busy("no process was free in time")
+            raise _busy_error("no process was free in time")
         try:
             yield
         finally:
@@ -305,7 +305,7 @@ class _Template:
         try:
             message = self._channel.recv(_MAX_ORDER_BYTES)
         except TimeoutError:
-            raise _busy("the process was not started in time") from None
+            raise _busy_error("the process was not started in time") from None
         except OSError:
             message = b""
         if not message:
@@ -339,7 +339,7 @@ class _Template:
         self._forked.clear()
 
 
-def _busy(why: str) -> Busy:
+def _busy_error(why: str) -> Busy:
     return Busy(why, hint="try again later, or allow more time", retry_after_ms=_BUSY_RETRY_MS)
 
 

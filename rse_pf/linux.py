@@ -39,7 +39,7 @@ def die_with_parent(parent: int | None = None) -> bool:
 
 
 def set_process_name(name: str) -> None:
-    """Let tools like top show *name* for this process, its first 15 bytes."""
+    """Set the name that tools like top show for this process to the first 15 bytes of *name*."""
     prctl(_PR_SET_NAME, name.encode())
 
 
@@ -99,7 +99,7 @@ def run_when_idle(pid: int) -> None:
 
 
 def run_as_batch(pid: int, nice: int) -> None:
-    """Let *pid* wait for a processor rather than take one from a process that runs, with niceness *nice*.
+    """Make *pid* wait for a processor rather than take one from a running process, with niceness *nice*.
 
     Threads that it starts later inherit both.  The niceness leaves it a share of a machine that is full.
     """

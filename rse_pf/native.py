@@ -123,7 +123,7 @@ class _Buffers(threading.local):
 
 
 @lru_cache(maxsize=256)
-def _packed(camera: Camera, options: NativeOptions) -> bytes:
+def _pack(camera: Camera, options: NativeOptions) -> bytes:
     return _BODY.pack(
         camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height,
         options.inlier_px, options.confidence, options.max_iterations,
@@ -222,7 +222,7 @@ class NativeSolver:
             buffers.lend(n)
         _REQUEST.pack_into(
             buffers.request, 0, _ABI, _PORTABLE if options.portable else 0, n, address_of(points_world),
-            address_of(pixels), _packed(camera, options), 0, 0,
+            address_of(pixels), _pack(camera, options), 0, 0,
         )  # fmt: skip
         self._call(buffers.request_at, buffers.inliers_at, buffers.result_at)
         values = _RESULT.unpack_from(buffers.result)
@@ -265,7 +265,7 @@ class NativeSolver:
         request = buffers.request
         flags |= _PORTABLE if options.portable else 0
         _HEAD.pack_into(request, 0, _ABI, flags, len(pixels), address_of(points_world), address_of(pixels))
-        request[_HEAD.size : _HEAD.size + _BODY.size] = _packed(camera, options)
+        request[_HEAD.size : _HEAD.size + _BODY.size] = _pack(camera, options)
         flag_at = 0 if cancelled is None else ctypes.addressof(cancelled)
         _TAIL.pack_into(request, _HEAD.size + _BODY.size, deadline_ns, flag_at)
         self._call(buffers.request_at, inliers_at, buffers.result_at)
@@ -381,7 +381,7 @@ def load_part(path: Path, part: str, abi: int, *functions: str) -> list[Any]:
 
 
 def open_found(open_part: Callable[[Path], Part]) -> Part | None:
-    """Return what *open_part* opens in the library that `find_library` finds; None without one that fits."""
+    """Return the part that *open_part* opens in the library of `find_library`; None if no library fits."""
     path = find_library()
     try:
         return None if path is None else open_part(path)

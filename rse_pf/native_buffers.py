@@ -38,7 +38,7 @@ class CallBuffers(threading.local):
         self.lend(self.text)
 
     def lend(self, text: npt.NDArray[np.uint8]) -> None:
-        """Let the next calls write to *text*, whose last `SLACK` bytes are no room."""
+        """Make the next calls write to *text*, whose last `SLACK` bytes stay free."""
         _HEAD.pack_into(
             self.call, 0, address_of(text), len(text) - SLACK, address_of(self.numbers), len(self.numbers)
         )

@@ -133,7 +133,7 @@ class MeasuringStore(Protocol):
     """A store that knows how much it holds without listing all of it each time."""
 
     def usage(self, prefix: str) -> Usage:
-        """Return what the objects below the folder *prefix*, which ends with a slash, count for."""
+        """Return the usage of the objects below the folder *prefix*, which ends with a slash."""
 
 
 @runtime_checkable
@@ -195,7 +195,7 @@ def charge_of(size: int) -> int:
 
 
 def usage_of(store: ObjectStore, prefix: str) -> Usage:
-    """Return what the objects below the folder *prefix* count for, in the cheapest way."""
+    """Return the usage of the objects below the folder *prefix*, in the cheapest way."""
     if isinstance(store, MeasuringStore):
         return store.usage(prefix)
     objects = charged = 0
@@ -364,7 +364,7 @@ class DirectoryStore:
         yield from sorted(name for name in self._scan(prefix)[1] if is_name(name))
 
     def usage(self, prefix: str) -> Usage:
-        """Return what the objects below *prefix* count for; only folders that changed are read again."""
+        """Return the usage of the objects below *prefix*; only folders that changed are read again."""
         place = f"{self._folder}/{prefix}"
         with _as_store_errors(prefix):
             try:
@@ -398,7 +398,7 @@ class DirectoryStore:
         path, lock = paths[0], paths[0].with_name(f"{_LOCK}{paths[0].name}")
         with contextlib.suppress(NotFound), _as_store_errors(name):
             self.head(name)
-            with _locked(lock) if lock.exists() else contextlib.nullcontext():
+            with _hold_lock(lock) if lock.exists() else contextlib.nullcontext():
                 for candidate in paths:
                     candidate.unlink(missing_ok=True)
                 lock.unlink(missing_ok=True)
@@ -422,13 +422,13 @@ class DirectoryStore:
             lock = path.with_name(f"{_LOCK}{path.name}")
             # Written before it is locked: a process that is paused hardly ever holds the lock then.
             try:
-                with _temporary(path, [data]) as temporary, _locked(lock):
+                with _temporary(path, [data]) as temporary, _hold_lock(lock):
                     check()
                     os.replace(temporary, path)
             except OSError as error:
                 if self._spares is None or not is_full(error):
                     raise
-                with _locked(lock):
+                with _hold_lock(lock):
                     check()
                     self._spares.replace(path, data)
             sync_folder(path.parent)
@@ -471,7 +471,7 @@ class DirectoryStore:
         return path.parent / f"{_SHARD}{path.name[:2]}" / path.name, path
 
     def _find(self, name: str, read: Callable[[Path], _T]) -> _T:
-        """Return what *read* returns for the file of the object; raises OSError."""
+        """Call *read* with the path of the object and return its result; raises OSError."""
         *first, last = self._paths(name)
         for path in [*first, *([last] if first else [])]:
             with contextlib.suppress(FileNotFoundError):
@@ -493,7 +493,7 @@ class DirectoryStore:
                     break
 
     def _measure(self, prefix: str) -> tuple[Usage, _Names]:
-        """Return what the objects in the folder *prefix* itself count for, and the folders in it."""
+        """Return the usage of the objects in the folder *prefix* itself, and the folders in it."""
         objects = charged = 0
         files, folders = self._scan(prefix)
         for name in files:
@@ -596,7 +596,7 @@ def _temporary(path: Path, pieces: Iterable[bytes]) -> Iterator[Path]:
 
 
 @contextlib.contextmanager
-def _locked(path: Path) -> Iterator[None]:
+def _hold_lock(path: Path) -> Iterator[None]:
     """Hold the lock file *path*, which its holder may remove."""
     while True:
         with path.open("wb") as file:

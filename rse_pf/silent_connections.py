@@ -234,9 +234,9 @@ class TlsListener:
         task = self._loop.create_task(self._shake_hands(accepted))
         self._tasks.add(task)
         self.silent.enter(task, task.cancel, source)
-        task.add_done_callback(functools.partial(self._ended, accepted))
+        task.add_done_callback(functools.partial(self._on_end, accepted))
 
-    def _ended(self, accepted: socket.socket, task: asyncio.Task[None]) -> None:
+    def _on_end(self, accepted: socket.socket, task: asyncio.Task[None]) -> None:
         self._tasks.discard(task)
         self.silent.leave(task)
         if accepted in self._raw:

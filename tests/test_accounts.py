@@ -124,14 +124,14 @@ def test_who_deletes_may_write_again_in_this_process_at_once_and_in_others_soon(
     accounts = Accounts(store, DataSettings(tenant_quota_bytes=MIB), wall_clock=clock)
     robot = RobotId("acme", "r")
     name = object_name(robot, digest_of(b"x"))
-    with accounts.reserved(robot, MIB - 8192):
+    with accounts.reservation(robot, MIB - 8192):
         store.put(name, bytes(MIB - 8192))
-    with pytest.raises(QuotaExceeded), accounts.reserved(robot, 20_000):
+    with pytest.raises(QuotaExceeded), accounts.reservation(robot, 20_000):
         pass
 
     store.delete(name)
     accounts.release(robot, MIB - 8192)
-    with accounts.reserved(robot, 20_000):
+    with accounts.reservation(robot, 20_000):
         pass
 
     clock.now_s += 100.0
@@ -142,7 +142,7 @@ def test_a_write_that_fails_is_not_charged() -> None:
     store, clock = MemoryStore(), Clock()
     accounts = Accounts(store, DataSettings(tenant_quota_bytes=MIB), wall_clock=clock)
     for _ in range(50):
-        with pytest.raises(StoreFull), accounts.reserved(RobotId("acme", "r"), 500_000):
+        with pytest.raises(StoreFull), accounts.reservation(RobotId("acme", "r"), 500_000):
             raise StoreFull("no space")
 
 

@@ -44,6 +44,6 @@ def store_within_quota(
     try:
         store.head(name)
     except NotFound:
-        with accounts.reserved(robot, len(data), max_bytes):
+        with accounts.reservation(robot, len(data), max_bytes):
             store.put(name, data)
     return digest

@@ -219,7 +219,7 @@ class Handlers:
     def _charged(self, claims: Claims, map_name: str, record: MapRecord, size: int) -> Iterator[None]:
         """Charge a robot with a version while it is written; not if nothing of it was stored."""
         charge = charge_name(claims.robot, map_name, record.id, size)
-        with self.objects.reserved(claims, size):
+        with self.objects.reservation(claims, size):
             self._store.put(charge, b"")
             try:
                 yield

@@ -57,9 +57,9 @@ class Objects:
         self._lock = threading.Lock()  # of the dictionary, never held during work
         self._writing: dict[str, tuple[threading.Lock, int]] = {}
 
-    def reserved(self, claims: Claims, size: int) -> AbstractContextManager[None]:
+    def reservation(self, claims: Claims, size: int) -> AbstractContextManager[None]:
         """Return the context in which a robot writes *size* bytes; it raises QuotaExceeded or StoreFull."""
-        return self.accounts.reserved(claims.robot, size, claims.quota("data_bytes") or None)
+        return self.accounts.reservation(claims.robot, size, claims.quota("data_bytes") or None)
 
     def head(self, claims: Claims, digest: str) -> ObjectInfo:
         """Return size and name; raises NotFound, also for an object of another robot."""
@@ -94,7 +94,7 @@ class Objects:
         with self._exclusive(name):
             if self._find(name) is not None:
                 return False
-            with self.reserved(claims, len(data)):
+            with self.reservation(claims, len(data)):
                 self._store.put(name, data)
         return True
 
@@ -129,7 +129,7 @@ class Objects:
             opened = self._opened(claims, digest)
             if opened is None:
                 self._check_open_uploads(claims)
-                with self.reserved(claims, size):
+                with self.reservation(claims, size):
                     self._store.put(
                         f"{self._parts(claims, digest)}size", f"{size} {self._wall_clock():.0f}".encode()
                     )

@@ -44,7 +44,7 @@ def ledger(store: ObjectStore, now: list[float], **settings: int) -> Accounts:
 
 
 def write(made: Accounts, store: ObjectStore, data: bytes) -> None:
-    with made.reserved(ROBOT, len(data)):
+    with made.reservation(ROBOT, len(data)):
         store.put(object_name(ROBOT, digest_of(data)), data)
 
 
@@ -186,7 +186,7 @@ def test_a_write_that_fails_counts_for_nothing() -> None:
     now, store = [0.0], MemoryStore()
     made = ledger(store, now, max_objects=1)
     for _ in range(3):
-        with pytest.raises(StoreFull), made.reserved(ROBOT, 10):
+        with pytest.raises(StoreFull), made.reservation(ROBOT, 10):
             raise StoreFull("no space")
 
     write(made, store, b"x")
@@ -198,14 +198,14 @@ def test_a_write_that_fails_counts_for_nothing() -> None:
 def test_writes_in_progress_count() -> None:
     made = ledger(MemoryStore(), [0.0], max_objects=2)
 
-    with made.reserved(ROBOT, 1), made.reserved(ROBOT, 1), pytest.raises(QuotaExceeded):
-        made.reserved(ROBOT, 1).__enter__()
+    with made.reservation(ROBOT, 1), made.reservation(ROBOT, 1), pytest.raises(QuotaExceeded):
+        made.reservation(ROBOT, 1).__enter__()
 
 
 def test_an_object_that_is_written_while_the_robot_is_counted_counts_once() -> None:
     now, store = [0.0], MemoryStore()
     made = ledger(store, now, max_objects=4)
-    with made.reserved(ROBOT, 1):
+    with made.reservation(ROBOT, 1):
         store.put(object_name(ROBOT, "0" * 64), b"x")
         now[0] += 1000.0
         write(made, store, b"a")

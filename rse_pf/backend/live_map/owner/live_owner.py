@@ -252,7 +252,7 @@ class LiveOwner:
         A snapshot writes what keyframes saw once more, before the log is shortened: that must fit, too.
         """
         account = self._context.account
-        if not account.spends(size):
+        if not account.try_charge(size):
             act = functools.partial(account.reserve, size, margin=self._unsaved_bytes + size)
             reserving = asyncio.ensure_future(self._context.threads.store(act))
             await asyncio.wait({reserving}, timeout=SLOW_STORE_S)
