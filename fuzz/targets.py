@@ -15,6 +15,7 @@ from fuzz import core_targets, live_targets, map_targets, native_targets
 from fuzz.checks import Target, TargetFailure, expect
 from fuzz.meter import Meter
 from rse_pf.backend.gateway.frames import (
+    MAX_CONTROL_PER_S,
     CloseBorder,
     CloseSocket,
     FrameAssembler,
@@ -32,7 +33,8 @@ from rse_pf.wire.envelope import peek, undecodable_id
 __all__ = ["TARGETS", "Target", "TargetFailure", "codec", "framed", "frames", "geometry", "stream"]
 
 PLATFORM = PlatformSettings()
-NARROW = SessionSettings(max_message_bytes=2000, max_fragments=4, max_control_per_s=3.0)
+NARROW = SessionSettings(max_message_bytes=2000, max_fragments=4)
+NARROW_CONTROL_PER_S = 3.0
 _CONTINUATION, _TEXT, _BINARY, _CLOSE, _PING, _PONG = 0, 1, 2, 8, 9, 10
 
 _CODECS = ("bin", "json", "zlib", "zlib")
@@ -98,11 +100,13 @@ def framed(data: bytes) -> list[tuple[int, bool, bool, bytes, float]]:
 
 def frames(data: bytes, meter: Meter) -> None:
     """Check that any frames give messages of allowed size, pongs at an allowed rate, or one close code."""
-    limits = NARROW if data[:1] < b"\x80" else PLATFORM.session
+    limits, control_per_s = (
+        (NARROW, NARROW_CONTROL_PER_S) if data[:1] < b"\x80" else (PLATFORM.session, MAX_CONTROL_PER_S)
+    )
     sent = framed(data)
 
     def receive_all(_: bytes) -> list[FrameDecision | None]:
-        assembler = FrameAssembler(limits)
+        assembler = FrameAssembler(limits, max_control_per_s=control_per_s)
         return [assembler.receive(*frame) for frame in sent]
 
     decisions = meter.call(receive_all, data, ProtocolError)
@@ -127,7 +131,7 @@ def frames(data: bytes, meter: Meter) -> None:
             pongs.append(now)
             expect(opcode == _PING and decision.data == payload and len(payload) <= 125, "a wrong pong")
             recent = [at for at in pongs if at > now - 1.0]
-            expect(len(recent) <= 2 * max(1.0, limits.max_control_per_s), "pongs beyond the rate")
+            expect(len(recent) <= 2 * max(1.0, control_per_s), "pongs beyond the rate")
         else:
             expect(decision is None, f"{decision!r} is no decision")
             expect(len(parts) <= limits.max_fragments, "more fragments than allowed are held")

@@ -44,6 +44,17 @@ __all__ = [
 
 Text = bytes | bytearray
 
+MESSAGE_INFLATE_RATIO = 100.0
+"""Inflated size over wire size of a robot's message."""
+MESSAGE_DEPTH = 16
+"""Levels of nesting of a robot's message."""
+MESSAGE_CONTAINERS = 7000
+"""Lists and maps of a robot's message, at any depth."""
+MESSAGE_VALUES = 30_000
+"""Values of a robot's message outside of raw arrays.  The largest request of ``pnp``, 5,000 correspondences
+in JSON, has less than all of them; 2,000 correspondences need less than half."""
+MESSAGE_MEMORY_BYTES = 2_000_000
+"""Estimated memory of a decoded JSON message."""
 LIST_VALUES, MAP_VALUES = 3, 6
 """How many values a list and a map count as, according to the memory that they take."""
 
@@ -118,9 +129,9 @@ class Budget:
         """Return the budget of a robot's message, also in an event of the Lambda."""
         return cls(
             wire_bytes=session.max_message_bytes, inflated_bytes=session.max_inflated_bytes,
-            inflate_ratio=session.max_inflate_ratio, free_bytes=session.max_message_bytes,
-            depth=session.max_json_depth, containers=session.max_json_lists, values=session.max_json_values,
-            mixed_values=session.max_json_values, memory_bytes=session.max_json_memory_bytes,
+            inflate_ratio=MESSAGE_INFLATE_RATIO, free_bytes=session.max_message_bytes,
+            depth=MESSAGE_DEPTH, containers=MESSAGE_CONTAINERS, values=MESSAGE_VALUES,
+            mixed_values=MESSAGE_VALUES, memory_bytes=MESSAGE_MEMORY_BYTES,
         )  # fmt: skip
 
 

@@ -10,22 +10,22 @@ from __future__ import annotations
 import threading
 from collections import OrderedDict, deque
 
-from rse_pf.config import ServiceSettings
 from rse_pf.errors import Busy
 from rse_pf.identity import RobotId
 
-__all__ = ["WINDOW_S", "CrashRecord"]
+__all__ = ["BLOCK_S", "MAX_CRASHES", "WINDOW_S", "CrashRecord"]
 
 WINDOW_S = 300.0
-"""``services.poison_crashes`` within this keep the robot out for ``services.breaker_open_s``."""
+"""`MAX_CRASHES` within this keep the robot out for `BLOCK_S`."""
+MAX_CRASHES = 2
+BLOCK_S = 60.0
 _MAX_ROBOTS = 10_000
 
 
 class CrashRecord:
     """Which robots ended processes of one worker or data server, and when; may be used by several threads."""
 
-    def __init__(self, settings: ServiceSettings) -> None:
-        self._settings = settings
+    def __init__(self) -> None:
         self._lock = threading.Lock()
         self._crashes: OrderedDict[RobotId, deque[float]] = OrderedDict()
         self._blocked_until: dict[RobotId, float] = {}
@@ -38,7 +38,7 @@ class CrashRecord:
                 self._blocked_until.pop(robot, None)
                 return None
         return Busy(
-            f"commands of this robot ended {self._settings.poison_crashes} processes; "
+            f"commands of this robot ended {MAX_CRASHES} processes; "
             f"map services are refused to it for another {rest_s:.0f} s",
             hint="send smaller maps; the server's log names the crashes",
             retry_after_ms=rest_s * 1e3,
@@ -47,10 +47,10 @@ class CrashRecord:
     def note_crash(self, robot: RobotId, now: float) -> bool:
         """Note that a command of *robot* ended a process; return whether the robot is blocked from now on."""
         with self._lock:
-            crashes = self._crashes.pop(robot, None) or deque(maxlen=self._settings.poison_crashes)
+            crashes = self._crashes.pop(robot, None) or deque(maxlen=MAX_CRASHES)
             crashes.append(now)
-            if len(crashes) == self._settings.poison_crashes and now - crashes[0] <= WINDOW_S:
-                self._blocked_until[robot] = now + self._settings.breaker_open_s
+            if len(crashes) == MAX_CRASHES and now - crashes[0] <= WINDOW_S:
+                self._blocked_until[robot] = now + BLOCK_S
                 if len(self._blocked_until) > _MAX_ROBOTS:
                     del self._blocked_until[next(iter(self._blocked_until))]
                 return True

@@ -14,7 +14,6 @@ QUICK = SessionSettings(
     stall_timeout_s=0.3,
     ping_interval_s=0.1,
     ping_timeout_s=0.5,
-    reconnect_base_s=0.01,
     reconnect_max_s=0.05,
     reconnect_long_max_s=0.4,
     hello_timeout_s=1.0,

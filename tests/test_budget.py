@@ -26,7 +26,7 @@ from rse_pf.config import SessionSettings
 from rse_pf.errors import BadMessage, LimitExceeded
 from rse_pf.wire import Command, make_codec
 
-SMALL = Budget.of_messages(SessionSettings(max_json_values=64, max_json_lists=16))
+SMALL = replace(Budget.of_messages(SessionSettings()), values=64, mixed_values=64, containers=16)
 
 
 def array_of(unit: bytes, count: int) -> bytes:
@@ -82,7 +82,7 @@ def test_counting_ends_for_bytes_that_are_not_messagepack(data):
     [b"\x90", b"\x80", b"\xe0", b"\xd0\x80", b"\xa1z", b"\xd9\x01z", b"\xc4\x00", b"\xcb" + b"\x3f" * 8],
 )
 def test_every_kind_of_small_value_has_its_limit(unit):
-    limits = Budget.of_messages(SessionSettings(max_json_values=1000, max_json_lists=500))
+    limits = replace(SMALL, values=1000, mixed_values=1000, containers=500)
 
     with pytest.raises(LimitExceeded):
         check_msgpack(array_of(unit, 1001), limits)
@@ -97,8 +97,9 @@ def test_raw_arrays_of_the_largest_message_are_two_values():
 
 
 @pytest.mark.parametrize("codec", ["json", "bin"])
-def test_numbers_have_a_limit_in_every_codec(codec):
-    speak = make_codec(codec, SessionSettings(max_json_values=2000))
+def test_numbers_have_a_limit_in_every_codec(codec, monkeypatch):
+    monkeypatch.setattr("rse_pf.budget.MESSAGE_VALUES", 2000)
+    speak = make_codec(codec)
     fits = Command(id=1, service="echo", payload=[1.5] * 1900)
     too_many = Command(id=1, service="echo", payload=[1.5] * 2100)
 
@@ -107,8 +108,9 @@ def test_numbers_have_a_limit_in_every_codec(codec):
         speak.decode_from_robot(speak.encode(too_many))
 
 
-def test_marks_within_a_word_are_no_values():
-    codec = make_codec("json", SessionSettings(max_json_values=2000))
+def test_marks_within_a_word_are_no_values(monkeypatch):
+    monkeypatch.setattr("rse_pf.budget.MESSAGE_VALUES", 2000)
+    codec = make_codec("json")
     text = ',:[{"\\' * 20000
 
     decoded = codec.decode_from_robot(codec.encode(Command(id=1, service="echo", payload=text)))

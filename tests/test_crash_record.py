@@ -2,29 +2,26 @@
 
 from __future__ import annotations
 
-from rse_pf.config import ServiceSettings
-from rse_pf.crash_record import WINDOW_S, CrashRecord
+from rse_pf.crash_record import BLOCK_S, WINDOW_S, CrashRecord
 from rse_pf.identity import RobotId
 
-SETTINGS = ServiceSettings()
 ALICE, NAMESAKE = RobotId("acme", "robot-1"), RobotId("rival", "robot-1")
-REST_S = SETTINGS.breaker_open_s
 
 
 def test_the_second_crash_keeps_a_robot_out_for_a_while():
-    record = CrashRecord(SETTINGS)
+    record = CrashRecord()
 
     blocks = [record.note_crash(ALICE, 0.0), record.note_crash(ALICE, 1.0)]
 
     assert blocks == [False, True]
     refusal = record.refusal(ALICE, 1.0)
     assert refusal is not None
-    assert refusal.retry_after_ms == REST_S * 1e3
-    assert record.refusal(ALICE, 1.0 + REST_S) is None
+    assert refusal.retry_after_ms == BLOCK_S * 1e3
+    assert record.refusal(ALICE, 1.0 + BLOCK_S) is None
 
 
 def test_a_robot_of_that_name_in_another_tenant_is_not_kept_out():
-    record = CrashRecord(SETTINGS)
+    record = CrashRecord()
     record.note_crash(ALICE, 0.0)
 
     assert not record.note_crash(NAMESAKE, 0.0)
@@ -34,16 +31,16 @@ def test_a_robot_of_that_name_in_another_tenant_is_not_kept_out():
 
 
 def test_crashes_that_lie_far_apart_do_not_count_together():
-    record = CrashRecord(SETTINGS)
+    record = CrashRecord()
 
     assert not any(record.note_crash(ALICE, number * (WINDOW_S + 1.0)) for number in range(5))
 
 
 def test_after_its_rest_a_robot_needs_as_many_crashes_again():
-    record = CrashRecord(SETTINGS)
+    record = CrashRecord()
     record.note_crash(ALICE, 0.0)
     record.note_crash(ALICE, 0.0)
 
-    assert not record.note_crash(ALICE, REST_S)
-    assert record.refusal(ALICE, REST_S) is None
-    assert record.note_crash(ALICE, REST_S)
+    assert not record.note_crash(ALICE, BLOCK_S)
+    assert record.refusal(ALICE, BLOCK_S) is None
+    assert record.note_crash(ALICE, BLOCK_S)

@@ -56,7 +56,7 @@ sys.exit(serve(PlatformSettings.from_dict(told["settings"]), keys=keys, server_i
                announce=Path(told["announce"]), audit=Path(told["audit"]) if told["audit"] else None))
 """
 UNLIMITED = {
-    "max_accepts_per_s": 1e6, "max_handshakes_per_source_per_s": 1e6, "handshake_burst": 1_000_000,
+    "max_accepts_per_s": 1e6, "max_handshakes_per_source_per_s": 1e6,
     "max_unauthenticated_per_source": 0, "max_robots": 100_000,
 }  # fmt: skip
 """Limits that are counted, but never reached."""

@@ -3,8 +3,8 @@
 Only what reaches a server is spared: an attempt that nobody answered costs nothing, and another one follows a
 second later.  The firewall in front of a platform counts the handshakes of an address, and many robots may
 share one.  So a robot bounds its handshakes by itself, whatever happens to its connections: a token bucket
-gives it ``session.dial_burst`` attempts at once and ``session.dials_per_minute`` later.  The limit of the
-firewall is derived from the same two settings (`rse_pf.config.front_door`).  Nothing here dials or sleeps.
+gives it `DIAL_BURST` attempts at once and `DIALS_PER_MINUTE` later.  The limit of the firewall is derived
+from the same two numbers (`rse_pf.config.front_door`).  Nothing here dials or sleeps.
 """
 
 from __future__ import annotations
@@ -13,10 +13,13 @@ from enum import Enum
 from random import Random
 
 from rse_pf.config import SessionSettings
+from rse_pf.config.front_door import DIAL_BURST, DIALS_PER_MINUTE
 from rse_pf.token_bucket import TokenBucket
 
 __all__ = ["Backoff", "Last"]
 
+RECONNECT_BASE_S = 0.1
+"""Longest first pause; it doubles with each attempt, with full jitter (AWS Architecture Blog, 2015)."""
 _SHARE = 1.0 / 3.0
 """Longest pause as a share of the time in which attempts fail: after an outage of a minute, 20 seconds."""
 _UNANSWERED_S = (1.0, 1.25)
@@ -48,7 +51,7 @@ class Backoff:
         self._random = random
         self._attempt = 0
         self._failing_since: float | None = None
-        self._bucket = TokenBucket(settings.dials_per_minute / 60.0, settings.dial_burst)
+        self._bucket = TokenBucket(DIALS_PER_MINUTE / 60.0, DIAL_BURST)
 
     def restart(self) -> None:
         """Begin with short pauses again: the last connection lasted, or the robot is asked to move."""
@@ -103,4 +106,4 @@ class Backoff:
         attempt, self._attempt = self._attempt, self._attempt + 1
         if longest_s > s.reconnect_max_s:
             return uniform(0.5 * longest_s, longest_s)
-        return uniform(0.0, min(s.reconnect_max_s, s.reconnect_base_s * 2.0 ** min(attempt, 16)))
+        return uniform(0.0, min(s.reconnect_max_s, RECONNECT_BASE_S * 2.0 ** min(attempt, 16)))

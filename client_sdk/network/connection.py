@@ -44,7 +44,7 @@ from rse_pf.wire.client_session import (
     Welcomed,
 )
 from rse_pf.wire.client_subscriptions import SubscriptionEnded, Updated
-from rse_pf.wire.server_session import CLOSE_RATE, CLOSE_REPLACED, CLOSE_REVOKED
+from rse_pf.wire.server_session import CLOSE_RATE, CLOSE_REPLACED, CLOSE_REVOKED, MAX_BAD_MESSAGES
 
 if TYPE_CHECKING:
     from rse_pf.recording.robot_recorder import RobotRecorder
@@ -463,7 +463,7 @@ class Connection:
         except ProtocolError as error:
             self.last_error = error.message
             socket.bad_messages += 1
-            if socket.bad_messages > self._settings.max_bad_messages:
+            if socket.bad_messages > MAX_BAD_MESSAGES:
                 self._abort(socket)
             return
         self._handle(socket, events)

@@ -30,6 +30,8 @@ __all__ = ["ObjectRefs", "named_in", "resolve", "takes_objects"]
 
 _KEY = "object"
 _DIGEST = re.compile(r"[0-9a-f]{64}")
+MAX_OBJECTS_PER_COMMAND = 64
+"""Stored objects that one command may refer to; each costs a request to the store."""
 _MAX_DEPTH = 8
 """Below this depth, and in recursive types, references are not looked for."""
 
@@ -65,7 +67,7 @@ def resolve(
         payload: As decoded from the wire: plain dicts and lists; not changed.
         robot: The robot that the token names.
         store: The store of the platform.
-        settings: ``max_objects_per_command`` and ``max_object_bytes_per_command``.
+        settings: ``max_object_bytes_per_command``.
 
     Raises:
         BadRequest: A reference is no sha256 in hex.
@@ -76,9 +78,9 @@ def resolve(
     digests = list(dict.fromkeys(named_in(request_type, payload)))
     if not digests:
         return payload
-    if len(digests) > settings.max_objects_per_command:
+    if len(digests) > MAX_OBJECTS_PER_COMMAND:
         raise LimitExceeded(
-            f"the command refers to {len(digests)} objects, above {settings.max_objects_per_command}",
+            f"the command refers to {len(digests)} objects, above {MAX_OBJECTS_PER_COMMAND}",
             hint="put them into fewer commands",
         )
     size = sum(_size(store, object_name(robot, digest), digest) for digest in digests)

@@ -38,6 +38,10 @@ __all__ = [
     "stop_process",
 ]
 
+PART_TRIES = 3
+"""A part whose workers ended this often is not tried again."""
+_SCHEDULER_RESTARTS = 3
+"""How often a lost scheduler is started again."""
 _START_TIMEOUT_S = 60.0
 _POLL_S = 0.2
 _DASK = {
@@ -71,7 +75,13 @@ class LocalCluster:
     """A scheduler and workers as child processes of this one; they end with it."""
 
     def __init__(
-        self, key: ClusterKey, workers: int, *, part_tries: int = 3, host: str = "127.0.0.1", port: int = 0
+        self,
+        key: ClusterKey,
+        workers: int,
+        *,
+        part_tries: int = PART_TRIES,
+        host: str = "127.0.0.1",
+        port: int = 0,
     ) -> None:
         """Start nothing yet.
 
@@ -83,6 +93,7 @@ class LocalCluster:
             port: Its port; 0 takes a free one.
         """
         self.address = ""
+        self.part_tries = part_tries
         self._key = key
         self._count = workers
         self._environment = {
@@ -198,7 +209,6 @@ class DaskEngine:
             clock: Seconds, monotonic.
         """
         self._store = store
-        self._batch = settings.batch
         self._settings = msgspec.json.encode(settings.to_dict())
         self._cluster = cluster
         self._key = key
@@ -290,7 +300,7 @@ class DaskEngine:
             answer: list[str] = future.result(timeout=_START_TIMEOUT_S)
         except KilledWorker as error:
             raise Crashed(
-                f"a part ended {self._batch.part_tries} workers",
+                f"a part ended {self._cluster.part_tries} workers",
                 hint="look at the memory of the workers; use fewer, or merge fewer maps",
             ) from error
         return answer
@@ -305,7 +315,7 @@ class DaskEngine:
     def _restart(self) -> None:
         self.close()
         self._restarts += 1
-        if self._restarts > self._batch.scheduler_restarts:
+        if self._restarts > _SCHEDULER_RESTARTS:
             raise Disconnected(
                 f"the scheduler ended {self._restarts} times", hint="run the same command again: it continues"
             )

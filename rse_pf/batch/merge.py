@@ -50,6 +50,14 @@ _DOING = {
     "agree": "pairs of maps", "tiles": "pairs of clouds", "optimise": "pose graphs", "cloud": "clouds",
 }  # fmt: skip
 MAX_MAPS = 256
+MAX_KEYFRAMES = 20_000
+"""Keyframes of all maps of one merge: as many as the largest stored map holds."""
+MAX_LINKS_PER_PAIR = 300
+"""Measured links of two maps, or within one, that are compared with each other, the best of each keyframe
+first.  The cost of comparing grows with the cube: 215 links take 0.4 s."""
+MAX_LINKS = 30_000
+"""Links of a merged map; where more agree, each pair of maps keeps its strongest.  A map holds 100,000 edges,
+and 24,701 take 16.5 s to optimise."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -146,11 +154,8 @@ class BatchMerge:
         for name in self._maps:
             versions.append(decode_map(self._store.get(name), limits=limits))
             keyframes += len(versions[-1].keyframes)
-            if keyframes > self._settings.batch.max_keyframes:
-                raise LimitExceeded(
-                    f"more than {self._settings.batch.max_keyframes} keyframes",
-                    hint="merge fewer maps at once, or raise batch.max_keyframes",
-                )
+            if keyframes > MAX_KEYFRAMES:
+                raise LimitExceeded(f"more than {MAX_KEYFRAMES} keyframes", hint="merge fewer maps at once")
             features += sum(len(each.pixels) for each in versions[-1].keyframes)
             if features > most.features:
                 raise LimitExceeded(
@@ -250,8 +255,7 @@ class BatchMerge:
             maps = self._names_of(pair)
             own = tuple(part.name for part, which in zip(parts, owner, strict=True) if which == number)
             arguments = {
-                "options": self._merge_options, "maps": len(maps), **self._limits,
-                "most": self._settings.batch.max_links_per_pair,
+                "options": self._merge_options, "maps": len(maps), **self._limits, "most": MAX_LINKS_PER_PAIR,
             }  # fmt: skip
             self._agreeing.append(Part(kind="agree", inputs=(*maps, *own), arguments=arguments))
 
@@ -280,7 +284,7 @@ class BatchMerge:
             pair = self._pairs[number]
             accepted += [groups[pair][row] for row in result.arrays["rows"].tolist()]
             refused.update({(*pair, reason): count for reason, count in result.counts.items()})
-        accepted, surplus = strongest(atlas, accepted, self._settings.batch.max_links)
+        accepted, surplus = strongest(atlas, accepted, MAX_LINKS)
         refused.update(surplus)
         return accepted, Counter({key: count for key, count in refused.items() if count})
 

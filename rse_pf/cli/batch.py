@@ -125,9 +125,8 @@ def _merge(args: argparse.Namespace, settings: PlatformSettings) -> int:
     parent = _id_of_head(args.out, maps)
     key = new_cluster_key()
     cluster = LocalCluster(
-        key, settings.batch.workers, part_tries=settings.batch.part_tries, host=args.host,
-        port=0 if is_alone else settings.batch.first_port,
-    )  # fmt: skip
+        key, settings.batch.workers, host=args.host, port=0 if is_alone else settings.batch.first_port
+    )
     invitation = None if is_alone else Invitation(store, key)
     engine = DaskEngine(
         store, settings, cluster, key, on_event=lambda text: show(text, error=True),

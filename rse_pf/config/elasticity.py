@@ -10,8 +10,10 @@ from rse_pf.config.schedule import parse_schedule, zone_named
 from rse_pf.config.validation import WHERE
 from rse_pf.errors import SettingsError
 
-__all__ = ["FAST_PERIOD_S", "FAST_SAMPLES", "check_elasticity", "instance_types"]
+__all__ = ["FAST_PERIOD_S", "FAST_SAMPLES", "MOVES_PER_S", "check_elasticity", "instance_types"]
 
+MOVES_PER_S = 20.0
+"""Robots that a crowded server asks to move each second, so that the others accept them without a queue."""
 FAST_PERIOD_S = 10
 """One sample of the fast profile: the shortest period of a high-resolution alarm."""
 FAST_SAMPLES = 3

@@ -1,7 +1,7 @@
 """How many requests of one address the web firewall lets pass.
 
 Many robots may share an address: those of one site stand behind one router.  The limit of each rule is what
-the robots of a site do at the most, computed from the settings by which they bound themselves; so robots that
+the robots of a site do at the most, computed from the numbers by which they bound themselves; so robots that
 all lose their connection at the same moment stay below it.  Pure arithmetic: the stacks write these rules
 down, tests and benchmarks play them.
 """
@@ -18,6 +18,9 @@ __all__ = [
     "BEARER_PATTERN",
     "BURST_PATH",
     "DATA_PATH",
+    "DIALS_PER_MINUTE",
+    "DIAL_BURST",
+    "MAX_HANDSHAKE_BYTES",
     "RETRY_AFTER_S",
     "STATUS",
     "RateRule",
@@ -27,6 +30,15 @@ __all__ = [
 BALANCER_IDLE_TIMEOUT_S = 120
 """How long the load balancer on AWS keeps a silent connection; robots ping far more often."""
 
+MAX_HANDSHAKE_BYTES = 8192
+"""Request head of a handshake; load balancer and server refuse a longer one with 431 (OWASP, slowloris)."""
+DIAL_BURST = 20
+"""Attempts to connect that a robot may make at once."""
+DIALS_PER_MINUTE = 10.0
+"""Attempts to connect of a robot after the burst."""
+DATA_REQUESTS_PER_MINUTE = 600
+"""Data requests of one robot, averaged over the robots of a site; ``data.max_requests_per_s`` bounds each
+alone."""
 DATA_PATH = "/data/"
 BURST_PATH = "/burst"
 """At the robots' address, where the serverless PnP answers."""
@@ -63,9 +75,9 @@ def rate_rules(settings: PlatformSettings) -> tuple[RateRule, ...]:
     Dials are what is neither data nor burst, so that a path that is written in an unusual way counts in the
     strictest rule.
     """
-    robots, session, burst = settings.cloud.robots_per_site, settings.session, settings.burst
-    dials = robots * (session.dial_burst + session.dials_per_minute)
-    requests = robots * settings.cloud.data_requests_per_minute
+    robots, burst = settings.cloud.robots_per_site, settings.burst
+    dials = robots * (DIAL_BURST + DIALS_PER_MINUTE)
+    requests = robots * DATA_REQUESTS_PER_MINUTE
     return (
         RateRule(name="dials", limit=_limit(dials), but=(DATA_PATH, BURST_PATH)),
         RateRule(name="data", limit=_limit(requests), path=DATA_PATH),

@@ -90,9 +90,13 @@ def fixed_live_ports(live: LiveSettings) -> range:
     return range(live.first_port, live.first_port + live.ports)
 
 
+_BATCH_PORTS = 100
+"""Ports of a batch, which the firewall opens between job servers."""
+
+
 def batch_ports(batch: BatchSettings) -> range:
     """Return the ports of a batch that has workers on other machines: of its scheduler first."""
-    return range(batch.first_port, batch.first_port + batch.ports)
+    return range(batch.first_port, batch.first_port + _BATCH_PORTS)
 
 
 def is_loopback(host: str) -> bool:

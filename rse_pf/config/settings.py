@@ -64,19 +64,15 @@ class ServingSettings:
     solver_threads: int = setting(1, doc="solver threads of each worker", low=1, high=64)
     max_robots: int = setting(10000, unit="robots", doc="connections of one server; more are refused with 503", low=1)
     handshake_timeout_s: float = setting(5.0, unit="s", doc="a handshake that takes longer is closed", source="slowloris, OWASP", low=0.1)
-    max_handshake_bytes: int = setting(8192, unit="bytes", doc="request head of a handshake; a longer one is refused with 431", source="slowloris, OWASP", low=1024, high=16384)
     max_unauthenticated: int = setting(200, unit="sockets", doc="sockets without a verified token; the oldest one is closed when a new one exceeds the limit", low=1)
     max_unauthenticated_per_source: int = setting(50, unit="sockets", doc="the same for each source address; not counted behind trusted proxies; 0 is off", low=0)
     max_accepts_per_s: float = setting(500.0, unit="sockets/s", doc="sockets that have begun to send and are passed to a worker each second; more wait; 0 is off", low=0)
     max_handshakes_per_source_per_s: float = setting(200.0, unit="handshakes/s", doc="handshakes of one source address; more are refused with 429; 0 is off", low=0)
-    handshake_burst: int = setting(1000, unit="handshakes", doc="burst of max_handshakes_per_source_per_s and of max_accepts_per_s", low=1)
     trusted_proxies: int = setting(1, unit="proxies", doc="load balancers that append to x-forwarded-for; 0: robots connect directly", low=0, high=8)
     allowed_origins: str = setting("", doc="origins of web pages that may connect, such as https://robots.example.org, with spaces between; pages of the platform itself always may")
     write_buffer_bytes: int = setting(262144, unit="bytes", doc="unsent bytes above which a client counts as a slow reader", low=4096)
     slow_reader_timeout_s: float = setting(1.0, unit="s", doc="a slow reader is disconnected after this", low=0.05)
-    max_unread_bytes: int = setting(16777216, unit="bytes", doc="long messages that wait for the decoder thread of a worker; more are refused", low=262144)
     max_queue_per_robot: int = setting(8, unit="commands", doc="queued commands of one robot; more are refused", low=1)
-    max_objects_per_command: int = setting(64, doc="stored objects that one command may refer to", low=0)
     max_object_bytes_per_command: int = setting(134217728, unit="bytes", doc="total size of the objects that one command refers to", low=1024)
     emulated_cores: float = setting(0.0, unit="cores", doc="CPU seconds per second that each worker may use, to emulate a smaller server; 0 is off", low=0, high=64)
     compute_processes: int = setting(1, doc="processes of each worker that compute map services; they are killed at the deadline", low=1, high=64)
@@ -88,7 +84,6 @@ class ServingSettings:
     job_poll_s: float = setting(5.0, unit="s", doc="time between two looks of a job server for jobs that wait; each look is one request to the store", low=0.05)
     max_waiting_jobs: int = setting(8, doc="further jobs of one worker that wait, or that it follows on another server; more are refused", low=0, high=1000)
     max_job_memory_bytes: int = setting(2147483648, unit="bytes", doc="memory of one job; a job that needs more is ended", low=134217728)
-    job_heartbeat_s: float = setting(1.0, unit="s", doc="time between two renewals of a job's lease", low=0.05)
     job_lease_s: float = setting(5.0, unit="s", doc="another server takes a job over when its lease was not renewed for this long", low=0.1)
     max_job_s: float = setting(3600.0, unit="s", doc="a job that takes longer is ended", low=1)
     job_record_ttl_s: float = setting(604800.0, unit="s", doc="the record of a job is deleted when it was not used for this long; the same request then runs again", low=60)
@@ -103,14 +98,7 @@ class SessionSettings:
 
     max_message_bytes: int = setting(262144, unit="bytes", doc="one WebSocket message on the wire", low=1024)
     max_inflated_bytes: int = setting(1048576, unit="bytes", doc="one message after inflating", low=1024)
-    max_inflate_ratio: float = setting(100.0, unit="x", doc="inflated size over wire size", low=2)
     max_fragments: int = setting(64, doc="fragments of one message, empty ones included", source="GHSA-96hv-2xvq-fx4p", low=1)
-    max_json_depth: int = setting(16, unit="levels", doc="nesting of a JSON message", low=4, high=200)
-    max_json_lists: int = setting(7000, doc="lists and objects of a message, at any depth", low=16)
-    max_json_values: int = setting(30000, doc="values of a robot's message outside of raw arrays; a list counts as three, an object as six", low=64)
-    max_json_memory_bytes: int = setting(2000000, unit="bytes", doc="estimated memory of a decoded JSON message", low=65536)
-    max_bad_messages: int = setting(10, unit="messages", doc="undecodable messages without a readable id of one socket before it is closed and its robot is refused for rate_ban_s", low=0)
-    max_control_per_s: float = setting(10.0, unit="frames/s", doc="control frames of one socket", low=1)
     max_in_flight: int = setting(8, unit="commands", doc="unanswered commands of one robot", low=1)
     max_commands_per_s: float = setting(20.0, unit="commands/s", doc="messages of one robot; more are refused; 0 is off", source="AWS IoT and Discord limit so", low=0)
     command_burst: int = setting(40, unit="commands", doc="burst of max_commands_per_s", low=1)
@@ -119,11 +107,8 @@ class SessionSettings:
     ping_timeout_s: float = setting(3.0, unit="s", doc="a connection without an answer to a ping for this long counts as lost", low=0.1)
     hello_timeout_s: float = setting(5.0, unit="s", doc="a socket without a Hello message is closed after this", low=0.1)
     connect_timeout_s: float = setting(2.0, unit="s", doc="time limit of one attempt to connect", low=0.1)
-    reconnect_base_s: float = setting(0.1, unit="s", doc="first reconnect back-off; full jitter", source="AWS Architecture Blog, 2015", low=0.001)
     reconnect_max_s: float = setting(1.0, unit="s", doc="longest reconnect back-off in the first seconds without a connection", low=0.01)
     reconnect_long_max_s: float = setting(40.0, unit="s", doc="longest reconnect back-off after minutes without a connection; after a refusal half of it at least", low=0.01)
-    dial_burst: int = setting(20, unit="dials", doc="attempts to connect that a robot may make at once; the firewall's limit follows", low=1)
-    dials_per_minute: float = setting(10.0, unit="dials/min", doc="attempts to connect of a robot after the burst; the firewall's limit follows", low=1)
     region_hold_s: float = setting(60.0, unit="s", doc="a robot with several addresses changes to another region that has been clearly nearer for this long", low=0.1)
     answer_timeout_s: float = setting(5.0, unit="s", doc="deadline of a command that sets none", low=0.05)
     stall_timeout_s: float = setting(1.0, unit="s", doc="the client reconnects when a command is unanswered and nothing arrived for this long", low=0.05)
@@ -169,7 +154,6 @@ class ScalingSettings:
     underused_cpu_percent: float = setting(15.0, unit="%", doc="average CPU below which a server can be spared; at most half of busy_cpu_percent", low=0, high=100)
     schedule: str = setting("", doc="min_servers by day and time, such as: weekdays 08:00 min 4; weekdays 18:00 min 1; sat,sun 10:00 min 2")
     time_zone: str = setting("UTC", doc="time zone of scaling.schedule, such as Asia/Seoul", source="IANA time zones")
-    moves_per_s: float = setting(20.0, unit="robots/s", doc="robots that a crowded server asks to move each second", low=0.1)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -186,13 +170,10 @@ class DataSettings:
     reserve_percent: float = setting(10.0, unit="%", doc="share of the store's disk that no tenant alone may fill: when less is free, a tenant that holds more than its share is refused", low=0, high=50)
     max_objects: int = setting(100000, unit="objects", doc="objects, unfinished uploads and map versions of one robot", source="file systems run out of inodes", low=1)
     max_requests_per_s: float = setting(50.0, unit="requests/s", doc="requests of one robot; a list counts as 5, a commit of a map as 20; more are refused with 429", low=0.1)
-    max_requests_per_robot: int = setting(8, unit="requests", doc="requests of one robot in progress; more are refused with 429", low=1)
     max_keyframe_features: int = setting(20000, unit="features", doc="features of one keyframe of a map that a service decodes", low=1)
     part_bytes: int = setting(4194304, unit="bytes", doc="body of one request; larger objects are sent in parts", low=1024)
     max_uploads: int = setting(32, doc="request bodies received at the same time; more are refused with 503 and Retry-After", low=1)
-    upload_ttl_s: int = setting(86400, unit="s", doc="an unfinished upload is deleted after this", low=60)
     body_timeout_s: float = setting(10.0, unit="s", doc="a request body that pauses for longer is refused", low=0.1)
-    presigned_url_ttl_s: int = setting(300, unit="s", doc="validity of a presigned URL of the bucket", low=10, high=300)
     background_bytes_per_s: int = setting(262144, unit="bytes/s", doc="rate at which a robot uploads keyframes in the background", low=1024)
     max_spool_bytes: int = setting(1073741824, unit="bytes", doc="keyframes that a robot keeps on its disk while it is offline", low=1024)
     glacier_after_days: int = setting(90, unit="days", source="paper, Sect. 5.1", doc="what was not written for this long moves to Glacier Instant Retrieval, which is read like any object", low=30)
@@ -220,10 +201,7 @@ class ServiceSettings:
     memory_bytes: int = setting(536870912, unit="bytes", doc="memory of one sandbox: its address space and its scratch folder together", low=16777216)
     scratch_bytes: int = setting(16777216, unit="bytes", doc="scratch folder of one sandbox; it holds at most one file per 4096 bytes of this", low=65536)
     grace_s: float = setting(5.0, unit="s", doc="a sandbox outlives the connection of its robot by this", low=0)
-    start_timeout_s: float = setting(5.0, unit="s", doc="a sandbox that is not ready by then is killed", low=0.1)
-    poison_crashes: int = setting(2, unit="crashes", doc="a request that crashed this many sandboxes is refused as poison", source="dead-letter queues; OWASP", low=1)
     breaker_crashes: int = setting(5, unit="crashes", doc="this many crashes of a service within 30 s open its circuit breaker", low=2)
-    breaker_open_s: float = setting(60.0, unit="s", doc="time that the circuit breaker of a service stays open", low=1)
     accept_weak_isolation: bool = setting(False, doc="run installed services even if the kernel lacks a means of isolation")
 
 
@@ -237,7 +215,6 @@ class LiveSettings:
     max_owners: int = setting(4, doc="owner processes of one worker; further maps are refused until another server takes them; 0 switches live maps off", low=0, high=64)
     max_memory_bytes: int = setting(2147483648, unit="bytes", doc="memory of one owner process; one that needs more is ended", low=134217728)
     warm_standby: bool = setting(True, doc="keep one started process, about 70 MB, in each worker whose robots use live maps; it takes a map over a second sooner")
-    heartbeat_s: float = setting(0.5, unit="s", doc="time between two renewals of a live map's lease", low=0.05)
     lease_s: float = setting(1.5, unit="s", doc="another server takes a live map over when its lease was not renewed for this long", low=0.1)
     publish_s: float = setting(600.0, unit="s", doc="time between two versions that a live map publishes while it changes; 0: only when the last robot leaves, or on request", low=0)
     publish_pause_s: float = setting(10.0, unit="s", doc="shortest time between two versions of a live map; a version that is asked for earlier comes then", source="a robot that left again and again wrote 959 MB in 45 s", low=0)
@@ -260,13 +237,7 @@ class BatchSettings:
 
     workers: int = setting(2, unit="processes", doc="processes on this machine that compute parts; 0 leaves all parts to job servers", low=0, high=64)
     pairs_per_part: int = setting(500, unit="pairs", doc="keyframe pairs of one part; what a killed worker loses", source="5.3 ms for a pair of 1,000 features each: 2.7 s", low=10, high=100000)
-    max_keyframes: int = setting(20000, unit="keyframes", doc="keyframes of all maps of one merge in parts", source="the largest map that is stored", low=1, high=20000)
     first_port: int = setting(8790, doc="first of the ports of a batch with --host: of its scheduler; workers take the next ones", low=1024, high=65000)
-    ports: int = setting(100, unit="ports", doc="ports of a batch with --host, which the firewall opens between job servers", low=2, high=500)
-    max_links_per_pair: int = setting(300, unit="links", doc="measured links of two maps, or within one, that are compared with each other: of each keyframe the best first", source="comparing grows with the cube: 215 links take 0.4 s", low=10, high=2000)
-    max_links: int = setting(30000, unit="links", doc="links of a merged map; where more agree, each pair of maps keeps its strongest", source="a map holds 100,000 edges; 24,701 take 16.5 s to optimise", low=100, high=90000)
-    part_tries: int = setting(3, doc="a part whose workers ended this often is not tried again", low=1, high=10)
-    scheduler_restarts: int = setting(3, doc="how often a lost scheduler on this machine is started again", low=0, high=10)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -316,25 +287,20 @@ class CloudSettings:
     on_demand_servers: int = setting(1, unit="servers", doc="servers that are never Spot instances", low=0, high=1000)
     job_servers: int = setting(0, unit="servers", doc="most job servers: Spot instances that run long jobs of robots and batches; needs serving.offer_jobs; 0 is none", low=0, high=100)
     job_instance_types: str = setting("c7i.large c6i.large m7i.large", doc="EC2 types of job servers (x86-64), with spaces between; the cheapest that is to be had is taken")
-    job_idle_s: int = setting(600, unit="s", doc="without any job for this long job servers end, one each minute", low=60, high=86400)
     image_parameter: str = setting("/aws/service/debian/release/12/latest/amd64", doc="SSM parameter that names the machine image", source="Debian's public parameter")
     profile: str = setting("standard", doc="small: one zone for servers and endpoints, and one server of a small type unless you set these; see docs/operations.md", choices=("standard", "small"))
     canary: bool = setting(True, doc="a function that asks for one known pose through the load balancer every minute, and an alarm")
     budget_per_month: float = setting(0.0, unit="USD", doc="cost of the account in a month above which the topic of alarms is told; 0 is off", low=0)
-    journal_ship_s: int = setting(60, unit="s", doc="time between two uploads of a server's journals; a machine that fails loses at most this much", low=5, high=3600)
     s3_prefix_list: str = setting("", doc="prefix list of S3 in the region; empty: from the table in stacks/firewall.py")
     robot_cidr: str = setting("0.0.0.0/0", doc="addresses that robots may connect from")
     robots_per_site: int = setting(100, unit="robots", doc="WAF: robots behind one address that may all connect, and send data, in the same minute", low=1, high=100000)
-    data_requests_per_minute: int = setting(600, unit="requests/min", doc="WAF: data requests of one robot, averaged over the robots of a site; data.max_requests_per_s bounds each alone", low=10)
     boot_s: int = setting(300, unit="s", doc="time that the launch hook gives a new server to become ready; then it is replaced", source="four times rse_pf/scaling/boot_time.py", low=180, high=7200)
     drain_s: int = setting(60, unit="s", doc="time that the termination hook gives a server to drain", low=30, high=7200)
-    poll_s: int = setting(5, unit="s", doc="time between two reads of an instance's lifecycle state", low=1, high=60)
     lambda_memory_mb: int = setting(1769, unit="MB", doc="memory of the serverless PnP; 1769 is one vCPU", low=128, high=10240)
     lambda_concurrency: int = setting(20, doc="concurrent executions of the serverless PnP", low=1)
     idle_hours: int = setting(24, unit="h", doc="hours without robots after which idle_action is taken", low=1, high=168)
     idle_action: str = setting("auto", doc="what a deployment does that has been idle for idle_hours: park ends its servers until rse-pf cloud resume or scaling.schedule; none; auto: park a trial, and none with TLS (allow_insecure is false) or scaling.schedule", choices=("auto", "park", "none"))
     log_days: int = setting(30, unit="days", doc="retention of logs", low=1)
-    audit_ship_s: int = setting(60, unit="s", doc="time between two uploads of a server's audit log; a machine that fails loses at most this much", low=5, high=3600)
     deleted_days: int = setting(30, unit="days", doc="an object of the map or artifact bucket that was overwritten or deleted can be restored for this long", low=1)
     replica_maps: str = setting("", doc="map buckets of deployments in other regions, with spaces between; new versions of maps are copied there")
     replica_artifacts: str = setting("", doc="artifact buckets of deployments in other regions, with spaces between; public keys, roster, deny list and published services are copied there")
@@ -409,10 +375,8 @@ def _check_contradictions(s: PlatformSettings) -> None:
         ("session", "max_message_bytes", "max_inflated_bytes"),
         ("burst", "robot_commands_per_day", "commands_per_day"),
         ("burst", "address_commands_per_5_minutes", "commands_per_5_minutes"),
-        ("session", "reconnect_base_s", "reconnect_max_s"),
         ("session", "reconnect_max_s", "reconnect_long_max_s"),
         ("services", "scratch_bytes", "memory_bytes"),
-        ("live", "heartbeat_s", "lease_s"),
         ("recording", "max_file_bytes", "max_bytes"),
     ]
     for group, small, large in pairs:

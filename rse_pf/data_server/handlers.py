@@ -53,6 +53,8 @@ _PIECE_BYTES = 1 << 20
 _MAX_JSON_BYTES = 16384
 _MAX_NOTE_LETTERS = 500
 _MAX_PAGE = 1000
+PRESIGNED_URL_TTL_S = 300
+"""Validity of a presigned URL of the bucket: long enough to begin one transfer, too short to be passed on."""
 _BEGINNING = re.compile(r"[0-9a-f]{0,64}")
 _MAP_THREADS = 1
 """They wait for the process that reads maps, so that slow maps delay only other maps."""
@@ -151,7 +153,7 @@ class Handlers:
 
     def _presigned_put(self, claims: Claims, state: Upload) -> PresignedPut | None:
         """Return a URL for a direct upload; None if a part is stored, or the store presigns none."""
-        store, ttl_s = self._store, self._settings.presigned_url_ttl_s
+        store, ttl_s = self._store, PRESIGNED_URL_TTL_S
         if state.offset or not isinstance(store, PresigningStore):
             return None
         name = self.objects.name(claims, state.digest)
@@ -268,7 +270,7 @@ class Handlers:
     async def _content(
         self, request: HttpRequest, robot: RobotId, name: str, size: int, digest: str
     ) -> HttpReply:
-        store, ttl_s = self._store, self._settings.presigned_url_ttl_s
+        store, ttl_s = self._store, PRESIGNED_URL_TTL_S
         if request.headers.get("x-accept-direct") == "1" and isinstance(store, PresigningStore):
             url = await self.threads.run(robot, lambda: store.presigned_get(name, ttl_s=ttl_s))
             return HttpReply(status=307, headers={"Location": url, **_content_headers(digest)})

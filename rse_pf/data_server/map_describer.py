@@ -55,7 +55,7 @@ class MapDescriber:
         """
         self._store = store if settings.data.store == _PRIVATE_STORE else None
         self._clock = clock
-        self._crashes = CrashRecord(settings.services)
+        self._crashes = CrashRecord()
         self._timeout_s = _WALL_S_PER_CPU_S * settings.serving.max_compute_s
         self._processes = processes or LimitedProcesses(
             _TARGET,

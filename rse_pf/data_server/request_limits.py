@@ -20,6 +20,8 @@ __all__ = ["RequestLimits"]
 _BURST_S = 4.0
 """A robot may make the requests of this time at once."""
 _MAX_ROBOTS = 10_000
+MAX_REQUESTS_PER_ROBOT = 8
+"""Requests of one robot in progress; more are refused."""
 _BODIES_PER_ROBOT, _BODIES_PER_TENANT = 0.25, 0.75
 """Shares of ``data.max_uploads``."""
 _RETRY_AFTER_MS = 1000.0
@@ -61,10 +63,10 @@ class RequestLimits:
             Busy: Too many bodies are being received, of this robot, its tenant or all.
         """
         held = self._of(robot, now)
-        if held.requests >= self._settings.max_requests_per_robot:
+        if held.requests >= MAX_REQUESTS_PER_ROBOT:
             raise TooManyRequests(
                 f"{held.requests} requests of this robot are in progress, the limit is "
-                f"{self._settings.max_requests_per_robot}",
+                f"{MAX_REQUESTS_PER_ROBOT}",
                 hint="wait for their replies",
                 retry_after_ms=_RETRY_AFTER_MS,
             )

@@ -23,6 +23,7 @@ from rse_pf.auth.tokens import KeySet
 from rse_pf.auth.trust_store import REFRESH_S, TrustStore
 from rse_pf.config import PlatformSettings
 from rse_pf.data_server.app import DataServer
+from rse_pf.data_server.uploads import UPLOAD_TTL_S
 from rse_pf.errors import ConfigurationError, MissingExtra, StoreError
 from rse_pf.files import replace_json
 from rse_pf.http_connections import bounded_protocol
@@ -117,8 +118,8 @@ async def _run(
     announce: Path | None,
 ) -> None:  # fmt: skip
     port = listening.getsockname()[1]
-    await asyncio.to_thread(_sweep, app, store, settings.data.upload_ttl_s)
-    sweeping = asyncio.create_task(_sweep_periodically(app, store, settings.data.upload_ttl_s))
+    await asyncio.to_thread(_sweep, app, store)
+    sweeping = asyncio.create_task(_sweep_periodically(app, store))
     serving = asyncio.create_task(server.serve(sockets=[listening]))
     try:
         while not server.started and not serving.done():
@@ -131,20 +132,20 @@ async def _run(
         sweeping.cancel()
 
 
-async def _sweep_periodically(app: DataServer, store: ObjectStore, upload_ttl_s: float) -> None:
+async def _sweep_periodically(app: DataServer, store: ObjectStore) -> None:
     if isinstance(store, DirectoryStore):
         await asyncio.to_thread(_move_old_objects, store)
     while True:
         await asyncio.sleep(_SWEEP_S)
-        await asyncio.to_thread(_sweep, app, store, upload_ttl_s)
+        await asyncio.to_thread(_sweep, app, store)
 
 
-def _sweep(app: DataServer, store: ObjectStore, upload_ttl_s: float) -> None:
+def _sweep(app: DataServer, store: ObjectStore) -> None:
     try:
         uploads = app.handlers.objects.sweep()
         files = 0
         if isinstance(store, DirectoryStore):
-            files = store.sweep(now=time.time(), older_than_s=upload_ttl_s)
+            files = store.sweep(now=time.time(), older_than_s=UPLOAD_TTL_S)
     except StoreError as error:
         _write_line({"event": "sweep-failed", "error": error.message})
         return

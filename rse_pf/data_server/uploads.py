@@ -35,6 +35,8 @@ __all__ = ["Objects"]
 
 _DIGEST = re.compile(r"[0-9a-f]{64}")
 _MAX_OPEN_UPLOADS = 1000
+UPLOAD_TTL_S = 86_400.0
+"""An unfinished upload is deleted after this: a robot that is off the network for a day begins again."""
 """Of one robot."""
 _FEW_PARTS, _SHORT_PART_BYTES = 64, 65_536
 """An upload has at most so many parts, and one more for each so many bytes of the object."""
@@ -197,13 +199,13 @@ class Objects:
             self._discard(claims, digest)
 
     def sweep(self) -> int:
-        """Remove uploads of crashes and those older than ``data.upload_ttl_s``; return their number."""
+        """Remove uploads of crashes and those older than `UPLOAD_TTL_S`; return their number."""
         folders: dict[str, float] = {}
         for info in self._store.list("uploads/"):
             folder, _, last = info.name.rpartition("/")
             begun = float(self._store.get(info.name).split()[1]) if last == "size" else 0.0
             folders[folder] = max(begun, folders.get(folder, 0.0))
-        oldest = self._wall_clock() - self._settings.upload_ttl_s
+        oldest = self._wall_clock() - UPLOAD_TTL_S
         old = [folder for folder, begun in folders.items() if begun < oldest]
         for folder in old:
             self._drop(f"{folder}/")

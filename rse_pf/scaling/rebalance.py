@@ -12,6 +12,8 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+from rse_pf.config.elasticity import MOVES_PER_S
+
 __all__ = ["MARGIN", "MAX_PAUSE_S", "MoveOrder", "Totals", "moves", "order_of", "pause_after_s", "share"]
 
 MARGIN = 0.2
@@ -90,7 +92,7 @@ class MoveOrder:
     spread_s: float
 
 
-def order_of(mine: int, totals: Sequence[Totals], *, moves_per_s: float) -> MoveOrder | None:
+def order_of(mine: int, totals: Sequence[Totals]) -> MoveOrder | None:
     """Return what a server with *mine* robots orders; None if nothing, or if the sums still change.
 
     A server that is above its share goes down to even, not to the border of the margin: some load balancers
@@ -99,7 +101,6 @@ def order_of(mine: int, totals: Sequence[Totals], *, moves_per_s: float) -> Move
     Args:
         mine: Robots of this server now.
         totals: Of whole periods, the newest first.
-        moves_per_s: ``scaling.moves_per_s``.
     """
     if len(totals) < 2 or not _is_steady(totals[0], totals[1]):
         return None
@@ -107,7 +108,7 @@ def order_of(mine: int, totals: Sequence[Totals], *, moves_per_s: float) -> Move
     if not share(mine, total, servers):
         return None
     robots = mine - math.ceil(total / servers)
-    return MoveOrder(robots=robots, spread_s=round(robots / moves_per_s, 3))
+    return MoveOrder(robots=robots, spread_s=round(robots / MOVES_PER_S, 3))
 
 
 def pause_after_s(order: MoveOrder, *, within_s: float, failures: int) -> float:

@@ -85,6 +85,8 @@ CLOSE_REVOKED = 4403
 CLOSE_UNSUPPORTED = 4406
 CLOSE_REPLACED = 4409
 CLOSE_RATE = 4429
+MAX_BAD_MESSAGES = 10
+"""Undecodable messages of one socket, without a readable id, before it is closed by either side."""
 # An undecodable message counts once more for so many bytes.
 _BAD_MESSAGE_BYTES = 65_536
 
@@ -365,7 +367,7 @@ class ServerSession:
         """Count a bad message that *sent* answers."""
         self.bad_messages += _weight(size_bytes)
         self.suspicion += _weight(size_bytes)
-        if self.bad_messages > self._limits.max_bad_messages:
+        if self.bad_messages > MAX_BAD_MESSAGES:
             return [*sent, *self._close(CLOSE_PROTOCOL, "too many bad messages")]
         return sent
 

@@ -127,13 +127,12 @@ def test_a_reference_that_is_no_digest_is_refused(store: Counting, wrong: dict[s
     assert store.heads == store.gets == 0
 
 
-@pytest.mark.parametrize(
-    ("limit", "reads"), [({"max_objects_per_command": 1}, 0), ({"max_object_bytes_per_command": len(MAP)}, 2)]
-)
+@pytest.mark.parametrize(("objects", "limit_bytes", "reads"), [(1, 4 * len(MAP), 0), (2, len(MAP), 2)])
 def test_more_than_a_command_may_refer_to_is_refused_before_it_is_read(
-    store: Counting, limit: dict[str, Any], reads: int
+    store: Counting, objects: int, limit_bytes: int, reads: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    settings = PlatformSettings().replace(serving=limit).serving
+    monkeypatch.setattr("rse_pf.backend.object_refs.MAX_OBJECTS_PER_COMMAND", objects)
+    settings = PlatformSettings().replace(serving={"max_object_bytes_per_command": limit_bytes}).serving
     payload = {"many": [name(MAP), name(OTHER)]}
 
     with pytest.raises(LimitExceeded):

@@ -95,7 +95,7 @@ def test_a_part_that_ends_its_workers_ends_the_job_and_not_all_workers(
         os._exit(3)
 
     monkeypatch.setattr("rse_pf.batch.cluster.compute", compute)
-    settings = PlatformSettings().replace(data={"store": f"dir:{tmp_path}"}, batch={"part_tries": 2})
+    settings = PlatformSettings().replace(data={"store": f"dir:{tmp_path}"})
     key, events = new_cluster_key(), []
     cluster = LocalCluster(key, 1, part_tries=2)
     engine = DaskEngine(DirectoryStore(tmp_path), settings, cluster, key, on_event=events.append)

@@ -128,12 +128,12 @@ def test_progress_never_goes_back() -> None:
     assert shares[-1] == 1.0
 
 
-def test_too_many_keyframes_are_refused_before_any_work() -> None:
+def test_too_many_keyframes_are_refused_before_any_work(monkeypatch: pytest.MonkeyPatch) -> None:
     store = a_store()
-    small = PlatformSettings().replace(batch={"max_keyframes": 20})
+    monkeypatch.setattr("rse_pf.batch.merge.MAX_KEYFRAMES", 20)
 
     with pytest.raises(LimitExceeded, match="20 keyframes"):
-        BatchMerge(store, InProcessEngine(store), small).run(NAMES)
+        BatchMerge(store, InProcessEngine(store), SETTINGS).run(NAMES)
 
 
 def test_of_too_many_links_each_pair_of_maps_keeps_its_strongest() -> None:
@@ -159,11 +159,11 @@ def test_the_strongest_links_are_spread_over_the_keyframes() -> None:
     ]  # fmt: skip
 
 
-def test_links_that_are_not_compared_are_named() -> None:
+def test_links_that_are_not_compared_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
     store = a_store()
-    few = PlatformSettings().replace(batch={"max_links_per_pair": 10})
+    monkeypatch.setattr("rse_pf.batch.merge.MAX_LINKS_PER_PAIR", 10)
 
-    found = BatchMerge(store, InProcessEngine(store), few).run(NAMES)
+    found = BatchMerge(store, InProcessEngine(store), SETTINGS).run(NAMES)
 
     assert len(found.links) == len(in_parts().links)
     assert found.merged.refused[0, 1, "surplus"] == len(found.links) - 10

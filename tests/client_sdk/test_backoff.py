@@ -11,6 +11,7 @@ import pytest
 from benchmarks.cloud.played_firewall import PlayedFirewall, rules_of_settings
 from client_sdk.network.backoff import Backoff, Last
 from rse_pf.config import PlatformSettings, SessionSettings
+from rse_pf.config.front_door import DIAL_BURST, DIALS_PER_MINUTE
 
 SITE = "203.0.113.7"
 BEGAN_S = 1000.0
@@ -61,10 +62,11 @@ def test_robots_behind_one_address_are_back_within_30_s_of_an_outage_of_60_s(rob
     assert len(outage.connected_s) == robots
 
 
-def test_without_the_bounds_a_site_is_blocked_and_back_much_later():
-    eager = {"reconnect_long_max_s": 1.0, "dial_burst": 10_000, "dials_per_minute": 600.0}
+def test_without_the_bounds_a_site_is_blocked_and_back_much_later(monkeypatch):
+    monkeypatch.setattr("client_sdk.network.backoff.DIAL_BURST", 10_000)
+    monkeypatch.setattr("client_sdk.network.backoff.DIALS_PER_MINUTE", 600.0)
     bounded = PlatformSettings()
-    loose = SessionSettings(**eager)
+    loose = SessionSettings(reconnect_long_max_s=1.0)
     firewall = PlayedFirewall(rules_of_settings(bounded))
     backoffs = [Backoff(loose, Random(robot)) for robot in range(100)]
     now = [BEGAN_S] * 100
@@ -80,7 +82,7 @@ def test_without_the_bounds_a_site_is_blocked_and_back_much_later():
 @pytest.mark.parametrize("outage_s", [5.0, 60.0, 600.0])
 def test_no_robot_dials_more_often_than_the_limit_is_derived_from(outage_s):
     settings = PlatformSettings()
-    bound = settings.session.dial_burst + settings.session.dials_per_minute
+    bound = DIAL_BURST + DIALS_PER_MINUTE
 
     outage = play(settings, robots=20, outage_s=outage_s)
 
@@ -97,7 +99,7 @@ def test_a_server_that_accepts_and_dies_again_and_again_does_not_empty_the_allow
         now += 1.5  # longer than reconnect_max_s: counts as a connection that lasted
         backoff.restart()
 
-    allowed = session.dial_burst + 10 * session.dials_per_minute
+    allowed = DIAL_BURST + 10 * DIALS_PER_MINUTE
     assert allowed - 2 <= dials <= allowed + 1
 
 
@@ -110,9 +112,9 @@ def test_a_move_that_does_not_succeed_leaves_half_of_the_allowance():
         dials_until_s.append(now)
         now += backoff.pause_s(now, is_move=True)
 
-    assert len(dials_until_s) <= 0.5 * session.dial_burst + 0.5 * session.dials_per_minute + 1
+    assert len(dials_until_s) <= 0.5 * DIAL_BURST + 0.5 * DIALS_PER_MINUTE + 1
     backoff.restart()
-    for _ in range(session.dial_burst // 2):
+    for _ in range(DIAL_BURST // 2):
         assert backoff.pause_s(now) <= session.reconnect_max_s
         backoff.dialled(now)
 
@@ -191,7 +193,7 @@ def test_a_cut_off_far_away_by_a_wrong_clock_does_not_keep_a_robot_from_trying()
 def test_refusals_cost_the_allowance_of_the_firewall_like_every_other_answer():
     session = SessionSettings()
     backoff = Backoff(session, Random(1))
-    for _ in range(session.dial_burst):
+    for _ in range(DIAL_BURST):
         backoff.dialled(0.0)
 
-    assert backoff.pause_s(0.0, last=Last.REFUSED, valid_in_s=0.0) >= 60.0 / session.dials_per_minute
+    assert backoff.pause_s(0.0, last=Last.REFUSED, valid_in_s=0.0) >= 60.0 / DIALS_PER_MINUTE

@@ -20,9 +20,7 @@ from rse_pf.pnp.problems import make_degenerate, make_problem
 from rse_pf.services.builtin import builtin_services
 from rse_pf.wire import Failure
 
-FAST = SessionSettings(
-    reconnect_base_s=0.01, reconnect_max_s=0.05, stall_timeout_s=0.4, connect_timeout_s=0.5
-)
+FAST = SessionSettings(reconnect_max_s=0.05, stall_timeout_s=0.4, connect_timeout_s=0.5)
 PROBLEM = make_problem(seed=5)
 FRAME = (PROBLEM.points_world, PROBLEM.pixels, PROBLEM.camera)
 BUDGET = 1000

@@ -13,7 +13,6 @@ from quick_robots import QUICK, answered, ask, robot, run
 
 import client_sdk
 from client_sdk.network.handshake import websocket_options
-from rse_pf.config import SessionSettings
 from rse_pf.errors import (
     Conflict,
     ConnectError,
@@ -23,7 +22,7 @@ from rse_pf.errors import (
     UnsupportedProtocol,
     UsageError,
 )
-from rse_pf.wire.server_session import CLOSE_REPLACED, CLOSE_REVOKED, CLOSE_TOKEN_OVER
+from rse_pf.wire.server_session import CLOSE_REPLACED, CLOSE_REVOKED, CLOSE_TOKEN_OVER, MAX_BAD_MESSAGES
 
 pytestmark = pytest.mark.system
 
@@ -386,7 +385,7 @@ def test_invalid_messages_of_a_server_affect_no_command_up_to_a_limit():
     async def test():
         async with FakePlatform() as platform, robot(platform.url) as a_robot:
             first = platform.sockets[0]
-            for _ in range(QUICK.max_bad_messages):
+            for _ in range(MAX_BAD_MESSAGES):
                 await first.send(b"\x00garbage")
             assert (await ask(a_robot, 1)).reply == {"value": 1}
             assert a_robot.stats.reconnects == 0
@@ -453,17 +452,12 @@ def test_an_old_server_names_the_protocol_that_it_needs(monkeypatch):
     run(test())
 
 
-def test_reconnects_spread_over_the_whole_back_off():
+def test_reconnects_spread_over_the_whole_back_off(monkeypatch):
+    monkeypatch.setattr("client_sdk.network.backoff.RECONNECT_BASE_S", 0.4)
+
     async def test():
         async with FakePlatform() as platform:
-            robots = [
-                client_sdk.connect(
-                    platform.url,
-                    settings=SessionSettings(reconnect_base_s=0.4),
-                    random=random.Random(seed),
-                )
-                for seed in range(30)
-            ]
+            robots = [client_sdk.connect(platform.url, random=random.Random(seed)) for seed in range(30)]
             for each in robots:
                 await each.__aenter__()
             platform.handshakes.clear()

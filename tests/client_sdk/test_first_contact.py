@@ -18,7 +18,7 @@ from rse_pf.config import SessionSettings
 from rse_pf.errors import ConnectError, Unauthorized
 from rse_pf.pnp.problems import make_problem
 
-QUICK = SessionSettings(connect_timeout_s=0.5, reconnect_base_s=0.01, reconnect_max_s=0.05)
+QUICK = SessionSettings(connect_timeout_s=0.5, reconnect_max_s=0.05)
 SECRET = "eyJhbGciOi.JFZERTQS.c2VjcmV0"
 
 

@@ -31,7 +31,7 @@ from rse_pf.pnp.problems import make_problem
 from rse_pf.services import pnp
 from rse_pf.wire import Command, Failure, Result
 
-FAST = SessionSettings(reconnect_base_s=0.01, reconnect_max_s=0.05, stall_timeout_s=0.4, ping_interval_s=0.2)
+FAST = SessionSettings(reconnect_max_s=0.05, stall_timeout_s=0.4, ping_interval_s=0.2)
 
 
 def run(work: Coroutine[Any, Any, None]) -> None:

@@ -29,7 +29,7 @@ from rse_pf.services.builtin import builtin_services
 from rse_pf.services.echo import EchoReply
 from rse_pf.wire import Failure
 
-FAST = SessionSettings(reconnect_base_s=0.01, reconnect_max_s=0.05, stall_timeout_s=0.4)
+FAST = SessionSettings(reconnect_max_s=0.05, stall_timeout_s=0.4)
 OWN_ECHO = client_sdk.CloudFirst(registry=echo_services(), robot_solve_s=0.01)
 
 

@@ -17,7 +17,7 @@ from rse_pf.wire import Command, Failure, Result, make_codec
 from rse_pf.wire.client_session import Answered
 from rse_pf.wire.preencoded import preencode
 
-FAST = SessionSettings(reconnect_base_s=0.01, reconnect_max_s=0.05, stall_timeout_s=0.4, ping_interval_s=0.2)
+FAST = SessionSettings(reconnect_max_s=0.05, stall_timeout_s=0.4, ping_interval_s=0.2)
 
 
 def run(work: Coroutine[Any, Any, None]) -> None:

@@ -18,7 +18,7 @@ from rse_pf.wire import CODECS
 
 QUICK = SessionSettings(
     connect_timeout_s=0.5, stall_timeout_s=0.3, ping_interval_s=0.1, ping_timeout_s=0.5,
-    reconnect_base_s=0.01, reconnect_max_s=0.05,
+    reconnect_max_s=0.05,
 )  # fmt: skip
 
 

@@ -9,6 +9,7 @@ import pytest
 from fake_data_service import small_settings
 
 from rse_pf.config import PlatformSettings
+from rse_pf.crash_record import BLOCK_S
 from rse_pf.data_server.map_describer import MapDescriber
 from rse_pf.errors import Busy, Crashed, RsePfError
 from rse_pf.identity import RobotId
@@ -90,9 +91,9 @@ def test_a_robot_whose_maps_ended_two_processes_is_refused_for_a_while(clock: Cl
         made.describe(ROBOT, "map")
 
     assert processes.calls == 2
-    assert refused.value.retry_after_ms == 1000 * settings.services.breaker_open_s
+    assert refused.value.retry_after_ms == 1000 * BLOCK_S
     with pytest.raises(Crashed):
         made.describe(OTHER, "map")
-    clock.now += settings.services.breaker_open_s
+    clock.now += BLOCK_S
     with pytest.raises(Crashed):
         made.describe(ROBOT, "map")

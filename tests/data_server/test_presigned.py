@@ -7,6 +7,7 @@ import json
 import pytest
 from fake_data_service import Service, small_settings
 
+from rse_pf.data_server.handlers import PRESIGNED_URL_TTL_S
 from rse_pf.identity import RobotId, object_name
 from rse_pf.object_store import MemoryStore, digest_of
 
@@ -40,7 +41,7 @@ def bucket() -> Bucket:
 @pytest.fixture
 def direct(bucket: Bucket) -> Service:
     """A service on it."""
-    return Service(small_settings(presigned_url_ttl_s=60), bucket)
+    return Service(small_settings(), bucket)
 
 
 def test_a_new_upload_gets_a_presigned_url(direct: Service, bucket: Bucket) -> None:
@@ -48,8 +49,10 @@ def test_a_new_upload_gets_a_presigned_url(direct: Service, bucket: Bucket) -> N
 
     assert told["direct"]["url"] == f"https://bucket/{NAME}?signed"
     assert told["direct"]["headers"] == {"Content-Length": str(len(DATA)), "x-checksum": DIGEST}
-    assert told["direct"]["life_s"] == 60
-    assert bucket.signed == [(NAME, len(DATA), DIGEST, 60)], "name, length and digest are fixed"
+    assert told["direct"]["life_s"] == PRESIGNED_URL_TTL_S
+    assert bucket.signed == [(NAME, len(DATA), DIGEST, PRESIGNED_URL_TTL_S)], (
+        "name, length and digest are fixed"
+    )
 
 
 def test_after_a_direct_upload_the_object_exists_and_the_upload_is_closed(
@@ -102,7 +105,7 @@ def test_a_download_is_redirected_only_on_request_and_only_to_own_objects(
     shown = direct.ask("GET", path, headers=asks)
 
     assert (shown.status, shown.body) == (307, b"")
-    assert shown.headers["location"] == f"https://bucket/{NAME}?life=60"
+    assert shown.headers["location"] == f"https://bucket/{NAME}?life={PRESIGNED_URL_TTL_S}"
     assert direct.ask("GET", path).body == DATA
     foreign = direct.ask("GET", path, headers=asks, robot="robot-2")
     assert (foreign.status, "location" in foreign.headers) == (404, False)

@@ -6,7 +6,7 @@ import pytest
 
 from rse_pf.config import DataSettings
 from rse_pf.data_server.http import TooManyRequests
-from rse_pf.data_server.request_limits import RequestLimits
+from rse_pf.data_server.request_limits import MAX_REQUESTS_PER_ROBOT, RequestLimits
 from rse_pf.errors import Busy
 from rse_pf.identity import RobotId
 
@@ -60,11 +60,11 @@ def test_the_body_of_a_refused_request_counts_for_several_and_is_paid_off_within
 
 
 def test_a_robot_has_a_limit_of_requests_in_progress() -> None:
-    gate = admission(max_requests_per_robot=2)
-    for _ in range(2):
+    gate = admission()
+    for _ in range(MAX_REQUESTS_PER_ROBOT):
         gate.begin(ROBOT, 1.0, 0.0, has_body=False)
 
-    with pytest.raises(TooManyRequests, match="2 requests"):
+    with pytest.raises(TooManyRequests, match=f"{MAX_REQUESTS_PER_ROBOT} requests"):
         gate.begin(ROBOT, 1.0, 0.0, has_body=False)
 
     gate.begin(OTHER, 1.0, 0.0, has_body=False)
@@ -91,8 +91,9 @@ def test_bodies_are_limited_for_a_robot_its_tenant_and_all() -> None:
     gate.begin(OTHER, 1.0, 0.0, has_body=True)
 
 
-def test_a_refused_request_takes_nothing() -> None:
-    gate = admission(max_requests_per_robot=1, max_uploads=4)
+def test_a_refused_request_takes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rse_pf.data_server.request_limits.MAX_REQUESTS_PER_ROBOT", 1)
+    gate = admission(max_uploads=4)
     gate.begin(ROBOT, 1.0, 0.0, has_body=True)
     for _ in range(1000):
         with pytest.raises(TooManyRequests):

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 from fake_data_service import Answer, Service, small_settings
 
+from rse_pf.data_server.uploads import UPLOAD_TTL_S
 from rse_pf.object_store import DirectoryStore, MemoryStore, digest_of
 
 DATA = bytes(n % 251 for n in range(10_000))
@@ -160,7 +161,7 @@ def test_old_uploads_and_orphaned_parts_are_removed_and_new_uploads_are_not(serv
 
     assert service.app.handlers.objects.sweep() == 1
     assert service.ask("GET", UPLOAD).json["offset"] == 4096
-    service.wall += service.settings.data.upload_ttl_s + 1
+    service.wall += UPLOAD_TTL_S + 1
     assert service.app.handlers.objects.sweep() == 1
     assert [info.name for info in service.store.list() if not info.name.startswith("accounts/")] == []
 

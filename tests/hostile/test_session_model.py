@@ -22,7 +22,7 @@ from rse_pf.wire import Command, Failure, Result, make_codec
 from rse_pf.wire.client_session import Answered, ClientSession, ConnectionState, Welcomed
 from rse_pf.wire.server_session import Close, Send, ServerSession, Submit
 
-LIMITS = SessionSettings(max_in_flight=3, max_bad_messages=2)
+LIMITS = SessionSettings(max_in_flight=3)
 CODEC = make_codec("json", LIMITS)
 AUTH = AuthSettings()
 KEY = SigningKey.from_seed(b"m" * 32, "model-1")
@@ -31,6 +31,11 @@ CODES = ("busy", "worker-lost", "stale", "internal", "degenerate")
 
 rarely = st.integers(0, 3).map(lambda drawn: drawn == 3)
 picks = st.integers(0, 10**6)
+
+
+@pytest.fixture(autouse=True)
+def few_bad_messages(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rse_pf.wire.server_session.MAX_BAD_MESSAGES", 2)
 
 
 class Socket:

@@ -123,7 +123,7 @@ def test_servers_that_know_only_the_sums_fill_up_an_empty_one_and_then_stop(robo
 def ordered(robots: dict[str, int]) -> dict[str, int]:
     """Return what each server orders that knows its own robots and steady sums."""
     sums = [Totals(start_s=at, robots=sum(robots.values()), servers=len(robots)) for at in (10.0, 0.0)]
-    found = {name: order_of(n, sums, moves_per_s=20.0) for name, n in robots.items()}
+    found = {name: order_of(n, sums) for name, n in robots.items()}
     return {name: order.robots for name, order in found.items() if order is not None}
 
 
@@ -147,10 +147,10 @@ def test_no_order_before_two_periods_agree() -> None:
         for robots, servers in ((120, 3), (140, 3), (120, 2))
     )
 
-    assert order_of(60, [steady], moves_per_s=20.0) is None
-    assert order_of(60, [steady, grown], moves_per_s=20.0) is None
-    assert order_of(60, [steady, joined], moves_per_s=20.0) is None
-    assert order_of(60, [steady, steady], moves_per_s=20.0) == MoveOrder(robots=20, spread_s=1.0)
+    assert order_of(60, [steady]) is None
+    assert order_of(60, [steady, grown]) is None
+    assert order_of(60, [steady, joined]) is None
+    assert order_of(60, [steady, steady]) == MoveOrder(robots=20, spread_s=1.0)
 
 
 def test_a_pause_doubles_with_each_order_that_moved_nobody_up_to_ten_minutes() -> None:

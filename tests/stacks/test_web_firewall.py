@@ -8,6 +8,7 @@ import pytest
 
 from benchmarks.cloud.played_firewall import PlayedFirewall, rules_of_settings, rules_of_template
 from client_sdk.network.dialling import dial_error_of
+from rse_pf.config.front_door import DIAL_BURST, DIALS_PER_MINUTE
 from rse_pf.config.resource_names import ROSBRIDGE_PATH
 
 SITE = "203.0.113.7"
@@ -53,7 +54,7 @@ def _counts(rule: Any, path: str) -> bool:
 def test_the_limit_of_dials_is_that_of_the_robots_of_a_site(assembly: Any, template: Any) -> None:
     settings = assembly.settings
     dials = next(rule for rule in rules_of_template(template) if rule.name == "dials")
-    of_a_robot = settings.session.dial_burst + settings.session.dials_per_minute
+    of_a_robot = DIAL_BURST + DIALS_PER_MINUTE
 
     assert dials.window_s == 60
     assert dials.limit == settings.cloud.robots_per_site * of_a_robot

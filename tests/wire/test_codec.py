@@ -14,6 +14,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from rse_pf.budget import MESSAGE_CONTAINERS, MESSAGE_DEPTH
 from rse_pf.config import SessionSettings
 from rse_pf.errors import BadMessage, LimitExceeded, ProtocolError, UnsupportedProtocol
 from rse_pf.wire import (
@@ -252,13 +253,13 @@ def nested(depth: int) -> Any:
 @pytest.mark.parametrize("name", CODECS)
 def test_the_depth_limit_is_kept_to_the_level_in_every_codec(name: str) -> None:
     codec = make_codec(name)
-    deepest = LIMITS.max_json_depth - 1  # the message itself is the first level
+    deepest = MESSAGE_DEPTH - 1  # the message itself is the first level
 
     message = Command(id=1, service="echo", payload=nested(deepest))
     assert codec.decode_from_robot(codec.encode(message)) == message
     error = refused(name, codec.encode(Command(id=1, service="echo", payload=nested(deepest + 1))))
     assert isinstance(error, LimitExceeded)
-    assert str(LIMITS.max_json_depth) in error.message
+    assert str(MESSAGE_DEPTH) in error.message
 
 
 @pytest.mark.parametrize(
@@ -280,7 +281,7 @@ def test_quotes_and_backslashes_hide_no_depth(padding: str) -> None:
 
 
 def test_more_lists_than_allowed_are_refused_and_those_in_strings_do_not_count() -> None:
-    most = LIMITS.max_json_lists - 2  # the message and its payload are boxes too
+    most = MESSAGE_CONTAINERS - 2  # the message and its payload are boxes too
     flat = "[" + "[]," * (most - 1) + "[]]"
 
     assert len(payload_of("json", command(flat))) == most

@@ -12,6 +12,8 @@ import msgspec
 import pytest
 
 from rse_pf import errors
+from rse_pf.backend.gateway.frames import MAX_CONTROL_PER_S
+from rse_pf.budget import MESSAGE_DEPTH, MESSAGE_INFLATE_RATIO
 from rse_pf.config import SessionSettings
 from rse_pf.wire import (
     SUBPROTOCOLS,
@@ -100,8 +102,8 @@ def test_the_limits_of_the_page_are_those_of_the_settings(page: str) -> None:
     table = page[page.index("### Limits") : page.index("## 5.")].replace(",", "")
 
     for value in (
-        limits.max_message_bytes, limits.max_inflated_bytes, limits.max_inflate_ratio, limits.max_fragments,
-        limits.max_json_depth, limits.max_control_per_s, limits.hello_timeout_s,
+        limits.max_message_bytes, limits.max_inflated_bytes, MESSAGE_INFLATE_RATIO, limits.max_fragments,
+        MESSAGE_DEPTH, MAX_CONTROL_PER_S, limits.hello_timeout_s,
     ):  # fmt: skip
         assert re.search(rf"\b{value:.0f}\b", table), value
 

@@ -320,7 +320,7 @@ def test_the_guards_give_the_verdicts_of_the_python_ones(name: str) -> None:
     assert NATIVE is not None
     budgets = [
         BUDGET,
-        Budget.of_messages(SessionSettings(max_json_depth=5, max_json_lists=40, max_json_values=200)),
+        replace(BUDGET, depth=5, containers=40, values=200, mixed_values=200),
     ]
     draw = random.Random(3)
 
@@ -369,9 +369,8 @@ def inflated(data: bytes, budget: Budget, *, native: bool) -> tuple[str, bytes]:
 def test_streams_are_inflated_or_refused_as_by_zlib() -> None:
     draw = random.Random(2)
     # Nothing here exceeds a count, so that only inflating is judged.
-    budget = Budget.of_messages(
-        SessionSettings(max_message_bytes=2048, max_inflated_bytes=9000, max_inflate_ratio=5.0)
-    )
+    limits = SessionSettings(max_message_bytes=2048, max_inflated_bytes=9000)
+    budget = replace(Budget.of_messages(limits), inflate_ratio=5.0)
     texts = [
         b"",
         b"0",

@@ -33,7 +33,15 @@ from rse_pf.wire.server_session import (
     Submit,
 )
 
-LIMITS = SessionSettings(max_in_flight=2, max_bad_messages=2, max_message_bytes=2048)
+LIMITS = SessionSettings(max_in_flight=2, max_message_bytes=2048)
+MAX_BAD_MESSAGES = 2
+
+
+@pytest.fixture(autouse=True)
+def few_bad_messages(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rse_pf.wire.server_session.MAX_BAD_MESSAGES", MAX_BAD_MESSAGES)
+
+
 HELLO = Hello(sdk="test")
 COMMAND = Command(id=1, service="echo", payload=1, trace="t")
 
@@ -122,7 +130,7 @@ def test_more_unanswered_commands_than_agreed_are_busy_with_a_time() -> None:
 def test_bad_messages_are_tolerated_up_to_a_limit() -> None:
     server = opened()
 
-    for _ in range(LIMITS.max_bad_messages):
+    for _ in range(MAX_BAD_MESSAGES):
         [failure] = [heard(server, each) for each in server_sessions.receive(server, b"nonsense", 1.0)]
         assert (failure.id, failure.code) == (None, "bad-message")
     failure, close = [heard(server, each) for each in server_sessions.receive(server, b"nonsense", 1.0)]
@@ -195,7 +203,7 @@ class IpcChannel(RuleBasedStateMachine):
             assert said == []
             return
         self.bad += 1
-        if self.bad > LIMITS.max_bad_messages:
+        if self.bad > MAX_BAD_MESSAGES:
             assert [type(each) for each in said] == [Failure, Close]
             self.state = "closed"
         else:

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from rse_pf.config import SessionSettings
 from rse_pf.wire import CODECS, Codec, Command, Failure, Hello, Subscribe, make_codec
 from rse_pf.wire.envelope import undecodable_id
-from rse_pf.wire.server_session import Close, SendRefusal, ServerSession, Submit
+from rse_pf.wire.server_session import MAX_BAD_MESSAGES, Close, SendRefusal, ServerSession, Submit
 
 LIMITS = SessionSettings()
 GOOD = Command(id=1, service="echo", payload=1)
@@ -166,9 +166,9 @@ def test_any_bytes_have_an_id_or_none(codec: str, data: bytes) -> None:
 def test_messages_without_an_id_still_close_the_connection() -> None:
     server = opened("json")
 
-    decisions = [server_sessions.receive(server, b"{", 1.0) for _ in range(LIMITS.max_bad_messages + 1)]
+    decisions = [server_sessions.receive(server, b"{", 1.0) for _ in range(MAX_BAD_MESSAGES + 1)]
 
-    assert [refusal(each).id for each in decisions[:-1]] == [None] * LIMITS.max_bad_messages
+    assert [refusal(each).id for each in decisions[:-1]] == [None] * MAX_BAD_MESSAGES
     assert isinstance(decisions[-1][-1], Close)
 
 

@@ -13,6 +13,8 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from rse_pf.aws.fleet.metrics import ServerMetrics, datums
+from rse_pf.aws.fleet.tasks.audit import AUDIT_SHIP_S
+from rse_pf.aws.fleet.tasks.journals import JOURNAL_SHIP_S
 from rse_pf.aws.money.prices import Prices
 from rse_pf.config import PlatformSettings
 from rse_pf.config.cloud_layout import CANARY_MB, CANARY_PERIOD_S, ENDPOINT_SERVICES, zone_count
@@ -302,7 +304,7 @@ def _running(
          prices.metric_per_month),
         ("monitor", f"publishing metrics, {when}", count * _published_by_a_server(settings), "thousand",
          prices.metric_calls_per_thousand),
-        ("data servers", f"audit logs and journals, {when}", count * _puts_of_a_server(settings),
+        ("data servers", f"audit logs and journals, {when}", count * _puts_of_a_server(),
          "thousand", prices.put_per_thousand),
     ):  # fmt: skip
         yield CostLine(
@@ -428,6 +430,6 @@ def _published_by_a_server(settings: PlatformSettings) -> float:
     return sum(_MONTH_S / period_s for period_s in periods) / 1e3
 
 
-def _puts_of_a_server(settings: PlatformSettings) -> float:
+def _puts_of_a_server() -> float:
     """Return the thousands of objects that a server writes in a month, if it always has something new."""
-    return (_MONTH_S / settings.cloud.audit_ship_s + _MONTH_S / settings.cloud.journal_ship_s) / 1e3
+    return (_MONTH_S / AUDIT_SHIP_S + _MONTH_S / JOURNAL_SHIP_S) / 1e3

@@ -45,7 +45,7 @@ class LimitedServices:
     def __init__(self, context: WorkerContext, processes: LimitedProcesses) -> None:
         self._context = context
         self._processes = processes
-        self._crashes = CrashRecord(context.settings.services)
+        self._crashes = CrashRecord()
 
     def refusal(self, queued: QueuedCommand, now: float) -> Busy | None:
         """Return why the robot of *queued* may not use these services now, None if it may."""

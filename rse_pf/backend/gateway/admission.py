@@ -28,8 +28,10 @@ from rse_pf.errors import Busy, Forbidden
 
 __all__ = ["DECODER_FULL", "TOO_FAST", "TOO_LATE", "Admission", "UnreadRefusal"]
 
+_MAX_UNREAD_BYTES = 1 << 24
+"""Long messages that may wait for the decoder thread of a worker: 64 of the largest that a robot may send."""
 _SUSPECTS_SHARE = 0.25
-"""Share of ``serving.max_unread_bytes`` that is open to robots which sent undecodable messages before."""
+"""Share of `_MAX_UNREAD_BYTES` that is open to robots which sent undecodable messages before."""
 
 
 class UnreadRefusal(NamedTuple):
@@ -59,7 +61,6 @@ class Admission:
 
     def __init__(self, session: SessionSettings, serving: ServingSettings) -> None:
         self.rates = RobotRates(session)
-        self._max_unread_bytes = serving.max_unread_bytes
         self._max_queue = serving.max_queue_per_robot
 
     def may_wait(self, size_bytes: int, unread_bytes: int, bad_messages: int) -> bool:
@@ -71,7 +72,7 @@ class Admission:
             bad_messages: How many messages of the connection could not be decoded.
         """
         share = _SUSPECTS_SHARE if bad_messages else 1.0
-        return not unread_bytes or unread_bytes + size_bytes <= share * self._max_unread_bytes
+        return not unread_bytes or unread_bytes + size_bytes <= share * _MAX_UNREAD_BYTES
 
     def is_in_scope(self, service: str, claims: Claims) -> bool:
         """Return whether a token allows commands to *service*."""

@@ -22,6 +22,7 @@ from rse_pf.wire import CODECS, Command, Failure, Progress
 from rse_pf.wire.messages import FromRobot
 from rse_pf.wire.server_session import (
     CLOSE_GOING_AWAY,
+    MAX_BAD_MESSAGES,
     Authenticate,
     BeginUpdates,
     Close,
@@ -312,7 +313,7 @@ class RobotConnection:
     ) -> None:
         """Execute what the session decided about one message; it was in *state* before."""
         self._execute(decisions, now, size_bytes)
-        if session.bad_messages > self._context.settings.session.max_bad_messages:
+        if session.bad_messages > MAX_BAD_MESSAGES:
             self._context.log.warning("cut-off", robot=self.robot, reason="bad-messages")
             self._handler.rates.ban(self.robot, now)
         if self._assembler.closed:

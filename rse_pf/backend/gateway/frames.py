@@ -33,6 +33,8 @@ CLOSE_INVALID_TEXT = 1007
 CLOSE_POLICY = 1008
 CLOSE_TOO_BIG = 1009
 
+MAX_CONTROL_PER_S = 10.0
+"""Control frames of one socket in a second; a robot sends a ping every other second."""
 _CONTROL = (CLOSE, PING, PONG)
 _MAX_CONTROL = 125
 _KNOWN_CLOSE_CODES = frozenset({1000, 1001, 1002, 1003, 1007, 1008, 1009, 1010, 1011, 1012, 1013, 1014})
@@ -74,14 +76,14 @@ class FrameAssembler:
         "closed",
     )
 
-    def __init__(self, limits: SessionSettings) -> None:
+    def __init__(self, limits: SessionSettings, *, max_control_per_s: float = MAX_CONTROL_PER_S) -> None:
         self.closed = False
         self._limits = limits
         self._message: list[bytes] | None = None
         self._opcode = 0
         self._count = 0
         self._size = 0
-        self._control_frames = TokenBucket(limits.max_control_per_s, limits.max_control_per_s)
+        self._control_frames = TokenBucket(max_control_per_s, max_control_per_s)
 
     def is_whole(self, opcode: int, fin: bool, rsv: bool, size_bytes: int) -> bool:
         """Return whether a frame is a binary message that `receive` would return as it is, as most are."""

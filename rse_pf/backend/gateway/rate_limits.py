@@ -17,11 +17,13 @@ from rse_pf.config import ServingSettings, SessionSettings
 from rse_pf.identity import RobotId
 from rse_pf.token_bucket import TokenBucket
 
-__all__ = ["CUT_OFF", "RobotRates", "SourceRates"]
+__all__ = ["CUT_OFF", "HANDSHAKE_BURST", "RobotRates", "SourceRates"]
 
 CUT_OFF = math.inf
 """The robot ignores refusals, so that its connection ends: it may not try again at all."""
 
+HANDSHAKE_BURST = 1000.0
+"""Sockets or handshakes above their rate that are accepted at once: a fleet that comes back."""
 _MAX_NAMES = 20000
 """Robots or addresses remembered at a time; those that did nothing wrong are forgotten first."""
 _MIN_RETRY_MS = 1.0
@@ -132,7 +134,7 @@ class SourceRates:
                     name: bucket for name, bucket in self._sources.items() if not bucket.is_full(now)
                 }
                 self._sources = _half(remembered, self._max_names)
-            bucket = self._sources[source] = TokenBucket(rate, float(self._serving.handshake_burst))
+            bucket = self._sources[source] = TokenBucket(rate, HANDSHAKE_BURST)
         return bucket.take(now)
 
     def source(self, peer: str, forwarded_for: str) -> str:

@@ -24,6 +24,7 @@ from rse_pf.backend.gateway.handshake import HEALTH, Accepted, HandshakePolicy, 
 from rse_pf.backend.gateway.rate_limits import SourceRates
 from rse_pf.backend.scheduling.deferred_work import DeferredWork
 from rse_pf.config import ServingSettings
+from rse_pf.config.front_door import MAX_HANDSHAKE_BYTES
 from rse_pf.errors import MissingExtra
 from rse_pf.silent_connections import PendingHandshakes
 
@@ -213,7 +214,7 @@ class RobotSockets:
 
     def _read(self, pending: PendingSocket) -> bool:
         """Read the part of the request that has arrived; return whether the socket is no longer pending."""
-        max_bytes = self._context.settings.serving.max_handshake_bytes
+        max_bytes = MAX_HANDSHAKE_BYTES
         try:
             # Closing with unread bytes would reset the connection, and its answer would be lost.
             data = pending.accepted.recv(_MAX_READ_BYTES)

@@ -26,9 +26,13 @@ __all__ = [
     "encode_record",
     "job_key",
     "record_name",
+    "renewal_s",
     "verdict_on",
 ]  # fmt: skip
 
+_RENEWALS_PER_LEASE = 5
+_MAX_RENEWAL_S = 1.0
+"""Who follows a job of another server sees its progress no later than this."""
 MAX_TRIES = 3
 """A job whose servers crashed this often is not run again: it may be the cause."""
 
@@ -88,6 +92,11 @@ def job_key(service: str, payload: Any, settings: str) -> str:
 def record_name(robot: RobotId, key: str) -> str:
     """Return the object name of the record of a robot's job: ``jobs/TENANT/ROBOT[=THUMBPRINT]/KEY``."""
     return f"jobs/{robot.folder}/{key}"
+
+
+def renewal_s(lease_s: float) -> float:
+    """Return the time between two renewals of a lease that ends after *lease_s* without one, in seconds."""
+    return min(_MAX_RENEWAL_S, lease_s / _RENEWALS_PER_LEASE)
 
 
 def verdict_on(record: JobRecord | None, *, unchanged_s: float, lease_s: float, is_watched: bool) -> Verdict:

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from rse_pf.accounts import Accounts
-from rse_pf.backend.jobs.lease import MAX_TRIES, JobLease, JobRecord, record_name, verdict_on
+from rse_pf.backend.jobs.lease import MAX_TRIES, JobLease, JobRecord, record_name, renewal_s, verdict_on
 from rse_pf.backend.jobs.process import JobProcess, JobRequest, inline_bytes, retry_store
 from rse_pf.backend.jobs.queue import JobQueue
 from rse_pf.backend.jobs.slots import JobSlots
@@ -176,7 +176,7 @@ def _follow_or_run(
             return JobOutcome()
         if verdict == "follow" and record is not None:
             tell(record.share, record.what)
-            signals.wait(serving.job_heartbeat_s * _POLL_SHARE)
+            signals.wait(renewal_s(serving.job_lease_s) * _POLL_SHARE)
             continue
         if verdict == "failed" and record is not None:
             return JobOutcome(error=error_from_code(record.code, record.message, hint=record.hint))
@@ -204,7 +204,7 @@ def _get_slot(request: JobRequest, context: JobContext, signals: JobSignals, lea
     if context.queue is None:
         return context.slots.acquire(request.robot, signals.wait)
     context.queue.offer(request)
-    poll_s = context.settings.serving.job_heartbeat_s * _POLL_SHARE
+    poll_s = renewal_s(context.settings.serving.job_lease_s) * _POLL_SHARE
     due_s, before = context.clock() + poll_s, lease.record
 
     def wait(seconds: float) -> bool:
@@ -283,7 +283,7 @@ class _JobRun:
         """Read from the process and renew the lease until the run ends."""
         serving, clock, signals = self._context.settings.serving, self._context.clock, self._signals
         began = renewed = clock()
-        next_heartbeat, killed_s = began + serving.job_heartbeat_s, float("inf")
+        next_heartbeat, killed_s = began + renewal_s(serving.job_lease_s), float("inf")
         while not self._is_over:
             now = clock()
             if signals.giving_up:
@@ -297,7 +297,7 @@ class _JobRun:
             if now - began >= serving.max_job_s:
                 return "late"
             if now >= next_heartbeat:
-                next_heartbeat = now + serving.job_heartbeat_s
+                next_heartbeat = now + renewal_s(serving.job_lease_s)
                 if self._renew():
                     renewed = clock()
                 elif not self._lease.is_ours or clock() - renewed >= serving.job_lease_s:

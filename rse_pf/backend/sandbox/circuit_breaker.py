@@ -1,8 +1,8 @@
 """Decide which requests and services are not run again after crashes, and for whom.
 
 Evidence is kept for each robot first.  A service whose sandboxes of one robot ended ``breaker_crashes`` times
-within `WINDOW_S` is refused to that robot for ``breaker_open_s``: its circuit breaker is open.  A request
-that crashed ``poison_crashes`` sandboxes of one robot is poison for it until `POISON_S` have passed.
+within `WINDOW_S` is refused to that robot for `OPEN_S`: its circuit breaker is open.  A request
+that crashed `POISON_CRASHES` sandboxes of one robot is poison for it until `POISON_S` have passed.
 Both hold for others only when their sandboxes crashed as well:
 
 - for a tenant, when the crashes are those of at least `ROBOTS_OF_A_TENANT` robots of it;
@@ -27,10 +27,22 @@ from rse_pf.config import ServiceSettings
 from rse_pf.errors import Poison, WorkerLost
 from rse_pf.identity import RobotId
 
-__all__ = ["POISON_S", "ROBOTS_OF_A_TENANT", "ROBOTS_OF_OTHERS", "WINDOW_S", "Block", "CircuitBreaker"]
+__all__ = [
+    "OPEN_S",
+    "POISON_S",
+    "ROBOTS_OF_A_TENANT",
+    "ROBOTS_OF_OTHERS",
+    "WINDOW_S",
+    "Block",
+    "CircuitBreaker",
+]
 
 WINDOW_S = 30.0
 """``services.breaker_crashes`` within this open the circuit breaker."""
+OPEN_S = 60.0
+"""Time that the circuit breaker of a service stays open."""
+POISON_CRASHES = 2
+"""A request that crashed this many sandboxes is poison: dead-letter queues count so, too."""
 POISON_S = 600.0
 """A request is tried again this long after the crashes that made it poison."""
 ROBOTS_OF_A_TENANT = 3
@@ -83,8 +95,9 @@ class Block:
 class CircuitBreaker:
     """What one worker knows of crashing requests and services."""
 
-    def __init__(self, settings: ServiceSettings) -> None:
+    def __init__(self, settings: ServiceSettings, *, poison_crashes: int = POISON_CRASHES) -> None:
         self._settings = settings
+        self._poison_crashes = poison_crashes
         self._ends_of_request: OrderedDict[tuple[str, str], tuple[_End, ...]] = OrderedDict()
         self._ends_of_service: dict[str, deque[_End]] = {}
         self._breakers: dict[tuple[str, Scope], _Breaker] = {}
@@ -194,12 +207,12 @@ class CircuitBreaker:
             if max(breaker.until_s, breaker.opened_s + WINDOW_S) > now
         }
         self._breakers.pop((service, scope), None)
-        self._breakers[service, scope] = _Breaker(now, now + self._settings.breaker_open_s, not last.is_crash)
+        self._breakers[service, scope] = _Breaker(now, now + OPEN_S, not last.is_crash)
         if len(self._breakers) > _MAX_BREAKERS:
             del self._breakers[next(iter(self._breakers))]
 
     def _poison_until(self, scope: Scope, ends: tuple[_End, ...]) -> float:
-        return _evidence_since(scope, ends, self._settings.poison_crashes) + POISON_S
+        return _evidence_since(scope, ends, self._poison_crashes) + POISON_S
 
     def _oldest_s(self) -> float:
         return next(iter(self._ends_of_request.values()))[-1].at_s

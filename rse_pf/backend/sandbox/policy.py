@@ -48,6 +48,8 @@ __all__ = [
     "SendMessage",
 ]
 
+START_TIMEOUT_S = 5.0
+"""A sandbox that is not ready by then is killed."""
 _MAX_TRIES = 2
 _BUSY_RETRY_MS = 1000.0
 _DEADLINE_FACTOR = 2.0
@@ -487,7 +489,7 @@ class SandboxPolicy:
 
     def _create(self, robot: RobotId, now: float) -> _Sandbox:
         self._last_number += 1
-        sandbox = _Sandbox(self._last_number, robot, kill_s=now + self._settings.start_timeout_s)
+        sandbox = _Sandbox(self._last_number, robot, kill_s=now + START_TIMEOUT_S)
         self._sandboxes[sandbox.number] = self._by_robot[robot] = sandbox
         self._held_by_tenant[robot.tenant] += 1
         self.counts["created"] += 1

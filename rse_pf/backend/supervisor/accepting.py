@@ -14,6 +14,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 
+from rse_pf.backend.gateway.rate_limits import HANDSHAKE_BURST
 from rse_pf.config import ServingSettings
 from rse_pf.silent_connections import SilentConnections
 from rse_pf.token_bucket import TokenBucket
@@ -59,7 +60,7 @@ class RobotAcceptor:
         self._serving = serving
         self._pass_on = pass_on
         self._on_refused = on_refused
-        self._rate = TokenBucket(serving.max_accepts_per_s, float(serving.handshake_burst))
+        self._rate = TokenBucket(serving.max_accepts_per_s, HANDSHAKE_BURST)
         self._ready: deque[Accepted] = deque()
         self._accept_pause: asyncio.TimerHandle | None = None
         self._rate_pause: asyncio.TimerHandle | None = None

@@ -56,6 +56,7 @@ from rse_pf.backend.supervisor.trust_poller import poll_trust
 from rse_pf.backend.supervisor.worker import WorkerPlan, run_in_loop
 from rse_pf.backend.supervisor.worker_handle import BUILTIN, RowsOrder, WorkerProcess, fork_workers
 from rse_pf.config import PlatformSettings
+from rse_pf.config.elasticity import MOVES_PER_S
 from rse_pf.config.placement import ServerPlacement
 from rse_pf.errors import ConfigurationError
 from rse_pf.files import replace_json
@@ -527,7 +528,7 @@ class _Supervisor:
         """Order the workers to ask *robots* to move; return how many are asked, and the time that takes."""
         delays = plan(
             [worker.load for worker in self._workers], robots, spread_s=spread_s,
-            moves_per_s=self._settings.scaling.moves_per_s, random=random.random,
+            moves_per_s=MOVES_PER_S, random=random.random,
         )  # fmt: skip
         asked = sum(map(len, delays))
         last_s = max((delays_s[-1] for delays_s in delays if delays_s), default=0.0)

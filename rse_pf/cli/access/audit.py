@@ -89,7 +89,7 @@ def _run_in_cloud(args: argparse.Namespace, settings: PlatformSettings) -> int:
         problems = fetch_audit(archive, args.files[0])
         if not chain_names(args.files[0]) and not problems:
             raise UsageError(
-                "the bucket holds no audit log yet", hint="servers send the first within cloud.audit_ship_s"
+                "the bucket holds no audit log yet", hint="servers send the first within a minute"
             )
         return _run_on(args, problems)
 

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from rse_pf.config import PlatformSettings
+from rse_pf.config.front_door import MAX_HANDSHAKE_BYTES
 from rse_pf.config.resource_names import HEALTH_PATH, READY_PATH, ROSBRIDGE_PATH
 from rse_pf.local.lan.connect_page import connect_page, page_headers
 from rse_pf.local.lan.listener import CERTIFICATE_NAME, LanListener, secret_file
@@ -121,7 +122,7 @@ def _listener(settings: PlatformSettings, port: int, lan: LanListener | None) ->
         # The default of 1 s makes every close take a second, and hides a dead server from its robots.
         "delayed_close_timeout": "0s",
         "request_headers_timeout": _seconds(settings.serving.handshake_timeout_s),
-        "max_request_headers_kb": settings.serving.max_handshake_bytes // 1024,
+        "max_request_headers_kb": MAX_HANDSHAKE_BYTES // 1024,
         # Whatever a robot says of its own address is dropped; servers read what stands here instead.
         "use_remote_address": True,
         # Strangers need to know neither the software nor how long a server took.

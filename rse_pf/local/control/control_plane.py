@@ -108,7 +108,7 @@ class ControlPlane:
         self._metrics_s = options.delays.metrics_s / options.compress
         self._seen_periods = math.inf
         self._periods = Periods(period_s, keep=cadence.most + 2)
-        self._rebalancer = Rebalancer(scaling) if options.elastic and options.rebalance else None
+        self._rebalancer = Rebalancer() if options.elastic and options.rebalance else None
         self._ports: dict[str, ControlPort] = {}
         self._cores = len(os.sched_getaffinity(0))
 

@@ -10,7 +10,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from rse_pf.config import ScalingSettings
+from rse_pf.config.elasticity import MOVES_PER_S
 from rse_pf.scaling.rebalance import moves
 
 __all__ = ["MoveRequest", "Rebalancer"]
@@ -33,8 +33,7 @@ class MoveRequest:
 class Rebalancer:
     """Remembers until when the spread of the robots is watched."""
 
-    def __init__(self, settings: ScalingSettings) -> None:
-        self._settings = settings
+    def __init__(self) -> None:
         self._until_s = -math.inf
         self._quiet_until_s = -math.inf
         self._before: Mapping[str, int] = {}
@@ -48,9 +47,8 @@ class Rebalancer:
         before, self._before = self._before, dict(robots)
         if not self._quiet_until_s <= now_s <= self._until_s or not _steady(before, robots):
             return ()
-        rate = self._settings.moves_per_s
         found = tuple(
-            MoveRequest(server=name, robots=count, spread_s=round(count / rate, 3))
+            MoveRequest(server=name, robots=count, spread_s=round(count / MOVES_PER_S, 3))
             for name, count in moves(robots).items()
             if count > 0
         )

@@ -11,7 +11,7 @@ from rse_pf.aws.fleet.task import AgentContext
 from rse_pf.aws.fleet.tasks import job_metrics
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import SettingsError
-from rse_pf.scaling.job_alarms import JOBS, JOBS_WAITING, job_alarms_of
+from rse_pf.scaling.job_alarms import JOB_IDLE_S, JOBS, JOBS_WAITING, job_alarms_of
 
 WITH = {"cloud": {"job_servers": 4}, "serving": {"offer_jobs": True}}
 
@@ -49,7 +49,7 @@ def test_the_alarms_read_what_is_published() -> None:
 
     assert {metric.metric for alarm in (waiting, idle) for metric in alarm.metrics} == {JOBS, JOBS_WAITING}
     assert waiting.steps[0].change > 0 > idle.steps[0].change
-    assert idle.period_s * idle.periods == PlatformSettings().cloud.job_idle_s
+    assert idle.period_s * idle.periods == JOB_IDLE_S
 
 
 def test_job_servers_need_servers_that_offer_jobs() -> None:

@@ -16,6 +16,7 @@ from rse_pf.aws.fleet.journal import UNITS, batch_of, journal_command, read_jour
 from rse_pf.aws.fleet.server_logs import console_of, last_lines, logged_servers
 from rse_pf.aws.fleet.task import AgentConfig, AgentContext
 from rse_pf.aws.fleet.tasks import journals
+from rse_pf.aws.fleet.tasks.journals import JOURNAL_SHIP_S
 from rse_pf.cli.main import main
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import StoreError
@@ -129,7 +130,7 @@ def test_journals_are_shipped_in_every_phase_and_before_the_machine_ends(tmp_pat
     assert journals.task in TASKS
     assert task.flushes
     assert task.phases == ALWAYS
-    assert task.period_s == PlatformSettings().cloud.journal_ship_s
+    assert task.period_s == JOURNAL_SHIP_S
 
 
 def test_the_units_are_those_that_the_boot_starts_and_the_boot_itself(repository: Path) -> None:

@@ -11,6 +11,7 @@ from backend.gateway.worker_parts import WorkerParts, worker_parts
 
 from rse_pf.backend.compute.limited_services import LimitedServices
 from rse_pf.backend.scheduling.scheduler import QueuedCommand
+from rse_pf.crash_record import BLOCK_S
 from rse_pf.errors import Busy, Crashed, WorkerLost
 from rse_pf.identity import RobotId
 from rse_pf.limited_process import Overran
@@ -99,7 +100,6 @@ def test_a_failure_keeps_its_code_and_hint(
 def test_two_crashes_keep_their_robot_out_and_no_other(
     worker: WorkerParts, processes: ScriptedProcesses, limited: LimitedServices
 ):
-    rest_s = worker.settings.services.breaker_open_s
     processes.script = [Crashed("memory"), Crashed("signal"), reply_of(1.0, None)]
 
     codes = [code_of(limited.compute(place(worker))) for _ in range(3)]
@@ -110,8 +110,8 @@ def test_two_crashes_keep_their_robot_out_and_no_other(
     assert limited.blocked_robots(worker.loop.now) == 1
     refusal = limited.refusal(place(worker), worker.loop.now)
     assert refusal is not None
-    assert refusal.retry_after_ms == rest_s * 1e3
-    assert limited.refusal(place(worker), worker.loop.now + rest_s) is None
+    assert refusal.retry_after_ms == BLOCK_S * 1e3
+    assert limited.refusal(place(worker), worker.loop.now + BLOCK_S) is None
 
 
 @pytest.mark.parametrize(

@@ -17,6 +17,7 @@ from rse_pf.backend.log import JsonLog
 from rse_pf.config import PlatformSettings
 from rse_pf.identity import RobotId
 from rse_pf.wire import Command, Failure, Ping, Pong, Result, make_codec
+from rse_pf.wire.server_session import MAX_BAD_MESSAGES
 
 SETTINGS = PlatformSettings()
 CODEC = make_codec("zlib")
@@ -103,11 +104,10 @@ def test_a_long_command_of_a_robot_that_left_meanwhile_is_dropped(worker: Worker
 
 
 def test_a_long_message_that_finds_the_decoder_full_is_refused_with_its_id():
-    settings = SETTINGS.replace(serving={"max_unread_bytes": 262144})
-    with worker_parts(codec="zlib", settings=settings) as worker:
+    with worker_parts(codec="zlib", settings=SETTINGS) as worker:
         connection, wire = worker.join()
         worker.decoder.begin = lambda *_, **__: None  # type: ignore[method-assign]
-        worker.decoder.unread_bytes = 262144
+        worker.decoder.unread_bytes = 1 << 24
         worker.say(connection, LONG)
 
     (refusal,) = [message for message in wire.sent if isinstance(message, Failure)]
@@ -167,7 +167,7 @@ def test_the_log_names_why_a_message_was_refused_and_a_robot_cut_off(tmp_path: P
         worker = WorkerParts(log, codec="zlib")
         connection, _ = worker.join()
         worker.say(connection, UNDECODABLE)
-        for _ in range(SETTINGS.session.max_bad_messages + 1):
+        for _ in range(MAX_BAD_MESSAGES + 1):
             worker.say(connection, b"no zlib stream")
         worker.dispatcher.close_all()
         log.close()

@@ -12,11 +12,11 @@ from rse_pf.backend.gateway.frames import CloseBorder, CloseSocket, FrameAssembl
 from rse_pf.config import SessionSettings
 
 CONTINUATION, TEXT, BINARY, CLOSE, PING, PONG = 0, 1, 2, 8, 9, 10
-LIMITS = SessionSettings(max_message_bytes=2000, max_fragments=4, max_control_per_s=3.0)
+LIMITS = SessionSettings(max_message_bytes=2000, max_fragments=4)
 
 
 def assembler() -> FrameAssembler:
-    return FrameAssembler(LIMITS)
+    return FrameAssembler(LIMITS, max_control_per_s=3.0)
 
 
 def frame_bytes(opcode: int, fin: bool, payload: bytes, mask: bytes = b"\0\0\0\0") -> bytes:
@@ -133,7 +133,7 @@ def stream_of(sent: list[tuple[bytes, int, bytes]]) -> bytes:
 
 def parsed(stream: bytes) -> list[bytes]:
     """Unmask and assemble a whole stream with a parser that is nothing like the product's."""
-    frames, found, i = FrameAssembler(SessionSettings(max_control_per_s=1000.0)), [], 0
+    frames, found, i = FrameAssembler(SessionSettings(), max_control_per_s=1000.0), [], 0
     while i < len(stream):
         size = stream[i + 1] & 127
         start = i + 2

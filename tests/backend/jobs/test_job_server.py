@@ -26,7 +26,7 @@ from rse_pf.object_store import MemoryStore
 from tests.backend.jobs.test_runner import FakeProcess
 
 SETTINGS = PlatformSettings.from_dict(
-    {"serving": {"job_heartbeat_s": 0.05, "job_lease_s": 0.3, "max_running_jobs": 0, "offer_jobs": True}}
+    {"serving": {"job_lease_s": 0.3, "max_running_jobs": 0, "offer_jobs": True}}
 )
 DONE = ["done", 12.5, msgspec.msgpack.encode({"value": 1})]
 

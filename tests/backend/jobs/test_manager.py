@@ -55,7 +55,7 @@ class Bench:
     """A job manager with processes that do what the test says."""
 
     def __init__(self, **serving: Any) -> None:
-        self.settings = PlatformSettings.from_dict({"serving": {"job_heartbeat_s": 0.05, **serving}})
+        self.settings = PlatformSettings.from_dict({"serving": {"job_lease_s": 0.25, **serving}})
         self.loop = FakeLoop()
         self.started: queue.SimpleQueue[FakeProcess] = queue.SimpleQueue()
         self.answers: dict[int, Result | Failure] = {}

@@ -23,7 +23,7 @@ from rse_pf.object_store import MemoryStore, digest_of
 
 SETTINGS = PlatformSettings.from_dict(
     {
-        "serving": {"job_heartbeat_s": 0.05, "job_lease_s": 0.2},
+        "serving": {"job_lease_s": 0.25},
         "session": {"max_message_bytes": 1024},
         "data": {"max_object_bytes": 4096},
     }

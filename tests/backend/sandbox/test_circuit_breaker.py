@@ -12,9 +12,7 @@ from rse_pf.config import PlatformSettings
 from rse_pf.errors import RsePfError, WorkerLost
 from rse_pf.identity import RobotId
 
-SETTINGS = PlatformSettings.from_dict(
-    {"services": {"poison_crashes": 2, "breaker_crashes": 3, "breaker_open_s": 60}}
-).services
+SETTINGS = PlatformSettings.from_dict({"services": {"breaker_crashes": 3}}).services
 ONE, TWO, THREE, FOUR = (RobotId("acme", f"robot-{i}") for i in range(1, 5))
 RIVAL, RIVAL_2, NAMESAKE = (
     RobotId("rival", "robot-9"),
@@ -94,9 +92,11 @@ def test_after_it_closed_the_breaker_needs_as_many_crashes_again():
     assert refused(breaker, ONE, now=64.0) == ["worker-lost"]
 
 
-def test_crashes_before_the_breaker_opened_are_not_counted_twice_if_it_is_open_for_a_short_time():
-    settings = PlatformSettings.from_dict({"services": {"breaker_crashes": 3, "breaker_open_s": 1}}).services
-    breaker = CircuitBreaker(settings)
+def test_crashes_before_the_breaker_opened_are_not_counted_twice_if_it_is_open_for_a_short_time(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    monkeypatch.setattr(circuit_breaker, "OPEN_S", 1.0)
+    breaker = CircuitBreaker(SETTINGS)
     for now in (0.0, 1.0, 2.0, 3.5):
         breaker.note_crash(ONE, "icp", str(now), now)
 

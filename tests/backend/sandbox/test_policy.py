@@ -5,8 +5,10 @@ from __future__ import annotations
 import math
 from typing import Any
 
+from rse_pf.backend.sandbox.circuit_breaker import OPEN_S, POISON_CRASHES, CircuitBreaker
 from rse_pf.backend.sandbox.ipc import encode_message
 from rse_pf.backend.sandbox.policy import (
+    START_TIMEOUT_S,
     Action,
     AnswerCall,
     CreateSandbox,
@@ -27,21 +29,25 @@ from rse_pf.errors import BadRequest, Conflict, RsePfError, StoreError
 from rse_pf.identity import RobotId
 from rse_pf.wire import Command
 
-GRACE_S, START_S, FACTOR, OPEN_S = 5.0, 2.0, 2.0, 60.0
+GRACE_S, FACTOR = 5.0, 2.0
 A, B, C = (RobotId("acme", name) for name in "abc")
 KINDS = {"icp": "stateless", "counter": "per_robot_state"}
 
 
-def make_policy(*, max_sandboxes: int = 4, keeps_snapshots: bool = True, **services: Any) -> SandboxPolicy:
+def make_policy(
+    *,
+    max_sandboxes: int = 4,
+    keeps_snapshots: bool = True,
+    poison_crashes: int = POISON_CRASHES,
+    **services: Any,
+) -> SandboxPolicy:
     """Return a policy that knows the connections of robots a, b and c."""
-    limits = {
-        "grace_s": GRACE_S, "start_timeout_s": START_S, "breaker_crashes": 100, "breaker_open_s": OPEN_S,
-        **services,
-    }  # fmt: skip
+    limits = {"grace_s": GRACE_S, "breaker_crashes": 100, **services}
     settings = PlatformSettings.from_dict({"services": limits})
     policy = SandboxPolicy(
         KINDS, settings.services, max_sandboxes=max_sandboxes, keeps_snapshots=keeps_snapshots
     )
+    policy.breaker = CircuitBreaker(settings.services, poison_crashes=poison_crashes)
     for robot in (A, B, C):
         policy.add_connection(robot)
     return policy
@@ -395,10 +401,10 @@ def test_a_command_that_waited_beyond_its_deadline_costs_no_compute():
 def test_a_sandbox_that_does_not_start_in_time_is_killed():
     policy, call = make_policy(), make_call()
     policy.submit(call, 0.0)
-    assert policy.wake_s == START_S
+    assert policy.wake_s == START_TIMEOUT_S
 
-    assert policy.tick(START_S) == [KillSandbox(1)]
-    actions = policy.on_exit(1, "signal SIGKILL", START_S)
+    assert policy.tick(START_TIMEOUT_S) == [KillSandbox(1)]
+    actions = policy.on_exit(1, "signal SIGKILL", START_TIMEOUT_S)
 
     assert outcomes(actions) == [(call, "worker-lost")]
     assert LogCrash(A, "", "it did not start in time (signal SIGKILL)") in actions

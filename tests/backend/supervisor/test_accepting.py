@@ -44,8 +44,10 @@ class Port:
 
 
 @contextlib.asynccontextmanager
-async def opened(**serving: Any) -> AsyncIterator[Port]:
-    port = Port(**serving)
+async def opened(*, burst: int = 1000, **serving: Any) -> AsyncIterator[Port]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("rse_pf.backend.supervisor.accepting.HANDSHAKE_BURST", float(burst))
+        port = Port(**serving)
     port.acceptor.open()
     try:
         yield port
@@ -64,7 +66,7 @@ def run(test: Any) -> None:
 
 def test_silent_sockets_take_nothing_of_the_rate_and_a_robot_is_passed_on_behind_them() -> None:
     async def test() -> None:
-        async with opened(max_accepts_per_s=1.0, handshake_burst=1, max_unauthenticated=50) as port:
+        async with opened(max_accepts_per_s=1.0, burst=1, max_unauthenticated=50) as port:
             silent = [await port.dial() for _ in range(300)]
             robot = await port.dial(b"GET")
             assert await port.passed.get() == (301, b"GET")
@@ -93,7 +95,7 @@ def test_a_silent_socket_is_cut_at_its_time_and_one_that_speaks_before_is_passed
 
 def test_sockets_that_send_wait_for_the_rate_in_their_order() -> None:
     async def test() -> None:
-        async with opened(max_accepts_per_s=100.0, handshake_burst=2) as port:
+        async with opened(max_accepts_per_s=100.0, burst=2) as port:
             began = asyncio.get_running_loop().time()
             robots = [await port.dial(b"GET") for _ in range(12)]
             passed = [(await port.passed.get())[0] for _ in robots]
@@ -108,7 +110,7 @@ def test_sockets_that_send_wait_for_the_rate_in_their_order() -> None:
 
 def test_a_socket_that_ends_while_it_waits_takes_nothing_of_the_rate() -> None:
     async def test() -> None:
-        async with opened(max_accepts_per_s=5.0, handshake_burst=1) as port:
+        async with opened(max_accepts_per_s=5.0, burst=1) as port:
             for _ in range(200):
                 (await port.dial()).close()
             robot = await port.dial(b"GET")
@@ -121,7 +123,7 @@ def test_a_socket_that_ends_while_it_waits_takes_nothing_of_the_rate() -> None:
 
 def test_closing_cuts_all_that_wait() -> None:
     async def test() -> None:
-        async with opened(max_accepts_per_s=0.01, handshake_burst=1) as port:
+        async with opened(max_accepts_per_s=0.01, burst=1) as port:
             waiting = [await port.dial(), *[await port.dial(b"GET") for _ in range(3)]]
             await port.passed.get()
             port.acceptor.close()

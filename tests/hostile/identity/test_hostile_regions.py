@@ -23,7 +23,7 @@ pytestmark = pytest.mark.system
 
 QUICK = SessionSettings(
     connect_timeout_s=1.0, stall_timeout_s=0.6, ping_interval_s=0.1, ping_timeout_s=0.8,
-    reconnect_base_s=0.01, reconnect_max_s=0.05, reconnect_long_max_s=0.2, region_hold_s=0.5,
+    reconnect_max_s=0.05, reconnect_long_max_s=0.2, region_hold_s=0.5,
 )  # fmt: skip
 TOKEN = "a-token-of-this-robot"
 Answer = Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None]]

@@ -113,11 +113,11 @@ def test_rosbridge_has_a_way_to_the_servers_if_it_is_switched_on() -> None:
 
 
 def test_headers_are_bounded_in_number_size_and_time() -> None:
-    made = manager(config(serving={"handshake_timeout_s": 1.5, "max_handshake_bytes": 4096}))
+    made = manager(config(serving={"handshake_timeout_s": 1.5}))
 
     assert made["request_headers_timeout"] == "1.5s"
     assert made["common_http_protocol_options"]["idle_timeout"] == "1.5s"
-    assert made["max_request_headers_kb"] == 4
+    assert made["max_request_headers_kb"] == 8
     assert made["common_http_protocol_options"]["max_headers_count"] <= 100
 
 

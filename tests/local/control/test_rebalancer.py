@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
-from rse_pf.config import ScalingSettings
 from rse_pf.local.control.rebalancer import MoveRequest, Rebalancer
 
-SCALING = ScalingSettings(moves_per_s=20.0)
 UNEVEN = {"server-1": 50, "server-2": 50, "server-3": 0}
 
 
 def watching(robots: dict[str, int], since_s: float = 100.0) -> Rebalancer:
     """Return one that watches since *since_s*, and has seen *robots* just before."""
-    rebalancer = Rebalancer(SCALING)
+    rebalancer = Rebalancer()
     rebalancer.requests(robots, since_s - 1.0)
     rebalancer.watch(since_s)
     return rebalancer
 
 
 def test_nobody_is_asked_before_something_happened() -> None:
-    rebalancer = Rebalancer(SCALING)
+    rebalancer = Rebalancer()
 
     assert [rebalancer.requests(UNEVEN, time_s) for time_s in (100.0, 101.0, 102.0)] == [()] * 3
 

@@ -69,7 +69,7 @@ def settings_of(folder: Path, **serving: Any) -> dict[str, Any]:
     return {
         "serving": {
             "port": 0, "control_port": 0, "workers": 1, "max_running_jobs": 0, "offer_jobs": True,
-            "job_heartbeat_s": 0.1, "job_lease_s": 1.0, "job_poll_s": 0.1, "drain_wait_s": 0.0, **serving,
+            "job_lease_s": 1.0, "job_poll_s": 0.1, "drain_wait_s": 0.0, **serving,
         },
         "data": {"store": f"dir:{folder / 'store'}"},
         "auth": {"required": False},

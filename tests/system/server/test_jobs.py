@@ -130,7 +130,7 @@ def platform(start_server, tmp_path):
     (tmp_path / "served_in_tests.py").write_text(_SERVICES)
 
     def start(**serving: Any):
-        chosen = {"job_heartbeat_s": 0.1, "job_lease_s": 1.0, "drain_wait_s": 0.0, **serving}
+        chosen = {"job_lease_s": 1.0, "drain_wait_s": 0.0, **serving}
         return start_server(keys=True, serving=chosen, data={"store": f"dir:{tmp_path / 'store'}"})
 
     return start

@@ -319,7 +319,7 @@ def test_a_poison_request_crashes_two_sandboxes_however_often_it_is_sent(serve_i
 
 
 def test_a_service_that_crashes_repeatedly_opens_its_circuit_breaker_and_readyz_reports_it(serve_isolated):
-    server = serve_isolated(breaker_crashes=3, poison_crashes=1)
+    server = serve_isolated(breaker_crashes=3)
     crashes = [("worker", {"do": what}) for what in ("segv", "abort", "leave")]
     answers = ask_all(server, "robot-1", [*crashes, ("worker", {"do": "look"})])
 
@@ -335,7 +335,7 @@ def test_a_service_that_crashes_repeatedly_opens_its_circuit_breaker_and_readyz_
 
 
 def test_an_operator_sees_and_lifts_what_is_refused_after_crashes(serve_isolated, capsys):
-    server = serve_isolated(breaker_crashes=2, poison_crashes=1)
+    server = serve_isolated(breaker_crashes=4)
     look = [("worker", {"do": "look"})]
     ask_all(server, "robot-1", [("worker", {"do": what}) for what in ("segv", "abort")])
     port = ["--control-port", str(server.identity["control_port"])]

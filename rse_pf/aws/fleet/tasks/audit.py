@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from rse_pf.aws.fleet.task import AgentContext, Task
 
-__all__ = ["task"]
+__all__ = ["AUDIT_SHIP_S", "task"]
+
+AUDIT_SHIP_S = 60.0
+"""Time between two uploads; a machine that fails loses at most this much."""
 
 
 def task(context: AgentContext) -> Task:
@@ -15,4 +18,4 @@ def task(context: AgentContext) -> Task:
         if count:
             context.log("shipped", pieces=count)
 
-    return Task(name="audit", period_s=context.settings.cloud.audit_ship_s, call=ship, flushes=True)
+    return Task(name="audit", period_s=AUDIT_SHIP_S, call=ship, flushes=True)

@@ -11,8 +11,10 @@ from rse_pf.aws.fleet.task import AgentContext, Task
 from rse_pf.config.resource_names import JOURNAL_PREFIX
 from rse_pf.files import replace_file
 
-__all__ = ["piece_name", "task"]
+__all__ = ["JOURNAL_SHIP_S", "piece_name", "task"]
 
+JOURNAL_SHIP_S = 60.0
+"""Time between two uploads; a machine that fails loses at most this much."""
 _CURSOR_FILE = "journal.cursor"
 _MAX_PIECES = 8
 """In one call; what is left is shipped in the next ones."""
@@ -21,7 +23,7 @@ _MAX_PIECES = 8
 def task(context: AgentContext) -> Task:
     """Upload what the journals have since the last call; also before and after a drain."""
     return Task(
-        name="journals", period_s=context.settings.cloud.journal_ship_s, call=lambda: _ship(context),
+        name="journals", period_s=JOURNAL_SHIP_S, call=lambda: _ship(context),
         flushes=True,
     )  # fmt: skip
 

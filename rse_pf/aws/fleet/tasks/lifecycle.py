@@ -15,12 +15,15 @@ from rse_pf.scaling.boot_time import ready_within_s
 
 __all__ = ["task"]
 
+_POLL_S = 5.0
+"""Time between two reads of the lifecycle state; a launch or a drain waits this long at the most."""
+
 
 def task(context: AgentContext) -> Task:
     """Ask where the instance is to go, and do once what each way needs."""
     return Task(
         name="lifecycle",
-        period_s=float(context.settings.cloud.poll_s),
+        period_s=_POLL_S,
         call=_Lifecycle(context).follow,
         phases=ALWAYS - {Phase.LEFT},
     )

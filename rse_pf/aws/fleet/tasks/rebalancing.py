@@ -76,7 +76,7 @@ class _Rebalancing:
 
     def _order(self, robots: int, totals: Sequence[Totals]) -> None:
         context = self._context
-        order = order_of(robots, totals, moves_per_s=context.settings.scaling.moves_per_s)
+        order = order_of(robots, totals)
         if order is None:
             self._asked = None
             return

@@ -26,6 +26,7 @@ __all__ = [
     "decode_lease",
     "lease_name",
     "map_folder",
+    "renewal_s",
     "tenant_folder",
     "verdict_on",
 ]
@@ -33,6 +34,8 @@ __all__ = [
 INTERNAL_KEY = "live/key=internal"
 """Object with the key of the tokens between servers; no tenant's folder has an equals sign without x."""
 _NAME = re.compile(r"[a-z0-9][a-z0-9-]{0,63}")
+_RENEWALS_PER_LEASE = 3
+"""Two renewals may fail or come late before another server takes the map over."""
 _FREE_TRIES = 2
 """So many owners may die one after the other before the next one waits longer than the lease."""
 _MAX_WAIT_S = 60.0
@@ -92,6 +95,11 @@ def map_folder(tenant: str, map_name: str) -> str:
 def lease_name(tenant: str, map_name: str) -> str:
     """Return the object name of the lease of a map; raises BadRequest."""
     return f"{map_folder(tenant, map_name)}lease"
+
+
+def renewal_s(lease_s: float) -> float:
+    """Return the time between two renewals of a lease that ends after *lease_s* without one, in seconds."""
+    return lease_s / _RENEWALS_PER_LEASE
 
 
 def verdict_on(record: LeaseRecord | None, *, unchanged_s: float, lease_s: float) -> LeaseVerdict:

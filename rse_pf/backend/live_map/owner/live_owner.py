@@ -19,7 +19,7 @@ import msgspec
 
 from rse_pf.accounts import TenantAccount
 from rse_pf.backend.live_map.owner import requests
-from rse_pf.backend.live_map.owner.lease import OwnerLease
+from rse_pf.backend.live_map.owner.lease import OwnerLease, renewal_s
 from rse_pf.backend.live_map.owner.log import LiveLog, MapSnapshot
 from rse_pf.backend.live_map.owner.publish import version_to_start_from
 from rse_pf.backend.live_map.owner.replies import relocalise_reply, show_reply, version_reply
@@ -407,7 +407,7 @@ class LiveOwner:
         settings, clock = self._context.settings, self._context.clock
         while not self._ended.done():
             is_settled = self._measuring.is_proven or clock() - self._began_s >= _SETTLED_S
-            wait_s = settings.heartbeat_s
+            wait_s = renewal_s(settings.lease_s)
             try:
                 is_ours = await self._context.threads.lease(
                     functools.partial(self._lease.renew, is_settled=is_settled)
@@ -459,7 +459,7 @@ class LiveOwner:
         self._publisher.ask("nobody used the live map")
         while self._publisher.is_due and not self._publisher.has_failed and not self.users:
             await self._publisher.publish_due()
-            await self._context.sleep(self._context.settings.heartbeat_s)
+            await self._context.sleep(renewal_s(self._context.settings.lease_s))
         if not self.users:
             await self.release()
 

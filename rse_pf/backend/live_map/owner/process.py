@@ -28,7 +28,7 @@ import msgspec
 
 from rse_pf.accounts import TenantAccount
 from rse_pf.aws.storage import open_data_store
-from rse_pf.backend.live_map.owner.lease import OwnerLease, lease_name, map_folder
+from rse_pf.backend.live_map.owner.lease import OwnerLease, lease_name, map_folder, renewal_s
 from rse_pf.backend.live_map.owner.link_security import (
     LinkClaims,
     check_token,
@@ -211,7 +211,7 @@ class _Process:
         """Renew the lease while the map is being restored; return when it is lost."""
         settings = self._settings.live
         while await self._retry(self._threads.lease, self._lease.renew):
-            await asyncio.sleep(settings.heartbeat_s)
+            await asyncio.sleep(renewal_s(settings.lease_s))
 
     async def _take_over(self) -> tuple[MapState, LiveLog]:
         record = self._lease.record

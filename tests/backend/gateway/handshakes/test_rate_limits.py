@@ -148,8 +148,9 @@ def test_the_source_is_the_address_that_the_first_trusted_proxy_saw(trusted, tol
     assert SourceRates(ServingSettings(trusted_proxies=trusted)).source("peer", told) == source
 
 
-def test_a_source_has_a_rate_of_handshakes():
-    sources = SourceRates(ServingSettings(max_handshakes_per_source_per_s=10.0, handshake_burst=3))
+def test_a_source_has_a_rate_of_handshakes(monkeypatch):
+    monkeypatch.setattr("rse_pf.backend.gateway.rate_limits.HANDSHAKE_BURST", 3.0)
+    sources = SourceRates(ServingSettings(max_handshakes_per_source_per_s=10.0))
 
     assert [sources.wait_s("a", 1.0) > 0 for _ in range(5)] == [False, False, False, True, True]
     assert sources.wait_s("b", 1.0) == 0.0
