@@ -55,6 +55,9 @@ _DRAWN_S, _WRITTEN_S = 5.0, 15.0
 """What was drawn is spent within the first time, and written within the second one."""
 _SWAPS = 50
 _SHARE_S = 1.0
+_RESERVE_SHARE = 0.1
+"""Share of the store's disk that no tenant alone may fill: when less is free, a tenant that holds more than
+its share is refused."""
 _NEVER = float("-inf")
 _OF_TENANT = ("objects", "maps", "live", "states", "jobs", "job-queue")
 
@@ -217,7 +220,7 @@ class TenantAccount:
         if not isinstance(self._store, SizedStore):
             return self._settings.tenant_quota_bytes
         free, total = self._store.space()
-        return free - int(total * self._settings.reserve_percent / 100.0)
+        return free - int(total * _RESERVE_SHARE)
 
     def _share(self) -> float:
         """Return how many bytes a tenant may hold while the disk is nearly full."""

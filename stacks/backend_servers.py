@@ -29,7 +29,7 @@ from rse_pf.config import PlatformSettings
 from rse_pf.config.cloud_layout import zone_count
 from rse_pf.config.resource_names import AUDIT_PREFIX, JOURNAL_PREFIX, VERSION_PARAMETER, ResourceNames
 from rse_pf.scaling.alarms import NAMESPACE
-from rse_pf.scaling.boot_time import retry_within_s
+from rse_pf.scaling.boot_time import BOOT_LIMIT_S, retry_within_s
 from rse_pf.scaling.health import MAX_HEALTHY_PERCENT
 from stacks.capacity import Capacity
 from stacks.permissions import allow
@@ -71,7 +71,7 @@ class BackendServers(Construct):
             "package": package.s3_object_url, "sha256": package_sums, "region": settings.cloud.region,
             "bucket": artifacts.bucket_name, "keys": key_set, "group": names.group,
             "hook": names.drain_hook, "launch": names.launch_hook,
-            "retry_s": f"{retry_within_s(settings):g}",
+            "retry_s": f"{retry_within_s():g}",
             "store": f"s3:{maps.bucket_name}" if maps is not None else settings.data.store,
             "audit": audit_logs.bucket_name,
         }  # fmt: skip
@@ -104,7 +104,7 @@ class BackendServers(Construct):
             autoscaling.CfnAutoScalingGroup.LifecycleHookSpecificationProperty(
                 lifecycle_hook_name=names.launch_hook,
                 lifecycle_transition="autoscaling:EC2_INSTANCE_LAUNCHING",
-                heartbeat_timeout=settings.cloud.boot_s, default_result="ABANDON",
+                heartbeat_timeout=BOOT_LIMIT_S, default_result="ABANDON",
             )
         ]  # fmt: skip
         self._keep_version(resource)

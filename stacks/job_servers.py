@@ -19,6 +19,7 @@ from constructs import Construct
 from rse_pf.config import PlatformSettings
 from rse_pf.config.cloud_layout import zone_count
 from rse_pf.config.resource_names import ResourceNames
+from rse_pf.scaling.boot_time import BOOT_LIMIT_S
 from rse_pf.scaling.job_alarms import job_alarms_of
 from stacks.backend_servers import launch_template
 from stacks.findings import acknowledge
@@ -89,7 +90,7 @@ class JobServers(Construct):
         hook = autoscaling.CfnAutoScalingGroup.LifecycleHookSpecificationProperty
         resource.lifecycle_hook_specification_list = [
             hook(
-                lifecycle_hook_name=names.job_launch_hook, heartbeat_timeout=cloud.boot_s,
+                lifecycle_hook_name=names.job_launch_hook, heartbeat_timeout=BOOT_LIMIT_S,
                 lifecycle_transition="autoscaling:EC2_INSTANCE_LAUNCHING", default_result="ABANDON",
             ),
             hook(

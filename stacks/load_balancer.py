@@ -11,7 +11,7 @@ from constructs import Construct
 from rse_pf.config import PlatformSettings
 from rse_pf.config.front_door import BALANCER_IDLE_TIMEOUT_S
 from rse_pf.config.resource_names import READY_PATH
-from rse_pf.scaling.health import CLOUD_TIMEOUT_S, HEALTHY_CHECKS, cloud_checks
+from rse_pf.scaling.health import CLOUD_INTERVAL_S, CLOUD_TIMEOUT_S, HEALTHY_CHECKS, cloud_checks
 from stacks.data_stack import BALANCER_LOGS
 from stacks.firewall import front_port
 from stacks.web_firewall import WebFirewall
@@ -78,7 +78,7 @@ class LoadBalancer(Construct):
             deregistration_delay=cdk.Duration.seconds(_DEREGISTRATION_S),
             health_check=elbv2.HealthCheck(
                 path=path, port=str(asked), healthy_http_codes="200",
-                interval=cdk.Duration.seconds(health.cloud_interval_s),
+                interval=cdk.Duration.seconds(CLOUD_INTERVAL_S),
                 timeout=cdk.Duration.seconds(CLOUD_TIMEOUT_S),
                 healthy_threshold_count=HEALTHY_CHECKS,
                 unhealthy_threshold_count=health.unhealthy_checks,

@@ -28,9 +28,7 @@ class Clock:
 
 
 def account(store: ObjectStore, clock: Clock, quota: int, tenant: str = "acme") -> TenantAccount:
-    return TenantAccount(
-        store, tenant, DataSettings(tenant_quota_bytes=quota, reserve_percent=10.0), wall_clock=clock
-    )
+    return TenantAccount(store, tenant, DataSettings(tenant_quota_bytes=quota), wall_clock=clock)
 
 
 class SmallDisk(DirectoryStore):

@@ -47,7 +47,7 @@ from rse_pf.config import PlatformSettings
 from rse_pf.errors import RsePfError
 from rse_pf.object_store import MemoryStore
 from rse_pf.pnp.problems import make_problem
-from rse_pf.scaling.health import CLOUD_TIMEOUT_S, Health, cloud_checks, observe
+from rse_pf.scaling.health import CLOUD_INTERVAL_S, CLOUD_TIMEOUT_S, Health, cloud_checks, observe
 from rse_pf.scaling.operator_alarms import STORE_PERIOD_S, operator_alarms
 from tests.alarm_states import AlarmRule, replay
 
@@ -235,7 +235,7 @@ class _Run:
                 if health[name].state == "unhealthy":
                     self._report.ended.append(f"server-{number}: {name}")
                     return
-            self._over.wait(max(0.0, begins_s + rule.cloud_interval_s - time.monotonic()))
+            self._over.wait(max(0.0, begins_s + CLOUD_INTERVAL_S - time.monotonic()))
 
     def _store(self, number: int, server: Mapping[str, int]) -> None:
         """Store a new object each second, as a robot that does not try again."""

@@ -233,7 +233,7 @@ async def _hostile(robot: Any, attack: str, call_s: float, end: float) -> None:
         await asyncio.sleep(0.5)  # the pace of the robot
 
 
-LIMITS = {"memory_bytes": MEMORY_BYTES, "scratch_bytes": SCRATCH_BYTES, "breaker_crashes": 100_000}
+LIMITS = {"memory_bytes": MEMORY_BYTES, "breaker_crashes": 100_000}
 
 
 async def measure(only: list[str], seconds: float) -> list[Row]:

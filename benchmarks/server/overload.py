@@ -1,6 +1,6 @@
 """Goodput of one small server at 0.9, 2 and 5 times its capacity.
 
-    python -m benchmarks.server.overload [--seconds 20] [--emulated-cores 0.25] [--threads 1]
+    python -m benchmarks.server.overload [--seconds 20] [--emulated-cores 0.25]
         [--codec zlib] [--out FILE]
 
 Real PnP (200 matches, 30 % wrong), open loop: Poisson send times fixed before the run, latency from the
@@ -346,7 +346,6 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=20.0, help="of each phase")
     parser.add_argument("--capacity-seconds", type=float, default=6.0, help="of the closed loop before")
     parser.add_argument("--emulated-cores", type=float, default=0.25, help="emulated cores of the server")
-    parser.add_argument("--threads", type=int, default=1, help="solver threads")
     parser.add_argument("--codec", default="zlib", choices=("zlib", "json", "bin"))
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--out", type=Path, help="write the figures as JSON")
@@ -357,7 +356,6 @@ def main() -> None:
             folder,
             workers=1,
             emulated_cores=args.emulated_cores,
-            solver_threads=args.threads,
             log_level="warning",
         )
         try:
@@ -368,14 +366,14 @@ def main() -> None:
     report |= {
         "machine": f"{platform.machine()}, {os.cpu_count()} cores",
         "settings": {
-            "emulated_cores": args.emulated_cores, "threads": args.threads, "codec": args.codec,
+            "emulated_cores": args.emulated_cores, "codec": args.codec,
             "seed": args.seed,
         },
         "seconds": args.seconds, "load_before": load, "load_after": os.getloadavg(),
         "verdict": verdict(report),
     }  # fmt: skip
     cores = f"{args.emulated_cores} emulated cores"
-    about = f"{cores}, {args.threads} threads, {args.codec}, {args.seconds:g} s a phase"
+    about = f"{cores}, {args.codec}, {args.seconds:g} s a phase"
     print(f"{report['machine']}, {about}")
     print(f"capacity {report['capacity_per_s']}/s; control port at most {report['control_max_ms']} ms")
     for row in report["phases"]:

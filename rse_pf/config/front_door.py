@@ -47,6 +47,8 @@ BEARER_PATTERN = r"^[Bb]earer +[A-Za-z0-9_-]+\.[A-Za-z0-9_-]+\.[A-Za-z0-9_-]{86}
 STATUS = 429
 RETRY_AFTER_S = 60
 """What an address above its limit is told: after one window without requests it is below."""
+_ADDRESS_SHARE = 0.4
+"""Share of the burst commands of all robots that one address may send: a site cannot take all of them."""
 _MINUTE_S = 60
 """The shortest window that AWS WAF has, so that an address is free again soon."""
 _FIVE_MINUTES_S = 300
@@ -83,7 +85,7 @@ def rate_rules(settings: PlatformSettings) -> tuple[RateRule, ...]:
         RateRule(name="data", limit=_limit(requests), path=DATA_PATH),
         RateRule(
             name="burst",
-            limit=burst.address_commands_per_5_minutes,
+            limit=_limit(_ADDRESS_SHARE * burst.commands_per_5_minutes),
             window_s=_FIVE_MINUTES_S,
             path=BURST_PATH,
         ),

@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from rse_pf.config.settings import BatchSettings, LiveSettings, PlatformSettings
+from rse_pf.config.settings import LIVE_PORTS, BatchSettings, LiveSettings, PlatformSettings
 from rse_pf.errors import SettingsError
 
 __all__ = ["ServerPlacement", "batch_ports", "fixed_live_ports", "is_loopback", "live_ports"]
@@ -87,7 +87,7 @@ def live_ports(live: LiveSettings) -> range:
 
 def fixed_live_ports(live: LiveSettings) -> range:
     """Return the ports of `live_ports` where other machines connect; ``live.first_port`` is not 0."""
-    return range(live.first_port, live.first_port + live.ports)
+    return range(live.first_port, live.first_port + LIVE_PORTS)
 
 
 _BATCH_PORTS = 100

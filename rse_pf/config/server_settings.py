@@ -18,14 +18,13 @@ READ_BY_SERVERS: dict[str, tuple[str, ...]] = {
     "cloud": (
         "name",
         "region",
-        "boot_s",
         "drain_s",
         "spot",
         "job_servers",
     ),
     "scaling": ("period_s", "profile", "warm_up_s"),
     "burst": ("url", "robot_commands_per_day", "commands_per_day"),
-    "health": ("cloud_interval_s", "unhealthy_checks"),
+    "health": ("unhealthy_checks",),
     "local": ("start_timeout_s",),
 }
 """Of these groups the named settings; of every other group all settings."""

@@ -31,6 +31,7 @@ from rse_pf.config.validation import (
 from rse_pf.errors import SettingsError
 
 __all__ = [
+    "LIVE_PORTS",
     "AuthSettings",
     "BatchSettings",
     "BurstSettings",
@@ -50,6 +51,10 @@ __all__ = [
 ]
 
 
+LIVE_PORTS = 64
+"""Ports from ``live.first_port`` on, which the firewall opens between servers: one for each owner of a live map."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ServingSettings:
     """One backend server: its sockets, workers and queue."""
@@ -61,9 +66,7 @@ class ServingSettings:
     path: str = setting("/ws", doc="path of the robots' WebSocket")
     rosbridge: bool = setting(False, doc="also serve rosbridge v2 clients, on the path /rosbridge")
     workers: int = setting(0, doc="worker processes; 0 means one per core", low=0, high=256)
-    solver_threads: int = setting(1, doc="solver threads of each worker", low=1, high=64)
     max_robots: int = setting(10000, unit="robots", doc="connections of one server; more are refused with 503", low=1)
-    handshake_timeout_s: float = setting(5.0, unit="s", doc="a handshake that takes longer is closed", source="slowloris, OWASP", low=0.1)
     max_unauthenticated: int = setting(200, unit="sockets", doc="sockets without a verified token; the oldest one is closed when a new one exceeds the limit", low=1)
     max_unauthenticated_per_source: int = setting(50, unit="sockets", doc="the same for each source address; not counted behind trusted proxies; 0 is off", low=0)
     max_accepts_per_s: float = setting(500.0, unit="sockets/s", doc="sockets that have begun to send and are passed to a worker each second; more wait; 0 is off", low=0)
@@ -72,7 +75,6 @@ class ServingSettings:
     allowed_origins: str = setting("", doc="origins of web pages that may connect, such as https://robots.example.org, with spaces between; pages of the platform itself always may")
     write_buffer_bytes: int = setting(262144, unit="bytes", doc="unsent bytes above which a client counts as a slow reader", low=4096)
     slow_reader_timeout_s: float = setting(1.0, unit="s", doc="a slow reader is disconnected after this", low=0.05)
-    max_queue_per_robot: int = setting(8, unit="commands", doc="queued commands of one robot; more are refused", low=1)
     max_object_bytes_per_command: int = setting(134217728, unit="bytes", doc="total size of the objects that one command refers to", low=1024)
     emulated_cores: float = setting(0.0, unit="cores", doc="CPU seconds per second that each worker may use, to emulate a smaller server; 0 is off", low=0, high=64)
     compute_processes: int = setting(1, doc="processes of each worker that compute map services; they are killed at the deadline", low=1, high=64)
@@ -86,7 +88,6 @@ class ServingSettings:
     max_job_memory_bytes: int = setting(2147483648, unit="bytes", doc="memory of one job; a job that needs more is ended", low=134217728)
     job_lease_s: float = setting(5.0, unit="s", doc="another server takes a job over when its lease was not renewed for this long", low=0.1)
     max_job_s: float = setting(3600.0, unit="s", doc="a job that takes longer is ended", low=1)
-    job_record_ttl_s: float = setting(604800.0, unit="s", doc="the record of a job is deleted when it was not used for this long; the same request then runs again", low=60)
     drain_wait_s: float = setting(1.0, unit="s", doc="a draining server reports not ready for this long before it moves its robots", low=0)
     drain_within_ms: float = setting(5000.0, unit="ms", doc="time that robots get to move to another server", low=100)
     log_level: str = setting("info", doc="least level of the lines that are logged", choices=("debug", "info", "warning", "error"))
@@ -101,11 +102,10 @@ class SessionSettings:
     max_fragments: int = setting(64, doc="fragments of one message, empty ones included", source="GHSA-96hv-2xvq-fx4p", low=1)
     max_in_flight: int = setting(8, unit="commands", doc="unanswered commands of one robot", low=1)
     max_commands_per_s: float = setting(20.0, unit="commands/s", doc="messages of one robot; more are refused; 0 is off", source="AWS IoT and Discord limit so", low=0)
-    command_burst: int = setting(40, unit="commands", doc="burst of max_commands_per_s", low=1)
     rate_ban_s: float = setting(5.0, unit="s", doc="a robot that was disconnected for its rate is refused for this long", low=0)
     ping_interval_s: float = setting(2.0, unit="s", doc="time between application pings", source="paper, Sect. 3.3 (delays); ours in value", low=0.05)
     ping_timeout_s: float = setting(3.0, unit="s", doc="a connection without an answer to a ping for this long counts as lost", low=0.1)
-    hello_timeout_s: float = setting(5.0, unit="s", doc="a socket without a Hello message is closed after this", low=0.1)
+    hello_timeout_s: float = setting(5.0, unit="s", doc="a socket is closed when its handshake, or after it the Hello message, takes longer", source="slowloris, OWASP", low=0.1)
     connect_timeout_s: float = setting(2.0, unit="s", doc="time limit of one attempt to connect", low=0.1)
     reconnect_max_s: float = setting(1.0, unit="s", doc="longest reconnect back-off in the first seconds without a connection", low=0.01)
     reconnect_long_max_s: float = setting(40.0, unit="s", doc="longest reconnect back-off after minutes without a connection; after a refusal half of it at least", low=0.01)
@@ -127,7 +127,6 @@ class PnpSettings:
 class HealthSettings:
     """When a server counts as healthy."""
 
-    cloud_interval_s: int = setting(5, unit="s", doc="time between checks of the ALB", low=5, high=300)
     unhealthy_checks: int = setting(2, unit="checks", doc="failed checks in a row after which a server is unhealthy", low=2, high=10)
     grace_s: int = setting(90, unit="s", doc="failed checks of a new server do not count for this long", low=0)
 
@@ -141,9 +140,6 @@ class ScalingSettings:
     idle_s: int = setting(300, unit="s", source="paper, Sect. 6.2", doc="remove a server after this long without work", low=60)
     idle_cpu_percent: float = setting(20.0, unit="%", doc="idle means no requests and CPU below this", low=0, high=100)
     period_s: int = setting(60, unit="s", doc="one sample of the monitor, in the paper's profile", low=10)
-    busy_periods: int = setting(2, unit="periods", doc="busy samples in a row before growing, in the paper's profile", low=1)
-    step: int = setting(1, unit="servers", doc="servers added when busy", low=1)
-    big_step: int = setting(2, unit="servers", doc="servers added when very busy", low=1)
     min_servers: int = setting(2, unit="servers", doc="never fewer", low=1)
     max_servers: int = setting(10, unit="servers", doc="never more", low=1)
     warm_up_s: int = setting(60, unit="s", doc="the CPU of a new server does not count for this long", low=0)
@@ -167,7 +163,6 @@ class DataSettings:
     max_object_bytes: int = setting(268435456, unit="bytes", doc="size of one object", low=1024)
     quota_bytes: int = setting(10737418240, unit="bytes", doc="total size of the objects of one robot", low=1024)
     tenant_quota_bytes: int = setting(107374182400, unit="bytes", doc="total size of what one tenant stores: objects, maps with all their versions, live maps, states of services and jobs that wait", low=1024)
-    reserve_percent: float = setting(10.0, unit="%", doc="share of the store's disk that no tenant alone may fill: when less is free, a tenant that holds more than its share is refused", low=0, high=50)
     max_objects: int = setting(100000, unit="objects", doc="objects, unfinished uploads and map versions of one robot", source="file systems run out of inodes", low=1)
     max_requests_per_s: float = setting(50.0, unit="requests/s", doc="requests of one robot; a list counts as 5, a commit of a map as 20; more are refused with 429", low=0.1)
     max_keyframe_features: int = setting(20000, unit="features", doc="features of one keyframe of a map that a service decodes", low=1)
@@ -198,8 +193,7 @@ class ServiceSettings:
     follow: bool = setting(False, doc="the services folder is a link that changes while the server runs: load it anew when the control port is told to, and serve without what cannot be loaded")
     published: bool = setting(False, doc="also run the services that installed Python packages publish (entry points rse_pf.services)")
     max_sandboxes: int = setting(64, doc="sandboxes of one server", low=1)
-    memory_bytes: int = setting(536870912, unit="bytes", doc="memory of one sandbox: its address space and its scratch folder together", low=16777216)
-    scratch_bytes: int = setting(16777216, unit="bytes", doc="scratch folder of one sandbox; it holds at most one file per 4096 bytes of this", low=65536)
+    memory_bytes: int = setting(536870912, unit="bytes", doc="memory of one sandbox: its address space and its scratch folder of 16 MiB together", low=16777216)
     grace_s: float = setting(5.0, unit="s", doc="a sandbox outlives the connection of its robot by this", low=0)
     breaker_crashes: int = setting(5, unit="crashes", doc="this many crashes of a service within 30 s open its circuit breaker", low=2)
     accept_weak_isolation: bool = setting(False, doc="run installed services even if the kernel lacks a means of isolation")
@@ -210,8 +204,7 @@ class LiveSettings:
     """Maps that robots make together while they drive; each has an owner process on one server."""
 
     host: str = setting("127.0.0.1", doc="address on which owners of live maps listen for the other servers; 0.0.0.0 listens on all and tells the main one")
-    first_port: int = setting(8800, doc="first port of owners of live maps; on loopback, and with 0, any free one is taken", low=0, high=65535)
-    ports: int = setting(64, doc="number of ports from live.first_port on", low=1, high=10000)
+    first_port: int = setting(8800, doc="first of the 64 ports of owners of live maps; on loopback, and with 0, any free one is taken", low=0, high=65535 - 63)
     max_owners: int = setting(4, doc="owner processes of one worker; further maps are refused until another server takes them; 0 switches live maps off", low=0, high=64)
     max_memory_bytes: int = setting(2147483648, unit="bytes", doc="memory of one owner process; one that needs more is ended", low=134217728)
     warm_standby: bool = setting(True, doc="keep one started process, about 70 MB, in each worker whose robots use live maps; it takes a map over a second sooner")
@@ -227,7 +220,6 @@ class RecordingSettings:
     """What robots and servers said, kept in files that rse-pf replay explains."""
 
     folder: str = setting("", doc="folder of recordings; empty: nothing is recorded")
-    max_file_bytes: int = setting(268435456, unit="bytes", doc="size of a recording's file at which the next one begins", low=1048576)
     max_bytes: int = setting(4294967296, unit="bytes", doc="size of all recordings of the folder above which the oldest files are deleted", low=1048576)
 
 
@@ -249,8 +241,6 @@ class LocalSettings:
     workers: int = setting(1, doc="worker processes of each local server", low=1, high=64)
     start_timeout_s: float = setting(20.0, unit="s", doc="a server that is not ready by then has failed", low=1)
     warm_standby: bool = setting(True, doc="keep one started process, about 60 MB, that becomes the next server at once", source="warm pools of AWS Auto Scaling")
-    max_restarts_per_minute: int = setting(5, unit="servers", doc="servers that failed soon after their start and are replaced within a minute", low=1)
-    disk_warning_bytes: int = setting(1 << 30, unit="bytes", doc="less free space than this on the disk of the state folder or of the store is reported", low=0)
     metrics_port: int = setting(9464, doc="port of the control plane on loopback: /metrics of all servers, for Prometheus; 0 takes a free one", source="OpenTelemetry's Prometheus exporter", low=0, high=65535)
     page_port: int = setting(8701, doc="port of the fleet page on loopback; 0 takes a free one, and so does a port that is taken", low=0, high=65535)
     foxglove_port: int = setting(8765, doc="port on loopback of the export to Foxglove (rse-pf local --foxglove); 0 takes a free one", low=0, high=65535)
@@ -267,7 +257,6 @@ class BurstSettings:
     robot_commands_per_day: int = setting(10000, unit="commands", doc="commands of one robot that go there in a day; more are refused, and the robot computes them itself; 0: none go there", low=0)
     commands_per_day: int = setting(500000, unit="commands", doc="commands of all robots that are answered there in a day; more are refused", low=1)
     commands_per_5_minutes: int = setting(50000, unit="commands", doc="WAF: commands of all robots in five minutes; more are refused with 429", low=100)
-    address_commands_per_5_minutes: int = setting(20000, unit="commands", doc="WAF: the same for one address", low=100)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -294,7 +283,6 @@ class CloudSettings:
     s3_prefix_list: str = setting("", doc="prefix list of S3 in the region; empty: from the table in stacks/firewall.py")
     robot_cidr: str = setting("0.0.0.0/0", doc="addresses that robots may connect from")
     robots_per_site: int = setting(100, unit="robots", doc="WAF: robots behind one address that may all connect, and send data, in the same minute", low=1, high=100000)
-    boot_s: int = setting(300, unit="s", doc="time that the launch hook gives a new server to become ready; then it is replaced", source="four times rse_pf/scaling/boot_time.py", low=180, high=7200)
     drain_s: int = setting(60, unit="s", doc="time that the termination hook gives a server to drain", low=30, high=7200)
     lambda_memory_mb: int = setting(1769, unit="MB", doc="memory of the serverless PnP; 1769 is one vCPU", low=128, high=10240)
     lambda_concurrency: int = setting(20, doc="concurrent executions of the serverless PnP", low=1)
@@ -371,13 +359,9 @@ def _check_contradictions(s: PlatformSettings) -> None:
         ("scaling", "min_servers", "max_servers"),
         ("scaling", "busy_cpu_percent", "very_busy_cpu_percent"),
         ("scaling", "idle_cpu_percent", "busy_cpu_percent"),
-        ("scaling", "step", "big_step"),
         ("session", "max_message_bytes", "max_inflated_bytes"),
         ("burst", "robot_commands_per_day", "commands_per_day"),
-        ("burst", "address_commands_per_5_minutes", "commands_per_5_minutes"),
         ("session", "reconnect_max_s", "reconnect_long_max_s"),
-        ("services", "scratch_bytes", "memory_bytes"),
-        ("recording", "max_file_bytes", "max_bytes"),
     ]
     for group, small, large in pairs:
         low, high = (getattr(getattr(s, group), name) for name in (small, large))
@@ -414,12 +398,7 @@ def _check_contradictions(s: PlatformSettings) -> None:
 
 def _check_live_ports(s: PlatformSettings) -> None:
     """Raise SettingsError if a port of live maps is none, or is another port of the same server."""
-    first, last = s.live.first_port, s.live.first_port + s.live.ports - 1
-    if first and last > 65535:
-        raise SettingsError(
-            f"live.first_port = {first} with live.ports = {s.live.ports} ends at port {last}, above 65535",
-            hint=f"lower one of them {WHERE}",
-        )
+    first, last = s.live.first_port, s.live.first_port + LIVE_PORTS - 1
     for name, port in (
         ("serving.port", s.serving.port), ("serving.control_port", s.serving.control_port),
         ("data.port", s.data.port),

@@ -15,12 +15,12 @@ from pathlib import Path
 from typing import Any, Literal
 
 from rse_pf.auth.trust_store import DENY_NAME, ROBOTS_NAME, AccessControlStore
-from rse_pf.config import LocalSettings
 from rse_pf.disk_reserve import SPARE_BYTES, SpareFiles, is_full
 from rse_pf.errors import RsePfError
 from rse_pf.object_store import DirectoryStore
 
 __all__ = [
+    "DISK_WARNING_BYTES",
     "LOOK_S", "DiskSpace", "DiskWatch", "access_control_store", "disk_level", "disk_line", "disk_spaces",
     "folders_of",
 ]  # fmt: skip
@@ -29,6 +29,8 @@ Level = Literal["ok", "low", "full"]
 
 LOOK_S = 0.5
 """Time between two looks; what waits for space goes on so soon after there is some."""
+DISK_WARNING_BYTES = 1 << 30
+"""Less free space than this on the disk of the state folder or of the store is reported."""
 _FULL_BYTES = 1 << 20
 _HYSTERESIS = 1.1
 _DIRECTORY = "dir:"
@@ -93,20 +95,18 @@ def access_control_store(state: Path) -> AccessControlStore:
 class DiskWatch:
     """The disks of one platform, as they were at the last look."""
 
-    def __init__(self, state: Path, store: str, local: LocalSettings, *, emit: Callable[..., None]) -> None:
+    def __init__(self, state: Path, store: str, *, emit: Callable[..., None]) -> None:
         """Look at nothing yet.
 
         Args:
             state: Folder of the platform.
             store: Location of its store, such as ``dir:PATH``.
-            local: How little free space is worth a warning.
             emit: Gets ``disk-full``, ``disk-low`` and ``disk-ok``, with ``reason`` and the bytes.
         """
         self.spaces: list[DiskSpace] = []
         self.on_space: Callable[[], None] = lambda: None
         self._state = state
         self._folders = folders_of(state, store)
-        self._low_bytes = local.disk_warning_bytes
         self._emit = emit
         self._levels: dict[str, Level] = {}
         self._reserve_problem = ""
@@ -114,7 +114,7 @@ class DiskWatch:
     def is_full(self) -> bool:
         """Return whether the disk of the state folder is full now."""
         with contextlib.suppress(OSError):
-            self._take(disk_spaces(self._folders, self._low_bytes))
+            self._take(disk_spaces(self._folders, DISK_WARNING_BYTES))
         return self._levels.get(str(self._state)) == "full"
 
     def prepare(self) -> None:
@@ -131,7 +131,7 @@ class DiskWatch:
         while True:
             await asyncio.sleep(LOOK_S)
             with contextlib.suppress(OSError):  # the folder was removed
-                self._take(await asyncio.to_thread(disk_spaces, self._folders, self._low_bytes))
+                self._take(await asyncio.to_thread(disk_spaces, self._folders, DISK_WARNING_BYTES))
             if self._levels.get(str(self._state)) != "full":
                 await asyncio.to_thread(self._refill)
 
@@ -143,7 +143,7 @@ class DiskWatch:
         self.spaces = spaces
         for space in spaces:
             before = self._levels.get(space.folder, "ok")
-            level = disk_level(space.free_bytes, self._low_bytes, before)
+            level = disk_level(space.free_bytes, DISK_WARNING_BYTES, before)
             self._levels[space.folder] = level
             if level != before:
                 free, total = space.free_bytes, space.total_bytes

@@ -86,7 +86,6 @@ class RecorderPlan(msgspec.Struct, frozen=True, kw_only=True):
     started_ns: int
     from_workers: int
     restarts: int = 0
-    max_file_bytes: int
     max_bytes: int
     session: dict[str, Any] = {}
     metadata: dict[str, str] = {}
@@ -259,7 +258,7 @@ def run_recorder(plan: RecorderPlan) -> None:
     with suppress(OSError):  # the writer says why it cannot write
         Path(plan.folder).mkdir(parents=True, exist_ok=True)
     writer = RecordingWriter(
-        Path(plan.folder), plan.server, started_ns=plan.started_ns, max_file_bytes=plan.max_file_bytes,
+        Path(plan.folder), plan.server, started_ns=plan.started_ns,
         max_bytes=plan.max_bytes, metadata=plan.metadata, version=plan.version,
     )  # fmt: skip
     recorder = MessageRecorder(writer, Pseudonyms(_key(plan.key)), session, plan.server)

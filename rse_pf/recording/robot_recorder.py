@@ -184,7 +184,7 @@ class RobotRecorder:
         """Write until `stop`, in a thread."""
         bounds = RecordingSettings()
         writer = RecordingWriter(
-            folder, "robot", started_ns=time.time_ns(), max_file_bytes=bounds.max_file_bytes,
+            folder, "robot", started_ns=time.time_ns(),
             max_bytes=bounds.max_bytes, metadata={"side": "robot", "protocol": str(PROTOCOL_VERSION)},
             version=self._version,
         )  # fmt: skip

@@ -32,6 +32,8 @@ from rse_pf.recording.mcap_file import McapFile
 
 __all__ = ["RecordingWriter", "checked_folder", "recorded"]
 
+MAX_FILE_BYTES = 1 << 28
+"""Size of a file at which the next one begins."""
 _PRUNE_NS = 10_000_000_000
 _RETRY_NS = 5_000_000_000
 _MAX_CHANNELS = 50_000
@@ -90,7 +92,7 @@ class RecordingWriter:
         server: str,
         *,
         started_ns: int,
-        max_file_bytes: int,
+        max_file_bytes: int = MAX_FILE_BYTES,
         max_bytes: int,
         metadata: Mapping[str, str] | None = None,
         version: str = "",

@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from rse_pf.config import ScalingSettings
+from rse_pf.scaling.policy import BIG_STEP, STEP
 from rse_pf.scaling.profile import cadence_of
 
 __all__ = ["CPU", "NAMESPACE", "Alarm", "Metric", "ScalingStep", "alarms_of"]
@@ -75,20 +76,20 @@ def alarms_of(settings: ScalingSettings) -> tuple[Alarm, ...]:
     """
     cpu = _FAST_CPU if cadence_of(settings).is_fast else _CPU
     further = settings.very_busy_cpu_percent - settings.busy_cpu_percent
-    steps = [ScalingStep(lower=0.0, upper=further, change=settings.step)] if further else []
+    steps = [ScalingStep(lower=0.0, upper=further, change=STEP)] if further else []
     busy = _grow(
         settings,
         "busy",
         cpu,
         settings.busy_cpu_percent,
-        (*steps, ScalingStep(lower=further, upper=None, change=settings.big_step)),
+        (*steps, ScalingStep(lower=further, upper=None, change=BIG_STEP)),
         "the average CPU of the servers is too high",
     )
     cadence = cadence_of(settings)
     alarms = [busy, _idle(settings, cpu)]
     if cadence.underused:
         alarms.append(_underused(settings, cpu))
-    one = (ScalingStep(lower=0.0, upper=None, change=settings.step),)
+    one = (ScalingStep(lower=0.0, upper=None, change=STEP),)
     if settings.max_robots_per_server:
         alarms.append(
             _grow(

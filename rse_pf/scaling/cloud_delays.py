@@ -67,7 +67,7 @@ class Design:
 
 _EC2 = "estimate, from experience with EC2; not measured by us"
 _BOOT = "estimate: our boot root on a loaded machine, not an instance"
-_CHECKS = "two checks of the load balancer, health.cloud_interval_s = 5, and the start of the server"
+_CHECKS = "two checks of the load balancer, one each 5 s, and the start of the server"
 
 DESIGNS: Mapping[str, Design] = {
     "0.1.0": Design(

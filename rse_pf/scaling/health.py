@@ -13,6 +13,7 @@ from rse_pf.config import HealthSettings, PlatformSettings
 from rse_pf.config.resource_names import HEALTH_PATH, READY_PATH
 
 __all__ = [
+    "CLOUD_INTERVAL_S",
     "CLOUD_TIMEOUT_S",
     "HEALTHY_CHECKS",
     "LOCAL_INTERVAL_S",
@@ -28,8 +29,8 @@ HEALTHY_CHECKS = 2
 """Good checks in a row that bring a server in."""
 LOCAL_INTERVAL_S, LOCAL_TIMEOUT_S = 0.25, 0.25
 """Time between checks on one machine; a check that takes longer than the second failed."""
-CLOUD_TIMEOUT_S = 4
-"""A check of the ALB that takes longer failed; below the least ``health.cloud_interval_s``."""
+CLOUD_INTERVAL_S, CLOUD_TIMEOUT_S = 5, 4
+"""Time between checks of the ALB, the least it offers; a check that takes longer than the second failed."""
 
 MAX_HEALTHY_PERCENT = 110
 """While servers are replaced: one new one more at a time, up to 19 servers, and never fewer than wanted.
@@ -77,6 +78,6 @@ def observe(health: Health, ok: bool, settings: HealthSettings, *, now_s: float)
 
 def time_to_notice_s(settings: HealthSettings, *, local: bool) -> float:
     """Return the longest time from a failure to its detection, in seconds; a drain waits for it."""
-    interval_s = LOCAL_INTERVAL_S if local else settings.cloud_interval_s
+    interval_s = LOCAL_INTERVAL_S if local else CLOUD_INTERVAL_S
     timeout_s = LOCAL_TIMEOUT_S if local else CLOUD_TIMEOUT_S
     return interval_s * settings.unhealthy_checks + timeout_s

@@ -15,7 +15,10 @@ from typing import Literal
 from rse_pf.config import ScalingSettings
 from rse_pf.scaling.profile import Cadence, cadence_of
 
-__all__ = ["Action", "FleetState", "Kind", "Sample", "decide", "holding_since"]
+__all__ = ["BIG_STEP", "STEP", "Action", "FleetState", "Kind", "Sample", "decide", "holding_since"]
+
+STEP, BIG_STEP = 1, 2
+"""Servers added above ``scaling.busy_cpu_percent``, and above ``scaling.very_busy_cpu_percent``."""
 
 Kind = Literal["grow", "shrink", "replace", "stay"]
 
@@ -154,9 +157,7 @@ def _rules(settings: ScalingSettings, cadence: Cadence) -> list[_Rule]:
             name="busy",
             samples=cadence.busy,
             holds=lambda one: one.cpu_percent >= settings.busy_cpu_percent,
-            change=lambda one: (
-                settings.big_step if one.cpu_percent >= settings.very_busy_cpu_percent else settings.step
-            ),
+            change=lambda one: BIG_STEP if one.cpu_percent >= settings.very_busy_cpu_percent else STEP,
             reason=lambda one: f"CPU at {one.cpu_percent:.0f} %",
         )
     ]
@@ -166,7 +167,7 @@ def _rules(settings: ScalingSettings, cadence: Cadence) -> list[_Rule]:
                 name="crowded",
                 samples=cadence.busy,
                 holds=lambda one: one.robots_per_server >= most_robots,
-                change=lambda one: settings.step,
+                change=lambda one: STEP,
                 reason=lambda one: f"{one.robots_per_server:.0f} robots on each server",
             )
         )
@@ -176,7 +177,7 @@ def _rules(settings: ScalingSettings, cadence: Cadence) -> list[_Rule]:
                 name="queueing",
                 samples=cadence.busy,
                 holds=lambda one: one.queue_ms >= most_queue_ms,
-                change=lambda one: settings.step,
+                change=lambda one: STEP,
                 reason=lambda one: f"commands wait {one.queue_ms:.0f} ms",
             )
         )

@@ -1,6 +1,6 @@
 """How often the monitor samples, and how many samples each rule of the policy needs, in either profile.
 
-The paper's profile takes ``scaling.period_s`` and ``scaling.busy_periods``; the fast one takes three samples
+The paper's profile takes ``scaling.period_s`` and `BUSY_PERIODS`; the fast one takes three samples
 of 10 s.  How long a fleet must be idle is the same in both.
 """
 
@@ -45,13 +45,17 @@ class Cadence:
         return max(self.busy, self.idle, self.underused)
 
 
+BUSY_PERIODS = 2
+"""Busy samples in a row before the paper's profile grows."""
+
+
 def cadence_of(settings: ScalingSettings) -> Cadence:
     """Return the cadence of ``scaling.profile``."""
     is_fast = settings.profile == "fast"
     period_s = FAST_PERIOD_S if is_fast else settings.period_s
     return Cadence(
         period_s=period_s,
-        busy=FAST_SAMPLES if is_fast else settings.busy_periods,
+        busy=FAST_SAMPLES if is_fast else BUSY_PERIODS,
         idle=settings.idle_s // period_s,
         underused=math.ceil(settings.underused_s / period_s),
         repeat=max(1, REPEAT_S // period_s),

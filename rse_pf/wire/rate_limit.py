@@ -21,15 +21,22 @@ from dataclasses import dataclass
 from rse_pf.token_bucket import TokenBucket
 from rse_pf.wire.messages import Limits
 
-__all__ = ["Backlog", "RateLimiter", "is_long_outage", "send_order"]
+__all__ = ["Backlog", "RateLimiter", "command_burst", "is_long_outage", "send_order"]
 
 # Share of the server's limit that a robot uses: a network may deliver messages closer together than sent.
 _OWN_SHARE = 0.9
 _UNLIMITED = 1 << 30
+# The burst is what a robot sends in this time at its rate: the frames of one reconnect.
+_BURST_S = 2.0
 # A server is loaded if a command queued for longer; equals its ``QUEUE_TARGET_S``.
 _SHORT_QUEUE_MS = 50.0
 # An outage is long if it took more than this share of a frame's time.
 _LONG_OUTAGE_SHARE = 0.5
+
+
+def command_burst(max_commands_per_s: float) -> int:
+    """Return how many messages a robot of this rate may send at once; 0 where there is no rate."""
+    return max(1, round(_BURST_S * max_commands_per_s)) if max_commands_per_s > 0 else 0
 
 
 class RateLimiter:

@@ -39,6 +39,7 @@ from rse_pf.wire.messages import (
     Unsubscribe,
     Welcome,
 )
+from rse_pf.wire.rate_limit import command_burst
 
 __all__ = [
     "CLOSE_GOING_AWAY",
@@ -325,7 +326,7 @@ class ServerSession:
                 max_message_bytes=self._limits.max_message_bytes,
                 max_in_flight=self._limits.max_in_flight,
                 max_commands_per_s=self._limits.max_commands_per_s,
-                command_burst=self._limits.command_burst if self._limits.max_commands_per_s else 0,
+                command_burst=command_burst(self._limits.max_commands_per_s),
                 burst_commands_per_day=burst.robot_commands_per_day if has_burst else 0,
             ),
             clock_s=now,

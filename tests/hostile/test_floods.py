@@ -34,10 +34,11 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[GuardedServer]:
     """One worker with short timeouts, where sockets come directly and from one address."""
     groups: dict[str, dict[str, Any]] = {
         "serving": {
-            "handshake_timeout_s": ONE_S, "slow_reader_timeout_s": 0.3, "write_buffer_bytes": 65536,
+            "slow_reader_timeout_s": 0.3, "write_buffer_bytes": 65536,
             "trusted_proxies": 0, "max_unauthenticated_per_source": 20, "max_unauthenticated": 40,
             "max_handshakes_per_source_per_s": 0.0, "max_accepts_per_s": 0.0,
         },
+        "session": {"hello_timeout_s": ONE_S},
     }  # fmt: skip
     with GuardedServer(tmp_path_factory.mktemp("floods"), workers=1, **groups) as made:
         yield made

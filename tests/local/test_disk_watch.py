@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from rse_pf.config import LocalSettings
+import pytest
+
 from rse_pf.local.disk_watch import DiskWatch, disk_level, disk_spaces, folders_of
 
 MIB = 1 << 20
@@ -30,15 +31,15 @@ def test_folders_on_one_disk_are_one_disk_and_a_store_elsewhere_is_none(tmp_path
 
 
 def test_each_change_is_one_event_that_names_folder_and_bytes(
-    small_disk: Callable[[str], Path], fill: Callable[[Path], Path]
+    small_disk: Callable[[str], Path], fill: Callable[[Path], Path], monkeypatch: pytest.MonkeyPatch
 ):
+    monkeypatch.setattr("rse_pf.local.disk_watch.DISK_WARNING_BYTES", 4 * MIB)
     disk = small_disk("8m")
     told: list[dict[str, object]] = []
     back: list[bool] = []
     watch = DiskWatch(
         disk,
         "memory:",
-        LocalSettings(disk_warning_bytes=4 * MIB),
         emit=lambda event, **more: told.append({"event": event, **more}),
     )
     watch.on_space = lambda: back.append(watch.is_full())

@@ -150,12 +150,12 @@ def walks(draw: st.DrawFn) -> list[float | None]:
 
 
 SCALINGS = st.builds(
-    lambda profile, idle_s, underused_s, low, more, warm, busy, robots, queue: ScalingSettings(
+    lambda profile, idle_s, underused_s, low, more, warm, robots, queue: ScalingSettings(
         profile=profile, idle_s=idle_s, underused_s=underused_s, min_servers=low, max_servers=low + more,
-        warm_up_s=warm, busy_periods=busy, max_robots_per_server=robots, max_queue_ms=queue,
+        warm_up_s=warm, max_robots_per_server=robots, max_queue_ms=queue,
     ),
     st.sampled_from(["paper", "fast"]), st.sampled_from([60, 180, 300]), st.sampled_from([0, 120, 900]),
-    st.integers(1, 3), st.integers(0, 8), st.sampled_from([0, 30, 60, 90, 180]), st.integers(1, 3),
+    st.integers(1, 3), st.integers(0, 8), st.sampled_from([0, 30, 60, 90, 180]),
     st.sampled_from([0, 60]), st.sampled_from([0.0, 32.0]),
 )  # fmt: skip
 

@@ -118,8 +118,9 @@ def test_a_slow_robot_does_not_hold_servers_that_have_nothing_to_do() -> None:
     assert actions(*[10.0] * 15, requests=1.0, settings=off) == ["stay"] * 15
 
 
-def test_a_server_that_leaves_would_not_crowd_the_others() -> None:
-    scaling = ScalingSettings(min_servers=1, max_robots_per_server=60, busy_periods=20)
+def test_a_server_that_leaves_would_not_crowd_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rse_pf.scaling.profile.BUSY_PERIODS", 20)
+    scaling = ScalingSettings(min_servers=1, max_robots_per_server=60)
     few, many = (
         [Sample(start_s=60.0 * i, cpu_percent=10.0, requests=1, robots_per_server=robots) for i in range(15)]
         for robots in (29.0, 30.0)

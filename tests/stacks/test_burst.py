@@ -78,7 +78,7 @@ def test_calls_with_an_invented_token_are_bounded_by_address_and_in_all(
     }
     burst = assembly.settings.burst
 
-    assert rates["burst"]["Limit"] == burst.address_commands_per_5_minutes
+    assert rates["burst"]["Limit"] == 0.4 * burst.commands_per_5_minutes
     assert rates["burst-of-all"]["Limit"] == burst.commands_per_5_minutes
     assert rates["burst-of-all"]["AggregateKeyType"] == "CONSTANT"
 

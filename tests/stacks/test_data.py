@@ -10,6 +10,7 @@ from rse_pf.auth.trust_store import DENY_NAME, ROBOTS_NAME
 from rse_pf.backend.live_map.owner.lease import lease_name
 from rse_pf.config import PlatformSettings
 from rse_pf.config.resource_names import KEYS_NAME, SERVICES_PREFIX
+from rse_pf.config.settings import LIVE_PORTS
 from rse_pf.errors import ConfigurationError
 
 Assembly = Any
@@ -128,7 +129,7 @@ def test_an_identity_and_maps_are_copied_to_other_regions_and_nothing_else(assem
 
 def test_servers_reach_live_maps_on_each_other_and_nothing_else_does(assembly: Assembly) -> None:
     live = assembly.settings.live
-    ports = (live.first_port, live.first_port + live.ports - 1)
+    ports = (live.first_port, live.first_port + LIVE_PORTS - 1)
     resources = assembly.templates["RsePf-Network"]["Resources"]
     (servers,) = [name for name in resources if name.startswith("FirewallServers") and len(name) == 23]
     allowed = {"AWS::EC2::SecurityGroupIngress": [], "AWS::EC2::SecurityGroupEgress": []}  # type: dict[str, list[Any]]

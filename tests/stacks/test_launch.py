@@ -10,8 +10,8 @@ import pytest
 
 from rse_pf.config import PlatformSettings
 from rse_pf.config.resource_names import VERSION_PARAMETER, ResourceNames
-from rse_pf.scaling.boot_time import BOOT_S
-from rse_pf.scaling.health import HEALTHY_CHECKS
+from rse_pf.scaling.boot_time import BOOT_LIMIT_S, BOOT_S
+from rse_pf.scaling.health import CLOUD_INTERVAL_S, HEALTHY_CHECKS
 
 NAMES = ResourceNames()
 REPLACING = {"AutoScalingRollingUpdate", "AutoScalingReplacingUpdate"}
@@ -35,7 +35,7 @@ def test_a_machine_that_says_nothing_never_joins(assembly: Any) -> None:
 
     assert hook == {
         "LifecycleHookName": NAMES.launch_hook, "LifecycleTransition": "autoscaling:EC2_INSTANCE_LAUNCHING",
-        "DefaultResult": "ABANDON", "HeartbeatTimeout": assembly.settings.cloud.boot_s,
+        "DefaultResult": "ABANDON", "HeartbeatTimeout": BOOT_LIMIT_S,
     }  # fmt: skip
 
 
@@ -59,7 +59,7 @@ def test_time_limits_of_a_launch_fit_one_measured_boot(assembly: Any) -> None:
 
     (hook,) = properties["LifecycleHookSpecificationList"]
     assert hook["HeartbeatTimeout"] >= 2 * BOOT_S
-    checks_s = HEALTHY_CHECKS * settings.health.cloud_interval_s
+    checks_s = HEALTHY_CHECKS * CLOUD_INTERVAL_S
     assert properties["HealthCheckGracePeriod"] >= 2 * checks_s, "it begins when the instance is in service"
     assert properties["HealthCheckGracePeriod"] == settings.health.grace_s
     assert properties["DefaultInstanceWarmup"] == settings.scaling.warm_up_s

@@ -18,6 +18,7 @@ from typing import Any
 import pytest
 
 from rse_pf.config.resource_names import READY_PATH, ResourceNames
+from rse_pf.scaling.health import CLOUD_INTERVAL_S
 
 boto3 = pytest.importorskip("boto3", reason="the infra extra is not installed")
 moto = pytest.importorskip("moto", reason="the infra extra is not installed")
@@ -180,7 +181,7 @@ def test_every_stack_is_created_and_what_moto_made_equals_the_settings(
     robots = next(each for each in targets if each.get("Port") == settings.serving.port)
     assert robots["HealthCheckPath"] == READY_PATH
     assert robots["HealthCheckPort"] == str(settings.serving.control_port)
-    assert robots["HealthCheckIntervalSeconds"] == settings.health.cloud_interval_s
+    assert robots["HealthCheckIntervalSeconds"] == CLOUD_INTERVAL_S
     if settings.data.enabled:
         data = next(each for each in targets if each.get("Port") == settings.data.port)
         assert data["HealthCheckPath"] == "/data/healthz"

@@ -13,7 +13,7 @@ from rse_pf.config import PlatformSettings
 from rse_pf.config.resource_names import READY_PATH
 from rse_pf.errors import ConfigurationError
 from rse_pf.scaling.alarms import Alarm, Metric, ScalingStep, alarms_of
-from rse_pf.scaling.health import CLOUD_TIMEOUT_S
+from rse_pf.scaling.health import CLOUD_INTERVAL_S, CLOUD_TIMEOUT_S
 
 Assembly = Any
 
@@ -198,7 +198,7 @@ def test_the_target_group_checks_the_control_port_as_the_settings_say(assembly: 
 
     assert group["HealthCheckPort"] == str(serving.control_port)
     assert group["HealthCheckPath"] == READY_PATH
-    assert group["HealthCheckIntervalSeconds"] == health.cloud_interval_s
+    assert group["HealthCheckIntervalSeconds"] == CLOUD_INTERVAL_S
     assert group["HealthCheckTimeoutSeconds"] == CLOUD_TIMEOUT_S
     assert group["UnhealthyThresholdCount"] == health.unhealthy_checks
     attributes = {each["Key"]: each["Value"] for each in group["TargetGroupAttributes"]}

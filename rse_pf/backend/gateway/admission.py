@@ -23,11 +23,13 @@ from rse_pf.backend.scheduling.scheduler import (
     max_wait_s,
     retry_after_ms,
 )
-from rse_pf.config import ServingSettings, SessionSettings
+from rse_pf.config import SessionSettings
 from rse_pf.errors import Busy, Forbidden
 
 __all__ = ["DECODER_FULL", "TOO_FAST", "TOO_LATE", "Admission", "UnreadRefusal"]
 
+MAX_QUEUE_PER_ROBOT = 8
+"""Queued commands of one robot, as many as may be unanswered by default; more are refused."""
 _MAX_UNREAD_BYTES = 1 << 24
 """Long messages that may wait for the decoder thread of a worker: 64 of the largest that a robot may send."""
 _SUSPECTS_SHARE = 0.25
@@ -59,9 +61,9 @@ DECODER_FULL = UnreadRefusal(
 class Admission:
     """The limits of one worker, and how much of its rate each robot has used."""
 
-    def __init__(self, session: SessionSettings, serving: ServingSettings) -> None:
+    def __init__(self, session: SessionSettings, *, max_queue: int = MAX_QUEUE_PER_ROBOT) -> None:
         self.rates = RobotRates(session)
-        self._max_queue = serving.max_queue_per_robot
+        self._max_queue = max_queue
 
     def may_wait(self, size_bytes: int, unread_bytes: int, bad_messages: int) -> bool:
         """Return whether a message that is too long for the event loop may wait for the decoder thread.

@@ -41,7 +41,7 @@ from rse_pf.backend.scheduling.scheduler import (
     RefusedCommand,
     Scheduler,
 )
-from rse_pf.backend.scheduling.thread_pool import SolverThreads
+from rse_pf.backend.scheduling.thread_pool import SOLVER_THREADS, SolverThreads
 from rse_pf.errors import NotFound, UnknownService
 from rse_pf.identity import RobotId
 from rse_pf.service import Registry
@@ -191,7 +191,7 @@ class Dispatcher:
             most=serving.max_unauthenticated, most_per_source=serving.max_unauthenticated_per_source,
         )  # fmt: skip
         self._threads = SolverThreads(
-            settings.serving.solver_threads,
+            SOLVER_THREADS,
             answers.compute,
             lambda answer: context.loop.call_soon_threadsafe(self._on_computed, answer),
         )
@@ -215,7 +215,6 @@ class Dispatcher:
         )
         """Services that `_runs_at_once` may run: in the event loop, without asking a store before."""
         self._monotonic = monotonic
-        self._solver_threads = settings.serving.solver_threads
         self._answer_timeout_s = settings.session.answer_timeout_s
         self._waits = LongestRecently()
         self._ran_inline = False
@@ -497,7 +496,7 @@ class Dispatcher:
     def _start(self) -> None:
         """Start the commands whose turn it is, as many as threads and the throttle allow."""
         scheduler = self._scheduler
-        while not self._ran_inline and scheduler.waiting and scheduler.running < self._solver_threads:
+        while not self._ran_inline and scheduler.waiting and scheduler.running < SOLVER_THREADS:
             now = self._monotonic()
             wait_s = self._throttle.wait_s(now)
             if wait_s > 0:

@@ -16,6 +16,7 @@ from rse_pf.auth.claimed import source_address
 from rse_pf.config import ServingSettings, SessionSettings
 from rse_pf.identity import RobotId
 from rse_pf.token_bucket import TokenBucket
+from rse_pf.wire.rate_limit import command_burst
 
 __all__ = ["CUT_OFF", "HANDSHAKE_BURST", "RobotRates", "SourceRates"]
 
@@ -32,7 +33,7 @@ _MIN_RETRY_MS = 1.0
 Key = TypeVar("Key", bound=Hashable)
 Value = TypeVar("Value")
 _MAX_VIOLATIONS, _VIOLATIONS_WINDOW_S = 3, 10.0
-"""A violation is ``session.command_burst`` refusals; so many within the window close the socket with 4429."""
+"""A violation is `command_burst` refusals; so many within the window close the socket with 4429."""
 
 
 @dataclass(slots=True)
@@ -46,7 +47,7 @@ class _Robot:
 class RobotRates:
     """The rate of each robot, over all of its sockets of one worker.
 
-    A violation is ``session.command_burst`` refusals: a robot a little above its rate gets refusals only, one
+    A violation is `command_burst` refusals: a robot a little above its rate gets refusals only, one
     far above it is cut off within a second and banned for ``session.rate_ban_s``.
     """
 
@@ -89,7 +90,7 @@ class RobotRates:
 
     def _violations(self, known: _Robot, now: float) -> int:
         known.refused += 1
-        if known.refused >= self._limits.command_burst:
+        if known.refused >= command_burst(self._limits.max_commands_per_s):
             known.refused = 0
             known.violations.append(now)
         while known.violations and now - known.violations[0] > _VIOLATIONS_WINDOW_S:
@@ -104,7 +105,8 @@ class RobotRates:
                 if state.violations or state.banned_until > now or not state.bucket.is_full(now)
             }
             self._robots = _half(remembered, self._max_names)
-        bucket = TokenBucket(self._limits.max_commands_per_s, float(self._limits.command_burst))
+        rate = self._limits.max_commands_per_s
+        bucket = TokenBucket(rate, float(command_burst(rate)))
         known = self._robots[robot] = _Robot(bucket)
         return known
 

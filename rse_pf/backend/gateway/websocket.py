@@ -175,10 +175,8 @@ class RobotSockets:
     def _read_first(self, pending: PendingSocket) -> None:
         if self._read(pending):
             return
-        loop, serving = self._context.loop, self._context.settings.serving
-        pending.timeout = loop.call_later(
-            serving.handshake_timeout_s, self._steps.add, self._cut_late, pending
-        )
+        loop, session = self._context.loop, self._context.settings.session
+        pending.timeout = loop.call_later(session.hello_timeout_s, self._steps.add, self._cut_late, pending)
         loop.add_reader(pending.accepted.fileno(), self._on_readable, pending)
         surplus = self._pending.enter(pending, pending.peer)
         if surplus is not None:

@@ -21,7 +21,7 @@ from rse_pf.backend.jobs.fair_queue import job_to_displace
 from rse_pf.backend.jobs.lease import job_key
 from rse_pf.backend.jobs.process import JobRequest
 from rse_pf.backend.jobs.queue import settings_digest_of
-from rse_pf.backend.jobs.record_gc import RecordCollector
+from rse_pf.backend.jobs.record_gc import RECORD_TTL_S, RecordCollector
 from rse_pf.backend.jobs.runner import WAITING, JobContext, JobOutcome, JobSignals, run_job
 from rse_pf.backend.ports import Log
 from rse_pf.backend.robot_store import quota_bytes
@@ -98,7 +98,7 @@ class JobManager:
         self._leaving = False
         self._collector = RecordCollector(
             context.store,
-            ttl_s=self._serving.job_record_ttl_s,
+            ttl_s=RECORD_TTL_S,
             clock=context.clock,
             wall_clock=wall_clock,
         )

@@ -1,4 +1,4 @@
-"""Garbage collection of job records that are unchanged for ``serving.job_record_ttl_s``.
+"""Garbage collection of job records that are unchanged for `RECORD_TTL_S`.
 
 A record is marked with the time when it is first seen; the next renewal of a running job removes the mark.  A
 record with an old mark is replaced by a tombstone and then deleted.  Each step is a compare-and-swap, so that
@@ -17,8 +17,10 @@ from rse_pf.backend.jobs.lease import JobRecord, decode_record, encode_record
 from rse_pf.errors import StoreError
 from rse_pf.object_store import ObjectStore
 
-__all__ = ["RecordCollector"]
+__all__ = ["RECORD_TTL_S", "RecordCollector"]
 
+RECORD_TTL_S = 604_800.0
+"""A record that was not used for a week is deleted; the same request then runs again."""
 _PREFIX = "jobs/"
 _LIST_INTERVAL_S = 3600.0
 _BATCH = 64
@@ -40,7 +42,7 @@ class RecordCollector:
 
         Args:
             store: Shared by all servers; their collections do not disturb each other.
-            ttl_s: ``serving.job_record_ttl_s``.
+            ttl_s: A record that was not used for this long is deleted.
             clock: Monotonic seconds.
             wall_clock: Unix seconds; may differ between machines by far less than *ttl_s*.
         """

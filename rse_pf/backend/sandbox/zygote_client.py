@@ -23,6 +23,8 @@ from rse_pf.services.custom.installed import InstalledService
 
 __all__ = ["ZygoteClient"]
 
+SCRATCH_BYTES = 1 << 24
+"""Scratch folder of one sandbox, in its memory; it holds at most one file per 4,096 bytes of this."""
 _MAX_MESSAGE = 1 << 16
 _END_S = 0.5
 """Time that a zygote has to end its sandboxes before it is killed."""
@@ -130,7 +132,7 @@ class ZygoteClient:
                 }
                 for s in self._services
             ],
-            "memory_bytes": limits.memory_bytes, "scratch_bytes": limits.scratch_bytes,
+            "memory_bytes": limits.memory_bytes, "scratch_bytes": SCRATCH_BYTES,
             "total_bytes": limits.memory_bytes,
             "max_bytes": self._settings.session.max_inflated_bytes,
         }  # fmt: skip

@@ -17,7 +17,6 @@ from typing import Any, NamedTuple
 import msgspec
 
 from rse_pf.backend.scheduling.turns import Turns
-from rse_pf.config import ServingSettings
 from rse_pf.errors import Busy, Expired, RsePfError, Stale
 from rse_pf.identity import RobotId
 from rse_pf.wire import Command
@@ -119,13 +118,12 @@ class _Robot:
 class Scheduler:
     """The queue of one worker."""
 
-    def __init__(self, settings: ServingSettings) -> None:
+    def __init__(self) -> None:
         self.waiting = 0
         self.running = 0
         self.is_behind = False
         self.turn_s = 0.0
         """Average time between two starts while robots wait: threads and CPU throttle included."""
-        self._is_serial = settings.solver_threads == 1 or 0 < settings.emulated_cores <= 1
         self._robots: dict[RobotId, _Robot] = {}
         self._turns = Turns()
         self._late_since: float | None = None
@@ -297,12 +295,12 @@ class Scheduler:
 
         It may if it is small and no thread would save time.
 
-        While the server is behind, a single solver thread and a server of one core have nothing to overlap
-        with but refusals, which cost less than passing the command to the thread.  So it is with services
-        that answer sooner than two threads pass the interpreter lock to each other.
+        While the server is behind, the one solver thread of a worker has nothing to overlap with but
+        refusals, which cost less than passing the command to the thread.  So it is with services that answer
+        sooner than two threads pass the interpreter lock to each other.
         """
         is_short = self._short_share >= _SHORT_SHARE
-        saves_time = self.waiting == 0 or is_short or (self.is_behind and self._is_serial)
+        saves_time = self.waiting == 0 or is_short or self.is_behind
         return cheap and size_bytes <= INLINE_BYTES and saves_time and self.running <= 1
 
     def _delay_s(self, robot_id: RobotId, robot: _Robot | None) -> float:

@@ -9,9 +9,14 @@ from typing import Generic, TypeVar
 
 from rse_pf.backend.scheduling.scheduler import QueuedCommand
 
-__all__ = ["SolverThreads"]
+__all__ = ["SOLVER_THREADS", "SolverThreads"]
 
 Outcome = TypeVar("Outcome")
+
+
+SOLVER_THREADS = 1
+"""Solver threads of each worker: a second one would wait for the interpreter lock; there is a worker for each
+core."""
 
 
 class SolverThreads(Generic[Outcome]):

@@ -44,6 +44,7 @@ class RobotAcceptor:
         listener: socket.socket,
         serving: ServingSettings,
         *,
+        silent_s: float,
         pass_on: Callable[[int, int, str], None],
         on_refused: Callable[[str], None],
     ) -> None:
@@ -52,12 +53,14 @@ class RobotAcceptor:
         Args:
             listener: A bound socket; closed by `close`.
             serving: Limits of the server.
+            silent_s: A socket that sends nothing for this long is closed.
             pass_on: Gets descriptor, number and address of a socket that has begun to send; the descriptor is
                 closed afterwards.
             on_refused: Gets the reason when the system accepts no more.
         """
         self._listener = listener
         self._serving = serving
+        self._silent_s = silent_s
         self._pass_on = pass_on
         self._on_refused = on_refused
         self._rate = TokenBucket(serving.max_accepts_per_s, HANDSHAKE_BURST)
@@ -79,7 +82,7 @@ class RobotAcceptor:
         self._loop = asyncio.get_running_loop()
         self._silent = SilentConnections(
             call_later=self._loop.call_later,
-            seconds=self._serving.handshake_timeout_s,
+            seconds=self._silent_s,
             most=self._serving.max_unauthenticated,
             most_per_source=(
                 0 if self._serving.trusted_proxies else self._serving.max_unauthenticated_per_source

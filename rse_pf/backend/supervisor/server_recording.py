@@ -92,7 +92,7 @@ class ServerRecording:
         self.to_recorder = self._to_recorder.fileno()
         plan = RecorderPlan(
             folder=recording.folder, server=self._server, version=server_version(), started_ns=time.time_ns(),
-            from_workers=self._from_workers.fileno(), max_file_bytes=recording.max_file_bytes,
+            from_workers=self._from_workers.fileno(),
             max_bytes=recording.max_bytes, session=asdict(self._settings.session), key=self._key,
             metadata={
                 "side": "server", "protocol": str(PROTOCOL_VERSION), "engine": self._settings.pnp.engine,

@@ -186,7 +186,7 @@ class _Supervisor:
         self._refused_full = 0
         self._trust = trust if settings.auth.required else None
         self._acceptor = RobotAcceptor(
-            listener, settings.serving, pass_on=self._pass_on,
+            listener, settings.serving, silent_s=settings.session.hello_timeout_s, pass_on=self._pass_on,
             on_refused=lambda reason: self._log.warning("accept-failed", reason=reason),
         )  # fmt: skip
         self._control_refused = 0

@@ -221,9 +221,9 @@ class _Worker:
         self._dispatcher = Dispatcher(
             context,
             registry=registry,
-            admission=Admission(settings.session, settings.serving),
+            admission=Admission(settings.session),
             queues=CommandQueues(
-                scheduler=Scheduler(settings.serving),
+                scheduler=Scheduler(),
                 compute=self._compute(plan, context, registry, answers),
                 sandboxes=self._sandboxes or NoQueue(),
                 jobs=self._jobs(plan, answers) if has_jobs(settings) else NoQueue(),
@@ -272,7 +272,7 @@ class _Worker:
         return ComputeLane(
             [service.name for service in registry if service.limited],
             LimitedServices(context, limited_processes(plan.services, plan.settings)),
-            scheduler=Scheduler(serving),
+            scheduler=Scheduler(),
             threads=serving.compute_processes,
             loop=self._loop,
             monotonic=time.monotonic,

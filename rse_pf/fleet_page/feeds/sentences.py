@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from rse_pf.config import ScalingSettings
+from rse_pf.scaling.policy import BIG_STEP, STEP
 from rse_pf.scaling.profile import cadence_of
 
 __all__ = ["event_sentence", "waiting_for"]
@@ -59,7 +60,7 @@ def _busy(
     if not count:
         return ""
     newest = float(samples[-1]["cpu_percent"])
-    step = settings.big_step if newest >= settings.very_busy_cpu_percent else settings.step
+    step = BIG_STEP if newest >= settings.very_busy_cpu_percent else STEP
     most = int(policy.get("max_servers", settings.max_servers))
     measured = f"{min(count, wanted)} of {wanted} samples above {limit:g} %"
     if servers >= most:

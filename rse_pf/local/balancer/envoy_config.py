@@ -115,13 +115,13 @@ def _listener(settings: PlatformSettings, port: int, lan: LanListener | None) ->
         "request_timeout": "0s",
         "common_http_protocol_options": {
             # For connections without a request; an open WebSocket is a request.
-            "idle_timeout": _seconds(settings.serving.handshake_timeout_s),
+            "idle_timeout": _seconds(settings.session.hello_timeout_s),
             "max_headers_count": _MAX_HEADERS,
             "headers_with_underscores_action": "REJECT_REQUEST",
         },
         # The default of 1 s makes every close take a second, and hides a dead server from its robots.
         "delayed_close_timeout": "0s",
-        "request_headers_timeout": _seconds(settings.serving.handshake_timeout_s),
+        "request_headers_timeout": _seconds(settings.session.hello_timeout_s),
         "max_request_headers_kb": MAX_HANDSHAKE_BYTES // 1024,
         # Whatever a robot says of its own address is dropped; servers read what stands here instead.
         "use_remote_address": True,
@@ -241,7 +241,7 @@ def _virtual_host(settings: PlatformSettings, lan: LanListener | None) -> dict[s
     # No retries: the robot knows whether a part arrived, and resumes there.
     idle = _seconds(3 * settings.data.body_timeout_s)
     data_route = {"cluster": DATA_CLUSTER, "timeout": "0s", "idle_timeout": idle}
-    timeout = _seconds(settings.serving.handshake_timeout_s)
+    timeout = _seconds(settings.session.hello_timeout_s)
     return {
         "name": "platform",
         "domains": ["*"],

@@ -42,6 +42,8 @@ from rse_pf.scaling.profile import cadence_of
 
 __all__ = ["ControlOptions", "ControlPlane"]
 
+MAX_RESTARTS_PER_MINUTE = 5
+"""Servers that failed soon after their start and are replaced within a minute; then the others wait."""
 _ASK_S = 2.0
 _STATUS_SHARE = 0.5
 _LATE_SHARE = 0.5
@@ -88,7 +90,7 @@ class ControlPlane:
         self.modifier = LocalScaleModifier(
             fleet,
             scaling,
-            max_restarts_per_minute=settings.local.max_restarts_per_minute,
+            max_restarts_per_minute=MAX_RESTARTS_PER_MINUTE,
             compress=options.compress,
             minimum=_scheduled(scaling),
             emit=emit,

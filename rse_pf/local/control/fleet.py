@@ -34,7 +34,8 @@ _CANCEL_AGAIN_S = 0.2
 _CALM_S = 3.0
 _PREFIX = "server-"
 _MIN_UPTIME_S = 10.0
-"""A server that ends sooner after it became healthy counts against ``local.max_restarts_per_minute``."""
+"""A server that ends sooner after it became healthy counts against the control plane's
+`MAX_RESTARTS_PER_MINUTE`."""
 
 
 @dataclass(slots=True, kw_only=True)

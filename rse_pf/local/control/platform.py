@@ -116,7 +116,7 @@ class LocalPlatform:
         self.state = state.absolute()
         self.settings = settings
         self._placement = local_placement(settings, self.state)
-        self._disks = DiskWatch(self.state, self._placement.store, settings.local, emit=self._emit)
+        self._disks = DiskWatch(self.state, self._placement.store, emit=self._emit)
         self._count = settings.local.servers if servers is None else servers
         self._wanted_port = settings.local.port if port is None else port
         self._has_data = data

@@ -62,7 +62,7 @@ class PlatformRecording:
             create_private_file(self._key, secrets.token_hex(_KEY_BYTES))
         self._writer = RecordingWriter(
             Path(recording.folder), _CONTROL_PLANE, started_ns=self._time_ns(),
-            max_file_bytes=recording.max_file_bytes, max_bytes=recording.max_bytes,
+            max_bytes=recording.max_bytes,
             metadata={"side": "platform"},
         )  # fmt: skip
 

@@ -15,7 +15,7 @@ from rse_pf.aws.fleet.task import Phase
 from rse_pf.aws.fleet.tasks import lifecycle
 from rse_pf.config import PlatformSettings
 from rse_pf.object_store import MemoryStore
-from rse_pf.scaling.health import CLOUD_TIMEOUT_S, time_to_notice_s
+from rse_pf.scaling.health import CLOUD_INTERVAL_S, CLOUD_TIMEOUT_S, time_to_notice_s
 
 SETTINGS = PlatformSettings()
 
@@ -75,7 +75,7 @@ def test_robots_move_only_after_the_load_balancer_has_noticed() -> None:
     leave(machine, FakeScaling(machine))
 
     health = SETTINGS.health
-    assert machine.waits == [health.cloud_interval_s * health.unhealthy_checks + CLOUD_TIMEOUT_S]
+    assert machine.waits == [CLOUD_INTERVAL_S * health.unhealthy_checks + CLOUD_TIMEOUT_S]
 
 
 def test_a_short_hook_leaves_two_thirds_of_its_time_to_the_robots() -> None:

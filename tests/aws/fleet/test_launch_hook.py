@@ -15,7 +15,7 @@ from rse_pf.aws.fleet.task import Phase, Task
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import ConfigurationError
 from rse_pf.object_store import MemoryStore
-from rse_pf.scaling.boot_time import BOOT_S, ready_within_s, retry_within_s
+from rse_pf.scaling.boot_time import BOOT_LIMIT_S, BOOT_S, ready_within_s, retry_within_s
 
 SETTINGS = PlatformSettings()
 LAUNCH, DRAIN = "rse-pf-launch", "rse-pf-drain"
@@ -82,7 +82,7 @@ def test_a_server_that_never_gets_ready_is_abandoned_within_its_budget(setup: Se
 
     assert setup.results() == [(LAUNCH, "ABANDON")]
     ((at_s, _),) = setup.scaling.completed
-    assert at_s - began_s <= ready_within_s(SETTINGS) + 5.0
+    assert at_s - began_s <= ready_within_s() + 5.0
     assert [event for event, _ in setup.log] == ["not-ready"]
     assert setup.published == []
 
@@ -162,12 +162,9 @@ def test_the_decision_waits_within_the_budget_only() -> None:
     assert launch_action(is_ready=False, age_s=1.0, budget_s=1.0) is LaunchAction.ABANDON
 
 
-@pytest.mark.parametrize("boot_s", [180, SETTINGS.cloud.boot_s, 7200])
-def test_retries_boot_and_readiness_fit_into_the_hook(boot_s: int) -> None:
-    settings = PlatformSettings.from_dict({"cloud": {"boot_s": boot_s}})
-    late_role_s, late_server_s = retry_within_s(settings), ready_within_s(settings)
+def test_retries_boot_and_readiness_fit_into_the_hook() -> None:
+    late_role_s, late_server_s = retry_within_s(), ready_within_s()
 
-    assert late_role_s + late_server_s + 0.2 * boot_s < boot_s
+    assert late_role_s + late_server_s + 0.2 * BOOT_LIMIT_S < BOOT_LIMIT_S
     assert late_role_s >= 2 * 20, "a role that comes 20 s late is no reason to end a machine"
-    assert boot_s >= 2 * BOOT_S
-    assert SETTINGS.cloud.boot_s == 4 * BOOT_S
+    assert BOOT_LIMIT_S >= 2 * BOOT_S

@@ -81,8 +81,8 @@ class WorkerParts:
         echo.register(self.registry)
         if register is not None:
             register(self.registry)
-        self.scheduler = Scheduler(self.settings.serving)
-        self.admission = Admission(self.settings.session, self.settings.serving)
+        self.scheduler = Scheduler()
+        self.admission = Admission(self.settings.session)
         self.handshake = HandshakePolicy(self.settings, keys)
         self.context = WorkerContext(
             settings=self.settings,
@@ -127,7 +127,7 @@ class WorkerParts:
         return ComputeLane(
             [service.name for service in self.registry if service.limited],
             LimitedServices(self.context, processes),
-            scheduler=Scheduler(self.settings.serving),
+            scheduler=Scheduler(),
             threads=self.settings.serving.compute_processes,
             loop=self.loop,
             monotonic=self.clocks.monotonic,

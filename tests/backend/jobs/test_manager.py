@@ -292,7 +292,7 @@ def test_a_draining_server_answers_no_job_because_the_robot_asks_another(make):
 
 
 def test_old_records_are_deleted_when_a_job_ends(make):
-    bench, owner = make(job_record_ttl_s=60.0), robot()
+    bench, owner = make(), robot()
     old = "jobs/default/robot-9/" + "0" * 64
     bench.store.put(old, encode_record(JobRecord(state="done", owner="", marked_s=1.0)))
     ask(bench, owner, 1)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from rse_pf.backend.gateway.admission import Admission
+from rse_pf.backend.gateway.admission import MAX_QUEUE_PER_ROBOT, Admission
 from rse_pf.backend.scheduling.scheduler import QueuedCommand, RefusedCommand, Scheduler
-from rse_pf.config import ServingSettings, SessionSettings
+from rse_pf.config import SessionSettings
 from rse_pf.identity import RobotId
 from rse_pf.wire import Command
 
@@ -21,9 +21,9 @@ def queued(
 class AdmittedScheduler(Scheduler):
     """Queues what is admitted."""
 
-    def __init__(self, settings: ServingSettings) -> None:
-        super().__init__(settings)
-        self._admission = Admission(SessionSettings(), settings)
+    def __init__(self, *, max_queue: int = MAX_QUEUE_PER_ROBOT) -> None:
+        super().__init__()
+        self._admission = Admission(SessionSettings(), max_queue=max_queue)
 
     def submit(self, command: QueuedCommand, now: float = 0.0) -> list[RefusedCommand]:
         refusal = self._admission.judge(command, None, self.backlog(command), self.max_delay_s)

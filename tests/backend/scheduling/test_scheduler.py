@@ -9,10 +9,7 @@ import pytest
 from backend.scheduling.admitted import AdmittedScheduler, fall_behind, measure_turns, queued
 
 from rse_pf.backend.scheduling.scheduler import INLINE_BYTES, QueuedCommand, Scheduler
-from rse_pf.config import ServingSettings
 from rse_pf.identity import RobotId
-
-SETTINGS = ServingSettings(max_queue_per_robot=4)
 
 
 def run_order(scheduler: Scheduler, count: int) -> list[tuple[str, int]]:
@@ -26,7 +23,7 @@ def run_order(scheduler: Scheduler, count: int) -> list[tuple[str, int]]:
 
 
 def test_robots_take_turns_however_much_one_of_them_asks():
-    scheduler = AdmittedScheduler(SETTINGS)
+    scheduler = AdmittedScheduler(max_queue=4)
     for identity in range(4):
         scheduler.submit(queued("flood", identity), 0.0)
     scheduler.submit(queued("a", 1), 0.0)
@@ -38,7 +35,7 @@ def test_robots_take_turns_however_much_one_of_them_asks():
 
 
 def test_tenants_take_turns_however_many_robots_one_of_them_has():
-    scheduler = AdmittedScheduler(SETTINGS)
+    scheduler = AdmittedScheduler(max_queue=4)
     for number in range(6):
         scheduler.submit(queued(f"many{number}", number, tenant="many"), 0.0)
     for number in range(2):
@@ -51,7 +48,7 @@ def test_tenants_take_turns_however_many_robots_one_of_them_has():
 
 
 def test_a_tenant_with_one_robot_is_served_while_another_tenants_robots_are_refused():
-    scheduler = AdmittedScheduler(SETTINGS)
+    scheduler = AdmittedScheduler(max_queue=4)
     fall_behind(scheduler, turn_s=0.05)
     for number in range(200):
         Scheduler.submit(scheduler, queued(f"many{number}", tenant="many"))
@@ -64,7 +61,7 @@ def test_a_tenant_with_one_robot_is_served_while_another_tenants_robots_are_refu
 
 
 def test_one_robot_never_has_two_commands_running():
-    scheduler = AdmittedScheduler(SETTINGS)
+    scheduler = AdmittedScheduler(max_queue=4)
     scheduler.submit(queued("a", 1), 0.0)
     scheduler.submit(queued("a", 2), 0.0)
     first, _ = scheduler.start(0.0)
@@ -78,7 +75,7 @@ def test_one_robot_never_has_two_commands_running():
 
 
 def test_the_newest_frame_takes_the_place_of_the_one_that_waits():
-    scheduler = AdmittedScheduler(SETTINGS)
+    scheduler = AdmittedScheduler(max_queue=4)
     scheduler.submit(queued("a", 1, stream="cam", seq=1), 0.0)
 
     (refusal,) = scheduler.submit(queued("a", 2, stream="cam", seq=2), 0.0)
@@ -89,7 +86,7 @@ def test_the_newest_frame_takes_the_place_of_the_one_that_waits():
 
 
 def test_an_older_frame_does_not_replace_a_newer_one():
-    scheduler = AdmittedScheduler(SETTINGS)
+    scheduler = AdmittedScheduler(max_queue=4)
     scheduler.submit(queued("a", 2, stream="cam", seq=2), 0.0)
 
     (refusal,) = scheduler.submit(queued("a", 1, stream="cam", seq=1), 0.0)
@@ -108,7 +105,7 @@ def test_an_older_frame_does_not_replace_a_newer_one():
     ],
 )
 def test_kept_frames_other_streams_and_no_stream_are_not_replaced(first, second):
-    scheduler = AdmittedScheduler(SETTINGS)
+    scheduler = AdmittedScheduler(max_queue=4)
 
     assert scheduler.submit(queued("a", 1, **first), 0.0) == []
     assert scheduler.submit(queued("a", 2, **second), 0.0) == []
@@ -116,14 +113,14 @@ def test_kept_frames_other_streams_and_no_stream_are_not_replaced(first, second)
 
 
 def test_streams_of_two_robots_do_not_meet():
-    scheduler = AdmittedScheduler(SETTINGS)
+    scheduler = AdmittedScheduler(max_queue=4)
     scheduler.submit(queued("a", 1, stream="cam"), 0.0)
 
     assert scheduler.submit(queued("b", 2, stream="cam", seq=5), 0.0) == []
 
 
 def test_an_expired_command_costs_no_compute():
-    scheduler = AdmittedScheduler(SETTINGS)
+    scheduler = AdmittedScheduler(max_queue=4)
     scheduler.submit(queued("a", 1, within=0.03), 0.0)
     scheduler.submit(queued("b", 2), 0.0)
 
@@ -135,13 +132,13 @@ def test_an_expired_command_costs_no_compute():
 
 
 def test_a_command_without_time_is_expired_at_once():
-    (refusal,) = AdmittedScheduler(SETTINGS).submit(queued("a", within=0.0), 0.0)
+    (refusal,) = AdmittedScheduler(max_queue=4).submit(queued("a", within=0.0), 0.0)
 
     assert refusal.error.code == "expired"
 
 
 def test_expired_commands_are_answered_although_nothing_starts():
-    scheduler = AdmittedScheduler(SETTINGS)
+    scheduler = AdmittedScheduler(max_queue=4)
     scheduler.submit(queued("a", 1), 0.0)
     scheduler.start(0.0)
     scheduler.submit(queued("a", 2, within=0.02), 0.0)
@@ -151,7 +148,7 @@ def test_expired_commands_are_answered_although_nothing_starts():
 
 
 def test_one_robot_waits_with_a_bound():
-    scheduler = AdmittedScheduler(SETTINGS)
+    scheduler = AdmittedScheduler(max_queue=4)
     for identity in range(4):
         scheduler.submit(queued("a", identity), 0.0)
 
@@ -163,7 +160,7 @@ def test_one_robot_waits_with_a_bound():
 
 
 def test_a_connection_that_ends_takes_its_waiting_commands_along():
-    scheduler = AdmittedScheduler(SETTINGS)
+    scheduler = AdmittedScheduler(max_queue=4)
     scheduler.submit(queued("a", 1), 0.0)
     scheduler.submit(queued("b", 2), 0.0)
 
@@ -173,7 +170,7 @@ def test_a_connection_that_ends_takes_its_waiting_commands_along():
 
 
 def test_only_a_small_cheap_command_that_is_alone_runs_inline():
-    scheduler = AdmittedScheduler(SETTINGS)
+    scheduler = AdmittedScheduler(max_queue=4)
     scheduler.submit(queued("a", 1), 0.0)
     scheduler.start(0.0)
 
@@ -261,7 +258,7 @@ def poisson(rate: float, robots: int, seed: int) -> list[tuple[float, str]]:
 def test_goodput_holds_under_overload(load, robots):
     arrivals = poisson(load * CAPACITY, robots, seed=load)
 
-    good, late, refused = simulate(AdmittedScheduler(ServingSettings()), arrivals, random.Random(1))
+    good, late, refused = simulate(AdmittedScheduler(), arrivals, random.Random(1))
 
     assert len(good) >= 0.95 * CAPACITY * SECONDS
     assert late <= 0.02 * len(good)
@@ -278,9 +275,7 @@ def test_a_plain_bounded_queue_would_collapse_under_the_same_load(load):
 
 
 def test_nothing_is_shed_below_capacity():
-    good, late, refused = simulate(
-        AdmittedScheduler(ServingSettings()), poisson(0.7 * CAPACITY, 40, 3), random.Random(1)
-    )
+    good, late, refused = simulate(AdmittedScheduler(), poisson(0.7 * CAPACITY, 40, 3), random.Random(1))
 
     assert late == 0
     assert len(refused) <= 0.01 * len(good)
@@ -289,13 +284,13 @@ def test_nothing_is_shed_below_capacity():
 def test_a_burst_shorter_than_the_interval_is_served_whole():
     burst = [(0.001 * k, f"r{k}") for k in range(28)]
 
-    good, late, refused = simulate(AdmittedScheduler(ServingSettings()), burst, random.Random(1))
+    good, late, refused = simulate(AdmittedScheduler(), burst, random.Random(1))
 
     assert (len(good), late, refused) == (28, 0, [])
 
 
 def test_one_robot_may_wait_for_a_slow_command_of_another():
-    scheduler = AdmittedScheduler(SETTINGS)
+    scheduler = AdmittedScheduler(max_queue=4)
     scheduler.submit(queued("slow"), 0.0)
     slow, _ = scheduler.start(0.0)
     assert slow is not None
@@ -311,7 +306,7 @@ def test_one_robot_may_wait_for_a_slow_command_of_another():
 
 
 def test_slow_services_below_capacity_are_not_shed():
-    scheduler = AdmittedScheduler(SETTINGS)
+    scheduler = AdmittedScheduler(max_queue=4)
     refused, now, i = [], 0.0, 0
     arrivals = sorted((1.0 * k + 0.1 * robot, f"r{robot}") for k in range(10) for robot in range(3))
     while i < len(arrivals) or scheduler.waiting:
@@ -334,7 +329,7 @@ def test_slow_services_below_capacity_are_not_shed():
 def test_no_robot_starves_under_overload():
     arrivals = poisson(5 * CAPACITY, 40, seed=9)
 
-    good, _, _ = simulate(AdmittedScheduler(ServingSettings()), arrivals, random.Random(1))
+    good, _, _ = simulate(AdmittedScheduler(), arrivals, random.Random(1))
 
     served = Counter(each.robot.name for each in good)
     assert len(served) == 40
@@ -345,7 +340,7 @@ def test_a_flooding_robot_takes_nothing_from_the_others():
     calm = poisson(0.4 * CAPACITY, 20, seed=5)
     flood = [(at, "flood") for at, _ in poisson(10 * CAPACITY, 1, seed=6)]
 
-    good, _, _ = simulate(AdmittedScheduler(ServingSettings()), sorted(calm + flood), random.Random(1))
+    good, _, _ = simulate(AdmittedScheduler(), sorted(calm + flood), random.Random(1))
 
     served = Counter(each.robot.name for each in good)
     calm_served = sum(count for robot, count in served.items() if robot != "flood")
@@ -353,7 +348,7 @@ def test_a_flooding_robot_takes_nothing_from_the_others():
 
 
 def test_the_server_stops_shedding_when_the_load_is_over():
-    scheduler = AdmittedScheduler(SETTINGS)
+    scheduler = AdmittedScheduler(max_queue=4)
     for second in range(3):
         for robot in range(400):
             scheduler.submit(queued(f"r{robot}", at=second, within=0.4), float(second))
@@ -372,7 +367,7 @@ def test_the_server_stops_shedding_when_the_load_is_over():
 
 
 def test_nothing_is_refused_unread_before_the_server_is_behind():
-    scheduler = AdmittedScheduler(SETTINGS)
+    scheduler = AdmittedScheduler(max_queue=4)
     for i in range(50):
         scheduler.submit(queued(f"r{i}"), 0.0)
 
@@ -380,7 +375,7 @@ def test_nothing_is_refused_unread_before_the_server_is_behind():
 
 
 def test_a_command_that_can_wait_is_admitted_where_a_hurried_one_is_refused():
-    scheduler = AdmittedScheduler(SETTINGS)
+    scheduler = AdmittedScheduler(max_queue=4)
     fall_behind(scheduler, turn_s=0.01)
     for i in range(50):
         scheduler.submit(queued(f"r{i}", within=5.0), 0.0)
@@ -396,7 +391,7 @@ def test_a_command_that_can_wait_is_admitted_where_a_hurried_one_is_refused():
 
 
 def test_the_waiting_commands_of_a_robot_itself_count_as_rounds():
-    scheduler = AdmittedScheduler(SETTINGS)
+    scheduler = AdmittedScheduler(max_queue=4)
     fall_behind(scheduler, turn_s=0.02)
     for number in range(3):
         for i in range(60):
@@ -407,7 +402,7 @@ def test_the_waiting_commands_of_a_robot_itself_count_as_rounds():
 
 
 def behind_with_one_waiting(turn_s: float) -> AdmittedScheduler:
-    scheduler = AdmittedScheduler(SETTINGS)
+    scheduler = AdmittedScheduler(max_queue=4)
     fall_behind(scheduler, turn_s=turn_s)
     scheduler.submit(queued("a"), 0.0)
     return scheduler
@@ -420,7 +415,7 @@ def test_a_server_that_is_behind_admits_another_robot_only_to_a_short_queue():
 
 
 def test_a_command_is_refused_before_decoding_if_its_turn_would_come_too_late():
-    scheduler = Scheduler(SETTINGS)
+    scheduler = Scheduler()
     measure_turns(scheduler, 0.2, 0.0)
     scheduler.submit(queued("a", within=60.0))
     robot = RobotId("default", "b")
@@ -432,7 +427,7 @@ def test_a_command_is_refused_before_decoding_if_its_turn_would_come_too_late():
 
 
 def test_a_frame_that_may_replace_a_waiting_one_is_always_decoded():
-    scheduler = AdmittedScheduler(SETTINGS)
+    scheduler = AdmittedScheduler(max_queue=4)
     measure_turns(scheduler, 1.0, -1.0)
     scheduler.submit(queued("a", 1, stream="cam", seq=1), 0.0)
     scheduler.submit(queued("b", 1), 0.0)
@@ -444,7 +439,7 @@ def test_a_frame_that_may_replace_a_waiting_one_is_always_decoded():
 
 
 def test_a_command_whose_turn_would_come_after_half_of_its_time_is_refused_at_once():
-    scheduler = AdmittedScheduler(SETTINGS)
+    scheduler = AdmittedScheduler(max_queue=4)
     measure_turns(scheduler, 0.1, 0.0)
     for i in range(4):
         scheduler.submit(queued(f"r{i}"), 0.0)
@@ -457,7 +452,7 @@ def test_a_command_whose_turn_would_come_after_half_of_its_time_is_refused_at_on
 
 
 def test_a_server_that_refuses_half_of_its_commands_stays_behind_however_short_the_queue():
-    scheduler = AdmittedScheduler(SETTINGS)
+    scheduler = AdmittedScheduler(max_queue=4)
     fall_behind(scheduler, turn_s=0.1)
     for step in range(20):
         now = step * 0.05
@@ -471,7 +466,7 @@ def test_a_server_that_refuses_half_of_its_commands_stays_behind_however_short_t
 
 
 def test_one_long_pause_does_not_make_the_server_refuse_for_ever():
-    scheduler = AdmittedScheduler(SETTINGS)
+    scheduler = AdmittedScheduler(max_queue=4)
     fall_behind(scheduler, turn_s=3.0)
     now, refused = 0.0, 0
     for step in range(400):
@@ -490,19 +485,13 @@ def test_one_long_pause_does_not_make_the_server_refuse_for_ever():
     assert not scheduler.is_behind
 
 
-def test_a_single_solver_thread_leaves_its_work_to_the_loop_only_while_behind():
-    settings = (
-        SETTINGS,
-        ServingSettings(solver_threads=2),
-        ServingSettings(solver_threads=2, emulated_cores=0.25),
-    )
-    for serving, is_serial in zip(settings, (True, False, True), strict=True):
-        scheduler = AdmittedScheduler(serving)
-        scheduler.submit(queued("a"), 0.0)
-        scheduler.submit(queued("b"), 0.0)
-        scheduler.start(0.0)
-        assert not scheduler.runs_inline(cheap=True, size_bytes=1)
-        fall_behind(scheduler, now=1.0)
+def test_the_solver_thread_leaves_its_work_to_the_loop_only_while_behind():
+    scheduler = AdmittedScheduler(max_queue=4)
+    scheduler.submit(queued("a"), 0.0)
+    scheduler.submit(queued("b"), 0.0)
+    scheduler.start(0.0)
+    assert not scheduler.runs_inline(cheap=True, size_bytes=1)
+    fall_behind(scheduler, now=1.0)
 
-        assert scheduler.runs_inline(cheap=True, size_bytes=1) is is_serial
-        assert not scheduler.runs_inline(cheap=False, size_bytes=1)
+    assert scheduler.runs_inline(cheap=True, size_bytes=1)
+    assert not scheduler.runs_inline(cheap=False, size_bytes=1)

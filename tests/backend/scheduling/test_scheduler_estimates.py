@@ -5,14 +5,10 @@ from __future__ import annotations
 import pytest
 from backend.scheduling.admitted import AdmittedScheduler, measure_turns, queued
 
-from rse_pf.config import ServingSettings
-
-SETTINGS = ServingSettings()
-
 
 def test_a_process_that_did_not_run_for_a_moment_refuses_nobody_who_has_time():
     """A second without the processor in the middle of a round of 50 robots, who have five seconds each."""
-    scheduler = AdmittedScheduler(SETTINGS)
+    scheduler = AdmittedScheduler()
     now = 0.0
 
     def serve(count: int) -> None:
@@ -36,7 +32,7 @@ def test_a_process_that_did_not_run_for_a_moment_refuses_nobody_who_has_time():
 
 @pytest.mark.parametrize("service_s", [0.05, 0.5])
 def test_a_service_that_became_slow_is_believed_within_a_few_commands(service_s):
-    scheduler = AdmittedScheduler(SETTINGS)
+    scheduler = AdmittedScheduler()
     now, turns = 0.0, []
     for number in range(40):
         for robot in ("a", "b"):
@@ -52,7 +48,7 @@ def test_a_service_that_became_slow_is_believed_within_a_few_commands(service_s)
 
 def test_a_robot_with_many_waiting_is_told_the_whole_queue_at_most():
     """Half of the robots came from a server that died, with six commands each; the others have one."""
-    scheduler = AdmittedScheduler(SETTINGS)
+    scheduler = AdmittedScheduler()
     measure_turns(scheduler, 0.01, 0.0)
     for robot in range(50):
         for number in range(6 if robot < 25 else 1):

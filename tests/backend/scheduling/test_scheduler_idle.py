@@ -9,9 +9,6 @@ import pytest
 from backend.scheduling.admitted import queued
 
 from rse_pf.backend.scheduling.scheduler import Scheduler
-from rse_pf.config import ServingSettings
-
-SETTINGS = ServingSettings()
 
 
 def state(scheduler: Scheduler) -> dict[str, Any]:
@@ -35,7 +32,7 @@ def compute(scheduler: Scheduler, wait_s: float, spent_s: float, now: float, *, 
 @pytest.mark.parametrize("seed", range(8))
 def test_a_command_that_starts_alone_leaves_the_scheduler_as_the_queue_would(seed: int) -> None:
     chance = random.Random(seed)
-    alone, by_queue = Scheduler(SETTINGS), Scheduler(SETTINGS)
+    alone, by_queue = Scheduler(), Scheduler()
     now, was_behind = 100.0, 0
     for _ in range(300):
         now += chance.choice((0.0001, 0.002, 0.08, 0.3))
@@ -50,7 +47,7 @@ def test_a_command_that_starts_alone_leaves_the_scheduler_as_the_queue_would(see
 
 
 def test_nothing_starts_alone_while_another_command_waits_or_runs_or_when_it_is_too_late() -> None:
-    scheduler, first, second = Scheduler(SETTINGS), queued("a"), queued("b")
+    scheduler, first, second = Scheduler(), queued("a"), queued("b")
     assert not scheduler.start_unqueued(queued("a", within=1.0), 1.0), "its deadline has passed"
 
     scheduler.submit(first)
@@ -63,7 +60,7 @@ def test_nothing_starts_alone_while_another_command_waits_or_runs_or_when_it_is_
 
 
 def test_services_that_answer_within_a_millisecond_stay_in_the_loop_although_others_wait() -> None:
-    scheduler = Scheduler(SETTINGS)
+    scheduler = Scheduler()
 
     def runs_inline_when_another_waits() -> bool:
         scheduler.submit(queued("a"))

@@ -20,14 +20,18 @@ DEADLINE_S = 10.0
 class Port:
     """An acceptor, and the numbers of the sockets that it passed on."""
 
-    def __init__(self, **serving: Any) -> None:
+    def __init__(self, *, silent_s: float, **serving: Any) -> None:
         self.listener = socket.socket()
         self.listener.bind(("127.0.0.1", 0))
         self.listener.setblocking(False)
         self.passed: asyncio.Queue[tuple[int, bytes]] = asyncio.Queue()
         settings: dict[str, Any] = {"max_unauthenticated_per_source": 0, **serving}
         self.acceptor = RobotAcceptor(
-            self.listener, ServingSettings(**settings), pass_on=self._pass_on, on_refused=pytest.fail
+            self.listener,
+            ServingSettings(**settings),
+            silent_s=silent_s,
+            pass_on=self._pass_on,
+            on_refused=pytest.fail,
         )
 
     def _pass_on(self, fd: int, number: int, peer: str) -> None:
@@ -44,10 +48,10 @@ class Port:
 
 
 @contextlib.asynccontextmanager
-async def opened(*, burst: int = 1000, **serving: Any) -> AsyncIterator[Port]:
+async def opened(*, burst: int = 1000, silent_s: float = 5.0, **serving: Any) -> AsyncIterator[Port]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("rse_pf.backend.supervisor.accepting.HANDSHAKE_BURST", float(burst))
-        port = Port(**serving)
+        port = Port(silent_s=silent_s, **serving)
     port.acceptor.open()
     try:
         yield port
@@ -81,7 +85,7 @@ def test_silent_sockets_take_nothing_of_the_rate_and_a_robot_is_passed_on_behind
 
 def test_a_silent_socket_is_cut_at_its_time_and_one_that_speaks_before_is_passed_on() -> None:
     async def test() -> None:
-        async with opened(handshake_timeout_s=0.2) as port:
+        async with opened(silent_s=0.2) as port:
             silent, robot = await port.dial(), await port.dial()
             robot.send(b"GET")
             assert await port.passed.get() == (2, b"GET")

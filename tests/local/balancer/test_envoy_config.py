@@ -113,7 +113,7 @@ def test_rosbridge_has_a_way_to_the_servers_if_it_is_switched_on() -> None:
 
 
 def test_headers_are_bounded_in_number_size_and_time() -> None:
-    made = manager(config(serving={"handshake_timeout_s": 1.5}))
+    made = manager(config(session={"hello_timeout_s": 1.5}))
 
     assert made["request_headers_timeout"] == "1.5s"
     assert made["common_http_protocol_options"]["idle_timeout"] == "1.5s"

@@ -21,7 +21,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.system, pytest.mark.timeout(1800)]
 SETTINGS = PlatformSettings.from_dict(
     {
         "scaling": {"period_s": 10},
-        "cloud": {"drain_s": 120, "boot_s": 180},
+        "cloud": {"drain_s": 120},
         "serving": {"workers": 1},
     }
 )

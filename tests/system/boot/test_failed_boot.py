@@ -82,7 +82,7 @@ def test_a_release_whose_server_never_gets_ready_ends_the_launch(
 
     world.boot(copy, sums_digest(copy))
 
-    world.wait(lambda: bool(world.completed()), 120 + ready_within_s(SETTINGS), "completed hook")
+    world.wait(lambda: bool(world.completed()), 120 + ready_within_s(), "completed hook")
     assert world.completed() == [(LAUNCH, "ABANDON")]
     world.wait(lambda: "agent-not-ready" in world.text(), 30, "line of the agent after its call")
     assert "--no-such-option" in world.text(), "the reason is in the unit's own lines"

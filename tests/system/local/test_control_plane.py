@@ -285,18 +285,20 @@ def test_load_makes_it_grow_and_rest_makes_it_shrink(tmp_path: Path) -> None:
     asyncio.run(run())
 
 
-def test_new_servers_that_all_crash_are_started_slowly_and_old_ones_serve_on(tmp_path: Path) -> None:
+def test_new_servers_that_all_crash_are_started_slowly_and_old_ones_serve_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("rse_pf.local.control.control_plane.MAX_RESTARTS_PER_MINUTE", 2)
     broken = tmp_path / "broken"
     script = (
         f"import os, sys\nif os.path.exists({str(broken)!r}): sys.exit('no cheese today')\n"
         "from rse_pf.cli.main import main\nsys.exit(main())"
     )
-    settings = SETTINGS.replace(local={"max_restarts_per_minute": 2})
 
     async def run() -> None:
         news = News()
         program = (sys.executable, "-c", script)
-        async with platform(tmp_path / "a", news, settings=settings, program=program) as cloud:
+        async with platform(tmp_path / "a", news, program=program) as cloud:
             broken.touch()
             cloud.kill("server-1")
             await news.heard("crash-loop")

@@ -35,6 +35,7 @@ from rse_pf.backend.live_map.owner.link_security import (
 )
 from rse_pf.backend.sandbox.ipc import FrameReader, encode_message
 from rse_pf.config import PlatformSettings
+from rse_pf.config.settings import LIVE_PORTS
 from rse_pf.object_store import DirectoryStore
 
 pytestmark = [pytest.mark.slow, pytest.mark.system]
@@ -221,7 +222,7 @@ def test_other_machines_reach_the_ports_of_the_firewall_only_and_owners_only_wit
 ) -> None:
     here = machines[0]
     store = DirectoryStore(here.folder / "store")
-    live = range(SETTINGS.live.first_port, SETTINGS.live.first_port + SETTINGS.live.ports)
+    live = range(SETTINGS.live.first_port, SETTINGS.live.first_port + LIVE_PORTS)
 
     async def test() -> None:
         async with robot(here, "first") as first:

@@ -279,7 +279,7 @@ def test_a_flood_of_pings_is_cut(start_server):
 
 
 def test_a_silent_connection_is_closed(start_server):
-    server = start_server(serving={"handshake_timeout_s": 0.3})
+    server = start_server(session={"hello_timeout_s": 0.3})
 
     with socket.create_connection(("127.0.0.1", server.port), timeout=LONG_S) as raw:
         assert raw.recv(1) == b""

@@ -53,9 +53,7 @@ class _Lifecycle:
         if self._began_s is None:
             self._began_s = context.clock()
         age_s = context.clock() - self._began_s
-        action = launch_action(
-            is_ready=context.machine.is_ready(), age_s=age_s, budget_s=ready_within_s(context.settings)
-        )
+        action = launch_action(is_ready=context.machine.is_ready(), age_s=age_s, budget_s=ready_within_s())
         if action is LaunchAction.WAIT:
             return
         did_wait = self._complete(context.config.launch_hook, action.value)

@@ -12,10 +12,9 @@ from rse_pf.auth.tokens import Claims
 from rse_pf.backend.gateway.admission import Admission
 from rse_pf.backend.gateway.rate_limits import CUT_OFF
 from rse_pf.backend.scheduling.scheduler import QueueBacklog
-from rse_pf.config import ServingSettings, SessionSettings
+from rse_pf.config import SessionSettings
 from rse_pf.identity import RobotId
 
-SERVING = ServingSettings(max_queue_per_robot=4)
 ADMITTED: dict[str, Any] = {
     "queued": queued("r", within=1.0), "claims": None, "backlog": QueueBacklog(), "max_delay_s": math.inf,
 }  # fmt: skip
@@ -30,7 +29,7 @@ def claims(*scopes: str) -> Claims:
 @pytest.fixture
 def admission(monkeypatch: pytest.MonkeyPatch) -> Admission:
     monkeypatch.setattr("rse_pf.backend.gateway.admission._MAX_UNREAD_BYTES", 1_000_000)
-    return Admission(SessionSettings(max_commands_per_s=20.0, command_burst=40), SERVING)
+    return Admission(SessionSettings(max_commands_per_s=20.0), max_queue=4)
 
 
 def reason(admission: Admission, **changed: object) -> str:

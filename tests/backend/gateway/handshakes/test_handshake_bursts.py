@@ -93,7 +93,7 @@ def test_silent_sockets_that_leave_together_are_ended_a_few_in_a_round(burst: Bu
 def test_silent_sockets_whose_time_is_over_together_are_ended_a_few_in_a_round(burst: Burst) -> None:
     burst.take()
     burst.longest_round()
-    burst.loop.now += burst.parts.settings.serving.handshake_timeout_s
+    burst.loop.now += burst.parts.settings.session.hello_timeout_s
 
     assert burst.longest_round() * HANDSHAKE_S <= ROUND_S
     assert sorted(burst.ended) == list(range(50))
@@ -109,5 +109,5 @@ def test_a_request_that_comes_in_two_parts_is_judged(burst: Burst) -> None:
     burst.longest_round()
 
     assert burst.ended == [7]
-    burst.loop.advance(burst.parts.settings.serving.handshake_timeout_s)
+    burst.loop.advance(burst.parts.settings.session.hello_timeout_s)
     assert len(burst.ended) == 50

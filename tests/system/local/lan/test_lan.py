@@ -283,7 +283,7 @@ def test_a_stranger_on_the_network_gets_one_page_and_holds_no_handshake_open(
     lan: Lan, other_machine: OtherMachine
 ) -> None:
     """300 connections are silent, send their first message byte by byte, or half of it, and are closed."""
-    limit_s = 2 * PlatformSettings().serving.handshake_timeout_s
+    limit_s = 2 * PlatformSettings().session.hello_timeout_s
 
     said = other_machine.python(STRANGER, other_machine.here, str(lan.state.port), str(limit_s))
 
