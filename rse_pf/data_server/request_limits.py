@@ -26,7 +26,7 @@ _BODIES_PER_ROBOT, _BODIES_PER_TENANT = 0.25, 0.75
 """Shares of ``data.max_uploads``."""
 _RETRY_AFTER_MS = 1000.0
 _REFUSED_BYTES, _REFUSED_COST = 64 << 10, 32.0
-"""So many bytes of a refused body count as one request more, and one refusal never as more than the second."""
+"""So many bytes of a refused body count as one request more, and one refusal as this many more at most."""
 
 
 @dataclass(slots=True)
