@@ -124,7 +124,7 @@ class Withdraw(msgspec.Struct, frozen=True, gc=False):
 
 
 class Renewal(msgspec.Struct, frozen=True, gc=False):
-    """Verify this fresh token and answer with `ServerSession.renewed`."""
+    """Verify this fresh token and answer with `ServerSession.answer_renewal`."""
 
     token: str
 

@@ -39,7 +39,7 @@ def test_the_page_of_the_sdk_has_every_public_name() -> None:
 
 def test_the_page_of_metrics_has_what_a_server_gives(repository: Path) -> None:
     metrics = Metrics()
-    metrics.answered("pnp", "ok", 0.01)
+    metrics.count_answer("pnp", "ok", 0.01)
     metrics.gauges["robots"] = 1.0
     told = render(merge([metrics.snapshot()])).decode()
     page = metrics_page(repository)

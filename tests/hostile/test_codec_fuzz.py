@@ -47,7 +47,7 @@ def test_equal_seeds_give_equal_inputs_and_others_do_not() -> None:
 
 
 def test_a_decoder_that_lets_a_foreign_error_out_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(codec, "_guarded", lambda decode, data: decode(data))
+    monkeypatch.setattr(codec, "_decode_guarded", lambda decode, data: decode(data))
 
     with pytest.raises(msgspec.DecodeError):
         fuzzed("codec", seed=7, inputs=1500)

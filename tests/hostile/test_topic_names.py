@@ -138,5 +138,5 @@ def test_beyond_the_quota_of_a_tenant_known_topics_and_other_tenants_go_on(
         assert greedy.say({"op": "publish", "topic": "/known", "msg": {"data": 1}}) == []
         assert [each["msg"]["data"] for each in listener.told()] == [1]
         assert other.say({"op": "advertise", "topic": "/t0"}, {"op": "subscribe", "topic": "/t9"}) == []
-        greedy.connection.ended()
+        greedy.connection.on_socket_end()
         assert listener.say({"op": "subscribe", "topic": "/late"}) == []

@@ -15,7 +15,7 @@ def page(answers: list[tuple[str, float]], **gauges: float) -> str:
     metrics = pytest.importorskip("rse_pf.backend.metrics")
     worker = metrics.Metrics()
     for service, duration_s in answers:
-        worker.answered(service, "ok", duration_s)
+        worker.count_answer(service, "ok", duration_s)
     worker.bytes_in, worker.bytes_out = 1000, 70
     worker.gauges = gauges
     return metrics.render(metrics.merge([worker.snapshot()])).decode()
