@@ -1,8 +1,7 @@
 """The data service as an ASGI application: find the route, check the token, call the handler, reply.
 
-It is plain ASGI because it consists of one table of routes and bodies with limits; docs/design.md has the
-measurement of a framework.  Every request gets a reply with a status and, on failure, a code; no token and no
-payload is logged.
+It is plain ASGI because it consists of one table of routes and bodies with limits.  Every request gets a
+reply with a status and, on failure, a code; no token and no payload is logged.
 """
 
 from __future__ import annotations
