@@ -91,7 +91,7 @@ bench: ## run every benchmark that needs no argument; prints tables, writes JSON
 	  $(BIN)/python -m benchmarks.$$name --out out/bench/$$name.json; case $$? in 0) ;; \
 	  2) echo "left out: it needs the arguments above" ;; *) exit 1 ;; esac; done
 
-docs: ## write the generated pages and the picture of the packages
+docs: ## write the generated pages, the source tree and the picture of the packages
 	@$(SETUP) dev
 	@$(BIN)/rse-pf settings --markdown > docs/settings.md
 	@$(BIN)/rse-pf errors --markdown > docs/errors.md
@@ -99,6 +99,7 @@ docs: ## write the generated pages and the picture of the packages
 	@$(BIN)/python scripts/asyncapi.py
 	@$(BIN)/python scripts/grafana.py
 	@$(BIN)/python scripts/architecture.py
+	@$(BIN)/python scripts/source_tree.py
 
 site: ## build the documentation site into build/site; needs no network after setup
 	@$(SETUP) docs

@@ -17,7 +17,7 @@ PAGES = (
 FOLDERS = "rse_pf|tests|docs|client_sdk|lambda_pnp|stacks|benchmarks|scripts|fuzz|locks|examples"
 FILE = re.compile(rf"`((?:{FOLDERS})/[\w./-]+)`")
 LINK = re.compile(r"\]\(([^)#:]+)\)")
-SETTING = re.compile(r"`([a-z]+)\.([a-z][a-z0-9_]+)`")
+SETTING = re.compile(r"`([a-z]+)\.(?!py`)([a-z][a-z0-9_]+)`")
 
 
 def missing(text: str, repository: Path, folder: str = "") -> list[str]:
