@@ -188,7 +188,7 @@ class Client:
         self._socket.close()
 
 
-def batch_of(server: Server, heads: list[bytes], status: bytes) -> None:
+def make_batch(server: Server, heads: list[bytes], status: bytes) -> None:
     """Shake hands with all of *heads* at once, and end the connections."""
     clients = [Client(server.address) for _ in heads]
     for client, head in zip(clients, heads, strict=True):
@@ -276,7 +276,7 @@ def measure(servers: dict[str, dict[bool, Server]], n: int, at_once: int, only: 
                 heads = [make_head(server.address) for _ in range(BATCH)]
                 before = settled(server)
                 for first in range(0, BATCH, at_once):
-                    batch_of(server, heads[first : first + at_once], status)
+                    make_batch(server, heads[first : first + at_once], status)
                 if number >= 0:
                     taken[tree].append((settled(server) - before) / BATCH * 1e6)
         figures[name] = {tree: figures_of(each) for tree, each in taken.items()}

@@ -53,7 +53,7 @@ class Account:
 
         call = getattr(self.client(service), method)
         try:
-            found: dict[str, Any] = with_retries(lambda: call(**arguments))
+            answer: dict[str, Any] = with_retries(lambda: call(**arguments))
         except ClientError as error:
             code = error_code(error)
             if code in _ABSENT:
@@ -62,7 +62,7 @@ class Account:
                 f"AWS refuses {service} {method}: {code}",
                 hint="check your account's permissions, or sign in again",
             ) from None
-        return found
+        return answer
 
     def change(self, service: str, method: str, **arguments: Any) -> dict[str, Any]:
         """Return the answer of one call that changes something which must exist.
@@ -71,26 +71,26 @@ class Account:
             ConfigurationError: AWS refused, or what the call names does not exist.
             StoreError: AWS does not answer.
         """
-        found = self.find(service, method, **arguments)
-        if found is None:
+        answer = self.find(service, method, **arguments)
+        if answer is None:
             raise ConfigurationError(
                 f"AWS refuses {service} {method}: it is not there, or cannot be changed so",
                 hint="rse-pf cloud status shows what there is; then repeat the command",
             )
-        return found
+        return answer
 
     def pages(self, service: str, method: str, rows: str, **arguments: Any) -> list[Any]:
         """Return *rows* of every page of a call; none if what it names does not exist.  Raises as `find`."""
         client = self.client(service)
         if not client.can_paginate(method):
             return list((self.find(service, method, **arguments) or {}).get(rows, ()))
-        found: list[Any] = []
+        collected: list[Any] = []
         token_in, token_out = _page_tokens(client.get_paginator(method))
         while True:
             page = self.find(service, method, **arguments) or {}
-            found += page.get(rows, ())
+            collected += page.get(rows, ())
             if not page.get(token_out):
-                return found
+                return collected
             arguments[token_in] = page[token_out]
 
     def resource(self, stack: str, kind: str, prefix: str) -> str:

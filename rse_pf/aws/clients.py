@@ -94,24 +94,24 @@ def with_retries(
     from botocore.exceptions import BotoCoreError, ClientError
 
     began, pause_s = clock(), FIRST_PAUSE_S
-    for left in range(MAX_TRIES - 1, -1, -1):
+    for tries_left in range(MAX_TRIES - 1, -1, -1):
         try:
             return call()
         except (BotoCoreError, ClientError) as error:
             last: Exception = error
         if isinstance(last, ClientError) and not _is_temporary(last):
             raise last
-        if not left or clock() - began + pause_s + _CONNECT_S + _READ_S > MAX_S:
+        if not tries_left or clock() - began + pause_s + _CONNECT_S + _READ_S > MAX_S:
             break
         sleep(pause_s)
         pause_s *= 2
     raise StoreError(
-        f"AWS does not answer: {_in_words(last)}",
+        f"AWS does not answer: {_describe_error(last)}",
         hint="check the endpoints of the VPC and status.aws.amazon.com",
     ) from last
 
 
-def _in_words(error: Any) -> str:
+def _describe_error(error: Any) -> str:
     """Return *error* on one line, without the page of HTML that a proxy or a load balancer may have sent."""
     text = str(error)
     if "<" not in text and "\n" not in text:
@@ -125,12 +125,12 @@ def call_api(client: Any, method: str, **arguments: Any) -> dict[str, Any]:
     from botocore.exceptions import ClientError
 
     try:
-        found: dict[str, Any] = with_retries(lambda: getattr(client, method)(**arguments))
+        answer: dict[str, Any] = with_retries(lambda: getattr(client, method)(**arguments))
     except ClientError as error:
         raise ConfigurationError(
             f"AWS refuses {method}: {error_code(error)}", hint="check the role's policy in the template"
         ) from error
-    return found
+    return answer
 
 
 def status_of(error: Any) -> int:

@@ -11,38 +11,38 @@ from rse_pf.aws.account import Account
 from rse_pf.config import PlatformSettings
 from rse_pf.config.resource_names import ResourceNames, toolkit_stack
 
-__all__ = ["bootstrap_version", "foreign_qualifier", "living_stacks"]
+__all__ = ["find_foreign_qualifier", "list_living_stacks", "read_bootstrap_version"]
 
 _GONE = ("DELETE_COMPLETE", "REVIEW_IN_PROGRESS")
 
 
-def living_stacks(account: Account, of: ResourceNames) -> dict[str, dict[str, Any]]:
+def list_living_stacks(account: Account, of: ResourceNames) -> dict[str, dict[str, Any]]:
     """Return the stacks of the deployment *of* that exist, by name; raises as `Account.find`."""
     rows = account.pages("cloudformation", "describe_stacks", "Stacks")
-    found = {row["StackName"]: row for row in rows if row["StackStatus"] not in _GONE}
-    return {name: found[name] for name in sorted(found) if of.owns_stack(name)}
+    living = {row["StackName"]: row for row in rows if row["StackStatus"] not in _GONE}
+    return {name: living[name] for name in sorted(living) if of.owns_stack(name)}
 
 
-def bootstrap_version(account: Account, settings: PlatformSettings) -> str | None:
+def read_bootstrap_version(account: Account, settings: PlatformSettings) -> str | None:
     """Return the version of the CDK's bootstrap, None without one; raises as `Account.find`."""
     name = f"/cdk-bootstrap/{settings.cloud.bootstrap_qualifier}/version"
-    found = account.find("ssm", "get_parameter", Name=name)
-    return None if found is None else str(found["Parameter"]["Value"])
+    parameter = account.find("ssm", "get_parameter", Name=name)
+    return None if parameter is None else str(parameter["Parameter"]["Value"])
 
 
-def foreign_qualifier(account: Account, settings: PlatformSettings) -> str | None:
+def find_foreign_qualifier(account: Account, settings: PlatformSettings) -> str | None:
     """Return the qualifier of the stack that a bootstrap would change, if it is another than ours.
 
     None if there is no such stack, or it is ours; raises as `Account.find`.
     """
     ours = settings.cloud.bootstrap_qualifier
-    found = account.find("cloudformation", "describe_stacks", StackName=toolkit_stack(ours))
-    stacks = found["Stacks"] if found else ()
-    told = [
-        str(each["ParameterValue"])
+    answer = account.find("cloudformation", "describe_stacks", StackName=toolkit_stack(ours))
+    stacks = answer["Stacks"] if answer else ()
+    qualifiers = [
+        str(parameter["ParameterValue"])
         for stack in stacks
         if stack["StackStatus"] not in _GONE
-        for each in stack.get("Parameters", ())
-        if each["ParameterKey"] == "Qualifier"
+        for parameter in stack.get("Parameters", ())
+        if parameter["ParameterKey"] == "Qualifier"
     ]
-    return told[0] if told and told[0] != ours else None
+    return qualifiers[0] if qualifiers and qualifiers[0] != ours else None

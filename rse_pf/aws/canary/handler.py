@@ -45,19 +45,19 @@ def handler(event: Mapping[str, Any], context: Any) -> dict[str, Any]:
     """Ask once; raises RsePfError, so that Lambda counts an error, if there was no right pose in time."""
     settings, trace = load_settings(_ROOT / "settings.json"), secrets.token_hex(16)
     try:
-        told = _ask(os.environ, settings, trace)
+        outcome = _ask(os.environ, settings, trace)
     except RsePfError as error:
         _KEYS.clear()  # it may have been replaced
         _log(event="canary-failed", trace=trace, code=error.code, error=error.message[:200])
         raise
-    _log(event="canary-solved", trace=trace, **told)
-    return told
+    _log(event="canary-solved", trace=trace, **outcome)
+    return outcome
 
 
 def read_key(secret: str, region: str) -> SigningKey:
     """Return the private key of the canary's robot from the secret; raises RsePfError."""
-    found = call_api(make_client("secretsmanager", region), "get_secret_value", SecretId=secret)
-    return SigningKey.from_json(str(found["SecretString"]))
+    secret_value = call_api(make_client("secretsmanager", region), "get_secret_value", SecretId=secret)
+    return SigningKey.from_json(str(secret_value["SecretString"]))
 
 
 def ask_known_pose(
@@ -92,13 +92,13 @@ def ask_known_pose(
                 if isinstance(event, Welcomed):
                     session.adopt(connection, clock())
                 elif isinstance(event, Answered):
-                    return _judged(event, problem.T_camera_world, (clock() - began) * 1e3)
+                    return _check_answer(event, problem.T_camera_world, (clock() - began) * 1e3)
                 elif isinstance(event, ConnectionLost | Notice):
                     raise InternalError(f"the session failed: {event}", hint="read the server's journal")
     raise Expired(f"no answer within {_TIMEOUT_S:g} s", hint="read the servers' journals")
 
 
-def _judged(event: Answered, expected: Any, took_ms: float) -> dict[str, Any]:
+def _check_answer(event: Answered, expected: Any, took_ms: float) -> dict[str, Any]:
     answer = event.answer
     if isinstance(answer, Failure):
         raise InternalError(f"{answer.server} answered {answer.code}: {answer.message}", hint=answer.hint)

@@ -53,12 +53,12 @@ class WebSocket:
                 if tls:
                     context = ssl.create_default_context()
                     stream = opened.enter_context(context.wrap_socket(stream, server_hostname=host))
-                made = cls(stream)
-                made._shake_hands(where, parts.path or "/", subprotocol, token)
+                connection = cls(stream)
+                connection._shake_hands(where, parts.path or "/", subprotocol, token)
             except OSError as error:
                 raise ConnectError(f"no server answers at {where}: {error}", hint=_HINT) from error
             opened.pop_all()
-        return made
+        return connection
 
     def __enter__(self) -> WebSocket:
         return self
@@ -89,7 +89,7 @@ class WebSocket:
         """Return the next whole message; raises ConnectError if the server leaves or takes too long."""
         message = b""
         while True:
-            opcode, is_last, payload = self._frame()
+            opcode, is_last, payload = self._receive_frame()
             if opcode == _CLOSE:
                 reason = payload[2:].decode("utf-8", "replace")
                 raise ConnectError(f"the server closed the connection: {reason[:200]}", hint=_HINT)
@@ -113,40 +113,40 @@ class WebSocket:
         while b"\r\n\r\n" not in self._buffer:
             if len(self._buffer) > _MAX_HEAD_BYTES:
                 raise ConnectError("the answer to the handshake has no end", hint=_HINT)
-            self._more()
+            self._receive_more()
         head, _, self._buffer = self._buffer.partition(b"\r\n\r\n")
         first, *rest = head.decode("latin-1").split("\r\n")
         status = first.split(" ", 2)[1:2]
         if status != [str(_SWITCHING)]:
-            told = self._buffer[:200].decode("utf-8", "replace")
-            raise ConnectError(f"the handshake was answered by {first[:100]}: {told}", hint=_HINT)
+            body = self._buffer[:200].decode("utf-8", "replace")
+            raise ConnectError(f"the handshake was answered by {first[:100]}: {body}", hint=_HINT)
         fields = {
             name.strip().lower(): value.strip() for name, _, value in (line.partition(":") for line in rest)
         }
-        wanted = base64.b64encode(
+        expected = base64.b64encode(
             hashlib.sha1((key + _GUID).encode(), usedforsecurity=False).digest()
         ).decode()
-        if fields.get("sec-websocket-accept") != wanted:
+        if fields.get("sec-websocket-accept") != expected:
             raise ConnectError("the answer to the handshake is none of a WebSocket", hint=_HINT)
 
-    def _frame(self) -> tuple[int, bool, bytes]:
-        first, second = self._take(2)
+    def _receive_frame(self) -> tuple[int, bool, bytes]:
+        first, second = self._take_bytes(2)
         size = second & 0x7F
         if size == 126:
-            (size,) = struct.unpack("!H", self._take(2))
+            (size,) = struct.unpack("!H", self._take_bytes(2))
         elif size == 127:
-            (size,) = struct.unpack("!Q", self._take(8))
+            (size,) = struct.unpack("!Q", self._take_bytes(8))
         if size > _MAX_MESSAGE_BYTES or second & 0x80:
             raise ConnectError("a frame that no server may send", hint=_HINT)
-        return first & 0x0F, bool(first & 0x80), self._take(size)
+        return first & 0x0F, bool(first & 0x80), self._take_bytes(size)
 
-    def _take(self, count: int) -> bytes:
+    def _take_bytes(self, count: int) -> bytes:
         while len(self._buffer) < count:
-            self._more()
-        taken, self._buffer = self._buffer[:count], self._buffer[count:]
-        return taken
+            self._receive_more()
+        data, self._buffer = self._buffer[:count], self._buffer[count:]
+        return data
 
-    def _more(self) -> None:
+    def _receive_more(self) -> None:
         try:
             data = self._stream.recv(65_536)
         except OSError as error:

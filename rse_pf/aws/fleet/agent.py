@@ -92,7 +92,7 @@ class Agent:
             now_s = self._context.clock()
             if not task.in_thread and self._may_run(task) and now_s >= self._due_s[task.name]:
                 self._due_s[task.name] = now_s + task.period_s
-                self._try(task)
+                self._try_task(task)
 
     def run(self, name: str) -> None:
         """Run the task *name* once; raises what it raises."""
@@ -100,14 +100,14 @@ class Agent:
 
     def attempt(self, name: str) -> None:
         """Run the task *name* once; a failure is logged."""
-        self._try(self._tasks[name])
+        self._try_task(self._tasks[name])
 
     def repeat(self, name: str, sleep: Callable[[float], None] = time.sleep) -> None:
         """Run the task *name* for ever, in a thread of its own."""
         task = self._tasks[name]
         while True:
             if self._may_run(task):
-                self._try(task)
+                self._try_task(task)
             sleep(task.period_s)
 
     def start_threads(self) -> None:
@@ -122,9 +122,9 @@ class Agent:
     def _flush(self) -> None:
         for task in self._tasks.values():
             if task.flushes:
-                self._try(task)
+                self._try_task(task)
 
-    def _try(self, task: Task) -> None:
+    def _try_task(self, task: Task) -> None:
         try:
             task.call()
         except (RsePfError, OSError) as error:

@@ -46,7 +46,7 @@ class AutoScalingGroup:
     @property
     def robots(self) -> tuple[float, ...]:
         """The robots of each server whose number is known."""
-        return tuple(each.robots for each in self.servers if each.robots is not None)
+        return tuple(server.robots for server in self.servers if server.robots is not None)
 
     @property
     def is_healthy(self) -> bool:
@@ -71,15 +71,15 @@ def read_group(
         StoreError: AWS does not answer.
     """
     of = ResourceNames(settings.cloud.name)
-    found = account.pages(
+    groups = account.pages(
         "autoscaling", "describe_auto_scaling_groups", "AutoScalingGroups", AutoScalingGroupNames=[of.group]
     )
-    if not found:
+    if not groups:
         raise ConfigurationError(f"no platform runs in {account.region}", hint="put it up: rse-pf cloud up")
-    group = found[0]
-    health = [_target_health(account, arn) for arn in group["TargetGroupARNs"]]
-    names = [each["InstanceId"] for each in group["Instances"]]
-    robots = _robots(account, of.group, names, settings.scaling.period_s, now) if asks_robots else {}
+    group = groups[0]
+    health = [_read_target_health(account, arn) for arn in group["TargetGroupARNs"]]
+    names = [instance["InstanceId"] for instance in group["Instances"]]
+    robots = _read_robots(account, of.group, names, settings.scaling.period_s, now) if asks_robots else {}
     alarms = account.pages("cloudwatch", "describe_alarms", "MetricAlarms", AlarmNamePrefix=of.alarm_prefix)
     return AutoScalingGroup(
         min_servers=group["MinSize"],
@@ -87,30 +87,30 @@ def read_group(
         max_servers=group["MaxSize"],
         servers=tuple(
             Server(
-                name=each["InstanceId"],
-                zone=each["AvailabilityZone"],
-                state=each["LifecycleState"],
-                targets=tuple(one.get(each["InstanceId"], "absent") for one in health),
-                robots=robots.get(each["InstanceId"]),
+                name=instance["InstanceId"],
+                zone=instance["AvailabilityZone"],
+                state=instance["LifecycleState"],
+                targets=tuple(states.get(instance["InstanceId"], "absent") for states in health),
+                robots=robots.get(instance["InstanceId"]),
             )
-            for each in sorted(group["Instances"], key=lambda one: str(one["InstanceId"]))
+            for instance in sorted(group["Instances"], key=lambda row: str(row["InstanceId"]))
         ),
-        alarms={each["AlarmName"].removeprefix(of.alarm_prefix): each["StateValue"] for each in alarms},
+        alarms={alarm["AlarmName"].removeprefix(of.alarm_prefix): alarm["StateValue"] for alarm in alarms},
         reasons={
-            each["AlarmName"].removeprefix(of.alarm_prefix): str(each.get("StateReason", ""))
-            for each in alarms
+            alarm["AlarmName"].removeprefix(of.alarm_prefix): str(alarm.get("StateReason", ""))
+            for alarm in alarms
         },
         target_groups=tuple(group["TargetGroupARNs"]),
     )
 
 
-def _target_health(account: Account, arn: str) -> dict[str, str]:
+def _read_target_health(account: Account, arn: str) -> dict[str, str]:
     """Return the health of each instance in one target group."""
     rows = account.pages("elbv2", "describe_target_health", "TargetHealthDescriptions", TargetGroupArn=arn)
     return {row["Target"]["Id"]: row["TargetHealth"]["State"] for row in rows}
 
 
-def _robots(
+def _read_robots(
     account: Account, group: str, servers: list[str], period_s: int, now: datetime
 ) -> dict[str, float]:
     """Return the newest value of each server within the last complete periods; unknown ones are left out.
@@ -133,13 +133,13 @@ def _robots(
     ]  # fmt: skip
     if not queries:
         return {}
-    found = account.pages(
+    results = account.pages(
         "cloudwatch", "get_metric_data", "MetricDataResults",
         MetricDataQueries=queries, ScanBy="TimestampDescending",
         StartTime=end - timedelta(seconds=_PERIODS * period_s), EndTime=end,
     )  # fmt: skip
     newest: dict[str, float] = {}
-    for row in found:
+    for row in results:
         if row["Values"]:
             newest.setdefault(servers[int(row["Id"].removeprefix("q"))], row["Values"][0])
     return newest

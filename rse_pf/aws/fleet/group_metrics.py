@@ -54,8 +54,8 @@ class GroupMetrics:
 
     def newest(self, name: str) -> float | None:
         """Return the newest number of a series, if it is of the last three periods."""
-        known = [each for each in self.series.get(name, ())[-_FRESH_PERIODS:] if each is not None]
-        return known[-1] if known else None
+        values = [value for value in self.series.get(name, ())[-_FRESH_PERIODS:] if value is not None]
+        return values[-1] if values else None
 
 
 def read_group_metrics(
@@ -72,40 +72,40 @@ def read_group_metrics(
     period_s, group = settings.scaling.period_s, ResourceNames(settings.cloud.name).group
     end_s = int(now.timestamp()) // period_s * period_s
     times_s = tuple(end_s - period_s * back for back in range(PERIODS - 1, -1, -1))
-    asked = [("", name, what) for name, what in _GROUP_SERIES.items()]
-    asked += [
-        (server, name, what) for server in servers[:_MAX_SERVERS] for name, what in _SERVER_SERIES.items()
+    queries = [("", name, source) for name, source in _GROUP_SERIES.items()]
+    queries += [
+        (server, name, source) for server in servers[:_MAX_SERVERS] for name, source in _SERVER_SERIES.items()
     ]
     end = datetime.fromtimestamp(end_s, now.tzinfo)
     rows = account.pages(
         "cloudwatch", "get_metric_data", "MetricDataResults",
         MetricDataQueries=[
-            _query(f"q{at}", dimensions_of(group, server), server, what, period_s)
-            for at, (server, _, what) in enumerate(asked)
+            _make_query(f"q{at}", dimensions_of(group, server), server, source, period_s)
+            for at, (server, _, source) in enumerate(queries)
         ],
         ScanBy="TimestampAscending", StartTime=end - timedelta(seconds=PERIODS * period_s), EndTime=end,
     )  # fmt: skip
-    found: dict[int, dict[int, float]] = {}
+    values_by_query: dict[int, dict[int, float]] = {}
     for row in rows:
-        values = found.setdefault(int(row["Id"].removeprefix("q")), {})
+        values = values_by_query.setdefault(int(row["Id"].removeprefix("q")), {})
         for begin, value in zip(row["Timestamps"], row["Values"], strict=False):
             values[int(begin.timestamp()) // period_s * period_s + period_s] = float(value)
     series: dict[str, tuple[float | None, ...]] = {}
     newest: dict[str, dict[str, float]] = {}
-    for at, (server, name, _) in enumerate(asked):
-        numbers = tuple(found.get(at, {}).get(time_s) for time_s in times_s)
-        known = [each for each in numbers[-_FRESH_PERIODS:] if each is not None]
+    for at, (server, name, _) in enumerate(queries):
+        numbers = tuple(values_by_query.get(at, {}).get(time_s) for time_s in times_s)
+        fresh = [value for value in numbers[-_FRESH_PERIODS:] if value is not None]
         if not server:
             series[name] = numbers
-        elif known:
-            newest.setdefault(server, {})[name] = known[-1]
+        elif fresh:
+            newest.setdefault(server, {})[name] = fresh[-1]
     return GroupMetrics(period_s=period_s, times_s=times_s, series=series, servers=newest)
 
 
-def _query(
-    identity: str, of_group: list[dict[str, str]], server: str, what: tuple[str, str, str], period_s: int
+def _make_query(
+    identity: str, of_group: list[dict[str, str]], server: str, source: tuple[str, str, str], period_s: int
 ) -> dict[str, Any]:
-    namespace, metric, statistic = what
+    namespace, metric, statistic = source
     dimensions = [{"Name": "InstanceId", "Value": server}] if server and namespace == _EC2 else of_group
     return {
         "Id": identity,

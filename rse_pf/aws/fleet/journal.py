@@ -13,7 +13,7 @@ from datetime import datetime, timezone
 
 import msgspec
 
-__all__ = ["UNITS", "Batch", "JournalReader", "batch_of", "journal_command", "read_journal"]
+__all__ = ["UNITS", "Batch", "JournalReader", "journal_command", "make_batch", "read_journal"]
 
 UNITS = (
     "rse-pf.service", "rse-pf-agent.service", "rse-pf-data.service", "rse-pf-jobs.service",
@@ -56,16 +56,16 @@ class Batch:
     cursor: str
 
 
-def batch_of(entries: Iterable[bytes], max_bytes: int = _MAX_BYTES) -> Batch | None:
+def make_batch(entries: Iterable[bytes], max_bytes: int = _MAX_BYTES) -> Batch | None:
     """Return the first *entries* as one batch of about *max_bytes*; None if there are none.
 
     An entry that cannot be read is left out; systemd writes none.
     """
     first_us, cursor, size = 0, "", 0
     lines: list[bytes] = []
-    for each in entries:
+    for encoded in entries:
         try:
-            entry = msgspec.json.decode(each, type=_Entry)
+            entry = msgspec.json.decode(encoded, type=_Entry)
             line = entry.line.encode()
         except (msgspec.DecodeError, ValueError, OverflowError):
             continue

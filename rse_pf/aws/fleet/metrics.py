@@ -46,14 +46,14 @@ def read_page(text: str) -> ServerMetrics:
     answers: Counter[float] = Counter()
     bounds_ms: list[float] = []
     for name, labels, value in _LINE.findall(text):
-        found = dict(_LABEL.findall(labels))
+        values = dict(_LABEL.findall(labels))
         if name == "duration_seconds_bucket":
-            bound_ms = float(found["le"]) * 1e3
+            bound_ms = float(values["le"]) * 1e3
             answers[bound_ms] += float(value)  # type: ignore[assignment]
-            if found["le"] != _INF:
+            if values["le"] != _INF:
                 bounds_ms.append(bound_ms)
         else:
-            totals[f"{name} {found['direction']}" if "direction" in found else name] += float(value)  # type: ignore[assignment]
+            totals[f"{name} {values['direction']}" if "direction" in values else name] += float(value)  # type: ignore[assignment]
     if bounds_ms:
         answers[max(bounds_ms) * _BEYOND] = answers.pop(float("inf"))
     return ServerMetrics(
@@ -72,7 +72,7 @@ def read_cpu_times(stat: str) -> tuple[float, float]:
 
     Time that the hypervisor took away counts as work, as in CPUUtilization of EC2.
     """
-    user, nice, system, idle, waiting, *others = (float(each) for each in stat.splitlines()[0].split()[1:9])
+    user, nice, system, idle, waiting, *others = (float(ticks) for ticks in stat.splitlines()[0].split()[1:9])
     busy = user + nice + system + sum(others)
     return busy, busy + idle + waiting
 
@@ -89,20 +89,20 @@ def datums(before: ServerMetrics, now: ServerMetrics, group: str, server: str) -
         ROBOTS: (now.robots, "Count"),
         "InFlight": (now.in_flight, "Count"),
         "QueueMs": (now.queue_ms, "Milliseconds"),
-        "Requests": (_since(before.requests, now.requests), "Count"),
-        "BytesIn": (_since(before.bytes_in, now.bytes_in), "Bytes"),
-        "BytesOut": (_since(before.bytes_out, now.bytes_out), "Bytes"),
+        "Requests": (_counter_growth(before.requests, now.requests), "Count"),
+        "BytesIn": (_counter_growth(before.bytes_in, now.bytes_in), "Bytes"),
+        "BytesOut": (_counter_growth(before.bytes_out, now.bytes_out), "Bytes"),
     }
     dimensions = dimensions_of(group)
-    made: list[dict[str, Any]] = [
+    data: list[dict[str, Any]] = [
         {"MetricName": name, "Dimensions": dimensions, "Value": value, "Unit": unit}
         for name, (value, unit) in values.items()
     ]
     of_server = dimensions_of(group, server)
-    made.append({"MetricName": ROBOTS, "Dimensions": of_server, "Value": now.robots, "Unit": "Count"})
-    slots = _answers_between(before.answers, now.answers)
+    data.append({"MetricName": ROBOTS, "Dimensions": of_server, "Value": now.robots, "Unit": "Count"})
+    slots = _count_answers(before.answers, now.answers)
     if slots:
-        made.append(
+        data.append(
             {
                 "MetricName": "AnswerMs",
                 "Dimensions": dimensions,
@@ -111,10 +111,10 @@ def datums(before: ServerMetrics, now: ServerMetrics, group: str, server: str) -
                 "Unit": "Milliseconds",
             }
         )
-    return made
+    return data
 
 
-def _answers_between(before: Mapping[float, float], now: Mapping[float, float]) -> dict[float, float]:
+def _count_answers(before: Mapping[float, float], now: Mapping[float, float]) -> dict[float, float]:
     """Return how many answers lie between each bound and the one below; empty intervals are left out."""
     slots, below = {}, 0.0
     restarted = any(now.get(bound, 0.0) < count for bound, count in before.items())
@@ -126,5 +126,5 @@ def _answers_between(before: Mapping[float, float], now: Mapping[float, float]) 
     return slots
 
 
-def _since(before: float, now: float) -> float:
+def _counter_growth(before: float, now: float) -> float:
     return now - before if now >= before else now

@@ -74,19 +74,19 @@ def read_overview(account: Account, settings: PlatformSettings, *, now: datetime
     """
     group = read_group(account, settings, now=now, asks_robots=False)
     problems: list[str] = []
-    names = [each.name for each in group.servers]
+    names = [server.name for server in group.servers]
     return CloudOverview(
         group=group,
-        balancer=_or_problem(problems, None, lambda: _balancer(account, group.target_groups)),
-        launched_s=_or_problem(problems, {}, lambda: _launched_s(account, names)),
-        activities=_or_problem(
-            problems, (), lambda: _activities(account, ResourceNames(settings.cloud.name).group)
+        balancer=_read_or_note_problem(problems, None, lambda: _read_balancer(account, group.target_groups)),
+        launched_s=_read_or_note_problem(problems, {}, lambda: _read_launch_times_s(account, names)),
+        activities=_read_or_note_problem(
+            problems, (), lambda: _read_activities(account, ResourceNames(settings.cloud.name).group)
         ),
         problems=tuple(problems),
     )
 
 
-def _or_problem(problems: list[str], otherwise: T, read: Callable[[], T]) -> T:
+def _read_or_note_problem(problems: list[str], otherwise: T, read: Callable[[], T]) -> T:
     try:
         return read()
     except RsePfError as error:
@@ -94,25 +94,25 @@ def _or_problem(problems: list[str], otherwise: T, read: Callable[[], T]) -> T:
         return otherwise
 
 
-def _balancer(account: Account, target_groups: tuple[str, ...]) -> CloudBalancer | None:
+def _read_balancer(account: Account, target_groups: tuple[str, ...]) -> CloudBalancer | None:
     if not target_groups:
         return None
     groups = account.pages(
         "elbv2", "describe_target_groups", "TargetGroups", TargetGroupArns=list(target_groups)
     )
-    arns = sorted({arn for each in groups for arn in each["LoadBalancerArns"]})
+    arns = sorted({arn for group in groups for arn in group["LoadBalancerArns"]})
     if not arns:
         return None
-    found = account.pages("elbv2", "describe_load_balancers", "LoadBalancers", LoadBalancerArns=arns[:1])
+    balancers = account.pages("elbv2", "describe_load_balancers", "LoadBalancers", LoadBalancerArns=arns[:1])
     listeners = account.pages("elbv2", "describe_listeners", "Listeners", LoadBalancerArn=arns[0])
     return CloudBalancer(
-        state=str(found[0]["State"]["Code"]),
-        address=str(found[0]["DNSName"]),
-        protocols=tuple(sorted({str(each["Protocol"]) for each in listeners})),
+        state=str(balancers[0]["State"]["Code"]),
+        address=str(balancers[0]["DNSName"]),
+        protocols=tuple(sorted({str(listener["Protocol"]) for listener in listeners})),
     )
 
 
-def _launched_s(account: Account, names: list[str]) -> dict[str, float]:
+def _read_launch_times_s(account: Account, names: list[str]) -> dict[str, float]:
     if not names:
         return {}
     # By a filter: an id that is gone would be an error.
@@ -120,15 +120,17 @@ def _launched_s(account: Account, names: list[str]) -> dict[str, float]:
         "ec2", "describe_instances", "Reservations", Filters=[{"Name": "instance-id", "Values": names[:200]}]
     )
     return {
-        str(each["InstanceId"]): each["LaunchTime"].timestamp() for row in rows for each in row["Instances"]
+        str(instance["InstanceId"]): instance["LaunchTime"].timestamp()
+        for row in rows
+        for instance in row["Instances"]
     }
 
 
-def _activities(account: Account, group: str) -> tuple[ScalingActivity, ...]:
-    found = account.find(
+def _read_activities(account: Account, group: str) -> tuple[ScalingActivity, ...]:
+    answer = account.find(
         "autoscaling", "describe_scaling_activities", AutoScalingGroupName=group, MaxRecords=_ACTIVITIES
     )
-    rows = (found or {}).get("Activities", ())
+    rows = (answer or {}).get("Activities", ())
     return tuple(
         sorted(
             (
@@ -141,6 +143,6 @@ def _activities(account: Account, group: str) -> tuple[ScalingActivity, ...]:
                 )
                 for row in rows
             ),
-            key=lambda each: (each.began_s, each.id),
+            key=lambda activity: (activity.began_s, activity.id),
         )
     )

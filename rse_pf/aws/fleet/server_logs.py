@@ -13,7 +13,7 @@ from rse_pf.aws.storage.s3_store import S3Store
 from rse_pf.config.resource_names import JOURNAL_PREFIX, ResourceNames
 from rse_pf.object_store import ObjectStore
 
-__all__ = ["LoggedServer", "console_of", "last_lines", "logged_servers", "open_journals"]
+__all__ = ["LoggedServer", "console_of", "last_lines", "list_logged_servers", "open_journals"]
 
 _PIECE = re.compile(rf"{JOURNAL_PREFIX}/(?P<server>[A-Za-z0-9-]{{1,64}})/(?P<first_us>\d{{20}})\.log")
 _MAX_PIECES = 200
@@ -36,18 +36,18 @@ def open_journals(account: Account, names: ResourceNames) -> S3Store:
     return S3Store(account.client("s3"), bucket)
 
 
-def logged_servers(store: ObjectStore) -> list[LoggedServer]:
+def list_logged_servers(store: ObjectStore) -> list[LoggedServer]:
     """Return the servers with journals in *store*, the one that wrote last first; raises StoreError."""
     pieces: dict[str, list[str]] = {}
     for info in store.list(f"{JOURNAL_PREFIX}/"):
         match = _PIECE.fullmatch(info.name)
         if match is not None:
             pieces.setdefault(match["server"], []).append(info.name)
-    found = [
+    servers = [
         LoggedServer(name=server, pieces=tuple(sorted(names)), newest_s=_begin_s(max(names)))
         for server, names in pieces.items()
     ]
-    return sorted(found, key=lambda each: (-each.newest_s, each.name))
+    return sorted(servers, key=lambda server: (-server.newest_s, server.name))
 
 
 def last_lines(store: ObjectStore, server: LoggedServer, count: int) -> list[str]:
@@ -67,8 +67,8 @@ def console_of(account: Account, server: str) -> list[str]:
         ConfigurationError: AWS refused.
         StoreError: AWS does not answer.
     """
-    told = account.find("ec2", "get_console_output", InstanceId=server, Latest=False)
-    text = str((told or {}).get("Output", ""))  # botocore has decoded it
+    output = account.find("ec2", "get_console_output", InstanceId=server, Latest=False)
+    text = str((output or {}).get("Output", ""))  # botocore has decoded it
     return [_CONTROL.sub("?", line) for line in text.splitlines()]
 
 

@@ -27,7 +27,7 @@ __all__ = [
     "State",
     "UpgradeStep",
     "Upgraded",
-    "failed_launch",
+    "find_failed_launch",
     "next_step",
     "preferences",
     "read_state",
@@ -95,7 +95,7 @@ def next_step(release: Release) -> UpgradeStep:
     """Return what brings every server, and then the stack, to the newest version."""
     if release.refresh is not None and release.refresh["Status"] in _ACTIVE:
         return UpgradeStep.FOLLOW
-    if release.group != release.newest or any(each != release.newest for each in release.instances):
+    if release.group != release.newest or any(version != release.newest for version in release.instances):
         return UpgradeStep.REFRESH
     return UpgradeStep.NOTHING if release.recorded == release.newest else UpgradeStep.RECORD
 
@@ -110,34 +110,34 @@ def state_of_refresh(refresh: Mapping[str, Any]) -> State:
     return {"Successful": State.DONE, "RollbackSuccessful": State.ROLLED_BACK}.get(status, State.FAILED)
 
 
-def failed_launch(activities: Sequence[Mapping[str, Any]], since: datetime) -> Mapping[str, Any] | None:
+def find_failed_launch(activities: Sequence[Mapping[str, Any]], since: datetime) -> Mapping[str, Any] | None:
     """Return the first launch since *since* that was abandoned, None if there is none.
 
     A launch that failed for want of capacity is none: AWS tries it again, and the release is not at fault.
     """
     failed = [
-        each
-        for each in activities
-        if each["StartTime"] >= since
-        and each["StatusCode"] in _ABANDONED
-        and each["Description"].startswith("Launching")
-        and _LIFECYCLE in each.get("StatusMessage", "")
+        activity
+        for activity in activities
+        if activity["StartTime"] >= since
+        and activity["StatusCode"] in _ABANDONED
+        and activity["Description"].startswith("Launching")
+        and _LIFECYCLE in activity.get("StatusMessage", "")
     ]
-    return min(failed, key=lambda each: each["StartTime"], default=None)
+    return min(failed, key=lambda activity: activity["StartTime"], default=None)
 
 
 def with_version(group: Mapping[str, Any], version: str) -> dict[str, Any]:
     """Return the launch template or the mixed policy of *group* with *version*: a DesiredConfiguration."""
     if group.get("MixedInstancesPolicy"):
         policy = copy.deepcopy(dict(group["MixedInstancesPolicy"]))
-        _id_only(policy["LaunchTemplate"]["LaunchTemplateSpecification"])["Version"] = version
+        _drop_template_name(policy["LaunchTemplate"]["LaunchTemplateSpecification"])["Version"] = version
         return {"MixedInstancesPolicy": policy}
-    return {"LaunchTemplate": {**_id_only(dict(group["LaunchTemplate"])), "Version": version}}
+    return {"LaunchTemplate": {**_drop_template_name(dict(group["LaunchTemplate"])), "Version": version}}
 
 
 def preferences(settings: PlatformSettings, alarms: Sequence[str]) -> dict[str, Any]:
     """Return how AWS replaces servers: one more before one less, watched by *alarms*, and taken back."""
-    made: dict[str, Any] = {
+    options: dict[str, Any] = {
         "MinHealthyPercentage": 100,
         "MaxHealthyPercentage": MAX_HEALTHY_PERCENT,
         "InstanceWarmup": settings.scaling.warm_up_s,
@@ -146,23 +146,23 @@ def preferences(settings: PlatformSettings, alarms: Sequence[str]) -> dict[str, 
         "ScaleInProtectedInstances": "Refresh",
         "StandbyInstances": "Ignore",
     }
-    return {**made, "AlarmSpecification": {"Alarms": list(alarms)}} if alarms else made
+    return {**options, "AlarmSpecification": {"Alarms": list(alarms)}} if alarms else options
 
 
 def read_state(account: Account, settings: PlatformSettings) -> Release:
     """Return the versions of a deployment; raises ConfigurationError where nothing is deployed."""
     names = ResourceNames(settings.cloud.name)
-    group = _group(account, names)
+    group = _read_group(account, names)
     refreshes = account.pages(
         "autoscaling", "describe_instance_refreshes", "InstanceRefreshes", AutoScalingGroupName=names.group
     )
-    versions = [each.get("LaunchTemplate", {}).get("Version", "") for each in group["Instances"]]
+    versions = [instance.get("LaunchTemplate", {}).get("Version", "") for instance in group["Instances"]]
     return Release(
-        newest=_newest(account, group),
+        newest=_read_newest_version(account, group),
         group=str(_specification(group).get("Version", "")),
         instances=tuple(versions),
-        recorded=_parameters(account, names).get(VERSION_PARAMETER, ""),
-        refresh=max(refreshes, key=_newness, default=None),
+        recorded=_read_parameters(account, names).get(VERSION_PARAMETER, ""),
+        refresh=max(refreshes, key=_refresh_order, default=None),
         raw_group=group,
     )
 
@@ -174,8 +174,8 @@ def versions_behind(account: Account, settings: PlatformSettings) -> tuple[str, 
         ConfigurationError: Nothing is deployed, or AWS refused.
         StoreError: AWS does not answer.
     """
-    group = _group(account, ResourceNames(settings.cloud.name))
-    newest, named = _newest(account, group), str(_specification(group).get("Version", ""))
+    group = _read_group(account, ResourceNames(settings.cloud.name))
+    newest, named = _read_newest_version(account, group), str(_specification(group).get("Version", ""))
     return None if named == newest else (named, newest)
 
 
@@ -211,7 +211,7 @@ def upgrade(
             version = _version_of(release.refresh) or version
             identity = release.refresh["InstanceRefreshId"]
         elif release.raw_group["Instances"]:
-            identity = _start(account, settings, release, tell)
+            identity = _start_refresh(account, settings, release, tell)
         else:
             account.change(
                 "autoscaling", "update_auto_scaling_group",
@@ -219,7 +219,7 @@ def upgrade(
                 **with_version(release.raw_group, version),
             )  # fmt: skip
         if release.raw_group["Instances"]:
-            ended = _follow(account, settings, identity, begun, tell, sleep)
+            ended = _follow_refresh(account, settings, identity, begun, tell, sleep)
             if ended.reason:
                 return ended
             replaced = True
@@ -227,20 +227,20 @@ def upgrade(
     if settings.cloud.job_servers:
         _end_old_job_servers(account, settings, tell)
     if step is UpgradeStep.RECORD:
-        _record(account, settings, version, sleep)
+        _record_version(account, settings, version, sleep)
         tell(f"the stack names version {version}")
     return Upgraded(version=version, replaced=replaced)
 
 
-def _start(
+def _start_refresh(
     account: Account, settings: PlatformSettings, release: Release, tell: Callable[[str], None]
 ) -> str:
     """Start an instance refresh; return its id."""
     names = ResourceNames(settings.cloud.name)
-    wanted = {names.alarm(name): name for name in WATCHED}
-    rows = account.pages("cloudwatch", "describe_alarms", "MetricAlarms", AlarmNames=list(wanted))
-    firing = sorted(wanted[each["AlarmName"]] for each in rows if each["StateValue"] == "ALARM")
-    quiet = sorted(each["AlarmName"] for each in rows if each["StateValue"] != "ALARM")
+    watched_alarms = {names.alarm(name): name for name in WATCHED}
+    rows = account.pages("cloudwatch", "describe_alarms", "MetricAlarms", AlarmNames=list(watched_alarms))
+    firing = sorted(watched_alarms[alarm["AlarmName"]] for alarm in rows if alarm["StateValue"] == "ALARM")
+    quiet = sorted(alarm["AlarmName"] for alarm in rows if alarm["StateValue"] != "ALARM")
     for name in firing:
         tell(f"alarm {name} fires already, so it does not end this upgrade")
     tell(f"replacing servers: version {release.group} by {release.newest}")
@@ -252,7 +252,7 @@ def _start(
     return str(started["InstanceRefreshId"])
 
 
-def _follow(
+def _follow_refresh(
     account: Account,
     settings: PlatformSettings,
     identity: str,
@@ -262,7 +262,7 @@ def _follow(
 ) -> Upgraded:
     """Tell the progress until the refresh *identity* has ended; a failed launch takes it back at once."""
     names = ResourceNames(settings.cloud.name)
-    told, cause = "", ""
+    last_line, cause = "", ""
     console: tuple[str, ...] = ()
     while True:
         rows = account.pages(
@@ -272,9 +272,9 @@ def _follow(
         refresh = rows[0] if rows else _NOT_LISTED
         state = state_of_refresh(refresh)
         line = f"{state.value}: {refresh.get('PercentageComplete', 0)} %"
-        if line != told:
+        if line != last_line:
             tell(line)
-            told = line
+            last_line = line
         if state is State.DONE:
             return Upgraded(version=_version_of(refresh), replaced=True)
         if state in (State.ROLLED_BACK, State.FAILED):
@@ -286,38 +286,38 @@ def _follow(
                 console=console,
             )
         if state is State.RUNNING and not cause:
-            failed = _failed_launch(account, names, begun)
+            failed = _read_failed_launch(account, names, begun)
             if failed is not None:
                 cause = str(failed.get("StatusMessage") or failed["Description"])
-                console = _console(account, failed)
+                console = _read_console(account, failed)
                 tell(f"a new server did not become ready: {cause}")
                 account.find("autoscaling", "rollback_instance_refresh", AutoScalingGroupName=names.group)
         sleep(POLL_S)
 
 
-def _newness(refresh: Mapping[str, Any]) -> tuple[bool, str]:
+def _refresh_order(refresh: Mapping[str, Any]) -> tuple[bool, str]:
     """Return a key that sorts the newest refresh to the end; one that waits may have no start yet."""
     return refresh["Status"] in _ACTIVE, str(refresh.get("StartTime", ""))
 
 
-def _failed_launch(account: Account, names: ResourceNames, begun: datetime) -> Mapping[str, Any] | None:
-    found = account.find(
+def _read_failed_launch(account: Account, names: ResourceNames, begun: datetime) -> Mapping[str, Any] | None:
+    answer = account.find(
         "autoscaling", "describe_scaling_activities", AutoScalingGroupName=names.group, MaxRecords=50
     )
-    return failed_launch((found or {}).get("Activities", ()), begun)
+    return find_failed_launch((answer or {}).get("Activities", ()), begun)
 
 
-def _console(account: Account, activity: Mapping[str, Any]) -> tuple[str, ...]:
+def _read_console(account: Account, activity: Mapping[str, Any]) -> tuple[str, ...]:
     """Return the last lines that the machine of *activity* wrote to its console, none if AWS has them not."""
     words = [word.strip(".,") for word in str(activity["Description"]).split()]
     instance = next((word for word in words if word.startswith("i-")), "")
     if not instance:
         return ()
     try:
-        found = account.find("ec2", "get_console_output", InstanceId=instance, Latest=True) or {}
+        output = account.find("ec2", "get_console_output", InstanceId=instance, Latest=True) or {}
     except RsePfError:
         return ()  # the machine is gone, or this type of machine has no console
-    lines = [line.strip() for line in str(found.get("Output", "")).splitlines() if line.strip()]
+    lines = [line.strip() for line in str(output.get("Output", "")).splitlines() if line.strip()]
     ours = [line for line in lines if "rse-pf" in line]
     return tuple((ours or lines)[-_LINES:])
 
@@ -329,8 +329,10 @@ def _end_old_job_servers(account: Account, settings: PlatformSettings, tell: Cal
         "autoscaling", "describe_auto_scaling_groups", "AutoScalingGroups", AutoScalingGroupNames=[name]
     )
     for group in groups:
-        versions = [str(each.get("LaunchTemplate", {}).get("Version", "")) for each in group["Instances"]]
-        newest = _newest(account, group) if versions else ""
+        versions = [
+            str(instance.get("LaunchTemplate", {}).get("Version", "")) for instance in group["Instances"]
+        ]
+        newest = _read_newest_version(account, group) if versions else ""
         if any(version != newest for version in versions):
             tell(f"ending {counted(len(versions), 'job server')}: an alarm starts new ones when jobs wait")
             account.change(
@@ -338,12 +340,12 @@ def _end_old_job_servers(account: Account, settings: PlatformSettings, tell: Cal
             )
 
 
-def _record(
+def _record_version(
     account: Account, settings: PlatformSettings, version: str, sleep: Callable[[float], None]
 ) -> None:
     """Write *version* into the parameter of the stack, whose template stays as it is."""
     names = ResourceNames(settings.cloud.name)
-    parameters = _parameters(account, names)
+    parameters = _read_parameters(account, names)
     if VERSION_PARAMETER not in parameters:
         raise ConfigurationError(
             f"the stack {names.stack('Backend')} has no parameter {VERSION_PARAMETER}",
@@ -351,68 +353,68 @@ def _record(
         )
     if parameters[VERSION_PARAMETER] == version:
         return
-    given: list[dict[str, Any]] = [
+    previous: list[dict[str, Any]] = [
         {"ParameterKey": name, "UsePreviousValue": True} for name in parameters if name != VERSION_PARAMETER
     ]
     account.change(
         "cloudformation", "update_stack", StackName=names.stack("Backend"), UsePreviousTemplate=True,
         Capabilities=["CAPABILITY_IAM", "CAPABILITY_NAMED_IAM"],
-        Parameters=[*given, {"ParameterKey": VERSION_PARAMETER, "ParameterValue": version}],
+        Parameters=[*previous, {"ParameterKey": VERSION_PARAMETER, "ParameterValue": version}],
     )  # fmt: skip
     for _ in range(_STACK_POLLS):
-        stack = _stack(account, names)
+        stack = _read_stack(account, names)
         if not stack["StackStatus"].endswith(_STACK_BUSY):
             break
         sleep(POLL_S)
-    if _parameters(account, names).get(VERSION_PARAMETER) != version:
+    if _read_parameters(account, names).get(VERSION_PARAMETER) != version:
         raise ConfigurationError(
             f"the servers run version {version}, and the stack does not name it: {stack['StackStatus']}",
             hint="repeat rse-pf cloud upgrade before the next deployment",
         )
 
 
-def _group(account: Account, names: ResourceNames) -> Mapping[str, Any]:
-    found = account.pages(
+def _read_group(account: Account, names: ResourceNames) -> Mapping[str, Any]:
+    groups = account.pages(
         "autoscaling",
         "describe_auto_scaling_groups",
         "AutoScalingGroups",
         AutoScalingGroupNames=[names.group],
     )
-    if not found:
+    if not groups:
         raise ConfigurationError(f"no platform runs in {account.region}", hint="deploy it: rse-pf cloud up")
-    group: Mapping[str, Any] = found[0]
+    group: Mapping[str, Any] = groups[0]
     return group
 
 
-def _newest(account: Account, group: Mapping[str, Any]) -> str:
-    found = account.change(
+def _read_newest_version(account: Account, group: Mapping[str, Any]) -> str:
+    templates = account.change(
         "ec2", "describe_launch_templates", LaunchTemplateIds=[_specification(group)["LaunchTemplateId"]]
     )
-    return str(found["LaunchTemplates"][0]["LatestVersionNumber"])
+    return str(templates["LaunchTemplates"][0]["LatestVersionNumber"])
 
 
-def _stack(account: Account, names: ResourceNames) -> dict[str, Any]:
-    found = account.change("cloudformation", "describe_stacks", StackName=names.stack("Backend"))
-    stack: dict[str, Any] = found["Stacks"][0]
+def _read_stack(account: Account, names: ResourceNames) -> dict[str, Any]:
+    answer = account.change("cloudformation", "describe_stacks", StackName=names.stack("Backend"))
+    stack: dict[str, Any] = answer["Stacks"][0]
     return stack
 
 
-def _parameters(account: Account, names: ResourceNames) -> dict[str, str]:
-    rows = _stack(account, names).get("Parameters", ())
+def _read_parameters(account: Account, names: ResourceNames) -> dict[str, str]:
+    rows = _read_stack(account, names).get("Parameters", ())
     return {row["ParameterKey"]: row["ParameterValue"] for row in rows}
 
 
 def _specification(group: Mapping[str, Any]) -> Mapping[str, Any]:
     if group.get("MixedInstancesPolicy"):
-        found: Mapping[str, Any] = group["MixedInstancesPolicy"]["LaunchTemplate"][
+        mixed: Mapping[str, Any] = group["MixedInstancesPolicy"]["LaunchTemplate"][
             "LaunchTemplateSpecification"
         ]
-        return found
+        return mixed
     plain: Mapping[str, Any] = group["LaunchTemplate"]
     return plain
 
 
-def _id_only(specification: dict[str, Any]) -> dict[str, Any]:
+def _drop_template_name(specification: dict[str, Any]) -> dict[str, Any]:
     """Leave the name out: AWS takes the id or the name, and describes both."""
     specification.pop("LaunchTemplateName", None)
     return specification

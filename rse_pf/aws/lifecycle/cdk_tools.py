@@ -60,12 +60,12 @@ class CdkTools:
         options = ["--exclusively", "--require-approval", "never", "--progress", "events"]
         self._cdk(f"the deployment of {stack}", ["deploy", stack, *options])
 
-    def _cdk(self, what: str, words: Sequence[str]) -> None:
+    def _cdk(self, task: str, words: Sequence[str]) -> None:
         file = self._settings_file
         context = [] if file is None else ["--context", f"{SETTINGS_CONTEXT}={file.resolve()}"]
-        self._run(what, ["sh", "scripts/cdk.sh", *words, *context])
+        self._run(task, ["sh", "scripts/cdk.sh", *words, *context])
 
-    def _run(self, what: str, command: Sequence[str]) -> None:
+    def _run(self, task: str, command: Sequence[str]) -> None:
         script = next(word for word in command if word.startswith("scripts/"))
         if not (self._checkout / script).exists():
             raise UsageError(
@@ -75,6 +75,6 @@ class CdkTools:
         code = subprocess.run(command, cwd=self._checkout, check=False).returncode
         if code:
             raise DeploymentFailed(
-                f"{what} failed with exit code {code}",
+                f"{task} failed with exit code {code}",
                 hint="read the lines above; when the cause is gone, the same command continues",
             )

@@ -12,7 +12,7 @@ from typing import Any
 import msgspec
 
 from rse_pf.aws.account import Account
-from rse_pf.aws.cloudformation import bootstrap_version, living_stacks
+from rse_pf.aws.cloudformation import list_living_stacks, read_bootstrap_version
 from rse_pf.config import PlatformSettings
 from rse_pf.config.resource_names import DEPLOYMENT_TAG, STACKS, ResourceNames
 from rse_pf.errors import ConfigurationError
@@ -71,15 +71,15 @@ def read_deployment(account: Account, settings: PlatformSettings) -> Deployment:
         StoreError: AWS does not answer.
     """
     names = ResourceNames(settings.cloud.name)
-    stacks = living_stacks(account, names)
+    stacks = list_living_stacks(account, names)
     ours = {name.removeprefix(names.stack_prefix): row for name, row in stacks.items()}
     outputs = ours.get("Backend", {}).get("Outputs", ())
     return Deployment(
         stacks={box: str(ours[box]["StackStatus"]) for box in STACKS if box in ours},
         groups=read_sizes(account, names),
         note=read_note(account, names),
-        is_bootstrapped=bootstrap_version(account, settings) is not None,
-        url=next((str(each["OutputValue"]) for each in outputs if each["OutputKey"] == "Url"), ""),
+        is_bootstrapped=read_bootstrap_version(account, settings) is not None,
+        url=next((str(output["OutputValue"]) for output in outputs if output["OutputKey"] == "Url"), ""),
     )
 
 
@@ -94,11 +94,11 @@ def read_sizes(account: Account, names: ResourceNames) -> dict[str, GroupSize]:
 
 def read_note(account: Account, names: ResourceNames) -> ParkNote | None:
     """Return the note of a parked deployment; None if it is not parked.  Raises as `read_deployment`."""
-    found = account.find("ssm", "get_parameter", Name=names.parked)
-    if found is None:
+    parameter = account.find("ssm", "get_parameter", Name=names.parked)
+    if parameter is None:
         return None
     try:
-        return msgspec.json.decode(found["Parameter"]["Value"], type=ParkNote)
+        return msgspec.json.decode(parameter["Parameter"]["Value"], type=ParkNote)
     except msgspec.DecodeError as error:
         raise ConfigurationError(
             f"the SSM parameter {names.parked} does not say what was parked: {error}",

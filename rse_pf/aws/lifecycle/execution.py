@@ -105,7 +105,7 @@ def _destroy(step: Step, world: StepContext) -> None:
     status = _await_stack(world, stack)
     if status not in ("", "DELETE_COMPLETE"):
         raise DeploymentFailed(
-            f"the stack {stack} is {status}: {_reason(world.account, stack)}",
+            f"the stack {stack} is {status}: {_read_failure_reason(world.account, stack)}",
             hint="remove what the reason names, then repeat the command",
         )
 
@@ -114,8 +114,8 @@ def _await_stack(world: StepContext, stack: str) -> str:
     """Return the status of *stack* when AWS no longer changes it; empty when it does not exist."""
     deadline = world.clock() + _STACK_S
     while True:
-        found = world.account.find("cloudformation", "describe_stacks", StackName=stack)
-        status = str(found["Stacks"][0]["StackStatus"]) if found and found["Stacks"] else ""
+        answer = world.account.find("cloudformation", "describe_stacks", StackName=stack)
+        status = str(answer["Stacks"][0]["StackStatus"]) if answer and answer["Stacks"] else ""
         if not status.endswith("_IN_PROGRESS"):
             return status
         if world.clock() > deadline:
@@ -126,25 +126,25 @@ def _await_stack(world: StepContext, stack: str) -> str:
         world.sleep(_POLL_S)
 
 
-def _reason(account: Account, stack: str) -> str:
+def _read_failure_reason(account: Account, stack: str) -> str:
     """Return why CloudFormation failed: the first failure that names no other one."""
     rows = account.pages("cloudformation", "describe_stack_events", "StackEvents", StackName=stack)
     failed = [row for row in rows if str(row["ResourceStatus"]).endswith("_FAILED")]
-    told = [
+    reasons = [
         f"{row['LogicalResourceId']}: {row.get('ResourceStatusReason', 'no reason given')}" for row in failed
     ]
-    return told[-1] if told else "AWS gives no reason"
+    return reasons[-1] if reasons else "AWS gives no reason"
 
 
-def _note(step: Step, world: StepContext) -> None:
+def _write_park_note(step: Step, world: StepContext) -> None:
     """Write the sizes down before they are changed; sizes that were noted before are kept."""
-    known = read_note(world.account, world.names)
-    groups = known.groups if known is not None else read_sizes(world.account, world.names)
-    since = known.since if known is not None else world.now().isoformat(timespec="seconds")
+    note = read_note(world.account, world.names)
+    groups = note.groups if note is not None else read_sizes(world.account, world.names)
+    since = note.since if note is not None else world.now().isoformat(timespec="seconds")
     write_note(world.account, world.names, ParkNote(groups=groups, since=since, deep=step.deep))
 
 
-def _silence(step: Step, world: StepContext) -> None:
+def _silence_alarms(step: Step, world: StepContext) -> None:
     silence_alarms(world.account, world.names)
 
 
@@ -155,10 +155,10 @@ def _empty(step: Step, world: StepContext) -> None:
 
 def _await_empty(step: Step, world: StepContext) -> None:
     deadline = world.clock() + world.settings.cloud.drain_s + _EMPTY_S
-    while left := sum(each.instances for each in read_sizes(world.account, world.names).values()):
+    while remaining := sum(group.instances for group in read_sizes(world.account, world.names).values()):
         if world.clock() > deadline:
             raise DeploymentFailed(
-                f"{left} servers did not end within {world.settings.cloud.drain_s + _EMPTY_S:g} s",
+                f"{remaining} servers did not end within {world.settings.cloud.drain_s + _EMPTY_S:g} s",
                 hint="rse-pf cloud status shows them; then repeat the command",
             )
         world.sleep(_POLL_S)
@@ -214,7 +214,7 @@ def _erase(step: Step, world: StepContext) -> None:
 
 _EFFECTS: dict[Action, Callable[[Step, StepContext], None]] = {
     "build": _build, "bootstrap": _bootstrap, "settle": _settle, "deploy": _deploy, "destroy": _destroy,
-    "note": _note, "silence": _silence, "empty": _empty, "await-empty": _await_empty, "fill": _fill,
-    "alert": _alert, "forget": _forget, "await-healthy": _await_healthy, "unprotect": _unprotect,
-    "sweep": _sweep, "erase": _erase,
+    "note": _write_park_note, "silence": _silence_alarms, "empty": _empty, "await-empty": _await_empty,
+    "fill": _fill, "alert": _alert, "forget": _forget, "await-healthy": _await_healthy,
+    "unprotect": _unprotect, "sweep": _sweep, "erase": _erase,
 }  # fmt: skip

@@ -64,9 +64,9 @@ def is_idle(hours: Sequence[Hour], *, idle_hours: int, has_canary: bool) -> bool
     last = hours[-idle_hours:]
     allowed = _CANARY_REQUESTS if has_canary else 0.0
     return len(last) >= idle_hours and all(
-        each.requests is not None and each.requests <= allowed
-        and each.robots is not None and each.robots < _MAX_IDLE_ROBOTS and each.jobs == 0
-        for each in last
+        hour.requests is not None and hour.requests <= allowed
+        and hour.robots is not None and hour.robots < _MAX_IDLE_ROBOTS and hour.jobs == 0
+        for hour in last
     )  # fmt: skip
 
 
@@ -79,21 +79,21 @@ def park_if_idle(account: Account, settings: PlatformSettings, *, now: datetime,
     """
     names, cloud = ResourceNames(settings.cloud.name), settings.cloud
     groups, note = read_sizes(account, names), read_note(account, names)
-    if note is not None and (note.by != "timer" or not any(each.max_servers for each in groups.values())):
+    if note is not None and (note.by != "timer" or not any(group.max_servers for group in groups.values())):
         return f"{names.prefix} is parked since {note.since}"
     hours = _read_hours(account, names, groups, cloud.idle_hours, now)
     if not is_idle(hours, idle_hours=cloud.idle_hours, has_canary=cloud.canary):
         return f"{names.prefix} was used within {cloud.idle_hours} hours, or nobody told"
-    told = f"{names.prefix} was idle for {cloud.idle_hours} hours and is parked now; rse-pf cloud resume"
+    message = f"{names.prefix} was idle for {cloud.idle_hours} hours and is parked now; rse-pf cloud resume"
     # Told before it is done: once the groups are empty, a repetition finds the deployment parked and ends.
-    account.change("sns", "publish", TopicArn=topic, Subject=f"{names.prefix} is parked", Message=told)
+    account.change("sns", "publish", TopicArn=topic, Subject=f"{names.prefix} is parked", Message=message)
     if note is None:
         since = now.isoformat(timespec="seconds")
         write_note(account, names, ParkNote(groups=groups, since=since, by="timer"))
     silence_alarms(account, names)
     for group in groups:
         empty_group(account, group)
-    return told
+    return message
 
 
 def resume_if_parked(account: Account, settings: PlatformSettings, *, least: int, topic: str) -> str:
@@ -109,12 +109,14 @@ def resume_if_parked(account: Account, settings: PlatformSettings, *, least: int
     note = read_note(account, names)
     if note is None or note.deep:
         return f"{names.prefix} is {'not parked' if note is None else 'parked deeply'}"
-    told = f"{names.prefix} was parked since {note.since}, and scaling.schedule resumes it: {least} servers"
+    message = (
+        f"{names.prefix} was parked since {note.since}, and scaling.schedule resumes it: {least} servers"
+    )
     fill_groups(account, names, least=least)
     enable_alarms(account, names)
-    account.change("sns", "publish", TopicArn=topic, Subject=f"{names.prefix} is resumed", Message=told)
+    account.change("sns", "publish", TopicArn=topic, Subject=f"{names.prefix} is resumed", Message=message)
     delete_note(account, names)  # at the end: what failed is repeated
-    return told
+    return message
 
 
 def handler(event: dict[str, Any], context: object) -> str:
@@ -122,11 +124,11 @@ def handler(event: dict[str, Any], context: object) -> str:
     settings = load_settings(Path(__file__).parents[3] / "settings.json")
     account, topic = Account(settings.cloud.region), os.environ["RSE_PF_TOPIC"]
     if RESUME_FIELD in event:
-        told = resume_if_parked(account, settings, least=int(event[RESUME_FIELD]), topic=topic)
+        message = resume_if_parked(account, settings, least=int(event[RESUME_FIELD]), topic=topic)
     else:
-        told = park_if_idle(account, settings, now=datetime.now(timezone.utc), topic=topic)
-    _log.info(told)
-    return told
+        message = park_if_idle(account, settings, now=datetime.now(timezone.utc), topic=topic)
+    _log.info(message)
+    return message
 
 
 def _read_hours(
@@ -135,30 +137,30 @@ def _read_hours(
     """Return the last *count* whole hours before *now*, oldest first."""
     end_s = int(now.timestamp()) // _HOUR_S * _HOUR_S
     end = datetime.fromtimestamp(end_s, timezone.utc)
-    found: dict[str, dict[int, float]] = {"requests": {}, "robots": {}, "jobs": {}}
+    values: dict[str, dict[int, float]] = {"requests": {}, "robots": {}, "jobs": {}}
     rows = account.pages(
         "cloudwatch", "get_metric_data", "MetricDataResults",
         MetricDataQueries=[
-            _query(names.group, "requests", "Requests", "Sum"),
-            _query(names.group, "robots", ROBOTS, "Average"),
-            _query(names.job_group, "jobs", JOBS, "Maximum"),
+            _make_query(names.group, "requests", "Requests", "Sum"),
+            _make_query(names.group, "robots", ROBOTS, "Average"),
+            _make_query(names.job_group, "jobs", JOBS, "Maximum"),
         ],
         StartTime=end - timedelta(hours=count), EndTime=end, ScanBy="TimestampAscending",
     )  # fmt: skip
     for row in rows:
         for begin, value in zip(row["Timestamps"], row["Values"], strict=False):
-            found[row["Id"]][int(begin.timestamp()) // _HOUR_S] = float(value)
+            values[row["Id"]][int(begin.timestamp()) // _HOUR_S] = float(value)
     servers = max(1, groups[names.group].instances) if names.group in groups else 1
-    made = []
+    hours = []
     for hour in range(end_s // _HOUR_S - count, end_s // _HOUR_S):
-        mean = found["robots"].get(hour)
+        mean = values["robots"].get(hour)
         robots = None if mean is None else mean * servers
-        jobs = found["jobs"].get(hour, 0.0)
-        made.append(Hour(requests=found["requests"].get(hour), robots=robots, jobs=jobs))
-    return made
+        jobs = values["jobs"].get(hour, 0.0)
+        hours.append(Hour(requests=values["requests"].get(hour), robots=robots, jobs=jobs))
+    return hours
 
 
-def _query(group: str, identity: str, metric: str, statistic: str) -> dict[str, Any]:
+def _make_query(group: str, identity: str, metric: str, statistic: str) -> dict[str, Any]:
     of_group = {"Namespace": NAMESPACE, "MetricName": metric, "Dimensions": dimensions_of(group)}
     return {
         "Id": identity, "MetricStat": {"Metric": of_group, "Period": _HOUR_S, "Stat": statistic},

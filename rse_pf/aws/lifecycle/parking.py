@@ -10,7 +10,7 @@ import msgspec
 
 from rse_pf.aws.account import Account
 from rse_pf.aws.lifecycle.deployment import ParkNote, read_note, read_sizes
-from rse_pf.aws.lifecycle.plan import restored
+from rse_pf.aws.lifecycle.plan import size_to_restore
 from rse_pf.config.resource_names import ResourceNames
 
 __all__ = [
@@ -70,7 +70,7 @@ def fill_groups(account: Account, names: ResourceNames, *, least: int = 0) -> No
     """
     note = read_note(account, names)
     for name, now in read_sizes(account, names).items():
-        size = restored(note.groups.get(name) if note is not None else None, now)
+        size = size_to_restore(note.groups.get(name) if note is not None else None, now)
         if size is not None:
             floor = max(size.min_servers, least) if name == names.group else size.min_servers
             floor = min(floor, size.max_servers)
@@ -87,5 +87,5 @@ def fill_groups(account: Account, names: ResourceNames, *, least: int = 0) -> No
 def _alarms_of_deployment(account: Account, names: ResourceNames) -> list[list[str]]:
     """Return the names of the deployment's alarms, in portions that one call takes."""
     rows = account.pages("cloudwatch", "describe_alarms", "MetricAlarms", AlarmNamePrefix=names.alarm_prefix)
-    found = [str(row["AlarmName"]) for row in rows]
-    return [found[at : at + _ALARMS_OF_A_CALL] for at in range(0, len(found), _ALARMS_OF_A_CALL)]
+    alarm_names = [str(row["AlarmName"]) for row in rows]
+    return [alarm_names[at : at + _ALARMS_OF_A_CALL] for at in range(0, len(alarm_names), _ALARMS_OF_A_CALL)]

@@ -14,7 +14,7 @@ from rse_pf.aws.lifecycle.deployment import Deployment, GroupSize
 from rse_pf.config.resource_names import STACKS
 from rse_pf.errors import ConfigurationError
 
-__all__ = ["KEPT", "Action", "Step", "plan_down", "plan_park", "plan_resume", "plan_up", "restored"]
+__all__ = ["KEPT", "Action", "Step", "plan_down", "plan_park", "plan_resume", "plan_up", "size_to_restore"]
 
 KEPT = "Data"
 """The stack that `plan_down` keeps unless the data is to go, too: maps, logs and the signing key."""
@@ -63,7 +63,7 @@ def plan_up(deployment: Deployment, *, has_packages: bool) -> list[Step]:
     if not deployment.is_bootstrapped:
         steps.append(Step("bootstrap"))
     for box in STACKS:
-        steps += _settled(deployment, box)
+        steps += _plan_wait(deployment, box)
         steps.append(Step("deploy", box))
     if deployment.note is not None:
         steps += [Step("fill"), Step("alert"), Step("forget")]
@@ -86,7 +86,7 @@ def plan_park(deployment: Deployment, *, deep: bool) -> list[Step]:
         if note is None or busy:
             steps += [Step("silence"), Step("empty"), Step("await-empty")]
     if deep or (note is not None and note.deep):
-        steps += [*_destroyed(deployment), Step("sweep")]
+        steps += [*_plan_destruction(deployment), Step("sweep")]
     return steps
 
 
@@ -107,17 +107,17 @@ def plan_resume(deployment: Deployment, *, has_packages: bool) -> list[Step]:
 
 def plan_down(deployment: Deployment, *, delete_data: bool) -> list[Step]:
     """Return the steps that destroy all stacks but `KEPT` and, if *delete_data*, that one and its data."""
-    steps = list(_destroyed(deployment))
+    steps = list(_plan_destruction(deployment))
     if deployment.note is not None:
         steps.append(Step("forget"))
     if delete_data:
         if KEPT in deployment.stacks:
-            steps += [*_settled(deployment, KEPT), Step("unprotect", KEPT), Step("destroy", KEPT)]
+            steps += [*_plan_wait(deployment, KEPT), Step("unprotect", KEPT), Step("destroy", KEPT)]
         steps.append(Step("erase"))
     return [*steps, Step("sweep")]
 
 
-def restored(saved: GroupSize | None, now: GroupSize) -> GroupSize | None:
+def size_to_restore(saved: GroupSize | None, now: GroupSize) -> GroupSize | None:
     """Return the size that a group gets back, or None if it keeps the one that it has.
 
     A group whose maximum is not 0 was deployed anew, with newer settings, or has its size back already.
@@ -125,13 +125,13 @@ def restored(saved: GroupSize | None, now: GroupSize) -> GroupSize | None:
     return saved if saved is not None and now.max_servers == 0 else None
 
 
-def _destroyed(deployment: Deployment) -> Iterator[Step]:
+def _plan_destruction(deployment: Deployment) -> Iterator[Step]:
     for box in reversed(STACKS):
         if box != KEPT and box in deployment.stacks:
-            yield from _settled(deployment, box)
+            yield from _plan_wait(deployment, box)
             yield Step("destroy", box)
 
 
-def _settled(deployment: Deployment, box: str) -> list[Step]:
+def _plan_wait(deployment: Deployment, box: str) -> list[Step]:
     """Return a step that waits, if an earlier command was ended while AWS changed the stack."""
     return [Step("settle", box)] if deployment.stacks.get(box, "").endswith("_IN_PROGRESS") else []

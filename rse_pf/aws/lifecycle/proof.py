@@ -52,23 +52,23 @@ class Proof:
 
 def prove(account: Account, names: ResourceNames, prices: Prices, *, now: datetime) -> Proof:
     """Return what there still is of a deployment at *now*, in UTC; raises as `Account.find`."""
-    tagged = _tagged(account, names)
-    kept = sorted({(_kind(arn), _name(arn)) for arn in tagged if _kind(arn)})
-    left = {arn for arn in tagged if not _kind(arn)} - _ended_servers(account, tagged)
-    left |= {
-        f"{each.kind} {each.name}"
-        for each in find_leftovers(account, names)
-        if each.kind not in _KEPT_SERVICES.values() and not any(each.name in arn for arn in tagged)
+    tagged = _list_tagged(account, names)
+    kept_names = sorted({(_kind_if_kept(arn), _name(arn)) for arn in tagged if _kind_if_kept(arn)})
+    remaining = {arn for arn in tagged if not _kind_if_kept(arn)} - _find_ended_servers(account, tagged)
+    remaining |= {
+        f"{leftover.kind} {leftover.name}"
+        for leftover in find_leftovers(account, names)
+        if leftover.kind not in _KEPT_SERVICES.values() and not any(leftover.name in arn for arn in tagged)
     }
-    found = []
-    for kind, name in kept:
+    resources = []
+    for kind, name in kept_names:
         gb = _gigabytes(account, name, now) if kind == "bucket" else 0.0
         price = prices.stored_per_gb_month * (gb or 0.0) if kind == "bucket" else prices.secret_per_month
-        found.append(KeptResource(kind=kind, name=name, gb=gb, per_month=price))
-    return Proof(kept=tuple(found), left=tuple(sorted(left)))
+        resources.append(KeptResource(kind=kind, name=name, gb=gb, per_month=price))
+    return Proof(kept=tuple(resources), left=tuple(sorted(remaining)))
 
 
-def _tagged(account: Account, names: ResourceNames) -> set[str]:
+def _list_tagged(account: Account, names: ResourceNames) -> set[str]:
     rows = account.pages(
         "resourcegroupstaggingapi", "get_resources", "ResourceTagMappingList",
         TagFilters=[{"Key": DEPLOYMENT_TAG, "Values": [names.prefix]}],
@@ -77,7 +77,7 @@ def _tagged(account: Account, names: ResourceNames) -> set[str]:
     return {str(row["ResourceARN"]) for row in rows if f":stack/{data}/" not in str(row["ResourceARN"])}
 
 
-def _kind(arn: str) -> str:
+def _kind_if_kept(arn: str) -> str:
     return _KEPT_SERVICES.get(arn.split(":")[2], "")
 
 
@@ -85,19 +85,22 @@ def _name(arn: str) -> str:
     return arn.split(":", 5)[5].removeprefix("secret:")
 
 
-def _ended_servers(account: Account, tagged: set[str]) -> set[str]:
+def _find_ended_servers(account: Account, tagged: set[str]) -> set[str]:
     """Return the instances that are listed for an hour after their end."""
-    asked = {arn.rpartition("/")[2]: arn for arn in tagged if ":instance/i-" in arn}
-    if not asked:
+    instances = {arn.rpartition("/")[2]: arn for arn in tagged if ":instance/i-" in arn}
+    if not instances:
         return set()
     rows = account.pages(
         "ec2", "describe_instances", "Reservations",
-        Filters=[{"Name": "instance-id", "Values": sorted(asked)[:200]}],
+        Filters=[{"Name": "instance-id", "Values": sorted(instances)[:200]}],
     )  # fmt: skip
     alive = {
-        each["InstanceId"] for row in rows for each in row["Instances"] if each["State"]["Name"] not in _ENDED
+        instance["InstanceId"]
+        for row in rows
+        for instance in row["Instances"]
+        if instance["State"]["Name"] not in _ENDED
     }
-    return {arn for name, arn in asked.items() if name not in alive}
+    return {arn for name, arn in instances.items() if name not in alive}
 
 
 def _gigabytes(account: Account, bucket: str, now: datetime) -> float | None:

@@ -22,10 +22,10 @@ _OBJECTS_OF_A_CALL = 1000
 
 def sweep(account: Account, names: ResourceNames) -> None:
     """Delete what no stack owns and nobody keeps on purpose; raises as `Account.find`."""
-    for each in find_leftovers(account, names):
-        if each.kind in _SWEPT and not each.unread:
-            service, method, argument = _SWEPT[each.kind]
-            value: Any = [each.name] if argument == "AlarmNames" else each.name
+    for leftover in find_leftovers(account, names):
+        if leftover.kind in _SWEPT and not leftover.unread:
+            service, method, argument = _SWEPT[leftover.kind]
+            value: Any = [leftover.name] if argument == "AlarmNames" else leftover.name
             account.find(service, method, **{argument: value})
 
 
@@ -37,19 +37,19 @@ def erase_data(account: Account, names: ResourceNames, *, audit_days: int) -> li
         StoreError: AWS does not answer.
     """
     refused = []
-    for each in sorted(find_leftovers(account, names), key=_access_logs_last):
-        if each.unread:
+    for leftover in sorted(find_leftovers(account, names), key=_deletion_order):
+        if leftover.unread:
             continue
-        if each.kind == "secret":
-            account.find("secretsmanager", "delete_secret", SecretId=each.name)
-        elif each.kind == "bucket":
-            has_lock = _AUDIT_LOGS in each.name.removeprefix(names.stack("Data").lower())
-            locked, until = _empty_bucket(account, each.name, audit_days, has_lock=has_lock)
+        if leftover.kind == "secret":
+            account.find("secretsmanager", "delete_secret", SecretId=leftover.name)
+        elif leftover.kind == "bucket":
+            has_lock = _AUDIT_LOGS in leftover.name.removeprefix(names.stack("Data").lower())
+            locked, until = _empty_bucket(account, leftover.name, audit_days, has_lock=has_lock)
             if locked:
                 logs = f"object lock keeps {locked} audit logs, the last until {until:%Y-%m-%d}"
-                refused.append(f"{each.name} stays: {logs}")
+                refused.append(f"{leftover.name} stays: {logs}")
             else:
-                account.find("s3", "delete_bucket", Bucket=each.name)
+                account.find("s3", "delete_bucket", Bucket=leftover.name)
     return refused
 
 
@@ -61,9 +61,9 @@ _SWEPT = {
 }
 
 
-def _access_logs_last(each: Leftover) -> tuple[bool, str]:
+def _deletion_order(leftover: Leftover) -> tuple[bool, str]:
     """Return a key that sorts the bucket into which the others write to the end."""
-    return "accesslogs" in each.name, each.name
+    return "accesslogs" in leftover.name, leftover.name
 
 
 def _empty_bucket(account: Account, bucket: str, audit_days: int, *, has_lock: bool) -> tuple[int, datetime]:
@@ -79,17 +79,17 @@ def _empty_bucket(account: Account, bucket: str, audit_days: int, *, has_lock: b
                 {"Key": row["Key"], "VersionId": row["VersionId"]}
                 for row in page[at : at + _OBJECTS_OF_A_CALL]
             ]
-            wanted = {"Objects": some, "Quiet": True}
-            told = account.find("s3", "delete_objects", Bucket=bucket, Delete=wanted)
-            for error in (told or {}).get("Errors", ()):
+            deletion = {"Objects": some, "Quiet": True}
+            answer = account.find("s3", "delete_objects", Bucket=bucket, Delete=deletion)
+            for error in (answer or {}).get("Errors", ()):
                 if not (has_lock and error["Code"] in _LOCKED):
                     raise ConfigurationError(
                         f"AWS refuses to delete objects of {bucket}: {error['Code']}",
                         hint="check your account's permissions, or sign in again",
                     )
                 locked += 1
-                kept = dates[error["Key"]] + timedelta(days=audit_days)
-                until = max(until, kept.replace(tzinfo=None))
+                locked_until = dates[error["Key"]] + timedelta(days=audit_days)
+                until = max(until, locked_until.replace(tzinfo=None))
     return locked, until
 
 

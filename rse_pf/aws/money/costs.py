@@ -122,7 +122,7 @@ class Bill:
         """Return the sum of the lines."""
         return round(sum(line.amount for line in self.lines), 2)
 
-    def by_box(self) -> dict[str, float]:
+    def sum_by_box(self) -> dict[str, float]:
         """Return the sum of each box, in the order of the lines."""
         sums: dict[str, float] = {}
         for line in self.lines:
@@ -215,7 +215,7 @@ def crossing_commands_per_s(
     floor, floor_servers = idle.total, settings.scaling.min_servers
     most, below = min(tariff.capacity_per_s, settings.serving.max_robots * fps), 0.0
     for servers in range(floor_servers, settings.scaling.max_servers + 1):
-        more = _more_servers(settings, prices, servers - floor_servers, hours)
+        more = _added_server_lines(settings, prices, servers - floor_servers, hours)
         rate = max(below, (floor + sum(line.amount for line in more)) / saved)
         if rate <= servers * most:
             return rate
@@ -253,46 +253,46 @@ def _servers(settings: PlatformSettings, tariff: _Tariff, load: Load) -> int:
 def _server_lines(settings: PlatformSettings, prices: Prices, load: Load) -> Iterable[CostLine]:
     floor = settings.scaling.min_servers
     servers = _servers(settings, _Tariff(settings, prices, load.fps), load)
-    yield from _running(settings, prices, "always", 0, floor, HOURS)
+    yield from _running_lines(settings, prices, "always", 0, floor, HOURS)
     hours = HOURS * load.hours_per_day / _DAY_H
-    yield from _more_servers(settings, prices, servers - floor, hours)
+    yield from _added_server_lines(settings, prices, servers - floor, hours)
     if load.robots:  # an agent without robots reads nothing
-        yield _reading(settings, prices, floor, hours)
-    box, kept = "backend servers", settings.cloud.warm_servers
+        yield _reading_line(settings, prices, floor, hours)
+    box, running = "backend servers", settings.cloud.warm_servers
     yield CostLine(
-        box=box, what="volumes of stopped warm servers", count=kept * VOLUME_GB, unit="GB",
+        box=box, what="volumes of stopped warm servers", count=running * VOLUME_GB, unit="GB",
         price=prices.volume_per_gb_month,
     )  # fmt: skip
 
 
-def _more_servers(
+def _added_server_lines(
     settings: PlatformSettings, prices: Prices, count: int, hours: float
 ) -> tuple[CostLine, ...]:
     floor = settings.scaling.min_servers
-    lines = _running(settings, prices, "in busy hours", floor, floor + count, hours)
-    return (*lines, _reading(settings, prices, count, hours, "of further servers"))
+    lines = _running_lines(settings, prices, "in busy hours", floor, floor + count, hours)
+    return (*lines, _reading_line(settings, prices, count, hours, "of further servers"))
 
 
-def _reading(
-    settings: PlatformSettings, prices: Prices, servers: int, hours: float, which: str = "of servers"
+def _reading_line(
+    settings: PlatformSettings, prices: Prices, servers: int, hours: float, whose: str = "of servers"
 ) -> CostLine:
     """Return what the agents of *servers* pay to see how many robots there are in all."""
     reads = hours * 3600 / cadence_of(settings.scaling).period_s * _READ_METRICS
     return CostLine(
-        box="monitor", what=f"reading metrics {which}, in busy hours", count=servers * reads / 1e3,
+        box="monitor", what=f"reading metrics {whose}, in busy hours", count=servers * reads / 1e3,
         unit="thousand", price=prices.metric_calls_per_thousand, needs="servers", all_day=False,
     )  # fmt: skip
 
 
-def _running(
+def _running_lines(
     settings: PlatformSettings, prices: Prices, when: str, first: int, last: int, hours: float
 ) -> Iterable[CostLine]:
     """Yield what the servers *first* to *last* of the fleet cost in *hours* of a month."""
     kind, count = settings.cloud.instance_type, last - first
-    each = prices.server(kind)
+    server = prices.server(kind)
     demanded = max(0, min(last, settings.cloud.on_demand_servers) - first) if settings.cloud.spot else count
     months = hours / HOURS
-    servers = {"on demand": (demanded, each.per_hour), "Spot": (count - demanded, each.spot_per_hour)}
+    servers = {"on demand": (demanded, server.per_hour), "Spot": (count - demanded, server.spot_per_hour)}
     for how, (some, price) in servers.items():
         yield CostLine(
             box="backend servers", what=f"{some} {kind} {how}, {when}", count=some * hours, unit="h",
@@ -300,11 +300,11 @@ def _running(
         )  # fmt: skip
     for box, what, number, unit, price in (
         ("backend servers", f"volumes, {when}", count * VOLUME_GB, "GB", prices.volume_per_gb_month),
-        ("monitor", f"metrics of each server, {when}", count * _metrics_of_a_server(), "metrics",
+        ("monitor", f"metrics of each server, {when}", count * _count_metrics_of_server(), "metrics",
          prices.metric_per_month),
-        ("monitor", f"publishing metrics, {when}", count * _published_by_a_server(settings), "thousand",
+        ("monitor", f"publishing metrics, {when}", count * _thousand_metric_requests(settings), "thousand",
          prices.metric_calls_per_thousand),
-        ("data servers", f"audit logs and journals, {when}", count * _puts_of_a_server(),
+        ("data servers", f"audit logs and journals, {when}", count * _thousand_puts(),
          "thousand", prices.put_per_thousand),
     ):  # fmt: skip
         yield CostLine(
@@ -339,12 +339,12 @@ def _front_lines(settings: PlatformSettings, prices: Prices, load: Load) -> Iter
 
 def _monitor_lines(settings: PlatformSettings, prices: Prices) -> Iterable[CostLine]:
     yield CostLine(
-        box="monitor", what="metrics of the fleet", count=len(_metrics("")), unit="metrics",
+        box="monitor", what="metrics of the fleet", count=len(_published_metrics("")), unit="metrics",
         price=prices.metric_per_month, needs="servers",
     )  # fmt: skip
-    calling = [(len(each.series), each.period_s) for each in operator_alarms(settings)]
-    scaling = [(len(each.metrics), each.period_s) for each in alarms_of(settings.scaling)]
-    jobs = [(len(each.metrics), each.period_s) for each in job_alarms_of(settings.cloud)]
+    calling = [(len(alarm.series), alarm.period_s) for alarm in operator_alarms(settings)]
+    scaling = [(len(alarm.metrics), alarm.period_s) for alarm in alarms_of(settings.scaling)]
+    jobs = [(len(alarm.metrics), alarm.period_s) for alarm in job_alarms_of(settings.cloud)]
     for box, what, alarms in (
         ("monitor", "alarms for the operator", calling), ("scale modifier", "alarms that scale", scaling),
         ("scale modifier", "alarms that scale job servers", jobs),
@@ -395,8 +395,8 @@ def _job_lines(settings: PlatformSettings, prices: Prices, load: Load) -> Iterab
         return
     hours = load.job_hours_per_day * HOURS / _DAY_H
     kinds = settings.cloud.job_instance_types.split()
-    known = [kind for kind in kinds if kind in prices.servers]
-    cheapest = min(known or kinds, key=lambda kind: prices.server(kind).spot_per_hour)
+    priced = [kind for kind in kinds if kind in prices.servers]
+    cheapest = min(priced or kinds, key=lambda kind: prices.server(kind).spot_per_hour)
     for what, count, unit, price in (
         (f"job servers, {cheapest} Spot", hours, "h", prices.server(cheapest).spot_per_hour),
         ("volumes of job servers", VOLUME_GB * hours / HOURS, "GB", prices.volume_per_gb_month),
@@ -411,18 +411,18 @@ def _job_lines(settings: PlatformSettings, prices: Prices, load: Load) -> Iterab
         )  # fmt: skip
 
 
-def _metrics(server: str) -> set[tuple[str, bool]]:
+def _published_metrics(server: str) -> set[tuple[str, bool]]:
     """Return the metrics that an agent publishes: name, and whether it is of one server."""
     some = ServerMetrics(answers={1.0: 1.0})
-    told = datums(ServerMetrics(), some, "group", server)
-    return {(each["MetricName"], len(each["Dimensions"]) > 1) for each in told}
+    data = datums(ServerMetrics(), some, "group", server)
+    return {(datum["MetricName"], len(datum["Dimensions"]) > 1) for datum in data}
 
 
-def _metrics_of_a_server() -> int:
-    return _DETAILED_METRICS + sum(is_of_one for _, is_of_one in _metrics("server"))
+def _count_metrics_of_server() -> int:
+    return _DETAILED_METRICS + sum(is_of_one for _, is_of_one in _published_metrics("server"))
 
 
-def _published_by_a_server(settings: PlatformSettings) -> float:
+def _thousand_metric_requests(settings: PlatformSettings) -> float:
     """Return the thousands of requests that publish the metrics of a server for a month."""
     periods = [float(cadence_of(settings.scaling).period_s)]
     if settings.cloud.job_servers:
@@ -430,6 +430,6 @@ def _published_by_a_server(settings: PlatformSettings) -> float:
     return sum(_MONTH_S / period_s for period_s in periods) / 1e3
 
 
-def _puts_of_a_server() -> float:
+def _thousand_puts() -> float:
     """Return the thousands of objects that a server writes in a month, if it always has something new."""
     return (_MONTH_S / AUDIT_SHIP_S + _MONTH_S / JOURNAL_SHIP_S) / 1e3

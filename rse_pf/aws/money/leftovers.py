@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from rse_pf.aws.account import Account
-from rse_pf.aws.cloudformation import living_stacks
+from rse_pf.aws.cloudformation import list_living_stacks
 from rse_pf.config.resource_names import DEPLOYMENT_TAG, ResourceNames
 from rse_pf.errors import ConfigurationError
 
@@ -42,25 +42,27 @@ def find_leftovers(account: Account, of: ResourceNames) -> list[Leftover]:
     """Return what no existing stack owns, sorted by kind and name; raises as `Account.find`."""
     owned = {
         str(row.get("PhysicalResourceId", ""))
-        for stack in living_stacks(account, of)
+        for stack in list_living_stacks(account, of)
         for row in account.pages(
             "cloudformation", "list_stack_resources", "StackResourceSummaries", StackName=stack
         )
     }
     unread: dict[str, str] = {}
-    found = {
-        (kind, name) for kind, name, alias in _all_of_ours(account, of, unread) if not owned & {name, alias}
+    leftovers = {
+        (kind, name)
+        for kind, name, alias in _list_resources(account, of, unread)
+        if not owned & {name, alias}
     }
     return sorted(
         Leftover(
             kind=kind, name=name, remove=_remove(kind, name), unread=name in unread,
             why=unread.get(name) or _KEPT.get(kind, "forgotten"),
         )
-        for kind, name in found
+        for kind, name in leftovers
     )  # fmt: skip
 
 
-def _all_of_ours(
+def _list_resources(
     account: Account, of: ResourceNames, unread: dict[str, str]
 ) -> Iterator[tuple[str, str, str]]:
     """Yield kind, name, and the other name that CloudFormation may know it by; fill *unread* with reasons."""
@@ -93,8 +95,8 @@ def _all_of_ours(
 
 
 def _is_tagged(account: Account, of: ResourceNames, bucket: str) -> bool:
-    found = account.find("s3", "get_bucket_tagging", Bucket=bucket) or {}
-    if not _has_tag(of, found.get("TagSet", ())):
+    answer = account.find("s3", "get_bucket_tagging", Bucket=bucket) or {}
+    if not _has_tag(of, answer.get("TagSet", ())):
         return False
     # Buckets of all regions are listed, and a deployment of this name may stand in another one.
     where = account.find("s3", "get_bucket_location", Bucket=bucket) or {}

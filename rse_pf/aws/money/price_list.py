@@ -107,14 +107,14 @@ def refresh(
     changes: dict[str, float] = {}
     unverified: list[str] = []
     for question in _QUESTIONS:
-        found = _price(price_list, question, region)
-        if found is None:
+        price = _read_price(price_list, question, region)
+        if price is None:
             unverified.append(question.name)
         else:
-            changes[question.name] = found * question.times
+            changes[question.name] = price * question.times
     servers = dict(old.servers) if old.region == region else {}
     for kind in instance_types:
-        server = _server(price_list, account, kind, region, now)
+        server = _read_server_price(price_list, account, kind, region, now)
         if isinstance(server, ServerPrice):
             servers[kind] = server
         else:
@@ -137,20 +137,20 @@ def document_of(prices: Prices) -> bytes:
     return msgspec.json.format(msgspec.json.encode(prices), indent=2) + b"\n"
 
 
-def _server(
+def _read_server_price(
     price_list: Account, account: Account, kind: str, region: str, now: datetime
 ) -> ServerPrice | None:
     question = _Question(kind, "AmazonEC2", {**_SERVER, "instanceType": kind}, rf"BoxUsage:{re.escape(kind)}")
-    products = _products(price_list, question, region)
-    per_hour = _one_amount(products)
-    vcpus = {str(each["product"]["attributes"].get("vcpu", "")) for each in products}
+    products = _read_products(price_list, question, region)
+    per_hour = _single_price(products)
+    vcpus = {str(product["product"]["attributes"].get("vcpu", "")) for product in products}
     if per_hour is None or len(vcpus) != 1 or not (count := vcpus.pop()).isdigit():
         return None
-    spot = _spot(account, kind, now)
+    spot = _read_spot_price(account, kind, now)
     return ServerPrice(vcpus=int(count), per_hour=per_hour, spot_per_hour=per_hour if spot is None else spot)
 
 
-def _spot(account: Account, kind: str, now: datetime) -> float | None:
+def _read_spot_price(account: Account, kind: str, now: datetime) -> float | None:
     """Return the newest Spot price, the mean of the zones; None where the type is not sold so."""
     rows = account.find(
         "ec2", "describe_spot_price_history", InstanceTypes=[kind], ProductDescriptions=["Linux/UNIX"],
@@ -159,19 +159,19 @@ def _spot(account: Account, kind: str, now: datetime) -> float | None:
     newest: dict[str, tuple[datetime, float]] = {}
     for row in (rows or {}).get("SpotPriceHistory", ()):
         if float(row["SpotPrice"]) > 0:
-            told = (row["Timestamp"], float(row["SpotPrice"]))
-            newest[row["AvailabilityZone"]] = max(told, newest.get(row["AvailabilityZone"], _NEVER))
+            dated_price = (row["Timestamp"], float(row["SpotPrice"]))
+            newest[row["AvailabilityZone"]] = max(dated_price, newest.get(row["AvailabilityZone"], _NEVER))
     return sum(price for _, price in newest.values()) / len(newest) if newest else None
 
 
 _NEVER = (datetime.combine(date.min, datetime.min.time(), tzinfo=timezone.utc), 0.0)
 
 
-def _price(price_list: Account, question: _Question, region: str) -> float | None:
-    return _one_amount(_products(price_list, question, region))
+def _read_price(price_list: Account, question: _Question, region: str) -> float | None:
+    return _single_price(_read_products(price_list, question, region))
 
 
-def _products(price_list: Account, question: _Question, region: str) -> list[dict[str, Any]]:
+def _read_products(price_list: Account, question: _Question, region: str) -> list[dict[str, Any]]:
     """Return the products of *region* whose usage type ends as asked; some price lists name no region."""
     filters = {"regionCode": region, **question.attributes}
     rows = price_list.pages(
@@ -179,22 +179,22 @@ def _products(price_list: Account, question: _Question, region: str) -> list[dic
         Filters=[{"Type": "TERM_MATCH", "Field": name, "Value": value} for name, value in filters.items()],
     )  # fmt: skip
     usage = re.compile(rf"(?:[A-Z0-9]+-)?{question.usage}")
-    found = []
+    products = []
     for row in rows:
         product: dict[str, Any] = json.loads(row)
         attributes = product["product"]["attributes"]
         if usage.fullmatch(str(attributes.get("usagetype", ""))):
-            found.append(product)
-    return found
+            products.append(product)
+    return products
 
 
-def _one_amount(products: list[dict[str, Any]]) -> float | None:
+def _single_price(products: list[dict[str, Any]]) -> float | None:
     """Return the on-demand price of the first tier in USD; None if there is none, or more than one."""
-    amounts = {amount for product in products for amount in _first_tiers(product)}
+    amounts = {amount for product in products for amount in _first_tier_prices(product)}
     return amounts.pop() if len(amounts) == 1 else None
 
 
-def _first_tiers(product: dict[str, Any]) -> Iterator[float]:
+def _first_tier_prices(product: dict[str, Any]) -> Iterator[float]:
     for offer in product.get("terms", {}).get("OnDemand", {}).values():
         for tier in offer["priceDimensions"].values():
             amount = float(tier["pricePerUnit"].get("USD", "nan"))

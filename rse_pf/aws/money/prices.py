@@ -97,38 +97,38 @@ class Prices(_Table, frozen=True, kw_only=True):
 
     def server(self, instance_type: str) -> ServerPrice:
         """Return the price of an EC2 type; raises ConfigurationError if the file has none."""
-        found = self.servers.get(instance_type)
-        if found is None:
+        price = self.servers.get(instance_type)
+        if price is None:
             raise ConfigurationError(
                 f"no price of {instance_type} is known; the file has {', '.join(sorted(self.servers))}",
                 hint="run rse-pf cloud prices --refresh, or give the price with --prices FILE",
             )
-        return found
+        return price
 
     def vcpus(self, instance_type: str) -> int:
         """Return the vCPUs of an EC2 type, by its size where the file does not have the type."""
-        found = self.servers.get(instance_type)
+        price = self.servers.get(instance_type)
         size = re.search(r"\.(\d*)xlarge$", instance_type)
-        return found.vcpus if found else 4 * int(size[1] or 1) if size else 2
+        return price.vcpus if price else 4 * int(size[1] or 1) if size else 2
 
     def warnings(self, *, today: date, region: str) -> list[str]:
         """Return what is wrong with these prices for an estimate of today in *region*."""
-        told = []
+        lines = []
         if self.unverified:
-            which = "these prices" if EVERY in self.unverified else f"the prices {', '.join(self.unverified)}"
-            told.append(f"UNVERIFIED: {which} were not read from AWS: rse-pf cloud prices --refresh")
+            whose = "these prices" if EVERY in self.unverified else f"the prices {', '.join(self.unverified)}"
+            lines.append(f"UNVERIFIED: {whose} were not read from AWS: rse-pf cloud prices --refresh")
         days = (today - date.fromisoformat(self.as_of)).days
         if days > STALE_DAYS:
-            told.append(
+            lines.append(
                 f"STALE: these prices are {days} days old, more than {STALE_DAYS}: "
                 "rse-pf cloud prices --refresh"
             )
         if self.region != region:
-            told.append(
+            lines.append(
                 f"WRONG REGION: these prices are for {self.region}, and cloud.region is {region}: "
                 "rse-pf cloud prices --refresh"
             )
-        return told
+        return lines
 
 
 def load_prices(over: Path | None = None) -> Prices:
@@ -141,12 +141,12 @@ def load_prices(over: Path | None = None) -> Prices:
     if over is None:
         return msgspec.convert(values, Prices)
     try:
-        given = msgspec.json.decode(over.read_bytes(), type=dict[str, Any])
-        servers = given.get("servers")
+        overrides = msgspec.json.decode(over.read_bytes(), type=dict[str, Any])
+        servers = overrides.get("servers")
         if isinstance(servers, dict):
-            given["servers"] = values["servers"] | servers
-        made = msgspec.convert(values | given, Prices)
-        date.fromisoformat(made.as_of)
+            overrides["servers"] = values["servers"] | servers
+        prices = msgspec.convert(values | overrides, Prices)
+        date.fromisoformat(prices.as_of)
     except OSError as error:
         raise ConfigurationError(
             f"cannot read {over}: {error.strerror}", hint="name an existing file with --prices"
@@ -156,16 +156,16 @@ def load_prices(over: Path | None = None) -> Prices:
             f"{over} holds no prices: {error}",
             hint=f"write a JSON object with some of these names: {', '.join(values)}",
         ) from error
-    return made
+    return prices
 
 
-def operators_prices(given: Path | None, folder: Path) -> Prices:
-    """Return the prices in the file *given*, else in `PRICES_FILE` of *folder* if there is one, else ours.
+def operators_prices(path: Path | None, folder: Path) -> Prices:
+    """Return the prices in the file *path*, else in `PRICES_FILE` of *folder* if there is one, else ours.
 
     Raises:
         ConfigurationError: As `load_prices`.
     """
-    if given is not None:
-        return load_prices(given)
+    if path is not None:
+        return load_prices(path)
     own = folder / PRICES_FILE
     return load_prices(own if own.exists() else None)

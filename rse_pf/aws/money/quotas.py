@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 from rse_pf.aws.account import Account
-from rse_pf.aws.cloudformation import bootstrap_version, foreign_qualifier, living_stacks
+from rse_pf.aws.cloudformation import find_foreign_qualifier, list_living_stacks, read_bootstrap_version
 from rse_pf.aws.money.prices import load_prices
 from rse_pf.config import PlatformSettings
 from rse_pf.config.cloud_layout import zone_count
@@ -44,10 +44,10 @@ def check_account(account: Account, settings: PlatformSettings) -> Iterator[Chec
         ConfigurationError: AWS does not accept the credentials.
         StoreError: AWS does not even say whose they are.
     """
-    who = account.find("sts", "get_caller_identity") or {}
-    yield Check("ok", f"signed in as {who.get('Arn', '?')}, region {account.region}")
+    caller = account.find("sts", "get_caller_identity") or {}
+    yield Check("ok", f"signed in as {caller.get('Arn', '?')}, region {account.region}")
     checks: tuple[Callable[[Account, PlatformSettings], Check], ...] = (
-        _bootstrap, _certificate, _instance_type, _vcpus, _executions, _vpcs,
+        _bootstrap, _check_certificate, _check_instance_type, _check_vcpus, _check_executions, _check_vpcs,
     )  # fmt: skip
     for check in checks:
         try:
@@ -57,8 +57,8 @@ def check_account(account: Account, settings: PlatformSettings) -> Iterator[Chec
 
 
 def _bootstrap(account: Account, settings: PlatformSettings) -> Check:
-    version = bootstrap_version(account, settings)
-    if version is None and (qualifier := foreign_qualifier(account, settings)) is not None:
+    version = read_bootstrap_version(account, settings)
+    if version is None and (qualifier := find_foreign_qualifier(account, settings)) is not None:
         stack = toolkit_stack(settings.cloud.bootstrap_qualifier)
         return Check(
             "fail", f"the stack {stack} is a bootstrap of other applications, qualifier {qualifier}",
@@ -69,7 +69,7 @@ def _bootstrap(account: Account, settings: PlatformSettings) -> Check:
     return Check("ok", f"bootstrapped, version {version}")
 
 
-def _certificate(account: Account, settings: PlatformSettings) -> Check:
+def _check_certificate(account: Account, settings: PlatformSettings) -> Check:
     cloud = settings.cloud
     if cloud.allow_insecure:
         return Check(
@@ -83,18 +83,20 @@ def _certificate(account: Account, settings: PlatformSettings) -> Check:
             "fail", f"{cloud.certificate_arn} is no ACM certificate of {account.region}",
             "a load balancer takes certificates of its own region",
         )  # fmt: skip
-    found = account.find("acm", "describe_certificate", CertificateArn=cloud.certificate_arn)
-    if found is None:
+    answer = account.find("acm", "describe_certificate", CertificateArn=cloud.certificate_arn)
+    if answer is None:
         return Check("fail", "there is no such certificate", "fix cloud.certificate_arn")
-    told = found["Certificate"]
-    names = {told["DomainName"], *told.get("SubjectAlternativeNames", ())}
+    certificate = answer["Certificate"]
+    names = {certificate["DomainName"], *certificate.get("SubjectAlternativeNames", ())}
     if not any(_covers(name, cloud.domain_name) for name in names):
         return Check(
             "fail", f"the certificate is for {', '.join(sorted(names))}, not for {cloud.domain_name}",
             "order one for cloud.domain_name",
         )  # fmt: skip
-    if told["Status"] != "ISSUED":
-        return Check("fail", f"the certificate is {told['Status']}", "add the DNS record that ACM shows")
+    if certificate["Status"] != "ISSUED":
+        return Check(
+            "fail", f"the certificate is {certificate['Status']}", "add the DNS record that ACM shows"
+        )
     return Check("ok", f"certificate for {cloud.domain_name}")
 
 
@@ -104,16 +106,16 @@ def _covers(name: str, domain: str) -> bool:
     return name == domain
 
 
-def _instance_type(account: Account, settings: PlatformSettings) -> Check:
+def _check_instance_type(account: Account, settings: PlatformSettings) -> Check:
     kinds = instance_types(settings.cloud)
     rows = account.pages(
         "ec2", "describe_instance_type_offerings", "InstanceTypeOfferings",
         LocationType="availability-zone", Filters=[{"Name": "instance-type", "Values": list(kinds)}],
     )  # fmt: skip
     offered = {(str(row["InstanceType"]), str(row["Location"])) for row in rows}
-    told = account.pages("ec2", "describe_availability_zones", "AvailabilityZones")
+    rows_of_zones = account.pages("ec2", "describe_availability_zones", "AvailabilityZones")
     # As Fn::GetAZs orders them, of which the stacks take the first.
-    zones = sorted(str(row["ZoneName"]) for row in told)[: zone_count(settings)]
+    zones = sorted(str(row["ZoneName"]) for row in rows_of_zones)[: zone_count(settings)]
     lacking = [f"{kind} in {zone}" for kind in kinds for zone in zones if (kind, zone) not in offered]
     if any(all((kind, zone) not in offered for kind in kinds) for zone in zones):
         return Check("fail", f"AWS does not offer {', '.join(lacking)}", "choose another cloud.instance_type")
@@ -126,35 +128,35 @@ def _instance_type(account: Account, settings: PlatformSettings) -> Check:
     return Check("ok", f"{', '.join(kinds)} is offered in {', '.join(zones)}")
 
 
-def _vcpus(account: Account, settings: PlatformSettings) -> Check:
+def _check_vcpus(account: Account, settings: PlatformSettings) -> Check:
     # An instance that drains still runs when its replacement starts.
     needed = (settings.scaling.max_servers + 1) * load_prices().vcpus(settings.cloud.instance_type)
-    return _enough(
+    return _check_quota(
         account, _VCPUS, needed, "vCPUs of on-demand instances for scaling.max_servers and one more"
     )
 
 
-def _executions(account: Account, settings: PlatformSettings) -> Check:
+def _check_executions(account: Account, settings: PlatformSettings) -> Check:
     needed = settings.cloud.lambda_concurrency + _ALWAYS_UNRESERVED
-    what = f"concurrent executions: cloud.lambda_concurrency, and {_ALWAYS_UNRESERVED} that stay unreserved"
-    return _enough(account, _EXECUTIONS, needed, what)
+    need = f"concurrent executions: cloud.lambda_concurrency, and {_ALWAYS_UNRESERVED} that stay unreserved"
+    return _check_quota(account, _EXECUTIONS, needed, need)
 
 
-def _vpcs(account: Account, settings: PlatformSettings) -> Check:
+def _check_vpcs(account: Account, settings: PlatformSettings) -> Check:
     names = ResourceNames(settings.cloud.name)
-    ours = names.stack("Network") in living_stacks(account, names)
+    ours = names.stack("Network") in list_living_stacks(account, names)
     there = len(account.pages("ec2", "describe_vpcs", "Vpcs"))
-    return _enough(account, _VPCS, there + (0 if ours else 1), "VPCs in the region, with this one")
+    return _check_quota(account, _VPCS, there + (0 if ours else 1), "VPCs in the region, with this one")
 
 
-def _enough(account: Account, quota: tuple[str, str], needed: int, what: str) -> Check:
+def _check_quota(account: Account, quota: tuple[str, str], needed: int, need: str) -> Check:
     service, code = quota
-    asked = {"ServiceCode": service, "QuotaCode": code}
-    found = account.find("service-quotas", "get_service_quota", **asked)
-    if found is None:  # the account has the default of AWS
-        found = account.find("service-quotas", "get_aws_default_service_quota", **asked)
-    if found is None:
-        return Check("warn", f"quota {service} {code} is not told; needed are {needed} {what}", _ASK_FOR_MORE)
-    most = float(found["Quota"]["Value"])
-    line = f"quota {most:g}, needed {needed}: {what}"
+    query = {"ServiceCode": service, "QuotaCode": code}
+    answer = account.find("service-quotas", "get_service_quota", **query)
+    if answer is None:  # the account has the default of AWS
+        answer = account.find("service-quotas", "get_aws_default_service_quota", **query)
+    if answer is None:
+        return Check("warn", f"quota {service} {code} is not told; needed are {needed} {need}", _ASK_FOR_MORE)
+    most = float(answer["Quota"]["Value"])
+    line = f"quota {most:g}, needed {needed}: {need}"
     return Check("ok", line) if most >= needed else Check("fail", line, _ASK_FOR_MORE)

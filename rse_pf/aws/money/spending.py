@@ -58,12 +58,12 @@ def read_spending(account: Account, *, now: datetime) -> Spending:
         everything[service] += float(amount["Amount"])  # type: ignore[assignment]
         if str(tag).partition("$")[2]:
             ours[service] += float(amount["Amount"])  # type: ignore[assignment]
-    told = ours or everything
-    services = sorted(told.items(), key=lambda each: (-each[1], each[0]))
+    costs = ours or everything
+    services = sorted(costs.items(), key=lambda service: (-service[1], service[0]))
     return Spending(
         begin=begin,
         currency=currency,
-        total=sum(told.values()),
+        total=sum(costs.values()),
         account_total=sum(everything.values()),
         services=tuple((name, float(amount)) for name, amount in services),
         is_ours=bool(ours),

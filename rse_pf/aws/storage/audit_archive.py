@@ -97,16 +97,16 @@ class Shipper:
             OSError: A log cannot be read.
         """
         marks, count = self._marks(), 0
-        for who in chain_names(self._folder):
-            for piece in _pieces(self._folder, who, marks.get(who, _Mark())):
+        for chain in chain_names(self._folder):
+            for piece in _read_pieces(self._folder, chain, marks.get(chain, _Mark())):
                 if piece.problem:
-                    self._on_broken(who, piece.problem)
-                name = piece_name(self._instance(), who, piece.first, piece.data)
+                    self._on_broken(chain, piece.problem)
+                name = piece_name(self._instance(), chain, piece.first, piece.data)
                 # Only the bytes of its digest take a name: they arrived before, and their mark was lost.
                 with contextlib.suppress(Conflict):
                     self._store.compare_and_swap(name, None, piece.data)
-                marks[who] = piece.after
-                replace_json(self._marks_file, {each: asdict(mark) for each, mark in marks.items()})
+                marks[chain] = piece.after
+                replace_json(self._marks_file, {chain: asdict(mark) for chain, mark in marks.items()})
                 count += 1
         return count
 
@@ -118,10 +118,10 @@ class Shipper:
             return {}
 
 
-def piece_name(instance: str, who: str, first: int, data: bytes) -> str:
+def piece_name(instance: str, chain: str, first: int, data: bytes) -> str:
     """Return the name of a piece, which holds the digest of its bytes."""
     digest = hashlib.sha256(data).hexdigest()[:_DIGEST_LETTERS]
-    return f"{AUDIT_PREFIX}/{instance}/{who}.{first:012d}.{digest}.jsonl"
+    return f"{AUDIT_PREFIX}/{instance}/{chain}.{first:012d}.{digest}.jsonl"
 
 
 def open_audit_archive(account: Account, names: ResourceNames) -> S3Store:
@@ -144,8 +144,8 @@ def fetch_audit(store: ObjectStore, folder: Path) -> list[str]:
         if match is None:
             problems.append(f"{info.name} is not a piece of an audit log")
             continue
-        instance, who = match["instance"], match["who"]
-        chain = who if who == instance else f"{instance}_{who}"[:64]
+        instance, writer = match["instance"], match["who"]
+        chain = writer if writer == instance else f"{instance}_{writer}"[:64]
         chains.setdefault(chain, []).append((int(match["first"]), info.name))
     folder.mkdir(parents=True, exist_ok=True)
     for chain, pieces in sorted(chains.items()):
@@ -154,16 +154,16 @@ def fetch_audit(store: ObjectStore, folder: Path) -> list[str]:
             data = store.get(name)
             if hashlib.sha256(data).hexdigest()[:_DIGEST_LETTERS] != name.rsplit(".", 2)[1]:
                 problems.append(f"{name} was changed: its bytes do not have the digest in its name")
-            _write(folder, chain, first, list(_unseen(data, seen)))
+            _write(folder, chain, first, list(_new_lines(data, seen)))
     if chains:
         write_heads(folder, {chain: newest_head(folder, chain) or GENESIS for chain in chains})
     return problems
 
 
-def _pieces(folder: Path, who: str, mark: _Mark) -> Iterator[_Piece]:
+def _read_pieces(folder: Path, chain: str, mark: _Mark) -> Iterator[_Piece]:
     """Yield what follows *mark*; a piece is part of one file, and only the newest file may still grow."""
     with contextlib.ExitStack() as stack:
-        files = _opened(folder, who, stack)
+        files = _open_files(folder, chain, stack)
         inodes = [os.fstat(file.fileno()).st_ino for file in files]
         if mark.inode in inodes and os.fstat(files[inodes.index(mark.inode)].fileno()).st_size < mark.offset:
             mark = _Mark()  # the file was truncated: the rest is uploaded again, and its head does not match
@@ -173,24 +173,24 @@ def _pieces(folder: Path, who: str, mark: _Mark) -> Iterator[_Piece]:
         head = parse_head(mark.head) or GENESIS
         for number in range(begin, len(files)):
             offset = mark.offset if inodes[number] == mark.inode else 0
-            while data := _next(files[number], offset, is_whole=number + 1 < len(files)):
+            while data := _read_piece(files[number], offset, is_whole=number + 1 < len(files)):
                 offset += len(data)
-                first, head, problem = _read(data, head)
+                first, head, problem = _check_piece(data, head)
                 yield _Piece(first, data, _Mark(inode=inodes[number], offset=offset, head=str(head)), problem)
 
 
-def _opened(folder: Path, who: str, stack: contextlib.ExitStack) -> list[BinaryIO]:
+def _open_files(folder: Path, chain: str, stack: contextlib.ExitStack) -> list[BinaryIO]:
     """Return the files of a chain, oldest first; none if they were rotated during every attempt."""
     for _ in range(_MAX_ATTEMPTS):
         with contextlib.suppress(FileNotFoundError):  # it was rotated meanwhile
-            files: list[BinaryIO] = [stack.enter_context(path.open("rb")) for path in files_of(folder, who)]
-            there = [path.stat().st_ino for path in files_of(folder, who)]
+            files: list[BinaryIO] = [stack.enter_context(path.open("rb")) for path in files_of(folder, chain)]
+            there = [path.stat().st_ino for path in files_of(folder, chain)]
             if there == [os.fstat(file.fileno()).st_ino for file in files]:
                 return files
     return []
 
 
-def _next(file: BinaryIO, offset: int, *, is_whole: bool) -> bytes:
+def _read_piece(file: BinaryIO, offset: int, *, is_whole: bool) -> bytes:
     """Return at most one piece of whole lines; the last line of a finished file may be incomplete."""
     data = os.pread(file.fileno(), _MAX_BYTES, offset)
     is_end = len(data) < _MAX_BYTES
@@ -198,27 +198,27 @@ def _next(file: BinaryIO, offset: int, *, is_whole: bool) -> bytes:
     return data if not cut and not is_end else data if is_whole and is_end else data[:cut]
 
 
-def _read(data: bytes, head: Head) -> tuple[int, Head, str]:
+def _check_piece(data: bytes, head: Head) -> tuple[int, Head, str]:
     """Return the first entry number in *data*, the head after it, and the first problem."""
     chain, first, problem = Chain(head), 0, ""
     for line in data.split(b"\n")[:-1]:  # an incomplete line is no entry; the next entry shows the gap
-        found = chain.add(line + b"\n")
-        if isinstance(found, str):
-            problem = problem or found
-            found = Chain(None).add(line + b"\n")
-        if isinstance(found, Entry):
-            first = first or found.seq
-            chain.head = found.head
+        entry = chain.add(line + b"\n")
+        if isinstance(entry, str):
+            problem = problem or entry
+            entry = Chain(None).add(line + b"\n")
+        if isinstance(entry, Entry):
+            first = first or entry.seq
+            chain.head = entry.head
     assert chain.head is not None
     return first or head.seq + 1, chain.head, problem
 
 
-def _unseen(data: bytes, seen: set[bytes]) -> Iterator[bytes]:
+def _new_lines(data: bytes, digests: set[bytes]) -> Iterator[bytes]:
     """Yield the lines that no earlier piece had: an agent that lost its marks uploads some lines twice."""
     for line in re.findall(rb"[^\n]*\n|[^\n]+", data):
         digest = hashlib.sha256(line).digest()
-        if digest not in seen:
-            seen.add(digest)
+        if digest not in digests:
+            digests.add(digest)
             yield line
 
 

@@ -43,12 +43,12 @@ class KeyRing:
         except (ValueError, TypeError, KeyError):
             return None
         try:
-            made = tuple((SigningKey.from_json(json.dumps(row["jwk"])), float(row["from_s"])) for row in rows)
+            keys = tuple((SigningKey.from_json(json.dumps(row["jwk"])), float(row["from_s"])) for row in rows)
         except (TypeError, KeyError, ValueError, UsageError) as error:
             raise ConfigurationError(
                 "the secret holds keys that cannot be read", hint="restore its version AWSPREVIOUS"
             ) from error
-        return cls(keys=made) if made else None
+        return cls(keys=keys) if keys else None
 
     def to_json(self) -> str:
         """Return the ring with its private keys, for the secret only."""
@@ -115,15 +115,15 @@ class KeyStore:
         Raises:
             ConfigurationError: AWS refused, or the secret holds broken keys.
         """
-        found = self._account.find("secretsmanager", "get_secret_value", SecretId=self._secret)
-        return None if found is None else KeyRing.from_json(found["SecretString"])
+        secret = self._account.find("secretsmanager", "get_secret_value", SecretId=self._secret)
+        return None if secret is None else KeyRing.from_json(secret["SecretString"])
 
     def ring(self) -> KeyRing:
         """Return the ring; raises ConfigurationError if there is none."""
-        found = self.read()
-        if found is None:
+        ring = self.read()
+        if ring is None:
             raise ConfigurationError("this cloud has no signing key yet", hint=_MAKE_ONE)
-        return found
+        return ring
 
     def write(self, ring: KeyRing) -> None:
         """Store *ring*, then publish its public keys; after a crash between the two, call `publish`.

@@ -55,7 +55,7 @@ class S3Store:
         if length <= 0:
             return b""
 
-        with _as_store_errors(name):
+        with _raise_store_errors(name):
             try:
                 return self._get(check_name(name), Range=f"bytes={start}-{start + length - 1}")[0]
             except ClientError as error:
@@ -69,7 +69,7 @@ class S3Store:
 
     def put_pieces(self, name: str, pieces: Iterator[bytes]) -> None:
         """Store the object durably, in parts of `_PART_BYTES`; if *pieces* raises an error, store nothing."""
-        parts = _joined(pieces, _PART_BYTES)
+        parts = _join_pieces(pieces, _PART_BYTES)
         first, second = next(parts, b""), next(parts, None)
         if second is None:
             self.put(name, first)
@@ -78,10 +78,10 @@ class S3Store:
         try:
             sent = []
             for number, part in enumerate(itertools.chain([first, second], parts), 1):
-                found = self._ask(
+                answer = self._ask(
                     name, "upload_part", Key=name, UploadId=upload, PartNumber=number, Body=part
                 )
-                sent.append({"PartNumber": number, "ETag": found["ETag"]})
+                sent.append({"PartNumber": number, "ETag": answer["ETag"]})
             self._ask(
                 name, "complete_multipart_upload", Key=name, UploadId=upload, MultipartUpload={"Parts": sent}
             )
@@ -92,21 +92,21 @@ class S3Store:
 
     def head(self, name: str) -> ObjectInfo:
         """Return size and name; raises NotFound."""
-        found = self._ask(name, "head_object", Key=check_name(name))
-        return ObjectInfo(name=name, size=int(found["ContentLength"]))
+        answer = self._ask(name, "head_object", Key=check_name(name))
+        return ObjectInfo(name=name, size=int(answer["ContentLength"]))
 
     def list(self, prefix: str = "", after: str = "") -> Iterator[ObjectInfo]:
         """Yield the objects whose names begin with *prefix* and are greater than *after*, sorted by name."""
         for page in self._pages(prefix, **({"StartAfter": after} if after else {})):
-            for each in page.get("Contents", ()):
+            for row in page.get("Contents", ()):
                 with contextlib.suppress(StoreError):  # a name that the platform did not write
-                    yield ObjectInfo(name=check_name(each["Key"]), size=int(each["Size"]))
+                    yield ObjectInfo(name=check_name(row["Key"]), size=int(row["Size"]))
 
     def folders(self, prefix: str) -> Iterator[str]:
         """Yield what stands between *prefix* and the next slash in names, sorted."""
         for page in self._pages(prefix, Delimiter="/"):
-            for each in page.get("CommonPrefixes", ()):
-                yield str(each["Prefix"])[len(prefix) : -1]
+            for row in page.get("CommonPrefixes", ()):
+                yield str(row["Prefix"])[len(prefix) : -1]
 
     def delete(self, name: str) -> None:
         """Remove the object; a missing one is no error."""
@@ -124,9 +124,9 @@ class S3Store:
             try:
                 current, tag = self._read(name)
             except NotFound as error:
-                raise _conflict(name) from error
+                raise _conflict_error(name) from error
             if current != expected:
-                raise _conflict(name)
+                raise _conflict_error(name)
             condition = {"IfMatch": tag}
         self._write(name, data, **condition)
 
@@ -165,13 +165,13 @@ class S3Store:
 
     def _read(self, name: str) -> tuple[bytes, str]:
         check_name(name)
-        with _as_store_errors(name):
+        with _raise_store_errors(name):
             return self._get(name)
 
     def _get(self, name: str, **more: str) -> tuple[bytes, str]:
         def get() -> tuple[bytes, str]:
-            found = self._client.get_object(Bucket=self._bucket, Key=name, **more)
-            return found["Body"].read(), found["ETag"]
+            answer = self._client.get_object(Bucket=self._bucket, Key=name, **more)
+            return answer["Body"].read(), answer["ETag"]
 
         return with_retries(get)
 
@@ -184,34 +184,34 @@ class S3Store:
             self._client.put_object(Bucket=self._bucket, Key=name, Body=data, **condition)
 
         try:
-            with _as_store_errors(name):
+            with _raise_store_errors(name):
                 with_retries(write)
         except Conflict:
             if tries == 1 or self.get(name) != data:
                 raise
 
     def _ask(self, name: str, method: str, **arguments: Any) -> dict[str, Any]:
-        with _as_store_errors(name):
-            found: dict[str, Any] = with_retries(
+        with _raise_store_errors(name):
+            answer: dict[str, Any] = with_retries(
                 lambda: getattr(self._client, method)(Bucket=self._bucket, **arguments)
             )
-        return found
+        return answer
 
 
-def _joined(pieces: Iterator[bytes], size: int) -> Iterator[bytes]:
+def _join_pieces(pieces: Iterator[bytes], size: int) -> Iterator[bytes]:
     """Yield what *pieces* hold in parts of at least *size* bytes, the last one excepted."""
-    held = bytearray()
+    part = bytearray()
     for piece in pieces:
-        held += piece
-        if len(held) >= size:
-            yield bytes(held)
-            held.clear()
-    if held:
-        yield bytes(held)
+        part += piece
+        if len(part) >= size:
+            yield bytes(part)
+            part.clear()
+    if part:
+        yield bytes(part)
 
 
 @contextlib.contextmanager
-def _as_store_errors(name: str) -> Iterator[None]:
+def _raise_store_errors(name: str) -> Iterator[None]:
     from botocore.exceptions import ClientError
 
     try:
@@ -232,7 +232,7 @@ def _as_store_errors(name: str) -> Iterator[None]:
         if status_of(error) == _NOT_FOUND:
             raise NotFound(f"no object named {name!r}") from error
         if status_of(error) == _PRECONDITION_FAILED:
-            raise _conflict(name) from error
+            raise _conflict_error(name) from error
         if code in _FULL:
             raise StoreFull(f"no space for {name!r}", hint="free some space") from error
         raise StoreError(
@@ -240,5 +240,5 @@ def _as_store_errors(name: str) -> Iterator[None]:
         ) from error
 
 
-def _conflict(name: str) -> Conflict:
+def _conflict_error(name: str) -> Conflict:
     return Conflict(f"{name!r} was changed by another writer", hint="read it again and retry")

@@ -108,7 +108,7 @@ def _show_bill(bill: Bill, prices: Prices) -> None:
     show(
         f"{'box of Fig. 2':<17}{'what':<47}{'units':>10} {'':<8}{'each':>10}{prices.currency + '/month':>11}"
     )
-    for box, amount in bill.by_box().items():
+    for box, amount in bill.sum_by_box().items():
         for line in bill.lines:
             if line.box == box:
                 show(

@@ -21,12 +21,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     """Print what is left over; return 1 if anything is, 2 if AWS could not be asked."""
     from rse_pf.aws.account import open_account
-    from rse_pf.aws.cloudformation import living_stacks
+    from rse_pf.aws.cloudformation import list_living_stacks
     from rse_pf.aws.money.leftovers import find_leftovers
 
     account, names = open_account(settings.cloud.region), ResourceNames(settings.cloud.name)
     try:
-        stacks, found = living_stacks(account, names), find_leftovers(account, names)
+        stacks, found = list_living_stacks(account, names), find_leftovers(account, names)
     except StoreError as error:  # its exit code is that of a finding
         show_error(error)
         return _FAILED

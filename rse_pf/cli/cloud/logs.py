@@ -29,7 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     """Print lines, or the servers that have some; return 1 if there are none."""
     from rse_pf.aws.account import open_account
-    from rse_pf.aws.fleet.server_logs import console_of, last_lines, logged_servers, open_journals
+    from rse_pf.aws.fleet.server_logs import console_of, last_lines, list_logged_servers, open_journals
 
     if not 1 <= args.lines <= _MAX_LINES:
         raise UsageError(f"--lines {args.lines} is not within 1..{_MAX_LINES}", hint="name how many lines")
@@ -40,7 +40,7 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
         lines = console_of(account, args.server)
     else:
         store = open_journals(account, ResourceNames(settings.cloud.name))
-        servers = logged_servers(store)
+        servers = list_logged_servers(store)
         if args.server is None:
             for each in servers:
                 newest = datetime.fromtimestamp(each.newest_s, timezone.utc)

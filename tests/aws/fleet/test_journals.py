@@ -12,8 +12,8 @@ from typing import Any
 import pytest
 
 from rse_pf.aws.account import open_account
-from rse_pf.aws.fleet.journal import UNITS, batch_of, journal_command, read_journal
-from rse_pf.aws.fleet.server_logs import console_of, last_lines, logged_servers
+from rse_pf.aws.fleet.journal import UNITS, journal_command, make_batch, read_journal
+from rse_pf.aws.fleet.server_logs import console_of, last_lines, list_logged_servers
 from rse_pf.aws.fleet.task import AgentConfig, AgentContext
 from rse_pf.aws.fleet.tasks import journals
 from rse_pf.aws.fleet.tasks.journals import JOURNAL_SHIP_S
@@ -58,7 +58,7 @@ def context(machine: Machine, store: Any, folder: Path) -> AgentContext:
 
 
 def test_each_line_has_its_time_and_its_unit() -> None:
-    batch = batch_of([
+    batch = make_batch([
         entry(0, "ready"), entry(1, "killed", UNIT="rse-pf-data.service", _SYSTEMD_UNIT="init.scope"),
         entry(2, [104, 105, 255]), entry(3, ""),
     ])  # fmt: skip
@@ -76,15 +76,15 @@ def test_each_line_has_its_time_and_its_unit() -> None:
 def test_entries_that_cannot_be_read_are_left_out_and_none_is_no_batch() -> None:
     broken = [b"", b"{", b"[]\n", entry(1, _X=1).replace(b'"17954', b'"x'), entry(2, [999])]
 
-    assert batch_of(broken) is None
-    assert batch_of([*broken, entry(5)]).text.endswith(b"line 5\n")  # type: ignore[union-attr]
+    assert make_batch(broken) is None
+    assert make_batch([*broken, entry(5)]).text.endswith(b"line 5\n")  # type: ignore[union-attr]
 
 
 def test_a_long_journal_becomes_several_pieces_and_no_line_is_lost_or_doubled(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     machine, store = Machine(10), MemoryStore()
-    monkeypatch.setattr(journals, "batch_of", lambda entries: batch_of(entries, 100))
+    monkeypatch.setattr(journals, "make_batch", lambda entries: make_batch(entries, 100))
     task = journals.task(context(machine, store, tmp_path))
 
     task.call()
@@ -92,7 +92,7 @@ def test_a_long_journal_becomes_several_pieces_and_no_line_is_lost_or_doubled(
     task.call()
     task.call()
 
-    (server,) = logged_servers(store)
+    (server,) = list_logged_servers(store)
     assert len(server.pieces) > 3
     assert [line.partition(" rse-pf ")[2] for line in last_lines(store, server, 100)] == [
         f"line {number}" for number in range(12)
@@ -118,7 +118,7 @@ def test_a_piece_that_did_not_arrive_is_sent_again(tmp_path: Path) -> None:
     task.call()
 
     assert machine.asked == ["", "", "c2"]
-    assert len(last_lines(store, logged_servers(store)[0], 100)) == 3
+    assert len(last_lines(store, list_logged_servers(store)[0], 100)) == 3
 
 
 def test_journals_are_shipped_in_every_phase_and_before_the_machine_ends(tmp_path: Path) -> None:
@@ -158,7 +158,7 @@ def test_an_entry_of_this_machine_can_be_read() -> None:
     if first is None:
         pytest.skip("the journal of this machine has no entry of our units")
 
-    assert batch_of([first]) is not None
+    assert make_batch([first]) is not None
 
 
 @pytest.fixture

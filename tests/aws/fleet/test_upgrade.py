@@ -15,7 +15,7 @@ from rse_pf.aws.account import Account
 from rse_pf.aws.fleet.upgrade import (
     State,
     UpgradeStep,
-    failed_launch,
+    find_failed_launch,
     next_step,
     preferences,
     read_state,
@@ -432,9 +432,9 @@ def test_every_status_of_aws_has_a_state(status: str, state: State) -> None:
 def test_a_launch_that_failed_for_want_of_capacity_does_not_take_the_release_back() -> None:
     launch = {"Description": "Launching a new EC2 instance", "StartTime": START, "StatusCode": "Failed"}
 
-    assert failed_launch([{**launch, "StatusMessage": "Insufficient capacity."}], START) is None
-    assert failed_launch([{**launch, "StatusMessage": REASON}], START + timedelta(seconds=1)) is None
-    assert failed_launch([{**launch, "StatusMessage": REASON}], START) is not None
+    assert find_failed_launch([{**launch, "StatusMessage": "Insufficient capacity."}], START) is None
+    assert find_failed_launch([{**launch, "StatusMessage": REASON}], START + timedelta(seconds=1)) is None
+    assert find_failed_launch([{**launch, "StatusMessage": REASON}], START) is not None
 
 
 @pytest.mark.parametrize(
@@ -451,8 +451,10 @@ def test_only_a_launch_that_has_failed_takes_the_release_back(change: dict[str, 
         "StatusMessage": REASON,
     }  # fmt: skip
 
-    assert failed_launch([launch, {**launch, "StartTime": START + timedelta(seconds=1)}], START) == launch
-    assert failed_launch([{**launch, **change}], START) is None
+    assert (
+        find_failed_launch([launch, {**launch, "StartTime": START + timedelta(seconds=1)}], START) == launch
+    )
+    assert find_failed_launch([{**launch, **change}], START) is None
 
 
 def test_one_server_more_than_wanted_is_started_at_a_time_and_none_less_is_kept() -> None:

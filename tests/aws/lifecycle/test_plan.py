@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from rse_pf.aws.lifecycle.deployment import Deployment, GroupSize, ParkNote
-from rse_pf.aws.lifecycle.plan import Step, plan_down, plan_park, plan_resume, plan_up, restored
+from rse_pf.aws.lifecycle.plan import Step, plan_down, plan_park, plan_resume, plan_up, size_to_restore
 from rse_pf.config.resource_names import STACKS
 from rse_pf.errors import ConfigurationError
 
@@ -80,9 +80,9 @@ def test_the_data_goes_last_and_only_on_demand() -> None:
 
 
 def test_a_group_keeps_the_size_that_a_newer_deployment_gave_it() -> None:
-    assert restored(GROUP, EMPTY) == GROUP
-    assert restored(GROUP, GroupSize(min_servers=1, wanted_servers=1, max_servers=4)) is None
-    assert restored(None, EMPTY) is None
+    assert size_to_restore(GROUP, EMPTY) == GROUP
+    assert size_to_restore(GROUP, GroupSize(min_servers=1, wanted_servers=1, max_servers=4)) is None
+    assert size_to_restore(None, EMPTY) is None
 
 
 @pytest.mark.parametrize(

@@ -47,7 +47,7 @@ def at(robots: int, fps: float = 10.0, hours: float = 24.0) -> Load:
 
 
 def amounts(bill: Bill, box: str) -> float:
-    return bill.by_box().get(box, 0.0)
+    return bill.sum_by_box().get(box, 0.0)
 
 
 def test_the_floor_is_paid_when_hardly_anybody_asks() -> None:
@@ -65,7 +65,7 @@ def test_a_bill_is_the_sum_of_its_lines_and_of_its_boxes_to_the_cent() -> None:
 
         printed = [f"{line.count * line.price:.2f}" for line in bill.lines]
         assert f"{sum(map(float, printed)):.2f}" == f"{bill.total:.2f}"
-        assert f"{sum(bill.by_box().values()):.2f}" == f"{bill.total:.2f}"
+        assert f"{sum(bill.sum_by_box().values()):.2f}" == f"{bill.total:.2f}"
 
 
 def test_the_small_profile_costs_less_than_a_hundred_a_month_and_parked_less_than_twenty_five() -> None:
@@ -82,8 +82,8 @@ def test_parked_there_is_no_server_and_deep_no_load_balancer() -> None:
 
     assert amounts(shallow, "backend servers") == 0
     assert amounts(shallow, "load balancer") == amounts(bill, "load balancer") > 0
-    assert {"load balancer", "firewall"}.isdisjoint(deep.by_box())
-    assert set(deep.by_box()) == {"monitor", "scale modifier", "data servers"}
+    assert {"load balancer", "firewall"}.isdisjoint(deep.sum_by_box())
+    assert set(deep.sum_by_box()) == {"monitor", "scale modifier", "data servers"}
 
 
 def test_parked_at_night_costs_between_always_and_never() -> None:

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from rse_pf.aws.account import Account, open_account
-from rse_pf.aws.cloudformation import living_stacks
+from rse_pf.aws.cloudformation import list_living_stacks
 from rse_pf.aws.money.leftovers import find_leftovers
 from rse_pf.config.resource_names import ResourceNames
 from rse_pf.errors import ConfigurationError
@@ -97,7 +97,7 @@ def test_what_a_living_stack_owns_is_no_leftover_until_it_is_gone(region: str) -
         StackName="Other", TemplateBody='{"Resources": {"T": {"Type": "AWS::SNS::Topic"}}}'
     )
 
-    assert list(living_stacks(account, NAMES)) == ["RsePf-Data"]
+    assert list(list_living_stacks(account, NAMES)) == ["RsePf-Data"]
     assert find_leftovers(account, NAMES) == []
 
     kept = account.client("s3")
@@ -106,7 +106,7 @@ def test_what_a_living_stack_owns_is_no_leftover_until_it_is_gone(region: str) -
     formation.get_waiter("stack_delete_complete").wait(StackName="RsePf-Data", WaiterConfig=soon)
     kept.create_bucket(Bucket="maps-of-a-stack", CreateBucketConfiguration={"LocationConstraint": region})
     kept.put_bucket_tagging(Bucket="maps-of-a-stack", Tagging={"TagSet": [TAG]})
-    assert list(living_stacks(account, NAMES)) == []
+    assert list(list_living_stacks(account, NAMES)) == []
     assert [each.name for each in find_leftovers(account, NAMES)] == ["maps-of-a-stack"]
 
 

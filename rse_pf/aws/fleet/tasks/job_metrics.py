@@ -39,5 +39,5 @@ def task(context: AgentContext) -> Task:
 
 def job_counts(page: str) -> tuple[float, float]:
     """Return the jobs of a server, and those of them that wait, from its page of metrics."""
-    found = dict(_LINE.findall(page))
-    return float(found.get("jobs", 0.0)), float(found.get("jobs_pending", 0.0))
+    counts = dict(_LINE.findall(page))
+    return float(counts.get("jobs", 0.0)), float(counts.get("jobs_pending", 0.0))

@@ -6,7 +6,7 @@ object a minute, where CloudWatch Logs would cost an endpoint in each zone.
 
 from __future__ import annotations
 
-from rse_pf.aws.fleet.journal import batch_of
+from rse_pf.aws.fleet.journal import make_batch
 from rse_pf.aws.fleet.task import AgentContext, Task
 from rse_pf.config.resource_names import JOURNAL_PREFIX
 from rse_pf.files import replace_file
@@ -39,7 +39,7 @@ def _ship(context: AgentContext) -> None:
     file = context.config.keys_file.with_name(_CURSOR_FILE)
     for _ in range(_MAX_PIECES):
         cursor = file.read_text(encoding="utf-8") if file.exists() else ""
-        batch = batch_of(context.journal(cursor))
+        batch = make_batch(context.journal(cursor))
         if batch is None:
             return
         # A piece whose cursor was lost is written again, under the same name.

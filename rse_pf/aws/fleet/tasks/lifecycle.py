@@ -41,7 +41,7 @@ class _Lifecycle:
     def follow(self) -> None:
         target = self._context.machine.target_state()
         if target == TERMINATED:
-            self._leave()
+            self._leave_group()
         elif target != self._joined and (target == IN_SERVICE or target.startswith(WARMED)):
             self._join(target)
 
@@ -63,7 +63,7 @@ class _Lifecycle:
         event = "joined" if action is LaunchAction.CONTINUE else "not-ready"
         context.log(event, target=target, after_s=round(age_s, 1), hook=did_wait)
 
-    def _leave(self) -> None:
+    def _leave_group(self) -> None:
         """Drain the server once, and complete the hook as soon as it waits."""
         context = self._context
         context.state.phase = Phase.LEAVING

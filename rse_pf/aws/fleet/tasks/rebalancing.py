@@ -72,15 +72,15 @@ class _Rebalancing:
         totals = read_totals(
             context.clients["cloudwatch"], context.config.group, self._period_s, period * self._period_s
         )
-        self._order(robots, totals)
+        self._order_moves(robots, totals)
 
-    def _order(self, robots: int, totals: Sequence[Totals]) -> None:
+    def _order_moves(self, robots: int, totals: Sequence[Totals]) -> None:
         context = self._context
         order = order_of(robots, totals)
         if order is None:
             self._asked = None
             return
-        asked = context.machine.move(order.robots, order.spread_s)
+        moving = context.machine.move(order.robots, order.spread_s)
         failures = 0 if self._asked is None else self._asked.failures
         stayed = self._asked is not None and robots >= self._asked.robots
         self._asked = _Asked(order=order, robots=robots, failures=failures + 1 if stayed else 0)
@@ -89,7 +89,7 @@ class _Rebalancing:
         self._quiet_until_s = context.clock() + pause_s
         newest = totals[0]
         context.log(
-            "rebalance", robots=asked, of=robots, all_robots=newest.robots, servers=newest.servers,
+            "rebalance", robots=moving, of=robots, all_robots=newest.robots, servers=newest.servers,
             pause_s=round(pause_s, 1),
         )  # fmt: skip
 
@@ -109,7 +109,7 @@ def read_totals(cloudwatch: Any, group: str, period_s: int, end_s: float) -> tup
     """
     end = datetime.fromtimestamp(end_s, timezone.utc)
     metric = {"Namespace": NAMESPACE, "MetricName": ROBOTS, "Dimensions": dimensions_of(group)}
-    told = call_api(
+    answer = call_api(
         cloudwatch, "get_metric_data", ScanBy="TimestampDescending", EndTime=end,
         StartTime=end - timedelta(seconds=_PERIODS * period_s),
         MetricDataQueries=[
@@ -117,14 +117,14 @@ def read_totals(cloudwatch: Any, group: str, period_s: int, end_s: float) -> tup
             for identity, stat in (("robots", "Sum"), ("servers", "SampleCount"))
         ],
     )  # fmt: skip
-    found = {
+    sums = {
         row["Id"]: {
             int(at.timestamp()): float(value)
             for at, value in zip(row["Timestamps"], row["Values"], strict=False)
         }
-        for row in told["MetricDataResults"]
+        for row in answer["MetricDataResults"]
     }
-    robots, servers = found.get("robots", {}), found.get("servers", {})
+    robots, servers = sums.get("robots", {}), sums.get("servers", {})
     return tuple(
         Totals(start_s=float(at), robots=round(robots[at]), servers=round(servers[at]))
         for at in sorted(robots, reverse=True)

@@ -51,16 +51,16 @@ class _Publisher:
         else:
             data = datums(self._before, now, context.config.group, machine.instance_id())
             if self._cadence.is_fast:
-                data += self._cpu(cpu)
+                data += self._measure_cpu_percent(cpu)
             call_api(
                 context.clients["cloudwatch"], "put_metric_data", Namespace=NAMESPACE,
-                MetricData=[self._of_period(each, period - 1) for each in data],
+                MetricData=[self._with_period(datum, period - 1) for datum in data],
             )  # fmt: skip
         self._period, self._before, self._cpu_before = period, now, cpu
 
-    def _cpu(self, now: tuple[float, float]) -> list[dict[str, Any]]:
+    def _measure_cpu_percent(self, now: tuple[float, float]) -> list[dict[str, Any]]:
         """Return the CPU of the machine, once the server is past its warm-up."""
-        busy, there = (each - before for each, before in zip(now, self._cpu_before, strict=True))
+        busy, there = (ticks - before for ticks, before in zip(now, self._cpu_before, strict=True))
         warm = self._context.clock() - self._began_s >= self._context.settings.scaling.warm_up_s
         if not warm or there <= 0:
             return []
@@ -68,7 +68,7 @@ class _Publisher:
         dimensions = dimensions_of(self._context.config.group)
         return [{"MetricName": CPU, "Dimensions": dimensions, "Value": value, "Unit": "Percent"}]
 
-    def _of_period(self, datum: dict[str, Any], period: int) -> dict[str, Any]:
+    def _with_period(self, datum: dict[str, Any], period: int) -> dict[str, Any]:
         begin = datetime.fromtimestamp(period * self._cadence.period_s, timezone.utc)
         fast = {"StorageResolution": _HIGH_RESOLUTION} if self._cadence.is_fast else {}
         return {**datum, "Timestamp": begin, **fast}

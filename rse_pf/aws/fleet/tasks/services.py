@@ -30,7 +30,7 @@ _EMPTY = msgspec.json.encode(PublishedList())
 def task(context: AgentContext) -> Task:
     """Install the services of the list if it changed, and have the server load them."""
     folder = PublishedFolder(context.config.keys_file.parent / FOLDER)
-    refused, told = b"", b""
+    refused, loaded = b"", b""
 
     def fetch(entry: PublishedService) -> bytes:
         name = archive_name(entry.archive)
@@ -40,7 +40,7 @@ def task(context: AgentContext) -> Task:
         return context.artifacts.get(name)
 
     def follow() -> None:
-        nonlocal refused, told
+        nonlocal refused, loaded
         if context.runs_jobs:  # a job server runs no published services
             return
         try:
@@ -49,16 +49,16 @@ def task(context: AgentContext) -> Task:
             data = _EMPTY
         if not folder.holds(data) and data != refused:
             try:
-                found = folder.install(data, fetch)
+                services = folder.install(data, fetch)
             except ConfigurationError:
                 refused = data
                 raise
-            context.log("services", names=[service.name for service in found])
-        if folder.holds(data) and data != told:
+            context.log("services", names=[service.name for service in services])
+        if folder.holds(data) and data != loaded:
             try:
                 context.machine.reload_services()
             except Disconnected:
                 return  # a server that starts reads the folder itself
-            told = data
+            loaded = data
 
     return Task(name="services", period_s=float(LOOK_PERIOD_S), call=follow, in_thread=True)

@@ -21,7 +21,7 @@ def task(context: AgentContext) -> Task:
     """Look every ten seconds, in a thread: calls of the other tasks wait for a bucket that is silent."""
     failing = False
 
-    def look() -> None:
+    def publish_failure() -> None:
         nonlocal failing
         if not context.settings.data.enabled or context.runs_jobs:
             return
@@ -40,6 +40,6 @@ def task(context: AgentContext) -> Task:
         )  # fmt: skip
 
     return Task(
-        name="store-errors", period_s=float(STORE_PERIOD_S), call=look, phases=frozenset({Phase.SERVING}),
-        in_thread=True,
+        name="store-errors", period_s=float(STORE_PERIOD_S), call=publish_failure,
+        phases=frozenset({Phase.SERVING}), in_thread=True,
     )  # fmt: skip
