@@ -15,7 +15,7 @@ from prometheus_client.metrics_core import Metric
 from prometheus_client.parser import text_string_to_metric_families
 
 from rse_pf.backend.metrics import GAUGE_HELP, Metrics, merge, render
-from rse_pf.local.control.federation import federated
+from rse_pf.local.control.federation import federate_pages
 
 __all__ = ["all_metrics", "dashboard", "main"]
 
@@ -34,7 +34,7 @@ def all_metrics() -> list[Metric]:
         counter["example"] += 1
     worker.gauges.update(dict.fromkeys(GAUGE_HELP, 0.0))
     disk = {"folder": "state", "free_bytes": 0, "total_bytes": 0}
-    page = federated({"server-1": render(merge([worker.snapshot()])).decode("utf-8")}, [disk])
+    page = federate_pages({"server-1": render(merge([worker.snapshot()])).decode("utf-8")}, [disk])
     families = text_string_to_metric_families(page.decode("utf-8"))
     return sorted(families, key=lambda each: (_ORDER[each.type], each.name))
 

@@ -61,9 +61,9 @@ def folders_of(state: Path, store: str) -> list[Path]:
 
 def disk_spaces(folders: Iterable[Path], low_bytes: int) -> list[DiskSpace]:
     """Return the file systems of *folders*, each once; a folder that is missing counts as its parent."""
-    found: dict[int, DiskSpace] = {}
+    spaces: dict[int, DiskSpace] = {}
     for folder in folders:
-        there = next(each for each in (folder, *folder.parents) if each.exists())
+        there = next(path for path in (folder, *folder.parents) if path.exists())
         about = os.statvfs(there)
         free = about.f_bavail * about.f_frsize
         space = DiskSpace(
@@ -72,18 +72,18 @@ def disk_spaces(folders: Iterable[Path], low_bytes: int) -> list[DiskSpace]:
             total_bytes=about.f_blocks * about.f_frsize,
             level=disk_level(free, low_bytes),
         )
-        found.setdefault(there.stat().st_dev, space)
-    return list(found.values())
+        spaces.setdefault(there.stat().st_dev, space)
+    return list(spaces.values())
 
 
 def disk_line(space: DiskSpace) -> str:
     """Return *space* as a line for a person; empty if there is enough."""
     sizes = f"{space.free_bytes // _MIB} of {space.total_bytes // _MIB} MiB"
-    told = f"{sizes} are free on the disk of {space.folder}"
+    sentence = f"{sizes} are free on the disk of {space.folder}"
     return {
         "ok": "",
-        "low": f"little space: {told}",
-        "full": f"disk full: {told}; servers are not started, and little is recorded: free some space",
+        "low": f"little space: {sentence}",
+        "full": f"disk full: {sentence}; servers are not started, and little is recorded: free some space",
     }[space.level]
 
 

@@ -104,20 +104,22 @@ def ensure_key(folder: Path, *, seed: bytes, key_id: str) -> SigningKey:
         replace_file(path, SigningKey.from_seed(seed, key_id).to_json(), mode=OWNER_ONLY)
     key = read_key(path)
     public = key_set_file(folder)
-    if _holds(public, key):
+    if _holds_key(public, key):
         return key
     replace_file(public, key.key_set().to_json())
     return key
 
 
-def _holds(public: Path, key: SigningKey) -> bool:
+def _holds_key(public: Path, key: SigningKey) -> bool:
     """Whether the set in the file *public* holds *key*, perhaps beside others."""
     try:
-        known = KeySet.from_json(public.read_text(encoding="utf-8")).get(key.key_id)
+        public_key = KeySet.from_json(public.read_text(encoding="utf-8")).get(key.key_id)
     except (OSError, UsageError):
         return False
     own = key.key_set().get(key.key_id)
-    return known is not None and own is not None and known.public_bytes_raw() == own.public_bytes_raw()
+    return (
+        public_key is not None and own is not None and public_key.public_bytes_raw() == own.public_bytes_raw()
+    )
 
 
 def read_key(path: Path) -> SigningKey:

@@ -137,7 +137,7 @@ def spawn(
             stdin=stdin,
             stdout=output,
             stderr=subprocess.STDOUT,
-            preexec_fn=_apart(os.getpid() if dies_with_parent else None),
+            preexec_fn=_child_setup(os.getpid() if dies_with_parent else None),
         )
     _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
     with contextlib.suppress(OSError):  # each robot needs two descriptors; the process may be gone already
@@ -241,11 +241,11 @@ class ServerProcess:
         code = None if self._child is None else self._child.poll()
         return "ended" if code is None else f"ended with exit code {code}"
 
-    def failed(self, what: str) -> ConfigurationError:
-        """Return the error that says *what* happened, with the last line that the process logged."""
+    def failed(self, problem: str) -> ConfigurationError:
+        """Return the error that says *problem* happened, with the last line that the process logged."""
         last = self.last_line()
         return ConfigurationError(
-            f"{self.name} {what}{': ' if last else ''}{last}", hint=f"its log is {self.log}"
+            f"{self.name} {problem}{': ' if last else ''}{last}", hint=f"its log is {self.log}"
         )
 
 
@@ -272,8 +272,8 @@ def last_line(log: Path, start: int = 0) -> str:
     except OSError:
         return ""
     lines = [line.strip() for line in text.splitlines() if line.strip()]
-    told = [line for line in lines if not line.startswith("hint:")]
-    return (told or lines or [""])[-1][:300]
+    messages = [line for line in lines if not line.startswith("hint:")]
+    return (messages or lines or [""])[-1][:300]
 
 
 async def rotate_logs(folder: Path, max_bytes: int, in_use: Collection[str]) -> None:
@@ -362,7 +362,7 @@ def _is_disk_full(folder: Path) -> bool:
     return about.f_bavail * about.f_frsize < _FULL_BYTES
 
 
-def _apart(parent: int | None) -> Callable[[], None]:
+def _child_setup(parent: int | None) -> Callable[[], None]:
     """Return what a child does before its program: leave the group, and be killed with *parent*, if any."""
 
     def leave() -> None:

@@ -216,15 +216,15 @@ def stop_platform(folder: Path, timeout_s: float = STOP_TIMEOUT_S) -> bool:
     if ran and not wait_ended(state.control_plane, 3 * timeout_s):
         send_signal(state.control_plane, signal.SIGKILL)
         wait_ended(state.control_plane, timeout_s)
-    left = [mark for mark in (read_state(folder) or state).processes() if is_alive(mark)]
-    for mark in left:
+    remaining = [mark for mark in (read_state(folder) or state).processes() if is_alive(mark)]
+    for mark in remaining:
         send_signal(mark, signal.SIGINT)
-    for mark in left:
+    for mark in remaining:
         if not wait_ended(mark, timeout_s):
             send_signal(mark, signal.SIGKILL)
             wait_ended(mark, timeout_s)
     remove_state(folder)
-    return ran or bool(left)
+    return ran or bool(remaining)
 
 
 def _state(document: Any) -> PlatformState:

@@ -141,7 +141,7 @@ class EnvoyLoadBalancer:
                 self.port = listeners[0]["local_address"]["socket_address"]["port_value"]
             return bool(listeners)
 
-        if not await self._until(live, timeout_s):
+        if not await self._wait_until(live, timeout_s):
             late = f"did not start within {timeout_s:g} s"
             raise self.process.failed(late if self.process.is_running() else self.process.ending())
 
@@ -159,12 +159,12 @@ class EnvoyLoadBalancer:
 
     async def wait_healthy(self, names: Iterable[str], timeout_s: float) -> bool:
         """Wait until Envoy gives robots to every one of *names*; return whether it does."""
-        wanted = set(names)
+        expected = set(names)
 
         async def healthy() -> bool:
-            return wanted <= {name for name, target in (await self.stats()).items() if target.healthy}
+            return expected <= {name for name, target in (await self.stats()).items() if target.healthy}
 
-        return await self._until(healthy, timeout_s)
+        return await self._wait_until(healthy, timeout_s)
 
     async def wait_gone(self, name: str, timeout_s: float) -> bool:
         """Wait until Envoy has dropped *name* from its targets; return whether that is certain."""
@@ -173,7 +173,7 @@ class EnvoyLoadBalancer:
             page = await self._get("/clusters?format=json")
             return bool(page) and name not in _targets(json.loads(page))
 
-        return await self._until(gone, timeout_s)
+        return await self._wait_until(gone, timeout_s)
 
     async def wait_over(self) -> str:
         """Wait until the process ends by itself; return the last line of its log."""
@@ -194,7 +194,7 @@ class EnvoyLoadBalancer:
         self._targets.close()
         self._data_targets.close()
 
-    async def _until(self, condition: Callable[[], Any], timeout_s: float) -> bool:
+    async def _wait_until(self, condition: Callable[[], Any], timeout_s: float) -> bool:
         """Ask *condition* until it holds, the time is over, or Envoy has ended."""
         end = time.monotonic() + timeout_s
         while self.process.is_running():
@@ -210,11 +210,11 @@ class EnvoyLoadBalancer:
 
 
 def _targets(page: Mapping[str, Any]) -> dict[str, TargetStats]:
-    found: dict[str, TargetStats] = {}
+    targets: dict[str, TargetStats] = {}
     for cluster in page.get("cluster_statuses", []):
         if cluster.get("name") == CLUSTER:
-            found.update(_target(host) for host in cluster.get("host_statuses", []))
-    return found
+            targets.update(_target(host) for host in cluster.get("host_statuses", []))
+    return targets
 
 
 def _target(host: Mapping[str, Any]) -> tuple[str, TargetStats]:

@@ -92,7 +92,7 @@ class ControlPlane:
             scaling,
             max_restarts_per_minute=MAX_RESTARTS_PER_MINUTE,
             compress=options.compress,
-            minimum=_scheduled(scaling),
+            minimum=_scheduled_minimum(scaling),
             emit=emit,
         )
         self._fleet = fleet
@@ -127,10 +127,10 @@ class ControlPlane:
         self._fleet.on_healthy = self.watch_spread
         self._fleet.keep(self._monitor())
         if self._elastic:
-            self._fleet.on_lost = self._soon
+            self._fleet.on_lost = self._act_soon
             self._fleet.keep(self._watch_balancer())
             self._fleet.keep(self._keep_standby())
-            self._soon()
+            self._act_soon()
 
     async def _keep_standby(self) -> None:
         """Start a standby after every launch, once no server is starting."""
@@ -142,9 +142,9 @@ class ControlPlane:
         """Take no further action."""
         self._elastic = False
 
-    def look_again(self) -> None:
+    def retry_replacements(self) -> None:
         """Replace now what had to wait."""
-        self._soon()
+        self._act_soon()
 
     def watch_spread(self) -> None:
         """Watch for half a minute whether robots are spread evenly."""
@@ -153,11 +153,11 @@ class ControlPlane:
 
     def document(self) -> dict[str, Any]:
         """Return the state of the policy as plain JSON values."""
-        told = [
+        samples = [
             {"start_s": sample.start_s, "cpu_percent": sample.cpu_percent, "requests": sample.requests}
             for sample in self._periods.samples(time.monotonic())
         ]
-        return {**self.modifier.document(), "elastic": self._elastic, "samples": told}
+        return {**self.modifier.document(), "elastic": self._elastic, "samples": samples}
 
     # --- health ----------------------------------------------------------------------------------
 
@@ -184,7 +184,7 @@ class ControlPlane:
             late_s = time.monotonic() - began_s - LOCAL_TIMEOUT_S
             return None if late_s > _LATE_SHARE * LOCAL_TIMEOUT_S else False
         if reply.status != 200 and reply.document().get("state") in _LEAVING:
-            self._fleet.leaves_by_itself(member)
+            self._fleet.note_own_drain(member)
             return None
         return reply.status == 200
 
@@ -196,7 +196,7 @@ class ControlPlane:
         if member.health.state == "unhealthy" and health.state != "unhealthy":
             failed = self._settings.health.unhealthy_checks
             self._emit("server-unhealthy", server=member.name, reason=f"{failed} checks in a row failed")
-            self._soon()
+            self._act_soon()
 
     # --- samples --------------------------------------------------------------------------------
 
@@ -229,7 +229,9 @@ class ControlPlane:
         for gone in set(self._ports) - there:
             self._ports.pop(gone).close()
         in_balancer = frozenset(name for name, target in stats.items() if target.healthy)
-        return monitor_sample(time.monotonic(), [each for each in servers if each.name in there], in_balancer)
+        return monitor_sample(
+            time.monotonic(), [server for server in servers if server.name in there], in_balancer
+        )
 
     async def _sample(self, member: Member) -> ServerSample:
         server = member.server
@@ -260,7 +262,7 @@ class ControlPlane:
 
     # --- actions ---------------------------------------------------------------------------------
 
-    def _soon(self) -> None:
+    def _act_soon(self) -> None:
         if self._elastic:
             asyncio.get_running_loop().call_soon(self._act)
 
@@ -273,7 +275,7 @@ class ControlPlane:
     def _rebalance(self, sample: MonitorSample) -> None:
         if self._rebalancer is None or self.hold:
             return
-        robots = {each.name: each.robots for each in sample.servers if each.state == "healthy"}
+        robots = {server.name: server.robots for server in sample.servers if server.state == "healthy"}
         for request in self._rebalancer.requests(robots, sample.time):
             self._fleet.keep(self._move(request))
 
@@ -285,9 +287,11 @@ class ControlPlane:
         reply = await self._fleet.control(member.server).ask_once(target, timeout_s=_ASK_S, method="POST")
         if reply is None or reply.status >= 300:
             return  # the next sample asks again
-        told = reply.document()
-        if told.get("robots"):
-            self._emit("rebalance", server=request.server, robots=told["robots"], spread_s=told["spread_s"])
+        answer = reply.document()
+        if answer.get("robots"):
+            self._emit(
+                "rebalance", server=request.server, robots=answer["robots"], spread_s=answer["spread_s"]
+            )
 
     # --- the balancer ----------------------------------------------------------------------------
 
@@ -319,7 +323,7 @@ class ControlPlane:
             pause_s = LOCAL_INTERVAL_S if self._fleet.is_full() else min(2 * pause_s, _MAX_PAUSE_S)
 
 
-def _scheduled(scaling: ScalingSettings) -> Callable[[], int] | None:
+def _scheduled_minimum(scaling: ScalingSettings) -> Callable[[], int] | None:
     """Return the minimum at the time of day, as a scheduled action sets it; None without a schedule."""
     entries, zone = parse_schedule(scaling.schedule), zone_named(scaling.time_zone)
     if not entries:

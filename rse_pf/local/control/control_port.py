@@ -112,8 +112,8 @@ async def _operate(writer: asyncio.StreamWriter, operation: Operation, query: Ma
     try:
         events = operation(query)
     except RsePfError as error:
-        told = {"code": error.code, "message": error.message, "hint": error.hint}
-        await _send(writer, "409 Conflict", _json(told))
+        document = {"code": error.code, "message": error.message, "hint": error.hint}
+        await _send(writer, "409 Conflict", _json(document))
         return
     head = "HTTP/1.1 200 OK\r\nContent-Type: application/jsonl\r\nCache-Control: no-store\r\n"
     writer.write(f"{head}Connection: close\r\n\r\n".encode())

@@ -13,14 +13,14 @@ from typing import Any
 from rse_pf.errors import MissingExtra
 from rse_pf.local.state import ServerState
 
-__all__ = ["federated", "service_discovery"]
+__all__ = ["federate_pages", "service_discovery"]
 
 _LOOPBACK = "127.0.0.1"
 _LABEL = "server"
 _FOLDER = "folder"
 
 
-def federated(pages: Mapping[str, str | None], disks: Sequence[Mapping[str, Any]] = ()) -> bytes:
+def federate_pages(pages: Mapping[str, str | None], disks: Sequence[Mapping[str, Any]] = ()) -> bytes:
     """Return one page in the text format of Prometheus.
 
     Args:
@@ -52,11 +52,11 @@ def federated(pages: Mapping[str, str | None], disks: Sequence[Mapping[str, Any]
     for server, page in pages.items():
         up.add_metric([server], float(page is not None))
         for family in text_string_to_metric_families(page or ""):
-            known = families.setdefault(
+            merged = families.setdefault(
                 family.name, Metric(family.name, family.documentation, family.type, family.unit)
             )
-            known.samples += [
-                each._replace(labels={_LABEL: server, **each.labels}) for each in family.samples
+            merged.samples += [
+                sample._replace(labels={_LABEL: server, **sample.labels}) for sample in family.samples
             ]
 
     class Families:

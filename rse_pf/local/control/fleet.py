@@ -214,7 +214,7 @@ class Fleet:
         while not member.over.is_set() and not member.leaving and not member.out:
             left_s = min(end - time.monotonic(), _LOOK_UP_S)
             if await self._load_balancer.wait_healthy([member.name], max(left_s, 0.0)):
-                self._now_healthy(member, server)
+                self._note_healthy(member, server)
                 return
             if time.monotonic() >= end:
                 raise ConfigurationError(
@@ -234,10 +234,10 @@ class Fleet:
         """Bring *member* up in the background; its failure is an event and a loss."""
         self.keep(self._start(member))
 
-    async def until_healthy(self, members: Iterable[Member], timeout_s: float) -> None:
+    async def wait_until_healthy(self, members: Iterable[Member], timeout_s: float) -> None:
         """Wait until robots are sent to all of *members*; raises ConfigurationError if that fails."""
         for member in members:
-            either = [asyncio.ensure_future(each.wait()) for each in (member.healthy, member.over)]
+            either = [asyncio.ensure_future(event.wait()) for event in (member.healthy, member.over)]
             try:
                 await asyncio.wait(either, timeout=timeout_s, return_when=asyncio.FIRST_COMPLETED)
             finally:
@@ -283,7 +283,7 @@ class Fleet:
         self.keep(self.finish_drain(least, time.monotonic()))
         return least.name
 
-    def put_in_place_of(self, name: str, reason: str) -> str:
+    def launch_replacement(self, name: str, reason: str) -> str:
         """Launch a server in place of *name*; one that lives is cut off so that its robots go elsewhere.
 
         One that leaves in order already is left alone.
@@ -327,22 +327,23 @@ class Fleet:
         reply = None
         if server is not None:
             reply = await self.control(server).ask_once("/drain?wait=0", timeout_s=_ASK_S, method="POST")
-        asked = reply is not None and reply.status == 202
+        accepted = reply is not None and reply.status == 202
         drain_s = serving.drain_within_ms / 1e3 + session.answer_timeout_s + STOP_TIMEOUT_S
         clean = True
         try:
-            await asyncio.wait_for(member.over.wait(), drain_s if asked else notice_s)
+            await asyncio.wait_for(member.over.wait(), drain_s if accepted else notice_s)
         except asyncio.TimeoutError:
             clean = False
             self._backend_servers.send(member.name, signal.SIGKILL)
             await member.over.wait()
         report = {
-            "server": member.name, "seconds": round(time.monotonic() - began_s, 3), "clean": asked and clean,
+            "server": member.name, "seconds": round(time.monotonic() - began_s, 3),
+            "clean": accepted and clean,
         }  # fmt: skip
         self._emit("drain-over", **report)
         return report
 
-    def leaves_by_itself(self, member: Member) -> None:
+    def note_own_drain(self, member: Member) -> None:
         """Note that *member* drains although this control plane did not ask: it is replaced.
 
         An adopted server is not: the earlier control plane that asked it wanted one server less.
@@ -357,7 +358,7 @@ class Fleet:
         """Let *work* go on until it is done or the platform ends."""
         task = asyncio.get_running_loop().create_task(work)
         self._tasks.add(task)
-        task.add_done_callback(self._done)
+        task.add_done_callback(self._finish_task)
 
     async def close(self) -> None:
         """End everything that still waits; no process is touched.
@@ -380,9 +381,9 @@ class Fleet:
             if member.server is not None:  # announced, but never healthy: `_watch` handles its end
                 self._backend_servers.send(member.name, signal.SIGKILL)
             elif not member.out and not member.leaving:
-                self._lost(member)
+                self._note_lost(member)
 
-    def _now_healthy(self, member: Member, server: BackendServer) -> None:
+    def _note_healthy(self, member: Member, server: BackendServer) -> None:
         """Note that the balancer found *member* healthy, by the same rule as `observe`."""
         member.healthy_s = time.monotonic()
         if member.health.state == "starting":
@@ -400,7 +401,7 @@ class Fleet:
         self._set_targets()
         self._emit_gone(server.name, server.pid, code)
         if unasked:
-            self._lost(member)
+            self._note_lost(member)
         if not member.leaving and await self._load_balancer.wait_gone(server.name, STOP_TIMEOUT_S):
             self._emit("server-out", server=server.name)
 
@@ -415,7 +416,7 @@ class Fleet:
         member.over.set()
         self._changed()
 
-    def _lost(self, member: Member) -> None:
+    def _note_lost(self, member: Member) -> None:
         if member.on_trial:
             return
         young_since_s = time.monotonic() - _MIN_UPTIME_S
@@ -428,7 +429,7 @@ class Fleet:
             self._load_balancer.set_targets([server.target for server in self.serving])
         self._changed()
 
-    def _done(self, task: asyncio.Task[Any]) -> None:
+    def _finish_task(self, task: asyncio.Task[Any]) -> None:
         self._tasks.discard(task)
         if not task.cancelled() and task.exception() is not None:
             task.get_loop().call_exception_handler(

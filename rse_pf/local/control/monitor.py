@@ -116,27 +116,27 @@ def server_sample(
     """
     if now is None:
         return ServerSample(name=name, pid=pid, state=state, warming=warming)
-    told = now.status
+    status = now.status
     then: Mapping[str, Any] = {} if before is None else before.status
 
     def more(field: str) -> int:
-        return max(int(told.get(field, 0)) - int(then.get(field, 0)), 0)
+        return max(int(status.get(field, 0)) - int(then.get(field, 0)), 0)
 
     cpu_percent = None
     if before is not None and now.at_s > before.at_s:
-        spent_s = float(told["cpu_s"]) - float(then["cpu_s"])
+        spent_s = float(status["cpu_s"]) - float(then["cpu_s"])
         cpu_percent = round(100.0 * max(spent_s, 0.0) / (capacity * (now.at_s - before.at_s)), 2)
     return ServerSample(
         name=name,
         pid=pid,
         state=state,
         warming=warming,
-        robots=int(told.get("robots", 0)),
+        robots=int(status.get("robots", 0)),
         cpu_percent=cpu_percent,
         requests=more("requests"),
-        queue=int(told.get("queue", 0)),
-        queue_ms=round(float(told.get("queue_ms", 1e3 * float(told.get("queue_oldest_s", 0.0)))), 3),
-        in_flight=int(told.get("in_flight", 0)),
+        queue=int(status.get("queue", 0)),
+        queue_ms=round(float(status.get("queue_ms", 1e3 * float(status.get("queue_oldest_s", 0.0)))), 3),
+        in_flight=int(status.get("in_flight", 0)),
         bytes_in=more("bytes_in"),
         bytes_out=more("bytes_out"),
     )
@@ -146,17 +146,19 @@ def monitor_sample(
     time_s: float, servers: Sequence[ServerSample], in_balancer: frozenset[str]
 ) -> MonitorSample:
     """Return the sample of all *servers*; *in_balancer* are those the balancer sends robots to."""
-    known = [each.cpu_percent for each in servers if each.cpu_percent is not None and not each.warming]
+    percents = [
+        server.cpu_percent for server in servers if server.cpu_percent is not None and not server.warming
+    ]
     return MonitorSample(
         time=time_s,
-        cpu_percent=round(sum(known) / len(known), 2) if known else None,
-        healthy_servers=sum(each.state == "healthy" and each.name in in_balancer for each in servers),
+        cpu_percent=round(sum(percents) / len(percents), 2) if percents else None,
+        healthy_servers=sum(server.state == "healthy" and server.name in in_balancer for server in servers),
         servers_count=len(servers),
-        robots=sum(each.robots for each in servers),
-        requests=sum(each.requests for each in servers),
-        queue_ms=max((each.queue_ms for each in servers), default=0.0),
-        bytes_in=sum(each.bytes_in for each in servers),
-        bytes_out=sum(each.bytes_out for each in servers),
+        robots=sum(server.robots for server in servers),
+        requests=sum(server.requests for server in servers),
+        queue_ms=max((server.queue_ms for server in servers), default=0.0),
+        bytes_in=sum(server.bytes_in for server in servers),
+        bytes_out=sum(server.bytes_out for server in servers),
         servers=tuple(servers),
     )
 
@@ -186,26 +188,26 @@ class Periods:
         """Return the samples of the periods that have ended by *now_s*, oldest first."""
         ended = math.floor(now_s / self._period_s + 1e-6)
         return tuple(
-            _period_sample(period * self._period_s, taken)
-            for period, taken in sorted(self._taken.items())
-            if period < ended and _known_s(taken) >= _WHOLE * self._period_s
+            _period_sample(period * self._period_s, period_samples)
+            for period, period_samples in sorted(self._taken.items())
+            if period < ended and _observed_s(period_samples) >= _WHOLE * self._period_s
         )
 
 
-def _period_sample(start_s: float, taken: Sequence[tuple[float, MonitorSample]]) -> Sample:
+def _period_sample(start_s: float, period_samples: Sequence[tuple[float, MonitorSample]]) -> Sample:
     """Return the sample of one period: means over time, the longest queue, and the sum of the requests."""
-    loads = [(since_s, each) for since_s, each in taken if each.cpu_percent is not None]
-    known_s = _known_s(taken)
+    loads = [(since_s, sample) for since_s, sample in period_samples if sample.cpu_percent is not None]
+    known_s = _observed_s(period_samples)
     return Sample(
         start_s=start_s,
-        cpu_percent=sum(since_s * (each.cpu_percent or 0.0) for since_s, each in loads) / known_s,
-        requests=sum(each.requests for _, each in taken),
-        robots_per_server=sum(since_s * each.robots / each.servers_count for since_s, each in loads)
+        cpu_percent=sum(since_s * (sample.cpu_percent or 0.0) for since_s, sample in loads) / known_s,
+        requests=sum(sample.requests for _, sample in period_samples),
+        robots_per_server=sum(since_s * sample.robots / sample.servers_count for since_s, sample in loads)
         / known_s,
-        queue_ms=max(each.queue_ms for _, each in taken),
+        queue_ms=max(sample.queue_ms for _, sample in period_samples),
     )
 
 
-def _known_s(taken: Sequence[tuple[float, MonitorSample]]) -> float:
+def _observed_s(period_samples: Sequence[tuple[float, MonitorSample]]) -> float:
     """Return how long the CPU was watched."""
-    return sum(since_s for since_s, each in taken if each.cpu_percent is not None)
+    return sum(since_s for since_s, sample in period_samples if sample.cpu_percent is not None)

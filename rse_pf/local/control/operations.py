@@ -41,7 +41,7 @@ class Operations:
         self._running = ""
         self._watchers = 0
 
-    def heard(self, event: Event) -> None:
+    def take_event(self, event: Event) -> None:
         """Take an event of the platform, and pass it on to the commands that wait for an operation."""
         for listener in list(self._listeners):
             listener(event)
@@ -60,7 +60,7 @@ class Operations:
         events: asyncio.Queue[Event] = asyncio.Queue()
         self._listeners.add(events.put_nowait)
         self._keep(self._run(work, events))
-        return self._until_over(events)
+        return self._yield_until_over(events)
 
     def watch(self, state: Callable[[], Event]) -> AsyncGenerator[Event, None]:
         """Return the *state* of the platform once a second, and each event at once, without an end.
@@ -72,9 +72,9 @@ class Operations:
         """
         if self._watchers >= _MAX_WATCHERS:
             raise UsageError(f"{_MAX_WATCHERS} others watch already", hint="end one of them")
-        return self._watched(state)
+        return self._yield_states_and_events(state)
 
-    async def _watched(self, state: Callable[[], Event]) -> AsyncGenerator[Event, None]:
+    async def _yield_states_and_events(self, state: Callable[[], Event]) -> AsyncGenerator[Event, None]:
         loop = asyncio.get_running_loop()
         events: asyncio.Queue[Event] = asyncio.Queue(_MAX_UNHEARD)
         number = 0
@@ -94,14 +94,14 @@ class Operations:
             while True:
                 left_s = due_s - loop.time()
                 if left_s <= 0 and events.empty():
-                    told = state()
+                    document = state()
                     due_s = (math.floor((loop.time() - _AFTER_S) / _LOOK_S) + 1) * _LOOK_S + _AFTER_S
-                    if sample is not None and told.get("sample") == sample and late < _MAX_LATE:
+                    if sample is not None and document.get("sample") == sample and late < _MAX_LATE:
                         late += 1
                         due_s = min(due_s, loop.time() + _SOONEST_S)
                     else:
-                        sample, late = told.get("sample"), 0
-                    yield {"state": told}
+                        sample, late = document.get("sample"), 0
+                    yield {"state": document}
                     continue
                 with contextlib.suppress(asyncio.TimeoutError):
                     yield await asyncio.wait_for(events.get(), max(left_s, 0.001))
@@ -121,7 +121,7 @@ class Operations:
             self._running = ""
             events.put_nowait(last)
 
-    async def _until_over(self, events: asyncio.Queue[Event]) -> AsyncGenerator[Event, None]:
+    async def _yield_until_over(self, events: asyncio.Queue[Event]) -> AsyncGenerator[Event, None]:
         try:
             while True:
                 event = await events.get()

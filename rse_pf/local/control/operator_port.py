@@ -10,7 +10,7 @@ from typing import Any, Protocol
 
 from rse_pf.errors import ConfigurationError, UsageError
 from rse_pf.local.control.control_port import METRICS_TYPE, serve_control_port
-from rse_pf.local.control.federation import federated
+from rse_pf.local.control.federation import federate_pages
 from rse_pf.local.control.operations import OVER, Operations
 from rse_pf.local.servers.backend_servers import BackendServer
 from rse_pf.local.servers.control_client import ControlPort
@@ -80,7 +80,7 @@ class OperatorPort:
         self._token = ""
         self._operations = Operations(keep)
         self._server: asyncio.Server | None = None
-        self.heard = self._operations.heard
+        self.take_event = self._operations.take_event
 
     @property
     def port(self) -> int:
@@ -98,9 +98,9 @@ class OperatorPort:
             "/drain": self._drain,
             "/roll": self._roll,
             "/move": self._move,
-            "/kill": functools.partial(self._at_once, self._platform.kill),
-            "/pause": functools.partial(self._at_once, self._platform.pause),
-            "/resume": functools.partial(self._at_once, self._platform.resume),
+            "/kill": functools.partial(self._act_at_once, self._platform.kill),
+            "/pause": functools.partial(self._act_at_once, self._platform.pause),
+            "/resume": functools.partial(self._act_at_once, self._platform.resume),
         }
         streams = {"/watch": self._watch}
         self._token = token
@@ -125,7 +125,7 @@ class OperatorPort:
     async def _metrics(self) -> tuple[str, bytes]:
         servers = list(self._platform.servers)
         pages = await asyncio.gather(*map(self._metrics_of, servers))
-        return METRICS_TYPE, federated(
+        return METRICS_TYPE, federate_pages(
             {server.name: page for server, page in zip(servers, pages, strict=True)}, self._disks()
         )
 
@@ -139,33 +139,37 @@ class OperatorPort:
 
     def _move(self, query: Mapping[str, str]) -> AsyncGenerator[Event, None]:
         name, robots = query.get("server", ""), _count(query.get("robots", ""))
-        found = next((server for server in self._platform.servers if server.name == name), None)
-        if found is None:
+        target_server = next((server for server in self._platform.servers if server.name == name), None)
+        if target_server is None:
             running = ", ".join(server.name for server in self._platform.servers) or "none"
             raise UsageError(f"no server named {name[:80]!r} takes robots", hint=f"these do: {running}")
-        port = ControlPort(found.control_port, self._token)
-        return self._operations.begin("move", lambda: self._asked_to_move(name, port, robots))
+        port = ControlPort(target_server.control_port, self._token)
+        return self._operations.begin("move", lambda: self._ask_to_move(name, port, robots))
 
-    async def _asked_to_move(self, name: str, port: ControlPort, robots: int) -> None:
+    async def _ask_to_move(self, name: str, port: ControlPort, robots: int) -> None:
         target = f"/move?robots={robots}&spread_s={_SPREAD_S:g}"
         reply = await port.ask_once(target, timeout_s=_ASK_S, method="POST")
-        told = {} if reply is None else reply.document()
-        if reply is None or reply.status >= 300 or told.get("under_way"):
+        answer = {} if reply is None else reply.document()
+        if reply is None or reply.status >= 300 or answer.get("under_way"):
             raise UsageError(
                 f"{name} lets no robot move now",
                 hint="its robots move already, or it drains; see rse-pf local status",
             )
-        self._emit("rebalance", server=name, robots=told["robots"], spread_s=told["spread_s"], reason="asked")
+        self._emit(
+            "rebalance", server=name, robots=answer["robots"], spread_s=answer["spread_s"], reason="asked"
+        )
 
-    def _at_once(self, act: Callable[[str], None], query: Mapping[str, str]) -> AsyncGenerator[Event, None]:
+    def _act_at_once(
+        self, act: Callable[[str], None], query: Mapping[str, str]
+    ) -> AsyncGenerator[Event, None]:
         act(query.get("server", ""))
-        return _over()
+        return _yield_over()
 
     def _watch(self, query: Mapping[str, str]) -> AsyncGenerator[Event, None]:
         return self._operations.watch(self._platform.status_document)
 
 
-async def _over() -> AsyncGenerator[Event, None]:
+async def _yield_over() -> AsyncGenerator[Event, None]:
     yield {"event": OVER}
 
 

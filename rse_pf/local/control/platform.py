@@ -125,8 +125,8 @@ class LocalPlatform:
         self.lan = LanListener(address=lan, folder=self.state) if lan else None
         self._lock = PlatformLock(self.state)
         self._audit = PlatformAudit(self.state)
-        self._state_file = LatestFile(state_file(self.state), on_problem=self._not_written)
-        self._targets_file = LatestFile(self.state / _TARGETS_FILE, on_problem=self._not_written)
+        self._state_file = LatestFile(state_file(self.state), on_problem=self._report_unwritten_state)
+        self._targets_file = LatestFile(self.state / _TARGETS_FILE, on_problem=self._report_unwritten_state)
         self._metrics_port = metrics_port
         self._key: SigningKey | None = None
         self.backend_servers = LocalBackendServers(
@@ -137,11 +137,12 @@ class LocalPlatform:
         )
         self.load_balancer = EnvoyLoadBalancer(
             settings, folder=self.state, port=self._wanted_port, dies_with_parent=not adoptable,
-            on_problem=self._not_written, lan=self.lan,
+            on_problem=self._report_unwritten_state, lan=self.lan,
         )  # fmt: skip
         self.data_servers = LocalDataServers(
             settings, folder=self.state, store=self._placement.store, dies_with_parent=not adoptable,
-            replaces=control.elastic, program=program, is_full=self._disks.is_full, emit=self._data_changed,
+            replaces=control.elastic, program=program, is_full=self._disks.is_full,
+            emit=self._report_data_change,
         )  # fmt: skip
         self._fleet = Fleet(
             self.backend_servers, self.load_balancer, settings,
@@ -191,13 +192,14 @@ class LocalPlatform:
         self._make_folder()
         self._lock.take(self.name)
         try:
-            left = self._leftovers()
-            if left is None:
+            previous = self._leftovers()
+            if previous is None:
                 host = self._wanted_address or self.settings.serving.host
                 check_listener(host, self._wanted_port, is_protected=self.lan is not None)
-            elif left.lan != self._wanted_address:
+            elif previous.lan != self._wanted_address:
                 raise ConfigurationError(
-                    f"servers of platform {self.name!r} still run, with {left.lan or 'loopback'} as address",
+                    f"servers of platform {self.name!r} still run, with "
+                    f"{previous.lan or 'loopback'} as address",
                     hint=f"end them with: rse-pf local stop --name {self.name}",
                 )
             if self.lan is not None:
@@ -208,7 +210,7 @@ class LocalPlatform:
             self._lock.release()
             raise
         try:
-            await self._start(left, began + self.settings.local.start_timeout_s)
+            await self._start(previous, began + self.settings.local.start_timeout_s)
         except BaseException:
             await self._end()
             raise
@@ -252,7 +254,7 @@ class LocalPlatform:
             }
             for member in self._fleet.members.values()
         ]
-        read = {each["name"]: each for each in ([] if sample is None else sample["servers"])}
+        read = {row["name"]: row for row in ([] if sample is None else sample["servers"])}
         return {
             "platform": self.name,
             "url": self.url,
@@ -262,7 +264,7 @@ class LocalPlatform:
                 "port": self.load_balancer.port,
                 "running": self.load_balancer.process.is_running(),
             },
-            "servers": [{**read.get(str(each["name"]), {}), **each} for each in servers],
+            "servers": [{**read.get(str(row["name"]), {}), **row} for row in servers],
             "data_servers": self.data_servers.document(),
             "disks": self._disks.document(),
             "sample": sample,
@@ -280,7 +282,7 @@ class LocalPlatform:
         """
         names = list(self._fleet.grow(n, reason))
         self._emit("grow", servers=n, names=names, reason=reason)
-        await self._until_healthy(names)
+        await self._wait_until_healthy(names)
         return names
 
     async def drain(self, name: str, reason: str = "asked") -> dict[str, Any]:
@@ -315,9 +317,9 @@ class LocalPlatform:
             ConfigurationError: The new one did not become healthy.
         """
         self._fleet.member(name)
-        new = self._fleet.put_in_place_of(name, reason)
+        new = self._fleet.launch_replacement(name, reason)
         self._emit("replace", servers=1, server=name, by=new, reason=reason)
-        await self._until_healthy([new])
+        await self._wait_until_healthy([new])
         return new
 
     async def roll(self) -> None:
@@ -338,7 +340,7 @@ class LocalPlatform:
                 await self.backend_servers.standby.wait_warm(self.settings.local.start_timeout_s)
                 names = list(self._fleet.grow(1, "rolling replacement", on_trial=True))
                 try:
-                    await self._until_healthy(names)
+                    await self._wait_until_healthy(names)
                 except ConfigurationError as error:
                     for name in names:
                         self._fleet.withdraw(name)
@@ -384,9 +386,9 @@ class LocalPlatform:
         for mark in () if server is None else server.worker_marks:
             send_signal(mark, number)
 
-    async def _until_healthy(self, names: Sequence[str]) -> None:
+    async def _wait_until_healthy(self, names: Sequence[str]) -> None:
         members = [self._fleet.members[name] for name in names if name in self._fleet.members]
-        await self._fleet.until_healthy(members, 2 * self.settings.local.start_timeout_s)
+        await self._fleet.wait_until_healthy(members, 2 * self.settings.local.start_timeout_s)
 
     # --- start -----------------------------------------------------------------------------------
 
@@ -416,26 +418,26 @@ class LocalPlatform:
             )
         return state
 
-    async def _start(self, left: PlatformState | None, end: float) -> None:
+    async def _start(self, previous: PlatformState | None, end: float) -> None:
         self._key = ensure_key(self.state, seed=secrets.token_bytes(32), key_id=secrets.token_hex(4))
         token = ensure_control_token(control_token_file(self.state), seed=secrets.token_bytes(32))
         replace_json(settings_file(self.state), self._placement.document(self.settings), indent=1)
         self._recording.begin()
         self._disks.prepare()
         self._control.start_checks()
-        if left is None:
+        if previous is None:
             await self._begin(end)
         else:
-            await run_together(self._adopt(left, end), self._adopt_data(left.data_server))
+            await run_together(self._adopt(previous, end), self._adopt_data(previous.data_server))
         self.url = robots_url(self.settings, self.port, self.lan)
-        await self._open_operator_port(token, 0 if left is None else left.status_port)
+        await self._open_operator_port(token, 0 if previous is None else previous.status_port)
         self._fleet.keep(self._audit.watch())
-        self._disks.on_space = self._control.look_again
+        self._disks.on_space = self._control.retry_replacements
         self._fleet.keep(self._disks.watch())
         self._fleet.keep(rotate_logs(self.state, _LOG_FILE_BYTES, self._fleet.members))
         if self.lan is not None:
             renewed = functools.partial(self._emit, "certificate-renewed")
-            self._fleet.keep(self.lan.keep_valid(self.name, renewed, self._not_written))
+            self._fleet.keep(self.lan.keep_valid(self.name, renewed, self._report_unwritten_state))
         self._control.start()
         self._write_state()
 
@@ -448,16 +450,16 @@ class LocalPlatform:
             *((self.data_servers.start(),) if self._has_data else ()),
         )
 
-    async def _adopt(self, left: PlatformState, end: float) -> None:
-        """Adopt the balancer and the servers of *left* that still run, and launch what is missing.
+    async def _adopt(self, previous: PlatformState, end: float) -> None:
+        """Adopt the balancer and the servers of *previous* that still run, and launch what is missing.
 
         Nothing that runs is killed or restarted, a server keeps its name, and the balancer keeps its port.
         Returns once one server gets robots.
         """
-        kept = left.load_balancer is not None and is_alive(left.load_balancer)
-        self.load_balancer.adopt(left.load_balancer if kept else None, port=left.port)
-        self._fleet.launched = left.launched
-        alive = [server for server in left.servers if is_alive(server.process)]
+        balancer_lives = previous.load_balancer is not None and is_alive(previous.load_balancer)
+        self.load_balancer.adopt(previous.load_balancer if balancer_lives else None, port=previous.port)
+        self._fleet.launched = previous.launched
+        alive = [server for server in previous.servers if is_alive(server.process)]
         members = []
         for server in alive:
             self.backend_servers.adopt(server.name, server.process)
@@ -468,15 +470,15 @@ class LocalPlatform:
         self._emit(
             "adopted",
             servers=list(digests),
-            balancer=kept,
-            settings_digest=left.settings_digest,
+            balancer=balancer_lives,
+            settings_digest=previous.settings_digest,
             digests=digests,
         )
-        if not kept:
+        if not balancer_lives:
             self.load_balancer.launch()
         await self.load_balancer.wait_live(end - time.monotonic())
         if not members:
-            members = [self._fleet.launch() for _ in left.servers] or [self._fleet.launch()]
+            members = [self._fleet.launch() for _ in previous.servers] or [self._fleet.launch()]
         for member in members:
             self._fleet.start(member)
         waiting = [asyncio.ensure_future(member.healthy.wait()) for member in members]
@@ -484,8 +486,8 @@ class LocalPlatform:
             left_s = max(end - time.monotonic(), 0.0)
             done, _ = await asyncio.wait(waiting, timeout=left_s, return_when=asyncio.FIRST_COMPLETED)
         finally:
-            for each in waiting:
-                each.cancel()
+            for wait in waiting:
+                wait.cancel()
         if not done:
             names = ", ".join(member.name for member in members)
             raise ConfigurationError(
@@ -501,16 +503,16 @@ class LocalPlatform:
         reply = await port.ask_once("/status", timeout_s=_ASK_S)
         return None if reply is None else str(reply.document().get("settings", "")) or None
 
-    async def _adopt_data(self, left: ServerState | None) -> None:
-        """Adopt the data server *left* if it runs; start a missing one, on its old port if that is free."""
-        if left is not None and left.port and is_alive(left.process):
-            self.data_servers.adopt(left.process, left.port)
+    async def _adopt_data(self, previous: ServerState | None) -> None:
+        """Adopt the data server *previous* if it runs, else start one, on the old port if that is free."""
+        if previous is not None and previous.port and is_alive(previous.process):
+            self.data_servers.adopt(previous.process, previous.port)
             self.load_balancer.set_data_targets([self.data_servers.target])
             return
-        if left is not None:
-            send_signal(left.process, signal.SIGKILL)  # it had not announced itself: its port is unknown
+        if previous is not None:
+            send_signal(previous.process, signal.SIGKILL)  # it had not announced itself: its port is unknown
         if self._has_data:
-            await self.data_servers.start(0 if left is None else left.port)
+            await self.data_servers.start(0 if previous is None else previous.port)
 
     async def _open_operator_port(self, token: str, earlier: int) -> None:
         """Listen on the wanted port, or on that of an earlier control plane, or on a free one."""
@@ -551,7 +553,7 @@ class LocalPlatform:
         self._state_file.write(state.to_json())
         self._targets_file.write(service_discovery(self.name, state.servers))
 
-    def _data_changed(self, event: str, **details: Any) -> None:
+    def _report_data_change(self, event: str, **details: Any) -> None:
         self._emit(event, **details)
         if event == "data-server-up":
             self.load_balancer.set_data_targets([self.data_servers.target])
@@ -587,7 +589,7 @@ class LocalPlatform:
             self._lock.release()
         self._emit("platform-gone")
 
-    def _not_written(self, problem: str) -> None:
+    def _report_unwritten_state(self, problem: str) -> None:
         self._emit("not-written", reason=problem)
 
     def _emit(self, event: str, **details: Any) -> None:
@@ -595,6 +597,6 @@ class LocalPlatform:
         self.events.append(entry)
         self._audit.record(entry)
         self._recording.event(entry)
-        self._operator_port.heard(entry)
+        self._operator_port.take_event(entry)
         if self._on_event is not None:
             self._on_event(entry)

@@ -68,8 +68,8 @@ class PlatformRecording:
 
     def event(self, event: Mapping[str, Any]) -> None:
         """Record one event of the platform."""
-        told = {name: value for name, value in event.items() if name not in (*_LEFT_OUT, "event")}
-        self._write(EVENTS_TOPIC, EVENT_SCHEMA, {"kind": event["event"], **told})
+        details = {name: value for name, value in event.items() if name not in (*_LEFT_OUT, "event")}
+        self._write(EVENTS_TOPIC, EVENT_SCHEMA, {"kind": event["event"], **details})
 
     def close(self) -> None:
         """Finish the file, and throw the key away."""

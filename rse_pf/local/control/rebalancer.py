@@ -47,14 +47,14 @@ class Rebalancer:
         before, self._before = self._before, dict(robots)
         if not self._quiet_until_s <= now_s <= self._until_s or not _steady(before, robots):
             return ()
-        found = tuple(
+        move_requests = tuple(
             MoveRequest(server=name, robots=count, spread_s=round(count / MOVES_PER_S, 3))
             for name, count in moves(robots).items()
             if count > 0
         )
-        if found:
-            self._quiet_until_s = now_s + max(order.spread_s for order in found) + _SETTLE_S
-        return found
+        if move_requests:
+            self._quiet_until_s = now_s + max(order.spread_s for order in move_requests) + _SETTLE_S
+        return move_requests
 
 
 def _steady(before: Mapping[str, int], now: Mapping[str, int]) -> bool:

@@ -154,13 +154,13 @@ class LocalScaleModifier:
             if young and at_s > now_s:
                 self._report_crash_loop(name, at_s - now_s)
             else:
-                self._put(name, "it ended", now_s)
+                self._launch_replacement(name, "it ended", now_s)
         for name in replace_now(standing.broken, healthy=standing.healthy, replacing=standing.replacing):
-            self._put(name, "it failed its health checks", now_s)
+            self._launch_replacement(name, "it failed its health checks", now_s)
 
-    def _put(self, name: str, reason: str, now_s: float) -> None:
+    def _launch_replacement(self, name: str, reason: str, now_s: float) -> None:
         self._starts.append(now_s)
-        new = self._servers.put_in_place_of(name, reason)
+        new = self._servers.launch_replacement(name, reason)
         self._emit("replace", servers=1, server=name, by=new, names=[name], reason=reason)
         self._last = Action(kind="replace", servers=1, names=(name,), reason=reason)
 

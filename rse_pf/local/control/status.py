@@ -73,10 +73,10 @@ def status_table(status: Mapping[str, Any]) -> str:
         ).rstrip()
         for row in rows
     ]
-    for told in status["data_servers"]:
-        lines.append(f"data server  {told['name']} is {told['state']} (pid {told['pid']})")
-    for what, told in (("load balancer", status["balancer"]), ("control plane", status["control_plane"])):
-        lines.append(f"{what}  {'runs' if told['running'] else 'does not run'} (pid {told['pid']})")
+    for process in status["data_servers"]:
+        lines.append(f"data server  {process['name']} is {process['state']} (pid {process['pid']})")
+    for role, process in (("load balancer", status["balancer"]), ("control plane", status["control_plane"])):
+        lines.append(f"{role}  {'runs' if process['running'] else 'does not run'} (pid {process['pid']})")
     lines += [disk["warning"] for disk in status.get("disks", ()) if disk["warning"]]
     lines.append(f"robots connect to  {status['url'] or 'nothing yet'}")
     if status["data_servers"] and status["url"]:
@@ -100,35 +100,35 @@ def _disks(folder: Path) -> list[DiskSpace]:
 
 
 async def _data_server(server: ServerState) -> dict[str, Any]:
-    known: dict[str, Any] = {"name": server.name, "pid": server.process.pid, "port": server.port}
+    row: dict[str, Any] = {"name": server.name, "pid": server.process.pid, "port": server.port}
     silent = _state_without_answer(server.process, server.port)
     if silent is not None:
-        return {**known, "state": silent}
+        return {**row, "state": silent}
     reply = await ControlPort(server.port).ask_once("/data/readyz", timeout_s=_TIMEOUT_S)
     if reply is None:
-        return {**known, "state": "silent"}
-    return {**known, "state": "ready" if reply.status == 200 else "not ready"}
+        return {**row, "state": "silent"}
+    return {**row, "state": "ready" if reply.status == 200 else "not ready"}
 
 
 async def _server(server: ServerState, token: str | None, sample_s: float) -> dict[str, Any]:
-    known: dict[str, Any] = {"name": server.name, "pid": server.process.pid}
+    row: dict[str, Any] = {"name": server.name, "pid": server.process.pid}
     silent = _state_without_answer(server.process, server.control_port)
     if silent is not None:
-        return {**known, "state": silent}
+        return {**row, "state": silent}
     port = ControlPort(server.control_port, token)
     try:
         first, began = await _ask(port), time.monotonic()
         await asyncio.sleep(sample_s)
         second, wall_s = await _ask(port), time.monotonic() - began
     except ConnectionError:
-        return {**known, "state": "silent"}
+        return {**row, "state": "silent"}
     finally:
         port.close()
     workers = len(second["workers"])
     emulated = second.get("emulated_cores", 0.0)
     cores = emulated * workers if emulated else workers
     return {
-        **known,
+        **row,
         **{key: second[key] for key in ("state", "robots", "queue", "queue_ms", "in_flight", "moved")},
         "requests": second["requests"],
         "requests_per_s": round((second["requests"] - first["requests"]) / wall_s, 1),
@@ -140,10 +140,10 @@ async def _server(server: ServerState, token: str | None, sample_s: float) -> di
 
 async def _ask(port: ControlPort) -> dict[str, Any]:
     reply = await port.ask("/status", timeout_s=_TIMEOUT_S)
-    told = reply.document()
-    if reply.status != 200 or "workers" not in told:
+    document = reply.document()
+    if reply.status != 200 or "workers" not in document:
         raise ConnectionError(f"the control port answers {reply.status}")
-    return told
+    return document
 
 
 def _state_without_answer(process: ProcessMark, port: int) -> str | None:

@@ -65,10 +65,10 @@ def install() -> None:
     choice = random.Random(os.getpid())
     for name in _READS + _WRITES:
         original = getattr(DirectoryStore, name)
-        setattr(DirectoryStore, name, _failing(original, share, choice, is_write=name in _WRITES))
+        setattr(DirectoryStore, name, _make_failing(original, share, choice, is_write=name in _WRITES))
 
 
-def _failing(
+def _make_failing(
     original: Callable[..., Any], share: Path, choice: random.Random, *, is_write: bool
 ) -> Callable[..., Any]:
     @functools.wraps(original)

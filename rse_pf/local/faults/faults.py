@@ -40,8 +40,8 @@ PERIOD_S = 0.04
 
 def find_server(state: PlatformState, name: str) -> ServerState:
     """Return the running server called *name*; raises UsageError, which names those that run."""
-    known = state.servers if state.data_server is None else (*state.servers, state.data_server)
-    alive = [server for server in known if is_alive(server.process)]
+    servers = state.servers if state.data_server is None else (*state.servers, state.data_server)
+    alive = [server for server in servers if is_alive(server.process)]
     for server in alive:
         if server.name == name:
             return server
@@ -62,14 +62,14 @@ def longest_pause_s(state: PlatformState, server: ServerState, health: HealthSet
 
 def tree(root: ProcessMark) -> list[ProcessMark]:
     """Return *root* and every process that it or its children started, parents first; empty if it is gone."""
-    found, seen = [root] if is_alive(root) else [], {root.pid}
-    for mark in found:  # grows while it is walked
+    marks, pids = [root] if is_alive(root) else [], {root.pid}
+    for mark in marks:  # grows while it is walked
         for pid in _children(mark.pid):
             child = mark_of(pid)
-            if child is not None and pid not in seen:
-                seen.add(pid)
-                found.append(child)
-    return found if is_alive(root) else []
+            if child is not None and pid not in pids:
+                pids.add(pid)
+                marks.append(child)
+    return marks if is_alive(root) else []
 
 
 def signal_tree(root: ProcessMark, number: signal.Signals) -> int:
@@ -77,12 +77,12 @@ def signal_tree(root: ProcessMark, number: signal.Signals) -> int:
 
     Looks again until nothing new was found: a process may start another one before it is stopped.
     """
-    told: set[ProcessMark] = set()
-    while new := [mark for mark in tree(root) if mark not in told]:
+    signalled: set[ProcessMark] = set()
+    while new := [mark for mark in tree(root) if mark not in signalled]:
         for mark in new:
             send_signal(mark, number)
-        told.update(new)
-    return len(told)
+        signalled.update(new)
+    return len(signalled)
 
 
 def kill_balancer(state: PlatformState) -> int:
@@ -175,9 +175,9 @@ def _wait_until_it_holds(child: subprocess.Popen[str]) -> None:
 
 
 def _children(pid: int) -> list[int]:
-    found: list[int] = []
+    pids: list[int] = []
     with contextlib.suppress(OSError):  # it may be gone by now
-        for each in Path(f"/proc/{pid}/task").glob("*/children"):
+        for path in Path(f"/proc/{pid}/task").glob("*/children"):
             with contextlib.suppress(OSError):
-                found += map(int, each.read_text(encoding="ascii").split())
-    return found
+                pids += map(int, path.read_text(encoding="ascii").split())
+    return pids

@@ -151,7 +151,7 @@ class EmulatedLink:
         self.port = self._listener.getsockname()[1]
         self.loop.add_reader(self._listener, self._accept)
         if self.profile.cut_every_s is not None:
-            self._tasks.add(self.loop.create_task(self._cut_now_and_then(self.profile.cut_every_s)))
+            self._tasks.add(self.loop.create_task(self._cut_periodically(self.profile.cut_every_s)))
         return self
 
     async def __aexit__(
@@ -192,21 +192,21 @@ class EmulatedLink:
         assert self._listener is not None
         while True:
             try:
-                made, address = self._listener.accept()
+                connection, address = self._listener.accept()
             except OSError:  # none waits, or the robot is gone already
                 return
             filler = self._fillers.pop(address, None)
             if filler is not None:
                 filler.close()
-                made.close()
+                connection.close()
                 continue
-            made.setblocking(False)
-            task = self.loop.create_task(self._serve(made))
+            connection.setblocking(False)
+            task = self.loop.create_task(self._serve(connection))
             self._tasks.add(task)
             task.add_done_callback(self._tasks.discard)
 
-    async def _serve(self, made: socket.socket) -> None:
-        await self.loop.connect_accepted_socket(lambda: _RobotEnd(self), made)
+    async def _serve(self, connection: socket.socket) -> None:
+        await self.loop.connect_accepted_socket(lambda: _RobotEnd(self), connection)
 
     def _stop_answering(self) -> None:
         """Let Linux drop the SYN of each new connection: the listener's queue is full."""
@@ -254,7 +254,7 @@ class EmulatedLink:
         """Call *act* with *arguments* at *when_s*, a time of the loop."""
         self.loop.call_at(when_s - _TIMER_GRAIN_S, act, *arguments)
 
-    async def _cut_now_and_then(self, every_s: float) -> None:
+    async def _cut_periodically(self, every_s: float) -> None:
         source = random.Random(f"{self._seed}/cuts")
         while True:
             await asyncio.sleep(source.expovariate(1.0 / every_s))
@@ -395,11 +395,11 @@ class _RobotEnd(_End):
             link.at(again, self._dial, accepted_s)
         elif self.out.source is not None and not self.out.source.is_closing():
             self.out.open(link.loop.time() + link.profile.down_s)
-            link.dial(lambda: _ServerEnd(self.out, self.back), self._refused)
+            link.dial(lambda: _ServerEnd(self.out, self.back), self._end_refused)
         else:
-            self._refused()
+            self._end_refused()
 
-    def _refused(self) -> None:
+    def _end_refused(self) -> None:
         self.back.send(None)
         self._link.ways.discard(self.out)
 
@@ -447,7 +447,7 @@ class LinkProcess:
 
     async def _ask(self, word: str | None) -> Any:
         assert self._pipe is not None, "entered with async with"
-        return await asyncio.to_thread(_talk, self._pipe, word)
+        return await asyncio.to_thread(_exchange, self._pipe, word)
 
     async def _end(self) -> None:
         assert self._pipe is not None
@@ -458,7 +458,7 @@ class LinkProcess:
             await asyncio.to_thread(self._process.join)
 
 
-def _talk(pipe: Connection, word: str | None) -> Any:
+def _exchange(pipe: Connection, word: str | None) -> Any:
     try:
         if word is not None:
             pipe.send(word)

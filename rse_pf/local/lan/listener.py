@@ -90,7 +90,7 @@ class LanListener:
 
     def _prepare(self, platform: str, now_s: float) -> bool:
         authority, is_new = self._authority(platform, now_s)
-        current = None if is_new else self._current()
+        current = None if is_new else self._read_certificate()
         if (
             current is not None
             and set(current.names) == set(self.names)
@@ -133,14 +133,15 @@ class LanListener:
             replace_file(authority_file(self.folder), authority.certificate)
         return authority, is_new
 
-    def _current(self) -> CertificateWithKey | None:
+    def _read_certificate(self) -> CertificateWithKey | None:
         """Return the certificate that Envoy has; None if there is none that can be used."""
         path = secret_file(self.folder)
         try:
             document = json.loads(read_private_file(path, "the certificate", hint=_HINT))
-            told = document["resources"][0]["tls_certificate"]
+            certificate = document["resources"][0]["tls_certificate"]
             return CertificateWithKey.from_pem(
-                told["certificate_chain"]["inline_string"] + told["private_key"]["inline_string"]
+                certificate["certificate_chain"]["inline_string"]
+                + certificate["private_key"]["inline_string"]
             )
         except (UsageError, ValueError, KeyError, IndexError, TypeError):
             return None

@@ -77,8 +77,8 @@ class LocalBackendServers:
     @property
     def marks(self) -> dict[str, ProcessMark]:
         """Every process that was launched and not yet ended by us, by server name."""
-        found = ((name, process.mark) for name, process in self._processes.items())
-        return {name: mark for name, mark in found if mark is not None}
+        marks = ((name, process.mark) for name, process in self._processes.items())
+        return {name: mark for name, mark in marks if mark is not None}
 
     def launch(self, name: str) -> None:
         """Start the process of server *name*, and return before it listens."""
@@ -108,13 +108,13 @@ class LocalBackendServers:
             ConfigurationError: It ended or was not ready in time; its last log line is in the message.
         """
         process = self._processes[name]
-        told = await process.wait_announced(timeout_s)
+        announcement = await process.wait_announced(timeout_s)
         mark = process.mark
         assert mark is not None
-        worker_marks = (mark_of(pid) for pid in told["workers"])
+        worker_marks = (mark_of(pid) for pid in announcement["workers"])
         return BackendServer(
-            name=name, pid=mark.pid, port=told["port"], control_port=told["control_port"],
-            workers=tuple(told["workers"]), log=process.log, mark=mark,
+            name=name, pid=mark.pid, port=announcement["port"], control_port=announcement["control_port"],
+            workers=tuple(announcement["workers"]), log=process.log, mark=mark,
             worker_marks=tuple(worker for worker in worker_marks if worker is not None),
         )  # fmt: skip
 

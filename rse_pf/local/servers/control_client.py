@@ -30,10 +30,10 @@ class ControlPortReply:
     def document(self) -> dict[str, Any]:
         """Return the body as a JSON object; empty when it is none."""
         try:
-            told = json.loads(self.body)
+            document = json.loads(self.body)
         except ValueError:
             return {}
-        return told if isinstance(told, dict) else {}
+        return document if isinstance(document, dict) else {}
 
 
 class ControlPort:

@@ -124,7 +124,7 @@ class LocalDataServers:
 
     async def is_ready(self) -> bool:
         """Return whether the service answers and its store does."""
-        return self.port > 0 and await self._answers(_READY)
+        return self.port > 0 and await self._is_answering(_READY)
 
     async def forget(self) -> None:
         """Stop watching, and leave the process running."""
@@ -170,7 +170,7 @@ class LocalDataServers:
         try:
             while not over.done():
                 await asyncio.wait({over}, timeout=DATA_CHECK_S)
-                failed = 0 if await self._answers(_ALIVE) else failed + 1
+                failed = 0 if await self._is_answering(_ALIVE) else failed + 1
                 if failed > self._settings.health.unhealthy_checks and self._replaces and not over.done():
                     self._emit("data-server-silent", name=self.process.name, pid=self.process.pid)
                     self.process.send(signal.SIGKILL)
@@ -178,7 +178,7 @@ class LocalDataServers:
         finally:
             over.cancel()
 
-    async def _answers(self, path: str) -> bool:
+    async def _is_answering(self, path: str) -> bool:
         reply = await ControlPort(self.port).ask_once(path, timeout_s=DATA_CHECK_S)
         return reply is not None and reply.status == 200
 
@@ -189,9 +189,9 @@ class LocalDataServers:
         run_as_batch(pid, NICENESS)
         self._emit("data-server-start", name=self.process.name, pid=pid)
         try:
-            told = await self.process.wait_announced(self._settings.local.start_timeout_s)
+            announcement = await self.process.wait_announced(self._settings.local.start_timeout_s)
         except BaseException:
             self.process.kill()
             raise
-        self.port = told["port"]
+        self.port = announcement["port"]
         self._emit("data-server-up", name=self.process.name, pid=pid, port=self.port)

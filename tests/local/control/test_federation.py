@@ -6,7 +6,7 @@ import json
 
 from prometheus_client.parser import text_string_to_metric_families
 
-from rse_pf.local.control.federation import federated, service_discovery
+from rse_pf.local.control.federation import federate_pages, service_discovery
 from rse_pf.local.processes import ProcessMark
 from rse_pf.local.state import ServerState
 
@@ -26,7 +26,7 @@ rse_pf_duration_seconds_sum{{service="pnp"}} 0.5
 
 
 def test_every_sample_names_its_server_and_every_family_stands_once() -> None:
-    text = federated({"server-1": PAGE.format(n=3), "server-2": PAGE.format(n=4)}).decode()
+    text = federate_pages({"server-1": PAGE.format(n=3), "server-2": PAGE.format(n=4)}).decode()
 
     families = {family.name: family for family in text_string_to_metric_families(text)}
     robots = {s.labels["server"]: s.value for s in families["rse_pf_robots"].samples}
@@ -45,7 +45,7 @@ def test_every_sample_names_its_server_and_every_family_stands_once() -> None:
 
 
 def test_a_silent_server_is_down_and_has_no_other_sample() -> None:
-    text = federated({"server-1": PAGE.format(n=3), "server-2": None}).decode()
+    text = federate_pages({"server-1": PAGE.format(n=3), "server-2": None}).decode()
 
     assert 'rse_pf_server_up{server="server-1"} 1.0' in text
     assert 'rse_pf_server_up{server="server-2"} 0.0' in text
@@ -67,7 +67,7 @@ def test_the_file_for_discovery_lists_the_servers_that_are_ready() -> None:
 def test_the_space_on_each_disk_is_on_the_page() -> None:
     disk = {"folder": "/var/lib/rse-pf", "free_bytes": 4096, "total_bytes": 8192}
 
-    text = federated({}, [disk]).decode()
+    text = federate_pages({}, [disk]).decode()
 
     assert 'rse_pf_disk_free_bytes{folder="/var/lib/rse-pf"} 4096.0' in text
     assert 'rse_pf_disk_total_bytes{folder="/var/lib/rse-pf"} 8192.0' in text

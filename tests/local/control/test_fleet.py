@@ -139,7 +139,7 @@ def test_a_server_that_ends_unasked_is_dead_until_it_is_replaced() -> None:
         assert (standing.servers, standing.healthy, dict(standing.dead)) == (2, 1, {"server-1": True})
         assert world.balancer.targets[-1] == ["server-2"]
 
-        assert world.fleet.put_in_place_of("server-1", "it ended") == "server-3"
+        assert world.fleet.launch_replacement("server-1", "it ended") == "server-3"
 
         assert world.fleet.standing(0.0).servers == 2
         assert world.fleet.dead == {}
@@ -150,11 +150,11 @@ def test_a_server_that_ends_unasked_is_dead_until_it_is_replaced() -> None:
 def test_a_living_broken_server_leaves_the_targets_before_it_is_killed() -> None:
     async def story(world: World) -> None:
         first, _ = await world.up(2)
-        world.fleet.put_in_place_of(first.name, "it failed its health checks")
+        world.fleet.launch_replacement(first.name, "it failed its health checks")
         assert world.servers.signals == [("server-1", signal.SIGKILL)]
         assert world.balancer.targets[-1] == ["server-2"]
         assert world.fleet.standing(0.0).replacing == 1
-        await world.fleet.until_healthy([world.fleet.members["server-3"]], SOON_S)
+        await world.fleet.wait_until_healthy([world.fleet.members["server-3"]], SOON_S)
         await first.over.wait()
         assert world.fleet.standing(0.0).replacing == 0
 
@@ -164,10 +164,10 @@ def test_a_living_broken_server_leaves_the_targets_before_it_is_killed() -> None
 def test_who_leaves_in_order_is_replaced_but_not_killed() -> None:
     async def story(world: World) -> None:
         first, _ = await world.up(2)
-        world.fleet.leaves_by_itself(first)
-        world.fleet.leaves_by_itself(first)
+        world.fleet.note_own_drain(first)
+        world.fleet.note_own_drain(first)
         assert world.fleet.dead == {"server-1": False}
-        world.fleet.put_in_place_of(first.name, "it ended")
+        world.fleet.launch_replacement(first.name, "it ended")
         assert world.servers.signals == []
         assert [each["event"] for each in world.events].count("drain-start") == 1
 
@@ -204,7 +204,7 @@ def test_a_wait_for_a_server_that_ends_does_not_last() -> None:
         world.servers.broken.add("server-1")
         (name,) = world.fleet.grow(1, "asked")
         with pytest.raises(ConfigurationError, match="server-1 did not become healthy"):
-            await world.fleet.until_healthy([world.fleet.members[name]], SOON_S)
+            await world.fleet.wait_until_healthy([world.fleet.members[name]], SOON_S)
 
     play(story)
 

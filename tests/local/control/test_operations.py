@@ -33,7 +33,7 @@ def test_the_events_of_the_platform_are_told_until_it_is_over() -> None:
         operations = Operations(Kept())
 
         async def work() -> None:
-            operations.heard({"event": "drain-start", "server": "server-1"})
+            operations.take_event({"event": "drain-start", "server": "server-1"})
 
         return await asyncio.wait_for(collected(operations.begin("drain", work)), SOON_S)
 

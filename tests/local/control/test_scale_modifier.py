@@ -41,7 +41,7 @@ class FakeServers:
         self.asked.append(("shrink",))
         return "server-1" if self.now.healthy > 1 else None
 
-    def put_in_place_of(self, name: str, reason: str) -> str:
+    def launch_replacement(self, name: str, reason: str) -> str:
         self.asked.append(("replace", name))
         return self._name()
 
