@@ -111,20 +111,20 @@ class Answering:
         try:
             headers, body = _read(event)
             kind, _, token = headers.get("authorization", "").partition(" ")
-            who = verify_token(
+            claims = verify_token(
                 token.strip() if kind.lower() == "bearer" else "",
                 keys=self._keys.at(arrived), now=now_s, settings=self._settings.auth,
             )  # fmt: skip
             codec = self._codec(headers.get("content-type", ""))
         except RsePfError as error:
-            return _rejected(error)
+            return _error_answer(error)
         try:
-            if not scopes_allow(who.scopes, _RIGHT):
-                raise _forbidden(_RIGHT)
-            self._budget.take(who.robot, now_s)
-            data = self._decoded(body)
+            if not scopes_allow(claims.scopes, _RIGHT):
+                raise _forbidden_error(_RIGHT)
+            self._budget.take(claims.robot, now_s)
+            data = self._decode(body)
         except RsePfError as error:
-            return self._encoded(codec, failure_of(error, server=_SERVER))
+            return self._encode(codec, failure_of(error, server=_SERVER))
         try:
             message = codec.decode_from_robot(data)
             if not isinstance(message, Command):
@@ -133,23 +133,23 @@ class Answering:
                 )
         except RsePfError as error:
             failure = failure_of(error, server=_SERVER)
-            return self._encoded(codec, structs.replace(failure, id=undecodable_id(codec, data)))
+            return self._encode(codec, structs.replace(failure, id=undecodable_id(codec, data)))
         allowed_ms = self._settings.session.answer_timeout_s * 1e3
         allowed_ms = min(left_ms, allowed_ms if message.deadline_ms is None else message.deadline_ms)
         if (clock() - arrived) * 1e3 >= allowed_ms:
-            return self._encoded(codec, self._late(message))
-        if not scopes_allow(who.scopes, f"services:{message.service}"):
-            forbidden = _forbidden(f"services:{message.service}")
-            return self._encoded(codec, failure_of(forbidden, message, server=_SERVER))
+            return self._encode(codec, self._deadline_failure(message))
+        if not scopes_allow(claims.scopes, f"services:{message.service}"):
+            forbidden = _forbidden_error(f"services:{message.service}")
+            return self._encode(codec, failure_of(forbidden, message, server=_SERVER))
         answer = dispatch(self._registry, message, clock, server=_SERVER)
         if (clock() - arrived) * 1e3 > allowed_ms:
-            answer = self._late(message)
+            answer = self._deadline_failure(message)
         self._log(
-            event="command", robot=str(who.robot), service=message.service, id=message.id,
+            event="command", robot=str(claims.robot), service=message.service, id=message.id,
             trace=message.trace, code=answer.code if isinstance(answer, Failure) else "ok",
             took_ms=round((clock() - arrived) * 1e3, 3),
         )  # fmt: skip
-        return self._encoded(codec, answer)
+        return self._encode(codec, answer)
 
     def _codec(self, content_type: str) -> Codec:
         subprotocol = content_type.partition(";")[0].strip().removeprefix("application/")
@@ -161,7 +161,7 @@ class Answering:
             )
         return self._codecs[name]
 
-    def _decoded(self, body: str | bytes) -> bytes:
+    def _decode(self, body: str | bytes) -> bytes:
         """Return the message of a body; a ``str`` is base64 that is judged by its length first."""
         if isinstance(body, bytes):
             return body
@@ -174,12 +174,12 @@ class Answering:
             raise BadMessage("the body is not base64", hint="send the bytes of one message") from error
 
     @staticmethod
-    def _late(command: Command) -> Any:
+    def _deadline_failure(command: Command) -> Any:
         error = Expired("the deadline passed before the answer was ready", hint="set a longer deadline_s")
         return failure_of(error, command, server=_SERVER)
 
     @staticmethod
-    def _encoded(codec: Codec, message: Any) -> LambdaAnswer:
+    def _encode(codec: Codec, message: Any) -> LambdaAnswer:
         return LambdaAnswer(
             status=200, content_type=f"application/{SUBPROTOCOLS[codec.name]}", body=codec.encode(message)
         )
@@ -189,11 +189,11 @@ def _to_stderr(**fields: Any) -> None:
     sys.stderr.write(json.dumps(fields) + "\n")
 
 
-def _forbidden(right: str) -> Forbidden:
+def _forbidden_error(right: str) -> Forbidden:
     return Forbidden(f"this token does not hold the scope {right}", hint="issue one that does")
 
 
-def _rejected(error: RsePfError) -> LambdaAnswer:
+def _error_answer(error: RsePfError) -> LambdaAnswer:
     body = {"code": error.code, "message": error.message, "hint": error.hint}
     status = 401 if isinstance(error, Unauthorized) else 400
     return LambdaAnswer(status=status, content_type="application/json", body=json.dumps(body).encode())
@@ -206,16 +206,16 @@ def _read(event: object) -> tuple[dict[str, str], str | bytes]:
         BadMessage: *event* is not one of a Function URL.
     """
     if not isinstance(event, Mapping):
-        raise _no_event("it is not an object")
+        raise _bad_event("it is not an object")
     headers, body = _headers(event), event.get("body") or ""
     if not isinstance(body, str):
-        raise _no_event("its body is not a text")
+        raise _bad_event("its body is not a text")
     if event.get("isBase64Encoded"):
         return headers, body
     try:
         return headers, body.encode()
     except UnicodeEncodeError as error:
-        raise _no_event("its body is not UTF-8") from error
+        raise _bad_event("its body is not UTF-8") from error
 
 
 def _headers(event: Mapping[Any, Any]) -> dict[str, str]:
@@ -223,22 +223,22 @@ def _headers(event: Mapping[Any, Any]) -> dict[str, str]:
     lists = event.get("multiValueHeaders")
     headers = lists or event.get("headers") or {}
     if not isinstance(headers, Mapping) or len(headers) > _MAX_HEADERS:
-        raise _no_event(f"its headers are not an object of at most {_MAX_HEADERS} texts")
+        raise _bad_event(f"its headers are not an object of at most {_MAX_HEADERS} texts")
     lowered: dict[str, str] = {}
     for name, value in headers.items():
         if lists and isinstance(value, list) and len(value) == 1:
             (value,) = value
         if not isinstance(name, str) or not (isinstance(value, str) or (lists and isinstance(value, list))):
-            raise _no_event("a header is not a text")
+            raise _bad_event("a header is not a text")
         if name.lower() in lowered or not isinstance(value, str):
             if name.lower() in _READ:
-                raise _no_event(f"there is more than one {name.lower()}")
+                raise _bad_event(f"there is more than one {name.lower()}")
             continue
         lowered[name.lower()] = value
     return lowered
 
 
-def _no_event(problem: str) -> BadMessage:
+def _bad_event(problem: str) -> BadMessage:
     return BadMessage(
         f"this is not an event of a load balancer or a Function URL: {problem}",
         hint="call the function by the address of the platform",

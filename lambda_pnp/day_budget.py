@@ -71,11 +71,11 @@ class DayBudget:
             self._robots.clear()
         rest_ms = (_DAY_S - now_s % _DAY_S) * 1e3
         if self._robots[robot] >= self._settings.robot_commands_per_day:
-            raise _spent("of this robot", self._settings.robot_commands_per_day, rest_ms)
+            raise _quota_error("of this robot", self._settings.robot_commands_per_day, rest_ms)
         if self._lease < 1:
             self._renew(now_s)
         if self._is_spent:
-            raise _spent("of all robots", self._settings.commands_per_day, rest_ms)
+            raise _quota_error("of all robots", self._settings.commands_per_day, rest_ms)
         self._lease -= 1
         self._robots[robot] += 1
 
@@ -83,14 +83,14 @@ class DayBudget:
         if self._is_spent:
             return
         if now_s < self._next_claim_s:
-            raise _unknown(self._next_claim_s - now_s)
-        wanted = min(self._wanted, max(1, self._settings.commands_per_day // _LEASES))
+            raise _unknown_error(self._next_claim_s - now_s)
+        requested = min(self._wanted, max(1, self._settings.commands_per_day // _LEASES))
         try:
-            self._lease = self._claim(self._day, wanted, self._settings.commands_per_day)
+            self._lease = self._claim(self._day, requested, self._settings.commands_per_day)
         except (OSError, RsePfError) as error:
             self._next_claim_s = now_s + _PAUSE_S
-            raise _unknown(_PAUSE_S) from error
-        self._wanted = 2 * wanted
+            raise _unknown_error(_PAUSE_S) from error
+        self._wanted = 2 * requested
         self._is_spent = self._lease < 1
 
 
@@ -120,19 +120,19 @@ def claim_in_bucket(
     Raises:
         OSError: The bucket cannot be asked, or others keep changing the object.
     """
-    send = send or _sent
+    send = send or _send
     for number in range(_TRIES):
         if number:
             sleep(_WAIT_S * number * random())
         status, etag, body = send(signed_request(environment, now(), name=BUDGET_NAME))
         if status != 200 and status not in _NO_OBJECT:
             raise OSError(f"S3 answers {status}")
-        granted = _granted(body, day) if status == 200 else 0
+        granted = _read_granted(body, day) if status == 200 else 0
         grant = min(wanted, most - granted)
         if grant < 1:
             return 0
-        told = json.dumps({"day": day, "granted": granted + grant}).encode()
-        put = signed_request(environment, now(), name=BUDGET_NAME, body=told)
+        counted = json.dumps({"day": day, "granted": granted + grant}).encode()
+        put = signed_request(environment, now(), name=BUDGET_NAME, body=counted)
         put.add_header(*(("If-Match", etag) if status == 200 else ("If-None-Match", "*")))
         status, _, _ = send(put)
         if status == 200:
@@ -142,19 +142,19 @@ def claim_in_bucket(
     raise OSError("others keep changing the budget")
 
 
-def _granted(body: bytes, day: str) -> int:
+def _read_granted(body: bytes, day: str) -> int:
     """Return what was granted of *day*; an object of an earlier day counts as none."""
     try:
-        told = json.loads(body)
-        known, granted = str(told["day"]), int(told["granted"])
+        record = json.loads(body)
+        recorded_day, granted = str(record["day"]), int(record["granted"])
     except (ValueError, KeyError, TypeError) as error:
         raise OSError("the budget in the bucket is damaged") from error
-    if known > day:
+    if recorded_day > day:
         raise OSError("the budget in the bucket is of a later day")
-    return granted if known == day else 0
+    return granted if recorded_day == day else 0
 
 
-def _sent(request: urllib.request.Request) -> tuple[int, str, bytes]:
+def _send(request: urllib.request.Request) -> tuple[int, str, bytes]:
     try:
         with urllib.request.urlopen(request, timeout=_TIMEOUT_S) as answer:
             return answer.status, answer.headers.get("ETag", ""), answer.read(_MAX_BYTES)
@@ -163,7 +163,7 @@ def _sent(request: urllib.request.Request) -> tuple[int, str, bytes]:
             return error.code, "", b""
 
 
-def _spent(whose: str, commands: int, rest_ms: float) -> QuotaExceeded:
+def _quota_error(whose: str, commands: int, rest_ms: float) -> QuotaExceeded:
     return QuotaExceeded(
         f"the {commands} burst commands {whose} are spent for today",
         hint="ask a server, or compute on the robot",
@@ -171,7 +171,7 @@ def _spent(whose: str, commands: int, rest_ms: float) -> QuotaExceeded:
     )
 
 
-def _unknown(after_s: float) -> Busy:
+def _unknown_error(after_s: float) -> Busy:
     return Busy(
         "the budget of the burst function cannot be read", hint="try later", retry_after_ms=after_s * 1e3
     )

@@ -25,7 +25,7 @@ def handler(event: Mapping[str, Any], context: Any) -> dict[str, Any]:
         _ANSWERING.append(load_answering())
     init_ms = (time.monotonic() - _IMPORTED_S) * 1e3 if cold else 0.0
     left_ms = float(context.get_remaining_time_in_millis())
-    answered: LambdaAnswer = _ANSWERING[0].answer(
+    answer: LambdaAnswer = _ANSWERING[0].answer(
         event, now_s=time.time(), left_ms=left_ms, clock=time.monotonic
     )
-    return answered.as_http(event, init_ms=init_ms, cold=cold)
+    return answer.as_http(event, init_ms=init_ms, cold=cold)

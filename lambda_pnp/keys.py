@@ -68,13 +68,13 @@ class KeyCache:
         if self._read_control is None:
             return kind()
         try:
-            found = from_json(self._read_control(name), kind)
+            control_list = from_json(self._read_control(name), kind)
         except NotFound:
             if name in self._found:
                 raise
             return kind()
         self._found.add(name)
-        return found
+        return control_list
 
 
 def read_object(environment: Mapping[str, str], now: datetime, control: str = "") -> str:
@@ -122,7 +122,7 @@ def signed_request(
     if environment.get("AWS_SESSION_TOKEN"):
         headers["x-amz-security-token"] = environment["AWS_SESSION_TOKEN"]
     names = ";".join(sorted(headers))
-    lines = "".join(f"{each}:{headers[each]}\n" for each in sorted(headers))
+    lines = "".join(f"{name}:{headers[name]}\n" for name in sorted(headers))
     request = "\n".join([method, f"/{name}", "", lines, names, digest])
     scope = f"{stamp[:8]}/{region}/s3/aws4_request"
     text = "\n".join(["AWS4-HMAC-SHA256", stamp, scope, hashlib.sha256(request.encode()).hexdigest()])

@@ -128,11 +128,11 @@ class LocalFront:
         body = await asyncio.wait_for(reader.readexactly(int(size)), _TIMEOUT_S)
         assert self._silent is not None
         self._silent.leave(writer)
-        status, told, answer = await self._judged(first, headers, body)
-        await _write(writer, status, told, answer)
+        status, response_headers, answer = await self._answer_request(first, headers, body)
+        await _write(writer, status, response_headers, answer)
         return True
 
-    async def _judged(
+    async def _answer_request(
         self, first: str, headers: dict[str, list[str]], body: bytes
     ) -> tuple[int, dict[str, str], bytes]:
         method, _, rest = first.partition(" ")
@@ -161,8 +161,8 @@ class LocalFront:
         used, answer = await loop.run_in_executor(self._threads, self._run, execution, event)
         self._idle.append(used)
         self.answered += 1
-        told = {name: str(values[0]) for name, values in answer["multiValueHeaders"].items()}
-        return int(answer["statusCode"]), told, base64.b64decode(answer["body"])
+        response_headers = {name: str(values[0]) for name, values in answer["multiValueHeaders"].items()}
+        return int(answer["statusCode"]), response_headers, base64.b64decode(answer["body"])
 
     def _run(self, execution: Answering | None, event: dict[str, Any]) -> tuple[Answering, dict[str, Any]]:
         began, is_cold = time.monotonic(), execution is None
@@ -175,8 +175,8 @@ class LocalFront:
 
 
 async def _write(writer: asyncio.StreamWriter, status: int, headers: dict[str, str], body: bytes) -> None:
-    told = "".join(f"{name}: {value}\r\n" for name, value in headers.items())
-    head = f"HTTP/1.1 {status} {_REASONS.get(status, 'Status')}\r\n{told}content-length: {len(body)}\r\n\r\n"
+    lines = "".join(f"{name}: {value}\r\n" for name, value in headers.items())
+    head = f"HTTP/1.1 {status} {_REASONS.get(status, 'Status')}\r\n{lines}content-length: {len(body)}\r\n\r\n"
     writer.write(head.encode() + body)
     await writer.drain()
 

@@ -67,17 +67,17 @@ def _check_fresh(packages: Path) -> None:
     built = {
         file.relative_to(packages).as_posix(): _digest(file) for file in (packages / _OURS).rglob("*.py")
     }
-    built.update(_listed(packages / ENVIRONMENT_FILE))
+    built.update(_read_digests(packages / ENVIRONMENT_FILE))
     if not built:
         return
     sources = {file.relative_to(_ROOT).as_posix(): file for file in (_ROOT / _OURS).rglob("*.py")}
-    if built.keys() != sources.keys() or any(_digest(sources[each]) != built[each] for each in built):
+    if built.keys() != sources.keys() or any(_digest(sources[name]) != built[name] for name in built):
         raise ConfigurationError(
             f"the packages in {packages} were built of other sources", hint="run make assets"
         )
 
 
-def _listed(file: Path) -> dict[str, str]:
+def _read_digests(file: Path) -> dict[str, str]:
     """Return the digests of our sources that the builder wrote into *file*; none without such a file."""
     if not file.exists():
         return {}

@@ -92,7 +92,7 @@ class BackendServers(Construct):
         )  # fmt: skip
         Capacity(self, "Capacity", group=self.group, settings=settings)
         resource = cast("autoscaling.CfnAutoScalingGroup", self.group.node.default_child)
-        resource.target_group_arns = [each.target_group_arn for each in targets]
+        resource.target_group_arns = [target.target_group_arn for target in targets]
         # A replacement is ready before an unhealthy server ends, as in an upgrade.
         resource.instance_maintenance_policy = (
             autoscaling.CfnAutoScalingGroup.InstanceMaintenancePolicyProperty(

@@ -21,7 +21,7 @@ from stacks.load_balancer import LoadBalancer
 from stacks.network_stack import CIDR, ZONES
 from stacks.permissions import allow
 from stacks.scale_modifier import ScaleModifier
-from stacks.values import imported_bucket, imported_group, imported_network, provide
+from stacks.values import import_bucket, import_group, import_network, provide
 
 __all__ = ["TRUSTED", "BackendStack"]
 
@@ -49,8 +49,8 @@ class BackendStack(cdk.Stack):
     ) -> None:
         super().__init__(scope, construct_id, env=env, synthesizer=synthesizer)
         names = ResourceNames(settings.cloud.name)
-        vpc = imported_network(self, names, zones=ZONES, server_zones=zone_count(settings), cidr=CIDR)
-        artifacts = imported_bucket(self, names, "artifacts")
+        vpc = import_network(self, names, zones=ZONES, server_zones=zone_count(settings), cidr=CIDR)
+        artifacts = import_bucket(self, names, "artifacts")
         self.topic = sns.Topic(self, "Events", enforce_ssl=True)
         # A topic with a policy of its own forgets the one that lets the account's alarms in.
         self.topic.add_to_resource_policy(
@@ -64,18 +64,18 @@ class BackendStack(cdk.Stack):
             )
         )  # fmt: skip
         self.balancer = LoadBalancer(
-            self, "LoadBalancer", vpc=vpc, group=imported_group(self, names, "balancer"), settings=settings,
-            logs=imported_bucket(self, names, "access-logs"),
+            self, "LoadBalancer", vpc=vpc, group=import_group(self, names, "balancer"), settings=settings,
+            logs=import_bucket(self, names, "access-logs"),
         )  # fmt: skip
         with tempfile.TemporaryDirectory() as folder:
             path = staged(assets, SERVERS, settings, Path(folder))
             package, sums = s3_assets.Asset(self, "Package", path=str(path)), sums_digest(path)
         self.servers = BackendServers(
-            self, "Servers", vpc=vpc, firewall_group=imported_group(self, names, "servers"), package=package,
+            self, "Servers", vpc=vpc, firewall_group=import_group(self, names, "servers"), package=package,
             package_sums=sums, topic=self.topic, targets=list(self.balancer.targets.values()),
             settings=settings, artifacts=artifacts,
-            maps=imported_bucket(self, names, "maps") if settings.data.enabled else None,
-            audit_logs=imported_bucket(self, names, "audit-logs"), key_set=KEYS_NAME,
+            maps=import_bucket(self, names, "maps") if settings.data.enabled else None,
+            audit_logs=import_bucket(self, names, "audit-logs"), key_set=KEYS_NAME,
         )  # fmt: skip
         allow(
             self.servers.role, ["s3:GetObject"], [artifacts.arn_for_objects(name) for name in TRUSTED],
@@ -91,7 +91,7 @@ class BackendStack(cdk.Stack):
         if settings.cloud.job_servers:
             groups.append(names.job_group)
             JobServers(
-                self, "JobServers", vpc=vpc, firewall_group=imported_group(self, names, "jobs"),
+                self, "JobServers", vpc=vpc, firewall_group=import_group(self, names, "jobs"),
                 role=self.servers.role, facts=self.servers.facts, topic=self.topic, settings=settings,
             )  # fmt: skip
         # By name, not by reference: a reference would make a cycle with the group.

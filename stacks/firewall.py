@@ -31,13 +31,13 @@ _LOOK_UP = "aws ec2 describe-managed-prefix-lists --filters Name=prefix-list-nam
 def s3_prefix_list(settings: PlatformSettings) -> str:
     """Return the prefix list of S3 in ``cloud.region``; raises ConfigurationError for an unknown region."""
     region = settings.cloud.region
-    found = settings.cloud.s3_prefix_list or S3_PREFIX_LISTS.get(region)
-    if not found:
+    prefix_list = settings.cloud.s3_prefix_list or S3_PREFIX_LISTS.get(region)
+    if not prefix_list:
         raise ConfigurationError(
             f"no S3 prefix list is known for cloud.region = {region!r}",
             hint=f"set cloud.s3_prefix_list to the id that this prints: {_LOOK_UP.format(region)}",
         )
-    return found
+    return prefix_list
 
 
 def front_port(settings: PlatformSettings) -> int:

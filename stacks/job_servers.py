@@ -57,13 +57,13 @@ class JobServers(Construct):
         """
         super().__init__(scope, construct_id)
         cloud, names = settings.cloud, ResourceNames(settings.cloud.name)
-        told = {
+        job_facts = {
             **facts, "role": "jobs", "group": names.job_group, "hook": names.job_drain_hook,
             "launch": names.job_launch_hook,
         }  # fmt: skip
         kinds = [ec2.InstanceType(name) for name in cloud.job_instance_types.split()]
         template = launch_template(
-            self, role=role, firewall_group=firewall_group, settings=settings, facts=told, kind=kinds[0]
+            self, role=role, firewall_group=firewall_group, settings=settings, facts=job_facts, kind=kinds[0]
         )
         self.group = autoscaling.AutoScalingGroup(
             self, "Group", auto_scaling_group_name=names.job_group, vpc=vpc, min_capacity=0,

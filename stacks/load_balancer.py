@@ -70,14 +70,14 @@ class LoadBalancer(Construct):
         self, name: str, vpc: ec2.IVpc, port: int, settings: PlatformSettings
     ) -> elbv2.ApplicationTargetGroup:
         health = settings.health
-        asked, path = cloud_checks(settings)[name.lower()]
+        check_port, path = cloud_checks(settings)[name.lower()]
         return elbv2.ApplicationTargetGroup(
             self, name, vpc=vpc, port=port, protocol=elbv2.ApplicationProtocol.HTTP,
             target_type=elbv2.TargetType.INSTANCE,
             load_balancing_algorithm_type=elbv2.TargetGroupLoadBalancingAlgorithmType.LEAST_OUTSTANDING_REQUESTS,
             deregistration_delay=cdk.Duration.seconds(_DEREGISTRATION_S),
             health_check=elbv2.HealthCheck(
-                path=path, port=str(asked), healthy_http_codes="200",
+                path=path, port=str(check_port), healthy_http_codes="200",
                 interval=cdk.Duration.seconds(CLOUD_INTERVAL_S),
                 timeout=cdk.Duration.seconds(CLOUD_TIMEOUT_S),
                 healthy_threshold_count=HEALTHY_CHECKS,

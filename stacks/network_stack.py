@@ -127,16 +127,16 @@ class NetworkStack(cdk.Stack):
 
     def _control_list(self, name: str, kind: ec2.SubnetType) -> ec2.NetworkAcl:
         where = ec2.SubnetSelection(subnet_type=kind)
-        made = ec2.NetworkAcl(self, name, vpc=self.vpc, subnet_selection=where)
-        acknowledge(made, _WHY_LISTS, "VPC3")
-        return made
+        control_list = ec2.NetworkAcl(self, name, vpc=self.vpc, subnet_selection=where)
+        acknowledge(control_list, _WHY_LISTS, "VPC3")
+        return control_list
 
     def _entry(
         self, of: ec2.NetworkAcl, name: str, number: int, cidr: Any, traffic: ec2.AclTraffic, *, inward: bool
     ) -> None:
         direction = ec2.TrafficDirection.INGRESS if inward else ec2.TrafficDirection.EGRESS
-        made = of.add_entry(name, cidr=cidr, rule_number=number, traffic=traffic, direction=direction)
-        acknowledge(made, _WHY_LISTS, "VPC3")
+        entry = of.add_entry(name, cidr=cidr, rule_number=number, traffic=traffic, direction=direction)
+        acknowledge(entry, _WHY_LISTS, "VPC3")
 
     def _flow_logs(self, settings: PlatformSettings) -> None:
         group = logs.LogGroup(self, "FlowLog", removal_policy=cdk.RemovalPolicy.DESTROY)

@@ -49,7 +49,7 @@ class Replication(Construct):
         """Copy new objects below *prefixes*, and their deletions, to the buckets *replicas*."""
         if not replicas:
             return
-        targets = [f"arn:{cdk.Aws.PARTITION}:s3:::{each}" for each in replicas]
+        targets = [f"arn:{cdk.Aws.PARTITION}:s3:::{replica}" for replica in replicas]
         allow(
             self._role, ["s3:GetReplicationConfiguration", "s3:ListBucket"], [bucket.bucket_arn],
             used_by=_BY_S3,
@@ -57,12 +57,12 @@ class Replication(Construct):
         allow(
             self._role,
             ["s3:GetObjectVersionForReplication", "s3:GetObjectVersionAcl", "s3:GetObjectVersionTagging"],
-            [bucket.arn_for_objects(f"{each}*") for each in prefixes],
+            [bucket.arn_for_objects(f"{prefix}*") for prefix in prefixes],
             used_by=_BY_S3, why="the rule copies whatever lies below these prefixes",
         )  # fmt: skip
         allow(
             self._role, ["s3:ReplicateObject", "s3:ReplicateDelete", "s3:ReplicateTags"],
-            [f"{target}/{each}*" for target in targets for each in prefixes],
+            [f"{target}/{prefix}*" for target in targets for prefix in prefixes],
             used_by=_BY_S3, why="the rule copies whatever lies below these prefixes",
         )  # fmt: skip
         rules = [

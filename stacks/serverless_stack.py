@@ -25,7 +25,7 @@ from stacks.assets import staged
 from stacks.backend_stack import TRUSTED
 from stacks.findings import acknowledge
 from stacks.permissions import BY_AWS, LOG_ACTIONS, allow, explain
-from stacks.values import imported_bucket, read
+from stacks.values import import_bucket, read
 
 __all__ = ["ServerlessStack"]
 
@@ -48,17 +48,17 @@ class ServerlessStack(cdk.Stack):
     ) -> None:
         super().__init__(scope, construct_id, env=env, synthesizer=synthesizer)
         names = ResourceNames(settings.cloud.name)
-        artifacts = imported_bucket(self, names, "artifacts")
+        artifacts = import_bucket(self, names, "artifacts")
         log = logs.LogGroup(self, "Log", removal_policy=cdk.RemovalPolicy.DESTROY)
         cast("logs.CfnLogGroup", log.node.default_child).retention_in_days = settings.cloud.log_days
         role = iam.Role(self, "Role", assumed_by=iam.ServicePrincipal("lambda.amazonaws.com"))
         allow(
             role, ["s3:GetObject"], [artifacts.arn_for_objects(name) for name in (*TRUSTED, BUDGET_NAME)],
-            used_by=("lambda_pnp/keys.py:read_object", "lambda_pnp/day_budget.py:_sent"),
+            used_by=("lambda_pnp/keys.py:read_object", "lambda_pnp/day_budget.py:_send"),
         )  # fmt: skip
         allow(
             role, ["s3:PutObject"], [artifacts.arn_for_objects(BUDGET_NAME)],
-            used_by="lambda_pnp/day_budget.py:_sent",
+            used_by="lambda_pnp/day_budget.py:_send",
         )  # fmt: skip
         log.grant_write(role)
         explain(role, LOG_ACTIONS, used_by=f"{BY_AWS}Lambda writes what the function prints")

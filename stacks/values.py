@@ -15,7 +15,7 @@ from constructs import Construct
 
 from rse_pf.config.resource_names import ResourceNames
 
-__all__ = ["imported_bucket", "imported_group", "imported_network", "provide", "provide_network", "read"]
+__all__ = ["import_bucket", "import_group", "import_network", "provide", "provide_network", "read"]
 
 _TYPE = "AWS::SSM::Parameter::Value<String>"
 
@@ -35,33 +35,33 @@ def read(scope: Construct, names: ResourceNames, path: str) -> str:
     The logical id is *path* in camel case, such as ``DataMaps``, without a hash: findings can name it.
     """
     stack = cdk.Stack.of(scope)
-    known = stack.node.try_find_child(_identity(path))
-    if isinstance(known, cdk.CfnParameter):
-        return known.value_as_string
-    made = cdk.CfnParameter(stack, _identity(path), type=_TYPE, default=names.parameter(path))
-    return made.value_as_string
+    existing = stack.node.try_find_child(_identity(path))
+    if isinstance(existing, cdk.CfnParameter):
+        return existing.value_as_string
+    parameter = cdk.CfnParameter(stack, _identity(path), type=_TYPE, default=names.parameter(path))
+    return parameter.value_as_string
 
 
-def imported_bucket(scope: Construct, names: ResourceNames, name: str) -> s3.IBucket:
+def import_bucket(scope: Construct, names: ResourceNames, name: str) -> s3.IBucket:
     """Return a bucket of the data stack: ``maps``, ``artifacts``, ``audit-logs`` or ``access-logs``."""
     return s3.Bucket.from_bucket_name(scope, f"{_identity(name)}Bucket", read(scope, names, f"data/{name}"))
 
 
-def imported_group(scope: Construct, names: ResourceNames, name: str) -> ec2.ISecurityGroup:
+def import_group(scope: Construct, names: ResourceNames, name: str) -> ec2.ISecurityGroup:
     """Return the security group *name* of the firewall; its rules are written in the network stack only."""
-    known = read(scope, names, f"network/group-{name}")
-    return ec2.SecurityGroup.from_security_group_id(scope, f"{_identity(name)}Group", known, mutable=False)
+    group_id = read(scope, names, f"network/group-{name}")
+    return ec2.SecurityGroup.from_security_group_id(scope, f"{_identity(name)}Group", group_id, mutable=False)
 
 
 def provide_network(scope: Construct, names: ResourceNames, vpc: ec2.Vpc) -> None:
-    """Write what `imported_network` reads."""
+    """Write what `import_network` reads."""
     provide(scope, names, "network/vpc", vpc.vpc_id)
     for kind, subnets in (("front", vpc.public_subnets), ("servers", vpc.isolated_subnets)):
         for at, subnet in enumerate(subnets):
             provide(scope, names, f"network/{kind}-{at}", subnet.subnet_id)
 
 
-def imported_network(
+def import_network(
     scope: Construct, names: ResourceNames, *, zones: int, server_zones: int, cidr: str
 ) -> ec2.IVpc:
     """Return the VPC of the network stack, with a public subnet in each of *zones* zones.

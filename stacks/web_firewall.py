@@ -48,7 +48,7 @@ class WebFirewall(Construct):
         super().__init__(scope, construct_id)
         names, rates = ResourceNames(settings.cloud.name), rate_rules(settings)
         acl = wafv2.CfnWebACL(
-            self, "Acl", scope="REGIONAL", visibility_config=_seen(names.firewall),
+            self, "Acl", scope="REGIONAL", visibility_config=_metrics_only(names.firewall),
             default_action=wafv2.CfnWebACL.DefaultActionProperty(allow={}),
             custom_response_bodies={
                 _BODY: wafv2.CfnWebACL.CustomResponseBodyProperty(
@@ -59,7 +59,7 @@ class WebFirewall(Construct):
                 ),
             },
             rules=[
-                _burst_needs_a_token(names.prefix, 0),
+                _burst_token_rule(names.prefix, 0),
                 *(_rule(names.prefix, place, rule) for place, rule in enumerate(rates, start=1)),
             ],
         )  # fmt: skip
@@ -68,7 +68,7 @@ class WebFirewall(Construct):
 
 def _rule(prefix: str, place: int, rule: RateRule) -> wafv2.CfnWebACL.RuleProperty:
     return wafv2.CfnWebACL.RuleProperty(
-        name=rule.name, priority=place, visibility_config=_seen(f"{prefix}-{rule.name}"),
+        name=rule.name, priority=place, visibility_config=_metrics_only(f"{prefix}-{rule.name}"),
         action=wafv2.CfnWebACL.RuleActionProperty(
             block=wafv2.CfnWebACL.BlockActionProperty(
                 custom_response=wafv2.CfnWebACL.CustomResponseProperty(
@@ -88,7 +88,7 @@ def _rule(prefix: str, place: int, rule: RateRule) -> wafv2.CfnWebACL.RuleProper
     )  # fmt: skip
 
 
-def _burst_needs_a_token(prefix: str, place: int) -> wafv2.CfnWebACL.RuleProperty:
+def _burst_token_rule(prefix: str, place: int) -> wafv2.CfnWebACL.RuleProperty:
     """Return the rule that keeps calls without a token away from the function, whose every call is paid."""
     looks_right = wafv2.CfnWebACL.StatementProperty(
         regex_match_statement=wafv2.CfnWebACL.RegexMatchStatementProperty(
@@ -101,7 +101,7 @@ def _burst_needs_a_token(prefix: str, place: int) -> wafv2.CfnWebACL.RulePropert
         not_statement=wafv2.CfnWebACL.NotStatementProperty(statement=looks_right)
     )
     return wafv2.CfnWebACL.RuleProperty(
-        name=_NO_TOKEN, priority=place, visibility_config=_seen(f"{prefix}-{_NO_TOKEN}"),
+        name=_NO_TOKEN, priority=place, visibility_config=_metrics_only(f"{prefix}-{_NO_TOKEN}"),
         action=wafv2.CfnWebACL.RuleActionProperty(
             block=wafv2.CfnWebACL.BlockActionProperty(
                 custom_response=wafv2.CfnWebACL.CustomResponseProperty(
@@ -110,15 +110,17 @@ def _burst_needs_a_token(prefix: str, place: int) -> wafv2.CfnWebACL.RulePropert
             )
         ),
         statement=wafv2.CfnWebACL.StatementProperty(
-            and_statement=wafv2.CfnWebACL.AndStatementProperty(statements=[_begins(BURST_PATH), other])
+            and_statement=wafv2.CfnWebACL.AndStatementProperty(
+                statements=[_path_begins_with(BURST_PATH), other]
+            )
         ),
     )  # fmt: skip
 
 
 def _scope(rule: RateRule) -> wafv2.CfnWebACL.StatementProperty:
     if rule.path:
-        return _begins(rule.path)
-    others = [_begins(path) for path in rule.but]
+        return _path_begins_with(rule.path)
+    others = [_path_begins_with(path) for path in rule.but]
     either = wafv2.CfnWebACL.StatementProperty(
         or_statement=wafv2.CfnWebACL.OrStatementProperty(statements=others)
     )
@@ -127,7 +129,7 @@ def _scope(rule: RateRule) -> wafv2.CfnWebACL.StatementProperty:
     )
 
 
-def _begins(path: str) -> wafv2.CfnWebACL.StatementProperty:
+def _path_begins_with(path: str) -> wafv2.CfnWebACL.StatementProperty:
     return wafv2.CfnWebACL.StatementProperty(
         byte_match_statement=wafv2.CfnWebACL.ByteMatchStatementProperty(
             field_to_match=wafv2.CfnWebACL.FieldToMatchProperty(uri_path={}), search_string=path,
@@ -137,7 +139,7 @@ def _begins(path: str) -> wafv2.CfnWebACL.StatementProperty:
     )  # fmt: skip
 
 
-def _seen(name: str) -> wafv2.CfnWebACL.VisibilityConfigProperty:
+def _metrics_only(name: str) -> wafv2.CfnWebACL.VisibilityConfigProperty:
     # Samples would show the headers of handshakes, and so the tokens of robots, for hours.
     return wafv2.CfnWebACL.VisibilityConfigProperty(
         cloud_watch_metrics_enabled=True, metric_name=name, sampled_requests_enabled=False

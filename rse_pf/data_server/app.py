@@ -201,9 +201,9 @@ class DataServer:
 
     def _find(self, request: HttpRequest) -> tuple[Route, Handler, dict[str, str]]:
         for pattern, route, handler in self._routes:
-            found = pattern.fullmatch(request.path)
-            if found and route.method == request.method:
-                return route, handler, found.groupdict()
+            match = pattern.fullmatch(request.path)
+            if match and route.method == request.method:
+                return route, handler, match.groupdict()
         raise MethodNotAllowed(", ".join(self._methods(request.path)))
 
     def _methods(self, path: str) -> list[str]:
@@ -231,8 +231,8 @@ class DataServer:
             line |= about
             if self._audit is not None and self._refusals.take(line["reason"], self._clock()):
                 self.record_counted()
-                now, who = self._wall_clock(), self._audit.who
-                self._audit.add([Note(time=now, actor=who, action="auth.refused", detail=about)])
+                now, recorder = self._wall_clock(), self._audit.who
+                self._audit.add([Note(time=now, actor=recorder, action="auth.refused", detail=about)])
             raise
         line["tenant"], line["robot"] = claims.robot.tenant, claims.robot.name
         if not scopes_allow(claims.scopes, scope, name):
@@ -248,8 +248,8 @@ class DataServer:
         """Record how many refusals were counted, but not recorded one by one, since the last call."""
         counted = self._refusals.summary()
         if self._audit is not None and counted:
-            now, who = self._wall_clock(), self._audit.who
-            self._audit.add([Note(time=now, actor=who, action="auth.refused-many", detail=counted)])
+            now, recorder = self._wall_clock(), self._audit.who
+            self._audit.add([Note(time=now, actor=recorder, action="auth.refused-many", detail=counted)])
 
 
 async def _send(reply: HttpReply, request: HttpRequest, send: Send) -> int:

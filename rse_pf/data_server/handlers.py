@@ -113,8 +113,8 @@ class Handlers:
         after = request.query.get("after", "")
         if not _BEGINNING.fullmatch(after):
             raise BadRequest(f"after={after[:80]!r} begins no digest", hint="use next of the page before")
-        found, more = await self.threads.run(claims.robot, self.objects.list, claims, after, limit)
-        page = [StoredObject(digest=info.name.rpartition("/")[2], size=info.size) for info in found]
+        listed, more = await self.threads.run(claims.robot, self.objects.list, claims, after, limit)
+        page = [StoredObject(digest=info.name.rpartition("/")[2], size=info.size) for info in listed]
         return json_reply(200, ObjectPage(objects=page, next=page[-1].digest if more else None))
 
     async def get_object(self, request: HttpRequest, claims: Claims, path: dict[str, str]) -> HttpReply:
@@ -189,8 +189,8 @@ class Handlers:
         """List maps with their heads."""
         maps = self._maps(claims)
 
-        found = await self.threads.run(claims.robot, maps.heads)
-        return json_reply(200, MapPage(maps=[MapName(name=name, head=head) for name, head in found.items()]))
+        heads = await self.threads.run(claims.robot, maps.heads)
+        return json_reply(200, MapPage(maps=[MapName(name=name, head=head) for name, head in heads.items()]))
 
     async def list_versions(self, request: HttpRequest, claims: Claims, path: dict[str, str]) -> HttpReply:
         """List versions."""
@@ -212,13 +212,13 @@ class Handlers:
             return self._maps(claims).commit_object(
                 path["name"], source, summary, digest=commit.digest, size=size, parent=commit.parent,
                 author=robot.name, created_s=self._wall_clock(), note=commit.note,
-                charged=functools.partial(self._charged, claims, path["name"]),
+                charged=functools.partial(self._charge, claims, path["name"]),
             )  # fmt: skip
 
         return _version(201, await self.threads.run(robot, work))
 
     @contextlib.contextmanager
-    def _charged(self, claims: Claims, map_name: str, record: MapRecord, size: int) -> Iterator[None]:
+    def _charge(self, claims: Claims, map_name: str, record: MapRecord, size: int) -> Iterator[None]:
         """Charge a robot with a version while it is written; not if nothing of it was stored."""
         charge = charge_name(claims.robot, map_name, record.id, size)
         with self.objects.reservation(claims, size):
@@ -234,8 +234,8 @@ class Handlers:
 
     async def show_version(self, request: HttpRequest, claims: Claims, path: dict[str, str]) -> HttpReply:
         """Show a version."""
-        found = self._maps(claims).record
-        return _version(200, await self.threads.run(claims.robot, found, path["name"], path["version"]))
+        read_record = self._maps(claims).record
+        return _version(200, await self.threads.run(claims.robot, read_record, path["name"], path["version"]))
 
     async def get_version(self, request: HttpRequest, claims: Claims, path: dict[str, str]) -> HttpReply:
         """Return the bytes of a version or a range of them."""

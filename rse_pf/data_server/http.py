@@ -147,12 +147,12 @@ class HttpRequest:
         announced = self.header_number("content-length")
         if announced is not None and announced > max_bytes:
             raise _too_long(announced, max_bytes)
-        held = bytearray()
+        received = bytearray()
         async for piece in self._pieces():
-            held += piece
-            if len(held) > max_bytes:
-                raise _too_long(len(held), max_bytes)
-        return bytes(held)
+            received += piece
+            if len(received) > max_bytes:
+                raise _too_long(len(received), max_bytes)
+        return bytes(received)
 
     async def drain_soon(self, max_bytes: int) -> bool:
         """Do the same as `drain`, for `_DRAIN_S` at the most: what is on its way can still be read."""
@@ -173,12 +173,12 @@ class HttpRequest:
             await asyncio.wait_for(self._drop(), _DISCARD_S)
 
     async def _drop(self) -> None:
-        left = _DISCARD_BYTES
-        while left > 0:
+        remaining = _DISCARD_BYTES
+        while remaining > 0:
             message = await self._receive()
             if message["type"] == "http.disconnect" or not message.get("more_body", False):
                 return
-            left -= len(message.get("body", b""))
+            remaining -= len(message.get("body", b""))
 
     async def drain(self, max_bytes: int) -> bool:
         """Read and discard the rest, so that the robot reads the reply; return whether all was read."""
@@ -240,15 +240,15 @@ def requested_range(text: str | None, size: int) -> tuple[int, int] | None:
     Raises:
         BadRequest: The range lies outside the object; the status is 416.
     """
-    found = _RANGE.fullmatch(text.strip()) if text else None
-    if found is None or found[1] == found[2] == "":
+    match = _RANGE.fullmatch(text.strip()) if text else None
+    if match is None or match[1] == match[2] == "":
         return None
-    if found[1] == "":
-        start, end = max(0, size - int(found[2])), size
+    if match[1] == "":
+        start, end = max(0, size - int(match[2])), size
     else:
-        start = int(found[1])
-        end = size if found[2] == "" else min(size, int(found[2]) + 1)
-        if found[2] and int(found[2]) < start:
+        start = int(match[1])
+        end = size if match[2] == "" else min(size, int(match[2]) + 1)
+        if match[2] and int(match[2]) < start:
             return None
     if start >= size or start >= end:
         raise BadRequest(f"{text!r} lies outside of {size} bytes", hint="HEAD returns the size")
@@ -261,5 +261,5 @@ def _too_long(got: int, max_bytes: int) -> LimitExceeded:
     )
 
 
-def _too_slow(what: str) -> Expired:
-    return Expired(f"the body is too slow: {what}", hint="send smaller parts and resume")
+def _too_slow(subject: str) -> Expired:
+    return Expired(f"the body is too slow: {subject}", hint="send smaller parts and resume")

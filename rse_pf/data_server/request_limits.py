@@ -62,27 +62,27 @@ class RequestLimits:
             TooManyRequests: The robot's rate or its requests in progress are at their limit.
             Busy: Too many bodies are being received, of this robot, its tenant or all.
         """
-        held = self._of(robot, now)
-        if held.requests >= MAX_REQUESTS_PER_ROBOT:
+        state = self._state_of(robot, now)
+        if state.requests >= MAX_REQUESTS_PER_ROBOT:
             raise TooManyRequests(
-                f"{held.requests} requests of this robot are in progress, the limit is "
+                f"{state.requests} requests of this robot are in progress, the limit is "
                 f"{MAX_REQUESTS_PER_ROBOT}",
                 hint="wait for their replies",
                 retry_after_ms=_RETRY_AFTER_MS,
             )
         if has_body:
-            self._check_bodies(held, robot.tenant)
-        wait_s = held.bucket.wait_s(now)
+            self._check_bodies(state, robot.tenant)
+        wait_s = state.bucket.wait_s(now)
         if wait_s:
             raise TooManyRequests(
                 f"this robot sends more than {self._settings.max_requests_per_s:g} requests a second",
                 hint="send fewer and larger ones",
                 retry_after_ms=1000 * wait_s,
             )
-        held.bucket.spend(cost, now)
-        held.requests += 1
+        state.bucket.spend(cost, now)
+        state.requests += 1
         if has_body:
-            held.bodies += 1
+            state.bodies += 1
             self._tenant_bodies[robot.tenant] += 1
 
     def charge_refused(self, robot: RobotId, body_bytes: int, now: float) -> None:
@@ -93,22 +93,22 @@ class RequestLimits:
             body_bytes: How long the body is, or says that it is.
             now: Monotonic seconds.
         """
-        self._of(robot, now).bucket.spend(min(body_bytes / _REFUSED_BYTES, _REFUSED_COST), now)
+        self._state_of(robot, now).bucket.spend(min(body_bytes / _REFUSED_BYTES, _REFUSED_COST), now)
 
     def end(self, robot: RobotId, *, has_body: bool) -> None:
         """Give back what `begin` took, except for the rate."""
-        held = self._robots[robot]
-        held.requests -= 1
+        state = self._robots[robot]
+        state.requests -= 1
         if has_body:
-            held.bodies -= 1
+            state.bodies -= 1
             self._tenant_bodies[robot.tenant] -= 1
             if not self._tenant_bodies[robot.tenant]:
                 del self._tenant_bodies[robot.tenant]
 
-    def _check_bodies(self, held: _Robot, tenant: str) -> None:
+    def _check_bodies(self, state: _Robot, tenant: str) -> None:
         most = self._settings.max_uploads
         limits = (
-            (held.bodies, _share(most, _BODIES_PER_ROBOT), "this robot"),
+            (state.bodies, _share(most, _BODIES_PER_ROBOT), "this robot"),
             (self._tenant_bodies[tenant], _share(most, _BODIES_PER_TENANT), "this tenant"),
             (self._tenant_bodies.total(), most, "all robots"),
         )
@@ -120,20 +120,20 @@ class RequestLimits:
                     retry_after_ms=_RETRY_AFTER_MS,
                 )
 
-    def _of(self, robot: RobotId, now: float) -> _Robot:
-        held = self._robots.get(robot)
-        if held is None:
+    def _state_of(self, robot: RobotId, now: float) -> _Robot:
+        state = self._robots.get(robot)
+        if state is None:
             rate = self._settings.max_requests_per_s
-            held = self._robots[robot] = _Robot(TokenBucket(rate, burst=rate * _BURST_S))
+            state = self._robots[robot] = _Robot(TokenBucket(rate, burst=rate * _BURST_S))
             self._forget_one(now)
         self._robots.move_to_end(robot)
-        return held
+        return state
 
     def _forget_one(self, now: float) -> None:
         """Forget the robot that has been quiet for longest; its bucket is full again in all likelihood."""
         if len(self._robots) > _MAX_ROBOTS:
-            for robot, held in self._robots.items():
-                if not held.requests and held.bucket.is_full(now):
+            for robot, state in self._robots.items():
+                if not state.requests and state.bucket.is_full(now):
                     del self._robots[robot]
                     return
 

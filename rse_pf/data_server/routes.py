@@ -326,7 +326,7 @@ def _operation(route: Route) -> dict[str, Any]:
     if route.scope is not None:
         failure = None if route.method == "HEAD" else HttpFailure
         replies |= {401: failure, 403: failure, 429: failure, 503: failure}
-    made: dict[str, Any] = {
+    document: dict[str, Any] = {
         "operationId": route.operation,
         "summary": route.doc,
         "responses": {
@@ -339,28 +339,28 @@ def _operation(route: Route) -> dict[str, Any]:
     ]
     parameters += [
         {
-            "name": each.name, "in": each.place, "required": each.required, "description": each.doc,
-            "schema": each.schema,
+            "name": field.name, "in": field.place, "required": field.required, "description": field.doc,
+            "schema": field.schema,
         }
-        for each in route.fields
+        for field in route.fields
     ]  # fmt: skip
     if parameters:
-        made["parameters"] = parameters
+        document["parameters"] = parameters
     if route.body is not None:
-        made["requestBody"] = {"required": True, "content": _content(route.body)}
+        document["requestBody"] = {"required": True, "content": _content(route.body)}
     if route.scope is not None:
-        made["security"] = [{"robot": []}]
-        made["description"] = f"Token scope `{route.scope}`; a token without scopes may do everything."
-    return made
+        document["security"] = [{"robot": []}]
+        document["description"] = f"Token scope `{route.scope}`; a token without scopes may do everything."
+    return document
 
 
 def _response(status: int, kind: Any, route: Route) -> dict[str, Any]:
-    made: dict[str, Any] = {"description": _DESCRIPTIONS[status]}
+    document: dict[str, Any] = {"description": _DESCRIPTIONS[status]}
     if kind is not None:
-        made["content"] = _content(kind)
+        document["content"] = _content(kind)
     if route.operation == "head_upload" and status == 200:
-        made["headers"] = {"Upload-Offset": {"schema": {"type": "integer"}}}
-    return made
+        document["headers"] = {"Upload-Offset": {"schema": {"type": "integer"}}}
+    return document
 
 
 def _content(kind: Any) -> dict[str, Any]:

@@ -79,8 +79,8 @@ class Objects:
     def list(self, claims: Claims, after: str, limit: int) -> tuple[list[ObjectInfo], bool]:
         """Return up to *limit* objects behind digest *after*, and whether there are more."""
         prefix = object_name(claims.robot, "")
-        found = while_wanted(self._store.list(prefix, after=prefix + after))
-        page = list(itertools.islice(found, limit + 1))
+        listed = while_wanted(self._store.list(prefix, after=prefix + after))
+        page = list(itertools.islice(listed, limit + 1))
         return page[:limit], len(page) > limit
 
     def put(self, claims: Claims, digest: str, data: bytes) -> bool:
@@ -104,10 +104,10 @@ class Objects:
         """Remove an object; a missing one is no error."""
         name = self.name(claims, digest)
         with self._exclusive(name):
-            found = self._find(name)
-            if found is not None:
+            info = self._find(name)
+            if info is not None:
                 self._store.delete(name)
-                self.accounts.release(claims.robot, found.size)
+                self.accounts.release(claims.robot, info.size)
 
     def begin(self, claims: Claims, digest: str, size: int) -> Upload:
         """Open an upload of *size* bytes, or return the state of the open one.
@@ -124,11 +124,13 @@ class Objects:
             )
         if self._find(name) is not None:
             with self._exclusive(name):
-                if self._opened(claims, digest) is not None:  # the robot uploaded it directly to the bucket
+                if (
+                    self._find_size(claims, digest) is not None
+                ):  # the robot uploaded it directly to the bucket
                     self._drop(self._parts(claims, digest))
             return self._state(digest, size, size)
         with self._exclusive(name):
-            opened = self._opened(claims, digest)
+            opened = self._find_size(claims, digest)
             if opened is None:
                 self._check_open_uploads(claims)
                 with self.reservation(claims, size):
@@ -140,17 +142,17 @@ class Objects:
                 raise Conflict(
                     f"this upload has {opened} bytes, not {size}", hint="DELETE the upload and begin it again"
                 )
-            return self._resumed(claims, digest, name, size)
+            return self._resume(claims, digest, name, size)
 
     def progress(self, claims: Claims, digest: str) -> Upload:
         """Return the state of an upload; raises NotFound."""
         name = self.name(claims, digest)
         with self._exclusive(name):
-            opened = self._opened(claims, digest)
+            opened = self._find_size(claims, digest)
             if opened is None:
                 size = self.head(claims, digest).size
                 return self._state(digest, size, size)
-            return self._resumed(claims, digest, name, opened)
+            return self._resume(claims, digest, name, opened)
 
     def append(self, claims: Claims, digest: str, offset: int, data: bytes) -> Upload:
         """Add a part; the last one completes the object, durably.
@@ -166,7 +168,7 @@ class Objects:
         """
         name = self.name(claims, digest)
         with self._exclusive(name):
-            size = self._opened(claims, digest)
+            size = self._find_size(claims, digest)
             if size is None:
                 info = self._find(name)
                 if info is None:
@@ -211,7 +213,7 @@ class Objects:
             self._drop(f"{folder}/")
         return len(old)
 
-    def _resumed(self, claims: Claims, digest: str, name: str, size: int) -> Upload:
+    def _resume(self, claims: Claims, digest: str, name: str, size: int) -> Upload:
         """Return the state of an upload; complete one whose server ended after the last part was stored."""
         offset = sum(part.size for part in self._stored_parts(claims, digest))
         if offset == size:
@@ -238,7 +240,7 @@ class Objects:
 
     def _discard(self, claims: Claims, digest: str) -> None:
         """Remove an upload that became no object."""
-        size = self._opened(claims, digest)
+        size = self._find_size(claims, digest)
         self._drop(self._parts(claims, digest))
         if size is not None and not isinstance(self._store, PresigningStore):
             # else the robot may have a URL with which it can still store the object
@@ -253,7 +255,7 @@ class Objects:
     def _parts(self, claims: Claims, digest: str) -> str:
         return f"uploads/{claims.robot.folder}/{digest}/"
 
-    def _opened(self, claims: Claims, digest: str) -> int | None:
+    def _find_size(self, claims: Claims, digest: str) -> int | None:
         try:
             return int(self._store.get(f"{self._parts(claims, digest)}size").split()[0])
         except NotFound:

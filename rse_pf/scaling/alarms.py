@@ -89,7 +89,7 @@ def alarms_of(settings: ScalingSettings) -> tuple[Alarm, ...]:
     alarms = [busy, _idle(settings, cpu)]
     if cadence.underused:
         alarms.append(_underused(settings, cpu))
-    one = (ScalingStep(lower=0.0, upper=None, change=STEP),)
+    single_step = (ScalingStep(lower=0.0, upper=None, change=STEP),)
     if settings.max_robots_per_server:
         alarms.append(
             _grow(
@@ -97,13 +97,13 @@ def alarms_of(settings: ScalingSettings) -> tuple[Alarm, ...]:
                 "crowded",
                 _ROBOTS,
                 float(settings.max_robots_per_server),
-                one,
+                single_step,
                 "too many robots on each server",
             )
         )
     if settings.max_queue_ms:
         alarms.append(
-            _grow(settings, "queueing", _QUEUE, settings.max_queue_ms, one, "commands wait too long")
+            _grow(settings, "queueing", _QUEUE, settings.max_queue_ms, single_step, "commands wait too long")
         )
     return tuple(alarms)
 
@@ -154,11 +154,11 @@ def _spare(settings: ScalingSettings, share: float) -> dict[Metric, str]:
 
 
 def _shrink(name: str, conditions: Mapping[Metric, str], period_s: int, periods: int, meaning: str) -> Alarm:
-    told = " AND ".join(f"{metric.name} {limit}" for metric, limit in conditions.items())
+    conditions_text = " AND ".join(f"{metric.name} {limit}" for metric, limit in conditions.items())
     return Alarm(
         name=name,
         metrics=tuple(conditions),
-        expression=f"IF({told}, 1, 0)",
+        expression=f"IF({conditions_text}, 1, 0)",
         comparison="GreaterThanOrEqualToThreshold",
         threshold=1.0,
         period_s=period_s,

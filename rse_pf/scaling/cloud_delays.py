@@ -61,7 +61,7 @@ class Design:
     def delays(self) -> CloudDelays:
         """Return the sums that are played."""
         return CloudDelays(
-            metrics_s=self.metrics.middle_s, launch_s=sum(each.middle_s for each in self.launch)
+            metrics_s=self.metrics.middle_s, launch_s=sum(phase.middle_s for phase in self.launch)
         )
 
 

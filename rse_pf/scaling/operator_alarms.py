@@ -69,7 +69,7 @@ class OperatorAlarm:
     @property
     def sources(self) -> set[Source]:
         """Return whose metrics the alarm needs."""
-        return {each.source for each in self.series}
+        return {series.source for series in self.series}
 
 
 def _balancer(name: str, metric: str, statistic: str, source: Source = "balancer") -> Series:

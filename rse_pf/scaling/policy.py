@@ -15,7 +15,7 @@ from typing import Literal
 from rse_pf.config import ScalingSettings
 from rse_pf.scaling.profile import Cadence, cadence_of
 
-__all__ = ["BIG_STEP", "STEP", "Action", "FleetState", "Kind", "Sample", "decide", "holding_since"]
+__all__ = ["BIG_STEP", "STEP", "Action", "FleetState", "Kind", "Sample", "decide", "find_rule_starts"]
 
 STEP, BIG_STEP = 1, 2
 """Servers added above ``scaling.busy_cpu_percent``, and above ``scaling.very_busy_cpu_percent``."""
@@ -90,7 +90,8 @@ def decide(
         now_s: Seconds, on the clock of the samples.
         acted_s: When the number of servers was last changed; each period leads to one change at most.
         compress: Factor by which periods are shorter; for experiments.
-        since_s: What `holding_since` returned; None finds it in *samples*, which must then reach back so far.
+        since_s: What `find_rule_starts` returned; None finds it in *samples*, which must then
+            reach back so far.
 
     Source:
         RSE-PF paper, Sect. 6.2: busy above 70 % CPU, one server less after five idle minutes.
@@ -115,7 +116,7 @@ def decide(
         return (*replacements, Action(kind="stay", reason="this period has led to an action already"))
     by_period = {round(sample.start_s / period_s): sample for sample in samples}
     if since_s is None:
-        since_s = _since(by_period, ended, settings, cadence, period_s, {})
+        since_s = _find_starts(by_period, ended, settings, cadence, period_s, {})
     acting = [
         rule
         for rule in _rules(settings, cadence)
@@ -126,7 +127,7 @@ def decide(
     return (*replacements, _scale(acting, by_period.get(ended - 1), fleet, settings))
 
 
-def holding_since(
+def find_rule_starts(
     samples: Sequence[Sample],
     settings: ScalingSettings,
     *,
@@ -146,7 +147,7 @@ def holding_since(
     cadence = cadence_of(settings)
     period_s = cadence.period_s / compress
     by_period = {round(sample.start_s / period_s): sample for sample in samples}
-    return _since(by_period, _periods(now_s, period_s), settings, cadence, period_s, before or {})
+    return _find_starts(by_period, _periods(now_s, period_s), settings, cadence, period_s, before or {})
 
 
 def _rules(settings: ScalingSettings, cadence: Cadence) -> list[_Rule]:
@@ -156,9 +157,9 @@ def _rules(settings: ScalingSettings, cadence: Cadence) -> list[_Rule]:
         _Rule(
             name="busy",
             samples=cadence.busy,
-            holds=lambda one: one.cpu_percent >= settings.busy_cpu_percent,
-            change=lambda one: BIG_STEP if one.cpu_percent >= settings.very_busy_cpu_percent else STEP,
-            reason=lambda one: f"CPU at {one.cpu_percent:.0f} %",
+            holds=lambda sample: sample.cpu_percent >= settings.busy_cpu_percent,
+            change=lambda sample: BIG_STEP if sample.cpu_percent >= settings.very_busy_cpu_percent else STEP,
+            reason=lambda sample: f"CPU at {sample.cpu_percent:.0f} %",
         )
     ]
     if most_robots:
@@ -166,9 +167,9 @@ def _rules(settings: ScalingSettings, cadence: Cadence) -> list[_Rule]:
             _Rule(
                 name="crowded",
                 samples=cadence.busy,
-                holds=lambda one: one.robots_per_server >= most_robots,
-                change=lambda one: STEP,
-                reason=lambda one: f"{one.robots_per_server:.0f} robots on each server",
+                holds=lambda sample: sample.robots_per_server >= most_robots,
+                change=lambda sample: STEP,
+                reason=lambda sample: f"{sample.robots_per_server:.0f} robots on each server",
             )
         )
     if most_queue_ms:
@@ -176,25 +177,25 @@ def _rules(settings: ScalingSettings, cadence: Cadence) -> list[_Rule]:
             _Rule(
                 name="queueing",
                 samples=cadence.busy,
-                holds=lambda one: one.queue_ms >= most_queue_ms,
-                change=lambda one: STEP,
-                reason=lambda one: f"commands wait {one.queue_ms:.0f} ms",
+                holds=lambda sample: sample.queue_ms >= most_queue_ms,
+                change=lambda sample: STEP,
+                reason=lambda sample: f"commands wait {sample.queue_ms:.0f} ms",
             )
         )
 
-    def spare(one: Sample, share: float) -> bool:
-        robots = not most_robots or one.robots_per_server < share * most_robots
-        return robots and (not most_queue_ms or one.queue_ms < share * most_queue_ms)
+    def spare(sample: Sample, share: float) -> bool:
+        robots = not most_robots or sample.robots_per_server < share * most_robots
+        return robots and (not most_queue_ms or sample.queue_ms < share * most_queue_ms)
 
     rules.append(
         _Rule(
             name="idle",
             samples=cadence.idle,
-            holds=lambda one: (
-                one.requests == 0 and one.cpu_percent < settings.idle_cpu_percent and spare(one, 1.0)
+            holds=lambda sample: (
+                sample.requests == 0 and sample.cpu_percent < settings.idle_cpu_percent and spare(sample, 1.0)
             ),
-            change=lambda one: -1,
-            reason=lambda one: f"idle for {settings.idle_s} s",
+            change=lambda sample: -1,
+            reason=lambda sample: f"idle for {settings.idle_s} s",
         )
     )
     if cadence.underused:
@@ -202,15 +203,17 @@ def _rules(settings: ScalingSettings, cadence: Cadence) -> list[_Rule]:
             _Rule(
                 name="underused",
                 samples=cadence.underused,
-                holds=lambda one: one.cpu_percent < settings.underused_cpu_percent and spare(one, 0.5),
-                change=lambda one: -1,
-                reason=lambda one: f"CPU at {one.cpu_percent:.0f} %, low for {settings.underused_s} s",
+                holds=lambda sample: (
+                    sample.cpu_percent < settings.underused_cpu_percent and spare(sample, 0.5)
+                ),
+                change=lambda sample: -1,
+                reason=lambda sample: f"CPU at {sample.cpu_percent:.0f} %, low for {settings.underused_s} s",
             )
         )
     return rules
 
 
-def _since(
+def _find_starts(
     by_period: Mapping[int, Sample],
     ended: int,
     settings: ScalingSettings,
@@ -219,15 +222,15 @@ def _since(
     before: Mapping[str, float],
 ) -> dict[str, float]:
     """Return since when each rule holds; a run as long as the history began when *before* says."""
-    found, oldest = {}, min(by_period, default=ended)
+    starts_s, oldest = {}, min(by_period, default=ended)
     for rule in _rules(settings, cadence):
         first = ended
         while first - 1 in by_period and rule.holds(by_period[first - 1]):
             first -= 1
         if ended - first >= rule.samples:
             began_s = (first + rule.samples) * period_s
-            found[rule.name] = min(began_s, before.get(rule.name, began_s)) if first == oldest else began_s
-    return found
+            starts_s[rule.name] = min(began_s, before.get(rule.name, began_s)) if first == oldest else began_s
+    return starts_s
 
 
 def _scale(
@@ -237,7 +240,7 @@ def _scale(
         return Action(kind="stay", reason="neither busy nor idle")
     growing = [rule for rule in acting if rule.change(newest) > 0]
     if growing:
-        rule = max(growing, key=lambda each: each.change(newest))
+        rule = max(growing, key=lambda growing_rule: growing_rule.change(newest))
         reason = rule.reason(newest)
         target = min(settings.max_servers, fleet.servers - fleet.warming + rule.change(newest))
         more = target - fleet.servers

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 from rse_pf.config.elasticity import MOVES_PER_S
 
-__all__ = ["MARGIN", "MAX_PAUSE_S", "MoveOrder", "Totals", "moves", "order_of", "pause_after_s", "share"]
+__all__ = ["MARGIN", "MAX_PAUSE_S", "MoveOrder", "Totals", "moves", "pause_after_s", "plan_order", "share"]
 
 MARGIN = 0.2
 """Crowded servers hand robots over until all are within this share of even."""
@@ -38,16 +38,16 @@ def moves(robots: Mapping[str, int], margin: float = MARGIN) -> dict[str, int]:
     if len(robots) < 2:
         return {}
     total, servers = sum(robots.values()), len(robots)
-    lowest, highest = _lowest(total, servers, margin), _highest(total, servers, margin)
+    lowest, highest = _lowest_share(total, servers, margin), _highest_share(total, servers, margin)
     missing = sum(max(0, lowest - n) for n in robots.values())
-    given = {name: n - highest for name, n in robots.items() if n > highest}
-    crowded = [(given.get(name, 0) - n, name) for name, n in robots.items()]
+    moving = {name: n - highest for name, n in robots.items() if n > highest}
+    crowded = [(moving.get(name, 0) - n, name) for name, n in robots.items()]
     heapq.heapify(crowded)
-    for _ in range(missing - sum(given.values())):
-        left, name = heapq.heappop(crowded)
-        given[name] = given.get(name, 0) + 1
-        heapq.heappush(crowded, (left + 1, name))
-    return given
+    for _ in range(missing - sum(moving.values())):
+        surplus, name = heapq.heappop(crowded)
+        moving[name] = moving.get(name, 0) + 1
+        heapq.heappush(crowded, (surplus + 1, name))
+    return moving
 
 
 def share(mine: int, total: int, servers: int, margin: float = MARGIN) -> int:
@@ -64,14 +64,14 @@ def share(mine: int, total: int, servers: int, margin: float = MARGIN) -> int:
     """
     if servers < 2:
         return 0
-    return max(0, mine - _highest(total, servers, margin / (servers - 1)))
+    return max(0, mine - _highest_share(total, servers, margin / (servers - 1)))
 
 
-def _highest(total: int, servers: int, margin: float) -> int:
+def _highest_share(total: int, servers: int, margin: float) -> int:
     return max(math.ceil(total / servers), math.floor(total / servers * (1 + margin) + 1e-9))
 
 
-def _lowest(total: int, servers: int, margin: float) -> int:
+def _lowest_share(total: int, servers: int, margin: float) -> int:
     return min(total // servers, math.ceil(total / servers * (1 - margin) - 1e-9))
 
 
@@ -92,7 +92,7 @@ class MoveOrder:
     spread_s: float
 
 
-def order_of(mine: int, totals: Sequence[Totals]) -> MoveOrder | None:
+def plan_order(mine: int, totals: Sequence[Totals]) -> MoveOrder | None:
     """Return what a server with *mine* robots orders; None if nothing, or if the sums still change.
 
     A server that is above its share goes down to even, not to the border of the margin: some load balancers

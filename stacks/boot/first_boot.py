@@ -63,12 +63,12 @@ def verified(data, sha256):
     sums = archive.read(SUMS) if SUMS in archive.namelist() else b""
     if hashlib.sha256(sums).hexdigest() != sha256:
         raise SystemExit("first boot: the package is not the one that the template names")
-    wanted = dict(reversed(line.split("  ", 1)) for line in sums.decode().splitlines())
+    digests = dict(reversed(line.split("  ", 1)) for line in sums.decode().splitlines())
     files = [name for name in archive.namelist() if not name.endswith("/") and name != SUMS]
-    if sorted(files) != sorted(wanted):
+    if sorted(files) != sorted(digests):
         raise SystemExit("first boot: the package holds other files than its list")
     for name in files:
-        if hashlib.sha256(archive.read(name)).hexdigest() != wanted[name]:
+        if hashlib.sha256(archive.read(name)).hexdigest() != digests[name]:
             raise SystemExit(f"first boot: {name} is not what the package's list says")
     return archive
 
@@ -86,11 +86,11 @@ def main(facts):
 
 def install(facts):
     """Fetch and verify the package, and run its install.py."""
-    data, server = patiently(lambda: fetched(facts), float(facts["retry_s"]))
+    data, server = retry_for(lambda: fetched(facts), float(facts["retry_s"]))
     PACKAGE.mkdir(parents=True, exist_ok=True)
     verified(data, facts["sha256"]).extractall(PACKAGE)
-    told = json.dumps({**facts, "server": server})
-    command = [sys.executable, str(PACKAGE / "install.py"), told]
+    facts_text = json.dumps({**facts, "server": server})
+    command = [sys.executable, str(PACKAGE / "install.py"), facts_text]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as running:
         for line in running.stdout:
             say(line.rstrip())
@@ -143,7 +143,7 @@ def imds(path, token=None):
         return answer.read().decode()
 
 
-def patiently(call, within_s):
+def retry_for(call, within_s):
     """Return what *call* returns; roles and endpoints may come a little later than the machine."""
     until = time.monotonic() + within_s
     while True:

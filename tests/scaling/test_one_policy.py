@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 
 from rse_pf.config import ScalingSettings
 from rse_pf.scaling.alarms import NAMESPACE, Alarm, alarms_of
-from rse_pf.scaling.policy import FleetState, Sample, decide, holding_since
+from rse_pf.scaling.policy import FleetState, Sample, decide, find_rule_starts
 from rse_pf.scaling.profile import cadence_of
 
 Point = dict[str, float] | None
@@ -108,7 +108,7 @@ class Local:
         warming = sum(now_s - each < self.scaling.warm_up_s for each in self.launched)
         fleet = FleetState(servers=len(self.launched), warming=warming)
         del self.samples[: -self.cadence.most - 1]
-        self.since_s = holding_since(self.samples, self.scaling, now_s=now_s, before=self.since_s)
+        self.since_s = find_rule_starts(self.samples, self.scaling, now_s=now_s, before=self.since_s)
         (action,) = decide(self.samples, fleet, self.scaling, now_s=now_s, since_s=self.since_s)
         if action.kind == "grow":
             self.launched += [now_s] * action.servers

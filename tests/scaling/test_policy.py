@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from rse_pf.config import ScalingSettings
-from rse_pf.scaling.policy import Action, FleetState, Sample, decide, holding_since
+from rse_pf.scaling.policy import Action, FleetState, Sample, decide, find_rule_starts
 
 SETTINGS = ScalingSettings(min_servers=1)
 
@@ -157,7 +157,7 @@ def test_a_rule_that_holds_for_longer_than_the_history_keeps_its_minute() -> Non
         samples = [
             Sample(start_s=10.0 * each, cpu_percent=80.0, requests=1) for each in range(max(i - 20, 0), i)
         ]
-        since_s = holding_since(samples, scaling, now_s=10.0 * i, before=since_s)
+        since_s = find_rule_starts(samples, scaling, now_s=10.0 * i, before=since_s)
         kinds.append(
             decide(samples, FleetState(servers=3), scaling, now_s=10.0 * i, since_s=since_s)[-1].kind
         )

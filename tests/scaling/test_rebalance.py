@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rse_pf.scaling.rebalance import MARGIN, MoveOrder, Totals, moves, order_of, pause_after_s, share
+from rse_pf.scaling.rebalance import MARGIN, MoveOrder, Totals, moves, pause_after_s, plan_order, share
 
 fleets = st.lists(st.integers(0, 400), min_size=2, max_size=12).map(
     lambda counts: {f"server-{i + 1}": n for i, n in enumerate(counts)}
@@ -123,7 +123,7 @@ def test_servers_that_know_only_the_sums_fill_up_an_empty_one_and_then_stop(robo
 def ordered(robots: dict[str, int]) -> dict[str, int]:
     """Return what each server orders that knows its own robots and steady sums."""
     sums = [Totals(start_s=at, robots=sum(robots.values()), servers=len(robots)) for at in (10.0, 0.0)]
-    found = {name: order_of(n, sums) for name, n in robots.items()}
+    found = {name: plan_order(n, sums) for name, n in robots.items()}
     return {name: order.robots for name, order in found.items() if order is not None}
 
 
@@ -147,10 +147,10 @@ def test_no_order_before_two_periods_agree() -> None:
         for robots, servers in ((120, 3), (140, 3), (120, 2))
     )
 
-    assert order_of(60, [steady]) is None
-    assert order_of(60, [steady, grown]) is None
-    assert order_of(60, [steady, joined]) is None
-    assert order_of(60, [steady, steady]) == MoveOrder(robots=20, spread_s=1.0)
+    assert plan_order(60, [steady]) is None
+    assert plan_order(60, [steady, grown]) is None
+    assert plan_order(60, [steady, joined]) is None
+    assert plan_order(60, [steady, steady]) == MoveOrder(robots=20, spread_s=1.0)
 
 
 def test_a_pause_doubles_with_each_order_that_moved_nobody_up_to_ten_minutes() -> None:

@@ -15,7 +15,7 @@ from typing import Any
 
 from rse_pf.config import ScalingSettings
 from rse_pf.local.control.fleet import Fleet, ServerHealth
-from rse_pf.scaling.policy import Action, FleetState, Sample, decide, holding_since
+from rse_pf.scaling.policy import Action, FleetState, Sample, decide, find_rule_starts
 
 __all__ = ["LocalScaleModifier", "bounds_for", "may_start_s", "replace_now"]
 
@@ -101,7 +101,7 @@ class LocalScaleModifier:
         if self._minimum is not None:
             self._settings = dataclasses.replace(self._settings, min_servers=self._minimum())
         if period_over:
-            self._since_s = holding_since(
+            self._since_s = find_rule_starts(
                 samples, self._settings, now_s=now_s, compress=self._compress, before=self._since_s
             )
         actions = decide(

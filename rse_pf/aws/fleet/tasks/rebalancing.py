@@ -19,7 +19,7 @@ from rse_pf.aws.fleet.task import AgentContext, Phase, Task
 from rse_pf.errors import Disconnected
 from rse_pf.scaling.alarms import NAMESPACE
 from rse_pf.scaling.profile import cadence_of
-from rse_pf.scaling.rebalance import MoveOrder, Totals, order_of, pause_after_s
+from rse_pf.scaling.rebalance import MoveOrder, Totals, pause_after_s, plan_order
 
 __all__ = ["LATE_S", "read_totals", "task"]
 
@@ -76,7 +76,7 @@ class _Rebalancing:
 
     def _order_moves(self, robots: int, totals: Sequence[Totals]) -> None:
         context = self._context
-        order = order_of(robots, totals)
+        order = plan_order(robots, totals)
         if order is None:
             self._asked = None
             return
