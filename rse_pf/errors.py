@@ -153,7 +153,7 @@ class MissingExtra(ConfigurationError, code="missing-extra"):
 
     @staticmethod
     def command(*extras: str) -> str:
-        """Return what installs *extras* into this environment; rse-pf itself is on no package index.
+        """Return the command that installs *extras* here; rse-pf itself is on no package index.
 
         pip takes the extras of an rse-pf that is installed, from a wheel or a checkout, from its metadata.
         A checkout that is only on the path has none, so the command names it.

@@ -87,7 +87,7 @@ def proportional_bytes(pid: int) -> int:
 
 
 def run_when_idle(pid: int) -> None:
-    """Let *pid* (0: this process) run only when nothing else wants the processor, for good.
+    """Make *pid* (0: this process) run only when nothing else wants the processor, for good.
 
     A parent that does this right after the start spares its other children the imports of the new one: a
     second of CPU for a job.

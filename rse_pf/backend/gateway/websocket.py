@@ -325,7 +325,7 @@ def _libraries() -> tuple[Any, Any]:
 
 
 def protocol_options(picows: Any, max_frame_bytes: int) -> dict[str, Any]:
-    """Return what picows' protocol takes for each robot's socket, but for the factory of its listener.
+    """Return the options of picows' protocol for a robot's socket, without the listener's factory.
 
     picows itself sends no pings and answers none: `RobotConnection` does.
     """

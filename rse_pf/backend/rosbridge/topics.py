@@ -278,7 +278,7 @@ class RosbridgeTopics:
         return topic
 
     def _settle(self, topic: _Topic, client: Client) -> None:
-        """Forget that *client* uses a topic, if it does not, and a topic that nobody uses any more."""
+        """Drop *topic* from those of *client* if it uses it no longer, and altogether if nobody does."""
         if client in topic.publishers or client in topic.subscriptions:
             return
         own = self._of_client.get(client, {})

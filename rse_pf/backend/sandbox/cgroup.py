@@ -196,7 +196,7 @@ def _is_delegated(folder: Path) -> bool:
 
 
 def _enable(hierarchy: Hierarchy) -> None:
-    """Let cgroups below *hierarchy* have its controllers; move the server's processes out of its folder.
+    """Enable the controllers of *hierarchy* below it; move the server's processes out of its folder.
 
     Raises:
         OSError: Refused, or the processes of a cgroup that was not delegated would have to be moved.

@@ -67,7 +67,7 @@ class SandboxPlan:
 
 
 def readable_paths(services: Sequence[InstalledService]) -> list[Path]:
-    """Return what a sandbox may read: Python's modules, this package, the system's libraries, the services.
+    """Return the paths that a sandbox may read: Python, this package, system libraries, the services.
 
     Programs, documentation, settings and homes are not among it.
     """

@@ -175,7 +175,7 @@ class Scheduler:
         return retry_after_ms(delay_s)
 
     def submit(self, queued: QueuedCommand) -> list[RefusedCommand]:
-        """Let *queued*, which was admitted, wait for its turn; return the frame of its stream that ends
+        """Queue *queued*, which was admitted, for its turn; return the frame of its stream that ends
         instead."""
         robot = self._robots.get(queued.robot)
         if robot is None:
@@ -304,7 +304,7 @@ class Scheduler:
         return cheap and size_bytes <= INLINE_BYTES and saves_time and self.running <= 1
 
     def _delay_s(self, robot_id: RobotId, robot: _Robot | None) -> float:
-        """Return the seconds that the next command of a robot waits: a round for each of its own commands."""
+        """Return the wait (s) of a robot's next command: a round for each of its own, at most for all."""
         rounds = 1 + (len(robot.waiting) if robot is not None else 0)
         return min(rounds * self._turns.before(robot_id.tenant), self.waiting + 1) * self.turn_s
 
