@@ -115,7 +115,7 @@ class FleetApp:
             await self._answer(request, receive, send)
         except RsePfError as error:
             with contextlib.suppress(OSError, RuntimeError):  # the answer may have begun
-                await _send(send, _STATUS.get(error.code, 400), _told(error))
+                await _send(send, _STATUS.get(error.code, 400), _error_document(error))
 
     def _check_origin(self, request: _Request) -> None:
         host = request.headers.get("host", "")
@@ -128,25 +128,25 @@ class FleetApp:
             raise Forbidden("requests of other pages are refused", hint="open the page itself")
 
     async def _answer(self, request: _Request, receive: Receive, send: Send) -> None:
-        what = (request.method, request.path)
+        endpoint = (request.method, request.path)
         if request.method in ("GET", "HEAD") and request.path in self._files:
             await self._send_file(request, self._files[request.path], send)
-        elif what == ("POST", "/session"):
+        elif endpoint == ("POST", "/session"):
             session, role = self._sessions.open(_text(await _body(receive), "key"), now_s=self._clock())
             await _send(send, 200, {"session": session, "role": role})
-        elif what == ("POST", "/keys"):
+        elif endpoint == ("POST", "/keys"):
             await _send(send, 200, self._new_key(request, await _body(receive)))
-        elif what == ("POST", "/operator"):
+        elif endpoint == ("POST", "/operator"):
             key = _text(await _body(receive), "key")
             self._sessions.promote(request.session, key, now_s=self._clock())
             await _send(send, 200, {"role": "operate"})
-        elif what == ("POST", "/act"):
+        elif endpoint == ("POST", "/act"):
             self._sessions.check_operator(request.session, now_s=self._clock())
             body = await _body(receive)
             action = _text(body, "action")
             rest = {name: str(value) for name, value in body.items() if name != "action"}
             await _send(send, 200, await self._actions.operate(action, rest))
-        elif what == ("GET", "/stream"):
+        elif endpoint == ("GET", "/stream"):
             self._sessions.role_of(request.session, now_s=self._clock())
             await self._stream(request, receive, send)
         elif request.method == "GET" and request.path.startswith("/page/"):
@@ -169,8 +169,8 @@ class FleetApp:
         await _send_bytes(send, 304 if same else 200, file.media_type, data, headers)
 
     async def _stream(self, request: _Request, receive: Receive, send: Send) -> None:
-        asked = request.query.get("topics", "").split(",")
-        topics = frozenset(each for each in asked if each in _TOPICS or each.startswith(_LIVE))
+        names = request.query.get("topics", "").split(",")
+        topics = frozenset(topic for topic in names if topic in _TOPICS or topic.startswith(_LIVE))
         if not topics or len(topics) > len(_TOPICS) + 1:
             raise BadRequest("a stream needs topics", hint=f"some of {', '.join(sorted(_TOPICS))}, live/MAP")
         messages = self._hub.messages(topics)
@@ -179,7 +179,7 @@ class FleetApp:
             await send(_start(200, b"text/event-stream", ((b"cache-control", b"no-store"),)))
             await send({"type": "http.response.body", "body": first, "more_body": True})
             sending = asyncio.ensure_future(self._send_messages(request, messages, send))
-            leaving = asyncio.ensure_future(_until_left(receive))
+            leaving = asyncio.ensure_future(_wait_until_left(receive))
             try:
                 await asyncio.wait({sending, leaving}, return_when=asyncio.FIRST_COMPLETED)
             finally:
@@ -196,7 +196,7 @@ class FleetApp:
             self._sessions.role_of(request.session, now_s=self._clock())
 
 
-async def _until_left(receive: Receive) -> None:
+async def _wait_until_left(receive: Receive) -> None:
     """Wait until the browser is gone, and not for the next message to it: its place is another page's."""
     while (await receive())["type"] != "http.disconnect":
         pass
@@ -215,12 +215,12 @@ async def _body(receive: Receive) -> dict[str, Any]:
         if not part.get("more_body"):
             break
     try:
-        told = json.loads(data)
+        body = json.loads(data)
     except (ValueError, RecursionError):
-        told = None
-    if not isinstance(told, dict):
+        body = None
+    if not isinstance(body, dict):
         raise BadRequest("the body is no JSON object", hint="send one")
-    return told
+    return body
 
 
 def _text(body: Mapping[str, Any], name: str) -> str:
@@ -230,7 +230,7 @@ def _text(body: Mapping[str, Any], name: str) -> str:
     return value
 
 
-def _told(error: RsePfError) -> dict[str, Any]:
+def _error_document(error: RsePfError) -> dict[str, Any]:
     return {"code": error.code, "message": printable(error.message), "hint": printable(error.hint)}
 
 

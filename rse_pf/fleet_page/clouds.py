@@ -60,10 +60,10 @@ class MapPages:
 
         The cloud that the page shows first, the newest one of the first map, is packed meanwhile.
         """
-        found = await asyncio.to_thread(self._maps)
-        if found and (self._preparing is None or self._preparing.done()):
-            self._preparing = asyncio.create_task(self._prepare({"map": found[0]["map"]}))
-        return "application/json", json.dumps(found).encode()
+        listed = await asyncio.to_thread(self._maps)
+        if listed and (self._preparing is None or self._preparing.done()):
+            self._preparing = asyncio.create_task(self._prepare({"map": listed[0]["map"]}))
+        return "application/json", json.dumps(listed).encode()
 
     async def cloud(self, query: Mapping[str, str]) -> tuple[str, bytes]:
         """Return what `packer` packs of the version ``version`` of the map ``map``.
@@ -152,16 +152,16 @@ def packer(configuration: str) -> Handler:
         high = np.array([points[:, axis].max() if len(points) else 0.0 for axis in range(3)], np.float32)
         step = np.maximum(high.astype(np.float64) - low, 1e-6) / 65535
         robots: dict[str, list[list[float]]] = {}
-        for keyframe in sorted(version.keyframes, key=lambda each: each.timestamp_s):
+        for keyframe in sorted(version.keyframes, key=lambda row: row.timestamp_s):
             place = [round(float(value), 4) for value in keyframe.T_world_camera[:3, 3]]
             robots.setdefault(printable(keyframe.robot), []).append(place)
-        down = np.array([each.T_world_camera[:3, 1] for each in version.keyframes]).reshape(-1, 3)
-        told = {
+        down = np.array([keyframe.T_world_camera[:3, 1] for keyframe in version.keyframes]).reshape(-1, 3)
+        header = {
             "points": len(points), "all_points": len(version.points), "block": BLOCK_POINTS,
             "low": low.tolist(), "step": step.tolist(), "robots": robots,
             "up": (-down.mean(axis=0)).tolist() if len(down) else [0.0, -1.0, 0.0],
         }  # fmt: skip
-        head = json.dumps(told).encode()
+        head = json.dumps(header).encode()
         head += b" " * (-(4 + len(head)) % 4)
         numbers = ((points - low) * (1 / step).astype(np.float32) + np.float32(0.5)).clip(0, 65535)
         numbers = numbers.astype("<u2")

@@ -29,7 +29,7 @@ from rse_pf.linux import die_with_parent, set_process_name
 from rse_pf.recording.file_format import JSON_SCHEMA_ENCODING, POSE_SCHEMA, SCHEMAS, encode_json
 from rse_pf.terminal import show_error, show_json
 
-__all__ = ["ExportedMessage", "exported", "serve_foxglove"]
+__all__ = ["ExportedMessage", "export_messages", "serve_foxglove"]
 
 _HOST = "127.0.0.1"
 _TOPICS = frozenset(("fleet", "event", "pose", "robots", "maps"))
@@ -49,16 +49,16 @@ class ExportedMessage:
     value: Mapping[str, Any]
 
 
-def exported(topic: str, key: str, value: Any, *, now_s: float) -> Iterator[ExportedMessage]:
+def export_messages(topic: str, key: str, value: Any, *, now_s: float) -> Iterator[ExportedMessage]:
     """Yield what Foxglove is told of one value or row of the hub; *now_s* stands in for a missing time."""
     if topic in _CHANNELS:
-        told = value if isinstance(value, Mapping) else {"rows": value}
-        yield ExportedMessage(channel=_CHANNELS[topic], schema=f"rse_pf.{topic.capitalize()}", value=told)
+        row = value if isinstance(value, Mapping) else {"rows": value}
+        yield ExportedMessage(channel=_CHANNELS[topic], schema=f"rse_pf.{topic.capitalize()}", value=row)
     elif topic.startswith(LIVE) and isinstance(value, Mapping):
-        name = _named(topic.removeprefix(LIVE))
+        name = _topic_part(topic.removeprefix(LIVE))
         if value.get("kind") == "pose" and len(value.get("T_map_camera") or ()) == 16:
             pose = _pose(value, frame=name, now_s=now_s)
-            channel = f"/live/{name}/{_named(str(value.get('robot', '')))}"
+            channel = f"/live/{name}/{_topic_part(str(value.get('robot', '')))}"
             yield ExportedMessage(channel=channel, schema=POSE_SCHEMA, value=pose)
         elif not key.startswith("path/"):
             yield ExportedMessage(channel=f"/live/{name}", schema="rse_pf.LiveMap", value=value)
@@ -128,7 +128,7 @@ async def _export(folder: Path, channels: _Channels) -> None:
                     if f"{LIVE}{name}" not in followed:
                         live = frozenset((f"{LIVE}{name}",))
                         followed[f"{LIVE}{name}"] = asyncio.ensure_future(follow(live))
-            for message in exported(told["topic"], told["key"], told["value"], now_s=time.time()):
+            for message in export_messages(told["topic"], told["key"], told["value"], now_s=time.time()):
                 channels.write(message)
 
     tasks = [
@@ -144,20 +144,20 @@ async def _export(folder: Path, channels: _Channels) -> None:
 def _pose(value: Mapping[str, Any], *, frame: str, now_s: float) -> dict[str, Any]:
     """Return ``foxglove.PoseInFrame`` of a pose of a live map; the frame is the map's."""
     T = np.asarray(value["T_map_camera"], dtype=np.float64).reshape(4, 4)
-    x, y, z, w = (float(each) for each in to_quaternion(T[:3, :3]))
+    x, y, z, w = (float(component) for component in to_quaternion(T[:3, :3]))
     stamp_s = value.get("timestamp_s")
     stamp_ns = round(1e9 * float(stamp_s if isinstance(stamp_s, int | float) else now_s))
     return {
         "timestamp": {"sec": stamp_ns // 1_000_000_000, "nsec": stamp_ns % 1_000_000_000},
         "frame_id": frame,
         "pose": {
-            "position": dict(zip("xyz", (float(each) for each in T[:3, 3]), strict=True)),
+            "position": dict(zip("xyz", (float(coordinate) for coordinate in T[:3, 3]), strict=True)),
             "orientation": {"x": x, "y": y, "z": z, "w": w},
         },
     }
 
 
-def _named(name: str) -> str:
+def _topic_part(name: str) -> str:
     """Return a name of a robot or map as a part of a topic."""
     return _NOT_FOR_A_TOPIC.sub("_", name)[:64] or "_"
 

@@ -72,11 +72,11 @@ class Hub:
 
     def append(self, topic: str, row: Any) -> None:
         """Add one row to *topic*; the oldest rows are forgotten."""
-        told = _message(topic, "", row)
-        self._rows.setdefault(topic, deque(maxlen=_KEPT)).append(told)
+        message = _message(topic, "", row)
+        self._rows.setdefault(topic, deque(maxlen=_KEPT)).append(message)
         for page in self._pages:
             if topic in page.topics:
-                page.rows.append(told)
+                page.rows.append(message)
                 page.woken.set()
 
     async def messages(self, topics: frozenset[str]) -> AsyncGenerator[bytes, None]:

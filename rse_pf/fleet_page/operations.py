@@ -57,13 +57,13 @@ class LocalOperations:
         token = read_control_token(Path(state.control_token_file))
         query = urlencode({name: parameters[name] for name in ACTIONS[action]})
         try:
-            return await self._asked(state.status_port, token, f"/{action}?{query}")
+            return await self._ask(state.status_port, token, f"/{action}?{query}")
         except (OSError, ValueError, EOFError, asyncio.TimeoutError) as error:
             raise Busy(
                 "the control plane does not answer", hint="see rse-pf local status", retry_after_ms=1000
             ) from error
 
-    async def _asked(self, port: int, token: str, target: str) -> Mapping[str, Any]:
+    async def _ask(self, port: int, token: str, target: str) -> Mapping[str, Any]:
         reader, writer = await asyncio.open_connection(_LOOPBACK, port, limit=_MAX_LINE_BYTES)
         try:
             head = f"POST {target} HTTP/1.1\r\nHost: {_LOOPBACK}\r\nAuthorization: {bearer(token)}\r\n"

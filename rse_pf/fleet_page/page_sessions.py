@@ -55,13 +55,13 @@ class PageSessions:
         Raises:
             Unauthorized: The key is unknown, was used, or is too old.
         """
-        role = self._used_up(key, now_s)
+        role = self._take_key(key, now_s)
         if role is None:
             raise Unauthorized("this key is unknown, was used already, or is too old", hint=_NEW_KEY)
         session = self._secret()
         self._sessions[_digest(session)] = _Session(role, now_s)
         while len(self._sessions) > MAX_SESSIONS:
-            del self._sessions[min(self._sessions, key=lambda each: self._sessions[each].used_s)]
+            del self._sessions[min(self._sessions, key=lambda name: self._sessions[name].used_s)]
         return session, role
 
     def promote(self, session: str, key: str, *, now_s: float) -> None:
@@ -72,7 +72,7 @@ class PageSessions:
             Forbidden: The key is for looking only.
         """
         self.role_of(session, now_s=now_s)
-        role = self._used_up(key, now_s)
+        role = self._take_key(key, now_s)
         if role is None:
             raise Unauthorized("this key is unknown, was used already, or is too old", hint=_NEW_OPERATOR_KEY)
         if role != "operate":
@@ -81,21 +81,21 @@ class PageSessions:
 
     def role_of(self, session: str, *, now_s: float) -> Role:
         """Return what a *session* may do; raises Unauthorized if there is none."""
-        found = self._sessions.get(_digest(session))
-        if found is not None and now_s - found.used_s > _IDLE_S:
+        entry = self._sessions.get(_digest(session))
+        if entry is not None and now_s - entry.used_s > _IDLE_S:
             del self._sessions[_digest(session)]
-            found = None
-        if found is None:
+            entry = None
+        if entry is None:
             raise Unauthorized("this page has no session", hint=_NEW_KEY)
-        found.used_s = now_s
-        return found.role
+        entry.used_s = now_s
+        return entry.role
 
     def check_operator(self, session: str, *, now_s: float) -> None:
         """Raise Forbidden if a *session* may only look, Unauthorized if there is none."""
         if self.role_of(session, now_s=now_s) != "operate":
             raise Forbidden("only an operator may do this", hint=_NEW_OPERATOR_KEY)
 
-    def _used_up(self, key: str, now_s: float) -> Role | None:
+    def _take_key(self, key: str, now_s: float) -> Role | None:
         role, until_s = self._keys.pop(_digest(key), (None, 0.0))
         return role if now_s <= until_s else None
 

@@ -61,17 +61,17 @@ class Replays:
                 await asyncio.sleep(_WRITTEN_S - age_s)
             size = query.get("bytes", "")
             command_bytes = int(size) if size.isascii() and size.isdigit() and len(size) < 10 else None
-            told = await asyncio.to_thread(
-                self._replayed, trace, int(identity), answered_s, command_bytes or None
+            reply = await asyncio.to_thread(
+                self._replay_command, trace, int(identity), answered_s, command_bytes or None
             )
-        return "application/json", json.dumps(told).encode()
+        return "application/json", json.dumps(reply).encode()
 
     def close(self) -> None:
         """End the process with limits."""
         if self._replay is not None:
             self._replay.close()
 
-    def _replayed(
+    def _replay_command(
         self, trace: str, identity: int, answered_s: float, command_bytes: int | None
     ) -> dict[str, Any]:
         from rse_pf.recording.replay.limited import LimitedReplay
@@ -82,15 +82,15 @@ class Replays:
         path = Path(settings.recording.folder)
         if self._replay is None:
             self._replay = LimitedReplay(settings)
-        found = self._replay.find(
+        command = self._replay.find(
             path, trace=trace, id=identity, near_s=answered_s, command_bytes=command_bytes
         )
-        if found is None:
+        if command is None:
             raise NotFound(
                 "this command is not in the recording",
                 hint="it was deleted with the oldest files, or its service is not recorded",
             )
-        report = self._replay.command(path, found)
+        report = self._replay.command(path, command)
         return {"path": printable(str(path)), **replay_document(report)}
 
 
@@ -102,7 +102,7 @@ def replay_document(report: CommandReport) -> dict[str, Any]:
     lines = [
         f"verdict {report.verdict}{reason}; engine {report.engine or '-'}",
         f"{report.inliers} inliers of {report.matches} matches, {report.rmse_px:.2f} px",
-        *(f"{each.name}: {each.verdict}, {each.inliers} inliers" for each in tried),
+        *(f"{attempt.name}: {attempt.verdict}, {attempt.inliers} inliers" for attempt in tried),
     ]
     if not report.is_equal and (report.why_not or report.difference):
         lines.insert(0, report.why_not or report.difference)
@@ -111,12 +111,12 @@ def replay_document(report: CommandReport) -> dict[str, Any]:
         "equal": report.is_equal,
         "findings": [
             {
-                "cause": printable(each.cause),
-                "confidence": each.confidence,
-                "sentence": printable(each.sentence),
-                "missing": [printable(word) for word in each.missing],
+                "cause": printable(cause.cause),
+                "confidence": cause.confidence,
+                "sentence": printable(cause.sentence),
+                "missing": [printable(word) for word in cause.missing],
             }
-            for each in report.causes
+            for cause in report.causes
         ],
         "lines": [printable(line) for line in lines],
         "picture": f"data:image/png;base64,{base64.b64encode(picture).decode()}" if picture else "",

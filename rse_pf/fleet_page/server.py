@@ -41,9 +41,9 @@ def page_url(port: int, key: str) -> str:
 
 def listen(port: int) -> socket.socket:
     """Return a socket on loopback at *port*, or at a free one if that is taken or 0."""
-    for wanted in (port, 0):
+    for candidate in (port, 0):
         with contextlib.suppress(OSError):
-            return socket.create_server((_LOOPBACK, wanted), backlog=BACKLOG)
+            return socket.create_server((_LOOPBACK, candidate), backlog=BACKLOG)
     raise ConfigurationError("no port on loopback is free", hint="end other programs")
 
 

@@ -31,18 +31,18 @@ class StaticFile:
 
 def page_files() -> dict[str, StaticFile]:
     """Return the files of the page by path; ``/`` is its beginning."""
-    found = {
+    files = {
         f"/{file.relative_to(STATIC).as_posix()}": _read(file)
         for file in sorted(STATIC.rglob("*"))
         if file.suffix in _TYPES
     }
-    return {**found, "/": found["/index.html"]}
+    return {**files, "/": files["/index.html"]}
 
 
 def vendored() -> list[Mapping[str, Any]]:
     """Return the packages of others that the page contains: version, licence, and the digest of each file."""
-    told: list[Mapping[str, Any]] = json.loads((STATIC / "vendor" / "vendored.json").read_text("utf-8"))
-    return told
+    packages: list[Mapping[str, Any]] = json.loads((STATIC / "vendor" / "vendored.json").read_text("utf-8"))
+    return packages
 
 
 def _read(file: Path) -> StaticFile:

@@ -168,7 +168,7 @@ def test_a_watcher_hears_states_and_events_and_watchers_are_bounded() -> None:
         operations = Operations(kept.append)
         watched = operations.watch(lambda: {"servers": 2})
         assert await watched.__anext__() == {"state": {"servers": 2}}
-        operations.heard({"event": "server-killed", "server": "server-1"})
+        operations.take_event({"event": "server-killed", "server": "server-1"})
         told = await asyncio.wait_for(watched.__anext__(), 2.0)
         assert (told["event"], told["number"]) == ("server-killed", 1)
 

@@ -9,12 +9,12 @@ import pytest
 
 from rse_pf.errors import MissingExtra
 from rse_pf.fleet_page import foxglove_export
-from rse_pf.fleet_page.foxglove_export import ExportedMessage, exported
+from rse_pf.fleet_page.foxglove_export import ExportedMessage, export_messages
 from rse_pf.recording.file_format import POSE_SCHEMA, SCHEMAS
 
 
 def only(topic: str, key: str, value: object) -> ExportedMessage:
-    (message,) = exported(topic, key, value, now_s=7.0)
+    (message,) = export_messages(topic, key, value, now_s=7.0)
     return message
 
 
@@ -43,8 +43,8 @@ def test_the_pose_of_a_robot_in_a_live_map_is_a_pose_in_the_frame_of_the_map() -
 
 def test_other_values_of_a_live_map_are_told_as_they_are_and_paths_are_left_out() -> None:
     assert only("live/hall", "map", {"kind": "map", "keyframes": 4}).channel == "/live/hall"
-    assert not list(exported("live/hall", "path/r", {"points": []}, now_s=0.0))
-    assert not list(exported("history", "minutes", [[1]], now_s=0.0))
+    assert not list(export_messages("live/hall", "path/r", {"points": []}, now_s=0.0))
+    assert not list(export_messages("history", "minutes", [[1]], now_s=0.0))
     broken = {"kind": "pose", "robot": "r", "T_map_camera": [1.0]}
     assert only("live/hall", "pose/r", broken).schema == "rse_pf.LiveMap"
 

@@ -40,15 +40,15 @@ class AuditRows:
 
         In place of an entry that does not match its hash stands what is wrong with it.
         """
-        found: list[tuple[str, Entry | str]] = []
+        entries: list[tuple[str, Entry | str]] = []
         files = sorted(self._folder.glob("*.jsonl")) if self._folder.is_dir() else []
         for file in files:
-            who = file.name.partition(".")[0]
-            found += [(who, Chain(None).add(line + b"\n")) for line in self._tail.new_lines(file)]
-        wanted = [each for each in found if isinstance(each[1], str) or each[1].action != HEADS]
-        wanted.sort(key=lambda each: each[1].time if isinstance(each[1], Entry) else float("inf"))
-        self.skipped += max(len(wanted) - _MAX_ROWS, 0)
-        return wanted[-_MAX_ROWS:]
+            chain = file.name.partition(".")[0]
+            entries += [(chain, Chain(None).add(line + b"\n")) for line in self._tail.new_lines(file)]
+        shown = [row for row in entries if isinstance(row[1], str) or row[1].action != HEADS]
+        shown.sort(key=lambda row: row[1].time if isinstance(row[1], Entry) else float("inf"))
+        self.skipped += max(len(shown) - _MAX_ROWS, 0)
+        return shown[-_MAX_ROWS:]
 
     def new_rows(
         self, *, now_s: float, is_told: Callable[[Entry], bool] = lambda entry: False
@@ -61,38 +61,38 @@ class AuditRows:
         """
         rows: list[dict[str, Any]] = []
         events: list[dict[str, Any]] = []
-        for who, entry in self.new_entries():
+        for chain, entry in self.new_entries():
             if isinstance(entry, str):
-                text = f"a line in the audit log of {who} was changed (rse-pf audit verify says which)"
-                rows.append(_row(who, _BROKEN, text, time_s=now_s, group="trouble"))
+                text = f"a line in the audit log of {chain} was changed (rse-pf audit verify says which)"
+                rows.append(_row(chain, _BROKEN, text, time_s=now_s, group="trouble"))
             elif not entry.action.startswith(PLATFORM):
-                rows.append(_row(who, entry.action, audit_sentence(who, entry), time_s=entry.time))
+                rows.append(_row(chain, entry.action, audit_sentence(chain, entry), time_s=entry.time))
             elif not is_told(entry):
                 kind = entry.action.removeprefix(PLATFORM)
                 events.append({"server": entry.subject, **entry.detail, "event": kind, "time_s": entry.time})
         return rows, events
 
 
-def audit_sentence(who: str, entry: Entry) -> str:
-    """Return an *entry* of the chain *who* as a sentence; its details if its action has none of its own."""
+def audit_sentence(chain: str, entry: Entry) -> str:
+    """Return an *entry* of the chain *chain* as a sentence; its details if its action has none of its own."""
     values = {name: str(value) for name, value in entry.detail.items()}
     subject = str(RobotId(values["tenant"], entry.subject)) if values.get("tenant") else entry.subject
     actor = values.get("user", entry.actor) if entry.actor == OPERATOR else entry.actor
     text = _SENTENCES.get(entry.action)
     if text is not None:
         return text.format_map(
-            _Missing({**values, "subject": subject or "a robot", "actor": actor, "who": who})
+            _Missing({**values, "subject": subject or "a robot", "actor": actor, "who": chain})
         )
-    told = [f"{name} {value}" for name, value in values.items() if name not in ("tenant", "user")]
-    by = [f"by {actor}"] if actor != who else []
-    words = " ".join([who, entry.action.replace(".", " ").replace("-", " "), subject, *by]).strip()
-    return f"{words}: {', '.join(told)}" if told else words
+    details = [f"{name} {value}" for name, value in values.items() if name not in ("tenant", "user")]
+    by = [f"by {actor}"] if actor != chain else []
+    words = " ".join([chain, entry.action.replace(".", " ").replace("-", " "), subject, *by]).strip()
+    return f"{words}: {', '.join(details)}" if details else words
 
 
-def _row(who: str, kind: str, text: str, *, time_s: float, group: str = "audit") -> dict[str, Any]:
+def _row(chain: str, kind: str, text: str, *, time_s: float, group: str = "audit") -> dict[str, Any]:
     return {
         "time_s": time_s, "kind": printable(kind), "text": printable(text[:_MAX_TEXT]),
-        "server": printable(who), "group": group,
+        "server": printable(chain), "group": group,
     }  # fmt: skip
 
 

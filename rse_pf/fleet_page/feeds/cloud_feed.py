@@ -79,11 +79,11 @@ class CloudFeed:
 
     async def run(self) -> None:
         """Feed until cancelled, at first with the state that was read before."""
-        self._tell()
+        self._publish()
         works: list[Coroutine[Any, Any, None]] = [
             self._repeat(_STATE_EVERY_S, self._read_state),
             self._repeat(float(self._settings.scaling.period_s), self._read_metrics),
-            self._keep_telling(),
+            self._publish_periodically(),
         ]
         if self._asks_costs:
             works.append(self._repeat(_COSTS_EVERY_S, self._read_spending))
@@ -94,25 +94,27 @@ class CloudFeed:
             while not self._hub.watches("fleet"):
                 await asyncio.sleep(_LOOK_S)
             await read()
-            self._tell()
+            self._publish()
             await asyncio.sleep(every_s)
 
-    async def _keep_telling(self) -> None:
+    async def _publish_periodically(self) -> None:
         while True:
-            self._tell_link()
+            self._publish_link()
             await asyncio.sleep(_TELL_EVERY_S)
 
     async def _read_state(self) -> None:
         now = self._now()
-        read = await self._asked("state", lambda: read_overview(self._account, self._settings, now=now))
+        read = await self._read_in_thread(
+            "state", lambda: read_overview(self._account, self._settings, now=now)
+        )
         if read is not None:
             for event in new_events(self._overview, read, time_s=now.timestamp()):
                 self._hub.append("event", event)
             self._overview = read
 
     async def _read_metrics(self) -> None:
-        names, now = [each.name for each in self._overview.group.servers], self._now()
-        read = await self._asked(
+        names, now = [server.name for server in self._overview.group.servers], self._now()
+        read = await self._read_in_thread(
             "metrics", lambda: read_group_metrics(self._account, self._settings, names, now=now)
         )
         if read is not None:
@@ -120,36 +122,36 @@ class CloudFeed:
             self._hub.put("history", "minutes", _history(read))
 
     async def _read_spending(self) -> None:
-        read = await self._asked("costs", lambda: read_spending(self._account, now=self._now()))
+        read = await self._read_in_thread("costs", lambda: read_spending(self._account, now=self._now()))
         self._spending = read or self._spending
 
-    async def _asked(self, what: str, read: Callable[[], T]) -> T | None:
-        """Return what *read* returns in a thread; None, and a problem under *what*, when AWS refuses."""
+    async def _read_in_thread(self, subject: str, read: Callable[[], T]) -> T | None:
+        """Return what *read* returns in a thread; None, and a problem under *subject*, when AWS refuses."""
         try:
             value = await asyncio.to_thread(read)
         except RsePfError as error:
-            self._problems[what] = f"{error.message} ({error.hint})"
+            self._problems[subject] = f"{error.message} ({error.hint})"
             return None
         except _NOT_UNDERSTOOD as error:  # the page shows what the other answers say
-            self._problems[what] = f"AWS answers in a way that is not understood: {error}"
+            self._problems[subject] = f"AWS answers in a way that is not understood: {error}"
             return None
-        self._problems.pop(what, None)
+        self._problems.pop(subject, None)
         return value
 
-    def _tell(self) -> None:
+    def _publish(self) -> None:
         document = cloud_document(
             self._overview, self._metrics, self._settings, time_s=self._wall_clock(),
             region=self._account.region, costs=self._costs(),
-            problems=[text for what, text in self._problems.items() if what not in ("state", "costs")],
+            problems=[text for subject, text in self._problems.items() if subject not in ("state", "costs")],
         )  # fmt: skip
         document["pages"] = self._hub.pages
         self._hub.put("fleet", "now", document)
-        self._tell_link()
+        self._publish_link()
 
-    def _tell_link(self) -> None:
+    def _publish_link(self) -> None:
         wrong = self._problems.get("state")
-        told = {"connected": wrong is None, "time_s": self._wall_clock()}
-        self._hub.put("link", "control_plane", {**told, **({"text": printable(wrong)} if wrong else {})})
+        link = {"connected": wrong is None, "time_s": self._wall_clock()}
+        self._hub.put("link", "control_plane", {**link, **({"text": printable(wrong)} if wrong else {})})
 
     def _costs(self) -> dict[str, Any]:
         wrong = self._problems.get("costs", "")
@@ -181,12 +183,12 @@ def cloud_document(
         problems: What could not be read beside those of *overview*.
     """
     group, balancer, period_s = overview.group, overview.balancer, metrics.period_s
-    servers = [_server(each, overview, metrics, time_s) for each in group.servers]
-    robots = [each["robots"] for each in servers if each["robots"] is not None]
+    servers = [_server(server, overview, metrics, time_s) for server in group.servers]
+    robots = [server["robots"] for server in servers if server["robots"] is not None]
     answers = metrics.newest("answers")
-    percentiles = {name: _rounded(metrics.newest(name), 1) for name in ("p50_ms", "p95_ms", "p99_ms")}
+    percentiles = {name: _round(metrics.newest(name), 1) for name in ("p50_ms", "p95_ms", "p99_ms")}
     per_s = {
-        name: _rounded(_divided(metrics.newest(name), period_s), 2)
+        name: _round(_divide(metrics.newest(name), period_s), 2)
         for name in ("requests", "bytes_in", "bytes_out")
     }
     unknown = [*_NOT_TOLD, *overview.problems, *(problems or ())]
@@ -198,16 +200,16 @@ def cloud_document(
         "platform": printable(f"on AWS, {region}"),
         "url": printable("" if balancer is None else balancer.address),
         "tls": balancer is not None and bool(balancer.protocols) and set(balancer.protocols) <= _SECURE,
-        "protocols": [] if balancer is None else [printable(each) for each in balancer.protocols],
+        "protocols": [] if balancer is None else [printable(protocol) for protocol in balancer.protocols],
         "balancer": balancer is not None and balancer.state in ("active", "active_impaired"),
         "balancer_state": printable("not known" if balancer is None else balancer.state),
         "robots": sum(robots) if robots else None,
-        "cpu_percent": _rounded(metrics.newest("cpu_percent"), 1),
-        "queue_ms": _rounded(metrics.newest("queue_ms"), 1),
+        "cpu_percent": _round(metrics.newest("cpu_percent"), 1),
+        "queue_ms": _round(metrics.newest("queue_ms"), 1),
         **per_s,
         "servers": servers,
         "data_servers": [],
-        "waiting": _waiting(group, metrics, settings),
+        "waiting": _list_wait_reasons(group, metrics, settings),
         "last_action": printable(overview.activities[-1].text[:_MAX_TEXT]) if overview.activities else "",
         "min_servers": group.min_servers,
         "max_servers": group.max_servers,
@@ -226,21 +228,27 @@ def cloud_document(
 
 def new_events(before: CloudOverview | None, after: CloudOverview, *, time_s: float) -> list[dict[str, Any]]:
     """Return what happened between two looks, as the Events view shows it; all that is known at the first."""
-    known = set() if before is None else {(each.id, each.status) for each in before.activities}
-    told = [_activity(each) for each in after.activities if (each.id, each.status) not in known]
-    was = {} if before is None else before.group.alarms
+    old_activities = (
+        set() if before is None else {(activity.id, activity.status) for activity in before.activities}
+    )
+    events = [
+        _activity(activity)
+        for activity in after.activities
+        if (activity.id, activity.status) not in old_activities
+    ]
+    old_alarms = {} if before is None else before.group.alarms
     for name, state in sorted(after.group.alarms.items()):
-        if state != was.get(name) and (before is not None or state == "ALARM"):
+        if state != old_alarms.get(name) and (before is not None or state == "ALARM"):
             reason = after.group.reasons.get(name, "")
-            told.append(
+            events.append(
                 _event(
                     time_s, f"alarm-{name}", f"alarm {name} is in state {state}: {reason}",
                     group="trouble" if state == "ALARM" and name not in _SCALES else "scaling",
                 )
             )  # fmt: skip
     if before is not None:
-        told += _changes(before.group, after.group, time_s)
-    return told
+        events += _changes(before.group, after.group, time_s)
+    return events
 
 
 _SECURE = {"TLS", "HTTPS"}
@@ -248,18 +256,20 @@ _SCALES = ("busy", "idle", "crowded", "queueing")
 
 
 def _changes(before: AutoScalingGroup, after: AutoScalingGroup, time_s: float) -> list[dict[str, Any]]:
-    was = {each.name: _state(each) for each in before.servers}
-    told = []
-    for each in after.servers:
-        state = _state(each)
-        if was.get(each.name) != state:
-            health = ", ".join(each.targets) or "in no target group"
-            text = f"{each.name} is {state} ({each.state}; {health})"
+    old_states = {server.name: _state(server) for server in before.servers}
+    changes = []
+    for server in after.servers:
+        state = _state(server)
+        if old_states.get(server.name) != state:
+            health = ", ".join(server.targets) or "in no target group"
+            text = f"{server.name} is {state} ({server.state}; {health})"
             group = "trouble" if state == "unhealthy" else "other"
-            told.append(_event(time_s, f"server-{state}", text, group=group, server=each.name))
-    for name in sorted(was.keys() - {each.name for each in after.servers}):
-        told.append(_event(time_s, "server-gone", f"{name} has left the group", group="other", server=name))
-    return told
+            changes.append(_event(time_s, f"server-{state}", text, group=group, server=server.name))
+    for name in sorted(old_states.keys() - {server.name for server in after.servers}):
+        changes.append(
+            _event(time_s, "server-gone", f"{name} has left the group", group="other", server=name)
+        )
+    return changes
 
 
 def _activity(activity: ScalingActivity) -> dict[str, Any]:
@@ -283,7 +293,7 @@ def _server(server: Server, overview: CloudOverview, metrics: GroupMetrics, time
         "name": printable(server.name),
         "state": printable(_state(server)),
         "note": printable(f"{server.state}, {server.zone}; targets: {', '.join(server.targets) or 'none'}"),
-        "cpu_percent": _rounded(numbers.get("cpu_percent"), 1),
+        "cpu_percent": _round(numbers.get("cpu_percent"), 1),
         "robots": None if robots is None else round(robots),
         "requests": None, "queue": None, "queue_ms": None, "in_flight": None, "pid": None, "warming": False,
         "age_s": None if launched_s is None else round(max(time_s - launched_s, 0.0), 1),
@@ -300,7 +310,9 @@ def _state(server: Server) -> str:
     return "unhealthy" if {"unhealthy", "draining", "unused"} & set(server.targets) else "starting"
 
 
-def _waiting(group: AutoScalingGroup, metrics: GroupMetrics, settings: PlatformSettings) -> list[str]:
+def _list_wait_reasons(
+    group: AutoScalingGroup, metrics: GroupMetrics, settings: PlatformSettings
+) -> list[str]:
     """Return what the alarms wait for: they are the same policy as that of a local platform."""
     pairs = list(zip(metrics.series.get("cpu_percent", ()), metrics.series.get("requests", ()), strict=False))
     while pairs and pairs[-1][0] is None and len(metrics.times_s) - len(pairs) < _LATE_PERIODS:
@@ -313,23 +325,23 @@ def _waiting(group: AutoScalingGroup, metrics: GroupMetrics, settings: PlatformS
         "elastic": True, "samples": samples,
         "min_servers": group.min_servers, "max_servers": group.max_servers,
     }  # fmt: skip
-    told = waiting_for(policy, settings.scaling, servers=len(group.servers))
+    reasons = waiting_for(policy, settings.scaling, servers=len(group.servers))
     if group.wanted_servers != len(group.servers):
-        told.insert(0, f"the group wants {group.wanted_servers} servers and has {len(group.servers)}")
+        reasons.insert(0, f"the group wants {group.wanted_servers} servers and has {len(group.servers)}")
     for name, state in sorted(group.alarms.items()):
         if state == "ALARM":
             text = f"alarm {name} is in state ALARM: {group.reasons.get(name, '')}"
-            told.append(f"{text[:_MAX_TEXT]} (docs/operations.md#{name})")
-    return [printable(each) for each in told]
+            reasons.append(f"{text[:_MAX_TEXT]} (docs/operations.md#{name})")
+    return [printable(reason) for reason in reasons]
 
 
 def _history(metrics: GroupMetrics) -> list[list[float | None]]:
     """Return time, CPU, commands a second, robots and p99 of each period; robots are not charted."""
     series, count = metrics.series, len(metrics.times_s)
     nothing: tuple[float | None, ...] = (None,) * count
-    rates = [_rounded(_divided(each, metrics.period_s), 2) for each in series.get("requests", nothing)]
+    rates = [_round(_divide(count, metrics.period_s), 2) for count in series.get("requests", nothing)]
     return [
-        [float(each) for each in metrics.times_s],
+        [float(time_s) for time_s in metrics.times_s],
         list(series.get("cpu_percent", nothing)),
         rates,
         list(nothing),
@@ -351,9 +363,9 @@ def _costs(spending: Spending | None) -> dict[str, Any]:
     }
 
 
-def _divided(value: float | None, by: float) -> float | None:
+def _divide(value: float | None, by: float) -> float | None:
     return None if value is None else value / by
 
 
-def _rounded(value: float | None, digits: int) -> float | None:
+def _round(value: float | None, digits: int) -> float | None:
     return None if value is None else round(value, digits)

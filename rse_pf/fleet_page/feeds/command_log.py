@@ -52,15 +52,15 @@ def _row(line: bytes) -> dict[str, Any] | None:
     if _MARK not in line:
         return None
     try:
-        told = json.loads(line)
+        fields = json.loads(line)
     except ValueError:
         return None
-    if not isinstance(told, dict) or told.get("event") != "command":
+    if not isinstance(fields, dict) or fields.get("event") != "command":
         return None
-    row: dict[str, Any] = {name: told[name] for name in _FIELDS if name in told}
+    row: dict[str, Any] = {name: fields[name] for name in _FIELDS if name in fields}
     if row.get("code") in ("busy", "stale") or (row.get("code") == "ok" and row.get("verdict") != "weak"):
         return None
-    time_s = told.get("time", 0.0)
+    time_s = fields.get("time", 0.0)
     row["time_s"] = time_s if isinstance(time_s, int | float) else 0.0
     return {
         name: value if isinstance(value, int | float) else printable(str(value)[:_MAX_TEXT])

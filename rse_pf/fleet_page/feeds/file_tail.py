@@ -29,13 +29,13 @@ class FileTail:
         At most 1 MiB is read at once: what was written before it is skipped.
         """
         try:
-            told = file.stat()
-            key, size = (told.st_dev, told.st_ino), told.st_size
-            known = self._read.get(key)
-            start = max(0, size - _TAIL_BYTES) if known is None else known
+            status = file.stat()
+            key, size = (status.st_dev, status.st_ino), status.st_size
+            position = self._read.get(key)
+            start = max(0, size - _TAIL_BYTES) if position is None else position
             if size < start:  # it was begun anew
                 start, self._rest[key] = 0, b""
-            is_cut = known is None and start > 0
+            is_cut = position is None and start > 0
             if size - start > _MAX_READ_BYTES:
                 start, self._rest[key], is_cut = size - _MAX_READ_BYTES, b"", True
             data = _part(file, key, start, size - start) if size > start else b""
@@ -53,8 +53,8 @@ class FileTail:
 def _part(file: Path, key: tuple[int, int], start: int, count: int) -> bytes:
     """Return *count* bytes of *file*; raises OSError if another file has its name by now."""
     with file.open("rb") as opened:
-        told = os.fstat(opened.fileno())
-        if (told.st_dev, told.st_ino) != key:
+        status = os.fstat(opened.fileno())
+        if (status.st_dev, status.st_ino) != key:
             raise FileNotFoundError(file)
         opened.seek(start)
         return opened.read(count)

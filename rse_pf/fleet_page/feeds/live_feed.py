@@ -47,10 +47,10 @@ class LiveFeed:
         while True:
             if self._hub.watches("maps"):
                 with contextlib.suppress(RsePfError, OSError):
-                    await self._connected()
+                    await self._connect()
             await asyncio.sleep(_LOOK_S)
 
-    async def _connected(self) -> None:
+    async def _connect(self) -> None:
         from client_sdk import connect
 
         state = await asyncio.to_thread(read_state, self._folder)
@@ -64,15 +64,15 @@ class LiveFeed:
         try:
             async with connect(state.url, token=token, codec="json") as robot:
                 while self._hub.watches("maps"):
-                    await self._follow_asked(robot)
+                    await self._follow_if_asked(robot)
         finally:
             for task in self._followed.values():
                 task.cancel()
             self._followed.clear()
 
-    async def _follow_asked(self, robot: Any) -> None:
+    async def _follow_if_asked(self, robot: Any) -> None:
         listed = (await robot.call("live-list", {})).reply
-        names = [str(each["name"]) for each in listed.get("maps", [])]
+        names = [str(entry["name"]) for entry in listed.get("maps", [])]
         self._hub.put("maps", "live", names)
         for _ in range(round(_LIST_EVERY_S / _LOOK_S)):
             for name in names[:_MAX_MAPS]:
@@ -83,11 +83,11 @@ class LiveFeed:
     async def _follow(self, robot: Any, name: str) -> None:
         paths = RobotPaths()
         async for key, value in robot.subscribe(LIVE + name):
-            told = plain(value)
-            self._hub.put(LIVE + name, printable(str(key)), told)
-            path = paths.take(told)
+            message = plain(value)
+            self._hub.put(LIVE + name, printable(str(key)), message)
+            path = paths.take(message)
             if path is not None:
-                self._hub.put(LIVE + name, f"path/{told['robot']}", path)
+                self._hub.put(LIVE + name, f"path/{message['robot']}", path)
 
 
 class RobotPaths:
@@ -116,26 +116,26 @@ class RobotPaths:
         path = self._paths.get(robot)
         if path is None or path["segment"] != segment:
             path = self._paths[robot] = {"segment": segment, "points": []}
-        path["points"] = [*path["points"], _in_odometry(known[1], T_map_camera)][-_MAX_PATH:]
+        path["points"] = [*path["points"], _position_in_odometry(known[1], T_map_camera)][-_MAX_PATH:]
         return path
 
 
 def plain(value: Any) -> Any:
     """Return *value* with arrays as lists and every text escaped."""
     if isinstance(value, Mapping):
-        return {printable(str(name)): plain(each) for name, each in value.items()}
+        return {printable(str(name)): plain(item) for name, item in value.items()}
     if isinstance(value, str):
         return printable(value)
     if hasattr(value, "tolist"):
         return value.tolist()
-    return [plain(each) for each in value] if isinstance(value, list | tuple) else value
+    return [plain(item) for item in value] if isinstance(value, list | tuple) else value
 
 
 def _is_matrix(value: Any) -> bool:
     return isinstance(value, list) and len(value) == 16
 
 
-def _in_odometry(T_map_odom: Sequence[float], T_map_camera: Sequence[float]) -> list[float]:
+def _position_in_odometry(T_map_odom: Sequence[float], T_map_camera: Sequence[float]) -> list[float]:
     """Return the position of the camera in the odometry frame, ``(3,)`` metres."""
     moved = [T_map_camera[4 * row + 3] - T_map_odom[4 * row + 3] for row in range(3)]
     return [

@@ -24,13 +24,13 @@ Buckets = dict[float, float]
 
 def buckets_of(page: str) -> Buckets:
     """Return the histogram of all services on a server's page of metrics."""
-    found: Buckets = {}
+    buckets: Buckets = {}
     for labels, value in _BUCKET.findall(page):
         bound = _BOUND.search(labels)
         if bound:
             least_s = math.inf if bound[1] == "+Inf" else float(bound[1])
-            found[least_s] = found.get(least_s, 0.0) + float(value)
-    return found
+            buckets[least_s] = buckets.get(least_s, 0.0) + float(value)
+    return buckets
 
 
 def percentile(buckets: Mapping[float, float], share: float) -> float | None:
@@ -63,10 +63,10 @@ class LastMinute:
 
     def add(self, server: str, buckets: Buckets, *, now_s: float) -> None:
         """Take the present histogram of *server*."""
-        taken = self._taken.setdefault(server, deque())
-        if taken and any(buckets.get(bound, 0.0) < count for bound, count in taken[-1][1].items()):
-            taken.clear()  # it restarted
-        taken.append((now_s, buckets))
+        snapshots = self._taken.setdefault(server, deque())
+        if snapshots and any(buckets.get(bound, 0.0) < count for bound, count in snapshots[-1][1].items()):
+            snapshots.clear()  # it restarted
+        snapshots.append((now_s, buckets))
 
     def document(self, *, now_s: float, servers: Sequence[str]) -> dict[str, Any]:
         """Return p50, p95 and p99 in milliseconds, the count, and how many seconds they cover."""
@@ -74,18 +74,18 @@ class LastMinute:
             del self._taken[gone]
         summed: Buckets = {}
         covered_s = 0.0
-        for taken in self._taken.values():
-            while len(taken) > 1 and taken[1][0] <= now_s - _MINUTE_S:
-                taken.popleft()
-            (began_s, first), (ended_s, last) = taken[0], taken[-1]
+        for snapshots in self._taken.values():
+            while len(snapshots) > 1 and snapshots[1][0] <= now_s - _MINUTE_S:
+                snapshots.popleft()
+            (began_s, first), (ended_s, last) = snapshots[0], snapshots[-1]
             covered_s = max(covered_s, ended_s - began_s)
             for bound, count in last.items():
                 summed[bound] = summed.get(bound, 0.0) + count - first.get(bound, 0.0)
         count = max(summed.values(), default=0.0)
 
         def told(share: float) -> float | None:
-            found = percentile(summed, share)
-            return None if found is None else round(1e3 * found, 2)
+            value = percentile(summed, share)
+            return None if value is None else round(1e3 * value, 2)
 
         return {
             "p50_ms": told(0.5), "p95_ms": told(0.95), "p99_ms": told(0.99), "count": int(count),

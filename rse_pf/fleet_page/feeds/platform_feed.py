@@ -119,11 +119,11 @@ class LocalFeed:
                 line = await asyncio.wait_for(reader.readline(), _ASK_S + 3.0)
                 if not line:
                     return
-                told = json.loads(line)
-                if "state" in told:
-                    self._take(told["state"])
+                message = json.loads(line)
+                if "state" in message:
+                    self._take(message["state"])
                 else:
-                    self._event(told)
+                    self._event(message)
         finally:
             writer.close()
 
@@ -147,14 +147,14 @@ class LocalFeed:
 
     def _event(self, event: Mapping[str, Any]) -> None:
         kind = str(event.get("event", ""))
-        told = {
+        row = {
             "time_s": event.get("time_s", time.time()),
             "kind": printable(kind),
             "text": printable(event_sentence(event))[:_MAX_TEXT],
             "server": printable(str(event.get("server", event.get("name", "")))),
             "group": group_of(kind),
         }
-        self._hub.append("event", told)
+        self._hub.append("event", row)
 
     # --- servers and logs ------------------------------------------------------------------------
 
@@ -166,9 +166,9 @@ class LocalFeed:
             await asyncio.sleep(_ROBOTS_EVERY_S)
 
     async def _read_robots(self) -> None:
-        names, told = await self._ask_servers("/robots")
+        names, replies = await self._ask_servers("/robots")
         rows: list[list[Any]] = []
-        for name, page in zip(names, told, strict=True):
+        for name, page in zip(names, replies, strict=True):
             for row in json.loads(page).get("robots", []) if page else []:
                 robot = _robot(str(row["tenant"]), str(row["robot"]))
                 last = printable(str(row["last_result"] or "-"))
@@ -177,7 +177,7 @@ class LocalFeed:
         for robot, before, after in moved_robots(self._where, where)[:_MAX_TOLD_MOVES]:
             self._event({"event": "robot-moved", "robot": robot, "before": before, "server": after})
         # A robot that moves is on no server for a moment: those that are gone are forgotten later.
-        gone = [each for each in self._where.items() if each[0] not in where][-_MAX_GONE:]
+        gone = [item for item in self._where.items() if item[0] not in where][-_MAX_GONE:]
         self._where = {**dict(gone), **where}
         self._hub.put("robots", "now", rows)
 
@@ -185,9 +185,9 @@ class LocalFeed:
         while True:
             if self._hub.watches("fleet"):
                 with contextlib.suppress(*_UNREADABLE):
-                    names, told = await self._ask_servers("/metrics")
+                    names, replies = await self._ask_servers("/metrics")
                     now_s = time.monotonic()
-                    for name, page in zip(names, told, strict=True):
+                    for name, page in zip(names, replies, strict=True):
                         if page:
                             self._minute.add(name, buckets_of(page.decode("utf-8", "replace")), now_s=now_s)
                     self._percentiles = self._minute.document(now_s=now_s, servers=names)
@@ -195,15 +195,18 @@ class LocalFeed:
 
     async def _ask_servers(self, target: str) -> tuple[list[str], list[bytes | None]]:
         state = await asyncio.to_thread(read_state, self._folder)
-        servers = [] if state is None else [each for each in state.servers if each.control_port]
+        servers = [] if state is None else [server for server in state.servers if server.control_port]
         if state is None or not servers:
             return [], []
         token = read_control_token(Path(state.control_token_file)) if state.control_token_file else None
         replies = await asyncio.gather(
-            *(ControlPort(each.control_port, token).ask_once(target, timeout_s=_ASK_S) for each in servers)
+            *(
+                ControlPort(server.control_port, token).ask_once(target, timeout_s=_ASK_S)
+                for server in servers
+            )
         )
         pages = [None if reply is None or reply.status != 200 else reply.body for reply in replies]
-        return [each.name for each in servers], pages
+        return [server.name for server in servers], pages
 
     async def _follow_logs(self) -> None:
         while True:
@@ -231,8 +234,8 @@ def fleet_document(state: Mapping[str, Any], settings: PlatformSettings, *, time
     """Return what the Fleet view shows of the control plane's *state*, every text escaped."""
     sample = state.get("sample") or {}
     policy = state.get("policy") or {}
-    servers = [_server(each) for each in state.get("servers", [])]
-    counted = sum(each["state"] in ("starting", "healthy", "unhealthy") for each in servers)
+    servers = [_server(server) for server in state.get("servers", [])]
+    counted = sum(server["state"] in ("starting", "healthy", "unhealthy") for server in servers)
     return {
         "time_s": time_s,
         "platform": printable(str(state.get("platform", ""))),
@@ -246,7 +249,7 @@ def fleet_document(state: Mapping[str, Any], settings: PlatformSettings, *, time
         "bytes_in": sample.get("bytes_in", 0),
         "bytes_out": sample.get("bytes_out", 0),
         "servers": servers,
-        "data_servers": [_data_server(each) for each in _listed(state.get("data_servers"))],
+        "data_servers": [_data_server(server) for server in _mappings_in(state.get("data_servers"))],
         "waiting": waiting_for(policy, settings.scaling, servers=counted),
         "last_action": printable(str(((policy.get("last_action") or {}).get("reason")) or "")),
         "min_servers": policy.get("min_servers"),
@@ -282,21 +285,24 @@ def _robot(tenant: str, name: str) -> str:
 
 def _mean_cpu(servers: Sequence[Mapping[str, Any]]) -> float | None:
     """Return the mean over all servers that told their CPU, those that warm up included."""
-    known = [float(each["cpu_percent"]) for each in servers if each["cpu_percent"] is not None]
-    return round(sum(known) / len(known), 1) if known else None
+    percents = [float(server["cpu_percent"]) for server in servers if server["cpu_percent"] is not None]
+    return round(sum(percents) / len(percents), 1) if percents else None
 
 
-def _server(told: Mapping[str, Any]) -> dict[str, Any]:
+def _server(server: Mapping[str, Any]) -> dict[str, Any]:
     numbers = ("cpu_percent", "robots", "requests", "queue", "queue_ms", "in_flight", "pid", "warming")
     return {
-        "name": printable(str(told.get("name", ""))),
-        "state": printable(str(told.get("state", ""))),
-        **{name: told.get(name) for name in numbers},
+        "name": printable(str(server.get("name", ""))),
+        "state": printable(str(server.get("state", ""))),
+        **{name: server.get(name) for name in numbers},
     }
 
 
-def _data_server(told: Mapping[str, Any]) -> dict[str, Any]:
-    return {"name": printable(str(told.get("name", ""))), "state": "runs" if told.get("running") else "gone"}
+def _data_server(server: Mapping[str, Any]) -> dict[str, Any]:
+    return {
+        "name": printable(str(server.get("name", ""))),
+        "state": "runs" if server.get("running") else "gone",
+    }
 
 
 def _age_s(pid: Any) -> float | None:
@@ -308,7 +314,7 @@ def _age_s(pid: Any) -> float | None:
     return round(uptime_s - int(mark.began.partition("@")[0]) / os.sysconf("SC_CLK_TCK"), 1)
 
 
-def _listed(value: Any) -> list[Mapping[str, Any]]:
+def _mappings_in(value: Any) -> list[Mapping[str, Any]]:
     if isinstance(value, Mapping):
         return [value]
-    return [each for each in value if isinstance(each, Mapping)] if isinstance(value, list | tuple) else []
+    return [item for item in value if isinstance(item, Mapping)] if isinstance(value, list | tuple) else []

@@ -27,89 +27,96 @@ def waiting_for(policy: Mapping[str, Any], settings: ScalingSettings, *, servers
     """
     if not policy.get("elastic"):
         return ["the scale modifier is off: no server is added, removed or replaced by itself"]
-    said = (
+    reasons = (
         ["servers end too soon after their start: the next start waits"] if policy.get("crash_loop") else []
     )
     samples = list(policy.get("samples", ()))
     if not samples:
         period_s = cadence_of(settings).period_s / float(policy.get("compress", 1.0))
-        return [*said, f"no whole period of {period_s:g} s was measured yet"]
-    busy = _busy(samples, policy, settings, servers)
+        return [*reasons, f"no whole period of {period_s:g} s was measured yet"]
+    busy = _busy_reason(samples, policy, settings, servers)
     idle = _idle(samples, policy, settings, servers)
     if busy or idle:
-        return [*said, busy or idle]
-    return [*said, _underused(samples, policy, settings, servers) or "the servers are neither busy nor idle"]
+        return [*reasons, busy or idle]
+    return [
+        *reasons,
+        _underused_reason(samples, policy, settings, servers) or "the servers are neither busy nor idle",
+    ]
 
 
 def event_sentence(event: Mapping[str, Any]) -> str:
     """Return *event* as a sentence; its kind and details if it has none of its own."""
     kind = str(event.get("event", ""))
     text = _EVENTS.get(kind)
-    values = {name: _shown(value) for name, value in event.items()}
+    values = {name: _format_value(value) for name, value in event.items()}
     if text is not None:
         return text.format_map(_Missing(values))
-    told = [f"{name} {value}" for name, value in values.items() if name not in ("event", "time_s", "number")]
-    return f"{kind.replace('-', ' ')}: {', '.join(told)}" if told else kind.replace("-", " ")
+    details = [
+        f"{name} {value}" for name, value in values.items() if name not in ("event", "time_s", "number")
+    ]
+    return f"{kind.replace('-', ' ')}: {', '.join(details)}" if details else kind.replace("-", " ")
 
 
-def _busy(
+def _busy_reason(
     samples: Sequence[Mapping[str, Any]], policy: Mapping[str, Any], settings: ScalingSettings, servers: int
 ) -> str:
-    limit, wanted = settings.busy_cpu_percent, cadence_of(settings).busy
-    count = _last_that(samples, lambda each: float(each["cpu_percent"]) >= limit)
+    limit, needed = settings.busy_cpu_percent, cadence_of(settings).busy
+    count = _count_last_that(samples, lambda sample: float(sample["cpu_percent"]) >= limit)
     if not count:
         return ""
     newest = float(samples[-1]["cpu_percent"])
     step = BIG_STEP if newest >= settings.very_busy_cpu_percent else STEP
     most = int(policy.get("max_servers", settings.max_servers))
-    measured = f"{min(count, wanted)} of {wanted} samples above {limit:g} %"
+    measured = f"{min(count, needed)} of {needed} samples above {limit:g} %"
     if servers >= most:
         return f"{measured}, but {servers} servers are the most that are allowed"
     more = _servers(min(step, most - servers), more=True)
-    if count >= wanted:
+    if count >= needed:
         return f"{measured}: {more} when the servers that start have warmed up"
-    return f"{measured}: {more} after {_counted(wanted - count, 'further such sample')}"
+    return f"{measured}: {more} after {_count_phrase(needed - count, 'further such sample')}"
 
 
 def _idle(
     samples: Sequence[Mapping[str, Any]], policy: Mapping[str, Any], settings: ScalingSettings, servers: int
 ) -> str:
     limit = settings.idle_cpu_percent
-    count = _last_that(
-        samples, lambda each: float(each["requests"]) == 0 and float(each["cpu_percent"]) < limit
+    count = _count_last_that(
+        samples, lambda sample: float(sample["requests"]) == 0 and float(sample["cpu_percent"]) < limit
     )
-    return _fewer(count, cadence_of(settings).idle, "idle", policy, settings, servers)
+    return _shrink_reason(count, cadence_of(settings).idle, "idle", policy, settings, servers)
 
 
-def _underused(
+def _underused_reason(
     samples: Sequence[Mapping[str, Any]], policy: Mapping[str, Any], settings: ScalingSettings, servers: int
 ) -> str:
-    wanted, limit = cadence_of(settings).underused, settings.underused_cpu_percent
-    count = _last_that(samples, lambda each: float(each["cpu_percent"]) < limit)
-    enough = wanted and servers > int(policy.get("min_servers", settings.min_servers))
-    return _fewer(count, wanted, f"below {limit:g} % CPU", policy, settings, servers) if enough else ""
+    needed, limit = cadence_of(settings).underused, settings.underused_cpu_percent
+    count = _count_last_that(samples, lambda sample: float(sample["cpu_percent"]) < limit)
+    enough = needed and servers > int(policy.get("min_servers", settings.min_servers))
+    return (
+        _shrink_reason(count, needed, f"below {limit:g} % CPU", policy, settings, servers) if enough else ""
+    )
 
 
-def _fewer(
-    count: int, wanted: int, what: str, policy: Mapping[str, Any], settings: ScalingSettings, servers: int
+def _shrink_reason(
+    count: int, needed: int, load: str, policy: Mapping[str, Any], settings: ScalingSettings, servers: int
 ) -> str:
     if not count:
         return ""
-    measured = f"{min(count, wanted)} of {wanted} samples {what}"
+    measured = f"{min(count, needed)} of {needed} samples {load}"
     least = int(policy.get("min_servers", settings.min_servers))
     if servers <= least:
         verb = "is" if least == 1 else "are"
         return f"{measured}: nothing happens, {_servers(least)} {verb} the fewest that are allowed"
-    if count >= wanted:
+    if count >= needed:
         return f"{measured}: one server leaves now"
-    kind = "idle" if what == "idle" else "such"
-    return f"{measured}: one server leaves after {_counted(wanted - count, f'further {kind} sample')}"
+    kind = "idle" if load == "idle" else "such"
+    return f"{measured}: one server leaves after {_count_phrase(needed - count, f'further {kind} sample')}"
 
 
-def _last_that(samples: Sequence[Mapping[str, Any]], holds: Any) -> int:
+def _count_last_that(samples: Sequence[Mapping[str, Any]], holds: Any) -> int:
     count = 0
-    for each in reversed(samples):
-        if not holds(each):
+    for sample in reversed(samples):
+        if not holds(sample):
             break
         count += 1
     return count
@@ -123,12 +130,12 @@ def _servers(count: int, *, more: bool = False) -> str:
     return f"{word} server{plural}"
 
 
-def _counted(count: int, what: str) -> str:
+def _count_phrase(count: int, noun: str) -> str:
     word = _NUMBERS[count] if 0 <= count < len(_NUMBERS) else str(count)
-    return f"{word} {what}{'' if count == 1 else 's'}"
+    return f"{word} {noun}{'' if count == 1 else 's'}"
 
 
-def _shown(value: Any) -> str:
+def _format_value(value: Any) -> str:
     return ", ".join(map(str, value)) if isinstance(value, list | tuple) else str(value)
 
 
