@@ -20,11 +20,11 @@ from rse_pf.config import PlatformSettings
 from rse_pf.errors import BadRequest, RsePfError
 from rse_pf.fleet_page.clouds import packer
 from rse_pf.maps.describe import describe_map
-from rse_pf.maps.export import FORMATS, export_map
 from rse_pf.maps.format import Edge, Keyframe, MapVersion, encode_map
 from rse_pf.service import dispatch
 from rse_pf.services.builtin import builtin_services
 from rse_pf.services.synthetic_maps import make_sphere, make_world
+from rse_pf.slam.map_export import FORMATS, export_map
 from rse_pf.slam.pose_graph import write_g2o
 from rse_pf.wire import Command, Failure, Result
 

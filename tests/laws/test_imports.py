@@ -18,7 +18,7 @@ ORDER = (
     "native_buffers", "native_matcher", "token_bucket", "config",
     "silent_connections", "http_connections", "budget", "wire", "scaling",
     "object_store", "identity", "crash_record", "maps", "accounts", "auth", "enrolment", "audit", "service",
-    "pnp", "slam", "maps.export", "services.mapping", "live_map", "services.custom", "services",
+    "pnp", "slam", "services.mapping", "live_map", "services.custom", "services",
     "recording", "recording.explain", "recording.replay",
     "aws", "aws.storage", "aws.canary", "aws.fleet", "aws.money", "aws.lifecycle",
     "batch",

@@ -45,9 +45,9 @@ from rse_pf.errors import NotFound, UsageError
 from rse_pf.files import replace_file
 from rse_pf.geometry import Camera, rotation_angle_deg, to_quaternion
 from rse_pf.local.state import state_folder
-from rse_pf.maps.export import FORMATS, export_map
 from rse_pf.maps.format import MapVersion
 from rse_pf.maps.registry import MapRecord, MapRegistry, difference
+from rse_pf.slam.map_export import FORMATS, export_map
 from rse_pf.terminal import at_work, counted, show, show_json
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ from maps.sample_maps import make_map
 
 from rse_pf.errors import UsageError
 from rse_pf.geometry import transform
-from rse_pf.maps.export import export_map
+from rse_pf.slam.map_export import export_map
 from rse_pf.slam.ply import decode_ply
 from rse_pf.slam.pose_graph import read_g2o
 
