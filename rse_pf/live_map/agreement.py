@@ -13,15 +13,13 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from rse_pf.geometry import Array, inverse, log_se3
+from rse_pf.geometry import Array, inverse
 from rse_pf.live_map.graph import Graph, LiveLink
 from rse_pf.live_map.options import LiveMapOptions
-from rse_pf.slam.consistency import largest_clique
+from rse_pf.slam.consistency import LinkEnds, fits_prediction, largest_clique, round_trips_close
 
 __all__ = ["agreeing_between", "agreeing_by_odometry", "has_enough_ends", "judge_within"]
 
-_CHI2_3_99 = 11.345
-"""99 % of the squared Mahalanobis norms of a 3-vector lie below."""
 _CONTRARY_LINKS = 24
 
 
@@ -30,7 +28,7 @@ def agreeing_between(
 ) -> list[int]:
     """Return the numbers of the largest set of open links between two components that agree pairwise.
 
-    Two links agree if the round trip over both is the identity, as in `consistency.consistent`; the
+    Two links agree if the round trip over both is the identity, as `round_trips_close` says; the
     poses within a component are those of the graph.  Links whose agreement is known are not compared again.
 
     Source:
@@ -90,18 +88,12 @@ def judge_within(
     """
     links = [graph.links[number] for number in numbers]
     predicted = inverse(graph.T[[link.a for link in links]]) @ graph.T[[link.b for link in links]]
-    off = log_se3(inverse(np.array([link.T_a_b for link in links])) @ predicted)
-    spread = np.array([link.variances for link in links])
     steps = np.maximum(np.array(walked), 1.0)
     # On a round way of a given length no point is farther than its diameter.
     apart_m = np.sqrt((predicted[:, :3, 3] ** 2).sum(axis=1))
     lever_m = np.maximum(apart_m, options.spacing_m * steps / math.pi)
-    turned2 = steps * math.radians(options.judged.step_deg) ** 2
-    rad2 = spread[:, 3:].mean(axis=1) + turned2
-    m2 = spread[:, :3].mean(axis=1) + steps * options.judged.step_m**2 + turned2 * lever_m**2
-    agrees = ((off[:, :3] ** 2).sum(axis=1) <= _CHI2_3_99 * m2) & (
-        (off[:, 3:] ** 2).sum(axis=1) <= _CHI2_3_99 * rad2
-    )
+    measured = _ends_of([_oriented(link, True) for link in links])
+    agrees = fits_prediction(predicted, measured, steps, lever_m, options.judged)
     return [
         "contrary" if not ok else "vague" if far else "agrees"
         for ok, far in zip(agrees.tolist(), (steps > options.vague_steps).tolist(), strict=True)
@@ -173,24 +165,22 @@ def _trips_close(
     along_b: dict[int, float] | None, options: LiveMapOptions,
 ) -> npt.NDArray[np.bool_]:  # fmt: skip
     """Return whether the round trips over link *last* and each of *ends* are close to the identity."""
-    a, b = np.array([each[0] for each in ends]), np.array([each[1] for each in ends])
-    steps = np.array([each[2] for each in ends])
-    spread = np.array([each[3] for each in ends])
-    way_b = inverse(T[last[1]]) @ T[b]
-    way_a = inverse(T[a]) @ T[last[0]]
-    trip = log_se3(last[2] @ way_b @ inverse(steps) @ way_a)
+    links = _ends_of(ends)
     if along_a is None or along_b is None:
-        walked = np.abs(graph.way[a] - graph.way[last[0]]) + np.abs(graph.way[b] - graph.way[last[1]])
+        way_a, way_b = graph.way[links.a] - graph.way[last[0]], graph.way[links.b] - graph.way[last[1]]
+        walked = np.abs(way_a) + np.abs(way_b)
     else:
-        walked = np.array([along_a[each[0]] + along_b[each[1]] for each in ends])
-    lever_m2 = (way_a[:, :3, 3] ** 2).sum(axis=1) + (way_b[:, :3, 3] ** 2).sum(axis=1)
-    noise = options.judged
-    rad2 = spread[:, 3:].mean(axis=1) + last[3][3:].mean() + walked * math.radians(noise.step_deg) ** 2
-    m2 = spread[:, :3].mean(axis=1) + last[3][:3].mean() + walked * noise.step_m**2 + rad2 * lever_m2
-    close: npt.NDArray[np.bool_] = ((trip[:, :3] ** 2).sum(axis=1) <= _CHI2_3_99 * m2) & (
-        (trip[:, 3:] ** 2).sum(axis=1) <= _CHI2_3_99 * rad2
+        walked = np.array([along_a[a] + along_b[b] for a, b, _, _ in ends])
+    return round_trips_close(T, links, _ends_of([last]), walked, options.judged)
+
+
+def _ends_of(ends: Sequence[_Ends]) -> LinkEnds:
+    return LinkEnds(
+        a=np.array([a for a, _, _, _ in ends], dtype=np.int64),
+        b=np.array([b for _, b, _, _ in ends], dtype=np.int64),
+        T_a_b=np.array([T_a_b for _, _, T_a_b, _ in ends]),
+        variances=np.array([variances for _, _, _, variances in ends]),
     )
-    return close
 
 
 def _ends_between(graph: Graph, number: int, one: int) -> _Ends:

@@ -14,7 +14,15 @@ import numpy.typing as npt
 
 from rse_pf.geometry import Array, inverse, log_se3
 
-__all__ = ["LoopClosure", "OdometryNoise", "consistent", "largest_clique"]
+__all__ = [
+    "LinkEnds",
+    "LoopClosure",
+    "OdometryNoise",
+    "consistent",
+    "fits_prediction",
+    "largest_clique",
+    "round_trips_close",
+]
 
 _CHI2_3_99 = 11.345
 """99 % of the squared Mahalanobis norms of a 3-vector lie below."""
@@ -43,6 +51,41 @@ class LoopClosure:
     matches: int = 0
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LinkEnds:
+    """*m* links as arrays: from rows *a* to rows *b*, ``T_a_b`` ``(m, 4, 4)``, variances ``(m, 6)``.
+
+    The variances are of the twist (square metres, square radians).
+    """
+
+    a: npt.NDArray[np.int64]
+    b: npt.NDArray[np.int64]
+    T_a_b: Array
+    variances: Array
+
+    @classmethod
+    def of(cls, links: Sequence[LoopClosure]) -> LinkEnds:
+        """Return *links*, at least one, as arrays."""
+        information = np.array([link.information for link in links])
+        return cls(
+            a=np.array([link.a for link in links], dtype=np.int64),
+            b=np.array([link.b for link in links], dtype=np.int64),
+            T_a_b=np.array([link.T_a_b for link in links]),
+            variances=np.diagonal(np.linalg.inv(information), axis1=1, axis2=2),
+        )
+
+    def rows(self, which: slice | npt.NDArray[np.int64]) -> LinkEnds:
+        """Return some of the links."""
+        return LinkEnds(
+            a=self.a[which], b=self.b[which], T_a_b=self.T_a_b[which], variances=self.variances[which]
+        )  # fmt: skip
+
+    @property
+    def mean_variances(self) -> tuple[Array, Array]:
+        """The ``(m,)`` means of the variances of an axis: square metres, square radians."""
+        return self.variances[:, :3].mean(axis=1), self.variances[:, 3:].mean(axis=1)
+
+
 def consistent(
     links: Sequence[LoopClosure],
     T_world_camera: Array,
@@ -51,43 +94,79 @@ def consistent(
 ) -> npt.NDArray[np.int64]:
     """Return the rows of the largest set of *links* that agree pairwise; deterministic.
 
-    Two links agree if the round trip a1 -> b1 -> b2 -> a2 -> a1 is the identity; translation and rotation are
-    tested separately, at 99 %, against the noise of both links and of the odometry between them; rotation
-    noise acts on translation with the length of the path as its lever.
+    Two links agree as `round_trips_close` says.
 
     Args:
         links: All between the same two trajectories (or within one).
         T_world_camera: ``(n, 4, 4)``, odometry of each trajectory in its own frame.
         order: ``(n,)``, index of each keyframe along its trajectory.
         noise: Of the odometry.
+    """
+    if not links:
+        return np.empty(0, dtype=np.int64)
+    ends = LinkEnds.of(links)
+    agree = np.zeros((len(links), len(links)), dtype=np.bool_)
+    for k in range(len(links)):
+        walked = np.abs(order[ends.a] - order[ends.a[k]]) + np.abs(order[ends.b] - order[ends.b[k]])
+        agree[k] = round_trips_close(T_world_camera, ends, ends.rows(slice(k, k + 1)), walked, noise)
+    agree &= agree.T
+    np.fill_diagonal(agree, False)
+    return largest_clique(agree)
+
+
+def round_trips_close(
+    T: Array, links: LinkEnds, last: LinkEnds, walked: Array, noise: OdometryNoise
+) -> npt.NDArray[np.bool_]:
+    """Return for each of *m* links whether it agrees with one other link: the only test of a pair.
+
+    The round trip a1 -> b1 -> b2 -> a2 -> a1 must be the identity; translation and rotation are tested
+    separately, at 99 %, against the noise of both links and of the odometry between them; rotation noise acts
+    on translation with the length of the path as its lever.
+
+    Args:
+        T: ``(n, 4, 4)``, poses of keyframes; all ends *a* in one frame, and all ends *b* in one.
+        links: The *m* links.
+        last: The one link they are compared with.
+        walked: ``(m,)``, steps of odometry between the ends *a* and between the ends *b* together.
+        noise: Of one step of odometry.
 
     Source:
         Mangelson et al., Pairwise consistent measurement set maximization, ICRA 2018.
     """
-    m = len(links)
-    if m == 0:
-        return np.empty(0, dtype=np.int64)
-    a = np.array([link.a for link in links])
-    b = np.array([link.b for link in links])
-    steps = np.array([link.T_a_b for link in links])
-    spread = np.array([np.diag(np.linalg.inv(link.information)) for link in links])
-    variance_m2, variance_rad2 = spread[:, :3].mean(axis=1), spread[:, 3:].mean(axis=1)
-    agree = np.zeros((m, m), dtype=np.bool_)
-    T_world_a, T_world_b = T_world_camera[a], T_world_camera[b]
-    for k in range(m):
-        along_b = np.linalg.inv(T_world_b[k]) @ T_world_b
-        along_a = np.linalg.inv(T_world_a) @ T_world_a[k]
-        trip = log_se3(steps[k] @ along_b @ inverse(steps) @ along_a)
-        walked = np.abs(order[a] - order[a[k]]) + np.abs(order[b] - order[b[k]])
-        lever_m2 = (along_a[:, :3, 3] ** 2).sum(axis=1) + (along_b[:, :3, 3] ** 2).sum(axis=1)
-        rad2 = variance_rad2 + variance_rad2[k] + walked * math.radians(noise.step_deg) ** 2
-        m2 = variance_m2 + variance_m2[k] + walked * noise.step_m**2 + rad2 * lever_m2
-        agree[k] = ((trip[:, :3] ** 2).sum(axis=1) <= _CHI2_3_99 * m2) & (
-            (trip[:, 3:] ** 2).sum(axis=1) <= _CHI2_3_99 * rad2
-        )
-    agree &= agree.T
-    np.fill_diagonal(agree, False)
-    return largest_clique(agree)
+    along_b = inverse(T[last.b]) @ T[links.b]
+    along_a = inverse(T[links.a]) @ T[last.a]
+    trip = log_se3(last.T_a_b @ along_b @ inverse(links.T_a_b) @ along_a)
+    lever_m2 = (along_a[:, :3, 3] ** 2).sum(axis=1) + (along_b[:, :3, 3] ** 2).sum(axis=1)
+    m2, rad2 = links.mean_variances
+    last_m2, last_rad2 = last.mean_variances
+    rad2 = rad2 + last_rad2 + walked * math.radians(noise.step_deg) ** 2
+    return within_noise(trip, m2 + last_m2 + walked * noise.step_m**2 + rad2 * lever_m2, rad2)
+
+
+def fits_prediction(
+    T_a_b: Array, links: LinkEnds, walked: Array, lever_m: Array, noise: OdometryNoise
+) -> npt.NDArray[np.bool_]:
+    """Return for each of *m* links whether it agrees with the pose that odometry or a graph predicts.
+
+    Args:
+        T_a_b: ``(m, 4, 4)``, predicted.
+        links: The *m* measured links.
+        walked: ``(m,)``, steps of odometry from *a* to *b*.
+        lever_m: ``(m,)``, metres: how far a rotation along the way moves its end.
+        noise: Of one step of odometry.
+    """
+    off = log_se3(inverse(links.T_a_b) @ T_a_b)
+    m2, rad2 = links.mean_variances
+    turned2 = walked * math.radians(noise.step_deg) ** 2
+    return within_noise(off, m2 + walked * noise.step_m**2 + turned2 * lever_m**2, rad2 + turned2)
+
+
+def within_noise(xi: Array, m2: Array, rad2: Array) -> npt.NDArray[np.bool_]:
+    """Return whether ``(m, 6)`` twists are noise of these variances of each axis, at 99 % for each half."""
+    close: npt.NDArray[np.bool_] = ((xi[:, :3] ** 2).sum(axis=1) <= _CHI2_3_99 * m2) & (
+        (xi[:, 3:] ** 2).sum(axis=1) <= _CHI2_3_99 * rad2
+    )
+    return close
 
 
 def largest_clique(agree: npt.NDArray[np.bool_]) -> npt.NDArray[np.int64]:

@@ -6,7 +6,6 @@ process, with the same result.
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -19,7 +18,7 @@ from rse_pf.errors import BadRequest, LimitExceeded
 from rse_pf.geometry import Array, inverse
 from rse_pf.maps.format import Keyframe, MapVersion
 from rse_pf.service import Report
-from rse_pf.slam.consistency import LoopClosure, OdometryNoise, consistent
+from rse_pf.slam.consistency import LinkEnds, LoopClosure, OdometryNoise, consistent, fits_prediction
 from rse_pf.slam.optimise import ignore_progress
 from rse_pf.slam.relative_pose import RelativePoseOptions, measure_link, reference_of, view_of_keyframe
 from rse_pf.slam.trained_places import PlaceIndex, VectorIndex
@@ -174,7 +173,7 @@ def measure_pairs(
 ) -> tuple[list[LoopClosure], Refused]:
     """Return the links of *pairs* of rows that PnP could measure, in their order, and why others failed."""
     pose_options = RelativePoseOptions(
-        min_inliers=options.min_inliers, min_inlier_ratio=options.min_inlier_ratio
+        min_inliers=options.min_inliers, min_inlier_ratio=options.min_inlier_ratio, accepts_weak=True
     )
     links: list[LoopClosure] = []
     failed: Refused = Counter()
@@ -219,7 +218,7 @@ def agreeing_links(
     chosen = list(range(len(links)))
     if one == other:
         # Within one map a loop must also agree with the odometry.
-        chosen = [row for row in chosen if _fits_odometry(T_world_camera, order, links[row], noise)]
+        chosen = _fits_odometry(T_world_camera, order, links, noise)
         refused[one, other, "against-odometry"] += len(links) - len(chosen)
     rows = consistent([links[row] for row in chosen], T_world_camera, order, noise)
     if one != other and len(rows) < options.min_links:
@@ -236,16 +235,17 @@ def maps_of(atlas: Atlas, a: int, b: int) -> tuple[int, int]:
 
 
 def _fits_odometry(
-    T_world_camera: Array, order: npt.NDArray[np.int64], link: LoopClosure, noise: OdometryNoise
-) -> bool:
-    """Return whether a loop differs from odometry by at most three sigma of its drift."""
-    predicted = inverse(T_world_camera[link.a]) @ T_world_camera[link.b]
-    off = inverse(link.T_a_b) @ predicted
-    walked = abs(int(order[link.a] - order[link.b])) + 2
-    rad = 3.0 * math.sqrt(3.0 * walked) * math.radians(noise.step_deg)
-    metres = 3.0 * math.sqrt(3.0 * walked) * noise.step_m + rad * _lever_m(T_world_camera, link)
-    turned = math.acos(min(1.0, max(-1.0, (np.trace(off[:3, :3]) - 1.0) / 2.0)))
-    return bool(np.linalg.norm(off[:3, 3]) <= metres and turned <= rad)
+    T_world_camera: Array, order: npt.NDArray[np.int64], links: Sequence[LoopClosure], noise: OdometryNoise
+) -> list[int]:
+    """Return the rows of the loops that differ from odometry by no more than its drift."""
+    if not links:
+        return []
+    ends = LinkEnds.of(links)
+    predicted = inverse(T_world_camera[ends.a]) @ T_world_camera[ends.b]
+    walked = np.abs(order[ends.a] - order[ends.b]).astype(np.float64)
+    lever_m = np.array([_lever_m(T_world_camera, link) for link in links])
+    fits = fits_prediction(predicted, ends, walked, lever_m, noise)
+    return [int(row) for row in np.flatnonzero(fits)]
 
 
 def _lever_m(T_world_camera: Array, link: LoopClosure) -> float:

@@ -21,12 +21,19 @@ ONE_PLACE = {
     "MeasureOptions": "rse_pf/slam/relative_pose.py",
     "measure_pose": "rse_pf/slam/relative_pose.py",
     "hamming_matche": "rse_pf/slam/descriptors.py",
+    "round_trips_close": "rse_pf/slam/consistency.py",
+    "within_noise": "rse_pf/slam/consistency.py",
+    "largest_clique": "rse_pf/slam/consistency.py",
     "encode_ply": "rse_pf/slam/ply.py",
     "decode_ply": "rse_pf/slam/ply.py",
     "read_g2o": "rse_pf/slam/pose_graph.py",
 }
 """Functions and classes, and the file that defines them."""
-ONE_WRITER = {"end_header": "rse_pf/slam/ply.py", "VERTEX_SE3": "rse_pf/slam/pose_graph.py"}
+ONE_WRITER = {
+    "11.345": "rse_pf/slam/consistency.py",
+    "end_header": "rse_pf/slam/ply.py",
+    "VERTEX_SE3": "rse_pf/slam/pose_graph.py",
+}
 """Words that only a reader or writer of a format needs, and the file that has them."""
 
 
