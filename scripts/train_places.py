@@ -19,13 +19,14 @@ from client_sdk.frontend import Frame, FrontEndOptions, extract
 from client_sdk.simulator import SIMULATED_CAMERA, true_trajectory
 from client_sdk.simulator.camera import Painter, add_depth_noise, add_image_noise
 from client_sdk.simulator.world import make_world
-from rse_pf.slam.descriptors import Descriptors, train_words
+from rse_pf.slam.descriptors import BYTES, Descriptors, load_faiss
 from rse_pf.slam.places import PARTS, PLACE_WORDS_FILE, WORDS
 
 WORLDS = range(101, 107)
 FRAMES, EACH = 410, 8
 """One round through a world, of which each eighth frame is rendered."""
 SEED = 1
+MAX_TRAINING, KMEANS_ITERATIONS = 20_000, 12
 
 
 def main() -> None:
@@ -34,7 +35,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=PLACE_WORDS_FILE)
     out = parser.parse_args().out
     views = [view for world in WORLDS for view in rendered_views(world)]
-    words = train_words(views, WORDS, SEED)
+    words = train_words(views)
     data = _int8(words, 1.0) + _int8(directions_of(views, words, PARTS), None)
     out.write_bytes(data)
     print(f"{out}: {len(data)} bytes from {len(views)} views, sha256 {hashlib.sha256(data).hexdigest()}")
@@ -55,6 +56,20 @@ def rendered_views(seed: int) -> list[Descriptors]:
         found = extract(frame, options)
         views.append(found.descriptors[np.isfinite(found.points_camera[:, 2])])
     return views
+
+
+def train_words(views: list[Descriptors]) -> npt.NDArray[np.float32]:
+    """Return ``(32, 256)`` cluster centres of the bits (-1, 1) of a sample of descriptors."""
+    stacked = np.concatenate(views)
+    if len(stacked) > MAX_TRAINING:
+        rows = np.random.default_rng(SEED).choice(len(stacked), MAX_TRAINING, replace=False)
+        stacked = stacked[np.sort(rows)]
+    kmeans = load_faiss().Kmeans(
+        8 * BYTES, WORDS, niter=KMEANS_ITERATIONS, seed=SEED, verbose=False, min_points_per_centroid=1
+    )
+    kmeans.train(np.unpackbits(stacked, axis=1) * np.float32(2.0) - np.float32(1.0))
+    centres: npt.NDArray[np.float32] = np.asarray(kmeans.centroids, dtype=np.float32)
+    return centres
 
 
 def directions_of(

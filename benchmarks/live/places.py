@@ -17,7 +17,7 @@ import os
 import platform
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import count
 from pathlib import Path
@@ -37,9 +37,8 @@ from rse_pf.live_map.keyframe_code import KeyframeFeatures, decode_features, enc
 from rse_pf.live_map.measure import measure_links
 from rse_pf.live_map.relocalise import Relocalised, relocalise, spread_candidates
 from rse_pf.maps.format import Keyframe, MapVersion
-from rse_pf.slam.descriptors import train_words, view_vector
 from rse_pf.slam.map_merge import merge_versions
-from rse_pf.slam.places import PLACE_NUMBERS, LivePlaceIndex, place_vector
+from rse_pf.slam.places import PLACE_NUMBERS, PlaceIndex, place_vector
 
 __all__ = ["main"]
 
@@ -115,35 +114,27 @@ def code_row(views: Sequence[View], rows: Sequence[int]) -> dict[str, Any]:
 def recall_rows(pool: Sequence[View], queries: Sequence[View]) -> dict[str, Any]:
     """Return the share of queries with an overlapping keyframe among the best ten, by source."""
     truth = [_overlapping(query, pool) for query in queries]
-    words = train_words([each.full[1] for each in pool], 32, 20)
-    rows: dict[str, Any] = {}
-    vectors: dict[str, Callable[[View], npt.NDArray[np.float32]]] = {
-        "fixed": lambda view: place_vector(view.features.descriptors),
-        "trained": lambda view: view_vector(view.full[1], words),
-    }
-    for name, vector in vectors.items():
-        known = np.array([vector(each) for each in pool])
-        found: dict[str, list[tuple[bool, float]]] = {}
-        for query, overlapping in zip(queries, truth, strict=True):
-            if not overlapping:
-                continue
-            similarity = known @ vector(query)
-            for place, each in enumerate(pool):
-                if _is_neighbour(query, each):
-                    similarity[place] = -2.0
-            best = np.argsort(-similarity, kind="stable")[:CANDIDATES]
-            hits = sum(int(place) in overlapping for place in best)
-            score = (hits > 0, hits / min(CANDIDATES, len(overlapping)))
-            found.setdefault(query.source, []).append(score)
-        rows[name] = {
-            source: {
-                "found_percent": round(100.0 * float(np.mean([hit for hit, _ in scores])), 1),
-                "of_all_percent": round(100.0 * float(np.mean([share for _, share in scores])), 1),
-                "n": len(scores),
-            }
-            for source, scores in found.items()
+    known = np.array([place_vector(each.features.descriptors) for each in pool])
+    scored: dict[str, list[tuple[bool, float]]] = {}
+    for query, overlapping in zip(queries, truth, strict=True):
+        if not overlapping:
+            continue
+        similarity = known @ place_vector(query.features.descriptors)
+        for place, each in enumerate(pool):
+            if _is_neighbour(query, each):
+                similarity[place] = -2.0
+        best = np.argsort(-similarity, kind="stable")[:CANDIDATES]
+        hits = sum(int(place) in overlapping for place in best)
+        score = (hits > 0, hits / min(CANDIDATES, len(overlapping)))
+        scored.setdefault(query.source, []).append(score)
+    return {
+        source: {
+            "found_percent": round(100.0 * float(np.mean([hit for hit, _ in scores])), 1),
+            "of_all_percent": round(100.0 * float(np.mean([share for _, share in scores])), 1),
+            "n": len(scores),
         }
-    return rows
+        for source, scores in scored.items()
+    }
 
 
 def search_rows(views: Sequence[View]) -> dict[str, Any]:
@@ -152,7 +143,7 @@ def search_rows(views: Sequence[View]) -> dict[str, Any]:
     rng = np.random.default_rng(1)
     for keyframes in (1000, 2000, 5000, 10_000):
         vectors = rng.normal(size=(keyframes, PLACE_NUMBERS)).astype(np.float32)
-        index = LivePlaceIndex()
+        index = PlaceIndex()
         for number, vector in enumerate(vectors):
             index.add(number, vector)
         rows[f"search_ms_{keyframes}"] = _timed(
@@ -166,13 +157,13 @@ class PlacedMap:
     """Keyframes with their poses, ready to be searched."""
 
     keyframes: Sequence[tuple[int, KeyframeFeatures, Camera, Array]]
-    index: LivePlaceIndex
+    index: PlaceIndex
     T_map_camera: Array
 
     @classmethod
     def of(cls, views: Sequence[View], poses: Sequence[Array]) -> PlacedMap:
         """Return the map of *views* at *poses*."""
-        index = LivePlaceIndex()
+        index = PlaceIndex()
         for number, each in enumerate(views):
             index.add(number, place_vector(each.features.descriptors))
         keyframes = [(n, v.features, v.camera, T) for n, (v, T) in enumerate(zip(views, poses, strict=True))]

@@ -37,6 +37,7 @@ from client_sdk.datasets import Dataset, open_dataset
 from rse_pf.geometry import Array, exp_se3, inverse, pose_difference
 from rse_pf.service import Report
 from rse_pf.services.mapping.localise import locate
+from rse_pf.services.mapping.place import MapIndex
 from rse_pf.services.mapping.wifi import Locator, fingerprint_of
 from rse_pf.services.synthetic_maps import make_building, make_room, make_sphere
 from rse_pf.slam.consistency import LoopClosure
@@ -51,7 +52,6 @@ from rse_pf.slam.map_merge import (
 )
 from rse_pf.slam.optimise import optimise_graph
 from rse_pf.slam.relative_pose import View
-from rse_pf.slam.trained_places import PlaceIndex
 
 THREE_ROBOTS = ((0, 84), (84, 168), (168, 250))
 LOCALISE_INLIERS = 30
@@ -157,10 +157,10 @@ def localise_row(recordings: Path) -> dict[str, float]:
     frames = [
         keyframe_of(dataset, row, truth[place], place) for place, row in enumerate(dataset.rows)
     ]  # fmt: skip
-    return _localised(frames, PlaceIndex([each for each in frames if each.id % 5]))
+    return _localised(frames, MapIndex([each for each in frames if each.id % 5]))
 
 
-def _localised(frames: Sequence[Any], index: PlaceIndex) -> dict[str, float]:
+def _localised(frames: Sequence[Any], index: MapIndex) -> dict[str, float]:
     errors, times = [], []
     asked = [each for each in frames if each.id % 5 == 0]
     for frame in asked:
@@ -226,7 +226,7 @@ def _located_in_merged(robots: Robots, merged: MergedMap) -> dict[str, float]:
         keyframe_of(robots.dataset, row, inverse(T_truth_merged) @ robots.truth[place], place)
         for place, row in enumerate(rows)
     ]
-    return _localised(frames, PlaceIndex(merged.version.keyframes))
+    return _localised(frames, MapIndex(merged.version.keyframes))
 
 
 def sphere_row() -> dict[str, float]:

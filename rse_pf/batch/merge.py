@@ -41,12 +41,12 @@ from rse_pf.slam.pose_graph import PoseGraph, components
 __all__ = ["BatchMerge", "BatchMergeResult", "strongest"]
 
 _SHARES = {
-    "words": 0.0, "vectors": 0.03, "pairs": 0.08, "links": 0.12, "agree": 0.70, "tiles": 0.76,
+    "vectors": 0.0, "pairs": 0.08, "links": 0.12, "agree": 0.70, "tiles": 0.76,
     "optimise": 0.88, "cloud": 0.95,
 }  # fmt: skip
 """Where the bar of progress stands when a step begins."""
 _DOING = {
-    "words": "vocabulary", "vectors": "views of maps", "pairs": "proposals", "links": "parts of links",
+    "vectors": "views of maps", "pairs": "proposals", "links": "parts of links",
     "agree": "pairs of maps", "tiles": "pairs of clouds", "optimise": "pose graphs", "cloud": "clouds",
 }  # fmt: skip
 MAX_MAPS = 256
@@ -210,11 +210,7 @@ class BatchMerge:
         return {name: getattr(self._options, name) for name in names}
 
     def _propose(self, atlas: Atlas, options: MergeOptions, report: Report) -> LoopProposals:
-        words = Part(kind="words", inputs=self._maps, arguments=self._limits)
-        self._run([words])
-        vectors = [
-            Part(kind="vectors", inputs=(name, words.name), arguments=self._limits) for name in self._maps
-        ]
+        vectors = [Part(kind="vectors", inputs=(name,), arguments=self._limits) for name in self._maps]
         self._run(vectors)
         count = len(self._maps)
         self._pairs = [

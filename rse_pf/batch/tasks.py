@@ -22,7 +22,6 @@ from rse_pf.object_store import ObjectStore
 from rse_pf.services.mapping.place import map_limits
 from rse_pf.slam.cloud_deform import deform_cloud
 from rse_pf.slam.consistency import LoopClosure
-from rse_pf.slam.descriptors import train_words
 from rse_pf.slam.links import (
     Atlas,
     MergeOptions,
@@ -32,8 +31,8 @@ from rse_pf.slam.links import (
     measure_pairs,
 )
 from rse_pf.slam.optimise import OptimiseOptions, optimise_graph
+from rse_pf.slam.places import PLACE_NUMBERS, PlaceIndex, place_vector
 from rse_pf.slam.pose_graph import PoseGraph
-from rse_pf.slam.trained_places import SEED, WORDS, VectorIndex, view_vectors
 
 __all__ = [
     "InProcessEngine",
@@ -129,20 +128,11 @@ def graph_of(result: PartResult) -> PoseGraph:
     )  # fmt: skip
 
 
-def _words(store: ObjectStore, part: Part) -> PartResult:
-    """Train the vocabulary of all maps."""
-    views = []
-    for name in part.inputs:
-        atlas = Atlas.of([_decoded(store.get(name), part.arguments["keyframe_features"])])
-        views += [each.descriptors for each in atlas.keyframes]
-    return PartResult(arrays={"words": train_words(views, WORDS, SEED)})
-
-
 def _vectors(store: ObjectStore, part: Part) -> PartResult:
     """Describe each keyframe of a map by a vector."""
     atlas = _atlas(store, part, 1)
-    words = read_result(store, part.inputs[1]).arrays["words"]
-    return PartResult(arrays={"vectors": view_vectors(atlas.keyframes, words)})
+    vectors = [place_vector(keyframe.descriptors) for keyframe in atlas.keyframes]
+    return PartResult(arrays={"vectors": np.array(vectors, dtype=np.float32).reshape(-1, PLACE_NUMBERS)})
 
 
 def _pairs(store: ObjectStore, part: Part) -> PartResult:
@@ -151,7 +141,11 @@ def _pairs(store: ObjectStore, part: Part) -> PartResult:
     of_map = np.concatenate([np.full(len(each), which) for which, each in enumerate(vectors)])
     stacked = np.concatenate(vectors)
     pairs = candidate_pairs(
-        VectorIndex(stacked), of_map, np.arange(len(stacked)), _options(part), between=(0, len(vectors) - 1)
+        PlaceIndex.of(stacked),
+        of_map,
+        np.arange(len(stacked)),
+        _options(part),
+        between=(0, len(vectors) - 1),
     )
     return PartResult(arrays={"pairs": np.array(pairs, dtype=np.int64).reshape(-1, 2)})
 
@@ -206,7 +200,6 @@ def _cloud(store: ObjectStore, part: Part) -> PartResult:
 
 
 _KINDS: dict[str, Callable[[ObjectStore, Part], PartResult]] = {
-    "words": _words,
     "vectors": _vectors,
     "pairs": _pairs,
     "links": _links,

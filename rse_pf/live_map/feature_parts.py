@@ -15,7 +15,7 @@ import numpy as np
 
 from rse_pf.errors import BadRequest, message_of
 from rse_pf.live_map.graph import Graph
-from rse_pf.slam.places import PLACE_NUMBERS, LivePlaceIndex
+from rse_pf.slam.places import PLACE_NUMBERS, PlaceIndex
 
 __all__ = ["FeatureParts", "SnapshotParts"]
 
@@ -37,7 +37,7 @@ class FeatureParts:
     def __init__(self) -> None:
         self._full: dict[int, tuple[str, frozenset[int]]] = {}
 
-    def encode(self, graph: Graph, places: LivePlaceIndex, known: Collection[str]) -> SnapshotParts:
+    def encode(self, graph: Graph, places: PlaceIndex, known: Collection[str]) -> SnapshotParts:
         """Return the map as parts; those whose names are *known* are not made again."""
         names: list[str] = []
         parts: dict[str, bytes | None] = {}
@@ -64,14 +64,14 @@ class FeatureParts:
             self._full.pop(number, None)
 
     @classmethod
-    def decode(cls, head: bytes, part: Callable[[str], bytes]) -> tuple[Graph, LivePlaceIndex, FeatureParts]:
+    def decode(cls, head: bytes, part: Callable[[str], bytes]) -> tuple[Graph, PlaceIndex, FeatureParts]:
         """Return the map whose parts *part* gives by name.
 
         Raises:
             BadRequest: The head or a part is damaged, or of another version.
         """
         graph, extra = Graph.decode(head)
-        places, parts = LivePlaceIndex(), cls()
+        places, parts = PlaceIndex(), cls()
         try:
             names = msgspec.msgpack.decode(extra["parts"], type=list[str])
             bits = np.frombuffer(extra["held"], dtype=np.uint8)
@@ -94,7 +94,7 @@ class FeatureParts:
         return graph, places, parts
 
 
-def _row(graph: Graph, places: LivePlaceIndex, i: int) -> _Row:
+def _row(graph: Graph, places: PlaceIndex, i: int) -> _Row:
     features = graph.keyframes[i].features
     assert features is not None
     return i, features, places.vector_of(i).astype("<f4").tobytes()

@@ -56,7 +56,7 @@ from rse_pf.live_map.smoothing import SmoothedWindows, odometry_step, smooth_all
 from rse_pf.live_map.versions import version_of, whole_graph
 from rse_pf.maps.format import MapVersion
 from rse_pf.slam.optimise import OptimiseOptions, optimise_graph
-from rse_pf.slam.places import LivePlaceIndex
+from rse_pf.slam.places import PlaceIndex
 from rse_pf.slam.pose_graph import PoseGraph
 
 __all__ = ["LiveMap"]
@@ -75,7 +75,7 @@ class LiveMap:
     def __init__(self, options: LiveMapOptions | None = None) -> None:
         self.options = options or LiveMapOptions()
         self._graph = Graph()
-        self._places = LivePlaceIndex()
+        self._places = PlaceIndex()
         self._parts = FeatureParts()
 
     @classmethod
@@ -87,7 +87,7 @@ class LiveMap:
         """
         restored = cls(options)
         restored._graph, extra = Graph.decode(snapshot)
-        restored._places = LivePlaceIndex.from_bytes(extra["places"])
+        restored._places = PlaceIndex.from_bytes(extra["places"])
         return restored
 
     def snapshot(self) -> bytes:
@@ -282,7 +282,7 @@ class LiveMap:
         aligned = np.flatnonzero(graph.held & self._aligned_mask())
         most = self.options.candidates
         # More are looked at, so that a second place that looks alike is compared, too.
-        found = self._places.nearest(LivePlaceIndex.vector(decoded.descriptors), 6 * most, aligned)
+        found = self._places.nearest(PlaceIndex.vector(decoded.descriptors), 6 * most, aligned)
         chosen = [(self._stored(i), graph.T[i].copy()) for i in spread_candidates(found, graph.T, most)]
         views = [(stored, T) for stored, T in chosen if stored is not None]
         options = RelocaliseOptions(has_equal_rooms=graph.equal_rooms_m > 0.0)
@@ -538,7 +538,7 @@ class LiveMap:
         keyframe = self._graph.keyframes[i]
         assert keyframe.features is not None
         features = decode_features(keyframe.features, self._graph.camera(i))
-        self._places.add(i, LivePlaceIndex.vector(features.descriptors))
+        self._places.add(i, PlaceIndex.vector(features.descriptors))
 
     def _candidates(self, k: int, most: int | None = None) -> list[int]:
         """Return the keyframes to compare with *k*: some of its own component, some of others.

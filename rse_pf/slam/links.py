@@ -20,8 +20,8 @@ from rse_pf.maps.format import Keyframe, MapVersion
 from rse_pf.service import Report
 from rse_pf.slam.consistency import LinkEnds, LoopClosure, OdometryNoise, consistent, fits_prediction
 from rse_pf.slam.optimise import ignore_progress
+from rse_pf.slam.places import PlaceIndex, place_vector
 from rse_pf.slam.relative_pose import RelativePoseOptions, measure_link, reference_of, view_of_keyframe
-from rse_pf.slam.trained_places import PlaceIndex, VectorIndex
 
 __all__ = [
     "Atlas",
@@ -122,8 +122,8 @@ def propose_links(atlas: Atlas, options: MergeOptions, report: Report = ignore_p
             f"up to {most} pairs of keyframes are above {_MAX_PAIRS}",
             hint="merge fewer maps at once, or ask for fewer candidates",
         )
-    index = PlaceIndex(atlas.keyframes)
-    pairs = candidate_pairs(index.vectors, atlas.of_map, atlas.order, options)
+    index = PlaceIndex.of(place_vector(keyframe.descriptors) for keyframe in atlas.keyframes)
+    pairs = candidate_pairs(index, atlas.of_map, atlas.order, options)
     links, failed = measure_pairs(
         atlas, pairs, options, lambda done, what: report(0.1 + 0.7 * done, what)
     )  # fmt: skip
@@ -131,7 +131,7 @@ def propose_links(atlas: Atlas, options: MergeOptions, report: Report = ignore_p
 
 
 def candidate_pairs(
-    index: VectorIndex,
+    index: PlaceIndex,
     of_map: npt.NDArray[np.int64],
     order: npt.NDArray[np.int64],
     options: MergeOptions,
@@ -160,7 +160,7 @@ def candidate_pairs(
             allowed = every[of_map == which]
             if own:
                 allowed = allowed[np.abs(order[allowed] - order[a]) >= _MIN_LOOP_LENGTH]
-            for b, _ in index.nearest_to(index.vector(a), options.candidates, allowed):
+            for b, _ in index.nearest(index.vector_of(a), options.candidates, allowed):
                 pairs.add((min(a, b), max(a, b)))
     return sorted(pairs)
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,7 @@ import numpy.typing as npt
 
 from rse_pf.errors import BadRequest
 
-__all__ = ["PLACE_NUMBERS", "PLACE_WORDS_FILE", "LivePlaceIndex", "PlaceVector", "place_vector"]
+__all__ = ["PLACE_NUMBERS", "PLACE_WORDS_FILE", "PlaceIndex", "PlaceVector", "place_vector"]
 
 WORDS, PARTS = 32, 16
 _BITS, _SCALE, _FINENESS = 256, 127, 16
@@ -57,7 +58,7 @@ def place_vector(descriptors: npt.NDArray[np.uint8]) -> PlaceVector:
     return vector
 
 
-class LivePlaceIndex:
+class PlaceIndex:
     """The vectors of keyframes by id, which is a position in the log; rows have no order of their own."""
 
     def __init__(self) -> None:
@@ -67,7 +68,7 @@ class LivePlaceIndex:
         self._row_of = np.full(_FIRST_ROWS, -1, dtype=np.int64)
 
     @classmethod
-    def from_bytes(cls, data: bytes) -> LivePlaceIndex:
+    def from_bytes(cls, data: bytes) -> PlaceIndex:
         """Return the index that `to_bytes` was called on; raises BadRequest."""
         count, odd = divmod(len(data), _ROW_BYTES)
         if odd:
@@ -92,6 +93,14 @@ class LivePlaceIndex:
 
     def __contains__(self, number: int) -> bool:
         return 0 <= number < len(self._row_of) and self._row_of[number] >= 0
+
+    @classmethod
+    def of(cls, vectors: Iterable[PlaceVector]) -> PlaceIndex:
+        """Return an index of *vectors*, whose ids are their row numbers."""
+        index = cls()
+        for number, vector in enumerate(vectors):
+            index.add(number, vector)
+        return index
 
     @staticmethod
     def vector(descriptors: npt.NDArray[np.uint8]) -> PlaceVector:

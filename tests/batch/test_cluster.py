@@ -102,7 +102,7 @@ def test_a_part_that_ends_its_workers_ends_the_job_and_not_all_workers(
     try:
         engine.start()
         with pytest.raises(Crashed, match="ended 2 workers"):
-            engine.run([Part(kind="words", inputs=())], lambda _: None)
+            engine.run([Part(kind="vectors", inputs=())], lambda _: None)
     finally:
         engine.close()
         cluster.stop()

@@ -146,7 +146,7 @@ PACKAGES: dict[str, tuple[str, ...]] = {
     "packaging": ("rse_pf/services/custom/dependencies.py",),
     "gtsam": ("rse_pf/slam/optimise.py",),
     "small_gicp": ("rse_pf/slam/icp.py",),
-    "faiss": ("rse_pf/slam/descriptors.py", "rse_pf/slam/trained_places.py"),
+    "faiss": ("rse_pf/slam/descriptors.py",),
     "envoy": ("rse_pf/local/",),
     "segno": ("rse_pf/cli/",),
 }

@@ -14,6 +14,7 @@ from rse_pf.maps.format import MapVersion, decode_map, encode_map
 from rse_pf.service import Report
 from rse_pf.services.mapping.merge import MergeRequest, merge_maps
 from rse_pf.services.synthetic_maps import make_world
+from rse_pf.slam import relative_pose
 from rse_pf.slam.consistency import LoopClosure, OdometryNoise, consistent, largest_clique
 from rse_pf.slam.map_merge import (
     Atlas,
@@ -244,6 +245,7 @@ def test_without_the_extra_the_answer_says_what_to_install(monkeypatch: pytest.M
     import sys
 
     monkeypatch.setitem(sys.modules, "faiss", None)
+    monkeypatch.setattr(relative_pose, "match_core", lambda: None)
 
     with pytest.raises(MissingExtra, match="faiss"):
         merge_versions(two_robots()[0])

@@ -13,11 +13,10 @@ from rse_pf.maps.format import Keyframe, MapVersion, encode_map
 from rse_pf.service import dispatch
 from rse_pf.services.builtin import builtin_services
 from rse_pf.services.mapping.localise import LocaliseOptions, LocaliseReply, LocaliseRequest, locate
-from rse_pf.services.mapping.place import PlaceReply, PlaceRequest
+from rse_pf.services.mapping.place import MapIndex, PlaceReply, PlaceRequest, Within
 from rse_pf.services.synthetic_maps import make_world
 from rse_pf.slam.descriptors import hamming_matches
 from rse_pf.slam.relative_pose import View
-from rse_pf.slam.trained_places import PlaceIndex, Within
 from rse_pf.wire import Command, Failure, Result
 
 pytest.importorskip("faiss", reason="the extra maps is not installed")
@@ -36,7 +35,7 @@ def true_map() -> MapVersion:
 
 
 MAP = true_map()
-INDEX = PlaceIndex(MAP.keyframes)
+INDEX = MapIndex(MAP.keyframes)
 
 
 def seen(turn: float, seed: int = 9) -> tuple[Keyframe, Array]:
@@ -93,7 +92,7 @@ def test_a_view_of_two_halls_that_look_alike_is_weak() -> None:
         for number, turn in enumerate(TURNS)
     ]
 
-    found = locate(PlaceIndex([*MAP.keyframes, *copies]), view(seen(0.31)[0]), LocaliseOptions(candidates=12))
+    found = locate(MapIndex([*MAP.keyframes, *copies]), view(seen(0.31)[0]), LocaliseOptions(candidates=12))
 
     assert (found.verdict, found.reason) == ("weak", "keyframes-disagree")
 
@@ -107,12 +106,6 @@ def test_a_prior_narrows_the_search_and_a_wrong_one_finds_nothing() -> None:
 
     assert near.verdict == "ok"
     assert (nowhere.verdict, nowhere.reason) == ("lost", "no-candidates")
-
-
-def test_the_vocabulary_is_the_same_for_the_same_map() -> None:
-    again = PlaceIndex(MAP.keyframes)
-    for row in range(len(MAP.keyframes)):
-        np.testing.assert_array_equal(INDEX.vector(row), again.vector(row))
 
 
 def test_matches_are_closest_and_unambiguous_and_used_once() -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from rse_pf.errors import BadRequest
 from rse_pf.services.synthetic_maps import make_world
-from rse_pf.slam.places import PLACE_NUMBERS, PLACE_WORDS_FILE, LivePlaceIndex, place_vector
+from rse_pf.slam.places import PLACE_NUMBERS, PLACE_WORDS_FILE, PlaceIndex, place_vector
 
 
 def unit_vectors(n: int, seed: int = 1):
@@ -17,8 +17,8 @@ def unit_vectors(n: int, seed: int = 1):
     return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 
-def index_of(vectors, ids=None) -> LivePlaceIndex:
-    index = LivePlaceIndex()
+def index_of(vectors, ids=None) -> PlaceIndex:
+    index = PlaceIndex()
     for number, vector in zip(range(len(vectors)) if ids is None else ids, vectors, strict=True):
         index.add(number, vector)
     return index
@@ -117,11 +117,11 @@ def test_an_index_from_bytes_finds_the_same_however_it_came_to_be():
     )
 
     assert grown.to_bytes() == direct.to_bytes()
-    again = LivePlaceIndex.from_bytes(grown.to_bytes())
+    again = PlaceIndex.from_bytes(grown.to_bytes())
     assert again.to_bytes() == grown.to_bytes()
     assert [n for n, _ in again.nearest(vectors[3], 9)] == [n for n, _ in grown.nearest(vectors[3], 9)]
 
 
 def test_damaged_bytes_of_an_index_are_refused():
     with pytest.raises(BadRequest, match="not an index of places"):
-        LivePlaceIndex.from_bytes(index_of(unit_vectors(2)).to_bytes()[:-1])
+        PlaceIndex.from_bytes(index_of(unit_vectors(2)).to_bytes()[:-1])

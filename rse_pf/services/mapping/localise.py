@@ -16,10 +16,9 @@ from rse_pf.geometry import Array as Matrix
 from rse_pf.geometry import Camera, inverse, pose_difference, transform
 from rse_pf.pnp import PnpOptions, PnpSolution, solve_pnp
 from rse_pf.service import Registry
-from rse_pf.services.mapping.place import check_comparisons, open_map, view_of
+from rse_pf.services.mapping.place import MapIndex, Within, check_comparisons, open_map, view_of
 from rse_pf.slam.descriptors import load_faiss
 from rse_pf.slam.relative_pose import RelativePoseOptions, View, match_points, reference_of
-from rse_pf.slam.trained_places import PlaceIndex, Within
 from rse_pf.wire.arrays import Array
 
 __all__ = ["LocaliseOptions", "LocaliseReply", "LocaliseRequest", "locate", "register"]
@@ -97,7 +96,7 @@ class _CandidatePose:
 
 
 def locate(
-    index: PlaceIndex, view: View, options: LocaliseOptions | None = None, *, within: Within | None = None
+    index: MapIndex, view: View, options: LocaliseOptions | None = None, *, within: Within | None = None
 ) -> LocaliseReply:
     """Find the pose of *view* among the keyframes of *index*.
 
@@ -111,7 +110,7 @@ def locate(
         MissingExtra: faiss or the solver is not installed.
     """
     options = options or LocaliseOptions()
-    rows = index.nearest(view.descriptors, options.candidates, index.rows_within(within))
+    rows = index.nearest(view.descriptors, options.candidates, within)
     if not rows:
         return LocaliseReply(verdict="lost", reason="no-candidates")
     candidates = [
@@ -153,9 +152,7 @@ def register(registry: Registry, data: DataSettings | None = None) -> None:
         return msgspec.structs.replace(found, T_map_camera=pose)
 
 
-def _candidate_pose(
-    index: PlaceIndex, row: int, view: View, options: LocaliseOptions
-) -> _CandidatePose | None:
+def _candidate_pose(index: MapIndex, row: int, view: View, options: LocaliseOptions) -> _CandidatePose | None:
     keyframe = index.keyframes[row]
     reference = reference_of(keyframe)
     points, pixels, _ = match_points(reference, view, RelativePoseOptions(inlier_px=options.inlier_px))

@@ -1,31 +1,35 @@
 """The place service: find the keyframes of a map that show the same place as a view.
 
-The vocabulary is trained, with a fixed seed, from the map of the request alone, so that the same request has
-the same answer.  A prior only narrows the search.  The index of recently used maps is cached.
+The same request has the same answer.  A prior only narrows the search; recently used maps are cached.
 """
 
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 
 import msgspec
+import numpy as np
+import numpy.typing as npt
 
 from rse_pf.config import DataSettings
 from rse_pf.errors import BadRequest, LimitExceeded
 from rse_pf.geometry import Camera
 from rse_pf.maps.format import Keyframe, MapLimits, MapVersion, decode_map
 from rse_pf.service import Registry
-from rse_pf.slam.descriptors import descriptors_of, load_faiss
+from rse_pf.slam.descriptors import Descriptors, descriptors_of, load_faiss
+from rse_pf.slam.places import PlaceIndex, place_vector
 from rse_pf.slam.relative_pose import View, measure_pose, reference_of
-from rse_pf.slam.trained_places import PlaceIndex, Within
 from rse_pf.wire.arrays import Array, reshaped
 
 __all__ = [
     "MAX_KEYFRAMES",
     "MAX_VIEW_FEATURES",
     "Candidate",
+    "MapIndex",
     "PlaceReply",
     "PlaceRequest",
+    "Within",
     "check_comparisons",
     "map_limits",
     "open_map",
@@ -42,6 +46,15 @@ MAX_VIEW_FEATURES = 20_000
 """Of the view of a request."""
 _MAX_COMPARISONS = 2_000_000_000
 """Of one descriptor of the view with one of a candidate; they take about five seconds."""
+
+
+class Within(msgspec.Struct, frozen=True, kw_only=True):
+    """A prior: the camera is within *radius_m* of ``(x, y, z)``, metres, map frame."""
+
+    x: float
+    y: float
+    z: float
+    radius_m: float
 
 
 class PlaceRequest(msgspec.Struct, frozen=True, kw_only=True):
@@ -78,6 +91,25 @@ class PlaceReply(msgspec.Struct, frozen=True, kw_only=True):
     candidates: list[Candidate]
 
 
+class MapIndex:
+    """The keyframes of a map and an index of their places; immutable.  Rows are those of *keyframes*."""
+
+    def __init__(self, keyframes: Sequence[Keyframe]) -> None:
+        self.keyframes = tuple(keyframes)
+        self._places = PlaceIndex.of(place_vector(keyframe.descriptors) for keyframe in self.keyframes)
+
+    def nearest(
+        self, descriptors: Descriptors, count: int, within: Within | None = None
+    ) -> list[tuple[int, float]]:
+        """Return up to *count* ``(row, score)`` for a view, best first, of keyframes that are *within*."""
+        rows: npt.NDArray[np.int64] | None = None
+        if within is not None:
+            centre = np.array([within.x, within.y, within.z])
+            at = np.array([keyframe.T_world_camera[:3, 3] for keyframe in self.keyframes])
+            rows = np.flatnonzero(np.linalg.norm(at - centre, axis=1) <= within.radius_m).astype(np.int64)
+        return self._places.nearest(place_vector(descriptors), count, rows)
+
+
 def map_limits(keyframe_features: int, keyframes: int = MAX_KEYFRAMES) -> MapLimits:
     """Return what a map may hold that a service computes with."""
     return MapLimits(keyframes=keyframes, keyframe_features=keyframe_features, features=MAX_FEATURES)
@@ -86,7 +118,7 @@ def map_limits(keyframe_features: int, keyframes: int = MAX_KEYFRAMES) -> MapLim
 @functools.lru_cache(maxsize=_CACHED_MAPS)
 def open_map(
     data: bytes, keyframe_features: int = MapLimits().keyframe_features
-) -> tuple[MapVersion, PlaceIndex]:
+) -> tuple[MapVersion, MapIndex]:
     """Return the map of *data* and its index; the last results are cached.
 
     Raises:
@@ -98,7 +130,7 @@ def open_map(
         raise LimitExceeded(
             f"a map of 0 keyframes is not within 1..{MAX_KEYFRAMES}", hint="send a map with keyframes"
         )
-    return version, PlaceIndex(version.keyframes)
+    return version, MapIndex(version.keyframes)
 
 
 def view_of(camera: Camera, pixels: Array, descriptors: bytes) -> View:
@@ -111,7 +143,7 @@ def view_of(camera: Camera, pixels: Array, descriptors: bytes) -> View:
     return View(camera=camera, pixels=rows, descriptors=descriptors_of(descriptors, len(rows)))
 
 
-def check_comparisons(index: PlaceIndex, view: View, candidates: int) -> None:
+def check_comparisons(index: MapIndex, view: View, candidates: int) -> None:
     """Raise LimitExceeded if matching *view* to *candidates* keyframes of *index* would take too long."""
     largest = max(len(each.descriptors) for each in index.keyframes)
     comparisons = min(candidates, len(index.keyframes)) * largest * len(view.pixels)
@@ -138,7 +170,7 @@ def register(registry: Registry, data: DataSettings | None = None) -> None:
         _, index = open_map(request.map, keyframe_features)
         if request.check:
             check_comparisons(index, view, request.candidates)
-        rows = index.nearest(view.descriptors, request.candidates, index.rows_within(request.within))
+        rows = index.nearest(view.descriptors, request.candidates, request.within)
         found = [_candidate(index.keyframes[row], score, view, request.check) for row, score in rows]
         if request.check:
             found.sort(key=lambda each: (-(each.inliers or 0), -each.score))
