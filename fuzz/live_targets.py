@@ -21,9 +21,9 @@ from rse_pf.live_map.keyframe_code import (
     decode_features,
     encode_features,
 )
-from rse_pf.live_map.measure import measure_links
-from rse_pf.live_map.relocalise import relocalise
+from rse_pf.live_map.measure import measure_links, reference_of_features, view_of_features
 from rse_pf.services.synthetic_maps import make_world
+from rse_pf.slam.localise import PlacedKeyframe, localise
 from rse_pf.slam.places import place_vector
 
 __all__ = ["live"]
@@ -60,9 +60,11 @@ def live(data: bytes, meter: Meter) -> None:
             expect(bool(np.isfinite(matrix_of(link.T_keyframe_other, 4, 4)).all()), "a pose not finite")
             information = matrix_of(link.information, 6, 6)
             expect(bool((np.linalg.eigvalsh(information) > 0.0).all()), "information that is not positive")
-    found = relocalise(
-        [(0, features, _CAMERA, np.eye(4)), (1, _KNOWN, _CAMERA, np.eye(4))], features, _CAMERA
-    )
+    candidates = [
+        PlacedKeyframe(id=number, reference=reference_of_features(each, _CAMERA), T_map_keyframe=np.eye(4))
+        for number, each in enumerate((features, _KNOWN))
+    ]
+    found = localise(candidates, view_of_features(features, _CAMERA))
     expect((found.verdict == "none") == (found.T_map_camera is None), "a pose without a verdict")
     expect((found.verdict == "ok") == (found.reason == ""), "a verdict without its reason")
     if found.T_map_camera is not None and found.covariance is not None:

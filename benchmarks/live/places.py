@@ -34,9 +34,9 @@ from client_sdk.simulator.camera import Painter, add_depth_noise, add_image_nois
 from client_sdk.simulator.world import make_world
 from rse_pf.geometry import Array, Camera, inverse, pose_difference, rotation_angle_deg, transform
 from rse_pf.live_map.keyframe_code import KeyframeFeatures, decode_features, encode_features
-from rse_pf.live_map.measure import measure_links
-from rse_pf.live_map.relocalise import Relocalised, relocalise, spread_candidates
+from rse_pf.live_map.measure import measure_links, reference_of_features, view_of_features
 from rse_pf.maps.format import Keyframe, MapVersion
+from rse_pf.slam.localise import Localised, PlacedKeyframe, localise, spread_candidates
 from rse_pf.slam.map_merge import merge_versions
 from rse_pf.slam.places import PLACE_NUMBERS, PlaceIndex, place_vector
 
@@ -169,11 +169,15 @@ class PlacedMap:
         keyframes = [(n, v.features, v.camera, T) for n, (v, T) in enumerate(zip(views, poses, strict=True))]
         return cls(keyframes=keyframes, index=index, T_map_camera=np.array(poses))
 
-    def find(self, view: View) -> Relocalised:
+    def find(self, view: View) -> Localised:
         """Return the place of a view."""
         near = self.index.nearest(place_vector(view.features.descriptors), SEARCHED)
         chosen = spread_candidates(near, self.T_map_camera, CANDIDATES)
-        return relocalise([self.keyframes[number] for number in chosen], view.features, view.camera)
+        candidates = [
+            PlacedKeyframe(id=number, reference=reference_of_features(features, camera), T_map_keyframe=T)
+            for number, features, camera, T in (self.keyframes[row] for row in chosen)
+        ]
+        return localise(candidates, view_of_features(view.features, view.camera))
 
 
 def kitchen_map(recordings: Path, views: Sequence[View]) -> tuple[PlacedMap, Array]:

@@ -38,7 +38,7 @@ from rse_pf.live_map.events import (
 from rse_pf.live_map.feature_parts import FeatureParts, SnapshotParts
 from rse_pf.live_map.graph import Graph, LiveKeyframe, LiveLink, Segment, camera_of, variances_of
 from rse_pf.live_map.keyframe_code import decode_features
-from rse_pf.live_map.measure import StoredView, decoded_view, measure_stored
+from rse_pf.live_map.measure import StoredView, measure_stored, placed_keyframe, view_of_features
 from rse_pf.live_map.options import LiveMapOptions
 from rse_pf.live_map.outcomes import (
     Added,
@@ -51,10 +51,10 @@ from rse_pf.live_map.outcomes import (
     Outcome,
     Unaligned,
 )
-from rse_pf.live_map.relocalise import Relocalised, RelocaliseOptions, relocalise, spread_candidates
 from rse_pf.live_map.smoothing import SmoothedWindows, odometry_step, smooth_all
 from rse_pf.live_map.versions import version_of, whole_graph
 from rse_pf.maps.format import MapVersion
+from rse_pf.slam.localise import LocalisationOptions, Localised, localise, spread_candidates
 from rse_pf.slam.optimise import OptimiseOptions, optimise_graph
 from rse_pf.slam.places import PlaceIndex
 from rse_pf.slam.pose_graph import PoseGraph
@@ -263,7 +263,7 @@ class LiveMap:
 
         return fit
 
-    def relocalise(self, camera: Camera, features: bytes) -> Relocalised:
+    def relocalise(self, camera: Camera, features: bytes) -> Localised:
         """Find the place of a view in the map; changes nothing.
 
         Raises:
@@ -271,7 +271,7 @@ class LiveMap:
         """
         return self.relocalising(camera, features)()
 
-    def relocalising(self, camera: Camera, features: bytes) -> Callable[[], Relocalised]:
+    def relocalising(self, camera: Camera, features: bytes) -> Callable[[], Localised]:
         """Return what does the work of `relocalise`; another thread may call it while the map changes.
 
         Raises:
@@ -285,8 +285,9 @@ class LiveMap:
         found = self._places.nearest(PlaceIndex.vector(decoded.descriptors), 6 * most, aligned)
         chosen = [(self._stored(i), graph.T[i].copy()) for i in spread_candidates(found, graph.T, most)]
         views = [(stored, T) for stored, T in chosen if stored is not None]
-        options = RelocaliseOptions(has_equal_rooms=graph.equal_rooms_m > 0.0)
-        return lambda: relocalise([(*decoded_view(each), T) for each, T in views], decoded, camera, options)
+        options = LocalisationOptions(has_equal_rooms=graph.equal_rooms_m > 0.0)
+        view = view_of_features(decoded, camera)
+        return lambda: localise([placed_keyframe(stored, T) for stored, T in views], view, options)
 
     def alignments(self) -> list[Alignment]:
         """Return where the newest segment of each robot lies."""

@@ -7,9 +7,10 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from rse_pf.geometry import Camera
+from rse_pf.geometry import Array, Camera
 from rse_pf.live_map.events import LinksMeasured, MeasuredLink, matrix_bytes
 from rse_pf.live_map.keyframe_code import KeyframeFeatures, decode_features
+from rse_pf.slam.localise import PlacedKeyframe
 from rse_pf.slam.relative_pose import Reference, RelativePoseOptions, View, measure_link
 
 __all__ = [
@@ -18,6 +19,7 @@ __all__ = [
     "joined_links",
     "measure_links",
     "measure_stored",
+    "placed_keyframe",
     "reference_of_features",
     "view_of_features",
 ]
@@ -84,6 +86,14 @@ def view_of_features(features: KeyframeFeatures, camera: Camera) -> View:
     return View(
         camera=camera, pixels=features.pixels.astype(np.float64), descriptors=features.descriptors,
         depths_m=features.depths_m.astype(np.float64),
+    )  # fmt: skip
+
+
+def placed_keyframe(stored: StoredView, T_map_keyframe: Array) -> PlacedKeyframe:
+    """Return a stored keyframe with its ``(4, 4)`` pose, to find a view near it; raises BadRequest."""
+    number, features, camera = decoded_view(stored)
+    return PlacedKeyframe(
+        id=number, reference=reference_of_features(features, camera), T_map_keyframe=T_map_keyframe
     )  # fmt: skip
 
 

@@ -86,10 +86,20 @@ class Reference:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class MeasuredPose:
-    """``T_view_reference`` by PnP and depth, and the number of matches it was found among."""
+    """``T_view_reference`` by PnP and depth, and the matches it was found among.
+
+    ``points_reference`` ``(k, 3)`` are metres, in the frame of the reference; ``pixels`` ``(k, 2)`` are those
+    of the view.
+    """
 
     solution: PnpSolution
-    matches: int
+    points_reference: Array
+    pixels: Array
+
+    @property
+    def matches(self) -> int:
+        """The number of matches."""
+        return len(self.pixels)
 
     @property
     def inliers(self) -> int:
@@ -185,7 +195,7 @@ def measure_pose(
         return "no-pose"
     if view.depths_m is not None and points[:, 2].min() >= _NEAREST_M:
         solution = refine_with_depth(solution, points, pixels, depths_m, view.camera)
-    return MeasuredPose(solution=solution, matches=len(points))
+    return MeasuredPose(solution=solution, points_reference=points, pixels=pixels)
 
 
 def match_points(

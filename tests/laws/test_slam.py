@@ -24,6 +24,8 @@ ONE_PLACE = {
     "round_trips_close": "rse_pf/slam/consistency.py",
     "within_noise": "rse_pf/slam/consistency.py",
     "largest_clique": "rse_pf/slam/consistency.py",
+    "LocalisationOptions": "rse_pf/slam/localise.py",
+    "RelocaliseOptions": "rse_pf/slam/localise.py",
     "place_vector": "rse_pf/slam/places.py",
     "view_vector": "rse_pf/slam/places.py",
     "PlaceIndex": "rse_pf/slam/places.py",

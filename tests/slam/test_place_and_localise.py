@@ -94,7 +94,7 @@ def test_a_view_of_two_halls_that_look_alike_is_weak() -> None:
 
     found = locate(MapIndex([*MAP.keyframes, *copies]), view(seen(0.31)[0]), LocaliseOptions(candidates=12))
 
-    assert (found.verdict, found.reason) == ("weak", "keyframes-disagree")
+    assert (found.verdict, found.reason) == ("weak", "ambiguous")
 
 
 def test_a_prior_narrows_the_search_and_a_wrong_one_finds_nothing() -> None:

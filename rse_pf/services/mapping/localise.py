@@ -1,30 +1,26 @@
 """The localisation service: from one view and a map to the pose of the camera in that map.
 
-A pose with few inliers, or on which two keyframes disagree, is not ok.  Earlier views are not used.
+A pose with few inliers, or that another place contradicts, is not ok.  Earlier views are not used.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import msgspec
-import numpy as np
 
 from rse_pf.config import DataSettings
-from rse_pf.errors import BadRequest, PnpError
-from rse_pf.geometry import Array as Matrix
-from rse_pf.geometry import Camera, inverse, pose_difference, transform
-from rse_pf.pnp import PnpOptions, PnpSolution, solve_pnp
+from rse_pf.errors import BadRequest
+from rse_pf.geometry import Camera
 from rse_pf.service import Registry
 from rse_pf.services.mapping.place import MapIndex, Within, check_comparisons, open_map, view_of
 from rse_pf.slam.descriptors import load_faiss
-from rse_pf.slam.relative_pose import RelativePoseOptions, View, match_points, reference_of
+from rse_pf.slam.localise import LocalisationOptions, PlacedKeyframe, localise, spread_candidates
+from rse_pf.slam.relative_pose import RelativePoseOptions, View, reference_of
 from rse_pf.wire.arrays import Array
 
 __all__ = ["LocaliseOptions", "LocaliseReply", "LocaliseRequest", "locate", "register"]
 
-_MAX_M = 1e6
-"""PnP refuses coordinates beyond it."""
+_SEARCHED = 6
+"""So many times the candidates are looked at, so that a second place that looks alike is compared, too."""
 
 
 class LocaliseOptions(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
@@ -73,7 +69,7 @@ class LocaliseRequest(msgspec.Struct, frozen=True, kw_only=True):
 class LocaliseReply(msgspec.Struct, frozen=True, kw_only=True):
     """A pose ``T_map_camera`` (16 numbers, row-major) with its evidence.
 
-    ``inliers`` counts the matches of the best keyframe alone; *rmse_px* is over those of all.
+    ``inliers`` counts the matches of the best keyframe, and *rmse_px* is over them.
 
     ``verdict``: ok; weak, with a *reason*; or lost, with a reason and without a pose.
     """
@@ -87,21 +83,12 @@ class LocaliseReply(msgspec.Struct, frozen=True, kw_only=True):
     """Ids of the keyframes that support the pose, best first."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _CandidatePose:
-    row: int
-    points_map: Matrix
-    pixels: Matrix
-    solution: PnpSolution
-
-
 def locate(
     index: MapIndex, view: View, options: LocaliseOptions | None = None, *, within: Within | None = None
 ) -> LocaliseReply:
     """Find the pose of *view* among the keyframes of *index*.
 
-    Place recognition gives candidates, PnP a pose from each; the best one is solved again with the points
-    of all candidates that agree with it.
+    Place recognition gives candidates of each place that looks alike, and `rse_pf.slam.localise` decides.
 
     Returns:
         The reply of the service, with ``T_map_camera`` as ``(4, 4)``.
@@ -110,29 +97,30 @@ def locate(
         MissingExtra: faiss or the solver is not installed.
     """
     options = options or LocaliseOptions()
-    rows = index.nearest(view.descriptors, options.candidates, within)
-    if not rows:
-        return LocaliseReply(verdict="lost", reason="no-candidates")
+    similar = index.nearest(view.descriptors, _SEARCHED * options.candidates, within)
+    limits = LocalisationOptions(
+        measured=RelativePoseOptions(
+            min_inliers=options.min_inliers, min_inlier_ratio=options.min_inlier_ratio,
+            inlier_px=options.inlier_px,
+        ),
+        least_inliers=options.min_inliers // 2,
+        agree_m=options.agree_m,
+        agree_deg=options.agree_deg,
+        of_place=max(1, 3 * options.candidates // 4),
+    )  # fmt: skip
+    rows = spread_candidates(similar, index.T_map_keyframe, options.candidates, limits)
+    keyframes = [index.keyframes[row] for row in rows]
     candidates = [
-        candidate for row, _ in rows if (candidate := _candidate_pose(index, row, view, options)) is not None
+        PlacedKeyframe(id=k.id, reference=reference_of(k), T_map_keyframe=k.T_world_camera) for k in keyframes
     ]
-    if not candidates:
-        return LocaliseReply(verdict="lost", reason="no-pose")
-    candidates.sort(key=lambda candidate: -len(candidate.solution.inliers))
-    best = candidates[0]
-    agreeing = [candidate for candidate in candidates if _agrees(candidate, best, options)]
-    solution = _solve_jointly(agreeing, view, options) or best.solution
-    count = len(best.solution.inliers)
-    if count < options.min_inliers // 2:
-        return LocaliseReply(verdict="lost", reason="few-inliers", inliers=count)
-    reason = _weakness(candidates, agreeing, solution, options)
+    located = localise(candidates, view, limits)
     return LocaliseReply(
-        verdict="weak" if reason else "ok",
-        reason=reason,
-        T_map_camera=inverse(solution.T_camera_world),
-        inliers=count,
-        rmse_px=solution.rmse_px,
-        keyframes=[index.keyframes[candidate.row].id for candidate in agreeing],
+        verdict="lost" if located.verdict == "none" else located.verdict,
+        reason=located.reason,
+        T_map_camera=located.T_map_camera,
+        inliers=located.inliers,
+        rmse_px=located.rmse_px,
+        keyframes=list(located.keyframes),
     )
 
 
@@ -142,7 +130,7 @@ def register(registry: Registry, data: DataSettings | None = None) -> None:
     keyframe_features = limits.max_keyframe_features
 
     @registry.service("localise", limited=True, warm_up=load_faiss)
-    def localise(request: LocaliseRequest) -> LocaliseReply:
+    def answer(request: LocaliseRequest) -> LocaliseReply:
         """Find the camera's pose in a map."""
         view = view_of(request.camera, request.pixels, request.descriptors)
         _, index = open_map(request.map, keyframe_features)
@@ -150,60 +138,3 @@ def register(registry: Registry, data: DataSettings | None = None) -> None:
         found = locate(index, view, request.options, within=request.within)
         pose = None if found.T_map_camera is None else found.T_map_camera.ravel()
         return msgspec.structs.replace(found, T_map_camera=pose)
-
-
-def _candidate_pose(index: MapIndex, row: int, view: View, options: LocaliseOptions) -> _CandidatePose | None:
-    keyframe = index.keyframes[row]
-    reference = reference_of(keyframe)
-    points, pixels, _ = match_points(reference, view, RelativePoseOptions(inlier_px=options.inlier_px))
-    if len(points) < options.min_inliers // 2:
-        return None
-    points_map = transform(keyframe.T_world_camera, points)
-    if not (np.abs(points_map) <= _MAX_M).all():  # too far from the origin of its map to be solved
-        return None
-    solution = _solve(points_map, pixels, view, options)
-    return None if solution is None else _CandidatePose(row, points_map, pixels, solution)
-
-
-def _solve_jointly(
-    candidates: list[_CandidatePose], view: View, options: LocaliseOptions
-) -> PnpSolution | None:
-    """Solve with the inliers of all *candidates* together."""
-    points = np.concatenate([candidate.points_map[candidate.solution.inliers] for candidate in candidates])
-    pixels = np.concatenate([candidate.pixels[candidate.solution.inliers] for candidate in candidates])
-    return _solve(points, pixels, view, options)
-
-
-def _solve(points: Matrix, pixels: Matrix, view: View, options: LocaliseOptions) -> PnpSolution | None:
-    try:
-        return solve_pnp(points, pixels, view.camera, PnpOptions(inlier_px=options.inlier_px))
-    except PnpError:
-        return None
-
-
-def _agrees(candidate: _CandidatePose, best: _CandidatePose, options: LocaliseOptions) -> bool:
-    metres, degrees = pose_difference(
-        inverse(candidate.solution.T_camera_world), inverse(best.solution.T_camera_world)
-    )
-    return metres <= options.agree_m and degrees <= options.agree_deg
-
-
-def _weakness(
-    candidates: list[_CandidatePose],
-    agreeing: list[_CandidatePose],
-    solution: PnpSolution,
-    options: LocaliseOptions,
-) -> str:
-    best = agreeing[0]
-    if len(best.solution.inliers) < options.min_inliers:
-        return "few-inliers"
-    if len(best.solution.inliers) < options.min_inlier_ratio * len(best.pixels):
-        return "low-inlier-ratio"
-    if solution.verdict != "ok":
-        return solution.reason
-    rival = max(options.min_inliers, len(best.solution.inliers) // 2)
-    if any(
-        candidate not in agreeing and len(candidate.solution.inliers) >= rival for candidate in candidates
-    ):
-        return "keyframes-disagree"
-    return ""

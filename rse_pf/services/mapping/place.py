@@ -92,10 +92,14 @@ class PlaceReply(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class MapIndex:
-    """The keyframes of a map and an index of their places; immutable.  Rows are those of *keyframes*."""
+    """The keyframes of a map, their ``(n, 4, 4)`` poses, and an index of their places; immutable.
+
+    Rows are those of *keyframes*.
+    """
 
     def __init__(self, keyframes: Sequence[Keyframe]) -> None:
         self.keyframes = tuple(keyframes)
+        self.T_map_keyframe = np.array([keyframe.T_world_camera for keyframe in self.keyframes])
         self._places = PlaceIndex.of(place_vector(keyframe.descriptors) for keyframe in self.keyframes)
 
     def nearest(
@@ -105,8 +109,8 @@ class MapIndex:
         rows: npt.NDArray[np.int64] | None = None
         if within is not None:
             centre = np.array([within.x, within.y, within.z])
-            at = np.array([keyframe.T_world_camera[:3, 3] for keyframe in self.keyframes])
-            rows = np.flatnonzero(np.linalg.norm(at - centre, axis=1) <= within.radius_m).astype(np.int64)
+            apart_m = np.linalg.norm(self.T_map_keyframe[:, :3, 3] - centre, axis=1)
+            rows = np.flatnonzero(apart_m <= within.radius_m).astype(np.int64)
         return self._places.nearest(place_vector(descriptors), count, rows)
 
 

@@ -16,7 +16,7 @@ __all__ = ["relocalise_reply", "show_missing", "show_reply", "version_reply"]
 
 
 def relocalise_reply(found: Any, version: int) -> dict[str, Any]:
-    """Return the answer to a robot that asked where it is; *found* is a `Relocalised`."""
+    """Return the answer to a robot that asked where it is; *found* is a `Localised`."""
     return {
         "verdict": found.verdict,
         "reason": found.reason,

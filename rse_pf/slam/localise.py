@@ -13,16 +13,16 @@ from typing import Literal
 
 import numpy as np
 
-from rse_pf.geometry import Array, Camera, adjoint, exp_se3, inverse, log_se3, pose_difference
-from rse_pf.live_map.keyframe_code import KeyframeFeatures
-from rse_pf.live_map.measure import reference_of_features, view_of_features
-from rse_pf.slam.relative_pose import MeasuredPose, RelativePoseOptions, measure_pose
+from rse_pf.errors import PnpError
+from rse_pf.geometry import Array, adjoint, exp_se3, inverse, log_se3, pose_difference, transform
+from rse_pf.pnp import PnpOptions, solve_pnp
+from rse_pf.slam.relative_pose import MeasuredPose, Reference, RelativePoseOptions, View, measure_pose
 
-__all__ = ["RelocaliseOptions", "Relocalised", "relocalise", "spread_candidates"]
+__all__ = ["LocalisationOptions", "Localised", "PlacedKeyframe", "localise", "spread_candidates"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class RelocaliseOptions:
+class LocalisationOptions:
     """When a placement counts, and when it is ok.
 
     Attributes:
@@ -53,13 +53,14 @@ class RelocaliseOptions:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Relocalised:
+class Localised:
     """Where a camera is in the map.
 
     ``verdict`` is ``ok``; ``weak`` with a reason ("ambiguous", "few-inliers", "low-inlier-ratio",
     "one-keyframe", or one of PnP); or ``none`` with a reason ("no-candidates", "no-pose") and without a pose.
-    ``covariance`` ``(6, 6)`` is of the twist (metres, radians) on the left of ``T_map_camera``.  ``inliers``
-    and ``matches`` are those of the best keyframe, ``keyframes`` the ids of those that agree, best first.
+    ``covariance`` ``(6, 6)`` is of the twist (metres, radians) on the left of ``T_map_camera``.  ``inliers``,
+    ``matches`` and ``rmse_px`` are those of the best keyframe; ``keyframes`` are the ids of those that agree,
+    best first.
     """
 
     verdict: Literal["ok", "weak", "none"]
@@ -68,7 +69,17 @@ class Relocalised:
     covariance: Array | None = None
     inliers: int = 0
     matches: int = 0
+    rmse_px: float = 0.0
     keyframes: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PlacedKeyframe:
+    """A keyframe of a map that may show the view: its id, its points, and its ``(4, 4)`` pose in the map."""
+
+    id: int
+    reference: Reference
+    T_map_keyframe: Array
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -76,61 +87,67 @@ class _Placement:
     """The pose of the view that one keyframe proposes, with its covariance on the right."""
 
     keyframe: int
+    T_map_keyframe: Array
     T_map_camera: Array
     covariance: Array
     found: MeasuredPose
 
 
-_DEFAULT = RelocaliseOptions()
+_DEFAULT = LocalisationOptions()
 
 
-def relocalise(
-    candidates: Sequence[tuple[int, KeyframeFeatures, Camera, Array]],
-    features: KeyframeFeatures,
-    camera: Camera,
-    options: RelocaliseOptions = _DEFAULT,
-) -> Relocalised:
-    """Return the place of a view among *candidates*; deterministic.
+def localise(
+    candidates: Sequence[PlacedKeyframe], view: View, options: LocalisationOptions = _DEFAULT
+) -> Localised:
+    """Return the place of *view* among *candidates*; deterministic.
 
     Args:
-        candidates: Id, features, camera and ``T_map_keyframe`` of keyframes that look alike.  Those of one
-            place say nothing against another one: give some of each place that looks alike.
-        features: Of the view.
-        camera: Of the view.
+        candidates: Keyframes that look alike.  Those of one place say nothing against another one: give some
+            of each place that looks alike.
+        view: The image whose place is sought.
         options: When a placement is ok.
+
+    Raises:
+        MissingExtra: There is no matcher or no solver.
     """
     if not candidates:
-        return Relocalised(verdict="none", reason="no-candidates")
+        return Localised(verdict="none", reason="no-candidates")
     placements = []
-    view = view_of_features(features, camera)
-    for number, known, known_camera, T_map_keyframe in candidates:
-        reference = reference_of_features(known, known_camera)
-        found = measure_pose(reference, view, options.measured)
-        if isinstance(found, str) or found.inliers < options.least_inliers:
+    for candidate in candidates:
+        measured = measure_pose(candidate.reference, view, options.measured)
+        if isinstance(measured, str) or measured.inliers < options.least_inliers:
             continue
         placements.append(
             _Placement(
-                keyframe=number, T_map_camera=T_map_keyframe @ inverse(found.solution.T_camera_world),
-                covariance=found.solution.covariance + options.measured.floor(), found=found,
+                keyframe=candidate.id,
+                T_map_keyframe=candidate.T_map_keyframe,
+                T_map_camera=candidate.T_map_keyframe @ inverse(measured.solution.T_camera_world),
+                covariance=measured.solution.covariance + options.measured.floor(),
+                found=measured,
             )
-        )  # fmt: skip
+        )
     if not placements:
-        return Relocalised(verdict="none", reason="no-pose")
+        return Localised(verdict="none", reason="no-pose")
     placements.sort(key=lambda each: (-each.found.inliers, each.keyframe))
     best = placements[0]
     agreeing = [each for each in placements if _agree(each, best, options)]
     others = [each for each in placements if not _agree(each, best, options)]
     reason = _weakness(agreeing, others, options)
     T_map_camera, covariance = _fused(agreeing)
-    return Relocalised(
+    if view.depths_m is None and len(agreeing) > 1:
+        T_map_camera = _solved_together(agreeing, view, options)
+    return Localised(
         verdict="weak" if reason else "ok", reason=reason, T_map_camera=T_map_camera, covariance=covariance,
-        inliers=best.found.inliers, matches=best.found.matches,
+        inliers=best.found.inliers, matches=best.found.matches, rmse_px=best.found.solution.rmse_px,
         keyframes=tuple(each.keyframe for each in agreeing),
     )  # fmt: skip
 
 
 def spread_candidates(
-    found: Sequence[tuple[int, float]], T_map_camera: Array, count: int, options: RelocaliseOptions = _DEFAULT
+    found: Sequence[tuple[int, float]],
+    T_map_camera: Array,
+    count: int,
+    options: LocalisationOptions = _DEFAULT,
 ) -> list[int]:
     """Return up to *count* ids of *found* (best first), only a few of each place.
 
@@ -155,19 +172,20 @@ def spread_candidates(
     return chosen
 
 
-def _agree(one: _Placement, other: _Placement, options: RelocaliseOptions) -> bool:
+def _agree(one: _Placement, other: _Placement, options: LocalisationOptions) -> bool:
     metres, degrees = pose_difference(one.T_map_camera, other.T_map_camera)
     return metres <= options.agree_m and degrees <= options.agree_deg
 
 
 def _weakness(
-    agreeing: Sequence[_Placement], others: Sequence[_Placement], options: RelocaliseOptions
+    agreeing: Sequence[_Placement], others: Sequence[_Placement], options: LocalisationOptions
 ) -> str:
     """Return why the placement of *agreeing* (best first) is not ok, "" if it is."""
     best = agreeing[0].found
     if options.has_equal_rooms:
         return "ambiguous"
-    if others and others[0].found.inliers >= options.rival * best.inliers:
+    rival = max((each.found.inliers for each in others if not each.found.solution.reason), default=0)
+    if rival and rival >= options.rival * best.inliers:
         return "ambiguous"
     if best.inliers < options.measured.min_inliers:
         return "few-inliers"
@@ -178,6 +196,30 @@ def _weakness(
     if len(agreeing) < 2 and best.inliers < options.alone_inliers:
         return "one-keyframe"
     return ""
+
+
+def _solved_together(placements: Sequence[_Placement], view: View, options: LocalisationOptions) -> Array:
+    """Return the pose that fits the inliers of all *placements*, or that of the first one.
+
+    Without depths a pose of one keyframe is no more exact than its few pixels; each has its own.
+    """
+    best = placements[0]
+    T_best_map = inverse(best.T_map_keyframe)
+    points, pixels = [], []
+    for placement in placements:
+        inliers = placement.found.solution.inliers
+        T_best_keyframe = T_best_map @ placement.T_map_keyframe
+        points.append(transform(T_best_keyframe, placement.found.points_reference[inliers]))
+        pixels.append(placement.found.pixels[inliers])
+    try:
+        solution = solve_pnp(
+            np.concatenate(points), np.concatenate(pixels), view.camera,
+            PnpOptions(inlier_px=options.measured.inlier_px),
+        )  # fmt: skip
+    except PnpError:
+        return best.T_map_camera
+    T_map_camera: Array = best.T_map_keyframe @ inverse(solution.T_camera_world)
+    return T_map_camera
 
 
 def _fused(placements: Sequence[_Placement]) -> tuple[Array, Array]:

@@ -9,8 +9,9 @@ import pytest
 
 from rse_pf.geometry import exp_se3, inverse, pose_difference
 from rse_pf.live_map.keyframe_code import KeyframeFeatures, decode_features, encode_features
-from rse_pf.live_map.relocalise import RelocaliseOptions, relocalise, spread_candidates
+from rse_pf.live_map.measure import reference_of_features, view_of_features
 from rse_pf.services.synthetic_maps import make_world
+from rse_pf.slam.localise import LocalisationOptions, Localised, PlacedKeyframe, localise, spread_candidates
 
 
 def coded(keyframe) -> KeyframeFeatures:
@@ -36,12 +37,21 @@ TURNED = T_VIEW @ exp_se3([0.0, 0.0, 0.0, 0.0, 1.0, 0.0]) @ inverse(T_VIEW)
 """About the view, which stays where it is."""
 
 
+def place_of(candidates, view: KeyframeFeatures, camera, *options: LocalisationOptions) -> Localised:
+    """Return the place of *view* among candidates of ids, features, cameras and poses."""
+    placed = [
+        PlacedKeyframe(id=number, reference=reference_of_features(features, of), T_map_keyframe=T)
+        for number, features, of, T in candidates
+    ]
+    return localise(placed, view_of_features(view, camera), *options)
+
+
 def renumbered(candidates, first: int):
     return [(first + number, *rest) for number, *rest in candidates]
 
 
 def test_a_view_finds_its_place():
-    found = relocalise(MAP, VIEW, CAMERA)
+    found = place_of(MAP, VIEW, CAMERA)
 
     assert (found.verdict, found.reason) == ("ok", "")
     metres, degrees = pose_difference(found.T_map_camera, T_VIEW)
@@ -53,8 +63,8 @@ def test_a_view_finds_its_place():
 
 def test_the_covariance_is_that_of_the_twist_on_the_left():
     far = exp_se3([100.0, 0.0, 0.0, 0.0, 0.0, 0.0])
-    here = relocalise(MAP, VIEW, CAMERA).covariance
-    there = relocalise([(n, f, c, far @ T) for n, f, c, T in MAP], VIEW, CAMERA).covariance
+    here = place_of(MAP, VIEW, CAMERA).covariance
+    there = place_of([(n, f, c, far @ T) for n, f, c, T in MAP], VIEW, CAMERA).covariance
 
     deviations = np.sqrt(np.diag(there))
     assert np.allclose(there, there.T)
@@ -65,7 +75,7 @@ def test_the_covariance_is_that_of_the_twist_on_the_left():
 
 
 def test_without_candidates_there_is_no_place():
-    found = relocalise([], VIEW, CAMERA)
+    found = place_of([], VIEW, CAMERA)
 
     assert (found.verdict, found.reason, found.T_map_camera) == ("none", "no-candidates", None)
 
@@ -73,7 +83,7 @@ def test_without_candidates_there_is_no_place():
 def test_a_foreign_view_has_no_place():
     _, foreign, camera, _ = candidates_of(4, (0.0,))[0]
 
-    found = relocalise(MAP, foreign, camera)
+    found = place_of(MAP, foreign, camera)
 
     assert (found.verdict, found.reason, found.T_map_camera) == ("none", "no-pose", None)
 
@@ -82,7 +92,7 @@ def test_a_foreign_view_has_no_place():
 def test_two_places_that_look_alike_are_ambiguous(other):
     twice = MAP + renumbered([(n, f, c, other @ T) for n, f, c, T in MAP], 10)
 
-    found = relocalise(twice, VIEW, CAMERA)
+    found = place_of(twice, VIEW, CAMERA)
 
     assert (found.verdict, found.reason) == ("weak", "ambiguous")
     assert found.T_map_camera is not None
@@ -94,7 +104,7 @@ def test_a_place_that_looks_alike_only_in_part_does_not_make_it_ambiguous():
         pixels=keyframe.pixels[:16], depths_m=keyframe.depths_m[:16], descriptors=keyframe.descriptors[:16]
     )
 
-    found = relocalise([*MAP, (10, part, CAMERA, ELSEWHERE @ MAP[1][3])], VIEW, CAMERA)
+    found = place_of([*MAP, (10, part, CAMERA, ELSEWHERE @ MAP[1][3])], VIEW, CAMERA)
 
     assert (found.verdict, found.reason) == ("ok", "")
     assert 10 not in found.keyframes
@@ -108,17 +118,17 @@ def test_a_place_that_looks_alike_only_in_part_does_not_make_it_ambiguous():
     ],
 )
 def test_one_keyframe_alone_needs_more_inliers(options, reason):
-    found = relocalise(MAP[1:2], VIEW, CAMERA, RelocaliseOptions(**options))
+    found = place_of(MAP[1:2], VIEW, CAMERA, LocalisationOptions(**options))
 
     assert found.reason == reason
     assert found.verdict == ("weak" if reason else "ok")
 
 
 def test_few_inliers_are_weak():
-    options = RelocaliseOptions()
+    options = LocalisationOptions()
     strict = replace(options, measured=replace(options.measured, min_inliers=200))
 
-    found = relocalise(MAP[:1], VIEW, CAMERA, strict)
+    found = place_of(MAP[:1], VIEW, CAMERA, strict)
 
     assert found.inliers < 200
     assert (found.verdict, found.reason) == ("weak", "few-inliers")
@@ -127,7 +137,7 @@ def test_few_inliers_are_weak():
 def test_a_view_far_from_its_keyframes_by_metres_is_still_relative_to_them():
     moved = [(n, f, c, ELSEWHERE @ T) for n, f, c, T in MAP]
 
-    found = relocalise(moved, VIEW, CAMERA)
+    found = place_of(moved, VIEW, CAMERA)
 
     metres, _ = pose_difference(inverse(ELSEWHERE) @ found.T_map_camera, T_VIEW)
     assert metres < 0.01
@@ -148,4 +158,4 @@ def test_candidates_that_look_another_way_are_of_another_place():
 
     found = [(number, 0.5) for number in range(8)]
 
-    assert spread_candidates(found, poses, 6, RelocaliseOptions(of_place=2)) == [0, 1, 4, 5]
+    assert spread_candidates(found, poses, 6, LocalisationOptions(of_place=2)) == [0, 1, 4, 5]
