@@ -1,6 +1,6 @@
-"""The fuzz target of a live map's keyframes: their features, and what computes with them.
+"""The fuzz target of a live map's keyframes: their bytes, and what computes with them.
 
-Features are decoded in the process that owns the map, so their cost has the bars of a robot's message.
+Keyframes are decoded in the process that owns the map, so their cost has the bars of a robot's message.
 """
 
 from __future__ import annotations
@@ -11,60 +11,65 @@ import numpy as np
 
 from fuzz.checks import expect
 from fuzz.meter import Meter
-from rse_pf.errors import BadRequest
+from rse_pf.errors import BadRequest, InvalidCamera
 from rse_pf.geometry import Camera
 from rse_pf.live_map.events import matrix_of
-from rse_pf.live_map.keyframe_code import (
-    MAX_FEATURES,
-    MAX_FEATURES_BYTES,
-    KeyframeFeatures,
-    decode_features,
-    encode_features,
-)
 from rse_pf.live_map.measure import measure_links, reference_of_features, view_of_features
 from rse_pf.services.synthetic_maps import make_world
+from rse_pf.slam.keyframe import (
+    MAX_FEATURES,
+    MAX_KEYFRAME_BYTES,
+    Keyframe,
+    decode_keyframe,
+    encode_keyframe,
+    make_features,
+)
 from rse_pf.slam.localise import PlacedKeyframe, localise
 from rse_pf.slam.places import place_vector
 
 __all__ = ["live"]
 
 _FEATURE_BYTES = 38
+_UNITS_BYTES, _DEPTHS_BYTES = 36, 2
 
 
 def live(data: bytes, meter: Meter) -> None:
-    """Check that bytes as a keyframe's features give features within bounds, or BadRequest.
+    """Check that bytes as a keyframe give one within bounds, or an error of ours.
 
-    Features survive encoding and decoding, and whatever they are, links and places come out with finite
-    numbers.  An odd first byte means that the head is written here, so that the rest is taken as features.
+    A keyframe survives encoding and decoding, and whatever it holds, links and places come out with finite
+    numbers.  An odd first byte means that the heads are written here, so that the rest is taken as features.
     """
     if not data:
         return
     body = data[1:]
     if data[0] % 2:
-        count = min(len(body) // _FEATURE_BYTES, MAX_FEATURES)
-        body = struct.pack("<BBH", 1, 2 + data[0] // 2 % 3, count) + body[: count * _FEATURE_BYTES]
-    features = meter.call(lambda sent: decode_features(sent, _CAMERA), body, BadRequest)
-    if features is None:
+        body = _with_heads(body, 2 + data[0] // 2 % 3)
+    keyframe = meter.call(_decode, body, BadRequest)
+    if keyframe is None:
         return
-    _check_features(features)
-    again = encode_features(features.pixels, features.depths_m, features.descriptors)
-    expect(len(again) <= MAX_FEATURES_BYTES, "encoded features that are too many")
-    twice = decode_features(again, _CAMERA)
+    features, camera = keyframe.features, keyframe.camera
+    _check_keyframe(keyframe)
+    again = encode_keyframe(keyframe)
+    expect(len(again) <= MAX_KEYFRAME_BYTES, "an encoded keyframe that is too long")
+    twice = decode_keyframe(again)
     for name in ("pixels", "depths_m", "descriptors"):
-        expect(np.array_equal(getattr(twice, name), getattr(features, name)), f"{name} changed")
+        expect(np.array_equal(getattr(twice.features, name), getattr(features, name)), f"{name} changed")
+    for name in ("timestamp_s", "camera", "others"):
+        expect(getattr(twice, name) == getattr(keyframe, name), f"{name} changed")
     vector = place_vector(features.descriptors)
     expect(bool(np.isfinite(vector).all()), "a vector that is not finite")
-    for keyframe, other in (((0, features), (1, _KNOWN)), ((1, _KNOWN), (0, features)), ((0, features),) * 2):
-        links = measure_links((*keyframe, _CAMERA), [(*other, _CAMERA)]).links
+    view, known = (0, features, camera), (1, _KNOWN, _CAMERA)
+    for measured, other in ((view, known), (known, view), (view, view)):
+        links = measure_links(measured, [other]).links
         for link in links:
             expect(bool(np.isfinite(matrix_of(link.T_keyframe_other, 4, 4)).all()), "a pose not finite")
             information = matrix_of(link.information, 6, 6)
             expect(bool((np.linalg.eigvalsh(information) > 0.0).all()), "information that is not positive")
     candidates = [
-        PlacedKeyframe(id=number, reference=reference_of_features(each, _CAMERA), T_map_keyframe=np.eye(4))
-        for number, each in enumerate((features, _KNOWN))
+        PlacedKeyframe(id=0, reference=reference_of_features(features, camera), T_map_keyframe=np.eye(4)),
+        PlacedKeyframe(id=1, reference=reference_of_features(_KNOWN, _CAMERA), T_map_keyframe=np.eye(4)),
     ]
-    found = localise(candidates, view_of_features(features, _CAMERA))
+    found = localise(candidates, view_of_features(features, camera))
     expect((found.verdict == "none") == (found.T_map_camera is None), "a pose without a verdict")
     expect((found.verdict == "ok") == (found.reason == ""), "a verdict without its reason")
     if found.T_map_camera is not None and found.covariance is not None:
@@ -72,19 +77,41 @@ def live(data: bytes, meter: Meter) -> None:
         expect(bool(np.isfinite(found.covariance).all()), "a covariance that is not finite")
 
 
-def _check_features(features: KeyframeFeatures) -> None:
+def _decode(data: bytes) -> Keyframe:
+    try:
+        return decode_keyframe(data)
+    except InvalidCamera as error:
+        raise BadRequest(error.message, hint=error.hint) from error
+
+
+def _with_heads(body: bytes, fraction: int) -> bytes:
+    """Return *body* as the features of a keyframe, their pixels in units of ``2**-fraction``."""
+    count = min(len(body) // _FEATURE_BYTES, MAX_FEATURES)
+    units_end, end = _UNITS_BYTES * count, _FEATURE_BYTES * count
+    empty = make_features(np.zeros((0, 2)), np.zeros(0), np.zeros((0, 32), np.uint8))
+    begin = encode_keyframe(
+        Keyframe(timestamp_s=0.0, T_odom_camera=np.eye(4), camera=_CAMERA, features=empty)
+    )[: -8 - 8 - 4 - 8]
+    return b"".join(
+        (
+            begin, struct.pack("<HHIBBHHBB", 2, 1, 8 + units_end, 1, 1, 32, count, fraction, 0),
+            body[:units_end], struct.pack("<HHIBBH", 3, 1, 4 + _DEPTHS_BYTES * count, 1, 0, count),
+            body[units_end:end],
+        )
+    )  # fmt: skip
+
+
+def _check_keyframe(keyframe: Keyframe) -> None:
+    features, camera = keyframe.features, keyframe.camera
     expect(len(features) <= MAX_FEATURES, "too many features")
-    numbers = (features.pixels, features.depths_m, features.points_camera(_CAMERA))
-    expect(all(bool(np.isfinite(each).all()) for each in numbers), "a feature that is not finite")
+    numbers = (features.pixels, features.depths_m, keyframe.T_odom_camera, features.points_camera(camera))
+    expect(all(bool(np.isfinite(array).all()) for array in numbers), "a number that is not finite")
     expect(bool((features.depths_m >= 0.0099).all()), "a feature too near")
-    expect(bool((features.pixels <= (_CAMERA.width + 64, _CAMERA.height + 64)).all()), "a pixel outside")
+    expect(bool((features.pixels <= (camera.width + 64, camera.height + 64)).all()), "a pixel outside")
 
 
 _WORLD, _ = make_world(7, points=1500).walk("robot-1", np.linspace(0.0, 0.05, 2), seed=2)
 _CAMERA: Camera = _WORLD.keyframes[0].camera
-_KNOWN = decode_features(
-    encode_features(
-        _WORLD.keyframes[0].pixels, _WORLD.keyframes[0].points_camera[:, 2], _WORLD.keyframes[0].descriptors
-    ),
-    _CAMERA,
+_KNOWN = make_features(
+    _WORLD.keyframes[0].pixels, _WORLD.keyframes[0].points_camera[:, 2], _WORLD.keyframes[0].descriptors
 )

@@ -50,14 +50,14 @@ from client_sdk.robot import Robot
 from rse_pf.accounts import stored_by_tenant
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import RsePfError
-from rse_pf.geometry import exp_se3
-from rse_pf.live_map.keyframe_code import encode_features
+from rse_pf.geometry import Camera, exp_se3
 from rse_pf.local.control.platform import LocalPlatform
 from rse_pf.local.firewall import ensure_key
 from rse_pf.maps.format import MapVersion, encode_map
 from rse_pf.object_store import DirectoryStore, digest_of
 from rse_pf.pnp.problems import make_problem
 from rse_pf.services.pnp import make_request
+from rse_pf.slam.keyframe import Keyframe, encode_keyframe, make_features
 from rse_pf.wire.live_map import live_topic
 
 __all__ = ["ATTACKS", "main", "measure"]
@@ -79,14 +79,15 @@ _GRAPH = "VERTEX_SE3:QUAT 0 0 0 0 0 0 0 1\nVERTEX_SE3:QUAT 1 1 0 0 0 0 0 1\n" + 
 def keyframe(name: str, number: int, features: int = 600) -> dict[str, Any]:
     """Return the request with keyframe *number* of a robot that drives straight on; all features differ."""
     rng = np.random.default_rng(number)
-    return {
-        "map": name, "segment": 0, "number": number, "timestamp_s": number / KEYFRAME_HZ,
-        "T_odom_camera": exp_se3([0.1 * number, 0, 0, 0, 0, 0]).ravel().tolist(), "camera": _CAMERA,
-        "features": encode_features(
+    made = Keyframe(
+        timestamp_s=number / KEYFRAME_HZ, T_odom_camera=exp_se3([0.1 * number, 0, 0, 0, 0, 0]),
+        camera=Camera(**_CAMERA),
+        features=make_features(
             rng.uniform([0, 0], [640, 480], (features, 2)), rng.uniform(0.5, 5.0, features),
             rng.integers(0, 256, (features, 32), dtype=np.uint8),
         ),
-    }  # fmt: skip
+    )  # fmt: skip
+    return {"map": name, "segment": 0, "number": number, "keyframe": encode_keyframe(made)}
 
 
 class DataClient:

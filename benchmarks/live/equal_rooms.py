@@ -35,10 +35,10 @@ from client_sdk.simulator import (
     with_equal_rooms,
 )
 from rse_pf.geometry import Array, inverse
-from rse_pf.live_map.events import KeyframeAdded, MapStarted, matrix_bytes
-from rse_pf.live_map.keyframe_code import encode_features
+from rse_pf.live_map.events import KeyframeAdded, MapStarted
 from rse_pf.live_map.live_map import LiveMap
 from rse_pf.live_map.outcomes import Added, Joined, OptimiseWanted
+from rse_pf.slam.keyframe import Keyframe, encode_keyframe, make_features
 
 __all__ = ["Drive", "Met", "main", "meet", "prepared"]
 
@@ -53,10 +53,9 @@ _WRONG_M = 1.0
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Drive:
-    """The keyframes of one robot: encoded features, and poses by odometry and in truth, ``(n, 4, 4)``."""
+    """The encoded keyframes of one robot, and their true poses, ``(n, 4, 4)``."""
 
-    features: tuple[bytes, ...]
-    T_odom_camera: Array
+    keyframes: tuple[bytes, ...]
     T_world_camera: Array
 
 
@@ -84,8 +83,8 @@ def prepared(folder: Path, seed: int) -> dict[str, Drive]:
     with np.load(path, allow_pickle=False) as held:
         return {
             name: Drive(
-                features=tuple(_split(held[f"{name}-features"], held[f"{name}-sizes"])),
-                T_odom_camera=held[f"{name}-odom"], T_world_camera=held[f"{name}-truth"],
+                keyframes=tuple(_split(held[f"{name}-keyframes"], held[f"{name}-sizes"])),
+                T_world_camera=held[f"{name}-truth"],
             )
             for name in WAYS
         }  # fmt: skip
@@ -97,10 +96,10 @@ def meet(drives: dict[str, Drive], names: Sequence[str], stated_m: float) -> Met
     live_map.apply(MapStarted(source="", keyframes=(), equal_rooms_m=stated_m))
     first: dict[str, int] = {}
     ever = wrong_ever = False
-    for number in range(max(len(drives[name].features) for name in names)):
+    for number in range(max(len(drives[name].keyframes) for name in names)):
         for name in names:
             drive = drives[name]
-            if number >= len(drive.features):
+            if number >= len(drive.keyframes):
                 continue
             outcomes = live_map.apply(_event(name, number, drive))
             added = next(each.id for each in outcomes if isinstance(each, Added))
@@ -125,12 +124,7 @@ def _off_m(live_map: LiveMap, drives: dict[str, Drive], root: str, first: dict[s
 
 
 def _event(name: str, number: int, drive: Drive) -> KeyframeAdded:
-    camera = SIMULATED_CAMERA
-    return KeyframeAdded(
-        robot=name, segment=0, number=number, timestamp_s=float(number),
-        T_odom_camera=matrix_bytes(drive.T_odom_camera[number]), features=drive.features[number],
-        camera=(camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height),
-    )  # fmt: skip
+    return KeyframeAdded(robot=name, segment=0, number=number, data=drive.keyframes[number])
 
 
 def _prepare(path: Path, seed: int) -> None:
@@ -139,18 +133,17 @@ def _prepare(path: Path, seed: int) -> None:
     for place, (name, (begin_m, end_m)) in enumerate(WAYS.items()):
         truth = loop_trajectory(begin_m, round((end_m - begin_m) / STEP_M), seed, ROOMS, step_m=STEP_M)
         tracker = Tracker(DENSE)
-        features, odom, true = [], [], []
+        keyframes, true = [], []
         for frame, T_world_camera in zip(
             render_along(truth, world, (seed, place)), truth.T_world_camera, strict=True
         ):
             T_odom_camera = _tracked(tracker, frame)
             if T_odom_camera is not None:
-                features.append(_encoded(frame))
-                odom.append(T_odom_camera)
+                keyframes.append(_encoded(frame, T_odom_camera, float(len(keyframes))))
                 true.append(T_world_camera)
-        held[f"{name}-features"] = np.frombuffer(b"".join(features), dtype=np.uint8)
-        held[f"{name}-sizes"] = np.array([len(each) for each in features])
-        held[f"{name}-odom"], held[f"{name}-truth"] = np.array(odom), np.array(true)
+        held[f"{name}-keyframes"] = np.frombuffer(b"".join(keyframes), dtype=np.uint8)
+        held[f"{name}-sizes"] = np.array([len(data) for data in keyframes])
+        held[f"{name}-truth"] = np.array(true)
     part = path.with_suffix(".part.npz")
     np.savez(part, **held)
     part.replace(path)
@@ -163,11 +156,15 @@ def _tracked(tracker: Tracker, frame: Frame) -> Array | None:
     return step.T_world_camera
 
 
-def _encoded(frame: Frame) -> bytes:
+def _encoded(frame: Frame, T_odom_camera: Array, timestamp_s: float) -> bytes:
     found = extract(frame, DENSE)
     depths_m = found.points_camera[:, 2]
     rows = np.flatnonzero(np.isfinite(depths_m))[:870]
-    return encode_features(found.pixels[rows], depths_m[rows], found.descriptors[rows])
+    keyframe = Keyframe(
+        timestamp_s=timestamp_s, T_odom_camera=T_odom_camera, camera=SIMULATED_CAMERA,
+        features=make_features(found.pixels[rows], depths_m[rows], found.descriptors[rows]),
+    )  # fmt: skip
+    return encode_keyframe(keyframe)
 
 
 def _split(data: Array, sizes: Array) -> list[bytes]:

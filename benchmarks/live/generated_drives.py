@@ -13,13 +13,13 @@ from itertools import pairwise
 
 import numpy as np
 
-from rse_pf.geometry import Array, exp_se3, inverse
+from rse_pf.geometry import Array, Camera, exp_se3, inverse
 from rse_pf.live_map.events import KeyframeAdded, LinksMeasured, MeasuredLink, matrix_bytes
-from rse_pf.live_map.keyframe_code import encode_features
+from rse_pf.slam.keyframe import Keyframe, encode_keyframe, make_features
 
 __all__ = ["GeneratedDrive", "GeneratedWorld", "circle", "meander", "measured_link", "straight"]
 
-CAMERA = (525.0, 525.0, 319.5, 239.5, 640, 480)
+CAMERA = Camera(fx=525.0, fy=525.0, cx=319.5, cy=239.5, width=640, height=480)
 STEP_M = 0.1
 LINK_SIGMA_M, LINK_SIGMA_DEG = 0.01, 0.4
 INFORMATION = np.diag([0.02**-2] * 3 + [math.radians(0.7) ** -2] * 3)
@@ -78,11 +78,14 @@ class GeneratedWorld:
         self.seen.append(drive.T_world_camera[number])
         self.owners.append((drive.robot, number))
         pixels = self.rng.uniform(0, 470, (self.features, 2))
-        return KeyframeAdded(
-            robot=drive.robot, segment=drive.segment, number=first + number, timestamp_s=0.2 * number,
-            T_odom_camera=matrix_bytes(drive.T_odom_camera[number]), camera=CAMERA,
-            features=encode_features(pixels, self.rng.uniform(1, 4, self.features), self._descriptors),
+        depths_m = self.rng.uniform(1, 4, self.features)
+        keyframe = Keyframe(
+            timestamp_s=0.2 * number, T_odom_camera=drive.T_odom_camera[number], camera=CAMERA,
+            features=make_features(pixels, depths_m, self._descriptors),
         )  # fmt: skip
+        return KeyframeAdded(
+            robot=drive.robot, segment=drive.segment, number=first + number, data=encode_keyframe(keyframe)
+        )
 
     def links_of(self, keyframe: int, wrong: float = 0.0) -> LinksMeasured:
         """Return the links of the newest keyframe to those that it truly overlaps; some may be wrong.

@@ -29,9 +29,9 @@ from rse_pf.live_map.events import (
     KeyframeAdded,
     LinksMeasured,
     RobotForgotten,
-    pose_bytes,
 )
 from rse_pf.live_map.live_map import LiveMap
+from rse_pf.slam.keyframe import encode_keyframe
 
 __all__ = ["ATTACKS", "HOSTILE", "Judged", "Played", "judge", "main", "play", "scenario", "without"]
 
@@ -73,10 +73,11 @@ def scenario(attack: str, seed: int, rounds: float = 1.5) -> tuple[list[Event], 
     events: list[Event] = []
     for event in world.play([*honest, lying]):
         if isinstance(event, KeyframeAdded) and event.robot == HOSTILE:
-            T = np.frombuffer(event.T_odom_camera, "<f8").reshape(4, 4).copy()
+            T = event.keyframe.T_odom_camera.copy()
             if attack == "scaled-rotations":
                 T[:3, :3] *= np.sqrt(1.0 + world.rng.uniform(-1.9e-3, 1.9e-3))
-            event = msgspec.structs.replace(event, T_odom_camera=pose_bytes(T))
+            data = encode_keyframe(dataclasses.replace(event.keyframe, T_odom_camera=T))
+            event = msgspec.structs.replace(event, data=data)
         events.append(event)
     return events, np.array(world.seen)
 

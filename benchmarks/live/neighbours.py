@@ -34,12 +34,12 @@ from client_sdk import connect
 from client_sdk.robot import Robot
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import RsePfError
-from rse_pf.geometry import exp_se3
-from rse_pf.live_map.keyframe_code import encode_features
+from rse_pf.geometry import Camera, exp_se3
 from rse_pf.local.control.platform import LocalPlatform
 from rse_pf.local.firewall import ensure_key
 from rse_pf.pnp.problems import make_problem
 from rse_pf.services.pnp import make_request
+from rse_pf.slam.keyframe import Keyframe, KeyframeFeatures, encode_keyframe, make_features
 from rse_pf.wire import Hello, Subscribe, make_codec
 from rse_pf.wire.live_map import live_topic
 from rse_pf.wire.server_session import UPDATES
@@ -84,10 +84,12 @@ class Driver:
         while True:
             due = max(due + 1.0 / KEYFRAME_HZ, time.monotonic())
             await asyncio.sleep(due - time.monotonic())
+            keyframe = Keyframe(
+                timestamp_s=number / KEYFRAME_HZ, T_odom_camera=exp_se3([0.1 * number, 0, 0, 0, 0, 0]),
+                camera=Camera(**_CAMERA), features=self._features(),
+            )  # fmt: skip
             request = {
-                "map": MAP, "segment": 0, "number": number, "timestamp_s": number / KEYFRAME_HZ,
-                "T_odom_camera": exp_se3([0.1 * number, 0, 0, 0, 0, 0]).ravel().tolist(),
-                "camera": _CAMERA, "features": self._features(),
+                "map": MAP, "segment": 0, "number": number, "keyframe": encode_keyframe(keyframe)
             }  # fmt: skip
             took = await self._timed("live-keyframe", request)
             if np.isfinite(took[1]):
@@ -107,9 +109,9 @@ class Driver:
             return began, float("nan")
         return began, 1e3 * (time.monotonic() - began)
 
-    def _features(self) -> bytes:
+    def _features(self) -> KeyframeFeatures:
         rng = self._rng
-        return encode_features(
+        return make_features(
             rng.uniform([0, 0], [640, 480], (600, 2)), rng.uniform(0.5, 5.0, 600),
             rng.integers(0, 256, (600, 32), dtype=np.uint8),
         )  # fmt: skip
@@ -154,8 +156,7 @@ async def _send_garbage(url: str, token: str, seconds: float) -> int:
         while time.monotonic() < until:
             sent += 1
             request = {
-                "map": MAP, "segment": 0, "number": sent, "timestamp_s": 0.0, "camera": _CAMERA,
-                "T_odom_camera": [float("1e300")] * 16, "features": os.urandom(30_000),
+                "map": MAP, "segment": 0, "number": sent, "keyframe": os.urandom(30_000)
             }  # fmt: skip
             try:
                 await robot.call("live-keyframe", request, deadline_s=1.0, keep=True)

@@ -32,8 +32,7 @@ from benchmarks.maps.recordings import Run, ate_m, drive, frame_poses, red_kitch
 from client_sdk.datasets import Dataset, open_dataset
 from client_sdk.frontend import FrontEndOptions
 from rse_pf.geometry import Array, exp_se3, inverse
-from rse_pf.live_map.events import Event, KeyframeAdded, LinksMeasured, MapStarted, matrix_bytes
-from rse_pf.live_map.keyframe_code import encode_features
+from rse_pf.live_map.events import Event, KeyframeAdded, LinksMeasured, MapStarted
 from rse_pf.live_map.live_map import LiveMap
 from rse_pf.live_map.options import LiveMapOptions
 from rse_pf.live_map.outcomes import (
@@ -46,6 +45,7 @@ from rse_pf.live_map.outcomes import (
     Outcome,
     Unaligned,
 )
+from rse_pf.live_map.versions import encoded
 
 __all__ = ["Played", "main", "play"]
 
@@ -111,12 +111,8 @@ def play(runs: Mapping[str, Run], starts: Mapping[str, int], options: LiveMapOpt
 def _send(played: Played, name: str, run: Run, number: int, tick: int) -> list[tuple[int, str, Array | None]]:
     """Send a keyframe, measure it, and return what robots learn of it, and when."""
     keyframe = run.version.keyframes[number]
-    camera = keyframe.camera
     event = KeyframeAdded(
-        robot=name, segment=0, number=number, timestamp_s=keyframe.timestamp_s,
-        T_odom_camera=matrix_bytes(keyframe.T_world_camera),
-        camera=(camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height),
-        features=encode_features(keyframe.pixels, keyframe.points_camera[:, 2], keyframe.descriptors),
+        robot=name, segment=0, number=number, data=encoded(keyframe)
     )  # fmt: skip
     found = played.live_map.apply(event)
     added = next(each for each in found if isinstance(each, Added))

@@ -33,9 +33,10 @@ from client_sdk.simulator import SIMULATED_CAMERA, true_trajectory
 from client_sdk.simulator.camera import Painter, add_depth_noise, add_image_noise
 from client_sdk.simulator.world import make_world
 from rse_pf.geometry import Array, Camera, inverse, pose_difference, rotation_angle_deg, transform
-from rse_pf.live_map.keyframe_code import KeyframeFeatures, decode_features, encode_features
 from rse_pf.live_map.measure import measure_links, reference_of_features, view_of_features
 from rse_pf.maps.format import Keyframe, MapVersion
+from rse_pf.slam.keyframe import Keyframe as SentKeyframe
+from rse_pf.slam.keyframe import KeyframeFeatures, encode_keyframe, make_features
 from rse_pf.slam.localise import Localised, PlacedKeyframe, localise, spread_candidates
 from rse_pf.slam.map_merge import merge_versions
 from rse_pf.slam.places import PLACE_NUMBERS, PlaceIndex, place_vector
@@ -71,10 +72,15 @@ def views_of(source: str, frames: Iterable[Frame], poses: Iterable[Array | None]
     views = []
     for row, frame, T in zip(count(), frames, poses, strict=False):
         found = extract(frame, FrontEndOptions())
-        data = encode_features(found.pixels, found.points_camera[:, 2], found.descriptors)
+        features = make_features(found.pixels, found.points_camera[:, 2], found.descriptors)
+        data = encode_keyframe(
+            SentKeyframe(
+                timestamp_s=frame.timestamp_s, T_odom_camera=np.eye(4), camera=frame.camera, features=features
+            )
+        )
         views.append(
             View(
-                source=source, row=row, features=decode_features(data, frame.camera),
+                source=source, row=row, features=features,
                 full=(found.pixels, found.descriptors, found.points_camera), size_bytes=len(data),
                 camera=frame.camera, timestamp_s=frame.timestamp_s, T=T,
             )

@@ -27,14 +27,14 @@ import numpy as np
 from client_sdk.answers import PoseAnswer
 from client_sdk.frontend import Features, Frame, FrontEndOptions, PoseQuery, TrackedFrame
 from client_sdk.live.alignments import Alignments, Correction, OtherRobot
-from client_sdk.live.sender import REFUSALS, KeyframeSender, LiveCaller, Myself, camera_request
-from client_sdk.live.waiting_keyframes import Base, KeyframeWaits, WaitingKeyframes
+from client_sdk.live.sender import REFUSALS, KeyframeSender, LiveCaller, Myself
+from client_sdk.live.waiting_keyframes import Base, WaitingKeyframe, WaitingKeyframes
 from client_sdk.mapper import AskPose, Mapper
 from client_sdk.mapping import MapOptions, PointMap, Trajectory
 from rse_pf.errors import BadMessage, BadRequest, RsePfError, UnsupportedProtocol, UsageError
 from rse_pf.geometry import Array, Camera, pose_difference
-from rse_pf.live_map.keyframe_code import encode_features
-from rse_pf.wire.live_map import RelocaliseReply, live_topic
+from rse_pf.slam.keyframe import Keyframe, encode_keyframe, make_features
+from rse_pf.wire.live_map import LiveRelocalise, RelocaliseReply, live_topic
 
 __all__ = ["KeyframeSent", "LiveMapper", "LiveOptions", "LiveRobot"]
 
@@ -451,16 +451,8 @@ class LiveMapper:
     async def _keep(self, done: TrackedFrame, pose: Array, features: Features) -> None:
         """Make a keyframe of a tracked frame, and queue it for the map."""
         waiting = self._waiting
-        data = await asyncio.to_thread(self._encoded, features)
-        camera = done.frame.camera
-        keyframe = KeyframeWaits(
-            index=waiting.next_index,
-            segment=self._segment,
-            timestamp_s=done.frame.timestamp_s,
-            T_odom_camera=tuple(pose.ravel().tolist()),
-            camera=(camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height),
-            features=data,
-        )
+        data = await asyncio.to_thread(self._encode, done.frame, pose, features)
+        keyframe = WaitingKeyframe(waiting.next_index, self._segment, data)
         self._last_keyframe = pose
         await self._added()
         self._adding = asyncio.ensure_future(asyncio.to_thread(self.map.add, done.frame, pose))
@@ -476,13 +468,17 @@ class LiveMapper:
         if self._adding is not None:
             await self._adding
 
-    def _encoded(self, features: Features) -> bytes:
-        """Return the first features that have depth: those of the finest levels of the pyramid."""
+    def _encode(self, frame: Frame, T_odom_camera: Array, features: Features) -> bytes:
+        """Return a keyframe of the first features that have depth: those of the finest levels."""
         depths_m = features.points_camera[:, 2]
         rows = np.flatnonzero(np.isfinite(depths_m))[: self.options.features]
-        return encode_features(features.pixels[rows], depths_m[rows], features.descriptors[rows])
+        keyframe = Keyframe(
+            timestamp_s=frame.timestamp_s, T_odom_camera=T_odom_camera, camera=frame.camera,
+            features=make_features(features.pixels[rows], depths_m[rows], features.descriptors[rows]),
+        )  # fmt: skip
+        return encode_keyframe(keyframe)
 
-    def _relocalise(self, keyframe: KeyframeWaits, pose: Array) -> None:
+    def _relocalise(self, keyframe: WaitingKeyframe, pose: Array) -> None:
         """Ask where in the map a keyframe is, if its segment is not aligned and the map has others."""
         now = self._clock()
         if (
@@ -501,10 +497,8 @@ class LiveMapper:
         is_alone = self._asked_in_vain >= _OFTEN_IN_VAIN
         return self.options.relocalise_s * (_RARELY if is_alone else 1.0)
 
-    async def _ask_place(self, keyframe: KeyframeWaits, pose: Array) -> None:
-        request = {
-            "map": self.name, "camera": camera_request(keyframe.camera), "features": keyframe.features
-        }  # fmt: skip
+    async def _ask_place(self, keyframe: WaitingKeyframe, pose: Array) -> None:
+        request = LiveRelocalise(map=self.name, keyframe=keyframe.data)
         try:
             answer = await self._robot.call(
                 "live-relocalise", request, RelocaliseReply, deadline_s=self.options.deadline_s, keep=True

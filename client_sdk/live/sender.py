@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 from client_sdk.answers import Answer
-from client_sdk.live.waiting_keyframes import Base, KeyframeWaits, WaitingKeyframes, rebased
+from client_sdk.live.waiting_keyframes import Base, WaitingKeyframe, WaitingKeyframes, rebased
 from rse_pf.errors import (
     BadMessage,
     BadRequest,
@@ -28,9 +28,9 @@ from rse_pf.errors import (
     UnknownService,
 )
 from rse_pf.token_bucket import TokenBucket
-from rse_pf.wire.live_map import KeyframeKept
+from rse_pf.wire.live_map import KeyframeKept, KeyframeRequest
 
-__all__ = ["REFUSALS", "KeyframeSender", "LiveCaller", "Myself", "ask_map", "camera_request"]
+__all__ = ["REFUSALS", "KeyframeSender", "LiveCaller", "Myself", "ask_map", "keyframe_request"]
 
 _MAX_QUIET_WAIT_S = 1.0
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.1, 1.0
@@ -209,7 +209,7 @@ class KeyframeSender:
         if base is None or not len(waiting):
             return
         keyframe = await asyncio.to_thread(waiting.first)
-        await asyncio.sleep(self._bucket.spend(len(keyframe.features), self._clock()))
+        await asyncio.sleep(self._bucket.spend(len(keyframe.data), self._clock()))
         await self._wait_quiet()
         number = base.number + keyframe.index
         sent_s = self._clock()
@@ -236,22 +236,12 @@ class KeyframeSender:
             await asyncio.wait_for(self._quiet.wait(), _MAX_QUIET_WAIT_S)
 
 
-def keyframe_request(name: str, keyframe: KeyframeWaits, base: Base) -> dict[str, Any]:
-    """Return the request of ``live-keyframe``."""
-    return {
-        "map": name,
-        "segment": base.segment + keyframe.segment,
-        "number": base.number + keyframe.index,
-        "timestamp_s": keyframe.timestamp_s,
-        "T_odom_camera": list(keyframe.T_odom_camera),
-        "camera": camera_request(keyframe.camera),
-        "features": keyframe.features,
-    }
-
-
-def camera_request(numbers: tuple[float, float, float, float, int, int]) -> dict[str, Any]:
-    """Return a camera as requests have it."""
-    return dict(zip(("fx", "fy", "cx", "cy", "width", "height"), numbers, strict=True))
+def keyframe_request(name: str, keyframe: WaitingKeyframe, base: Base) -> KeyframeRequest:
+    """Return the request of ``live-keyframe`` to the map *name*, which numbers keyframes by *base*."""
+    return KeyframeRequest(
+        map=name, segment=base.segment + keyframe.segment, number=base.number + keyframe.index,
+        keyframe=keyframe.data,
+    )  # fmt: skip
 
 
 def _pause_after(error: RsePfError, failures: int) -> float:

@@ -1,8 +1,9 @@
 """The keyframes of a robot that a live map has not acknowledged: in order, none lost, none twice.
 
-They are kept in memory, or in a folder that survives a restart of the robot.  One program at a time uses a
-folder: two would remove each other's keyframes.  Numbers that the map knows are
-given when a keyframe is sent: a robot that is offline does not know the first of them yet.
+They are kept in memory, or in a folder that survives a restart of the robot: a file holds the bytes of one
+keyframe, as they are sent, and its name is ``INDEX-SEGMENT.keyframe``.  One program at a time uses a folder:
+two would remove each other's keyframes.  Numbers that the map knows are given when a keyframe is sent: a
+robot that is offline does not know the first of them yet.
 """
 
 from __future__ import annotations
@@ -16,11 +17,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import msgspec
+import numpy as np
 
-from rse_pf.errors import UsageError
+from rse_pf.errors import BadRequest, InvalidCamera, UsageError
 from rse_pf.files import TEMPORARY_PREFIX, replace_file
+from rse_pf.geometry import Camera
+from rse_pf.slam.keyframe_v1 import CameraNumbers, keyframe_of_v1
 
-__all__ = ["Base", "KeyframeWaits", "WaitingKeyframes", "rebased"]
+__all__ = ["Base", "WaitingKeyframe", "WaitingKeyframes", "rebased"]
 
 _SUFFIX = ".keyframe"
 _STATE = "state.json"
@@ -29,19 +33,37 @@ _MEMORY_BYTES = 64 << 20
 _DISK_BYTES = 1 << 30
 
 
-class KeyframeWaits(msgspec.Struct, frozen=True, kw_only=True):
+@dataclass(frozen=True, slots=True)
+class WaitingKeyframe:
     """A keyframe that waits; ``index`` and ``segment`` count from the start of this robot's records.
 
-    ``T_odom_camera`` holds 16 numbers, ``camera`` fx fy cx cy width height, ``features`` what `keyframe_code`
-    encodes.
+    ``data`` is what `rse_pf.slam.keyframe.encode_keyframe` returned.
     """
+
+    index: int
+    segment: int
+    data: bytes
+
+
+class _KeyframeV1(msgspec.Struct, frozen=True, kw_only=True):
+    """The content of a file of protocol version 1, whose name is ``INDEX.keyframe``."""
 
     index: int
     segment: int
     timestamp_s: float
     T_odom_camera: tuple[float, ...]
-    camera: tuple[float, float, float, float, int, int]
+    camera: CameraNumbers
     features: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class _Held:
+    """A keyframe of the queue; ``data`` is None if its file holds it."""
+
+    index: int
+    segment: int
+    size_bytes: int
+    data: bytes | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +86,7 @@ class WaitingKeyframes:
         """
         self._folder = folder
         self._max_bytes = max_bytes or (_MEMORY_BYTES if folder is None else _DISK_BYTES)
-        self._held: deque[tuple[int, int, bytes | None]] = deque()  # index, bytes, data unless on disk
+        self._held: deque[_Held] = deque()
         self._bytes = 0
         self._next_index = 0
         self._first_segment = 0
@@ -82,7 +104,7 @@ class WaitingKeyframes:
     @property
     def first_index(self) -> int:
         """The index of the keyframe that is sent next."""
-        return self._held[0][0] if self._held else self._next_index
+        return self._held[0].index if self._held else self._next_index
 
     @property
     def next_index(self) -> int:
@@ -103,17 +125,19 @@ class WaitingKeyframes:
             self._take_lock(folder)
             for part in folder.glob(f"{TEMPORARY_PREFIX}*"):
                 part.unlink()
+            _rewrite_version_1(folder)
             for path in sorted(folder.glob(f"*{_SUFFIX}")):
-                self._held.append((int(path.name.removesuffix(_SUFFIX)), path.stat().st_size, None))
+                index, segment = map(int, path.name.removesuffix(_SUFFIX).split("-"))
+                self._held.append(_Held(index, segment, path.stat().st_size, None))
             if not self._held:
                 (folder / _STATE).unlink(missing_ok=True)
                 return 0
-            self._bytes = sum(size for _, size, _ in self._held)
-            self._next_index = self._held[-1][0] + 1
+            self._bytes = sum(held.size_bytes for held in self._held)
+            self._next_index = self._held[-1].index + 1
             if (folder / _STATE).exists():
                 self._base = Base(**json.loads((folder / _STATE).read_text(encoding="utf-8")))
-            self._first_segment = self._read(self._held[-1][0], None).segment + 1
-        except (OSError, ValueError, TypeError, msgspec.MsgspecError) as error:
+            self._first_segment = self._held[-1].segment + 1
+        except (OSError, ValueError, TypeError, msgspec.MsgspecError, BadRequest, InvalidCamera) as error:
             self.close()
             raise UsageError(
                 f"cannot use the keyframes in {folder}: {error}", hint="name another folder as spool"
@@ -126,45 +150,50 @@ class WaitingKeyframes:
             os.close(self._lock)
         self._lock = -1
 
-    def add(self, keyframe: KeyframeWaits) -> bool:
+    def add(self, keyframe: WaitingKeyframe) -> bool:
         """Keep *keyframe*, whose index is `next_index`; return False if there is no space for it.
 
         Raises:
             UsageError: The folder cannot be written.
         """
-        data = msgspec.msgpack.encode(keyframe)
-        if self._bytes + len(data) > self._max_bytes:
+        size_bytes = len(keyframe.data)
+        if self._bytes + size_bytes > self._max_bytes:
             return False
         if self._folder is not None:
             try:
-                replace_file(self._path(keyframe.index), data)
+                replace_file(_path(self._folder, keyframe.index, keyframe.segment), keyframe.data)
             except OSError as error:
                 raise UsageError(
                     f"cannot keep a keyframe in {self._folder}: {error.strerror}",
                     hint="free space on this disk",
                 ) from error
-        self._held.append((keyframe.index, len(data), data if self._folder is None else None))
-        self._bytes += len(data)
+        data = keyframe.data if self._folder is None else None
+        self._held.append(_Held(keyframe.index, keyframe.segment, size_bytes, data))
+        self._bytes += size_bytes
         self._next_index = keyframe.index + 1
         return True
 
-    def first(self) -> KeyframeWaits:
-        """Return the oldest keyframe; raises UsageError if its file is gone or damaged."""
-        index, _, data = self._held[0]
-        try:
-            return self._read(index, data)
-        except (OSError, msgspec.MsgspecError) as error:
-            raise UsageError(
-                f"keyframe {index} in {self._folder} cannot be read: {error}", hint="leave the spool alone"
-            ) from error
+    def first(self) -> WaitingKeyframe:
+        """Return the oldest keyframe; raises UsageError if its file is gone."""
+        held, data = self._held[0], self._held[0].data
+        if data is None:
+            assert self._folder is not None
+            try:
+                data = _path(self._folder, held.index, held.segment).read_bytes()
+            except OSError as error:
+                raise UsageError(
+                    f"keyframe {held.index} in {self._folder} cannot be read: {error}",
+                    hint="leave the spool alone",
+                ) from error
+        return WaitingKeyframe(held.index, held.segment, data)
 
     def remove_first(self) -> None:
         """Forget the oldest keyframe: the map has it, or refused it for good."""
-        index, size, _ = self._held.popleft()
-        self._bytes -= size
+        held = self._held.popleft()
+        self._bytes -= held.size_bytes
         if self._folder is not None:
             with contextlib.suppress(OSError):
-                self._path(index).unlink()
+                _path(self._folder, held.index, held.segment).unlink()
 
     def set_base(self, base: Base) -> None:
         """Keep what the map calls keyframe 0 and segment 0; raises UsageError."""
@@ -189,13 +218,30 @@ class WaitingKeyframes:
                 f"another program keeps its keyframes in {folder}", hint="give each robot a spool of its own"
             ) from error
 
-    def _read(self, index: int, data: bytes | None) -> KeyframeWaits:
-        raw = self._path(index).read_bytes() if data is None else data
-        return msgspec.msgpack.decode(raw, type=KeyframeWaits)
 
-    def _path(self, index: int) -> Path:
-        assert self._folder is not None
-        return self._folder / f"{index:012d}{_SUFFIX}"
+def _path(folder: Path, index: int, segment: int) -> Path:
+    """Return the file of a keyframe; names sort by index."""
+    return folder / f"{index:012d}-{segment}{_SUFFIX}"
+
+
+def _rewrite_version_1(folder: Path) -> None:
+    """Write the files of protocol version 1 in *folder* as files of today.
+
+    Raises:
+        OSError: The folder cannot be written.
+        ValueError: The content of a file is not of version 1.
+        BadRequest, InvalidCamera: A keyframe is malformed.
+    """
+    for path in list(folder.glob(f"*{_SUFFIX}")):
+        if "-" in path.name:
+            continue
+        old = msgspec.msgpack.decode(path.read_bytes(), type=_KeyframeV1)
+        fx, fy, cx, cy, width, height = old.camera
+        camera = Camera(fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height)
+        T_odom_camera = np.array(old.T_odom_camera).reshape(4, 4)
+        data = keyframe_of_v1(old.timestamp_s, T_odom_camera, camera, old.features)
+        replace_file(_path(folder, old.index, old.segment), data)
+        path.unlink()
 
 
 def rebased(base: Base | None, first: Base, end: int, wanted: Base) -> tuple[Base, int]:

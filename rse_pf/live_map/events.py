@@ -7,12 +7,15 @@ the first on, or a snapshot and those after it, give the same map everywhere.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cached_property
 
 import msgspec
 import numpy as np
 
-from rse_pf.errors import BadRequest, message_of
-from rse_pf.geometry import Array, rigid
+from rse_pf.errors import BadRequest, RsePfError, message_of
+from rse_pf.geometry import Array, Camera
+from rse_pf.slam.keyframe import Keyframe, decode_keyframe
+from rse_pf.slam.keyframe_v1 import CameraNumbers, keyframe_of_v1
 
 __all__ = [
     "Event",
@@ -26,33 +29,31 @@ __all__ = [
     "RobotLeft",
     "StartKeyframe",
     "StartLink",
+    "camera_of",
     "decode_events",
     "encode_events",
     "matrix_bytes",
     "matrix_of",
-    "pose_bytes",
 ]
 
-_MAX_M = 1e6
-CameraNumbers = tuple[float, float, float, float, int, int]
-"""fx fy cx cy (pixels), width, height."""
 
-
-class KeyframeAdded(msgspec.Struct, frozen=True, kw_only=True, tag="keyframe"):
+class KeyframeAdded(msgspec.Struct, frozen=True, kw_only=True, dict=True, tag="keyframe-2"):
     """A robot made a keyframe.
 
     ``robot`` is the text of `RobotId.folder`.  ``segment`` counts the odometry frames of a robot: a new one
     begins when tracking was lost, or the robot started again.  ``number`` counts its keyframes over all
-    segments, from 0 and without gaps.  ``features`` is what `keyframe_code` encodes.
+    segments, from 0 and without gaps.  ``data`` is the keyframe as the robot encoded it.
     """
 
     robot: str
     segment: int
     number: int
-    timestamp_s: float
-    T_odom_camera: bytes
-    camera: CameraNumbers
-    features: bytes
+    data: bytes
+
+    @cached_property
+    def keyframe(self) -> Keyframe:
+        """The keyframe, decoded once; raises BadRequest or InvalidCamera."""
+        return decode_keyframe(self.data)
 
 
 class MeasuredLink(msgspec.Struct, frozen=True, kw_only=True):
@@ -94,13 +95,10 @@ class RobotLeft(msgspec.Struct, frozen=True, kw_only=True, tag="left"):
 
 
 class StartKeyframe(msgspec.Struct, frozen=True, kw_only=True):
-    """A keyframe of the version that a live map starts from."""
+    """A keyframe of the version that a live map starts from; the pose in ``data`` is that in the version."""
 
     robot: str
-    timestamp_s: float
-    T_map_camera: bytes
-    camera: CameraNumbers
-    features: bytes
+    data: bytes
 
 
 class StartLink(msgspec.Struct, frozen=True, kw_only=True):
@@ -112,7 +110,7 @@ class StartLink(msgspec.Struct, frozen=True, kw_only=True):
     information: bytes
 
 
-class MapStarted(msgspec.Struct, frozen=True, kw_only=True, tag="started"):
+class MapStarted(msgspec.Struct, frozen=True, kw_only=True, tag="started-2"):
     """The map begins with the keyframes of a version, or with none; it has no keyframes before.
 
     ``equal_rooms_m`` is the size of rooms that look the same, 0 if every place is unique: what joins robots
@@ -134,8 +132,34 @@ class OwnerChanged(msgspec.Struct, frozen=True, kw_only=True, tag="owner"):
 
 Event = KeyframeAdded | LinksMeasured | Optimised | RobotForgotten | RobotLeft | MapStarted | OwnerChanged
 
+
+class _KeyframeAddedV1(msgspec.Struct, frozen=True, kw_only=True, tag="keyframe"):
+    robot: str
+    segment: int
+    number: int
+    timestamp_s: float
+    T_odom_camera: bytes
+    camera: CameraNumbers
+    features: bytes
+
+
+class _StartKeyframeV1(msgspec.Struct, frozen=True, kw_only=True):
+    robot: str
+    timestamp_s: float
+    T_map_camera: bytes
+    camera: CameraNumbers
+    features: bytes
+
+
+class _MapStartedV1(msgspec.Struct, frozen=True, kw_only=True, tag="started"):
+    source: str
+    keyframes: tuple[_StartKeyframeV1, ...]
+    links: tuple[StartLink, ...] = ()
+    equal_rooms_m: float = 0.0
+
+
 _ENCODER = msgspec.msgpack.Encoder(order="deterministic")
-_DECODER = msgspec.msgpack.Decoder(list[Event])
+_DECODER = msgspec.msgpack.Decoder(list[Event | _KeyframeAddedV1 | _MapStartedV1])
 
 
 def encode_events(events: Sequence[Event]) -> bytes:
@@ -144,14 +168,14 @@ def encode_events(events: Sequence[Event]) -> bytes:
 
 
 def decode_events(data: bytes) -> list[Event]:
-    """Return the events of an entry that `encode_events` returned.
+    """Return the events of an entry that `encode_events` returned, of this form or of version 1.
 
     Raises:
         BadRequest: The bytes are damaged.
     """
     try:
-        return _DECODER.decode(data)
-    except (msgspec.MsgspecError, ValueError, RecursionError) as error:
+        return [_upgrade(event) for event in _DECODER.decode(data)]
+    except (msgspec.MsgspecError, ValueError, RecursionError, RsePfError) as error:
         raise BadRequest(
             f"an entry of the log is damaged: {message_of(error)}", hint="restore the map from a snapshot"
         ) from error
@@ -177,16 +201,31 @@ def matrix_of(data: bytes, rows: int, columns: int) -> Array:
     return matrix
 
 
-def pose_bytes(numbers: Array) -> bytes:
-    """Return 16 numbers, row-major, metres, as `matrix_bytes` of a rigid motion: with the nearest rotation.
+def camera_of(numbers: CameraNumbers) -> Camera:
+    """Return the camera of six numbers; raises InvalidCamera."""
+    fx, fy, cx, cy, width, height = numbers
+    return Camera(fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height)
 
-    Raises:
-        BadRequest: They are no rigid motion of sensible size, by `geometry.rigid`.
-    """
-    T = rigid(numbers.reshape(4, 4), _MAX_M) if numbers.size == 16 else None
-    if T is None:
-        raise BadRequest(
-            "T_odom_camera is no pose: it takes 16 numbers of a rotation and a translation",
-            hint="send it row after row with at least three decimals, the last row 0 0 0 1",
+
+def _upgrade(event: Event | _KeyframeAddedV1 | _MapStartedV1) -> Event:
+    """Return an event of version 1 in today's form, every other one as it is; raises RsePfError."""
+    if isinstance(event, _KeyframeAddedV1):
+        data = keyframe_of_v1(
+            event.timestamp_s, matrix_of(event.T_odom_camera, 4, 4), camera_of(event.camera), event.features
         )
-    return matrix_bytes(T)
+        return KeyframeAdded(robot=event.robot, segment=event.segment, number=event.number, data=data)
+    if isinstance(event, _MapStartedV1):
+        keyframes = tuple(
+            StartKeyframe(
+                robot=start.robot,
+                data=keyframe_of_v1(
+                    start.timestamp_s, matrix_of(start.T_map_camera, 4, 4), camera_of(start.camera),
+                    start.features,
+                ),
+            )
+            for start in event.keyframes
+        )  # fmt: skip
+        return MapStarted(
+            source=event.source, keyframes=keyframes, links=event.links, equal_rooms_m=event.equal_rooms_m
+        )
+    return event

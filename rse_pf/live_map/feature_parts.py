@@ -1,7 +1,7 @@
-"""What keyframes saw, in parts that do not change: so that a snapshot of a large map writes what is new.
+"""The bytes of keyframes, in parts that do not change: so that a snapshot of a large map writes what is new.
 
-A part holds the features and place vectors of up to 128 keyframes that came after each other, and is named by
-its content.  A part that is full is kept as it is while at least half of its keyframes keep their features.
+A part holds the bytes and place vectors of up to 128 keyframes that came after each other, and is named by
+its content.  A part that is full is kept as it is while at least half of its keyframes keep their bytes.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class FeatureParts:
             names.append(name)
             parts[name] = data
         extra = {"parts": msgspec.msgpack.encode(names), "held": np.packbits(held).tobytes()}
-        return SnapshotParts(head=graph.encode(extra, with_features=False), parts=parts)
+        return SnapshotParts(head=graph.encode(extra, with_data=False), parts=parts)
 
     def forget(self, keyframes: Iterable[int]) -> None:
         """Make the parts of *keyframes* anew: what a robot said must go."""
@@ -81,23 +81,23 @@ class FeatureParts:
                 if hashlib.sha256(data).hexdigest() != name:
                     raise _damaged(f"part {number} is not what its name says")
                 rows = msgspec.msgpack.decode(data, type=list[_Row])
-                for i, features, vector in rows:
+                for i, keyframe, vector in rows:
                     if held[i]:
-                        graph.keep_features(i, features)
+                        graph.set_data(i, keyframe)
                         places.add(i, np.frombuffer(vector, dtype="<f4", count=PLACE_NUMBERS))
-                if (number + 1) * _KEYFRAMES <= len(graph):
+                if (number + 1) * _KEYFRAMES <= len(graph) and not graph.cameras_v1:
                     parts._full[number] = name, frozenset(i for i, _, _ in rows)
         except (msgspec.MsgspecError, KeyError, IndexError, ValueError) as error:
             raise _damaged(message_of(error)) from error
         if not np.array_equal(graph.held, held):
-            raise _damaged("features of a keyframe are missing")
+            raise _damaged("a keyframe is missing")
         return graph, places, parts
 
 
 def _row(graph: Graph, places: PlaceIndex, i: int) -> _Row:
-    features = graph.keyframes[i].features
-    assert features is not None
-    return i, features, places.vector_of(i).astype("<f4").tobytes()
+    data = graph.keyframes[i].data
+    assert data is not None
+    return i, data, places.vector_of(i).astype("<f4").tobytes()
 
 
 def _damaged(why: str) -> BadRequest:

@@ -17,14 +17,15 @@ import numpy as np
 import numpy.typing as npt
 
 from rse_pf.errors import BadRequest, message_of
-from rse_pf.geometry import Array, Camera
-from rse_pf.live_map.events import CameraNumbers
+from rse_pf.geometry import Array
+from rse_pf.live_map.events import camera_of
+from rse_pf.slam.keyframe_v1 import CameraNumbers, keyframe_of_v1
 
-__all__ = ["Graph", "LiveKeyframe", "LiveLink", "Segment", "camera_of", "variances_of"]
+__all__ = ["Graph", "LiveKeyframe", "LiveLink", "Segment", "variances_of"]
 
 LinkState = Literal["open", "believed", "removed"]
 
-_VERSION = 1
+_VERSION = 2
 _MAX_WALK = 200.0
 """Steps of odometry beyond which two keyframes tell nothing about each other."""
 _MAX_VISITED = 250
@@ -39,14 +40,13 @@ _FLOOR: Array = np.diag([0.02**2] * 3 + [math.radians(0.7) ** 2] * 3)
 
 @dataclass(slots=True, eq=False)
 class LiveKeyframe:
-    """What does not change of a keyframe; ``features`` is None when it was culled or forgotten."""
+    """The row of a keyframe; ``data`` are its bytes, None when it was culled or forgotten."""
 
     robot: str
     segment: int
     number: int
     timestamp_s: float
-    camera: CameraNumbers
-    features: bytes | None
+    data: bytes | None
 
 
 @dataclass(slots=True, eq=False)
@@ -99,12 +99,13 @@ class Graph:
         T: ``(n, 4, 4)``, pose of each keyframe in the frame of its component; `T_odom` that of its odometry.
         way: ``(n,)``, steps of odometry from the begin of its segment.
         of_segment: ``(n,)``, row of its segment, -1 when it was forgotten.
-        held: ``(n,)``, whether its features are kept.
+        held: ``(n,)``, whether its bytes are kept.
         links: By number, in the order in which they were measured; `open` are those not believed.
         equal_rooms_m: What joins robots must lie farther apart than this.
         removed: The newest links that were taken out, by number: who refuted them may be forgotten.
         smoothing: By robot, how many keyframes were smoothed because of it beyond what its own ones allow.
         lookalikes: Keyframes at places of which the map knows another one that looks the same.
+        cameras_v1: Cameras by id of a snapshot of version 1, whose parts hold features alone; else empty.
     """
 
     def __init__(self) -> None:
@@ -125,6 +126,7 @@ class Graph:
         self.lookalikes: set[int] = set()
         self.source = ""
         self.equal_rooms_m = 0.0
+        self.cameras_v1: list[CameraNumbers] = []
         self._links_of: dict[int, list[int]] = {}
         self._size = 0
         self._T = np.empty((64, 4, 4))
@@ -178,14 +180,17 @@ class Graph:
         self.segments[row].keyframes.append(i)
         return i
 
-    def drop_features(self, i: int) -> None:
+    def drop_data(self, i: int) -> None:
         """Forget what keyframe *i* saw; its pose and its links stay."""
-        self.keyframes[i].features = None
+        self.keyframes[i].data = None
         self._held[i] = False
 
-    def keep_features(self, i: int, features: bytes) -> None:
-        """Give keyframe *i* of a snapshot what it saw."""
-        self.keyframes[i].features = features
+    def set_data(self, i: int, data: bytes) -> None:
+        """Give keyframe *i* of a snapshot its bytes, which are features alone in one of version 1."""
+        if self.cameras_v1:
+            camera, timestamp_s = camera_of(self.cameras_v1[i]), self.keyframes[i].timestamp_s
+            data = keyframe_of_v1(timestamp_s, self._T_odom[i], camera, data)
+        self.keyframes[i].data = data
         self._held[i] = True
 
     def add_link(self, link: LiveLink) -> int:
@@ -274,7 +279,7 @@ class Graph:
                 segment.contradictions, segment.disbelieved = 0, False
         self.smoothing.pop(robot, None)
         for i in gone:
-            self.drop_features(i)
+            self.drop_data(i)
             self._of_segment[i] = -1
         return gone
 
@@ -404,21 +409,17 @@ class Graph:
                 found.setdefault((min(one, other), max(one, other)), []).append(number)
         return found
 
-    def camera(self, i: int) -> Camera:
-        """Return the camera of keyframe *i*."""
-        return camera_of(self.keyframes[i].camera)
-
     def _connect(self, number: int, link: LiveLink) -> None:
         self._links_of.setdefault(link.a, []).append(number)
         self._links_of.setdefault(link.b, []).append(number)
 
-    def encode(self, extra: dict[str, bytes], with_features: bool = True) -> bytes:
+    def encode(self, extra: dict[str, bytes], with_data: bool = True) -> bytes:
         """Return everything as bytes, with *extra* byte strings beside it."""
         believed = {str(i): numbers for i, numbers in sorted(self._links_of.items()) if numbers}
         packed = _Packed(
             version=_VERSION,
             keyframes=[
-                (k.robot, k.segment, k.number, k.timestamp_s, k.camera, k.features if with_features else None)
+                (k.robot, k.segment, k.number, k.timestamp_s, k.data if with_data else None)
                 for k in self.keyframes
             ],
             segments=[
@@ -452,25 +453,26 @@ class Graph:
 
     @classmethod
     def decode(cls, data: bytes) -> tuple[Graph, dict[str, bytes]]:
-        """Return what `encode` was given.
+        """Return the graph and the extra bytes of a snapshot, of this version or of version 1.
 
         Raises:
             BadRequest: The snapshot is damaged, or of another version.
         """
         try:
-            packed = msgspec.msgpack.decode(data, type=_Packed)
+            version = msgspec.msgpack.decode(data, type=_Versioned).version
+            if version not in (1, _VERSION):
+                raise BadRequest(
+                    f"the snapshot is of version {version}, not {_VERSION}",
+                    hint="publish the map with the release that wrote it: rse-pf map publish MAP; "
+                    "then start from that version: rse-pf map live start MAP --from MAP",
+                )
+            packed = msgspec.msgpack.decode(data, type=_PackedV1 if version == 1 else _Packed)
         except (msgspec.MsgspecError, ValueError) as error:
             raise BadRequest(
                 f"the snapshot is damaged: {message_of(error)}", hint="take the older one"
             ) from error
-        if packed.version != _VERSION:
-            raise BadRequest(
-                f"the snapshot is of version {packed.version}, not {_VERSION}",
-                hint="publish the map with the release that wrote it, and start a new one from the version",
-            )
         graph = cls()
-        graph.keyframes = [LiveKeyframe(*each) for each in packed.keyframes]
-        n = graph._size = len(graph.keyframes)
+        n = graph._size = len(packed.keyframes)
         capacity = max(64, n)
         kinds = (("<f8", (4, 4)), ("<f8", (4, 4)), ("<f8", ()), ("<i8", ()), ("<i8", ()))
         names = ("_T", "_T_odom", "_way", "_of_segment", "_place")
@@ -479,7 +481,11 @@ class Graph:
             array[:n] = np.frombuffer(raw, dtype=np.dtype(kind)).reshape(n, *shape)
             setattr(graph, name, array)
         graph._held = np.zeros(capacity, dtype=np.bool_)
-        graph._held[:n] = [keyframe.features is not None for keyframe in graph.keyframes]
+        graph.cameras_v1 = packed.cameras()
+        graph.keyframes = [LiveKeyframe(*row[:4], data=None) for row in packed.keyframes]
+        for i, row in enumerate(packed.keyframes):
+            if row[-1] is not None:
+                graph.set_data(i, row[-1])
         graph.segments = [
             Segment(
                 robot=robot, segment=segment, keyframes=keyframes, component=component,
@@ -506,9 +512,13 @@ class Graph:
 _PackedLink = tuple[int, int, int, bytes, bytes, int, int, bool, LinkState, int]
 
 
+class _Versioned(msgspec.Struct):
+    version: int
+
+
 class _Packed(msgspec.Struct, kw_only=True):
     version: int
-    keyframes: list[tuple[str, int, int, float, CameraNumbers, bytes | None]]
+    keyframes: list[tuple[str, int, int, float, bytes | None]]
     segments: list[tuple[str, int, list[int], int, bytes | None, bytes, str, bool]]
     links: list[_PackedLink]
     open: list[int]
@@ -526,6 +536,18 @@ class _Packed(msgspec.Struct, kw_only=True):
     removed: list[_PackedLink] = []
     trust: list[tuple[int, bool]] = []
     smoothing: list[tuple[str, int]] = []
+
+    def cameras(self) -> list[CameraNumbers]:
+        """Return no cameras: they are in the bytes of the keyframes."""
+        return []
+
+
+class _PackedV1(_Packed, kw_only=True):
+    keyframes: list[tuple[str, int, int, float, CameraNumbers, bytes | None]]  # type: ignore[assignment]
+
+    def cameras(self) -> list[CameraNumbers]:
+        """Return the cameras of the keyframes, by id."""
+        return [row[4] for row in self.keyframes]
 
 
 def _packed_link(number: int, link: LiveLink) -> _PackedLink:
@@ -551,12 +573,6 @@ def variances_of(information: Array) -> Array:
     """Return the ``(m, 6)`` variances of twists with the ``(m, 6, 6)`` *information*."""
     variances: Array = np.diagonal(np.linalg.inv(information), axis1=1, axis2=2)
     return variances
-
-
-def camera_of(numbers: CameraNumbers) -> Camera:
-    """Return the camera of six numbers; raises InvalidCamera."""
-    fx, fy, cx, cy, width, height = numbers
-    return Camera(fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height)
 
 
 def _matrix(raw: bytes, n: int) -> Array:

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rse_pf.errors import BadRequest, InvalidCamera
-from rse_pf.geometry import Array, Camera, inverse
+from rse_pf.geometry import Array, inverse
 from rse_pf.live_map.beliefs import (
     Changes,
     disbelieve_contradicting,
@@ -33,11 +33,9 @@ from rse_pf.live_map.events import (
     RobotLeft,
     matrix_bytes,
     matrix_of,
-    pose_bytes,
 )
 from rse_pf.live_map.feature_parts import FeatureParts, SnapshotParts
-from rse_pf.live_map.graph import Graph, LiveKeyframe, LiveLink, Segment, camera_of, variances_of
-from rse_pf.live_map.keyframe_code import decode_features
+from rse_pf.live_map.graph import Graph, LiveKeyframe, LiveLink, Segment, variances_of
 from rse_pf.live_map.measure import StoredView, measure_stored, placed_keyframe, view_of_features
 from rse_pf.live_map.options import LiveMapOptions
 from rse_pf.live_map.outcomes import (
@@ -54,6 +52,7 @@ from rse_pf.live_map.outcomes import (
 from rse_pf.live_map.smoothing import SmoothedWindows, odometry_step, smooth_all
 from rse_pf.live_map.versions import version_of, whole_graph
 from rse_pf.maps.format import MapVersion
+from rse_pf.slam.keyframe import Keyframe, check_sent, decode_keyframe
 from rse_pf.slam.localise import LocalisationOptions, Localised, localise, spread_candidates
 from rse_pf.slam.optimise import OptimiseOptions, optimise_graph
 from rse_pf.slam.places import PlaceIndex
@@ -61,7 +60,6 @@ from rse_pf.slam.pose_graph import PoseGraph
 
 __all__ = ["LiveMap"]
 
-_MAX_TIME_S = 1e12
 _MAX_SEGMENT = 2**31
 
 
@@ -185,14 +183,10 @@ class LiveMap:
                 f"segment {event.segment} is not within {oldest}..{_MAX_SEGMENT - 1}",
                 hint="count segments upwards, one for each time that tracking starts again",
             )
-        if not abs(event.timestamp_s) <= _MAX_TIME_S:
-            raise BadRequest("the time of the keyframe is absurd", hint="send seconds since 1970")
-        pose_bytes(matrix_of(event.T_odom_camera, 4, 4))
         try:
-            camera = camera_of(event.camera)
+            check_sent(event.keyframe)
         except InvalidCamera as error:
             raise BadRequest(error.message, hint=error.hint) from error
-        decode_features(event.features, camera)
         return "new"
 
     def apply(self, event: Event) -> list[Outcome]:
@@ -263,31 +257,22 @@ class LiveMap:
 
         return fit
 
-    def relocalise(self, camera: Camera, features: bytes) -> Localised:
-        """Find the place of a view in the map; changes nothing.
+    def relocalise(self, view: Keyframe) -> Localised:
+        """Find the place of a view in the map, whatever its pose; changes nothing."""
+        return self.relocalising(view)()
 
-        Raises:
-            BadRequest: The features are malformed.
-        """
-        return self.relocalising(camera, features)()
-
-    def relocalising(self, camera: Camera, features: bytes) -> Callable[[], Localised]:
-        """Return what does the work of `relocalise`; another thread may call it while the map changes.
-
-        Raises:
-            BadRequest: The features are malformed.
-        """
-        decoded = decode_features(features, camera)
+    def relocalising(self, view: Keyframe) -> Callable[[], Localised]:
+        """Return what does the work of `relocalise`; another thread may call it while the map changes."""
         graph = self._graph
         aligned = np.flatnonzero(graph.held & self._aligned_mask())
         most = self.options.candidates
         # More are looked at, so that a second place that looks alike is compared, too.
-        found = self._places.nearest(PlaceIndex.vector(decoded.descriptors), 6 * most, aligned)
+        found = self._places.nearest(PlaceIndex.vector(view.features.descriptors), 6 * most, aligned)
         chosen = [(self._stored(i), graph.T[i].copy()) for i in spread_candidates(found, graph.T, most)]
         views = [(stored, T) for stored, T in chosen if stored is not None]
         options = LocalisationOptions(has_equal_rooms=graph.equal_rooms_m > 0.0)
-        view = view_of_features(decoded, camera)
-        return lambda: localise([placed_keyframe(stored, T) for stored, T in views], view, options)
+        image = view_of_features(view.features, view.camera)
+        return lambda: localise([placed_keyframe(stored, T) for stored, T in views], image, options)
 
     def alignments(self) -> list[Alignment]:
         """Return where the newest segment of each robot lies."""
@@ -308,9 +293,10 @@ class LiveMap:
 
     def _add(self, event: KeyframeAdded) -> list[Outcome]:
         graph, options = self._graph, self.options
+        keyframe = event.keyframe
+        T_odom = keyframe.T_odom_camera
         row = graph.segment_row(event.robot, event.segment)
         segment = graph.segments[row]
-        T_odom = np.array(matrix_of(event.T_odom_camera, 4, 4))
         T, way = T_odom, 0.0
         if segment.keyframes:
             last = segment.keyframes[-1]
@@ -320,11 +306,11 @@ class LiveMap:
         i = graph.add(
             LiveKeyframe(
                 robot=event.robot, segment=event.segment, number=event.number,
-                timestamp_s=event.timestamp_s, camera=event.camera, features=event.features,
+                timestamp_s=keyframe.timestamp_s, data=event.data,
             ),
             row, T_odom, T, way,
         )  # fmt: skip
-        self._place(i)
+        self._places.add(i, PlaceIndex.vector(keyframe.features.descriptors))
         graph.next_numbers[event.robot] = event.number + 1
         graph.newest[event.robot] = row
         if graph.root < 0:
@@ -430,14 +416,15 @@ class LiveMap:
         graph.segments.append(Segment(robot="", segment=-1, version=True))
         graph.root = 0
         outcomes: list[Outcome] = []
-        for number, each in enumerate(event.keyframes):
-            T = np.array(matrix_of(each.T_map_camera, 4, 4))
-            keyframe = LiveKeyframe(
-                robot=each.robot, segment=-1, number=number, timestamp_s=each.timestamp_s, camera=each.camera,
-                features=each.features,
+        for number, start in enumerate(event.keyframes):
+            keyframe = decode_keyframe(start.data)
+            T_map_camera = keyframe.T_odom_camera
+            row = LiveKeyframe(
+                robot=start.robot, segment=-1, number=number, timestamp_s=keyframe.timestamp_s,
+                data=start.data,
             )  # fmt: skip
-            i = graph.add(keyframe, 0, T, T, 0.0)
-            self._place(i)
+            i = graph.add(row, 0, T_map_camera, T_map_camera, 0.0)
+            self._places.add(i, PlaceIndex.vector(keyframe.features.descriptors))
             outcomes.append(Added(id=i))
         information = np.array([matrix_of(link.information, 6, 6) for link in event.links]).reshape(-1, 6, 6)
         for link, each_link, variances in zip(
@@ -530,16 +517,9 @@ class LiveMap:
         surplus = len(near) - options.same_place_most
         gone = tuple(int(i) for i in near[: max(0, surplus)] if i != k)
         for i in gone:
-            graph.drop_features(i)
+            graph.drop_data(i)
             self._places.remove(i)
         return [Culled(ids=gone)] if gone else []
-
-    def _place(self, i: int) -> None:
-        """Add keyframe *i* to the index of places."""
-        keyframe = self._graph.keyframes[i]
-        assert keyframe.features is not None
-        features = decode_features(keyframe.features, self._graph.camera(i))
-        self._places.add(i, PlaceIndex.vector(features.descriptors))
 
     def _candidates(self, k: int, most: int | None = None) -> list[int]:
         """Return the keyframes to compare with *k*: some of its own component, some of others.
@@ -564,9 +544,9 @@ class LiveMap:
         return sorted(i for i, _ in found_here + found_there)
 
     def _stored(self, i: int) -> StoredView | None:
-        """Return the features of a keyframe as they are kept, None if they are not."""
-        features = self._graph.keyframes[i].features
-        return None if features is None else (i, features, self._graph.camera(i))
+        """Return a keyframe as it is kept, None if its bytes are not."""
+        data = self._graph.keyframes[i].data
+        return None if data is None else (i, data)
 
     def _is_ignored(self, i: int) -> bool:
         """Return whether links of a keyframe are not taken: it is gone, or its segment is not believed."""

@@ -9,7 +9,7 @@ import numpy as np
 
 from rse_pf.geometry import Array, Camera
 from rse_pf.live_map.events import LinksMeasured, MeasuredLink, matrix_bytes
-from rse_pf.live_map.keyframe_code import KeyframeFeatures, decode_features
+from rse_pf.slam.keyframe import KeyframeFeatures, decode_keyframe
 from rse_pf.slam.localise import PlacedKeyframe
 from rse_pf.slam.relative_pose import Reference, RelativePoseOptions, View, measure_link
 
@@ -25,8 +25,8 @@ __all__ = [
 ]
 
 _DEFAULT = RelativePoseOptions()
-StoredView = tuple[int, bytes, Camera]
-"""Id, encoded features and camera of a keyframe."""
+StoredView = tuple[int, bytes]
+"""Id and bytes of a keyframe."""
 
 
 def measure_links(
@@ -71,9 +71,10 @@ def measure_stored(
 
 
 def decoded_view(stored: StoredView) -> tuple[int, KeyframeFeatures, Camera]:
-    """Return id, features and camera of a stored keyframe; raises BadRequest."""
-    number, features, camera = stored
-    return number, decode_features(features, camera), camera
+    """Return id, features and camera of a keyframe as it is kept; raises BadRequest."""
+    number, data = stored
+    keyframe = decode_keyframe(data)
+    return number, keyframe.features, keyframe.camera
 
 
 def reference_of_features(features: KeyframeFeatures, camera: Camera) -> Reference:

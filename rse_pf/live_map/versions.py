@@ -11,15 +11,16 @@ import numpy as np
 
 from rse_pf.errors import BadMessage, BadRequest, InternalError, LimitExceeded
 from rse_pf.geometry import Array, inverse
-from rse_pf.live_map.events import CameraNumbers, MapStarted, StartKeyframe, StartLink, matrix_bytes
+from rse_pf.live_map.events import MapStarted, StartKeyframe, StartLink, matrix_bytes
 from rse_pf.live_map.graph import Graph, Segment
-from rse_pf.live_map.keyframe_code import decode_features, encode_features
 from rse_pf.live_map.options import LiveMapOptions
 from rse_pf.live_map.smoothing import edges_of
 from rse_pf.maps.format import Edge, EdgeKind, Keyframe, MapVersion
+from rse_pf.slam.keyframe import Keyframe as SentKeyframe
+from rse_pf.slam.keyframe import decode_keyframe, encode_keyframe, make_features
 from rse_pf.slam.pose_graph import PoseGraph, is_positive_definite
 
-__all__ = ["errors_of_maps", "started_from", "version_of", "whole_graph"]
+__all__ = ["encoded", "errors_of_maps", "started_from", "version_of", "whole_graph"]
 
 
 @contextlib.contextmanager
@@ -53,12 +54,7 @@ def started_from(version: MapVersion, source: str) -> MapStarted:
     return MapStarted(
         source=source,
         keyframes=tuple(
-            StartKeyframe(
-                robot=each.robot, timestamp_s=each.timestamp_s,
-                T_map_camera=matrix_bytes(each.T_world_camera), camera=_numbers(each),
-                features=encode_features(each.pixels, each.points_camera[:, 2], each.descriptors),
-            )
-            for each in version.keyframes
+            StartKeyframe(robot=keyframe.robot, data=encoded(keyframe)) for keyframe in version.keyframes
         ),
         links=tuple(
             StartLink(
@@ -86,15 +82,15 @@ def _version_of(graph: Graph, options: LiveMapOptions) -> MapVersion:
     ids = [i for i in _aligned(graph) if graph.held[i]]
     keyframes = []
     for i in ids:
-        each, camera = graph.keyframes[i], graph.camera(i)
-        assert each.features is not None
-        features = decode_features(each.features, camera)
+        row = graph.keyframes[i]
+        assert row.data is not None
+        seen = decode_keyframe(row.data)
         keyframes.append(
             Keyframe(
-                id=i, robot=_shown(each.robot), timestamp_s=each.timestamp_s,
-                T_world_camera=graph.T[i].copy(), camera=camera, pixels=features.pixels,
-                descriptors=features.descriptors,
-                points_camera=features.points_camera(camera).astype(np.float32),
+                id=i, robot=_shown(row.robot), timestamp_s=row.timestamp_s,
+                T_world_camera=graph.T[i].copy(), camera=seen.camera, pixels=seen.features.pixels,
+                descriptors=seen.features.descriptors,
+                points_camera=seen.features.points_camera(seen.camera).astype(np.float32),
             )
         )  # fmt: skip
     kept = set(ids)
@@ -151,9 +147,15 @@ def _odometry(graph: Graph, ids: list[int], options: LiveMapOptions) -> list[Edg
     return edges
 
 
-def _numbers(keyframe: Keyframe) -> CameraNumbers:
-    camera = keyframe.camera
-    return camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height
+def encoded(keyframe: Keyframe) -> bytes:
+    """Return a keyframe of a version as a robot would have sent it, its pose that in the version."""
+    features = make_features(keyframe.pixels, keyframe.points_camera[:, 2], keyframe.descriptors)
+    return encode_keyframe(
+        SentKeyframe(
+            timestamp_s=keyframe.timestamp_s, T_odom_camera=keyframe.T_world_camera, camera=keyframe.camera,
+            features=features,
+        )
+    )  # fmt: skip
 
 
 def _shown(folder: str) -> str:

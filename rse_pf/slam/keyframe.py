@@ -292,9 +292,10 @@ def _features(
             f"{depth_count} depths in {depths_end - depths_begin} bytes are not those of {n} features"
         )
     units = np.frombuffer(data, dtype="<u2", count=2 * n, offset=begin + _FEATURES.size).reshape(2, n)
-    pixels = (units.T * np.float32(2.0**-fraction)).astype(np.float32)
+    pixels = (units.T * np.float32(2.0**-fraction)).astype(np.float32, copy=False)
     depths_mm = np.frombuffer(data, dtype="<u2", count=n, offset=depths_begin + _GEOMETRY.size)
-    if n and (pixels.max(axis=0) > (camera.width + _BORDER_PX, camera.height + _BORDER_PX)).any():
+    widest, highest = (camera.width + _BORDER_PX) << fraction, (camera.height + _BORDER_PX) << fraction
+    if n and (units[0].max() > widest or units[1].max() > highest):
         raise _refusal(f"a pixel lies outside the image of {camera.width}x{camera.height} px")
     if n and depths_mm.min() < _NEAREST_MM:
         raise _refusal(f"a depth is below {_NEAREST_MM} mm")

@@ -12,7 +12,7 @@ import struct
 import numpy as np
 
 from rse_pf.errors import BadRequest
-from rse_pf.geometry import Array, Camera
+from rse_pf.geometry import Array, Camera, rigid
 from rse_pf.slam.keyframe import MAX_FEATURES, Keyframe, KeyframeFeatures, decode_keyframe, encode_keyframe
 
 __all__ = ["MAX_FEATURES_BYTES", "CameraNumbers", "keyframe_of_v1"]
@@ -40,8 +40,14 @@ def keyframe_of_v1(timestamp_s: float, T_odom_camera: Array, camera: Camera, fea
     Raises:
         BadRequest: A part is malformed, as `decode_keyframe` says.
     """
+    T_rigid = rigid(T_odom_camera)
+    if T_rigid is None:
+        raise BadRequest(
+            "T_odom_camera is no pose: it takes 16 numbers of a rotation and a translation",
+            hint="send it row after row with at least three decimals, the last row 0 0 0 1",
+        )
     keyframe = Keyframe(
-        timestamp_s=timestamp_s, T_odom_camera=T_odom_camera, camera=camera, features=_decoded(features)
+        timestamp_s=timestamp_s, T_odom_camera=T_rigid, camera=camera, features=_decoded(features)
     )  # fmt: skip
     data = encode_keyframe(keyframe)
     decode_keyframe(data)

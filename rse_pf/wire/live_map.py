@@ -16,14 +16,18 @@ from rse_pf.geometry import Camera
 from rse_pf.wire.arrays import Array
 
 __all__ = [
+    "LIVE_REQUESTS",
+    "LIVE_REQUESTS_V1",
     "LIVE_TOPIC",
-    "MAX_FEATURES_BYTES",
     "AlignmentUpdate",
     "KeyframeKept",
     "KeyframeRequest",
+    "KeyframeRequestV1",
     "LiveForget",
     "LiveMapRequest",
     "LiveRelocalise",
+    "LiveRelocaliseV1",
+    "LiveRequest",
     "LiveStart",
     "MapCause",
     "MapUpdate",
@@ -35,8 +39,6 @@ __all__ = [
 
 LIVE_TOPIC = "live/"
 """Beginning of the topics of live maps; the name of the map follows."""
-MAX_FEATURES_BYTES = 34_000
-"""The encoded features of one keyframe."""
 
 _MapName = Annotated[str, msgspec.Meta(pattern=r"^[a-z0-9][a-z0-9-]{0,63}\Z")]
 _Count = Annotated[int, msgspec.Meta(ge=0, le=2**53 - 1)]
@@ -56,8 +58,17 @@ class KeyframeRequest(_Value, frozen=True, kw_only=True):
     """``live-keyframe``: one keyframe of the robot that sends it.
 
     ``segment`` counts the robot's odometry frames, ``number`` its keyframes over all segments, both from 0.
-    ``features`` is encoded as `rse_pf.live_map.keyframe_code` says.
+    ``keyframe`` is encoded as `rse_pf.slam.keyframe` says.
     """
+
+    map: _MapName
+    segment: _Count
+    number: _Count
+    keyframe: bytes
+
+
+class KeyframeRequestV1(_Value, frozen=True, kw_only=True):
+    """``live-keyframe`` with the parts of a keyframe; ``features`` as `rse_pf.slam.keyframe_v1` says."""
 
     map: _MapName
     segment: _Count
@@ -65,7 +76,7 @@ class KeyframeRequest(_Value, frozen=True, kw_only=True):
     timestamp_s: float
     T_odom_camera: Array
     camera: Camera
-    features: Annotated[bytes, msgspec.Meta(max_length=MAX_FEATURES_BYTES)]
+    features: bytes
 
 
 class KeyframeKept(_Value, frozen=True, kw_only=True):
@@ -76,11 +87,18 @@ class KeyframeKept(_Value, frozen=True, kw_only=True):
 
 
 class LiveRelocalise(_Value, frozen=True, kw_only=True):
-    """``live-relocalise``: where in the map is the camera that sees these features?"""
+    """``live-relocalise``: where in the map is the camera of this keyframe, whatever its pose says?"""
+
+    map: _MapName
+    keyframe: bytes
+
+
+class LiveRelocaliseV1(_Value, frozen=True, kw_only=True):
+    """``live-relocalise`` with the parts of a keyframe; ``features`` as `rse_pf.slam.keyframe_v1` says."""
 
     map: _MapName
     camera: Camera
-    features: Annotated[bytes, msgspec.Meta(max_length=MAX_FEATURES_BYTES)]
+    features: bytes
 
 
 class RelocaliseReply(_Value, frozen=True, kw_only=True):
@@ -111,6 +129,26 @@ class LiveStart(_Value, frozen=True, kw_only=True):
     map: _MapName
     source: Annotated[str, msgspec.Meta(max_length=160)] = msgspec.field(name="from", default="")
     equal_rooms_m: Annotated[float, msgspec.Meta(ge=0.0, le=100.0)] = 0.0
+
+
+LiveRequest = KeyframeRequest | LiveRelocalise | LiveMapRequest | LiveForget | LiveStart
+"""What the owner of a map is asked for."""
+LIVE_REQUESTS: dict[str, type[LiveRequest]] = {
+    "live-keyframe": KeyframeRequest,
+    "live-relocalise": LiveRelocalise,
+    "live-leave": LiveMapRequest,
+    "live-show": LiveMapRequest,
+    "live-publish": LiveMapRequest,
+    "live-stop": LiveMapRequest,
+    "live-forget": LiveForget,
+    "live-start": LiveStart,
+}
+"""The request of each service that the owner of a map answers."""
+LIVE_REQUESTS_V1: dict[str, type[KeyframeRequestV1 | LiveRelocaliseV1]] = {
+    "live-keyframe": KeyframeRequestV1,
+    "live-relocalise": LiveRelocaliseV1,
+}
+"""The same of requests that hold ``features`` of their own, which older robots send."""
 
 
 class MapCause(_Value, frozen=True, kw_only=True):

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-WAYS = ("The way of a frame", "The way of a setting", "The way of a token")
+WAYS = ("The way of a frame", "The way of a keyframe", "The way of a setting", "The way of a token")
 ROW = re.compile(r"^\| \d+ \| `([\w./-]+)` \| ([^|]*) \|", re.M)
 
 
@@ -110,6 +110,10 @@ def test_each_way_names_existing_functions_and_passes_no_file_twice(
 
     assert len(found) >= 6
     assert broken_steps(found, repository) == []
+
+
+def test_a_keyframe_passes_at_most_15_files(page: str) -> None:
+    assert len(steps(page, "The way of a keyframe")) <= 15
 
 
 def test_a_wrong_step_is_noticed(repository: Path) -> None:

@@ -8,10 +8,10 @@ import pytest
 import rse_pf.slam.relative_pose as relative_pose
 from rse_pf.geometry import inverse, pose_difference
 from rse_pf.live_map.events import LinksMeasured, matrix_of
-from rse_pf.live_map.keyframe_code import KeyframeFeatures, decode_features, encode_features
 from rse_pf.live_map.measure import joined_links, measure_links
 from rse_pf.maps.format import Keyframe
 from rse_pf.services.synthetic_maps import make_world
+from rse_pf.slam.keyframe import KeyframeFeatures, make_features
 from rse_pf.slam.relative_pose import RelativePoseOptions
 
 WORLD, TRUTH = make_world(3, points=4000).walk("r", np.array([0.0, 0.02, 0.04, 0.5]), seed=1)
@@ -19,8 +19,7 @@ CAMERA = WORLD.keyframes[0].camera
 
 
 def coded(keyframe: Keyframe) -> KeyframeFeatures:
-    depths_m = keyframe.points_camera[:, 2]
-    return decode_features(encode_features(keyframe.pixels, depths_m, keyframe.descriptors), CAMERA)
+    return make_features(keyframe.pixels, keyframe.points_camera[:, 2], keyframe.descriptors)
 
 
 FEATURES = [coded(each) for each in WORLD.keyframes]

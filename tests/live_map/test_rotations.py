@@ -9,32 +9,41 @@ import numpy as np
 import pytest
 
 from benchmarks.live.generated_drives import INFORMATION, GeneratedWorld, measured_link, straight
-from rse_pf.backend.live_map.owner.requests import keyframe_event
-from rse_pf.backend.live_map.router import _payload_of
+from rse_pf.backend.live_map.router import _check_keyframe, _request_of
 from rse_pf.errors import BadRequest, InternalError
-from rse_pf.geometry import Array, Camera, exp_se3, inverse, rigid, rigid_many
-from rse_pf.identity import RobotId
-from rse_pf.live_map.events import KeyframeAdded, LinksMeasured, matrix_bytes, matrix_of
+from rse_pf.geometry import Array, exp_se3, inverse, rigid, rigid_many
+from rse_pf.live_map.events import KeyframeAdded, LinksMeasured
 from rse_pf.live_map.live_map import LiveMap
 from rse_pf.live_map.versions import started_from
 from rse_pf.maps.format import decode_map, encode_map
+from rse_pf.slam.keyframe import encode_keyframe
 from rse_pf.slam.optimise import OptimiseOptions
 from rse_pf.slam.pose_graph import PoseGraph
 from rse_pf.wire.live_map import KeyframeRequest
+from tests.slam.v1_features import features_v1
 
-ROBOT = RobotId("default", "raw")
 FITTING = np.sqrt(1.0 + 1.9e-3)
 """A rotation that is scaled by this is accepted, and the step between two of them was refused."""
 
 
 def sent(T: Array, good: KeyframeAdded, number: int) -> KeyframeAdded:
-    """Return the event of a keyframe that a raw client sent with the pose *T*."""
-    fx, fy, cx, cy, width, height = good.camera
-    request = KeyframeRequest(
-        map="m", segment=0, number=number, timestamp_s=1.0, T_odom_camera=T.ravel(),
-        camera=Camera(fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height), features=good.features,
-    )  # fmt: skip
-    return keyframe_event(ROBOT, _payload_of(request))
+    """Return the event of a keyframe that a raw client of protocol version 1 sent with the pose *T*."""
+    seen = good.keyframe.features
+    payload = {
+        "map": "m", "segment": 0, "number": number, "timestamp_s": 1.0, "T_odom_camera": T.ravel(),
+        "camera": msgspec.structs.asdict(good.keyframe.camera),
+        "features": features_v1(seen.pixels, seen.depths_m, seen.descriptors),
+    }  # fmt: skip
+    request = _request_of("live-keyframe", payload)
+    _check_keyframe(request)
+    assert isinstance(request, KeyframeRequest)
+    return KeyframeAdded(robot="default/raw", segment=0, number=number, data=request.keyframe)
+
+
+def with_pose(event: KeyframeAdded, T: Array) -> KeyframeAdded:
+    """Return *event* with the pose *T*, as it is."""
+    data = encode_keyframe(dataclasses.replace(event.keyframe, T_odom_camera=T))
+    return msgspec.structs.replace(event, data=data)
 
 
 def rounded(rng: np.random.Generator, decimals: int) -> Array:
@@ -102,10 +111,10 @@ def test_absurd_poses_are_refused_where_they_arrive(wrong: float, place: tuple[i
     T = np.eye(4)
     T[place] = wrong
 
-    with pytest.raises(BadRequest, match="T_odom_camera"):
+    with pytest.raises(BadRequest, match=r"T_odom_camera|not finite"):
         sent(T, good, 0)
     with pytest.raises(BadRequest, match="T_odom_camera"):
-        LiveMap().judge(msgspec.structs.replace(good, T_odom_camera=matrix_bytes(T)))
+        LiveMap().judge(with_pose(good, T))
 
 
 def test_a_log_of_an_earlier_release_with_scaled_rotations_is_replayed_and_published() -> None:
@@ -114,9 +123,9 @@ def test_a_log_of_an_earlier_release_with_scaled_rotations_is_replayed_and_publi
     one, other = LiveMap(), LiveMap()
     for number in range(12):
         event = world.keyframe(drive, number)
-        T = np.array(matrix_of(event.T_odom_camera, 4, 4))
+        T = event.keyframe.T_odom_camera.copy()
         T[:3, :3] *= 1.0 + 4.9e-5 * (-1) ** number
-        stored = msgspec.structs.replace(event, T_odom_camera=matrix_bytes(T))
+        stored = with_pose(event, T)
         for live_map in (one, other):
             live_map.apply(stored)
 

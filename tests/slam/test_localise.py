@@ -8,15 +8,14 @@ import numpy as np
 import pytest
 
 from rse_pf.geometry import exp_se3, inverse, pose_difference
-from rse_pf.live_map.keyframe_code import KeyframeFeatures, decode_features, encode_features
 from rse_pf.live_map.measure import reference_of_features, view_of_features
 from rse_pf.services.synthetic_maps import make_world
+from rse_pf.slam.keyframe import KeyframeFeatures, make_features
 from rse_pf.slam.localise import LocalisationOptions, Localised, PlacedKeyframe, localise, spread_candidates
 
 
 def coded(keyframe) -> KeyframeFeatures:
-    depths_m = keyframe.points_camera[:, 2]
-    return decode_features(encode_features(keyframe.pixels, depths_m, keyframe.descriptors), keyframe.camera)
+    return make_features(keyframe.pixels, keyframe.points_camera[:, 2], keyframe.descriptors)
 
 
 def candidates_of(seed: int, turns, T_map_world=None):

@@ -20,7 +20,7 @@ from benchmarks.live.places import (
 )
 from benchmarks.maps.recordings import RED_KITCHEN
 from client_sdk.datasets import open_dataset
-from rse_pf.live_map.keyframe_code import MAX_FEATURES_BYTES
+from rse_pf.slam.keyframe import MAX_KEYFRAME_BYTES
 
 pytest.importorskip("cv2", reason="needs the extra 'vision'")
 pytest.importorskip("gtsam", reason="needs the extra 'maps'")
@@ -45,7 +45,7 @@ def known(recordings: Path, kitchen: list[View]) -> tuple[PlacedMap, np.ndarray]
 
 
 def test_no_keyframe_of_the_kitchen_is_larger_than_the_limit(kitchen):
-    assert max(view.size_bytes for view in kitchen) <= MAX_FEATURES_BYTES
+    assert max(view.size_bytes for view in kitchen) <= MAX_KEYFRAME_BYTES
 
 
 def test_the_vocabulary_of_rendered_worlds_finds_the_places_of_the_kitchen(kitchen):

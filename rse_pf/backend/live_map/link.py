@@ -22,6 +22,7 @@ from rse_pf.config import PlatformSettings
 from rse_pf.errors import BadRequest, NotFound
 from rse_pf.identity import RobotId
 from rse_pf.object_store import ObjectStore
+from rse_pf.wire.live_map import LiveRequest
 
 __all__ = ["OwnerLinks"]
 
@@ -89,7 +90,7 @@ class OwnerLinks:
         map_name: str,
         robot: RobotId,
         operation: str,
-        payload: dict[str, Any],
+        request: LiveRequest,
         deadline_s: float,
     ) -> dict[str, Any]:
         """Return the answer of the map's owner to a command.
@@ -99,7 +100,7 @@ class OwnerLinks:
             map_name: Of the live map.
             robot: Who asks.
             operation: The service, such as ``live-keyframe``.
-            payload: Of the command; the owner checks it.
+            request: Of the command; the owner checks it.
             deadline_s: Seconds from now on.
 
         Raises:
@@ -108,7 +109,7 @@ class OwnerLinks:
         """
         link = self._link(tenant, map_name)
         self._children.use(is_used=True)
-        return await link.request(robot, operation, payload, deadline_s)
+        return await link.request(robot, operation, request, deadline_s)
 
     async def list_maps(self, tenant: str) -> list[dict[str, Any]]:
         """Return name, state, owner and server of each live map of *tenant*, from the store alone."""

@@ -24,7 +24,7 @@ from rse_pf.backend.live_map.owner.link_security import (
 )
 from rse_pf.backend.live_map.owner.process import OwnerOrder
 from rse_pf.backend.live_map.owner.replies import show_missing
-from rse_pf.backend.live_map.owner.requests import SHOW, begins_a_map
+from rse_pf.backend.live_map.owner.requests import SHOW, begins_a_map, encode_request
 from rse_pf.backend.live_map.owner.server import MAX_LINK_BYTES
 from rse_pf.backend.log import JsonLog
 from rse_pf.backend.sandbox.ipc import FrameReader, encode_message
@@ -32,6 +32,7 @@ from rse_pf.config import LiveSettings
 from rse_pf.errors import Busy, Conflict, NotFound, RsePfError, StoreError, Unauthorized, error_from_code
 from rse_pf.identity import RobotId
 from rse_pf.object_store import ObjectStore
+from rse_pf.wire.live_map import LiveRequest
 
 __all__ = ["LinkContext", "MapLink"]
 
@@ -78,12 +79,12 @@ class LinkContext:
 class _Pending:
     robot: RobotId
     operation: str
-    payload: dict[str, Any]
+    request: LiveRequest
     future: asyncio.Future[dict[str, Any]]
 
     @property
     def begins(self) -> bool:
-        return begins_a_map(self.operation, self.payload)
+        return begins_a_map(self.request)
 
 
 class MapLink:
@@ -129,12 +130,12 @@ class MapLink:
         self._task = asyncio.get_running_loop().create_task(self._run())
 
     async def request(
-        self, robot: RobotId, operation: str, payload: dict[str, Any], deadline_s: float
+        self, robot: RobotId, operation: str, request: LiveRequest, deadline_s: float
     ) -> dict[str, Any]:
         """Return the answer of the owner; raises Busy after *deadline_s*, and what the owner refused."""
         number = next(self._numbers)
         self._was_asked = True
-        pending = _Pending(robot, operation, payload, asyncio.get_running_loop().create_future())
+        pending = _Pending(robot, operation, request, asyncio.get_running_loop().create_future())
         self._pending[number] = pending
         self._send(number, pending)
         self._wake.set()
@@ -382,7 +383,9 @@ class MapLink:
         return True
 
     def _send(self, number: int, pending: _Pending) -> None:
-        self._say(["request", number, list(pending.robot), pending.operation, pending.payload])
+        self._say(
+            ["request", number, list(pending.robot), pending.operation, encode_request(pending.request)]
+        )
 
     def _say(self, message: list[Any]) -> None:
         if self._writer is not None:

@@ -7,12 +7,10 @@ A robot that sends garbage loses the live maps for a while, and nothing else.
 from __future__ import annotations
 
 import asyncio
-import math
 import traceback
 from collections.abc import Callable, Mapping
 from typing import Any
 
-import msgspec
 import numpy as np
 
 from rse_pf.auth.roster import scopes_allow
@@ -34,34 +32,25 @@ from rse_pf.errors import (
     RsePfError,
 )
 from rse_pf.identity import RobotId
-from rse_pf.live_map.events import pose_bytes
-from rse_pf.live_map.keyframe_code import decode_features
 from rse_pf.service import failure_of
+from rse_pf.slam.keyframe import MAX_KEYFRAME_BYTES, check_sent, decode_keyframe
+from rse_pf.slam.keyframe_v1 import MAX_FEATURES_BYTES, keyframe_of_v1
 from rse_pf.wire import Failure, Result, as_type
 from rse_pf.wire.live_map import (
-    MAX_FEATURES_BYTES,
+    LIVE_REQUESTS,
+    LIVE_REQUESTS_V1,
     KeyframeRequest,
-    LiveForget,
-    LiveMapRequest,
+    KeyframeRequestV1,
     LiveRelocalise,
-    LiveStart,
+    LiveRelocaliseV1,
+    LiveRequest,
     map_of_topic,
 )
 
 __all__ = ["LIVE_LIST", "LIVE_SERVICES", "LiveMapRouter"]
 
 LIVE_LIST = "live-list"
-_REQUESTS: dict[str, type[Any]] = {
-    "live-keyframe": KeyframeRequest,
-    "live-relocalise": LiveRelocalise,
-    "live-leave": LiveMapRequest,
-    "live-show": LiveMapRequest,
-    "live-publish": LiveMapRequest,
-    "live-stop": LiveMapRequest,
-    "live-forget": LiveForget,
-    "live-start": LiveStart,
-}
-LIVE_SERVICES = frozenset((*_REQUESTS, LIVE_LIST))
+LIVE_SERVICES = frozenset((*LIVE_REQUESTS, LIVE_LIST))
 """The commands that go to the owner of a live map."""
 
 _FOR_OPERATORS = frozenset(("live-publish", "live-stop", "live-forget", "live-start"))
@@ -151,17 +140,13 @@ class LiveMapRouter:
         deadline_s = queued.deadline_s - now
         if service == LIVE_LIST:
             return lambda: self._list(robot.tenant, claims)
-        _check_features(command.payload)
-        try:
-            request = as_type({} if command.payload is None else command.payload, _REQUESTS[service])
-        except BadMessage as error:
-            raise BadRequest(f"{service}: {error.message}", hint=error.hint) from error
+        request = _request_of(service, {} if command.payload is None else command.payload)
         right = "maps:write" if service in _FOR_OPERATORS else "maps:live"
         forbidden = _forbidden(claims, right, request.map)
         if forbidden is not None:
             raise forbidden
-        payload = _payload_of(request)
-        return lambda: self._owners.request(robot.tenant, request.map, robot, service, payload, deadline_s)
+        _check_keyframe(request)
+        return lambda: self._owners.request(robot.tenant, request.map, robot, service, request, deadline_s)
 
     async def _list(self, tenant: str, claims: Claims | None) -> dict[str, Any]:
         """Return the maps of a tenant that a robot may enter."""
@@ -300,36 +285,56 @@ def _forbidden_to_read(claims: Claims | None, map_name: str) -> RsePfError | Non
     return _forbidden(claims, "maps:live", map_name)
 
 
-def _check_features(payload: Any) -> None:
-    """Raise LimitExceeded if the features are too long, before anything is made from them."""
-    features = payload.get("features") if isinstance(payload, dict) else None
-    size = 0
-    if isinstance(features, str):  # base64: four characters for three bytes
-        size = len(features) // 4 * 3 - 2
-    elif isinstance(features, bytes | bytearray | memoryview):
-        size = len(features)
-    if size > MAX_FEATURES_BYTES:
-        raise LimitExceeded(
-            f"the features of a keyframe are {size} bytes, above {MAX_FEATURES_BYTES}",
-            hint="send fewer features",
+def _request_of(service: str, payload: Any) -> LiveRequest:
+    """Return the request of a command, one of protocol version 1 in today's form.
+
+    Raises:
+        RsePfError: It is too long, or not valid.
+    """
+    kind: type[Any] = LIVE_REQUESTS[service]
+    if isinstance(payload, dict):
+        _check_size(payload.get("keyframe"), "a keyframe is", MAX_KEYFRAME_BYTES)
+        _check_size(payload.get("features"), "the features of a keyframe are", MAX_FEATURES_BYTES)
+        if "keyframe" not in payload and "features" in payload:
+            kind = LIVE_REQUESTS_V1.get(service, kind)
+    try:
+        request = as_type(payload, kind)
+    except BadMessage as error:
+        raise BadRequest(f"{service}: {error.message}", hint=error.hint) from error
+    if isinstance(request, KeyframeRequestV1):
+        T_odom_camera = request.T_odom_camera
+        if T_odom_camera.size != 16:
+            raise BadRequest("T_odom_camera is no pose: it takes 16 numbers", hint="send it row after row")
+        keyframe = keyframe_of_v1(
+            request.timestamp_s, T_odom_camera.reshape(4, 4), request.camera, request.features
         )
+        return KeyframeRequest(
+            map=request.map, segment=request.segment, number=request.number, keyframe=keyframe
+        )
+    if isinstance(request, LiveRelocaliseV1):
+        keyframe = keyframe_of_v1(0.0, np.eye(4), request.camera, request.features)
+        return LiveRelocalise(map=request.map, keyframe=keyframe)
+    checked: LiveRequest = request
+    return checked
 
 
-def _payload_of(request: Any) -> dict[str, Any]:
-    """Return a judged request as the owner's link takes it: plain values, matrices as bytes."""
-    payload: dict[str, Any] = msgspec.structs.asdict(request)
-    del payload["map"]
+def _check_size(value: Any, what: str, most: int) -> None:
+    """Raise LimitExceeded if bytes are too long, before anything is made from them."""
+    size = 0
+    if isinstance(value, str):  # base64: four characters for three bytes
+        size = len(value) // 4 * 3 - 2
+    elif isinstance(value, bytes | bytearray | memoryview):
+        size = len(value)
+    if size > most:
+        raise LimitExceeded(f"{what} {size} bytes, above {most}", hint="send fewer features")
+
+
+def _check_keyframe(request: LiveRequest) -> None:
+    """Raise RsePfError for a keyframe that is garbage: the owner, which others share, decodes none."""
     if isinstance(request, KeyframeRequest):
-        if not math.isfinite(request.timestamp_s):
-            raise BadRequest("timestamp_s is no finite number", hint="send seconds")
-        payload["T_odom_camera"] = pose_bytes(request.T_odom_camera)
-    if isinstance(request, KeyframeRequest | LiveRelocalise):
-        camera = request.camera
-        decode_features(request.features, camera)  # the owner, which others share, decodes no garbage
-        payload["camera"] = [camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height]
-    if isinstance(request, LiveStart):
-        payload["from"] = payload.pop("source")
-    return payload
+        check_sent(decode_keyframe(request.keyframe))
+    elif isinstance(request, LiveRelocalise):
+        decode_keyframe(request.keyframe)
 
 
 def _with_arrays(values: Mapping[str, Any]) -> dict[str, Any]:

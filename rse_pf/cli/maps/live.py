@@ -19,6 +19,7 @@ from rse_pf.config import PlatformSettings
 from rse_pf.errors import Busy, NotFound
 from rse_pf.identity import RobotId
 from rse_pf.terminal import counted, show, show_json
+from rse_pf.wire.live_map import LiveForget, LiveMapRequest, LiveRequest, LiveStart
 
 if TYPE_CHECKING:
     from rse_pf.backend.live_map.link import OwnerLinks
@@ -73,7 +74,7 @@ def run_live(args: argparse.Namespace, settings: PlatformSettings) -> int:
 
 def run_publish(args: argparse.Namespace, settings: PlatformSettings) -> int:
     """Publish a live map as the next version of the map of the same name."""
-    reply = _ask(args, settings, "live-publish", {})
+    reply = _ask(args, settings, "live-publish", LiveMapRequest(map=args.name))
     _record(args, settings, reply)
     _print(args, reply, _published(args.name, reply))
     return 0
@@ -87,7 +88,8 @@ def _list(args: argparse.Namespace, settings: PlatformSettings) -> None:
 
 def _show(args: argparse.Namespace, settings: PlatformSettings) -> None:
     try:
-        reply = _ask(args, settings.replace(live={"max_owners": 0}), "live-show", {}, _OWNER_S)
+        request = LiveMapRequest(map=args.name)
+        reply = _ask(args, settings.replace(live={"max_owners": 0}), "live-show", request, _OWNER_S)
     except Busy:
         reply = {}
     if not reply or reply["state"] == "none":
@@ -110,12 +112,13 @@ def _show(args: argparse.Namespace, settings: PlatformSettings) -> None:
 
 
 def _start(args: argparse.Namespace, settings: PlatformSettings) -> None:
-    reply = _ask(args, settings, "live-start", {"from": args.source, "equal_rooms_m": args.equal_rooms_m})
+    request = LiveStart(map=args.name, source=args.source, equal_rooms_m=args.equal_rooms_m)
+    reply = _ask(args, settings, "live-start", request)
     _print(args, reply, f"{args.name} has begun with {counted(reply['keyframes'], 'keyframe')}")
 
 
 def _stop(args: argparse.Namespace, settings: PlatformSettings) -> None:
-    reply = _ask(args, settings, "live-stop", {})
+    reply = _ask(args, settings, "live-stop", LiveMapRequest(map=args.name))
     if reply:
         _record(args, settings, reply)
     what = _published(args.name, reply) if reply else f"{args.name} was empty, so nothing was published"
@@ -123,7 +126,7 @@ def _stop(args: argparse.Namespace, settings: PlatformSettings) -> None:
 
 
 def _forget(args: argparse.Namespace, settings: PlatformSettings) -> None:
-    reply = _ask(args, settings, "live-forget", {"robot": args.robot})
+    reply = _ask(args, settings, "live-forget", LiveForget(map=args.name, robot=args.robot))
     _print(args, reply, f"{args.name} holds nothing of {args.robot} any more")
 
 
@@ -138,7 +141,7 @@ def _record(args: argparse.Namespace, settings: PlatformSettings, reply: dict[st
 
 
 def _ask(
-    args: argparse.Namespace, settings: PlatformSettings, operation: str, payload: dict[str, Any],
+    args: argparse.Namespace, settings: PlatformSettings, operation: str, request: LiveRequest,
     deadline_s: float = _DEADLINE_S,
 ) -> dict[str, Any]:  # fmt: skip
     """Return what the owner of the map answers; raises what it refuses, or Busy."""
@@ -148,7 +151,7 @@ def _ask(
     operator = RobotId(args.tenant, "operator")
 
     async def ask(links: OwnerLinks) -> dict[str, Any]:
-        return await links.request(args.tenant, args.name, operator, operation, payload, deadline_s)
+        return await links.request(args.tenant, args.name, operator, operation, request, deadline_s)
 
     return asyncio.run(_with_links(settings, ask))
 

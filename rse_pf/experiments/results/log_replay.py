@@ -87,7 +87,7 @@ def _replayed(objects: Path, position: int) -> LoggedMap:
         events = decode_events(entry.events)
         epochs.add(entry.epoch)
         keyframes += [
-            (shown_name(each.robot), each.number, each.timestamp_s)
+            (shown_name(each.robot), each.number, each.keyframe.timestamp_s)
             for each in events
             if isinstance(each, KeyframeAdded)
         ]

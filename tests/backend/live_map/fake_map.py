@@ -21,19 +21,22 @@ from rse_pf.live_map.events import (
     Optimised,
     RobotForgotten,
     encode_events,
-    matrix_bytes,
 )
 from rse_pf.live_map.feature_parts import SnapshotParts
 from rse_pf.live_map.outcomes import Added, Alignment, Corrected, Outcome
 from rse_pf.maps.format import Keyframe, MapVersion
+from rse_pf.slam.keyframe import Keyframe as SentKeyframe
+from rse_pf.slam.keyframe import UnknownBlock, encode_keyframe, make_features
+from rse_pf.wire.live_map import KeyframeRequest
 
-__all__ = ["FAKE_MAP", "FakeMap", "keyframe_payload"]
+__all__ = ["FAKE_MAP", "FakeMap", "content_of", "keyframe_bytes", "keyframe_request"]
 
-_CAMERA = (500.0, 500.0, 320.0, 240.0, 640, 480)
+_CAMERA = Camera(fx=500.0, fy=500.0, cx=320.0, cy=240.0, width=640, height=480)
+_CONTENT_KIND = 1000
 
 
 class FakeMap:
-    """Keyframes with features ``bad`` are garbage, with ``defect`` they break the map's logic."""
+    """Keyframes with the content ``bad`` are garbage, with ``defect`` they break the map's logic."""
 
     def __init__(self) -> None:
         self._state: dict[str, Any] = {"digest": "", "keyframes": [], "numbers": {}, "segments": {}}
@@ -56,7 +59,7 @@ class FakeMap:
         expected = self.next_number(event.robot)
         if event.number != expected:
             return "known" if event.number < expected else "ahead"
-        if event.features == b"bad":
+        if content_of(event) == b"bad":
             raise BadRequest("garbage")
         return "new"
 
@@ -67,11 +70,11 @@ class FakeMap:
         return int(self._state["segments"].get(robot, -1)) + 1
 
     def apply(self, event: Event) -> list[Outcome]:
-        if isinstance(event, KeyframeAdded) and event.features == b"defect":
+        if isinstance(event, KeyframeAdded) and content_of(event) == b"defect":
             raise ZeroDivisionError
         self._state["digest"] = hashlib.sha256(self.digest().encode() + encode_events([event])).hexdigest()
         if isinstance(event, KeyframeAdded):
-            self._state["keyframes"].append([event.robot, event.number, event.timestamp_s])
+            self._state["keyframes"].append([event.robot, event.number, event.keyframe.timestamp_s])
             self._state["numbers"][event.robot] = event.number + 1
             self._state["segments"][event.robot] = event.segment
             return [Added(id=len(self._state["keyframes"]) - 1)]
@@ -99,7 +102,7 @@ class FakeMap:
     def optimising(self, solve: WholeFit | None = None) -> Callable[[], Optimised]:
         return lambda: Optimised(up_to=0, ids=(), T_map_camera=b"")
 
-    def relocalising(self, camera: Camera, features: bytes) -> Callable[[], Any]:
+    def relocalising(self, view: SentKeyframe) -> Callable[[], Any]:
         raise BadRequest("the fake map cannot relocalise")
 
     def alignments(self) -> list[Alignment]:
@@ -147,21 +150,32 @@ def _started(version: MapVersion, source: str) -> MapStarted:
     return MapStarted(
         source=source,
         keyframes=tuple(
-            StartKeyframe(
-                robot=each.robot, timestamp_s=0.0, T_map_camera=matrix_bytes(np.eye(4)), camera=_CAMERA,
-                features=b"",
-            )
-            for each in version.keyframes
+            StartKeyframe(robot=each.robot, data=keyframe_bytes(0.0, b"")) for each in version.keyframes
         ),
-    )  # fmt: skip
+    )
 
 
 FAKE_MAP = MapKind(empty=FakeMap, restore=FakeMap.restore, started_from=_started)
 
 
-def keyframe_payload(number: int, features: bytes = b"good", segment: int = 0) -> dict[str, Any]:
+def keyframe_bytes(timestamp_s: float, content: bytes) -> bytes:
+    """Return a keyframe without features, which holds *content* in a block of its own."""
+    features = make_features(np.zeros((0, 2)), np.zeros(0), np.zeros((0, 32), np.uint8))
+    return encode_keyframe(
+        SentKeyframe(
+            timestamp_s=timestamp_s, T_odom_camera=np.eye(4), camera=_CAMERA, features=features,
+            others=(UnknownBlock(_CONTENT_KIND, content),),
+        )
+    )  # fmt: skip
+
+
+def content_of(event: KeyframeAdded) -> bytes:
+    """Return what `keyframe_bytes` was given."""
+    return event.keyframe.others[0].content
+
+
+def keyframe_request(number: int, content: bytes = b"good", segment: int = 0) -> KeyframeRequest:
     """Return what a robot sends with keyframe *number*."""
-    return {
-        "segment": segment, "number": number, "timestamp_s": float(number), "camera": list(_CAMERA),
-        "T_odom_camera": matrix_bytes(np.eye(4)), "features": features,
-    }  # fmt: skip
+    return KeyframeRequest(
+        map="m", segment=segment, number=number, keyframe=keyframe_bytes(float(number), content)
+    )

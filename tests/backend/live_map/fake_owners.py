@@ -23,12 +23,12 @@ class FakeOwners:
 
     def __init__(self, on_update: OnUpdate) -> None:
         self.on_update = on_update
-        self.asked: list[tuple[str, str, RobotId, str, dict[str, Any], float]] = []
+        self.asked: list[tuple[str, str, RobotId, str, Any, float]] = []
         self.watched: list[tuple[str, str]] = []
         self.may_start: dict[tuple[str, str], bool] = {}
         self.unwatched: list[tuple[str, str]] = []
         self.maps: dict[str, list[dict[str, Any]]] = {}
-        self.answer: Callable[[str, dict[str, Any]], dict[str, Any] | RsePfError | None] | None = None
+        self.answer: Callable[[str, Any], dict[str, Any] | RsePfError | None] | None = None
         self.gave_up = self.closed = False
         self._next: dict[tuple[str, str, RobotId], int] = {}
 
@@ -38,7 +38,7 @@ class FakeOwners:
         map_name: str,
         robot: RobotId,
         operation: str,
-        payload: dict[str, Any],
+        payload: Any,
         deadline_s: float,
     ) -> dict[str, Any]:
         self.asked.append((tenant, map_name, robot, operation, payload, deadline_s))
@@ -53,9 +53,9 @@ class FakeOwners:
             return answer
         key = (tenant, map_name, robot)
         next_number = self._next.get(key, 0)
-        if payload["number"] > next_number:
+        if payload.number > next_number:
             raise Conflict(f"the next keyframe is {next_number}", hint="send the earlier ones first")
-        self._next[key] = max(next_number, payload["number"] + 1)
+        self._next[key] = max(next_number, payload.number + 1)
         return {"number": self._next[key], "version": len(self.asked)}
 
     async def list_maps(self, tenant: str) -> list[dict[str, Any]]:

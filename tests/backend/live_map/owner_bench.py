@@ -8,10 +8,13 @@ import random
 from collections.abc import Callable, Coroutine
 from typing import Any, TypeVar
 
+import msgspec
+
 from rse_pf.accounts import TenantAccount
 from rse_pf.backend.live_map.owner.lease import LeaseRecord, OwnerLease, decode_lease, lease_name, map_folder
 from rse_pf.backend.live_map.owner.live_owner import LiveOwner, OwnerContext
 from rse_pf.backend.live_map.owner.log import LiveLog
+from rse_pf.backend.live_map.owner.requests import encode_request
 from rse_pf.backend.live_map.owner.state import MapState, take_over
 from rse_pf.backend.live_map.owner.work.threads import Urgency
 from rse_pf.backend.log import JsonLog
@@ -131,12 +134,16 @@ class OwnerBench:
     async def keyframe(
         self, number: int, features: bytes = b"good", robot: RobotId = ROBOT
     ) -> dict[str, Any]:
-        from tests.backend.live_map.fake_map import keyframe_payload
+        from tests.backend.live_map.fake_map import keyframe_request
 
-        return await self.owner.answer(robot, "live-keyframe", keyframe_payload(number, features))
+        request = encode_request(keyframe_request(number, features))
+        return await self.owner.answer(robot, "live-keyframe", request)
 
-    async def ask(self, operation: str, payload: dict[str, Any] | None = None) -> dict[str, Any]:
-        return await self.owner.answer(ROBOT, operation, payload or {})
+    async def ask(
+        self, operation: str, payload: dict[str, Any] | None = None, robot: RobotId = ROBOT
+    ) -> dict[str, Any]:
+        request = msgspec.msgpack.encode({"map": MAP, **(payload or {})})
+        return await self.owner.answer(robot, operation, request)
 
     def newest(self, kind: str) -> dict[str, Any]:
         return [payload for payload in self.told if payload["kind"] == kind][-1]

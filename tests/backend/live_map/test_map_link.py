@@ -20,9 +20,10 @@ from rse_pf.config import PlatformSettings
 from rse_pf.errors import Busy, NotFound
 from rse_pf.identity import RobotId
 from rse_pf.object_store import MemoryStore
+from rse_pf.wire.live_map import KeyframeRequest
 
 LEASE = lease_name("default", "warehouse")
-FIRST = {"number": 0, "segment": 0}
+FIRST = KeyframeRequest(map="warehouse", segment=0, number=0, keyframe=b"")
 ROBOT = RobotId("default", "robot-1")
 
 

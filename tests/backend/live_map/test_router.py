@@ -29,20 +29,29 @@ from rse_pf.errors import (
     StoreError,
     StoreFull,
 )
+from rse_pf.geometry import Camera
 from rse_pf.identity import RobotId
-from rse_pf.live_map.keyframe_code import encode_features
+from rse_pf.slam.keyframe import MAX_KEYFRAME_BYTES, Keyframe, decode_keyframe, encode_keyframe, make_features
 from rse_pf.wire import Command, Failure, Result, Update
+from rse_pf.wire.live_map import KeyframeRequest
+from tests.slam.v1_features import features_v1
 
 CAMERA = {"fx": 525.0, "fy": 525.0, "cx": 319.5, "cy": 239.5, "width": 640, "height": 480}
 POSE = [1, 0, 0, 0.5, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
 
 
-FEATURES = encode_features(
-    np.full((300, 2), 7.5), np.full(300, 2.0), np.arange(9600, dtype=np.uint8).reshape(300, 32)
-)
+SEEN = np.full((300, 2), 7.5), np.full(300, 2.0), np.arange(9600, dtype=np.uint8).reshape(300, 32)
+FEATURES = features_v1(*SEEN)
+KEYFRAME = encode_keyframe(
+    Keyframe(
+        timestamp_s=1.5, T_odom_camera=np.array(POSE, dtype=float).reshape(4, 4), camera=Camera(**CAMERA),
+        features=make_features(*SEEN),
+    )
+)  # fmt: skip
 
 
 def keyframe(number: int = 0, **changes: Any) -> dict[str, Any]:
+    """Return a keyframe as robots of protocol version 1 send it."""
     return {
         "map": "m", "segment": 0, "number": number, "timestamp_s": 1.5, "T_odom_camera": POSE,
         "camera": CAMERA, "features": FEATURES, **changes,
@@ -119,21 +128,20 @@ def test_a_keyframe_goes_to_the_owner_of_its_tenants_map_and_the_reply_comes_bac
         [(tenant, name, robot, operation, payload, deadline_s)] = parts.owners.asked
         assert (tenant, name, robot, operation) == ("acme", "m", RobotId("acme", "bob"), "live-keyframe")
         assert 4.0 < deadline_s <= 5.0
-        assert payload == {
-            "segment": 0, "number": 0, "timestamp_s": 1.5, "features": FEATURES,
-            "T_odom_camera": np.array(POSE, "<f8").tobytes(),
-            "camera": [525.0, 525.0, 319.5, 239.5, 640, 480],
-        }  # fmt: skip
+        assert payload == KeyframeRequest(map="m", segment=0, number=0, keyframe=KEYFRAME)
 
     with_router(test)
 
 
-def test_features_arrive_the_same_from_json_and_from_messagepack() -> None:
+def test_a_keyframe_arrives_the_same_in_both_versions_from_json_and_from_messagepack() -> None:
     async def test(parts: Parts) -> None:
         for number, sent in enumerate((FEATURES, base64.b64encode(FEATURES).decode())):
             await parts.ask("live-keyframe", keyframe(number, features=sent))
+        for number, sent in enumerate((KEYFRAME, base64.b64encode(KEYFRAME).decode()), start=2):
+            await parts.ask("live-keyframe", {"map": "m", "segment": 0, "number": number, "keyframe": sent})
 
-        assert [asked[4]["features"] for asked in parts.owners.asked] == [FEATURES] * 2
+        assert [asked[4].keyframe for asked in parts.owners.asked] == [KEYFRAME] * 4
+        assert [asked[4].number for asked in parts.owners.asked] == [0, 1, 2, 3]
 
     with_router(test)
 
@@ -176,6 +184,39 @@ WRONG = [
 def test_an_invalid_keyframe_is_refused_before_any_owner_sees_it(changes: Any, code: str) -> None:
     async def test(parts: Parts) -> None:
         answer = await parts.ask("live-keyframe", keyframe(**changes))
+
+        assert isinstance(answer, Failure)
+        assert (answer.code, bool(answer.hint)) == (code, True), answer
+        assert parts.owners.asked == []
+
+    with_router(test)
+
+
+def absurd() -> bytes:
+    """Return a keyframe that is 2,000 km away from its start."""
+    far = decode_keyframe(KEYFRAME)
+    far.T_odom_camera[0, 3] = 2e6
+    return encode_keyframe(far)
+
+
+WRONG_KEYFRAMES = [
+    (7, "bad-request"),
+    ("no base64!", "bad-request"),
+    (KEYFRAME[:-1], "bad-request"),
+    (KEYFRAME + b"x", "bad-request"),
+    (b"", "bad-request"),
+    (FEATURES, "bad-request"),
+    (absurd(), "bad-request"),
+    (bytes(MAX_KEYFRAME_BYTES + 1), "too-large"),
+    ("AAAA" * (MAX_KEYFRAME_BYTES // 3 + 2), "too-large"),
+]
+
+
+@pytest.mark.parametrize(("sent", "code"), WRONG_KEYFRAMES)
+def test_an_invalid_keyframe_of_version_2_is_refused_before_any_owner_sees_it(sent: Any, code: str) -> None:
+    async def test(parts: Parts) -> None:
+        payload = {"map": "m", "segment": 0, "number": 0, "keyframe": sent}
+        answer = await parts.ask("live-keyframe", payload)
 
         assert isinstance(answer, Failure)
         assert (answer.code, bool(answer.hint)) == (code, True), answer
@@ -291,7 +332,7 @@ def test_a_sender_of_garbage_loses_the_live_maps_for_a_while_and_the_others_do_n
     async def test(parts: Parts) -> None:
         hostile, good = FakeReader("hostile"), FakeReader("good")
         parts.owners.answer = lambda operation, payload: (
-            BadRequest("a keyframe of 10 km away") if payload["segment"] else {}
+            BadRequest("a keyframe of 10 km away") if payload.segment else {}
         )
         for _ in range(9):
             await parts.ask("live-keyframe", keyframe(segment=1), connection=hostile)

@@ -18,8 +18,8 @@ from rse_pf.auth.roster import scopes_allow
 from rse_pf.backend.live_map.router import LIVE_SERVICES
 from rse_pf.data_server.routes import ROUTES
 from rse_pf.errors import Forbidden
-from rse_pf.live_map.keyframe_code import encode_features
 from rse_pf.services.builtin import builtin_services
+from tests.slam.v1_features import features_v1
 
 pytestmark = [pytest.mark.slow, pytest.mark.system]
 
@@ -28,7 +28,7 @@ CAMERA = {"fx": 525.0, "fy": 525.0, "cx": 319.5, "cy": 239.5, "width": 640, "hei
 
 def keyframe(number: int) -> dict[str, Any]:
     noise = np.random.default_rng(number)
-    features = encode_features(
+    features = features_v1(
         noise.uniform(10, 400, (300, 2)), np.full(300, 2.0), noise.integers(0, 255, (300, 32), dtype=np.uint8)
     )
     return {

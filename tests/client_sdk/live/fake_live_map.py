@@ -6,6 +6,7 @@ import asyncio
 from collections.abc import AsyncIterator, Callable
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from client_sdk.answers import Answer, PoseAnswer
@@ -115,7 +116,7 @@ class FakeLiveRobot:
         return {"keyframes": len(self.kept) + self.foreign_keyframes, "you": you}
 
     def _keyframe(self, request: Any) -> Any:
-        keyframe = as_type(request, KeyframeRequest)
+        keyframe = as_type(msgspec.to_builtins(request, builtin_types=(bytes,)), KeyframeRequest)
         if keyframe.number > len(self.kept):
             raise Conflict(f"keyframe {len(self.kept)} comes next")
         if keyframe.number == len(self.kept):
@@ -123,7 +124,7 @@ class FakeLiveRobot:
         return {"number": len(self.kept), "version": len(self.kept)}
 
     def _relocalise(self, request: Any) -> Any:
-        as_type(request, LiveRelocalise)
+        as_type(msgspec.to_builtins(request, builtin_types=(bytes,)), LiveRelocalise)
         return self.relocalised
 
     def _leave(self, request: Any) -> Any:

@@ -16,11 +16,11 @@ from client_sdk.answers import PoseAnswer
 from client_sdk.frontend import Frame, PoseQuery, TrackedFrame
 from client_sdk.live import BlockingLiveMapper, Correction, LiveMapper, LiveOptions
 from client_sdk.live.sender import keyframe_request
-from client_sdk.live.waiting_keyframes import Base, KeyframeWaits, WaitingKeyframes, rebased
+from client_sdk.live.waiting_keyframes import Base, WaitingKeyframe, WaitingKeyframes, rebased
 from rse_pf.config import SessionSettings
 from rse_pf.errors import BadRequest, Busy, Forbidden, UsageError
 from rse_pf.geometry import exp_se3
-from rse_pf.live_map.keyframe_code import decode_features, encode_features
+from rse_pf.slam.keyframe import Keyframe, decode_keyframe, encode_keyframe, make_features
 from rse_pf.wire import Command, make_codec
 from tests.client_sdk.live.fake_live_map import FakeLiveRobot, alignment, failing, solve
 from tests.client_sdk.mapper.flat_world import CAMERA, STEP_M, frame_at
@@ -46,6 +46,11 @@ async def drive(mapper: LiveMapper, rows: range) -> list[TrackedFrame]:
     return [await mapper.track(frame_at(row, depth=True)) for row in rows]
 
 
+def times_s(robot: FakeLiveRobot) -> list[float]:
+    """Return the times of the keyframes that the map has."""
+    return [decode_keyframe(request.keyframe).timestamp_s for request in robot.kept]
+
+
 def dark(row: int) -> Frame:
     """Return a frame without features."""
     frame = frame_at(row, depth=True)
@@ -61,11 +66,11 @@ def test_a_keyframe_each_10_cm_is_kept_by_the_map_in_order() -> None:
             await robot.until(lambda: mapper.keyframes_waiting == 0)
 
             assert [each.number for each in robot.kept] == [0, 1, 2]
-            assert [each.timestamp_s for each in robot.kept] == [0.0, 0.4, 0.8]  # 4 steps are 12.8 cm
-            pose = robot.kept[2].T_odom_camera.reshape(4, 4)
-            np.testing.assert_allclose(pose[:3, 3], [8 * STEP_M, 0, 0], atol=0.02)
-            features = decode_features(robot.kept[2].features, CAMERA)
-            assert 100 < len(features) <= QUICK.features
+            assert times_s(robot) == [0.0, 0.4, 0.8]  # 4 steps are 12.8 cm
+            keyframe = decode_keyframe(robot.kept[2].keyframe)
+            np.testing.assert_allclose(keyframe.T_odom_camera[:3, 3], [8 * STEP_M, 0, 0], atol=0.02)
+            assert keyframe.camera == CAMERA
+            assert 100 < len(keyframe.features) <= QUICK.features
             assert mapper.keyframes == 3
             assert mapper.report()["live"]["keyframes_kept"] == 3
         assert "live-leave" in robot.asked
@@ -95,16 +100,16 @@ def test_the_robots_own_cloud_is_made_of_its_keyframes_beside_its_frames() -> No
 def test_the_largest_keyframe_takes_at_most_34_kb_in_every_codec(codec: str) -> None:
     rng = np.random.default_rng(0)
     count = LiveOptions().sent_with(codec).features
-    features = encode_features(
+    features = make_features(
         rng.uniform([0, 0], [640, 480], (count, 2)), rng.uniform(0.3, 8.0, count),
         rng.integers(0, 256, (count, 32), dtype=np.uint8),
     )  # fmt: skip
-    waits = KeyframeWaits(
-        index=10**6, segment=999, timestamp_s=1.8e9 + 0.123456789,
-        T_odom_camera=tuple(rng.uniform(-1e3, 1e3, 16).tolist()),
-        camera=(525.123456789, 525.123456789, 319.512345, 239.512345, 640, 480), features=features,
+    keyframe = Keyframe(
+        timestamp_s=1.8e9 + 0.123456789, T_odom_camera=exp_se3(rng.uniform(-3.0, 3.0, 6)), camera=CAMERA,
+        features=features,
     )  # fmt: skip
-    request = keyframe_request("warehouse", waits, Base(10**6, 10))
+    waiting = WaitingKeyframe(10**6, 999, encode_keyframe(keyframe))
+    request = keyframe_request("warehouse", waiting, Base(10**6, 10))
 
     message = make_codec(codec, SessionSettings()).encode(
         Command(id=10**6, service="live-keyframe", payload=request, deadline_ms=5000.0)
@@ -190,7 +195,7 @@ def test_keyframes_wait_on_disk_while_offline_and_arrive_once_in_order(tmp_path:
             await robot.until(lambda: mapper.keyframes_waiting == 0)
 
             assert [each.number for each in robot.kept] == [0, 1, 2, 3]
-            assert sorted(each.timestamp_s for each in robot.kept) == [0.0, 0.4, 0.8, 1.2]
+            assert sorted(times_s(robot)) == [0.0, 0.4, 0.8, 1.2]
             assert not list((tmp_path / "lab").glob("*.keyframe"))
 
     run(work)
@@ -374,7 +379,7 @@ def test_a_busy_map_is_asked_again_and_a_refused_keyframe_leaves_no_gap() -> Non
             await robot.until(lambda: mapper.keyframes_waiting == 0)
 
             assert [(each.number, each.segment) for each in robot.kept] == [(0, 0), (1, 0)]
-            assert [each.timestamp_s for each in robot.kept] == [0.0, 0.8]
+            assert times_s(robot) == [0.0, 0.8]
             assert mapper.report()["live"]["keyframes_refused"] == 1
 
     run(work)

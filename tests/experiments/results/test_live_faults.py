@@ -18,11 +18,11 @@ from rse_pf.experiments.results.live_error import LIVE_RECORDS, TRUTH
 from rse_pf.experiments.results.live_faults import fault_rows, live_fault_figures
 from rse_pf.experiments.results.log_replay import read_log
 from rse_pf.experiments.results.records import CommandRecord, Records
-from rse_pf.geometry import exp_se3
+from rse_pf.geometry import Camera, exp_se3
 from rse_pf.identity import DEFAULT_TENANT
-from rse_pf.live_map.events import KeyframeAdded, OwnerChanged, encode_events, matrix_bytes
-from rse_pf.live_map.keyframe_code import encode_features
+from rse_pf.live_map.events import KeyframeAdded, OwnerChanged, encode_events
 from rse_pf.object_store import DirectoryStore
+from rse_pf.slam.keyframe import Keyframe, encode_keyframe, make_features
 
 NUMBERS = range(4)
 FAULT_S, RELEASED_S, SERVING_S = 12.0, 12.5, 14.25
@@ -31,12 +31,13 @@ FAULT_S, RELEASED_S, SERVING_S = 12.0, 12.5, 14.25
 def keyframe(number: int, *, stamp: float | None = None) -> KeyframeAdded:
     rng = np.random.default_rng(number)
     pixels, descriptors = rng.uniform(10, 200, (40, 2)), rng.integers(0, 256, (40, 32), dtype=np.uint8)
-    return KeyframeAdded(
-        robot="robot-1", segment=0, number=number, timestamp_s=number / 5 if stamp is None else stamp,
-        T_odom_camera=matrix_bytes(exp_se3([0.1 * number, 0, 0, 0, 0, 0])),
-        camera=(500.0, 500.0, 159.5, 119.5, 320, 240),
-        features=encode_features(pixels, rng.uniform(1, 3, 40), descriptors),
-    )  # fmt: skip
+    made = Keyframe(
+        timestamp_s=number / 5 if stamp is None else stamp,
+        T_odom_camera=exp_se3([0.1 * number, 0, 0, 0, 0, 0]),
+        camera=Camera(fx=500.0, fy=500.0, cx=159.5, cy=119.5, width=320, height=240),
+        features=make_features(pixels, rng.uniform(1, 3, 40), descriptors),
+    )
+    return KeyframeAdded(robot="robot-1", segment=0, number=number, data=encode_keyframe(made))
 
 
 def write_run(folder: Path, keyframes: list[KeyframeAdded], *, fault: str = "kill", **more: Any) -> Records:

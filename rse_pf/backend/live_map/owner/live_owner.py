@@ -33,7 +33,7 @@ from rse_pf.backend.live_map.owner.work.waits import FIRST_RETRY_S, Sleep, next_
 from rse_pf.backend.live_map.owner.work.whole_fit import WholeFit, fit_here
 from rse_pf.backend.log import JsonLog
 from rse_pf.config import LiveSettings
-from rse_pf.errors import Conflict, InternalError, NotFound, StoreError, StoreFull, UnknownService
+from rse_pf.errors import Conflict, InternalError, NotFound, StoreError, StoreFull
 from rse_pf.identity import RobotId
 from rse_pf.live_map.events import Event, KeyframeAdded, MapStarted, RobotForgotten, RobotLeft
 from rse_pf.live_map.outcomes import (
@@ -46,6 +46,8 @@ from rse_pf.live_map.outcomes import (
     Unaligned,
 )
 from rse_pf.maps.registry import MapRegistry
+from rse_pf.slam.keyframe import decode_keyframe
+from rse_pf.wire.live_map import KeyframeRequest, LiveForget, LiveMapRequest, LiveRelocalise, LiveStart
 
 __all__ = ["LiveOwner", "OwnerContext"]
 
@@ -56,7 +58,7 @@ _LAST_VERSION_S = 3.0
 _UNUSED_SHARE = 1.0 / 6.0
 """A map that got no command for this share of ``live.idle_s`` is only watched."""
 _EVENT_BYTES = 512
-"""Of a keyframe's event in the log, without what it saw."""
+"""Size of a keyframe's event in the log, without the keyframe."""
 _WAITING = "waiting for the store"
 _ALIGNING = (Joined, Corrected, Unaligned, Ambiguous, LinkRemoved)
 
@@ -162,8 +164,8 @@ class LiveOwner:
             await asyncio.gather(*self._tasks, return_exceptions=True)
             self._writer.refuse_all(self._moving)
 
-    async def answer(self, robot: RobotId, operation: str, payload: dict[str, Any]) -> dict[str, Any]:
-        """Do what a robot or an operator asks for.
+    async def answer(self, robot: RobotId, operation: str, request: bytes) -> dict[str, Any]:
+        """Do what a robot or an operator asks for, in a request that `encode_request` encoded.
 
         Raises:
             Busy: The map moves to another owner.
@@ -173,7 +175,7 @@ class LiveOwner:
             raise self._moving()
         self._names[robot.folder] = robot.name
         self._note_use(is_used=True)
-        reply = await self._reply_to(robot, operation, payload)
+        reply = await self._reply_to(robot, operation, request)
         while (
             operation != requests.STOP and not self._is_owner()
         ):  # paused, or cut off from the store: the map may be another's
@@ -189,12 +191,22 @@ class LiveOwner:
 
     # --- requests -----------------------------------------------------------------------------------
 
-    async def _reply_to(self, robot: RobotId, operation: str, payload: dict[str, Any]) -> dict[str, Any]:
+    async def _reply_to(self, robot: RobotId, operation: str, data: bytes) -> dict[str, Any]:
+        match requests.decode_request(operation, data):
+            case KeyframeRequest() as request:
+                return await self._take_keyframe(robot, request)
+            case LiveRelocalise() as request:
+                return await self._relocalise(request)
+            case LiveForget() as request:
+                return await self._forget(request)
+            case LiveStart() as request:
+                return await self._start_from(request)
+            case LiveMapRequest():
+                return await self._reply_about(robot, operation)
+
+    async def _reply_about(self, robot: RobotId, operation: str) -> dict[str, Any]:
+        """Answer an operation whose request names the map alone."""
         match operation:
-            case requests.KEYFRAME:
-                return await self._take_keyframe(robot, payload)
-            case requests.RELOCALISE:
-                return await self._relocalise(payload)
             case requests.LEAVE:
                 return await self._leave(robot)
             case requests.SHOW:
@@ -205,16 +217,12 @@ class LiveOwner:
                 return version_reply(
                     self._context.map_name, await self._publisher.publish(f"published by {robot}")
                 )
-            case requests.STOP:
-                return await self._stop()
-            case requests.FORGET:
-                return await self._forget(requests.to_request(payload, requests.ForgetRequest))
-            case requests.START:
-                return await self._start_from(requests.to_request(payload, requests.StartRequest))
-        raise UnknownService(f"no operation {operation[:80]!r} of live maps", hint="see docs/protocol.md")
+        return await self._stop()
 
-    async def _take_keyframe(self, robot: RobotId, payload: dict[str, Any]) -> dict[str, Any]:
-        event = requests.keyframe_event(robot, payload)
+    async def _take_keyframe(self, robot: RobotId, request: KeyframeRequest) -> dict[str, Any]:
+        event = KeyframeAdded(
+            robot=robot.folder, segment=request.segment, number=request.number, data=request.keyframe
+        )
         key = event.robot, event.number
         adding = self._adding.get(key)  # the robot has sent it twice
         if adding is None:
@@ -232,8 +240,8 @@ class LiveOwner:
             if verdict == "known":
                 return
             if verdict == "new":
-                await self._charge(len(event.features) + _EVENT_BYTES)
-                await asyncio.shield(self._writer.submit(event, len(event.features)))
+                await self._charge(len(event.data) + _EVENT_BYTES)
+                await asyncio.shield(self._writer.submit(event, len(event.data)))
                 return
             before = self._adding.get((event.robot, event.number - 1))
             if before is not None:
@@ -266,13 +274,10 @@ class LiveOwner:
                 pass
         self._unsaved_bytes += size
 
-    async def _relocalise(self, payload: dict[str, Any]) -> dict[str, Any]:
-        request = requests.to_request(payload, requests.RelocaliseRequest)
-        camera = requests.camera_of(request.camera)
+    async def _relocalise(self, request: LiveRelocalise) -> dict[str, Any]:
+        view = decode_keyframe(request.keyframe)
         threads, live_map = self._context.threads, self._state.live_map
-        look = await threads.compute(
-            Urgency.ANSWER, functools.partial(live_map.relocalising, camera, request.features)
-        )
+        look = await threads.compute(Urgency.ANSWER, functools.partial(live_map.relocalising, view))
         position = self._state.position
         return relocalise_reply(await threads.look(look), position)
 
@@ -287,7 +292,7 @@ class LiveOwner:
             self._start(self._publisher.publish_due())
         return {}
 
-    async def _forget(self, request: requests.ForgetRequest) -> dict[str, Any]:
+    async def _forget(self, request: LiveForget) -> dict[str, Any]:
         known = await self._context.threads.compute(
             Urgency.ANSWER, lambda: list(self._state.live_map.contributors)
         )
@@ -301,7 +306,7 @@ class LiveOwner:
             await asyncio.shield(self._writer.submit(RobotForgotten(robot=folder)))
         return {"forgotten": len(folders), "version": self._state.position}
 
-    async def _start_from(self, request: requests.StartRequest) -> dict[str, Any]:
+    async def _start_from(self, request: LiveStart) -> dict[str, Any]:
         if self._state.changes or self._state.keyframes:
             raise Conflict(
                 f"the live map {self._context.map_name!r} has begun already",
@@ -318,7 +323,7 @@ class LiveOwner:
             event = MapStarted(source="", keyframes=())
         if request.source or request.equal_rooms_m:
             event = msgspec.structs.replace(event, equal_rooms_m=request.equal_rooms_m)
-            await self._charge(sum(len(each.features) + _EVENT_BYTES for each in event.keyframes))
+            await self._charge(sum(len(start.data) + _EVENT_BYTES for start in event.keyframes))
             await asyncio.shield(self._writer.submit(event))
         return {"keyframes": self._state.keyframes, "version": self._state.position}
 

@@ -182,9 +182,9 @@ class _Link:
 
     async def _take(self, message: list[Any]) -> None:
         match message:
-            case ["request", int(number), [str(), str(), str()] as robot, str(operation), dict(payload)]:
+            case ["request", int(number), [str(), str(), str()] as robot, str(operation), bytes(request)]:
                 await self._in_work.acquire()
-                task = asyncio.ensure_future(self._answer(number, RobotId(*robot), operation, payload))
+                task = asyncio.ensure_future(self._answer(number, RobotId(*robot), operation, request))
                 self._tasks.add(task)
                 task.add_done_callback(self._tasks.discard)
             case ["watch"]:
@@ -195,9 +195,9 @@ class _Link:
                 self.is_watching = False
                 self._updates.clear()
 
-    async def _answer(self, number: int, robot: RobotId, operation: str, payload: dict[str, Any]) -> None:
+    async def _answer(self, number: int, robot: RobotId, operation: str, request: bytes) -> None:
         try:
-            self.say(["answer", number, await self._owner.answer(robot, operation, payload)])
+            self.say(["answer", number, await self._owner.answer(robot, operation, request)])
         except MapMoves:
             self.say(["again", number])
         except RsePfError as error:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from rse_pf.geometry import Array
-from rse_pf.live_map.events import KeyframeAdded, matrix_bytes, matrix_of
+from rse_pf.live_map.events import KeyframeAdded, matrix_bytes
 from rse_pf.live_map.outcomes import Alignment, Corrected, Outcome
 
 __all__ = ["UpdateBook", "upper_triangle"]
@@ -64,13 +64,13 @@ class UpdateBook:
         found = self._alignments.get(event.robot)
         if found is None or not found.aligned or found.segment != event.segment or found.T_map_odom is None:
             return []
-        T_map_camera = found.T_map_odom @ matrix_of(event.T_odom_camera, 4, 4)
+        T_map_camera = found.T_map_odom @ event.keyframe.T_odom_camera
         return self._put(
             {
                 "kind": "pose",
                 "robot": self._name_of(event.robot),
                 "segment": event.segment,
-                "timestamp_s": event.timestamp_s,
+                "timestamp_s": event.keyframe.timestamp_s,
                 "T_map_camera": matrix_bytes(T_map_camera),
             }
         )

@@ -6,7 +6,6 @@ import asyncio
 from collections.abc import Awaitable, Callable
 from typing import Any, cast
 
-import numpy as np
 import pytest
 
 from rse_pf.backend.live_map.owner.work.entries import EntryWriter, Submitted
@@ -43,10 +42,7 @@ class Store:
 
 
 def keyframe(number: int) -> Event:
-    return KeyframeAdded(
-        robot="r", number=number, segment=0, timestamp_s=0.0, T_odom_camera=np.eye(4).tobytes(),
-        camera=(1.0, 1.0, 1.0, 1.0, 2, 2), features=b"",
-    )  # fmt: skip
+    return KeyframeAdded(robot="r", number=number, segment=0, data=b"")
 
 
 def writer(taker: Taker) -> EntryWriter:

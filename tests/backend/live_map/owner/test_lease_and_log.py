@@ -23,7 +23,8 @@ from rse_pf.errors import BadRequest, StoreError, Unauthorized
 from rse_pf.identity import RobotId
 from rse_pf.live_map.events import OwnerChanged, encode_events
 from rse_pf.object_store import MemoryStore
-from tests.backend.live_map.fake_map import FAKE_MAP, FakeMap
+from rse_pf.wire.live_map import LiveMapRequest, LiveStart
+from tests.backend.live_map.fake_map import FAKE_MAP, FakeMap, keyframe_request
 from tests.backend.live_map.owner_bench import FOLDER, LEASE, HandClock
 
 LEASE_S = 1.5
@@ -294,7 +295,8 @@ def test_robots_are_shown_by_name_and_found_whatever_their_enrolment():
 
 
 def test_only_a_first_keyframe_or_an_operator_begins_a_map():
-    assert begins_a_map("live-keyframe", {"number": 0, "segment": 0})
-    assert begins_a_map("live-start", {})
-    assert not begins_a_map("live-keyframe", {"number": 1, "segment": 0})
-    assert not begins_a_map("live-show", {})
+    assert begins_a_map(keyframe_request(0))
+    assert begins_a_map(LiveStart(map="m"))
+    assert not begins_a_map(keyframe_request(1))
+    assert not begins_a_map(keyframe_request(0, segment=1))
+    assert not begins_a_map(LiveMapRequest(map="m"))

@@ -387,7 +387,7 @@ def test_a_map_is_published_when_the_last_robot_leaves_and_the_same_map_only_onc
         await owner.ask("live-leave")
         await settle()
         assert maps.names() == []
-        await owner.owner.answer(OTHER, "live-leave", {})
+        await owner.ask("live-leave", robot=OTHER)
         await settle()
         assert maps.head(MAP).number == 1
         assert maps.head(MAP).keyframes == 2

@@ -29,7 +29,8 @@ from rse_pf.errors import Conflict, NotFound, RsePfError
 from rse_pf.identity import RobotId
 from rse_pf.live_map.events import KeyframeAdded, decode_events
 from rse_pf.object_store import DirectoryStore
-from tests.backend.live_map.fake_map import FAKE_MAP, keyframe_payload
+from rse_pf.wire.live_map import LiveMapRequest, LiveRequest
+from tests.backend.live_map.fake_map import FAKE_MAP, keyframe_request
 
 MAP, ROBOT = "warehouse", RobotId("default", "robot-1")
 KIND = "tests.backend.live_map.fake_map:FAKE_MAP"
@@ -48,11 +49,11 @@ class Servers:
 
     async def send(self, links: OwnerLinks, number: int) -> dict[str, Any]:
         return await links.request(
-            "default", MAP, ROBOT, "live-keyframe", keyframe_payload(number), PATIENT_S
+            "default", MAP, ROBOT, "live-keyframe", keyframe_request(number), PATIENT_S
         )
 
     async def show(self, links: OwnerLinks) -> dict[str, Any]:
-        return await links.request("default", MAP, ROBOT, "live-show", {}, PATIENT_S)
+        return await links.request("default", MAP, ROBOT, "live-show", LiveMapRequest(map=MAP), PATIENT_S)
 
     async def owner(self) -> OwnerChild:
         """Return the process that serves the map; on a busy machine another one may be about to."""
@@ -145,7 +146,7 @@ def test_a_tenant_that_holds_most_owners_gives_one_up_within_seconds(
 
             async def drive(robot: RobotId, name: str, number: int) -> dict[str, Any]:
                 return await both.a.request(
-                    robot.tenant, name, robot, "live-keyframe", keyframe_payload(number), PATIENT_S
+                    robot.tenant, name, robot, "live-keyframe", keyframe_request(number), PATIENT_S
                 )
 
             async def drive_on(name: str) -> None:
@@ -153,7 +154,7 @@ def test_a_tenant_that_holds_most_owners_gives_one_up_within_seconds(
                 while True:
                     with contextlib.suppress(RsePfError):
                         await both.a.request(
-                            "acme", name, hostile, "live-keyframe", keyframe_payload(number), 1.0
+                            "acme", name, hostile, "live-keyframe", keyframe_request(number), 1.0
                         )
                         number += 1
 
@@ -205,22 +206,22 @@ def test_one_tenant_fills_the_disk_and_is_told_so_while_the_other_ones_keyframes
     async def test(disk: Path) -> None:
         async with servers(disk, publish_pause_s=0.5) as both:
 
-            async def ask(robot: RobotId, operation: str, payload: dict[str, Any]) -> dict[str, Any]:
+            async def ask(robot: RobotId, operation: str, request: LiveRequest) -> dict[str, Any]:
                 links = both.a if robot is hostile else both.b
-                return await links.request(robot.tenant, MAP, robot, operation, payload, PATIENT_S)
+                return await links.request(robot.tenant, MAP, robot, operation, request, PATIENT_S)
 
             kept, number, refused = 0, 0, Counter[str]()
             for turn in range(1500):
                 try:
-                    await ask(hostile, "live-keyframe", keyframe_payload(number, os.urandom(30_000)))
+                    await ask(hostile, "live-keyframe", keyframe_request(number, os.urandom(30_000)))
                     number += 1
                 except RsePfError as error:
                     refused[error.code] += 1
                     if refused.total() > 50:
                         break
-                await ask(hostile, "live-leave", {})
+                await ask(hostile, "live-leave", LiveMapRequest(map=MAP))
                 if not turn % 10 or refused:
-                    answer = await ask(victim, "live-keyframe", keyframe_payload(kept, os.urandom(30_000)))
+                    answer = await ask(victim, "live-keyframe", keyframe_request(kept, os.urandom(30_000)))
                     kept += 1
                     assert answer["number"] == kept
             assert set(refused) == {"store-full"}
@@ -255,7 +256,7 @@ def test_two_servers_that_begin_a_map_at_the_same_time_share_one_owner(tmp_path:
             other = RobotId("default", "robot-2")
             await asyncio.gather(
                 both.send(both.a, 0),
-                both.b.request("default", MAP, other, "live-keyframe", keyframe_payload(0), PATIENT_S),
+                both.b.request("default", MAP, other, "live-keyframe", keyframe_request(0), PATIENT_S),
             )
             one, two = await both.show(both.a), await both.show(both.b)
             assert one["owner"] == two["owner"]
@@ -272,9 +273,13 @@ def test_a_stopped_map_refuses_later_keyframes_and_another_tenant_sees_nothing(t
             await both.send(both.a, 0)
             stranger = RobotId("other", "robot-1")
             with pytest.raises(NotFound):
-                await both.b.request("other", MAP, stranger, "live-publish", {}, PATIENT_S)
+                await both.b.request(
+                    "other", MAP, stranger, "live-publish", LiveMapRequest(map=MAP), PATIENT_S
+                )
             assert await both.b.list_maps("other") == []
-            stopped = await both.b.request("default", MAP, ROBOT, "live-stop", {}, PATIENT_S)
+            stopped = await both.b.request(
+                "default", MAP, ROBOT, "live-stop", LiveMapRequest(map=MAP), PATIENT_S
+            )
             assert stopped["keyframes"] == 1
             with pytest.raises(Conflict, match="was stopped"):
                 await both.send(both.b, 1)
