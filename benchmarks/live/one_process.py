@@ -45,7 +45,7 @@ from rse_pf.live_map.outcomes import (
     Outcome,
     Unaligned,
 )
-from rse_pf.live_map.versions import encoded
+from rse_pf.live_map.versions import encode_stored
 
 __all__ = ["Played", "main", "play"]
 
@@ -112,7 +112,7 @@ def _send(played: Played, name: str, run: Run, number: int, tick: int) -> list[t
     """Send a keyframe, measure it, and return what robots learn of it, and when."""
     keyframe = run.version.keyframes[number]
     event = KeyframeAdded(
-        robot=name, segment=0, number=number, data=encoded(keyframe)
+        robot=name, segment=0, number=number, data=encode_stored(keyframe)
     )  # fmt: skip
     found = played.live_map.apply(event)
     added = next(each for each in found if isinstance(each, Added))

@@ -200,7 +200,7 @@ class LiveMapper:
     async def _join(self) -> None:
         self._sender = KeyframeSender(
             self._robot, self.name, self._waiting, deadline_s=self.options.deadline_s,
-            bytes_per_s=self.options.bytes_per_s, clock=self._clock, on_known=self._known,
+            bytes_per_s=self.options.bytes_per_s, clock=self._clock, on_known=self._note_introduction,
             on_sent=lambda *sent: self.sent_keyframes.append(KeyframeSent(*sent)),
         )  # fmt: skip
         self._sender.current_segment = self._segment
@@ -212,7 +212,7 @@ class LiveMapper:
             except RsePfError as error:
                 self._trouble = f"{error.code}: {error.message}"
         if len(self._waiting):
-            self._sender.added()
+            self._sender.note_added()
         self._is_open = True
         self._tasks = [asyncio.create_task(self._sender.run()), asyncio.create_task(self._follow())]
 
@@ -225,7 +225,7 @@ class LiveMapper:
         """
         self._is_open = False
         try:
-            await self._added()
+            await self._wait_for_cloud()
             if self._robot.connected and not isinstance(error, asyncio.CancelledError):
                 with contextlib.suppress(asyncio.TimeoutError):
                     await asyncio.wait_for(self._sender.wait_empty(), self.options.leave_s)
@@ -267,7 +267,7 @@ class LiveMapper:
                 features = self._mapper.features
                 if features is not None and self._is_keyframe(pose):
                     await self._keep(done, pose, features)
-            return self._placed(done)
+            return self._place_in_map(done)
 
     @property
     def aligned(self) -> bool:
@@ -428,11 +428,11 @@ class LiveMapper:
 
     async def _ask_first(self, query: PoseQuery) -> PoseAnswer:
         """Ask for a pose while keyframes wait."""
-        self._sender.pose_asked()
+        self._sender.note_pose_asked()
         try:
             return await self._ask(query)
         finally:
-            self._sender.pose_answered()
+            self._sender.note_pose_answered()
 
     def _begin_segment(self) -> None:
         """Begin an odometry frame of its own at the last known pose."""
@@ -454,16 +454,16 @@ class LiveMapper:
         data = await asyncio.to_thread(self._encode, done.frame, pose, features)
         keyframe = WaitingKeyframe(waiting.next_index, self._segment, data)
         self._last_keyframe = pose
-        await self._added()
+        await self._wait_for_cloud()
         self._adding = asyncio.ensure_future(asyncio.to_thread(self.map.add, done.frame, pose))
         if not await asyncio.to_thread(waiting.add, keyframe):
             self._dropped += 1
             return
         self._made += 1
-        self._sender.added()
+        self._sender.note_added()
         self._relocalise(keyframe, pose)
 
-    async def _added(self) -> None:
+    async def _wait_for_cloud(self) -> None:
         """Wait until the last keyframe is in the robot's own cloud."""
         if self._adding is not None:
             await self._adding
@@ -528,7 +528,7 @@ class LiveMapper:
         except BadMessage as error:
             self._trouble = f"{error.code}: {error.message}"
 
-    def _known(self, myself: Myself, base: Base) -> None:
+    def _note_introduction(self, myself: Myself, base: Base) -> None:
         """Take how the map knows this robot."""
         self._is_known = True
         if myself.robot:
@@ -546,7 +546,7 @@ class LiveMapper:
                 listener.get_nowait()
             listener.put_nowait(correction)
 
-    def _placed(self, done: TrackedFrame) -> TrackedFrame:
+    def _place_in_map(self, done: TrackedFrame) -> TrackedFrame:
         """Return the result with its place in the map by the alignment of this moment."""
         T_map_odom, pose = self.T_map_odom, done.T_world_camera
         placed = replace(

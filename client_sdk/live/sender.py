@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 from client_sdk.answers import Answer
-from client_sdk.live.waiting_keyframes import Base, WaitingKeyframe, WaitingKeyframes, rebased
+from client_sdk.live.waiting_keyframes import Base, WaitingKeyframe, WaitingKeyframes, rebase
 from rse_pf.errors import (
     BadMessage,
     BadRequest,
@@ -128,16 +128,16 @@ class KeyframeSender:
         self._one_introduction = asyncio.Lock()
         self._is_known = False
 
-    def added(self) -> None:
+    def note_added(self) -> None:
         """Take that a keyframe was added."""
         self._empty.clear()
         self._added.set()
 
-    def pose_asked(self) -> None:
+    def note_pose_asked(self) -> None:
         """Take that a pose is asked for: keyframes wait."""
         self._quiet.clear()
 
-    def pose_answered(self) -> None:
+    def note_pose_answered(self) -> None:
         """Take that no pose is asked for any more."""
         self._quiet.set()
 
@@ -179,7 +179,7 @@ class KeyframeSender:
         """Number the waiting keyframes as the map expects them."""
         waiting = self._waiting
         segment = waiting.first().segment if len(waiting) else self.current_segment
-        base, known = rebased(
+        base, known = rebase(
             waiting.base,
             Base(waiting.first_index, segment),
             waiting.next_index,

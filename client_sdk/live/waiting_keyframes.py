@@ -24,7 +24,7 @@ from rse_pf.files import TEMPORARY_PREFIX, replace_file
 from rse_pf.geometry import Camera
 from rse_pf.slam.keyframe_v1 import CameraNumbers, keyframe_of_v1
 
-__all__ = ["Base", "WaitingKeyframe", "WaitingKeyframes", "rebased"]
+__all__ = ["Base", "WaitingKeyframe", "WaitingKeyframes", "rebase"]
 
 _SUFFIX = ".keyframe"
 _STATE = "state.json"
@@ -244,7 +244,7 @@ def _rewrite_version_1(folder: Path) -> None:
         path.unlink()
 
 
-def rebased(base: Base | None, first: Base, end: int, wanted: Base) -> tuple[Base, int]:
+def rebase(base: Base | None, first: Base, end: int, wanted: Base) -> tuple[Base, int]:
     """Return the base to send with, and how many of the oldest waiting keyframes the map has already.
 
     Args:

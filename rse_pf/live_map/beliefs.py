@@ -31,7 +31,7 @@ _CONTRADICTIONS = 16
 
 @dataclass(slots=True)
 class Changes:
-    """What happened to links: outcomes, and the keyframes around which the graph must be smoothed."""
+    """Changes of links: their outcomes, and the keyframes around which the graph must be smoothed."""
 
     outcomes: list[Outcome] = field(default_factory=list)
     moved: list[int] = field(default_factory=list)

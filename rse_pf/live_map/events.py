@@ -67,7 +67,7 @@ class MeasuredLink(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class LinksMeasured(msgspec.Struct, frozen=True, kw_only=True, tag="links"):
-    """What `measure` found for a keyframe, and how many candidates failed, by reason."""
+    """The links that `measure` found for a keyframe, and the number of candidates that failed, by reason."""
 
     keyframe: int
     links: tuple[MeasuredLink, ...] = ()

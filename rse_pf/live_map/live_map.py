@@ -217,7 +217,7 @@ class LiveMap:
     def measuring(
         self, keyframe: int, pieces: int = 1, candidates: int | None = None
     ) -> list[Callable[[], LinksMeasured]]:
-        """Return what does the work of `measure`; other threads may call it while the map changes.
+        """Return functions that together do the work of `measure`, in any thread, while the map changes.
 
         The results of the pieces, one for each share of the candidates, are joined by `joined_links`.  Less
         *candidates* than those of the options are for an owner that is behind.
@@ -242,7 +242,7 @@ class LiveMap:
     def optimising(
         self, solve: Callable[[PoseGraph, OptimiseOptions], Array] | None = None
     ) -> Callable[[], Optimised]:
-        """Return what does the work of `optimise`; another thread may call it while the map changes.
+        """Return a function that does the work of `optimise`, in any thread, while the map changes.
 
         *solve* returns the poses that `optimise_graph` does, in a process of its own for example.
         """
@@ -454,10 +454,10 @@ class LiveMap:
         return window
 
     def _tell(self, cause: tuple[str, int] | None, window: SmoothedWindows | None = None) -> list[Outcome]:
-        """Return what robots must know about the alignments of their newest segments."""
+        """Return the outcomes that tell robots how the alignments of their newest segments changed."""
         graph = self._graph
         outcomes: list[Outcome] = []
-        for row, T_map_odom, is_new in self._told_anew():
+        for row, T_map_odom, is_new in self._find_new_alignments():
             segment = graph.segments[row]
             if not self._is_aligned(row):
                 if segment.told is not None:
@@ -485,7 +485,7 @@ class LiveMap:
             )  # fmt: skip
         return outcomes
 
-    def _told_anew(self) -> list[tuple[int, Array, bool]]:
+    def _find_new_alignments(self) -> list[tuple[int, Array, bool]]:
         """Return row and alignment of the newest segments, and whether it changed since it was told."""
         graph, options = self._graph, self.options
         rows = [row for row in graph.newest.values() if graph.segments[row].keyframes]

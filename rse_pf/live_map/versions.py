@@ -20,7 +20,7 @@ from rse_pf.slam.keyframe import Keyframe as SentKeyframe
 from rse_pf.slam.keyframe import decode_keyframe, encode_keyframe, make_features
 from rse_pf.slam.pose_graph import PoseGraph, is_positive_definite
 
-__all__ = ["encoded", "errors_of_maps", "started_from", "version_of", "whole_graph"]
+__all__ = ["encode_stored", "errors_of_maps", "started_from", "version_of", "whole_graph"]
 
 
 @contextlib.contextmanager
@@ -54,7 +54,8 @@ def started_from(version: MapVersion, source: str) -> MapStarted:
     return MapStarted(
         source=source,
         keyframes=tuple(
-            StartKeyframe(robot=keyframe.robot, data=encoded(keyframe)) for keyframe in version.keyframes
+            StartKeyframe(robot=keyframe.robot, data=encode_stored(keyframe))
+            for keyframe in version.keyframes
         ),
         links=tuple(
             StartLink(
@@ -87,7 +88,7 @@ def _version_of(graph: Graph, options: LiveMapOptions) -> MapVersion:
         seen = decode_keyframe(row.data)
         keyframes.append(
             Keyframe(
-                id=i, robot=_shown(row.robot), timestamp_s=row.timestamp_s,
+                id=i, robot=_short_name(row.robot), timestamp_s=row.timestamp_s,
                 T_world_camera=graph.T[i].copy(), camera=seen.camera, pixels=seen.features.pixels,
                 descriptors=seen.features.descriptors,
                 points_camera=seen.features.points_camera(seen.camera).astype(np.float32),
@@ -147,7 +148,7 @@ def _odometry(graph: Graph, ids: list[int], options: LiveMapOptions) -> list[Edg
     return edges
 
 
-def encoded(keyframe: Keyframe) -> bytes:
+def encode_stored(keyframe: Keyframe) -> bytes:
     """Return a keyframe of a version as a robot would have sent it, its pose that in the version."""
     features = make_features(keyframe.pixels, keyframe.points_camera[:, 2], keyframe.descriptors)
     return encode_keyframe(
@@ -158,6 +159,6 @@ def encoded(keyframe: Keyframe) -> bytes:
     )  # fmt: skip
 
 
-def _shown(folder: str) -> str:
+def _short_name(folder: str) -> str:
     """Return the name of a robot without its tenant and its enrolment."""
     return folder.rpartition("/")[2].partition("=")[0][:64]

@@ -50,7 +50,7 @@ class OwnerChild:
 
     @property
     def pid(self) -> int:
-        """Of the process."""
+        """The number of the process."""
         return self._process.pid
 
     @property

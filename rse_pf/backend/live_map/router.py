@@ -120,7 +120,7 @@ class LiveMapRouter:
                     "too many commands wait for live maps", hint="try again later",
                     retry_after_ms=_BUSY_RETRY_MS,
                 )  # fmt: skip
-            work = self._judged(queued, now)
+            work = self._check_command(queued, now)
         except RsePfError as error:
             if error.code in _IS_GARBAGE:
                 self._garbage.note(queued.robot, now)
@@ -133,8 +133,8 @@ class LiveMapRouter:
         self._waiting[queued.robot] = self._waiting.get(queued.robot, 0) + 1
         task.add_done_callback(self._done)
 
-    def _judged(self, queued: QueuedCommand, now: float) -> Callable[[], Any]:
-        """Return what asks the owner; raises RsePfError for a request that is not allowed or not valid."""
+    def _check_command(self, queued: QueuedCommand, now: float) -> Callable[[], Any]:
+        """Return a function that asks the owner; raises RsePfError if the request is refused."""
         command, claims = queued.command, queued.owner.claims
         robot, service = queued.robot, command.service
         deadline_s = queued.deadline_s - now

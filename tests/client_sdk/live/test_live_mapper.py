@@ -16,7 +16,7 @@ from client_sdk.answers import PoseAnswer
 from client_sdk.frontend import Frame, PoseQuery, TrackedFrame
 from client_sdk.live import BlockingLiveMapper, Correction, LiveMapper, LiveOptions
 from client_sdk.live.sender import keyframe_request
-from client_sdk.live.waiting_keyframes import Base, WaitingKeyframe, WaitingKeyframes, rebased
+from client_sdk.live.waiting_keyframes import Base, WaitingKeyframe, WaitingKeyframes, rebase
 from rse_pf.config import SessionSettings
 from rse_pf.errors import BadRequest, Busy, Forbidden, UsageError
 from rse_pf.geometry import exp_se3
@@ -475,4 +475,4 @@ def test_a_full_spool_drops_the_newest_and_a_damaged_one_is_told(tmp_path: Path)
 def test_numbers_follow_what_the_map_expects(
     base: Base | None, wanted: Base, expected: tuple[Base, int]
 ) -> None:
-    assert rebased(base, Base(4, 1), 9, wanted) == expected
+    assert rebase(base, Base(4, 1), 9, wanted) == expected

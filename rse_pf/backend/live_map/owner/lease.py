@@ -103,7 +103,7 @@ def renewal_s(lease_s: float) -> float:
 
 
 def verdict_on(record: LeaseRecord | None, *, unchanged_s: float, lease_s: float) -> LeaseVerdict:
-    """Return what a process that needs a map does about its lease.
+    """Decide how a process that needs a map treats its lease.
 
     Args:
         record: As it stands in the store; None if there is none.

@@ -146,7 +146,7 @@ class LiveOwner:
         return self._ended.done() or self._is_closing
 
     def present(self) -> list[dict[str, Any]]:
-        """Return what a new reader is told; nothing while the lease may be another's."""
+        """Return the payloads for a new reader, none while the lease may be another's."""
         return self._book.present() if self._is_owner() else []
 
     async def run(self) -> str:
@@ -211,7 +211,7 @@ class LiveOwner:
                 return await self._leave(robot)
             case requests.SHOW:
                 return await self._context.threads.compute(
-                    Urgency.ANSWER, functools.partial(self._shown, robot)
+                    Urgency.ANSWER, functools.partial(self._show, robot)
                 )
             case requests.PUBLISH:
                 return version_reply(
@@ -339,13 +339,13 @@ class LiveOwner:
             )
         return {} if record is None else version_reply(self._context.map_name, record)
 
-    def _shown(self, robot: RobotId) -> dict[str, Any]:
-        """Return what *robot* sees of the map; in the thread of the map."""
+    def _show(self, robot: RobotId) -> dict[str, Any]:
+        """Return the reply of ``live-show`` for *robot*; called in the thread of the map."""
         return show_reply(
             robot,
             self._state,
             self._lease.record,
-            told_state=self._told_state(),
+            told_state=self._name_state(),
             name_of=self._name_of,
             is_present=self._present.__contains__,
         )
@@ -516,7 +516,7 @@ class LiveOwner:
             self._untold = True
 
     def _describe(self) -> None:
-        state = self._told_state()
+        state = self._name_state()
         for payload in self._book.describe(
             keyframes=self._state.keyframes, version=self._state.position,
             owner=self._lease.record.server, state=state,
@@ -526,7 +526,7 @@ class LiveOwner:
             else:
                 self._tell(payload)
 
-    def _told_state(self) -> str:
+    def _name_state(self) -> str:
         if self._is_closing:
             return "moving"
         return _WAITING if self._is_waiting_for_store else "live"

@@ -29,7 +29,7 @@ def relocalise_reply(found: Any, version: int) -> dict[str, Any]:
 
 
 def show_missing(robot: RobotId) -> dict[str, Any]:
-    """Return what *robot* sees of a map that does not exist yet, or was stopped."""
+    """Return the reply of ``live-show`` about a map that does not exist yet, or was stopped."""
     return {
         "keyframes": 0,
         "robots": [],
@@ -52,7 +52,7 @@ def show_reply(
     name_of: Callable[[str], str],
     is_present: Callable[[str], bool],
 ) -> dict[str, Any]:
-    """Return what operators and robots see of a map.
+    """Return the reply of ``live-show``: the state of a map, and how *robot* numbers its keyframes.
 
     Args:
         robot: Who asks; ``you`` in the answer says how the robot numbers its next keyframe.

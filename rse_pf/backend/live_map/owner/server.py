@@ -107,7 +107,7 @@ class OwnerServer:
                 self._owner.users -= 1
                 self._links.discard(link)
         except RsePfError as error:
-            link.say(["refused", 0, *_told(error)])
+            link.say(["refused", 0, *_error_fields(error)])
             with contextlib.suppress(asyncio.TimeoutError):
                 await asyncio.wait_for(link.flush(), _FLUSH_S)
         except (OSError, asyncio.TimeoutError):  # the worker is gone, or is none
@@ -201,11 +201,11 @@ class _Link:
         except MapMoves:
             self.say(["again", number])
         except RsePfError as error:
-            self.say(["refused", number, *_told(error)])
+            self.say(["refused", number, *_error_fields(error)])
         except Exception as error:  # noqa: BLE001  the worker must not wait for it
             self._on_defect(error)
             refused = InternalError("the owner of the live map failed", hint="the server's log has it")
-            self.say(["refused", number, *_told(refused)])
+            self.say(["refused", number, *_error_fields(refused)])
         finally:
             self._in_work.release()
 
@@ -240,5 +240,5 @@ async def _first_message(reader: asyncio.StreamReader, frames: FrameReader) -> t
             raise ConnectionResetError
 
 
-def _told(error: RsePfError) -> list[Any]:
+def _error_fields(error: RsePfError) -> list[Any]:
     return [error.code, error.message, error.hint, error.retry_after_ms]

@@ -91,10 +91,10 @@ class UpdateBook:
         key = f"{payload['kind']}/{payload['robot']}"
         before = self._payloads.get(key)
         self._payloads[key] = payload
-        return [] if before is not None and _told(before) == _told(payload) else [payload]
+        return [] if before is not None and _without_cause(before) == _without_cause(payload) else [payload]
 
 
-def _told(payload: Payload) -> Payload:
+def _without_cause(payload: Payload) -> Payload:
     return {name: value for name, value in payload.items() if name not in _NEVER}
 
 

@@ -29,12 +29,12 @@ _ARRAYS = ("T_world_pose", "a", "b", "T_a_b", "information", "robust", "ids")
 
 
 def fit_here(graph: PoseGraph, options: OptimiseOptions) -> Array:
-    """Return what `optimise_graph` finds, in this process; raises MissingExtra."""
+    """Return the poses that `optimise_graph` finds, computed in this process; raises MissingExtra."""
     return optimise_graph(graph, options).T_world_pose
 
 
 def fit_apart(graph: PoseGraph, options: OptimiseOptions) -> Array:
-    """Return what `fit_here` does, from a process of low priority that ends with the calling thread.
+    """Return the poses of `fit_here` from a process of low priority that ends with the calling thread.
 
     Raises:
         CalledProcessError: The process failed; its error output tells why.
