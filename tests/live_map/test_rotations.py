@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from benchmarks.live.generated_drives import INFORMATION, GeneratedWorld, measured_link, straight
-from rse_pf.backend.live_map.router import _check_keyframe, _request_of
+from rse_pf.backend.live_map.router import _check_keyframe, _request_of, _upgrade
 from rse_pf.errors import BadRequest, InternalError
 from rse_pf.geometry import Array, exp_se3, inverse, rigid, rigid_many
 from rse_pf.live_map.events import KeyframeAdded, LinksMeasured
@@ -34,7 +34,7 @@ def sent(T: Array, good: KeyframeAdded, number: int) -> KeyframeAdded:
         "camera": msgspec.structs.asdict(good.keyframe.camera),
         "features": features_v1(seen.pixels, seen.depths_m, seen.descriptors),
     }  # fmt: skip
-    request = _request_of("live-keyframe", payload)
+    request = _upgrade(_request_of("live-keyframe", payload))
     _check_keyframe(request)
     assert isinstance(request, KeyframeRequest)
     return KeyframeAdded(robot="default/raw", segment=0, number=number, data=request.keyframe)

@@ -140,11 +140,12 @@ class LiveMapRouter:
         deadline_s = queued.deadline_s - now
         if service == LIVE_LIST:
             return lambda: self._list(robot.tenant, claims)
-        request = _request_of(service, {} if command.payload is None else command.payload)
+        sent = _request_of(service, {} if command.payload is None else command.payload)
         right = "maps:write" if service in _FOR_OPERATORS else "maps:live"
-        forbidden = _forbidden(claims, right, request.map)
+        forbidden = _forbidden(claims, right, sent.map)
         if forbidden is not None:
             raise forbidden
+        request = _upgrade(sent)
         _check_keyframe(request)
         return lambda: self._owners.request(robot.tenant, request.map, robot, service, request, deadline_s)
 
@@ -285,8 +286,8 @@ def _forbidden_to_read(claims: Claims | None, map_name: str) -> RsePfError | Non
     return _forbidden(claims, "maps:live", map_name)
 
 
-def _request_of(service: str, payload: Any) -> LiveRequest:
-    """Return the request of a command, one of protocol version 1 in today's form.
+def _request_of(service: str, payload: Any) -> LiveRequest | KeyframeRequestV1 | LiveRelocaliseV1:
+    """Return the typed request of a command.
 
     Raises:
         RsePfError: It is too long, or not valid.
@@ -298,9 +299,14 @@ def _request_of(service: str, payload: Any) -> LiveRequest:
         if "keyframe" not in payload and "features" in payload:
             kind = LIVE_REQUESTS_V1.get(service, kind)
     try:
-        request = as_type(payload, kind)
+        request: LiveRequest | KeyframeRequestV1 | LiveRelocaliseV1 = as_type(payload, kind)
     except BadMessage as error:
         raise BadRequest(f"{service}: {error.message}", hint=error.hint) from error
+    return request
+
+
+def _upgrade(request: LiveRequest | KeyframeRequestV1 | LiveRelocaliseV1) -> LiveRequest:
+    """Return a request of protocol version 1 in today's form, every other one as it is; raises RsePfError."""
     if isinstance(request, KeyframeRequestV1):
         T_odom_camera = request.T_odom_camera
         if T_odom_camera.size != 16:
@@ -314,8 +320,7 @@ def _request_of(service: str, payload: Any) -> LiveRequest:
     if isinstance(request, LiveRelocaliseV1):
         keyframe = keyframe_of_v1(0.0, np.eye(4), request.camera, request.features)
         return LiveRelocalise(map=request.map, keyframe=keyframe)
-    checked: LiveRequest = request
-    return checked
+    return request
 
 
 def _check_size(value: Any, what: str, most: int) -> None:
