@@ -18,7 +18,9 @@ from rse_pf.auth.roster import scopes_allow
 from rse_pf.backend.live_map.router import LIVE_SERVICES
 from rse_pf.data_server.routes import ROUTES
 from rse_pf.errors import Forbidden
+from rse_pf.geometry import Camera
 from rse_pf.services.builtin import builtin_services
+from rse_pf.slam.keyframe import Keyframe, encode_keyframe, make_features
 from tests.slam.v1_features import features_v1
 
 pytestmark = [pytest.mark.slow, pytest.mark.system]
@@ -27,13 +29,21 @@ CAMERA = {"fx": 525.0, "fy": 525.0, "cx": 319.5, "cy": 239.5, "width": 640, "hei
 
 
 def keyframe(number: int) -> dict[str, Any]:
+    """Return a keyframe as robots of protocol version 1 send it, each second one in today's form."""
     noise = np.random.default_rng(number)
-    features = features_v1(
+    seen = (
         noise.uniform(10, 400, (300, 2)), np.full(300, 2.0), noise.integers(0, 255, (300, 32), dtype=np.uint8)
-    )
+    )  # fmt: skip
+    begin = {"map": "m", "segment": 0, "number": number}
+    if number % 2:
+        made = Keyframe(
+            timestamp_s=float(number), T_odom_camera=np.eye(4), camera=Camera(**CAMERA),
+            features=make_features(*seen),
+        )  # fmt: skip
+        return {**begin, "keyframe": encode_keyframe(made)}
     return {
-        "map": "m", "segment": 0, "number": number, "timestamp_s": float(number),
-        "T_odom_camera": np.eye(4).ravel().tolist(), "camera": CAMERA, "features": features,
+        **begin, "timestamp_s": float(number), "T_odom_camera": np.eye(4).ravel().tolist(), "camera": CAMERA,
+        "features": features_v1(*seen),
     }  # fmt: skip
 
 
