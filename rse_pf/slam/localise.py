@@ -20,6 +20,9 @@ from rse_pf.slam.relative_pose import MeasuredPose, Reference, RelativePoseOptio
 
 __all__ = ["LocalisationOptions", "Localised", "PlacedKeyframe", "localise", "spread_candidates"]
 
+_MAX_M = 1e6
+"""A keyframe farther from the origin of its map than any robot drives is no rival for a place."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LocalisationOptions:
@@ -114,6 +117,8 @@ def localise(
         return Localised(verdict="none", reason="no-candidates")
     placements = []
     for candidate in candidates:
+        if not (np.abs(candidate.T_map_keyframe[:3, 3]) <= _MAX_M).all():
+            continue
         measured = measure_pose(candidate.reference, view, options.measured)
         if isinstance(measured, str) or measured.inliers < options.least_inliers:
             continue
