@@ -80,10 +80,10 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     """Do one action and return the exit code."""
     chosen = settings if args.store is None else settings.replace(data={"store": args.store})
     if chosen.data.store == "memory:":
-        kept = state_folder("default", os.environ) / "objects"
+        folder = state_folder("default", os.environ) / "objects"
         raise UsageError(
             "no store is named, and one in memory belongs to another process",
-            hint=f"name --store dir:PATH; that of rse-pf local is dir:{kept}",
+            hint=f"name --store dir:PATH; that of rse-pf local is dir:{folder}",
         )
     kind, _, path = chosen.data.store.partition(":")
     if kind == "dir" and not os.path.isdir(path):
@@ -114,8 +114,8 @@ def _merge(args: argparse.Namespace, settings: PlatformSettings) -> int:
         )
     store = open_data_store(settings)
 
-    def record(action: str, name: str, made: MapRecord) -> None:
-        record_map_change(settings, action, name, version=made.id, number=made.number)
+    def record(action: str, name: str, version: MapRecord) -> None:
+        record_map_change(settings, action, name, version=version.id, number=version.number)
 
     maps = MapRegistry(
         store, args.tenant, max_bytes=4 * settings.data.max_object_bytes, on_change=record
@@ -138,23 +138,23 @@ def _merge(args: argparse.Namespace, settings: PlatformSettings) -> int:
     began = time.perf_counter()
     try:
         engine.start()
-        found = merge.run(inputs)
+        result = merge.run(inputs)
     finally:
         engine.close()
         cluster.stop()
         if invitation is not None:
             invitation.withdraw()
     seconds = round(time.perf_counter() - began, 3)
-    parts = {"parts": {"computed": found.computed, "found": found.found}, "clouds": len(found.tiles)}
+    parts = {"parts": {"computed": result.computed, "found": result.found}, "clouds": len(result.tiles)}
     code = commit_merge(
-        reply_of(found.merged), maps, args.names, into=args.out, parent=parent,
+        reply_of(result.merged), maps, args.names, into=args.out, parent=parent,
         author="rse-pf batch run merge", note=args.note, seconds=seconds, as_json=args.json, more=parts,
     )  # fmt: skip
     merge.forget()
     if not args.json:
         show(
-            f"{'parts':<11} {found.computed} computed, {found.found} found; "
-            f"{counted(len(found.tiles), 'link')} from aligned clouds; {seconds:.1f} s"
+            f"{'parts':<11} {result.computed} computed, {result.found} found; "
+            f"{counted(len(result.tiles), 'link')} from aligned clouds; {seconds:.1f} s"
         )
     return code
 
@@ -162,7 +162,7 @@ def _merge(args: argparse.Namespace, settings: PlatformSettings) -> int:
 def _clean(store: ObjectStore) -> int:
     from rse_pf.batch.parts import PREFIX
 
-    names = [each.name for each in store.list(f"{PREFIX}/")]
+    names = [info.name for info in store.list(f"{PREFIX}/")]
     for name in names:
         store.delete(name)
     show(f"{counted(len(names), 'object')} deleted")

@@ -99,8 +99,8 @@ def _extras(settings: PlatformSettings) -> Iterator[Finding]:
             yield _finding(f"extra {name}: not installed, and only for developers: {extra.enables}")
             continue
         fix = MissingExtra.command(*([] if name == "base" else [name]))
-        what = f"extra {name}: {missing} cannot be imported" if missing else f"extra {name}"
-        yield _finding(f"{what}; for {extra.enables}", fix if missing else "", is_required=extra.is_required)
+        title = f"extra {name}: {missing} cannot be imported" if missing else f"extra {name}"
+        yield _finding(f"{title}; for {extra.enables}", fix if missing else "", is_required=extra.is_required)
     yield from _verbs(absent)
 
 
@@ -113,8 +113,8 @@ def _verbs(absent: set[str]) -> Iterator[Finding]:
     for verb, lacks in lacking.items():
         if lacks:
             missing = {module for extra in lacks for module in absent & modules_of(extra).keys()}
-            what = f"rse-pf {verb} does not work here: it needs {', '.join(sorted(missing))}"
-            yield _finding(what, MissingExtra.command(*lacks))
+            title = f"rse-pf {verb} does not work here: it needs {', '.join(sorted(missing))}"
+            yield _finding(title, MissingExtra.command(*lacks))
 
 
 def _native_library(settings: PlatformSettings) -> Iterator[Finding]:
@@ -140,8 +140,8 @@ def _engines(settings: PlatformSettings) -> Iterator[Finding]:
             yield Finding(grade="ok", what=f"engine {engine} {_version_of(module)}")
         else:
             needed = chosen == engine
-            what = f"engine {engine} is not installed" + (" but needed by pnp.engine" if needed else "")
-            yield _finding(what, MissingExtra.command(extra), is_required=needed)
+            title = f"engine {engine} is not installed" + (" but needed by pnp.engine" if needed else "")
+            yield _finding(title, MissingExtra.command(extra), is_required=needed)
 
 
 def _isolation(settings: PlatformSettings) -> Iterator[Finding]:
@@ -160,10 +160,10 @@ def _isolation(settings: PlatformSettings) -> Iterator[Finding]:
             isolation.forbid_system_calls,
         ]
     )
-    held = ", ".join(name for name in isolation.ISOLATION if name not in missing)
-    what = f"isolation of custom services: {held or 'none'}"
-    what += f"; missing: {', '.join(missing)}" if missing else ""
-    yield _finding(what, _ISOLATION_FIX if missing else "")
+    present = ", ".join(name for name in isolation.ISOLATION if name not in missing)
+    title = f"isolation of custom services: {present or 'none'}"
+    title += f"; missing: {', '.join(missing)}" if missing else ""
+    yield _finding(title, _ISOLATION_FIX if missing else "")
 
 
 def _balancer(settings: PlatformSettings) -> Iterator[Finding]:
@@ -171,7 +171,7 @@ def _balancer(settings: PlatformSettings) -> Iterator[Finding]:
 
     try:
         binary = envoy_binary()
-        told = subprocess.run(
+        completed = subprocess.run(
             [binary, "--version"], capture_output=True, text=True, timeout=_ENVOY_ANSWERS_S, check=True
         )
     except MissingExtra as error:
@@ -183,7 +183,7 @@ def _balancer(settings: PlatformSettings) -> Iterator[Finding]:
             fix="it needs glibc 2.31 and x86-64; update both",
         )
     else:
-        parts = told.stdout.strip().partition("version:")[2].split("/")
+        parts = completed.stdout.strip().partition("version:")[2].split("/")
         yield Finding(grade="ok", what=f"Envoy {parts[1] if len(parts) > 1 else ''} runs")
 
 
@@ -208,28 +208,28 @@ def _open_files(settings: PlatformSettings) -> Iterator[Finding]:
         return
     needed = settings.serving.max_robots * _DESCRIPTORS_PER_ROBOT + _OTHER_DESCRIPTORS
     robots = max(0, (most - _OTHER_DESCRIPTORS) // _DESCRIPTORS_PER_ROBOT)
-    what = f"open files: {most}, enough for {robots} robots through one load balancer"
+    title = f"open files: {most}, enough for {robots} robots through one load balancer"
     fix = ""
     if most < needed:
-        what += f"; serving.max_robots is {settings.serving.max_robots}"
+        title += f"; serving.max_robots is {settings.serving.max_robots}"
         fix = f"raise the hard limit (ulimit -Hn) to {needed}, or lower serving.max_robots"
-    yield _finding(what, fix)
+    yield _finding(title, fix)
 
 
 def _size(settings: PlatformSettings) -> Iterator[Finding]:
     cores = len(os.sched_getaffinity(0))
-    wanted = settings.local.servers * settings.local.workers
-    fix = f"expect shared cores: local.servers x local.workers = {wanted}" if cores < wanted else ""
+    processes = settings.local.servers * settings.local.workers
+    fix = f"expect shared cores: local.servers x local.workers = {processes}" if cores < processes else ""
     yield _finding(f"{cores} cores", fix)
-    found = None
+    match = None
     with contextlib.suppress(OSError):
-        found = re.search(r"MemAvailable: *(\d+) kB", Path("/proc/meminfo").read_text(encoding="ascii"))
-    if found is None:
+        match = re.search(r"MemAvailable: *(\d+) kB", Path("/proc/meminfo").read_text(encoding="ascii"))
+    if match is None:
         yield _finding("memory unknown")
         return
-    what = f"{int(found[1]) // 1024} MiB of memory available"
+    title = f"{int(match[1]) // 1024} MiB of memory available"
     fix = f"free some: the demo needs about {_LITTLE_MEMORY_MIB} MiB"
-    yield _finding(what, fix if int(found[1]) // 1024 < _LITTLE_MEMORY_MIB else "")
+    yield _finding(title, fix if int(match[1]) // 1024 < _LITTLE_MEMORY_MIB else "")
 
 
 def _finding(what: str, fix: str = "", *, is_required: bool = False) -> Finding:

@@ -57,28 +57,33 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     """Print one explanation, all codes, or the page."""
-    known = explanations()
+    explained = explanations()
     if args.markdown:
         if args.code is not None:
             raise UsageError("--markdown prints all codes", hint="leave out the code, or --markdown")
-        show_page(errors_page(known))
+        show_page(errors_page(explained))
         return 0
     if args.code is None:
-        width = max(len(each.code) for each in known)
-        show(*(f"{each.code:<{width}}  {each.meaning}".replace("``", "") for each in known))
+        width = max(len(explanation.code) for explanation in explained)
+        show(
+            *(
+                f"{explanation.code:<{width}}  {explanation.meaning}".replace("``", "")
+                for explanation in explained
+            )
+        )
         return 0
-    found = [each for each in known if args.code in (each.code, each.name)]
-    if not found:
-        codes = [each.code for each in known]
+    matching = [explanation for explanation in explained if args.code in (explanation.code, explanation.name)]
+    if not matching:
+        codes = [explanation.code for explanation in explained]
         raise UsageError(
             f"there is no error {args.code[:80]!r}", hint=did_you_mean(args.code, codes, "see rse-pf errors")
         )
-    (each,) = found
+    (explanation,) = matching
     lines = (
-        f"{each.code} ({each.name}): {each.meaning}",
-        f"  cause  {each.cause}",
-        f"  check  {each.check}",
-        f"  fix    {each.fix}",
+        f"{explanation.code} ({explanation.name}): {explanation.meaning}",
+        f"  cause  {explanation.cause}",
+        f"  check  {explanation.check}",
+        f"  fix    {explanation.fix}",
     )
     show(*(line.replace("``", "") for line in lines))  # a terminal does not set code in another type
     return 0
@@ -87,24 +92,24 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
 def explanations() -> list[Explanation]:
     """Return the explanation of every code, in the order of the codes."""
     public = [getattr(errors, name) for name in errors.__all__]
-    kinds = [each for each in public if isinstance(each, type) and issubclass(each, RsePfError)]
-    return sorted(map(explain, kinds), key=lambda each: each.code)
+    kinds = [value for value in public if isinstance(value, type) and issubclass(value, RsePfError)]
+    return sorted(map(explain, kinds), key=lambda explanation: explanation.code)
 
 
 def explain(kind: type[RsePfError]) -> Explanation:
     """Return what the docstring of *kind* says; raises ValueError if a part is missing or empty."""
-    found = _PARTS.fullmatch(kind.__doc__ or "")
-    if found is None:
+    match = _PARTS.fullmatch(kind.__doc__ or "")
+    if match is None:
         raise ValueError(f"the docstring of {kind.__name__} needs a sentence, Cause:, Check: and Fix:")
-    parts = {name: " ".join(text.split()) for name, text in found.groupdict().items()}
+    parts = {name: " ".join(text.split()) for name, text in match.groupdict().items()}
     return Explanation(code=kind.code, name=kind.__name__, **parts)
 
 
-def errors_page(known: Iterable[Explanation]) -> str:
+def errors_page(explained: Iterable[Explanation]) -> str:
     """Return ``docs/errors.md``: a section with an anchor for each code."""
     sections = (
-        f"\n## {each.code}\n\n`{each.name}`: {each.meaning}\n\n"
-        f"- **Cause:** {each.cause}\n- **Check:** {each.check}\n- **Fix:** {each.fix}\n"
-        for each in known
+        f"\n## {explanation.code}\n\n`{explanation.name}`: {explanation.meaning}\n\n"
+        f"- **Cause:** {explanation.cause}\n- **Check:** {explanation.check}\n- **Fix:** {explanation.fix}\n"
+        for explanation in explained
     )
     return _INTRODUCTION + "".join(sections)

@@ -163,11 +163,11 @@ _OPTIONAL = {"poselib", "segno", "h5py"}
 
 def modules_of(extra: str) -> dict[str, str]:
     """Return module to package of *extra* and of all that it includes, without those that may be missing."""
-    found = {
+    modules = {
         module: package for name in EXTRAS[extra].includes for module, package in modules_of(name).items()
     }
     own = EXTRAS[extra].modules
-    return {**found, **{module: package for module, package in own.items() if module not in _OPTIONAL}}
+    return {**modules, **{module: package for module, package in own.items() if module not in _OPTIONAL}}
 
 
 def require(verb: str) -> None:

@@ -72,8 +72,8 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     with LimitedReplay(settings) as replay:
         is_case = path.suffix == ".rsepf" and not args.all
         if args.command is not None or is_case:
-            return _one(args, replay, overrides)
-        return _many(args, replay, overrides)
+            return _show_one(args, replay, overrides)
+        return _show_all(args, replay, overrides)
 
 
 def _check(args: argparse.Namespace) -> None:
@@ -115,65 +115,65 @@ def _overrides(args: argparse.Namespace) -> Overrides:
 # --- a whole recording ------------------------------------------------------------------------------------
 
 
-def _many(args: argparse.Namespace, replay: LimitedReplay, overrides: Overrides) -> int:
+def _show_all(args: argparse.Namespace, replay: LimitedReplay, overrides: Overrides) -> int:
     solve = bool(args.all or args.json or overrides.changes)
     with at_work("reading the recording"):
-        seen = replay.overview(
+        overview = replay.overview(
             args.file, solve=solve, overrides=overrides, worst=_EXPLAINED_IN_JSON if args.json else _SHOWN,
             explain=_EXPLAINED_IN_JSON if args.json else _SHOWN,
         )  # fmt: skip
         reports = []
         if args.html is not None:
-            reports = [replay.command(args.file, each.id, overrides) for each in seen.troubles[:_IN_PAGE]]
+            reports = [replay.command(args.file, each.id, overrides) for each in overview.troubles[:_IN_PAGE]]
     if args.html is not None:
-        _write_page(args.html, reports, seen, args.file.name)
+        _write_page(args.html, reports, overview, args.file.name)
     if args.json:
-        show_json(_overview_json(seen), indent=2)
+        show_json(_overview_json(overview), indent=2)
     else:
-        _show_overview(seen, args)
-    return 1 if solve and seen.different and not overrides.changes else 0
+        _show_overview(overview, args)
+    return 1 if solve and overview.different and not overrides.changes else 0
 
 
-def _show_overview(seen: Overview, args: argparse.Namespace) -> None:
+def _show_overview(overview: Overview, args: argparse.Namespace) -> None:
     show(
-        f"{counted(seen.commands, 'command')} of {counted(seen.robots, 'robot')} in {seen.seconds:.1f} s, "
-        f"{counted(seen.files, 'file')}"
+        f"{counted(overview.commands, 'command')} of {counted(overview.robots, 'robot')} "
+        f"in {overview.seconds:.1f} s, {counted(overview.files, 'file')}"
     )
-    for name in seen.cut[:3]:
+    for name in overview.cut[:3]:
         show(f"note: {name} is cut off or still being written; read up to its last whole chunk")
-    if seen.left_out:
-        show(f"note: {counted(seen.left_out, 'message')} cannot be read and was left out")
-    if seen.was_solved:
-        show(f"solved again: {seen.equal} equal to the byte, {seen.different} different")
-        for why, count in seen.not_solved.items():
+    if overview.left_out:
+        show(f"note: {counted(overview.left_out, 'message')} cannot be read and was left out")
+    if overview.was_solved:
+        show(f"solved again: {overview.equal} equal to the byte, {overview.different} different")
+        for why, count in overview.not_solved.items():
             show(f"not solved again: {count}: {why}")
-        for each in seen.changed[:_SHOWN]:
+        for each in overview.changed[:_SHOWN]:
             show(f"  {each.id}  {each.what}")
-        if len(seen.changed) > _SHOWN:
-            show(f"  and {seen.different - _SHOWN} more; --json lists them")
-    bad = sum(seen.by_kind.values())
+        if len(overview.changed) > _SHOWN:
+            show(f"  and {overview.different - _SHOWN} more; --json lists them")
+    bad = sum(overview.by_kind.values())
     if not bad:
         show("nothing went wrong")
         return
-    told = ", ".join(f"{count} {kind}" for kind, count in seen.by_kind.items())
+    told = ", ".join(f"{count} {kind}" for kind, count in overview.by_kind.items())
     show("", f"went wrong: {told}; worst first:")
-    for trouble in seen.troubles:
+    for trouble in overview.troubles:
         show(f"  {trouble.kind:<10} {trouble.id}  {trouble.robot}  {trouble.what}")
-        causes = seen.causes.get(trouble.id, ())
+        causes = overview.causes.get(trouble.id, ())
         if causes and causes[0].cause != "none":
             show(f"  {'':<10} {causes[0].cause}: {causes[0].sentence}")
-    if bad > len(seen.troubles):
-        show(f"  and {bad - len(seen.troubles)} more; --json lists up to {_EXPLAINED_IN_JSON}")
-    show("", f"explain one: rse-pf replay {args.file} --command {seen.troubles[0].id}")
+    if bad > len(overview.troubles):
+        show(f"  and {bad - len(overview.troubles)} more; --json lists up to {_EXPLAINED_IN_JSON}")
+    show("", f"explain one: rse-pf replay {args.file} --command {overview.troubles[0].id}")
 
 
-def _overview_json(seen: Overview) -> dict[str, Any]:
+def _overview_json(overview: Overview) -> dict[str, Any]:
     import msgspec
 
-    plain: dict[str, Any] = msgspec.to_builtins(seen)
+    plain: dict[str, Any] = msgspec.to_builtins(overview)
     explained: dict[str, Any] = plain.pop("causes")
     causes: dict[str, int] = {}
-    for found in seen.causes.values():
+    for found in overview.causes.values():
         if found:
             causes[found[0].cause] = causes.get(found[0].cause, 0) + 1
     ordered = sorted(causes, key=lambda each: (each == "none", -causes[each]))
@@ -184,10 +184,10 @@ def _overview_json(seen: Overview) -> dict[str, Any]:
 # --- one command ------------------------------------------------------------------------------------------
 
 
-def _one(args: argparse.Namespace, replay: LimitedReplay, overrides: Overrides) -> int:
+def _show_one(args: argparse.Namespace, replay: LimitedReplay, overrides: Overrides) -> int:
     identity = args.command or ""
     with at_work("solving the command again"):
-        seen = replay.command(args.file, identity, overrides, with_picture=args.html is not None)
+        report = replay.command(args.file, identity, overrides, with_picture=args.html is not None)
         exported = replay.case(args.file, identity) if args.export is not None else None
     if exported is not None:
         from rse_pf.recording.replay.case import write_case
@@ -199,44 +199,44 @@ def _one(args: argparse.Namespace, replay: LimitedReplay, overrides: Overrides) 
         if not args.json:
             show(f"wrote {args.export}: {size} bytes, without names and tokens", "")
     if args.html is not None:
-        _write_page(args.html, [seen], None, args.file.name)
+        _write_page(args.html, [report], None, args.file.name)
     if args.json:
-        show_json(_report_json(seen), indent=2)
+        show_json(_report_json(report), indent=2)
     else:
-        _show_report(seen)
-    return 1 if not seen.is_equal and not seen.why_not else 0
+        _show_report(report)
+    return 1 if not report.is_equal and not report.why_not else 0
 
 
-def _show_report(seen: CommandReport) -> None:
-    verdict = f"{seen.verdict}: {seen.reason}" if seen.reason else seen.verdict
-    show(f"command {seen.id} of {seen.robot}, service {seen.service}: {verdict}")
-    if seen.hint:
-        show(f"  hint: {seen.hint}")
-    if seen.round_trip_ms is not None:
+def _show_report(report: CommandReport) -> None:
+    verdict = f"{report.verdict}: {report.reason}" if report.reason else report.verdict
+    show(f"command {report.id} of {report.robot}, service {report.service}: {verdict}")
+    if report.hint:
+        show(f"  hint: {report.hint}")
+    if report.round_trip_ms is not None:
         show(
-            f"answered in {seen.round_trip_ms:.1f} ms: {seen.queue_ms:.1f} ms in the queue, "
-            f"{seen.compute_ms:.1f} ms of work"
+            f"answered in {report.round_trip_ms:.1f} ms: {report.queue_ms:.1f} ms in the queue, "
+            f"{report.compute_ms:.1f} ms of work"
         )
-    if seen.why_not:
-        show(f"cannot be solved again: {seen.why_not}")
-    elif seen.is_equal:
+    if report.why_not:
+        show(f"cannot be solved again: {report.why_not}")
+    elif report.is_equal:
         show("solved again: equal to the byte, but for times and places")
     else:
-        show(f"solved again: DIFFERENT: {seen.difference}")
-    if seen.matches:
+        show(f"solved again: DIFFERENT: {report.difference}")
+    if report.matches:
         show(
-            f"{seen.matches} matches, {seen.inliers} inliers, {seen.rmse_px:.2f} px, "
-            f"engine {seen.engine or 'none'}"
+            f"{report.matches} matches, {report.inliers} inliers, {report.rmse_px:.2f} px, "
+            f"engine {report.engine or 'none'}"
         )
-    if seen.causes:
+    if report.causes:
         show("", "why:")
-        for each in seen.causes:
-            show(f"  {each.cause:<12} {each.confidence:.2f}  {each.sentence}")
-        if seen.causes[0].missing:
-            show(f"  not recorded: {'; '.join(seen.causes[0].missing)}")
-    if seen.rules:
+        for cause in report.causes:
+            show(f"  {cause.cause:<12} {cause.confidence:.2f}  {cause.sentence}")
+        if report.causes[0].missing:
+            show(f"  not recorded: {'; '.join(report.causes[0].missing)}")
+    if report.rules:
         show("", "rules of the evidence:")
-        for rule in seen.rules:
+        for rule in report.rules:
             says = "kept" if rule.is_kept else ("REFUSES" if rule.refuses else "WEAK")
             relation = "at least" if rule.at_least else "at most"
             unit = f" {rule.unit}" if rule.unit else ""
@@ -244,40 +244,41 @@ def _show_report(seen: CommandReport) -> None:
                 f"  {says:<8} {rule.name:<18} {rule.about}: {rule.measured:.4g}{unit}, "
                 f"{relation} {rule.limit:.4g}{unit}"
             )
-    if seen.tried is not None:
-        _show_attempts("what you asked for:", [seen.tried], seen.tried_name)
-    _show_attempts("engines:", seen.engines, "")
-    _show_attempts("other options:", seen.options, "")
+    if report.tried is not None:
+        _show_attempts("what you asked for:", [report.tried], report.tried_name)
+    _show_attempts("engines:", report.engines, "")
+    _show_attempts("other options:", report.options, "")
 
 
 def _show_attempts(title: str, attempts: Any, name: str) -> None:
     if not attempts:
         return
     show("", title)
-    for each in attempts:
-        show(f"  {each.name or name:<24} {_attempt(each)}")
+    for attempt in attempts:
+        show(f"  {attempt.name or name:<24} {_attempt(attempt)}")
 
 
-def _attempt(each: Attempt) -> str:
-    verdict = f"{each.verdict} ({each.reason})" if each.reason else each.verdict
-    if not each.inliers:
+def _attempt(attempt: Attempt) -> str:
+    verdict = f"{attempt.verdict} ({attempt.reason})" if attempt.reason else attempt.verdict
+    if not attempt.inliers:
         return verdict
     moved = ""
-    if each.moved_m is not None and each.moved_deg is not None:
-        moved = f", {1e3 * each.moved_m:.3g} mm and {each.moved_deg:.3g} deg from the recorded pose"
-    return f"{verdict}, {each.inliers} inliers, {each.rmse_px:.2f} px{moved}"
+    if attempt.moved_m is not None and attempt.moved_deg is not None:
+        moved = f", {1e3 * attempt.moved_m:.3g} mm and {attempt.moved_deg:.3g} deg from the recorded pose"
+    return f"{verdict}, {attempt.inliers} inliers, {attempt.rmse_px:.2f} px{moved}"
 
 
-def _report_json(seen: CommandReport) -> dict[str, Any]:
+def _report_json(report: CommandReport) -> dict[str, Any]:
     import msgspec
 
-    plain: dict[str, Any] = msgspec.to_builtins(msgspec.structs.replace(seen, picture_png=b""))
+    plain: dict[str, Any] = msgspec.to_builtins(msgspec.structs.replace(report, picture_png=b""))
     plain.pop("picture_png")
     explanations = plain.pop("causes")
-    was_solved = not seen.why_not
+    was_solved = not report.why_not
     return {
-        "commands": 1, "equal": int(was_solved and seen.is_equal),
-        "different": int(was_solved and not seen.is_equal), "causes": [each.cause for each in seen.causes],
+        "commands": 1, "equal": int(was_solved and report.is_equal),
+        "different": int(was_solved and not report.is_equal),
+        "causes": [cause.cause for cause in report.causes],
         "explanations": explanations, **plain,
     }  # fmt: skip
 

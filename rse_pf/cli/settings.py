@@ -41,7 +41,7 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
         show_page(settings_page())
         return 0
     if args.group is not None:
-        values = _chosen(args.group, values)
+        values = _choose(args.group, values)
     if args.json:
         show_json(values, indent=2)
         return 0
@@ -54,7 +54,7 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     return 0
 
 
-def _chosen(word: str, values: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
+def _choose(word: str, values: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
     """Return the group, or the single setting ``group.name``, that *word* names."""
     group, dot, name = word.partition(".")
     if group not in values:
@@ -63,6 +63,6 @@ def _chosen(word: str, values: dict[str, dict[str, Any]]) -> dict[str, dict[str,
         return {group: values[group]}
     if name not in values[group]:
         full = f"{group}.{name[:80]}"
-        known = [f"{group}.{each}" for each in values[group]]
-        raise UsageError(f"no setting named {full!r}", hint=did_you_mean(full, known))
+        names = [f"{group}.{name}" for name in values[group]]
+        raise UsageError(f"no setting named {full!r}", hint=did_you_mean(full, names))
     return {group: {name: values[group][name]}}

@@ -1,4 +1,4 @@
-"""What things of a deployment are called by more than one side: by the stacks, and by who looks for them.
+"""Names of the resources of a deployment that both the stacks and other programs use.
 
 Promises to import nothing, and to read no setting: constants are the same in every deployment, and
 `ResourceNames` makes the others of the deployment's name.
@@ -38,26 +38,26 @@ answers, which agents publish and for which no server is ended."""
 ROSBRIDGE_PATH = "/rosbridge"
 """At the robots' port, where ``serving.rosbridge`` is on."""
 KEYS_NAME = "keys.json"
-"""Of the public key set in the artifact bucket."""
+"""Name of the object in the artifact bucket that holds the public key set."""
 ROBOTS_NAME = "control/robots.json"
-"""Of the roster beside it: who is enrolled."""
+"""Name of the object in the artifact bucket that holds the roster of enrolled robots."""
 DENY_NAME = "control/deny.json"
-"""Of the deny-list beside it: who is refused."""
+"""Name of the object in the artifact bucket that holds the list of refused robots and tokens."""
 JOURNAL_PREFIX = "journals"
-"""Of what servers logged, in the artifact bucket; one folder for each instance."""
+"""Prefix of the journals of servers in the artifact bucket; each instance has a folder below it."""
 SERVICES_PREFIX = "services"
-"""Of the published services in the artifact bucket: their list and their archives."""
+"""Prefix of the published services in the artifact bucket: their list and their archives."""
 BUDGET_NAME = "burst/budget.json"
-"""Of the object of the artifact bucket that counts the commands of the burst function of a day."""
+"""Name of the object in the artifact bucket that counts a day's commands of the burst function."""
 VERSION_PARAMETER = "ServersVersion"
-"""Of the backend stack: the version of the launch template that the servers run."""
+"""Parameter of the backend stack that holds the version of the launch template that servers run."""
 AUDIT_PREFIX = "audit"
-"""Of the pieces of audit logs in their bucket."""
+"""Prefix of the pieces of audit logs in their bucket."""
 STACKS = ("Network", "Data", "Backend", "Serverless", "Observability")
 """The boxes that are stacks, in an order in which they can be deployed."""
 
 SETTINGS_CONTEXT = "rse-pf:settings"
-"""Of the CDK's context: the file of settings, where that is not cdk.json."""
+"""Key of the CDK's context that names the file of settings, if that is not cdk.json."""
 
 
 _DEFAULT_QUALIFIER, _DEFAULT_TOOLKIT = "hnb659fds", "CDKToolkit"

@@ -115,34 +115,34 @@ def _show(args: argparse.Namespace, folder: Path | None) -> int:
         raise UsageError("--head is for verify", hint="see rse-pf audit --help")
     if args.last is not None and args.last < 1:
         raise UsageError(f"--last {args.last} shows no entry", hint="give 1 or more")
-    chains = [args.files] if folder is None else [files_of(folder, who) for who in chain_names(folder)]
-    found = ((path[-1].name.partition(".")[0], entry) for path in chains for entry in entries_of(path))
-    wanted = ((who, entry) for who, entry in found if args.only is None or args.only in entry.action)
-    shown = sorted(wanted, key=lambda each: (each[1].time, each[0], each[1].seq))
-    for who, entry in deque(shown, args.last):
+    chains = [args.files] if folder is None else [files_of(folder, chain) for chain in chain_names(folder)]
+    entries = ((path[-1].name.partition(".")[0], entry) for path in chains for entry in entries_of(path))
+    selected = ((chain, entry) for chain, entry in entries if args.only is None or args.only in entry.action)
+    ordered = sorted(selected, key=lambda row: (row[1].time, row[0], row[1].seq))
+    for who, entry in deque(ordered, args.last):
         show(_json_line(who, entry) if args.json else _line(who, entry))
     return 0
 
 
 def _verify(args: argparse.Namespace, folder: Path | None) -> int:
-    known = _heads(args.head)
+    heads = _heads(args.head)
     if folder is None:
-        if known:
+        if heads:
             raise UsageError("--head needs all chains of a folder", hint="name the folder, not files")
         first = args.files[0]
         verdicts = [check_chain(first.name.partition(".")[0], args.files, from_genesis=False)]
     else:
-        verdicts = _check_live(folder, known)
+        verdicts = _check_live(folder, heads)
     for verdict in verdicts:
         _print_verdict(verdict)
     return int(any(verdict.problem for verdict in verdicts))
 
 
-def _check_live(folder: Path, known: dict[str, Head]) -> list[Verdict]:
+def _check_live(folder: Path, heads: dict[str, Head]) -> list[Verdict]:
     """Check logs that may still be written; a line or a rename in progress is checked again."""
     for attempt in range(_MAX_ATTEMPTS):
         try:
-            verdicts = check_folder(folder, known=known)
+            verdicts = check_folder(folder, known=heads)
         except FileNotFoundError:
             if attempt + 1 == _MAX_ATTEMPTS:
                 raise
@@ -164,13 +164,13 @@ def _print_verdict(verdict: Verdict) -> None:
 def _heads(words: Sequence[str]) -> dict[str, Head]:
     heads = {}
     for word in words:
-        who, _, rest = word.partition("=")
+        chain, _, rest = word.partition("=")
         head = parse_head(rest)
-        if head is None or not who:
+        if head is None or not chain:
             raise UsageError(
                 f"{word[:80]!r} is not a head", hint="copy it from a line of rse-pf audit verify"
             )
-        heads[who] = head
+        heads[chain] = head
     return heads
 
 
@@ -185,17 +185,17 @@ def _folder(args: argparse.Namespace) -> Path:
     return folder
 
 
-def _json_line(who: str, entry: Entry) -> str:
+def _json_line(chain: str, entry: Entry) -> str:
     fields: dict[str, object] = {name: getattr(entry, name) for name in entry.__struct_fields__}
-    return json.dumps({"log": who, **fields})
+    return json.dumps({"log": chain, **fields})
 
 
-def _line(who: str, entry: Entry) -> str:
+def _line(chain: str, entry: Entry) -> str:
     when = datetime.fromtimestamp(entry.time, timezone.utc).strftime("%Y-%m-%d %H:%M:%S")
-    actor = [] if entry.actor == who else [f"by {_word(entry.actor)}"]
+    actor = [] if entry.actor == chain else [f"by {_word(entry.actor)}"]
     words: Iterable[str] = (f"{_word(key)}={_word(value)}" for key, value in entry.detail.items())
     subject = [_word(entry.subject)] if entry.subject else []
-    return " ".join([when, f"{who}#{entry.seq}", _word(entry.action), *subject, *actor, *words])
+    return " ".join([when, f"{chain}#{entry.seq}", _word(entry.action), *subject, *actor, *words])
 
 
 def _word(value: object) -> str:

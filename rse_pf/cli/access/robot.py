@@ -148,8 +148,8 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
         raise UsageError(f"robot {robot!r} is not disabled", hint="rse-pf robot list shows who is")
 
     def enabled(denied: DenyList) -> DenyList:
-        kept = denied.pruned(now=now, max_token_s=longest).without_robot(tenant, robot)
-        return kept.with_tokens_before(tenant, robot, float(int(now)))
+        remaining = denied.pruned(now=now, max_token_s=longest).without_robot(tenant, robot)
+        return remaining.with_tokens_before(tenant, robot, float(int(now)))
 
     access.change_deny_list(enabled)
     record_action(args, settings, "robot.enabled", robot, tenant=tenant)
@@ -194,8 +194,8 @@ def _check(args: argparse.Namespace) -> None:
     """Raise UsageError for arguments that the action does not take."""
     named = args.action not in ("keygen", "list")
     if named != (args.robot is not None):
-        what = "needs the name of a robot" if named else "names no robot"
-        raise UsageError(f"rse-pf robot {args.action} {what}", hint="see rse-pf robot --help")
+        problem = "needs the name of a robot" if named else "names no robot"
+        raise UsageError(f"rse-pf robot {args.action} {problem}", hint="see rse-pf robot --help")
     if args.action == "keygen" and args.out is None:
         raise UsageError("keygen needs --out", hint="for example: --out robot.key")
     if args.action not in ("keygen", "enrol") and args.out is not None:
@@ -218,22 +218,22 @@ def _check(args: argparse.Namespace) -> None:
 def _enrol(
     args: argparse.Namespace, access: AccessControlStore, now: float, settings: PlatformSettings
 ) -> int:
-    made = None if args.out is None else make_enrolment(args, settings)
+    enrolment = None if args.out is None else make_enrolment(args, settings)
     robot = EnrolledRobot(
         robot=args.robot,
         tenant=args.tenant,
-        x=public_key_of(_text(args.public_key)) if made is None else str(made.key["x"]),
+        x=public_key_of(_text(args.public_key)) if enrolment is None else str(enrolment.key["x"]),
         scopes=check_scopes(tuple(args.scope)),
-        quotas=check_quotas(dict(_quota(each) for each in args.quota)),
+        quotas=check_quotas(dict(_quota(text) for text in args.quota)),
         enrolled_s=round(now, 3),
     )
-    if made is not None:
-        made.write(args.out)
+    if enrolment is not None:
+        enrolment.write(args.out)
     before = access.roster().find(args.tenant, args.robot)
     try:
         access.change_roster(lambda roster: roster.enrolled(robot))
     except BaseException:
-        if made is not None:  # a file whose key no platform knows
+        if enrolment is not None:  # a file whose key no platform knows
             args.out.unlink(missing_ok=True)
         raise
     allowed = " ".join(robot.scopes) or "everything"
@@ -247,22 +247,22 @@ def _enrol(
             "its earlier key is refused within 2 s; to give it what it stored under that key:  "
             f"rse-pf robot adopt {robot.robot} --from-key {before.key_id}{tenant}"
         )
-    if made is not None:
-        show(*enrolment_lines(made, args.out))
+    if enrolment is not None:
+        show(*enrolment_lines(enrolment, args.out))
     return 0
 
 
 def _remove(args: argparse.Namespace, access: AccessControlStore, settings: PlatformSettings) -> int:
-    found = access.roster().find(args.tenant, args.robot)
-    if found is None:
+    enrolled = access.roster().find(args.tenant, args.robot)
+    if enrolled is None:
         raise UsageError(f"robot {args.robot!r} is not enrolled", hint="rse-pf robot list shows who is")
 
     def without(roster: Roster) -> Roster:
-        return Roster(robots=tuple(each for each in roster.robots if each.x != found.x))
+        return Roster(robots=tuple(robot for robot in roster.robots if robot.x != enrolled.x))
 
     access.change_roster(without)
-    record_action(args, settings, "robot.removed", args.robot, tenant=args.tenant, key=found.key_id)
-    show(f"robot {args.robot!r} is removed: tokens signed by {found.key_id} are refused within 2 s")
+    record_action(args, settings, "robot.removed", args.robot, tenant=args.tenant, key=enrolled.key_id)
+    show(f"robot {args.robot!r} is removed: tokens signed by {enrolled.key_id} are refused within 2 s")
     return 0
 
 
@@ -288,9 +288,9 @@ def _quota(text: str) -> tuple[str, float]:
 def _list(args: argparse.Namespace, access: AccessControlStore) -> int:
     roster, denied = access.roster(), access.deny_list()
     rows = [_row(robot, denied) for robot in roster.robots if robot.tenant == args.tenant]
-    for each in denied.disabled:
-        if each.tenant == args.tenant and roster.find(each.tenant, each.robot) is None:
-            rows.append({"robot": each.robot, "state": "disabled", "key": "no key of its own", "scopes": []})
+    for entry in denied.disabled:
+        if entry.tenant == args.tenant and roster.find(entry.tenant, entry.robot) is None:
+            rows.append({"robot": entry.robot, "state": "disabled", "key": "no key of its own", "scopes": []})
     if args.json:
         show_json(rows, indent=2)
         return 0

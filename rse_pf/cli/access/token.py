@@ -95,12 +95,12 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     if args.all_of is not None or (args.scope and args.action != "issue"):
         raise UsageError("--all-of is for revoke and --scope for issue", hint="see rse-pf token --help")
     if args.subject is None:
-        what = "the name of a robot" if args.action == "issue" else "a token"
-        raise UsageError(f"rse-pf token {args.action} needs {what}", hint="see rse-pf token --help")
+        subject = "the name of a robot" if args.action == "issue" else "a token"
+        raise UsageError(f"rse-pf token {args.action} needs {subject}", hint="see rse-pf token --help")
     if args.cloud and args.key is not None:
         raise UsageError("--cloud and --key name two keys", hint="leave one of them out")
     named = args.settings is not None or args.key is not None or args.keys is not None or args.cloud
-    chosen = settings if named else _of_platform(args.name) or settings
+    chosen = settings if named else _settings_of_platform(args.name) or settings
     if args.action == "issue":
         if args.keys is not None:
             raise UsageError("--keys only checks tokens", hint="name the signing key with --key")
@@ -165,7 +165,7 @@ def _revoke(args: argparse.Namespace, settings: PlatformSettings) -> int:
 
 def _tenant_of(access: AccessControlStore, header: dict[str, Any], claims: dict[str, Any]) -> str:
     """Return the tenant of a token's robot: the roster's if the robot signed it, else the token's."""
-    enrolled = [each for each in access.roster().robots if each.key_id == header.get("kid")]
+    enrolled = [robot for robot in access.roster().robots if robot.key_id == header.get("kid")]
     return enrolled[0].tenant if enrolled else str(claims.get("tenant", "default"))
 
 
@@ -237,8 +237,13 @@ def _inspect(args: argparse.Namespace, settings: PlatformSettings) -> int:
     header, claims = unverified_parts(token)
     now = time.time()
     verdict, code = _verdict(token, _keys(args, settings), now, settings)
-    told = {"header": header, "claims": claims, "seconds_left": _left(claims, now), "verified": verdict}
-    show_json(told, indent=2)
+    document = {
+        "header": header,
+        "claims": claims,
+        "seconds_left": _seconds_left(claims, now),
+        "verified": verdict,
+    }
+    show_json(document, indent=2)
     return code
 
 
@@ -246,10 +251,10 @@ def _token(subject: str) -> str:
     return sys.stdin.readline().strip() if subject == "-" else str(subject).strip()
 
 
-def _left(claims: dict[str, Any], now: float) -> int | None:
+def _seconds_left(claims: dict[str, Any], now: float) -> int | None:
     over = claims.get("exp")
-    known = isinstance(over, (int, float)) and not isinstance(over, bool) and abs(over) < _LAST_TIME
-    return round(over - now) if known and over is not None else None
+    is_time = isinstance(over, (int, float)) and not isinstance(over, bool) and abs(over) < _LAST_TIME
+    return round(over - now) if is_time and over is not None else None
 
 
 def _verdict(token: str, keys: Any, now: float, settings: PlatformSettings) -> tuple[str, int]:
@@ -271,11 +276,11 @@ def _keys(args: argparse.Namespace, settings: PlatformSettings) -> Any:
 
     if args.cloud:
         store = _key_store(settings)
-        return _governed(store.ring().key_set(), store.access_control_store())
+        return _with_access_control(store.ring().key_set(), store.access_control_store())
     path = args.keys if args.keys is not None else key_set_file(_folder(args.name))
     try:
         keys = KeySet.from_json(path.read_text(encoding="utf-8"))
-        return _governed(keys, AccessControlStore(DirectoryStore(path.absolute().parent)))
+        return _with_access_control(keys, AccessControlStore(DirectoryStore(path.absolute().parent)))
     except FileNotFoundError as error:
         if args.keys is None:
             return None
@@ -284,11 +289,11 @@ def _keys(args: argparse.Namespace, settings: PlatformSettings) -> Any:
         raise ConfigurationError(f"cannot read {path}", hint="name a JWKS with --keys") from error
 
 
-def _governed(keys: KeySet, access: AccessControlStore) -> KeySet:
+def _with_access_control(keys: KeySet, access: AccessControlStore) -> KeySet:
     return keys.with_access_control(access.roster(), access.deny_list())
 
 
-def _of_platform(name: str) -> PlatformSettings | None:
+def _settings_of_platform(name: str) -> PlatformSettings | None:
     from rse_pf.local.state import platform_settings
 
     return platform_settings(_folder(name))

@@ -65,8 +65,8 @@ def deployment_costs(settings: PlatformSettings) -> DeploymentCosts:
 
 def make_tools(account: Account, settings: PlatformSettings, args: argparse.Namespace) -> CdkTools:
     """Return the tools of the checkout in the working folder; tests put others in their place."""
-    who = account.find("sts", "get_caller_identity") or {}
-    return CdkTools(Path.cwd(), settings, str(who.get("Account", "")), args.settings)
+    caller = account.find("sts", "get_caller_identity") or {}
+    return CdkTools(Path.cwd(), settings, str(caller.get("Account", "")), args.settings)
 
 
 def open_world(account: Account, settings: PlatformSettings, tools: Tools) -> StepContext:

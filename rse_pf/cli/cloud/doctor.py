@@ -65,19 +65,19 @@ def check_tools(checkout: Path) -> Iterator[Finding]:
 def _node() -> Finding:
     fix = f"make setup installs Node {_OLDEST_NODE} or newer into .venv"
     path = os.pathsep.join((sysconfig.get_path("scripts"), os.environ.get("PATH", "")))
-    found = shutil.which("node", path=path)
-    if found is None:
+    program = shutil.which("node", path=path)
+    if program is None:
         return Finding(grade="fail", what="Node is not installed", fix=fix)
     try:
-        told = subprocess.run(
-            [found, "--version"], capture_output=True, text=True, timeout=_NODE_ANSWERS_S, check=True
+        completed = subprocess.run(
+            [program, "--version"], capture_output=True, text=True, timeout=_NODE_ANSWERS_S, check=True
         ).stdout.strip()
     except (OSError, subprocess.SubprocessError) as error:
         return Finding(grade="fail", what=f"Node does not run: {error}", fix=fix)
-    version = re.match(r"v(\d+)\.", told)
+    version = re.match(r"v(\d+)\.", completed)
     if version is None or int(version[1]) < _OLDEST_NODE:
-        return Finding(grade="fail", what=f"Node {told} is too old for the CDK", fix=fix)
-    return Finding(grade="ok", what=f"Node {told}")
+        return Finding(grade="fail", what=f"Node {completed} is too old for the CDK", fix=fix)
+    return Finding(grade="ok", what=f"Node {completed}")
 
 
 def _cli(checkout: Path) -> Finding:

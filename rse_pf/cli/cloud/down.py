@@ -52,8 +52,8 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     changing.perform(plan, changing.open_world(account, settings, tools))
     proof = _last_proof(account, names, costs)
     _show_kept(proof, is_over=True)
-    for each in proof.left:
-        show(f"LEFT OVER  {each}")
+    for name in proof.left:
+        show(f"LEFT OVER  {name}")
     show(f"{len(proof.left)} left over, {counted(len(proof.kept), 'resource')} kept on purpose")
     return 1 if proof.left else 0
 
@@ -86,15 +86,15 @@ def _last_proof(account: Account, names: ResourceNames, costs: changing.Deployme
 
 
 def _show_kept(proof: Proof, *, is_over: bool) -> None:
-    for each in proof.kept:
+    for resource in proof.kept:
         size = (
             ""
-            if each.kind != "bucket"
+            if resource.kind != "bucket"
             else "  not measured yet"
-            if each.gb is None
-            else f"  {each.gb:.2f} GB"
+            if resource.gb is None
+            else f"  {resource.gb:.2f} GB"
         )
         verb = "kept" if is_over else "there is"
-        show(f"{verb}  {each.kind}  {each.name}{size}, {each.per_month:.2f} a month")
+        show(f"{verb}  {resource.kind}  {resource.name}{size}, {resource.per_month:.2f} a month")
     if proof.kept:
         show(f"together {proof.per_month:.2f} a month")

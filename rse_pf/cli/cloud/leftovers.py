@@ -26,14 +26,14 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
 
     account, names = open_account(settings.cloud.region), ResourceNames(settings.cloud.name)
     try:
-        stacks, found = list_living_stacks(account, names), find_leftovers(account, names)
+        stacks, leftovers = list_living_stacks(account, names), find_leftovers(account, names)
     except StoreError as error:  # its exit code is that of a finding
         show_error(error)
         return _FAILED
     if stacks:
         show(f"these stacks stand, and what they own is not listed: {', '.join(stacks)}")
-    for each in found:
-        show(f"{each.kind}  {each.name}", f"  {each.why}", f"  remove: {each.remove}")
-    unread = sum(each.unread for each in found)
-    show(f"{len(found) - unread} left over" + (f", {unread} could not be looked into" if unread else ""))
-    return 1 if found else 0
+    for leftover in leftovers:
+        show(f"{leftover.kind}  {leftover.name}", f"  {leftover.why}", f"  remove: {leftover.remove}")
+    unread = sum(leftover.unread for leftover in leftovers)
+    show(f"{len(leftovers) - unread} left over" + (f", {unread} could not be looked into" if unread else ""))
+    return 1 if leftovers else 0

@@ -42,15 +42,15 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
         store = open_journals(account, ResourceNames(settings.cloud.name))
         servers = list_logged_servers(store)
         if args.server is None:
-            for each in servers:
-                newest = datetime.fromtimestamp(each.newest_s, timezone.utc)
-                show(f"{each.name}  {newest:%Y-%m-%d %H:%M:%S} UTC  {counted(len(each.pieces), 'piece')}")
+            for server in servers:
+                newest = datetime.fromtimestamp(server.newest_s, timezone.utc)
+                show(f"{server.name}  {newest:%Y-%m-%d %H:%M:%S} UTC  {counted(len(server.pieces), 'piece')}")
             if not servers:
                 show("no server has sent its journals; they come every minute")
             return 0 if servers else 1
-        found = [each for each in servers if each.name == args.server]
+        matching = [server for server in servers if server.name == args.server]
         # A boot that failed early shipped nothing, and its console is all that there is.
-        lines = last_lines(store, found[0], args.lines) if found else console_of(account, args.server)
+        lines = last_lines(store, matching[0], args.lines) if matching else console_of(account, args.server)
     if not lines:
         show(f"{args.server} has sent no journals, and AWS has no console of it")
         return 1

@@ -51,10 +51,10 @@ def _refresh(file: Path, settings: PlatformSettings) -> None:
     from rse_pf.config.elasticity import instance_types
 
     kinds, region = instance_types(settings.cloud), settings.cloud.region
-    made = refresh(
+    prices = refresh(
         load_prices(file if file.exists() else None), kinds, region=region,
         price_list=open_account(PRICE_LIST_REGION), account=open_account(region),
         now=datetime.now(timezone.utc),
     )  # fmt: skip
-    replace_file(file, document_of(made))
-    show(f"wrote {file}: {counted(len(made.unverified), 'price')} could not be read from AWS")
+    replace_file(file, document_of(prices))
+    show(f"wrote {file}: {counted(len(prices.unverified), 'price')} could not be read from AWS")

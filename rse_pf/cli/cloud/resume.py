@@ -27,7 +27,7 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     deployment = read_deployment(account, settings)
     plan = plan_resume(deployment, has_packages=tools.has_packages)
     is_deep = deployment.note is not None and deployment.note.deep
-    if is_deep and up.lacks(account, settings):
+    if is_deep and up.show_failed_checks(account, settings):
         return 1
     changing.show_steps(plan)
     costs = changing.deployment_costs(settings)

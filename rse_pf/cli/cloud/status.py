@@ -35,10 +35,10 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
         f"{counted(len(fleet.servers), 'server')}, wanted {fleet.wanted_servers}"
         f" of {fleet.min_servers} to {fleet.max_servers}"
     )
-    for each in fleet.servers:
-        health = ", ".join(each.targets) or "in no target group"
-        robots = "robots: not told" if each.robots is None else counted(int(each.robots), "robot")
-        show(f"  {each.name}  {each.zone}  {each.state:<12}  {health:<20}  {robots}")
+    for server in fleet.servers:
+        health = ", ".join(server.targets) or "in no target group"
+        robots = "robots: not told" if server.robots is None else counted(int(server.robots), "robot")
+        show(f"  {server.name}  {server.zone}  {server.state:<12}  {health:<20}  {robots}")
     if fleet.robots:
         told = fleet.robots
         of = f" of {len(fleet.servers)}" if len(told) < len(fleet.servers) else ""

@@ -14,7 +14,7 @@ from rse_pf.config import PlatformSettings
 from rse_pf.config.cloud_layout import parks_when_idle
 from rse_pf.terminal import show
 
-__all__ = ["add_arguments", "finish", "lacks", "run"]
+__all__ = ["add_arguments", "finish", "run", "show_failed_checks"]
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -31,7 +31,7 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     account = open_account(settings.cloud.region)
     tools = changing.make_tools(account, settings, args)
     plan = plan_up(read_deployment(account, settings), has_packages=tools.has_packages)
-    if lacks(account, settings):
+    if show_failed_checks(account, settings):
         return 1
     changing.show_steps(plan)
     costs = changing.deployment_costs(settings)
@@ -43,12 +43,12 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     return finish(account, settings)
 
 
-def lacks(account: Account, settings: PlatformSettings) -> bool:
+def show_failed_checks(account: Account, settings: PlatformSettings) -> bool:
     """Show what has to be fixed before a deployment; return whether there is anything."""
-    found = [each for each in _findings(account, settings) if each.grade == "fail"]
-    for each in found:
-        show(*each.lines())
-    return bool(found)
+    failed = [finding for finding in _findings(account, settings) if finding.grade == "fail"]
+    for finding in failed:
+        show(*finding.lines())
+    return bool(failed)
 
 
 def finish(account: Account, settings: PlatformSettings) -> int:

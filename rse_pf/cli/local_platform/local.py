@@ -143,8 +143,8 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     from rse_pf.cli.local_platform.lan import chosen_address
     from rse_pf.recording.writer import recorded
 
-    wanted = {"servers": args.servers, "port": args.port, "metrics_port": args.metrics_port}
-    chosen = settings.replace(local={name: value for name, value in wanted.items() if value is not None})
+    overrides = {"servers": args.servers, "port": args.port, "metrics_port": args.metrics_port}
+    chosen = settings.replace(local={name: value for name, value in overrides.items() if value is not None})
     chosen = recorded(_with_services(chosen, args), args.record)
     lan = chosen_address(args.lan)
     page = not args.no_page
@@ -202,7 +202,7 @@ def _check(args: argparse.Namespace) -> None:
     if args.action != "logs" and (args.of_server or args.follow):
         raise UsageError("--server and --follow are for logs", hint="see rse-pf local --help")
     of_start = (args.lan, args.metrics_port, args.record)
-    if args.action != "start" and any(each is not None for each in of_start):
+    if args.action != "start" and any(value is not None for value in of_start):
         raise UsageError(
             "--lan, --metrics-port and --record are for the start of a platform",
             hint="see rse-pf local --help",
@@ -245,12 +245,12 @@ def _on_running(args: argparse.Namespace, folder: Any) -> int:
     if args.action == "slow":
         show(f"{server.name} has {args.percent:g} % of its time; Ctrl-C ends that")
         faults.slow_down(server.process, args.percent, wait)
-        show(f"{server.name} {_afterwards(server, 'has all of its time again')}")
+        show(f"{server.name} {_describe_outcome(server, 'has all of its time again')}")
     elif args.action == "partition":
         with faults.cut_off(server, args.name):
             show(f"{server.name} is cut off; Ctrl-C ends that")
             wait(math.inf)
-        show(f"{server.name} {_afterwards(server, 'is reachable again')}")
+        show(f"{server.name} {_describe_outcome(server, 'is reachable again')}")
     else:
         number = {"kill": signal.SIGKILL, "pause": signal.SIGSTOP, "resume": signal.SIGCONT}[args.action]
         count = faults.signal_tree(server.process, number)
@@ -259,7 +259,7 @@ def _on_running(args: argparse.Namespace, folder: Any) -> int:
         if args.action == "pause" and args.for_s is not None:
             wait(math.inf)
             faults.signal_tree(server.process, signal.SIGCONT)
-            show(f"{server.name} {_afterwards(server, 'goes on')}")
+            show(f"{server.name} {_describe_outcome(server, 'goes on')}")
     return 0
 
 
@@ -279,7 +279,7 @@ def _check_pause(for_s: float, longest_s: float, server: str) -> None:
         )
 
 
-def _afterwards(server: Any, done: str) -> str:
+def _describe_outcome(server: Any, done: str) -> str:
     """Return what became of a server after a fault: *done*, or that it is gone."""
     from rse_pf.local.processes import is_alive
 
@@ -287,29 +287,29 @@ def _afterwards(server: Any, done: str) -> str:
 
 
 def _logs(args: argparse.Namespace, folder: Path) -> int:
-    from rse_pf.cli.local_platform.logs import LogFollower, last_lines, log_files, shown_line
+    from rse_pf.cli.local_platform.logs import LogFollower, format_line, last_lines, log_files
 
     follower = LogFollower(folder, args.of_server, args.level)
     for line in last_lines(log_files(folder, args.of_server), args.level, _LINES):
-        show(shown_line(line))
+        show(format_line(line))
     if args.follow:
         signal.pthread_sigmask(signal.SIG_BLOCK, _STOPPERS)
         wait = functools.partial(_wait, math.inf, _FOLLOW_S)
-        follower.follow(lambda line: show(shown_line(line)), wait)
+        follower.follow(lambda line: show(format_line(line)), wait)
     return 0
 
 
 def _robots(args: argparse.Namespace, state: Any) -> int:
     from rse_pf.cli.local_platform.robots import connected_robots, robots_table
 
-    told = connected_robots(state)
+    robots = connected_robots(state)
     if args.json:
-        show_json(told, indent=2)
+        show_json(robots, indent=2)
     else:
-        show(*robots_table(told))
-        for name in told["silent"]:
+        show(*robots_table(robots))
+        for name in robots["silent"]:
             show(f"no answer from {name}", error=True)
-    return 1 if told["silent"] else 0
+    return 1 if robots["silent"] else 0
 
 
 def _operate(args: argparse.Namespace, state: Any) -> int:
@@ -371,7 +371,7 @@ async def _foreground(
     try:
         async with platform:
             ready = True
-            _welcome(platform, name)
+            _show_welcome(platform, name)
             beside = page_beside(folder, settings.local.page_port, _show_page) if page else nullcontext()
             export = process_beside(
                 "rse_pf.fleet_page.foxglove_export", folder, settings.local.foxglove_port,
@@ -392,7 +392,7 @@ async def _foreground(
     return 0
 
 
-def _welcome(platform: Any, name: str) -> None:
+def _show_welcome(platform: Any, name: str) -> None:
     from rse_pf.local.control.status import data_url
 
     which = "" if name == DEFAULT_NAME else f" --name {name}"

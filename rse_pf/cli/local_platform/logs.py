@@ -15,7 +15,7 @@ from typing import Any
 
 from rse_pf.errors import UsageError
 
-__all__ = ["LEVELS", "LogFollower", "LogLine", "last_lines", "log_files", "shown_line"]
+__all__ = ["LEVELS", "LogFollower", "LogLine", "format_line", "last_lines", "log_files"]
 
 LEVELS = ("debug", "info", "warning", "error")
 _TAIL_BYTES = 1 << 20
@@ -34,25 +34,25 @@ class LogLine:
 
 def log_files(folder: Path, server: str | None) -> list[Path]:
     """Return the logs of *folder*, or that of *server*; raises UsageError if there is none."""
-    found = sorted(folder.glob("*.log"))
-    chosen = [file for file in found if server is None or file.stem == server]
+    files = sorted(folder.glob("*.log"))
+    chosen = [file for file in files if server is None or file.stem == server]
     if chosen:
         return chosen
-    known = ", ".join(file.stem for file in found)
-    if not known:
+    names = ", ".join(file.stem for file in files)
+    if not names:
         raise UsageError(
             f"no logs in {folder}", hint="start a platform with rse-pf local, or name one with --name"
         )
-    raise UsageError(f"there is no log of {str(server)[:80]!r}", hint=f"there are logs of {known}")
+    raise UsageError(f"there is no log of {str(server)[:80]!r}", hint=f"there are logs of {names}")
 
 
 def last_lines(files: Sequence[Path], level: str, count: int) -> list[LogLine]:
     """Return the newest *count* lines of at least *level* of all files, oldest first."""
-    lines = [line for file in files for line in _parsed(file, _tail(file), level)]
+    lines = [line for file in files for line in _parse(file, _tail(file), level)]
     return sorted(lines, key=lambda line: line.time_s)[-count:]
 
 
-def shown_line(line: LogLine) -> str:
+def format_line(line: LogLine) -> str:
     """Return *line* for a person, in the local time of this machine."""
     clock = time.strftime("%H:%M:%S", time.localtime(line.time_s))
     return f"{clock}  {line.source}  {line.level:7}  {line.text}"
@@ -71,8 +71,8 @@ class LogFollower:
 
     def new_lines(self) -> list[LogLine]:
         """Return the lines that were completed since the last call, oldest first."""
-        found = [line for file in self._files() for line in self._of(file)]
-        return sorted(found, key=lambda line: line.time_s)
+        lines = [line for file in self._files() for line in self._of(file)]
+        return sorted(lines, key=lambda line: line.time_s)
 
     def follow(self, take: Callable[[LogLine], None], wait: Callable[[], bool]) -> None:
         """Give every new line to *take*; look again after each *wait* that returns False."""
@@ -101,10 +101,10 @@ class LogFollower:
             return []
         self._read[file] = at + len(data)
         whole, _, self._rest[file] = (self._rest.get(file, b"") + data).rpartition(b"\n")
-        return list(_parsed(file, whole, self._level))
+        return list(_parse(file, whole, self._level))
 
 
-def _parsed(file: Path, data: bytes, level: str) -> Iterator[LogLine]:
+def _parse(file: Path, data: bytes, level: str) -> Iterator[LogLine]:
     """Yield the lines of *data* of at least *level*; a line of text has the level of the line before it.
 
     Text before the first line with a time has the time at which the file was written last.
@@ -114,11 +114,11 @@ def _parsed(file: Path, data: bytes, level: str) -> Iterator[LogLine]:
     for text in data.decode("utf-8", "replace").splitlines():
         if not text.strip():
             continue
-        told = _document(text)
-        if told is not None:
-            time_s, last = float(told["time"]), str(told["level"])
+        document = _document(text)
+        if document is not None:
+            time_s, last = float(document["time"]), str(document["level"])
         if last not in LEVELS or LEVELS.index(last) >= least:
-            body = text if told is None else _body(told)
+            body = text if document is None else _body(document)
             yield LogLine(time_s=time_s, source=file.stem, level=last, text=body)
 
 
@@ -126,17 +126,17 @@ def _document(text: str) -> dict[str, Any] | None:
     if not text.startswith("{"):
         return None
     try:
-        told = json.loads(text)
-        float(told["time"])
+        document = json.loads(text)
+        float(document["time"])
     except (ValueError, KeyError, TypeError, RecursionError):
         return None
-    return {"level": "info", **told} if "event" in told else None
+    return {"level": "info", **document} if "event" in document else None
 
 
-def _body(told: dict[str, Any]) -> str:
-    fields = " ".join(f"{name}={_word(value)}" for name, value in told.items() if name not in _HEAD)
-    trace = str(told.get("traceback", "")).strip().rpartition("\n")[2]
-    return " ".join(word for word in (str(told["event"]), fields, trace) if word)
+def _body(document: dict[str, Any]) -> str:
+    fields = " ".join(f"{name}={_word(value)}" for name, value in document.items() if name not in _HEAD)
+    trace = str(document.get("traceback", "")).strip().rpartition("\n")[2]
+    return " ".join(word for word in (str(document["event"]), fields, trace) if word)
 
 
 def _word(value: Any) -> str:

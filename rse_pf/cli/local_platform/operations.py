@@ -55,10 +55,10 @@ def _events(state: PlatformState, target: str) -> Iterator[Mapping[str, Any]]:
         connection.request("POST", target, headers={"Authorization": bearer(token)})
         reply = connection.getresponse()
         if reply.status != 200:
-            told = json.loads(reply.read())
+            document = json.loads(reply.read())
             raise UsageError(
-                str(told.get("message", f"the control plane answers {reply.status}")),
-                hint=str(told.get("hint", "is it of this version?")),
+                str(document.get("message", f"the control plane answers {reply.status}")),
+                hint=str(document.get("hint", "is it of this version?")),
             )
         for line in reply:
             yield json.loads(line)

@@ -27,23 +27,23 @@ def connected_robots(state: PlatformState) -> dict[str, Any]:
     """
     token = read_control_token(Path(state.control_token_file)) if state.control_token_file else None
     servers = [server for server in state.servers if server.control_port]
-    told = asyncio.run(_ask_all(servers, token))
+    replies = asyncio.run(_ask_all(servers, token))
     rows = [
         {**row, "server": server.name}
-        for server, page in zip(servers, told, strict=True)
+        for server, page in zip(servers, replies, strict=True)
         for row in (page or {}).get("robots", [])
     ]
     return {
         "robots": sorted(rows, key=lambda row: (row["tenant"], row["robot"])),
-        "count": sum((page or {}).get("count", 0) for page in told),
-        "silent": [server.name for server, page in zip(servers, told, strict=True) if page is None],
+        "count": sum((page or {}).get("count", 0) for page in replies),
+        "silent": [server.name for server, page in zip(servers, replies, strict=True) if page is None],
     }
 
 
-def robots_table(told: Mapping[str, Any]) -> list[str]:
+def robots_table(document: Mapping[str, Any]) -> list[str]:
     """Return the lines for a terminal."""
-    rows = [_COLUMNS, *map(_row, told["robots"])]
-    if not told["robots"]:
+    rows = [_COLUMNS, *map(_row, document["robots"])]
+    if not document["robots"]:
         return ["no robot is connected"]
     widths = [max(len(row[column]) for row in rows) for column in range(len(_COLUMNS))]
     lines = [
@@ -53,13 +53,16 @@ def robots_table(told: Mapping[str, Any]) -> list[str]:
         ).rstrip()
         for row in rows
     ]
-    left_out = told["count"] - len(told["robots"])
+    left_out = document["count"] - len(document["robots"])
     return [*lines, *([f"and {left_out} more"] if left_out > 0 else [])]
 
 
 async def _ask_all(servers: Sequence[ServerState], token: str | None) -> list[dict[str, Any] | None]:
     replies = await asyncio.gather(
-        *(ControlPort(each.control_port, token).ask_once("/robots", timeout_s=_TIMEOUT_S) for each in servers)
+        *(
+            ControlPort(server.control_port, token).ask_once("/robots", timeout_s=_TIMEOUT_S)
+            for server in servers
+        )
     )
     return [None if reply is None or reply.status != 200 else reply.document() for reply in replies]
 

@@ -122,14 +122,14 @@ def _to_bag(args: argparse.Namespace) -> int:
     from client_sdk.mapping import read_ply, read_trajectory
 
     folders = _robot_folders(args.source)
-    paths = [(each.name if each != args.source else "robot", read_trajectory(each / "trajectory.txt"))
-             for each in folders]  # fmt: skip
-    clouds = [read_ply(each / "map.ply") for each in folders]
+    paths = [(path.name if path != args.source else "robot", read_trajectory(path / "trajectory.txt"))
+             for path in folders]  # fmt: skip
+    clouds = [read_ply(path / "map.ply") for path in folders]
     merged = args.source / "merged.ply"
     if merged.is_file():
         clouds = [read_ply(merged)]
-    points = np.concatenate([each for each, _ in clouds])
-    colours = np.concatenate([each for _, each in clouds])
+    points = np.concatenate([cloud for cloud, _ in clouds])
+    colours = np.concatenate([colour for _, colour in clouds])
     messages = write_map_bag(args.out, kind, paths, points, colours)
     show(f"{args.out}: {counted(messages, 'message')}, {counted(len(points), 'point')}, "
          f"{counted(len(paths), 'path')}")  # fmt: skip
@@ -147,14 +147,14 @@ def export_bag(file: Path, version: MapVersion) -> int:
     from client_sdk.mapping import Trajectory
 
     paths = []
-    for robot in sorted({each.robot for each in version.keyframes}):
+    for robot in sorted({keyframe.robot for keyframe in version.keyframes}):
         own = sorted((k for k in version.keyframes if k.robot == robot), key=lambda k: k.timestamp_s)
         poses = np.stack([k.T_world_camera for k in own])
         paths.append((robot, Trajectory(np.array([k.timestamp_s for k in own]), poses)))
     with TemporaryDirectory(prefix=".export-", dir=file.absolute().parent) as folder:
-        made = Path(folder) / "map.mcap"
-        write_map_bag(made, "mcap", paths, version.points, version.colours)
-        made.replace(file)
+        bag = Path(folder) / "map.mcap"
+        write_map_bag(bag, "mcap", paths, version.points, version.colours)
+        bag.replace(file)
     return file.stat().st_size
 
 

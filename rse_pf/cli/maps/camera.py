@@ -106,13 +106,13 @@ def _calibrate(args: argparse.Namespace, board: Board) -> int:
         if len(views.found) >= _WANTED_VIEWS or (is_live and views.images >= _LIVE_IMAGES):
             break
     show_progress(f"{len(views.found)} views in {views.images} images; computing", is_over=True)
-    found = calibrate(views, max_rms_px=args.max_rms_px, depth_scale=args.depth_scale)
-    write_intrinsics(args.out, found)
-    camera = found.camera
+    calibration = calibrate(views, max_rms_px=args.max_rms_px, depth_scale=args.depth_scale)
+    write_intrinsics(args.out, calibration)
+    camera = calibration.camera
     show(
         f"{args.out}: fx {camera.fx:.2f}  fy {camera.fy:.2f}  cx {camera.cx:.2f}  cy {camera.cy:.2f}, "
         f"{camera.width}x{camera.height} px",
-        f"reprojection error {found.rms_px:.3f} px rms over {found.views} views",
+        f"reprojection error {calibration.rms_px:.3f} px rms over {calibration.views} views",
     )
     return 0
 
@@ -124,10 +124,10 @@ def _raw_images(sources: list[str]) -> Iterator[npt.NDArray[np.uint8]]:
     from client_sdk.cameras.source import colour_of
 
     paths = [
-        each
+        path
         for word in sources
-        for each in (image_files(Path(word)) if Path(word).is_dir() else [Path(word)])
-        if is_image(each)
+        for path in (image_files(Path(word)) if Path(word).is_dir() else [Path(word)])
+        if is_image(path)
     ]
     for path in paths:
         yield _gray(colour_of(read_raw_image(path), str(path)))

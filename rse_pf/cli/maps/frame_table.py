@@ -83,9 +83,9 @@ class FrameTable:
 
 def named_frames(numbers: list[int]) -> str:
     """Return ``frames 3, 7-9`` for sorted numbers; the first few of many."""
-    found = []
+    ranges = []
     for _, group in itertools.groupby(enumerate(numbers), lambda pair: pair[1] - pair[0]):
         run = [number for _, number in group]
-        found.append(str(run[0]) if len(run) == 1 else f"{run[0]}-{run[-1]}")
-    named = ", ".join(found[:_MOST_NAMED]) + (", ..." if len(found) > _MOST_NAMED else "")
+        ranges.append(str(run[0]) if len(run) == 1 else f"{run[0]}-{run[-1]}")
+    named = ", ".join(ranges[:_MOST_NAMED]) + (", ..." if len(ranges) > _MOST_NAMED else "")
     return f"{'frame' if len(numbers) == 1 else 'frames'} {named}"

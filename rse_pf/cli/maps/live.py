@@ -76,7 +76,7 @@ def run_publish(args: argparse.Namespace, settings: PlatformSettings) -> int:
     """Publish a live map as the next version of the map of the same name."""
     reply = _ask(args, settings, "live-publish", LiveMapRequest(map=args.name))
     _record(args, settings, reply)
-    _print(args, reply, _published(args.name, reply))
+    _print(args, reply, _publication_line(args.name, reply))
     return 0
 
 
@@ -121,7 +121,9 @@ def _stop(args: argparse.Namespace, settings: PlatformSettings) -> None:
     reply = _ask(args, settings, "live-stop", LiveMapRequest(map=args.name))
     if reply:
         _record(args, settings, reply)
-    what = _published(args.name, reply) if reply else f"{args.name} was empty, so nothing was published"
+    what = (
+        _publication_line(args.name, reply) if reply else f"{args.name} was empty, so nothing was published"
+    )
     _print(args, reply, f"{args.name} was stopped", what)
 
 
@@ -130,7 +132,7 @@ def _forget(args: argparse.Namespace, settings: PlatformSettings) -> None:
     _print(args, reply, f"{args.name} holds nothing of {args.robot} any more")
 
 
-def _published(name: str, reply: dict[str, Any]) -> str:
+def _publication_line(name: str, reply: dict[str, Any]) -> str:
     return f"{name} is now version {reply['number']}, {reply['version'][:12]}: " + counted(
         reply["keyframes"], "keyframe"
     )

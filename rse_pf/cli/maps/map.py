@@ -168,14 +168,14 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
         return run_bags(args, settings)
     chosen = settings if args.store is None else settings.replace(data={"store": args.store})
     if chosen.data.store == "memory:":
-        kept = state_folder("default", os.environ) / "objects"
+        folder = state_folder("default", os.environ) / "objects"
         raise UsageError(
             "no store is named, and one in memory belongs to another process",
-            hint=f"name --store dir:PATH; that of rse-pf local is dir:{kept}",
+            hint=f"name --store dir:PATH; that of rse-pf local is dir:{folder}",
         )
 
-    def record(action: str, name: str, made: MapRecord) -> None:
-        record_map_change(chosen, action, name, version=made.id, number=made.number)
+    def record(action: str, name: str, version: MapRecord) -> None:
+        record_map_change(chosen, action, name, version=version.id, number=version.number)
 
     _check_store(chosen.data.store)
     if args.action in ("live", "publish"):
@@ -249,13 +249,13 @@ def _show(args: argparse.Namespace, maps: MapRegistry) -> None:
         *_rows(
             ("version", f"{record.number}  {record.id}"),
             ("parent", record.parent or "-"),
-            ("made by", f"{record.author}, {_when(record.created_s)}  {record.note}".rstrip()),
+            ("made by", f"{record.author}, {_format_time(record.created_s)}  {record.note}".rstrip()),
             ("keyframes", f"{record.keyframes}  ({_counts(robots)})"),
             ("edges", f"{record.edges}  ({_counts(kinds)})"),
             ("points", record.points),
             ("size", f"{record.size} bytes, sha256 {record.digest}"),
             *(
-                ("provenance", f"{key} = {_shortened(str(version.provenance[key]))}")
+                ("provenance", f"{key} = {_shorten(str(version.provenance[key]))}")
                 for key in sorted(version.provenance)
             ),
         ),
@@ -321,7 +321,7 @@ def _localise(args: argparse.Namespace, maps: MapRegistry) -> int:
     found: list[dict[str, Any]] = []
     for each in frames:
         location = locate(index, _view_of(each, version_map, args.camera))
-        found.append(_found(each.label, location))
+        found.append(_location_document(each.label, location))
         if not args.json:
             show(_location_line(found[-1]))
     good = sum(each["verdict"] == "ok" for each in found)
@@ -443,16 +443,20 @@ def _view_of(named: _NamedFrame, version: MapVersion, camera: str | None) -> Vie
     else:
         rgb = read_colour(named.path)
         height, width = rgb.shape[:2]
-        lens = _lens(camera, width, height) if camera else _lens_of_map(version, width, height, named.label)
+        lens = (
+            _parse_lens(camera, width, height)
+            if camera
+            else _lens_of_map(version, width, height, named.label)
+        )
         nothing = np.zeros((height, width), dtype=np.float32)
         frame = Frame(timestamp_s=0.0, rgb=rgb, depth_m=nothing, camera=lens)
     features = extract(frame, FrontEndOptions())
     return View(camera=frame.camera, pixels=features.pixels, descriptors=features.descriptors)
 
 
-def _lens(numbers: str, width: int, height: int) -> Camera:
+def _parse_lens(numbers: str, width: int, height: int) -> Camera:
     try:
-        fx, fy, cx, cy = (float(each) for each in numbers.split(","))
+        fx, fy, cx, cy = (float(number) for number in numbers.split(","))
     except ValueError as error:
         raise UsageError(
             f"--camera {numbers} is not four numbers", hint="write fx,fy,cx,cy in pixels"
@@ -471,7 +475,7 @@ def _lens_of_map(version: MapVersion, width: int, height: int, label: str) -> Ca
     )
 
 
-def _found(label: str, location: LocaliseReply) -> dict[str, Any]:
+def _location_document(label: str, location: LocaliseReply) -> dict[str, Any]:
     T = location.T_map_camera
     return {
         "frame": label, "verdict": location.verdict, "reason": location.reason, "inliers": location.inliers,
@@ -488,7 +492,7 @@ def _location_line(found: dict[str, Any]) -> str:
         return f"{start}  {found['reason']}, {found['inliers']} inliers"
     x, y, z = found["position_m"]
     reason = f" ({found['reason']})" if found["reason"] else ""
-    keyframes = ", ".join(str(each) for each in found["keyframes"])
+    keyframes = ", ".join(str(keyframe) for keyframe in found["keyframes"])
     return (
         f"{start}  x {x:7.3f}  y {y:7.3f}  z {z:7.3f} m, turned {found['turned_deg']:6.2f} deg; "
         f"{found['inliers']} inliers, {found['rmse_px']:.2f} px, keyframes {keyframes}{reason}"
@@ -503,7 +507,7 @@ def _record_line(record: MapRecord) -> str:
             counted(record.points, "point"),
         )
     )
-    columns = (f"{record.number:>4}", record.id[:_SHORT], _when(record.created_s), counts, record.note)
+    columns = (f"{record.number:>4}", record.id[:_SHORT], _format_time(record.created_s), counts, record.note)
     return "  ".join(columns).rstrip()
 
 
@@ -515,11 +519,11 @@ def _counts(counted: Counter[str]) -> str:
     return ", ".join(f"{name} {counted[name]}" for name in sorted(counted)) or "none"
 
 
-def _shortened(text: str) -> str:
+def _shorten(text: str) -> str:
     return text if len(text) <= _MAX_VALUE else f"{text[:_MAX_VALUE]} ... (whole with --json)"
 
 
-def _when(created_s: float) -> str:
+def _format_time(created_s: float) -> str:
     return time.strftime("%Y-%m-%d %H:%M:%SZ", time.gmtime(created_s))
 
 

@@ -44,7 +44,7 @@ def commit_merge(
     Raises:
         CommandFailed: No two maps could be joined; nothing is written.
     """
-    not_joined = [(names[each.map], each.reason) for each in reply.not_joined]
+    not_joined = [(names[failure.map], failure.reason) for failure in reply.not_joined]
     if len(names) > 1 and len(reply.joined) < 2:
         reasons = "; ".join(f"{name}: {reason}" for name, reason in not_joined)
         raise CommandFailed(
@@ -52,14 +52,14 @@ def commit_merge(
             hint="record frames at places that another robot has seen, then merge again",
         )
     joined = [names[row] for row in reply.joined]
-    made = maps.commit(
+    version = maps.commit(
         into, reply.map, parent=parent, author=author, created_s=time.time(),
         note=note or f"merged {', '.join(joined)}",
     )  # fmt: skip
     refused = _refused(names, reply)
     if as_json:
         plain = {
-            "name": into, "id": made.id, "number": made.number, "joined": joined,
+            "name": into, "id": version.id, "number": version.number, "joined": joined,
             "not_joined": [{"map": name, "reason": reason} for name, reason in not_joined],
             "refused": refused, "links": reply.merges, "loops": reply.loops, "seconds": seconds,
             **(more or {}),
@@ -67,8 +67,9 @@ def commit_merge(
         show_json(plain, indent=2, sort_keys=True)
         return 1 if not_joined else 0
     show(
-        f"{into} is now version {made.number}, {made.id[:12]}: {counted(made.keyframes, 'keyframe')}, "
-        f"{counted(made.points, 'point')}, {counted(reply.merges, 'link')} between maps, "
+        f"{into} is now version {version.number}, {version.id[:12]}: "
+        f"{counted(version.keyframes, 'keyframe')}, {counted(version.points, 'point')}, "
+        f"{counted(reply.merges, 'link')} between maps, "
         f"{counted(reply.loops, 'loop')}",
         _row("joined", ", ".join(joined)),
         *(_row("not joined", f"{name}: {reason}") for name, reason in not_joined),
@@ -91,11 +92,11 @@ def merge_progress(done: float, what: str) -> None:
 def _refused(names: Sequence[str], reply: MergeReply) -> list[dict[str, Any]]:
     """Return the counts of pairs of keyframes that were not linked, by their maps and reasons."""
     pairs: dict[str, dict[str, int]] = {}
-    for each in reply.refused:
-        between = " and ".join(dict.fromkeys(names[row] for row in each.maps))
-        if len(set(each.maps)) == 1:
+    for refusal in reply.refused:
+        between = " and ".join(dict.fromkeys(names[row] for row in refusal.maps))
+        if len(set(refusal.maps)) == 1:
             between = f"within {between}"
-        pairs.setdefault(between, {})[each.reason] = each.count
+        pairs.setdefault(between, {})[refusal.reason] = refusal.count
     return [{"between": between, "reasons": reasons} for between, reasons in pairs.items()]
 
 

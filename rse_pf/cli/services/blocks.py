@@ -21,7 +21,7 @@ from rse_pf.local.servers.control_client import ControlPort, ControlPortReply
 from rse_pf.local.state import read_state, state_folder
 from rse_pf.terminal import show
 
-__all__ = ["Server", "add_block_arguments", "chosen_servers", "show_blocks", "unblock"]
+__all__ = ["Server", "add_block_arguments", "choose_servers", "show_blocks", "unblock"]
 
 _TIMEOUT_S = 5.0
 _LOOPBACK = ("127.0.0.1", "localhost", "::1")
@@ -54,16 +54,16 @@ def add_block_arguments(parser: argparse.ArgumentParser) -> None:
 
 def show_blocks(args: argparse.Namespace) -> int:
     """Show what is refused, to whom, and for how long; return 1 if a server did not answer."""
-    told, silent = asyncio.run(_ask_all(chosen_servers(args), "GET", "/blocks"))
-    rows = [_row(server, block) for server, each in told for block in each["blocks"]]
-    left_out = sum(each["count"] - len(each["blocks"]) for _, each in told)
+    answers, silent = asyncio.run(_ask_all(choose_servers(args), "GET", "/blocks"))
+    rows = [_row(server, block) for server, answer in answers for block in answer["blocks"]]
+    left_out = sum(answer["count"] - len(answer["blocks"]) for _, answer in answers)
     if rows:
         _show_table([_COLUMNS, *rows])
-    elif told:
+    elif answers:
         show("no service and no request is refused")
     if left_out:
         show(f"and {left_out} more")
-    return _show_silent(silent, told)
+    return _show_silent(silent, answers)
 
 
 def unblock(args: argparse.Namespace) -> int:
@@ -72,20 +72,20 @@ def unblock(args: argparse.Namespace) -> int:
     wanted = {"service": args.what, "tenant": tenant, "robot": args.robot}
     query = urlencode({name: value for name, value in wanted.items() if value})
     target = f"/unblock?{query}" if query else "/unblock"
-    told, silent = asyncio.run(_ask_all(chosen_servers(args), "POST", target))
-    for server, each in told:
-        for block in each["blocks"]:
+    answers, silent = asyncio.run(_ask_all(choose_servers(args), "POST", target))
+    for server, answer in answers:
+        for block in answer["blocks"]:
             _, service, whom, why, _ = _row(server, block)
             show(f"{server}: {service} is no longer refused to {whom} ({why})")
-        left_out = each["count"] - len(each["blocks"])
+        left_out = answer["count"] - len(answer["blocks"])
         if left_out:
             show(f"{server}: and {left_out} more")
-    if told and not any(each["count"] for _, each in told):
+    if answers and not any(answer["count"] for _, answer in answers):
         show("nothing was refused that could be lifted")
-    return _show_silent(silent, told)
+    return _show_silent(silent, answers)
 
 
-def chosen_servers(args: argparse.Namespace) -> list[Server]:
+def choose_servers(args: argparse.Namespace) -> list[Server]:
     """Return the servers that the options name: those of a platform, or one by its control port.
 
     Raises:
@@ -98,7 +98,7 @@ def chosen_servers(args: argparse.Namespace) -> list[Server]:
         token = None if args.control_token is None else read_control_token(args.control_token)
         return [(f"port {named}", named, token)]
     state = read_state(state_folder(args.name, os.environ))
-    servers = [] if state is None else [each for each in state.servers if each.control_port]
+    servers = [] if state is None else [server for server in state.servers if server.control_port]
     if state is None or not servers:
         raise UsageError(
             f"no server of a platform named {args.name!r} is running",
@@ -132,16 +132,16 @@ async def _ask_all(
             for _, port, token in servers
         )
     )
-    told, silent = [], []
+    answers, silent = [], []
     for (name, _, _), reply in zip(servers, replies, strict=True):
         document = None if reply is None else _document(name, reply)
         if document is None:
             silent.append(name)
             continue
-        told.append((str(document["server"]), document))
+        answers.append((str(document["server"]), document))
         if document["silent_workers"]:
             silent.append(f"{document['silent_workers']} workers of {name}")
-    return told, silent
+    return answers, silent
 
 
 def _document(name: str, reply: ControlPortReply) -> dict[str, Any] | None:
@@ -157,8 +157,8 @@ def _document(name: str, reply: ControlPortReply) -> dict[str, Any] | None:
     return document if {"server", "blocks", "count", "silent_workers"} <= set(document) else None
 
 
-def _show_silent(silent: Sequence[str], told: Sequence[Any]) -> int:
-    if not told:
+def _show_silent(silent: Sequence[str], answers: Sequence[Any]) -> int:
+    if not answers:
         raise CommandFailed(
             f"no answer from {', '.join(silent)}", hint="see rse-pf local status and the logs of the servers"
         )

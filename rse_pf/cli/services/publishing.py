@@ -65,20 +65,24 @@ def publish_service(args: argparse.Namespace, settings: PlatformSettings) -> int
 def _list(store: ObjectStore, *, as_json: bool) -> int:
     services = read_list(store).services
     if as_json:
-        show_json([_row(each) for each in services])
+        show_json([_row(service) for service in services])
         return 0
-    for each in services:
-        at = time.strftime("%Y-%m-%d %H:%M", time.gmtime(each.published_s))
-        show(f"{each.name:<24} {each.language:<8} {each.size:>10} bytes  {each.identity[:12]}  {at} UTC")
+    for service in services:
+        at = time.strftime("%Y-%m-%d %H:%M", time.gmtime(service.published_s))
+        show(
+            f"{service.name:<24} {service.language:<8} {service.size:>10} bytes  "
+            f"{service.identity[:12]}  {at} UTC"
+        )
     if not services:
         show("no service is published")
     return 0
 
 
-def _row(each: PublishedService) -> dict[str, object]:
+def _row(service: PublishedService) -> dict[str, object]:
     return {
-        "name": each.name, "language": each.language, "bytes": each.size, "identity": each.identity,
-        "archive": each.archive, "published_s": each.published_s, "packages": each.packages,
+        "name": service.name, "language": service.language, "bytes": service.size,
+        "identity": service.identity,
+        "archive": service.archive, "published_s": service.published_s, "packages": service.packages,
     }  # fmt: skip
 
 

@@ -91,17 +91,17 @@ async def _record(name: str, servers: Sequence[Server], limits: RecordLimits) ->
         for server, port in ports.items():
             began[server] = await _begin(server, port, name, limits)
         until = time.monotonic() + limits.seconds
-        found: list[RecordedCall] = []
+        calls: list[RecordedCall] = []
         is_over = False
         while not is_over:
             with suppress(asyncio.TimeoutError):
                 await asyncio.wait_for(stopped.wait(), _POLL_S)
             is_over = stopped.is_set() or time.monotonic() >= until
             over = [await _take(ports[server], server, began, streams) for server in list(began)]
-            found = [call for stream in streams.values() for call in recorded_calls(bytes(stream))]
-            show_progress(f"{len(found)} of {limits.calls} requests to {name}", is_over=False)
-            is_over = is_over or all(over) or len(found) >= limits.calls
-        return found[: limits.calls]
+            calls = [call for stream in streams.values() for call in recorded_calls(bytes(stream))]
+            show_progress(f"{len(calls)} of {limits.calls} requests to {name}", is_over=False)
+            is_over = is_over or all(over) or len(calls) >= limits.calls
+        return calls[: limits.calls]
     finally:
         show_progress("", is_over=False)
         for server in began:
@@ -113,15 +113,15 @@ async def _record(name: str, servers: Sequence[Server], limits: RecordLimits) ->
 
 async def _begin(server: str, port: ControlPort, name: str, limits: RecordLimits) -> int:
     """Begin a recording on one server and return its number."""
-    told = await _ask(
+    reply = await _ask(
         server, port, "/record", service=name, count=limits.calls, seconds=limits.seconds, mib=limits.max_mib
     )
-    if not any(row.get("offers") for row in told["workers"]):
+    if not any(row.get("offers") for row in reply["workers"]):
         raise UsageError(
             f"{server} runs no installed service named {name!r}",
             hint="rse-pf service list shows the installed ones",
         )
-    return int(told["recording"])
+    return int(reply["recording"])
 
 
 async def _take(
@@ -136,33 +136,33 @@ async def _take(
     """
     while True:
         try:
-            told = await _ask(server, port, "/record/take", recording=began[server])
+            reply = await _ask(server, port, "/record/take", recording=began[server])
         except CommandFailed as error:
             show(f"{error.message}; what it had recorded until then is kept", error=True)
             del began[server]
             return True
-        for row in told["workers"]:
+        for row in reply["workers"]:
             streams[server, int(row["worker"])] += base64.b64decode(row["data"])
-        if not any(row["waiting"] for row in told["workers"]):
-            return all(row["is_over"] for row in told["workers"])
+        if not any(row["waiting"] for row in reply["workers"]):
+            return all(row["is_over"] for row in reply["workers"])
 
 
 async def _ask(server: str, port: ControlPort, path: str, **query: Any) -> dict[str, Any]:
     try:
         reply = await port.ask(f"{path}?{urlencode(query)}", timeout_s=_TIMEOUT_S, method="POST")
-        told = reply.document()
+        document = reply.document()
     except ConnectionError as error:
         raise CommandFailed(
             f"no answer from {server}", hint="see rse-pf local status and the logs of the servers"
         ) from error
     refusal = _REFUSALS.get(reply.status)
     if refusal is not None:
-        raise refusal(server, told)
-    if reply.status != 200 or not isinstance(told.get("workers"), list):
+        raise refusal(server, document)
+    if reply.status != 200 or not isinstance(document.get("workers"), list):
         raise CommandFailed(
-            f"{server} answers {reply.status}", hint=str(told.get("hint", "see the server's log"))
+            f"{server} answers {reply.status}", hint=str(document.get("hint", "see the server's log"))
         )
-    return told
+    return document
 
 
 _REFUSALS: dict[int, Callable[[str, dict[str, Any]], RsePfError]] = {

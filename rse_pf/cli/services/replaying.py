@@ -28,14 +28,14 @@ _MOST_LETTERS = 300
 
 def recorded_requests(source: Path) -> Recorded:
     """Return the recorded requests of the service in *source*; raises UsageError if there are none."""
-    found: list[tuple[str, Mapping[str, Any]]] = []
+    requests: list[tuple[str, Mapping[str, Any]]] = []
     for path in sorted((source / "requests").glob("*.json")):
-        found += read_requests(path).calls
-    if not found:
+        requests += read_requests(path).calls
+    if not requests:
         raise UsageError(
             f"{source} has no recorded requests", hint=f"write one to {source / 'requests'}/NAME.json"
         )
-    return found
+    return requests
 
 
 def requests_of(path: Path, service: str) -> Recorded:
@@ -64,7 +64,7 @@ def replay(
     """
     from rse_pf.backend.sandbox.dry_run import dry_run
 
-    requests = [each["request"] for _, each in recorded]
+    requests = [call["request"] for _, call in recorded]
     missing, runs = dry_run(
         service, requests, settings, lambda line: show(shown_output(time.time(), _DRY_RUN, line))
     )
@@ -72,10 +72,10 @@ def replay(
         show(f"note: this machine lacks isolation that a server has: {', '.join(missing)}")
     wrong = 0
     for (name, each), each_run in zip(recorded, runs, strict=True):
-        problem, detail = _judged(each, each_run.answer, compare=compare)
+        problem, detail = _judge(each, each_run.answer, compare=compare)
         wrong += problem
         show(f"{name:<28} {'WRONG' if problem else 'ok':<6} {each_run.took_ms:8.1f} ms  {detail}".rstrip())
-    secrets = sum(bool(each.get("secrets")) for _, each in recorded)
+    secrets = sum(bool(call.get("secrets")) for _, call in recorded)
     if secrets:
         show(f"note: {counted(secrets, 'request')} held secrets, which were left out of the recording")
     show(f"{len(runs) - wrong} of {counted(len(runs), 'recorded request')} as expected")
@@ -87,7 +87,7 @@ def plain(value: Any) -> Any:
     return json.loads(json.dumps(value, default=lambda each: getattr(each, "tolist", each.__repr__)()))
 
 
-def _judged(expected: Mapping[str, Any], answer: Any, *, compare: bool) -> tuple[bool, str]:
+def _judge(expected: Mapping[str, Any], answer: Any, *, compare: bool) -> tuple[bool, str]:
     """Return whether *answer* is wrong, and what to say about it."""
     from rse_pf.wire import Failure
 
@@ -97,15 +97,15 @@ def _judged(expected: Mapping[str, Any], answer: Any, *, compare: bool) -> tuple
     if "failure" in expected:
         return True, f"it was answered, expected {expected['failure']}"
     if compare and "reply" not in expected:
-        return False, f"no reply is expected; it is {_shortened(json.dumps(plain(answer.reply)))}"
+        return False, f"no reply is expected; it is {_shorten(json.dumps(plain(answer.reply)))}"
     if not compare:
         return False, ""
     tolerance = expected.get("tolerance", _DEFAULT_TOLERANCE)
-    found = _difference(plain(answer.reply), plain(expected["reply"]), tolerance)
-    return bool(found), found
+    difference = _difference(plain(answer.reply), plain(expected["reply"]), tolerance)
+    return bool(difference), difference
 
 
-def _shortened(text: str) -> str:
+def _shorten(text: str) -> str:
     return text if len(text) <= _MOST_LETTERS else f"{text[:_MOST_LETTERS]}..."
 
 
@@ -114,13 +114,13 @@ def _difference(got: Any, expected: Any, tolerance: float, path: str = "reply") 
     if isinstance(expected, dict) and isinstance(got, dict):
         if set(got) != set(expected):
             return f"{path} has {', '.join(sorted(got))}, expected {', '.join(sorted(expected))}"
-        found = (_difference(got[key], expected[key], tolerance, f"{path}.{key}") for key in expected)
-        return next(filter(None, found), "")
+        differences = (_difference(got[key], expected[key], tolerance, f"{path}.{key}") for key in expected)
+        return next(filter(None, differences), "")
     if isinstance(expected, list) and isinstance(got, list):
         if len(got) != len(expected):
             return f"{path} has {len(got)} values, expected {len(expected)}"
         pairs = enumerate(zip(got, expected, strict=True))
         return next(filter(None, (_difference(g, e, tolerance, f"{path}[{i}]") for i, (g, e) in pairs)), "")
-    numbers = all(isinstance(each, int | float) and not isinstance(each, bool) for each in (got, expected))
+    numbers = all(isinstance(value, int | float) and not isinstance(value, bool) for value in (got, expected))
     equal = math.isclose(got, expected, rel_tol=tolerance, abs_tol=tolerance) if numbers else got == expected
     return "" if equal else f"{path} is {got!r}, expected {expected!r}"

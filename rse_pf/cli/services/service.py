@@ -48,7 +48,7 @@ from typing import Any
 
 from rse_pf.cli.extras import require
 from rse_pf.cli.local_platform.logs import LogFollower, LogLine
-from rse_pf.cli.services.blocks import add_block_arguments, chosen_servers, show_blocks, unblock
+from rse_pf.cli.services.blocks import add_block_arguments, choose_servers, show_blocks, unblock
 from rse_pf.cli.services.building import build_service, built_service, changed_s, lock_service
 from rse_pf.cli.services.debugging import DebugOptions, debug_service
 from rse_pf.cli.services.publishing import add_publish_arguments, publish_service
@@ -239,7 +239,7 @@ def _test(source: Path, args: argparse.Namespace, settings: PlatformSettings) ->
     service, _ = built_service(source)
     file = args.requests
     if args.record is not None:
-        record_service(service.name, chosen_servers(args), _limits(args), args.record)
+        record_service(service.name, choose_servers(args), _limits(args), args.record)
         file = args.record
     if file is None:
         return replay(service, recorded_requests(source), settings, compare=True)
@@ -249,7 +249,7 @@ def _test(source: Path, args: argparse.Namespace, settings: PlatformSettings) ->
 def _record(args: argparse.Namespace) -> int:
     if args.out is None:
         raise UsageError("record needs a file to write", hint=f"add --out {args.what}.jsonl")
-    record_service(args.what, chosen_servers(args), _limits(args), args.out)
+    record_service(args.what, choose_servers(args), _limits(args), args.out)
     return 0
 
 
@@ -295,15 +295,15 @@ async def _run(source: Path, settings: PlatformSettings, *, once: bool) -> int:
                 if once:
                     return 0 if good else 1
                 show(f"save a file in {source} to load it anew; Ctrl-C ends")
-                seen = changed_s(service.folder)
+                changed_at_s = changed_s(service.folder)
                 while not stopped.is_set():
                     _show_output(output)
                     try:
                         await asyncio.wait_for(stopped.wait(), _POLL_S)
                     except asyncio.TimeoutError:
                         newest = changed_s(service.folder)
-                        if newest > seen:
-                            seen = newest
+                        if newest > changed_at_s:
+                            changed_at_s = newest
                             await _reload(platform, source, place / "services", recorded, settings)
         finally:
             _show_output(output)  # what the servers wrote until they ended
@@ -313,12 +313,12 @@ async def _run(source: Path, settings: PlatformSettings, *, once: bool) -> int:
 def _show_output(output: LogFollower) -> None:
     """Show what the service has printed since the last call."""
     for line in output.new_lines():
-        shown = _shown(line)
-        if shown:
-            show(shown)
+        line_text = _format_line(line)
+        if line_text:
+            show(line_text)
 
 
-def _shown(line: LogLine) -> str:
+def _format_line(line: LogLine) -> str:
     printed = _OUTPUT.fullmatch(line.text)
     if printed is None:
         return ""
@@ -351,17 +351,17 @@ async def _ask_recorded(platform: Any, service: Any, recorded: Recorded, setting
 
     failed = []
     async with connect(platform.url, token=platform.issue_token("robot-1")) as robot:
-        for path, each in recorded:
+        for path, call in recorded:
             try:
-                answer = await robot.call(service.name, each["request"])
+                answer = await robot.call(service.name, call["request"])
             except RsePfError as error:
-                if each.get("failure") != error.code:
-                    failed.append(each["request"])
+                if call.get("failure") != error.code:
+                    failed.append(call["request"])
                 hint = f" ({error.hint})" if error.hint else ""
                 show(f"{path}: {error.code}: {error.message}{hint}")
                 continue
-            shown = json.dumps(plain(answer.reply))
-            show(f"{path}: {shown[:500]}  ({answer.round_trip_ms:.1f} ms)")
+            reply_text = json.dumps(plain(answer.reply))
+            show(f"{path}: {reply_text[:500]}  ({answer.round_trip_ms:.1f} ms)")
     if failed:
         await asyncio.to_thread(dry_run, service, failed[:1], settings, lambda line: show(f"  {line}"))
     return not failed

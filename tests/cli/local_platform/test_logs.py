@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from rse_pf.cli.local_platform.logs import LogFollower, last_lines, log_files, shown_line
+from rse_pf.cli.local_platform.logs import LogFollower, format_line, last_lines, log_files
 from rse_pf.errors import UsageError
 
 
@@ -48,8 +48,8 @@ def test_a_level_and_a_server_choose(folder: Path) -> None:
 def test_a_line_shows_its_fields_and_the_end_of_a_traceback(folder: Path) -> None:
     found = last_lines(log_files(folder, None), "debug", 10)
 
-    assert shown_line(found[1])[8:] == '  server-2  debug    command robot="r 1" id=7'
-    assert shown_line(found[-1]).endswith("error    defect ZeroDivisionError")
+    assert format_line(found[1])[8:] == '  server-2  debug    command robot="r 1" id=7'
+    assert format_line(found[-1]).endswith("error    defect ZeroDivisionError")
 
 
 def test_an_unknown_server_and_an_empty_folder_are_refused_with_what_there_is(folder: Path) -> None:
