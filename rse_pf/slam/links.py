@@ -173,7 +173,7 @@ def measure_pairs(
 ) -> tuple[list[LoopClosure], Refused]:
     """Return the links of *pairs* of rows that PnP could measure, in their order, and why others failed."""
     pose_options = RelativePoseOptions(
-        min_inliers=options.min_inliers, min_inlier_ratio=options.min_inlier_ratio, accepts_weak=True
+        min_inliers=options.min_inliers, min_inlier_ratio=options.min_inlier_ratio
     )
     links: list[LoopClosure] = []
     failed: Refused = Counter()

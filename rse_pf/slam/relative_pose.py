@@ -49,11 +49,6 @@ class RelativePoseOptions:
     floor_m: float = 0.02
     floor_deg: float = 0.7
     """Smallest standard deviations for each axis: errors of depth and calibration are correlated."""
-    accepts_weak: bool = False
-    """Whether a pose that its evidence calls weak is a link; its covariance says which directions are weak.
-
-    Merges compare all links at once and gain by them; a live map believes links as they come.
-    """
 
     def floor(self) -> Array:
         """Return the ``(6, 6)`` covariance that every measured pose has at least."""
@@ -162,7 +157,7 @@ def measure_link(
         return "few-inliers"
     if measured.inliers < options.min_inlier_ratio * measured.matches:
         return "low-inlier-ratio"
-    if measured.solution.reason and not options.accepts_weak:
+    if measured.solution.reason:
         return measured.solution.reason
     # T_b_a true = exp(xi) T_b_a, and its inverse has exp(-xi) on its right: the same covariance.
     information = np.linalg.inv(measured.solution.covariance + options.floor())

@@ -22,7 +22,6 @@ MEANT = {
     "rse_pf/backend/sandbox/manager.py: robot: str | None",
     "rse_pf/backend/sandbox/reloading.py: robot: str | None",
     "rse_pf/backend/supervisor/orders.py: robot: str | None",
-    "rse_pf/backend/live_map/owner/requests.py: robot: str",
 }
 """What is meant to know a robot as text."""
 _KEYED = {"get", "setdefault", "pop"}

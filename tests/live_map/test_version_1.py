@@ -26,7 +26,7 @@ OLD: dict[str, Any] = msgspec.msgpack.decode(
 )
 
 SAME_M = 1e-12
-"""Poses are computed anew from a log, by arithmetic that rounds differently: the largest difference is 2e-16."""
+"""Poses are computed anew from a log, by arithmetic that rounds differently; they differ by 2e-16 at most."""
 
 
 def assert_as_before(live_map: LiveMap) -> None:
