@@ -59,7 +59,9 @@ class PoseAnswer(_Origin):
     @classmethod
     def of(cls, answer: Answer, solution: PnpSolution) -> PoseAnswer:
         """Return *solution* with the origin of *answer*, whose reply it was."""
-        return cls(solution=solution, **{each.name: getattr(answer, each.name) for each in fields(_Origin)})
+        return cls(
+            solution=solution, **{field.name: getattr(answer, field.name) for field in fields(_Origin)}
+        )
 
 
 def decode_reply(data: bytes, reply_type: type[T]) -> T:

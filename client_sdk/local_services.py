@@ -44,7 +44,7 @@ class LocalServices:
 
     def offers(self, service: str) -> bool:
         """Return whether the robot offers *service*."""
-        return self._registry is not None and any(each.name == service for each in self._registry)
+        return self._registry is not None and any(registered.name == service for registered in self._registry)
 
     async def ask(self, command: Command) -> Result | Failure:
         """Answer *command* on the robot."""

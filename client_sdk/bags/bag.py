@@ -188,7 +188,7 @@ def _open(file: BagFile, options: BagOptions) -> Bag:
         ),
         chosen=chosen,
         _file=file,
-        _stream=ImageStream(file, list({each[0] for each in pairs[0]}), use_log_time=index.uses_log_time),
+        _stream=ImageStream(file, list({pair[0] for pair in pairs[0]}), use_log_time=index.uses_log_time),
         _pairs=tuple(pairs),
         _rectify_colour=Rectifier(lens, camera),
         _rectify_depth=rectify_depth,
@@ -371,24 +371,24 @@ def _losses(
     index: BagIndex, pairs: list[tuple[tuple[str, int, int], ...]], chosen: ChosenTopics, options: BagOptions
 ) -> tuple[str, ...]:
     """Return a sentence for each thing that was left out or put right."""
-    found = []
+    names = []
     unpaired = len(index.colour.stamps_ns) - len(pairs)
     if unpaired:
-        found.append(
+        names.append(
             f"{_counted(unpaired, 'colour image')} without depth within {options.pair_within_s:g} s left out"
         )
     if index.broken:
-        found.append(f"{_counted(index.broken, 'broken message')} left out; the first: {index.first_broken}")
+        names.append(f"{_counted(index.broken, 'broken message')} left out; the first: {index.first_broken}")
     copies = index.colour.copies + (index.depth.copies if chosen.depth is not None else 0)
     if copies:
-        found.append(f"{_counted(copies, 'message')} with the time stamp of another left out")
+        names.append(f"{_counted(copies, 'message')} with the time stamp of another left out")
     if not (index.colour.was_in_order and index.depth.was_in_order):
-        found.append("the time stamps were not in order; frames are sorted by them")
+        names.append("the time stamps were not in order; frames are sorted by them")
     if index.uses_log_time:
-        found.append("all time stamps are 0; the times of recording are used")
+        names.append("all time stamps are 0; the times of recording are used")
     if index.ended:
-        found.append(f"the bag cannot be read to its end ({index.ended}); what comes before is used")
-    return tuple(found)
+        names.append(f"the bag cannot be read to its end ({index.ended}); what comes before is used")
+    return tuple(names)
 
 
 def _counted(number: int, noun: str) -> str:

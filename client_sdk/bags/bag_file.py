@@ -97,12 +97,12 @@ class BagFile(Closing):
         self._store = store
         self._size_bytes = size_bytes
         self._is_ros1 = is_ros1
-        found: dict[tuple[str, str], int] = {}
-        for each in reader.connections:
-            key = (each.topic, each.msgtype)
-            found[key] = found.get(key, 0) + each.msgcount
+        counts: dict[tuple[str, str], int] = {}
+        for connection in reader.connections:
+            key = (connection.topic, connection.msgtype)
+            counts[key] = counts.get(key, 0) + connection.msgcount
         self.topics = tuple(
-            Topic(name=name, kind=kind, messages=count) for (name, kind), count in sorted(found.items())
+            Topic(name=name, kind=kind, messages=count) for (name, kind), count in sorted(counts.items())
         )
 
     def messages(self, names: Collection[str], start_ns: int | None = None) -> Iterator[RawMessage]:
@@ -117,11 +117,11 @@ class BagFile(Closing):
         if not wanted:
             return
         allowance = Allowance(self._size_bytes)
-        found = self._reader.messages(wanted, start=start_ns)
+        messages = self._reader.messages(wanted, start=start_ns)
         try:
             while True:
                 charge(allowance)
-                message = next(found, None)
+                message = next(messages, None)
                 if message is None:
                     return
                 connection, log_ns, data = message
@@ -166,8 +166,8 @@ class BagFile(Closing):
 
 def _only_bag_of(folder: Path) -> Path | None:
     """Return the one bag file of a folder without ``metadata.yaml``; None if there are none or several."""
-    found = [each for each in folder.iterdir() if each.suffix in _ENDINGS and each.is_file()]
-    return found[0] if len(found) == 1 else None
+    bag_paths = [path for path in folder.iterdir() if path.suffix in _ENDINGS and path.is_file()]
+    return bag_paths[0] if len(bag_paths) == 1 else None
 
 
 def _reader(path: Path, is_ros1: bool) -> Any:
@@ -183,7 +183,7 @@ def _reader(path: Path, is_ros1: bool) -> Any:
 def _size_bytes(path: Path) -> int:
     """Return the size of a bag: of its file, or of the files in its folder."""
     files = path.iterdir() if path.is_dir() else (path,)
-    return sum(each.stat().st_size for each in files if each.is_file())
+    return sum(file.stat().st_size for file in files if file.is_file())
 
 
 def _all_faults() -> tuple[type[Exception], ...]:
@@ -198,7 +198,7 @@ def _all_faults() -> tuple[type[Exception], ...]:
 
 
 def _said(error: BaseException) -> str:
-    text = " ".join(str(each) for each in error.args) or type(error).__name__
+    text = " ".join(str(argument) for argument in error.args) or type(error).__name__
     return " ".join(text.split())[:160].rstrip(".")
 
 

@@ -65,12 +65,12 @@ def choose_topics(
     Raises:
         UsageError: A topic is missing; the message lists those that were found.
     """
-    images = [each for each in topics if each.kind in _IMAGES and each.messages]
+    images = [topic for topic in topics if topic.kind in _IMAGES and topic.messages]
     of_colour = _chosen(topics, images, formats, "colour", colour, None)
     of_depth = None
     if use_depth:
         of_depth = _chosen(topics, images, formats, "depth", depth, formats[of_colour.name])
-    infos = [each for each in topics if each.kind == CAMERA_INFO and each.messages]
+    infos = [topic for topic in topics if topic.kind == CAMERA_INFO and topic.messages]
     if info is not None:
         colour_info: Topic | None = _named(topics, info, {CAMERA_INFO})
     else:
@@ -81,7 +81,7 @@ def choose_topics(
         colour_info=colour_info,
         depth_info=None if of_depth is None else _info_of(of_depth, infos, formats, info_frames),
         poses=_poses(topics, poses),
-        tf=tuple(each.name for each in topics if each.kind in _TF),
+        tf=tuple(topic.name for topic in topics if topic.kind in _TF),
     )
 
 
@@ -98,10 +98,10 @@ def is_registered(topic: Topic) -> bool:
 def topics_line(topics: Sequence[Topic], formats: Mapping[str, ImageFormat]) -> str:
     """Return the topics of a bag with their types, for one line of an error."""
     words = []
-    for each in topics:
-        kind = each.kind.replace("/msg/", "/").rpartition("/")[2]
-        encoding = f" {formats[each.name].encoding}" if each.name in formats else ""
-        words.append(f"{each.name} ({kind}{encoding})")
+    for topic in topics:
+        kind = topic.kind.replace("/msg/", "/").rpartition("/")[2]
+        encoding = f" {formats[topic.name].encoding}" if topic.name in formats else ""
+        words.append(f"{topic.name} ({kind}{encoding})")
     more = len(words) - _MOST_LISTED
     listed = ", ".join(words[:_MOST_LISTED]) or "none"
     return f"{listed} and {more} more" if more > 0 else listed
@@ -117,16 +117,16 @@ def _chosen(
 ) -> Topic:
     if named is not None:
         topic = _named(topics, named, _IMAGES)
-        found = formats.get(named)
-        if found is None:
+        image_format = formats.get(named)
+        if image_format is None:
             raise UsageError(f"{named} holds no image that can be read", hint="name another topic")
-        if found.holds != wanted:
+        if image_format.holds != wanted:
             raise UsageError(
-                f"{named} holds {found.encoding}, which is not {wanted} that can be read",
+                f"{named} holds {image_format.encoding}, which is not {wanted} that can be read",
                 hint=_encodings(wanted),
             )
         return topic
-    good = [each for each in images if each.name in formats and formats[each.name].holds == wanted]
+    good = [image for image in images if image.name in formats and formats[image.name].holds == wanted]
     if not good:
         hint = f"{_encodings(wanted)}; or name the topic: --{wanted} TOPIC"
         if wanted == "depth":
@@ -158,14 +158,14 @@ def _reversed(name: str) -> tuple[int, ...]:
 
 
 def _named(topics: Sequence[Topic], name: str, kinds: set[str]) -> Topic:
-    for each in topics:
-        if each.name == name:
-            if each.kind not in kinds:
+    for topic in topics:
+        if topic.name == name:
+            if topic.kind not in kinds:
                 short = " or ".join(sorted(kind.rpartition("/")[2] for kind in kinds))
-                raise UsageError(f"{name} is a topic of {each.kind}", hint=f"name a topic of {short}")
-            if not each.messages:
+                raise UsageError(f"{name} is a topic of {topic.kind}", hint=f"name a topic of {short}")
+            if not topic.messages:
                 raise UsageError(f"{name} has no message", hint="name another topic")
-            return each
+            return topic
     raise UsageError(
         f"the bag has no topic {name}; its topics: {topics_line(topics, {})}", hint="name one of these"
     )
@@ -188,9 +188,9 @@ def _info_of(
     """Return the camera of an image topic: its neighbour by name, or one of the same frame."""
     base = _base(topic)
     wanted = (f"{base.rpartition('/')[0]}/camera_info", f"{base}/camera_info")
-    for each in infos:
-        if each.name in wanted:
-            return each
+    for info in infos:
+        if info.name in wanted:
+            return info
     frame = formats[topic.name].frame
     return next((each for each in infos if frame and frames.get(each.name) == frame), None)
 
@@ -198,5 +198,5 @@ def _info_of(
 def _poses(topics: Sequence[Topic], named: str | None) -> Topic | None:
     if named is not None:
         return _named(topics, named, set(_POSES))
-    found = [each for each in topics if each.kind == POSE and each.messages > 1]
-    return max(found, key=lambda each: each.messages, default=None)
+    pose_topics = [topic for topic in topics if topic.kind == POSE and topic.messages > 1]
+    return max(pose_topics, key=lambda each: each.messages, default=None)

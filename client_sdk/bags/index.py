@@ -96,11 +96,11 @@ def read_index(file: BagFile, chosen: ChosenTopics, formats: dict[str, ImageForm
             broken += 1
             first_broken = first_broken or f"{raw.topic}: {error}"
     # Some drivers leave the stamps at 0; then the time of writing is all there is.
-    no_stamps = all(not any(each.stamps_ns) for each in images.values())
-    found = [each.finish(use_log_time=no_stamps) for each in images.values()]
+    no_stamps = all(not any(image.stamps_ns) for image in images.values())
+    stamps = [image.finish(use_log_time=no_stamps) for image in images.values()]
     return BagIndex(
-        colour=found[0],
-        depth=found[-1],
+        colour=stamps[0],
+        depth=stamps[-1],
         tree=tree,
         poses=poses,
         broken=broken,

@@ -67,7 +67,7 @@ def lens_of(message: Any, topic: str, *, is_rectified: bool) -> Lens:
         )  # fmt: skip
     except InvalidCamera as error:
         raise UsageError(f"{topic} holds no calibration: {error.message}", hint=_HINT) from error
-    distortion = tuple(float(each) for each in D) if has_distortion else ()
+    distortion = tuple(float(coefficient) for coefficient in D) if has_distortion else ()
     return Lens(camera=camera, distortion=distortion, is_fisheye=is_fisheye)
 
 

@@ -63,7 +63,7 @@ class MessageMaker:
         try:
             return parse(data, kind)
         except (*_FAULTS, SerdeError, TypesysError) as error:
-            text = " ".join(str(each) for each in error.args) or type(error).__name__
+            text = " ".join(str(argument) for argument in error.args) or type(error).__name__
             raise BrokenMessage(text) from error
 
     def make(self, kind: str, **fields: Any) -> Any:

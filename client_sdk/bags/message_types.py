@@ -110,8 +110,8 @@ def load_types(*, is_ros1: bool) -> Any:
         CAMERA_INFO: _CAMERA.format(**names),
     }
     store = get_typestore(Stores.EMPTY)
-    found: dict[str, Any] = {}
+    definitions: dict[str, Any] = {}
     for name, text in texts.items():
-        found.update(get_types_from_msg(text, name))
-    store.register(found)
+        definitions.update(get_types_from_msg(text, name))
+    store.register(definitions)
     return store

@@ -32,7 +32,7 @@ class _Edge:
 
     def add(self, stamp_ns: int, place: Any, turn: Any) -> None:
         numbers = (place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w)
-        norm = sum(each * each for each in numbers[3:])
+        norm = sum(number * number for number in numbers[3:])
         if not np.isfinite(numbers).all() or not 0.5 < norm < 2.0:
             return
         if self.is_static:  # the latest one counts
@@ -68,14 +68,14 @@ class TransformTree:
 
     def add(self, message: Any, *, is_static: bool) -> None:
         """Add a ``TFMessage``."""
-        for each in message.transforms:
-            parent, child = each.header.frame_id.strip("/"), each.child_frame_id.strip("/")
+        for transform in message.transforms:
+            parent, child = transform.header.frame_id.strip("/"), transform.child_frame_id.strip("/")
             edge = self._edges.get(child)
             if edge is None or edge.parent != parent:
                 edge = self._edges[child] = _Edge(parent=parent, is_static=is_static)
-            stamp = each.header.stamp
+            stamp = transform.header.stamp
             stamp_ns = int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
-            edge.add(stamp_ns, each.transform.translation, each.transform.rotation)
+            edge.add(stamp_ns, transform.transform.translation, transform.transform.rotation)
 
     def root_of(self, frame: str) -> tuple[str, bool]:
         """Return the frame above all others of *frame*, and whether it moves against it."""
@@ -153,10 +153,12 @@ class PoseTopic:
 
 def _path(poses: Iterable[tuple[int, Array | None]]) -> Trajectory | None:
     """Return the poses that are known, None if they are fewer than two."""
-    found = [(stamp_ns / 1e9, T) for stamp_ns, T in poses if T is not None]
-    if len(found) < 2:
+    stamped_poses = [(stamp_ns / 1e9, T) for stamp_ns, T in poses if T is not None]
+    if len(stamped_poses) < 2:
         return None
-    return Trajectory(np.array([stamp_s for stamp_s, _ in found]), np.stack([T for _, T in found]))
+    return Trajectory(
+        np.array([stamp_s for stamp_s, _ in stamped_poses]), np.stack([T for _, T in stamped_poses])
+    )
 
 
 def _pose(numbers: Array) -> Array:

@@ -34,7 +34,7 @@ def register_depth(
     points = points[points[:, 2] > _MIN_DEPTH_M]
     # The nearer one is written last, so it stays.
     points = points[np.argsort(-points[:, 2], kind="stable")]
-    found = np.zeros((colour_camera.height, colour_camera.width), dtype=np.float32)
+    registered_m = np.zeros((colour_camera.height, colour_camera.width), dtype=np.float32)
     spread = max(1, math.ceil(colour_camera.fx / depth_camera.fx - 1e-6))
     corner = np.round(colour_camera.project(points) - (spread - 1) / 2).astype(np.int64)
     for across in range(spread):
@@ -43,10 +43,12 @@ def register_depth(
             inside = (x >= 0) & (x < colour_camera.width) & (y >= 0) & (y < colour_camera.height)
             seen = points[inside, 2].astype(np.float32)
             if spread == 1:
-                found[y[inside], x[inside]] = seen
+                registered_m[y[inside], x[inside]] = seen
                 continue
             # Between the areas of several readings the nearer one must win, whichever came last.
-            layer = np.zeros_like(found)
+            layer = np.zeros_like(registered_m)
             layer[y[inside], x[inside]] = seen
-            found = np.where((found == 0) | ((layer > 0) & (layer < found)), layer, found)
-    return found
+            registered_m = np.where(
+                (registered_m == 0) | ((layer > 0) & (layer < registered_m)), layer, registered_m
+            )
+    return registered_m

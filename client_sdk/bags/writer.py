@@ -132,8 +132,8 @@ def _write_map(
     colours: npt.NDArray[np.uint8],
     frame: str,
 ) -> int:
-    starts = [round(1e9 * float(each.timestamps_s[0])) for _, each in paths if len(each)]
-    ends = [round(1e9 * float(each.timestamps_s[-1])) for _, each in paths if len(each)]
+    starts = [round(1e9 * float(trajectory.timestamps_s[0])) for _, trajectory in paths if len(trajectory)]
+    ends = [round(1e9 * float(trajectory.timestamps_s[-1])) for _, trajectory in paths if len(trajectory)]
     count = 0
     with BagWriter(path, kind) as writer:
         events = []

@@ -97,9 +97,9 @@ def calibrate(views: BoardViews, *, max_rms_px: float = 1.0, depth_scale: float 
         points, pixels, views.size, None, None
     )
     # Views that were blurred or half found are far worse than the others: leave them out once.
-    kept = np.flatnonzero(each_px.ravel() <= max(2.5 * float(np.median(each_px)), 0.1))
-    if _MIN_VIEWS <= len(kept) < len(points):
-        points, pixels = [points[row] for row in kept], [pixels[row] for row in kept]
+    good_rows = np.flatnonzero(each_px.ravel() <= max(2.5 * float(np.median(each_px)), 0.1))
+    if _MIN_VIEWS <= len(good_rows) < len(points):
+        points, pixels = [points[row] for row in good_rows], [pixels[row] for row in good_rows]
         rms_px, K, distortion, turns, _, deviations, _, _ = cv2.calibrateCameraExtended(
             points, pixels, views.size, None, None
         )

@@ -48,7 +48,9 @@ def open_video(
                 hint="see ls /dev/video*; close other programs that use it; add yourself to the group video",
             )
         raise UsageError(f"{source} is not a video that OpenCV can read", hint="convert it, such as to mp4")
-    width, height = (int(capture.get(each)) for each in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
+    width, height = (
+        int(capture.get(property_id)) for property_id in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)
+    )
     if width * height > MAX_IMAGE_PIXELS:
         capture.release()
         raise UsageError(
@@ -68,7 +70,7 @@ def _is_text(path: Path) -> bool:
             start = file.read(64)
     except OSError as error:
         raise UsageError(f"cannot read {path}: {error.strerror}", hint="name another video") from error
-    return all(32 <= each < 127 or each in b"\t\r\n" for each in start) and not start.startswith(b"YUV4MPEG2")
+    return all(32 <= byte < 127 or byte in b"\t\r\n" for byte in start) and not start.startswith(b"YUV4MPEG2")
 
 
 def _silence(cv2: Any) -> None:

@@ -52,7 +52,7 @@ class Intrinsics:
 
     def __post_init__(self) -> None:
         if len(self.distortion) not in (0, 4, 5) or not all(
-            abs(each) <= _MAX_DISTORTION for each in self.distortion
+            abs(coefficient) <= _MAX_DISTORTION for coefficient in self.distortion
         ):
             raise UsageError(
                 f"{len(self.distortion)} distortion numbers, or one that is not within {_MAX_DISTORTION:g}",

@@ -220,10 +220,10 @@ class LabelledFile:
             raise self._damaged() from error
         if not fits:
             file.close()
-            what = (
+            problem = (
                 f"images and depths of {_PIXELS[0]}x{_PIXELS[1]} px" if is_complete else "images and depths"
             )
-            raise UsageError(f"{self.path} holds no {what}", hint=_MAT_HINT)
+            raise UsageError(f"{self.path} holds no {problem}", hint=_MAT_HINT)
         return file
 
     def _damaged(self) -> UsageError:
@@ -238,15 +238,15 @@ def _holds_images(h5py: Any, file: Any) -> bool:
     """
     counts = set()
     for name in _SHAPES.keys() & file.keys():
-        found = file[name] if isinstance(file.get(name, getlink=True), h5py.HardLink) else None
-        if not isinstance(found, h5py.Dataset) or found.shape[1:] != _SHAPES[name]:
+        dataset = file[name] if isinstance(file.get(name, getlink=True), h5py.HardLink) else None
+        if not isinstance(dataset, h5py.Dataset) or dataset.shape[1:] != _SHAPES[name]:
             return False
-        if found.external or found.is_virtual or found.dtype.kind not in "uif":
+        if dataset.external or dataset.is_virtual or dataset.dtype.kind not in "uif":
             return False
-        chunk = found.chunks or (1,)
+        chunk = dataset.chunks or (1,)
         if np.prod(chunk, dtype=float) > _MAX_CHUNK_VALUES:
             return False
-        counts.add(len(found))
+        counts.add(len(dataset))
     return len(counts) == 1 and counts.pop() <= _MAX_IMAGES
 
 

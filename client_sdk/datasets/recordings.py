@@ -72,12 +72,12 @@ class Dataset:
         """Return the frames that are at least ``1 / rate_hz`` s apart by time stamp."""
         if not (math.isfinite(rate_hz) and rate_hz > 0):
             raise UsageError(f"rate {rate_hz:g} is not above 0", hint="name frames per second, such as 5")
-        kept: list[int] = []
+        rows: list[int] = []
         for index, timestamp_s in enumerate(self.timestamps_s):
             # A tolerance of one microsecond, because the stamps are decimal fractions.
-            if not kept or timestamp_s - self.timestamps_s[kept[-1]] >= 1.0 / rate_hz - 1e-6:
-                kept.append(index)
-        return self._only(kept)
+            if not rows or timestamp_s - self.timestamps_s[rows[-1]] >= 1.0 / rate_hz - 1e-6:
+                rows.append(index)
+        return self._only(rows)
 
     def share(self, robot: int, robots: int) -> Dataset:
         """Return the contiguous share of ``ceil(n / robots)`` frames of *robot* 0, 1, ..."""

@@ -196,7 +196,7 @@ class Connection:
 
     def _current_region(self) -> Region:
         current = self._session.current
-        held = (each.region for each in self._sockets if each.state is current)
+        held = (socket.region for socket in self._sockets if socket.state is current)
         return next(held, self._regions[0])
 
     def _is_hopeless(self, failed: DialError) -> bool:
@@ -327,7 +327,7 @@ class Connection:
 
     def _note_refusal(self) -> None:
         """End the commands with the reason if every region refuses this robot; it goes on trying."""
-        if not all(self._pauses.is_lasting(each.failed) for each in self._regions):
+        if not all(self._pauses.is_lasting(region.failed) for region in self._regions):
             return
         failed = self._regions[0].failed
         assert failed is not None
@@ -452,8 +452,10 @@ class Connection:
     def _is_double(self, socket: RegionSocket) -> bool:
         """Note if two addresses lead to one platform, which keeps the newest connection of a robot only."""
         since = max(socket.state.opened, self._clock() - _DOUBLE_S)
-        others = (each for each in self._sockets if each.region is not socket.region)
-        if any(each.state.opened >= since for each in others):
+        others = (
+            region_socket for region_socket in self._sockets if region_socket.region is not socket.region
+        )
+        if any(other.state.opened >= since for other in others):
             socket.region.is_double = True
         return socket.region.is_double
 

@@ -112,12 +112,12 @@ def dial_error_of(address: str, status: int, retry_after: str, body: bytes = b""
     after_s = float(retry_after) if retry_after.isdecimal() else 0.0
     after_s = min(after_s, _MAX_RETRY_AFTER_S)
     if status in (401, 403):
-        told = refusal_in(body, Unauthorized.code if status == 401 else Forbidden.code)
-        if told is None:
+        refusal = refusal_in(body, Unauthorized.code if status == 401 else Forbidden.code)
+        if refusal is None:
             return DialError(_not_ours(address, status), after_s=after_s)
         return DialError(
-            _refused(address, status, told),
-            is_refusal=True, after_s=after_s, cause=told.cause, valid_from_s=told.valid_from_s,
+            _refused(address, status, refusal),
+            is_refusal=True, after_s=after_s, cause=refusal.cause, valid_from_s=refusal.valid_from_s,
         )  # fmt: skip
     is_client_error = 300 <= status < 500 and status != 429
     hint = "check the URL: it ends with the path of the servers, /ws"

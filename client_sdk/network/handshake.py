@@ -100,11 +100,11 @@ class Dialler:
             except RsePfError as error:  # its message is written for users, unlike that of any other error
                 raise DialError(ConnectError(f"no token: {error.message}", hint=error.hint)) from error
             except Exception as error:
-                told = ConnectError(
+                connect_error = ConnectError(
                     f"no token: the token callable raised {type(error).__name__}",
                     hint="fix the token callable",
                 )
-                raise DialError(told) from error
+                raise DialError(connect_error) from error
         if token is None:
             return None
         try:
@@ -141,9 +141,9 @@ class Dialler:
                 **options,
             )
         except InvalidStatus as error:
-            told = error.response
-            after = told.headers.get("Retry-After", "")
-            raise dial_error_of(address, told.status_code, after, bytes(told.body or b"")) from error
+            response = error.response
+            after = response.headers.get("Retry-After", "")
+            raise dial_error_of(address, response.status_code, after, bytes(response.body or b"")) from error
         except ssl.SSLCertVerificationError as error:
             raise untrusted(address, error) from error
         except (OSError, asyncio.TimeoutError, WebSocketException, EOFError) as error:

@@ -42,8 +42,8 @@ class TcpDialler:
                 no way there, or the name is not known.
         """
         until = asyncio.get_running_loop().time() + within_s
-        found = await self._addresses(host, port, within_s)
-        return await _first_answer(found[:_MAX_ADDRESSES], until)
+        addresses = await self._addresses(host, port, within_s)
+        return await _first_answer(addresses[:_MAX_ADDRESSES], until)
 
     async def _addresses(self, host: str, port: int, within_s: float) -> list[_Address]:
         key = (host, port)

@@ -167,8 +167,8 @@ class Burst:
         """End what still runs, and close the idle connections."""
         await cancel_all(self._tasks)
         for idle in self._idle.values():
-            for each in idle:
-                each.writer.transport.abort()
+            for connection in idle:
+                connection.writer.transport.abort()
         self._idle.clear()
 
     async def _post(self, address: str, body: bytes) -> tuple[Result | Failure, bool]:
@@ -225,13 +225,15 @@ class Burst:
             raise _BrokenHttp("the token holds a letter that HTTP cannot carry") from error
         idle = self._idle.setdefault(f"{parts.scheme}://{host}", [])
         while idle:
-            each = idle.pop()
-            if self._clock() - each.since < _IDLE_S and not each.reader.at_eof():
+            connection = idle.pop()
+            if self._clock() - connection.since < _IDLE_S and not connection.reader.at_eof():
                 try:
-                    return await self._exchange(each.reader, each.writer, head + body, idle, is_reused=True)
+                    return await self._exchange(
+                        connection.reader, connection.writer, head + body, idle, is_reused=True
+                    )
                 except _Stale:
                     continue
-            each.writer.transport.abort()
+            connection.writer.transport.abort()
         is_secure = parts.scheme == "https"
         try:
             reader, writer = await asyncio.open_connection(
@@ -301,14 +303,14 @@ def _refused(response: _Response) -> Failure:
     """Return what an HTTP status other than 200 means."""
     after = response.headers.get("retry-after", "")
     after_ms = float(after) * 1e3 if after.isdecimal() and len(after) < 9 else None
-    what = f"the burst function answers {response.status}"
+    problem = f"the burst function answers {response.status}"
     if response.status == _UNAUTHORIZED:
-        return _failure("unauthorized", what)
+        return _failure("unauthorized", problem)
     if response.status == _FORBIDDEN:
-        return _failure("forbidden", what)
+        return _failure("forbidden", problem)
     if response.status == _TOO_MANY or response.status >= 500:
-        return _failure("busy", what, after_ms=after_ms)
-    return _failure("connect", what)
+        return _failure("busy", problem, after_ms=after_ms)
+    return _failure("connect", problem)
 
 
 def _failure(code: str, message: str, *, hint: str = "", after_ms: float | None = None) -> Failure:

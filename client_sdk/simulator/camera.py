@@ -122,10 +122,10 @@ class Painter:
         crossing = (seen[:, 2] < _NEAR_M) != (following[:, 2] < _NEAR_M)
         start, end = seen[crossing], following[crossing]
         share = (_NEAR_M - start[:, 2]) / (end[:, 2] - start[:, 2])
-        kept = np.concatenate((seen[seen[:, 2] >= _NEAR_M], start + share[:, None] * (end - start)))
-        if not len(kept):
+        visible = np.concatenate((seen[seen[:, 2] >= _NEAR_M], start + share[:, None] * (end - start)))
+        if not len(visible):
             return None
-        pixels = self._camera.project(kept)
+        pixels = self._camera.project(visible)
         low = np.clip(np.floor(pixels.min(axis=0)), 0, [self._camera.width, self._camera.height])
         high = np.clip(np.ceil(pixels.max(axis=0)) + 1, 0, [self._camera.width, self._camera.height])
         if (low >= high).any():

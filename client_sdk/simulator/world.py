@@ -160,10 +160,10 @@ def with_equal_rooms(world: World, one: int, other: int) -> World:
             f"rooms {one} and {other} of {last + 1} cannot be equal",
             hint="name two rooms with doors on both sides, both even or both odd",
         )
-    kept = [face for face in world.faces if face.room != other]
+    faces = [face for face in world.faces if face.room != other]
     shift_m = (other - one) * ROOM_M
     copies = [_shifted(face, other, shift_m) for face in world.faces if face.room == one]
-    return World((*kept, *copies), world.textures)
+    return World((*faces, *copies), world.textures)
 
 
 def _shifted(face: Face, room: int, shift_m: float) -> Face:

@@ -154,7 +154,7 @@ class DataClient:
         while True:
             with self._lock:
                 page = self._json("GET", f"/data/v1/objects?after={after}")
-            yield from ((str(each["digest"]), int(each["size"])) for each in page["objects"])
+            yield from ((str(entry["digest"]), int(entry["size"])) for entry in page["objects"])
             if page["next"] is None:
                 return
             after = page["next"]
@@ -162,20 +162,20 @@ class DataClient:
     def maps(self) -> dict[str, str]:
         """Return the maps of this tenant: name to id of the head."""
         with self._lock:
-            return {each["name"]: each["head"] for each in self._json("GET", "/data/v1/maps")["maps"]}
+            return {entry["name"]: entry["head"] for entry in self._json("GET", "/data/v1/maps")["maps"]}
 
     def map_version(self, name: str, version: str = "head") -> dict[str, Any]:
         """Return ``id`` and ``record`` of a version of a map."""
         with self._lock:
-            found: dict[str, Any] = self._json("GET", f"/data/v1/maps/{name}/versions/{version}")
-            return found
+            description: dict[str, Any] = self._json("GET", f"/data/v1/maps/{name}/versions/{version}")
+            return description
 
     def download_map(self, name: str, version: str = "head", progress: OnBytes | None = None) -> bytes:
         """Return a version's bytes, for `rse_pf.maps.format.decode_map`."""
-        found = self.map_version(name, version)
+        description = self.map_version(name, version)
         with self._lock:
-            path = f"/data/v1/maps/{name}/versions/{found['id']}/content"
-            return self._download(path, found["record"]["digest"], None, progress)
+            path = f"/data/v1/maps/{name}/versions/{description['id']}/content"
+            return self._download(path, description["record"]["digest"], None, progress)
 
     def commit_map(self, name: str, data: bytes, *, parent: str | None, note: str = "") -> str:
         """Upload the bytes of a map and make them the head; return the version's id.
@@ -244,9 +244,9 @@ class DataClient:
                 if status != _REDIRECTED:
                     return status, answer, piece
             if is_allowed(route.url, secure=self._secure):
-                found = _ask_bucket("GET", route.url, headers, None, options.timeout_s)
-                if found is not None:
-                    return found
+                response = _ask_bucket("GET", route.url, headers, None, options.timeout_s)
+                if response is not None:
+                    return response
             route.url, route.tries = "", route.tries - 1  # expired, or the bucket cannot be reached
             options.sleep(options.first_pause_s)
         return self._request("GET", path, None, headers, also=(416,))

@@ -40,7 +40,7 @@ async def merge_maps(
     Raises:
         RsePfError: The typed failure of an upload, or of the command.
     """
-    digests = [await asyncio.to_thread(data.upload, each) for each in maps]
+    digests = [await asyncio.to_thread(data.upload, robot_map) for robot_map in maps]
     request: dict[str, Any] = {"maps": [{"object": digest} for digest in digests]}
     if options is not None:
         request["options"] = options
