@@ -112,7 +112,7 @@ class DdsTopics:
     def _make(self, kind: str) -> Any:
         package, _, name = kind.partition("/msg/")
         _, described = self._maker.types.fielddefs[kind]
-        fields = {field: self._field(each) for field, each in described}
+        fields = {field: self._field(field_type) for field, field_type in described}
 
         def fill(namespace: dict[str, Any]) -> None:
             namespace["__annotations__"] = fields
@@ -148,8 +148,8 @@ class DdsTopics:
     def _field(self, described: tuple[int, Any]) -> Any:
         kind, what = int(described[0]), described[1]
         if kind == _BASE:
-            found = _NUMBERS[what[0]]
-            return getattr(self._idl_types, found) if isinstance(found, str) else found
+            number_type = _NUMBERS[what[0]]
+            return getattr(self._idl_types, number_type) if isinstance(number_type, str) else number_type
         if kind == _NAME:
             return self.class_of(what)
         inner = self._field(what[0])

@@ -174,11 +174,15 @@ class IncomingFrames:
     def _check(self, role: Role, message: Any) -> None:
         """Refuse an image that is cut off, or unlike the first one of its topic."""
         if role not in self._formats:
-            found = format_of(message, self._kinds[role])
-            if found.holds != role:
-                holds = f"holds {found.holds}" if found.holds else f"has the encoding {found.encoding}"
+            image_format = format_of(message, self._kinds[role])
+            if image_format.holds != role:
+                holds = (
+                    f"holds {image_format.holds}"
+                    if image_format.holds
+                    else f"has the encoding {image_format.encoding}"
+                )
                 raise BrokenMessage(f"it {holds}, where {role} is expected")
-            self._formats[role] = found
+            self._formats[role] = image_format
         check_image(message, self._formats[role])
 
     def _pair(self) -> None:

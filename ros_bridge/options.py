@@ -90,7 +90,7 @@ class BridgeOptions:
         Raises:
             UsageError: A name is unknown, or a value is of another type.
         """
-        kinds = {each.name: str(each.type) for each in fields(BridgeOptions)}
+        kinds = {field.name: str(field.type) for field in fields(BridgeOptions)}
         unknown = sorted(set(values) - set(kinds))
         if unknown:
             raise UsageError(

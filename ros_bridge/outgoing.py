@@ -45,8 +45,8 @@ def ros_covariance(covariance: Array, T_world_camera: Array) -> Array:
     # exp(xi) T_camera_world has the inverse T_world_camera exp(-xi): both parts are rotated into the world.
     turn = np.zeros((6, 6))
     turn[:3, :3] = turn[3:, 3:] = T_world_camera[:3, :3]
-    found: Array = turn @ covariance @ turn.T
-    return found
+    turned: Array = turn @ covariance @ turn.T
+    return turned
 
 
 def with_alignment(covariance: Array, T_map_camera: Array, alignment: Array) -> Array:
@@ -60,8 +60,8 @@ def with_alignment(covariance: Array, T_map_camera: Array, alignment: Array) -> 
     x, y, z = T_map_camera[:3, 3]
     lever = np.eye(6)
     lever[:3, 3:] = -np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    found: Array = covariance + lever @ alignment @ lever.T
-    return found
+    moved: Array = covariance + lever @ alignment @ lever.T
+    return moved
 
 
 def advertised(options: BridgeOptions) -> list[tuple[str, str, bool]]:
@@ -121,11 +121,11 @@ class OutgoingMessages:
         if options.publish_odom:
             moved.append(self._maker.transform(stamp_ns, odom, camera_frame, T_odom_camera))
         made = self._maker.pose_with_covariance(stamp_ns, frame, pose, covariance)
-        found = [self._message("rse_pf/pose", POSE_WITH_COVARIANCE, made)]
+        messages = [self._message("rse_pf/pose", POSE_WITH_COVARIANCE, made)]
         if moved:
-            found.append(self._message("/tf", TF, self._maker.transforms(moved)))
+            messages.append(self._message("/tf", TF, self._maker.transforms(moved)))
         self._extend_path(stamp_ns, T_odom_camera)
-        return found
+        return messages
 
     def path(self) -> list[Message]:
         """Return the path in the odometry frame: the transform to the map moves all of it at once."""

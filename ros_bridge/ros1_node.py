@@ -51,8 +51,8 @@ def run_ros1_node(arguments: list[str], options: dict[str, Any]) -> int:
     _wait_for_master()
     rospy.init_node("rse_pf_bridge", argv=arguments, disable_signals=True)
     namespace = str(rospy.get_namespace()).strip("/")
-    found = {"namespace": namespace, **(rospy.get_param("~", {}) or {}), **options}
-    node = _Node(rospy, BridgeOptions.of(found))
+    parameters = {"namespace": namespace, **(rospy.get_param("~", {}) or {}), **options}
+    node = _Node(rospy, BridgeOptions.of(parameters))
     try:
         return asyncio.run(node.run())
     finally:

@@ -43,11 +43,11 @@ def run_ros2_node(arguments: list[str], options: dict[str, Any]) -> int:
         automatically_declare_parameters_from_overrides=True,
     )  # fmt: skip
     try:
-        own = {name: each.value for name, each in node.get_parameters_by_prefix("").items()}
+        own = {name: parameter.value for name, parameter in node.get_parameters_by_prefix("").items()}
         own = {name: value for name, value in own.items() if name != "use_sim_time" and "." not in name}
         namespace = str(node.get_namespace()).strip("/")
-        found = BridgeOptions.of({"namespace": namespace, **own, **options})
-        return asyncio.run(_run(rclpy, node, found))
+        bridge_options = BridgeOptions.of({"namespace": namespace, **own, **options})
+        return asyncio.run(_run(rclpy, node, bridge_options))
     finally:
         node.destroy_node()
         rclpy.try_shutdown()
