@@ -98,14 +98,14 @@ class FileName(NamedTuple):
     @classmethod
     def parse(cls, name: str) -> FileName | None:
         """Return what *name* says, None if it is no such name."""
-        found = _FILE_NAME.fullmatch(name.removesuffix(SUFFIX)) if name.endswith(SUFFIX) else None
-        if found is None:
+        match = _FILE_NAME.fullmatch(name.removesuffix(SUFFIX)) if name.endswith(SUFFIX) else None
+        if match is None:
             return None
         try:
-            started = datetime.strptime(found[1], _TIME_FORMAT).replace(tzinfo=timezone.utc)
+            started = datetime.strptime(match[1], _TIME_FORMAT).replace(tzinfo=timezone.utc)
         except ValueError:
             return None
-        return cls(started, found[2], int(found[3]))
+        return cls(started, match[2], int(match[3]))
 
 
 def wire_topic(connection: str, direction: Direction) -> str:
@@ -125,13 +125,13 @@ def wire_metadata(channel: WireChannel) -> dict[str, str]:
 
 def wire_channel(topic: str, metadata: dict[str, str]) -> WireChannel | None:
     """Return which connection a channel with this *topic* and *metadata* holds, None for another channel."""
-    found = _WIRE_TOPIC.fullmatch(topic)
-    if found is None:
+    match = _WIRE_TOPIC.fullmatch(topic)
+    if match is None:
         return None
-    direction: Direction = "up" if found[2] == "up" else "down"
+    direction: Direction = "up" if match[2] == "up" else "down"
     codec, server = metadata.get("codec", ""), metadata.get("server", "")
     robot, tenant = metadata.get("robot", ""), metadata.get("tenant", "")
-    return WireChannel(found[1], direction, codec, server, robot, tenant)
+    return WireChannel(match[1], direction, codec, server, robot, tenant)
 
 
 def _schema(title: str, **properties: Any) -> bytes:

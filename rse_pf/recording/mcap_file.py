@@ -175,7 +175,7 @@ class McapFile:
             chunk_count=len(self._chunk_indexes), message_start_time=first_ns, message_end_time=last_ns,
             channel_message_counts=dict(self._counts),
         )  # fmt: skip
-        described = [_record(each) for each in (*self._schemas.values(), *self._channels, statistics)]
+        described = [_record(record) for record in (*self._schemas.values(), *self._channels, statistics)]
         summary = b"".join((*described, *self._chunk_indexes, *self._metadata_index))
         checked = summary + struct.pack("<BQQQ", 2, 20, start, 0)
         footer = Footer(summary_start=start, summary_offset_start=0, summary_crc=zlib.crc32(checked))

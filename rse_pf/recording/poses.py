@@ -104,7 +104,7 @@ def point_cloud(points: bytes, time_ns: int, frame: str = WORLD_FRAME) -> dict[s
             "orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0},
         },
         "point_stride": _POINT_BYTES,
-        "fields": [{"name": each, "offset": 4 * k, "type": _FLOAT32} for k, each in enumerate(names)],
+        "fields": [{"name": name, "offset": 4 * k, "type": _FLOAT32} for k, name in enumerate(names)],
         "data": base64.b64encode(points).decode("ascii"),
     }
 

@@ -156,13 +156,13 @@ class WireRecording:
         """Read what is said before the first message; raises what `commands` raises."""
         for path in self.files:
             try:
-                found = _head(path)
+                head = _head(path)
             except BadRequest:
                 if len(self.files) == 1:
                     raise
                 continue
-            about = found.get(file_format.METADATA_NAME, {})
-            self.case_id = self.case_id or found.get(CASE_NAME, {}).get("command", "")
+            about = head.get(file_format.METADATA_NAME, {})
+            self.case_id = self.case_id or head.get(CASE_NAME, {}).get("command", "")
             if about.get("side") in ("server", "robot"):
                 self.metadata = about
                 return
@@ -187,7 +187,7 @@ class WireRecording:
                 yield from self._paired(sight, sight.of, waiting, sights)
             elif len(sights) < _MAX_CONNECTIONS:
                 sights.setdefault(sight.of[1], _Sights()).add(sight)
-        yield from (self._with_sights(each, sights) for each in waiting.values())
+        yield from (self._with_sights(command, sights) for command in waiting.values())
 
     def find(self, identity: str) -> RecordedCommand:
         """Return the command ``CONNECTION:ID``, or the only one whose name ends in *identity*.
@@ -201,30 +201,32 @@ class WireRecording:
         """Return a command, and up to *count* of its robot and service before it, oldest first."""
         exact = bool(_COMMAND_ID.fullmatch(identity))
         before: dict[tuple[str, str], deque[RecordedCommand]] = {}
-        found: list[tuple[RecordedCommand, list[RecordedCommand]]] = []
-        for each in self.commands(self._wanted(identity) if exact else None):
-            if each.id == identity or (not exact and each.id.endswith(f":{identity}")):
-                found.append((each, list(before.get((each.robot, each.service), ()))))
+        commands_with_history: list[tuple[RecordedCommand, list[RecordedCommand]]] = []
+        for command in self.commands(self._wanted(identity) if exact else None):
+            if command.id == identity or (not exact and command.id.endswith(f":{identity}")):
+                commands_with_history.append(
+                    (command, list(before.get((command.robot, command.service), ())))
+                )
                 if exact:
                     break
-                if len(found) > 1:
+                if len(commands_with_history) > 1:
                     raise BadRequest(
                         f"several commands are called {identity[:40]!r}",
-                        hint=f"give the connection, too: {found[0][0].id} or {each.id}",
+                        hint=f"give the connection, too: {commands_with_history[0][0].id} or {command.id}",
                     )
-            before.setdefault((each.robot, each.service), deque(maxlen=count)).append(each)
-        if not found:
+            before.setdefault((command.robot, command.service), deque(maxlen=count)).append(command)
+        if not commands_with_history:
             raise BadRequest(
                 f"the recording has no command {identity[:40]!r}",
                 hint="rse-pf replay FILE lists those that went wrong",
             )
-        return found[0]
+        return commands_with_history[0]
 
     def _wanted(self, identity: str) -> Wanted | None:
         """Return what is read to find a command and its history, None if no summary knows its robot."""
         topic = file_format.wire_topic(identity.partition(":")[0], "up")
         robots = (robot_of(path, topic) for path in self.files)
-        robot = next((each for each in robots if each), None)
+        robot = next((candidate for candidate in robots if candidate), None)
         return None if robot is None else Wanted(robot=robot)
 
     def _merged(self, wanted: Wanted | None) -> Iterator[_Sight]:
@@ -233,8 +235,8 @@ class WireRecording:
         if len(streams) > _MAX_STREAMS:
             streams = [list(self.files)]
         of_file = partial(self._messages, wanted=wanted)
-        each = [itertools.chain.from_iterable(map(of_file, files)) for files in streams]
-        yield from heapq.merge(*each, key=lambda sight: sight.time_ns)
+        messages = [itertools.chain.from_iterable(map(of_file, files)) for files in streams]
+        yield from heapq.merge(*messages, key=lambda sight: sight.time_ns)
 
     def _messages(self, path: Path, wanted: Wanted | None) -> Iterator[_Sight]:
         """Yield the messages of one file; in a folder, one that was never begun does not end the others."""
@@ -363,15 +365,15 @@ class _Sights:
 
     def of(self, kind: str, command: RecordedCommand) -> bytes | None:
         """Return the JSON of what belongs to *command*: what names it, else the newest before it."""
-        kept = self._kept.get(kind, ())
+        sights = self._kept.get(kind, ())
         mark = f'"command":"{command.id}"'.encode()
-        named = next((each.data for each in kept if mark in each.data), None)
+        named = next((sight.data for sight in sights if mark in sight.data), None)
         if named is not None:
             return named
         near = [
-            each
-            for each in kept
-            if 0 <= command.sent_ns - each.time_ns <= _SIGHT_AGE_NS and b'"command":' not in each.data
+            sight
+            for sight in sights
+            if 0 <= command.sent_ns - sight.time_ns <= _SIGHT_AGE_NS and b'"command":' not in sight.data
         ]
         return max(near, key=lambda each: each.time_ns).data if near else None
 
@@ -438,13 +440,13 @@ def _head(path: Path) -> dict[str, dict[str, str]]:
     """Return the metadata of a file by name."""
     from mcap.records import Chunk, Message, Metadata
 
-    found = {}
+    metadata_by_name = {}
     for record in _records(path, []):
         if isinstance(record, Chunk | Message):
             break
         if isinstance(record, Metadata):
-            found[record.name] = dict(record.metadata)
-    return found
+            metadata_by_name[record.name] = dict(record.metadata)
+    return metadata_by_name
 
 
 def _messages(path: Path, cut: list[Path], wanted: Wanted | None) -> Iterator[_Sight]:
@@ -460,8 +462,8 @@ def _messages(path: Path, cut: list[Path], wanted: Wanted | None) -> Iterator[_S
             channels[number] = of
 
     plan = None if wanted is None else plan_of(path, wanted, _robot_of)
-    for number, each in ({} if plan is None else plan.channels).items():
-        add(number, *each)
+    for number, channel in ({} if plan is None else plan.channels).items():
+        add(number, *channel)
     for record in _flat(path, cut, plan):
         if isinstance(record, Message):
             of = channels.get(record.channel_id)

@@ -137,10 +137,12 @@ class MessageRecorder:
     def take(self, connection: RecordedConnection, direction: Direction, time_ns: int, data: bytes) -> None:
         """Write a message, unless it is one of those that are left out."""
         redactor = connection.redactor
-        kept = redactor.up(data) if direction == "up" else redactor.down(data)
-        self._write(connection, direction, time_ns, kept)
-        if kept is not None and kept.type == "result" and kept.service == "pnp":
-            self._add_pose(connection, time_ns, answered_pose(kept.text, is_binary=connection.codec == "bin"))
+        stored = redactor.up(data) if direction == "up" else redactor.down(data)
+        self._write(connection, direction, time_ns, stored)
+        if stored is not None and stored.type == "result" and stored.service == "pnp":
+            self._add_pose(
+                connection, time_ns, answered_pose(stored.text, is_binary=connection.codec == "bin")
+            )
 
     def take_plain(self, connection: RecordedConnection, time_ns: int, data: bytes) -> None:
         """Write a command that its server has read, the data of a ``PLAIN`` entry."""
@@ -149,9 +151,9 @@ class MessageRecorder:
     def take_pose(self, connection: RecordedConnection, time_ns: int, data: bytes) -> None:
         """Write an answer whose pose its server told, the data of a ``POSE`` entry."""
         identity, pose, message = pose_parts(data)
-        kept = connection.redactor.pose(identity, message)
-        self._write(connection, "down", time_ns, kept)
-        if kept is not None:
+        stored = connection.redactor.pose(identity, message)
+        self._write(connection, "down", time_ns, stored)
+        if stored is not None:
             self._add_pose(connection, time_ns, pose)
 
     def _write(
@@ -182,9 +184,9 @@ class MessageRecorder:
         self, connection: RecordedConnection, time_ns: int, T_camera_world: Sequence[float] | None
     ) -> None:
         if T_camera_world is not None:
-            told = pose_in_frame(inverse(T_camera_world), time_ns)
+            frame_message = pose_in_frame(inverse(T_camera_world), time_ns)
             topic = f"{POSES_PREFIX}{connection.redactor.robot}"
-            self.writer.add_json(topic, POSE_SCHEMA, time_ns, told)
+            self.writer.add_json(topic, POSE_SCHEMA, time_ns, frame_message)
 
 
 class PipeRecorder:

@@ -133,7 +133,7 @@ class ConnectionRedactor:
         longest_first = sorted(names, key=len, reverse=True)
         self._in_text = re.compile(_either(longest_first)) if names else None
         self._forms = [form.encode() for form in {form for name in names for form in _written(name)}]
-        self._secrets = [each.encode() for each in secrets if each]
+        self._secrets = [secret.encode() for secret in secrets if secret]
         self._marks = (_TOKEN_START, *self._secrets, *self._forms)
         self._open: OrderedDict[int, str] = OrderedDict()
 
@@ -151,10 +151,10 @@ class ConnectionRedactor:
                 self._remember(identity, service)
             elif kind not in _ALWAYS_UP:
                 return self._left_out()
-            kept = self._without_names(data, text, kind, service, from_robot=True)
+            stored = self._without_names(data, text, kind, service, from_robot=True)
         except _UNDECODABLE:
             return self._left_out()
-        return kept or self._left_out()
+        return stored or self._left_out()
 
     def plain(self, identity: int, words: bytes, data: bytes) -> Kept | None:
         """Return what is stored of a `pnp` command that its server has read already.
@@ -179,8 +179,8 @@ class ConnectionRedactor:
         """Return what is stored of a message of the server, None if it is left out."""
         try:
             text = self._inflated(data)
-            found = _RESULT.match(text) if self._is_text else None
-            head = self._head(text) if found is None else _Head("result", int(found[1]))
+            match = _RESULT.match(text) if self._is_text else None
+            head = self._head(text) if match is None else _Head("result", int(match[1]))
             service = ""
             if head.type == "welcome":
                 return self._welcome(data)
@@ -192,10 +192,10 @@ class ConnectionRedactor:
                     del self._open[head.id or 0]
             elif head.type not in _ALWAYS_DOWN and head.type != "failure":
                 return self._left_out()
-            kept = self._without_names(data, text, head.type, service, from_robot=False)
+            stored = self._without_names(data, text, head.type, service, from_robot=False)
         except _UNDECODABLE:
             return self._left_out()
-        return kept or self._left_out()
+        return stored or self._left_out()
 
     def _left_out(self) -> Kept | None:
         self.left_out += 1
@@ -224,7 +224,7 @@ class ConnectionRedactor:
     ) -> Kept | None:
         if self._is_clean(text):
             return Kept(data, text, kind, service)
-        if any(each in text for each in self._secrets):
+        if any(secret in text for secret in self._secrets):
             return None
         if _TOKEN.search(text) is not None:
             return None
@@ -250,12 +250,12 @@ class ConnectionRedactor:
             return value if text == value else text
         if isinstance(value, dict):
             items = [
-                (self._replaced(key, spared), self._replaced(each, spared)) for key, each in value.items()
+                (self._replaced(key, spared), self._replaced(item, spared)) for key, item in value.items()
             ]
             is_same = all(a is c and b is d for (a, b), (c, d) in zip(value.items(), items, strict=True))
             return value if is_same else dict(items)
         if isinstance(value, list):
-            parts = [self._replaced(each, spared) for each in value]
+            parts = [self._replaced(item, spared) for item in value]
             return value if all(a is b for a, b in zip(value, parts, strict=True)) else parts
         return value
 
@@ -264,8 +264,8 @@ class ConnectionRedactor:
 
     def _is_clean(self, text: bytes) -> bool:
         """Return whether *text* has nothing that might be a token, a secret or a name."""
-        for each in self._marks:  # noqa: SIM110  a generator costs more than the search
-            if each in text:
+        for mark in self._marks:  # noqa: SIM110  a generator costs more than the search
+            if mark in text:
                 return False
         return True
 

@@ -261,8 +261,8 @@ class _Thread:
     def _seen(self, seen: _Seen) -> None:
         writer = self._recorder.writer
         if seen.rgb is not None:
-            told = image(_jpeg(seen.rgb), seen.time_ns)
-            writer.add_json(f"{FRAMES_PREFIX}{self._robot}", IMAGE_SCHEMA, seen.time_ns, told)
+            image_message = image(_jpeg(seen.rgb), seen.time_ns)
+            writer.add_json(f"{FRAMES_PREFIX}{self._robot}", IMAGE_SCHEMA, seen.time_ns, image_message)
         if seen.T_odom_camera is not None:
             value = {
                 "number": seen.number,

@@ -49,8 +49,10 @@ def plan_of(
     summary = _summary(path)
     if summary is None:
         return None
-    channels = {number: (each.topic, dict(each.metadata)) for number, each in summary.channels.items()}
-    robots = {number: robot_of_channel(*each) for number, each in channels.items()}
+    channels = {
+        number: (channel.topic, dict(channel.metadata)) for number, channel in summary.channels.items()
+    }
+    robots = {number: robot_of_channel(*channel) for number, channel in channels.items()}
     of_robot = {
         number
         for number, robot in robots.items()
@@ -60,10 +62,10 @@ def plan_of(
     return ChunkPlan(
         channels,
         [
-            each.message_end_time >= wanted.begin_ns
-            and each.message_start_time <= wanted.end_ns
-            and not of_robot.isdisjoint(each.message_index_offsets)
-            for each in chunks
+            chunk.message_end_time >= wanted.begin_ns
+            and chunk.message_start_time <= wanted.end_ns
+            and not of_robot.isdisjoint(chunk.message_index_offsets)
+            for chunk in chunks
         ],
     )
 
@@ -72,7 +74,7 @@ def robot_of(path: Path, topic: str) -> str | None:
     """Return the pseudonym of the robot whose channel is *topic*, None if the summary does not know it."""
     summary = _summary(path)
     channels = () if summary is None else summary.channels.values()
-    return next((each.metadata.get("robot") for each in channels if each.topic == topic), None)
+    return next((channel.metadata.get("robot") for channel in channels if channel.topic == topic), None)
 
 
 def _summary(path: Path) -> Any:

@@ -249,7 +249,7 @@ class RecordingTap:
         if fd is not None:
             self._fd = fd
             now = self._time_ns()
-            waiting = [each for each in self._entries if each[0] != OPENED or each[1] not in self._open]
+            waiting = [entry for entry in self._entries if entry[0] != OPENED or entry[1] not in self._open]
             self._entries = [(OPENED, number, now, data) for number, data in self._open.items()] + waiting
             self._waiting_bytes = sum(_ENTRY.size + len(data) for _, _, _, data in self._entries)
             self._wait(_RETRY_S)

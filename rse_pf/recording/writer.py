@@ -246,14 +246,14 @@ class RecordingWriter:
     def _prune(self, now_ns: int) -> None:
         """Delete the oldest recordings of the folder that nobody writes, while all are too long."""
         self._pruned_ns = now_ns
-        found = []
+        recordings = []
         for path in self._folder.glob(f"*{SUFFIX}"):
             name = FileName.parse(path.name)
             with suppress(OSError):
                 if name is not None and not path.is_symlink():
-                    found.append((name.started, name.number, path.stat().st_size, path))
-        total = sum(size for _, _, size, _ in found)
-        for _, _, size, path in sorted(found):
+                    recordings.append((name.started, name.number, path.stat().st_size, path))
+        total = sum(size for _, _, size, _ in recordings)
+        for _, _, size, path in sorted(recordings):
             if total <= self._max_bytes:
                 return
             if path != self._path and _delete_unlocked(path):

@@ -19,7 +19,7 @@ def late(timing: Timing | None) -> tuple[PoseExplanation | None, tuple[str, ...]
         return None, ("times (they would show a late frame or a late answer)",)
     missing = []
     allowed_s = max(_LEAST_ALLOWED_S, _PERIODS * (timing.period_s or _DEFAULT_PERIOD_S))
-    found: list[tuple[float, str, dict[str, float]]] = []
+    candidates: list[tuple[float, str, dict[str, float]]] = []
     if timing.sent_s is None:
         missing.append("the time of sending (it would show a late frame or a late answer)")
     elif timing.frame_s is None:
@@ -27,14 +27,14 @@ def late(timing: Timing | None) -> tuple[PoseExplanation | None, tuple[str, ...]
     else:
         age_s = timing.sent_s - timing.frame_s
         if age_s > allowed_s:
-            found.append((
+            candidates.append((
                 age_s / allowed_s,
                 f"the frame was {_ms(age_s)} old when it was sent, and at most {_ms(allowed_s)} are usual: "
                 "the camera's clock or the robot's queue is late",
                 {"frame_age_s": age_s, "allowed_s": allowed_s},
             ))  # fmt: skip
         elif age_s < -_EARLY_S:
-            found.append((
+            candidates.append((
                 1.0 - age_s / allowed_s,
                 f"the frame is stamped {_ms(-age_s)} after it was sent: the clock of the camera is not that "
                 "of the robot",
@@ -43,10 +43,10 @@ def late(timing: Timing | None) -> tuple[PoseExplanation | None, tuple[str, ...]
     if timing.answered_s is None:
         missing.append("the arrival of the answer (it would show a late answer)")
     elif timing.sent_s is not None:
-        found += _late_answer(timing, timing.answered_s - timing.sent_s, allowed_s)
-    if not found:
+        candidates += _late_answer(timing, timing.answered_s - timing.sent_s, allowed_s)
+    if not candidates:
         return None, tuple(missing)
-    strength, sentence, evidence = max(found, key=lambda each: each[0])
+    strength, sentence, evidence = max(candidates, key=lambda each: each[0])
     explanation = PoseExplanation(
         cause=Cause.LATE, confidence=min(0.97, 0.75 + 0.08 * strength), sentence=sentence, evidence=evidence
     )

@@ -118,11 +118,11 @@ def fitted(
         options = PnpOptions(inlier_px=matches.tight_px, max_iterations=iterations)
         try:
             engine = engine_for(usable_engine("native"))
-            found = engine(matches.points, matches.pixels, matches.camera, options)
+            solution = engine(matches.points, matches.pixels, matches.camera, options)
         except (ConfigurationError, PnpError):
-            found = None
-        if found is not None and np.isfinite(found).all():
-            poses.append(np.vstack([found, _LAST_ROW]))
+            solution = None
+        if solution is not None and np.isfinite(solution).all():
+            poses.append(np.vstack([solution, _LAST_ROW]))
     best: Fit | None = None
     for pose in poses:
         tried = [fit_of(pose, matches)]

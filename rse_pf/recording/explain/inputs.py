@@ -88,11 +88,11 @@ def checked_history(history: Sequence[PastCommand] | None) -> tuple[PastCommand,
     """Return the last commands, each without what is no pose."""
     return tuple(
         replace(
-            each,
-            T_camera_world=checked_pose(each.T_camera_world),
-            T_odom_camera=checked_pose(each.T_odom_camera),
+            past,
+            T_camera_world=checked_pose(past.T_camera_world),
+            T_odom_camera=checked_pose(past.T_odom_camera),
         )
-        for each in (history or ())[-_MAX_HISTORY:]
+        for past in (history or ())[-_MAX_HISTORY:]
     )
 
 

@@ -155,15 +155,15 @@ def line(matches: Matches, base: Fit | None) -> PoseExplanation | None:
 def _planar_share(points: Array, depths_m: Array) -> tuple[float, float]:
     """Return which share lies within depth noise of the best plane, and the median distance from it."""
     noise_m = 3.0 * (0.0025 + 0.0019 * np.maximum(0.0, depths_m - 0.4) ** 2) + 0.004
-    kept = np.ones(len(points), dtype=np.bool_)
+    is_inside = np.ones(len(points), dtype=np.bool_)
     distance = np.zeros(len(points))
     for _ in range(4):
-        if np.count_nonzero(kept) < 4:
+        if np.count_nonzero(is_inside) < 4:
             break
-        centre = points[kept].mean(axis=0)
-        _, axes = np.linalg.eigh(np.cov((points[kept] - centre).T))
+        centre = points[is_inside].mean(axis=0)
+        _, axes = np.linalg.eigh(np.cov((points[is_inside] - centre).T))
         distance = np.abs((points - centre) @ axes[:, 0])
-        kept = distance <= np.maximum(noise_m, np.quantile(distance, 0.8))
+        is_inside = distance <= np.maximum(noise_m, np.quantile(distance, 0.8))
     return float(np.mean(distance <= noise_m)), float(np.median(distance))
 
 
@@ -187,7 +187,7 @@ def stale_map(matches: Matches, base: Fit) -> tuple[PoseExplanation, int] | None
     if shift_m < (_LEAST_SHIFT_M if small_group else _NOISE_SHIFT_M):
         return None
     share = second.count / (second.count + base.count)
-    found = PoseExplanation(
+    explanation = PoseExplanation(
         cause=Cause.STALE_MAP,
         confidence=min(0.93, 0.6 + 0.25 * second.count / len(rest) + 0.2 * max(0.0, apart - 0.5)),
         sentence=(
@@ -199,7 +199,7 @@ def stale_map(matches: Matches, base: Fit) -> tuple[PoseExplanation, int] | None
             "poses_apart_m": metres, "poses_apart_deg": degrees, "second_share": share, "separation": apart,
         },
     )  # fmt: skip
-    return found, base.count + second.count
+    return explanation, base.count + second.count
 
 
 def _median_shift(points: Array, first: Array, second: Array) -> float:

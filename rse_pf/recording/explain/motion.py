@@ -86,7 +86,9 @@ def motion_against_odometry(
     turn_deviation = _TURN_NOISE_DEG * math.sqrt(count) / max(1e-9, float(turns[turning, 1].sum()))
     if abs(turn_scale - 1.0) > max(0.5 * abs(scale - 1.0), 3.0 * turn_deviation):
         return None, ()
-    moved_m, odom_m = (float(np.linalg.norm(each[moving], axis=1).sum()) for each in (by_pose, by_odom))
+    moved_m, odom_m = (
+        float(np.linalg.norm(positions[moving], axis=1).sum()) for positions in (by_pose, by_odom)
+    )
     return PoseExplanation(
         cause=Cause.DEPTH_SCALE,
         confidence=min(0.93, 0.7 + 0.5 * abs(math.log(scale))),

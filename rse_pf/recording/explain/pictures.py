@@ -29,11 +29,11 @@ def sharpness(thumbnail: bytes) -> Array | None:
     gray = _decoded(thumbnail)
     if gray is None:
         return None
-    found = []
+    pictures = []
     for down, right in _DIRECTIONS:
         fine, coarse = (_second_difference(gray, down * step, right * step) for step in (1, 4))
-        found.append(fine / max(coarse, 1e-6))
-    return np.array(found)
+        pictures.append(fine / max(coarse, 1e-6))
+    return np.array(pictures)
 
 
 def _decoded(thumbnail: bytes) -> Array | None:
@@ -60,8 +60,8 @@ def _second_difference(gray: Array, down: int, right: int) -> float:
     def part(times: int) -> Array:
         top = rows + times * down
         left = columns + times * right
-        found: Array = gray[top : top + height - 2 * rows, left : left + width - 2 * columns]
-        return found
+        inner: Array = gray[top : top + height - 2 * rows, left : left + width - 2 * columns]
+        return inner
 
     second = part(-1) - 2.0 * part(0) + part(1)
     return float(np.mean(second * second))
@@ -83,7 +83,7 @@ def blur(
     now = sharpness(thumbnail)
     if now is None:
         return None, (_UNREADABLE,)
-    before = [each for each in map(sharpness, past) if each is not None]
+    before = [value for value in map(sharpness, past) if value is not None]
     if not before:
         return None, ("thumbnails of earlier frames (they would show what is sharp here)",)
     ratios = now / np.maximum(np.median(np.array(before), axis=0), 1e-9)

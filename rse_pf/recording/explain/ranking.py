@@ -90,21 +90,24 @@ def _ranked(
 ) -> list[PoseExplanation]:  # fmt: skip
     rows, options = checked_matches(matches)
     found_late, missing = late(timing)
-    thumbnails = [each.thumbnail for each in history if each.thumbnail is not None]
-    usual = [each.matches for each in history if each.matches]
+    thumbnails = [past.thumbnail for past in history if past.thumbnail is not None]
+    usual = [past.matches for past in history if past.matches]
     usual_matches = float(np.median(usual)) if usual else None
     found_blur, lacks = blur(thumbnail, thumbnails[-_MAX_THUMBNAILS:], len(rows), usual_matches)
     missing += lacks
-    found = [each for each in (found_late, found_blur) if each is not None]
+    explanations = [explanation for explanation in (found_late, found_blur) if explanation is not None]
     if len(rows) >= _LEAST_ROWS:
         more, lacks = _by_matches(rows, options, reply, history, T_odom_camera)
-        found += more
+        explanations += more
         missing += lacks
-    found.sort(key=lambda each: -each.confidence)
-    if not found:
-        found = [_nothing_found(rows, reply)]
+    explanations.sort(key=lambda each: -each.confidence)
+    if not explanations:
+        explanations = [_nothing_found(rows, reply)]
     lacking = tuple(dict.fromkeys(missing))
-    return [replace(each, evidence=_finite(each.evidence), missing=lacking) for each in found]
+    return [
+        replace(explanation, evidence=_finite(explanation.evidence), missing=lacking)
+        for explanation in explanations
+    ]
 
 
 def _finite(evidence: Mapping[str, float]) -> dict[str, float]:
@@ -121,32 +124,34 @@ def _by_matches(
     base = fitted(distinct, iterations=1000, start=start, polish=True)
     count = 0 if base is None else base.count
     is_pair = rows.depths_m is not None or _seen_from_origin(distinct)
-    found: list[PoseExplanation | None] = [
+    explanations: list[PoseExplanation | None] = [
         duplicates(len(rows), len(distinct), count),
         line(rows, base if len(distinct) >= _LEAST_ROWS else None),
     ]
     reflected = mirrored(distinct, base)
     if reflected is not None:
-        return [each for each in (*found, reflected) if each is not None], ()
+        return [explanation for explanation in (*explanations, reflected) if explanation is not None], ()
     if count < _HEALTHY_SHARE * len(distinct):
-        found += _rivals(distinct, base, history, is_pair=is_pair)
+        explanations += _rivals(distinct, base, history, is_pair=is_pair)
     elif base is not None:
         freed = intrinsics(distinct, base, is_pair=is_pair)
-        found.append(None if freed is None else freed[0])
-    other_camera = any(each is not None and each.cause is Cause.INTRINSICS for each in found)
+        explanations.append(None if freed is None else freed[0])
+    other_camera = any(
+        explanation is not None and explanation.cause is Cause.INTRINSICS for explanation in explanations
+    )
     lacks: tuple[str, ...] = ()
     if base is not None:
         weakness, deviation_m = _weakness(rows, options, reply)
         flat = plane(distinct, base, weakness, deviation_m)
         if flat is not None and other_camera:
             flat = replace(flat, confidence=_BEHIND_CAMERA * flat.confidence)
-        found.append(flat)
+        explanations.append(flat)
         pose = base.T_camera_world if start is None else start
         moved, lacks = motion_against_odometry(pose, T_odom_camera, history, is_pair=is_pair)
         # Another camera moves along its axis, too, and a pose of few rows moves anywhere.
         if not other_camera and count >= _RIGHT_SHARE * len(distinct):
-            found += [moved, depth_against_map(distinct, base)]
-    return [each for each in found if each is not None], lacks
+            explanations += [moved, depth_against_map(distinct, base)]
+    return [explanation for explanation in explanations if explanation is not None], lacks
 
 
 def _rivals(
@@ -154,7 +159,7 @@ def _rivals(
 ) -> list[PoseExplanation | None]:
     """Return the causes that may explain why rows disagree: of those, the one that explains most rows."""
     priors = [np.eye(4)] if is_pair else []
-    past = [each.T_camera_world for each in history if each.T_camera_world is not None]
+    past = [command.T_camera_world for command in history if command.T_camera_world is not None]
     priors += past[-1:]
     count = 0 if base is None else base.count
     tried = [row_order(rows, base, priors), intrinsics(rows, base, is_pair=is_pair)]

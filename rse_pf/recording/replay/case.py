@@ -66,10 +66,10 @@ def case_parts(
         BadRequest: It is no command of `pnp`, or its bytes cannot be read.
     """
     connection = command.id.partition(":")[0]
-    told = [*(each for each in history if each.id.startswith(f"{connection}:")), command]
-    start_ns = min(each.sent_ns for each in told)
+    commands = [*(past for past in history if past.id.startswith(f"{connection}:")), command]
+    start_ns = min(recorded.sent_ns for recorded in commands)
     parts: list[CasePart] = []
-    for each in told:
+    for each in commands:
         try:
             parts += _parts(each, start_ns, resolver)
         except RsePfError as error:
@@ -102,8 +102,8 @@ def write_case(
     Raises:
         UsageError: The file cannot be written.
     """
-    kept = {name: metadata[name] for name in _KEPT_METADATA if _VERSION.fullmatch(metadata.get(name, ""))}
-    kept |= {"format": str(file_format.FORMAT_VERSION), **_settings_of(metadata)}
+    versions = {name: metadata[name] for name in _KEPT_METADATA if _VERSION.fullmatch(metadata.get(name, ""))}
+    versions |= {"format": str(file_format.FORMAT_VERSION), **_settings_of(metadata)}
     about = {"command": f"{_CONNECTION}:{number}", "exported_by": version}
     try:
         fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o644)
@@ -111,7 +111,7 @@ def write_case(
             file = McapFile(fd)
             file.begin(
                 file_format.PROFILE, f"{file_format.LIBRARY} {version}",
-                {file_format.METADATA_NAME: kept, CASE_NAME: about},
+                {file_format.METADATA_NAME: versions, CASE_NAME: about},
             )  # fmt: skip
             channels: dict[str, int] = {}
             for part in parts:
@@ -240,7 +240,7 @@ def _only(given: Mapping[str, Any], kind: type[msgspec.Struct]) -> dict[str, Any
 
 def _scalars(given: dict[str, Any], *, engine: bool) -> dict[str, Any]:
     """Return what is a number, and the name of an engine."""
-    numbers = {name: each for name, each in given.items() if isinstance(each, int | float)}
+    numbers = {name: number for name, number in given.items() if isinstance(number, int | float)}
     if engine and given.get("engine") in ENGINES:
         numbers["engine"] = given["engine"]
     return {name: numbers[name] for name in given if name in numbers}
@@ -250,6 +250,6 @@ def _numbers(value: Any) -> Any:
     """Return an array or a list of numbers as it is, None for anything else."""
     if isinstance(value, np.ndarray):
         return value
-    if isinstance(value, list) and all(type(each) in (int, float) for each in value):
+    if isinstance(value, list) and all(type(number) in (int, float) for number in value):
         return value
     return None

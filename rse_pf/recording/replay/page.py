@@ -97,8 +97,8 @@ def _overview(seen: Overview) -> str:
 
 
 def _first_cause(seen: Overview, identity: str) -> str:
-    found = seen.causes.get(identity, ())
-    return f"{_text(found[0].cause)}: {_text(found[0].sentence)}" if found else ""
+    causes = seen.causes.get(identity, ())
+    return f"{_text(causes[0].cause)}: {_text(causes[0].sentence)}" if causes else ""
 
 
 def _report(seen: CommandReport) -> str:
@@ -291,8 +291,8 @@ def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """Return a table whose cells are HTML already."""
     if not rows:
         return ""
-    top = "".join(f'<th scope="col">{_text(each)}</th>' for each in head)
-    body = "".join(f"<tr>{''.join(f'<td>{each}</td>' for each in row)}</tr>\n" for row in rows)
+    top = "".join(f'<th scope="col">{_text(heading)}</th>' for heading in head)
+    body = "".join(f"<tr>{''.join(f'<td>{cell}</td>' for cell in row)}</tr>\n" for row in rows)
     return f'<div class="wide"><table><thead><tr>{top}</tr></thead><tbody>\n{body}</tbody></table></div>\n'
 
 

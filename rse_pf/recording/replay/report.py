@@ -293,10 +293,10 @@ def _causes(
     problem: _Problem,
     reply: Result | Failure | None,
 ) -> tuple[CauseFound, ...]:
-    past = [each for each in map(_past, history) if each is not None]
+    past = [past_command for past_command in map(_past, history) if past_command is not None]
     odometry = command.odometry
     with np.errstate(all="ignore"):
-        found = explain(
+        explanations = explain(
             problem.request,
             problem.recorded,
             thumbnail=command.thumbnail,
@@ -304,7 +304,7 @@ def _causes(
             timing=_timing(command, history, reply),
             T_odom_camera=None if odometry is None else odometry.T_odom_camera,
         )
-    return tuple(CauseFound.of(each) for each in found)
+    return tuple(CauseFound.of(explanation) for explanation in explanations)
 
 
 def _past(command: RecordedCommand) -> PastCommand | None:
@@ -331,7 +331,7 @@ def _timing(
     command: RecordedCommand, history: Sequence[RecordedCommand], reply: Result | Failure | None
 ) -> Timing:
     """Return when command and answer were where, by the clock of the server or robot that recorded."""
-    sent = [each.sent_s for each in history] + [command.sent_s]
+    sent = [past_command.sent_s for past_command in history] + [command.sent_s]
     gaps = np.diff(np.array(sent))
     period_s = float(np.median(gaps)) if len(gaps) > 1 else None
     deadline_ms = command.command.deadline_ms
@@ -399,8 +399,10 @@ def _options(
         ),
     ]
     return tuple(
-        _attempt(_name_of(msgspec.structs.replace(each, engine=None)), resolver.again(command, each), pose)
-        for each in tries
+        _attempt(
+            _name_of(msgspec.structs.replace(attempt, engine=None)), resolver.again(command, attempt), pose
+        )
+        for attempt in tries
     )
 
 
@@ -427,7 +429,7 @@ def _finite_rules(problem: _Problem) -> tuple[Rule, ...]:
             rules = [rule for rule, _ in judgement.ask()]
         except (RsePfError, ValueError, ArithmeticError, np.linalg.LinAlgError):
             return ()  # numbers that no pose has
-    return tuple(msgspec.structs.replace(each, measured=_plain(each.measured)) for each in rules)
+    return tuple(msgspec.structs.replace(rule, measured=_plain(rule.measured)) for rule in rules)
 
 
 def _view(problem: _Problem) -> Array | None:
@@ -462,7 +464,7 @@ def _depths(problem: _Problem) -> Histogram | None:
     good = depths[np.isfinite(depths)]
     if not len(good):
         return None
-    low, high = (float(each) for each in np.percentile(good, (5, 95)))
+    low, high = (float(percentile) for percentile in np.percentile(good, (5, 95)))
     if not high - low > 1e-9:
         low, high = low - 0.5, high + 0.5
     edges = (-math.inf, *np.linspace(low, high, _DEPTH_BINS - 1).tolist(), math.inf)
@@ -474,7 +476,7 @@ def _histogram(values: Array, agrees: npt.NDArray[np.bool_], edges: tuple[float,
     places = np.searchsorted(inner, values, side="right")
     counts = [np.bincount(places[which], minlength=len(edges) - 1).tolist() for which in (agrees, ~agrees)]
     return Histogram(
-        edges=tuple(_plain(each) for each in edges), inliers=tuple(counts[0]), outliers=tuple(counts[1])
+        edges=tuple(_plain(edge) for edge in edges), inliers=tuple(counts[0]), outliers=tuple(counts[1])
     )
 
 

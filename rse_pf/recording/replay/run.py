@@ -95,7 +95,7 @@ class _Worst:
 
     def add(self, trouble: Trouble, command: RecordedCommand, history: tuple[RecordedCommand, ...]) -> None:
         self._added += 1
-        mildness = tuple(-each for each in trouble.order)
+        mildness = tuple(-number for number in trouble.order)
         entry = mildness, -self._added, trouble, command, history
         if len(self._heap) < self._count:
             heapq.heappush(self._heap, entry)
@@ -131,7 +131,7 @@ def overview(
     recording = open_recording(path, settings.session)
     resolvers = _Resolvers(settings)
     robots: dict[str, tuple[RobotHistory, dict[str, deque[RecordedCommand]]]] = {}
-    kept = _Worst(max(worst, explain))
+    worst_commands = _Worst(max(worst, explain))
     others: list[tuple[RecordedCommand, tuple[RecordedCommand, ...]]] = []
     by_kind: Counter[str] = Counter()
     not_solved: Counter[str] = Counter()
@@ -151,7 +151,7 @@ def overview(
         trouble = judged.judge(command)
         if trouble is not None:
             by_kind[trouble.kind] += 1
-            kept.add(trouble, command, tuple(past))
+            worst_commands.add(trouble, command, tuple(past))
         elif len(others) < explain:
             others.append((command, tuple(past)))
         past.append(command)
@@ -166,10 +166,10 @@ def overview(
             different += 1
             if len(changed) < _MAX_CHANGED:
                 changed.append(Changed(id=command.id, what=again.difference))
-    bad = kept.sorted()
+    bad = worst_commands.sorted()
     looked_at = [*((command, past) for _, command, past in bad), *others][:explain]
     return Overview(
-        files=len(recording.files), cut=tuple(sorted({each.name for each in recording.cut})),
+        files=len(recording.files), cut=tuple(sorted({file.name for file in recording.cut})),
         version=recording.metadata.get("version", ""), side=recording.metadata.get("side", ""),
         commands=commands, robots=len(robots),
         seconds=0.0 if first_s is None or last_s is None else last_s - first_s, left_out=recording.left_out,
@@ -234,7 +234,7 @@ def find(
         near_s: When it was answered, Unix time: the nearest within 5 s is taken; None for the newest.
         command_bytes: The length of its message, None where it is not known.
     """
-    found, nearest_s = "", _NEAR_S
+    nearest, nearest_s = "", _NEAR_S
     wanted = None
     if near_s is not None and 0.0 < near_s < _LATEST_S:
         begin_s, end_s = near_s - _NEAR_S - _LONGEST_S, near_s + _NEAR_S
@@ -248,10 +248,10 @@ def find(
             continue
         try:
             if command.command.trace == trace:
-                found, nearest_s = command.id, apart_s if near_s is not None else _NEAR_S
+                nearest, nearest_s = command.id, apart_s if near_s is not None else _NEAR_S
         except RsePfError:
             continue
-    return found
+    return nearest
 
 
 def _identity(recording: WireRecording, identity: str) -> str:

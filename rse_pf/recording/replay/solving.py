@@ -210,8 +210,8 @@ class Resolver:
         """Return *answer* as it would have been sent then; None if it is of another kind."""
         if type(answer) is not type(recorded):
             return None
-        kept = {name: getattr(recorded, name) for name in TIMES_AND_PLACES if hasattr(recorded, name)}
-        return self._text(codec, self._codec(codec).encode(msgspec.structs.replace(answer, **kept)))
+        unchanged = {name: getattr(recorded, name) for name in TIMES_AND_PLACES if hasattr(recorded, name)}
+        return self._text(codec, self._codec(codec).encode(msgspec.structs.replace(answer, **unchanged)))
 
     def _text(self, codec: str, data: bytes | None) -> bytes:
         """Return the bytes of a message before it was deflated: how tightly it is says nothing of a pose."""
@@ -236,7 +236,7 @@ def pnp_reply(answer: Result | Failure | None) -> PnpReply | None:
 def solver_codes() -> frozenset[str]:
     """Return the codes of failures that depend on nothing but the command."""
     kinds: list[type[RsePfError]] = [PnpError, *PnpError.__subclasses__(), BadRequest, LimitExceeded]
-    return frozenset(each.code for each in kinds)
+    return frozenset(kind.code for kind in kinds)
 
 
 def difference_of(before: Result | Failure, after: Result | Failure) -> str:

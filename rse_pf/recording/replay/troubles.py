@@ -96,10 +96,10 @@ class RobotHistory:
             return "unanswered", "no answer was recorded", 0.0
         took_ms = command.round_trip_ms or 0.0
         if isinstance(reply, Failure):
-            told = f"{reply.code}: {reply.message}"
+            sentence = f"{reply.code}: {reply.message}"
             if reply.code in solver_codes():
-                return "failed", told, 0.0
-            return _WITHOUT_WORK.get(reply.code, "refused"), told, 0.0
+                return "failed", sentence, 0.0
+            return _WITHOUT_WORK.get(reply.code, "refused"), sentence, 0.0
         pose = pnp_reply(reply)
         if pose is not None:
             jump = self._jump(command, pose.solution().T_camera_world)
