@@ -64,8 +64,8 @@ class ChildFailed:
 
     def error(self, name: str) -> CommandFailed:
         """Return the error for the parent to raise."""
-        what, _, hint = self.report.partition("\n  hint: ")
-        return CommandFailed(f"{name}: {what}", hint=hint)
+        problem, _, hint = self.report.partition("\n  hint: ")
+        return CommandFailed(f"{name}: {problem}", hint=hint)
 
 
 class ParentPipe:

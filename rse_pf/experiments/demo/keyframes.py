@@ -81,16 +81,16 @@ class KeyframeCollector:
         """Add *tracked* if it is a keyframe."""
         if not tracked.keyframe or tracked.T_world_camera is None:
             return
-        found = extract(tracked.frame, self._options)
+        features = extract(tracked.frame, self._options)
         keyframe = Keyframe(
             id=len(self._keyframes),
             robot=self._robot,
             timestamp_s=tracked.frame.timestamp_s,
             T_world_camera=tracked.T_world_camera,
             camera=tracked.frame.camera,
-            pixels=found.pixels.astype(np.float32),
-            descriptors=found.descriptors,
-            points_camera=found.points_camera.astype(np.float32),
+            pixels=features.pixels.astype(np.float32),
+            descriptors=features.descriptors,
+            points_camera=features.points_camera.astype(np.float32),
         )
         self._keyframes.append(keyframe)
         self._uploads.keyframe(encode_map(MapVersion(keyframes=(keyframe,))))

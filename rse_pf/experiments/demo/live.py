@@ -59,11 +59,11 @@ class LiveRecorder:
         self._lines += [
             {
                 "event": "keyframe",
-                "number": each.number,
-                "sent": self._since(each.sent_s),
-                "kept": self._since(each.kept_s),
+                "number": sent_keyframe.number,
+                "sent": self._since(sent_keyframe.sent_s),
+                "kept": self._since(sent_keyframe.kept_s),
             }
-            for each in self._mapper.sent_keyframes
+            for sent_keyframe in self._mapper.sent_keyframes
         ]
         text = "".join(json.dumps(line) + "\n" for line in self._lines)
         await asyncio.to_thread((folder / LIVE_RECORDS).write_text, text, encoding="utf-8")
@@ -71,17 +71,17 @@ class LiveRecorder:
             await asyncio.to_thread(write_trajectory, folder / TRUTH, truth)
 
     async def _listen(self) -> None:
-        async for each in self._mapper.corrections():
+        async for correction in self._mapper.corrections():
             self._lines.append(
                 {
                     "event": "correction",
                     "t": self._since(self._now()),
-                    "segment": each.segment,
-                    "T_map_odom": _numbers(each.after),
-                    "by": each.by,
-                    "reason": each.reason,
-                    "version": each.version,
-                    "cause": each.cause,
+                    "segment": correction.segment,
+                    "T_map_odom": _numbers(correction.after),
+                    "by": correction.by,
+                    "reason": correction.reason,
+                    "version": correction.version,
+                    "cause": correction.cause,
                 }
             )
 

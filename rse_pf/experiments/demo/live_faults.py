@@ -135,32 +135,32 @@ class Disturbance:
         if name == "none":
             return
         owner = await self._owner()
-        what = {"fault": name, "seconds": seconds}
+        event = {"fault": name, "seconds": seconds}
         if name == "wifi":
             assert self._link is not None
-            self._log("fault", **what, robot=f"robot-{_CUT_ROBOT + 1}")
+            self._log("fault", **event, robot=f"robot-{_CUT_ROBOT + 1}")
             await self._link.cut()
             await asyncio.sleep(seconds)
             await self._link.heal()
         elif name == "store":
-            self._log("fault", **what, percent=_FAILING_PERCENT)
+            self._log("fault", **event, percent=_FAILING_PERCENT)
             await self._fail_store(seconds)
         elif name == "roll":
-            self._log("fault", **what, owner=owner.owner, server=owner.server)
+            self._log("fault", **event, owner=owner.owner, server=owner.server)
             await self._platform.roll()
         elif name == "drain":
-            self._log("fault", **what, owner=owner.owner, server=owner.server)
+            self._log("fault", **event, owner=owner.owner, server=owner.server)
             await self._platform.drain(owner.server, reason="experiment: drain of the owner's server")
         elif name == "kill":
-            self._log("fault", **what, owner=owner.owner, server=owner.server)
+            self._log("fault", **event, owner=owner.owner, server=owner.server)
             self._platform.kill(owner.server)
         else:
-            await self._stop(owner, what)
+            await self._stop(owner, event)
         self._log("fault-over", fault=name)
 
     async def _stop(self, owner: LeaseRecord, what: dict[str, Any]) -> None:
         """Stop all processes of the owner's server, the owner among them, and let them go on."""
-        server = next(each for each in self._platform.servers if each.name == owner.server)
+        server = next(candidate for candidate in self._platform.servers if candidate.name == owner.server)
         self._log("fault", **what, owner=owner.owner, server=owner.server)
         stopped = signal_tree(server.mark, signal.SIGSTOP)
         self._log("stopped", processes=stopped)

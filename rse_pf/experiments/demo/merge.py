@@ -92,8 +92,8 @@ def _draw(path: Path, robots: Sequence[JoinedRobot], merged: MapVersion, section
     if section["ate_cm"] is not None:
         caption += f", ATE {section['ate_cm']:.1f} cm"
     if section["not_joined"]:
-        caption += f"; not joined: {', '.join(each['robot'] for each in section['not_joined'])}"
-    shown = [RobotPath(name=each.name, T_world_camera=each.merged.T_world_camera) for each in robots]
+        caption += f"; not joined: {', '.join(entry['robot'] for entry in section['not_joined'])}"
+    shown = [RobotPath(name=robot.name, T_world_camera=robot.merged.T_world_camera) for robot in robots]
     draw_map(path, merged.points, merged.colours, shown, caption)
 
 

@@ -183,12 +183,12 @@ class Swarm:
         )
         wall_s = time.monotonic() - self._start_s
         ended = [child.ended for child in self._children if child.ended is not None]
-        totals = sum((each.counts for each in ended), Counter[str]())
+        totals = sum((end.counts for end in ended), Counter[str]())
         commands = [command for rows in self.rows for command in records_of(rows, self.options.robot_prefix)]
         late_ms = [1e3 * (command.sent - command.planned) for command in commands]
         return SwarmResult(
             commands=commands,
-            cpu_s=round(sum(each.cpu_s for each in ended), 3),
+            cpu_s=round(sum(end.cpu_s for end in ended), 3),
             wall_s=round(wall_s, 3),
             wrong_poses=totals["wrong_poses"],
             reconnects=totals["reconnects"],
@@ -196,7 +196,7 @@ class Swarm:
             moves=totals["moves"],
             duplicates=totals["duplicates"]
             + len(commands)
-            - len({(each.robot, each.id) for each in commands}),
+            - len({(command.robot, command.id) for command in commands}),
             link=self.options.link,
             late_sends_ms_p99=round(float(np.percentile(late_ms, 99)), 3) if late_ms else 0.0,
         )

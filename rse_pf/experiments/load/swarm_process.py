@@ -458,7 +458,7 @@ class _Robot:
         wire_bytes: int = 0,
         parts_ms: tuple[float, ...] = _NO_PARTS,
     ) -> None:
-        seconds = (each - self._process.origin_s for each in (*times, ended))
+        seconds = (time_s - self._process.origin_s for time_s in (*times, ended))
         self._process.write((self._number, identity, *seconds, wire_bytes, *parts_ms), server, code)
 
     async def _token(self) -> str:

@@ -81,8 +81,8 @@ class CpuCost:
 
     def emulated_cores(self, commands_per_s: float, busy_percent: float) -> float:
         """Return the cores per server with which five servers handle all commands at *busy_percent*."""
-        each = commands_per_s * self.command_s / _SERVERS_AT_FULL + self.idle_s_per_s
-        return round(each / (busy_percent / 100.0), 4)
+        needed_s = commands_per_s * self.command_s / _SERVERS_AT_FULL + self.idle_s_per_s
+        return round(needed_s / (busy_percent / 100.0), 4)
 
 
 def run_elasticity(options: ElasticityOptions, settings: PlatformSettings) -> int:
@@ -104,7 +104,7 @@ def run_elasticity(options: ElasticityOptions, settings: PlatformSettings) -> in
     for part, rebalance in runs.values():
         asyncio.run(_run(options, chosen, part, rebalance))
     records = {name: read_records(part) for name, (part, _) in runs.items()}
-    figures = {name: elasticity_figures(each) for name, each in records.items()}
+    figures = {name: elasticity_figures(record) for name, record in records.items()}
     body: Mapping[str, Any] = {"runs": figures} if options.compare else next(iter(figures.values()))
     asked = {**asdict(options), "out": options.out.name, "size": cores}
     del asked["emulated_cores"]  # its key in reports is "size"
@@ -115,7 +115,7 @@ def run_elasticity(options: ElasticityOptions, settings: PlatformSettings) -> in
         "size": cores,
         "cost": None if cost is None else asdict(cost),
         **body,
-        "generator": {name: generator_of(each) for name, each in records.items()},
+        "generator": {name: generator_of(record) for name, record in records.items()},
         "paper": PAPER,
     }
     if not options.compare:
@@ -124,7 +124,7 @@ def run_elasticity(options: ElasticityOptions, settings: PlatformSettings) -> in
         finish_report(folder, report, lambda whole: elasticity_page(whole, figures), chosen, load_before)
     )
     captions = {"": "with rebalancing" if options.rebalance else "without rebalancing"}
-    draw_elasticity(folder / FIGURE, {captions.get(name, name): each for name, each in records.items()})
+    draw_elasticity(folder / FIGURE, {captions.get(name, name): record for name, record in records.items()})
     show(f"wrote {FIGURE}, report.json, report.md and the raw records to {options.out}")
     return int(any(run["commands"]["lost"] or run["commands"]["twice"] for run in figures.values()))
 
@@ -263,15 +263,15 @@ def elasticity_figures(records: Records) -> dict[str, Any]:
     """
     parameters, samples = parameters_of(records), records.samples
     summary = summary_of(records)
-    found = crashes(records.events)
+    crash_rows = crashes(records.events)
     return {
         "scale_outs": len(_scale_outs(records.events)),
         "scale_ins": sum(event["action"] == "shrink" for event in records.events),
         "min_servers": parameters["min_servers"],
         "max_servers": max((sample.healthy_servers for sample in samples), default=0),
         "final_servers": samples[-1].healthy_servers if samples else 0,
-        "crashes": len(found),
-        "replaced_in_s": slowest_replacement_s(found),
+        "crashes": len(crash_rows),
+        "replaced_in_s": slowest_replacement_s(crash_rows),
         "commands": summary["commands"],
         "failures_by_code": summary["failures_by_code"],
         "wrong_poses": summary["wrong_poses"],
@@ -290,7 +290,7 @@ def elasticity_figures(records: Records) -> dict[str, Any]:
             for event in records.events
             if event["action"] in ("grow", "shrink", "replace")
         ],
-        "crash_list": found,
+        "crash_list": crash_rows,
         "cpu_percent_series": [
             [round(sample.time, 3), round(sample.cpu_percent, 2)]
             for sample in samples
@@ -298,7 +298,8 @@ def elasticity_figures(records: Records) -> dict[str, Any]:
         ],
         "healthy_servers_series": [[round(sample.time, 3), sample.healthy_servers] for sample in samples],
         "robots_per_server_series": [
-            [round(sample.time, 3), {each.name: each.robots for each in sample.servers}] for sample in samples
+            [round(sample.time, 3), {server.name: server.robots for server in sample.servers}]
+            for sample in samples
         ],
     }
 
@@ -330,7 +331,7 @@ def elasticity_page(report: Mapping[str, Any], runs: Mapping[str, Mapping[str, A
         f"Each server emulates {report['size']:g} cores{measured}.",
         table(
             ["figure", *(name or "here" for name in runs)],
-            [[what, *(cell(run) for run in runs.values())] for what, cell in cells.items()],
+            [[label, *(cell(run) for run in runs.values())] for label, cell in cells.items()],
         ),
         "The paper: a robot every 20 s up to a hundred, scale-out above 70 % CPU, scale-in after "
         "5 minutes idle, one crash; it gives no figures for p99, recovery or loss.",
@@ -347,7 +348,7 @@ def crashes(events: Sequence[Event]) -> list[dict[str, Any]]:
     leaving = {event["server"] for event in events if event["action"] == "drain-start"}
     launched = {event["server"]: event["time"] for event in events if event["action"] == "server-launched"}
     taken: set[str] = set()
-    found = []
+    rows = []
     for event in events:
         if event["action"] != "server-gone" or event["server"] in leaving:
             continue
@@ -362,7 +363,7 @@ def crashes(events: Sequence[Event]) -> list[dict[str, Any]]:
         ]
         if healthy:
             taken.add(healthy[0]["server"])
-        found.append(
+        rows.append(
             {
                 "server": event["server"],
                 "pid": event.get("pid"),
@@ -371,12 +372,12 @@ def crashes(events: Sequence[Event]) -> list[dict[str, Any]]:
                 "replaced_in_s": round(healthy[0]["time"] - began, 3) if healthy else None,
             }
         )
-    return found
+    return rows
 
 
 def slowest_replacement_s(found: Sequence[Mapping[str, Any]]) -> float | None:
     """Return the longest replacement time of `crashes`; None if there is none or one was never replaced."""
-    times = [each["replaced_in_s"] for each in found]
+    times = [crash["replaced_in_s"] for crash in found]
     return max(times) if times and None not in times else None
 
 
@@ -453,7 +454,7 @@ def _phases(records: Records) -> dict[str, Any]:
     figures = {}
     ends = [*(float(mark["time"]) for mark in marks[1:]), math.inf]
     for mark, end in zip(marks, ends, strict=False):
-        within = [each for each in records.commands if float(mark["time"]) <= each.planned < end]
+        within = [command for command in records.commands if float(mark["time"]) <= command.planned < end]
         if within:
             summary = summarise(within)
             names = ("commands", "failures_by_code", "round_trip_ms")

@@ -58,14 +58,14 @@ def run_as_cloud(options: ElasticityOptions, settings: PlatformSettings) -> int:
             part.mkdir()
             asyncio.run(_run(options, chosen, part, design_name, design, phase))
     records = {name: read_records(folder / name) for name in names}
-    runs = {name: as_cloud_figures(each) for name, each in records.items()}
+    runs = {name: as_cloud_figures(record) for name, record in records.items()}
     report = {
         "experiment": KIND,
         "asked": {"robots": options.robots, "fps": options.fps, "speed": options.speed, "out": folder.name},
         "size": cores,
         "delays": {name: _delays(design) for name, design in DESIGNS.items()},
         "runs": runs,
-        "generator": {name: generator_of(each) for name, each in records.items()},
+        "generator": {name: generator_of(record) for name, record in records.items()},
     }
     show_page(finish_report(folder, report, as_cloud_page, settings, load_before))
     show(f"wrote report.json, report.md and the raw records to {options.out}")
@@ -82,7 +82,7 @@ def as_cloud_figures(records: Records) -> dict[str, Any]:
     speed = float(parameters["speed"])
 
     def after(action: str, since_s: float) -> float | None:
-        times = (float(each["time"]) for each in records.events if each["action"] == action)
+        times = (float(event["time"]) for event in records.events if event["action"] == action)
         return next((at for at in times if at >= since_s), None)
 
     loaded_s = after("robot-joined", 0.0) or 0.0
@@ -103,9 +103,9 @@ def as_cloud_page(report: Mapping[str, Any]) -> str:
     """Return ``report.md``."""
     asked, runs = report["asked"], report["runs"]
     steps = [
-        [name, each["step"], _range(each), each["source"]]
+        [name, delay["step"], _range(delay), delay["source"]]
         for name, delays in report["delays"].items()
-        for each in delays
+        for delay in delays
     ]
     rows = [
         [
@@ -191,8 +191,8 @@ def _until_phase(now_s: float, period_s: float, phase: float) -> float:
 
 def _delays(design: Design) -> list[dict[str, Any]]:
     return [
-        {"step": each.step, "low_s": each.low_s, "high_s": each.high_s, "source": each.source}
-        for each in (design.metrics, *design.launch)
+        {"step": stage.step, "low_s": stage.low_s, "high_s": stage.high_s, "source": stage.source}
+        for stage in (design.metrics, *design.launch)
     ]
 
 

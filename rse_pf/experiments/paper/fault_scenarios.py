@@ -98,7 +98,7 @@ async def _log_when_empty(harness: Harness) -> None:
     """Record when no server has a robot any more, more precisely than the samples of the monitor."""
     while True:
         servers = await harness.platform.status()
-        if len(servers) == len(harness.platform.servers) and not any(each["robots"] for each in servers):
+        if len(servers) == len(harness.platform.servers) and not any(server["robots"] for server in servers):
             harness.log("servers-empty")
             return
         await asyncio.sleep(_POLL_S)
@@ -158,8 +158,8 @@ async def _wait_replaced(harness: Harness, began: float) -> None:
     """Wait until a server that was launched after *began* is healthy."""
 
     def replaced() -> bool:
-        new = {each["server"] for each in harness.events_since("server-launched", began)}
-        return any(each["server"] in new for each in harness.events_since("server-healthy", began))
+        new = {event["server"] for event in harness.events_since("server-launched", began)}
+        return any(event["server"] in new for event in harness.events_since("server-healthy", began))
 
     await harness.wait_for(replaced, _TIMEOUT_S)
 

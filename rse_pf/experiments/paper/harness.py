@@ -163,14 +163,14 @@ class Harness:
         """Wait until the number of servers was not changed for *quiet_s*; return whether that happened."""
 
         def quiet() -> bool:
-            times = (each["time"] for each in self.events if each["action"] in _SERVER_CHANGES)
+            times = (event["time"] for event in self.events if event["action"] in _SERVER_CHANGES)
             return self.now() - max(times, default=0.0) >= quiet_s
 
         return await self.wait_for(quiet, timeout_s)
 
     def events_since(self, action: str, since_s: float) -> list[dict[str, Any]]:
         """Return the events *action* since *since_s*."""
-        return [each for each in self.events if each["action"] == action and each["time"] >= since_s]
+        return [event for event in self.events if event["action"] == action and event["time"] >= since_s]
 
     def busiest(self) -> Any:
         """Return the server with the most robots, an entry of `LocalPlatform.servers`."""

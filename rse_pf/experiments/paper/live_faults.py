@@ -58,8 +58,8 @@ def run_live_faults(
     }
     finish_report(folder, report, live_faults_page, settings, load_before)
     show(f"wrote report.json, report.md and the records of each run to {options.out}")
-    kept = [run["keyframes"] for run in runs.values()]
-    lost = any(each["lost"] or each["twice"] for each in kept)
+    keyframe_counts = [run["keyframes"] for run in runs.values()]
+    lost = any(counts["lost"] or counts["twice"] for counts in keyframe_counts)
     return int(lost or any(run["frames_lost"] for run in runs.values()))
 
 
@@ -82,9 +82,9 @@ def live_faults_page(report: Mapping[str, Any]) -> str:
     runs: Mapping[str, Mapping[str, Any]] = report["runs"]
     head, *rows = fault_rows(runs)
     bars = [
-        [name, what, number(bar["value"]), bar["bar"], "met" if bar["held"] else "**missed**"]
+        [name, figure, number(bar["value"]), bar["bar"], "met" if bar["held"] else "**missed**"]
         for name, run in runs.items()
-        for what, bar in run["bars"].items()
+        for figure, bar in run["bars"].items()
     ]
     return page(
         "# RSE-PF experiment: faults of a live map",

@@ -192,7 +192,7 @@ def _robot(records: Records, name: str, parameters: Mapping[str, Any]) -> dict[s
     folder = records.folder / name
     frames = int(parameters["frames"][name])
     trajectory = read_trajectory(folder / "trajectory.txt")
-    planned = sorted({each.planned for each in records.commands if each.robot == name})
+    planned = sorted({command.planned for command in records.commands if command.robot == name})
     sending_s = planned[-1] - planned[0] if planned else 0.0
     truth = read_trajectory(folder / "truth.txt") if (folder / "truth.txt").exists() else None
     return {

@@ -77,7 +77,7 @@ def run_robustness(options: RobustnessOptions, settings: PlatformSettings) -> in
     )
     load_before = load_average()
     runs: dict[str, dict[str, Any]] = {}
-    for scenario in options.only or [name for name, each in SCENARIOS.items() if not each.slow]:
+    for scenario in options.only or [name for name, fault in SCENARIOS.items() if not fault.slow]:
         for turn in range(options.repeat):
             name = scenario if options.repeat == 1 else f"{scenario}-{turn + 1}"
             (folder / name).mkdir()
@@ -89,7 +89,7 @@ def run_robustness(options: RobustnessOptions, settings: PlatformSettings) -> in
         "experiment": "robustness",
         "asked": {**asdict(options), "out": options.out.name},
         "runs": runs,
-        "generator": {name: generator_of(each) for name, each in records.items()},
+        "generator": {name: generator_of(record) for name, record in records.items()},
         "paper": PAPER,
         RERUN: _rerun_plan(options.only or tuple(SCENARIOS)),
     }
@@ -200,7 +200,7 @@ def robustness_figures(records: Records) -> dict[str, Any]:
     scenario = str(parameters_of(records)["scenario"])
     summary = summary_of(records)
     faults = [event for event in records.events if event["action"] == "fault"]
-    found = crashes(records.events)
+    crash_rows = crashes(records.events)
     figures: dict[str, Any] = {
         "scenario": scenario,
         "commands": summary["commands"],
@@ -211,8 +211,8 @@ def robustness_figures(records: Records) -> dict[str, Any]:
         "round_trip_ms": summary["round_trip_ms"],
         "gap_s": _outages(records, faults),
         "out_of_rotation_s": _out_of_rotation_s(records.events, faults),
-        "crashes": len(found),
-        "replaced_in_s": slowest_replacement_s(found),
+        "crashes": len(crash_rows),
+        "replaced_in_s": slowest_replacement_s(crash_rows),
         "drains": sum(event["action"] == "drain-over" for event in records.events),
         "balancer_back_s": _after(records.events, "balancer-gone", "balancer-back"),
         **_scenario_figures(scenario, records, faults),
@@ -242,9 +242,9 @@ def robustness_page(report: Mapping[str, Any]) -> str:
         for name, run in runs.items()
     ]
     bars = [
-        [name, what, number(bar["value"]), bar["bar"], "met" if bar["held"] else "**missed**"]
+        [name, figure, number(bar["value"]), bar["bar"], "met" if bar["held"] else "**missed**"]
         for name, run in runs.items()
-        for what, bar in run["bars"].items()
+        for figure, bar in run["bars"].items()
     ]
     head = (
         "fault, sent, lost, twice, failed, outage p50 / p99 s, out of rotation s, replaced s, other figures"
@@ -270,7 +270,7 @@ def evened_out_s(samples: Sequence[MonitorSample], since_s: float) -> float | No
     for sample in samples:
         if sample.time < since_s:
             continue
-        counts = [each.robots for each in sample.servers if each.state == "healthy"]
+        counts = [server.robots for server in sample.servers if server.state == "healthy"]
         if not sum(counts):
             continue  # no robot is connected any more
         mean = sum(counts) / len(counts)
@@ -364,8 +364,8 @@ def _cut(records: Records, faults: Sequence[Event]) -> dict[str, Any]:
     first = _first_answers(records.commands, healed[0]) if healed else []
     deadline_s = float(parameters_of(records)["deadline_s"]) + _CLOCK_S
     stale = sum(
-        each.code == "ok" and each.answered is not None and each.answered - each.sent > deadline_s
-        for each in records.commands
+        command.code == "ok" and command.answered is not None and command.answered - command.sent > deadline_s
+        for command in records.commands
     )
     return {
         "noticed_s": _spread(list(noticed.values())),
@@ -385,7 +385,7 @@ def _emptied_s(samples: Sequence[MonitorSample], faults: Sequence[Event]) -> flo
     """Return the time from the fault until no server had a robot; None if that never happened."""
     for sample in samples:
         after = bool(faults) and sample.time >= faults[0]["time"]
-        if after and sample.servers and not any(each.robots for each in sample.servers):
+        if after and sample.servers and not any(server.robots for server in sample.servers):
             return round(sample.time - float(faults[0]["time"]), 3)
     return None
 

@@ -108,18 +108,18 @@ def verify(folder: Path) -> list[FigureCheck]:
     if parts != [folder]:
         return [_prefixed(part.name, check) for part in parts for check in verify(part)]
     report = read_report(folder)
-    found: list[FigureCheck] = []
+    checks: list[FigureCheck] = []
     runs = run_folders(folder)
     for name, part in runs.items():
         reported = report if not name else report.get("runs", {}).get(name)
         if isinstance(reported, dict):
-            found += [_prefixed(name, check) for check in _verify_run(part, reported)]
+            checks += [_prefixed(name, check) for check in _verify_run(part, reported)]
         else:
-            found.append(FigureCheck(what=f"{name}: run", agrees=False, detail="is not in the report"))
+            checks.append(FigureCheck(what=f"{name}: run", agrees=False, detail="is not in the report"))
     if "" not in runs:
         for name in sorted(set(report.get("runs", {})) - set(runs)):
-            found.append(FigureCheck(what=f"{name}: run", agrees=False, detail="has no records"))
-    return found
+            checks.append(FigureCheck(what=f"{name}: run", agrees=False, detail="has no records"))
+    return checks
 
 
 def report_folders(folder: Path) -> list[Path]:
@@ -150,8 +150,8 @@ def broken_invariants(records: Records) -> dict[str, str]:
 
 
 def _verify_run(folder: Path, reported: Mapping[str, Any]) -> Iterator[FigureCheck]:
-    kept = any((folder / name).exists() for name in (COMMANDS, f"{COMMANDS}.gz"))
-    partial = not kept and (folder / "commands.sha256").exists()
+    has_commands = any((folder / name).exists() for name in (COMMANDS, f"{COMMANDS}.gz"))
+    partial = not has_commands and (folder / "commands.sha256").exists()
     records = read_records(folder, without_commands=partial)
     figures = json.loads(json.dumps(figures_of(records)))
     for path, value in _leaves(figures):
@@ -173,8 +173,8 @@ _FROM_COMMANDS = {
 
 
 def _prefixed(name: str, check: FigureCheck) -> FigureCheck:
-    what = f"{name}: {check.what}" if name else check.what
-    return FigureCheck(what=what, agrees=check.agrees, detail=check.detail)
+    label = f"{name}: {check.what}" if name else check.what
+    return FigureCheck(what=label, agrees=check.agrees, detail=check.detail)
 
 
 def _wrong_round_trip(records: Records) -> str:
@@ -195,15 +195,15 @@ def _wrong_round_trip(records: Records) -> str:
 
 
 def _compare(reported: Mapping[str, Any], path: tuple[str, ...], value: Any) -> FigureCheck:
-    what, missing = "/".join(path), object()
+    label, missing = "/".join(path), object()
     there: Any = reported
     for step in path:
         there = there.get(step, missing) if isinstance(there, dict) else missing
     if there is missing:
-        return FigureCheck(what=what, agrees=False, detail="is not in the report")
+        return FigureCheck(what=label, agrees=False, detail="is not in the report")
     if there == value:
-        return FigureCheck(what=what, agrees=True, detail=_short(value))
-    return FigureCheck(what=what, agrees=False, detail=f"report {_short(there)}, records {_short(value)}")
+        return FigureCheck(what=label, agrees=True, detail=_short(value))
+    return FigureCheck(what=label, agrees=False, detail=f"report {_short(there)}, records {_short(value)}")
 
 
 def _leaves(

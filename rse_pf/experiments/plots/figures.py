@@ -124,7 +124,7 @@ def draw_live(
     )
     colours = (_BLUE, _ORANGE, _GREEN, _RED, "#7b4fa3", "#4aa3a2")
     final = [final_trajectory(drive, version) for drive in drives]
-    across, up = _widest_axes([each.positions for each in final if len(each)])
+    across, up = _widest_axes([trajectory.positions for trajectory in final if len(trajectory)])
     for row, (drive, path_in_map) in enumerate(zip(drives, final, strict=True)):
         colour = colours[row % len(colours)]
         aligned = {frame["stamp"] for frame in drive.frames if frame["T_map"] is not None}
@@ -210,7 +210,9 @@ def _servers(axis: Any, records: Records, parameters: Mapping[str, Any]) -> None
 
 def _round_trips(axis: Any, records: Records) -> None:
     """Draw percentiles over bins of planned time, and the largest median of a single robot."""
-    done = [each for each in records.commands if each.code == "ok" and each.round_trip_ms is not None]
+    done = [
+        command for command in records.commands if command.code == "ok" and command.round_trip_ms is not None
+    ]
     edges, bins = _binned(done, records.commands)
     middle = (edges[:-1] + edges[1:]) / 2
     for percent, colour, width in ((50, _BLUE, 1.6), (99, _ORANGE, 1.2)):
@@ -218,7 +220,7 @@ def _round_trips(axis: Any, records: Records) -> None:
         axis.plot(middle, values, color=colour, linewidth=width, label=f"all robots, p{percent}")
     worst = [_worst_robot(b) for b in bins]
     axis.plot(middle, worst, color=_RED, linewidth=0.8, alpha=0.7, label="slowest robot, p50")
-    failed = [each.planned for each in records.commands if each.code not in ("ok", "")]
+    failed = [command.planned for command in records.commands if command.code not in ("ok", "")]
     if failed:
         counts, _ = np.histogram(failed, edges)
         bars = axis.twinx()
@@ -237,7 +239,7 @@ def _round_trips(axis: Any, records: Records) -> None:
 
 
 def _robots(axis: Any, records: Records) -> None:
-    by_server = [{each.name: each.robots for each in sample.servers} for sample in records.samples]
+    by_server = [{server.name: server.robots for server in sample.servers} for sample in records.samples]
     names = sorted({name for robots in by_server for name in robots}, key=_server_number)
     times = [sample.time for sample in records.samples]
     for name in names:
@@ -319,11 +321,13 @@ def _inside(axis: Any, x: float, y: float, text: str, colour: str = "black") -> 
 
 
 def _fault(axis: Any, name: str, records: Records, row: Mapping[str, Any]) -> None:
-    answered = [each for each in records.commands if each.code == "ok" and each.round_trip_ms is not None]
-    other = [each for each in records.commands if each.code != "ok"]
+    answered = [
+        command for command in records.commands if command.code == "ok" and command.round_trip_ms is not None
+    ]
+    other = [command for command in records.commands if command.code != "ok"]
     axis.scatter(
-        [each.planned for each in answered],
-        [each.round_trip_ms or 0.0 for each in answered],
+        [command.planned for command in answered],
+        [command.round_trip_ms or 0.0 for command in answered],
         s=2,
         color=_BLUE,
         alpha=0.35,
@@ -331,8 +335,8 @@ def _fault(axis: Any, name: str, records: Records, row: Mapping[str, Any]) -> No
     )
     if other:
         axis.scatter(
-            [each.planned for each in other],
-            [each.round_trip_ms or 5000.0 for each in other],
+            [command.planned for command in other],
+            [command.round_trip_ms or 5000.0 for command in other],
             s=9,
             color=_RED,
             marker="x",
@@ -350,7 +354,7 @@ def _fault(axis: Any, name: str, records: Records, row: Mapping[str, Any]) -> No
         fontsize=9,
         color="black" if met else _RED,
     )
-    _log_ms(axis, [each.round_trip_ms or 0.0 for each in answered])
+    _log_ms(axis, [command.round_trip_ms or 0.0 for command in answered])
     axis.set_ylabel("round trip, ms", fontsize=8)
     axis.set_xlabel("planned time, s", fontsize=8)
     axis.tick_params(labelsize=8)

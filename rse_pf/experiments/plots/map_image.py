@@ -165,8 +165,8 @@ def _splat(view: _Observer, points: Array, colours: npt.NDArray[np.uint8]) -> np
 def _splat_size(pixels: npt.NDArray[np.int64]) -> int:
     """Return the size of squares that just closes the gaps between neighbours."""
     spread = np.percentile(pixels, 98, axis=0) - np.percentile(pixels, 2, axis=0)
-    each = float(spread[0] * spread[1]) / max(1, len(pixels))
-    return int(np.clip(round(math.sqrt(2.5 * each)), 1, 4))
+    area_per_pixel = float(spread[0] * spread[1]) / max(1, len(pixels))
+    return int(np.clip(round(math.sqrt(2.5 * area_per_pixel)), 1, 4))
 
 
 def _draw_path(draw: Any, view: _Observer, robot: RobotPath, colour: tuple[int, int, int]) -> None:

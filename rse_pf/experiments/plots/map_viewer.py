@@ -68,7 +68,7 @@ def first_view(version: MapVersion) -> tuple[Array, Array, Array]:
     Up is opposite to the mean of the cameras' downward axes.  The view stands outside of the cloud and above
     it, on the side from which the cameras looked, so that it sees the surfaces that they saw.
     """
-    poses = np.array([each.T_world_camera for each in version.keyframes]).reshape(-1, 4, 4)
+    poses = np.array([keyframe.T_world_camera for keyframe in version.keyframes]).reshape(-1, 4, 4)
     up = _unit(-poses[:, :3, 1].sum(axis=0), np.array([0.0, -1.0, 0.0]))
     points = np.asarray(version.points, dtype=np.float64).reshape(-1, 3)
     points = points if len(points) else poses[:, :3, 3]
@@ -90,7 +90,7 @@ def _unit(vector: Array, otherwise: Array) -> Array:
 
 
 def _draw(server: Any, version: MapVersion) -> None:
-    position, look_at, up = (tuple(float(x) for x in each) for each in first_view(version))
+    position, look_at, up = (tuple(float(x) for x in vector) for vector in first_view(version))
     server.scene.set_up_direction(up)
     camera = server.initial_camera
     camera.position, camera.look_at, camera.up = position, look_at, up

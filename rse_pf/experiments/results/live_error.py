@@ -111,7 +111,7 @@ def live_figures(drives: Sequence[LiveDrive], version: MapVersion | None) -> dic
         "keyframes": sum(len(drive.keyframes) for drive in drives),
         "keyframes_in_map": None if version is None else len(version.keyframes),
         "keyframe_kept_ms": _percentiles(
-            [1e3 * (each["kept"] - each["sent"]) for drive in drives for each in drive.keyframes]
+            [1e3 * (keyframe["kept"] - keyframe["sent"]) for drive in drives for keyframe in drive.keyframes]
         ),
         "owners": _owners(drives),
         "lost_frames": sum(frame["T_odom"] is None for drive in drives for frame in drive.frames),
@@ -121,12 +121,14 @@ def live_figures(drives: Sequence[LiveDrive], version: MapVersion | None) -> dic
 
 def correction_delays_ms(drives: Sequence[LiveDrive]) -> list[float]:
     """Return the time from the sending of each keyframe to each correction that it caused."""
-    sent = {(drive.name, each["number"]): each["sent"] for drive in drives for each in drive.keyframes}
+    sent = {
+        (drive.name, keyframe["number"]): keyframe["sent"] for drive in drives for keyframe in drive.keyframes
+    }
     return [
-        1e3 * (each["t"] - sent[tuple(each["cause"])])
+        1e3 * (correction["t"] - sent[tuple(correction["cause"])])
         for drive in drives
-        for each in drive.corrections
-        if each["cause"] is not None and tuple(each["cause"]) in sent
+        for correction in drive.corrections
+        if correction["cause"] is not None and tuple(correction["cause"]) in sent
     ]
 
 
@@ -138,11 +140,17 @@ def online_trajectory(drive: LiveDrive) -> Trajectory:
 
 def final_trajectory(drive: LiveDrive, version: MapVersion | None) -> Trajectory:
     """Return the poses of all frames in the published map, by its keyframes of the same segment."""
-    keyframes = [] if version is None else [each for each in version.keyframes if each.robot == drive.name]
-    T_map = {round(each.timestamp_s, 6): each.T_world_camera for each in keyframes}
+    keyframes = (
+        []
+        if version is None
+        else [keyframe for keyframe in version.keyframes if keyframe.robot == drive.name]
+    )
+    T_map = {round(keyframe.timestamp_s, 6): keyframe.T_world_camera for keyframe in keyframes}
     parts = []
     for segment in sorted({frame["segment"] for frame in drive.frames}):
-        known = [each for each in drive.frames if each["segment"] == segment and each["T_odom"] is not None]
+        known = [
+            frame for frame in drive.frames if frame["segment"] == segment and frame["T_odom"] is not None
+        ]
         path = _trajectory(known, "T_odom")
         rows = [row for row, stamp in enumerate(path.timestamps_s) if round(stamp, 6) in T_map]
         if rows:
@@ -199,7 +207,7 @@ def live_lines(live: Mapping[str, Any], robots: int) -> str:
 
 def live_table(live: Mapping[str, Any]) -> list[str]:
     """Return the table of ``report.md``."""
-    delay, kept = live["correction_ms"], live["keyframe_kept_ms"]
+    delay, acknowledged_ms = live["correction_ms"], live["keyframe_kept_ms"]
     rows = [
         ("joined", live["joined"]),
         ("own frame of the join, by robot", ", ".join(map(number, live["join_frame"]))),
@@ -207,7 +215,7 @@ def live_table(live: Mapping[str, Any]) -> list[str]:
         ("ATE cm, at the end", number(live["final_ate_cm"])),
         ("ATE cm, as given out", number(live["online_ate_cm"])),
         ("keyframe sent to correction, p50 / p99 ms, n", f"{delay['p50']} / {delay['p99']}, {delay['n']}"),
-        ("keyframe sent to kept, p50 / p99 ms", f"{kept['p50']} / {kept['p99']}"),
+        ("keyframe sent to kept, p50 / p99 ms", f"{acknowledged_ms['p50']} / {acknowledged_ms['p99']}"),
         ("keyframes / in the published map", f"{live['keyframes']} / {number(live['keyframes_in_map'])}"),
         ("owners", ", ".join(live["owners"]) or "-"),
     ]
@@ -279,8 +287,8 @@ def _owners(drives: Sequence[LiveDrive]) -> list[str]:
 
 def _summed(counts: Iterable[Mapping[str, int]]) -> dict[str, int]:
     total = Counter[str]()
-    for each in counts:
-        total.update(each)
+    for count in counts:
+        total.update(count)
     return dict(sorted(total.items()))
 
 

@@ -50,10 +50,14 @@ def live_fault_figures(records: Records) -> dict[str, Any]:
     fault = str(parameters["fault"])
     names = [f"robot-{row + 1}" for row in range(int(parameters["robots"]))]
     drives = read_live_drives(records.folder, names)
-    final: Mapping[str, Any] = next((each for each in records.events if each["action"] == "final-map"), {})
+    final: Mapping[str, Any] = next((event for event in records.events if event["action"] == "final-map"), {})
     logged = read_log(records.folder / "platform" / "objects", int(final.get("position", 0)))
-    started = next((float(each["time"]) for each in records.events if each["action"] == "robots-start"), 0.0)
-    after = next((float(each["after_s"]) for each in records.events if each["action"] == "robots-start"), 0.0)
+    started = next(
+        (float(event["time"]) for event in records.events if event["action"] == "robots-start"), 0.0
+    )
+    after = next(
+        (float(event["after_s"]) for event in records.events if event["action"] == "robots-start"), 0.0
+    )
     summary = summarise(records.commands)
     figures: dict[str, Any] = {
         "fault": fault,
@@ -82,23 +86,23 @@ def fault_rows(runs: Mapping[str, Mapping[str, Any]]) -> list[list[str]]:
     The error of a run is compared with the mean of the runs without a fault among *runs*, if there are some.
     """
     undisturbed = [
-        each["live"]["final_ate_cm"]
-        for each in runs.values()
-        if each["fault"] == "none" and each["live"]["final_ate_cm"] is not None
+        one_run["live"]["final_ate_cm"]
+        for one_run in runs.values()
+        if one_run["fault"] == "none" and one_run["live"]["final_ate_cm"] is not None
     ]
     rows = [list(_HEAD)]
     for name, run in runs.items():
-        kept, live, ate = run["keyframes"], run["live"], run["live"]["final_ate_cm"]
+        tally, live, ate = run["keyframes"], run["live"], run["live"]["final_ate_cm"]
         than = (
             f" ({ate - sum(undisturbed) / len(undisturbed):+.2f})" if undisturbed and ate is not None else ""
         )
-        missed = [what for what, bar in run["bars"].items() if not bar["held"]]
+        missed = [figure for figure, bar in run["bars"].items() if not bar["held"]]
         rows.append(
             [
                 name,
                 number(run["at_s"]),
-                f"{kept['acknowledged']} / {kept['in_log']}",
-                f"{kept['lost']} / {kept['twice']} / {kept['out_of_order']} / {kept['ahead_of_poses']}",
+                f"{tally['acknowledged']} / {tally['in_log']}",
+                f"{tally['lost']} / {tally['twice']} / {tally['out_of_order']} / {tally['ahead_of_poses']}",
                 str(run["frames_lost"]),
                 f"{number(run['new_owner_s'])} ({run['owners']})",
                 number(run["unacknowledged_s"]),
@@ -128,9 +132,9 @@ def _keyframes(drives: Sequence[LiveDrive], logged: LoggedMap) -> dict[str, int]
         held = [(number, stamp) for name, number, stamp in logged.keyframes if name == drive.name]
         numbers = Counter(number for number, _ in held)
         stamps = Counter(stamp for _, stamp in held)
-        lost += sum(each["number"] not in numbers for each in drive.keyframes)
+        lost += sum(keyframe["number"] not in numbers for keyframe in drive.keyframes)
         twice += sum(count - 1 for count in numbers.values()) + sum(count - 1 for count in stamps.values())
-        twice += len(drive.keyframes) - len({each["number"] for each in drive.keyframes})
+        twice += len(drive.keyframes) - len({keyframe["number"] for keyframe in drive.keyframes})
         out_of_order += sum(after <= before for before, after in pairwise(held))
     return {
         "made": sum(int(drive.end["keyframes"]) for drive in drives),
@@ -146,15 +150,15 @@ def _keyframes(drives: Sequence[LiveDrive], logged: LoggedMap) -> dict[str, int]
 def _ahead(drive: LiveDrive, commands: Sequence[CommandRecord]) -> int:
     """Return how many keyframes were sent while a pose was asked for, which may wait for a second at most."""
     asked = sorted(
-        (each.sent, min(each.answered or math.inf, each.sent + 1.0))
-        for each in commands
-        if each.robot == drive.name
+        (command.sent, min(command.answered or math.inf, command.sent + 1.0))
+        for command in commands
+        if command.robot == drive.name
     )
-    return sum(any(begin < each["sent"] < end for begin, end in asked) for each in drive.keyframes)
+    return sum(any(begin < keyframe["sent"] < end for begin, end in asked) for keyframe in drive.keyframes)
 
 
 def _fault_at_s(events: Sequence[Event], started_s: float) -> float | None:
-    at = next((float(each["time"]) for each in events if each["action"] == "fault"), None)
+    at = next((float(event["time"]) for event in events if event["action"] == "fault"), None)
     return None if at is None else round(at - started_s, 3)
 
 
@@ -180,5 +184,7 @@ def _new_owner_s(events: Sequence[Event]) -> float | None:
 
 def _longest_wait_s(drives: Sequence[LiveDrive]) -> float | None:
     """Return the longest time from the sending of a keyframe to its acknowledgement."""
-    waits = [float(each["kept"]) - float(each["sent"]) for drive in drives for each in drive.keyframes]
+    waits = [
+        float(keyframe["kept"]) - float(keyframe["sent"]) for drive in drives for keyframe in drive.keyframes
+    ]
     return round(max(waits), 3) if waits else None

@@ -87,9 +87,9 @@ def _replayed(objects: Path, position: int) -> LoggedMap:
         events = decode_events(entry.events)
         epochs.add(entry.epoch)
         keyframes += [
-            (shown_name(each.robot), each.number, each.keyframe.timestamp_s)
-            for each in events
-            if isinstance(each, KeyframeAdded)
+            (shown_name(event.robot), event.number, event.keyframe.timestamp_s)
+            for event in events
+            if isinstance(event, KeyframeAdded)
         ]
         state.apply(log.position, events)
         if log.position == position:

@@ -61,9 +61,9 @@ def joined_robots(
         keyframes = versions[row].keyframes
         moved = move_frames(
             paths[row],
-            np.array([each.timestamp_s for each in keyframes]),
-            np.array([each.T_world_camera for each in keyframes]),
-            np.array([poses[row, each.id] for each in keyframes]),
+            np.array([keyframe.timestamp_s for keyframe in keyframes]),
+            np.array([keyframe.T_world_camera for keyframe in keyframes]),
+            np.array([poses[row, keyframe.id] for keyframe in keyframes]),
         )
         robots.append(JoinedRobot(name=names[row], own=paths[row], merged=moved, truth=truths[row]))
     return robots
@@ -81,7 +81,7 @@ def move_frames(path: Trajectory, stamps_s: Array, T_before: Array, T_after: Arr
         T_before: ``(k, 4, 4)``, poses of the keyframes before.
         T_after: ``(k, 4, 4)``, poses of the keyframes after, in another world frame.
     """
-    corrections = T_after @ np.array([inverse(each) for each in T_before])
+    corrections = T_after @ np.array([inverse(T) for T in T_before])
     after = np.clip(np.searchsorted(stamps_s, path.timestamps_s, side="right"), 0, len(stamps_s) - 1)
     before = np.clip(np.searchsorted(stamps_s, path.timestamps_s, side="right") - 1, 0, len(stamps_s) - 1)
     gap_s = stamps_s[after] - stamps_s[before]
@@ -109,10 +109,12 @@ def merge_section(
     """
     return {
         "joined": [names[row] for row in reply.joined],
-        "not_joined": [{"robot": names[each.map], "reason": each.reason} for each in reply.not_joined],
+        "not_joined": [
+            {"robot": names[refusal.map], "reason": refusal.reason} for refusal in reply.not_joined
+        ],
         "refused": [
-            {"robots": [names[row] for row in each.maps], "reason": each.reason, "count": each.count}
-            for each in reply.refused
+            {"robots": [names[row] for row in refusal.maps], "reason": refusal.reason, "count": refusal.count}
+            for refusal in reply.refused
         ],
         "links_between_robots": reply.merges,
         "loops": reply.loops,
@@ -141,10 +143,10 @@ def merged_lines(section: Mapping[str, Any]) -> str:
             f"ATE {section['ate_cm']:.2f} cm in the merged map{together} "
             f"(before: {section['ate_before_cm']:.2f} cm{alone})"
         )
-    lines += [f"{each['robot']} not joined: {each['reason']}" for each in section["not_joined"]]
+    lines += [f"{entry['robot']} not joined: {entry['reason']}" for entry in section["not_joined"]]
     reasons = Counter[str]()
-    for each in section["refused"]:
-        reasons[each["reason"]] += each["count"]
+    for refusal in section["refused"]:
+        reasons[refusal["reason"]] += refusal["count"]
     if reasons:
         counts = ", ".join(f"{count} {reason}" for reason, count in sorted(reasons.items()))
         pairs = (
@@ -159,10 +161,10 @@ def merged_lines(section: Mapping[str, Any]) -> str:
 def merged_table(section: Mapping[str, Any]) -> list[str]:
     """Return the table of ``report.md`` about a merged map."""
     rejected: dict[str, list[str]] = defaultdict(list)
-    for each in section["refused"]:
-        one, other = each["robots"]
-        pair = f"within {one}" if one == other else f"between {one} and {other}"
-        rejected[pair].append(f"{each['count']} {each['reason']}")
+    for refusal in section["refused"]:
+        first, other = refusal["robots"]
+        pair = f"within {first}" if first == other else f"between {first} and {other}"
+        rejected[pair].append(f"{refusal['count']} {refusal['reason']}")
     errors = [
         (what, "-" if section[name] is None else f"{section[name]:.2f}")
         for what, name in (
@@ -177,8 +179,8 @@ def merged_table(section: Mapping[str, Any]) -> list[str]:
         ("not joined", "; ".join(f"{e['robot']}: {e['reason']}" for e in section["not_joined"]) or "-"),
         ("keyframes / links between robots / loops", " / ".join(counts)),
         *errors,
-        *((f"error of the origin of {each['robot']}", f"{each['cm']:.1f} cm, {each['deg']:.2f} deg")
-          for each in section["origins"]),
+        *((f"error of the origin of {origin['robot']}", f"{origin['cm']:.1f} cm, {origin['deg']:.2f} deg")
+          for origin in section["origins"]),
         *((f"not linked {pair}", ", ".join(reasons)) for pair, reasons in rejected.items()),
     ]  # fmt: skip
     return table(["merged map", ""], rows)

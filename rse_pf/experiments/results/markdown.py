@@ -51,9 +51,9 @@ def about_run(report: Mapping[str, Any]) -> str:
     about = report["environment"]
     versions = ", ".join(f"{name} {version}" for name, version in about["versions"].items())
     generators = "".join(
-        f" Load generator ({name or 'run'}): {100 * each['cpu_s'] / max(each['wall_s'], 1e-9):.0f} % of a "
-        f"core, {each['wrong_poses']} wrong poses."
-        for name, each in (report.get("generator") or {}).items()
+        f" Load generator ({name or 'run'}): {100 * value['cpu_s'] / max(value['wall_s'], 1e-9):.0f} % of a "
+        f"core, {value['wrong_poses']} wrong poses."
+        for name, value in (report.get("generator") or {}).items()
     )
     commit = f"Commit {about['commit']}. " if about.get("commit") else ""
     return (

@@ -42,8 +42,8 @@ class FigureReached:
 
 def rerun_plan(arguments: Sequence[str], bars: Bars) -> dict[str, Any]:
     """Return the plan for a report: arguments of ``rse-pf experiment KIND``, and bars of figures."""
-    told = {name: f"{sense} {bar:g}" for name, (bar, sense) in bars.items()}
-    return {"arguments": list(arguments), "slack": _SLACK, "bars": told}
+    bar_texts = {name: f"{sense} {bar:g}" for name, (bar, sense) in bars.items()}
+    return {"arguments": list(arguments), "slack": _SLACK, "bars": bar_texts}
 
 
 def rerun_arguments(report: Mapping[str, Any]) -> list[str]:
@@ -74,10 +74,10 @@ def rerun_figures(report: Mapping[str, Any], short: Mapping[str, Any]) -> list[F
 
 
 def _limit(bar: str, slack: float) -> tuple[str, float]:
-    found = _BAR.fullmatch(bar)
-    if found is None or slack < 1.0:
+    match = _BAR.fullmatch(bar)
+    if match is None or slack < 1.0:
         raise ValueError(f"{bar!r} with slack {slack:g} is no bar")
-    return found[1], float(found[2]) * (slack if found[1] == "<=" else 1.0 / slack)
+    return match[1], float(match[2]) * (slack if match[1] == "<=" else 1.0 / slack)
 
 
 def _reached(name: str, sense: str, limit: float, *, value: Any, reported: Any) -> FigureReached:
@@ -93,6 +93,6 @@ def _at(report: Mapping[str, Any], name: str) -> float | None:
     for step in name.split("/"):
         value = value.get(step) if isinstance(value, Mapping) else None
     if isinstance(value, list):
-        numbers = [each for each in value if isinstance(each, int | float)]
+        numbers = [number for number in value if isinstance(number, int | float)]
         value = max(numbers) if numbers and len(numbers) == len(value) else None
     return value if isinstance(value, int | float) else None

@@ -63,7 +63,7 @@ def fresh_folder(folder: Path, written: Sequence[str]) -> Path:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         old = list(folder.iterdir())
-        own = [each for each in old if any(fnmatchcase(each.name, name) for name in written)]
+        own = [path for path in old if any(fnmatchcase(path.name, name) for name in written)]
         is_run = (folder / EVENTS).exists() or any(folder.glob(f"*/{EVENTS}"))
         if own != old or (old and not is_run):
             raise UsageError(f"{folder} holds other files", hint="name an empty folder with --out")

@@ -80,12 +80,12 @@ def answered_percent(commands: Sequence[CommandRecord], within_ms: float | None 
     if not commands:
         return None
     good = {
-        (each.robot, each.id)
-        for each in commands
-        if each.code == "ok"
-        and (within_ms is None or (each.round_trip_ms is not None and each.round_trip_ms <= within_ms))
+        (command.robot, command.id)
+        for command in commands
+        if command.code == "ok"
+        and (within_ms is None or (command.round_trip_ms is not None and command.round_trip_ms <= within_ms))
     }
-    return round(100.0 * len(good) / len({(each.robot, each.id) for each in commands}), 3)
+    return round(100.0 * len(good) / len({(command.robot, command.id) for command in commands}), 3)
 
 
 def percentiles(values: Sequence[float]) -> dict[str, float | int | None]:
