@@ -68,13 +68,15 @@ def noisy_copy(version: MapVersion, number: int) -> MapVersion:
     rng = np.random.default_rng(number)
     start = np.eye(4) if number == 0 else exp_se3(rng.normal(size=6) * np.array([2, 2, 0.2, 0.1, 0.1, 1.0]))
     spread = np.array([_STEP_M] * 3 + [np.radians(_STEP_DEG)] * 3)
-    old = [each.T_world_camera for each in version.keyframes]
+    old = [keyframe.T_world_camera for keyframe in version.keyframes]
     poses, edges = [start @ old[0]], []
     for row in range(1, len(old)):
         step = inverse(old[row - 1]) @ old[row] @ exp_se3(rng.normal(size=6) * spread)
         poses.append(poses[-1] @ step)
         edges.append(Edge(a=row - 1, b=row, T_a_b=step, information=np.diag(spread**-2.0)))
-    keyframes = tuple(_noisy(each, T, number, rng) for each, T in zip(version.keyframes, poses, strict=True))
+    keyframes = tuple(
+        _noisy(keyframe, T, number, rng) for keyframe, T in zip(version.keyframes, poses, strict=True)
+    )
     points = deform_cloud(version.points, version.keyframes, np.array(poses))
     points += rng.normal(size=points.shape) * _CLOUD_M
     return MapVersion(
@@ -232,7 +234,7 @@ def _times_of(folder: Path, count: int) -> list[float]:
     processes = [
         subprocess.Popen(command, env=_environment(), stdout=subprocess.PIPE, text=True) for _ in range(count)
     ]
-    return [float(json.loads(each.communicate()[0])["seconds"]) for each in processes]
+    return [float(json.loads(process.communicate()[0])["seconds"]) for process in processes]
 
 
 def _time_of_pairs(folder: Path, pairs: int = 600) -> float:
@@ -282,7 +284,7 @@ def _apart_m(one: MapVersion, other: MapVersion) -> float:
     """Return the largest distance of a keyframe's two positions."""
 
     def places(version: MapVersion) -> Array:
-        return np.array([each.T_world_camera[:3, 3] for each in version.keyframes])
+        return np.array([keyframe.T_world_camera[:3, 3] for keyframe in version.keyframes])
 
     return float(np.linalg.norm(places(one) - places(other), axis=1).max())
 

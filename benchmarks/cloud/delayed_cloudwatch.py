@@ -30,13 +30,17 @@ class DelayedCloudWatch:
 
     def put_metric_data(self, **arguments: Any) -> dict[str, Any]:
         """Store the numbers of one agent."""
-        self.data += [(self._clock() + self._delay_s, each) for each in arguments["MetricData"]]
+        self.data += [(self._clock() + self._delay_s, argument) for argument in arguments["MetricData"]]
         return {}
 
     def get_metric_data(self, **arguments: Any) -> dict[str, Any]:
         """Return what is old enough, the newest first."""
         self.reads += 1
-        return {"MetricDataResults": [self._row(each, arguments) for each in arguments["MetricDataQueries"]]}
+        return {
+            "MetricDataResults": [
+                self._row(argument, arguments) for argument in arguments["MetricDataQueries"]
+            ]
+        }
 
     def _row(self, query: dict[str, Any], asked: dict[str, Any]) -> dict[str, Any]:
         metric, reduce = query["MetricStat"]["Metric"], _STATISTICS[query["MetricStat"]["Stat"]]

@@ -140,7 +140,7 @@ async def serve(robots: int) -> None:
             print(json.dumps({"url": url, "tokens": tokens}), flush=True)
             while line := await loop.run_in_executor(None, sys.stdin.readline):
                 since = float(line)
-                dials = [each for each in front.dials if each >= since]
+                dials = [dial for dial in front.dials if dial >= since]
                 told = {"dials": len(dials), "most_in_a_minute": most_within(dials, 60.0)}
                 print(json.dumps({**told, "blocked": front.firewall.blocked}), flush=True)
 

@@ -180,7 +180,7 @@ async def drive(
         ended_as = await _end_of(disabled, time.monotonic() + WAIT_S)
         for task in asking:
             task.cancel()
-        dials = sorted(each for each in front.dials if each >= began)
+        dials = sorted(dial for dial in front.dials if dial >= began)
         await asyncio.gather(*(robot.close() for robot in (*fleet, disabled)))
         times = sorted(back_after_s.values())
         return {
@@ -189,7 +189,7 @@ async def drive(
             "answered": len(times),
             "all_back_after_s": round(times[-1], 2) if done else None,
             "p50_back_after_s": round(times[len(times) // 2], 2) if times else None,
-            "dials_in_outage": sum(each < ended_at for each in dials),
+            "dials_in_outage": sum(dial < ended_at for dial in dials),
             "most_dials_in_a_minute": most_within(dials, 60.0),
             "limit_of_dials": rules[0].limit,
             "window_s": rules[0].window_s,

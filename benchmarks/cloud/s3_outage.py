@@ -109,7 +109,7 @@ class CloudWatch:
 
     def put_metric_data(self, **arguments: Any) -> dict[str, Any]:
         """Keep the numbers of one call."""
-        self.data += [(time.monotonic(), each) for each in arguments["MetricData"]]
+        self.data += [(time.monotonic(), argument) for argument in arguments["MetricData"]]
         return {}
 
 
@@ -184,8 +184,8 @@ class _Run:
             for target in (self._check, self._store, self._look)
         ]
         began_s = time.monotonic()
-        for each in threads:
-            each.start()
+        for thread in threads:
+            thread.start()
         poses = [asyncio.create_task(self._pose(n, server)) for n, server in enumerate(self._servers)]
         await asyncio.sleep(outage.before_s)
         self._fails_s = time.monotonic()
@@ -271,7 +271,11 @@ class _Run:
 
     def _judge_alarm(self, began_s: float, ended_s: float) -> None:
         """Replay the alarm on what was published, in periods of CloudWatch."""
-        (alarm,) = [each for each in operator_alarms(self._settings) if each.name == "store"]
+        (alarm,) = [
+            operator_alarm
+            for operator_alarm in operator_alarms(self._settings)
+            if operator_alarm.name == "store"
+        ]
         rule = AlarmRule(
             expression=alarm.expression, comparison=alarm.comparison, threshold=alarm.threshold,
             periods=alarm.periods, datapoints=alarm.datapoints, missing=alarm.missing,
@@ -354,8 +358,8 @@ def _server(folder: Path, name: str, settings: PlatformSettings) -> Iterator[Map
             "data_port": told["data"]["port"],
         }  # fmt: skip
     finally:
-        for each in processes:
-            each.terminate()
+        for process in processes:
+            process.terminate()
         for each in processes:
             try:
                 each.wait(_STOP_S)
@@ -367,7 +371,7 @@ def _server(folder: Path, name: str, settings: PlatformSettings) -> Iterator[Map
 def _announced(file: Path, processes: list[subprocess.Popen[bytes]], home: Path) -> dict[str, int]:
     until_s = time.monotonic() + _START_S
     while not file.exists():
-        if time.monotonic() > until_s or any(each.poll() is not None for each in processes):
+        if time.monotonic() > until_s or any(process.poll() is not None for process in processes):
             logs = "\n".join(path.read_text()[-2000:] for path in home.glob("*.log"))
             raise RuntimeError(f"{file.name} is not ready:\n{logs}")
         time.sleep(0.05)  # polls, with a deadline

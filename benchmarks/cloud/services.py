@@ -109,7 +109,7 @@ async def _run(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
     heard = Heard()
     took: list[float] = []
     async with LocalPlatform(settings, state=folder / "platform", servers=2, port=0) as platform:
-        agents = [_agent(folder, bucket, each.control_port) for each in platform.servers]
+        agents = [_agent(folder, bucket, server.control_port) for server in platform.servers]
         over = asyncio.Event()
         robots = [
             asyncio.ensure_future(_drive(platform, f"robot-{number}", args.rate, heard, over))

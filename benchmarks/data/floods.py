@@ -151,8 +151,8 @@ def flood(port: int, token: str, listers: int, writers: int, begun: Event, stop:
 def _run_threads(work: Callable[[int], None], count: int, begun: Event) -> None:
     """Run *work* of each number below *count* in a thread, set *begun*, and wait for them."""
     threads = [threading.Thread(target=work, args=(row,)) for row in range(count)]
-    for each in threads:
-        each.start()
+    for thread in threads:
+        thread.start()
     begun.set()
     for each in threads:
         each.join()

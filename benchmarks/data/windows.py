@@ -11,7 +11,7 @@ from rse_pf.experiments.results.records import CommandRecord
 
 def poses(commands: list[CommandRecord], begin_s: float, end_s: float) -> dict[str, Any]:
     """Return latencies and unanswered frames of poses planned from *begin_s* to *end_s*."""
-    chosen = [each for each in commands if begin_s <= each.planned < end_s]
+    chosen = [command for command in commands if begin_s <= command.planned < end_s]
     took = [
         (each.answered - each.planned) * 1e3
         for each in chosen

@@ -50,9 +50,9 @@ MIB = 1 << 20
 def family(root: int) -> list[int]:
     """Return *root* and the processes below it."""
     parents: dict[int, int] = {}
-    for each in Path("/proc").glob("[0-9]*"):
+    for path in Path("/proc").glob("[0-9]*"):
         with contextlib.suppress(OSError, ValueError):
-            parents[int(each.name)] = int((each / "stat").read_text().rpartition(")")[2].split()[1])
+            parents[int(path.name)] = int((path / "stat").read_text().rpartition(")")[2].split()[1])
     found = [root]
     for pid in found:
         found += [child for child, parent in parents.items() if parent == pid]
@@ -64,9 +64,9 @@ def listening(pids: list[int]) -> dict[int, str]:
     owners: dict[str, int] = {}
     for pid in pids:
         with contextlib.suppress(OSError):
-            for each in Path(f"/proc/{pid}/fd").iterdir():
+            for path in Path(f"/proc/{pid}/fd").iterdir():
                 with contextlib.suppress(OSError):
-                    owners.setdefault(os.readlink(each), pid)
+                    owners.setdefault(os.readlink(path), pid)
     found = {}
     for line in Path("/proc/net/tcp").read_text().splitlines()[1:]:
         fields = line.split()

@@ -125,8 +125,8 @@ async def deadlines(folder: Path, seconds: float, *, row: str, payload_of: Calla
     return {
         "row": row, "seconds": seconds, **quiet.row("quiet"), **beside.row("others"),
         "hostile_codes": dict(attacker.codes), "counts": status["isolation"]["counts"],
-        "refused_to_others": [each for each in blocks if each["tenant"] != "hostile"],
-        "refused_to_hostile": [each["reason"] for each in blocks if each["tenant"] == "hostile"],
+        "refused_to_others": [block for block in blocks if block["tenant"] != "hostile"],
+        "refused_to_hostile": [block["reason"] for block in blocks if block["tenant"] == "hostile"],
     }  # fmt: skip
 
 

@@ -174,7 +174,7 @@ async def flood(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
             await swarm.wait_joined(START_S)
             requests = hostile_requests(server, args.only)
             for name in ("commands",) if args.without_jobs else ("commands", "jobs"):
-                mine = [each for each in requests if (each[1] == "merge") == (name == "jobs")]
+                mine = [request for request in requests if (request[1] == "merge") == (name == "jobs")]
                 await asyncio.sleep(SETTLE_S)
                 began = now()
                 await asyncio.sleep(args.seconds)

@@ -240,7 +240,7 @@ async def _keyframes(robot: Robot, place: _Place) -> None:
     while True:
         most = 8 if number else 1  # the first one begins the map
         requests = [keyframe(place.tag, number + each, 894) for each in range(most)]
-        codes = await asyncio.gather(*(place.call(robot, "live-keyframe", each) for each in requests))
+        codes = await asyncio.gather(*(place.call(robot, "live-keyframe", request) for request in requests))
         number += codes.count("ok")
 
 
@@ -412,7 +412,7 @@ async def _pairs(
             what: _median_ratio(measured, windows, name, what) for what in ("pose", "keyframe", "object")
         },
         "p99_ms": {
-            what: [_p99(measured, [each[kind] for each in windows], what) for kind in (FAIR, name)]
+            what: [_p99(measured, [window[kind] for window in windows], what) for kind in (FAIR, name)]
             for what in ("pose", "keyframe", "object")
         },
         "n": dict(Counter(what for _, what, _, _ in measured.rows)),
@@ -423,7 +423,7 @@ async def _pairs(
                 if code != "ok" and at >= began_s
             )
         ),
-        "neighbours": {kind: dict(each) for kind, each in codes.items()},
+        "neighbours": {kind: dict(code) for kind, code in codes.items()},
         "stored_mib": round(stored_by_tenant(store, RIVAL).charged_bytes / 2**20, 1),
         "memory_mib": round(most[name] - most[FAIR], 1),
     }  # fmt: skip
@@ -446,7 +446,9 @@ def _p99(measured: Measured, spans: Sequence[tuple[float, float]], what: str) ->
 def _median_ratio(
     measured: Measured, windows: Sequence[dict[str, tuple[float, float]]], name: str, what: str
 ) -> float:
-    ratios = [_p99(measured, [each[name]], what) / _p99(measured, [each[FAIR]], what) for each in windows]
+    ratios = [
+        _p99(measured, [window[name]], what) / _p99(measured, [window[FAIR]], what) for window in windows
+    ]
     return round(statistics.median(ratios), 3)
 
 

@@ -82,7 +82,7 @@ async def attack(process: Process, cloud: LocalPlatform) -> tuple[dict[str, Any]
 
 def seen(commands: Sequence[CommandRecord], begin: float, end: float) -> dict[str, Any]:
     """Return what the others saw of commands planned within a window."""
-    planned = [each for each in commands if begin <= each.planned < end]
+    planned = [command for command in commands if begin <= command.planned < end]
     trips = [each.round_trip_ms for each in planned if each.round_trip_ms is not None]
     codes: dict[str, int] = {}
     for each in planned:

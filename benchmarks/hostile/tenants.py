@@ -237,7 +237,7 @@ def logged(log: str) -> Counter[str]:
 
 def owners(store: Path, area: str) -> list[str]:
     """Return the folders ``TENANT/ROBOT`` below an area of the store: states, jobs or objects."""
-    return sorted(str(each.relative_to(store / area)) for each in (store / area).glob("*/*"))
+    return sorted(str(path.relative_to(store / area)) for path in (store / area).glob("*/*"))
 
 
 def main(arguments: Sequence[str]) -> int:

@@ -36,7 +36,8 @@ def slipping(run: Run, slip: float) -> Run:
         step[:3, 3] *= slip
         T.append(T[-1] @ step)
     moved = tuple(
-        dataclasses.replace(each, T_world_camera=pose) for each, pose in zip(keyframes, T, strict=True)
+        dataclasses.replace(keyframe, T_world_camera=pose)
+        for keyframe, pose in zip(keyframes, T, strict=True)
     )
     return dataclasses.replace(run, version=dataclasses.replace(run.version, keyframes=moved))
 
@@ -45,8 +46,8 @@ def most_contradictions(live_map: LiveMap) -> tuple[int, int, int]:
     """Return the most contradicting keyframes of 32, disbelieved segments, and the most smoothing used."""
     segments = live_map._graph.segments
     return (
-        max(each.contradictions.bit_count() for each in segments),
-        sum(each.disbelieved for each in segments),
+        max(segment.contradictions.bit_count() for segment in segments),
+        sum(segment.disbelieved for segment in segments),
         max(live_map._graph.smoothing.values(), default=0),
     )
 

@@ -102,16 +102,16 @@ def meet(drives: dict[str, Drive], names: Sequence[str], stated_m: float) -> Met
             if number >= len(drive.keyframes):
                 continue
             outcomes = live_map.apply(_event(name, number, drive))
-            added = next(each.id for each in outcomes if isinstance(each, Added))
+            added = next(outcome.id for outcome in outcomes if isinstance(outcome, Added))
             first.setdefault(name, added)
             outcomes += live_map.apply(live_map.measure(added))
-            if any(isinstance(each, OptimiseWanted) for each in outcomes):
+            if any(isinstance(outcome, OptimiseWanted) for outcome in outcomes):
                 outcomes += live_map.apply(live_map.optimise())
-            joined = any(isinstance(each, Joined) and each.robot == "b" for each in outcomes)
+            joined = any(isinstance(outcome, Joined) and outcome.robot == "b" for outcome in outcomes)
             if "b" in first:
                 ever |= joined
                 wrong_ever |= joined and _off_m(live_map, drives, names[0], first) > _WRONG_M
-    found = next(each for each in live_map.alignments() if each.robot == "b")
+    found = next(alignment for alignment in live_map.alignments() if alignment.robot == "b")
     wrong = found.aligned and _off_m(live_map, drives, names[0], first) > _WRONG_M
     return Met(ever=ever, wrong_ever=wrong_ever, aligned=found.aligned, wrong=wrong, reason=found.reason)
 

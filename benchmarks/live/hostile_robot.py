@@ -143,7 +143,11 @@ def play(events: Sequence[Event]) -> Played:
 
 def joins(live_map: LiveMap) -> dict[str, bool]:
     """Return which honest robots are in the map."""
-    return {each.robot: each.aligned for each in live_map.alignments() if each.robot != HOSTILE}
+    return {
+        alignment.robot: alignment.aligned
+        for alignment in live_map.alignments()
+        if alignment.robot != HOSTILE
+    }
 
 
 def error_cm(played: Played, true: Array) -> float:

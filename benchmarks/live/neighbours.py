@@ -241,7 +241,7 @@ async def measure(rounds: int, seconds: float, folder: Path) -> dict[str, Any]:
         },
         "garbage_keyframes_sent": counted["garbage"],
         "updates_of_a_foreign_map": counted["tenant"],
-        "foreign_robots_in_the_map": sum(RIVAL in line for each in drivers for line in each.seen),
+        "foreign_robots_in_the_map": sum(RIVAL in line for driver in drivers for line in driver.seen),
     }
 
 

@@ -178,7 +178,7 @@ def foreign(recordings: Path, runs: int) -> None:
         rng = np.random.default_rng(seed)
         starts = {name: int(rng.integers(0, 40)) for name in rng.permutation(list(drives)).tolist()}
         played = play({name: drives[name] for name in starts}, starts)
-        wrong += sum(isinstance(each, Joined) for each in played.outcomes) - 1
+        wrong += sum(isinstance(outcome, Joined) for outcome in played.outcomes) - 1
         links += played.live_map.links_open
     keyframes = {name: len(run.version.keyframes) for name, run in drives.items()}
     print(f"unrelated recordings {keyframes}, {runs} seeds: {wrong} wrong joins, {links} open links")
@@ -265,10 +265,10 @@ def _twins(runs: int, told_m: float) -> None:
             live_map = LiveMap()
             live_map.apply(MapStarted(source="", keyframes=(), equal_rooms_m=told_m))
             outcomes = [each for event in world.play(drives) for each in live_map.apply(event)]
-            ever += any(isinstance(each, Joined) and each.robot == "b" for each in outcomes)
-            aligned = {each.robot: each.aligned for each in live_map.alignments()}
+            ever += any(isinstance(outcome, Joined) and outcome.robot == "b" for outcome in outcomes)
+            aligned = {alignment.robot: alignment.aligned for alignment in live_map.alignments()}
             wrong += aligned["b"]
-            ambiguous += any(isinstance(each, Ambiguous) and each.robot == "b" for each in outcomes)
+            ambiguous += any(isinstance(outcome, Ambiguous) and outcome.robot == "b" for outcome in outcomes)
         print(
             f"two equal rooms, {told_m:g} m stated, {what}, {runs} seeds: {ever} joined at some time, "
             f"{wrong} at the end, {ambiguous} called ambiguous"

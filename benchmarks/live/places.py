@@ -110,7 +110,7 @@ def code_row(views: Sequence[View], rows: Sequence[int]) -> dict[str, Any]:
             found = measure_links((0, one.features, one.camera), [(1, other.features, other.camera)])
             took_ms.append((time.process_time() - start) * 1e3)
             links += len(found.links)
-    sizes = [each.size_bytes for each in views]
+    sizes = [view.size_bytes for view in views]
     return {
         "keyframe_bytes": {"mean": round(float(np.mean(sizes))), "max": max(sizes), "n": len(sizes)},
         "pair_ms": _percentiles(took_ms), "links": links,
@@ -145,7 +145,7 @@ def recall_rows(pool: Sequence[View], queries: Sequence[View]) -> dict[str, Any]
 
 def search_rows(views: Sequence[View]) -> dict[str, Any]:
     """Return the cost of a vector, and of a search among so many keyframes."""
-    rows: dict[str, Any] = {"vector_ms": _timed(place_vector, [each.features.descriptors for each in views])}
+    rows: dict[str, Any] = {"vector_ms": _timed(place_vector, [view.features.descriptors for view in views])}
     rng = np.random.default_rng(1)
     for keyframes in (1000, 2000, 5000, 10_000):
         vectors = rng.normal(size=(keyframes, PLACE_NUMBERS)).astype(np.float32)
@@ -204,7 +204,7 @@ def kitchen_map(recordings: Path, views: Sequence[View]) -> tuple[PlacedMap, Arr
 
 def relocalise_row(known: PlacedMap, views: Sequence[View], T_map_camera: Array) -> dict[str, Any]:
     """Return how well each fifth view is found."""
-    T_truth = np.array([each.T for each in views])
+    T_truth = np.array([view.T for view in views])
     T_map_world, rotation = _aligned(T_map_camera, T_truth)
     verdicts: Counter[str] = Counter()
     by_map, by_truth, took_ms = [], [], []
@@ -251,8 +251,8 @@ def main() -> None:
     queries = kitchen[::3] + rendered[::2] + [view for name in SMALL for view in sources[name]]
     known, T_map_camera = kitchen_map(arguments.recordings, kitchen)
     halves = rendered[::2], rendered[1::2]
-    house = PlacedMap.of(halves[0], [_true(each) for each in halves[0]])
-    twins = [replace(each, T=ELSEWHERE @ _true(each)) for each in halves[1]]
+    house = PlacedMap.of(halves[0], [_true(view) for view in halves[0]])
+    twins = [replace(view, T=ELSEWHERE @ _true(view)) for view in halves[1]]
     both = [*(view for place, view in enumerate(halves[0]) if place % 3), *twins]
     report: dict[str, Any] = {
         "machine": platform.platform(),

@@ -130,7 +130,7 @@ def main() -> None:
 
 def _read(path: Path) -> dict[str, Any]:
     files = [path] if path.is_file() else [each for each in path.rglob("*") if each.is_file()]
-    size = sum(each.stat().st_size for each in files)
+    size = sum(file.stat().st_size for file in files)
     wall, cpu = time.perf_counter(), time.process_time()
     with open_bag(path) as bag:
         opened_s = time.perf_counter() - wall

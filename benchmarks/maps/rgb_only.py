@@ -129,7 +129,7 @@ def row_of(drive: Drive, *, with_scale: bool) -> dict[str, Any]:
         "scale": mapper.scale,
         "path_m": truth.length_m,
         "cpu_ms_p50_p95_max": [float(np.percentile(frame_ms, q)) for q in (50, 95, 100)],
-        "command_bytes_max": {name: max(each, default=0) for name, each in sizes.items()},
+        "command_bytes_max": {name: max(size, default=0) for name, size in sizes.items()},
         "load_average": os.getloadavg()[0],
         "ate_cm": None,
         "live_ate_cm": None,

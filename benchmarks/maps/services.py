@@ -93,7 +93,7 @@ def joined_poses(runs: Sequence[Run], merged: MergedMap) -> Array:
     for run in runs:
         count = len(run.version.keyframes)
         keyframes = merged.version.keyframes[first : first + count]
-        parts.append(frame_poses(run, np.array([each.T_world_camera for each in keyframes])))
+        parts.append(frame_poses(run, np.array([keyframe.T_world_camera for keyframe in keyframes])))
         first += count
     return np.concatenate(parts)
 

@@ -58,8 +58,10 @@ def judge(dataset: Dataset, folder: Path, every: int = 5) -> dict[str, Any]:
     paths = [read_trajectory(folder / name / "merged_trajectory.txt") for name in merged["joined"]]
     stamps = np.concatenate([path.timestamps_s for path in paths])
     poses = np.concatenate([path.T_world_camera for path in paths])
-    truth = truth_of(dataset, [float(each) for each in stamps])
-    rows = [dataset.rows[int(np.argmin(np.abs(np.asarray(dataset.timestamps_s) - each)))] for each in stamps]
+    truth = truth_of(dataset, [float(stamp) for stamp in stamps])
+    rows = [
+        dataset.rows[int(np.argmin(np.abs(np.asarray(dataset.timestamps_s) - stamp)))] for stamp in stamps
+    ]
     T_truth_merged = alignment_of_poses(poses, truth)
     true_cloud = cloud_of(dataset, rows[::every], truth[::every]).points()[0]
     tree = small_gicp.KdTree(small_gicp.PointCloud(true_cloud.astype(np.float64)))

@@ -67,7 +67,7 @@ class RecordingSite:
     def recorded_bytes(self) -> int:
         """Return the size of its recordings."""
         return (
-            0 if self.recordings is None else sum(each.stat().st_size for each in self.recordings.iterdir())
+            0 if self.recordings is None else sum(path.stat().st_size for path in self.recordings.iterdir())
         )
 
 
@@ -126,7 +126,7 @@ def _wait_state(folder: Path, process: subprocess.Popen[bytes]) -> PlatformState
     until = time.monotonic() + _START_S
     while time.monotonic() < until and process.poll() is None:
         state = read_state(folder)
-        if state is not None and len([each for each in state.servers if each.port]) == SERVERS:
+        if state is not None and len([server for server in state.servers if server.port]) == SERVERS:
             return state
         time.sleep(0.05)  # looks again, with a deadline
     lines = (folder.parents[1] / f"{folder.name}.log").read_text(errors="replace").splitlines()

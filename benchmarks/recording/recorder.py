@@ -87,7 +87,7 @@ def cost_us(data: bytes, commands: int, folder: Path) -> tuple[float, int]:
         writer.flush(time.time_ns())
     spent = time.process_time() - began
     writer.close()
-    return 1e6 * spent / commands, sum(each.stat().st_size for each in folder.iterdir())
+    return 1e6 * spent / commands, sum(path.stat().st_size for path in folder.iterdir())
 
 
 def main() -> None:

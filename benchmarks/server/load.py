@@ -82,7 +82,7 @@ def compiled(folder: Path = _BUILD) -> Path:
 
 def write_messages(file: Path, messages: Iterable[bytes]) -> Path:
     """Write *messages*, each after its length; message k must have the id k.  Return *file*."""
-    file.write_bytes(b"".join(struct.pack("<I", len(each)) + each for each in messages))
+    file.write_bytes(b"".join(struct.pack("<I", len(message)) + message for message in messages))
     return file
 
 
@@ -112,7 +112,7 @@ def pnp_file(folder: Path, codec_name: str, outlier_ratio: float, **fields: Any)
 
 def _encoded(file: Path, codec_name: str, messages: Sequence[Message]) -> Path:
     codec = make_codec(codec_name)
-    return write_messages(file, [codec.encode(each) for each in messages])
+    return write_messages(file, [codec.encode(message) for message in messages])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -246,7 +246,7 @@ class LoadReport:
 
     def group(self, name: str) -> GroupReport:
         """Return the report of one group."""
-        return next(each for each in self.groups if each.name == name)
+        return next(group for group in self.groups if group.name == name)
 
 
 class LoadProcess:

@@ -113,7 +113,7 @@ def summary(name: str, windows: list[dict[str, Any]], outcomes: list[dict[str, A
     """Return one row of the table."""
     row: dict[str, Any] = {"row": name, "bar": BARS[name], "outcomes": _added(outcomes), "windows": windows}
     for kind, is_loaded in (("quiet", False), ("loaded", True)):
-        chosen = [each for each in windows if each["is_loaded"] == is_loaded]
+        chosen = [window for window in windows if window["is_loaded"] == is_loaded]
         row[kind] = {
             "windows": len(chosen), "n": sum(each["n"] for each in chosen),
             "not_ok": sum(each["not_ok"] for each in chosen),
@@ -128,8 +128,8 @@ def summary(name: str, windows: list[dict[str, Any]], outcomes: list[dict[str, A
 def _added(outcomes: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Return counts added up, and the largest of all other figures."""
     made: dict[str, Any] = {}
-    for each in outcomes:
-        for name, value in each.items():
+    for outcome in outcomes:
+        for name, value in outcome.items():
             if isinstance(value, dict):
                 made[name] = dict(Counter(made.get(name, {})) + Counter(value))
             elif isinstance(value, int):

@@ -61,7 +61,7 @@ class Way:
             self.match_us.append(spent_us)
             results += [getattr(found, name) for name in ARRAYS]
         self.before = features
-        return [each.tobytes() for each in results]
+        return [result.tobytes() for result in results]
 
 
 def cpu_us(work: Callable[[], Any]) -> tuple[float, Any]:

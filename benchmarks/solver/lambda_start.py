@@ -102,8 +102,8 @@ def main() -> None:
         }
         for kind, taken in rows.items()
     }
-    for kind, each in figures.items():
-        for name, found in each.items():
+    for kind, figure in figures.items():
+        for name, found in figure.items():
             print(
                 f"{kind:<16} {name:<9} p50 {found['p50']:.3f}  max {found['max']:.3f} s of processor time "
                 f"(n = {RUNS})"
