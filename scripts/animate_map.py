@@ -55,11 +55,12 @@ def read_drives(folder: Path) -> list[Drive]:
         points, colours = read_ply(robot / "map.ply")
         # The new points of a frame are sorted by their first coordinate: a fall begins the next frame.
         number = np.concatenate(([0], np.cumsum(np.diff(points[:, 0]) < -_FALL_M)))
-        kept = points[:, 2] < _CEILING_M
+        below = points[:, 2] < _CEILING_M
         path = np.loadtxt(robot / "trajectory.txt", usecols=(1, 2, 3), ndmin=2)
         drives.append(
             Drive(
-                points=points[kept].astype(np.float64), colours=colours[kept], frames=number[kept], path=path
+                points=points[below].astype(np.float64), colours=colours[below],
+                frames=number[below], path=path
             )
         )  # fmt: skip
     if not drives:

@@ -74,10 +74,10 @@ def read_sources(repository: Path) -> dict[str, str]:
 def package_imports(sources: Mapping[str, str]) -> dict[str, set[str]]:
     """Return the modules that each module imports, lazily, for types or at once, by dotted names."""
     modules = {_module(path) for path in sources}
-    found: dict[str, set[str]] = {}
+    imports_of: dict[str, set[str]] = {}
     for path, text in sources.items():
         module = _module(path)
-        names = found.setdefault(module, set())
+        names = imports_of.setdefault(module, set())
         for node in ast.walk(ast.parse(text)):
             if isinstance(node, ast.Import):
                 names |= {alias.name for alias in node.names}
@@ -86,7 +86,7 @@ def package_imports(sources: Mapping[str, str]) -> dict[str, set[str]]:
                 names |= {name if name in modules else node.module for name in whole}
         names &= modules
         names.discard(module)
-    return found
+    return imports_of
 
 
 def purpose(text: str) -> str:
@@ -101,7 +101,8 @@ def draw(sources: Mapping[str, str]) -> str:
     rooms = sorted({_room(module) for module in modules} - {"rse_pf"})
     purposes = {_module(path): purpose(text) for path, text in sources.items()}
     boxes = [
-        _room_box(room, [one for one in modules if _room(one) == room], imports, purposes) for room in rooms
+        _room_box(room, [module for module in modules if _room(module) == room], imports, purposes)
+        for room in rooms
     ]
     drawing = arrange(boxes, _edges(imports, {module: _room(module) for module in modules}, rooms))
     return _svg(drawing)
@@ -225,9 +226,9 @@ def arrange(boxes: list[Box], edges: Mapping[str, list[str]]) -> Drawing:
                 chain.append(lane)
             chain.append(lower)
             chains.append(chain)
-            for one, other in itertools.pairwise(chain):
-                joined[one].append(other)
-                joined[other].append(one)
+            for source, other in itertools.pairwise(chain):
+                joined[source].append(other)
+                joined[other].append(source)
     middle = _middles(rows, width, joined)
     left = min(middle[name] - width[name] / 2 for name in middle)
     heights = [max((by_name[name].height for name in row if name in by_name), default=0) for row in rows]
@@ -303,7 +304,7 @@ def _settle(
             group = (
                 before[0] + group[0] - shift * group[1],
                 before[1] + group[1],
-                before[2] + [(one, offset + shift) for one, offset in group[2]],
+                before[2] + [(node, offset + shift) for node, offset in group[2]],
             )
             groups.pop()
         groups.append(group)
@@ -323,8 +324,14 @@ def _arrow(
     level: Mapping[str, int],
 ) -> list[tuple[float, float]]:
     upper, lower = by_name[chain[0]], by_name[chain[-1]]
-    out = sorted((one for one in chains if one[0] == chain[0]), key=lambda one: (middle[one[1]], one))
-    into = sorted((one for one in chains if one[-1] == chain[-1]), key=lambda one: (middle[one[-2]], one))
+    out = sorted(
+        (other_chain for other_chain in chains if other_chain[0] == chain[0]),
+        key=lambda one: (middle[one[1]], one),
+    )
+    into = sorted(
+        (other_chain for other_chain in chains if other_chain[-1] == chain[-1]),
+        key=lambda one: (middle[one[-2]], one),
+    )
     x = _port(upper, out.index(chain), len(out))
     number = level[chain[0]]
     points = [(x, upper.y + upper.height), (x, top[number] + heights[number])]

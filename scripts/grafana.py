@@ -114,8 +114,8 @@ def _queries(metric: Metric) -> tuple[list[tuple[str, str]], str]:
 
 def _labels(metric: Metric) -> list[str]:
     """Return the labels of a metric but for the server."""
-    found: Iterable[str] = {label for sample in metric.samples for label in sample.labels}
-    return sorted(set(found) - {"server", "le"})
+    labels: Iterable[str] = {label for sample in metric.samples for label in sample.labels}
+    return sorted(set(labels) - {"server", "le"})
 
 
 def _unit(name: str) -> str:

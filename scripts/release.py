@@ -95,11 +95,11 @@ def _release(into: Path, machines: Iterable[str]) -> None:
                 )
         _check(first.values(), shipped(files))
         into.mkdir(parents=True, exist_ok=True)
-        for old in (each for pattern in ("*.whl", "*.tar.gz") for each in into.glob(pattern)):
+        for old in (path for pattern in ("*.whl", "*.tar.gz") for path in into.glob(pattern)):
             old.unlink()
         made = [Path(shutil.copyfile(package, into / name)) for name, package in sorted(first.items())]
     sums = {package.name: hashlib.sha256(package.read_bytes()).hexdigest() for package in made}
-    (into / "SHA256SUMS").write_text("".join(f"{each}  {name}\n" for name, each in sums.items()), "utf-8")
+    (into / "SHA256SUMS").write_text("".join(f"{digest}  {name}\n" for name, digest in sums.items()), "utf-8")
     sizes = {package.name: package.stat().st_size for package in made}
     (into / "RELEASE_NOTES.md").write_text(notes(origin, section, sizes, sums), "utf-8")
     for name, size in sizes.items():
@@ -120,8 +120,8 @@ def tracked_files(root: Path) -> list[str]:
     names = _git(root, "ls-files", "-z").split("\0")
     if "pyproject.toml" not in names:
         folders = (*PACKAGES, "examples", "docs", "native")
-        found = [file for folder in folders for file in (root / folder).rglob("*")]
-        names = [file.relative_to(root).as_posix() for file in found] + list(SINGLE_FILES)
+        files = [file for folder in folders for file in (root / folder).rglob("*")]
+        names = [file.relative_to(root).as_posix() for file in files] + list(SINGLE_FILES)
         names = [name for name in names if not re.search(r"(^|/)(__pycache__|build)(/|$)", name)]
     return sorted(name for name in names if _is_used(name) and (root / name).is_file())
 
@@ -146,10 +146,10 @@ def changes_of(version: str, changelog: str) -> str:
     """
     released = re.match(r"\d+\.\d+\.\d+", version)
     number = released[0] if released else version
-    found = re.search(rf"^## {re.escape(number)}\n(.*?)(?=^## |\Z)", changelog, re.M | re.S)
-    if found is None or not found[1].strip():
+    section = re.search(rf"^## {re.escape(number)}\n(.*?)(?=^## |\Z)", changelog, re.M | re.S)
+    if section is None or not section[1].strip():
         raise ReleaseError(f"CHANGELOG.md has no section {number}", "write what changed, for its users")
-    return found[1].strip()
+    return section[1].strip()
 
 
 def _origin(files: Collection[str]) -> Origin:

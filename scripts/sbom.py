@@ -24,17 +24,17 @@ def with_vendored(bill: Mapping[str, Any], packages: Sequence[Mapping[str, Any]]
 
     Components of an earlier run are replaced.
     """
-    added = [_component(each) for each in packages]
-    names = {each["bom-ref"] for each in added}
+    added = [_component(package) for package in packages]
+    names = {component["bom-ref"] for component in added}
     root = bill["metadata"]["component"]["bom-ref"]
-    kept = [each for each in bill.get("components", ()) if each["bom-ref"] not in names]
-    depends = {each["ref"]: dict(each) for each in bill.get("dependencies", ())}
+    components = [component for component in bill.get("components", ()) if component["bom-ref"] not in names]
+    depends = {dependency["ref"]: dict(dependency) for dependency in bill.get("dependencies", ())}
     depends.update((name, {"ref": name}) for name in names)
     of_root = depends.setdefault(root, {"ref": root})
     of_root["dependsOn"] = sorted({*of_root.get("dependsOn", ()), *names})
     return {
         **bill,
-        "components": sorted([*kept, *added], key=lambda each: str(each["bom-ref"])),
+        "components": sorted([*components, *added], key=lambda each: str(each["bom-ref"])),
         "dependencies": [depends[name] for name in sorted(depends)],
     }
 

@@ -53,8 +53,8 @@ def rendered_views(seed: int) -> list[Descriptors]:
             timestamp_s=0.0, rgb=add_image_noise(colour, rng), depth_m=add_depth_noise(depth_m, cosine, rng),
             camera=SIMULATED_CAMERA,
         )  # fmt: skip
-        found = extract(frame, options)
-        views.append(found.descriptors[np.isfinite(found.points_camera[:, 2])])
+        features = extract(frame, options)
+        views.append(features.descriptors[np.isfinite(features.points_camera[:, 2])])
     return views
 
 

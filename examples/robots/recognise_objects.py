@@ -30,10 +30,10 @@ async def main(args: argparse.Namespace) -> None:
     }
     async with connect(enrolment=args.enrolment, codec="bin") as robot:
         answer = await robot.call("object-recognition", request, deadline_s=10.0)
-    for found in answer.reply["found"]:
-        T_camera_object = np.reshape(found["T_camera_object"], (4, 4))
+    for recognised in answer.reply["found"]:
+        T_camera_object = np.reshape(recognised["T_camera_object"], (4, 4))
         x, y, z = T_camera_object[:3, 3]
-        print(f"{found['name']} at {x:.3f} {y:.3f} {z:.3f} m, {found['inliers']} inliers")
+        print(f"{recognised['name']} at {x:.3f} {y:.3f} {z:.3f} m, {recognised['inliers']} inliers")
     print(f"{len(answer.reply['found'])} found, {answer.compute_ms:.0f} ms")
 
 

@@ -41,8 +41,8 @@ async def main(args: argparse.Namespace) -> None:
     maps = [await asyncio.to_thread(data.download_map, name) for name in ("first", "second")]
     async with connect(enrolment=args.first_enrolment) as robot:
         reply = await merge_maps(robot, data, maps)
-    for each in reply.not_joined:
-        print(f"map {each.map + 1} was not joined: {each.reason}")
+    for refusal in reply.not_joined:
+        print(f"map {refusal.map + 1} was not joined: {refusal.reason}")
     merged = decode_map(reply.map)
     write_ply(args.out, merged.points, merged.colours)
     print(f"{len(reply.joined)} maps joined, {reply.merges} links: {len(merged.points)} points in {args.out}")

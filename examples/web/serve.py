@@ -62,10 +62,12 @@ class Page(http.server.BaseHTTPRequestHandler):
 def certificate_of(state: Path) -> ssl.SSLContext:
     """Return the TLS context of the platform whose folder is *state*."""
     resource = json.loads((state / "tls.json").read_text(encoding="utf-8"))["resources"][0]
-    told = resource["tls_certificate"]
+    certificate = resource["tls_certificate"]
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     with tempfile.NamedTemporaryFile("w", suffix=".pem") as file:  # readable by its owner only
-        file.write(told["certificate_chain"]["inline_string"] + told["private_key"]["inline_string"])
+        file.write(
+            certificate["certificate_chain"]["inline_string"] + certificate["private_key"]["inline_string"]
+        )
         file.flush()
         context.load_cert_chain(file.name)
     return context

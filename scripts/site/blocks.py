@@ -57,15 +57,15 @@ class Block:
 
 def pages(root: Path) -> list[str]:
     """Return README.md and all pages of ``docs``, by path, without the reports of experiments."""
-    found = [path.relative_to(root).as_posix() for path in sorted((root / "docs").rglob("*.md"))]
-    return ["README.md", *(each for each in found if not each.endswith("/report.md"))]
+    paths = [path.relative_to(root).as_posix() for path in sorted((root / "docs").rglob("*.md"))]
+    return ["README.md", *(page for page in paths if not page.endswith("/report.md"))]
 
 
 def read_blocks(page: str, text: str) -> Iterator[Block]:
     """Yield the blocks of a page that hold code, fenced or indented, in their order."""
     spans: list[tuple[int, str, str]] = []
-    for found in _FENCE.finditer(text):
-        spans.append((found.start(), found[2], found[3]))
+    for match in _FENCE.finditer(text):
+        spans.append((match.start(), match[2], match[3]))
     without = _FENCE.sub(lambda found: re.sub(r"[^\n]", "x", found[0]), text)
     for found in _INDENTED.finditer(without):
         body = "".join(line[4:] + "\n" for line in found[1].splitlines())
@@ -75,14 +75,14 @@ def read_blocks(page: str, text: str) -> Iterator[Block]:
             continue
         before = re.split(r"\n[ \t]*\n|```", text[:start].rstrip("\n"))[-1].lower()
         comments = _COMMENT.findall(before)
-        told = [comment.removeprefix("file: ") for comment in comments if comment.startswith("file: ")]
+        file_names = [comment.removeprefix("file: ") for comment in comments if comment.startswith("file: ")]
         mark = next((mark for mark in MARKS if mark in before), "")
-        if told:
+        if file_names:
             # The words were compared in small letters; names are not.
-            told = [re.findall(r"<!-- file: (\S+) -->", text[:start])[-1]]
+            file_names = [re.findall(r"<!-- file: (\S+) -->", text[:start])[-1]]
         yield Block(
             page=page, line=text.count("\n", 0, start) + 1, language=language, text=body, mark=mark,
-            file=told[0] if told else "",
+            file=file_names[0] if file_names else "",
         )  # fmt: skip
 
 

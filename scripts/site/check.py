@@ -51,15 +51,15 @@ class _Page(HTMLParser):
         self._within = ""
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        found = {name: value or "" for name, value in attrs}
+        attributes = {name: value or "" for name, value in attrs}
         self._within = tag if tag in ("script", "style") else ""
-        self.anchors |= {found[name] for name in ("id", "name") if name in found}
-        self.loads += [found[name] for name in _LOADS.get(tag, ()) if name in found]
-        self.loads += _IN_CSS.findall(found.get("style", ""))
-        if tag == "link" and set(found.get("rel", "").split()) & _LINK_LOADS:
-            self.loads.append(found.get("href", ""))
-        if tag == "a" and "href" in found:
-            self.links.append(found["href"])
+        self.anchors |= {attributes[name] for name in ("id", "name") if name in attributes}
+        self.loads += [attributes[name] for name in _LOADS.get(tag, ()) if name in attributes]
+        self.loads += _IN_CSS.findall(attributes.get("style", ""))
+        if tag == "link" and set(attributes.get("rel", "").split()) & _LINK_LOADS:
+            self.loads.append(attributes.get("href", ""))
+        if tag == "a" and "href" in attributes:
+            self.links.append(attributes["href"])
 
     def handle_data(self, data: str) -> None:
         if self._within == "style":
@@ -79,14 +79,14 @@ def outside_requests(files: Mapping[str, str]) -> Iterator[str]:
     """Yield what the *files* (path to text) of a site would load from other hosts, one line each."""
     for path, text in files.items():
         if path.endswith(".html"):
-            found = [each for each in read_page(text).loads if _OTHER_HOST.match(each)]
+            foreign = [load for load in read_page(text).loads if _OTHER_HOST.match(load)]
         elif path.endswith(".css"):
-            found = _IN_CSS.findall(text)
+            foreign = _IN_CSS.findall(text)
         elif path.endswith(".js"):
-            found = _IN_SCRIPT.findall(text)
+            foreign = _IN_SCRIPT.findall(text)
         else:
             continue
-        yield from (f"{path}: {each}" for each in found if not each.startswith(_NAMESPACES))
+        yield from (f"{path}: {address}" for address in foreign if not address.startswith(_NAMESPACES))
 
 
 def dead_links(files: Mapping[str, str], others: set[str]) -> Iterator[str]:

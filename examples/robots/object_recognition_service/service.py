@@ -74,7 +74,7 @@ class _Model:
         self.points_m = np.column_stack((places * (width_m / width_px), np.zeros(len(places))))
 
 
-_models = [_Model(*each) for each in json.loads((_OBJECTS / "objects.json").read_text()).items()]
+_models = [_Model(*item) for item in json.loads((_OBJECTS / "objects.json").read_text()).items()]
 
 
 def serve(request: Request) -> Reply:
@@ -94,8 +94,11 @@ def serve(request: Request) -> Reply:
     if request.tags_only:
         return Reply(found=_tags(image, K, request.tag_m))
     keypoints, descriptors = _sift.detectAndCompute(image, None)
-    found = [_object(model, keypoints, descriptors, K) for model in _models]
-    return Reply(found=[each for each in found if each is not None] + _tags(image, K, request.tag_m))
+    objects = [_object(model, keypoints, descriptors, K) for model in _models]
+    return Reply(
+        found=[recognised for recognised in objects if recognised is not None]
+        + _tags(image, K, request.tag_m)
+    )
 
 
 def _object(model: _Model, keypoints: Any, descriptors: Any, K: npt.NDArray[Any]) -> Found | None:
@@ -106,8 +109,8 @@ def _object(model: _Model, keypoints: Any, descriptors: Any, K: npt.NDArray[Any]
     good = [best for best, second in pairs if best.distance < _RATIO * second.distance]
     if len(good) < _MIN_INLIERS:
         return None
-    points_m = model.points_m[[each.queryIdx for each in good]]
-    pixels = np.array([keypoints[each.trainIdx].pt for each in good])
+    points_m = model.points_m[[match.queryIdx for match in good]]
+    pixels = np.array([keypoints[match.trainIdx].pt for match in good])
     _, mask = cv2.findHomography(points_m[:, :2], pixels, cv2.RANSAC, _INLIER_PX)
     agreeing = np.flatnonzero(mask) if mask is not None else np.empty(0, np.intp)
     if len(agreeing) < _MIN_INLIERS:
