@@ -43,7 +43,7 @@ class Enrolment(msgspec.Struct, frozen=True, kw_only=True):
     robot: str
     tenant: str = DEFAULT_TENANT
     key: dict[str, Any]
-    issuer: str = "rse-pf"
+    issuer: Literal["rse-pf"] = "rse-pf"
     audience: str = "rse-pf"
     token_ttl_s: int = 900
 
@@ -74,7 +74,7 @@ class Enrolment(msgspec.Struct, frozen=True, kw_only=True):
 
     def token(self, *, now_s: float, token_id: str) -> str:
         """Return a token that the robot signs, valid from *now_s* (Unix); raises UsageError for a bad key."""
-        settings = AuthSettings(issuer=self.issuer, audience=self.audience, token_ttl_s=self.token_ttl_s)
+        settings = AuthSettings(audience=self.audience, token_ttl_s=self.token_ttl_s)
         key = SigningKey.from_json(msgspec.json.encode(self.key))
         return key.issue(self.robot, now=now_s, token_id=token_id, settings=settings)
 

@@ -30,7 +30,7 @@ from rse_pf.config.cloud_layout import zone_count
 from rse_pf.config.resource_names import AUDIT_PREFIX, JOURNAL_PREFIX, VERSION_PARAMETER, ResourceNames
 from rse_pf.scaling.alarms import NAMESPACE
 from rse_pf.scaling.boot_time import BOOT_LIMIT_S, retry_within_s
-from rse_pf.scaling.health import MAX_HEALTHY_PERCENT
+from rse_pf.scaling.health import DRAIN_S, MAX_HEALTHY_PERCENT
 from stacks.capacity import Capacity
 from stacks.permissions import allow
 
@@ -111,7 +111,7 @@ class BackendServers(Construct):
         self.group.add_lifecycle_hook(
             "Drain", lifecycle_hook_name=names.drain_hook,
             lifecycle_transition=autoscaling.LifecycleTransition.INSTANCE_TERMINATING,
-            heartbeat_timeout=cdk.Duration.seconds(settings.cloud.drain_s),
+            heartbeat_timeout=cdk.Duration.seconds(DRAIN_S),
             default_result=autoscaling.DefaultResult.CONTINUE,
         )  # fmt: skip
 

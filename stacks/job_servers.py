@@ -20,6 +20,7 @@ from rse_pf.config import PlatformSettings
 from rse_pf.config.cloud_layout import zone_count
 from rse_pf.config.resource_names import ResourceNames
 from rse_pf.scaling.boot_time import BOOT_LIMIT_S
+from rse_pf.scaling.health import DRAIN_S
 from rse_pf.scaling.job_alarms import job_alarms_of
 from stacks.backend_servers import launch_template
 from stacks.findings import acknowledge
@@ -94,7 +95,7 @@ class JobServers(Construct):
                 lifecycle_transition="autoscaling:EC2_INSTANCE_LAUNCHING", default_result="ABANDON",
             ),
             hook(
-                lifecycle_hook_name=names.job_drain_hook, heartbeat_timeout=cloud.drain_s,
+                lifecycle_hook_name=names.job_drain_hook, heartbeat_timeout=DRAIN_S,
                 lifecycle_transition="autoscaling:EC2_INSTANCE_TERMINATING", default_result="CONTINUE",
             ),
         ]  # fmt: skip

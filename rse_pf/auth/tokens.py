@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
 
 __all__ = [
+    "ISSUER",
     "Claims",
     "KeySet",
     "ProvenRefusal",
@@ -50,6 +51,8 @@ __all__ = [
     "verify_token",
 ]
 
+ISSUER = "rse-pf"
+"""Issuer (iss) of every token; platforms tell each other apart by ``auth.audience``."""
 _ALGORITHM = "EdDSA"
 _TYPE = "robot+jwt"
 _REQUIRED = ("iss", "aud", "sub", "exp", "iat", "jti")
@@ -158,7 +161,7 @@ class SigningKey:
                 hint=f"give 1 to {settings.token_ttl_s} s, or leave it out; auth.token_ttl_s is the limit",
             )
         claims = {
-            "iss": settings.issuer,
+            "iss": ISSUER,
             "aud": settings.audience,
             "sub": robot,
             "tenant": tenant,
@@ -350,7 +353,7 @@ class _TokenRefused(ValueError):
 def _check(token: str, keys: KeySet, now: float, settings: AuthSettings) -> Claims:
     if not token or len(token) > _MAX_TOKEN_BYTES or not token.isascii():
         raise _TokenRefused("missing-or-too-long")
-    digest = hashlib.sha256(f"{settings.issuer}\n{settings.audience}\n{token}".encode()).digest()
+    digest = hashlib.sha256(f"{ISSUER}\n{settings.audience}\n{token}".encode()).digest()
     remembered = keys.find_verified(digest)
     signed = remembered or _signed_claims(token, keys, settings)
     verified = signed.claims
@@ -425,7 +428,7 @@ def _is_for_us(claims: dict[str, Any], settings: AuthSettings) -> bool:
         and isinstance(audience, list)
         and all(isinstance(name, str) for name in audience)
         and settings.audience in audience
-        and claims["iss"] == settings.issuer
+        and claims["iss"] == ISSUER
         and isinstance(claims["sub"], str)
         and isinstance(claims["jti"], str)
     )

@@ -147,7 +147,7 @@ class BatchMerge:
     def _versions(self) -> list[MapVersion]:
         if not 1 <= len(self._maps) <= MAX_MAPS:
             raise BadRequest(f"{len(self._maps)} maps are not within 1..{MAX_MAPS}", hint="name one or more")
-        limits = map_limits(self._settings.data.max_keyframe_features)
+        limits = map_limits()
         most = MapLimits()
         versions: list[MapVersion] = []
         keyframes = features = 0
@@ -201,16 +201,12 @@ class BatchMerge:
         return name
 
     @property
-    def _limits(self) -> dict[str, int]:
-        return {"keyframe_features": self._settings.data.max_keyframe_features}
-
-    @property
     def _merge_options(self) -> dict[str, float | int | bool]:
         names = self._options.__struct_fields__
         return {name: getattr(self._options, name) for name in names}
 
     def _propose(self, atlas: Atlas, options: MergeOptions, report: Report) -> LoopProposals:
-        vectors = [Part(kind="vectors", inputs=(name,), arguments=self._limits) for name in self._maps]
+        vectors = [Part(kind="vectors", inputs=(name,)) for name in self._maps]
         self._run(vectors)
         count = len(self._maps)
         self._pairs = [
@@ -233,7 +229,7 @@ class BatchMerge:
         for number, (each, pairs) in enumerate(zip(proposing, proposed, strict=True)):
             for first in range(0, pairs, step):
                 arguments = {
-                    "options": self._merge_options, "rows": (first, min(first + step, pairs)), **self._limits
+                    "options": self._merge_options, "rows": (first, min(first + step, pairs))
                 }  # fmt: skip
                 inputs = (*self._names_of(self._pairs[number]), each.name)
                 parts.append(Part(kind="links", inputs=inputs, arguments=arguments))
@@ -251,7 +247,7 @@ class BatchMerge:
             maps = self._names_of(pair)
             own = tuple(part.name for part, which in zip(parts, owner, strict=True) if which == number)
             arguments = {
-                "options": self._merge_options, "maps": len(maps), **self._limits, "most": MAX_LINKS_PER_PAIR,
+                "options": self._merge_options, "maps": len(maps), "most": MAX_LINKS_PER_PAIR,
             }  # fmt: skip
             self._agreeing.append(Part(kind="agree", inputs=(*maps, *own), arguments=arguments))
 
@@ -296,7 +292,7 @@ class BatchMerge:
                 continue
             guess = self._put(T_one_other=inverse(T_world_map[one]) @ T_world_map[other])
             inputs = (self._maps[one], self._maps[other], guess)
-            parts.append(Part(kind="tiles", inputs=inputs, arguments=self._limits))
+            parts.append(Part(kind="tiles", inputs=inputs))
             pairs.append((one, other))
         results = self._run(parts)
         self._tiles = [
@@ -354,7 +350,6 @@ class BatchMerge:
             Part(
                 kind="cloud",
                 inputs=(self._maps[which], self._put(poses=poses[atlas.of_map == which])),
-                arguments=self._limits,
             )
             for which in joined
         ]

@@ -174,7 +174,7 @@ def _agree(store: ObjectStore, part: Part) -> PartResult:
 
 def _tiles(store: ObjectStore, part: Part) -> PartResult:
     """Align the clouds of two maps by tiles."""
-    versions = [_map(store, name, part.arguments["keyframe_features"]) for name in part.inputs[:2]]
+    versions = [_map(store, name) for name in part.inputs[:2]]
     pose = read_result(store, part.inputs[2]).arrays["T_one_other"]
     links, refused = align_tiles(Atlas.of(versions), (versions[0].points, versions[1].points), pose)
     return PartResult(arrays=link_arrays(links), counts=dict(refused))
@@ -194,7 +194,7 @@ def _optimise(store: ObjectStore, part: Part) -> PartResult:
 def _cloud(store: ObjectStore, part: Part) -> PartResult:
     """Move the cloud of a map with its keyframes."""
     atlas = _atlas(store, part, 1)
-    points = _map(store, part.inputs[0], part.arguments["keyframe_features"]).points
+    points = _map(store, part.inputs[0]).points
     poses = read_result(store, part.inputs[1]).arrays["poses"]
     return PartResult(arrays={"points": deform_cloud(points, atlas.keyframes, poses)})
 
@@ -211,22 +211,22 @@ _KINDS: dict[str, Callable[[ObjectStore, Part], PartResult]] = {
 
 
 def _atlas(store: ObjectStore, part: Part, maps: int) -> Atlas:
-    return Atlas.of([_map(store, name, part.arguments["keyframe_features"]) for name in part.inputs[:maps]])
+    return Atlas.of([_map(store, name) for name in part.inputs[:maps]])
 
 
-def _map(store: ObjectStore, name: str, keyframe_features: int) -> MapVersion:
-    version: MapVersion = _cached_map(cast("Hashable", store), name, keyframe_features)
+def _map(store: ObjectStore, name: str) -> MapVersion:
+    version: MapVersion = _cached_map(cast("Hashable", store), name)
     return version
 
 
 @functools.lru_cache(maxsize=_CACHED_MAPS)
-def _cached_map(store: Any, name: str, keyframe_features: int) -> MapVersion:
+def _cached_map(store: Any, name: str) -> MapVersion:
     """Return a map; its name has its digest, so that it never changes."""
-    return _decoded(store.get(name), keyframe_features)
+    return _decoded(store.get(name))
 
 
-def _decoded(data: bytes, keyframe_features: int) -> MapVersion:
-    return decode_map(data, limits=map_limits(keyframe_features))
+def _decoded(data: bytes) -> MapVersion:
+    return decode_map(data, limits=map_limits())
 
 
 def _options(part: Part) -> MergeOptions:

@@ -10,7 +10,14 @@ from rse_pf.config.schedule import parse_schedule, zone_named
 from rse_pf.config.validation import WHERE
 from rse_pf.errors import SettingsError
 
-__all__ = ["FAST_PERIOD_S", "FAST_SAMPLES", "MOVES_PER_S", "check_elasticity", "instance_types"]
+__all__ = [
+    "FAST_PERIOD_S",
+    "FAST_SAMPLES",
+    "MOVES_PER_S",
+    "UNDERUSED_CPU_PERCENT",
+    "check_elasticity",
+    "instance_types",
+]
 
 MOVES_PER_S = 20.0
 """Robots that a crowded server asks to move each second, so that the others accept them without a queue."""
@@ -18,6 +25,8 @@ FAST_PERIOD_S = 10
 """One sample of the fast profile: the shortest period of a high-resolution alarm."""
 FAST_SAMPLES = 3
 """Busy samples in a row before the fast profile grows."""
+UNDERUSED_CPU_PERCENT = 15.0
+"""Average CPU below which a server can be spared although robots send commands; ``scaling.underused_s``."""
 
 _TYPE = re.compile(r"[a-z][a-z0-9-]*\.[a-z0-9-]+")
 _ARM = re.compile(r"a1|[a-z]+[0-9]+[a-z]*g[a-z]*")
@@ -43,12 +52,12 @@ def check_elasticity(scaling: Mapping[str, Any], cloud: Mapping[str, Any]) -> No
     """Raise SettingsError if two settings of *scaling* and *cloud*, by name, cannot both hold."""
     types = _types(cloud["instance_type"], cloud["other_instance_types"])
     _check_periods(scaling)
-    if scaling["underused_s"] and 2 * scaling["underused_cpu_percent"] > scaling["busy_cpu_percent"]:
+    if scaling["underused_s"] and scaling["busy_cpu_percent"] < 2 * UNDERUSED_CPU_PERCENT:
         raise SettingsError(
-            f"scaling.underused_cpu_percent = {scaling['underused_cpu_percent']:g} is more than half of "
-            f"scaling.busy_cpu_percent = {scaling['busy_cpu_percent']:g}; one of two servers that leaves "
+            f"scaling.busy_cpu_percent = {scaling['busy_cpu_percent']:g} is less than twice the "
+            f"{UNDERUSED_CPU_PERCENT:g} % below which a server is spared; one of two servers that leaves "
             "would make the other one busy",
-            hint=f"lower scaling.underused_cpu_percent {WHERE}, or set scaling.underused_s to 0",
+            hint=f"raise scaling.busy_cpu_percent {WHERE}, or set scaling.underused_s to 0",
         )
     zone_named(scaling["time_zone"])
     for entry in parse_schedule(scaling["schedule"]):

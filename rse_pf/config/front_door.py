@@ -16,6 +16,7 @@ from rse_pf.config.settings import PlatformSettings
 __all__ = [
     "BALANCER_IDLE_TIMEOUT_S",
     "BEARER_PATTERN",
+    "BODY_TIMEOUT_S",
     "BURST_PATH",
     "DATA_PATH",
     "DIALS_PER_MINUTE",
@@ -30,6 +31,9 @@ __all__ = [
 BALANCER_IDLE_TIMEOUT_S = 120
 """How long the load balancer on AWS keeps a silent connection; robots ping far more often."""
 
+BODY_TIMEOUT_S = 10.0
+"""A request body of the data service that pauses for longer is refused; the local balancer waits three times
+as long."""
 MAX_HANDSHAKE_BYTES = 8192
 """Request head of a handshake; load balancer and server refuse a longer one with 431 (OWASP, slowloris)."""
 DIAL_BURST = 20

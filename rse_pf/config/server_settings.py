@@ -18,7 +18,6 @@ READ_BY_SERVERS: dict[str, tuple[str, ...]] = {
     "cloud": (
         "name",
         "region",
-        "drain_s",
         "spot",
         "job_servers",
     ),

@@ -82,7 +82,6 @@ class ServingSettings:
     max_compute_s: float = setting(20.0, unit="s", doc="CPU time of one command of a map service; the process of one that needs more is ended", low=0.1)
     max_running_jobs: int = setting(1, doc="long jobs that run at the same time on one server; 0 leaves them to job servers, or turns long services off where none are offered", low=0, high=64)
     offer_jobs: bool = setting(False, doc="offer jobs that wait to job servers (rse-pf serve --jobs-only), through data.store")
-    job_server_slots: int = setting(1, doc="long jobs that run at the same time on one job server", low=1, high=64)
     job_poll_s: float = setting(5.0, unit="s", doc="time between two looks of a job server for jobs that wait; each look is one request to the store", low=0.05)
     max_waiting_jobs: int = setting(8, doc="further jobs of one worker that wait, or that it follows on another server; more are refused", low=0, high=1000)
     max_job_memory_bytes: int = setting(2147483648, unit="bytes", doc="memory of one job; a job that needs more is ended", low=134217728)
@@ -146,8 +145,7 @@ class ScalingSettings:
     max_robots_per_server: int = setting(0, unit="robots", source="paper, Sect. 3.1", doc="add a server above this many robots each; 0 is off", low=0)
     max_queue_ms: float = setting(0.0, unit="ms", doc="add a server above this queue delay; 0 is off", low=0)
     profile: str = setting("paper", doc="how fast load is noticed; paper: samples of scaling.period_s; fast: three samples of 10 s that the servers publish themselves", choices=("paper", "fast"))
-    underused_s: int = setting(900, unit="s", doc="remove a server after CPU was below underused_cpu_percent for this long, although robots send commands; 0 is off", low=0, high=86400)
-    underused_cpu_percent: float = setting(15.0, unit="%", doc="average CPU below which a server can be spared; at most half of busy_cpu_percent", low=0, high=100)
+    underused_s: int = setting(900, unit="s", doc="remove a server after CPU was below 15 % for this long, although robots send commands; 0 is off", low=0, high=86400)
     schedule: str = setting("", doc="min_servers by day and time, such as: weekdays 08:00 min 4; weekdays 18:00 min 1; sat,sun 10:00 min 2")
     time_zone: str = setting("UTC", doc="time zone of scaling.schedule, such as Asia/Seoul", source="IANA time zones")
 
@@ -165,10 +163,8 @@ class DataSettings:
     tenant_quota_bytes: int = setting(107374182400, unit="bytes", doc="total size of what one tenant stores: objects, maps with all their versions, live maps, states of services and jobs that wait", low=1024)
     max_objects: int = setting(100000, unit="objects", doc="objects, unfinished uploads and map versions of one robot", source="file systems run out of inodes", low=1)
     max_requests_per_s: float = setting(50.0, unit="requests/s", doc="requests of one robot; a list counts as 5, a commit of a map as 20; more are refused with 429", low=0.1)
-    max_keyframe_features: int = setting(20000, unit="features", doc="features of one keyframe of a map that a service decodes", low=1)
     part_bytes: int = setting(4194304, unit="bytes", doc="body of one request; larger objects are sent in parts", low=1024)
     max_uploads: int = setting(32, doc="request bodies received at the same time; more are refused with 503 and Retry-After", low=1)
-    body_timeout_s: float = setting(10.0, unit="s", doc="a request body that pauses for longer is refused", low=0.1)
     background_bytes_per_s: int = setting(262144, unit="bytes/s", doc="rate at which a robot uploads keyframes in the background", low=1024)
     max_spool_bytes: int = setting(1073741824, unit="bytes", doc="keyframes that a robot keeps on its disk while it is offline", low=1024)
     glacier_after_days: int = setting(90, unit="days", source="paper, Sect. 5.1", doc="what was not written for this long moves to Glacier Instant Retrieval, which is read like any object", low=30)
@@ -178,7 +174,6 @@ class DataSettings:
 class AuthSettings:
     """Robot tokens."""
 
-    issuer: str = setting("rse-pf", doc="issuer (iss) of the tokens")
     audience: str = setting("rse-pf", doc="audience (aud) of the tokens")
     token_ttl_s: int = setting(900, unit="s", doc="longest validity of a robot token", source="RFC 8725; short-lived", low=10, high=900)
     leeway_s: int = setting(30, unit="s", doc="clock difference that is tolerated", low=0, high=300)
@@ -283,7 +278,6 @@ class CloudSettings:
     s3_prefix_list: str = setting("", doc="prefix list of S3 in the region; empty: from the table in stacks/firewall.py")
     robot_cidr: str = setting("0.0.0.0/0", doc="addresses that robots may connect from")
     robots_per_site: int = setting(100, unit="robots", doc="WAF: robots behind one address that may all connect, and send data, in the same minute", low=1, high=100000)
-    drain_s: int = setting(60, unit="s", doc="time that the termination hook gives a server to drain", low=30, high=7200)
     lambda_memory_mb: int = setting(1769, unit="MB", doc="memory of the serverless PnP; 1769 is one vCPU", low=128, high=10240)
     lambda_concurrency: int = setting(20, doc="concurrent executions of the serverless PnP", low=1)
     idle_hours: int = setting(24, unit="h", doc="hours without robots after which idle_action is taken", low=1, high=168)

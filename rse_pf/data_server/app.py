@@ -115,7 +115,7 @@ class DataServer:
         if scope["type"] != "http":
             raise BadRequest(f"{scope['type']} is not supported", hint="use HTTP")
         began = self._clock()
-        request = HttpRequest(scope, receive, self._clock, self._settings.data)
+        request = HttpRequest(scope, receive, self._clock)
         line: dict[str, Any] = {"event": "request", "method": request.method}
         work = asyncio.ensure_future(self._serve(request, line, send))
         gone = asyncio.ensure_future(request.wait_until_gone())

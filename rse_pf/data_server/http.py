@@ -16,7 +16,7 @@ from urllib.parse import parse_qsl
 
 import msgspec
 
-from rse_pf.config import DataSettings
+from rse_pf.config.front_door import BODY_TIMEOUT_S
 from rse_pf.errors import (
     Archived,
     BadRequest,
@@ -100,9 +100,7 @@ class HttpReply:
 class HttpRequest:
     """One request whose body has not been read yet."""
 
-    def __init__(
-        self, scope: Mapping[str, Any], receive: Receive, clock: Callable[[], float], limits: DataSettings
-    ) -> None:
+    def __init__(self, scope: Mapping[str, Any], receive: Receive, clock: Callable[[], float]) -> None:
         self.method = str(scope["method"])
         self.path = str(scope["path"])
         self.peer = str((scope.get("client") or ("",))[0])
@@ -114,7 +112,6 @@ class HttpRequest:
         self._complete = asyncio.Event()
         self._receive = receive
         self._clock = clock
-        self._limits = limits
 
     @property
     def is_complete(self) -> bool:
@@ -141,7 +138,7 @@ class HttpRequest:
 
         Raises:
             LimitExceeded: It is longer than *max_bytes*.
-            Expired: It pauses for ``data.body_timeout_s`` or stays below `_MIN_BODY_BYTES_PER_S`.
+            Expired: It pauses for `BODY_TIMEOUT_S` or stays below `_MIN_BODY_BYTES_PER_S`.
             Disconnected: The robot closed the connection before the end.
         """
         announced = self.header_number("content-length")
@@ -196,9 +193,9 @@ class HttpRequest:
         began = self._clock()
         while not self.is_complete:
             try:
-                message = await asyncio.wait_for(self._receive(), self._limits.body_timeout_s)
+                message = await asyncio.wait_for(self._receive(), BODY_TIMEOUT_S)
             except asyncio.TimeoutError:
-                raise _too_slow(f"no data for {self._limits.body_timeout_s:g} s") from None
+                raise _too_slow(f"no data for {BODY_TIMEOUT_S:g} s") from None
             if message["type"] == "http.disconnect":
                 self._complete.set()
                 raise Disconnected("the robot closed the connection within its request")

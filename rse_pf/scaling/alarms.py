@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from rse_pf.config import ScalingSettings
+from rse_pf.config.elasticity import UNDERUSED_CPU_PERCENT
 from rse_pf.scaling.policy import BIG_STEP, STEP
 from rse_pf.scaling.profile import cadence_of
 
@@ -140,7 +141,7 @@ def _idle(settings: ScalingSettings, cpu: Metric) -> Alarm:
 
 
 def _underused(settings: ScalingSettings, cpu: Metric) -> Alarm:
-    conditions = {cpu: f"< {settings.underused_cpu_percent:g}", **_spare(settings, 0.5)}
+    conditions = {cpu: f"< {UNDERUSED_CPU_PERCENT:g}", **_spare(settings, 0.5)}
     cadence = cadence_of(settings)
     return _shrink(
         "underused", conditions, cadence.period_s, cadence.underused, "a server less can do the work"

@@ -15,6 +15,7 @@ from rse_pf.config.resource_names import HEALTH_PATH, READY_PATH
 __all__ = [
     "CLOUD_INTERVAL_S",
     "CLOUD_TIMEOUT_S",
+    "DRAIN_S",
     "HEALTHY_CHECKS",
     "LOCAL_INTERVAL_S",
     "LOCAL_TIMEOUT_S",
@@ -31,6 +32,8 @@ LOCAL_INTERVAL_S, LOCAL_TIMEOUT_S = 0.25, 0.25
 """Time between checks on one machine; a check that takes longer than the second failed."""
 CLOUD_INTERVAL_S, CLOUD_TIMEOUT_S = 5, 4
 """Time between checks of the ALB, the least it offers; a check that takes longer than the second failed."""
+DRAIN_S = 60
+"""Time that the termination hook of a cloud gives a server to drain."""
 
 MAX_HEALTHY_PERCENT = 110
 """While servers are replaced: one new one more at a time, up to 19 servers, and never fewer than wanted.

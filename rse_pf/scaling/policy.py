@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from rse_pf.config import ScalingSettings
+from rse_pf.config.elasticity import UNDERUSED_CPU_PERCENT
 from rse_pf.scaling.profile import Cadence, cadence_of
 
 __all__ = ["BIG_STEP", "STEP", "Action", "FleetState", "Kind", "Sample", "decide", "find_rule_starts"]
@@ -203,9 +204,7 @@ def _rules(settings: ScalingSettings, cadence: Cadence) -> list[_Rule]:
             _Rule(
                 name="underused",
                 samples=cadence.underused,
-                holds=lambda sample: (
-                    sample.cpu_percent < settings.underused_cpu_percent and spare(sample, 0.5)
-                ),
+                holds=lambda sample: sample.cpu_percent < UNDERUSED_CPU_PERCENT and spare(sample, 0.5),
                 change=lambda sample: -1,
                 reason=lambda sample: f"CPU at {sample.cpu_percent:.0f} %, low for {settings.underused_s} s",
             )

@@ -16,9 +16,6 @@ def builtin_services(settings: PlatformSettings) -> Registry:
     pnp.register(registry, settings.pnp)
     echo.register(registry)
     # Optional packages are imported by the first command: a server without them answers missing-extra.
-    icp.register(registry)
-    for each in (place, localise, merge):
-        each.register(registry, settings.data)
-    optimise.register(registry)
-    wifi.register(registry)
+    for service in (icp, place, localise, merge, optimise, wifi):
+        service.register(registry)
     return registry

@@ -23,7 +23,7 @@ from undecodable import as_input
 import client_sdk
 from rse_pf.auth.control_token import bearer, read_control_token
 from rse_pf.auth.roster import EnrolledRobot
-from rse_pf.auth.tokens import SigningKey
+from rse_pf.auth.tokens import ISSUER, SigningKey
 from rse_pf.auth.trust_store import AccessControlStore
 from rse_pf.errors import Unauthorized
 from rse_pf.local.control.platform import LocalPlatform
@@ -111,7 +111,7 @@ class Bench:
         private = json.loads(key.to_json())
         enrolled = EnrolledRobot(robot=robot, x=private["x"])
         self._access.change_roster(lambda roster: roster.enrolled(enrolled))
-        self._own_key = {**private, "sub": robot, "iss": auth.issuer, "aud": auth.audience}
+        self._own_key = {**private, "sub": robot, "iss": ISSUER, "aud": auth.audience}
         return self._own_key
 
     async def until_enrolled(self) -> None:

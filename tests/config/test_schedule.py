@@ -54,7 +54,7 @@ def test_a_time_zone_is_found_by_its_name() -> None:
         ({"scaling": {"schedule": "daily 08:00 min 40"}}, "scaling.max_servers = 10", "smaller number"),
         ({"scaling": {"schedule": "daily 08:00 min 2; mon 8:00 min 3"}}, "mon 08:00", "one of them"),
         ({"scaling": {"time_zone": "8 o'clock"}}, "no time zone", "Asia/Seoul"),
-        ({"scaling": {"underused_cpu_percent": 36}}, "more than half", "underused_s to 0"),
+        ({"scaling": {"busy_cpu_percent": 29}}, "less than twice", "underused_s to 0"),
         ({"scaling": {"profile": "slow"}}, "paper, fast", "choose one"),
         ({"scaling": {"profile": "fast", "idle_s": 305}}, "the 10 s of the fast profile", "multiple"),
         ({"cloud": {"warm_servers": 1, "spot": True}}, "cloud.spot exclude each other", "choose one"),

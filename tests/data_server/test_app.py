@@ -17,6 +17,7 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
 from rse_pf.auth.tokens import SigningKey
+from rse_pf.data_server import http
 from rse_pf.errors import Archived, StoreError, StoreFull
 from rse_pf.object_store import DirectoryStore, MemoryStore, ObjectInfo, digest_of
 
@@ -179,8 +180,8 @@ def test_a_slow_body_is_refused(service: Service) -> None:
     assert service.now == 6.0
 
 
-def test_a_stalled_body_is_refused() -> None:
-    service = Service(small_settings(body_timeout_s=0.1), MemoryStore())
+def test_a_stalled_body_is_refused(service: Service, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(http, "BODY_TIMEOUT_S", 0.1)
 
     answer = service.ask("PUT", OBJECT, [{"type": "http.request", "body": b"x", "more_body": True}])
 

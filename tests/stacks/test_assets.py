@@ -19,6 +19,7 @@ from rse_pf.aws.fleet.agent import SERVICES
 from rse_pf.config import PlatformSettings, load_settings
 from rse_pf.config.server_settings import server_settings
 from rse_pf.errors import ConfigurationError
+from rse_pf.scaling.health import DRAIN_S
 from stacks.assets import ENVIRONMENT_FILE, SERVERS, SETTINGS_FILE, SUMS_FILE, staged, sums_digest
 
 
@@ -131,7 +132,7 @@ def test_the_group_and_the_hook_are_those_that_an_instance_is_told(assembly: Any
     assert assembly.one("AWS::AutoScaling::AutoScalingGroup")["AutoScalingGroupName"] == "rse-pf"
     hook = assembly.one("AWS::AutoScaling::LifecycleHook")
     assert hook["LifecycleHookName"] == "rse-pf-drain"
-    assert hook["HeartbeatTimeout"] == assembly.settings.cloud.drain_s
+    assert hook["HeartbeatTimeout"] == DRAIN_S
 
 
 def test_an_instance_may_complete_the_hook_of_its_own_group_only(assembly: Any) -> None:

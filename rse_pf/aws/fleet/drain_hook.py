@@ -12,7 +12,7 @@ from collections.abc import Callable
 from rse_pf.aws.fleet.instance import Instance
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import Disconnected
-from rse_pf.scaling.health import time_to_notice_s
+from rse_pf.scaling.health import DRAIN_S, time_to_notice_s
 
 __all__ = ["drain_server"]
 
@@ -29,10 +29,10 @@ def drain_server(
     sleep: Callable[[float], None],
 ) -> bool:
     """Drain the server of *machine* and wait for its end; return whether it ended in time."""
-    until = clock() + settings.cloud.drain_s - _RESERVE_S
+    until = clock() + DRAIN_S - _RESERVE_S
     try:
         # The load balancer sends robots until it has noticed that the server is not ready.
-        machine.drain(min(time_to_notice_s(settings.health, local=False), settings.cloud.drain_s / 3))
+        machine.drain(min(time_to_notice_s(settings.health, local=False), DRAIN_S / 3))
         while clock() < until:
             machine.page()
             sleep(_POLL_S)

@@ -28,13 +28,14 @@ from rse_pf.config import PlatformSettings
 from rse_pf.config.resource_names import ResourceNames
 from rse_pf.config.schedule import minimum_at, parse_schedule, zone_named
 from rse_pf.errors import DeploymentFailed
+from rse_pf.scaling.health import DRAIN_S
 
 __all__ = ["StepContext", "Tools", "carry_out"]
 
 _POLL_S = 5.0
 _STACK_S = 2400.0
 _EMPTY_S = 600.0
-"""Beside ``cloud.drain_s``."""
+"""Beside `DRAIN_S`."""
 _HEALTHY_S = 600.0
 
 
@@ -154,11 +155,11 @@ def _empty(step: Step, world: StepContext) -> None:
 
 
 def _await_empty(step: Step, world: StepContext) -> None:
-    deadline = world.clock() + world.settings.cloud.drain_s + _EMPTY_S
+    deadline = world.clock() + DRAIN_S + _EMPTY_S
     while remaining := sum(group.instances for group in read_sizes(world.account, world.names).values()):
         if world.clock() > deadline:
             raise DeploymentFailed(
-                f"{remaining} servers did not end within {world.settings.cloud.drain_s + _EMPTY_S:g} s",
+                f"{remaining} servers did not end within {DRAIN_S + _EMPTY_S:g} s",
                 hint="rse-pf cloud status shows them; then repeat the command",
             )
         world.sleep(_POLL_S)

@@ -32,6 +32,9 @@ from rse_pf.files import replace_json
 
 __all__ = ["serve_jobs"]
 
+_JOBS_AT_ONCE = 1
+"""Long jobs that run at the same time on one job server."""
+
 
 def serve_jobs(
     settings: PlatformSettings,
@@ -80,20 +83,20 @@ class _Service:
         self._announce = announce
         self._token = control_token
         self._log = JsonLog(level=settings.serving.log_level, server=server_id, wall_clock=time.time)
-        slots, store = settings.serving.job_server_slots, open_data_store(settings)
+        store = open_data_store(settings)
         self._queue = JobQueue(
             store, settings, lambda name: self._log.warning("job-offer-damaged", offer=name, hint="delete it")
         )
         context = JobContext(
-            store=store, slots=JobSlots(make_pipe(slots)), settings=settings, server_id=server_id,
+            store=store, slots=JobSlots(make_pipe(_JOBS_AT_ONCE)), settings=settings, server_id=server_id,
             start=spawner(services, settings), clock=time.monotonic,
             finished=self._queue.withdraw, follows=False,  # without `queue`: it offers nothing itself
         )  # fmt: skip
         self._jobs = JobServer(
-            context, self._queue, self._log, lambda: f"{server_id}-{secrets.token_hex(8)}", slots
+            context, self._queue, self._log, lambda: f"{server_id}-{secrets.token_hex(8)}", _JOBS_AT_ONCE
         )  # fmt: skip
         _, *ports = batch_ports(settings.batch)
-        self._helpers = BatchHelpers(store, slots, ports=f"{ports[0]}:{ports[-1]}")
+        self._helpers = BatchHelpers(store, _JOBS_AT_ONCE, ports=f"{ports[0]}:{ports[-1]}")
         self._waiting = 0
         self._state = "starting"
         self._over = asyncio.Event()

@@ -36,7 +36,6 @@ def make_enrolment(args: argparse.Namespace, settings: PlatformSettings) -> Enro
         robot=args.robot,
         tenant=args.tenant,
         key=json.loads(SigningKey.of_robot(secrets.token_bytes(_SEED_BYTES)).to_json()),
-        issuer=auth.issuer,
         audience=auth.audience,
         token_ttl_s=auth.token_ttl_s,
     )

@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from rse_pf.config import ScalingSettings
+from rse_pf.config.elasticity import UNDERUSED_CPU_PERCENT
 from rse_pf.scaling.policy import BIG_STEP, STEP
 from rse_pf.scaling.profile import cadence_of
 
@@ -89,7 +90,7 @@ def _idle(
 def _underused_reason(
     samples: Sequence[Mapping[str, Any]], policy: Mapping[str, Any], settings: ScalingSettings, servers: int
 ) -> str:
-    needed, limit = cadence_of(settings).underused, settings.underused_cpu_percent
+    needed, limit = cadence_of(settings).underused, UNDERUSED_CPU_PERCENT
     count = _count_last_that(samples, lambda sample: float(sample["cpu_percent"]) < limit)
     enough = needed and servers > int(policy.get("min_servers", settings.min_servers))
     return (

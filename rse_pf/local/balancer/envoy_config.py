@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from rse_pf.config import PlatformSettings
-from rse_pf.config.front_door import MAX_HANDSHAKE_BYTES
+from rse_pf.config.front_door import BODY_TIMEOUT_S, MAX_HANDSHAKE_BYTES
 from rse_pf.config.resource_names import HEALTH_PATH, READY_PATH, ROSBRIDGE_PATH
 from rse_pf.local.lan.connect_page import connect_page, page_headers
 from rse_pf.local.lan.listener import CERTIFICATE_NAME, LanListener, secret_file
@@ -239,7 +239,7 @@ def _virtual_host(settings: PlatformSettings, lan: LanListener | None) -> dict[s
     route = {"cluster": CLUSTER, "timeout": "0s", "idle_timeout": "0s", "retry_policy": retry}
     # A large upload has no time limit while bytes flow; the data server is stricter.
     # No retries: the robot knows whether a part arrived, and resumes there.
-    idle = _seconds(3 * settings.data.body_timeout_s)
+    idle = _seconds(3 * BODY_TIMEOUT_S)
     data_route = {"cluster": DATA_CLUSTER, "timeout": "0s", "idle_timeout": idle}
     timeout = _seconds(settings.session.hello_timeout_s)
     return {

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import msgspec
 
-from rse_pf.config import DataSettings
 from rse_pf.errors import BadRequest
 from rse_pf.geometry import Camera
 from rse_pf.service import Registry
@@ -124,16 +123,14 @@ def locate(
     )
 
 
-def register(registry: Registry, data: DataSettings | None = None) -> None:
-    """Add ``localise`` to *registry*; *data* has the limit of a keyframe's features."""
-    limits = data or DataSettings()
-    keyframe_features = limits.max_keyframe_features
+def register(registry: Registry) -> None:
+    """Add ``localise`` to *registry*."""
 
     @registry.service("localise", limited=True, warm_up=load_faiss)
     def answer(request: LocaliseRequest) -> LocaliseReply:
         """Find the camera's pose in a map."""
         view = view_of(request.camera, request.pixels, request.descriptors)
-        _, index = open_map(request.map, keyframe_features)
+        _, index = open_map(request.map)
         check_comparisons(index, view, (request.options or LocaliseOptions()).candidates)
         found = locate(index, view, request.options, within=request.within)
         pose = None if found.T_map_camera is None else found.T_map_camera.ravel()

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import msgspec
 
-from rse_pf.config import DataSettings
 from rse_pf.errors import BadRequest, LimitExceeded
 from rse_pf.maps.format import MapVersion, decode_map, encode_map
 from rse_pf.service import Registry, Report
@@ -67,21 +66,16 @@ class MergeReply(msgspec.Struct, frozen=True, kw_only=True):
     cost_after: float
 
 
-def merge_maps(
-    request: MergeRequest, *, report: Report = ignore_progress, data: DataSettings | None = None
-) -> MergeReply:
+def merge_maps(request: MergeRequest, *, report: Report = ignore_progress) -> MergeReply:
     """Make one map of several robots' maps, or close the loops of one.
 
-    *report* gets the progress, and may raise Cancelled to end the work; *data* has the limit of a keyframe's
-    features.
+    *report* gets the progress, and may raise Cancelled to end the work.
     """
     if not 1 <= len(request.maps) <= MAX_MAPS:
         raise BadRequest(f"{len(request.maps)} maps are not within 1..{MAX_MAPS}", hint="send one or more")
-    limits = data or DataSettings()
-    keyframe_features = limits.max_keyframe_features
     versions: list[MapVersion] = []
     for encoded in request.maps:
-        versions.append(decode_map(encoded, limits=map_limits(keyframe_features)))
+        versions.append(decode_map(encoded, limits=map_limits()))
         count = sum(len(version.keyframes) for version in versions)
         points = sum(len(version.points) for version in versions)
         if count > MAX_KEYFRAMES or count * points > _MAX_PROJECTIONS:
@@ -95,13 +89,13 @@ def merge_maps(
     return reply_of(merge_versions(versions, request.options, report=report))
 
 
-def register(registry: Registry, data: DataSettings | None = None) -> None:
+def register(registry: Registry) -> None:
     """Add ``merge`` to *registry*; *data* has the limit of a keyframe's features."""
 
     @registry.service("merge", kind="long")
     def merge(request: MergeRequest, *, report: Report = ignore_progress) -> MergeReply:
         """Make one map of several robots' maps, or close the loops of one."""
-        return merge_maps(request, report=report, data=data)
+        return merge_maps(request, report=report)
 
 
 def reply_of(merged: MergedMap) -> MergeReply:

@@ -12,7 +12,6 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from rse_pf.config import DataSettings
 from rse_pf.errors import BadRequest, LimitExceeded
 from rse_pf.geometry import Camera
 from rse_pf.maps.format import Keyframe, MapLimits, MapVersion, decode_map
@@ -114,22 +113,20 @@ class MapIndex:
         return self._places.nearest(place_vector(descriptors), count, rows)
 
 
-def map_limits(keyframe_features: int, keyframes: int = MAX_KEYFRAMES) -> MapLimits:
+def map_limits(keyframes: int = MAX_KEYFRAMES) -> MapLimits:
     """Return what a map may hold that a service computes with."""
-    return MapLimits(keyframes=keyframes, keyframe_features=keyframe_features, features=MAX_FEATURES)
+    return MapLimits(keyframes=keyframes, features=MAX_FEATURES)
 
 
 @functools.lru_cache(maxsize=_CACHED_MAPS)
-def open_map(
-    data: bytes, keyframe_features: int = MapLimits().keyframe_features
-) -> tuple[MapVersion, MapIndex]:
+def open_map(data: bytes) -> tuple[MapVersion, MapIndex]:
     """Return the map of *data* and its index; the last results are cached.
 
     Raises:
         BadRequest: The bytes are not a map.
         LimitExceeded: It holds no keyframe, or more keyframes or features than a service computes with.
     """
-    version = decode_map(data, limits=map_limits(keyframe_features))
+    version = decode_map(data, limits=map_limits())
     if not version.keyframes:
         raise LimitExceeded(
             f"a map of 0 keyframes is not within 1..{MAX_KEYFRAMES}", hint="send a map with keyframes"
@@ -158,10 +155,8 @@ def check_comparisons(index: MapIndex, view: View, candidates: int) -> None:
         )
 
 
-def register(registry: Registry, data: DataSettings | None = None) -> None:
-    """Add ``place`` to *registry*; *data* has the limit of a keyframe's features."""
-    limits = data or DataSettings()
-    keyframe_features = limits.max_keyframe_features
+def register(registry: Registry) -> None:
+    """Add ``place`` to *registry*."""
 
     @registry.service("place", limited=True, warm_up=load_faiss)
     def place(request: PlaceRequest) -> PlaceReply:
@@ -171,7 +166,7 @@ def register(registry: Registry, data: DataSettings | None = None) -> None:
                 f"candidates = {request.candidates} is not within 1..100", hint="5 to 10 are enough"
             )
         view = view_of(request.camera, request.pixels, request.descriptors)
-        _, index = open_map(request.map, keyframe_features)
+        _, index = open_map(request.map)
         if request.check:
             check_comparisons(index, view, request.candidates)
         rows = index.nearest(view.descriptors, request.candidates, request.within)

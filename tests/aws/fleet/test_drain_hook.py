@@ -15,7 +15,7 @@ from rse_pf.aws.fleet.task import Phase
 from rse_pf.aws.fleet.tasks import lifecycle
 from rse_pf.config import PlatformSettings
 from rse_pf.object_store import MemoryStore
-from rse_pf.scaling.health import CLOUD_INTERVAL_S, CLOUD_TIMEOUT_S, time_to_notice_s
+from rse_pf.scaling.health import CLOUD_INTERVAL_S, CLOUD_TIMEOUT_S, DRAIN_S, time_to_notice_s
 
 SETTINGS = PlatformSettings()
 
@@ -56,7 +56,7 @@ def test_the_hook_is_completed_before_its_timeout_when_the_server_does_not_end()
     assert not leave(machine, scaling)
 
     ((at_s, _),) = scaling.completed
-    waited_s, whole_s = at_s - 100.0, SETTINGS.cloud.drain_s
+    waited_s, whole_s = at_s - 100.0, DRAIN_S
     assert waited_s <= whole_s - 10.0, "no time for the call and its retries"
     assert waited_s >= whole_s - 20.0, "robots had more time to move"
 
@@ -78,12 +78,12 @@ def test_robots_move_only_after_the_load_balancer_has_noticed() -> None:
     assert machine.waits == [CLOUD_INTERVAL_S * health.unhealthy_checks + CLOUD_TIMEOUT_S]
 
 
-def test_a_short_hook_leaves_two_thirds_of_its_time_to_the_robots() -> None:
+def test_a_slow_load_balancer_leaves_two_thirds_of_the_hooks_time_to_the_robots() -> None:
     machine = FakeMachine()
 
-    leave(machine, FakeScaling(machine), SETTINGS.replace(cloud={"drain_s": 30}))
+    leave(machine, FakeScaling(machine), SETTINGS.replace(health={"unhealthy_checks": 10}))
 
-    assert machine.waits == [10.0]
+    assert machine.waits == [DRAIN_S / 3]
 
 
 def test_the_whole_drain_fits_into_the_hook_by_default() -> None:
@@ -93,7 +93,7 @@ def test_the_whole_drain_fits_into_the_hook_by_default() -> None:
         + SETTINGS.session.answer_timeout_s
     )
 
-    assert longest_s < SETTINGS.cloud.drain_s - 15.0
+    assert longest_s < DRAIN_S - 15.0
 
 
 def test_the_call_and_its_arguments_match_the_api_of_aws() -> None:

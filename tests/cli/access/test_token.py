@@ -85,12 +85,12 @@ def test_a_token_is_read_from_the_standard_input(
 def test_a_token_follows_the_settings_that_its_platform_was_started_with(
     capsys: pytest.CaptureFixture[str], platform: Path
 ) -> None:
-    chosen = {"context": {"rse-pf": {"auth": {"issuer": "my-lab", "token_ttl_s": 30}}}}
+    chosen = {"context": {"rse-pf": {"auth": {"audience": "my-lab", "token_ttl_s": 30}}}}
     settings_file(platform).write_text(json.dumps(chosen))
 
     _, told = inspected(capsys, issued(capsys))
 
-    assert told["claims"]["iss"] == "my-lab"
+    assert told["claims"]["aud"] == "my-lab"
     assert told["verified"] == "yes"
     assert told["claims"]["exp"] - told["claims"]["iat"] == 30
 

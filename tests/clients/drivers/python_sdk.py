@@ -55,7 +55,7 @@ class Run:
         own = self.given["own_key"]
         key, auth = (
             SigningKey.from_json(json.dumps(own)),
-            AuthSettings(issuer=own["iss"], audience=own["aud"]),
+            AuthSettings(audience=own["aud"]),
         )
         return key.issue(own["sub"], now=time.time(), token_id=os.urandom(8).hex(), settings=auth)
 

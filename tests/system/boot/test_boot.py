@@ -21,7 +21,6 @@ pytestmark = [pytest.mark.slow, pytest.mark.system, pytest.mark.timeout(1800)]
 SETTINGS = PlatformSettings.from_dict(
     {
         "scaling": {"period_s": 10},
-        "cloud": {"drain_s": 120},
         "serving": {"workers": 1},
     }
 )
