@@ -48,8 +48,7 @@ def serve_cloud_page(
         PageActions(operate=_operate, page=_page),
         listening=listen(port),
         works=lambda: [feed.run()],
-        token_file=None,
-        announce=None,
+        platform=None,
         ready=ready,
     )
 

@@ -13,8 +13,7 @@ from rse_pf.fleet_page.feeds.platform_feed import LocalFeed
 from rse_pf.fleet_page.hub import Hub
 from rse_pf.fleet_page.operations import LocalOperations
 from rse_pf.fleet_page.replays import Replays
-from rse_pf.fleet_page.server import ANNOUNCEMENT, listen, serve_page
-from rse_pf.local.state import control_token_file
+from rse_pf.fleet_page.server import listen, serve_page
 from rse_pf.terminal import show_json
 
 __all__ = ["serve_local_page"]
@@ -41,8 +40,7 @@ def serve_local_page(folder: Path, *, port: int) -> int:
             PageActions(operate=LocalOperations(folder).operate, page=page),
             listening=listen(port),
             works=lambda: [feed.run(), live.run()],
-            token_file=control_token_file(folder),
-            announce=folder / ANNOUNCEMENT,
+            platform=folder,
             ready=lambda url: show_json({"url": url}),
         )
     finally:

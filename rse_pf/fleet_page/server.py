@@ -21,6 +21,7 @@ from rse_pf.fleet_page.hub import MAX_PAGES, Hub
 from rse_pf.fleet_page.page_sessions import PageSessions
 from rse_pf.fleet_page.static_files import page_files
 from rse_pf.http_connections import bounded_protocol
+from rse_pf.local.state import control_token_file
 from rse_pf.silent_connections import BACKLOG
 
 __all__ = ["ANNOUNCEMENT", "listen", "page_url", "serve_page"]
@@ -53,8 +54,7 @@ def serve_page(
     *,
     listening: socket.socket,
     works: Callable[[], list[Coroutine[Any, Any, None]]],
-    token_file: Path | None,
-    announce: Path | None,
+    platform: Path | None,
     ready: Callable[[str], None],
 ) -> int:
     """Serve until SIGTERM or SIGINT; return the exit code.
@@ -64,8 +64,8 @@ def serve_page(
         actions: What browsers can ask for.
         listening: Socket on loopback.
         works: Returns what feeds the hub, to be run beside.
-        token_file: Token for which further keys are made; None makes none.
-        announce: File that gets pid and port; removed at the end.
+        platform: Folder of the local platform: its control token lets further keys be made, and a file in it
+            has pid and port until the end; None for a deployment, which has neither.
         ready: Called with the address that has the first key.
 
     Raises:
@@ -79,10 +79,12 @@ def serve_page(
     sessions = PageSessions(secret=lambda: secrets.token_urlsafe(24))
     hosts = frozenset((f"{_LOOPBACK}:{port}", f"localhost:{port}"))
     fallback = secrets.token_hex(32)
-    app = FleetApp(
-        hub, sessions, page_files(), actions, hosts=lambda: hosts,
-        admin_token=lambda: fallback if token_file is None else read_control_token(token_file),
-    )  # fmt: skip
+    announce = None if platform is None else platform / ANNOUNCEMENT
+
+    def admin_token() -> str:
+        return fallback if platform is None else read_control_token(control_token_file(platform))
+
+    app = FleetApp(hub, sessions, page_files(), actions, hosts=lambda: hosts, admin_token=admin_token)
     config = uvicorn.Config(
         app, http=bounded_protocol(most=_MAX_SILENT, most_idle=_MAX_SILENT), ws="none", lifespan="off",
         access_log=False, log_level="critical",

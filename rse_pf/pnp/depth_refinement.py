@@ -8,6 +8,7 @@ or lost.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -110,8 +111,8 @@ def refine_with_depth(
     core = depth_core() if solution.engine == "native" else None
     if core is not None:
         found = core.refine(
-            solution.T_camera_world, solution.rmse_px, solution.inliers, points_reference, pixels, depths_m,
-            camera, (noise.base_m, noise.growth_per_m, noise.from_m),
+            solution, points_reference, pixels, depths_m, camera,
+            (noise.base_m, noise.growth_per_m, noise.from_m),
         )  # fmt: skip
         if found == "kept":
             return solution
@@ -143,7 +144,7 @@ def refine_by_numpy(
     if not has_depth.any():
         return solution
     try:
-        fit = _fitted(solution, points, measured, has_depth, camera, noise)
+        fit = _fitted(solution, _Matches(points, measured, has_depth), camera, noise)
         covariance = fit.covariance()
     except np.linalg.LinAlgError:
         return solution
@@ -157,27 +158,30 @@ def refine_by_numpy(
     )
 
 
-def _fitted(
-    solution: PnpSolution,
-    points: Array,
-    measured: Array,
-    has_depth: npt.NDArray[np.bool_],
-    camera: Camera,
-    noise: DepthNoise,
-) -> _Fit:
+class _Matches(NamedTuple):
+    """The inliers of a pose: points in the reference frame and what the camera measured of them."""
+
+    points: Array
+    """``(k, 3)``, metres."""
+    measured: Array
+    """``(k, 3)``: u and v in pixels, the depth in metres, 0 without a reading."""
+    has_depth: npt.NDArray[np.bool_]
+
+
+def _fitted(solution: PnpSolution, matches: _Matches, camera: Camera, noise: DepthNoise) -> _Fit:
     """Return the fit at the best pose; raises LinAlgError where some motion is free."""
     pixel_px2 = max(_MIN_PIXEL_PX, 0.5 * solution.rmse_px) ** 2
-    spread = _spread_of_reference(points, camera, noise, pixel_px2)
+    spread = _spread_of_reference(matches.points, camera, noise, pixel_px2)
     T = solution.T_camera_world
     for _ in range(_MAX_ITERATIONS):
-        fit = _Fit(T, points, measured, has_depth, spread, camera, noise, pixel_px2)
+        fit = _Fit(T, matches, spread, camera, noise, pixel_px2)
         xi = np.linalg.solve(fit.weighted_information, fit.gradient)
         if not np.isfinite(xi).all():
             raise np.linalg.LinAlgError
         T = exp_se3(xi) @ T
         if np.abs(xi).max() < _CONVERGED:
             break
-    return _Fit(T, points, measured, has_depth, spread, camera, noise, pixel_px2)
+    return _Fit(T, matches, spread, camera, noise, pixel_px2)
 
 
 def _checked(points_reference: Array, depths_m: Array) -> Array:
@@ -219,16 +223,15 @@ class _Fit:
     def __init__(
         self,
         T_camera_reference: Array,
-        points: Array,
-        measured: Array,
-        has_depth: npt.NDArray[np.bool_],
+        matches: _Matches,
         spread: Array,
         camera: Camera,
         noise: DepthNoise,
         pixel_px2: float,
     ) -> None:
+        measured, has_depth = matches.measured, matches.has_depth
         self.T_camera_reference = T_camera_reference
-        self.points_camera = transform(T_camera_reference, points)
+        self.points_camera = transform(T_camera_reference, matches.points)
         self.points_camera[:, 2] = np.maximum(self.points_camera[:, 2], _NEAR_M)
         x, y, z = self.points_camera.T
         k = len(z)

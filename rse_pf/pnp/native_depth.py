@@ -14,10 +14,10 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from rse_pf.geometry import Array, Camera
 from rse_pf.native import address_of, aligned, load_part, open_found
+from rse_pf.pnp.solver import PnpSolution
 
 __all__ = ["DepthCore", "RefinedPose", "depth_core", "open_depth"]
 
@@ -76,9 +76,7 @@ class DepthCore:
 
     def refine(
         self,
-        T_camera_reference: Array,
-        rmse_px: float,
-        inliers: npt.NDArray[np.intp],
+        solution: PnpSolution,
         points_reference: Array,
         pixels: Array,
         depths_m: Array,
@@ -88,9 +86,7 @@ class DepthCore:
         """Refine the pose that pixels gave.
 
         Args:
-            T_camera_reference: ``(4, 4)``.
-            rmse_px: That it leaves over the inliers.
-            inliers: Row numbers.
+            solution: The pose of the camera in the frame of the reference camera, and its inliers.
             points_reference: ``(n, 3)``, metres, in the frame of the camera that measured them.
             pixels: ``(n, 2)`` in the second image.
             depths_m: ``(n,)`` at these pixels, 0 where there is none.
@@ -101,6 +97,7 @@ class DepthCore:
             The refined pose; ``kept`` where the pose stays as it is; ``refused`` where the arrays have other
             shapes or hold numbers that the reference refuses, too.
         """
+        T_camera_reference, inliers = solution.T_camera_world, solution.inliers
         n, k = len(depths_m), len(inliers)
         arrays = [aligned(each, np.float64) for each in (points_reference, pixels, depths_m)]
         shapes = [each.shape for each in arrays]
@@ -112,7 +109,7 @@ class DepthCore:
             buffers.lend(2 * k)
         _HEAD.pack_into(
             buffers.request, 0, _ABI, self._flags, n, k, *map(address_of, arrays), address_of(rows),
-            camera.fx, camera.fy, camera.cx, camera.cy, *noise, rmse_px,
+            camera.fx, camera.fy, camera.cx, camera.cy, *noise, solution.rmse_px,
         )  # fmt: skip
         buffers.start[:] = T_camera_reference
         self._refine(buffers.request_at, buffers.workspace_at, buffers.result_at)

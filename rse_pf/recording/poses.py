@@ -71,7 +71,7 @@ def answered_pose(text: bytes, *, is_binary: bool) -> Sequence[float] | None:
 def pose_in_frame(T_frame_camera: Sequence[float], time_ns: int, frame: str = WORLD_FRAME) -> dict[str, Any]:
     """Return the PoseInFrame of 16 numbers (row-major) that map the camera to *frame*."""
     (a, b, c, x, d, e, f, y, g, h, i, z) = T_frame_camera[:12]
-    qx, qy, qz, qw = _quaternion(a, b, c, d, e, f, g, h, i)
+    qx, qy, qz, qw = _quaternion((a, b, c, d, e, f, g, h, i))
     return {
         "timestamp": _time(time_ns),
         "frame_id": frame,
@@ -123,14 +123,13 @@ def _time(time_ns: int) -> dict[str, int]:
     return {"sec": time_ns // _NS, "nsec": time_ns % _NS}
 
 
-def _quaternion(
-    a: float, b: float, c: float, d: float, e: float, f: float, g: float, h: float, i: float
-) -> tuple[float, float, float, float]:
-    """Return x, y, z, w of the rotation matrix with the rows a b c, d e f, g h i.
+def _quaternion(rotation: tuple[float, ...]) -> tuple[float, float, float, float]:
+    """Return x, y, z, w of a rotation matrix, whose nine numbers are row-major.
 
     Source:
         Shepperd, Quaternion from rotation matrix, 1978: the largest component is computed first.
     """
+    a, b, c, d, e, f, g, h, i = rotation
     trace = a + e + i
     largest = max(trace, a, e, i)
     if largest == trace:

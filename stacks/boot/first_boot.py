@@ -32,8 +32,12 @@ CONSOLE = pathlib.Path("/dev/console")
 LINES = collections.deque(maxlen=20)
 
 
-def signed_headers(host, path, region, credentials, now, service="s3", query=""):
-    """Return the headers of a GET that *service* accepts (Signature Version 4)."""
+def signed_headers(host, target, region, credentials, now, service="s3"):
+    """Return the headers of a GET that *service* accepts (Signature Version 4).
+
+    *target* is the path of the request, with its query if it has one.
+    """
+    path, _, query = target.partition("?")
     stamp, day = now.strftime("%Y%m%dT%H%M%SZ"), now.strftime("%Y%m%d")
     headers = {"host": host, "x-amz-content-sha256": hashlib.sha256(b"").hexdigest(), "x-amz-date": stamp}
     if credentials.get("Token"):
@@ -116,18 +120,18 @@ def abandon(facts):
             "LifecycleHookName": facts["launch"], "Version": "2011-01-01",
         }  # fmt: skip
         host = f"autoscaling.{facts['region']}.amazonaws.com"
-        asked(host, "/", facts, token, "autoscaling", urllib.parse.urlencode(sorted(call.items())))
+        asked(host, "/?" + urllib.parse.urlencode(sorted(call.items())), facts, token, "autoscaling")
     except (OSError, ValueError, IndexError) as error:
         say(f"first boot: not abandoned: {error}")
 
 
-def asked(host, path, facts, token, service="s3", query=""):
+def asked(host, target, facts, token, service="s3"):
     """Return the answer to a GET, signed as the instance's role."""
     role = imds("meta-data/iam/security-credentials/", token).split()[0]
     credentials = json.loads(imds("meta-data/iam/security-credentials/" + role, token))
     now = datetime.datetime.now(datetime.timezone.utc)
-    headers = signed_headers(host, path, facts["region"], credentials, now, service, query)
-    request = urllib.request.Request(f"https://{host}{path}{'?' if query else ''}{query}", headers=headers)
+    headers = signed_headers(host, target, facts["region"], credentials, now, service)
+    request = urllib.request.Request(f"https://{host}{target}", headers=headers)
     with urllib.request.urlopen(request, timeout=60) as answer:
         return answer.read()
 

@@ -66,10 +66,7 @@ def problem(seed: int, n: int | None = None) -> Problem:
 
 
 def refined(core: DepthCore, case: Problem) -> RefinedPose | str:
-    found = case.solution
-    return core.refine(
-        found.T_camera_world, found.rmse_px, found.inliers, *case.arguments, KINECT, NOISE
-    )  # fmt: skip
+    return core.refine(case.solution, *case.arguments, KINECT, NOISE)
 
 
 @needs_library

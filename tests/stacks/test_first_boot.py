@@ -51,8 +51,8 @@ def test_the_call_that_abandons_a_launch_is_signed_as_the_sdk_does(monkeypatch: 
 
     host, query = "autoscaling.ap-northeast-2.amazonaws.com", "Action=CompleteLifecycleAction&InstanceId=i-1"
     ours = signed_headers(
-        host, "/", "ap-northeast-2", {"AccessKeyId": "AKID", "SecretAccessKey": "secret", "Token": "session"},
-        NOW, "autoscaling", query,
+        host, f"/?{query}", "ap-northeast-2",
+        {"AccessKeyId": "AKID", "SecretAccessKey": "secret", "Token": "session"}, NOW, "autoscaling",
     )  # fmt: skip
     digest = {"X-Amz-Content-SHA256": ours["x-amz-content-sha256"], "host": host}
     request = AWSRequest(method="GET", url=f"https://{host}/?{query}", headers=digest)

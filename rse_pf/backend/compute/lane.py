@@ -34,6 +34,19 @@ class _Answered(Protocol):
 Answer = TypeVar("Answer", bound=_Answered)
 
 
+class _Answers(Protocol[Answer]):
+    """Makes and sends the answers of the worker."""
+
+    def encode(self, queued: QueuedCommand, message: Result | Failure, started_s: float) -> Answer:
+        """Return the answer of *message*, whose computation began at *started_s* of the worker's clock."""
+
+    def send(self, answer: Answer, now: float) -> None:
+        """Send *answer* at *now*."""
+
+    def send_refusal(self, refusal: RefusedCommand, now: float) -> None:
+        """Answer a command that is given up at *now*."""
+
+
 class ComputeLane(Generic[Answer]):
     """Commands of limited services that wait or run."""
 
@@ -42,36 +55,28 @@ class ComputeLane(Generic[Answer]):
         names: Iterable[str],
         limited: LimitedServices,
         *,
-        scheduler: Scheduler,
         threads: int,
         loop: AbstractEventLoop,
         monotonic: Callable[[], float],
-        encode: Callable[[QueuedCommand, Result | Failure, float], Answer],
-        send: Callable[[Answer, float], None],
-        refuse: Callable[[RefusedCommand, float], None],
+        answers: _Answers[Answer],
     ) -> None:
         """Start the threads; they do nothing before the first command.
 
         Args:
             names: Names of the limited services.
             limited: Computes their commands.
-            scheduler: A queue of its own.
             threads: Commands that run at the same time.
             loop: Event loop of the worker.
             monotonic: Its clock, s.
-            encode: Makes an answer of a message and of the time when its computation began, in the threads.
-            send: Takes each answer and the time, in the loop.
-            refuse: Takes each command that is given up and the time, in the loop.
+            answers: Encodes answers in the threads, and sends answers and refusals in the loop.
         """
         self._names = frozenset(names)
         self._limited = limited
-        self._scheduler = scheduler
+        self._scheduler = Scheduler()
         self._count = threads
         self._loop = loop
         self._monotonic = monotonic
-        self._encode = encode
-        self._send = send
-        self._refuse = refuse
+        self._answers = answers
         self._sweep_timer: TimerHandle | None = None
         self._threads = SolverThreads(
             threads,
@@ -106,7 +111,7 @@ class ComputeLane(Generic[Answer]):
         """Queue *queued*, which was admitted, or refuse it while its robot is blocked after crashes."""
         refusal = self._limited.refusal(queued, now)
         if refusal is not None:
-            self._refuse(RefusedCommand(queued, refusal, "blocked"), now)
+            self._answers.send_refusal(RefusedCommand(queued, refusal, "blocked"), now)
             return
         self._refuse_all(self._scheduler.submit(queued), now)
         self._start()
@@ -142,12 +147,12 @@ class ComputeLane(Generic[Answer]):
 
     def _compute(self, queued: QueuedCommand) -> Answer:
         started = self._monotonic()
-        return self._encode(queued, self._limited.compute(queued), started)
+        return self._answers.encode(queued, self._limited.compute(queued), started)
 
     def _on_computed(self, answer: Answer) -> None:
         now = self._monotonic()
         self._scheduler.done(answer.queued, now)
-        self._send(answer, now)
+        self._answers.send(answer, now)
         self._start()
 
     def _sweep(self) -> None:
@@ -158,4 +163,4 @@ class ComputeLane(Generic[Answer]):
 
     def _refuse_all(self, refusals: list[RefusedCommand], now: float) -> None:
         for refusal in refusals:
-            self._refuse(refusal, now)
+            self._answers.send_refusal(refusal, now)

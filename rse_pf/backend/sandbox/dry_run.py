@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from rse_pf.backend.sandbox.manager import SandboxManager
+from rse_pf.backend.sandbox.manager import SandboxHost, SandboxManager
 from rse_pf.backend.scheduling.scheduler import QueuedCommand
 from rse_pf.config import PlatformSettings
 from rse_pf.identity import DEFAULT_TENANT, RobotId
@@ -81,16 +81,19 @@ async def _dry_run(
 ) -> tuple[tuple[str, ...], list[DryRun]]:
     loop = asyncio.get_running_loop()
     answers: dict[int, asyncio.Future[Result | Failure]] = {}
+    host = SandboxHost(
+        server_id=_SERVER,
+        loop=loop,
+        monotonic=time.monotonic,
+        log=_Printer(say),
+        answer=lambda queued, answer: answers[queued.command.id].set_result(answer),
+    )
     sandboxes = SandboxManager(
         [service],
         settings=settings.replace(services={"accept_weak_isolation": True}),
         max_sandboxes=1,
-        server_id=_SERVER,
         store=MemoryStore(),
-        monotonic=time.monotonic,
-        loop=loop,
-        log=_Printer(say),
-        answer=lambda queued, answer: answers[queued.command.id].set_result(answer),
+        host=host,
     )
     sandboxes.add_connection(_ROBOT)
     runs = []

@@ -12,6 +12,7 @@ import math
 from asyncio import AbstractEventLoop, TimerHandle
 from collections import deque
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from rse_pf.backend.ports import Log
@@ -44,7 +45,22 @@ from rse_pf.services.custom.installed import InstalledService
 from rse_pf.services.custom.recording import Recording
 from rse_pf.wire import Failure, Result
 
-__all__ = ["SandboxManager"]
+__all__ = ["SandboxHost", "SandboxManager"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SandboxHost:
+    """The worker that sandboxes run for."""
+
+    server_id: str
+    """Goes into answers."""
+    loop: AbstractEventLoop
+    monotonic: Callable[[], float]
+    """Clock of deadlines, s."""
+    log: Log
+    """Gets what services print."""
+    answer: Callable[[QueuedCommand, Result | Failure], None]
+    """Called exactly once for each submitted command whose robot stays connected."""
 
 
 class SandboxManager:
@@ -56,12 +72,8 @@ class SandboxManager:
         *,
         settings: PlatformSettings,
         max_sandboxes: int,
-        server_id: str,
         store: ObjectStore | None,
-        monotonic: Callable[[], float],
-        loop: AbstractEventLoop,
-        log: Log,
-        answer: Callable[[QueuedCommand, Result | Failure], None],
+        host: SandboxHost,
         on_ready: Callable[[tuple[str, ...] | None], None] | None = None,
     ) -> None:
         """Start the zygote and wait until it is ready.
@@ -70,12 +82,8 @@ class SandboxManager:
             services: As installed and checked.
             settings: Limits and grace.
             max_sandboxes: Sandboxes of this worker at a time.
-            server_id: Goes into answers.
             store: Where snapshots are kept; None keeps none.
-            monotonic: Clock of deadlines.
-            loop: Event loop of the worker.
-            log: Log of the worker; gets what services print.
-            answer: Called exactly once for each submitted command whose robot stays connected.
+            host: The worker.
             on_ready: As for `ZygoteClient`: if given, nothing blocks, and nothing may be submitted before it
                 was called.
 
@@ -90,12 +98,12 @@ class SandboxManager:
         )
         self._names = {service.name for service in services}
         self._max_message_bytes = settings.session.max_inflated_bytes
-        self._server_id = server_id
+        self._server_id = host.server_id
         self._store = store
-        self._monotonic = monotonic
-        self._loop = loop
-        self._log = log
-        self._answer = answer
+        self._monotonic = host.monotonic
+        self._loop = host.loop
+        self._log = host.log
+        self._answer = host.answer
         self._channels: dict[int, IpcChannel] = {}
         self._working: set[int] = set()
         """Sandboxes that were sent a request and have not replied; all others are paused."""
@@ -106,7 +114,7 @@ class SandboxManager:
         self._timer: TimerHandle | None = None
         self._timer_s = math.inf
         self._zygote = ZygoteClient(
-            services, settings, loop=loop, log=log, on_gone=self._on_gone, on_lost=self._on_lost,
+            services, settings, loop=host.loop, log=host.log, on_gone=self._on_gone, on_lost=self._on_lost,
             on_ready=on_ready,
         )  # fmt: skip
 

@@ -9,15 +9,14 @@ that a snapshot holds moves with the robot.
 from __future__ import annotations
 
 import functools
-from asyncio import AbstractEventLoop, TimerHandle
+from asyncio import TimerHandle
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
-from rse_pf.backend.ports import Log
 from rse_pf.backend.sandbox.circuit_breaker import Block
-from rse_pf.backend.sandbox.manager import SandboxManager
+from rse_pf.backend.sandbox.manager import SandboxHost, SandboxManager
 from rse_pf.backend.scheduling.scheduler import QueuedCommand
 from rse_pf.identity import RobotId
 from rse_pf.service import failure_of, unknown_service
@@ -57,10 +56,7 @@ class ReloadingSandboxes:
         *,
         accepts_weak_isolation: bool,
         start_timeout_s: float,
-        server_id: str,
-        loop: AbstractEventLoop,
-        log: Log,
-        answer: Answer,
+        host: SandboxHost,
         on_change: Callable[[tuple[str, ...]], None],
     ) -> None:
         """Run *services*, and wait until they are ready; without any, start no process.
@@ -70,10 +66,7 @@ class ReloadingSandboxes:
             services: As installed and checked.
             accepts_weak_isolation: ``services.accept_weak_isolation``.
             start_timeout_s: A replacement that is not ready after this is given up.
-            server_id: Goes into answers.
-            loop: Event loop of the worker.
-            log: Log of the worker.
-            answer: As for `SandboxManager`.
+            host: The worker.
             on_change: Called with the names of the services that run from now on.
 
         Raises:
@@ -82,10 +75,10 @@ class ReloadingSandboxes:
         self._make = make
         self._accepts_weak_isolation = accepts_weak_isolation
         self._start_timeout_s = start_timeout_s
-        self._server_id = server_id
-        self._loop = loop
-        self._log = log
-        self._answer = answer
+        self._server_id = host.server_id
+        self._loop = host.loop
+        self._log = host.log
+        self._answer = host.answer
         self._on_change = on_change
         self._connections: Counter[RobotId] = Counter()
         self._waiting: dict[RobotId, deque[QueuedCommand]] = {}

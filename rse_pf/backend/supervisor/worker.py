@@ -19,7 +19,7 @@ import socket
 import struct
 import time
 from collections.abc import Callable, Coroutine, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -51,7 +51,7 @@ from rse_pf.backend.robot_store import is_shared
 from rse_pf.backend.rosbridge.peers import NoPeers, PeerChannels, WorkerPeers
 from rse_pf.backend.rosbridge.topics import RosbridgeTopics
 from rse_pf.backend.sandbox.circuit_breaker import Block
-from rse_pf.backend.sandbox.manager import SandboxManager
+from rse_pf.backend.sandbox.manager import SandboxHost, SandboxManager
 from rse_pf.backend.sandbox.reloading import Answer, OnReady, ReloadingSandboxes
 from rse_pf.backend.scheduling.scheduler import Scheduler
 from rse_pf.backend.supervisor.orders import (
@@ -272,13 +272,10 @@ class _Worker:
         return ComputeLane(
             [service.name for service in registry if service.limited],
             LimitedServices(context, limited_processes(plan.services, plan.settings)),
-            scheduler=Scheduler(),
             threads=serving.compute_processes,
             loop=self._loop,
             monotonic=time.monotonic,
-            encode=answers.encode,
-            send=answers.send,
-            refuse=answers.send_refusal,
+            answers=answers,
         )
 
     def _installed_services(self, chosen: ServiceSettings) -> list[InstalledService]:
@@ -300,6 +297,11 @@ class _Worker:
         settings = plan.settings
         chosen = settings.services
 
+        host = SandboxHost(
+            server_id=plan.server_id, loop=self._loop, monotonic=time.monotonic, log=self._log,
+            answer=answers.send_message,
+        )  # fmt: skip
+
         def make(
             services: Sequence[InstalledService], *, answer: Answer, on_ready: OnReady | None
         ) -> SandboxManager:
@@ -307,12 +309,8 @@ class _Worker:
                 services,
                 settings=settings,
                 max_sandboxes=-(-settings.services.max_sandboxes // plan.workers),
-                server_id=plan.server_id,
                 store=open_data_store(settings),
-                monotonic=time.monotonic,
-                loop=self._loop,
-                log=self._log,
-                answer=answer,
+                host=replace(host, answer=answer),
                 on_ready=on_ready,
             )
 
@@ -321,8 +319,7 @@ class _Worker:
                 make, services,
                 accepts_weak_isolation=chosen.accept_weak_isolation,
                 start_timeout_s=settings.local.start_timeout_s,
-                server_id=plan.server_id, loop=self._loop, log=self._log, answer=answers.send_message,
-                on_change=self._offer,
+                host=host, on_change=self._offer,
             )  # fmt: skip
 
         try:

@@ -32,7 +32,7 @@ import signal
 import time
 from contextlib import nullcontext
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from rse_pf.cli.extras import require
 from rse_pf.config import HealthSettings, PlatformSettings
@@ -155,8 +155,8 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
         chosen = _with_burst(chosen, burst_port, lan)
     return asyncio.run(
         _foreground(
-            args.name, folder, chosen, data=not args.no_data, lan=lan, page=page, foxglove=args.foxglove,
-            burst_port=burst_port,
+            args.name, folder, chosen, data=not args.no_data, lan=lan,
+            extras=_Extras(page=page, foxglove=args.foxglove, burst_port=burst_port),
         )
     )  # fmt: skip
 
@@ -335,9 +335,16 @@ def _wait(end_s: float, seconds: float) -> bool:
     return signal.sigtimedwait(_STOPPERS, left_s) is not None or time.monotonic() >= end_s
 
 
+class _Extras(NamedTuple):
+    """The processes beside a platform: fleet page, export to Foxglove, burst function (None: none)."""
+
+    page: bool
+    foxglove: bool
+    burst_port: int | None
+
+
 async def _foreground(
-    name: str, folder: Any, settings: PlatformSettings, *, data: bool, lan: str, page: bool, foxglove: bool,
-    burst_port: int | None = None,
+    name: str, folder: Any, settings: PlatformSettings, *, data: bool, lan: str, extras: _Extras
 ) -> int:  # fmt: skip
     from rse_pf.cli.local_platform.page import page_beside, process_beside
     from rse_pf.local.control.control_plane import ControlOptions
@@ -372,17 +379,19 @@ async def _foreground(
         async with platform:
             ready = True
             _show_welcome(platform, name)
-            beside = page_beside(folder, settings.local.page_port, _show_page) if page else nullcontext()
+            beside = page_beside(folder, settings.local.page_port, _show_page)
             export = process_beside(
                 "rse_pf.fleet_page.foxglove_export", folder, settings.local.foxglove_port,
                 folder / "foxglove.log", lambda url: show(f"foxglove            {url}"),
             )  # fmt: skip
             burst = process_beside(
-                "lambda_pnp.local_front", folder, burst_port or 0, folder / "burst.log",
+                "lambda_pnp.local_front", folder, extras.burst_port or 0, folder / "burst.log",
                 lambda url: show(f"burst function      {url}"),
             )  # fmt: skip
             async with (
-                beside, export if foxglove else nullcontext(), burst if burst_port else nullcontext(),
+                beside if extras.page else nullcontext(),
+                export if extras.foxglove else nullcontext(),
+                burst if extras.burst_port else nullcontext(),
             ):  # fmt: skip
                 await stopped.wait()
                 show("", "stopping")

@@ -395,7 +395,7 @@ class _Robot:
             await asyncio.wait({waiting}, timeout=grace_s)
             waiting.cancel()
         for identity, times in self._waiting.items():
-            self._write(identity, times, math.nan, "", "")
+            self._write(identity, (*times, math.nan), "", "")
         self._waiting.clear()
 
     async def leave(self) -> None:
@@ -426,7 +426,7 @@ class _Robot:
                 deadline_s=max(0.0, options.deadline_s - (sent - planned)), stream="pose", keep=options.keep,
             )  # fmt: skip
         except RsePfError as error:
-            self._write(identity, (planned, sent), sent, "", error.code)
+            self._write(identity, (planned, sent, sent), "", error.code)
             return
         self._waiting[identity] = (planned, sent)
         if not self._has_joined:
@@ -444,21 +444,20 @@ class _Robot:
             self._process.wrong_poses += not is_right(problem, answer.reply)
         else:
             code = answer.code
-        self._write(identity, times, time.monotonic(), answer.server, code, event.wire_bytes, parts_ms)
+        self._write(identity, (*times, time.monotonic()), answer.server, code, event.wire_bytes, parts_ms)
         if not self._waiting:
             self._idle.set()
 
     def _write(
         self,
         identity: int,
-        times: tuple[float, float],
-        ended: float,
+        times: tuple[float, float, float],
         server: str,
         code: str,
         wire_bytes: int = 0,
         parts_ms: tuple[float, ...] = _NO_PARTS,
     ) -> None:
-        seconds = (time_s - self._process.origin_s for time_s in (*times, ended))
+        seconds = (time_s - self._process.origin_s for time_s in times)
         self._process.write((self._number, identity, *seconds, wire_bytes, *parts_ms), server, code)
 
     async def _token(self) -> str:

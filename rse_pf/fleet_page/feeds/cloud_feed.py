@@ -8,6 +8,7 @@ from __future__ import annotations
 import asyncio
 import time
 from collections.abc import Callable, Coroutine, Mapping
+from dataclasses import replace
 from datetime import datetime, timezone
 from typing import Any, TypeVar
 
@@ -139,10 +140,11 @@ class CloudFeed:
         return value
 
     def _publish(self) -> None:
+        unread = (text for subject, text in self._problems.items() if subject not in ("state", "costs"))
+        overview = replace(self._overview, problems=(*self._overview.problems, *unread))
         document = cloud_document(
-            self._overview, self._metrics, self._settings, time_s=self._wall_clock(),
+            overview, self._metrics, self._settings, time_s=self._wall_clock(),
             region=self._account.region, costs=self._costs(),
-            problems=[text for subject, text in self._problems.items() if subject not in ("state", "costs")],
         )  # fmt: skip
         document["pages"] = self._hub.pages
         self._hub.put("fleet", "now", document)
@@ -169,7 +171,6 @@ def cloud_document(
     time_s: float,
     region: str = "",
     costs: Mapping[str, Any] | None = None,
-    problems: list[str] | None = None,
 ) -> dict[str, Any]:
     """Return what the Fleet view shows of a deployment, every text escaped; what is unknown is None.
 
@@ -180,7 +181,6 @@ def cloud_document(
         time_s: Unix seconds.
         region: Of the deployment.
         costs: What is told of costs.
-        problems: What could not be read beside those of *overview*.
     """
     group, balancer, period_s = overview.group, overview.balancer, metrics.period_s
     servers = [_server(server, overview, metrics, time_s) for server in group.servers]
@@ -191,7 +191,7 @@ def cloud_document(
         name: _round(_divide(metrics.newest(name), period_s), 2)
         for name in ("requests", "bytes_in", "bytes_out")
     }
-    unknown = [*_NOT_TOLD, *overview.problems, *(problems or ())]
+    unknown = [*_NOT_TOLD, *overview.problems]
     if len(robots) < len(servers):
         unknown.insert(0, f"{len(servers) - len(robots)} of {len(servers)} servers did not tell their robots")
     return {

@@ -246,13 +246,16 @@ class ControlPlane:
                 if reply.status == 200 and "cpu_s" in reply.document():
                     observed = Observed(at_s=time.monotonic(), status=reply.document())
         workers = 1 if server is None else len(server.workers)
-        sample = server_sample(
-            member.observed,
-            observed,
+        silent = ServerSample(
             name=member.name,
             pid=0 if server is None else server.pid,
             state=member.phase,
             warming=self._fleet.is_warming(member, time.monotonic()),
+        )
+        sample = server_sample(
+            silent,
+            member.observed,
+            observed,
             capacity=capacity_cores(self._settings.serving, workers, self._cores),
         )
         if observed is not None:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
 from rse_pf.config import ServingSettings
@@ -94,28 +94,18 @@ def capacity_cores(serving: ServingSettings, workers: int, machine_cores: int) -
 
 
 def server_sample(
-    before: Observed | None,
-    now: Observed | None,
-    *,
-    name: str,
-    pid: int,
-    state: ServerPhase,
-    warming: bool,
-    capacity: float,
+    silent: ServerSample, before: Observed | None, now: Observed | None, *, capacity: float
 ) -> ServerSample:
     """Return what a server did between *before* and *now*; None means that it did not answer.
 
     Args:
+        silent: Its sample without an answer: name, pid, phase, and whether its CPU does not count yet.
         before: Its last answer.
         now: Its answer of this sample.
-        name: Of the server.
-        pid: Of its supervisor.
-        state: As the platform sees it.
-        warming: Whether its CPU does not count yet.
         capacity: CPU seconds per second that are 100 %.
     """
     if now is None:
-        return ServerSample(name=name, pid=pid, state=state, warming=warming)
+        return silent
     status = now.status
     then: Mapping[str, Any] = {} if before is None else before.status
 
@@ -126,11 +116,8 @@ def server_sample(
     if before is not None and now.at_s > before.at_s:
         spent_s = float(status["cpu_s"]) - float(then["cpu_s"])
         cpu_percent = round(100.0 * max(spent_s, 0.0) / (capacity * (now.at_s - before.at_s)), 2)
-    return ServerSample(
-        name=name,
-        pid=pid,
-        state=state,
-        warming=warming,
+    return replace(
+        silent,
         robots=int(status.get("robots", 0)),
         cpu_percent=cpu_percent,
         requests=more("requests"),

@@ -66,7 +66,9 @@ def match_picture(
     finite = np.isfinite(pixels).all(axis=1) & (np.abs(pixels) < 1e6).all(axis=1)
     shown = np.flatnonzero(finite)[:_MAX_DRAWN]
     if T_camera_world is not None:
-        _draw_lines(draw, shown, agrees, points_world, pixels, T_camera_world, camera, scale)
+        is_near, projected = _project_near(points_world[shown], T_camera_world, camera)
+        drawn = shown[is_near]
+        _draw_lines(draw, pixels[drawn] * scale, projected[is_near] * scale, agrees[drawn])
     for row in shown[np.argsort(agrees[shown], kind="stable")]:  # inliers on top
         u, v = pixels[row] * scale
         if agrees[row]:
@@ -95,28 +97,23 @@ def plain_thumbnail(thumbnail: bytes) -> bytes:
     return file.getvalue()
 
 
-def _draw_lines(
-    draw: Any,
-    rows: npt.NDArray[np.intp],
-    agrees: npt.NDArray[np.bool_],
-    points_world: Array,
-    pixels: Array,
-    T_camera_world: Array,
-    camera: Camera,
-    scale: float,
-) -> None:
-    """Draw from each pixel to the projection of its point, where that is in or near the image."""
+def _project_near(
+    points_world: Array, T_camera_world: Array, camera: Camera
+) -> tuple[npt.NDArray[np.bool_], Array]:
+    """Return which of the points are projected into or near the image, and the pixels of all."""
     with np.errstate(all="ignore"):
-        points_camera = transform(T_camera_world, points_world[rows])
+        points_camera = transform(T_camera_world, points_world)
         in_front = points_camera[:, 2] > _NEAR_M
         points_camera[~in_front] = 1.0
         projected = camera.project(points_camera)
     reach = 2.0 * max(camera.width, camera.height)
-    near = in_front & (np.abs(projected) < reach).all(axis=1)
-    for row, (u, v) in zip(rows[near], projected[near], strict=True):
-        at = pixels[row] * scale
-        colour = INLIER if agrees[row] else MOVED
-        draw.line((at[0], at[1], u * scale, v * scale), fill=colour, width=1)
+    return in_front & (np.abs(projected) < reach).all(axis=1), projected
+
+
+def _draw_lines(draw: Any, seen: Array, projected: Array, agrees: npt.NDArray[np.bool_]) -> None:
+    """Draw from each seen pixel of the picture to the projection of its point."""
+    for (x, y), (u, v), is_inlier in zip(seen, projected, agrees, strict=True):
+        draw.line((x, y, u, v), fill=INLIER if is_inlier else MOVED, width=1)
 
 
 def _opened(thumbnail: bytes) -> Any:

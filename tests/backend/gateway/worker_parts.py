@@ -127,13 +127,10 @@ class WorkerParts:
         return ComputeLane(
             [service.name for service in self.registry if service.limited],
             LimitedServices(self.context, processes),
-            scheduler=Scheduler(),
             threads=self.settings.serving.compute_processes,
             loop=self.loop,
             monotonic=self.clocks.monotonic,
-            encode=self.answers.encode,
-            send=self.answers.send,
-            refuse=self.answers.send_refusal,
+            answers=self.answers,
         )
 
     def join(

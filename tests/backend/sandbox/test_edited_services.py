@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 
-from rse_pf.backend.sandbox.manager import SandboxManager
+from rse_pf.backend.sandbox.manager import SandboxHost, SandboxManager
 from rse_pf.backend.scheduling.scheduler import QueuedCommand
 from rse_pf.config import PlatformSettings
 from rse_pf.identity import RobotId
@@ -109,12 +109,14 @@ def serve(services: list[InstalledService], use: Callable[[Ask], Awaitable[None]
             services,
             settings=PlatformSettings.from_dict({"services": {"accept_weak_isolation": True}}),
             max_sandboxes=4,
-            server_id="test",
             store=MemoryStore(),
-            monotonic=time.monotonic,
-            loop=loop,
-            log=Lines(),
-            answer=lambda queued, answer: answers[queued.command.id].set_result(answer),
+            host=SandboxHost(
+                server_id="test",
+                loop=loop,
+                monotonic=time.monotonic,
+                log=Lines(),
+                answer=lambda queued, answer: answers[queued.command.id].set_result(answer),
+            ),
         )
 
         async def ask(robot: str) -> Result | Failure:

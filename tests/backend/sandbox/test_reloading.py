@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 import pytest
 from fakes import FakeLoop
 
+from rse_pf.backend.sandbox.manager import SandboxHost
 from rse_pf.backend.sandbox.reloading import ReloadingSandboxes
 from rse_pf.backend.scheduling.scheduler import QueuedCommand
 from rse_pf.errors import ConfigurationError
@@ -74,10 +76,16 @@ class Parts:
         self.made: list[Sandboxes] = []
         self.answers: list[tuple[int | None, str]] = []
         self.offered: list[tuple[str, ...]] = []
+        self.host = SandboxHost(
+            server_id="s",
+            loop=self.loop,
+            monotonic=time.monotonic,
+            log=self.log,
+            answer=self._answer,  # type: ignore[arg-type]
+        )
         self.sandboxes = ReloadingSandboxes(
             self._make, services(*names), accepts_weak_isolation=accepts_weak_isolation,
-            start_timeout_s=20.0, server_id="s", loop=self.loop, log=self.log, answer=self._answer,  # type: ignore[arg-type]
-            on_change=self.offered.append,
+            start_timeout_s=20.0, host=self.host, on_change=self.offered.append,
         )  # fmt: skip
 
     def _make(self, found: Sequence[InstalledService], *, answer: Any, on_ready: Any) -> Any:
@@ -218,6 +226,6 @@ def test_the_first_services_are_started_when_they_come_and_a_failure_of_the_star
     make: Callable[..., Any] = refuse
     with pytest.raises(ConfigurationError):
         ReloadingSandboxes(
-            make, services("a"), accepts_weak_isolation=False, start_timeout_s=1.0, server_id="s",
-            loop=parts.loop, log=parts.log, answer=parts._answer, on_change=parts.offered.append,  # type: ignore[arg-type]
+            make, services("a"), accepts_weak_isolation=False, start_timeout_s=1.0, host=parts.host,
+            on_change=parts.offered.append,
         )  # fmt: skip

@@ -33,9 +33,8 @@ def observed(at_s: float, **more: float) -> Observed:
 
 
 def one(before: Observed | None, now: Observed | None, capacity: float = 1.0) -> ServerSample:
-    return server_sample(
-        before, now, name="server-1", pid=5, state="healthy", warming=False, capacity=capacity
-    )
+    silent = ServerSample(name="server-1", pid=5, state="healthy")
+    return server_sample(silent, before, now, capacity=capacity)
 
 
 def server(name: str, cpu_percent: float | None, *, state: str = "healthy", **more: object) -> ServerSample:
