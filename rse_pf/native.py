@@ -171,9 +171,10 @@ class NativeSolver:
         """
         n = len(pixels)
         inliers = np.empty(n, dtype=np.int64)
-        values = self._run(
-            points_world, pixels, camera, options, 0, address_of(inliers), deadline_ns, cancelled
-        )
+        # The arrays stay referenced during the call: the request holds their addresses only.
+        arrays = self._write_request(points_world, pixels, camera, options)
+        values = self._run(address_of(inliers), deadline_ns, cancelled)
+        del arrays
         status, reason, count, _, _, trials = values[:6]
         if status:
             raise _error(values, n, options)
@@ -240,20 +241,15 @@ class NativeSolver:
         self, points_world: Array, pixels: Array, camera: Camera, options: NativeOptions
     ) -> Array | None:
         """Return the ``(3, 4)`` pose [R | t] without evidence, or None where there is none."""
-        values = self._run(points_world, pixels, camera, options, _PROPOSE, 0, 0, None)
+        arrays = self._write_request(points_world, pixels, camera, options, flags=_PROPOSE)
+        values = self._run(0)
+        del arrays
         return None if values[0] else self._buffers.pose[:3].copy()
 
-    def _run(
-        self,
-        points_world: Array,
-        pixels: Array,
-        camera: Camera,
-        options: NativeOptions,
-        flags: int,
-        inliers_at: int,
-        deadline_ns: int,
-        cancelled: ctypes.c_int32 | None,
-    ) -> tuple[Any, ...]:
+    def _write_request(
+        self, points_world: Array, pixels: Array, camera: Camera, options: NativeOptions, *, flags: int = 0
+    ) -> tuple[Array, Array]:
+        """Write what is solved into the request; return the arrays that it points to."""
         # The library trusts these: what is not contiguous, not aligned or not float64 is copied.
         points_world, pixels = aligned(points_world, np.float64), aligned(pixels, np.float64)
         if points_world.shape != (len(pixels), 3) or pixels.shape != (len(pixels), 2):
@@ -261,13 +257,19 @@ class NativeSolver:
                 f"points {points_world.shape} and pixels {pixels.shape} are not (n, 3) and (n, 2)",
                 hint="send one pixel for each point",
             )
-        buffers = self._buffers
-        request = buffers.request
+        request = self._buffers.request
         flags |= _PORTABLE if options.portable else 0
         _HEAD.pack_into(request, 0, _ABI, flags, len(pixels), address_of(points_world), address_of(pixels))
         request[_HEAD.size : _HEAD.size + _BODY.size] = _pack(camera, options)
+        return points_world, pixels
+
+    def _run(
+        self, inliers_at: int, deadline_ns: int = 0, cancelled: ctypes.c_int32 | None = None
+    ) -> tuple[Any, ...]:
+        """Solve the request that was written last."""
+        buffers = self._buffers
         flag_at = 0 if cancelled is None else ctypes.addressof(cancelled)
-        _TAIL.pack_into(request, _HEAD.size + _BODY.size, deadline_ns, flag_at)
+        _TAIL.pack_into(buffers.request, _HEAD.size + _BODY.size, deadline_ns, flag_at)
         self._call(buffers.request_at, inliers_at, buffers.result_at)
         return _RESULT.unpack_from(buffers.result)
 

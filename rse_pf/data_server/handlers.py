@@ -40,7 +40,7 @@ from rse_pf.errors import BadRequest, Conflict, NotFound
 from rse_pf.identity import RobotId
 from rse_pf.maps.charges import charge_name
 from rse_pf.maps.describe import MapSummary
-from rse_pf.maps.registry import MapRecord, MapRegistry
+from rse_pf.maps.registry import MapContent, MapOrigin, MapRecord, MapRegistry
 from rse_pf.object_store import ObjectStore, PresigningStore, read_range
 
 __all__ = ["Handler", "Handlers"]
@@ -210,8 +210,10 @@ class Handlers:
 
         def work() -> MapRecord:
             return self._maps(claims).commit_object(
-                path["name"], source, summary, digest=commit.digest, size=size, parent=commit.parent,
-                author=robot.name, created_s=self._wall_clock(), note=commit.note,
+                path["name"], source, summary, MapContent(commit.digest, size),
+                MapOrigin(
+                    parent=commit.parent, author=robot.name, created_s=self._wall_clock(), note=commit.note
+                ),
                 charged=functools.partial(self._charge, claims, path["name"]),
             )  # fmt: skip
 

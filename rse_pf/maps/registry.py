@@ -15,7 +15,7 @@ import re
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import msgspec
 
@@ -33,7 +33,7 @@ from rse_pf.object_store import (
 if TYPE_CHECKING:  # importing numpy takes a third of a data server's start, and only maps need it
     from rse_pf.maps.format import MapVersion
 
-__all__ = ["MapDiff", "MapRecord", "MapRegistry", "difference"]
+__all__ = ["MapContent", "MapDiff", "MapOrigin", "MapRecord", "MapRegistry", "difference"]
 
 _NAME = re.compile(r"[a-z0-9][a-z0-9-]{0,63}")
 _ID = re.compile(r"[0-9a-f]{64}")
@@ -81,6 +81,23 @@ class MapDiff:
     points_after: int
 
 
+class MapContent(NamedTuple):
+    """Which bytes a version is."""
+
+    digest: str
+    size: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MapOrigin:
+    """Where a version comes from: the head that its maker last read, who made it, when (Unix) and why."""
+
+    parent: str | None
+    author: str
+    created_s: float
+    note: str = ""
+
+
 class MapRegistry:
     """The maps of one tenant in one store.  Blocking."""
 
@@ -123,27 +140,36 @@ class MapRegistry:
         return found
 
     def commit(
-        self, name: str, data: bytes, *, parent: str | None, author: str, created_s: float, note: str = "",
-        charge: Callable[[int], None] = lambda size: None,
-    ) -> MapRecord:  # fmt: skip
+        self, name: str, data: bytes, *, parent: str | None, author: str, created_s: float, note: str = ""
+    ) -> MapRecord:
         """Make *data* (of `encode_map`) the next version and the head of map *name*.
 
         Args:
             name: Lower-case letters, digits and hyphens.
+            data: The map.
             parent: The head that the caller last read; None for the first version.
             author: Who made it.
             created_s: Unix seconds.
             note: What was done.
-            charge: Gets how many bytes are added to the store before they are written; refuses by an error.
 
         Raises:
             BadRequest: *data* is not a map, or *name* not a valid name.
             Conflict: The head is not *parent*: read it, merge, and commit again.
             StoreError: The head did not change.
         """
+        origin = MapOrigin(parent=parent, author=author, created_s=created_s, note=note)
+        return self.commit_charged(name, data, origin, charge=lambda size: None)
+
+    def commit_charged(
+        self, name: str, data: bytes, origin: MapOrigin, *, charge: Callable[[int], None]
+    ) -> MapRecord:
+        """Do the same as `commit`; *charge* gets how many bytes are added before they are written.
+
+        Raises:
+            As `commit`, and what *charge* raises to refuse the bytes.
+        """
         return self._commit(
-            name, describe_map(data, self._max_bytes), digest=digest_of(data), size=len(data), parent=parent,
-            author=author, created_s=created_s, note=note,
+            name, describe_map(data, self._max_bytes), MapContent(digest_of(data), len(data)), origin,
             write=lambda blob: self._store.put(blob, data),
             charged=lambda record, size: _charged(charge, size),
         )  # fmt: skip
@@ -153,13 +179,8 @@ class MapRegistry:
         name: str,
         source: str,
         summary: MapSummary,
-        *,
-        digest: str,
-        size: int,
-        parent: str | None,
-        author: str,
-        created_s: float,
-        note: str,
+        content: MapContent,
+        origin: MapOrigin,
         charged: Callable[[MapRecord, int], AbstractContextManager[None]],
     ) -> MapRecord:
         """Make an object of the store the next version, as `commit` does, without holding it in memory.
@@ -168,12 +189,8 @@ class MapRegistry:
             name: Of the map.
             source: Name of the object.
             summary: What the map holds, from `rse_pf.maps.describe`.
-            digest: Of the object.
-            size: Likewise.
-            parent: The head that the caller last read; None for the first version.
-            author: Who made it.
-            created_s: Unix seconds.
-            note: What was done.
+            content: Digest and size of the object.
+            origin: Where the version comes from.
             charged: Returns the context in which the version is written, for its record and the bytes that
                 it adds to the store; refuses it by an error.
 
@@ -183,37 +200,44 @@ class MapRegistry:
 
         def pieces() -> Iterator[bytes]:
             hashed = hashlib.sha256()
-            for start in range(0, size, _PIECE_BYTES):
+            for start in range(0, content.size, _PIECE_BYTES):
                 self._check()
                 piece = read_range(self._store, source, start, _PIECE_BYTES)
                 hashed.update(piece)
                 yield piece
-            if hashed.hexdigest() != digest:
+            if hashed.hexdigest() != content.digest:
                 raise StoreError("the bytes are not those of the digest", hint="store the object again")
 
         return self._commit(
-            name, summary, digest=digest, size=size, parent=parent, author=author, created_s=created_s,
-            note=note, write=lambda blob: put_pieces(self._store, blob, pieces()), charged=charged,
+            name, summary, content, origin,
+            write=lambda blob: put_pieces(self._store, blob, pieces()), charged=charged,
         )  # fmt: skip
 
     def _commit(
-        self, name: str, summary: MapSummary, *, digest: str, size: int, parent: str | None, author: str,
-        created_s: float, note: str, write: Callable[[str], None],
+        self,
+        name: str,
+        summary: MapSummary,
+        content: MapContent,
+        origin: MapOrigin,
+        *,
+        write: Callable[[str], None],
         charged: Callable[[MapRecord, int], AbstractContextManager[None]],
-    ) -> MapRecord:  # fmt: skip
+    ) -> MapRecord:
+        digest, parent = content.digest, origin.parent
         base = self._base(name)
         before = self.record(name, parent) if parent is not None else None
         if self._head(name) != parent:
             raise _moved(name)
         self._check_counts(base, is_new=before is None)
         record = MapRecord(
-            digest=digest, size=size, parent=None if before is None else before.id,
-            number=1 if before is None else before.number + 1, author=author, created_s=created_s, note=note,
+            digest=digest, size=content.size, parent=None if before is None else before.id,
+            number=1 if before is None else before.number + 1,
+            author=origin.author, created_s=origin.created_s, note=origin.note,
             keyframes=summary.keyframes, edges=summary.edges, points=summary.points, robots=summary.robots,
         )  # fmt: skip
         blob = f"{base}blobs/{digest}"
         is_new = not self._holds(blob)
-        with charged(record, size if is_new else 0):
+        with charged(record, content.size if is_new else 0):
             if is_new:
                 write(blob)
             self._store.put(f"{base}versions/{record.id}", msgspec.json.encode(record))

@@ -9,7 +9,7 @@ import pytest
 
 from client_sdk.network.dialling import dial_error_of, shown_address, unconnected, unreachable
 from rse_pf.auth.tokens import KeySet
-from rse_pf.backend.gateway.handshake import HandshakePolicy, Rejected
+from rse_pf.backend.gateway.handshake import HandshakePolicy, HandshakeRequest, Rejected
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import ConnectError, Forbidden, Unauthorized, UsageError
 from rse_pf.wire.refusal import refusal_body
@@ -54,17 +54,17 @@ def test_every_refusal_of_the_handshake_carries_the_mark():
     policy = HandshakePolicy(PlatformSettings(), KeySet({}))
 
     refused = policy.judge(
-        path=b"/ws",
-        authorization="Bearer x",
-        offered=["rse-pf.v1.json"],
+        HandshakeRequest(path=b"/ws", authorization="Bearer x", offered=["rse-pf.v1.json"]),
         is_full=False,
         anonymous="",
         now_s=0.0,
     )
     origin = policy.judge(
-        path=b"/ws", authorization="", offered=[], is_full=False, anonymous="", now_s=0.0,
-        origin="https://elsewhere.example",
-    )  # fmt: skip
+        HandshakeRequest(path=b"/ws", authorization="", offered=[], origin="https://elsewhere.example"),
+        is_full=False,
+        anonymous="",
+        now_s=0.0,
+    )
 
     assert isinstance(refused, Rejected)
     assert isinstance(origin, Rejected)

@@ -32,7 +32,7 @@ from rse_pf.identity import DEFAULT_TENANT, RobotId
 from rse_pf.wire import SUBPROTOCOLS, codec_for
 from rse_pf.wire.refusal import CUT_OFF, refusal_body
 
-__all__ = ["HEALTH", "Accepted", "HandshakePolicy", "Rejected", "RequestHead"]
+__all__ = ["HEALTH", "Accepted", "HandshakePolicy", "HandshakeRequest", "Rejected", "RequestHead"]
 
 HEALTH = "health"
 """Result of a request for the health page."""
@@ -179,6 +179,20 @@ def _http_answer(status: int, result: str, body: bytes, headers: Mapping[str, st
     return Rejected(status=status, body=body, result=result, headers=headers, answer=answer)
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class HandshakeRequest:
+    """What a handshake is judged by; a header that is absent is empty."""
+
+    path: bytes
+    """With its query."""
+    authorization: str
+    offered: list[str]
+    """Sub-protocols, in the robot's order."""
+    origin: str = ""
+    """Browsers send it."""
+    host: str = ""
+
+
 class HandshakePolicy:
     """The rules of one worker for handshakes."""
 
@@ -221,28 +235,21 @@ class HandshakePolicy:
 
     def judge(
         self,
+        request: HandshakeRequest,
         *,
-        path: bytes,
-        authorization: str,
-        offered: list[str],
         is_full: bool,
         anonymous: str,
         now_s: float,
-        origin: str = "",
-        host: str = "",
     ) -> Accepted | Rejected:
         """Return which robot is accepted, or the HTTP answer that rejects it.
 
         Args:
-            path: The path of the request, with its query.
-            authorization: The header, "" if absent.
-            offered: Sub-protocols, in the robot's order.
+            request: What the robot sent.
             is_full: Whether the worker has as many robots as it may.
             anonymous: Name of a robot where no token is required.
             now_s: Unix seconds.
-            origin: The header that browsers send, "" if absent.
-            host: The header, "" if absent.
         """
+        path, authorization, offered = request.path, request.authorization, request.offered
         unnamed = RobotId(DEFAULT_TENANT, anonymous)
         if self._conformance_echo:
             return Accepted(robot=unnamed, codec="", subprotocol="")
@@ -251,7 +258,7 @@ class HandshakePolicy:
         asked = path.split(b"?")[0]
         if asked not in (self._path, self._rosbridge):
             return self._not_found
-        if not self._origins.allows(origin, host):
+        if not self._origins.allows(request.origin, request.host):
             return self._forbidden
         if is_full:
             return self._full

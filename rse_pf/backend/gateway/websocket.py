@@ -20,7 +20,14 @@ from rse_pf.backend.gateway.audit_recorder import AuditRecorder
 from rse_pf.backend.gateway.connection import RobotConnection
 from rse_pf.backend.gateway.dispatcher import Dispatcher
 from rse_pf.backend.gateway.frames import CloseBorder
-from rse_pf.backend.gateway.handshake import HEALTH, Accepted, HandshakePolicy, Rejected, RequestHead
+from rse_pf.backend.gateway.handshake import (
+    HEALTH,
+    Accepted,
+    HandshakePolicy,
+    HandshakeRequest,
+    Rejected,
+    RequestHead,
+)
 from rse_pf.backend.gateway.rate_limits import SourceRates
 from rse_pf.backend.scheduling.deferred_work import DeferredWork
 from rse_pf.config import ServingSettings
@@ -294,14 +301,16 @@ class RobotSockets:
             return replace(self._handshake.too_fast, reason="address-rate")
         authorization, offered = head.text(b"authorization"), head.words(b"sec-websocket-protocol")
         verdict = self._handshake.judge(
-            path=head.path,
-            authorization=authorization,
-            offered=offered,
+            HandshakeRequest(
+                path=head.path,
+                authorization=authorization,
+                offered=offered,
+                origin=head.text(b"origin"),
+                host=head.text(b"host"),
+            ),
             is_full=len(self._dispatcher.connections) >= self._max_robots,
             anonymous=self._new_name(),
             now_s=self._context.clocks.wall(),
-            origin=head.text(b"origin"),
-            host=head.text(b"host"),
         )
         if isinstance(verdict, Accepted):
             if self._dispatcher.rates.banned_s(verdict.robot, now) > 0:

@@ -72,7 +72,6 @@ class JobManager:
         answer: Callable[[QueuedCommand, Result | Failure], None],
         progress: Callable[[Any, Progress], None],
         new_owner: Callable[[], str],
-        wall_clock: Callable[[], float] = time.time,
     ) -> None:
         """Start nothing yet.
 
@@ -85,7 +84,6 @@ class JobManager:
                 server drains before the job's end.
             progress: Called with the connection of a command, and its progress.
             new_owner: Returns a name that is unique among all servers.
-            wall_clock: Unix seconds.
         """
         self._context = context
         self._serving = context.settings.serving
@@ -100,7 +98,7 @@ class JobManager:
             context.store,
             ttl_s=RECORD_TTL_S,
             clock=context.clock,
-            wall_clock=wall_clock,
+            wall_clock=time.time,
         )
         self._settings_digest = settings_digest_of(context.settings)
 

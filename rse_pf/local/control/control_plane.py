@@ -22,7 +22,7 @@ from rse_pf.config.resource_names import READY_PATH
 from rse_pf.config.schedule import minimum_at, parse_schedule, zone_named
 from rse_pf.errors import ConfigurationError
 from rse_pf.local.balancer.load_balancer import EnvoyLoadBalancer
-from rse_pf.local.control.fleet import Fleet, Member
+from rse_pf.local.control.fleet import Fleet, FleetReports, Member
 from rse_pf.local.control.monitor import (
     MonitorSample,
     Observed,
@@ -80,9 +80,7 @@ class ControlPlane:
         settings: PlatformSettings,
         scaling: ScalingSettings,
         options: ControlOptions,
-        *,
-        emit: Callable[..., None],
-        changed: Callable[[], None],
+        reports: FleetReports,
     ) -> None:
         self.sample: MonitorSample | None = None
         self.hold = False
@@ -93,7 +91,7 @@ class ControlPlane:
             max_restarts_per_minute=MAX_RESTARTS_PER_MINUTE,
             compress=options.compress,
             minimum=_scheduled_minimum(scaling),
-            emit=emit,
+            emit=reports.emit,
         )
         self._fleet = fleet
         self._load_balancer = load_balancer
@@ -101,8 +99,8 @@ class ControlPlane:
         self._elastic = options.elastic
         self._compress = options.compress
         self._is_idle = not options.elastic and options.on_sample is None
-        self._emit = emit
-        self._changed = changed
+        self._emit = reports.emit
+        self._changed = reports.changed
         self._on_sample = options.on_sample
         period_s = cadence.period_s / options.compress
         self._every_s = sample_interval_s(period_s)

@@ -25,7 +25,7 @@ from rse_pf.local.servers.backend_servers import BackendServer, LocalBackendServ
 from rse_pf.local.servers.control_client import ControlPort
 from rse_pf.scaling.health import Health, time_to_notice_s
 
-__all__ = ["Fleet", "Member", "ServerHealth"]
+__all__ = ["Fleet", "FleetReports", "Member", "ServerHealth"]
 
 _ASK_S = 2.0
 _LOOK_UP_S = 0.5
@@ -90,6 +90,14 @@ class ServerHealth:
     dead: Mapping[str, bool] = field(default_factory=dict)
 
 
+@dataclass(frozen=True, slots=True)
+class FleetReports:
+    """How others hear of the servers: *emit* takes an event with details, *changed* has the state written."""
+
+    emit: Callable[..., None]
+    changed: Callable[[], None]
+
+
 class Fleet:
     """The members, by name."""
 
@@ -101,14 +109,9 @@ class Fleet:
         *,
         compress: float,
         launch_s: float = 0.0,
-        emit: Callable[..., None],
-        changed: Callable[[], None],
-        is_full: Callable[[], bool] = lambda: False,
+        reports: FleetReports,
     ) -> None:
-        """Make a fleet without members; later servers serve *launch_s* after their launch, compressed.
-
-        While the disk *is_full*, no server is to be launched: it could not announce itself.
-        """
+        """Make a fleet without members; later servers serve *launch_s* after their launch, compressed."""
         self._launch_s = launch_s / compress
         self.members: dict[str, Member] = {}
         self.dead: dict[str, bool] = {}
@@ -119,9 +122,10 @@ class Fleet:
         self._compress = compress
         self._calm_s = _CALM_S / compress
         self._warm_up_s = settings.scaling.warm_up_s / compress
-        self._emit = emit
-        self._changed = changed
-        self.is_full = is_full
+        self._emit = reports.emit
+        self._changed = reports.changed
+        self.is_full: Callable[[], bool] = lambda: False
+        """While the disk is full, no server is to be launched: it could not announce itself."""
         self._tasks: set[asyncio.Task[Any]] = set()
         self._still_targets: set[str] = set()
         self.on_ready: Callable[[Member], None] = lambda member: None

@@ -28,7 +28,7 @@ from rse_pf.local.balancer.load_balancer import EnvoyLoadBalancer
 from rse_pf.local.control.audit_recorder import PlatformAudit
 from rse_pf.local.control.control_plane import ControlOptions, ControlPlane
 from rse_pf.local.control.federation import service_discovery
-from rse_pf.local.control.fleet import Fleet, Member
+from rse_pf.local.control.fleet import Fleet, FleetReports, Member
 from rse_pf.local.control.operator_port import OperatorPort
 from rse_pf.local.control.platform_recording import PlatformRecording
 from rse_pf.local.control.scale_modifier import bounds_for
@@ -144,18 +144,19 @@ class LocalPlatform:
             replaces=control.elastic, program=program, is_full=self._disks.is_full,
             emit=self._report_data_change,
         )  # fmt: skip
+        reports = FleetReports(emit=self._emit, changed=self._write_state)
         self._fleet = Fleet(
             self.backend_servers, self.load_balancer, settings,
-            compress=control.compress, launch_s=control.delays.launch_s, emit=self._emit,
-            changed=self._write_state, is_full=self._disks.is_full,
+            compress=control.compress, launch_s=control.delays.launch_s, reports=reports,
         )  # fmt: skip
+        self._fleet.is_full = self._disks.is_full
         self._operator_port = OperatorPort(
             self, metrics=self.backend_servers.metrics, disks=self._disks.document, keep=self._fleet.keep,
             emit=self._emit,
         )  # fmt: skip
         self._control = ControlPlane(
             self._fleet, self.load_balancer, settings, bounds_for(settings.scaling, self._count), control,
-            emit=self._emit, changed=self._write_state,
+            reports,
         )  # fmt: skip
 
     @property

@@ -12,7 +12,7 @@ from fakes import FakeWire
 
 from rse_pf.auth.tokens import SigningKey
 from rse_pf.backend.gateway.connection import RobotConnection
-from rse_pf.backend.gateway.handshake import Accepted
+from rse_pf.backend.gateway.handshake import Accepted, HandshakeRequest
 from rse_pf.backend.ports import WorkerContext
 from rse_pf.backend.rosbridge.peers import NoPeers
 from rse_pf.backend.rosbridge.topics import RosbridgeTopics, TopicPeers
@@ -72,8 +72,8 @@ class Worker:
 
     def judge(self, authorization: str = "", path: bytes = b"/rosbridge", **more: Any) -> Any:
         return self.parts.handshake.judge(
-            path=path, authorization=authorization, offered=[""], is_full=False,
-            anonymous=f"anonymous-{self.count}", now_s=UNIX_S, **more,
+            HandshakeRequest(path=path, authorization=authorization, offered=[""], **more),
+            is_full=False, anonymous=f"anonymous-{self.count}", now_s=UNIX_S,
         )  # fmt: skip
 
     def client(self, robot: str = "r", **more: Any) -> Client:

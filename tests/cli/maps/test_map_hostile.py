@@ -12,7 +12,7 @@ from hostile.hostile_maps import DAMAGED_PROVENANCE, DECODABLE, hostile_maps
 
 from rse_pf.cli.main import main
 from rse_pf.maps.describe import MapSummary
-from rse_pf.maps.registry import MapRegistry
+from rse_pf.maps.registry import MapContent, MapOrigin, MapRegistry
 from rse_pf.object_store import DirectoryStore, digest_of
 
 _CONTROL = re.compile(r"[\x00-\x09\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069]")
@@ -28,8 +28,9 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for number, data in enumerate(hostile_maps().values()):
         held.put("object", data)
         maps.commit_object(
-            f"map-{number}", "object", summary, digest=digest_of(data), size=len(data), parent=None,
-            author="robot-1", created_s=1e9, note="", charged=lambda record, size: nullcontext(),
+            f"map-{number}", "object", summary, MapContent(digest_of(data), len(data)),
+            MapOrigin(parent=None, author="robot-1", created_s=1e9),
+            charged=lambda record, size: nullcontext(),
         )  # fmt: skip
     return folder
 

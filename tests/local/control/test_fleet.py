@@ -13,7 +13,7 @@ import pytest
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import ConfigurationError
 from rse_pf.local.balancer.envoy_config import Target
-from rse_pf.local.control.fleet import Fleet, Member
+from rse_pf.local.control.fleet import Fleet, FleetReports, Member
 from rse_pf.local.processes import ProcessMark
 from rse_pf.local.servers.backend_servers import BackendServer
 from rse_pf.local.servers.control_client import ControlPort
@@ -93,8 +93,10 @@ class World:
             self.balancer,  # type: ignore[arg-type]
             SETTINGS,
             compress=1.0,
-            emit=lambda event, **details: self.events.append({"event": event, **details}),
-            changed=lambda: None,
+            reports=FleetReports(
+                emit=lambda event, **details: self.events.append({"event": event, **details}),
+                changed=lambda: None,
+            ),
         )
 
     async def up(self, count: int) -> list[Member]:

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from rse_pf.errors import Conflict, NotFound
 from rse_pf.live_map.versions import errors_of_maps
 from rse_pf.maps.format import MapVersion, encode_map
-from rse_pf.maps.registry import MapRecord, MapRegistry
+from rse_pf.maps.registry import MapOrigin, MapRecord, MapRegistry
 from rse_pf.object_store import digest_of
 
 __all__ = ["publish_version", "version_to_start_from"]
@@ -50,10 +50,8 @@ def _publish(
             return head
         parent = None if head is None else head.id
         try:
-            return maps.commit(
-                name, data, parent=parent, author=author, created_s=created_s, note=note,
-                charge=charge,
-            )  # fmt: skip
+            origin = MapOrigin(parent=parent, author=author, created_s=created_s, note=note)
+            return maps.commit_charged(name, data, origin, charge=charge)
         except Conflict:
             if not tries_left:
                 raise

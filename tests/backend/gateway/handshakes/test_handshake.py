@@ -11,7 +11,14 @@ from picows import picows
 
 from rse_pf.auth.roster import DenyList, EnrolledRobot, Roster
 from rse_pf.auth.tokens import SigningKey
-from rse_pf.backend.gateway.handshake import HEALTH, Accepted, HandshakePolicy, Rejected, RequestHead
+from rse_pf.backend.gateway.handshake import (
+    HEALTH,
+    Accepted,
+    HandshakePolicy,
+    HandshakeRequest,
+    Rejected,
+    RequestHead,
+)
 from rse_pf.config import PlatformSettings
 from rse_pf.identity import RobotId
 from rse_pf.wire import SUBPROTOCOLS
@@ -30,7 +37,9 @@ def judge(policy: HandshakePolicy | None = None, **changed: object) -> Accepted 
         "path": b"/ws", "authorization": f"Bearer {token()}", "offered": [SUBPROTOCOLS["bin"]],
         "is_full": False, "anonymous": "anonymous-1", "now_s": NOW_S, **changed,
     }  # fmt: skip
-    return (policy or HandshakePolicy(SETTINGS, KEY.key_set())).judge(**asked)
+    worker = {name: asked.pop(name) for name in ("is_full", "anonymous", "now_s")}
+    policy = policy or HandshakePolicy(SETTINGS, KEY.key_set())
+    return policy.judge(HandshakeRequest(**asked), **worker)
 
 
 def test_a_valid_token_gives_the_robot_and_the_end_of_its_connection():

@@ -12,7 +12,7 @@ from fakes import FakeWire
 from rse_pf.auth.roster import DenyList, Roster
 from rse_pf.auth.tokens import SigningKey
 from rse_pf.backend.gateway.connection import RobotConnection
-from rse_pf.backend.gateway.handshake import Accepted
+from rse_pf.backend.gateway.handshake import Accepted, HandshakeRequest
 from rse_pf.backend.log import JsonLog
 from rse_pf.config import PlatformSettings
 from rse_pf.identity import RobotId
@@ -38,8 +38,10 @@ class Worker(WorkerParts):
     def record_verdict(self, token: str) -> Accepted:
         """Judge a handshake that is good."""
         accepted = self.handshake.judge(
-            path=b"/ws", authorization=f"Bearer {token}", offered=[SUBPROTOCOLS["bin"]], is_full=False,
-            anonymous="a", now_s=self.clocks.wall(),
+            HandshakeRequest(
+                path=b"/ws", authorization=f"Bearer {token}", offered=[SUBPROTOCOLS["bin"]]
+            ),
+            is_full=False, anonymous="a", now_s=self.clocks.wall(),
         )  # fmt: skip
         assert isinstance(accepted, Accepted)
         self._number += 1
