@@ -1,6 +1,6 @@
 """Run a function over a stranger's bytes in processes that have limits and are killed at a timeout.
 
-    with LimitedProcesses("rse_pf.maps.describe:describer", memory_bytes=1 << 28, cpu_s=5.0) as processes:
+    with LimitedProcesses("rse_pf.maps.describe:describer", ProcessLimits(memory_bytes=1 << 28)) as processes:
         description = processes.call(data, timeout_s=5.0)
 
 ``describer`` is called once, in a template process that has one thread, with the configuration; it imports
@@ -33,6 +33,7 @@ import threading
 import time
 import traceback
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -48,7 +49,7 @@ from rse_pf.errors import (
 from rse_pf.linux import die_with_parent, set_process_name
 from rse_pf.one_thread import ONE_THREAD
 
-__all__ = ["DEFAULT_NICENESS", "Handler", "LimitedProcesses", "Overran", "main"]
+__all__ = ["DEFAULT_NICENESS", "Handler", "LimitedProcesses", "Overran", "ProcessLimits", "main"]
 
 Handler = Callable[[bytes], bytes]
 """What answers a call; raises MemoryError, or an `RsePfError` that the caller is to see."""
@@ -77,37 +78,45 @@ class Overran(Expired):
         self.cpu_s = cpu_s
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ProcessLimits:
+    """What one process may use."""
+
+    memory_bytes: int
+    """What calls may allocate, beside what the template has allocated."""
+    cpu_s: float = 60.0
+    """CPU seconds of one call, however busy the machine is."""
+    max_reply_bytes: int = _MAX_REPLY_BYTES
+    """A process that replies with more has failed."""
+
+
 class LimitedProcesses:
     """Up to *count* processes that answer calls; nothing is started before the first call."""
 
     def __init__(
         self,
         target: str,
+        limits: ProcessLimits,
         *,
-        memory_bytes: int,
-        cpu_s: float = 60.0,
         configuration: str = "",
         count: int = 1,
         niceness: int = DEFAULT_NICENESS,
-        max_reply_bytes: int = _MAX_REPLY_BYTES,
     ) -> None:
         """Say what is run and within which limits.
 
         Args:
             target: ``module:function``; the function takes *configuration* and returns a `Handler`.
-            memory_bytes: What calls may allocate in one process, beside what the template has allocated.
-            cpu_s: CPU seconds of one call, however busy the machine is.
+            limits: What one process may use.
             configuration: Text for *target*, such as settings in JSON; at most 100 kB.
             count: Processes that work at the same time; further calls wait for one of them.
             niceness: Of the processes, above that of this process.
-            max_reply_bytes: A process that replies with more has failed.
         """
         self._order = json.dumps(
-            {"target": target, "configuration": configuration, "limits": [memory_bytes, cpu_s]}
+            {"target": target, "configuration": configuration, "limits": [limits.memory_bytes, limits.cpu_s]}
         ).encode()
-        self._memory_bytes = memory_bytes
-        self._cpu_s = cpu_s
-        self._max_reply_bytes = max_reply_bytes
+        self._memory_bytes = limits.memory_bytes
+        self._cpu_s = limits.cpu_s
+        self._max_reply_bytes = limits.max_reply_bytes
         self._template = _Template(self._order, niceness)
         self._free: queue.LifoQueue[_Slot] = queue.LifoQueue()
         for _ in range(count):

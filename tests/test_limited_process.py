@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from rse_pf.errors import BadRequest, Busy, Crashed, Expired, InternalError, RsePfError, WorkerLost
-from rse_pf.limited_process import LimitedProcesses, Overran
+from rse_pf.limited_process import LimitedProcesses, Overran, ProcessLimits
 
 _HANDLER = '''
 import os, resource, signal, socket, time
@@ -90,7 +90,7 @@ def handler(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 
 def made_of(handler: str, count: int = 1) -> LimitedProcesses:
     return LimitedProcesses(
-        handler, memory_bytes=MEMORY_BYTES, cpu_s=0.3, configuration="chosen", count=count
+        handler, ProcessLimits(memory_bytes=MEMORY_BYTES, cpu_s=0.3), configuration="chosen", count=count
     )
 
 
@@ -299,7 +299,7 @@ def test_a_template_that_ended_is_replaced(own: LimitedProcesses):
 
 
 def test_a_target_that_cannot_start_is_no_fault_of_the_bytes(handler: str):
-    with LimitedProcesses("handled_in_tests:broken", memory_bytes=MEMORY_BYTES) as processes:
+    with LimitedProcesses("handled_in_tests:broken", ProcessLimits(memory_bytes=MEMORY_BYTES)) as processes:
         for _ in range(2):
             with pytest.raises(WorkerLost, match="cannot be started"):
                 processes.call(b"", LONG_S)

@@ -13,7 +13,6 @@ import queue
 import selectors
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import CancelledError
 from dataclasses import dataclass
@@ -195,7 +194,6 @@ class DaskEngine:
         *,
         on_event: Callable[[str], None] = lambda text: None,
         on_start: Callable[[str], None] | None = None,
-        clock: Callable[[], float] = time.monotonic,
     ) -> None:
         """Connect to nothing yet.
 
@@ -206,7 +204,6 @@ class DaskEngine:
             key: Of the cluster.
             on_event: Called with one line when a worker or a scheduler was replaced.
             on_start: Called with the scheduler's address when it was started.
-            clock: Seconds, monotonic.
         """
         self._store = store
         self._settings = msgspec.json.encode(settings.to_dict())
@@ -214,7 +211,6 @@ class DaskEngine:
         self._key = key
         self._on_event = on_event
         self._on_start = on_start
-        self._clock = clock
         self._client: Any = None
         self._restarts = 0
 

@@ -24,7 +24,7 @@ from rse_pf.cli.maps.merge_output import commit_merge, merge_progress
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import NotFound, UsageError
 from rse_pf.local.state import state_folder
-from rse_pf.maps.registry import MapRecord, MapRegistry
+from rse_pf.maps.registry import MapOrigin, MapRecord, MapRegistry
 from rse_pf.object_store import ObjectStore
 from rse_pf.terminal import counted, show
 
@@ -145,10 +145,15 @@ def _merge(args: argparse.Namespace, settings: PlatformSettings) -> int:
         if invitation is not None:
             invitation.withdraw()
     seconds = round(time.perf_counter() - began, 3)
-    parts = {"parts": {"computed": result.computed, "found": result.found}, "clouds": len(result.tiles)}
+    fields = {
+        "seconds": seconds,
+        "parts": {"computed": result.computed, "found": result.found},
+        "clouds": len(result.tiles),
+    }
+    origin = MapOrigin(parent=parent, author="rse-pf batch run merge", created_s=time.time(), note=args.note)
     code = commit_merge(
-        reply_of(result.merged), maps, args.names, into=args.out, parent=parent,
-        author="rse-pf batch run merge", note=args.note, seconds=seconds, as_json=args.json, more=parts,
+        reply_of(result.merged), maps, args.names, into=args.out, origin=origin,
+        json_fields=fields if args.json else None,
     )  # fmt: skip
     merge.forget()
     if not args.json:

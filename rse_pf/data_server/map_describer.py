@@ -16,7 +16,7 @@ from rse_pf.config import PlatformSettings
 from rse_pf.crash_record import CrashRecord
 from rse_pf.errors import Crashed
 from rse_pf.identity import RobotId
-from rse_pf.limited_process import Handler, LimitedProcesses
+from rse_pf.limited_process import Handler, LimitedProcesses, ProcessLimits
 from rse_pf.maps.describe import MapSummary, describe_map
 from rse_pf.object_store import ObjectStore
 
@@ -59,9 +59,10 @@ class MapDescriber:
         self._timeout_s = _WALL_S_PER_CPU_S * settings.serving.max_compute_s
         self._processes = processes or LimitedProcesses(
             _TARGET,
+            ProcessLimits(
+                memory_bytes=settings.serving.max_compute_memory_bytes, cpu_s=settings.serving.max_compute_s
+            ),
             configuration=json.dumps(settings.to_dict()),
-            memory_bytes=settings.serving.max_compute_memory_bytes,
-            cpu_s=settings.serving.max_compute_s,
         )
 
     def describe(self, robot: RobotId, name: str) -> MapSummary:

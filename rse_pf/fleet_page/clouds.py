@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 from rse_pf.aws.storage import open_data_store
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import NotFound, RsePfError
-from rse_pf.limited_process import Handler, LimitedProcesses
+from rse_pf.limited_process import Handler, LimitedProcesses, ProcessLimits
 from rse_pf.local.servers.backend_servers import local_placement
 from rse_pf.local.state import platform_settings
 from rse_pf.maps.registry import MapRegistry
@@ -48,8 +48,8 @@ class MapPages:
         """Read nothing yet; *folder* is that of the platform's state."""
         self._folder = folder
         self._processes = LimitedProcesses(
-            "rse_pf.fleet_page.clouds:packer", memory_bytes=_MEMORY_BYTES, cpu_s=_CPU_S,
-            max_reply_bytes=_MAX_REPLY_BYTES,
+            "rse_pf.fleet_page.clouds:packer",
+            ProcessLimits(memory_bytes=_MEMORY_BYTES, cpu_s=_CPU_S, max_reply_bytes=_MAX_REPLY_BYTES),
         )  # fmt: skip
         self._ready: OrderedDict[tuple[str, str], bytes] = OrderedDict()
         self._packing = threading.Lock()

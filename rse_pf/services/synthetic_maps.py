@@ -19,6 +19,9 @@ from rse_pf.slam.pose_graph import PoseGraph
 
 __all__ = ["Building", "SyntheticWorld", "make_building", "make_room", "make_sphere", "make_world"]
 
+_NOISE_PX = 0.5
+_DEPTH_NOISE = 0.005
+"""Of the depth, as a share of it."""
 _CAMERA = Camera(fx=525.0, fy=525.0, cx=319.5, cy=239.5, width=640, height=480)
 
 
@@ -142,17 +145,16 @@ class SyntheticWorld:
         return T
 
     def keyframe(
-        self, number: int, robot: str, T_true: Array, T_world_camera: Array, rng: np.random.Generator,
-        *, noise_px: float = 0.5, depth_noise: float = 0.005,
-    ) -> Keyframe:  # fmt: skip
+        self, number: int, robot: str, T_true: Array, T_world_camera: Array, rng: np.random.Generator
+    ) -> Keyframe:
         """Return the keyframe of a camera at *T_true*, with the estimated pose *T_world_camera*."""
         seen = transform(inverse(T_true), self.points)
         ahead = np.flatnonzero(seen[:, 2] > 0.3)
         pixels = _CAMERA.project(seen[ahead])
         inside = ((pixels >= 0) & (pixels < [_CAMERA.width, _CAMERA.height])).all(axis=1)
         rows, pixels = ahead[inside], pixels[inside]
-        pixels = pixels + rng.normal(size=pixels.shape) * noise_px
-        depth = seen[rows, 2] * (1.0 + rng.normal(size=len(rows)) * depth_noise)
+        pixels = pixels + rng.normal(size=pixels.shape) * _NOISE_PX
+        depth = seen[rows, 2] * (1.0 + rng.normal(size=len(rows)) * _DEPTH_NOISE)
         flipped = np.packbits(rng.random((len(rows), 256)) < 0.05, axis=1)
         return Keyframe(
             id=number, robot=robot, timestamp_s=float(number), T_world_camera=T_world_camera, camera=_CAMERA,

@@ -14,7 +14,7 @@ from rse_pf.backend.scheduling.scheduler import QueuedCommand
 from rse_pf.config import PlatformSettings
 from rse_pf.crash_record import CrashRecord
 from rse_pf.errors import Busy, Crashed, Expired, InternalError, RsePfError
-from rse_pf.limited_process import LimitedProcesses, Overran
+from rse_pf.limited_process import LimitedProcesses, Overran, ProcessLimits
 from rse_pf.linux import cpu_seconds
 from rse_pf.service import failure_of
 from rse_pf.wire import Command, Failure, Result
@@ -31,11 +31,13 @@ def limited_processes(services: str, settings: PlatformSettings) -> LimitedProce
     serving = settings.serving
     return LimitedProcesses(
         TARGET,
+        ProcessLimits(
+            memory_bytes=serving.max_compute_memory_bytes,
+            cpu_s=serving.max_compute_s,
+            max_reply_bytes=settings.session.max_inflated_bytes,
+        ),
         configuration=configuration_of(services, settings),
         count=serving.compute_processes,
-        memory_bytes=serving.max_compute_memory_bytes,
-        cpu_s=serving.max_compute_s,
-        max_reply_bytes=settings.session.max_inflated_bytes,
     )
 
 

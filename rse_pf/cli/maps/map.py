@@ -46,7 +46,7 @@ from rse_pf.files import replace_file
 from rse_pf.geometry import Camera, rotation_angle_deg, to_quaternion
 from rse_pf.local.state import state_folder
 from rse_pf.maps.format import MapVersion
-from rse_pf.maps.registry import MapRecord, MapRegistry, difference
+from rse_pf.maps.registry import MapOrigin, MapRecord, MapRegistry, difference
 from rse_pf.slam.map_export import FORMATS, export_map
 from rse_pf.terminal import at_work, counted, show, show_json
 
@@ -300,9 +300,10 @@ def _merge(args: argparse.Namespace, maps: MapRegistry) -> int:
     began = time.perf_counter()
     reply = merge_maps(request, report=merge_progress)
     seconds = round(time.perf_counter() - began, 3)
+    origin = MapOrigin(parent=parent, author="rse-pf map merge", created_s=time.time(), note=args.note)
     return commit_merge(
-        reply, maps, args.names, into=args.into, parent=parent, author="rse-pf map merge",
-        note=args.note, seconds=seconds, as_json=args.json,
+        reply, maps, args.names, into=args.into, origin=origin,
+        json_fields={"seconds": seconds} if args.json else None,
     )  # fmt: skip
 
 

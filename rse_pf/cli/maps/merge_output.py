@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from typing import Any
 
 from rse_pf.errors import CommandFailed
-from rse_pf.maps.registry import MapRegistry
+from rse_pf.maps.registry import MapOrigin, MapRegistry
 from rse_pf.services.mapping.merge import MergeReply
 from rse_pf.terminal import counted, show, show_json, show_progress
 
@@ -20,12 +19,8 @@ def commit_merge(
     names: Sequence[str],
     *,
     into: str,
-    parent: str | None,
-    author: str,
-    note: str,
-    seconds: float,
-    as_json: bool,
-    more: dict[str, Any] | None = None,
+    origin: MapOrigin,
+    json_fields: dict[str, Any] | None,
 ) -> int:
     """Commit the merged map as a version of *into*, and print what was joined; return the exit code.
 
@@ -34,12 +29,8 @@ def commit_merge(
         maps: Where the version goes.
         names: What the user called the maps, in the order of the merge.
         into: The map that gets a new version.
-        parent: Its head before the merge, None if there is none.
-        author: The command.
-        note: Of the user; empty names what was joined.
-        seconds: How long the merge took.
-        as_json: Print JSON.
-        more: Further fields of the JSON.
+        origin: Head before the merge, author, time, and the user's note; an empty note names what was joined.
+        json_fields: Further fields of the JSON that is printed; None prints text.
 
     Raises:
         CommandFailed: No two maps could be joined; nothing is written.
@@ -53,16 +44,15 @@ def commit_merge(
         )
     joined = [names[row] for row in reply.joined]
     version = maps.commit(
-        into, reply.map, parent=parent, author=author, created_s=time.time(),
-        note=note or f"merged {', '.join(joined)}",
+        into, reply.map, parent=origin.parent, author=origin.author, created_s=origin.created_s,
+        note=origin.note or f"merged {', '.join(joined)}",
     )  # fmt: skip
     refused = _refused(names, reply)
-    if as_json:
+    if json_fields is not None:
         plain = {
             "name": into, "id": version.id, "number": version.number, "joined": joined,
             "not_joined": [{"map": name, "reason": reason} for name, reason in not_joined],
-            "refused": refused, "links": reply.merges, "loops": reply.loops, "seconds": seconds,
-            **(more or {}),
+            "refused": refused, "links": reply.merges, "loops": reply.loops, **json_fields,
         }  # fmt: skip
         show_json(plain, indent=2, sort_keys=True)
         return 1 if not_joined else 0

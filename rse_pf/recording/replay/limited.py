@@ -17,7 +17,7 @@ import msgspec
 
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import BadMessage, BadRequest, Crashed, InternalError, LimitExceeded
-from rse_pf.limited_process import Handler, LimitedProcesses, Overran
+from rse_pf.limited_process import Handler, LimitedProcesses, Overran, ProcessLimits
 from rse_pf.recording.reader import recording_files
 from rse_pf.recording.replay import run
 from rse_pf.recording.replay.case import CASE_SUFFIX, MAX_CASE_BYTES
@@ -58,7 +58,10 @@ class LimitedReplay:
     def __init__(self, settings: PlatformSettings | None = None) -> None:
         """Keep the limits of messages; *settings* are those of this machine."""
         self._processes = LimitedProcesses(
-            _TARGET, memory_bytes=_MEMORY_BYTES, cpu_s=_RECORDING_S, max_reply_bytes=_MAX_REPLY_BYTES,
+            _TARGET,
+            ProcessLimits(
+                memory_bytes=_MEMORY_BYTES, cpu_s=_RECORDING_S, max_reply_bytes=_MAX_REPLY_BYTES
+            ),
             configuration=json.dumps((settings or PlatformSettings()).to_dict()), niceness=0,
         )  # fmt: skip
 
