@@ -40,11 +40,15 @@ class Sample:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FleetState:
-    """The current servers: their number, those still warming up, and the names of the unhealthy ones."""
+    """The current servers: their number, those still warming up, and the names of the unhealthy ones.
+
+    ``acted_s`` is when the number of servers was last changed: each period leads to one change at most.
+    """
 
     servers: int
     warming: int = 0
     unhealthy: tuple[str, ...] = ()
+    acted_s: float = -math.inf
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -74,7 +78,6 @@ def decide(
     settings: ScalingSettings,
     *,
     now_s: float,
-    acted_s: float = -math.inf,
     compress: float = 1.0,
     since_s: Mapping[str, float] | None = None,
 ) -> tuple[Action, ...]:
@@ -89,7 +92,6 @@ def decide(
         fleet: The servers now.
         settings: Profile, thresholds and limits.
         now_s: Seconds, on the clock of the samples.
-        acted_s: When the number of servers was last changed; each period leads to one change at most.
         compress: Factor by which periods are shorter; for experiments.
         since_s: What `find_rule_starts` returned; None finds it in *samples*, which must then
             reach back so far.
@@ -113,7 +115,7 @@ def decide(
     if fleet.servers < settings.min_servers:
         missing = settings.min_servers - fleet.servers
         return (*replacements, Action(kind="grow", servers=missing, reason="fewer than scaling.min_servers"))
-    if math.isfinite(acted_s) and ended <= _periods(acted_s, period_s):
+    if math.isfinite(fleet.acted_s) and ended <= _periods(fleet.acted_s, period_s):
         return (*replacements, Action(kind="stay", reason="this period has led to an action already"))
     by_period = {round(sample.start_s / period_s): sample for sample in samples}
     if since_s is None:

@@ -75,10 +75,10 @@ def test_a_period_without_a_sample_is_no_reason_to_act() -> None:
 
 def test_a_period_is_acted_on_once() -> None:
     samples = [Sample(start_s=60.0 * i, cpu_percent=80, requests=1) for i in range(3)]
-    fleet = FleetState(servers=3)
+    fleet = FleetState(servers=3, acted_s=121.0)
 
-    assert decide(samples, fleet, SETTINGS, now_s=130.0, acted_s=121.0)[-1].kind == "stay"
-    assert decide(samples, fleet, SETTINGS, now_s=180.0, acted_s=121.0)[-1].kind == "grow"
+    assert decide(samples, fleet, SETTINGS, now_s=130.0)[-1].kind == "stay"
+    assert decide(samples, fleet, SETTINGS, now_s=180.0)[-1].kind == "grow"
 
 
 def test_a_sample_speaks_for_the_period_it_began_in() -> None:

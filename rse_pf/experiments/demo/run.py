@@ -142,13 +142,17 @@ async def _run(
             samples = asyncio.create_task(_sample(platform, folder / SAMPLES, now))
             robots = [
                 _start(
-                    options,
-                    settings,
-                    folder,
-                    platform.url if disturbance is None else disturbance.url_of(number),
-                    number,
+                    RobotSpec(
+                        name=_name(number),
+                        number=number,
+                        url=platform.url if disturbance is None else disturbance.url_of(number),
+                        folder=folder / _name(number),
+                        options=options,
+                        session=settings.session,
+                        data_settings=settings.data,
+                        has_offload=fault is not None and fault.has_offload,
+                    ),
                     screen,
-                    has_offload=fault is not None and fault.has_offload,
                 )
                 for number in range(options.robots)
             ]
@@ -180,25 +184,11 @@ async def _run(
     return _write_results(options, folder, finished, before, merged)
 
 
-def _start(
-    options: DemoOptions, settings: PlatformSettings, folder: Path, url: str, number: int, screen: Progress,
-    *, has_offload: bool,
-) -> _Robot:  # fmt: skip
-    name = _name(number)
-    (folder / name).mkdir()
-    spec = RobotSpec(
-        name=name,
-        number=number,
-        url=url,
-        folder=folder / name,
-        options=options,
-        session=settings.session,
-        data_settings=settings.data,
-        has_offload=has_offload,
-    )
-    process, pipe = start_process(run_robot, spec, name)
-    phase = "rendering the world" if options.data is None else "reading the recording"
-    bar = screen.add_task(f"{name}  {phase}", total=options.frame_count)
+def _start(spec: RobotSpec, screen: Progress) -> _Robot:
+    spec.folder.mkdir()
+    process, pipe = start_process(run_robot, spec, spec.name)
+    phase = "rendering the world" if spec.options.data is None else "reading the recording"
+    bar = screen.add_task(f"{spec.name}  {phase}", total=spec.options.frame_count)
     return _Robot(spec=spec, process=process, pipe=pipe, bar=bar)
 
 

@@ -97,6 +97,7 @@ class LocalScaleModifier:
             servers=standing.servers,
             warming=standing.warming,
             unhealthy=(*standing.dead, *standing.broken),
+            acted_s=self._acted_s if period_over else now_s,
         )
         if self._minimum is not None:
             self._settings = dataclasses.replace(self._settings, min_servers=self._minimum())
@@ -109,7 +110,6 @@ class LocalScaleModifier:
             fleet,
             self._settings,
             now_s=now_s,
-            acted_s=self._acted_s if period_over else now_s,
             compress=self._compress,
             since_s=self._since_s,
         )
