@@ -169,7 +169,7 @@ def over_the_websocket(body: bytes) -> Failure:
             allowed_s = command.deadline_ms / 1e3
         queued = QueuedCommand(None, RobotId("default", "robot-1"), command, len(body), 0.0, allowed_s)
         admission = Admission(SETTINGS.session)
-        refused = admission.judge(queued, None, (0, 0.0, 0.0), math.inf)
+        refused = admission.judge(queued, None, QueueBacklog(), math.inf)
         if refused is not None:
             told = failure_of(refused.error, command, server="lambda")
         else:
