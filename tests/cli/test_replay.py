@@ -34,7 +34,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str,
 class InThisProcess:
     """Stands for the process with limits, which takes half a second to start."""
 
-    def __init__(self, target: str, *, configuration: str, **_: object) -> None:
+    def __init__(self, target: str, _limits: object, *, configuration: str, **_: object) -> None:
         assert target == "rse_pf.recording.replay.limited:replayer"
         self._answer = limited.replayer(configuration)
 

@@ -148,7 +148,7 @@ def test_a_late_answer_is_expired_before_and_after_the_work() -> None:
 def over_the_websocket(body: bytes) -> Failure:
     """Return what a backend's session, scheduler and dispatch say to the same bytes."""
     from rse_pf.backend.gateway.admission import Admission
-    from rse_pf.backend.scheduling.scheduler import QueuedCommand
+    from rse_pf.backend.scheduling.scheduler import QueueBacklog, QueuedCommand
     from rse_pf.service import dispatch, failure_of
     from rse_pf.services.builtin import builtin_services
     from rse_pf.wire.server_session import Send, ServerSession, Submit

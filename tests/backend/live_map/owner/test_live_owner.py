@@ -530,7 +530,7 @@ def test_a_map_that_the_registry_refuses_is_an_internal_error_for_who_asks(opera
     def refuse(*args: object, **named: object) -> None:
         raise BadRequest("keyframe 1 has no rigid pose", hint="leave it out")
 
-    monkeypatch.setattr(MapRegistry, "commit", refuse)
+    monkeypatch.setattr(MapRegistry, "commit_charged", refuse)
 
     async def test() -> None:
         owner = await bench.own("a")
