@@ -19,6 +19,7 @@ from fuzz.meter import Meter
 from rse_pf.errors import ProtocolError
 from rse_pf.geometry import Array, Camera
 from rse_pf.native import address_of, find_library, load_part
+from rse_pf.pnp import PnpSolution
 from rse_pf.pnp.native_depth import DepthCore, RefinedPose, open_depth
 from rse_pf.pnp.problems import KINECT
 
@@ -179,7 +180,11 @@ def depth(data: bytes, meter: Meter) -> None:
     inliers = _cut(np.arange(k, dtype=np.int64) * (1 + data[7] % 5) - data[7] // 64, data[6])
     noise = (data[3] / 1e4, data[4] / 1e5, data[5] / 16.0)
     rmse_px = _STRANGE[data[3] % 5] if data[7] == 255 else data[5] / 8.0
-    arguments = (T, rmse_px, inliers, points, pixels, depths_m, KINECT, noise)
+    solution = PnpSolution(
+        T_camera_world=T, inliers=inliers, rmse_px=rmse_px,
+        covariance=np.eye(6), verdict="ok", reason="", engine="native",
+    )  # fmt: skip
+    arguments = (solution, points, pixels, depths_m, KINECT, noise)
 
     def refined(core: DepthCore) -> Any:
         return meter.call(lambda _: core.refine(*arguments), data, ProtocolError)
