@@ -215,3 +215,18 @@ def test_an_object_that_is_written_while_the_robot_is_counted_counts_once() -> N
 
     with pytest.raises(QuotaExceeded):
         write(made, store, b"d")
+
+
+def test_a_refused_upload_costs_its_sender_the_rate_that_its_body_is_worth_and_nobody_else() -> None:
+    service = Service(small_settings(max_requests_per_s=1.0), MemoryStore())  # four at once
+    large = f"/data/v1/objects/{digest_of(b'large')}"
+
+    assert put(service, b"small").status == 201
+    assert service.ask("PUT", large, headers={"content-length": str(10 << 16)}).status == 413
+    service.now += 7.5  # 4 - 1 - 1 - 10 + 7.5 is below one
+    refused = put(service, b"other")
+    assert put(service, b"other", robot="robot-2").status == 201
+    service.now += 2.0
+
+    assert (refused.status, refused.headers["retry-after"]) == (429, "2")
+    assert put(service, b"other").status == 201
