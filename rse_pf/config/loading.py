@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -15,7 +16,7 @@ def load_settings(path: Path | None = None) -> PlatformSettings:
     """Read ``context."rse-pf"`` of *path*, by default ``./cdk.json``, else the built-in defaults.
 
     Raises:
-        SettingsError: The file is named but missing, is not JSON, or holds a bad setting.
+        SettingsError: The file is named but missing, is not JSON, or holds a bad setting or one in the wrong place.
     """
     chosen = path or Path("cdk.json")
     if path is None and not chosen.exists():
@@ -33,6 +34,13 @@ def load_settings(path: Path | None = None) -> PlatformSettings:
     if not isinstance(overrides, dict):
         raise SettingsError(
             f'{chosen} has no object at context."rse-pf"',
+            hint='write {"context": {"rse-pf": {"scaling": {"max_servers": 4}}}}',
+        )
+    groups = {group.name for group in dataclasses.fields(PlatformSettings)}
+    misplaced = sorted(groups.intersection(document)) if not overrides else []
+    if misplaced:
+        raise SettingsError(
+            f'{chosen} has {", ".join(misplaced)} at its top, where settings are not read',
             hint='write {"context": {"rse-pf": {"scaling": {"max_servers": 4}}}}',
         )
     return PlatformSettings.from_dict(overrides)

@@ -200,6 +200,15 @@ def test_a_cdk_file_without_our_context_is_fine(tmp_path: Path) -> None:
     assert load_settings(write(tmp_path, {"app": "python app.py"})) == PlatformSettings()
 
 
+def test_settings_at_the_top_of_a_file_are_refused_instead_of_being_left_out(tmp_path: Path) -> None:
+    file = write(tmp_path, {"serving": {"port": 1}, "session": {}})
+
+    with pytest.raises(SettingsError, match="has serving, session at its top") as refused:
+        load_settings(file)
+
+    assert '{"context": {"rse-pf"' in refused.value.hint
+
+
 @pytest.mark.parametrize(
     "data",
     [b"", b"not json", b"\xff\xfe", b"[" * 100000, b"[]", b'"x"', b'{"context": []}',
