@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 from rse_pf.object_store import name_segment
 
-__all__ = ["DEFAULT_TENANT", "RobotId", "object_name", "state_name"]
+__all__ = ["DEFAULT_TENANT", "RobotId", "folders_of", "object_name", "shown_name", "state_name"]
 
 DEFAULT_TENANT = "default"
 
@@ -50,3 +50,20 @@ def object_name(robot: RobotId, digest: str) -> str:
 def state_name(robot: RobotId, service: str) -> str:
     """Return the name of the state of *service* for *robot*: ``states/TENANT/ROBOT[=THUMBPRINT]/SERVICE``."""
     return f"states/{robot.folder}/{service}"
+
+
+def shown_name(folder: str) -> str:
+    """Return the name of the robot with this `RobotId.folder`, without its enrolment.
+
+    A name that is no plain segment is shown as the digest that stands for it.
+    """
+    robot = folder.rpartition("/")[2]
+    if robot.startswith("x="):
+        return "=".join(robot.split("=")[:2])
+    return robot.partition("=")[0]
+
+
+def folders_of(name: str, folders: list[str]) -> list[str]:
+    """Return those of *folders* that belong to robots called *name*, whatever their enrolment."""
+    wanted = {name, name_segment(name)}
+    return [folder for folder in folders if shown_name(folder) in wanted]

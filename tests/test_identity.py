@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rse_pf.auth.roster import EnrolledRobot
-from rse_pf.identity import RobotId, object_name, state_name
+from rse_pf.identity import RobotId, folders_of, object_name, shown_name, state_name
 from rse_pf.object_store import is_name
 
 THUMBPRINT = "kPrK_qmxVWaYVA9wwBF6Iuo3vVzz7TxHCTwXBygrS4k"
@@ -51,3 +51,14 @@ def test_a_name_with_another_key_is_another_robot():
     assert first.id != second.id
     assert first.id.folder.startswith("acme/r=")
     assert first.id == EnrolledRobot(robot="r", tenant="acme", x="A" * 43).id
+
+
+def test_robots_are_shown_by_name_and_found_whatever_their_enrolment():
+    folders = [
+        RobotId("t", "r1").folder, RobotId("t", "r1", "thumb").folder, RobotId("t", "R 2").folder,
+    ]  # fmt: skip
+
+    assert shown_name(folders[0]) == shown_name(folders[1]) == "r1"
+    assert folders_of("r1", folders) == folders[:2]
+    assert folders_of("R 2", folders) == folders[2:]
+    assert folders_of("r", folders) == []

@@ -41,7 +41,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from multiprocessing.synchronize import Event
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from rse_pf.auth.tokens import SigningKey
 from rse_pf.config import AuthSettings, PlatformSettings
@@ -124,8 +124,16 @@ def token_of(key: SigningKey, robot: RobotId) -> str:
     return key.issue(robot.name, now=time.time(), token_id="t", settings=AuthSettings(), tenant=robot.tenant)
 
 
-def flood(port: int, token: str, listers: int, writers: int, begun: Event, stop: Event, results: Any) -> None:
+class Crowd(NamedTuple):
+    """How many connections list objects, and how many write them."""
+
+    listers: int
+    writers: int
+
+
+def flood(port: int, token: str, crowd: Crowd, begun: Event, stop: Event, results: Any) -> None:
     """List and write over many connections until *stop*; put the statuses into *results*."""
+    listers, writers = crowd
     os.nice(_LOWEST_PRIORITY)
     statuses: Counter[str] = Counter()
 
@@ -282,7 +290,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
             victim = Client(server.port, token_of(key, VICTIM))
             store_pictures(victim, 2.0)
             before_mib = server.memory_mib()
-            lists = server.port, token_of(key, HOSTILE), args.listers, args.writers
+            lists = server.port, token_of(key, HOSTILE), Crowd(args.listers, args.writers)
             robots = [RobotId("rival", f"mapper-{row}") for row in range(args.committers)]
             maps = server.port, [token_of(key, robot) for robot in robots]
             for _ in range(args.rounds):

@@ -23,7 +23,7 @@ import urllib.error
 import urllib.request
 from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from client_sdk import connect
 from rse_pf.auth.tokens import SigningKey
@@ -238,7 +238,7 @@ async def crashes(folder: Path, seconds: float, others: int = 20, count: int = 5
                     part_s = seconds / turns
                     end = time.perf_counter() + part_s
                     each = [
-                        pnp_robot(server, f"other-{i}", end, i / others, times[crashing], failed)
+                        pnp_robot(server, f"other-{i}", end, i / others, Answers(times[crashing], failed))
                         for i in range(others)
                     ]
                     if crashing:
@@ -257,11 +257,17 @@ async def crashes(folder: Path, seconds: float, others: int = 20, count: int = 5
     return rows
 
 
+class Answers(NamedTuple):
+    """How long requests took from their planned time on, and the codes of those that failed."""
+
+    times_s: list[float]
+    failed: list[str]
+
+
 async def pnp_robot(
-    server: Server, name: str, end: float, phase: float, times: list[float], failed: list[str], *,
-    period_s: float = 1.0,
-) -> None:  # fmt: skip
-    """Request a pose every *period_s*, from *phase* periods from now until *end*; note times and errors."""
+    server: Server, name: str, end: float, phase: float, answers: Answers, *, period_s: float = 1.0
+) -> None:
+    """Request a pose every *period_s*, from *phase* periods from now until *end*; fill *answers*."""
     problem = make_problem(n=200, outlier_ratio=0.3, seed=int(phase * 1000))
     request = make_request(problem.points_world, problem.pixels, problem.camera, binary=True)
     async with server.robot(name) as robot:
@@ -271,8 +277,8 @@ async def pnp_robot(
             try:
                 await robot.call("pnp", request, deadline_s=5)
             except RsePfError as error:
-                failed.append(error.code)
-            times.append(time.perf_counter() - planned)
+                answers.failed.append(error.code)
+            answers.times_s.append(time.perf_counter() - planned)
             planned += period_s
 
 

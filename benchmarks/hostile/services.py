@@ -16,7 +16,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from benchmarks.hostile.sandboxes import Row, Server, percentile, pnp_robot, run_rows, serving
+from benchmarks.hostile.sandboxes import Answers, Row, Server, percentile, pnp_robot, run_rows, serving
 from rse_pf.errors import RsePfError
 from rse_pf.linux import cpu_seconds, proportional_bytes
 from rse_pf.services.custom.installed import install
@@ -204,10 +204,9 @@ async def cpu(folder: Path, seconds: float, others: int = 10, turns: int = 4) ->
                     end = time.perf_counter() + seconds / turns
                     began_s = time.perf_counter()
                     before = sum(map(cpu_seconds, sandbox_pids(server)))
+                    answers = Answers(times[is_hostile], failed)
                     each = [
-                        pnp_robot(
-                            server, f"other-{i}", end, i / others, times[is_hostile], failed, period_s=0.5
-                        )
+                        pnp_robot(server, f"other-{i}", end, i / others, answers, period_s=0.5)
                         for i in range(others)
                     ]
                     if is_hostile:

@@ -113,11 +113,11 @@ def agreeing_by_odometry(
     row = int(graph.of_segment[graph.links[number].a])
     ends = [_ends(graph, each, row) for each in others]
     last = _ends(graph, number, row)
-    near = np.flatnonzero(_trips_close(graph, graph.T_odom, ends, last, None, None, options))
+    near = np.flatnonzero(_trips_close(graph, graph.T_odom, ends, last, None, options))
     agree = np.zeros((len(near), len(near)), dtype=np.bool_)
     for j in range(1, len(near)):
         before = [ends[each] for each in near[:j]]
-        agree[j, :j] = _trips_close(graph, graph.T_odom, before, ends[near[j]], None, None, options)
+        agree[j, :j] = _trips_close(graph, graph.T_odom, before, ends[near[j]], None, options)
     clique = largest_clique(agree | agree.T) if len(near) else near
     return sorted([number, *(others[near[each]] for each in clique.tolist())])
 
@@ -154,23 +154,28 @@ def _compare(graph: Graph, number: int, others: list[int], one: int, options: Li
     """Return whether each of *others* agrees with link *number*; all connect component *one* with another."""
     last = _ends_between(graph, number, one)
     ends = [_ends_between(graph, each, one) for each in others]
-    along_a = graph.walks(last[0], [each[0] for each in ends])
-    along_b = graph.walks(last[1], [each[1] for each in ends])
-    found = _trips_close(graph, graph.T, ends, last, along_a, along_b, options)
-    return [bool(each) for each in found]
+    along_a = graph.walks(last[0], [end[0] for end in ends])
+    along_b = graph.walks(last[1], [end[1] for end in ends])
+    return [
+        bool(is_close) for is_close in _trips_close(graph, graph.T, ends, last, (along_a, along_b), options)
+    ]
 
 
 def _trips_close(
-    graph: Graph, T: Array, ends: Sequence[_Ends], last: _Ends, along_a: dict[int, float] | None,
-    along_b: dict[int, float] | None, options: LiveMapOptions,
+    graph: Graph, T: Array, ends: Sequence[_Ends], last: _Ends,
+    along: tuple[dict[int, float], dict[int, float]] | None, options: LiveMapOptions,
 ) -> npt.NDArray[np.bool_]:  # fmt: skip
-    """Return whether the round trips over link *last* and each of *ends* are close to the identity."""
+    """Return whether the round trips over link *last* and each of *ends* are close to the identity.
+
+    *along* are the metres from each end of *last* to the keyframes of *ends*; None takes those of the
+    odometry.
+    """
     links = _ends_of(ends)
-    if along_a is None or along_b is None:
+    if along is None:
         way_a, way_b = graph.way[links.a] - graph.way[last[0]], graph.way[links.b] - graph.way[last[1]]
         walked = np.abs(way_a) + np.abs(way_b)
     else:
-        walked = np.array([along_a[a] + along_b[b] for a, b, _, _ in ends])
+        walked = np.array([along[0][a] + along[1][b] for a, b, _, _ in ends])
     return round_trips_close(T, links, _ends_of([last]), walked, options.judged)
 
 

@@ -16,9 +16,17 @@ from rse_pf.geometry import Camera
 from rse_pf.wire.arrays import Array
 
 __all__ = [
+    "FORGET",
+    "KEYFRAME",
+    "LEAVE",
     "LIVE_REQUESTS",
     "LIVE_REQUESTS_V1",
     "LIVE_TOPIC",
+    "PUBLISH",
+    "RELOCALISE",
+    "SHOW",
+    "START",
+    "STOP",
     "AlignmentUpdate",
     "KeyframeKept",
     "KeyframeRequest",
@@ -133,20 +141,22 @@ class LiveStart(_Value, frozen=True, kw_only=True):
 
 LiveRequest = KeyframeRequest | LiveRelocalise | LiveMapRequest | LiveForget | LiveStart
 """What the owner of a map is asked for."""
+KEYFRAME, RELOCALISE, LEAVE, SHOW = "live-keyframe", "live-relocalise", "live-leave", "live-show"
+PUBLISH, STOP, FORGET, START = "live-publish", "live-stop", "live-forget", "live-start"
 LIVE_REQUESTS: dict[str, type[LiveRequest]] = {
-    "live-keyframe": KeyframeRequest,
-    "live-relocalise": LiveRelocalise,
-    "live-leave": LiveMapRequest,
-    "live-show": LiveMapRequest,
-    "live-publish": LiveMapRequest,
-    "live-stop": LiveMapRequest,
-    "live-forget": LiveForget,
-    "live-start": LiveStart,
+    KEYFRAME: KeyframeRequest,
+    RELOCALISE: LiveRelocalise,
+    LEAVE: LiveMapRequest,
+    SHOW: LiveMapRequest,
+    PUBLISH: LiveMapRequest,
+    STOP: LiveMapRequest,
+    FORGET: LiveForget,
+    START: LiveStart,
 }
 """The request of each service that the owner of a map answers."""
 LIVE_REQUESTS_V1: dict[str, type[KeyframeRequestV1 | LiveRelocaliseV1]] = {
-    "live-keyframe": KeyframeRequestV1,
-    "live-relocalise": LiveRelocaliseV1,
+    KEYFRAME: KeyframeRequestV1,
+    RELOCALISE: LiveRelocaliseV1,
 }
 """The same of requests that hold ``features`` of their own, which older robots send."""
 

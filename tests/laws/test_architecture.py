@@ -13,6 +13,13 @@ from typing import Any
 import pytest
 
 WAYS = ("The way of a frame", "The way of a keyframe", "The way of a setting", "The way of a token")
+LIVE_MAPS_BESIDE = frozenset({
+    "children.py", "garbage.py", "subscriptions.py", "owner/context.py", "owner/lease.py",
+    "owner/link_security.py", "owner/process.py", "owner/publisher.py", "owner/replies.py", "owner/start.py",
+    "owner/threads.py", "owner/whole_fit.py",
+})  # fmt: skip
+"""Files of live maps that no keyframe passes: processes, leases, keys, versions, other replies; and the one
+file that a correction passes besides, as the page says."""
 ROW = re.compile(r"^\| \d+ \| `([\w./-]+)` \| ([^|]*) \|", re.M)
 
 
@@ -114,6 +121,16 @@ def test_each_way_names_existing_functions_and_passes_no_file_twice(
 
 def test_a_keyframe_passes_at_most_15_files(page: str) -> None:
     assert len(steps(page, "The way of a keyframe")) <= 15
+
+
+def test_no_file_of_live_maps_is_passed_beside_the_way_of_a_keyframe(page: str, repository: Path) -> None:
+    folder = repository / "rse_pf" / "backend" / "live_map"
+    files = {path.relative_to(folder).as_posix() for path in folder.rglob("*.py")}
+    rows = {file.partition("rse_pf/backend/live_map/")[2] for file, _ in steps(page, "The way of a keyframe")}
+
+    unknown = {file for file in files - rows - LIVE_MAPS_BESIDE if not file.endswith("__init__.py")}
+    assert unknown == set(), "merge what only passes a keyframe on, or name it in LIVE_MAPS_BESIDE"
+    assert files >= LIVE_MAPS_BESIDE
 
 
 def test_a_wrong_step_is_noticed(repository: Path) -> None:

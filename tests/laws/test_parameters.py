@@ -14,8 +14,6 @@ MAX_PARAMETERS = 6
 FOLDERS = ("rse_pf", "client_sdk", "lambda_pnp", "stacks", "ros_bridge", "benchmarks")
 
 LONGER = frozenset({
-    "benchmarks/data/floods.py: flood",
-    "benchmarks/hostile/sandboxes.py: pnp_robot",
     "client_sdk/bags/choose.py: choose_topics",
     "client_sdk/live/mapper.py: LiveMapper.__init__",
     "client_sdk/live/sender.py: KeyframeSender.__init__",
@@ -34,11 +32,6 @@ LONGER = frozenset({
     "lambda_pnp/day_budget.py: claim_in_bucket",
     "rse_pf/audit/log.py: AuditLog.__init__",
     "rse_pf/auth/tokens.py: SigningKey.issue",
-    "rse_pf/backend/live_map/link.py: OwnerLinks.__init__",
-    "rse_pf/backend/live_map/owner/publish.py: _publish",
-    "rse_pf/backend/live_map/owner/publish.py: publish_version",
-    "rse_pf/backend/live_map/owner/work/publisher.py: Publisher.__init__",
-    "rse_pf/backend/live_map/subscriptions.py: Subscriptions.begin",
     "rse_pf/backend/sandbox/zygote_client.py: ZygoteClient.__init__",
     "rse_pf/backend/supervisor/supervisor.py: _Supervisor.__init__",
     "rse_pf/backend/supervisor/supervisor.py: serve",
@@ -47,7 +40,6 @@ LONGER = frozenset({
     "rse_pf/data_server/app.py: DataServer.__init__",
     "rse_pf/experiments/paper/harness.py: Harness.__init__",
     "rse_pf/fleet_page/app.py: FleetApp.__init__",
-    "rse_pf/live_map/agreement.py: _trips_close",
     "rse_pf/slam/smoother.py: _normal_equations",
     "rse_pf/slam/smoother.py: smooth",
     "rse_pf/local/control/platform.py: LocalPlatform.__init__",
@@ -56,7 +48,6 @@ LONGER = frozenset({
     "rse_pf/recording/writer.py: RecordingWriter.__init__",
     "rse_pf/service.py: dispatch",
     "rse_pf/slam/map_merge.py: _version",
-    "rse_pf/services/mapping/wifi_signal.py: _conditioned",
     "rse_pf/services/pnp.py: make_request",
     "rse_pf/wire/client_session.py: ClientSession.submit",
     "stacks/backend_servers.py: BackendServers.__init__",

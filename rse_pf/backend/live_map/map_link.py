@@ -1,7 +1,9 @@
-"""The way from one worker to the owner of one live map: find it, connect, start one, and connect again.
+"""The ways from one worker to the owners of live maps: find an owner, connect, start one, and connect again.
 
-It lasts while somebody waits for an answer or for updates, and a little longer.  A request that was not
-answered when a connection ended is sent again on the next one.
+A worker finds the owner of a map through its lease in the store, and starts one when there is none or when it
+has stopped.  A link lasts while somebody waits for an answer or for updates, and a little longer.  A request
+that was not answered when a connection ended is sent again on the next one: every operation can be done twice
+without harm.
 """
 
 from __future__ import annotations
@@ -9,32 +11,52 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import itertools
+import time
 from collections.abc import Awaitable, Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
+import msgspec
+
 from rse_pf.backend.live_map.children import OwnerChild, OwnerChildren
-from rse_pf.backend.live_map.owner.lease import LeaseRecord, LeaseWatch, lease_name, verdict_on
+from rse_pf.backend.live_map.owner.lease import (
+    LeaseRecord,
+    LeaseWatch,
+    decode_lease,
+    lease_name,
+    tenant_folder,
+    verdict_on,
+)
 from rse_pf.backend.live_map.owner.link_security import (
     TOKEN_S,
     LinkClaims,
     check_certificate,
     client_context,
+    internal_key,
     make_token,
 )
-from rse_pf.backend.live_map.owner.process import OwnerOrder
+from rse_pf.backend.live_map.owner.process import MAP_KIND, OwnerOrder, OwnerProcess
 from rse_pf.backend.live_map.owner.replies import show_missing
-from rse_pf.backend.live_map.owner.requests import SHOW, begins_a_map, encode_request
 from rse_pf.backend.live_map.owner.server import MAX_LINK_BYTES
 from rse_pf.backend.log import JsonLog
 from rse_pf.backend.sandbox.ipc import FrameReader, encode_message
-from rse_pf.config import LiveSettings
-from rse_pf.errors import Busy, Conflict, NotFound, RsePfError, StoreError, Unauthorized, error_from_code
+from rse_pf.config import LiveSettings, PlatformSettings
+from rse_pf.errors import (
+    BadRequest,
+    Busy,
+    Conflict,
+    NotFound,
+    RsePfError,
+    StoreError,
+    Unauthorized,
+    error_from_code,
+)
 from rse_pf.identity import RobotId
 from rse_pf.object_store import ObjectStore
-from rse_pf.wire.live_map import LiveRequest
+from rse_pf.wire.live_map import SHOW, KeyframeRequest, LiveRequest, LiveStart
 
-__all__ = ["LinkContext", "MapLink"]
+__all__ = ["LinkContext", "MapLink", "OwnerLinks", "begins_a_map"]
 
 _READ_BYTES = 1 << 18
 _CONNECT_S = 1.0
@@ -47,6 +69,10 @@ _LINGER_S = 10.0
 _PREPARE_SHARE = 0.66
 """After this share of the lease without a renewal a process is started, so that it is ready in time."""
 _BUSY_RETRY_MS = 500.0
+_THREADS = 4
+"""They wait for the store: for the leases of the maps that have no owner now."""
+_RELEASE_S = 5.0
+_STATES = {"serving": "live", "starting": "moving", "released": "idle", "stopped": "stopped"}
 _NO_MAP = {"kind": "map", "keyframes": 0, "version": 0, "owner": ""}
 """What is told of a map whose owner has told nothing yet."""
 
@@ -383,9 +409,8 @@ class MapLink:
         return True
 
     def _send(self, number: int, pending: _Pending) -> None:
-        self._say(
-            ["request", number, list(pending.robot), pending.operation, encode_request(pending.request)]
-        )
+        request = msgspec.msgpack.encode(pending.request)
+        self._say(["request", number, list(pending.robot), pending.operation, request])
 
     def _say(self, message: list[Any]) -> None:
         if self._writer is not None:
@@ -455,6 +480,16 @@ class MapLink:
             await asyncio.wait_for(self._wake.wait(), seconds)
 
 
+def begins_a_map(request: LiveRequest) -> bool:
+    """Return whether a request may begin a map that does not exist, or was stopped.
+
+    A robot's first keyframe does; its later ones belong to the map that was stopped.
+    """
+    if isinstance(request, KeyframeRequest):
+        return request.number == 0 and request.segment == 0
+    return isinstance(request, LiveStart)
+
+
 async def _next_messages(reader: asyncio.StreamReader, frames: FrameReader) -> list[Any]:
     """Return the next messages, one at least; raises OSError at the end."""
     while True:
@@ -464,3 +499,160 @@ async def _next_messages(reader: asyncio.StreamReader, frames: FrameReader) -> l
         messages = list(frames.feed(data))
         if messages:
             return messages
+
+
+class OwnerLinks:
+    """The connections of one worker to the owners of the maps that its robots use.
+
+    All methods are called in the event loop.
+    """
+
+    def __init__(
+        self,
+        *,
+        store: ObjectStore,
+        settings: PlatformSettings,
+        server_id: str,
+        log: JsonLog,
+        on_update: Callable[[str, str, dict[str, Any]], None],
+        kind: str = MAP_KIND,
+    ) -> None:
+        """Connect to nobody yet.
+
+        Args:
+            store: Shared by all servers.
+            settings: Of the platform.
+            server_id: Of this server.
+            log: Of the worker.
+            on_update: Called with tenant, map and payload of each update of a watched map.
+            kind: The logic of the maps, as ``module:name`` of a `MapKind`.
+        """
+        self._store = store
+        self._settings = settings
+        self._on_update = on_update
+        self._links: dict[tuple[str, str], MapLink] = {}
+        self._key: bytes | None = None
+        self._threads = ThreadPoolExecutor(_THREADS, thread_name_prefix="live-link")
+        self._children = OwnerChildren(
+            lambda calmly: OwnerProcess(settings, kind, calmly=calmly),
+            max_owners=settings.live.max_owners,
+            keeps_spare=settings.live.warm_standby,
+        )
+        self._context = LinkContext(
+            store=store,
+            settings=settings.live,
+            server_id=server_id,
+            log=log,
+            call=lambda act: asyncio.get_running_loop().run_in_executor(self._threads, act),
+            key=self._internal_key,
+            children=self._children,
+            clock=time.monotonic,
+            wall_clock=time.time,
+        )
+
+    async def request(
+        self,
+        tenant: str,
+        map_name: str,
+        robot: RobotId,
+        operation: str,
+        request: LiveRequest,
+        deadline_s: float,
+    ) -> dict[str, Any]:
+        """Return the answer of the map's owner to a command.
+
+        Args:
+            tenant: Of the robot.
+            map_name: Of the live map.
+            robot: Who asks.
+            operation: The service, such as ``live-keyframe``.
+            request: Of the command; the owner checks it.
+            deadline_s: Seconds from now on.
+
+        Raises:
+            Busy: The map has no owner in time; ``retry_after_ms`` says when to ask again.
+            RsePfError: What the owner refused: Conflict, BadRequest, NotFound, Forbidden.
+        """
+        link = self._link(tenant, map_name)
+        self._children.use(is_used=True)
+        return await link.request(robot, operation, request, deadline_s)
+
+    async def list_maps(self, tenant: str) -> list[dict[str, Any]]:
+        """Return name, state, owner and server of each live map of *tenant*, from the store alone."""
+        listed: list[dict[str, Any]] = await self._context.call(lambda: self._list(tenant))
+        return listed
+
+    def watch(self, tenant: str, map_name: str, *, may_start: bool = True) -> None:
+        """Ask for the updates of a map; the present state comes first, and again from each new owner.
+
+        Args:
+            tenant: Whose map.
+            map_name: Its name.
+            may_start: Whether an owner is started for that if the map has none.
+        """
+        self._link(tenant, map_name).set_watched(True, may_start=may_start)
+        self._keep_spare()
+
+    def unwatch(self, tenant: str, map_name: str) -> None:
+        """Ask for no more updates of a map."""
+        link = self._links.get((tenant, map_name))
+        if link is not None:
+            link.set_watched(False)
+            self._keep_spare()
+
+    def give_up(self) -> None:
+        """Let the owners that this worker started release their leases: the server drains."""
+        self._children.release()
+
+    @property
+    def children(self) -> list[OwnerChild]:
+        """The owner processes that this worker has started and that claim or serve a map."""
+        return self._children.used
+
+    async def close(self) -> None:
+        """Release the leases of the owners that this worker started, and close all connections."""
+        self.give_up()
+        children = [child.ended for child in self._children.used]
+        if children:
+            await asyncio.wait(children, timeout=_RELEASE_S)
+        for link in list(self._links.values()):
+            await link.close()
+        self._threads.shutdown(wait=False)
+
+    def _link(self, tenant: str, map_name: str) -> MapLink:
+        """Return the link of a map; raises BadRequest."""
+        if self._settings.data.store == "memory:":
+            raise BadRequest("live maps need a store that all servers share", hint="set data.store")
+        link = self._links.get((tenant, map_name))
+        if link is None:
+            link = self._links[tenant, map_name] = MapLink(
+                self._context, tenant, map_name,
+                on_update=lambda payload: self._on_update(tenant, map_name, payload), on_end=self._forget,
+            )  # fmt: skip
+        return link
+
+    def _keep_spare(self) -> None:
+        """Keep a process ready while some map may need it."""
+        self._children.use(is_used=any(link.is_in_use for link in self._links.values()))
+
+    def _forget(self, link: MapLink) -> None:
+        self._links.pop((link.tenant, link.map_name), None)
+        self._keep_spare()
+
+    def _internal_key(self) -> bytes:
+        if self._key is None:
+            self._key = internal_key(self._store)
+        return self._key
+
+    def _list(self, tenant: str) -> list[dict[str, Any]]:
+        found = []
+        for name in self._store.folders(tenant_folder(tenant)):
+            object_name = lease_name(tenant, name)
+            try:
+                record = decode_lease(object_name, self._store.get(object_name))
+            except NotFound:
+                continue
+            found.append(
+                {"name": name, "state": _STATES[record.state], "owner": record.owner, "server": record.server}
+            )
+        return found

@@ -16,7 +16,7 @@ import numpy as np
 from rse_pf.auth.roster import scopes_allow
 from rse_pf.auth.tokens import Claims
 from rse_pf.backend.live_map.garbage import GarbageCounts
-from rse_pf.backend.live_map.link import OwnerLinks
+from rse_pf.backend.live_map.map_link import OwnerLinks
 from rse_pf.backend.live_map.subscriptions import Reader, Subscriptions
 from rse_pf.backend.ports import WorkerContext
 from rse_pf.backend.scheduling.scheduler import QueuedCommand
@@ -37,8 +37,14 @@ from rse_pf.slam.keyframe import MAX_KEYFRAME_BYTES, check_sent, decode_keyframe
 from rse_pf.slam.keyframe_v1 import MAX_FEATURES_BYTES, keyframe_of_v1
 from rse_pf.wire import Failure, Result, as_type
 from rse_pf.wire.live_map import (
+    FORGET,
+    KEYFRAME,
     LIVE_REQUESTS,
     LIVE_REQUESTS_V1,
+    PUBLISH,
+    RELOCALISE,
+    START,
+    STOP,
     KeyframeRequest,
     KeyframeRequestV1,
     LiveRelocalise,
@@ -53,13 +59,13 @@ LIVE_LIST = "live-list"
 LIVE_SERVICES = frozenset((*LIVE_REQUESTS, LIVE_LIST))
 """The commands that go to the owner of a live map."""
 
-_FOR_OPERATORS = frozenset(("live-publish", "live-stop", "live-forget", "live-start"))
+_FOR_OPERATORS = frozenset((PUBLISH, STOP, FORGET, START))
 _MAX_HELD_BYTES = 64 << 20
 """Size of all messages that wait for owners; while a store is slow, robots keep the others."""
 _MAX_HELD_OF_TENANT_BYTES = _MAX_HELD_BYTES // 4
 _BUSY_RETRY_MS = 500.0
 _IS_GARBAGE = (BadRequest.code, BadMessage.code, LimitExceeded.code, InvalidCamera.code)
-_JUDGED_BY_OWNER = ("live-keyframe", "live-relocalise")
+_JUDGED_BY_OWNER = (KEYFRAME, RELOCALISE)
 """Of these the owner judges the request; its other errors are those of the map, and count against nobody."""
 
 
@@ -227,9 +233,8 @@ class LiveMapRouter:
                 self._subscriptions.stop_starting(reader, identity)
             return _forbidden_to_read(judged, map_name)
 
-        first = {"kind": "map", "keyframes": 0, "version": 0, "owner": "", "state": "moving"}
         self._subscriptions.begin(
-            reader, identity, tenant, map_name, first=first, may_go_on=may_go_on,
+            reader, identity, tenant, map_name, may_go_on=may_go_on,
             may_start=_forbidden(judged, "maps:live", map_name) is None,
         )  # fmt: skip
 

@@ -33,6 +33,8 @@ _MAX_SENT_AT_ONCE = 200
 _MAX_KEYS = 1024
 """Values of one map; the one that changed longest ago is forgotten first."""
 _MAX_VALUE_BYTES = 65_536
+_NO_OWNER = {"kind": "map", "keyframes": 0, "version": 0, "owner": "", "state": "moving"}
+"""The value of the key ``map`` as long as the map's owner has sent none."""
 
 
 class Reader(SlowReader, Protocol):
@@ -119,7 +121,6 @@ class Subscriptions:
         tenant: str,
         map_name: str,
         *,
-        first: dict[str, Any],
         may_go_on: Callable[[], RsePfError | None],
         may_start: bool = True,
     ) -> None:
@@ -130,7 +131,6 @@ class Subscriptions:
             identity: The robot's id of the subscription.
             tenant: Of the robot.
             map_name: A map of the tenant.
-            first: The value of the key ``map`` as long as its owner has told none.
             may_go_on: Returns why the robot may read the map no longer; called before anything is sent.
             may_start: Whether an owner is started for this reader if the map has none.
         """
@@ -139,7 +139,7 @@ class Subscriptions:
         is_new = topic is None
         if topic is None:
             topic = self._topics[key] = _Topic(tenant, map_name)
-            topic.values["map"] = _Value(first)
+            topic.values["map"] = _Value(_NO_OWNER)
         subscription = _Subscription(reader, identity, topic, may_go_on)
         topic.readers[subscription] = None
         self._of_reader.setdefault(reader, {})[identity] = subscription

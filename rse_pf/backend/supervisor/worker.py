@@ -42,7 +42,7 @@ from rse_pf.backend.jobs.process import spawner
 from rse_pf.backend.jobs.queue import JobQueue, has_jobs
 from rse_pf.backend.jobs.runner import JobContext
 from rse_pf.backend.jobs.slots import JobSlots
-from rse_pf.backend.live_map.link import OwnerLinks
+from rse_pf.backend.live_map.map_link import OwnerLinks
 from rse_pf.backend.live_map.router import LIVE_SERVICES, LiveMapRouter
 from rse_pf.backend.log import JsonLog
 from rse_pf.backend.object_refs import ObjectRefs
@@ -533,8 +533,8 @@ class _Worker:
 def _live_maps(context: WorkerContext, answers: Answers, store: ObjectStore) -> LiveMapRouter:
     def owners(on_update: Callable[[str, str, dict[str, Any]], None]) -> OwnerLinks:
         return OwnerLinks(
-            store=store, settings=context.settings, server_id=context.server_id, loop=context.loop,
-            log=context.log, on_update=on_update,
+            store=store, settings=context.settings, server_id=context.server_id, log=context.log,
+            on_update=on_update,
         )  # fmt: skip
 
     return LiveMapRouter(context, owners=owners, answer=answers.send_message)

@@ -17,12 +17,12 @@ from rse_pf.audit.operator import record_map_change
 from rse_pf.aws.storage import open_data_store
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import Busy, NotFound
-from rse_pf.identity import RobotId
+from rse_pf.identity import RobotId, shown_name
 from rse_pf.terminal import counted, show, show_json
 from rse_pf.wire.live_map import LiveForget, LiveMapRequest, LiveRequest, LiveStart
 
 if TYPE_CHECKING:
-    from rse_pf.backend.live_map.link import OwnerLinks
+    from rse_pf.backend.live_map.map_link import OwnerLinks
 
 __all__ = ["LIVE_ACTIONS", "add_live_arguments", "run_live", "run_publish"]
 
@@ -159,14 +159,14 @@ def _ask(
 
 
 async def _with_links(settings: PlatformSettings, act: Callable[[OwnerLinks], Any]) -> Any:
-    from rse_pf.backend.live_map.link import OwnerLinks
+    from rse_pf.backend.live_map.map_link import OwnerLinks
     from rse_pf.backend.log import JsonLog
 
     settings = settings.replace(serving={"log_level": "error"})  # the owner's lines are for a server's log
     log = JsonLog(level="error", server="operator", wall_clock=time.time)
     links = OwnerLinks(
         store=open_data_store(settings), settings=settings, server_id=f"operator-{os.getpid()}",
-        loop=asyncio.get_running_loop(), log=log, on_update=lambda tenant, name, payload: None,
+        log=log, on_update=lambda tenant, name, payload: None,
     )  # fmt: skip
     try:
         return await act(links)
@@ -179,10 +179,8 @@ def _read(args: argparse.Namespace, settings: PlatformSettings) -> dict[str, Any
     """Return what the log says of a map that has no owner now; raises NotFound."""
     from rse_pf.backend.live_map.owner.lease import decode_lease, lease_name, map_folder
     from rse_pf.backend.live_map.owner.log import LiveLog
-    from rse_pf.backend.live_map.owner.map_kind import LIVE_MAP
     from rse_pf.backend.live_map.owner.replies import show_reply
-    from rse_pf.backend.live_map.owner.requests import shown_name
-    from rse_pf.backend.live_map.owner.state import restore
+    from rse_pf.backend.live_map.owner.state import LIVE_MAP, restore
 
     store = open_data_store(settings)
     name = lease_name(args.tenant, args.name)

@@ -17,11 +17,9 @@ import msgspec
 
 from rse_pf.backend.live_map.owner.lease import map_folder
 from rse_pf.backend.live_map.owner.log import LiveLog, MapSnapshot
-from rse_pf.backend.live_map.owner.map_kind import LIVE_MAP
-from rse_pf.backend.live_map.owner.requests import shown_name
-from rse_pf.backend.live_map.owner.state import MapState
+from rse_pf.backend.live_map.owner.state import LIVE_MAP, MapState
 from rse_pf.errors import RsePfError, UsageError
-from rse_pf.identity import DEFAULT_TENANT
+from rse_pf.identity import DEFAULT_TENANT, shown_name
 from rse_pf.live_map.events import KeyframeAdded, decode_events
 from rse_pf.object_store import DirectoryStore
 from rse_pf.one_thread import ONE_THREAD

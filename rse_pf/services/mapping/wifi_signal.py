@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -66,10 +67,10 @@ class SignalField:
         kept = ~np.isin(self.rows, held_out)
         if kept.sum() < _MIN_READINGS:
             return None
-        return _conditioned(
-            self.places[kept], self.residuals[kept], self.rows[kept], self.source, self.trend,
-            self.signal_dbm2, self.noise_dbm2, self.length_m,
-        )  # fmt: skip
+        kernel = _Kernel(self.signal_dbm2, self.noise_dbm2, self.length_m)
+        return _condition(
+            self.places[kept], self.residuals[kept], self.rows[kept], self.source, self.trend, kernel
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -132,13 +133,23 @@ def _fit(all_places: Array, rows: Rows, dbm: Array) -> SignalField:
             best = max(best, (likelihood, length_m, share))
     _, length_m, share = best
     noise = max((1.0 - share) * total, _FLOOR_DBM2)
-    return _conditioned(places, residuals, rows, source, trend, share * total, noise, length_m)
+    kernel = _Kernel(share * total, noise, length_m)
+    return _condition(places, residuals, rows, source, trend, kernel)
 
 
-def _conditioned(
-    places: Array, residuals: Array, rows: Rows, source: Array, trend: Array, signal: float, noise: float,
-    length_m: float,
-) -> SignalField:  # fmt: skip
+class _Kernel(NamedTuple):
+    """The parameters of a Gaussian process: variances of signal and noise, and the length of its kernel."""
+
+    signal_dbm2: float
+    noise_dbm2: float
+    length_m: float
+
+
+def _condition(
+    places: Array, residuals: Array, rows: Rows, source: Array, trend: Array, kernel: _Kernel
+) -> SignalField:
+    """Return the field of a process with *kernel* that was read with *residuals* at *places*."""
+    signal, noise, length_m = kernel
     covariance = _kernel(places, places, signal, length_m) + noise * np.eye(len(places))
     inverse = np.linalg.inv(covariance).astype(np.float64)
     return SignalField(

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import gc
 from collections.abc import Callable
-from typing import Any
 
 import pytest
 from backend.gateway.worker_parts import WorkerParts, quiet_log, worker_parts
@@ -127,10 +126,10 @@ def _watch_and_leave(quiet: JsonLog) -> None:
         unwatch=lambda *key: watched.remove(key),
     )
 
-    def cycle(first: dict[str, Any]) -> None:
+    def cycle() -> None:
         reader = FakeReader()
         for number in range(4):
-            subscriptions.begin(reader, number, "default", f"m-{number}", first=first, may_go_on=lambda: None)
+            subscriptions.begin(reader, number, "default", f"m-{number}", may_go_on=lambda: None)
         reader.unsent_bytes = 1 << 20
         loop.advance(0.02)
         subscriptions.update("default", "m-1", "pose/r", {"kind": "pose", "robot": "r", "x": 1.0})
@@ -140,7 +139,7 @@ def _watch_and_leave(quiet: JsonLog) -> None:
 
     readers = held(FakeReader)
     for _ in range(TIMES):
-        cycle({"kind": "map", "keyframes": 0, "version": 0, "owner": "", "state": "moving"})
+        cycle()
     loop.advance(1.0)
 
     assert loop.timers == 0

@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 
 from rse_pf.backend.live_map.owner.state import MapKind
-from rse_pf.backend.live_map.owner.work.whole_fit import WholeFit
+from rse_pf.backend.live_map.owner.whole_fit import WholeFit
 from rse_pf.errors import BadRequest
 from rse_pf.geometry import Camera
 from rse_pf.live_map.events import (

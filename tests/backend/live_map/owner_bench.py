@@ -11,12 +11,12 @@ from typing import Any, TypeVar
 import msgspec
 
 from rse_pf.accounts import TenantAccount
+from rse_pf.backend.live_map.owner.context import OwnerContext
 from rse_pf.backend.live_map.owner.lease import LeaseRecord, OwnerLease, decode_lease, lease_name, map_folder
-from rse_pf.backend.live_map.owner.live_owner import LiveOwner, OwnerContext
+from rse_pf.backend.live_map.owner.live_owner import LiveOwner
 from rse_pf.backend.live_map.owner.log import LiveLog
-from rse_pf.backend.live_map.owner.requests import encode_request
 from rse_pf.backend.live_map.owner.state import MapState, take_over
-from rse_pf.backend.live_map.owner.work.threads import Urgency
+from rse_pf.backend.live_map.owner.threads import Urgency
 from rse_pf.backend.log import JsonLog
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import NotFound, StoreError
@@ -136,7 +136,7 @@ class OwnerBench:
     ) -> dict[str, Any]:
         from tests.backend.live_map.fake_map import keyframe_request
 
-        request = encode_request(keyframe_request(number, features))
+        request = msgspec.msgpack.encode(keyframe_request(number, features))
         return await self.owner.answer(robot, "live-keyframe", request)
 
     async def ask(

@@ -11,7 +11,7 @@ from collections.abc import Awaitable, Callable
 from typing import Any
 
 from rse_pf.backend.live_map.children import OwnerChild, OwnerChildren
-from rse_pf.backend.live_map.map_link import LinkContext, MapLink
+from rse_pf.backend.live_map.map_link import LinkContext, MapLink, begins_a_map
 from rse_pf.backend.live_map.owner.lease import LeaseRecord, OwnerLease, decode_lease, lease_name
 from rse_pf.backend.live_map.owner.process import OwnerOrder
 from rse_pf.backend.log import JsonLog
@@ -20,7 +20,8 @@ from rse_pf.config import PlatformSettings
 from rse_pf.errors import Busy, NotFound
 from rse_pf.identity import RobotId
 from rse_pf.object_store import MemoryStore
-from rse_pf.wire.live_map import KeyframeRequest
+from rse_pf.wire.live_map import KeyframeRequest, LiveMapRequest, LiveStart
+from tests.backend.live_map.fake_map import keyframe_request
 
 LEASE = lease_name("default", "warehouse")
 FIRST = KeyframeRequest(map="warehouse", segment=0, number=0, keyframe=b"")
@@ -218,3 +219,11 @@ def test_who_may_only_watch_a_map_that_is_driven_in_takes_no_part_in_a_takeover(
         assert decode_lease(LEASE, worker.store.get(LEASE)).epoch == 1
 
     play(test)
+
+
+def test_only_a_first_keyframe_or_an_operator_begins_a_map():
+    assert begins_a_map(keyframe_request(0))
+    assert begins_a_map(LiveStart(map="m"))
+    assert not begins_a_map(keyframe_request(1))
+    assert not begins_a_map(keyframe_request(0, segment=1))
+    assert not begins_a_map(LiveMapRequest(map="m"))

@@ -14,8 +14,6 @@ from rse_pf.backend.live_map.subscriptions import Subscriptions
 from rse_pf.errors import Forbidden, RsePfError
 from rse_pf.wire import CODECS, Failure, Update
 
-FIRST = {"kind": "map", "keyframes": 0, "version": 0, "owner": "", "state": "moving"}
-
 
 class Log:
     def __init__(self) -> None:
@@ -43,7 +41,7 @@ class Parts:
 
     def begin(self, reader: FakeReader, identity: int = 7, name: str = "m", **more: Any) -> None:
         more.setdefault("may_go_on", lambda: None)
-        self.all.begin(reader, identity, reader.robot.tenant, name, first=FIRST, **more)
+        self.all.begin(reader, identity, reader.robot.tenant, name, **more)
 
     def pose(self, robot: str, x: float, *, tenant: str = "default") -> None:
         self.all.update(tenant, "m", f"pose/{robot}", {"kind": "pose", "robot": robot, "x": x})

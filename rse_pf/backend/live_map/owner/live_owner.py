@@ -12,29 +12,38 @@ import asyncio
 import contextlib
 import functools
 from collections.abc import Callable, Coroutine
-from dataclasses import dataclass
 from typing import Any
 
 import msgspec
 
-from rse_pf.accounts import TenantAccount
-from rse_pf.backend.live_map.owner import requests
+from rse_pf.backend.live_map.owner.context import OwnerContext
 from rse_pf.backend.live_map.owner.lease import OwnerLease, renewal_s
-from rse_pf.backend.live_map.owner.log import LiveLog, MapSnapshot
-from rse_pf.backend.live_map.owner.publish import version_to_start_from
+from rse_pf.backend.live_map.owner.log import (
+    BUSY_RETRY_MS,
+    SLOW_STORE_S,
+    EntryWriter,
+    LiveLog,
+    MapSnapshot,
+    Submitted,
+)
+from rse_pf.backend.live_map.owner.publisher import Publisher, version_to_start_from
 from rse_pf.backend.live_map.owner.replies import relocalise_reply, show_reply, version_reply
-from rse_pf.backend.live_map.owner.state import Applied, MapKind, MapState
+from rse_pf.backend.live_map.owner.state import Applied, MapState, Measuring
+from rse_pf.backend.live_map.owner.threads import FIRST_RETRY_S, Urgency, next_retry_s
 from rse_pf.backend.live_map.owner.updates import UpdateBook
-from rse_pf.backend.live_map.owner.work.entries import BUSY_RETRY_MS, SLOW_STORE_S, EntryWriter, Submitted
-from rse_pf.backend.live_map.owner.work.measuring import Measuring
-from rse_pf.backend.live_map.owner.work.publisher import Publisher
-from rse_pf.backend.live_map.owner.work.threads import Threads, Urgency
-from rse_pf.backend.live_map.owner.work.waits import FIRST_RETRY_S, Sleep, next_retry_s
-from rse_pf.backend.live_map.owner.work.whole_fit import WholeFit, fit_here
-from rse_pf.backend.log import JsonLog
 from rse_pf.config import LiveSettings
-from rse_pf.errors import Conflict, InternalError, NotFound, StoreError, StoreFull
-from rse_pf.identity import RobotId
+from rse_pf.errors import (
+    BadRequest,
+    Busy,
+    Conflict,
+    InternalError,
+    NotFound,
+    StoreError,
+    StoreFull,
+    UnknownService,
+    message_of,
+)
+from rse_pf.identity import RobotId, folders_of, shown_name
 from rse_pf.live_map.events import Event, KeyframeAdded, MapStarted, RobotForgotten, RobotLeft
 from rse_pf.live_map.outcomes import (
     Added,
@@ -45,11 +54,22 @@ from rse_pf.live_map.outcomes import (
     OptimiseWanted,
     Unaligned,
 )
-from rse_pf.maps.registry import MapRegistry
 from rse_pf.slam.keyframe import decode_keyframe
-from rse_pf.wire.live_map import KeyframeRequest, LiveForget, LiveMapRequest, LiveRelocalise, LiveStart
+from rse_pf.wire.live_map import (
+    LEAVE,
+    LIVE_REQUESTS,
+    PUBLISH,
+    SHOW,
+    STOP,
+    KeyframeRequest,
+    LiveForget,
+    LiveMapRequest,
+    LiveRelocalise,
+    LiveRequest,
+    LiveStart,
+)
 
-__all__ = ["LiveOwner", "OwnerContext"]
+__all__ = ["LiveOwner", "MapMoves"]
 
 _SETTLED_S = 5.0
 """An owner that served for this long does not die of its map; nor one that has measured a keyframe."""
@@ -63,35 +83,13 @@ _WAITING = "waiting for the store"
 _ALIGNING = (Joined, Corrected, Unaligned, Ambiguous, LinkRemoved)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class OwnerContext:
-    """What surrounds an owner: the map's name, time, threads, registry and listeners.
+class MapMoves(Busy):
+    """The map is being given up: the worker sends the request to the next owner.
 
-    Attributes:
-        clock: Seconds, monotonic.
-        wall_clock: Unix seconds.
-        sleep: Waits for seconds.
-        account: Of the tenant, which is charged with what the map stores.
-        tell: Gets each new payload.
-        on_beat: Gets the number of each renewal of the lease.
-        on_use: Gets whether the map is used: commands came, or none for a while.
-        fit: Fits a whole graph.
+    Cause: The server of the owner drains, or was paused.
+    Check: rse-pf map live list: which server owns the map.
+    Fix: Nothing; the worker repeats the request.
     """
-
-    map_name: str
-    settings: LiveSettings
-    kind: MapKind
-    threads: Threads
-    maps: MapRegistry
-    clock: Callable[[], float]
-    wall_clock: Callable[[], float]
-    sleep: Sleep
-    account: TenantAccount
-    log: JsonLog
-    tell: Callable[[dict[str, Any]], None]
-    on_beat: Callable[[int], None]
-    on_use: Callable[[bool], None] = lambda is_used: None
-    fit: WholeFit = fit_here
 
 
 class LiveOwner:
@@ -120,12 +118,7 @@ class LiveOwner:
             state, context.threads, self._writer.submit, fit=context.fit, json_log=context.log,
             name=context.map_name,
         )  # fmt: skip
-        self._publisher = Publisher(
-            state, context.maps, threads=context.threads, clock=context.clock,
-            wall_clock=context.wall_clock, sleep=context.sleep, pause_s=context.settings.publish_pause_s,
-            json_log=context.log, name=context.map_name, author=f"live map on {lease.record.server}",
-            charge=lambda size, freed: context.account.reserve(size, freed=freed),
-        )  # fmt: skip
+        self._publisher = Publisher(state, context, author=f"live map on {lease.record.server}")
         self._adding: dict[tuple[str, int], asyncio.Task[None]] = {}
         self._present: dict[str, None] = {}
         self._renewed = asyncio.Event()
@@ -165,7 +158,7 @@ class LiveOwner:
             self._writer.refuse_all(self._moving)
 
     async def answer(self, robot: RobotId, operation: str, request: bytes) -> dict[str, Any]:
-        """Do what a robot or an operator asks for, in a request that `encode_request` encoded.
+        """Do what a robot or an operator asks for, in a request as a link of a worker has encoded it.
 
         Raises:
             Busy: The map moves to another owner.
@@ -176,9 +169,8 @@ class LiveOwner:
         self._names[robot.folder] = robot.name
         self._note_use(is_used=True)
         reply = await self._reply_to(robot, operation, request)
-        while (
-            operation != requests.STOP and not self._is_owner()
-        ):  # paused, or cut off from the store: the map may be another's
+        while operation != STOP and not self._is_owner():
+            # it was paused, or cut off from the store: the map may be another's
             if self._ended.done():
                 raise self._moving()
             self._renewed.clear()
@@ -192,7 +184,7 @@ class LiveOwner:
     # --- requests -----------------------------------------------------------------------------------
 
     async def _reply_to(self, robot: RobotId, operation: str, data: bytes) -> dict[str, Any]:
-        match requests.decode_request(operation, data):
+        match _decode_request(operation, data):
             case KeyframeRequest() as request:
                 return await self._take_keyframe(robot, request)
             case LiveRelocalise() as request:
@@ -206,17 +198,14 @@ class LiveOwner:
 
     async def _reply_about(self, robot: RobotId, operation: str) -> dict[str, Any]:
         """Answer an operation whose request names the map alone."""
-        match operation:
-            case requests.LEAVE:
-                return await self._leave(robot)
-            case requests.SHOW:
-                return await self._context.threads.compute(
-                    Urgency.ANSWER, functools.partial(self._show, robot)
-                )
-            case requests.PUBLISH:
-                return version_reply(
-                    self._context.map_name, await self._publisher.publish(f"published by {robot}")
-                )
+        if operation == LEAVE:
+            return await self._leave(robot)
+        if operation == SHOW:
+            show = functools.partial(self._show, robot)
+            return await self._context.threads.compute(Urgency.ANSWER, show)
+        if operation == PUBLISH:
+            record = await self._publisher.publish(f"published by {robot}")
+            return version_reply(self._context.map_name, record)
         return await self._stop()
 
     async def _take_keyframe(self, robot: RobotId, request: KeyframeRequest) -> dict[str, Any]:
@@ -297,7 +286,7 @@ class LiveOwner:
             Urgency.ANSWER, lambda: list(self._state.live_map.contributors)
         )
         folders = [folder for folder in known if self._names.get(folder) == request.robot]
-        folders += [each for each in requests.folders_of(request.robot, known) if each not in folders]
+        folders += [each for each in folders_of(request.robot, known) if each not in folders]
         if not folders:
             raise NotFound(
                 f"robot {request.robot[:80]!r} contributed nothing", hint="see rse-pf map live show MAP"
@@ -429,6 +418,7 @@ class LiveOwner:
             await self._context.sleep(wait_s)
 
     def _after_renewal(self) -> None:
+        settings: LiveSettings = self._context.settings
         now = self._context.clock()
         self._renewed.set()
         if self._untold:
@@ -440,13 +430,13 @@ class LiveOwner:
         if self._is_closing:
             return
         if now >= self._publish_due_s:
-            self._publish_due_s = now + self._context.settings.publish_s
+            self._publish_due_s = now + settings.publish_s
             self._publisher.ask("live map")
-        if now - self._used_s >= _UNUSED_SHARE * self._context.settings.idle_s:
+        if now - self._used_s >= _UNUSED_SHARE * settings.idle_s:
             self._note_use(is_used=False)
         if self.users:
             self._idle_since_s = now
-        elif now - self._idle_since_s >= self._context.settings.idle_s:
+        elif now - self._idle_since_s >= settings.idle_s:
             self._idle_since_s = now
             self._start(self._end_idle())
         self._start(self._publisher.publish_due())
@@ -539,10 +529,10 @@ class LiveOwner:
 
     def _name_of(self, folder: str) -> str:
         """Return the name under which the robot with this `RobotId.folder` is shown."""
-        return self._names.get(folder) or requests.shown_name(folder)
+        return self._names.get(folder) or shown_name(folder)
 
-    def _moving(self) -> requests.MapMoves:
-        return requests.MapMoves(
+    def _moving(self) -> MapMoves:
+        return MapMoves(
             "the live map moves to another server", hint="try again", retry_after_ms=BUSY_RETRY_MS
         )
 
@@ -558,3 +548,21 @@ class LiveOwner:
                 "live-owner-defect", map=self._context.map_name, error=repr(task.exception())
             )
             self._end("defect")
+
+
+def _decode_request(operation: str, data: bytes) -> LiveRequest:
+    """Return the request of *operation* as a link of a worker has encoded it.
+
+    Raises:
+        BadRequest: The bytes are no such request.
+        UnknownService: There is no such operation.
+    """
+    kind = LIVE_REQUESTS.get(operation)
+    if kind is None:
+        raise UnknownService(f"no operation {operation[:80]!r} of live maps", hint="see docs/protocol.md")
+    try:
+        return msgspec.msgpack.decode(data, type=kind)
+    except (msgspec.MsgspecError, ValueError, RecursionError) as error:
+        raise BadRequest(
+            f"the request of the live map is invalid: {message_of(error)}", hint="see docs/protocol.md"
+        ) from error

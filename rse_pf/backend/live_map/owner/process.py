@@ -28,6 +28,7 @@ import msgspec
 
 from rse_pf.accounts import TenantAccount
 from rse_pf.aws.storage import open_data_store
+from rse_pf.backend.live_map.owner.context import OwnerContext
 from rse_pf.backend.live_map.owner.lease import OwnerLease, lease_name, map_folder, renewal_s
 from rse_pf.backend.live_map.owner.link_security import (
     LinkClaims,
@@ -35,12 +36,12 @@ from rse_pf.backend.live_map.owner.link_security import (
     internal_key,
     server_context,
 )
-from rse_pf.backend.live_map.owner.live_owner import LiveOwner, OwnerContext
+from rse_pf.backend.live_map.owner.live_owner import LiveOwner
 from rse_pf.backend.live_map.owner.log import LiveLog, OwnershipLost
 from rse_pf.backend.live_map.owner.server import OwnerServer, listen
 from rse_pf.backend.live_map.owner.state import MapKind, MapState, take_over
-from rse_pf.backend.live_map.owner.work.threads import OwnerThreads, Urgency
-from rse_pf.backend.live_map.owner.work.whole_fit import fit_apart
+from rse_pf.backend.live_map.owner.threads import OwnerThreads, Urgency
+from rse_pf.backend.live_map.owner.whole_fit import fit_apart
 from rse_pf.backend.log import JsonLog
 from rse_pf.backend.sandbox.ipc import FrameReader, encode_message, receive
 from rse_pf.config import PlatformSettings
@@ -53,7 +54,7 @@ from rse_pf.one_thread import ONE_THREAD
 
 __all__ = ["MAP_KIND", "OwnerOrder", "OwnerProcess", "advertised_address", "main"]
 
-MAP_KIND = "rse_pf.backend.live_map.owner.map_kind:LIVE_MAP"
+MAP_KIND = "rse_pf.backend.live_map.owner.state:LIVE_MAP"
 """Where the `MapKind` of real maps is, as ``module:name``."""
 _READ_BYTES = 1 << 16
 _RETRY_S = 0.1

@@ -13,8 +13,7 @@ import ssl
 from collections.abc import Callable
 from typing import Any
 
-from rse_pf.backend.live_map.owner.live_owner import LiveOwner
-from rse_pf.backend.live_map.owner.requests import MapMoves
+from rse_pf.backend.live_map.owner.live_owner import LiveOwner, MapMoves
 from rse_pf.backend.sandbox.ipc import FrameReader, encode_message
 from rse_pf.errors import InternalError, RsePfError
 from rse_pf.identity import RobotId

@@ -29,7 +29,6 @@ def main(arguments: list[str]) -> None:
 def _import_at(nice: int) -> None:
     # Linux has a priority for each thread: this one ends, and the others keep theirs.
     os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), os.getpriority(os.PRIO_PROCESS, 0) + nice)
-    import rse_pf.backend.live_map.owner.map_kind
     import rse_pf.backend.live_map.owner.process  # noqa: F401  imported for its time only
 
 

@@ -1,18 +1,23 @@
-"""A live map as its owner holds it: restored from the log, changed by entries only.
+"""A live map as its owner holds it: restored from the log, changed by entries only, and measured afterwards.
 
-Two processes that read the same log hold the same map; `MapState.digest` shows it.  No store, no thread.
+Two processes that read the same log hold the same map; `MapState.digest` shows it.  The links of a keyframe
+are measured after it was applied, while the map goes on, and enter the log as events, too.
 """
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import functools
-from collections.abc import Callable, Collection, Sequence
+from collections import deque
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from rse_pf.backend.live_map.owner.log import LiveLog, MapSnapshot, OwnershipLost, snapshot_entries
-from rse_pf.backend.live_map.owner.work.whole_fit import WholeFit
+from rse_pf.backend.live_map.owner.threads import Threads, Urgency
+from rse_pf.backend.live_map.owner.whole_fit import WholeFit
+from rse_pf.backend.log import JsonLog
 from rse_pf.errors import BadRequest, NotFound
 from rse_pf.live_map.events import (
     Event,
@@ -26,13 +31,29 @@ from rse_pf.live_map.events import (
     encode_events,
 )
 from rse_pf.live_map.live_map import LiveMap
+from rse_pf.live_map.measure import joined_links
 from rse_pf.live_map.outcomes import Added, Outcome
+from rse_pf.live_map.versions import started_from
 from rse_pf.maps.format import MapVersion
 
-__all__ = ["Applied", "MapKind", "MapState", "restore", "take_over"]
+__all__ = [
+    "LIVE_MAP",
+    "Applied",
+    "MapKind",
+    "MapState",
+    "Measuring",
+    "candidates_of",
+    "restore",
+    "take_over",
+]
 
 _T = TypeVar("_T")
 _UNCHANGING = (OwnerChanged, RobotLeft)
+_AT_ONCE = 2
+"""Threads that measure: both share one keyframe, or take one each where more wait."""
+_FEW_WAIT, _FEWER, _FEWEST = 4, 6, 4
+"""Where more keyframes wait than the first number, a keyframe is compared with so many others; where twice as
+many wait, with the last number."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -42,6 +63,10 @@ class MapKind:
     empty: Callable[[], LiveMap]
     restore: Callable[[bytes, Callable[[str], bytes]], LiveMap]
     started_from: Callable[[MapVersion, str], MapStarted]
+
+
+LIVE_MAP = MapKind(empty=LiveMap, restore=LiveMap.restore_parts, started_from=started_from)
+"""The map that owners serve."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -186,3 +211,94 @@ def _from_snapshot(log: LiveLog, kind: MapKind) -> MapState:
             live_map = kind.restore(snapshot.head, log.part)
             return MapState(live_map, snapshot.position, snapshot.unmeasured)
     return MapState(kind.empty(), log.position)
+
+
+def candidates_of(waiting: int) -> int | None:
+    """Return with how many others a keyframe is compared while *waiting* others wait; None for all.
+
+    What is found enters the log, so a replay does not depend on it.
+    """
+    if waiting <= _FEW_WAIT:
+        return None
+    return _FEWER if waiting <= 2 * _FEW_WAIT else _FEWEST
+
+
+class Measuring:
+    """Measures one keyframe or two at a time; its methods are called in the event loop."""
+
+    def __init__(
+        self,
+        state: MapState,
+        threads: Threads,
+        submit: Callable[[Event], Any],
+        *,
+        fit: WholeFit,
+        json_log: JsonLog,
+        name: str,
+    ) -> None:
+        """Begin with what the last owner has left, at `run`.
+
+        Args:
+            state: The map.
+            threads: In which to look.
+            submit: Lets an event enter the log.
+            fit: Fits the whole graph.
+            json_log: Of the server.
+            name: Of the map.
+        """
+        self._state, self._threads, self._submit = state, threads, submit
+        self._fit, self._json_log, self._name = fit, json_log, name
+        self._waiting = deque(state.unmeasured)
+        self._wake = asyncio.Event()
+        self._wake.set()
+        self._optimise_wanted = False
+        self._has_measured = False
+
+    @property
+    def is_proven(self) -> bool:
+        """Whether a keyframe has gone the whole way, and none is left that may end the process."""
+        return self._has_measured and not self._state.unmeasured
+
+    def measure(self, keyframes: Iterable[int]) -> None:
+        """Measure these keyframes, too."""
+        self._waiting.extend(keyframes)
+        self._wake.set()
+
+    def optimise(self) -> None:
+        """Fit the whole graph when no keyframe waits."""
+        self._optimise_wanted = True
+        self._wake.set()
+
+    async def run(self) -> None:
+        """Work until cancelled."""
+        await asyncio.gather(*(self._work() for _ in range(_AT_ONCE)))
+
+    async def _work(self) -> None:
+        while True:
+            await self._wake.wait()
+            if self._waiting:
+                await self._measure(self._waiting.popleft())
+            elif self._optimise_wanted:
+                self._optimise_wanted = False
+                await self._optimise()
+            else:
+                self._wake.clear()
+
+    async def _measure(self, keyframe: int) -> None:
+        threads, waiting = self._threads, len(self._waiting)
+        look = functools.partial(
+            self._state.measuring, keyframe, 1 if waiting else _AT_ONCE, candidates_of(waiting)
+        )
+        pieces = await threads.compute(Urgency.MEASURE, look)
+        begun = [threads.look(measure) for measure in pieces]
+        self._submit(joined_links(keyframe, [await each for each in begun]))
+        self._has_measured = True
+
+    async def _optimise(self) -> None:
+        begin = functools.partial(self._state.optimising, self._fit)
+        fit = await self._threads.compute(Urgency.BACKGROUND, begin)
+        optimised = await self._threads.look(fit)
+        if optimised is None:
+            self._json_log.warning("live-optimisation-failed", map=self._name)
+        else:
+            self._submit(optimised)

@@ -8,7 +8,7 @@ from typing import Any, cast
 
 import pytest
 
-from rse_pf.backend.live_map.owner.work.entries import EntryWriter, Submitted
+from rse_pf.backend.live_map.owner.log import EntryWriter, Submitted
 from rse_pf.errors import Busy
 from rse_pf.live_map.events import Event, KeyframeAdded, RobotLeft
 

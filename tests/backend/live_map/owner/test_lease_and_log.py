@@ -17,14 +17,11 @@ from rse_pf.backend.live_map.owner.link_security import (
     make_token,
 )
 from rse_pf.backend.live_map.owner.log import LiveLog, MapSnapshot, OwnershipLost, snapshot_entries
-from rse_pf.backend.live_map.owner.requests import begins_a_map, folders_of, shown_name
 from rse_pf.backend.live_map.owner.state import MapState, restore
 from rse_pf.errors import BadRequest, StoreError, Unauthorized
-from rse_pf.identity import RobotId
 from rse_pf.live_map.events import OwnerChanged, encode_events
 from rse_pf.object_store import MemoryStore
-from rse_pf.wire.live_map import LiveMapRequest, LiveStart
-from tests.backend.live_map.fake_map import FAKE_MAP, FakeMap, keyframe_request
+from tests.backend.live_map.fake_map import FAKE_MAP, FakeMap
 from tests.backend.live_map.owner_bench import FOLDER, LEASE, HandClock
 
 LEASE_S = 1.5
@@ -281,22 +278,3 @@ def test_all_servers_use_one_key_that_outlives_them():
 
     assert internal_key(store) == internal_key(store)
     assert len(internal_key(store)) == 32
-
-
-def test_robots_are_shown_by_name_and_found_whatever_their_enrolment():
-    folders = [
-        RobotId("t", "r1").folder, RobotId("t", "r1", "thumb").folder, RobotId("t", "R 2").folder,
-    ]  # fmt: skip
-
-    assert shown_name(folders[0]) == shown_name(folders[1]) == "r1"
-    assert folders_of("r1", folders) == folders[:2]
-    assert folders_of("R 2", folders) == folders[2:]
-    assert folders_of("r", folders) == []
-
-
-def test_only_a_first_keyframe_or_an_operator_begins_a_map():
-    assert begins_a_map(keyframe_request(0))
-    assert begins_a_map(LiveStart(map="m"))
-    assert not begins_a_map(keyframe_request(1))
-    assert not begins_a_map(keyframe_request(0, segment=1))
-    assert not begins_a_map(LiveMapRequest(map="m"))

@@ -9,8 +9,8 @@ from typing import TypeVar
 import pytest
 
 from rse_pf.backend.live_map.owner.lease import verdict_on
+from rse_pf.backend.live_map.owner.live_owner import MapMoves
 from rse_pf.backend.live_map.owner.log import LiveLog
-from rse_pf.backend.live_map.owner.requests import MapMoves
 from rse_pf.errors import BadRequest, Conflict, InternalError, NotFound, StoreError
 from rse_pf.identity import RobotId
 from rse_pf.live_map.events import MapStarted, decode_events

@@ -10,10 +10,9 @@ from typing import TypeVar
 import numpy as np
 import pytest
 
-from rse_pf.backend.live_map.owner.state import MapState
-from rse_pf.backend.live_map.owner.work.measuring import Measuring, candidates_of
-from rse_pf.backend.live_map.owner.work.threads import Urgency
-from rse_pf.backend.live_map.owner.work.whole_fit import fit_apart, fit_here
+from rse_pf.backend.live_map.owner.state import MapState, Measuring, candidates_of
+from rse_pf.backend.live_map.owner.threads import Urgency
+from rse_pf.backend.live_map.owner.whole_fit import fit_apart, fit_here
 from rse_pf.backend.log import JsonLog
 from rse_pf.geometry import Array, exp_se3, inverse
 from rse_pf.live_map.events import Event, LinksMeasured

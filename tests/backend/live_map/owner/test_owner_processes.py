@@ -19,7 +19,7 @@ from typing import Any
 import pytest
 
 from rse_pf.backend.live_map.children import OwnerChild
-from rse_pf.backend.live_map.link import OwnerLinks
+from rse_pf.backend.live_map.map_link import OwnerLinks
 from rse_pf.backend.live_map.owner.lease import decode_lease, lease_name, map_folder
 from rse_pf.backend.live_map.owner.log import LiveLog
 from rse_pf.backend.live_map.owner.state import MapState
@@ -87,7 +87,7 @@ async def servers(folder: Path, **live: Any) -> AsyncIterator[Servers]:
     log = JsonLog(level="error", server="test", wall_clock=time.time)
     made = [
         OwnerLinks(
-            store=store, settings=settings, server_id=name, loop=asyncio.get_running_loop(), log=log,
+            store=store, settings=settings, server_id=name, log=log,
             on_update=lambda tenant, name, payload: updates.append(payload), kind=KIND,
         )
         for name in ("a", "b")

@@ -1,4 +1,7 @@
-"""The threads of an owner process: one that holds the map, some that look, some that wait for the store."""
+"""The threads of an owner process, and how long it waits before it asks a store again that failed.
+
+One thread holds the map, some look, some wait for the store.
+"""
 
 from __future__ import annotations
 
@@ -7,17 +10,20 @@ import enum
 import itertools
 import os
 import threading
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Coroutine
 from concurrent.futures import Future, ThreadPoolExecutor
 from queue import PriorityQueue
 from typing import Any, Protocol, TypeVar
 
-__all__ = ["OwnerThreads", "Threads", "Urgency"]
+__all__ = ["FIRST_RETRY_S", "OwnerThreads", "Sleep", "Threads", "Urgency", "next_retry_s"]
 
 _LOOKING = 3
 """Two measure keyframes, one may look for a robot that is lost; matching and solving free the GIL."""
 _CALM_NICE = 10
 """Of threads whose work poses do not wait for."""
+FIRST_RETRY_S, _LAST_RETRY_S = 0.05, 1.0
+Sleep = Callable[[float], Coroutine[Any, Any, None]]
+"""Waits for seconds."""
 _T = TypeVar("_T")
 
 
@@ -105,3 +111,8 @@ class OwnerThreads:
 def _calm() -> None:
     """Lower the priority of the calling thread, which Linux has for each thread."""
     os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _CALM_NICE)
+
+
+def next_retry_s(wait_s: float) -> float:
+    """Return how long to wait after a wait of *wait_s* has not helped."""
+    return min(_LAST_RETRY_S, 2 * wait_s)

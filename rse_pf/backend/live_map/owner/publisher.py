@@ -9,54 +9,46 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import dataclasses
 import functools
+import re
 from collections.abc import Callable
 
-from rse_pf.backend.live_map.owner.publish import publish_version
+from rse_pf.backend.live_map.owner.context import OwnerContext
 from rse_pf.backend.live_map.owner.state import MapState
-from rse_pf.backend.live_map.owner.work.threads import Threads, Urgency
-from rse_pf.backend.live_map.owner.work.waits import Sleep
-from rse_pf.backend.log import JsonLog
-from rse_pf.errors import Busy, NotFound, RsePfError, StoreError
-from rse_pf.maps.registry import MapRecord, MapRegistry
+from rse_pf.backend.live_map.owner.threads import Urgency
+from rse_pf.errors import Busy, Conflict, NotFound, RsePfError, StoreError
+from rse_pf.live_map.versions import errors_of_maps
+from rse_pf.maps.format import MapVersion, encode_map
+from rse_pf.maps.registry import MapOrigin, MapRecord, MapRegistry
+from rse_pf.object_store import digest_of
 
-__all__ = ["Publisher"]
+__all__ = ["Publisher", "version_to_start_from"]
 
 _MOST_WAIT_S = 10.0
 """Who asks for a version waits for so long; who would wait longer is told when to ask again."""
 _FIRST_RETRY_S, _LAST_RETRY_S = 5.0, 600.0
 """A version that could not be stored is tried again after these times; encoding a large map takes seconds."""
 _NEVER = -1
+_TRIES = 5
+_VERSION = re.compile(r"head|[0-9a-f]{6,64}")
 
 
 class Publisher:
     """Publishes one map; its methods are called in the event loop."""
 
-    def __init__(
-        self, state: MapState, maps: MapRegistry, *, threads: Threads, clock: Callable[[], float],
-        wall_clock: Callable[[], float], sleep: Sleep, pause_s: float, json_log: JsonLog, name: str,
-        author: str, charge: Callable[[int, int], None],
-    ) -> None:  # fmt: skip
+    def __init__(self, state: MapState, context: OwnerContext, *, author: str) -> None:
         """Publish nothing yet.
 
         Args:
             state: The map.
-            maps: The registry.
-            threads: In which to compute and wait.
-            clock: Seconds, monotonic.
-            wall_clock: Unix seconds.
-            sleep: Waits for seconds.
-            pause_s: Shortest time between two versions.
-            json_log: Of the server.
-            name: Of the map.
+            context: Of its owner; the tenant is charged with a version before it is written.
             author: Of the versions.
-            charge: Gets the bytes of a version before they are written, and how many are removed for them;
-                refuses by an error.
         """
-        self._state, self._maps, self._threads = state, maps, threads
-        self._clock, self._wall_clock, self._sleep, self._pause_s = clock, wall_clock, sleep, pause_s
-        self._json_log, self._name, self._author = json_log, name, author
-        self._charge = charge
+        self._state, self._context, self._author = state, context, author
+        self._maps, self._threads = context.maps, context.threads
+        self._clock, self._json_log, self._name = context.clock, context.log, context.map_name
+        self._pause_s = context.settings.publish_pause_s
         self._lock = asyncio.Lock()
         self._published = _NEVER
         self._last_record: MapRecord | None = None
@@ -95,7 +87,7 @@ class Publisher:
                     hint="ask again then, or lower live.publish_pause_s", retry_after_ms=1e3 * wait_s,
                 )  # fmt: skip
             if wait_s > 0:
-                await self._sleep(wait_s)
+                await self._context.sleep(wait_s)
             return await self._publish(note, freed)
 
     def ask(self, note: str) -> None:
@@ -133,10 +125,10 @@ class Publisher:
     async def _publish(self, note: str, freed: int = 0) -> MapRecord:
         changes = self._state.changes
         version = await self._threads.compute(Urgency.BACKGROUND, self._state.live_map.to_version)
-        publish = functools.partial(
-            publish_version, self._maps, self._name, version, author=self._author,
-            created_s=self._wall_clock(), note=note, charge=lambda size: self._charge(size, freed),
-        )  # fmt: skip
+        made_s = self._context.wall_clock()
+        origin = MapOrigin(parent=None, author=self._author, created_s=made_s, note=note)
+        charge = functools.partial(self._context.account.reserve, freed=freed)
+        publish = functools.partial(_publish_version, self._maps, self._name, version, origin, charge)
         record = await self._threads.background(publish)
         self._free_s = self._clock() + self._pause_s
         self._published, self._last_record = changes, record
@@ -154,6 +146,63 @@ class Publisher:
     def _age_s(self) -> float:
         """Return how old the newest version is; blocking."""
         try:
-            return self._wall_clock() - self._maps.head(self._name).created_s
+            return self._context.wall_clock() - self._maps.head(self._name).created_s
         except NotFound:
             return float("inf")
+
+
+def _publish_version(
+    maps: MapRegistry, name: str, version: MapVersion, origin: MapOrigin, charge: Callable[[int], None]
+) -> MapRecord:
+    """Make *version* the head of map *name* and return its record; the head itself if it is the same map.
+
+    Blocking; the parent in *origin* becomes the head of now.
+
+    Raises:
+        QuotaExceeded, StoreFull: What *charge* raises for the bytes that the version adds to the store.
+        Conflict: Others move the head all the time.
+        InternalError: The registry takes no such map.
+        StoreError: The store fails.
+    """
+    with errors_of_maps("the live map cannot be published"):
+        data = encode_map(version)
+        digest = digest_of(data)
+        for tries_left in reversed(range(_TRIES)):
+            try:
+                head: MapRecord | None = maps.head(name)
+            except NotFound:
+                head = None
+            if head is not None and head.digest == digest:
+                return head
+            origin = dataclasses.replace(origin, parent=None if head is None else head.id)
+            try:
+                return maps.commit_charged(name, data, origin, charge=charge)
+            except Conflict:
+                if not tries_left:
+                    raise
+    raise AssertionError("the last try returns or raises")
+
+
+def version_to_start_from(maps: MapRegistry, map_name: str, source: str) -> tuple[MapVersion, str]:
+    """Return the version that *source* names, and its full name ``MAP@ID``.
+
+    Args:
+        maps: Of the tenant.
+        map_name: Of the live map.
+        source: ``MAP@VERSION``, a version of the map *map_name*, or another map, whose head is meant; "" is
+            the head of *map_name*.
+
+    Raises:
+        InternalError: The version is damaged.
+        NotFound: There is no such map or version.
+    """
+    name, at, version = source.partition("@")
+    if not at:
+        name, version = (map_name, source or "head") if _is_version(source) else (source, "head")
+    record = maps.record(name, version)
+    with errors_of_maps(f"{name}@{record.id} cannot be read"):
+        return maps.load(name, record.id), f"{name}@{record.id}"
+
+
+def _is_version(source: str) -> bool:
+    return not source or _VERSION.fullmatch(source) is not None
