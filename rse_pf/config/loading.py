@@ -16,7 +16,7 @@ def load_settings(path: Path | None = None) -> PlatformSettings:
     """Read ``context."rse-pf"`` of *path*, by default ``./cdk.json``, else the built-in defaults.
 
     Raises:
-        SettingsError: The file is named but missing, is not JSON, or holds a bad setting or one in the wrong place.
+        SettingsError: The file is named but missing, is not JSON, or holds a bad or misplaced setting.
     """
     chosen = path or Path("cdk.json")
     if path is None and not chosen.exists():
@@ -40,7 +40,7 @@ def load_settings(path: Path | None = None) -> PlatformSettings:
     misplaced = sorted(groups.intersection(document)) if not overrides else []
     if misplaced:
         raise SettingsError(
-            f'{chosen} has {", ".join(misplaced)} at its top, where settings are not read',
+            f"{chosen} has {', '.join(misplaced)} at its top, where settings are not read",
             hint='write {"context": {"rse-pf": {"scaling": {"max_servers": 4}}}}',
         )
     return PlatformSettings.from_dict(overrides)
