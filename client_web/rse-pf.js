@@ -7,6 +7,8 @@
  */
 
 const FIRST_TRIES = 4;
+// After some that failed Chromium delays a WebSocket by up to 5 s; it may repeat the packets of one itself.
+const LONG_TRY_MS = 11e3;
 const PING_S = 2;
 const PONG_S = 3;
 const ANSWER_S = 5;
@@ -63,7 +65,7 @@ const wrong = (...words) => new RsePfError(...words);
 const told = (failure) => wrong(failure.code, failure.message, failure.hint, failure);
 const unreadable = (message) => wrong("protocol", message, "is it an RSE-PF server?");
 const cancelled = () => wrong("cancelled", "the robot took the command back");
-const unauthorized = (message = "the token is missing, wrong, expired or revoked", hint = "connect with a fresh token") =>
+const unauthorized = (message = "the token is missing, wrong, expired or revoked", hint = "use a fresh token") =>
   wrong("unauthorized", message, hint);
 
 // --- codecs (section 1) ----------------------------------------------------------------------------------
@@ -149,19 +151,19 @@ const allowance = (link, time) => {
   link._left = min(max(1, burst * link._share), link._left + fresh * rate);
   link._filledAt += fresh;
   link._nextAt = link._filledAt + (1 - link._left) / rate;
-  return Math.floor(link._left);
+  return link._left | 0;
 };
 
 /** Return whether the claims of a token say that it has expired; one that cannot be read has not. */
 const isExpired = (token) => {
   try {
-    return parse(atob(token.split(".")[1].replace(/-/g, "+").replace(/_/g, "/"))).exp < unixTime();
+    return parse(atob(token.split(".")[1].replace(/[-_]/g, (sign) => (sign < "_" ? "+" : "/")))).exp < unixTime();
   } catch {
     return false;
   }
 };
 
-const trimmed = (token) => String(token || "").trim();
+const trimmed = (token) => `${token || ""}`.trim();
 const bearer = (token) => (token ? { Authorization: "Bearer " + token } : {});
 
 const BROKEN = ["protocol", "this client breaks the protocol"];
@@ -170,14 +172,15 @@ const REFUSALS = {
   1002: BROKEN,
   1007: BROKEN,
   1008: BROKEN,
-  1009: ["too-large", "a message is too large or in too many pieces"],
+  1009: ["too-large", "a message has too many bytes or pieces"],
   4400: BROKEN,
   4406: [UNSUPPORTED, "the server speaks another version", "update rse-pf.js"],
-  4409: ["conflict", "another connection of this robot replaced this one", "give every robot its own token"],
+  4409: ["conflict", "another connection replaced this one", "give every robot its own token"],
 };
 
 /** Node's words for an attempt that reached nobody; a browser tells no more than whether it is online. */
-const NOWHERE = /^E(NET|HOST|AI_|NOTF|TIMED)/;
+const NOWHERE = /^E(NET|HOST|AI_|NOTF|TIMED)|^Timeout/;
+const isOnline = () => globalThis.navigator?.onLine;
 
 /** Mark an error as the refusal of a server: the robot connects again in 20 to 40 s, or once its tokens are valid. */
 const refused = (failed, validInS = Infinity) => {
@@ -261,7 +264,7 @@ export const connect = async (url, options = {}) => {
     links.add(link);
     socket.binaryType = "arraybuffer";
     return new Promise((resolve, reject) => {
-      link._end = ending(resolve, reject, connectTimeoutMs, () => {
+      link._end = ending(resolve, reject, isOnline() && trouble._isUnanswered ? LONG_TRY_MS : connectTimeoutMs, () => {
         lateUntil = now() + 60;
         const failed = unreadable("no Welcome");
         failed._isUnanswered = !socket.readyState;
@@ -292,7 +295,7 @@ export const connect = async (url, options = {}) => {
       notBefore = now() + 5;
     }
     const refusalOfCode = REFUSALS[code];
-    let failed = wrong(...(refusalOfCode || [CONNECT, "the connection ended: " + code, "is it running, the token valid, the origin allowed?"]));
+    let failed = wrong(...(refusalOfCode || [CONNECT, "the connection ended: " + code, "is it up, the token valid, the origin allowed?"]));
     // An attempt that was given up may still replace the connection that came after it.
     const isOwn = code === 4409 && (current?._moveUntil || now() < lateUntil);
     if (refusalOfCode && (link === current || !current) && !isOwn) refused(failed);
@@ -306,13 +309,11 @@ export const connect = async (url, options = {}) => {
 
   /** Ask why a handshake failed, where the answer may be read: in Node, and in pages of the same origin. */
   const reasonOf = async (link, failed, isStatic) => {
-    const { location, navigator } = globalThis;
-    const address = new URL(httpUrl);
-    if (navigator?.onLine === false) failed._isUnanswered = true;
+    const { host } = new URL(httpUrl);
     // A request more for each attempt would double what a firewall counts.
-    else if ((attempt % 4 === 1 || refusal) && (!location || location.host === address.host)) {
+    if ((attempt % 4 === 1 || refusal) && (globalThis.location?.host ?? host) === host) {
       try {
-        const answer = await fetch(address, { headers: bearer(link._token), signal: AbortSignal.timeout(1e3) });
+        const answer = await fetch(httpUrl, { headers: bearer(link._token), signal: AbortSignal.timeout(1e3) });
         const { platform, message, hint, valid_from_s: validFromS } = await answer.json();
         if (answer.status === 401 && platform === "rse-pf") {
           // The same token stays revoked, and so does a new one if the clock that signs is behind.
@@ -320,7 +321,7 @@ export const connect = async (url, options = {}) => {
           return refused(unauthorized(message, hint), !isStatic && validInS > -SOON_S ? validInS : Infinity);
         }
       } catch (problem) {
-        failed._isUnanswered = NOWHERE.test(problem.cause?.code);
+        failed._isUnanswered = NOWHERE.test(problem.cause?.code || problem.name);
       }
     }
     return failed;
@@ -332,7 +333,8 @@ export const connect = async (url, options = {}) => {
     const { _validInS: validInS, _isUnanswered: isUnanswered } = trouble;
     if (validInS != null) return min(20 + 20 * jitter, max(0, validInS) + jitter / 2);
     if (isUnanswered) return 1 + jitter / 4 - spent;
-    const longest = min(40, (now() - failingAt) / 3);
+    // Without a network nobody is spared, but Chromium counts what fails.
+    const longest = min(40, (now() - failingAt) / (isOnline() === false ? 1 : 3));
     return longest > 1 ? (longest * (1 + jitter)) / 2 - spent : jitter * min(1, 0.1 * 2 ** attempt);
   };
 
@@ -349,11 +351,14 @@ export const connect = async (url, options = {}) => {
       const before = trouble;
       const until = max(notBefore, now() + pauseAfter(now() - began));
       const offset = clockOffset();
-      // Not so long if the clock of this machine is set, which may make tokens valid, or if there is another token.
-      while (now() < until && !error && trouble === before && Math.abs(clockOffset() - offset) < CLOCK_SET_S) {
+      const wasOnline = isOnline();
+      // Not so long if the clock of this machine is set, which may make tokens valid, or if there is another token
+      // or a network.
+      while (now() < until && !error && trouble === before && isOnline() === wasOnline && Math.abs(clockOffset() - offset) < CLOCK_SET_S) {
         await pause(min(0.25, until - now()));
       }
       if (error) break;
+      if (isOnline() !== wasOnline) failingAt = Infinity;
       attempt++;
       began = now();
       if (began > current?._moveUntil) current._moveUntil = 0;
@@ -446,7 +451,7 @@ export const connect = async (url, options = {}) => {
     const write = (data) => {
       const size = sizeOf(data);
       if (command && (size > link._limits.max_message_bytes || text.length > MAX_INFLATED_BYTES)) {
-        settle(command, wrong("too-large", `a command of ${size} bytes is above the limit`, "upload large data, and name its digest"));
+        settle(command, wrong("too-large", `a command of ${size} bytes is above the limit`, "upload it, and name its digest"));
       } else if (links.has(link)) {
         counts.bytesUp += size;
         link._socket.send(data);
@@ -460,7 +465,7 @@ export const connect = async (url, options = {}) => {
     link._heardAt = now();
     counts.bytesDown += sizeOf(data);
     link._incoming = inOrder(link._incoming, () => decode(data), (message) => receive(link, message)).catch((problem) => {
-      const failed = unreadable("cannot read a message: " + problem);
+      const failed = unreadable("cannot read it: " + problem);
       const isDamaged = problem?.name; // otherwise it is a type that is not known here
       // It may have been the answer to any of them, and would not be readable when it came again.
       if (isDamaged) settleAll(sentOn(link), failed);
@@ -699,7 +704,7 @@ export const connect = async (url, options = {}) => {
       const { status, name } = response;
       const failed = status
         ? told({ code: "store", message: "HTTP " + status, ...(await response.json().catch(nothing)) })
-        : wrong(CONNECT, "no data service answers: " + name, "is this page's origin in serving.allowed_origins?");
+        : wrong(CONNECT, "no data service: " + name, "is this page's origin in serving.allowed_origins?");
       if (tries > 4 || (status && !/408|429|50[0234]/.test(status))) throw failed;
       await pause(random() * 0.2 * 2 ** tries);
     }
@@ -809,7 +814,7 @@ export const connect = async (url, options = {}) => {
     },
 
     download: async (digest, { signal } = {}) => {
-      const bytes = bytesOf(await (await http("GET", "objects/" + digest, undefined, signal)).arrayBuffer());
+      const bytes = bytesOf(await (await http("GET", "objects/" + digest, null, signal)).arrayBuffer());
       if ((await sha256(bytes)) !== digest) throw wrong("store", "the bytes do not match the digest", "try again");
       return bytes;
     },
