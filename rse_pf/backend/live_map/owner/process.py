@@ -144,12 +144,13 @@ def main(arguments: list[str]) -> None:
     kind: MapKind = getattr(importlib.import_module(module), name)
     store = open_data_store(settings)
     address = advertised_address(settings.live.host)
-    listener = listen(settings.live.host, live_ports(settings.live))
     context, certificate = server_context(address, now_s=time.time())
     worker.sendall(encode_message(["ready"]))
     claim = receive(worker)
     if claim is None:
         return
+    # Not before: strangers would fill the backlog of a process that does not accept yet.
+    listener = listen(settings.live.host, live_ports(settings.live))
     process = _Process(
         worker,
         settings,

@@ -18,10 +18,12 @@ from typing import Any
 
 import pytest
 
+from benchmarks.hostile.connections import listening
 from rse_pf.backend.live_map.children import OwnerChild
 from rse_pf.backend.live_map.map_link import OwnerLinks
 from rse_pf.backend.live_map.owner.lease import decode_lease, lease_name, map_folder
 from rse_pf.backend.live_map.owner.log import LiveLog
+from rse_pf.backend.live_map.owner.process import OwnerOrder, OwnerProcess
 from rse_pf.backend.live_map.owner.state import MapState
 from rse_pf.backend.log import JsonLog
 from rse_pf.config import PlatformSettings
@@ -230,6 +232,25 @@ def test_one_tenant_fills_the_disk_and_is_told_so_while_the_other_ones_keyframes
 
     with small_disk(tmp_path / "disk", "24m") as disk:
         asyncio.run(test(disk))
+
+
+def test_a_process_listens_only_once_it_has_a_map(tmp_path: Path) -> None:
+    """Strangers would fill the backlog of one that does not accept, and nobody would close them."""
+
+    async def test() -> None:
+        settings = PlatformSettings.from_dict({"data": {"store": f"dir:{tmp_path}"}})
+        child = OwnerChild(OwnerProcess(settings, KIND))
+        try:
+            await child.wait_ready(PATIENT_S)
+            assert child.is_ready
+            assert not listening([child.pid])
+            order = OwnerOrder(tenant="default", map_name=MAP, server="a", known=None)
+            assert await asyncio.wait_for(child.claim(order), PATIENT_S)
+            assert listening([child.pid])
+        finally:
+            child.kill()
+
+    asyncio.run(test())
 
 
 def test_a_drained_server_gives_its_maps_to_the_next_one_at_once(tmp_path: Path) -> None:
