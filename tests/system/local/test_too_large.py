@@ -16,7 +16,7 @@ import pytest
 from rse_pf.config import PlatformSettings
 from rse_pf.local.control.platform import LocalPlatform
 
-pytestmark = [pytest.mark.system, pytest.mark.slow]
+pytestmark = [pytest.mark.system, pytest.mark.slow, pytest.mark.timeout(300)]
 
 MIB = 1 << 20
 SETTINGS = PlatformSettings().replace(local={"workers": 1})
@@ -54,6 +54,42 @@ def by_curl(address: tuple[str, int], size: int, token: str) -> tuple[int, str]:
     return int(status), json.loads(body)["code"]
 
 
+CPP_PROGRAM = """
+#include <cstdio>
+#include <rse_pf/data.hpp>
+int main(int, char** given) {
+    rse_pf::DataOptions options;
+    options.part_bytes = std::size_t{1} << 30;  // all in one request
+    rse_pf::DataClient data(std::string("http://") + given[1], given[2], options);
+    try {
+        data.upload(std::string(std::stoul(given[3]), 'x'));
+    } catch (const rse_pf::Error& error) {
+        std::printf("%s", error.code().c_str());
+    }
+}
+"""
+HEADERS = ("boost/beast/websocket.hpp", "nlohmann/json.hpp", "openssl/ssl.h")
+
+
+@pytest.fixture(scope="module")
+def cpp_program(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A program of the C++ client that stores so many bytes at once, and prints the code of its error."""
+    compiler = shutil.which("c++") or pytest.skip("no C++ compiler")
+    include = Path(__file__).resolve().parents[3] / "client_cpp" / "include"
+    for header in HEADERS:
+        is_there = subprocess.run(
+            [compiler, "-E", "-x", "c++", "-"], input=f"#include <{header}>", text=True, capture_output=True,
+            check=False,
+        )  # fmt: skip
+        if is_there.returncode != 0:
+            pytest.skip(f"no {header}: sh scripts/client_cpp.sh names the packages")
+    folder = tmp_path_factory.mktemp("cpp")
+    (folder / "store.cpp").write_text(CPP_PROGRAM)
+    words = [compiler, "-std=c++17", f"-I{include}", "store.cpp", "-o", "store", "-pthread"]
+    subprocess.run([*words, "-lssl", "-lcrypto"], cwd=folder, check=True, timeout=300)
+    return folder / "store"
+
+
 def data_port(folder: Path) -> int:
     (announced,) = folder.glob("data-[0-9]*.json")
     return int(json.loads(announced.read_text())["port"])
@@ -63,13 +99,33 @@ def test_the_answer_arrives_directly_and_through_the_balancer(tmp_path: Path) ->
     async def run() -> None:
         state = tmp_path / "a"
         async with LocalPlatform(SETTINGS, servers=1, port=0, state=state, data=True) as platform:
-            token = platform.issue_token("robot-1")
             balancer = urlsplit(platform.url)
             for address in ((balancer.hostname or "", balancer.port or 0), ("127.0.0.1", data_port(state))):
                 for send in (sent_first, by_curl):
                     for size in (5 * MIB, 60 * MIB):
-                        for _ in range(TIMES):
+                        for number in range(TIMES):
+                            # What is refused counts, so one robot would soon be told to wait instead.
+                            token = platform.issue_token(f"{send.__name__}-{size}-{number}".replace("_", "-"))
                             told = await asyncio.to_thread(send, address, size, token)
                             assert told == (413, "too-large"), (address, send, size)
+
+    asyncio.run(run())
+
+
+def test_the_cpp_client_has_the_answer_directly_and_through_the_balancer(
+    tmp_path: Path, cpp_program: Path
+) -> None:
+    async def run() -> None:
+        state = tmp_path / "a"
+        async with LocalPlatform(SETTINGS, servers=1, port=0, state=state, data=True) as platform:
+            token = platform.issue_token("robot-1")
+            for address in (urlsplit(platform.url).netloc, f"127.0.0.1:{data_port(state)}"):
+                for size in (5 * MIB, 60 * MIB):
+                    for _ in range(TIMES):
+                        done = await asyncio.to_thread(
+                            subprocess.run, [cpp_program, address, token, str(size)], capture_output=True,
+                            text=True, timeout=60, check=True,
+                        )  # fmt: skip
+                        assert done.stdout == "too-large", (address, size)
 
     asyncio.run(run())
