@@ -24,8 +24,8 @@ FILES = {
     "/web_scenarios.mjs": HERE / "web_scenarios.mjs",
 }
 CLAIMS = (
-    "golden", "pnp", "typed-error", "busy", "deadline", "newest", "stream", "renew", "expired", "revoked",
-    "updates", "progress", "data",
+    "golden", "pnp", "typed-error", "undecodable", "busy", "deadline", "newest", "stream", "renew", "expired",
+    "revoked", "updates", "progress", "data",
 )  # fmt: skip
 
 RUN = """
