@@ -1,15 +1,18 @@
 """Silent connections to every port of a platform, and what connections that were used leave behind.
 
     python -m benchmarks.hostile.connections silent [--count 5000] [--ports NAME ...]
+    python -m benchmarks.hostile.connections beside [--count 5000] [--pairs 5] [--ports NAME ...]
     python -m benchmarks.hostile.connections leave [--times 500]
 
 ``silent`` starts a platform with its page, a live map and a cluster of Dask, and opens connections that
 send nothing to one port after the other.  For each port it shows in how many seconds the server had closed
 all of them (bar: 10), how much memory the processes of the platform took meanwhile (bar: 64 MiB), and how
-long a new robot took to connect and to get an answer (bar: 1 s).  ``leave`` lets robots, rosbridge clients
-and readers of a live map connect, use what there is, and leave, and then browsers of the page; it shows
-descriptors, threads and memory of the worker, and of the page, before and after (bars: as before; 1 KiB a
-cycle).
+long a new robot took to connect and to get an answer (bar: 1 s).  ``beside`` compares, for each port, p99 of
+poses of four connected robots while the connections are opened, held and closed with that of as many seconds
+without them, in turns (bar: the median of the ratios is at most 1.2).  ``leave`` lets robots, rosbridge
+clients and readers of a live map connect, use what there is, and leave, and then browsers of the page; it
+shows descriptors, threads and memory of the worker, and of the page, before and after (bars: as before; 1 KiB
+a cycle).
 """
 
 from __future__ import annotations
@@ -23,6 +26,7 @@ import os
 import random
 import resource
 import socket
+import statistics
 import subprocess
 import sys
 import tempfile
@@ -39,11 +43,15 @@ from benchmarks.server.serving import machine
 from rse_pf.batch.cluster import LocalCluster, new_cluster_key
 from rse_pf.cli.local_platform.page import new_address
 from rse_pf.fleet_page.server import ANNOUNCEMENT
+from rse_pf.pnp.problems import make_problem
+from rse_pf.services.pnp import make_request
 
 _NAME = "silent-connections"
 _OWNER = "rse-pf live map"
 _LONGEST_S = 40.0
 _WARM_UP = 100
+_ROBOTS, _POSES_HZ = 4, 15.0
+_WINDOW_S, _REST_S = 6.0, 1.0
 MIB = 1 << 20
 
 
@@ -85,11 +93,17 @@ def rss_bytes(pids: list[int]) -> int:
     return total
 
 
-def open_at(port: int) -> int:
-    """Return how many connections the server's side of *port* has, those in its backlog included."""
+def open_at(port: int, peers: set[int]) -> int:
+    """Return how many connections from *peers* the server's side of *port* has, its backlog included.
+
+    Robots and the platform itself connect to the same port meanwhile.
+    """
     local = f":{port:04X}"
     rows = (line.split() for line in Path("/proc/net/tcp").read_text().splitlines()[1:])
-    return sum(row[1].endswith(local) and row[3] in ("01", "03") for row in rows)
+    return sum(
+        row[1].endswith(local) and row[3] in ("01", "03") and int(row[2].split(":")[1], 16) in peers
+        for row in rows
+    )
 
 
 def open_silent(port: int, count: int) -> list[socket.socket]:
@@ -112,24 +126,25 @@ async def robot_s(url: str, token: str, name: str) -> float:
 
 def attack(port: int, count: int, pids: list[int], url: str, token: str) -> dict[str, float]:
     """Open *count* silent connections to *port*; return what was seen."""
-    before, had = rss_bytes(pids), open_at(port)
+    before = rss_bytes(pids)
     began = time.monotonic()
     opened = open_silent(port, count)
+    peers = {silent_socket.getsockname()[1] for silent_socket in opened}
     robot = asyncio.run(asyncio.wait_for(robot_s(url, token, str(port)), 60))
     peak = rss_bytes(pids)
-    while (left := open_at(port) - had) > 0 and time.monotonic() - began < _LONGEST_S:
+    while (left := open_at(port, peers)) > 0 and time.monotonic() - began < _LONGEST_S:
         peak = max(peak, rss_bytes(pids))
         time.sleep(0.1)
     closed_s = time.monotonic() - began
     for each in opened:
         each.close()
     memory_mib = (peak - before) / MIB
-    return {"closed_s": closed_s, "left": max(0, left), "memory_mib": memory_mib, "robot_s": robot}
+    return {"closed_s": closed_s, "left": left, "memory_mib": memory_mib, "robot_s": robot}
 
 
 @contextlib.contextmanager
-def platform(folder: Path) -> Iterator[tuple[int, str, str]]:
-    """Yield pid, address and a token of a platform with a live map."""
+def platform(folder: Path) -> Iterator[tuple[int, str, Callable[[str], str]]]:
+    """Yield pid and address of a platform with a live map, and what issues the token of a robot."""
     environment = {**os.environ, "XDG_STATE_HOME": str(folder)}
     command = [sys.executable, "-m", "rse_pf.cli.main"]
     with (folder / "log").open("wb") as log:
@@ -144,11 +159,15 @@ def platform(folder: Path) -> Iterator[tuple[int, str, str]]:
                 raise SystemExit(said)
             time.sleep(0.1)
         url = next(line.split()[-1] for line in said.splitlines() if "robots connect to" in line)
-        issued = subprocess.run(
-            [*command, "token", "issue", "robot-1", "--name", _NAME], env=environment, capture_output=True,
-            text=True, check=True,
-        )  # fmt: skip
-        yield process.pid, url, issued.stdout.split()[-1]
+
+        def issue(robot: str) -> str:
+            issued = subprocess.run(
+                [*command, "token", "issue", robot, "--name", _NAME], env=environment, capture_output=True,
+                text=True, check=True,
+            )  # fmt: skip
+            return issued.stdout.split()[-1]
+
+        yield process.pid, url, issue
     finally:
         subprocess.run(
             [*command, "local", "stop", "--name", _NAME], env=environment, capture_output=True, check=False
@@ -156,21 +175,27 @@ def platform(folder: Path) -> Iterator[tuple[int, str, str]]:
         process.wait(60)
 
 
-def silent(count: int, only: list[str]) -> list[dict[str, Any]]:
-    """Attack every port of a platform, one after the other."""
+Attack = Callable[[int, list[int]], dict[str, Any]]
+"""Takes a port and the processes of the platform; returns what was seen."""
+
+
+def at_all_ports(
+    only: list[str], prepare: Callable[[str, Callable[[str], str]], Attack]
+) -> list[dict[str, Any]]:
+    """Attack every port of a platform, one after the other; *prepare* takes its url and its issuer."""
     limit = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
     resource.setrlimit(resource.RLIMIT_NOFILE, (limit, limit))
     rows = []
     with (
         tempfile.TemporaryDirectory() as name,
-        platform(Path(name)) as (pid, url, token),
+        platform(Path(name)) as (pid, url, issue),
         contextlib.ExitStack() as stack,
     ):
         cluster = LocalCluster(new_cluster_key(), 1)
         stack.callback(cluster.stop)
         cluster.start()
         watcher = subprocess.Popen(
-            [sys.executable, "-c", _WATCH, url, token], stdout=subprocess.PIPE, text=True
+            [sys.executable, "-c", _WATCH, url, issue("watcher")], stdout=subprocess.PIPE, text=True
         )
         stack.callback(watcher.wait)
         stack.callback(watcher.kill)
@@ -185,12 +210,13 @@ def silent(count: int, only: list[str]) -> list[dict[str, Any]]:
             time.sleep(0.2)
         if late:
             print(f"not listening: {', '.join(sorted(late))}", flush=True)
+        attack = prepare(url, issue)
         # A map that is only watched gives its owner up, so that owner comes first.
         for port, owner in sorted(listening(pids).items(), key=lambda row: (row[1] != _OWNER, row[0])):
             if port not in listening(pids):
                 print(f"listens no longer: {port} {owner}", flush=True)
             elif not only or owner in only:
-                row = {"port": port, "owner": owner, **attack(port, count, pids, url, token)}
+                row = {"port": port, "owner": owner, **attack(port, pids)}
                 print(
                     json.dumps({k: round(v, 2) if isinstance(v, float) else v for k, v in row.items()}),
                     flush=True,
@@ -199,12 +225,107 @@ def silent(count: int, only: list[str]) -> list[dict[str, Any]]:
     return rows
 
 
+def silent(count: int, only: list[str]) -> list[dict[str, Any]]:
+    """Attack every port of a platform, one after the other."""
+
+    def prepare(url: str, issue: Callable[[str], str]) -> Attack:
+        token = issue("robot-1")
+        return lambda port, pids: attack(port, count, pids, url, token)
+
+    return at_all_ports(only, prepare)
+
+
+def beside(count: int, pairs: int, only: list[str]) -> list[dict[str, Any]]:
+    """Compare the poses of connected robots with and without silent connections, at every port."""
+
+    def prepare(url: str, issue: Callable[[str], str]) -> Attack:
+        tokens = [issue(f"robot-{number}") for number in range(_ROBOTS)]
+        return lambda port, _: asyncio.run(compared(url, tokens, port, count, pairs))
+
+    return at_all_ports(only, prepare)
+
+
+async def compared(url: str, tokens: list[str], port: int, count: int, pairs: int) -> dict[str, Any]:
+    """Return p99 of poses (ms) with and without *count* silent connections, and the median of the ratios."""
+    problem = make_problem(seed=1, n=200, outlier_ratio=0.3)
+    payload = make_request(problem.points_world, problem.pixels, problem.camera)
+    took_ms: list[float] = []
+
+    async def drive(robot: client_sdk.Robot) -> None:
+        while True:
+            began = time.monotonic()
+            await robot.call("pnp", payload, deadline_s=20.0)
+            took_ms.append((time.monotonic() - began) * 1e3)
+            await asyncio.sleep(max(0.0, 1 / _POSES_HZ - (time.monotonic() - began)))
+
+    async def window(is_attacked: bool) -> float:
+        """Return p99 of the poses of a window; the connections are opened in a process of their own."""
+        await asyncio.sleep(_REST_S)
+        took_ms.clear()
+        opener = None
+        if is_attacked:
+            opener = await asyncio.create_subprocess_exec(
+                "nice", "-n", "19", sys.executable, "-c", _OPEN, str(port), str(count),
+                stdout=subprocess.PIPE,
+            )  # fmt: skip
+            assert opener.stdout is not None
+            await opener.stdout.readline()
+            took_ms.clear()  # the start of the process is not the attack
+        await asyncio.sleep(_WINDOW_S)
+        for task in driving:
+            if task.done():
+                task.result()
+        if opener is not None:
+            opener.kill()
+            await opener.wait()
+        return sorted(took_ms)[int(0.99 * (len(took_ms) - 1))]
+
+    async with contextlib.AsyncExitStack() as ends:
+        fleet = [
+            await ends.enter_async_context(client_sdk.connect(url, token=token, random=random.Random(token)))
+            for token in tokens
+        ]
+        driving = [asyncio.create_task(drive(robot)) for robot in fleet]
+        await window(False)  # warms up
+        without_ms, with_ms = [], []
+        for number in range(pairs):
+            for is_attacked in (number % 2 == 0, number % 2 == 1):
+                (with_ms if is_attacked else without_ms).append(await window(is_attacked))
+        for task in driving:
+            task.cancel()
+    ratios = [beside_ms / alone_ms for beside_ms, alone_ms in zip(with_ms, without_ms, strict=True)]
+    return {
+        "without_p99_ms": [round(p99_ms, 2) for p99_ms in without_ms],
+        "with_p99_ms": [round(p99_ms, 2) for p99_ms in with_ms],
+        "ratio": statistics.median(ratios), "load": os.getloadavg()[0],
+    }  # fmt: skip
+
+
+_OPEN = """
+import resource, socket, sys, time
+limit = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
+resource.setrlimit(resource.RLIMIT_NOFILE, (limit, limit))
+port, count = map(int, sys.argv[1:])
+print("begins", flush=True)
+opened = [socket.socket() for _ in range(count)]
+for one in opened:
+    one.setblocking(False)
+    one.connect_ex(("127.0.0.1", port))
+time.sleep(600)
+"""
+
+
 _WATCH = """
-import asyncio, random, sys, client_sdk
+import asyncio, itertools, random, sys, client_sdk
+from benchmarks.hostile.one_tenant import keyframe
 async def main():
     async with client_sdk.connect(sys.argv[1], token=sys.argv[2], random=random.Random(1)) as robot:
-        print(await robot.subscribe("live/m").next(), flush=True)
-        await asyncio.Event().wait()
+        updates = robot.subscribe("live/m")
+        for number in itertools.count():  # a map that gets nothing has no owner
+            await robot.call("live-keyframe", keyframe("m", number), deadline_s=20.0)
+            if number == 0:
+                print(await updates.next(), flush=True)
+            await asyncio.sleep(2.0)
 asyncio.run(main())
 """
 
@@ -317,8 +438,9 @@ def main() -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("part", choices=("silent", "leave"))
+    parser.add_argument("part", choices=("silent", "beside", "leave"))
     parser.add_argument("--count", type=int, default=5000)
+    parser.add_argument("--pairs", type=int, default=5)
     parser.add_argument("--times", type=int, default=500)
     parser.add_argument("--ports", nargs="*", default=[], help="names of processes")
     args = parser.parse_args()
@@ -330,6 +452,8 @@ def main() -> int:
             same = all(found["after"][what] <= found["before"][what] for what in ("descriptors", "threads"))
             kept.append(same and found["kib_per_cycle"] <= 1.0)
         return 0 if all(kept) else 1
+    if args.part == "beside":
+        return 0 if all(row["ratio"] <= 1.2 for row in beside(args.count, args.pairs, args.ports)) else 1
     rows = silent(args.count, args.ports)
     kept = [
         r["closed_s"] <= 10 and not r["left"] and r["memory_mib"] <= 64 and r["robot_s"] <= 1 for r in rows
