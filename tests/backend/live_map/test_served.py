@@ -7,11 +7,13 @@ import random
 import time
 from collections.abc import Awaitable, Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pytest
 from guarded_server import KEY, GuardedServer
+from websockets.asyncio.client import ClientConnection, connect
+from websockets.exceptions import ConnectionClosed
 
 import client_sdk
 from rse_pf.auth.roster import scopes_allow
@@ -21,6 +23,8 @@ from rse_pf.errors import Forbidden
 from rse_pf.geometry import Camera
 from rse_pf.services.builtin import builtin_services
 from rse_pf.slam.keyframe import Keyframe, encode_keyframe, make_features
+from rse_pf.wire import SUBPROTOCOLS, make_codec, messages
+from rse_pf.wire.server_session import CLOSE_PROTOCOL, UPDATES
 from tests.slam.v1_features import features_v1
 
 pytestmark = [pytest.mark.slow, pytest.mark.system]
@@ -62,7 +66,8 @@ async def value(updates: client_sdk.Updates, key: str, fits: Callable[[Any], boo
 
 def run(folder: Path, test: Callable[[GuardedServer], Awaitable[None]]) -> None:
     (folder / "store").mkdir()
-    with GuardedServer(folder, workers=2, data={"store": f"dir:{folder / 'store'}"}) as server:
+    data = {"store": f"dir:{folder / 'store'}"}
+    with GuardedServer(folder, workers=2, data=data, session={"max_commands_per_s": 0.0}) as server:
         asyncio.run(asyncio.wait_for(test(server), 60.0))  # type: ignore[arg-type]
 
 
@@ -132,5 +137,142 @@ def test_a_token_to_watch_a_map_allows_to_subscribe_to_it_and_nothing_else(tmp_p
             if route.scope and scopes_allow(("maps:watch/m",), route.scope)
         ] == []
         assert not any(scopes_allow(("maps:watch",), right) for right in ("topics:read", "topics:write"))
+
+    run(tmp_path, test)
+
+
+async def ask_raw(
+    socket: ClientConnection, message: messages.Message, until: type[messages.Message] = messages.Pong
+) -> list[messages.FromServer]:
+    """Send one message and a ping; return the answers up to the ping's, and on to the first of *until*."""
+    codec, ping = make_codec("json"), messages.Ping(sent_s=time.monotonic())
+    for sent in (message, ping):
+        await socket.send(codec.encode(sent).decode())
+    answers: list[messages.FromServer] = []
+    is_answered = is_pong_heard = False
+    while not (is_answered and is_pong_heard):
+        answer = codec.decode_from_server((await asyncio.wait_for(socket.recv(), 20.0)).encode())
+        is_answered |= type(answer) is until
+        if isinstance(answer, messages.Pong) and answer.sent_s == ping.sent_s:
+            is_pong_heard = True
+        else:
+            answers.append(answer)
+    return answers
+
+
+async def sends_hello(socket: ClientConnection, server: GuardedServer) -> None:
+    with pytest.raises(ConnectionClosed):
+        await ask_raw(socket, messages.Hello(capabilities=(UPDATES,)))
+    assert (socket.close_code, socket.close_reason) == (CLOSE_PROTOCOL, "hello came twice")
+
+
+async def sends_commands(socket: ClientConnection, server: GuardedServer) -> None:
+    services = {*LIVE_SERVICES, *(service.name for service in builtin_services(server.settings)), "no-such"}
+    for identity, service in enumerate(sorted(services - {"live-list"})):
+        payload = keyframe(0) | {"robot": "r", "from": "m@abcdef"}
+        command = messages.Command(id=identity, service=service, payload=payload)
+        [failure] = await ask_raw(socket, command, messages.Failure)
+        assert (failure.id, failure.code) == (identity, "forbidden"), service
+    [listed] = await ask_raw(socket, messages.Command(id=99, service="live-list"), messages.Result)
+    assert listed.reply == {"maps": []}
+
+
+async def sends_ping(socket: ClientConnection, server: GuardedServer) -> None:
+    [pong] = await ask_raw(socket, messages.Ping(sent_s=7.0))
+    assert (type(pong), pong.sent_s) == (messages.Pong, 7.0)
+
+
+async def sends_cancel(socket: ClientConnection, server: GuardedServer) -> None:
+    assert await ask_raw(socket, messages.Cancel(id=0)) == []
+
+
+async def sends_renewals(socket: ClientConnection, server: GuardedServer) -> None:
+    stranger = server.token("stranger", scopes=("maps:live/m",))
+    [failure] = await ask_raw(socket, messages.Renew(token=stranger), messages.Failure)
+    assert failure.code == "unauthorized"
+    token = server.token("v", scopes=("maps:watch/m",))
+    answer: messages.FromServer = failure
+    while not isinstance(answer, messages.Renewed):  # at most one is judged in `RENEWAL_PAUSE_S`
+        [answer] = await ask_raw(socket, messages.Renew(token=token))
+        assert isinstance(answer, messages.Renewed) or answer.code == "busy"
+    command = messages.Command(id=100, service="live-show", payload={"map": "m"})
+    [failure] = await ask_raw(socket, command, messages.Failure)
+    assert failure.code == "forbidden", "a fresh token of the same right gives no more"
+
+
+async def subscribes(socket: ClientConnection, server: GuardedServer) -> None:
+    no_maps = ("jobs/m", "live/", "live/m/pose", "m")
+    codes = {"live/other": "forbidden"} | dict.fromkeys(no_maps, "bad-request")
+    for identity, (topic, code) in enumerate(codes.items(), 200):
+        [failure] = await ask_raw(socket, messages.Subscribe(id=identity, topic=topic), messages.Failure)
+        assert (failure.id, failure.code) == (identity, code), topic
+    [update] = await ask_raw(socket, messages.Subscribe(id=300, topic="live/m"), messages.Update)
+    assert (update.id, update.topic, update.key) == (300, "live/m", "map")
+    while update.payload["state"] != "idle":  # nobody who may start an owner needs one
+        assert update.payload["owner"] == ""
+        update = make_codec("json").decode_from_server((await asyncio.wait_for(socket.recv(), 20.0)).encode())
+
+
+async def unsubscribes(socket: ClientConnection, server: GuardedServer) -> None:
+    await ask_raw(socket, messages.Subscribe(id=301, topic="live/m"), messages.Update)
+    for identity in (300, 301, 302):
+        assert await ask_raw(socket, messages.Unsubscribe(id=identity)) == []
+
+
+def is_refused(message: messages.FromServer) -> Callable[[ClientConnection, GuardedServer], Awaitable[None]]:
+    async def send(socket: ClientConnection, server: GuardedServer) -> None:
+        [failure] = await ask_raw(socket, message, messages.Failure)
+        assert failure.code == "bad-message"
+
+    return send
+
+
+LIMITS = messages.Limits(max_message_bytes=1 << 20, max_in_flight=9)
+SENT_BY_WATCHER: dict[type, Callable[[ClientConnection, GuardedServer], Awaitable[None]]] = {
+    messages.Command: sends_commands,
+    messages.Ping: sends_ping,
+    messages.Cancel: sends_cancel,
+    messages.Renew: sends_renewals,
+    messages.Subscribe: subscribes,
+    messages.Unsubscribe: unsubscribes,
+    **{
+        type(message): is_refused(message)
+        for message in (
+            messages.Welcome(server="s", session="s", robot="r", protocol=1, limits=LIMITS, clock_s=0.0),
+            messages.Result(id=1, reply={}), messages.Failure(code="busy", message="m"),
+            messages.Move(reason="drain", within_ms=1.0), messages.Progress(id=1, done=0.5),
+            messages.Pong(sent_s=0.0, received_s=0.0, answered_s=0.0), messages.Renewed(token_s=1e9),
+            messages.Update(id=300, topic="live/m", seq=1, key="map", payload={"kind": "map"}),
+        )
+    },
+    messages.Hello: sends_hello,
+}  # fmt: skip
+"""What a robot that may only watch sends of each type, and what becomes of it; the last one ends the
+connection."""
+
+
+def test_a_token_to_watch_a_map_gets_no_message_of_any_type_past_its_right(tmp_path: Path) -> None:
+    assert set(SENT_BY_WATCHER) == set(get_args(messages.Message)), "each type of message has its case"
+
+    async def test(server: GuardedServer) -> None:
+        lease = tmp_path / "store/live/default/m/lease"
+        async with robot(server, "r") as driver:
+            await driver.call("live-keyframe", keyframe(0), deadline_s=20.0)
+        server.restart()  # the map has no owner now, and whoever may start one gets one
+        before, token = lease.read_bytes(), server.token("v", scopes=("maps:watch/m",))
+        async with connect(
+            server.url, subprotocols=[SUBPROTOCOLS["json"]], compression=None, ping_interval=None,
+            additional_headers={"Authorization": f"Bearer {token}"},
+        ) as socket:  # fmt: skip
+            [welcome] = await ask_raw(socket, messages.Hello(capabilities=(UPDATES,)), messages.Welcome)
+            assert welcome.robot == "v"
+            for kind, send in SENT_BY_WATCHER.items():
+                await send(socket, server)
+                assert lease.read_bytes() == before, f"{kind.__name__} starts an owner"
+        assert [path.parent.name for path in (tmp_path / "store/live").glob("*/*/lease")] == ["m"]
+
+        async with robot(server, "r") as driver:
+            await value(driver.subscribe("live/m"), "map", lambda payload: payload["owner"] != "")
+        assert lease.read_bytes() != before, "an owner that starts is seen"
 
     run(tmp_path, test)
