@@ -107,6 +107,11 @@ class TenantAccount:
         self._drawn_bytes, self._drawn_s = 0, _NEVER
         self._share_bytes, self._share_s = 0.0, _NEVER
 
+    @property
+    def quota_bytes(self) -> int:
+        """What the tenant may store."""
+        return self._settings.tenant_quota_bytes
+
     def try_charge(self, size: int) -> bool:
         """Charge an object of *size* bytes unless that needs the store; return whether it was charged."""
         charge = charge_of(size)
@@ -201,7 +206,8 @@ class TenantAccount:
         if used + charge + margin > most:
             return QuotaExceeded(
                 f"the tenant {self._tenant!r} stores {used} bytes; {charge} more are above its quota {most}",
-                hint="delete objects, stop live maps, or raise data.tenant_quota_bytes",
+                hint="delete objects, remove old versions of maps (rse-pf map prune), or raise "
+                "data.tenant_quota_bytes",
             )
         free = self._free_bytes()
         if free >= charge:
@@ -367,6 +373,13 @@ class Accounts:
         account = self._account(robot)
         with account.lock:
             account.counted_s = _NEVER
+
+    def forget_all(self, tenant: str) -> None:
+        """Count the robots of a tenant anew when they write next."""
+        with self._lock:
+            robots = [robot for robot in self._robots if robot.tenant == tenant]
+        for robot in robots:
+            self.forget(robot)
 
     def tenant(self, tenant: str) -> TenantAccount:
         """Return the account of a tenant."""

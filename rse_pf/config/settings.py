@@ -206,6 +206,7 @@ class LiveSettings:
     lease_s: float = setting(1.5, unit="s", doc="another server takes a live map over when its lease was not renewed for this long", low=0.1)
     publish_s: float = setting(600.0, unit="s", doc="time between two versions that a live map publishes while it changes; 0: only when the last robot leaves, or on request", low=0)
     publish_pause_s: float = setting(10.0, unit="s", doc="shortest time between two versions of a live map; a version that is asked for earlier comes then", source="a robot that left again and again wrote 959 MB in 45 s", low=0)
+    keep_versions: int = setting(20, unit="versions", doc="newest versions of a live map that stay, of those that nobody asked for; older ones are removed, and those above a quarter of the tenant's quota; 0 keeps all", low=0)
     idle_s: float = setting(60.0, unit="s", doc="the owner of a map that nobody uses for this long publishes it and ends", low=1)
     keep_log: bool = setting(False, doc="keep all entries of a live map's log, which experiments replay; else those before the older snapshot are deleted")
 

@@ -29,6 +29,7 @@ from rse_pf.data_server.routes import (
     MoveHead,
     ObjectPage,
     PresignedPut,
+    Pruned,
     ServiceHealth,
     StoredObject,
     Upload,
@@ -41,6 +42,7 @@ from rse_pf.identity import RobotId
 from rse_pf.maps.charges import charge_name
 from rse_pf.maps.describe import MapSummary
 from rse_pf.maps.registry import MapContent, MapOrigin, MapRecord, MapRegistry
+from rse_pf.maps.removal import freed_bytes, superseded
 from rse_pf.object_store import ObjectStore, PresigningStore, read_range
 
 __all__ = ["Handler", "Handlers"]
@@ -59,6 +61,7 @@ _BEGINNING = re.compile(r"[0-9a-f]{0,64}")
 _MAP_THREADS = 1
 """They wait for the process that reads maps, so that slow maps delay only other maps."""
 _PROBE = "ready/probe"
+_COUNT = re.compile(r"[0-9]{1,6}")
 
 
 class Handlers:
@@ -233,6 +236,25 @@ class Handlers:
             except BaseException:
                 self._store.delete(charge)
                 raise
+
+    async def prune_versions(self, request: HttpRequest, claims: Claims, path: dict[str, str]) -> HttpReply:
+        """Remove old versions, above every quota, too."""
+        text = request.query.get("keep", "")
+        keep = int(text) if _COUNT.fullmatch(text) else 0
+        if keep < 1:
+            raise BadRequest(f"keep={text[:40]!r} is no number above 0", hint="say how many versions stay")
+
+        def work() -> list[MapRecord]:
+            maps = self._maps(claims)
+            removed = maps.remove(path["name"], functools.partial(superseded, keep=keep))
+            tenant, accounts = claims.robot.tenant, self.objects.accounts
+            accounts.forget_all(tenant)
+            for record in removed:
+                accounts.tenant(tenant).release(record.size)
+            return removed
+
+        removed = await self.threads.run(claims.robot, work)
+        return json_reply(200, Pruned(removed=len(removed), freed_bytes=freed_bytes(removed)))
 
     async def show_version(self, request: HttpRequest, claims: Claims, path: dict[str, str]) -> HttpReply:
         """Show a version."""

@@ -116,6 +116,13 @@ class MoveHead(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     expected: str
 
 
+class Pruned(msgspec.Struct, frozen=True, kw_only=True):
+    """How many versions were removed, and how many bytes less the tenant is charged with."""
+
+    removed: int
+    freed_bytes: int
+
+
 class ServiceHealth(msgspec.Struct, frozen=True, kw_only=True):
     """The state of the service."""
 
@@ -168,6 +175,10 @@ _DIRECT = Field(
     doc="1: the answer may be 307 with a presigned URL in Location", schema=_WHOLE_NUMBER,
 )  # fmt: skip
 _AFTER = Field(name="after", place="query", doc="only objects with a greater digest")
+_KEEP = Field(
+    name="keep", place="query", doc="how many of the newest versions stay, besides the head", required=True,
+    schema={"type": "integer", "minimum": 1},
+)  # fmt: skip
 _LIMIT = Field(
     name="limit",
     place="query",
@@ -253,6 +264,11 @@ ROUTES: tuple[Route, ...] = (
         cost=_COMMIT_COST,
         doc="Make an uploaded object the next version and the head of a map",
         replies={201: MapVersionInfo, **_BAD, **_NOT_FOUND, **_CONFLICT, **_STORING},
+    ),
+    Route(
+        operation="prune_versions", method="DELETE", path=_MAP, scope="maps:write", cost=_COMMIT_COST,
+        fields=(_KEEP,), doc="Remove all but the newest versions of a map",
+        replies={200: Pruned, **_BAD, **_NOT_FOUND, 503: HttpFailure},
     ),
     Route(
         operation="show_version", method="GET", path=_VERSION, scope="maps:read",

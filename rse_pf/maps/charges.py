@@ -6,12 +6,12 @@ the store, in bytes.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 
 from rse_pf.identity import RobotId
 from rse_pf.object_store import ObjectStore, Usage, charge_of
 
-__all__ = ["charge_name", "charged_to"]
+__all__ = ["charge_name", "charged_to", "remove_charges"]
 
 
 def charge_name(robot: RobotId, map_name: str, version: str, size: int) -> str:
@@ -33,3 +33,12 @@ def charged_to(store: ObjectStore, robot: RobotId, check: Callable[[], None] = l
         objects += 1
         charged += charge_of(int(info.name.rpartition(".")[2]))
     return Usage(objects, charged)
+
+
+def remove_charges(store: ObjectStore, tenant: str, map_name: str, versions: Collection[str]) -> None:
+    """Charge no robot any longer with *versions* of a map, by their ids; *tenant* is the folder."""
+    for robot in store.folders(f"charges/{tenant}/"):
+        prefix = f"charges/{tenant}/{robot}/{map_name}/"
+        for info in store.list(prefix):
+            if info.name.removeprefix(prefix).partition(".")[0] in versions:
+                store.delete(info.name)

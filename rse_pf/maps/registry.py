@@ -1,8 +1,9 @@
 """The map registry: versions that never change, a head that moves by compare-and-swap.
 
 A commit writes the map, then its record, then the head, each durable before the next; a crash in between
-leaves the old head and, at most, an object without a reference.  Every version that a head or a parent refers
-to is complete, and only one of two robots moves a head.
+leaves the old head and, at most, an object without a reference.  Every version that a head refers to is
+complete, and only one of two robots moves a head.  A version that was removed is gone as a whole; its id may
+still be the parent of another.
 
 Layout: ``maps/TENANT/NAME/blobs/DIGEST``, ``.../versions/ID`` (ID is the sha256 of the record), ``.../head``.
 """
@@ -12,15 +13,19 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import re
-from collections.abc import Callable, Iterator
+import time
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 import msgspec
 
-from rse_pf.errors import BadRequest, Conflict, LimitExceeded, NotFound, StoreError
+from rse_pf.errors import BadRequest, Busy, Conflict, LimitExceeded, NotFound, StoreError
+from rse_pf.maps.charges import remove_charges
 from rse_pf.maps.describe import MapSummary, describe_map
+from rse_pf.maps.record import MapRecord
+from rse_pf.maps.removal import HELD, MOST_S, REMOVING, Marks
 from rse_pf.object_store import (
     ObjectStore,
     digest_of,
@@ -41,29 +46,10 @@ _MIN_ID = 6
 _MAX_MAPS, _MAX_VERSIONS = 10_000, 10_000
 """Of one tenant, and of one map: all of them are read when somebody asks for a list."""
 _PIECE_BYTES = 1 << 20
+_REMOVED_AT_ONCE = 50
+"""So many are marked, and then removed, within `MOST_S` also in a slow store."""
 # A keyframe that moved less has not moved: messages are rounded to more than this.
 _MOVED_M, _MOVED_DEG = 1e-3, 0.05
-
-
-class MapRecord(msgspec.Struct, frozen=True, kw_only=True):
-    """What is stored about a version beside the map; the sha256 of the record is the version's id."""
-
-    digest: str
-    size: int
-    parent: str | None
-    number: int
-    author: str
-    created_s: float
-    note: str
-    keyframes: int
-    edges: int
-    points: int
-    robots: tuple[str, ...]
-
-    @property
-    def id(self) -> str:
-        """The id of this version."""
-        return digest_of(msgspec.json.encode(self))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -109,6 +95,7 @@ class MapRegistry:
         max_bytes: int = 1 << 30,
         on_change: Callable[[str, str, MapRecord], None] = lambda action, name, record: None,
         check: Callable[[], None] = lambda: None,
+        wall_clock: Callable[[], float] = time.time,
     ) -> None:
         """Make a registry.
 
@@ -116,12 +103,14 @@ class MapRegistry:
             store: Where the maps lie.
             tenant: Whose maps.
             max_bytes: Size of a map when it is decoded.
-            on_change: Gets ``map.commit`` or ``map.head``, map and version.
+            on_change: Gets ``map.commit``, ``map.head`` or ``map.remove``, map and version.
             check: Called between two reads of long work; ends the work by the error that it raises.
+            wall_clock: Unix seconds.
         """
-        self._store = store
+        self._store, self._wall_clock = store, wall_clock
         self._on_change = on_change
-        self._prefix = f"maps/{name_segment(tenant)}/"
+        self._tenant = name_segment(tenant)
+        self._prefix = f"maps/{self._tenant}/"
         self._max_bytes = max_bytes
         self._check = check
 
@@ -225,9 +214,9 @@ class MapRegistry:
     ) -> MapRecord:
         digest, parent = content.digest, origin.parent
         base = self._base(name)
-        before = self.record(name, parent) if parent is not None else None
         if self._head(name) != parent:
             raise _moved(name)
+        before = self.record(name, parent) if parent is not None else None
         self._check_counts(base, is_new=before is None)
         record = MapRecord(
             digest=digest, size=content.size, parent=None if before is None else before.id,
@@ -235,12 +224,20 @@ class MapRegistry:
             author=origin.author, created_s=origin.created_s, note=origin.note,
             keyframes=summary.keyframes, edges=summary.edges, points=summary.points, robots=summary.robots,
         )  # fmt: skip
-        blob = f"{base}blobs/{digest}"
+        blob, marks = f"{base}blobs/{digest}", self._marks(name)
+        marks.check(digest)
         is_new = not self._holds(blob)
         with charged(record, content.size if is_new else 0):
             if is_new:
                 write(blob)
             self._store.put(f"{base}versions/{record.id}", msgspec.json.encode(record))
+            try:
+                marks.check(digest)
+            except Busy:
+                self._store.delete(f"{base}versions/{record.id}")
+                raise
+            if not self._holds(blob):  # a removal that did not see the record has ended: none removes it now
+                write(blob)
             self._swap(name, parent, record.id)
         self._on_change("map.commit", name, record)
         return record
@@ -250,7 +247,8 @@ class MapRegistry:
         versions = usage_of(self._store, f"{base}versions/").objects
         if versions >= _MAX_VERSIONS:
             raise LimitExceeded(
-                f"the map has {versions} versions, the limit is {_MAX_VERSIONS}", hint="begin another map"
+                f"the map has {versions} versions, the limit is {_MAX_VERSIONS}",
+                hint="remove old ones: rse-pf map prune",
             )
         maps = sum(1 for _ in self._store.folders(self._prefix)) if is_new else 0
         if maps >= _MAX_MAPS:
@@ -266,11 +264,16 @@ class MapRegistry:
         return True
 
     def head(self, name: str) -> MapRecord:
-        """Return the record of the newest version; raises NotFound."""
+        """Return the record of the head; raises NotFound."""
         head = self._head(name)
-        if head is None:
-            raise NotFound(f"there is no map {name!r}", hint="see rse-pf map list")
-        return self.record(name, head)
+        while head is not None:
+            try:
+                return self.record(name, head)
+            except NotFound:
+                before, head = head, self._head(name)
+                if head == before:
+                    raise  # else it was removed when another version was the head
+        raise NotFound(f"there is no map {name!r}", hint="see rse-pf map list")
 
     def record(self, name: str, version: str) -> MapRecord:
         """Return a version's record by its id or an unambiguous beginning of it; ``head`` is the newest."""
@@ -290,7 +293,8 @@ class MapRegistry:
         found = []
         for info in self._store.list(prefix):
             self._check()
-            found.append(self.record(name, info.name.removeprefix(prefix)))
+            with contextlib.suppress(NotFound):  # it was removed meanwhile
+                found.append(self.record(name, info.name.removeprefix(prefix)))
         if not found:
             raise NotFound(f"there is no map {name!r}", hint="see rse-pf map list")
         return sorted(found, key=lambda record: (record.number, record.created_s, record.id))
@@ -319,11 +323,104 @@ class MapRegistry:
         Raises:
             NotFound: There is no such version.
             Conflict: The head is not *expected*.
+            Busy: The version is being removed.
         """
-        record = self.record(name, version)
-        self._swap(name, self.record(name, expected).id, record.id)
+        record, before, marks = self.record(name, version), self.record(name, expected), self._marks(name)
+        mark = marks.put(HELD, record.digest)
+        try:
+            marks.check(record.digest)
+            self.record(name, record.id)  # else a removal that did not see the mark has ended
+            self._swap(name, before.id, record.id)
+        finally:
+            marks.clear(mark)
         self._on_change("map.head", name, record)
         return record
+
+    def remove(
+        self, name: str, choose: Callable[[Sequence[MapRecord], str], Sequence[MapRecord]]
+    ) -> list[MapRecord]:
+        """Remove versions and return them; also finish what a removal that crashed has begun.
+
+        What is the head, or shares its bytes with a version that stays, is not removed, whatever is chosen.
+
+        Args:
+            name: Of the map.
+            choose: Returns which of all versions to remove, given them and the id of the head.
+
+        Raises:
+            NotFound: There is no such map.
+            Busy, StoreError: What is not removed yet is removed by the next call.
+        """
+        head, records = self.head(name).id, self.versions(name)
+        digests = {record.id: record.digest for record in records}
+        marks = self._marks(name)
+        abandoned = marks.abandoned()
+        by_digest: dict[str, list[MapRecord]] = {
+            mark.digest: [] for mark in abandoned if mark.kind == REMOVING
+        }
+        for record in choose(records, head):
+            by_digest.setdefault(record.digest, []).append(record)
+        removed: list[MapRecord] = []
+        waiting = list(by_digest)
+        for first in range(0, len(waiting), _REMOVED_AT_ONCE):
+            batch = {digest: by_digest[digest] for digest in waiting[first : first + _REMOVED_AT_ONCE]}
+            for record in self._remove_batch(name, batch, digests):
+                removed.append(record)
+                self._on_change("map.remove", name, record)
+        for mark in abandoned:
+            marks.clear(mark.name)
+        return removed
+
+    def _remove_batch(
+        self, name: str, batch: Mapping[str, Sequence[MapRecord]], digests: dict[str, str]
+    ) -> Iterator[MapRecord]:
+        """Remove the versions of *batch*, by their digests, and their bytes, and yield them.
+
+        Args:
+            name: Of the map.
+            batch: All versions to remove that have these bytes; none where only the bytes are left.
+            digests: Of versions by their ids; those that are read are added.
+        """
+        base, marks = self._base(name), self._marks(name)
+        began_s = self._wall_clock()
+        set_marks: dict[str, str] = {}
+        try:
+            for digest in batch:
+                set_marks[digest] = marks.put(REMOVING, digest)
+            chosen = {record.id for records in batch.values() for record in records}
+            held = marks.marked(HELD)
+            used = held | self._used_digests(name, digests, chosen)  # the head is read after the marks
+            for digest, records in batch.items():
+                if digest in used:
+                    continue
+                self._check()
+                if not 0.0 <= self._wall_clock() - began_s < MOST_S:
+                    raise Busy("the store is too slow to remove versions now", hint="remove the rest later")
+                mark = set_marks.pop(digest)  # an error leaves it, so that the next call goes on
+                remove_charges(self._store, self._tenant, name, {record.id for record in records})
+                for record in records:
+                    self._store.delete(f"{base}versions/{record.id}")
+                self._store.delete(f"{base}blobs/{digest}")
+                marks.clear(mark)
+                yield from records
+        finally:
+            for mark in set_marks.values():
+                marks.clear(mark)
+
+    def _used_digests(self, name: str, digests: dict[str, str], without: Collection[str]) -> set[str]:
+        """Return the digests of the head and of all versions but those *without*."""
+        prefix = f"{self._base(name)}versions/"
+        ids = {info.name.removeprefix(prefix) for info in self._store.list(prefix)} - set(without)
+        head = self._head(name)
+        for version in ids | ({head} if head is not None else set()):
+            self._check()
+            if version not in digests:
+                with contextlib.suppress(NotFound):  # another process has just removed it
+                    digests[version] = self.record(name, version).digest
+        return {digest for version, digest in digests.items() if version in ids or version == head}
+
+    def _marks(self, name: str) -> Marks:
+        return Marks(self._store, f"{self._base(name)}blobs/", self._wall_clock)
 
     def _base(self, name: str) -> str:
         if not _NAME.fullmatch(name):

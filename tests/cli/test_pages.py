@@ -36,7 +36,9 @@ OTHER_PROGRAMS = (
 )  # fmt: skip
 BLOCK = re.compile(r"^```(\w*)\n(.*?)^```", re.DOTALL | re.MULTILINE)
 IN_A_LINE = re.compile(r"`((?:rse-pf|make) [^`]*)`")
-RUN_HERE = "rse-pf map list|rse-pf map show|rse-pf map diff|rse-pf map rollback|rse-pf map export"
+RUN_HERE = "|".join(
+    f"rse-pf map {action}" for action in ("list", "show", "diff", "rollback", "prune", "export")
+)
 SOON_S = 60.0
 
 
@@ -175,7 +177,7 @@ def test_the_commands_about_maps_run_on_a_store(
         words = shlex.split(command.replace("3f9bd1", first.id[:6]))
         assert main(words[1:]) == 0, f"{command}: {capsys.readouterr().err}"
 
-    assert len(found) == 5
+    assert len(found) == 6
     assert Path("kitchen.png").stat().st_size > 0
     assert Path("kitchen.g2o").read_text().startswith("VERTEX_SE3")
 

@@ -68,6 +68,16 @@ def test_commits_and_rollbacks_are_recorded_with_robot_map_and_version(recorded:
     ]
 
 
+def test_who_removed_a_version_is_recorded(recorded: Recorded) -> None:
+    first = recorded.commit(1, None, robot="robot-1")
+    recorded.commit(2, first, robot="robot-1")
+    assert recorded.ask("DELETE", f"{MAPS}/versions", query="keep=1", robot="robot-2").status == 200
+
+    last = list(recorded.entries())[-1]
+    assert (last.action, last.actor, last.subject) == ("map.remove", "robot-2", "kitchen")
+    assert (last.detail["version"], last.detail["number"]) == (first, 1)
+
+
 def test_the_map_of_another_tenant_is_named_with_it(recorded: Recorded) -> None:
     recorded.commit(1, None, robot="robot-1", tenant="acme")
 

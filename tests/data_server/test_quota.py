@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import urllib.parse
 from pathlib import Path
 
 import pytest
@@ -14,7 +15,7 @@ from rse_pf.config import DataSettings
 from rse_pf.errors import QuotaExceeded, StoreFull
 from rse_pf.identity import RobotId, object_name
 from rse_pf.maps.format import MapVersion, encode_map
-from rse_pf.object_store import DirectoryStore, MemoryStore, ObjectStore, digest_of
+from rse_pf.object_store import DirectoryStore, MemoryStore, ObjectStore, digest_of, usage_of
 
 ROBOT = RobotId("default", "robot-1")
 
@@ -92,12 +93,73 @@ def test_committed_maps_count_for_their_author_although_the_objects_were_deleted
     assert service.ask("PUT", *begin, robot="robot-2").status == 200
 
 
+VERSIONS = "/data/v1/maps/kitchen/versions"
+
+
+def test_a_tenant_over_its_quota_removes_old_versions_and_commits_again() -> None:
+    limits = {"tenant_quota_bytes": 60_000, "quota_bytes": 1_000_000, "max_requests_per_s": 1e6}
+    service = Service(small_settings(**limits), MemoryStore())
+    head, answer = None, commit(service, 0, None)
+    while answer.status == 201:
+        head = answer.json["id"]
+        answer = commit(service, 1, head)
+    assert (answer.status, answer.json["code"]) == (413, "quota")
+    before = usage_of(service.store, "").charged_bytes
+
+    pruned = service.ask("DELETE", VERSIONS, query="keep=2", robot="robot-2")
+
+    assert pruned.status == 200
+    assert pruned.json["removed"] >= 2
+    assert before - usage_of(service.store, "maps/").charged_bytes >= pruned.json["freed_bytes"] > 0
+    listed = service.ask("GET", VERSIONS).json
+    assert [version["id"] for version in listed][-1] == head
+    assert len(listed) == 2
+    assert len(list(service.store.list("charges/"))) == 2
+    again = commit(service, 2, head)
+    assert again.status == 201, again.json
+    assert service.ask("DELETE", VERSIONS, query="keep=2").json["removed"] == 1
+
+
+def test_a_robot_whose_versions_were_removed_may_store_as_much_again() -> None:
+    service = Service(small_settings(quota_bytes=30_000), MemoryStore())
+    head, answer = None, commit(service, 0, None)
+    while answer.status == 201:
+        head = answer.json["id"]
+        answer = commit(service, 1, head)
+
+    assert service.ask("DELETE", VERSIONS, query="keep=1", robot="robot-2").status == 200
+
+    assert commit(service, 2, head).status == 201
+
+
+@pytest.mark.parametrize("query", ["", "keep=", "keep=0", "keep=-1", "keep=1e3", "keep=99999999", "keep=²"])
+def test_how_many_versions_stay_is_a_number_above_zero(service: Service, query: str) -> None:
+    commit(service, 1, None)
+
+    answer = service.ask("DELETE", VERSIONS, query=urllib.parse.quote(query, safe="="))
+
+    assert (answer.status, answer.json["code"]) == (400, "bad-request")
+    assert len(service.ask("GET", VERSIONS).json) == 1
+
+
+def test_versions_of_a_map_that_does_not_exist_are_not_removed(service: Service) -> None:
+    assert service.ask("DELETE", VERSIONS, query="keep=1").status == 404
+
+
+def test_another_tenant_removes_nothing(service: Service) -> None:
+    first = commit(service, 1, None)
+    commit(service, 2, first.json["id"])
+
+    assert service.ask("DELETE", VERSIONS, query="keep=1", tenant="rival").status == 404
+    assert len(service.ask("GET", VERSIONS).json) == 2
+
+
 def test_a_refused_commit_charges_nothing(service: Service) -> None:
     first = commit(service, 1, None)
     before = [info.name for info in service.store.list("charges/")]
 
     assert commit(service, 2, None).status == 409
-    assert commit(service, 3, "0" * 64).status == 404
+    assert commit(service, 3, "0" * 64).status == 409, "it may have been removed"
 
     assert first.status == 201
     assert [info.name for info in service.store.list("charges/")] == before

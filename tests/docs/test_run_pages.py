@@ -35,6 +35,7 @@ EXECUTED_IN = {
     "rse-pf map show": "tests/cli/test_pages.py",
     "rse-pf map diff": "tests/cli/test_pages.py",
     "rse-pf map rollback": "tests/cli/test_pages.py",
+    "rse-pf map prune": "tests/cli/test_pages.py",
     "rse-pf map export": "tests/cli/test_pages.py",
     "rse-pf robot adopt": "tests/cli/access/test_adopt.py",
 }

@@ -1,8 +1,9 @@
-"""Work with the maps that robots share: show them, merge them, localise images in them, roll them back.
+"""Work with the maps that robots share: show, merge and prune them, localise in them, roll them back.
 
 Works on the store itself (--store, by default data.store; rse-pf local keeps its own in STATE/objects).  A
 VERSION is head, or six or more digits of an id; show --all lists the ids.  rollback sets the head to an
-earlier version and deletes nothing.  Each action has its own help page: rse-pf map merge --help.
+earlier version and deletes nothing; prune removes old versions.  Each action has its own help page:
+rse-pf map merge --help.
 
 examples:
   rse-pf map from-camera 0 --intrinsics intrinsics.json --out out-camera
@@ -14,6 +15,7 @@ examples:
   rse-pf map view kitchen --out kitchen.png --store dir:objects
   rse-pf map diff kitchen 3f9bd1 head --store dir:objects
   rse-pf map live list --store dir:objects
+  rse-pf map prune kitchen --keep 10 --store dir:objects
   rse-pf map export kitchen --format ply --out kitchen.ply --store dir:objects
 """
 
@@ -21,6 +23,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import functools
 import os
 import re
 import threading
@@ -47,6 +50,7 @@ from rse_pf.geometry import Camera, rotation_angle_deg, to_quaternion
 from rse_pf.local.state import state_folder
 from rse_pf.maps.format import MapVersion
 from rse_pf.maps.registry import MapOrigin, MapRecord, MapRegistry, difference
+from rse_pf.maps.removal import freed_bytes, superseded
 from rse_pf.slam.map_export import FORMATS, export_map
 from rse_pf.terminal import at_work, counted, show, show_json
 
@@ -70,6 +74,7 @@ _ACTIONS = {
     "localise": ("estimate the camera poses of images in a map", "localise kitchen frame.png"),
     "diff": ("show the differences between two versions", "diff kitchen 3f9bd1 head"),
     "rollback": ("set the head to an earlier version", "rollback kitchen 3f9bd1"),
+    "prune": ("remove all but the newest versions", "prune kitchen --keep 10"),
     "export": (
         "write a version in the format of another program",
         "export kitchen --format ply --out kitchen.ply",
@@ -96,7 +101,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         )
         for name, (text, example) in _ACTIONS.items()
     }  # fmt: skip
-    for name in ("show", "view", "diff", "rollback", "export", "localise", "publish"):
+    for name in ("show", "view", "diff", "rollback", "prune", "export", "localise", "publish"):
         made[name].add_argument("name", metavar="MAP", help="name of the map")
     for name in ("show", "view", "export"):
         made[name].add_argument(
@@ -116,6 +121,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "after", nargs="?", default="head", metavar="AFTER", help="default: %(default)s"
     )
     made["rollback"].add_argument("version", metavar="VERSION", help="the version to go back to")
+    made["prune"].add_argument(
+        "--keep", type=int, required=True, metavar="N", help="how many of the newest stay, besides the head"
+    )
     made["export"].add_argument("--format", choices=(*FORMATS, BAG_FORMAT), required=True, help="the format")
     made["export"].add_argument("--out", type=Path, required=True, metavar="FILE", help="the file to write")
     made["export"].add_argument("--robot", help="tum: only the keyframes of this robot")
@@ -190,6 +198,7 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
         "localise": _localise,
         "diff": _diff,
         "rollback": _rollback,
+        "prune": _prune,
         "export": _export,
     }
     return actions[args.action](args, maps) or 0
@@ -351,6 +360,19 @@ def _rollback(args: argparse.Namespace, maps: MapRegistry) -> None:
         args,
         {"was": head.id, "head": record.id},
         f"the head of {args.name} was {head.id[:_SHORT]} and is {record.id[:_SHORT]}",
+    )
+
+
+def _prune(args: argparse.Namespace, maps: MapRegistry) -> None:
+    if args.keep < 1:
+        raise UsageError(f"--keep {args.keep} is below 1", hint="1 keeps the head and the newest version")
+    removed = maps.remove(args.name, functools.partial(superseded, keep=args.keep))
+    freed = freed_bytes(removed)
+    _print(
+        args,
+        {"removed": [_fields(record) for record in removed], "freed_bytes": freed},
+        *map(_record_line, removed),
+        f"{counted(len(removed), 'version')} of {args.name} removed, {freed} bytes freed",
     )
 
 

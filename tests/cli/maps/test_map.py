@@ -79,6 +79,19 @@ def test_diff_rollback_and_show_all_agree(store: Path, capsys: pytest.CaptureFix
     assert [each["head"] for each in again] == [True, False]  # type: ignore[attr-defined]
 
 
+def test_prune_removes_old_versions_and_says_how_many_bytes_are_free(
+    store: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    first, second = (each["id"] for each in asked(capsys, store, "show", "hall", "--all"))  # type: ignore[attr-defined]
+
+    assert run(store, "prune", "hall", "--keep", "1") == 0
+
+    assert "1 version of hall removed, " in (said := capsys.readouterr().out)
+    assert first[:12] in said
+    assert [each["id"] for each in asked(capsys, store, "show", "hall", "--all")] == [second]  # type: ignore[attr-defined]
+    assert asked(capsys, store, "prune", "hall", "--keep", "1") == {"freed_bytes": 0, "removed": []}
+
+
 @pytest.mark.parametrize(
     ("kind", "begins"), [("ply", b"ply"), ("pcd", b"# .PCD"), ("tum", b"#"), ("g2o", b"VERTEX")]
 )
@@ -96,6 +109,8 @@ def test_export_writes_the_file(store: Path, kind: str, begins: bytes) -> None:
         (["show", "nowhere"], 1),
         (["show", "../x"], 1),
         (["rollback", "hall", "abc"], 1),
+        (["prune", "hall", "--keep", "0"], 2),
+        (["prune", "nowhere", "--keep", "1"], 1),
         (["export", "hall", "--format", "obj", "--out", "x"], 2),
         (["export", "hall", "--format", "ply", "--out", "/nowhere/x"], 2),
     ],

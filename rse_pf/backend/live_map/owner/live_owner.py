@@ -26,7 +26,7 @@ from rse_pf.backend.live_map.owner.log import (
     MapSnapshot,
     Submitted,
 )
-from rse_pf.backend.live_map.owner.publisher import Publisher, version_to_start_from
+from rse_pf.backend.live_map.owner.publisher import AUTOMATIC_NOTES, Publisher, version_to_start_from
 from rse_pf.backend.live_map.owner.replies import relocalise_reply, show_reply, version_reply
 from rse_pf.backend.live_map.owner.state import Applied, MapState, Measuring
 from rse_pf.backend.live_map.owner.threads import FIRST_RETRY_S, Urgency, next_retry_s
@@ -80,6 +80,7 @@ _UNUSED_SHARE = 1.0 / 6.0
 _EVENT_BYTES = 512
 """Size of a keyframe's event in the log, without the keyframe."""
 _WAITING = "waiting for the store"
+_ALL_LEFT, _CHANGED, _UNUSED = AUTOMATIC_NOTES
 _ALIGNING = (Joined, Corrected, Unaligned, Ambiguous, LinkRemoved)
 
 
@@ -118,7 +119,7 @@ class LiveOwner:
             state, context.threads, self._writer.submit, fit=context.fit, json_log=context.log,
             name=context.map_name,
         )  # fmt: skip
-        self._publisher = Publisher(state, context, author=f"live map on {lease.record.server}")
+        self._publisher = Publisher(state, context, server=lease.record.server)
         self._adding: dict[tuple[str, int], asyncio.Task[None]] = {}
         self._present: dict[str, None] = {}
         self._renewed = asyncio.Event()
@@ -277,7 +278,7 @@ class LiveOwner:
             await asyncio.shield(self._writer.submit(RobotLeft(robot=robot.folder)))
         self._present.pop(robot.folder, None)
         if not self._present:
-            self._publisher.ask("the last robot left")
+            self._publisher.ask(_ALL_LEFT)
             self._start(self._publisher.publish_due())
         return {}
 
@@ -431,7 +432,7 @@ class LiveOwner:
             return
         if now >= self._publish_due_s:
             self._publish_due_s = now + settings.publish_s
-            self._publisher.ask("live map")
+            self._publisher.ask(_CHANGED)
         if now - self._used_s >= _UNUSED_SHARE * settings.idle_s:
             self._note_use(is_used=False)
         if self.users:
@@ -451,7 +452,7 @@ class LiveOwner:
 
     async def _end_idle(self) -> None:
         """Publish the map, when it may be, and give it up; a version that fails is left to the next owner."""
-        self._publisher.ask("nobody used the live map")
+        self._publisher.ask(_UNUSED)
         while self._publisher.is_due and not self._publisher.has_failed and not self.users:
             await self._publisher.publish_due()
             await self._context.sleep(renewal_s(self._context.settings.lease_s))

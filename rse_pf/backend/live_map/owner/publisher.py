@@ -12,7 +12,7 @@ import contextlib
 import dataclasses
 import functools
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from rse_pf.backend.live_map.owner.context import OwnerContext
 from rse_pf.backend.live_map.owner.state import MapState
@@ -21,9 +21,18 @@ from rse_pf.errors import Busy, Conflict, NotFound, RsePfError, StoreError
 from rse_pf.live_map.versions import errors_of_maps
 from rse_pf.maps.format import MapVersion, encode_map
 from rse_pf.maps.registry import MapOrigin, MapRecord, MapRegistry
+from rse_pf.maps.removal import superseded
 from rse_pf.object_store import digest_of
 
-__all__ = ["Publisher", "version_to_start_from"]
+__all__ = ["AUTOMATIC_NOTES", "Publisher", "version_to_start_from"]
+
+AUTOMATIC_NOTES = ("the last robot left", "live map", "nobody used the live map")
+"""Notes of versions that nobody asked for: all robots left, time passed, nobody used the map."""
+_AUTHOR = "live map on "
+_QUOTA_SHARE = 4
+"""The versions of one map that nobody asked for take at most this part of the tenant's quota."""
+_REMOVED_AT_ONCE = 10
+"""A publication removes no more, so that it ends soon, also when the server drains."""
 
 _MOST_WAIT_S = 10.0
 """Who asks for a version waits for so long; who would wait longer is told when to ask again."""
@@ -37,15 +46,15 @@ _VERSION = re.compile(r"head|[0-9a-f]{6,64}")
 class Publisher:
     """Publishes one map; its methods are called in the event loop."""
 
-    def __init__(self, state: MapState, context: OwnerContext, *, author: str) -> None:
+    def __init__(self, state: MapState, context: OwnerContext, *, server: str) -> None:
         """Publish nothing yet.
 
         Args:
             state: The map.
             context: Of its owner; the tenant is charged with a version before it is written.
-            author: Of the versions.
+            server: On which it runs, and which the versions name as their author.
         """
-        self._state, self._context, self._author = state, context, author
+        self._state, self._context, self._author = state, context, _AUTHOR + server
         self._maps, self._threads = context.maps, context.threads
         self._clock, self._json_log, self._name = context.clock, context.log, context.map_name
         self._pause_s = context.settings.publish_pause_s
@@ -134,7 +143,34 @@ class Publisher:
         self._published, self._last_record = changes, record
         self.has_failed, self._retry_s = False, _FIRST_RETRY_S
         self._json_log.info("live-map-published", map=self._name, id=record.id, number=record.number)
+        try:
+            removed = await self._threads.background(self._remove_old_versions)
+        except RsePfError as error:  # they are removed after the next version
+            self._json_log.warning("live-versions-not-removed", map=self._name, error=error.message)
+        else:
+            if removed:
+                self._json_log.info("live-versions-removed", map=self._name, removed=removed)
         return record
+
+    def _remove_old_versions(self) -> int:
+        """Remove the oldest versions that nobody asked for, ten at most; return how many.  Blocking.
+
+        Raises:
+            Busy, StoreError: The rest is removed after the next publication.
+        """
+        keep, account = self._context.settings.keep_versions, self._context.account
+        if not keep:
+            return 0
+        most_bytes = account.quota_bytes / _QUOTA_SHARE
+
+        def choose(records: Sequence[MapRecord], head: str) -> list[MapRecord]:
+            old = superseded(records, head, keep=keep, most_bytes=most_bytes, counts=_is_automatic)
+            return old[:_REMOVED_AT_ONCE]
+
+        removed = self._maps.remove(self._name, choose)
+        for record in removed:
+            account.release(record.size)
+        return len(removed)
 
     async def _wait_s(self) -> float:
         """Return for how long no version may be published."""
@@ -149,6 +185,10 @@ class Publisher:
             return self._context.wall_clock() - self._maps.head(self._name).created_s
         except NotFound:
             return float("inf")
+
+
+def _is_automatic(record: MapRecord) -> bool:
+    return record.author.startswith(_AUTHOR) and record.note in AUTOMATIC_NOTES
 
 
 def _publish_version(

@@ -6,7 +6,7 @@ import asyncio
 
 import pytest
 
-from rse_pf.errors import Busy, NotFound, StoreFull
+from rse_pf.errors import Busy, NotFound, StoreError, StoreFull
 from rse_pf.maps.registry import MapRegistry
 from rse_pf.object_store import MemoryStore
 from tests.backend.live_map.owner_bench import MAP, Bench, settle
@@ -138,6 +138,17 @@ class FullRegistry(MemoryStore):
         super().put(name, data)
 
 
+class UndeletableMaps(MemoryStore):
+    """Removes no record of a version while it is slow."""
+
+    is_slow = False
+
+    def delete(self, name: str) -> None:
+        if self.is_slow and "/versions/" in name:
+            raise StoreError("the store is slow", hint="wait")
+        super().delete(name)
+
+
 def test_a_version_that_cannot_be_stored_stays_due_and_who_asks_is_told_why():
     store = FullRegistry()
     bench = Bench(store, publish_pause_s=1.0)
@@ -156,5 +167,66 @@ def test_a_version_that_cannot_be_stored_stays_due_and_who_asks_is_told_why():
         store.is_full = False
         await bench.clock.advance(12.0)
         assert MapRegistry(store, "default").head(MAP).keyframes == 1
+
+    bench.run(test)
+
+
+def test_of_versions_that_nobody_asked_for_the_newest_stay_and_the_others_give_their_bytes_back():
+    bench = Bench(publish_pause_s=0.0, keep_versions=3)
+
+    async def test() -> None:
+        owner = await bench.own("a")
+        owner.owner.users = 1
+        maps = MapRegistry(bench.store, "default")
+        numbers = []
+        for number in range(8):
+            await owner.keyframe(number)
+            if number == 1:
+                await owner.ask("live-publish")
+            await owner.ask("live-leave")
+            await bench.clock.advance(1.0)
+            numbers.append([each.number for each in maps.versions(MAP)])
+        assert numbers[2] == [1, 2, 3]
+        assert numbers[-1] == [2, 6, 7, 8], "number 2 was asked for"
+        assert [maps.data(MAP, each.id) for each in maps.versions(MAP)]
+        assert len(list(bench.store.list(f"maps/default/{MAP}/blobs/"))) == 4
+
+    bench.run(test)
+
+
+def test_an_operator_may_keep_all_versions():
+    bench = Bench(publish_pause_s=0.0, keep_versions=0)
+
+    async def test() -> None:
+        owner = await bench.own("a")
+        owner.owner.users = 1
+        for number in range(25):
+            await owner.keyframe(number)
+            await owner.ask("live-leave")
+            await bench.clock.advance(1.0)
+        assert len(MapRegistry(bench.store, "default").versions(MAP)) == 25
+
+    bench.run(test)
+
+
+def test_a_version_that_cannot_be_removed_is_no_failure_of_the_one_that_was_published():
+    store = UndeletableMaps()
+    bench = Bench(store, publish_pause_s=0.0, keep_versions=1)
+
+    async def test() -> None:
+        owner = await bench.own("a")
+        owner.owner.users = 1
+        maps = MapRegistry(store, "default")
+        store.is_slow = True
+        for number in range(3):
+            await owner.keyframe(number)
+            await owner.ask("live-leave")
+            await bench.clock.advance(1.0)
+        assert [each.number for each in maps.versions(MAP)] == [1, 2, 3]
+        store.is_slow = False
+        await owner.keyframe(3)
+        await owner.ask("live-leave")
+        await bench.clock.advance(1.0)
+        assert [each.number for each in maps.versions(MAP)] == [4]
 
     bench.run(test)

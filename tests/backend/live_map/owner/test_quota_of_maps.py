@@ -9,8 +9,9 @@ import pytest
 
 from rse_pf.errors import Conflict, QuotaExceeded, StoreFull
 from rse_pf.identity import RobotId
+from rse_pf.maps.registry import MapRegistry
 from rse_pf.object_store import MemoryStore, ObjectStore, charge_of
-from tests.backend.live_map.owner_bench import FOLDER, Bench, OwnerBench, settle
+from tests.backend.live_map.owner_bench import FOLDER, MAP, Bench, OwnerBench, settle
 
 OTHER = RobotId("default", "robot-2", "thumb")
 QUOTA = 1_000_000
@@ -72,6 +73,25 @@ def test_over_the_quota_a_map_is_shown_forgotten_and_stopped_and_then_there_is_r
         await bench.clock.advance(30.0)
         new = await bench.own("b")
         assert (await new.keyframe(0, bytes(20_000)))["number"] == 1
+
+    bench.run(test)
+
+
+def test_a_robot_that_always_drives_fills_a_quarter_of_the_quota_with_versions_and_no_more() -> None:
+    bench = Bench(
+        MemoryStore(), data={"tenant_quota_bytes": QUOTA}, publish_pause_s=0.0, keep_versions=1000
+    )  # fmt: skip
+
+    async def test() -> None:
+        owner = await bench.own("a")
+        owner.owner.users = 1
+        for number in range(60):
+            await owner.keyframe(number, bytes(5_000))
+            await owner.ask("live-leave")
+            await bench.clock.advance(1.0)
+            assert stored(bench.store, "maps/") <= QUOTA / 4 + 4096, "the versions and the head"
+        assert len(MapRegistry(bench.store, "default").versions(MAP)) == 30
+        assert stored(bench.store, "live/", "maps/") <= QUOTA
 
     bench.run(test)
 

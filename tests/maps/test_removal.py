@@ -1,0 +1,351 @@
+"""Versions of maps are removed: which ones, beside others who commit and roll back, and over a crash."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import subprocess
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+import msgspec
+import pytest
+from maps.sample_maps import make_map
+
+from rse_pf.errors import Busy, Conflict, NotFound, StoreError, StoreFull
+from rse_pf.identity import RobotId
+from rse_pf.maps.charges import charge_name, charged_to
+from rse_pf.maps.format import encode_map
+from rse_pf.maps.registry import MapRecord, MapRegistry
+from rse_pf.maps.removal import ABANDONED_S, MOST_S, Marks, freed_bytes, superseded
+from rse_pf.object_store import DirectoryStore, MemoryStore, ObjectInfo, ObjectStore, Usage, usage_of
+
+NAME, FOLDER = "kitchen", "maps/default/kitchen/"
+ROBOT = RobotId("default", "robot-1")
+
+
+class SteppedStore(MemoryStore):
+    """Calls *act* before the operation number *at*, counted from 1 since `count_from_here`."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.steps, self._at, self._act = 0, 0, lambda: None
+
+    def count_from_here(self, at: int, act: Callable[[], None]) -> None:
+        self.steps, self._at, self._act = 0, at, act
+
+    def _step(self) -> None:
+        self.steps += 1
+        if self.steps == self._at:
+            self._at = 0
+            self._act()
+
+    def get(self, name: str) -> bytes:
+        self._step()
+        return super().get(name)
+
+    def put(self, name: str, data: bytes) -> None:
+        self._step()
+        super().put(name, data)
+
+    def list(self, prefix: str = "", after: str = "") -> Iterator[ObjectInfo]:
+        self._step()
+        return super().list(prefix, after)
+
+    def delete(self, name: str) -> None:
+        self._step()
+        super().delete(name)
+
+    def compare_and_swap(self, name: str, expected: bytes | None, data: bytes) -> None:
+        self._step()
+        super().compare_and_swap(name, expected, data)
+
+
+def bytes_of(seed: int) -> bytes:
+    return encode_map(make_map(seed))
+
+
+def commit(maps: MapRegistry, seed: int, created_s: float | None = None) -> MapRecord:
+    try:
+        parent: str | None = maps.head(NAME).id
+    except NotFound:
+        parent = None
+    created_s = 1e9 + seed if created_s is None else created_s
+    return maps.commit(NAME, bytes_of(seed), parent=parent, author="robot-1", created_s=created_s)
+
+
+def prune(maps: MapRegistry, keep: int = 2) -> list[MapRecord]:
+    return maps.remove(NAME, lambda records, head: superseded(records, head, keep=keep))
+
+
+def assert_whole(maps: MapRegistry) -> None:
+    """Assert that the head and every version that is listed can be read."""
+    assert maps.data(NAME)
+    for record in maps.versions(NAME):
+        assert maps.data(NAME, record.id)
+
+
+def names(store: ObjectStore) -> list[str]:
+    return [info.name for info in store.list()]
+
+
+def test_the_newest_versions_stay_and_of_the_others_neither_bytes_nor_record_nor_charge():
+    store, told = MemoryStore(), []
+    maps = MapRegistry(store, on_change=lambda action, name, record: told.append((action, record.number)))
+    records = [commit(maps, seed) for seed in range(5)]
+    for record in records:
+        store.put(charge_name(ROBOT, NAME, record.id, record.size), b"")
+    store.put(charge_name(ROBOT, "hall", records[0].id, 9), b"")
+    before, told[:] = usage_of(store, "maps/"), []
+
+    removed = prune(maps, keep=2)
+
+    assert [record.number for record in removed] == [1, 2, 3]
+    assert told == [("map.remove", number) for number in (1, 2, 3)]
+    assert [record.number for record in maps.versions(NAME)] == [4, 5]
+    assert_whole(maps)
+    after = usage_of(store, "maps/")
+    assert before.charged_bytes - after.charged_bytes == freed_bytes(removed)
+    assert after.objects == 5, "two maps, two records and the head; no mark"
+    assert charged_to(store, ROBOT).objects == 3, "two versions, and one of another map"
+    with pytest.raises(NotFound):
+        maps.record(NAME, records[0].id)
+    assert prune(maps, keep=2) == []
+    assert commit(maps, 9).number == 6
+
+
+def test_the_head_stays_after_a_rollback_and_so_do_bytes_that_another_version_shares():
+    maps = MapRegistry(MemoryStore())
+    first, second = commit(maps, 1), commit(maps, 2)
+    commit(maps, 3)
+    shared = commit(maps, 2, created_s=2e9)
+    maps.move_head(NAME, first.id, expected=shared.id)
+
+    assert [record.number for record in prune(maps, keep=1)] == [3]
+
+    assert maps.head(NAME).id == first.id
+    assert {record.id for record in maps.versions(NAME)} == {first.id, second.id, shared.id}
+    assert_whole(maps)
+
+
+def record(number: int, *, size: int = 10, note: str = "", digest: str = "") -> MapRecord:
+    return MapRecord(
+        digest=digest or f"d{number}", size=size, parent=None, number=number, author="r",
+        created_s=float(number), note=note, keyframes=0, edges=0, points=0, robots=(),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("options", "numbers"),
+    [
+        ({"keep": 2}, [1, 2, 3]),
+        ({"keep": 9}, []),
+        ({"keep": 9, "most_bytes": 3 * 8192}, [1, 2]),
+        ({"keep": 9, "most_bytes": 1}, [1, 2, 3, 4]),
+        ({"keep": 1, "counts": lambda each: each.note == ""}, [1, 3, 4]),
+        ({"keep": 2, "head": 2}, [1, 3]),
+    ],
+    ids=["number", "all", "bytes", "the newest always", "only some count", "the head"],
+)
+def test_versions_are_superseded_by_their_number_and_their_bytes(options: dict, numbers: list[int]):
+    records = [record(number, note="asked for" if number == 2 else "") for number in range(1, 6)]
+    head = records[options.pop("head", 5) - 1].id
+
+    assert [each.number for each in superseded(records, head, **options)] == numbers
+
+
+def inner_commit(maps: MapRegistry) -> None:
+    commit(maps, 1, created_s=3e9)  # the bytes of a version that is being removed
+
+
+def inner_rollback(maps: MapRegistry) -> None:
+    oldest = min(maps.versions(NAME), key=lambda each: each.number)
+    maps.move_head(NAME, oldest.id, expected=maps.head(NAME).id)
+
+
+class Turns:
+    """One of two that use a store; it does as many operations as it is allowed to, and then waits."""
+
+    def __init__(self, act: Callable[[], object]) -> None:
+        self._act, self._left, self._is_waiting, self._is_done = act, 0, False, False
+        self._changed = threading.Condition()
+        self.error: Exception | None = None
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def allow(self, steps: int) -> bool:
+        """Let it do so many operations; return whether it has ended."""
+        with self._changed:
+            self._left, self._is_waiting = steps, False
+            self._changed.notify_all()
+            assert self._changed.wait_for(lambda: self._is_waiting or self._is_done, 20.0)
+            return self._is_done
+
+    def step(self) -> None:
+        with self._changed:
+            while not self._left:
+                self._is_waiting = True
+                self._changed.notify_all()
+                assert self._changed.wait(20.0)
+            self._left -= 1
+
+    def _run(self) -> None:
+        TURNS.of_thread = self
+        try:
+            self._act()
+        except (Busy, Conflict, NotFound) as error:
+            self.error = error
+        finally:
+            with self._changed:
+                self._is_done = True
+                self._changed.notify_all()
+
+
+TURNS = threading.local()
+
+
+class SharedStore(SteppedStore):
+    """Each operation waits for the turn of its thread."""
+
+    def _step(self) -> None:
+        turns = getattr(TURNS, "of_thread", None)
+        if turns is not None:
+            turns.step()
+
+
+ACTS = {"prune": prune, "commit": inner_commit, "rollback": inner_rollback}
+PAIRS = [pair for pair in itertools.product(ACTS, ACTS) if "prune" in pair]
+
+
+@pytest.mark.parametrize(("first", "second"), PAIRS)
+def test_in_every_order_of_two_interruptions_the_head_and_every_version_stay_whole(first: str, second: str):
+    codes = set()
+    for before in itertools.count():
+        for between in itertools.count():
+            store = SharedStore()
+            maps = MapRegistry(store)
+            for seed in range(1, 4):
+                commit(maps, seed)
+            one = Turns(lambda: ACTS[first](maps))  # noqa: B023  it ends within this round
+            two = Turns(lambda: ACTS[second](maps))  # noqa: B023
+            one_ended = one.allow(before)
+            two_ended = two.allow(between)
+            assert one.allow(1000)
+            assert two.allow(1000)
+            assert_whole(maps)
+            assert not any(".removing-" in name or ".held-" in name for name in names(store))
+            codes |= {turns.error.code for turns in (one, two) if turns.error is not None}
+            if two_ended:
+                break
+        if one_ended:
+            break
+    assert codes or first == second, "in some order they are in each other's way"
+
+
+@pytest.mark.parametrize("step", range(1, 40))
+def test_after_a_crash_at_any_step_all_is_whole_and_a_later_call_removes_the_rest(step: int):
+    now = [1e9]
+    store = SteppedStore()
+    maps = MapRegistry(store, wall_clock=lambda: now[0])
+    for seed in range(1, 5):
+        version = commit(maps, seed)
+        store.put(charge_name(ROBOT, NAME, version.id, version.size), b"")
+
+    def crash() -> None:
+        store.count_from_here(1, crash)  # nothing that follows reaches the store either
+        raise StoreError("the process is killed")
+
+    store.count_from_here(step, crash)
+    with contextlib.suppress(StoreError):
+        prune(maps)
+    store.count_from_here(0, crash)
+
+    assert_whole(maps)
+    now[0] += ABANDONED_S + 2
+    prune(maps)
+    assert [each.number for each in maps.versions(NAME)] == [3, 4]
+    assert_whole(maps)
+    assert len([name for name in names(store) if name.startswith(FOLDER)]) == 5
+    assert charged_to(store, ROBOT).objects == 2
+
+
+def test_who_removes_stops_before_its_marks_count_as_abandoned():
+    assert MOST_S * 2 < ABANDONED_S
+    now = [1e9]
+    store = SteppedStore()
+    maps = MapRegistry(store, wall_clock=lambda: now[0])
+    for seed in range(1, 5):
+        commit(maps, seed)
+
+    def pause() -> None:
+        now[0] += MOST_S
+
+    def begin_at_the_first_mark(records: Sequence[MapRecord], head: str) -> list[MapRecord]:
+        store.count_from_here(2, pause)
+        return superseded(records, head, keep=2)
+
+    with pytest.raises(Busy, match="too slow"):
+        maps.remove(NAME, begin_at_the_first_mark)
+    assert len(maps.versions(NAME)) == 4
+    assert_whole(maps)
+
+
+def test_marks_of_a_process_that_crashed_keep_nobody_from_committing_for_ever():
+    now = [1e9]
+    store = MemoryStore()
+    maps = MapRegistry(store, wall_clock=lambda: now[0])
+    first = commit(maps, 1)
+    commit(maps, 2)
+    Marks(store, FOLDER + "blobs/", lambda: now[0]).put("removing", first.digest)
+
+    with pytest.raises(Busy, match="being removed") as refused:
+        inner_commit(maps)
+    assert refused.value.retry_after_ms
+    now[0] += ABANDONED_S + 2
+    inner_commit(maps)
+
+    assert maps.data(NAME) == bytes_of(1)
+
+
+def test_a_version_whose_parent_was_removed_is_a_conflict_for_who_still_holds_it():
+    maps = MapRegistry(MemoryStore())
+    first = commit(maps, 1)
+    for seed in (2, 3):
+        commit(maps, seed)
+    prune(maps, keep=1)
+
+    with pytest.raises(Conflict):
+        maps.commit(NAME, bytes_of(4), parent=first.id, author="r", created_s=2e9)
+
+
+@pytest.mark.system
+def test_versions_are_removed_from_a_disk_that_is_full(tmp_path: Path):
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    command = ["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", str(folder)]
+    if subprocess.run(command, capture_output=True, check=False).returncode:
+        pytest.skip("this test mounts a small disk, which takes the rights of root")
+    try:
+        store = DirectoryStore(folder / "store")
+        maps = MapRegistry(store)
+        for seed in range(1, 5):
+            commit(maps, seed)
+        with pytest.raises(StoreFull):
+            store.put("objects/filler", bytes(2 << 20))
+        for number in range(1000):
+            try:
+                store.put(f"objects/filler-{number}", bytes(4096))
+            except StoreFull:
+                break
+
+        assert len(prune(maps)) == 2
+        assert commit(maps, 9).number == 5
+    finally:
+        subprocess.run(["umount", str(folder)], check=True)
+
+
+def test_the_usage_of_a_record_is_what_the_store_charges():
+    data = msgspec.json.encode(record(1))
+
+    assert Usage(1, freed_bytes([record(1, size=5000)])) == Usage(1, 5000 + max(4096, len(data)))
