@@ -112,9 +112,9 @@ class PointMap:
         sums = np.add.reduceat(values, first, axis=0)
         counts = np.diff(np.append(first, len(keys)))
         rows = self._rows_of(keys[first])
-        kept = rows >= 0
-        self._average(rows[kept], sums[kept], counts[kept])
-        return int(counts[kept].sum())
+        has_row = rows >= 0
+        self._average(rows[has_row], sums[has_row], counts[has_row])
+        return int(counts[has_row].sum())
 
     def points(self, min_readings: int = 1) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.uint8]]:
         """Return ``(n, 3)`` float32 points in metres and their ``(n, 3)`` uint8 colours.
@@ -190,15 +190,15 @@ def frame_points(frame: Frame, options: MapOptions) -> tuple[Array, npt.NDArray[
     """Return the camera-frame points ``(n, 3)`` and colours ``(n, 3)`` that a map takes of a frame."""
     step = options.every_px
     depth = frame.depth_m
-    kept = (depth >= options.min_depth_m) & (depth <= options.max_depth_m)
+    in_range = (depth >= options.min_depth_m) & (depth <= options.max_depth_m)
     limit = depth * (options.edge_percent / 100.0)
     across = np.abs(np.diff(depth, axis=1)) <= limit[:, 1:]
     down = np.abs(np.diff(depth, axis=0)) <= limit[1:]
-    kept[:, 1:] &= across
-    kept[:, :-1] &= across
-    kept[1:] &= down
-    kept[:-1] &= down
-    rows, columns = np.nonzero(kept[::step, ::step])
+    in_range[:, 1:] &= across
+    in_range[:, :-1] &= across
+    in_range[1:] &= down
+    in_range[:-1] &= down
+    rows, columns = np.nonzero(in_range[::step, ::step])
     rows, columns = rows * step, columns * step
     pixels = np.column_stack((columns, rows)).astype(np.float64)
     points = frame.camera.back_project(pixels, depth[rows, columns].astype(np.float64))

@@ -22,7 +22,7 @@ from client_sdk.network.dialling import DialError
 from client_sdk.network.handshake import Token
 from client_sdk.offloading.asking import Asking, Call, OnProgress
 from client_sdk.offloading.burst import Burst
-from client_sdk.offloading.burst_rules import checked_burst_url
+from client_sdk.offloading.burst_rules import check_burst_url
 from client_sdk.offloading.offload import CloudFirst
 from client_sdk.recording import make_recorder, sdk_version
 from client_sdk.stats import Stats, StatsKeeper
@@ -117,7 +117,7 @@ class Robot:
             urls,
             token=token,
             session=self._session,
-            on_answer=self._answered,
+            on_answer=self._take_answer,
             clock=clock,
             random=random,
             wall_clock=wall_clock,
@@ -133,7 +133,7 @@ class Robot:
         self._burst = Burst(
             codec=self._session.codec, read_token=self._read_token, clock=clock, random=random,
             own=lambda: (self._connection.url, self._connection.dialler.ssl_context),
-            max_answer_bytes=settings.max_message_bytes, url=checked_burst_url(burst_url, urls[0]),
+            max_answer_bytes=settings.max_message_bytes, url=check_burst_url(burst_url, urls[0]),
         )  # fmt: skip
         self._asking = Asking(
             session=self._session, flush=self._connection.flush, keeper=self._keeper, clock=clock,
@@ -186,7 +186,7 @@ class Robot:
         self._open = False
         for event in self._session.abandon("disconnected", "the robot closed its connection"):
             if isinstance(event, Answered | SubscriptionEnded):
-                self._answered(event)
+                self._take_answer(event)
         await self._connection.close()
         await self._asking.close()
         if self._local is not None:
@@ -286,7 +286,7 @@ class Robot:
             refusal = self._connection.refusal
             if refusal is not None and not (self._local is not None and self._local.offers(service)):
                 raise error_from_code(refusal.code, refusal.message, hint=refusal.hint)
-            return self._typed(await self._asking.ask(call), reply_type, started)
+            return self._type_reply(await self._asking.ask(call), reply_type, started)
         except RsePfError as error:
             self._keeper.failures[error.code] += 1
             raise
@@ -453,7 +453,7 @@ class Robot:
             last_error=connection.last_error,
         )
 
-    def _typed(self, answer: Answer | Failure, reply_type: type[Any] | None, started: float) -> Answer:
+    def _type_reply(self, answer: Answer | Failure, reply_type: type[Any] | None, started: float) -> Answer:
         """Return the answer with its reply typed and the caller's round trip; raise if it is a failure."""
         if isinstance(answer, Failure):
             raise error_from_code(
@@ -478,7 +478,7 @@ class Robot:
         except DialError as failed:
             raise failed.error from None
 
-    def _answered(self, event: ForRobot) -> None:
+    def _take_answer(self, event: ForRobot) -> None:
         if isinstance(event, Updated | SubscriptionEnded):
             self._subscriptions.take(event)
             return

@@ -101,16 +101,16 @@ class StatsKeeper:
 
     def percentile(self, name: str, share: float) -> float | None:
         """Return a percentile of the recorded values, by nearest rank; None without a value."""
-        return _percentile(self._sorted(name), share)
+        return _percentile(self._sort(name), share)
 
     def percentiles(self, name: str) -> Percentiles:
         """Return the 50th, 95th and 99th percentile of the recorded values."""
-        values = self._sorted(name)
+        values = self._sort(name)
         return Percentiles(
             p50=_percentile(values, 0.5), p95=_percentile(values, 0.95), p99=_percentile(values, 0.99)
         )
 
-    def _sorted(self, name: str) -> list[float]:
+    def _sort(self, name: str) -> list[float]:
         return sorted(self._samples[name].values) if name in self._samples else []
 
 

@@ -9,13 +9,13 @@ import re
 
 from rse_pf.errors import Unauthorized
 
-__all__ = ["checked_token"]
+__all__ = ["strip_token"]
 
 _TOKEN = re.compile(r"[!-~]+")
 _HINT = "pass the text that rse-pf token issue ROBOT prints, or an async function that returns it"
 
 
-def checked_token(token: object) -> str:
+def strip_token(token: object) -> str:
     """Return *token* without the white space around it, which files and shells add.
 
     Raises:

@@ -141,8 +141,8 @@ def _measure(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
     _say(f"with kills: {broken['seconds']:.0f} s, {broken['events']}")
     report |= {"one_process": one, "workers": quiet, "workers_killed": broken}
     speed_up = _seconds_of(one, *_PARALLEL) / _seconds_of(quiet, *_PARALLEL)
-    apart_m = _apart_m(killed.merged.version, _merged(folder, "one"))
-    single_m = _apart_m(_merged(folder, "one"), _merged(folder, "single"))
+    apart_m = _apart_m(killed.merged.version, _merge(folder, "one"))
+    single_m = _apart_m(_merge(folder, "one"), _merge(folder, "single"))
     bars = {
         "links_and_clouds_equal": one["digest"] == quiet["digest"] == broken["digest"],
         "poses_within_0.1_mm_of_one_process": apart_m <= 1e-4,
@@ -166,10 +166,10 @@ def _in_one_process(folder: Path, candidates: int) -> None:
     names = json.loads((folder / "names.json").read_text(encoding="utf-8"))
     options = MergeOptions(candidates=candidates)
     began = time.monotonic()
-    found = BatchMerge(store, InProcessEngine(store), PlatformSettings(), options=options).run(names)
+    result = BatchMerge(store, InProcessEngine(store), PlatformSettings(), options=options).run(names)
     seconds = time.monotonic() - began
-    (folder / "one.map").write_bytes(encode_map(found.merged.version))
-    (folder / "one.json").write_text(json.dumps(_figures(found, seconds)), encoding="utf-8")
+    (folder / "one.map").write_bytes(encode_map(result.merged.version))
+    (folder / "one.json").write_text(json.dumps(_figures(result, seconds)), encoding="utf-8")
     single = BatchMerge(
         store, InProcessEngine(store), PlatformSettings(), options=options, two_levels=False
     ).run(names)  # fmt: skip
@@ -194,11 +194,11 @@ def _in_workers(
         engine.start()
         up_s = time.monotonic() - began
         options = MergeOptions(candidates=args.candidates)
-        found = BatchMerge(store, engine, settings, options=options, report=kill).run(names)
+        result = BatchMerge(store, engine, settings, options=options, report=kill).run(names)
     finally:
         engine.close()
         cluster.stop()
-    return found, {**_figures(found, time.monotonic() - began), "up_s": round(up_s, 2), "events": events}
+    return result, {**_figures(result, time.monotonic() - began), "up_s": round(up_s, 2), "events": events}
 
 
 def _killer(cluster: LocalCluster) -> Callable[[float, str], None]:
@@ -261,14 +261,14 @@ def _environment() -> dict[str, str]:
     return {**os.environ, **ONE_THREAD}
 
 
-def _figures(found: BatchMergeResult, seconds: float) -> dict[str, Any]:
+def _figures(result: BatchMergeResult, seconds: float) -> dict[str, Any]:
     parts = b"".join(
-        each.T_a_b.tobytes() + each.information.tobytes() + bytes(f"{each.a} {each.b};", "ascii")
-        for each in (*found.links, *found.tiles)
+        link.T_a_b.tobytes() + link.information.tobytes() + bytes(f"{link.a} {link.b};", "ascii")
+        for link in (*result.links, *result.tiles)
     )
     return {
-        "seconds": round(seconds, 2), "by_step_s": {k: round(v, 2) for k, v in found.seconds.items()},
-        "parts": found.computed, "digest": digest_of(parts),
+        "seconds": round(seconds, 2), "by_step_s": {k: round(v, 2) for k, v in result.seconds.items()},
+        "parts": result.computed, "digest": digest_of(parts),
     }  # fmt: skip
 
 
@@ -276,7 +276,7 @@ def _seconds_of(figures: dict[str, Any], *steps: str) -> float:
     return float(sum(figures["by_step_s"].get(step, 0.0) for step in steps))
 
 
-def _merged(folder: Path, name: str) -> MapVersion:
+def _merge(folder: Path, name: str) -> MapVersion:
     return decode_map((folder / f"{name}.map").read_bytes())
 
 

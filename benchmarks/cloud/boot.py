@@ -61,15 +61,15 @@ def main() -> int:
         return 2
     root = debian_root(build / "debian12")
     print(f"{platform.platform()}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}, n = {args.runs}")
-    found: dict[str, list[tuple[float, float, float]]] = {way: [] for way in WAYS}
+    runs_of: dict[str, list[tuple[float, float, float]]] = {way: [] for way in WAYS}
     for _ in range(args.runs):
         for way in WAYS:
-            found[way].append(measure(way, build, root))
+            runs_of[way].append(measure(way, build, root))
     ready = {}
-    for way, runs in found.items():
+    for way, runs in runs_of.items():
         installed_s, cpu_s, ready_s = (statistics.median(values) for values in zip(*runs, strict=True))
         ready[way] = ready_s
-        worst_s = max(each for *_, each in runs)
+        worst_s = max(run_s for *_, run_s in runs)
         print(
             f"{way:8} installed {installed_s:6.1f} s ({cpu_s:.1f} s of CPU)   /readyz {ready_s:6.1f} s"
             f"   worst {worst_s:.1f} s"

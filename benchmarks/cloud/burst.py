@@ -82,14 +82,14 @@ def measure(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
     """Run without the function, with it, and with it while the server dies; return what came of each."""
     key = SigningKey.from_seed(os.urandom(32), "bench")
     (folder / "keys.json").write_text(key.key_set().to_json(), encoding="utf-8")
-    found: dict[str, Any] = {}
+    figures: dict[str, Any] = {}
     for name, has_burst, dies in (
         ("without", False, False), ("with", True, False), ("server dies", True, True),
     ):  # fmt: skip
         outcome = _run(args, folder, key, has_burst=has_burst, dies=dies)
-        found[name] = outcome.document()
-        print(f"{name:12} {json.dumps(found[name])}", flush=True)
-    return found
+        figures[name] = outcome.document()
+        print(f"{name:12} {json.dumps(figures[name])}", flush=True)
+    return figures
 
 
 def _run(args: argparse.Namespace, folder: Path, key: SigningKey, *, has_burst: bool, dies: bool) -> Outcome:
@@ -239,23 +239,23 @@ def main() -> int:
     """Measure, print, and return 1 if the row is not kept."""
     args = _options()
     with tempfile.TemporaryDirectory() as folder:
-        found = measure(args, Path(folder))
+        figures = measure(args, Path(folder))
     document = {
         "command": " ".join(sys.argv), "machine": platform.platform(), "cores": os.cpu_count(),
-        "load_average": os.getloadavg()[0], "runs": found,
+        "load_average": os.getloadavg()[0], "runs": figures,
     }  # fmt: skip
     if args.out:
         args.out.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
-    kept = [
+    held = [
         (run["in_time_percent"] >= BAR_PERCENT or name != "with")
         and not run["wrong"]
         and set(run["servers_of_burst"]) == {"lambda"}
         and run["most_commands_of_a_robot_there"] <= args.budget
-        for name, run in found.items()
+        for name, run in figures.items()
         if name != "without"
     ]
-    print("kept" if all(kept) else "not kept")
-    return 0 if all(kept) else 1
+    print("kept" if all(held) else "not kept")
+    return 0 if all(held) else 1
 
 
 if __name__ == "__main__":

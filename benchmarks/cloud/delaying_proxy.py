@@ -70,10 +70,10 @@ class DelayingProxy:
             pass
         finally:
             self._tasks.discard(task)
-            for each in (writer, there):
-                if each is not None:
-                    self._writers.discard(each)
-                    each.transport.abort()
+            for stream in (writer, there):
+                if stream is not None:
+                    self._writers.discard(stream)
+                    stream.transport.abort()
 
     async def _pump(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Carry bytes one way; each piece arrives after the delay, and never before an earlier one."""

@@ -53,7 +53,7 @@ class LocalPlatform:
         until = time.monotonic() + _START_S
         while time.monotonic() < until and self._process.poll() is None:
             state = self._state()
-            ready = [each for each in state.get("servers", []) if each["state"] == "ready"]
+            ready = [server for server in state.get("servers", []) if server["state"] == "ready"]
             if len(ready) >= self.servers:
                 self.port = int(state["balancer"]["port"])
                 return self
@@ -101,7 +101,7 @@ class LocalPlatform:
             capture_output=True, env=self._environment, cwd=self.folder, check=False,
         )  # fmt: skip
         try:
-            found: dict[str, Any] = json.loads(done.stdout)
+            state: dict[str, Any] = json.loads(done.stdout)
         except ValueError:
             return {}
-        return found
+        return state

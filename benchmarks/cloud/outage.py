@@ -86,7 +86,7 @@ class FrontDoor:
             reply = self.firewall.judge(SITE, path, now) or (UNAVAILABLE if self.is_out else None)
             if reply is not None:
                 self.answered[reply.status] += 1
-                writer.write(_written(reply))
+                writer.write(_write(reply))
                 await writer.drain()
                 return
             back, there = await asyncio.open_connection("127.0.0.1", self._target)
@@ -96,10 +96,10 @@ class FrontDoor:
         except (OSError, asyncio.IncompleteReadError, asyncio.LimitOverrunError):
             pass
         finally:
-            for each in (writer, there):
-                if each is not None:
-                    self._writers.discard(each)
-                    each.close()
+            for stream in (writer, there):
+                if stream is not None:
+                    self._writers.discard(stream)
+                    stream.close()
 
 
 async def _pump(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -109,7 +109,7 @@ async def _pump(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> N
     writer.close()
 
 
-def _written(reply: Reply) -> bytes:
+def _write(reply: Reply) -> bytes:
     headers = {**reply.headers, "Content-Length": str(len(reply.body)), "Connection": "close"}
     lines = "".join(f"{name}: {value}\r\n" for name, value in headers.items())
     return f"HTTP/1.1 {reply.status} Refused\r\n{lines}\r\n".encode() + reply.body
@@ -202,21 +202,21 @@ async def drive(
 
 async def _end_of(robot: client_sdk.Robot, until: float) -> str:
     """Return as what *robot* ended, or the last it said."""
-    told = ""
+    reason = ""
     while time.monotonic() < until:
         try:
             await robot.call("echo", {}, deadline_s=1.0)
         except (Unauthorized, Forbidden) as error:
             return error.code
         except RsePfError as error:
-            told = error.code
+            reason = error.code
         await asyncio.sleep(0.2)  # polls, with a deadline
-    return f"not ended: {told}"
+    return f"not ended: {reason}"
 
 
 def most_within(times: list[float], window_s: float) -> int:
     """Return the most of *times* (s, in order) in one window."""
-    return max((sum(begin <= each < begin + window_s for each in times) for begin in times), default=0)
+    return max((sum(begin <= seconds < begin + window_s for seconds in times) for begin in times), default=0)
 
 
 def measure(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
@@ -237,14 +237,14 @@ def main() -> int:
     parser.add_argument("--out", type=Path)
     args = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="outage-") as folder:
-        found = measure(args, Path(folder))
-    found["machine"] = f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}"
-    print(json.dumps(found, indent=1))
+        figures = measure(args, Path(folder))
+    figures["machine"] = f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}"
+    print(json.dumps(figures, indent=1))
     if args.out is not None:
-        args.out.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
-    after_s = found["all_back_after_s"]
-    is_met = after_s is not None and after_s <= BAR_S and found["answered"] == args.robots
-    is_ended = found["disabled_robot_ended_as"] in ("unauthorized", "forbidden")
+        args.out.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
+    after_s = figures["all_back_after_s"]
+    is_met = after_s is not None and after_s <= BAR_S and figures["answered"] == args.robots
+    is_ended = figures["disabled_robot_ended_as"] in ("unauthorized", "forbidden")
     print(f"bar ({BAR_S:g} s, the disabled robot ends): {'met' if is_met and is_ended else 'MISSED'}")
     return 0 if is_met and is_ended else 1
 

@@ -97,7 +97,7 @@ def _reply(block: Mapping[str, Any], bodies: Mapping[str, Any]) -> Reply:
     if custom is None:
         return Reply(status=403, headers={}, body=b"<html>403 Forbidden</html>")
     body = bodies.get(custom.get("CustomResponseBodyKey", ""), {}).get("Content", "")
-    headers = {each["Name"]: each["Value"] for each in custom.get("ResponseHeaders", [])}
+    headers = {header["Name"]: header["Value"] for header in custom.get("ResponseHeaders", [])}
     return Reply(status=int(custom["ResponseCode"]), headers=headers, body=body.encode())
 
 
@@ -107,7 +107,7 @@ def _matches(statement: Mapping[str, Any], path: str) -> bool:
     if kind == "NotStatement":
         return not _matches(inside["Statement"], path)
     if kind == "OrStatement":
-        return any(_matches(each, path) for each in inside["Statements"])
+        return any(_matches(inner, path) for inner in inside["Statements"])
     if kind == "ByteMatchStatement" and inside["PositionalConstraint"] == "STARTS_WITH":
         encoded = inside.get("SearchStringBase64")
         wanted = inside["SearchString"] if encoded is None else base64.b64decode(encoded).decode()

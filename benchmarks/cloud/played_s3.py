@@ -56,9 +56,9 @@ class PlayedS3:
                 sent = {name: value for name, value in self.headers.items() if name.lower() != "connection"}
                 connection.request(self.command, self.path, body, sent)
                 made = connection.getresponse()
-                told = {name: value for name, value in made.getheaders() if name.lower() not in _HOP}
+                headers = {name: value for name, value in made.getheaders() if name.lower() not in _HOP}
                 length = made.headers.get("Content-Length") if self.command == "HEAD" else None
-                self._send(made.status, told, made.read(), length)
+                self._send(made.status, headers, made.read(), length)
                 connection.close()
 
             def _send(

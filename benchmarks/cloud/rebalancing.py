@@ -171,7 +171,7 @@ async def _watch(platform: LocalPlatform, began_s: float, args: argparse.Namespa
 
 
 async def _robots(platform: LocalPlatform) -> Mapping[str, int]:
-    return {str(each["server"]): int(each["robots"]) for each in await platform.status()}
+    return {str(server["server"]): int(server["robots"]) for server in await platform.status()}
 
 
 if __name__ == "__main__":

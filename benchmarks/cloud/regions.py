@@ -169,7 +169,9 @@ async def loses_near(site: Site, how: str) -> dict[str, Any]:
             site.near_link.is_stalled = False
             await site.near_link.listen()
         back_s = await site.in_region(robot, site.near_link)
-    return _noticed(asker, {"changed_after_s": changed_s, "longest_gap_s": round(gap_s, 3), "back_s": back_s})
+    return _summarise(
+        asker, {"changed_after_s": changed_s, "longest_gap_s": round(gap_s, 3), "back_s": back_s}
+    )
 
 
 async def gets_slow(site: Site) -> dict[str, Any]:
@@ -182,7 +184,9 @@ async def gets_slow(site: Site) -> dict[str, Any]:
         gap_s = asker.longest_gap_s(began)
         site.near_link.delay_s = NEAR_S
         back_s = await site.in_region(robot, site.near_link)
-    return _noticed(asker, {"changed_after_s": changed_s, "longest_gap_s": round(gap_s, 3), "back_s": back_s})
+    return _summarise(
+        asker, {"changed_after_s": changed_s, "longest_gap_s": round(gap_s, 3), "back_s": back_s}
+    )
 
 
 async def flaps(site: Site, seconds: float) -> dict[str, Any]:
@@ -195,13 +199,13 @@ async def flaps(site: Site, seconds: float) -> dict[str, Any]:
                 site.near_link.delay_s = delay_s
                 await asyncio.sleep(period_s)
         changes = robot.stats.region_changes
-    return _noticed(asker, {"seconds": seconds, "changes": changes})
+    return _summarise(asker, {"seconds": seconds, "changes": changes})
 
 
-def _noticed(asker: Asker, found: dict[str, Any]) -> dict[str, Any]:
+def _summarise(asker: Asker, figures: dict[str, Any]) -> dict[str, Any]:
     stats = asker.robot.stats
     return {
-        **found,
+        **figures,
         "sent": asker.sent,
         "answered": len(asker.answers),
         "lost": dict(asker.lost),
@@ -212,37 +216,37 @@ def _noticed(asker: Asker, found: dict[str, Any]) -> dict[str, Any]:
 
 async def measure(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
     """Run all parts and return what was found."""
-    found: dict[str, Any] = {"hold_s": args.hold}
+    figures: dict[str, Any] = {"hold_s": args.hold}
     async with Site(folder, args.hold) as site:
-        found["connects"] = [await connects(site) for _ in range(args.runs)]
-        _print("connects", found)
-        found["dies"] = [await loses_near(site, "dies") for _ in range(args.runs)]
-        _print("dies", found)
-        found["falls silent"] = [await loses_near(site, "falls silent")]
-        _print("falls silent", found)
-        found["gets slow"] = [await gets_slow(site)]
-        _print("gets slow", found)
-        found["flaps"] = [await flaps(site, args.flapping)]
-        _print("flaps", found)
-    return found
+        figures["connects"] = [await connects(site) for _ in range(args.runs)]
+        _print("connects", figures)
+        figures["dies"] = [await loses_near(site, "dies") for _ in range(args.runs)]
+        _print("dies", figures)
+        figures["falls silent"] = [await loses_near(site, "falls silent")]
+        _print("falls silent", figures)
+        figures["gets slow"] = [await gets_slow(site)]
+        _print("gets slow", figures)
+        figures["flaps"] = [await flaps(site, args.flapping)]
+        _print("flaps", figures)
+    return figures
 
 
-def _print(part: str, found: dict[str, Any]) -> None:
-    for each in found[part]:
-        print(f"{part:14} {json.dumps(each)}", flush=True)
+def _print(part: str, figures: dict[str, Any]) -> None:
+    for figure in figures[part]:
+        print(f"{part:14} {json.dumps(figure)}", flush=True)
 
 
-def is_met(found: dict[str, Any]) -> bool:
+def is_met(figures: dict[str, Any]) -> bool:
     """Return whether the bars of the head of this file are met."""
-    lost = [each for part in ("dies", "falls silent", "gets slow", "flaps") for each in found[part]]
+    lost = [figure for part in ("dies", "falls silent", "gets slow", "flaps") for figure in figures[part]]
     changed = [
-        each["longest_gap_s"] for part in ("dies", "falls silent", "gets slow") for each in found[part]
+        figure["longest_gap_s"] for part in ("dies", "falls silent", "gets slow") for figure in figures[part]
     ]
     return (
-        all(each["near"] and each["answered_s"] <= CONNECT_BAR_S for each in found["connects"])
-        and all(each["answered"] == each["sent"] and not each["twice"] for each in lost)
+        all(figure["near"] and figure["answered_s"] <= CONNECT_BAR_S for figure in figures["connects"])
+        and all(figure["answered"] == figure["sent"] and not figure["twice"] for figure in lost)
         and max(changed) <= CHANGE_BAR_S
-        and not found["flaps"][0]["changes"]
+        and not figures["flaps"][0]["changes"]
     )
 
 
@@ -257,12 +261,12 @@ def main() -> int:
     parser.add_argument("--out", type=Path)
     args = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="regions-") as folder:
-        found = asyncio.run(measure(args, Path(folder)))
-    found["machine"] = f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}"
+        figures = asyncio.run(measure(args, Path(folder)))
+    figures["machine"] = f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}"
     if args.out is not None:
-        args.out.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
-    print(f"bar: {'met' if is_met(found) else 'MISSED'}")
-    return 0 if is_met(found) else 1
+        args.out.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
+    print(f"bar: {'met' if is_met(figures) else 'MISSED'}")
+    return 0 if is_met(figures) else 1
 
 
 if __name__ == "__main__":

@@ -93,7 +93,7 @@ class Report:
     @property
     def holds(self) -> bool:
         """Return whether every bar is met."""
-        typed = all(" " in each or each.startswith("2") for each in self.data)
+        typed = all(" " in status or status.startswith("2") for status in self.data)
         return bool(
             not self.ended and set(self.poses) == {"cloud"} and typed and self.data_during
             and self.alarm_after_s is not None and self.alarm_after_s <= ALARM_WITHIN_S
@@ -198,8 +198,8 @@ class _Run:
         await asyncio.sleep(outage.after_s)
         over.set()
         await asyncio.gather(*poses)
-        for each in threads:
-            await asyncio.to_thread(each.join, _DATA_TIMEOUT_S)
+        for writer in threads:
+            await asyncio.to_thread(writer.join, _DATA_TIMEOUT_S)
         self._judge_alarm(began_s, time.monotonic())
         return self._report
 
@@ -247,12 +247,12 @@ class _Run:
             content = f"{number} {count}".encode()
             count += 1
             url = base + hashlib.sha256(content).hexdigest()
-            told = _status(url, _DATA_TIMEOUT_S, "PUT", content, {"Authorization": f"Bearer {token}"})
-            self._report.data[told] += 1
+            status = _status(url, _DATA_TIMEOUT_S, "PUT", content, {"Authorization": f"Bearer {token}"})
+            self._report.data[status] += 1
             if self._fails_s <= begins_s < self._well_s:
-                self._report.data_during[told] += 1
+                self._report.data_during[status] += 1
             if begins_s >= self._well_s + 5.0:
-                self._report.data_after[told] += 1
+                self._report.data_after[status] += 1
             self._over.wait(max(0.0, begins_s + _OBJECT_EACH_S - time.monotonic()))
 
     def _look(self, number: int, server: Mapping[str, int]) -> None:
@@ -352,23 +352,23 @@ def _server(folder: Path, name: str, settings: PlatformSettings) -> Iterator[Map
                         [*command, verb, *common, "--announce", str(file), *more], stdout=log, stderr=log
                     )
                 )
-        told = {verb: _announced(file, processes, home) for verb, file in files.items()}
+        pids = {verb: _read_pids(file, processes, home) for verb, file in files.items()}
         yield {
-            "port": told["serve"]["port"], "control_port": told["serve"]["control_port"],
-            "data_port": told["data"]["port"],
+            "port": pids["serve"]["port"], "control_port": pids["serve"]["control_port"],
+            "data_port": pids["data"]["port"],
         }  # fmt: skip
     finally:
         for process in processes:
             process.terminate()
-        for each in processes:
+        for child in processes:
             try:
-                each.wait(_STOP_S)
+                child.wait(_STOP_S)
             except subprocess.TimeoutExpired:
-                each.kill()
-                each.wait()
+                child.kill()
+                child.wait()
 
 
-def _announced(file: Path, processes: list[subprocess.Popen[bytes]], home: Path) -> dict[str, int]:
+def _read_pids(file: Path, processes: list[subprocess.Popen[bytes]], home: Path) -> dict[str, int]:
     until_s = time.monotonic() + _START_S
     while not file.exists():
         if time.monotonic() > until_s or any(process.poll() is not None for process in processes):

@@ -88,9 +88,9 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--seconds", type=float, default=10.0, help="between two versions")
     args = parser.parse_args(arguments)
     with tempfile.TemporaryDirectory(prefix="rse-pf-services-") as folder:
-        told = asyncio.run(_run(args, Path(folder)))
-    print(json.dumps(told, indent=1))
-    return int(told["lost"] > 0 or told["out_of_order"] > 0)
+        figures = asyncio.run(_run(args, Path(folder)))
+    print(json.dumps(figures, indent=1))
+    return int(figures["lost"] > 0 or figures["out_of_order"] > 0)
 
 
 async def _run(args: argparse.Namespace, folder: Path) -> dict[str, Any]:

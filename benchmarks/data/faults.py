@@ -84,8 +84,8 @@ def upload_all(
         client.close()
 
     with ThreadPoolExecutor(UPLOADERS) as pool:
-        for each in [pool.submit(robot, row) for row in range(UPLOADERS)]:
-            each.result()
+        for upload in [pool.submit(robot, row) for row in range(UPLOADERS)]:
+            upload.result()
     pipe.send(None)
 
 
@@ -210,11 +210,11 @@ async def run(args: argparse.Namespace) -> dict[str, Any]:
                 result = await swarm.finish()
             both = [*uploads.acknowledged, *slow.acknowledged]
             wanted = {digest_of(content(number, size)) for number in range(args.uploads + count)}
-            found = await asyncio.to_thread(judge, cloud, [digest for digest, _ in both], wanted)
+            verdict = await asyncio.to_thread(judge, cloud, [digest for digest, _ in both], wanted)
     rows = [poses(result.commands, *times[i : i + 2]) for i in range(3)]
     names = ("before", f"{args.uploads} uploads, {args.kills} kills", f"{count} paced uploads")
     return {
-        "poses": dict(zip(names, rows, strict=True)), "back_s": back_s, "objects": found,
+        "poses": dict(zip(names, rows, strict=True)), "back_s": back_s, "objects": verdict,
         "upload_s": times[2] - times[1], "longest_upload_s": max(s for _, s in uploads.acknowledged),
         "mib_per_s": args.uploads * size / MIB / (times[2] - times[1]),
         "late_sends_ms": result.late_sends_ms_p99,
@@ -234,27 +234,29 @@ def main() -> None:
     args = parser.parse_args()
     load = os.getloadavg()[0]
     try:
-        found = asyncio.run(run(args))
+        verdict = asyncio.run(run(args))
     except RsePfError as error:
         raise SystemExit(error.report()) from error
-    found["load"] = [load, os.getloadavg()[0]]
-    print(f"{platform.node()}, {os.cpu_count()} cores, load {load:.1f} -> {found['load'][1]:.1f}")
+    verdict["load"] = [load, os.getloadavg()[0]]
+    print(f"{platform.node()}, {os.cpu_count()} cores, load {load:.1f} -> {verdict['load'][1]:.1f}")
     print(
         f"{args.robots} robots x {args.fps:g} fps; {UPLOADERS} robots upload objects of {args.size_kib} KiB"
     )
-    first = next(iter(found["poses"].values()))["p99_ms"]
-    for name, row in found["poses"].items():
+    first = next(iter(verdict["poses"].values()))["p99_ms"]
+    for name, row in verdict["poses"].items():
         print(
             f"{name:24} n={row['n']} unanswered={row['unanswered']} p50={row['p50_ms']:.1f} ms "
             f"p99={row['p99_ms']:.1f} ms, {row['p99_ms'] / first:.2f} x before (bar {RATIO})"
         )
-    back = ", ".join(f"{s:.2f}" for s in found["back_s"])
+    back = ", ".join(f"{s:.2f}" for s in verdict["back_s"])
     print(
-        f"service ready after {back} s (bar {BACK_S:g} s); longest upload {found['longest_upload_s']:.1f} s"
+        f"service ready after {back} s (bar {BACK_S:g} s); longest upload {verdict['longest_upload_s']:.1f} s"
     )
-    print(f"{found['mib_per_s']:.1f} MiB/s with the kills; {found['objects']} (bar: 0 missing, 0 partial)")
+    print(
+        f"{verdict['mib_per_s']:.1f} MiB/s with the kills; {verdict['objects']} (bar: 0 missing, 0 partial)"
+    )
     if args.out is not None:
-        args.out.write_text(json.dumps(found, indent=1))
+        args.out.write_text(json.dumps(verdict, indent=1))
 
 
 if __name__ == "__main__":

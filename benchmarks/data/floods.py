@@ -162,8 +162,8 @@ def _run_threads(work: Callable[[int], None], count: int, begun: Event) -> None:
     for thread in threads:
         thread.start()
     begun.set()
-    for each in threads:
-        each.join()
+    for worker in threads:
+        worker.join()
 
 
 def flood_of_maps(port: int, tokens: list[str], begun: Event, stop: Event, results: Any) -> None:
@@ -329,20 +329,20 @@ def main() -> None:
     parser.add_argument("--out", type=Path)
     args = parser.parse_args()
     load = os.getloadavg()[0]
-    found = run(args)
-    found["load"] = [load, os.getloadavg()[0]]
-    print(f"{platform.node()}, {os.cpu_count()} cores, load {load:.1f} -> {found['load'][1]:.1f}")
+    result = run(args)
+    result["load"] = [load, os.getloadavg()[0]]
+    print(f"{platform.node()}, {os.cpu_count()} cores, load {load:.1f} -> {result['load'][1]:.1f}")
     for name in ("quiet", "lists", "maps", "pages"):
-        figures = " ".join(f"{what}={value:.1f}" for what, value in found[name].items() if what != "n")
-        print(f"{name:8} n={found[name]['n']} {figures}")
-    lists, maps = (found[name]["p99_ms"] / found["quiet"]["p99_ms"] for name in ("lists", "maps"))
+        figures = " ".join(f"{what}={value:.1f}" for what, value in result[name].items() if what != "n")
+        print(f"{name:8} n={result[name]['n']} {figures}")
+    lists, maps = (result[name]["p99_ms"] / result["quiet"]["p99_ms"] for name in ("lists", "maps"))
     print(f"PUT beside lists and writes: p99 {lists:.2f} x quiet (bar {RATIO}); pages: bar {PAGE_MS:g} ms")
     print(f"PUT beside hostile maps: p99 {maps:.2f} x quiet (bar {MAPS_RATIO}, and {MAPS_MS:g} ms)")
-    print(f"answers to the hostile robots: {found['statuses']}")
-    print(f"stored {found['stored']} of at most {args.objects}; without a limit of rates: {found['count']}")
-    print(f"the server grew by {found['server_grown_mib']:.0f} MiB (bar {GROWTH_MIB:g})")
+    print(f"answers to the hostile robots: {result['statuses']}")
+    print(f"stored {result['stored']} of at most {args.objects}; without a limit of rates: {result['count']}")
+    print(f"the server grew by {result['server_grown_mib']:.0f} MiB (bar {GROWTH_MIB:g})")
     if args.out is not None:
-        args.out.write_text(json.dumps(found, indent=1))
+        args.out.write_text(json.dumps(result, indent=1))
 
 
 if __name__ == "__main__":

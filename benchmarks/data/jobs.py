@@ -76,15 +76,15 @@ def two_maps(recordings: Path | None, count: int) -> list[bytes]:
         mine = kept[number % 2]
         if not mine:
             firsts.append(inverse(T_world_camera))
-        found = extract(frame, FrontEndOptions())
+        features = extract(frame, FrontEndOptions())
         mine.append(
             Keyframe(
                 id=len(mine), robot=f"robot-{number % 2}", timestamp_s=frame.timestamp_s, camera=frame.camera,
-                T_world_camera=firsts[number % 2] @ T_world_camera, pixels=found.pixels.astype(np.float32),
-                descriptors=found.descriptors, points_camera=found.points_camera.astype(np.float32),
+                T_world_camera=firsts[number % 2] @ T_world_camera, pixels=features.pixels.astype(np.float32),
+                descriptors=features.descriptors, points_camera=features.points_camera.astype(np.float32),
             )
         )  # fmt: skip
-    return [encode_map(MapVersion(keyframes=tuple(each))) for each in kept]
+    return [encode_map(MapVersion(keyframes=tuple(keyframes))) for keyframes in kept]
 
 
 class Bench:
@@ -120,14 +120,14 @@ class Bench:
                 took.append(time.monotonic() - began)
         return took
 
-    async def undisturbed(self) -> tuple[str, Any, float]:
+    async def run_undisturbed(self) -> tuple[str, Any, float]:
         """Return the digest of the result, the result, and how long it took (s)."""
         async with self.robot("reference") as robot:
             began = time.monotonic()
             answer = await robot.call("merge", self.request("reference"), on_progress=lambda done, what: None)
             return answer.object, answer.reply, time.monotonic() - began
 
-    async def killed(self) -> dict[str, Any]:
+    async def run_killed(self) -> dict[str, Any]:
         """Kill the server of a merge half-way; return where and when it ended."""
         half = asyncio.Event()
         heard: list[tuple[float, float, str]] = []
@@ -174,19 +174,19 @@ async def run(args: argparse.Namespace) -> dict[str, Any]:
                 during = time.monotonic() - origin
                 took = await bench.merges(time.monotonic() + args.seconds)
                 after = time.monotonic() - origin
-                reference, reply, alone_s = await bench.undisturbed()
-                death = await bench.killed()
+                reference, reply, alone_s = await bench.run_undisturbed()
+                death = await bench.run_killed()
                 result = await swarm.finish()
-    kept = [poses(result.commands, before, during), poses(result.commands, during, after)]
+    poses_of = [poses(result.commands, before, during), poses(result.commands, during, after)]
     return {
         "keyframes": args.keyframes, "map_bytes": [len(data) for data in maps], "merges_s": took,
-        "merge_alone_s": alone_s, "joined": _joined(reply), "before": kept[0], "during": kept[1],
-        "ratio": kept[1]["p99_ms"] / kept[0]["p99_ms"], "death": death,
+        "merge_alone_s": alone_s, "joined": _read_joins(reply), "before": poses_of[0], "during": poses_of[1],
+        "ratio": poses_of[1]["p99_ms"] / poses_of[0]["p99_ms"], "death": death,
         "same_digest": death["object"] == reference, "late_sends_ms": result.late_sends_ms_p99,
     }  # fmt: skip
 
 
-def _joined(reply: Any) -> Any:
+def _read_joins(reply: Any) -> Any:
     """Return which maps the result holds; None where the reply was too large for a message."""
     return None if reply is None else as_type(reply, MergeReply).joined
 
@@ -206,27 +206,29 @@ def main() -> None:
     load = os.getloadavg()[0]
     is_idle_class = os.sched_getscheduler(0) == os.SCHED_IDLE
     try:
-        found = asyncio.run(run(args))
+        figures = asyncio.run(run(args))
     except RsePfError as error:
         raise SystemExit(error.report()) from error
-    found["is_idle_class"] = is_idle_class
+    figures["is_idle_class"] = is_idle_class
     if is_idle_class:
         print("everything runs in SCHED_IDLE: jobs are behind nobody, and the ratio says nothing")
-    found["load"] = [load, os.getloadavg()[0]]
-    print(f"{platform.node()}, {os.cpu_count()} cores, load {load:.1f} -> {found['load'][1]:.1f}")
-    print(f"{args.robots} robots x {args.fps:g} fps; {args.keyframes} keyframes, {found['map_bytes']} bytes")
+    figures["load"] = [load, os.getloadavg()[0]]
+    print(f"{platform.node()}, {os.cpu_count()} cores, load {load:.1f} -> {figures['load'][1]:.1f}")
+    print(
+        f"{args.robots} robots x {args.fps:g} fps; {args.keyframes} keyframes, {figures['map_bytes']} bytes"
+    )
     for name in ("before", "during"):
-        row = found[name]
+        row = figures[name]
         print(
             f"{name:8} n={row['n']} unanswered={row['unanswered']} "
             f"p50={row['p50_ms']:.1f} ms p99={row['p99_ms']:.1f} ms"
         )
-    took = [round(s, 1) for s in found["merges_s"]]
-    print(f"ratio of p99: {found['ratio']:.2f} (bar {BAR})")
-    print(f"merges: {took} s, the one after them {found['merge_alone_s']:.1f} s")
-    print(f"server killed half-way: {found['death']}; same digest: {found['same_digest']}")
+    took = [round(s, 1) for s in figures["merges_s"]]
+    print(f"ratio of p99: {figures['ratio']:.2f} (bar {BAR})")
+    print(f"merges: {took} s, the one after them {figures['merge_alone_s']:.1f} s")
+    print(f"server killed half-way: {figures['death']}; same digest: {figures['same_digest']}")
     if args.out is not None:
-        args.out.write_text(json.dumps(found, indent=1))
+        args.out.write_text(json.dumps(figures, indent=1))
 
 
 if __name__ == "__main__":

@@ -13,9 +13,9 @@ def poses(commands: list[CommandRecord], begin_s: float, end_s: float) -> dict[s
     """Return latencies and unanswered frames of poses planned from *begin_s* to *end_s*."""
     chosen = [command for command in commands if begin_s <= command.planned < end_s]
     took = [
-        (each.answered - each.planned) * 1e3
-        for each in chosen
-        if each.answered is not None and each.code == "ok"
+        (command.answered - command.planned) * 1e3
+        for command in chosen
+        if command.answered is not None and command.code == "ok"
     ]
     p50, p99 = np.percentile(took, [50, 99]) if took else (float("nan"),) * 2
     return {"n": len(chosen), "unanswered": len(chosen) - len(took), "p50_ms": p50, "p99_ms": p99}

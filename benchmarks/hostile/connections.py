@@ -349,7 +349,7 @@ async def cycle(url: str, tokens: tuple[str, str], number: int) -> None:
             pass
 
 
-def held_by(pid: int) -> dict[str, int]:
+def count_held(pid: int) -> dict[str, int]:
     status = dict(line.split(":", 1) for line in Path(f"/proc/{pid}/status").read_text().splitlines())
     return {
         "descriptors": len(list(Path(f"/proc/{pid}/fd").iterdir())), "threads": int(status["Threads"]),
@@ -382,15 +382,15 @@ def leave(times: int) -> dict[str, Any]:
                 for each in family(root)
                 if Path(f"/proc/{each}/comm").read_text().strip() == "rse-pf worker"
             )
-            return grown_by(worker, times, lambda count: asyncio.run(run(count)))
+            return count_growth(worker, times, lambda count: asyncio.run(run(count)))
 
 
-def grown_by(pid: int, times: int, run: Callable[[int], None]) -> dict[str, Any]:
+def count_growth(pid: int, times: int, run: Callable[[int], None]) -> dict[str, Any]:
     """Return what the process *pid* holds before and after *times* cycles."""
-    before = held_by(pid)
+    before = count_held(pid)
     run(times)
     deadline = time.monotonic() + 10
-    while (after := held_by(pid))["descriptors"] > before["descriptors"] and time.monotonic() < deadline:
+    while (after := count_held(pid))["descriptors"] > before["descriptors"] and time.monotonic() < deadline:
         time.sleep(0.1)
     grown = (after["anonymous_kib"] - before["anonymous_kib"]) / times
     return {"times": times, "before": before, "after": after, "kib_per_cycle": round(grown, 3)}
@@ -430,7 +430,7 @@ def leave_page(times: int) -> dict[str, Any]:
                 browse(announced[0].parent)
 
         run(_WARM_UP)
-        return grown_by(int(json.loads(announced[0].read_text())["pid"]), times, run)
+        return count_growth(int(json.loads(announced[0].read_text())["pid"]), times, run)
 
 
 def main() -> int:

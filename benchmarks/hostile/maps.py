@@ -37,7 +37,7 @@ from typing import Any
 import numpy as np
 
 import client_sdk
-from benchmarks.hostile.robots import seen
+from benchmarks.hostile.robots import summarise_window
 from rse_pf.auth.tokens import SigningKey
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import RsePfError
@@ -95,16 +95,16 @@ class Server:
             if self._process.poll() is not None or time.monotonic() > end:
                 raise SystemExit((folder / "server.log").read_text()[-2000:])
             time.sleep(0.05)  # looks again, with a deadline: the file comes by rename
-        told = json.loads(announce.read_text())
-        self.url = f"ws://127.0.0.1:{told['port']}/ws"
-        self.serving = [self._process.pid, *told["workers"]]
+        announced = json.loads(announce.read_text())
+        self.url = f"ws://127.0.0.1:{announced['port']}/ws"
+        self.serving = [self._process.pid, *announced["workers"]]
 
     def token(self, robot: str) -> str:
         """Return a token that this server accepts."""
         settings = PlatformSettings().auth
         return KEY.issue(robot, now=time.time(), token_id=f"{robot}-{time.monotonic()}", settings=settings)
 
-    def put_all(self, robots: Iterable[str], data: bytes) -> dict[str, str]:
+    def store_all(self, robots: Iterable[str], data: bytes) -> dict[str, str]:
         """Store *data* as an object of each of *robots*, and return the reference to it."""
         place, digest = f"dir:{self.folder / 'objects'}", digest_of(data)
         # Other sources may lay out their objects in another way, so they store them themselves.
@@ -185,7 +185,7 @@ async def flood(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
             result = await swarm.finish(GRACE_S)
     finally:
         server.stop()
-    others = {name: seen(result.commands, *window) for name, window in windows.items()}
+    others = {name: summarise_window(result.commands, *window) for name, window in windows.items()}
     show_flood(rows, others)
     return {"attacks": rows, "others": others}
 
@@ -201,10 +201,10 @@ def hostile_requests(server: Server, only: str) -> list[tuple[str, str, dict[str
     chosen = [data for name, data in corpus.items() if re.search(only, name)]
     made: list[tuple[str, str, dict[str, Any]]] = []
     honest_map = encode_map(make_world(3).walk("honest", np.linspace(0, 0.2, 8), 3)[0])
-    beside = server.put_all([f"hostile-merge-{number}" for number in range(len(chosen))], honest_map)
+    beside = server.store_all([f"hostile-merge-{number}" for number in range(len(chosen))], honest_map)
     for number, data in enumerate(chosen):
         robots = {service: f"hostile-{service}-{number}" for service in ("place", "localise", "merge")}
-        reference = server.put_all(robots.values(), data)
+        reference = server.store_all(robots.values(), data)
         for service, robot in robots.items():
             payload = {"maps": [reference, beside]} if service == "merge" else {"map": reference, **view}
             made.append((robot, service, payload))
@@ -280,12 +280,12 @@ async def attack(
 
 def _family(pids: Sequence[int]) -> list[int]:
     """Return these processes and all that they and their threads started."""
-    found = list(pids)
-    for pid in found:
+    family = list(pids)
+    for pid in family:
         for children in Path(f"/proc/{pid}/task").glob("*/children"):
             with contextlib.suppress(OSError):
-                found += [int(child) for child in children.read_text().split() if int(child) not in found]
-    return found
+                family += [int(child) for child in children.read_text().split() if int(child) not in family]
+    return family
 
 
 def _own_mib(pids: Iterable[int]) -> float:
@@ -366,7 +366,7 @@ def _place(keyframes: int, *, service_options: dict[str, Any]) -> Callable[..., 
         version, _ = world.walk("honest", np.linspace(0, 1, keyframes), 3)
         data, view = encode_map(version), honest_view()
         return {
-            "map": server.put_all(["honest"], data), "camera": view.camera,
+            "map": server.store_all(["honest"], data), "camera": view.camera,
             "pixels": view.pixels.ravel().astype(float), "descriptors": view.descriptors.tobytes(),
             **service_options,
         }  # fmt: skip

@@ -230,8 +230,8 @@ async def _maps(robot: Robot, place: _Place) -> None:
             if number < 8:
                 listening.append(asyncio.ensure_future(listen(name)))
     finally:
-        for each in listening:
-            each.cancel()
+        for listener in listening:
+            listener.cancel()
         await asyncio.gather(*listening, return_exceptions=True)
 
 
@@ -239,7 +239,7 @@ async def _keyframes(robot: Robot, place: _Place) -> None:
     number = 0
     while True:
         most = 8 if number else 1  # the first one begins the map
-        requests = [keyframe(place.tag, number + each, 894) for each in range(most)]
+        requests = [keyframe(place.tag, number + socket_number, 894) for socket_number in range(most)]
         codes = await asyncio.gather(*(place.call(robot, "live-keyframe", request) for request in requests))
         number += codes.count("ok")
 
@@ -251,7 +251,7 @@ async def _topics(robot: Robot, place: _Place) -> None:
     for number in itertools.count():
         try:
             async with connect_websocket(address, additional_headers=headers, compression=None) as socket:
-                for topic in (f"/t{number}-{each}" for each in range(20)):
+                for topic in (f"/t{number}-{row}" for row in range(20)):
                     asked = {
                         "op": "subscribe",
                         "topic": topic,
@@ -324,10 +324,10 @@ def run_neighbour(name: str, url: str, token: str, seconds: float, pipe: Connect
     os.nice(_LOWEST_PRIORITY)
     work = {FAIR: _fair, **ATTACKS}[name]
     while pipe.recv() == "go":
-        pipe.send(asyncio.run(_bounded(work, url, token, seconds)))
+        pipe.send(asyncio.run(_run_bounded(work, url, token, seconds)))
 
 
-async def _bounded(work: Neighbour, url: str, token: str, seconds: float) -> dict[str, int]:
+async def _run_bounded(work: Neighbour, url: str, token: str, seconds: float) -> dict[str, int]:
     place = _Place(url, token)
     until = time.monotonic() + seconds
     async with contextlib.AsyncExitStack() as stack:
@@ -396,15 +396,15 @@ async def _pairs(
     servers = [mark.pid for mark in platform.backend_servers.marks.values()]
     most = dict.fromkeys((FAIR, name), 0.0)
     for number in range(pairs):
-        found = {}
+        rows = {}
         for kind in (FAIR, name) if number % 2 else (name, FAIR):
             began = time.monotonic()
             neighbours[kind][0].send("go")
             codes[kind].update(await asyncio.to_thread(neighbours[kind][0].recv))
-            found[kind] = began, time.monotonic()
+            rows[kind] = began, time.monotonic()
             most[kind] = max(most[kind], resident_mib(servers))
             await asyncio.sleep(_REST_S)
-        windows.append(found)
+        windows.append(rows)
     store = DirectoryStore(_store_of(state))
     return {
         "attack": name, "pairs": pairs, "load_average": round(os.getloadavg()[0], 2),
@@ -431,7 +431,7 @@ async def _pairs(
 
 def _store_of(state: Path) -> Path:
     """Return the folder of the platform's objects."""
-    return next(each.parent for each in state.rglob("accounts") if each.is_dir())
+    return next(path.parent for path in state.rglob("accounts") if path.is_dir())
 
 
 def _p99(measured: Measured, spans: Sequence[tuple[float, float]], what: str) -> float:

@@ -76,17 +76,17 @@ async def attack(process: Process, cloud: LocalPlatform) -> tuple[dict[str, Any]
     while not talking.done():
         await asyncio.wait({talking}, timeout=0.1)
         most = max(most, resident_mib(servers))
-    told, _ = talking.result()
-    return json.loads(told or b'{"ends": {"attacker failed": 1}}'), most - before
+    outcome, _ = talking.result()
+    return json.loads(outcome or b'{"ends": {"attacker failed": 1}}'), most - before
 
 
-def seen(commands: Sequence[CommandRecord], begin: float, end: float) -> dict[str, Any]:
+def summarise_window(commands: Sequence[CommandRecord], begin: float, end: float) -> dict[str, Any]:
     """Return what the others saw of commands planned within a window."""
     planned = [command for command in commands if begin <= command.planned < end]
-    trips = [each.round_trip_ms for each in planned if each.round_trip_ms is not None]
+    trips = [command.round_trip_ms for command in planned if command.round_trip_ms is not None]
     codes: dict[str, int] = {}
-    for each in planned:
-        codes[each.code or "lost"] = codes.get(each.code or "lost", 0) + 1
+    for planned_command in planned:
+        codes[planned_command.code or "lost"] = codes.get(planned_command.code or "lost", 0) + 1
     return {
         "n": len(planned),
         "goodput": len(trips) / max(1, len(planned)),
@@ -130,8 +130,8 @@ async def run(names: Sequence[str], robots: int, seconds: float, folder: Path) -
                 rows.append({**row, "quiet_s": quiet, "began_s": began, "ended_s": now()})
             result = await swarm.finish(GRACE_S)
     for row in rows:
-        row["quiet"] = seen(result.commands, row["quiet_s"], row["began_s"])
-        row["others"] = seen(result.commands, row["began_s"], row["ended_s"])
+        row["quiet"] = summarise_window(result.commands, row["quiet_s"], row["began_s"])
+        row["others"] = summarise_window(result.commands, row["began_s"], row["ended_s"])
         row["dropped"] = sum(row["began_s"] <= at < row["ended_s"] for at in dropped)
         row["twice"] = result.duplicates
     return rows
@@ -163,9 +163,9 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
     ]
     for row in rows:
         outcome, quiet, others = row["outcome"], row["quiet"], row["others"]
-        told = f"{outcome.get('refused')} of {outcome.get('tried')} refused, {outcome.get('ends')}"
+        text = f"{outcome.get('refused')} of {outcome.get('tried')} refused, {outcome.get('ends')}"
         lines.append(
-            f"| {row['attack']} | {told}, slowest {outcome.get('slowest_s', 0):.2f} s | {others['n']} | "
+            f"| {row['attack']} | {text}, slowest {outcome.get('slowest_s', 0):.2f} s | {others['n']} | "
             f"{100 * others['goodput']:.2f} % | {others['p50_ms']:.1f} | {others['p99_ms']:.1f} "
             f"({quiet['p99_ms']:.1f}) | {others['p99_ms'] / quiet['p99_ms']:.2f} | {row['dropped']} | "
             f"{row['grown_mib']:+.1f} | {row['load']:.1f} | {verdict(row)} |"

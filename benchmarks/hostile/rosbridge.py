@@ -47,12 +47,12 @@ DEAD_S = 8.0
 
 def payloads() -> list[Any]:
     """Return the payloads of poses with `POINTS` matches, as JSON has them."""
-    codec, found = make_codec("json"), []
+    codec, texts = make_codec("json"), []
     for seed, points in enumerate(POINTS):
         problem = make_problem(n=points, seed=seed)
         request = make_request(problem.points_world, problem.pixels, problem.camera)
-        found.append(json.loads(codec.encode(Command(id=0, service="pnp", payload=request)))["payload"])
-    return found
+        texts.append(json.loads(codec.encode(Command(id=0, service="pnp", payload=request)))["payload"])
+    return texts
 
 
 def enter(port: int, token: str = "", *, rosbridge: bool = True, **more: Any) -> connect:
@@ -65,7 +65,7 @@ def enter(port: int, token: str = "", *, rosbridge: bool = True, **more: Any) ->
     )  # fmt: skip
 
 
-async def timed(socket: ClientConnection, message: str) -> float:
+async def time_answer_ms(socket: ClientConnection, message: str) -> float:
     """Return how long the answer to *message* took, in ms."""
     began = time.perf_counter()
     await socket.send(message)
@@ -78,7 +78,7 @@ async def cost(server: BenchServer, rounds: int) -> dict[str, Any]:
     times: dict[tuple[int, bool], list[float]] = {}
     poses = list(zip(POINTS, payloads(), strict=True))
     async with enter(server.port, server.token("json"), rosbridge=False) as own:
-        await timed(own, '{"type":"hello"}')
+        await time_answer_ms(own, '{"type":"hello"}')
         async with enter(server.port, server.token("ros")) as ros:
             for number in range(rounds * 20):
                 for points, payload in poses:
@@ -86,9 +86,9 @@ async def cost(server: BenchServer, rounds: int) -> dict[str, Any]:
                     call = {"op": "call_service", "id": f"c:{number}", "service": "/pnp", "args": payload}
                     turns = [(own, command, False), (ros, call, True)]
                     for socket, message, is_ros in turns if number % 2 else turns[::-1]:
-                        taken = await timed(socket, json.dumps(message))
+                        taken = await time_answer_ms(socket, json.dumps(message))
                         times.setdefault((points, is_ros), []).append(taken)
-    medians = {key: statistics.median(each) for key, each in times.items()}
+    medians = {key: statistics.median(times_ms) for key, times_ms in times.items()}
     return {
         str(points): {
             "n": len(times[points, True]), "json_ms": round(medians[points, False], 3),
@@ -173,7 +173,7 @@ async def attack(port: int, tokens: list[str], rounds: int, seconds: float) -> d
         began = time.monotonic()
         named = [name for name in ATTACKS if name != "no-token"]
         work = [one(name, tokens.pop()) for name in named] + [one("no-token", "") for _ in range(STRANGERS)]
-        running = [asyncio.ensure_future(each) for each in work]
+        running = [asyncio.ensure_future(coroutine) for coroutine in work]
         await asyncio.sleep(seconds)
         windows.append((quiet, began, time.monotonic()))
         await asyncio.gather(*running)
@@ -183,12 +183,12 @@ async def attack(port: int, tokens: list[str], rounds: int, seconds: float) -> d
 async def robot(port: int, token: str, payload: Any, times: list[tuple[float, float]]) -> None:
     """Solve poses until it is cancelled; append when, and how long each took in ms."""
     async with enter(port, token, rosbridge=False) as socket:
-        await timed(socket, '{"type":"hello"}')
+        await time_answer_ms(socket, '{"type":"hello"}')
         number = 0
         while True:
             number += 1
             message = {"type": "command", "id": number, "service": "pnp", "payload": payload}
-            times.append((time.monotonic(), await timed(socket, json.dumps(message))))
+            times.append((time.monotonic(), await time_answer_ms(socket, json.dumps(message))))
             await asyncio.sleep(1 / PER_S)
 
 
@@ -206,21 +206,21 @@ async def beside(server: BenchServer, rounds: int, seconds: float) -> dict[str, 
         str(server.port), "--rounds", str(rounds), "--seconds", str(seconds),
         stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE,
     )  # fmt: skip
-    told, _ = await process.communicate(json.dumps(tokens).encode())
-    for each in robots:
-        each.cancel()
-    found = json.loads(told)
-    quiet = sorted(ms for at, ms in times if any(a <= at < b for a, b, _ in found["windows"]))
-    attacked = sorted(ms for at, ms in times if any(b <= at < c for _, b, c in found["windows"]))
+    output, _ = await process.communicate(json.dumps(tokens).encode())
+    for task in robots:
+        task.cancel()
+    measured = json.loads(output)
+    quiet = sorted(ms for at, ms in times if any(a <= at < b for a, b, _ in measured["windows"]))
+    attacked = sorted(ms for at, ms in times if any(b <= at < c for _, b, c in measured["windows"]))
     figures = {
         name: {
-            "n": len(each),
-            **{f"p{p}_ms": round(each[int(p / 100 * (len(each) - 1))], 2) for p in (50, 99)},
+            "n": len(row),
+            **{f"p{p}_ms": round(row[int(p / 100 * (len(row) - 1))], 2) for p in (50, 99)},
         }
-        for name, each in (("quiet", quiet), ("attacked", attacked))
+        for name, row in (("quiet", quiet), ("attacked", attacked))
     }
     ratio = figures["attacked"]["p99_ms"] / figures["quiet"]["p99_ms"]
-    return {**figures, "p99_ratio": round(ratio, 2), "ends": found["ends"]}
+    return {**figures, "p99_ratio": round(ratio, 2), "ends": measured["ends"]}
 
 
 def main() -> int:
@@ -241,13 +241,13 @@ def main() -> int:
         with BenchServer(Path(folder), workers=2, serving=serving, session=unlimited) as server:
             paid = asyncio.run(cost(server, args.rounds))
         with BenchServer(Path(folder), workers=2, serving=serving) as server:
-            told = asyncio.run(beside(server, args.rounds, args.seconds))
-    result = {"machine": machine(), "cost": paid, "beside": told}
+            figures = asyncio.run(beside(server, args.rounds, args.seconds))
+    result = {"machine": machine(), "cost": paid, "beside": figures}
     print(json.dumps(result, indent=1))
     if args.out is not None:
         args.out.parent.mkdir(parents=True, exist_ok=True)
         args.out.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
-    wrong = [end for end in told["ends"] if end.split()[1] not in map(str, MUST[end.split()[0]])]
+    wrong = [end for end in figures["ends"] if end.split()[1] not in map(str, MUST[end.split()[0]])]
     return 1 if wrong else 0
 
 

@@ -298,29 +298,29 @@ async def _crash_robot(
 
 async def poison(folder: Path, requests: int = 5000) -> list[Row]:
     """Send one request that crashes its sandbox among many good ones."""
-    told: list[str] = []
+    codes: list[str] = []
     async with serving(folder) as server, server.robot("poisoner") as robot:
         for i in range(requests):
             deadly = i == requests // 2
             try:
                 await robot.call("hard-stateless", {"do": "crash" if deadly else "add"}, deadline_s=3)
-                told.append("answered")
+                codes.append("answered")
             except RsePfError as error:
-                told.append(error.code)
+                codes.append(error.code)
         ready = server.ready()
     return [{
         "row": f"one poison among {requests}",
-        "answers": {code: told.count(code) for code in sorted(set(told))},
+        "answers": {code: codes.count(code) for code in sorted(set(codes))},
         "readyz": ready,
     }]  # fmt: skip
 
 
-async def released(folder: Path, robots: int = 10) -> list[Row]:
+async def measure_release(folder: Path, robots: int = 10) -> list[Row]:
     """Count processes and descriptors before robots come and after they left."""
     async with serving(folder) as server:
         async with server.robot("first") as robot:
             await robot.call("hard", {}, deadline_s=5)
-        await _settled(server, 0)
+        await _wait_settled(server, 0)
         before = (len(server.processes()), server.descriptors())
         async with contextlib.AsyncExitStack() as stack:
             for i in range(robots):
@@ -338,7 +338,7 @@ async def released(folder: Path, robots: int = 10) -> list[Row]:
     }]  # fmt: skip
 
 
-async def _settled(server: Server, sandboxes: int) -> None:
+async def _wait_settled(server: Server, sandboxes: int) -> None:
     """Wait until only *sandboxes* are left (the grace period is 5 s)."""
     seen, end = -1, time.monotonic() + 12
     while time.monotonic() < end:
@@ -432,7 +432,7 @@ async def measure(only: list[str], crash_s: float) -> list[Row]:
         folder = Path(temporary)
         prepare(folder)
         works = {
-            "cost": lambda: cost(folder), "released": lambda: released(folder),
+            "cost": lambda: cost(folder), "released": lambda: measure_release(folder),
             "poison": lambda: poison(folder), "state": lambda: state(folder),
             "crashes": lambda: crashes(folder, crash_s),
         }  # fmt: skip

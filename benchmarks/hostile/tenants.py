@@ -41,8 +41,8 @@ __all__ = [
     "NAME",
     "TENANTS",
     "Outcome",
+    "count_logged",
     "interleave",
-    "logged",
     "owners",
     "prepare",
     "secret_of",
@@ -225,14 +225,14 @@ async def _jobs(robot: _Robot, jobs: int) -> None:
         await robot.ask("optimise", {"g2o": GRAPH, "options": {"max_iterations": 10 + number}})
 
 
-def logged(log: str) -> Counter[str]:
+def count_logged(log: str) -> Counter[str]:
     """Return how many commands the log of a server has of each tenant; "" counts lines that name none."""
-    found: Counter[str] = Counter()
+    counts: Counter[str] = Counter()
     for line in log.splitlines():
         entry = json.loads(line) if line.startswith("{") else {}
         if entry.get("event") == "command":
-            found[entry.get("tenant", "")] += 1
-    return found
+            counts[entry.get("tenant", "")] += 1
+    return counts
 
 
 def owners(store: Path, area: str) -> list[str]:
@@ -281,7 +281,7 @@ def main(arguments: Sequence[str]) -> int:
         finally:
             server.terminate()
             server.wait()
-        lines = logged(log.read_text())
+        lines = count_logged(log.read_text())
         areas = {area: owners(folder / "store", area) for area in ("states", "jobs", "objects")}
     expected = sorted(f"{tenant}/{NAME}" for tenant in TENANTS)
     report = {
@@ -292,7 +292,7 @@ def main(arguments: Sequence[str]) -> int:
     sys.stdout.write(json.dumps(report, indent=1) + "\n")
     if chosen.out:
         chosen.out.write_text(json.dumps(report, indent=1))
-    is_right = lines == outcome.commands and all(found == expected for found in areas.values())
+    is_right = lines == outcome.commands and all(stored == expected for stored in areas.values())
     return 0 if not outcome.shared and not outcome.stale and is_right else 1
 
 

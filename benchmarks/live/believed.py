@@ -72,9 +72,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
             for seed in range(chosen.runs):
                 at = np.random.default_rng(seed).integers(0, 60, len(runs))
                 starts = dict(zip(runs, (at - at.min()).tolist(), strict=True))
-                found = most_contradictions(play(slipped, starts).live_map)
-                most, disbelieved = max(most, found[0]), disbelieved + found[1]
-                smoothed = max(smoothed, found[2])
+                contradictions = most_contradictions(play(slipped, starts).live_map)
+                most, disbelieved = max(most, contradictions[0]), disbelieved + contradictions[1]
+                smoothed = max(smoothed, contradictions[2])
             print(
                 f"{what}, steps x{slip:g}, {chosen.runs} runs: at most {most} of 32 keyframes contradict, "
                 f"{disbelieved} segments disbelieved, {smoothed} of 2,000 of the budget used at the end; "

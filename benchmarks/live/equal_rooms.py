@@ -40,7 +40,7 @@ from rse_pf.live_map.live_map import LiveMap
 from rse_pf.live_map.outcomes import Added, Joined, OptimiseWanted
 from rse_pf.slam.keyframe import Keyframe, encode_keyframe, make_features
 
-__all__ = ["Drive", "Met", "main", "meet", "prepared"]
+__all__ = ["Drive", "Met", "main", "meet", "prepare_drives"]
 
 ROOMS, EQUAL, APART_M = 5, (1, 3), 10.0
 STEP_M = 0.11
@@ -74,7 +74,7 @@ class Met:
     reason: str
 
 
-def prepared(folder: Path, seed: int) -> dict[str, Drive]:
+def prepare_drives(folder: Path, seed: int) -> dict[str, Drive]:
     """Return the drives of a seed; they are rendered, tracked and kept if they are not there."""
     path = folder / f"equal-{seed}.npz"
     if not path.exists():
@@ -111,9 +111,11 @@ def meet(drives: dict[str, Drive], names: Sequence[str], stated_m: float) -> Met
             if "b" in first:
                 ever |= joined
                 wrong_ever |= joined and _off_m(live_map, drives, names[0], first) > _WRONG_M
-    found = next(alignment for alignment in live_map.alignments() if alignment.robot == "b")
-    wrong = found.aligned and _off_m(live_map, drives, names[0], first) > _WRONG_M
-    return Met(ever=ever, wrong_ever=wrong_ever, aligned=found.aligned, wrong=wrong, reason=found.reason)
+    alignment_b = next(alignment for alignment in live_map.alignments() if alignment.robot == "b")
+    wrong = alignment_b.aligned and _off_m(live_map, drives, names[0], first) > _WRONG_M
+    return Met(
+        ever=ever, wrong_ever=wrong_ever, aligned=alignment_b.aligned, wrong=wrong, reason=alignment_b.reason
+    )
 
 
 def _off_m(live_map: LiveMap, drives: dict[str, Drive], root: str, first: dict[str, int]) -> float:
@@ -137,9 +139,9 @@ def _prepare(path: Path, seed: int) -> None:
         for frame, T_world_camera in zip(
             render_along(truth, world, (seed, place)), truth.T_world_camera, strict=True
         ):
-            T_odom_camera = _tracked(tracker, frame)
+            T_odom_camera = _track(tracker, frame)
             if T_odom_camera is not None:
-                keyframes.append(_encoded(frame, T_odom_camera, float(len(keyframes))))
+                keyframes.append(_encode(frame, T_odom_camera, float(len(keyframes))))
                 true.append(T_world_camera)
         held[f"{name}-keyframes"] = np.frombuffer(b"".join(keyframes), dtype=np.uint8)
         held[f"{name}-sizes"] = np.array([len(data) for data in keyframes])
@@ -149,20 +151,20 @@ def _prepare(path: Path, seed: int) -> None:
     part.replace(path)
 
 
-def _tracked(tracker: Tracker, frame: Frame) -> Array | None:
+def _track(tracker: Tracker, frame: Frame) -> Array | None:
     step = tracker.prepare(frame)
     while isinstance(step, PoseQuery):
         step = tracker.accept(step, *pose_answer(step))
     return step.T_world_camera
 
 
-def _encoded(frame: Frame, T_odom_camera: Array, timestamp_s: float) -> bytes:
-    found = extract(frame, DENSE)
-    depths_m = found.points_camera[:, 2]
+def _encode(frame: Frame, T_odom_camera: Array, timestamp_s: float) -> bytes:
+    features = extract(frame, DENSE)
+    depths_m = features.points_camera[:, 2]
     rows = np.flatnonzero(np.isfinite(depths_m))[:870]
     keyframe = Keyframe(
         timestamp_s=timestamp_s, T_odom_camera=T_odom_camera, camera=SIMULATED_CAMERA,
-        features=make_features(found.pixels[rows], depths_m[rows], found.descriptors[rows]),
+        features=make_features(features.pixels[rows], depths_m[rows], features.descriptors[rows]),
     )  # fmt: skip
     return encode_keyframe(keyframe)
 
@@ -182,19 +184,23 @@ def main(arguments: Sequence[str] | None = None) -> None:
     chosen = parser.parse_args(arguments)
     if chosen.part == "prepare":
         with get_context("spawn").Pool(chosen.processes) as pool:
-            pool.starmap(prepared, [(chosen.features, seed) for seed in range(chosen.seeds)], chunksize=1)
+            pool.starmap(
+                prepare_drives, [(chosen.features, seed) for seed in range(chosen.seeds)], chunksize=1
+            )
         return
     for names in (("a", "b"), ("a", "c", "b")):
         for stated_m in (0.0, STATED_M):
-            found = [meet(prepared(chosen.features, seed), names, stated_m) for seed in range(chosen.seeds)]
+            meetings = [
+                meet(prepare_drives(chosen.features, seed), names, stated_m) for seed in range(chosen.seeds)
+            ]
             figures = {
-                "robots": "".join(names), "stated_m": stated_m, "seeds": len(found),
-                "joined_ever": sum(each.ever for each in found),
-                "joined_wrongly_ever": sum(each.wrong_ever for each in found),
-                "joined": sum(each.aligned for each in found),
-                "joined_wrongly": sum(each.wrong for each in found),
-                "ambiguous": sum("ambiguous" in each.reason for each in found),
-                "reasons": sorted({each.reason for each in found}),
+                "robots": "".join(names), "stated_m": stated_m, "seeds": len(meetings),
+                "joined_ever": sum(meeting.ever for meeting in meetings),
+                "joined_wrongly_ever": sum(meeting.wrong_ever for meeting in meetings),
+                "joined": sum(meeting.aligned for meeting in meetings),
+                "joined_wrongly": sum(meeting.wrong for meeting in meetings),
+                "ambiguous": sum("ambiguous" in meeting.reason for meeting in meetings),
+                "reasons": sorted({meeting.reason for meeting in meetings}),
             }  # fmt: skip
             print(json.dumps(figures))
 

@@ -58,7 +58,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     report_file.write_text(
         json.dumps({"experiment": "live", "runs": runs}, indent=1) + "\n", encoding="utf-8"
     )
-    undisturbed = {each: run for each, run in runs.items() if run["fault"] == "none" and each != name}
+    undisturbed = {other: run for other, run in runs.items() if run["fault"] == "none" and other != name}
     rows = fault_rows({**undisturbed, name: figures})
     print(json.dumps(figures))
     print("\n".join(table(rows[0], rows[-1:])))

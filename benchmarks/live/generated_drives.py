@@ -17,7 +17,7 @@ from rse_pf.geometry import Array, Camera, exp_se3, inverse
 from rse_pf.live_map.events import KeyframeAdded, LinksMeasured, MeasuredLink, matrix_bytes
 from rse_pf.slam.keyframe import Keyframe, encode_keyframe, make_features
 
-__all__ = ["GeneratedDrive", "GeneratedWorld", "circle", "meander", "measured_link", "straight"]
+__all__ = ["GeneratedDrive", "GeneratedWorld", "circle", "make_link", "meander", "straight"]
 
 CAMERA = Camera(fx=525.0, fy=525.0, cx=319.5, cy=239.5, width=640, height=480)
 STEP_M = 0.1
@@ -107,7 +107,7 @@ class GeneratedWorld:
                 other = int(self.rng.integers(0, keyframe))
                 self.wrong_sent += 1
                 off = exp_se3(np.r_[self.rng.uniform(-3, 3, 3), self.rng.uniform(-1.5, 1.5, 3)])
-                links.append(measured_link(other, self.step(keyframe, other) @ off))
+                links.append(make_link(other, self.step(keyframe, other) @ off))
         return LinksMeasured(keyframe=keyframe, links=tuple(links))
 
     def _poses(self, count: int) -> Array:
@@ -134,7 +134,7 @@ class GeneratedWorld:
         chosen = near[np.argsort(apart[near], kind="stable")[: self.links]]
         sigma = np.array([LINK_SIGMA_M] * 3 + [math.radians(LINK_SIGMA_DEG)] * 3)
         return [
-            measured_link(int(i), inverse(shifted) @ poses[i] @ exp_se3(sigma * self.rng.normal(size=6)))
+            make_link(int(i), inverse(shifted) @ poses[i] @ exp_se3(sigma * self.rng.normal(size=6)))
             for i in chosen
         ]
 
@@ -146,7 +146,7 @@ class GeneratedWorld:
     def true_link(self, keyframe: int, other: int) -> MeasuredLink:
         """Return a link as PnP measures it."""
         sigma = np.array([LINK_SIGMA_M] * 3 + [math.radians(LINK_SIGMA_DEG)] * 3)
-        return measured_link(other, self.step(keyframe, other) @ exp_se3(sigma * self.rng.normal(size=6)))
+        return make_link(other, self.step(keyframe, other) @ exp_se3(sigma * self.rng.normal(size=6)))
 
     def play(
         self, drives: list[GeneratedDrive], wrong: float = 0.0
@@ -159,7 +159,7 @@ class GeneratedWorld:
                     yield self.links_of(len(self.seen) - 1, wrong)
 
 
-def measured_link(other: int, T_keyframe_other: Array) -> MeasuredLink:
+def make_link(other: int, T_keyframe_other: Array) -> MeasuredLink:
     """Return a link with the noise that the map expects."""
     return MeasuredLink(
         other=other, T_keyframe_other=matrix_bytes(T_keyframe_other), information=matrix_bytes(INFORMATION),

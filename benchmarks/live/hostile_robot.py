@@ -106,21 +106,21 @@ def _lying(world: GeneratedWorld, attack: str, positions: Array) -> GeneratedDri
 def without(events: Sequence[Event], robot: str) -> list[Event]:
     """Return *events* as they are without *robot*: keyframes are numbered anew, links to it are left out."""
     number_of: dict[int, int] = {}
-    kept: list[Event] = []
+    others: list[Event] = []
     count = 0
     for event in events:
         if isinstance(event, KeyframeAdded):
             if event.robot != robot:
                 number_of[count] = len(number_of)
-                kept.append(event)
+                others.append(event)
             count += 1
         elif isinstance(event, LinksMeasured) and event.keyframe in number_of:
             links = tuple(
                 msgspec.structs.replace(link, other=number_of[link.other])
                 for link in event.links if link.other in number_of
             )  # fmt: skip
-            kept.append(LinksMeasured(keyframe=number_of[event.keyframe], links=links))
-    return kept
+            others.append(LinksMeasured(keyframe=number_of[event.keyframe], links=links))
+    return others
 
 
 def play(events: Sequence[Event]) -> Played:
@@ -198,14 +198,15 @@ def main() -> None:
         print(f"forget {given.forget} keyframes: {forget_s(given.forget):.2f} s of CPU (bar 5)")
         return
     for attack in ATTACKS:
-        found = [judge(attack, seed) for seed in range(given.seeds)]
-        worse = [abs(each.ate_cm - each.ate_without_cm) for each in found]
+        verdicts = [judge(attack, seed) for seed in range(given.seeds)]
+        worse = [abs(verdict.ate_cm - verdict.ate_without_cm) for verdict in verdicts]
         print(
-            f"{attack}: n {len(found)}, same joins {sum(each.same_joins for each in found)}, "
+            f"{attack}: n {len(verdicts)}, same joins {sum(verdict.same_joins for verdict in verdicts)}, "
             f"ATE differs by {np.median(worse):.3f} cm, at most {max(worse):.3f} (bar 0.1); "
-            f"honest keyframes p50 x{np.median([each.slower_p50 for each in found]):.2f}, "
-            f"p99 x{np.median([each.slower_p99 for each in found]):.2f} (bar 2); "
-            f"forget at most {max(each.forget_s for each in found):.2f} s; load {os.getloadavg()[0]:.1f}",
+            f"honest keyframes p50 x{np.median([verdict.slower_p50 for verdict in verdicts]):.2f}, "
+            f"p99 x{np.median([verdict.slower_p99 for verdict in verdicts]):.2f} (bar 2); "
+            f"forget at most {max(verdict.forget_s for verdict in verdicts):.2f} s; "
+            f"load {os.getloadavg()[0]:.1f}",
             flush=True,
         )
 

@@ -66,7 +66,7 @@ def run(folder: Path, out: Path, rounds: int) -> dict[str, Any]:
     os.environ[_FEATURES] = str(folder.resolve())
     demo_run.run_robot = run_feature_robot  # type: ignore[attr-defined]
     out.mkdir(parents=True, exist_ok=True)
-    found = []
+    rows = []
     for turn in range(rounds):
         load = os.getloadavg()[0]
         options = DemoOptions(
@@ -79,7 +79,7 @@ def run(folder: Path, out: Path, rounds: int) -> dict[str, Any]:
         run_demo(options, PlatformSettings())
         beside = _poses_ms(options.out)
         live = json.loads((options.out / "report.json").read_text(encoding="utf-8"))["live"]
-        found.append(
+        rows.append(
             {
                 "load_average": [round(load, 2), round(os.getloadavg()[0], 2)],
                 "joined": live["joined"],
@@ -95,7 +95,7 @@ def run(folder: Path, out: Path, rounds: int) -> dict[str, Any]:
                 "poses_p99_ratio": round(_p99(beside) / _p99(alone), 3),
             }
         )
-    return {**about, "rounds": found}
+    return {**about, "rounds": rows}
 
 
 def run_feature_robot(spec: RobotSpec, pipe: Connection) -> None:
@@ -108,15 +108,17 @@ def run_feature_robot(spec: RobotSpec, pipe: Connection) -> None:
 
 
 def _prepare_robot(folder: Path, robot: int, robots: int, rooms: int, frames: int) -> None:
-    found = [frontend.extract(each, _OPTIONS) for each in render_frames(robot, robots, frames, SEED, rooms)]
+    features = [
+        frontend.extract(frame, _OPTIONS) for frame in render_frames(robot, robots, frames, SEED, rooms)
+    ]
     truth = true_trajectory(robot, robots, frames, SEED, rooms)
     part = _file_of(folder, robot).with_suffix(".part.npz")
     np.savez(
         part,
-        counts=[len(each.pixels) for each in found],
-        pixels=np.concatenate([each.pixels for each in found]),
-        descriptors=np.concatenate([each.descriptors for each in found]),
-        points_camera=np.concatenate([each.points_camera for each in found]),
+        counts=[len(row.pixels) for row in features],
+        pixels=np.concatenate([row.pixels for row in features]),
+        descriptors=np.concatenate([row.descriptors for row in features]),
+        points_camera=np.concatenate([row.points_camera for row in features]),
         stamps=truth.timestamps_s,
         poses=truth.T_world_camera,
     )
@@ -156,7 +158,7 @@ def _file_of(folder: Path, robot: int) -> Path:
 
 def _poses_ms(out: Path) -> list[float]:
     commands = read_commands(out / "commands.csv")
-    return [each.round_trip_ms for each in commands if each.round_trip_ms is not None]
+    return [command.round_trip_ms for command in commands if command.round_trip_ms is not None]
 
 
 def _p99(values: Sequence[float]) -> float:
@@ -180,21 +182,21 @@ def main(arguments: Sequence[str] | None = None) -> None:
         return
     figures = run(chosen.features, chosen.out, chosen.rounds)
     print(json.dumps(figures))
-    for each in figures["rounds"]:
+    for row in figures["rounds"]:
         missed = [
             what
             for what, held in (
-                ("all joined", each["joined"] == figures["robots"]),
-                ("correction p99", (each["correction_ms"]["p99"] or 1e9) <= CORRECTION_P99_MS),
-                ("poses beside it", each["poses_p99_ratio"] <= POSES_RATIO),
+                ("all joined", row["joined"] == figures["robots"]),
+                ("correction p99", (row["correction_ms"]["p99"] or 1e9) <= CORRECTION_P99_MS),
+                ("poses beside it", row["poses_p99_ratio"] <= POSES_RATIO),
             )
             if not held
         ]
         print(
-            f"{each['joined']} of {figures['robots']} joined, correction p50 {each['correction_ms']['p50']}, "
-            f"p99 {each['correction_ms']['p99']} ms (n {each['correction_ms']['n']}), poses p99 "
-            f"{each['poses_p99_ms']['beside']} ms, {each['poses_p99_ratio']} times that alone, ATE "
-            f"{each['final_ate_cm']} cm, load {each['load_average']}: {', '.join(missed) or 'all met'}"
+            f"{row['joined']} of {figures['robots']} joined, correction p50 {row['correction_ms']['p50']}, "
+            f"p99 {row['correction_ms']['p99']} ms (n {row['correction_ms']['n']}), poses p99 "
+            f"{row['poses_p99_ms']['beside']} ms, {row['poses_p99_ratio']} times that alone, ATE "
+            f"{row['final_ate_cm']} cm, load {row['load_average']}: {', '.join(missed) or 'all met'}"
         )
 
 

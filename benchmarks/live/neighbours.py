@@ -77,7 +77,7 @@ class Driver:
         while True:
             due = max(due + 1.0 / POSE_HZ, time.monotonic())
             await asyncio.sleep(due - time.monotonic())
-            self.poses.append(await self._timed("pnp", self._pose))
+            self.poses.append(await self._time("pnp", self._pose))
 
     async def _send_keyframes(self) -> None:
         number, due = 0, time.monotonic()
@@ -91,7 +91,7 @@ class Driver:
             request = {
                 "map": MAP, "segment": 0, "number": number, "keyframe": encode_keyframe(keyframe)
             }  # fmt: skip
-            took = await self._timed("live-keyframe", request)
+            took = await self._time("live-keyframe", request)
             if np.isfinite(took[1]):
                 self.keyframes.append(took)
                 number += 1
@@ -100,7 +100,7 @@ class Driver:
         async for key, value in self._robot.subscribe(live_topic(MAP)):
             self.seen.append(f"{key} {value}")
 
-    async def _timed(self, service: str, request: Any) -> tuple[float, float]:
+    async def _time(self, service: str, request: Any) -> tuple[float, float]:
         began = time.monotonic()
         try:
             await self._robot.call(service, request, deadline_s=5.0, keep=True)
@@ -228,13 +228,13 @@ async def measure(rounds: int, seconds: float, folder: Path) -> dict[str, Any]:
     for error in ended:
         if not isinstance(error, asyncio.CancelledError):
             raise RuntimeError(f"a robot ended early: {error!r}")
-    found = {name: _figures(drivers, spans) for name, spans in windows.items()}
+    figures = {name: _figures(drivers, spans) for name, spans in windows.items()}
     return {
         "load_average": [round(load, 2), round(os.getloadavg()[0], 2)],
-        "windows": found,
+        "windows": figures,
         "ratios": {
             kind: {
-                what: round(found[kind][what]["p99"] / found["quiet"][what]["p99"], 3)
+                what: round(figures[kind][what]["p99"] / figures["quiet"][what]["p99"], 3)
                 for what in ("poses_ms", "keyframes_ms")
             }
             for kind in NEIGHBOURS

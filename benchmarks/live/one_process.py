@@ -24,8 +24,8 @@ from benchmarks.live.generated_drives import (
     GeneratedDrive,
     GeneratedWorld,
     circle,
+    make_link,
     meander,
-    measured_link,
     straight,
 )
 from benchmarks.maps.recordings import Run, ate_m, drive, frame_poses, red_kitchen, truth_of
@@ -67,7 +67,7 @@ class Played:
 
     def online_cm(self, truth: Mapping[str, Array]) -> float:
         """Return the error of the poses as they were given out."""
-        rows = {name: sorted(found) for name, found in self.given.items() if found}
+        rows = {name: sorted(errors_cm) for name, errors_cm in self.given.items() if errors_cm}
         given = np.array([self.given[name][row] for name in rows for row in rows[name]])
         return 100.0 * ate_m(given, np.concatenate([truth[name][rows[name]] for name in rows]))
 
@@ -81,7 +81,7 @@ class Played:
 
     def joined_at(self) -> dict[str, int]:
         """Return the own frame from which on each robot knew its place."""
-        return {name: min(found) for name, found in self.given.items() if found}
+        return {name: min(frames) for name, frames in self.given.items() if frames}
 
 
 def play(runs: Mapping[str, Run], starts: Mapping[str, int], options: LiveMapOptions | None = None) -> Played:
@@ -92,9 +92,9 @@ def play(runs: Mapping[str, Run], starts: Mapping[str, int], options: LiveMapOpt
     for name in runs:
         played.ids[name], played.given[name] = [], {}
     for tick in range(max(starts[name] + len(runs[name].stamps_s) for name in runs)):
-        for _, name, T_map_odom in [each for each in under_way if each[0] <= tick]:
+        for _, name, T_map_odom in [waiting for waiting in under_way if waiting[0] <= tick]:
             known[name] = T_map_odom
-        under_way = [each for each in under_way if each[0] > tick]
+        under_way = [waiting for waiting in under_way if waiting[0] > tick]
         for name, run in runs.items():
             row = tick - starts[name]
             if not 0 <= row < len(run.stamps_s):
@@ -114,23 +114,23 @@ def _send(played: Played, name: str, run: Run, number: int, tick: int) -> list[t
     event = KeyframeAdded(
         robot=name, segment=0, number=number, data=encode_stored(keyframe)
     )  # fmt: skip
-    found = played.live_map.apply(event)
-    added = next(each for each in found if isinstance(each, Added))
+    outcomes = played.live_map.apply(event)
+    added = next(outcome for outcome in outcomes if isinstance(outcome, Added))
     played.ids[name].append(added.id)
     begin = time.process_time()
     links = played.live_map.measure(added.id)
     played.measure_ms.append(1000.0 * (time.process_time() - begin))
-    found = [*found, *played.live_map.apply(links)]
-    if any(isinstance(each, OptimiseWanted) for each in found):
-        found = [*found, *played.live_map.apply(played.live_map.optimise())]
-    played.outcomes += found
-    told: list[tuple[int, str, Array | None]] = []
-    for each in found:
-        if isinstance(each, Corrected):
-            told.append((tick + LATE_FRAMES, each.robot, each.T_map_odom))
-        elif isinstance(each, Unaligned):
-            told.append((tick + LATE_FRAMES, each.robot, None))
-    return told
+    outcomes = [*outcomes, *played.live_map.apply(links)]
+    if any(isinstance(outcome, OptimiseWanted) for outcome in outcomes):
+        outcomes = [*outcomes, *played.live_map.apply(played.live_map.optimise())]
+    played.outcomes += outcomes
+    alignments: list[tuple[int, str, Array | None]] = []
+    for outcome in outcomes:
+        if isinstance(outcome, Corrected):
+            alignments.append((tick + LATE_FRAMES, outcome.robot, outcome.T_map_odom))
+        elif isinstance(outcome, Unaligned):
+            alignments.append((tick + LATE_FRAMES, outcome.robot, None))
+    return alignments
 
 
 def kitchen(recordings: Path, runs: int) -> None:
@@ -198,14 +198,14 @@ def wrong_links(runs: int) -> None:
             off = inverse(T_a_b) @ inverse(world.seen[a]) @ world.seen[b]
             believed += float(np.linalg.norm(off[:3, 3])) > 0.3
         sent += world.wrong_sent
-        waited.append(_planted(seed))
+        waited.append(_plant(seed))
     print(
         f"{runs} seeds: {believed} of {sent} random wrong links believed; four planted links are removed "
         f"after {np.median(waited):.0f} (most {max(waited)}) keyframes with contrary links"
     )
 
 
-def _planted(seed: int) -> int:
+def _plant(seed: int) -> int:
     """Return after how many keyframes with true links four planted ones, which agree, are removed."""
     world = GeneratedWorld(seed=seed, links=0)
     live_map = LiveMap()
@@ -217,13 +217,13 @@ def _planted(seed: int) -> int:
     rng = np.random.default_rng(seed)
     off = world.seen[0] @ exp_se3(np.r_[rng.uniform(0.5, 2.0, 3), 0.0, 0.4, 0.0]) @ inverse(world.seen[0])
     for k in range(20, 24):
-        planted = measured_link(k - 20, inverse(world.seen[k]) @ off @ world.seen[k - 20])
+        planted = make_link(k - 20, inverse(world.seen[k]) @ off @ world.seen[k - 20])
         live_map.apply(LinksMeasured(keyframe=k, links=(planted,)))
     for later in range(16):
         k = 24 + later
         links = tuple(world.true_link(k, k - 20 - near) for near in (0, 1))
-        found = live_map.apply(LinksMeasured(keyframe=k, links=links))
-        if any(isinstance(each, LinkRemoved) for each in found):
+        outcomes = live_map.apply(LinksMeasured(keyframe=k, links=links))
+        if any(isinstance(outcome, LinkRemoved) for outcome in outcomes):
             return later + 1
     return 99
 
@@ -244,8 +244,8 @@ def _one_building(runs: int, told_m: float) -> None:
         live_map = LiveMap()
         live_map.apply(MapStarted(source="", keyframes=(), equal_rooms_m=told_m))
         for event in world.play(drives):
-            for each in live_map.apply(event):
-                if isinstance(each, Joined) and each.robot == "b":
+            for outcome in live_map.apply(event):
+                if isinstance(outcome, Joined) and outcome.robot == "b":
                     joined += 1
                     at_m.append(float(world.seen[-1][0, 3]))
     print(
@@ -264,7 +264,7 @@ def _twins(runs: int, told_m: float) -> None:
                 drives.insert(1, world.drive("c", straight(0.0, 13.0)))
             live_map = LiveMap()
             live_map.apply(MapStarted(source="", keyframes=(), equal_rooms_m=told_m))
-            outcomes = [each for event in world.play(drives) for each in live_map.apply(event)]
+            outcomes = [outcome for event in world.play(drives) for outcome in live_map.apply(event)]
             ever += any(isinstance(outcome, Joined) and outcome.robot == "b" for outcome in outcomes)
             aligned = {alignment.robot: alignment.aligned for alignment in live_map.alignments()}
             wrong += aligned["b"]
@@ -279,7 +279,7 @@ def replay() -> None:
     """State the time of a replay of 2,000 keyframes with measured links, and whether it is the same map."""
     world = GeneratedWorld(seed=1)
     drives = [world.drive(f"robot-{i}", circle(8.0, 0.8, 2.0 * i)[:400]) for i in range(5)]
-    log, live_map = _made(world, drives)
+    log, live_map = _make(world, drives)
     begin = time.process_time()
     again = LiveMap()
     for event in log:
@@ -305,7 +305,7 @@ def growth(keyframes: int) -> None:
         world = GeneratedWorld(seed=1)
         drives = [world.drive("a", way[:keyframes])]
         ms: list[float] = []
-        _, live_map = _made(world, drives, ms)
+        _, live_map = _make(world, drives, ms)
         cost = np.array(ms[0::2]) + np.array(ms[1::2])
         early, late = cost[len(cost) * 9 // 100 : len(cost) // 10], cost[len(cost) * 9 // 10 :]
         ratios = [np.percentile(late, q) / np.percentile(early, q) for q in (50, 95)]
@@ -317,7 +317,7 @@ def growth(keyframes: int) -> None:
         )
 
 
-def _made(
+def _make(
     world: GeneratedWorld, drives: Sequence[GeneratedDrive], ms: list[float] | None = None
 ) -> tuple[list[Event], LiveMap]:
     """Return the log of generated drives, with whole optimisations, and the map."""
@@ -325,11 +325,11 @@ def _made(
     log: list[Event] = []
     for event in world.play(list(drives)):
         begin = time.process_time()
-        found = live_map.apply(event)
+        outcomes = live_map.apply(event)
         if ms is not None:
             ms.append(1000.0 * (time.process_time() - begin))
         log.append(event)
-        if any(isinstance(each, OptimiseWanted) for each in found):
+        if any(isinstance(outcome, OptimiseWanted) for outcome in outcomes):
             log.append(live_map.optimise())
             live_map.apply(log[-1])
     return log, live_map

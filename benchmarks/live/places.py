@@ -71,8 +71,8 @@ def views_of(source: str, frames: Iterable[Frame], poses: Iterable[Array | None]
     """Return frames as views."""
     views = []
     for row, frame, T in zip(count(), frames, poses, strict=False):
-        found = extract(frame, FrontEndOptions())
-        features = make_features(found.pixels, found.points_camera[:, 2], found.descriptors)
+        extracted = extract(frame, FrontEndOptions())
+        features = make_features(extracted.pixels, extracted.points_camera[:, 2], extracted.descriptors)
         data = encode_keyframe(
             SentKeyframe(
                 timestamp_s=frame.timestamp_s, T_odom_camera=np.eye(4), camera=frame.camera, features=features
@@ -81,23 +81,23 @@ def views_of(source: str, frames: Iterable[Frame], poses: Iterable[Array | None]
         views.append(
             View(
                 source=source, row=row, features=features,
-                full=(found.pixels, found.descriptors, found.points_camera), size_bytes=len(data),
+                full=(extracted.pixels, extracted.descriptors, extracted.points_camera), size_bytes=len(data),
                 camera=frame.camera, timestamp_s=frame.timestamp_s, T=T,
             )
         )  # fmt: skip
     return views
 
 
-def spaced(poses: Sequence[Array], rows: Iterable[int]) -> list[int]:
+def space_out(poses: Sequence[Array], rows: Iterable[int]) -> list[int]:
     """Return *rows* that become dense keyframes."""
-    kept: list[int] = []
+    dense: list[int] = []
     for row in rows:
-        if kept:
-            metres, degrees = pose_difference(poses[kept[-1]], poses[row])
+        if dense:
+            metres, degrees = pose_difference(poses[dense[-1]], poses[row])
             if metres <= SPACING_M and degrees <= SPACING_DEG:
                 continue
-        kept.append(row)
-    return kept
+        dense.append(row)
+    return dense
 
 
 def code_row(views: Sequence[View], rows: Sequence[int]) -> dict[str, Any]:
@@ -107,9 +107,9 @@ def code_row(views: Sequence[View], rows: Sequence[int]) -> dict[str, Any]:
         for b in rows[:place]:
             one, other = views[a], views[b]
             start = time.process_time()
-            found = measure_links((0, one.features, one.camera), [(1, other.features, other.camera)])
+            measured = measure_links((0, one.features, one.camera), [(1, other.features, other.camera)])
             took_ms.append((time.process_time() - start) * 1e3)
-            links += len(found.links)
+            links += len(measured.links)
     sizes = [view.size_bytes for view in views]
     return {
         "keyframe_bytes": {"mean": round(float(np.mean(sizes))), "max": max(sizes), "n": len(sizes)},
@@ -120,14 +120,14 @@ def code_row(views: Sequence[View], rows: Sequence[int]) -> dict[str, Any]:
 def recall_rows(pool: Sequence[View], queries: Sequence[View]) -> dict[str, Any]:
     """Return the share of queries with an overlapping keyframe among the best ten, by source."""
     truth = [_overlapping(query, pool) for query in queries]
-    known = np.array([place_vector(each.features.descriptors) for each in pool])
+    known = np.array([place_vector(view.features.descriptors) for view in pool])
     scored: dict[str, list[tuple[bool, float]]] = {}
     for query, overlapping in zip(queries, truth, strict=True):
         if not overlapping:
             continue
         similarity = known @ place_vector(query.features.descriptors)
-        for place, each in enumerate(pool):
-            if _is_neighbour(query, each):
+        for place, candidate in enumerate(pool):
+            if _is_neighbour(query, candidate):
                 similarity[place] = -2.0
         best = np.argsort(-similarity, kind="stable")[:CANDIDATES]
         hits = sum(int(place) in overlapping for place in best)
@@ -145,14 +145,14 @@ def recall_rows(pool: Sequence[View], queries: Sequence[View]) -> dict[str, Any]
 
 def search_rows(views: Sequence[View]) -> dict[str, Any]:
     """Return the cost of a vector, and of a search among so many keyframes."""
-    rows: dict[str, Any] = {"vector_ms": _timed(place_vector, [view.features.descriptors for view in views])}
+    rows: dict[str, Any] = {"vector_ms": _time(place_vector, [view.features.descriptors for view in views])}
     rng = np.random.default_rng(1)
     for keyframes in (1000, 2000, 5000, 10_000):
         vectors = rng.normal(size=(keyframes, PLACE_NUMBERS)).astype(np.float32)
         index = PlaceIndex()
         for number, vector in enumerate(vectors):
             index.add(number, vector)
-        rows[f"search_ms_{keyframes}"] = _timed(
+        rows[f"search_ms_{keyframes}"] = _time(
             lambda v, index=index: index.nearest(v, SEARCHED), vectors[:200]
         )
     return rows
@@ -170,8 +170,8 @@ class PlacedMap:
     def of(cls, views: Sequence[View], poses: Sequence[Array]) -> PlacedMap:
         """Return the map of *views* at *poses*."""
         index = PlaceIndex()
-        for number, each in enumerate(views):
-            index.add(number, place_vector(each.features.descriptors))
+        for number, view in enumerate(views):
+            index.add(number, place_vector(view.features.descriptors))
         keyframes = [(n, v.features, v.camera, T) for n, (v, T) in enumerate(zip(views, poses, strict=True))]
         return cls(keyframes=keyframes, index=index, T_map_camera=np.array(poses))
 
@@ -189,11 +189,11 @@ class PlacedMap:
 def kitchen_map(recordings: Path, views: Sequence[View]) -> tuple[PlacedMap, Array]:
     """Return the map of the frames that are not each fifth, and every frame's pose in it."""
     run = drive(open_dataset(recordings / RED_KITCHEN), range(len(views)), "robot")
-    rows = spaced(list(run.T_world_camera), [row for row in range(len(views)) if row % 5])
+    rows = space_out(list(run.T_world_camera), [row for row in range(len(views)) if row % 5])
     keyframes = [_keyframe(views[row], run.T_world_camera[row], number) for number, row in enumerate(rows)]
     version = MapVersion(keyframes=tuple(keyframes))
     merged = sorted(merge_versions([version]).version.keyframes, key=lambda each: each.timestamp_s)
-    poses = np.array([each.T_world_camera for each in merged])
+    poses = np.array([keyframe.T_world_camera for keyframe in merged])
     owner = np.maximum(0, np.searchsorted(rows, np.arange(len(views)), side="right") - 1)
     whole = Run(
         version=version, stamps_s=run.stamps_s, T_world_camera=run.T_world_camera, keyframe_of_frame=owner,
@@ -205,18 +205,18 @@ def kitchen_map(recordings: Path, views: Sequence[View]) -> tuple[PlacedMap, Arr
 def relocalise_row(known: PlacedMap, views: Sequence[View], T_map_camera: Array) -> dict[str, Any]:
     """Return how well each fifth view is found."""
     T_truth = np.array([view.T for view in views])
-    T_map_world, rotation = _aligned(T_map_camera, T_truth)
+    T_map_world, rotation = _align(T_map_camera, T_truth)
     verdicts: Counter[str] = Counter()
     by_map, by_truth, took_ms = [], [], []
     for row in range(0, len(views), 5):
         start = time.process_time()
-        found = known.find(views[row])
+        localised = known.find(views[row])
         took_ms.append((time.process_time() - start) * 1e3)
-        verdicts[f"{found.verdict} {found.reason}".strip()] += 1
-        if found.verdict == "ok" and found.T_map_camera is not None:
-            by_map.append(pose_difference(found.T_map_camera, T_map_camera[row]))
-            away = found.T_map_camera[:3, 3] - (T_map_world @ T_truth[row])[:3, 3]
-            turned = found.T_map_camera[:3, :3].T @ rotation @ T_truth[row][:3, :3]
+        verdicts[f"{localised.verdict} {localised.reason}".strip()] += 1
+        if localised.verdict == "ok" and localised.T_map_camera is not None:
+            by_map.append(pose_difference(localised.T_map_camera, T_map_camera[row]))
+            away = localised.T_map_camera[:3, 3] - (T_map_world @ T_truth[row])[:3, 3]
+            turned = localised.T_map_camera[:3, :3].T @ rotation @ T_truth[row][:3, :3]
             by_truth.append((float(np.linalg.norm(away)), rotation_angle_deg(turned)))
     return {
         "verdicts": dict(verdicts), "keyframes": len(known.keyframes), "ms": _percentiles(took_ms),
@@ -227,7 +227,7 @@ def relocalise_row(known: PlacedMap, views: Sequence[View], T_map_camera: Array)
 
 def verdicts_of(known: PlacedMap, views: Iterable[View]) -> dict[str, int]:
     """Return how often each verdict was given."""
-    given = Counter(f"{found.verdict} {found.reason}".strip() for found in map(known.find, views))
+    given = Counter(f"{localised.verdict} {localised.reason}".strip() for localised in map(known.find, views))
     return dict(given)
 
 
@@ -238,14 +238,14 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     arguments = parser.parse_args()
     load_before = os.getloadavg()[0]
-    sources = {name: _recorded(arguments.recordings, name) for name in (RED_KITCHEN, *SMALL)}
+    sources = {name: _load_views(arguments.recordings, name) for name in (RED_KITCHEN, *SMALL)}
     kitchen = sources[RED_KITCHEN]
-    rendered = _rendered(7, range(0, ROUND, 2))
+    rendered = _render_views(7, range(0, ROUND, 2))
     foreign = [view for name in SMALL for view in sources[name]]
-    foreign += [view for seed in FOREIGN_SEEDS for view in _rendered(seed, range(seed % 10, ROUND, 13))]
+    foreign += [view for seed in FOREIGN_SEEDS for view in _render_views(seed, range(seed % 10, ROUND, 13))]
     foreign = foreign[:200]
-    dense = spaced([_true(each) for each in kitchen], range(len(kitchen)))
-    dense_rendered = spaced([_true(each) for each in rendered], range(len(rendered)))
+    dense = space_out([_true(view) for view in kitchen], range(len(kitchen)))
+    dense_rendered = space_out([_true(view) for view in rendered], range(len(rendered)))
     pool = [kitchen[row] for row in dense] + [rendered[row] for row in dense_rendered]
     pool += [view for name in SMALL for view in sources[name]]
     queries = kitchen[::3] + rendered[::2] + [view for name in SMALL for view in sources[name]]
@@ -271,13 +271,13 @@ def main() -> None:
     arguments.out.write_text(text + "\n", encoding="utf-8")
 
 
-def _recorded(recordings: Path, name: str) -> list[View]:
+def _load_views(recordings: Path, name: str) -> list[View]:
     dataset = open_dataset(recordings / name)
     poses = [None] * len(dataset) if dataset.truth is None else list(dataset.truth.T_world_camera)
     return views_of(name, dataset, poses)
 
 
-def _rendered(seed: int, rows: range) -> list[View]:
+def _render_views(seed: int, rows: range) -> list[View]:
     poses = true_trajectory(0, 1, ROUND, seed).T_world_camera[rows.start : rows.stop : rows.step]
     return views_of(f"rendered {seed}", _frames(seed, poses), list(poses))
 
@@ -316,19 +316,19 @@ def _is_neighbour(query: View, other: View) -> bool:
 
 def _overlapping(query: View, pool: Sequence[View]) -> set[int]:
     """Return the places in *pool* that show the same, as poses and a measured link agree."""
-    found: set[int] = set()
+    overlapping: set[int] = set()
     for place, other in enumerate(pool):
         if query.source != other.source or _is_neighbour(query, other):
             continue
         is_long = query.source not in SMALL
-        if is_long and min(_shared(query, other), _shared(other, query)) < OVERLAP:
+        if is_long and min(_share_in_view(query, other), _share_in_view(other, query)) < OVERLAP:
             continue
         if measure_links((0, query.features, query.camera), [(1, other.features, other.camera)]).links:
-            found.add(place)
-    return found
+            overlapping.add(place)
+    return overlapping
 
 
-def _shared(one: View, other: View) -> float:
+def _share_in_view(one: View, other: View) -> float:
     """Return the share of the points of *one* that lie in the image of *other*."""
     points = transform(inverse(_true(other)) @ _true(one), one.features.points_camera(one.camera))
     ahead = points[:, 2] > 0.2
@@ -337,7 +337,7 @@ def _shared(one: View, other: View) -> float:
     return float((ahead & inside).mean()) if len(points) else 0.0
 
 
-def _aligned(T_estimate: Array, T_truth: Array) -> tuple[Array, Array]:
+def _align(T_estimate: Array, T_truth: Array) -> tuple[Array, Array]:
     """Return the transform of the true positions to the estimated ones, and the rotation of rotations."""
     a, b = T_estimate[:, :3, 3], T_truth[:, :3, 3]
     T = np.eye(4)
@@ -353,11 +353,11 @@ def _nearest_rotation(matrix: Array) -> Array:
     return rotation
 
 
-def _timed(call: Any, inputs: Iterable[Any]) -> dict[str, float]:
+def _time(call: Any, inputs: Iterable[Any]) -> dict[str, float]:
     took_ms = []
-    for each in inputs:
+    for value in inputs:
         start = time.process_time()
-        call(each)
+        call(value)
         took_ms.append((time.process_time() - start) * 1e3)
     return _percentiles(took_ms)
 

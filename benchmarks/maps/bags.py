@@ -129,7 +129,7 @@ def main() -> None:
 
 
 def _read(path: Path) -> dict[str, Any]:
-    files = [path] if path.is_file() else [each for each in path.rglob("*") if each.is_file()]
+    files = [path] if path.is_file() else [entry for entry in path.rglob("*") if entry.is_file()]
     size = sum(file.stat().st_size for file in files)
     wall, cpu = time.perf_counter(), time.process_time()
     with open_bag(path) as bag:
@@ -159,17 +159,19 @@ def _map(name: str, frames: Iterable[Frame], start_s: float, source: Path) -> di
     points, _ = mapper.map.points()
     return {
         "bag": name, "ate_mm": round(1e3 * error.rmse_m, 4), "poses": len(mapper.trajectory),
-        "points": len(points), "mean_point_m": [round(float(each), 6) for each in points.mean(axis=0)],
+        "points": len(points), "mean_point_m": [round(float(value), 6) for value in points.mean(axis=0)],
     }  # fmt: skip
 
 
 async def answer_query(query: PoseQuery) -> PoseAnswer:
     """Answer as the PnP service does."""
-    found = query.correspondences
+    matches = query.correspondences
     options = PnpOptions(inlier_px=query.inlier_px, max_iterations=query.max_iterations)
-    solution = solve_pnp(found.points_world, found.pixels, query.camera, options)
-    if found.depths_m.any():
-        solution = refine_with_depth(solution, found.points_world, found.pixels, found.depths_m, query.camera)
+    solution = solve_pnp(matches.points_world, matches.pixels, query.camera, options)
+    if matches.depths_m.any():
+        solution = refine_with_depth(
+            solution, matches.points_world, matches.pixels, matches.depths_m, query.camera
+        )
     return PoseAnswer(
         solution=solution, source="cloud", server="s", round_trip_ms=1.0, queue_ms=0.0, compute_ms=1.0
     )
@@ -218,8 +220,8 @@ def _camera_info(w: BagWriter, stamp_ns: int, numbers: dict[str, Any]) -> Any:
 
 
 def _transform(w: BagWriter, stamp_ns: int, T: Array) -> Any:
-    x, y, z = (float(each) for each in T[:3, 3])
-    qx, qy, qz, qw = (float(each) for each in to_quaternion(T[:3, :3]))
+    x, y, z = (float(value) for value in T[:3, 3])
+    qx, qy, qz, qw = (float(value) for value in to_quaternion(T[:3, :3]))
     moved = w.make(
         "geometry_msgs/msg/Transform",
         translation=w.make("geometry_msgs/msg/Vector3", x=x, y=y, z=z),
@@ -238,11 +240,11 @@ def _show(row: dict[str, Any]) -> dict[str, Any]:
 
 
 def _remove(path: Path) -> None:
-    for each in [path] if path.is_file() else [*path.iterdir(), path]:
-        if each.is_dir():
-            each.rmdir()
+    for entry in [path] if path.is_file() else [*path.iterdir(), path]:
+        if entry.is_dir():
+            entry.rmdir()
         else:
-            each.unlink()
+            entry.unlink()
 
 
 if __name__ == "__main__":

@@ -73,30 +73,32 @@ def recording_row(dataset: Dataset, options: FrontEndOptions, *, with_depth: boo
 
 
 def _answer(query: PoseQuery, *, with_depth: bool) -> tuple[Array | None, int]:
-    found = query.correspondences
+    matches = query.correspondences
     options = PnpOptions(inlier_px=query.inlier_px, max_iterations=query.max_iterations)
     try:
-        solution = solve_pnp(found.points_world, found.pixels, query.camera, options)
+        solution = solve_pnp(matches.points_world, matches.pixels, query.camera, options)
     except PnpError:
         return None, 0
     if with_depth:
-        solution = refine_with_depth(solution, found.points_world, found.pixels, found.depths_m, query.camera)
+        solution = refine_with_depth(
+            solution, matches.points_world, matches.pixels, matches.depths_m, query.camera
+        )
     return solution.T_camera_world, len(solution.inliers)
 
 
 def _command_bytes(codec: Any, query: PoseQuery, *, with_depth: bool) -> int:
-    found = query.correspondences
+    matches = query.correspondences
     options = PnpOptions(inlier_px=query.inlier_px, max_iterations=query.max_iterations)
     request = make_request(
-        found.points_world, found.pixels, query.camera, options,
-        depths_m=found.depths_m if with_depth else None,
+        matches.points_world, matches.pixels, query.camera, options,
+        depths_m=matches.depths_m if with_depth else None,
     )  # fmt: skip
     return len(codec.encode(Command(id=1000, service="pnp", payload=request, stream="pose", keep=True)))
 
 
 def command_rows(dataset: Dataset) -> dict[str, dict[str, int]]:
     """Return the most matches and bytes of a command; long recordings by every tenth step."""
-    found: dict[str, dict[str, int]] = {}
+    sizes: dict[str, dict[str, int]] = {}
     step = 1 if len(dataset) < 20 else 10
     for preset, options in (("default", FrontEndOptions()), ("wide", FrontEndOptions.wide_baseline())):
         for row in range(0, len(dataset) - 1, step):
@@ -111,10 +113,10 @@ def command_rows(dataset: Dataset) -> dict[str, dict[str, int]]:
                 )  # fmt: skip
                 command = Command(id=1000, service="pnp", payload=request, stream="pose", keep=True)
                 sent = len(make_codec(codec).encode(command))
-                most = found.setdefault(f"{preset}, {codec}", {"matches": 0, "bytes": 0})
+                most = sizes.setdefault(f"{preset}, {codec}", {"matches": 0, "bytes": 0})
                 most["matches"] = max(most["matches"], len(matches))
                 most["bytes"] = max(most["bytes"], sent)
-    return found
+    return sizes
 
 
 def map_rows(recordings: Path) -> dict[str, float]:
@@ -135,8 +137,8 @@ def consistency_row(n: int) -> dict[str, float]:
         before = solve_pnp(views.points_reference, views.pixels, views.camera, PnpOptions(inlier_px=5.0))
         after = refine_with_depth(before, views.points_reference, views.pixels, views.depths_m, views.camera)
         both = (before, after)
-        errors.append([_error_m(each, views.T_camera_reference) for each in both])
-        squares.append([_normalised_error2(each, views.T_camera_reference) for each in both])
+        errors.append([_error_m(solution, views.T_camera_reference) for solution in both])
+        squares.append([_normalised_error2(solution, views.T_camera_reference) for solution in both])
     (before_m, after_m), (before_2, after_2) = np.median(errors, axis=0), np.mean(squares, axis=0)
     return {
         "n": n, "median_mm_pnp": 1e3 * before_m, "median_mm_depth": 1e3 * after_m,
@@ -171,7 +173,7 @@ def cost_row(n: int) -> dict[str, Any]:
             spent[name].append((time.thread_time_ns() - begin) / 1e3)
     return {
         "n": n,
-        **{name: np.percentile(each, [50, 95, 99]).round(1).tolist() for name, each in spent.items()},
+        **{name: np.percentile(times, [50, 95, 99]).round(1).tolist() for name, times in spent.items()},
     }
 
 

@@ -79,21 +79,21 @@ def reference(graph: PoseGraph, interpreter: Path, rounds: int, cauchy: float) -
 
 def row(name: str, graph: PoseGraph, truth: Array, args: argparse.Namespace) -> dict[str, Any]:
     """Fit *graph* by both, with and without a kernel."""
-    found: dict[str, Any] = {"graph": name, "poses": len(graph.ids), "edges": len(graph.a)}
+    figures: dict[str, Any] = {"graph": name, "poses": len(graph.ids), "edges": len(graph.a)}
     for kernel in (0.0, CAUCHY):
         began = time.perf_counter()
         ours = optimise_graph(graph, OptimiseOptions(cauchy=kernel)).T_world_pose
         seconds = time.perf_counter() - began
         theirs, g2o_s = reference(graph, args.g2o_python, args.rounds, kernel)
-        found["kernel" if kernel else "squares"] = {
+        figures["kernel" if kernel else "squares"] = {
             "chi2": [graph.chi2(ours), graph.chi2(theirs)],
-            "cost": [robust_cost(graph, each, kernel) for each in (ours, theirs)],
-            "ate_cm": [100 * ate_m(each, truth) for each in (ours, theirs)],
+            "cost": [robust_cost(graph, poses, kernel) for poses in (ours, theirs)],
+            "ate_cm": [100 * ate_m(poses, truth) for poses in (ours, theirs)],
             "seconds": [seconds, g2o_s],
         }
-    found["chi2_start"], found["chi2_truth"] = graph.chi2(), graph.chi2(truth)
-    found["ate_start_cm"] = 100 * ate_m(graph.T_world_pose, truth)
-    return found
+    figures["chi2_start"], figures["chi2_truth"] = graph.chi2(), graph.chi2(truth)
+    figures["ate_start_cm"] = 100 * ate_m(graph.T_world_pose, truth)
+    return figures
 
 
 def main() -> None:
@@ -109,14 +109,14 @@ def main() -> None:
     if args.recordings is not None:
         rows.append(row("red kitchen", *kitchen_graph(args.recordings), args))
     print(f"{platform.node()}, {os.cpu_count()} cores, load {load:.1f} -> {os.getloadavg()[0]:.1f}")
-    for each in rows:
+    for figures in rows:
         print(
-            f"{each['graph']}: {each['poses']} poses, {each['edges']} edges; chi2 at the start "
-            f"{each['chi2_start']:.1f}, at the truth {each['chi2_truth']:.1f}; "
-            f"trajectory off by {each['ate_start_cm']:.1f} cm at the start"
+            f"{figures['graph']}: {figures['poses']} poses, {figures['edges']} edges; chi2 at the start "
+            f"{figures['chi2_start']:.1f}, at the truth {figures['chi2_truth']:.1f}; "
+            f"trajectory off by {figures['ate_start_cm']:.1f} cm at the start"
         )
         for name in ("squares", "kernel"):
-            both = each[name]
+            both = figures[name]
             parts = [
                 f"{what} {both[what][0]:.{digits}f} (g2o {both[what][1]:.{digits}f})"
                 for what, digits in (("chi2", 2), ("cost", 2), ("ate_cm", 3), ("seconds", 2))

@@ -58,7 +58,7 @@ def drive(dataset: Dataset, rows: Sequence[int], robot: str, options: FrontEndOp
     options = options or FrontEndOptions()
     tracker = Tracker(options)
     keyframes: list[Keyframe] = []
-    poses, stamps, owner, kept = [], [], [], []
+    poses, stamps, owner, views = [], [], [], []
     for row in rows:
         frame = dataset.read(row)
         step = tracker.prepare(frame)
@@ -67,36 +67,36 @@ def drive(dataset: Dataset, rows: Sequence[int], robot: str, options: FrontEndOp
         if step.T_world_camera is None:
             continue
         if step.keyframe:
-            found = extract(frame, options)
+            features = extract(frame, options)
             keyframes.append(
                 Keyframe(
                     id=len(keyframes), robot=robot, timestamp_s=frame.timestamp_s,
                     T_world_camera=step.T_world_camera, camera=frame.camera,
-                    pixels=found.pixels.astype(np.float32), descriptors=found.descriptors,
-                    points_camera=found.points_camera.astype(np.float32),
+                    pixels=features.pixels.astype(np.float32), descriptors=features.descriptors,
+                    points_camera=features.points_camera.astype(np.float32),
                 )
             )  # fmt: skip
         poses.append(step.T_world_camera)
         stamps.append(frame.timestamp_s)
         owner.append(len(keyframes) - 1)
-        kept.append(row)
+        views.append(row)
     return Run(
         version=MapVersion(keyframes=tuple(keyframes), provenance={"robot": robot}),
         stamps_s=tuple(stamps),
         T_world_camera=np.array(poses),
         keyframe_of_frame=np.array(owner),
-        rows=tuple(kept),
+        rows=tuple(views),
     )
 
 
 def keyframe_of(dataset: Dataset, row: int, T_world_camera: Array, number: int) -> Keyframe:
     """Return frame *row* as a keyframe at a given pose."""
     frame = dataset.read(row)
-    found = extract(frame, FrontEndOptions())
+    features = extract(frame, FrontEndOptions())
     return Keyframe(
         id=number, robot="map", timestamp_s=frame.timestamp_s, T_world_camera=T_world_camera,
-        camera=frame.camera, pixels=found.pixels.astype(np.float32), descriptors=found.descriptors,
-        points_camera=found.points_camera.astype(np.float32),
+        camera=frame.camera, pixels=features.pixels.astype(np.float32), descriptors=features.descriptors,
+        points_camera=features.points_camera.astype(np.float32),
     )  # fmt: skip
 
 
@@ -113,11 +113,13 @@ def pose_answer(query: PoseQuery) -> tuple[Array | None, int]:
     options = PnpOptions(inlier_px=query.inlier_px, max_iterations=query.max_iterations)
     matches = query.correspondences
     try:
-        found = solve_pnp(matches.points_world, matches.pixels, query.camera, options)
+        solution = solve_pnp(matches.points_world, matches.pixels, query.camera, options)
     except PnpError:
         return None, 0
-    found = refine_with_depth(found, matches.points_world, matches.pixels, matches.depths_m, query.camera)
-    return found.T_camera_world, len(found.inliers)
+    solution = refine_with_depth(
+        solution, matches.points_world, matches.pixels, matches.depths_m, query.camera
+    )
+    return solution.T_camera_world, len(solution.inliers)
 
 
 def frame_poses(run: Run, T_world_keyframe: Array) -> Array:
@@ -126,7 +128,7 @@ def frame_poses(run: Run, T_world_keyframe: Array) -> Array:
     A frame between two keyframes takes part of the correction of each, by its place between them.
     """
     old = np.array([keyframe.T_world_camera for keyframe in run.version.keyframes])
-    steps = np.array([inverse(each) for each in old]) @ run.T_world_camera[:, None]
+    steps = np.array([inverse(view) for view in old]) @ run.T_world_camera[:, None]
     moved = []
     counts = np.bincount(run.keyframe_of_frame, minlength=len(old))
     starts = np.concatenate([[0], np.cumsum(counts)[:-1]])

@@ -58,13 +58,13 @@ class Drive:
     truth: Trajectory
 
 
-def recorded(dataset: Dataset, name: str) -> Drive:
+def load_drive(dataset: Dataset, name: str) -> Drive:
     """Return the drive of a recording."""
     assert dataset.truth is not None
     return Drive(name=name, frames=dataset, count=len(dataset), truth=dataset.truth)
 
 
-def held_out(recordings: Path) -> Iterator[Drive]:
+def held_out_drives(recordings: Path) -> Iterator[Drive]:
     """Yield drives that did not choose the thresholds of the tracker."""
     for seed in range(4):
         yield Drive(
@@ -73,13 +73,13 @@ def held_out(recordings: Path) -> Iterator[Drive]:
             count=_WORLD_FRAMES,
             truth=true_trajectory(0, 1, _WORLD_FRAMES, seed),
         )
-    yield recorded(open_dataset(recordings / "tum_fr1_xyz_start"), "fr1 (start)")
+    yield load_drive(open_dataset(recordings / "tum_fr1_xyz_start"), "fr1 (start)")
     kitchen = open_dataset(recordings / _RECORDING)
     for first, stride in ((1, 2), (0, 3)):
         chosen = replace(
             kitchen, rows=kitchen.rows[first::stride], timestamps_s=kitchen.timestamps_s[first::stride]
         )
-        yield recorded(chosen, f"kitchen, {10 / stride:.3g} Hz from frame {first}")
+        yield load_drive(chosen, f"kitchen, {10 / stride:.3g} Hz from frame {first}")
 
 
 def row_of(drive: Drive, *, with_scale: bool) -> dict[str, Any]:
@@ -89,14 +89,14 @@ def row_of(drive: Drive, *, with_scale: bool) -> dict[str, Any]:
     sizes: dict[str, list[int]] = {name: [] for name in codecs}
 
     async def ask(query: PoseQuery) -> PoseAnswer:
-        found = query.correspondences
+        matches = query.correspondences
         options = PnpOptions(inlier_px=query.inlier_px, max_iterations=query.max_iterations)
         for name, codec in codecs.items():
             request = make_request(
-                found.points_world, found.pixels, query.camera, options, binary=name == "bin"
+                matches.points_world, matches.pixels, query.camera, options, binary=name == "bin"
             )
             sizes[name].append(len(codec.encode(Command(id=1, service="pnp", payload=request))))
-        solution = solve_pnp(found.points_world, found.pixels, query.camera, options)
+        solution = solve_pnp(matches.points_world, matches.pixels, query.camera, options)
         return PoseAnswer(
             solution=solution, source="robot", server="", round_trip_ms=0.0, queue_ms=0.0, compute_ms=0.0
         )
@@ -148,7 +148,7 @@ def row_of(drive: Drive, *, with_scale: bool) -> dict[str, Any]:
 
 def line_of(row: dict[str, Any]) -> str:
     """Return the figures of a row in one line."""
-    cpu = " / ".join(f"{each:.0f}" for each in row["cpu_ms_p50_p95_max"])
+    cpu = " / ".join(f"{value:.0f}" for value in row["cpu_ms_p50_p95_max"])
     scale = "-" if row["sim3_scale"] is None else f"{row['sim3_scale']:.3f}"
     live = "" if row["live_metric_poses"] is None else f" of {row['live_metric_poses']} poses"
     return (
@@ -186,10 +186,10 @@ def main() -> int:
     barred = []
     for rate_hz in args.rates:
         dataset = open_dataset(args.recordings / _RECORDING).thinned(rate_hz)
-        barred.append(measure(recorded(dataset, f"kitchen, {rate_hz:g} Hz"), with_scale=True))
-        measure(recorded(dataset, f"kitchen, {rate_hz:g} Hz"), with_scale=False)
+        barred.append(measure(load_drive(dataset, f"kitchen, {rate_hz:g} Hz"), with_scale=True))
+        measure(load_drive(dataset, f"kitchen, {rate_hz:g} Hz"), with_scale=False)
     if args.hold_out:
-        for drive in held_out(args.recordings):
+        for drive in held_out_drives(args.recordings):
             measure(drive, with_scale=True)
     if args.out:
         args.out.write_text(json.dumps(rows, indent=2) + "\n", encoding="utf-8")

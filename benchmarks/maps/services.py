@@ -133,19 +133,19 @@ def cloud_distances(
     return float(np.median(distances)), float((distances < 0.05).mean())
 
 
-def planted(share: float, seed: int) -> Callable[[Atlas, MergeOptions, Report], LoopProposals]:
+def plant_wrong_links(share: float, seed: int) -> Callable[[Atlas, MergeOptions, Report], LoopProposals]:
     """Return a proposer that replaces a share of the measured links by wrong ones."""
 
     def propose(atlas: Atlas, options: MergeOptions, report: Report) -> LoopProposals:
-        found = propose_links(atlas, options, report)
+        proposals = propose_links(atlas, options, report)
         rng = np.random.default_rng(seed)
-        links = list(found.links)
+        links = list(proposals.links)
         for k in rng.choice(len(links), max(1, round(share * len(links))), replace=False).tolist():
             off = exp_se3(rng.uniform(-1, 1, 6) * [1.5, 1.5, 1.5, 1.0, 1.0, 1.0])
             links[k] = LoopClosure(
                 a=links[k].a, b=links[k].b, T_a_b=links[k].T_a_b @ off, information=links[k].information
             )
-        return LoopProposals(links=tuple(links), failed=found.failed)
+        return LoopProposals(links=tuple(links), failed=proposals.failed)
 
     return propose
 
@@ -157,21 +157,25 @@ def localise_row(recordings: Path) -> dict[str, float]:
     frames = [
         keyframe_of(dataset, row, truth[place], place) for place, row in enumerate(dataset.rows)
     ]  # fmt: skip
-    return _localised(frames, MapIndex([each for each in frames if each.id % 5]))
+    return _localise(frames, MapIndex([frame for frame in frames if frame.id % 5]))
 
 
-def _localised(frames: Sequence[Any], index: MapIndex) -> dict[str, float]:
+def _localise(frames: Sequence[Any], index: MapIndex) -> dict[str, float]:
     errors, times = [], []
-    asked = [each for each in frames if each.id % 5 == 0]
+    asked = [query for query in frames if query.id % 5 == 0]
     for frame in asked:
         view = View(
             camera=frame.camera, pixels=frame.pixels.astype(np.float64), descriptors=frame.descriptors
         )  # fmt: skip
         begin = time.perf_counter()
-        found = locate(index, view)
+        localised = locate(index, view)
         times.append(time.perf_counter() - begin)
-        if found.verdict == "ok" and found.inliers >= LOCALISE_INLIERS and found.T_map_camera is not None:
-            errors.append(pose_difference(found.T_map_camera, frame.T_world_camera))
+        if (
+            localised.verdict == "ok"
+            and localised.inliers >= LOCALISE_INLIERS
+            and localised.T_map_camera is not None
+        ):
+            errors.append(pose_difference(localised.T_map_camera, frame.T_world_camera))
     metres, degrees = np.array(errors).T
     return {
         "found_percent": 100.0 * len(errors) / len(asked),
@@ -194,7 +198,9 @@ def merge_rows(recordings: Path) -> dict[str, Any]:
     by_positions_m, share_by_positions = cloud_distances(robots, merged, by_positions=True)
     clean = robots.ate_m(joined_poses(robots.runs, merged))
     wrong = [
-        robots.ate_m(joined_poses(robots.runs, merge_versions(versions, propose=planted(0.1, seed))))
+        robots.ate_m(
+            joined_poses(robots.runs, merge_versions(versions, propose=plant_wrong_links(0.1, seed)))
+        )
         for seed in range(5)
     ]
     alone = robots_of(recordings, cuts=((0, 250),))
@@ -205,12 +211,12 @@ def merge_rows(recordings: Path) -> dict[str, Any]:
         "keyframes": [len(version.keyframes) for version in versions],
         "merge_links": merged.merges,
         "ate_cm": 100 * clean,
-        "ate_wrong_loops_cm": [100 * each for each in wrong],
+        "ate_wrong_loops_cm": [100 * error_m for error_m in wrong],
         "origins_m_deg": origin_errors(robots, merged),
         "cloud_median_mm": 1e3 * median_m,
         "cloud_under_5_cm_percent": 100 * share,
         "cloud_aligned_by_positions": [1e3 * by_positions_m, 100 * share_by_positions],
-        "localise_in_merged": _located_in_merged(robots, merged),
+        "localise_in_merged": _locate_in_merged(robots, merged),
         "seconds": seconds,
         "one_robot_before_cm": 100 * alone.ate_m(joined_poses(alone.runs, without)),
         "one_robot_after_cm": 100 * alone.ate_m(joined_poses(alone.runs, closed)),
@@ -218,7 +224,7 @@ def merge_rows(recordings: Path) -> dict[str, Any]:
     }
 
 
-def _located_in_merged(robots: Robots, merged: MergedMap) -> dict[str, float]:
+def _locate_in_merged(robots: Robots, merged: MergedMap) -> dict[str, float]:
     """Locate every fifth frame in the merged map, whose poses are estimates, aligned to the truth."""
     T_truth_merged = alignment_of_poses(joined_poses(robots.runs, merged), robots.truth)
     rows = [row for run in robots.runs for row in run.rows]
@@ -226,21 +232,21 @@ def _located_in_merged(robots: Robots, merged: MergedMap) -> dict[str, float]:
         keyframe_of(robots.dataset, row, inverse(T_truth_merged) @ robots.truth[place], place)
         for place, row in enumerate(rows)
     ]
-    return _localised(frames, MapIndex(merged.version.keyframes))
+    return _localise(frames, MapIndex(merged.version.keyframes))
 
 
 def sphere_row() -> dict[str, float]:
     """Optimise a sphere of 2,500 poses."""
     graph, truth = make_sphere(7)
     begin = time.perf_counter()
-    found = optimise_graph(graph)
+    optimised = optimise_graph(graph)
     return {
         "seconds": time.perf_counter() - begin,
         "chi2_start": graph.chi2(),
         "chi2_truth": graph.chi2(truth),
-        "chi2_end": graph.chi2(found.T_world_pose),
+        "chi2_end": graph.chi2(optimised.T_world_pose),
         "ate_start_m": ate_m(graph.T_world_pose, truth),
-        "ate_end_m": ate_m(found.T_world_pose, truth),
+        "ate_end_m": ate_m(optimised.T_world_pose, truth),
     }
 
 
@@ -256,12 +262,12 @@ def icp_row(cases: int = 40) -> dict[str, float]:
         twist = [0.05 * t / np.linalg.norm(t), math.radians(3.0) * r / np.linalg.norm(r)]
         start = exp_se3(np.concatenate(twist))
         begin = time.perf_counter()
-        found = align(target, source, start)
+        alignment = align(target, source, start)
         times.append(time.perf_counter() - begin)
-        metres, degrees = pose_difference(found.T_target_source, np.eye(4))
-        accepted += found.verdict == "ok"
-        right += found.verdict == "ok" and metres <= 0.01 and degrees <= 0.5
-        worse += found.verdict == "ok" and (metres > 0.05 or degrees > 3.0)
+        metres, degrees = pose_difference(alignment.T_target_source, np.eye(4))
+        accepted += alignment.verdict == "ok"
+        right += alignment.verdict == "ok" and metres <= 0.01 and degrees <= 0.5
+        worse += alignment.verdict == "ok" and (metres > 0.05 or degrees > 3.0)
     return {
         "cases": cases, "ok": accepted, "right": right, "worse_called_ok": worse,
         "median_ms": 1e3 * float(np.median(times)),
@@ -283,10 +289,10 @@ def wifi_row(buildings: int = 8, scans: int = 250) -> dict[str, float]:
         times.append(time.perf_counter() - begin)
         for _ in range(scans):
             place = np.array([rng.uniform(1, 39), rng.uniform(1, 19), 0.3])
-            found = locator.position_of(fingerprint_of(building.scan(place, rng), key).rssi_dbm)
-            if found.found:
-                errors.append(math.hypot(found.x - place[0], found.y - place[1]))
-                radii.append(found.sigma_m)
+            position = locator.position_of(fingerprint_of(building.scan(place, rng), key).rssi_dbm)
+            if position.found:
+                errors.append(math.hypot(position.x - place[0], position.y - place[1]))
+                radii.append(position.sigma_m)
     return {
         "scans": len(errors),
         "median_error_m": float(np.median(errors)),

@@ -68,10 +68,10 @@ def judge(dataset: Dataset, folder: Path, every: int = 5) -> dict[str, Any]:
 
     def distances(points: npt.NDArray[np.float32]) -> dict[str, float]:
         chosen = transform(T_truth_merged, points[:: max(1, len(points) // SAMPLE)].astype(np.float64))
-        found = np.sqrt(np.asarray(tree.batch_nearest_neighbor_search(chosen)[1]))
+        distances_m = np.sqrt(np.asarray(tree.batch_nearest_neighbor_search(chosen)[1]))
         return {
-            "median_mm": round(1e3 * float(np.median(found)), 2),
-            "under_5_cm_percent": round(100.0 * float((found < 0.05).mean()), 1),
+            "median_mm": round(1e3 * float(np.median(distances_m)), 2),
+            "under_5_cm_percent": round(100.0 * float((distances_m < 0.05).mean()), 1),
         }
 
     left_out = ("refused", "map", "points", "frames")
@@ -84,8 +84,8 @@ def judge(dataset: Dataset, folder: Path, every: int = 5) -> dict[str, Any]:
 
 def rows_of(three: dict[str, Any], one: dict[str, Any]) -> list[tuple[str, str, str, bool]]:
     """Return the issue's rows: what, bar, measured, met."""
-    worst_cm = max(each["cm"] for each in three["origins"])
-    worst_deg = max(each["deg"] for each in three["origins"])
+    worst_cm = max(origin["cm"] for origin in three["origins"])
+    worst_deg = max(origin["deg"] for origin in three["origins"])
     cloud, ply = three["cloud"], three["merged_ply"]
     rows = [
         ("joined", "3 robots", str(len(three["joined"])), len(three["joined"]) == 3),
@@ -97,13 +97,13 @@ def rows_of(three: dict[str, Any], one: dict[str, Any]) -> list[tuple[str, str, 
             worst_cm <= 7 and worst_deg <= 2.5,
         ),
     ]
-    for name, found in (("cloud of the frames", cloud), ("merged.ply", ply)):
-        told = f"{found['median_mm']:.1f} mm, {found['under_5_cm_percent']:.0f} %"
-        met = found["median_mm"] <= 15 and found["under_5_cm_percent"] >= 85
-        rows.append((name, "15 mm median, 85 % under 5 cm", told, met))
-    told = f"{one['ate_cm']:.2f} cm, without {one['ate_before_cm']:.2f} cm"
+    for name, figures in (("cloud of the frames", cloud), ("merged.ply", ply)):
+        text = f"{figures['median_mm']:.1f} mm, {figures['under_5_cm_percent']:.0f} %"
+        met = figures["median_mm"] <= 15 and figures["under_5_cm_percent"] >= 85
+        rows.append((name, "15 mm median, 85 % under 5 cm", text, met))
+    text = f"{one['ate_cm']:.2f} cm, without {one['ate_before_cm']:.2f} cm"
     met = one["ate_cm"] <= min(4.5, one["ate_before_cm"])
-    return [*rows, ("one robot, loops closed", "4.5 cm, not worse than without", told, met)]
+    return [*rows, ("one robot, loops closed", "4.5 cm, not worse than without", text, met)]
 
 
 def main() -> int:

@@ -27,9 +27,9 @@ from benchmarks.recording.planted_causes import (
     RecordedCase,
     Sequence,
     healthy_case,
-    planted_case,
-    recorded,
-    rendered,
+    load_sequence,
+    plant_case,
+    render_sequence,
 )
 from rse_pf.recording.explain import Cause, PoseExplanation, explain
 
@@ -45,35 +45,37 @@ Label = tuple[Cause, int]
 def sequence_of(seed: int, recordings: Path | None) -> Sequence:
     """Return the sequence of *seed*: rendered, or where there are recordings every other one real."""
     if recordings is None or seed % 2 == 0:
-        return rendered(seed)
+        return render_sequence(seed)
     is_report = seed >= _FIRST_OF_SECOND_HALF
     if is_report and seed % 10 == 1:
-        return recorded(recordings / "tum_fr1_xyz_start", seed, share=(0.0, 1.0))
-    return recorded(recordings / "7scenes_redkitchen", seed, share=(0.5, 1.0) if is_report else (0.0, 0.5))
+        return load_sequence(recordings / "tum_fr1_xyz_start", seed, share=(0.0, 1.0))
+    return load_sequence(
+        recordings / "7scenes_redkitchen", seed, share=(0.5, 1.0) if is_report else (0.0, 0.5)
+    )
 
 
 def cases_of(
     seed: int, rounds: int, healthy: int, recordings: Path | None, only: Cause | None
 ) -> list[tuple[Label, RecordedCase]]:
     """Return labelled cases in random order, each of a seed of its own."""
-    found: list[tuple[Label, RecordedCase]] = []
+    cases: list[tuple[Label, RecordedCase]] = []
     labels: list[Label] = [
         (cause, severity) for _ in range(rounds) for cause in PLANTED for severity in _SEVERITIES
     ]
     for cause, severity in labels:
         seed += 1
         if only in (None, cause):
-            found.append(
-                ((cause, severity), planted_case(sequence_of(seed, recordings), seed, cause, severity))
+            cases.append(
+                ((cause, severity), plant_case(sequence_of(seed, recordings), seed, cause, severity))
             )
-    wanted = len(found) + (healthy if only in (None, Cause.NONE) else 0)
-    while len(found) < wanted:
+    wanted = len(cases) + (healthy if only in (None, Cause.NONE) else 0)
+    while len(cases) < wanted:
         seed += 1
         case = healthy_case(sequence_of(seed, recordings), seed)
         if case.error_m < _CORRECT_M and case.error_deg < _CORRECT_DEG:
-            found.append(((Cause.NONE, 0), case))
-    order = np.random.default_rng(seed).permutation(len(found))
-    return [found[k] for k in order]
+            cases.append(((Cause.NONE, 0), case))
+    order = np.random.default_rng(seed).permutation(len(cases))
+    return [cases[k] for k in order]
 
 
 def answers_of(cases: list[RecordedCase]) -> tuple[list[list[PoseExplanation]], list[float]]:
@@ -102,7 +104,7 @@ def report_of(cases: list[tuple[Label, RecordedCase]], verbose: bool) -> dict[st
         else:
             wrong.append({
                 "planted": label[0].value, "severity": label[1], "kind": case.kind, "origin": case.origin,
-                "named": [each.cause.value for each in given], "said": given[0].sentence,
+                "named": [explanation.cause.value for explanation in given], "said": given[0].sentence,
                 "error_m": round(min(case.error_m, 99.0), 3),
                 "error_deg": round(min(case.error_deg, 180.0), 2),
             })  # fmt: skip
@@ -110,8 +112,8 @@ def report_of(cases: list[tuple[Label, RecordedCase]], verbose: bool) -> dict[st
             mark = "right" if given[0].cause is label[0] else "WRONG"
             what = f"{label[0].value} {label[1]} ({case.kind}; {case.origin}; off {case.error_m:.3f} m)"
             print(f"{mark} {what}")
-            for each in given:
-                print(f"      {each.cause.value} {each.confidence:.2f}: {each.sentence}")
+            for explanation in given:
+                print(f"      {explanation.cause.value} {explanation.confidence:.2f}: {explanation.sentence}")
     planted = [label for label in total if label[0] is not Cause.NONE]
     return {
         "machine": platform.processor() or platform.machine(), "load": os.getloadavg(),

@@ -29,7 +29,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from benchmarks.server.load import LoadPlan, RobotGroup, compiled, hello_file, pnp_file, run_load
+from benchmarks.server.load import LoadPlan, RobotGroup, compile_generator, hello_file, pnp_file, run_load
 from benchmarks.server.serving import machine, tree
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import ConfigurationError
@@ -147,15 +147,15 @@ def one_round(site: RecordingSite, folder: Path, asked: argparse.Namespace, seco
     )  # fmt: skip
     report = run_load(plan, lambda mark: marks.__setitem__(mark, site.cpu_s()))
     time.sleep(_LAST_CHUNK_S if site.recordings else 0.0)
-    found = report.groups[0]
+    load = report.groups[0]
     workers_s, all_s, recorders_s = (marks["end"][k] - marks["begin"][k] for k in range(3))
-    commands = max(1, found.ok + found.failed)
+    commands = max(1, load.ok + load.failed)
     # The commands of the warm-up are in the file, too.
     recorded = commands + asked.robots * FRAMES_PER_S * plan.warm_up_s
     return {
-        "is_recording": site.recordings is not None, "commands": commands, "ok": found.ok,
-        "not_ok": found.failed + found.lost + found.unsent, "p50_ms": found.latency_ms.p50,
-        "p99_ms": found.latency_ms.p99, "workers_us": 1e6 * workers_s / commands,
+        "is_recording": site.recordings is not None, "commands": commands, "ok": load.ok,
+        "not_ok": load.failed + load.lost + load.unsent, "p50_ms": load.latency_ms.p50,
+        "p99_ms": load.latency_ms.p99, "workers_us": 1e6 * workers_s / commands,
         "platform_us": 1e6 * all_s / commands, "recorders_us": 1e6 * recorders_s / commands,
         "bytes": (site.recorded_bytes() - bytes_before) / recorded,
     }  # fmt: skip
@@ -163,8 +163,8 @@ def one_round(site: RecordingSite, folder: Path, asked: argparse.Namespace, seco
 
 def summary(rounds: list[dict[str, Any]]) -> dict[str, Any]:
     """Return the ratios of recording to not recording: medians over pairs of rounds."""
-    off = [each for each in rounds if not each["is_recording"]]
-    on = [each for each in rounds if each["is_recording"]]
+    off = [pair for pair in rounds if not pair["is_recording"]]
+    on = [pair for pair in rounds if pair["is_recording"]]
     pairs = list(zip(on, off, strict=True))
 
     def ratio(name: str) -> float:
@@ -172,7 +172,7 @@ def summary(rounds: list[dict[str, Any]]) -> dict[str, Any]:
 
     row = {
         "workers": ratio("workers_us"), "platform": ratio("platform_us"), "p99": ratio("p99_ms"),
-        "bytes": statistics.median(each["bytes"] for each in on),
+        "bytes": statistics.median(window["bytes"] for window in on),
     }  # fmt: skip
     return {**row, "holds": {name: row[name] <= bar for name, bar in BARS.items()}, "pairs": len(pairs)}
 
@@ -195,14 +195,14 @@ def measure(asked: argparse.Namespace) -> dict[str, Any]:
     return {**report, "rounds": rounds, **summary(rounds), "load_average_after": machine()["load_average"]}
 
 
-def print_round(found: dict[str, Any]) -> None:
+def print_round(window: dict[str, Any]) -> None:
     """Print one line for a round."""
     print(
-        f"  {'recording' if found['is_recording'] else 'off':9} {found['commands']:6} commands, "
-        f"{found['not_ok']} not ok, p50 {found['p50_ms']:6.2f} p99 {found['p99_ms']:7.2f} ms; CPU a command: "
-        f"workers {found['workers_us']:6.1f}, platform {found['platform_us']:6.1f}, recorders "
-        f"{found['recorders_us']:.1f} us; "
-        f"{found['bytes'] / 1e3:.2f} kB recorded a command",
+        f"  {'recording' if window['is_recording'] else 'off':9} {window['commands']:6} commands, "
+        f"{window['not_ok']} not ok, p50 {window['p50_ms']:6.2f} p99 {window['p99_ms']:7.2f} ms; "
+        f"CPU a command: workers {window['workers_us']:6.1f}, platform {window['platform_us']:6.1f}, "
+        f"recorders {window['recorders_us']:.1f} us; "
+        f"{window['bytes'] / 1e3:.2f} kB recorded a command",
         flush=True,
     )
 
@@ -220,7 +220,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, help="write the figures as JSON")
     asked = parser.parse_args()
     try:
-        compiled()
+        compile_generator()
         report = measure(asked)
     except ConfigurationError as error:
         print(f"skipped: {error.message} ({error.hint})")

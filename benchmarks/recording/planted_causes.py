@@ -22,7 +22,15 @@ from rse_pf.geometry import Array, Camera, exp_se3, inverse, pose_difference, tr
 from rse_pf.pnp import PnpOptions, PnpSolution, solve_pnp
 from rse_pf.recording.explain import Cause, PastCommand, Timing
 
-__all__ = ["PLANTED", "RecordedCase", "Sequence", "healthy_case", "planted_case", "recorded", "rendered"]
+__all__ = [
+    "PLANTED",
+    "RecordedCase",
+    "Sequence",
+    "healthy_case",
+    "load_sequence",
+    "plant_case",
+    "render_sequence",
+]
 
 PLANTED = (
     Cause.MIRRORED, Cause.INTRINSICS, Cause.ROW_ORDER, Cause.OUTLIERS, Cause.DUPLICATES, Cause.PLANE,
@@ -72,7 +80,7 @@ class RecordedCase:
     origin: str
 
 
-def rendered(seed: int) -> Sequence:
+def render_sequence(seed: int) -> Sequence:
     """Return a sequence of a rendered world; *seed* chooses world, place and speed."""
     rng = np.random.default_rng([seed, 1])
     robots, stride = int(rng.integers(5, 40)), int(rng.integers(1, 3))
@@ -82,11 +90,11 @@ def rendered(seed: int) -> Sequence:
     return _sequence(f"rendered {seed}", tuple(frames), np.asarray(poses), stride / RATE_HZ)
 
 
-def recorded(folder: Path, seed: int, *, share: tuple[float, float]) -> Sequence:
+def load_sequence(folder: Path, seed: int, *, share: tuple[float, float]) -> Sequence:
     """Return a part of a real recording, from within *share* of it."""
     dataset = open_dataset(folder)
     rng = np.random.default_rng([seed, 2])
-    low, high = (round(each * len(dataset)) for each in share)
+    low, high = (round(part * len(dataset)) for part in share)
     stride = int(rng.integers(1, 3)) if high - low >= 2 * FRAMES else 1
     start = int(rng.integers(low, max(low + 1, high - stride * FRAMES + 1)))
     rows = list(range(start, high, stride))[:FRAMES]
@@ -118,7 +126,7 @@ def healthy_case(sequence: Sequence, seed: int) -> RecordedCase:
     )  # fmt: skip
 
 
-def planted_case(sequence: Sequence, seed: int, cause: Cause, severity: int) -> RecordedCase:
+def plant_case(sequence: Sequence, seed: int, cause: Cause, severity: int) -> RecordedCase:
     """Return a command of *sequence* with *cause* planted, of *severity* 1, 2 or 3."""
     return _Recorder(sequence, np.random.default_rng([seed, 4])).case(cause, severity)
 
@@ -140,7 +148,7 @@ class _Recorder:
         plant = _Plant(cause, severity, rng, self.is_pair)
         features, thumbnails = list(sequence.features), list(sequence.thumbnails)
         if cause is Cause.BLUR:
-            blurred = plant.blurred(sequence.frames[-1])
+            blurred = plant.blur(sequence.frames[-1])
             features[-1], thumbnails[-1] = extract(blurred, _OPTIONS), _thumbnail(blurred)
         odometry = self._odometry()
         history: list[PastCommand] = []
@@ -148,8 +156,8 @@ class _Recorder:
         result: RecordedCase | None = None
         for k in range(1, last + 1):
             reference = max(0, k - self.back)
-            found = match(features[reference], features[k], _OPTIONS)
-            query = self._query(found, reference, k)
+            matches = match(features[reference], features[k], _OPTIONS)
+            query = self._query(matches, reference, k)
             query = plant.query(query, is_last=k == last)
             reply = _answer(query)
             sent_s = first_s + k * sequence.period_s + float(rng.uniform(0.005, 0.04))
@@ -173,10 +181,10 @@ class _Recorder:
         assert result is not None
         return result
 
-    def _query(self, found: Any, reference: int, k: int) -> Query:
+    def _query(self, matches: Any, reference: int, k: int) -> Query:
         poses = self.sequence.T_world_camera
         T_camera_reference = inverse(poses[k]) @ poses[reference]
-        points, T, depths = found.points_world, T_camera_reference, found.depths_m
+        points, T, depths = matches.points_world, T_camera_reference, matches.depths_m
         if not self.is_pair:
             T_map_reference = self.T_map_world @ poses[reference]
             points = transform(T_map_reference, points)
@@ -186,8 +194,8 @@ class _Recorder:
             depths = None
         options = PnpOptions(inlier_px=self.inlier_px)
         return Query(
-            points_world=points, pixels=found.pixels, camera=self.sequence.frames[k].camera, options=options,
-            depths_m=depths, T_camera_world=T,
+            points_world=points, pixels=matches.pixels, camera=self.sequence.frames[k].camera,
+            options=options, depths_m=depths, T_camera_world=T,
         )  # fmt: skip
 
     def _odometry(self) -> list[Array]:
@@ -241,7 +249,7 @@ class _Plant:
         elif cause is Cause.LATE:
             self.kind = str(rng.choice(["answer", "frame", "clock ahead"]))
 
-    def blurred(self, frame: Frame) -> Frame:
+    def blur(self, frame: Frame) -> Frame:
         """Return the frame, blurred by a motion or out of focus."""
         cv2 = load_opencv()
         if self.kind == "focus":
@@ -263,7 +271,7 @@ class _Plant:
         if self.cause is None or not (is_last or self.every):
             return query
         by_cause = {
-            Cause.MIRRORED: self._mirrored, Cause.INTRINSICS: self._intrinsics,
+            Cause.MIRRORED: self._mirror, Cause.INTRINSICS: self._intrinsics,
             Cause.ROW_ORDER: self._row_order, Cause.OUTLIERS: self._outliers,
             Cause.DUPLICATES: self._duplicates, Cause.PLANE: self._plane,
             Cause.DEPTH_SCALE: self._depth_scale, Cause.STALE_MAP: self._stale_map,
@@ -289,8 +297,8 @@ class _Plant:
             replied_s=received_s + 0.002, period_s=period_s,
         )  # fmt: skip
 
-    def _mirrored(self, query: Query) -> Query:
-        worse = replace(query, pixels=self._strayed(query, (0.0, 0.25, 0.45)[self.level], "anywhere"))
+    def _mirror(self, query: Query) -> Query:
+        worse = replace(query, pixels=self._stray(query, (0.0, 0.25, 0.45)[self.level], "anywhere"))
         if self.kind == "image":
             flipped = worse.pixels * [-1.0, 1.0] + [query.camera.width - 1.0, 0.0]
             return replace(worse, pixels=flipped)
@@ -328,7 +336,7 @@ class _Plant:
             order = self.rng.permutation(n)
         return replace(query, pixels=query.pixels[order])
 
-    def _strayed(self, query: Query, share: float, kind: str) -> Array:
+    def _stray(self, query: Query, share: float, kind: str) -> Array:
         n = len(query.pixels)
         wrong = self.rng.permutation(n)[: round(share * n)]
         pixels = query.pixels.copy()
@@ -341,14 +349,14 @@ class _Plant:
         return pixels
 
     def _outliers(self, query: Query) -> Query:
-        return replace(query, pixels=self._strayed(query, (0.6, 0.7, 0.85)[self.level], self.kind))
+        return replace(query, pixels=self._stray(query, (0.6, 0.7, 0.85)[self.level], self.kind))
 
     def _duplicates(self, query: Query) -> Query:
         n = len(query.pixels)
         share = (0.5, 0.7, 0.9)[self.level]
-        kept = self.rng.permutation(n)[: max(6, round((1 - share) * n))]
-        copied = kept[: 1 if self.kind == "one group" else max(2, len(kept) // 4)]
-        rows = np.sort(np.concatenate([kept, self.rng.choice(copied, n - len(kept))]))
+        sources = self.rng.permutation(n)[: max(6, round((1 - share) * n))]
+        copied = sources[: 1 if self.kind == "one group" else max(2, len(sources) // 4)]
+        rows = np.sort(np.concatenate([sources, self.rng.choice(copied, n - len(sources))]))
         pixels, points = query.pixels[rows], query.points_world[rows]
         if self.kind == "trembling":
             pixels = pixels + self.rng.normal(size=pixels.shape) * 0.05

@@ -36,11 +36,11 @@ _READ_BYTES = 1 << 15
 _STEP_NS = 1_000_000
 
 
-def answered(codec_name: str) -> list[tuple[bytes, Command, bytes, Result]]:
+def answer_commands(codec_name: str) -> list[tuple[bytes, Command, bytes, Result]]:
     """Return commands and their answers, encoded and decoded."""
     registry = builtin_services(PlatformSettings())
     codec = make_codec(codec_name, pnp=wire_types(registry))
-    found = []
+    pairs = []
     for seed in range(_PROBLEMS):
         p = make_problem(seed=seed, outlier_ratio=0.3)
         payload = make_request(p.points_world, p.pixels, p.camera, binary=codec_name == "bin")
@@ -49,8 +49,8 @@ def answered(codec_name: str) -> list[tuple[bytes, Command, bytes, Result]]:
         assert isinstance(command, Command)
         result = dispatch(registry, command, itertools.count(100.0).__next__, server="s", received_s=99.5)
         assert isinstance(result, Result)
-        found.append((asked, command, codec.encode(result), result))
-    return found
+        pairs.append((asked, command, codec.encode(result), result))
+    return pairs
 
 
 def stream(codec_name: str, commands: int, *, is_told: bool) -> bytes:
@@ -60,7 +60,7 @@ def stream(codec_name: str, commands: int, *, is_told: bool) -> bytes:
     clock = itertools.count(1_790_000_000_000_000_000, _STEP_NS)
     tap = RecordingTap(write, call_later=lambda seconds, call: None, time_ns=lambda: next(clock))
     robots = [tap.opened(codec_name, RobotId("default", f"robot-{k}")) for k in range(_ROBOTS)]
-    pairs, parts = answered(codec_name), []
+    pairs, parts = answer_commands(codec_name), []
     for number in range(commands):
         asked, command, answer, result = pairs[number % _PROBLEMS]
         tap.up(robots[number % _ROBOTS], asked)
@@ -109,7 +109,7 @@ def main() -> None:
                 us, size = cost_us(data, asked.commands, Path(folder))
                 spent[name].append(us)
                 print(f"{name:6} {us:6.1f} us of CPU a command, {size / asked.commands / 1e3:.2f} kB")
-    least = {name: min(each) for name, each in spent.items()}
+    least = {name: min(times_us) for name, times_us in spent.items()}
     print(
         f"least of {asked.runs}: untold {least['untold']:.1f}, told {least['told']:.1f} us, ratio "
         f"{least['told'] / least['untold']:.2f}; n = {asked.commands} commands, {asked.codec}, load average "

@@ -56,7 +56,7 @@ def main() -> None:
         servers = [Server(Path(folder) / name.replace(" ", "-"), name == "on") for name in SERVERS]
         try:
             for kind in [args.only] if args.only else KINDS:
-                report["kinds"][kind] = judged(measured(servers, kind, args.n))
+                report["kinds"][kind] = judge(measure_ms(servers, kind, args.n))
         finally:
             for server in servers:
                 server.stop()
@@ -102,7 +102,7 @@ class Server:
         self._log.close()
 
 
-def measured(servers: list[Server], kind: str, rounds: int) -> np.ndarray:
+def measure_ms(servers: list[Server], kind: str, rounds: int) -> np.ndarray:
     """Return milliseconds, ``(rounds, servers)``."""
     draw, taken = random.Random(7), np.zeros((rounds, len(servers)))
     settings, now = PlatformSettings().auth, time.time()
@@ -140,7 +140,7 @@ def handshake_ms(port: int, token: str, expected: int) -> float:
     return took_s * 1e3
 
 
-def judged(taken: np.ndarray) -> dict[str, Any]:
+def judge(taken: np.ndarray) -> dict[str, Any]:
     """Return quantiles, what the log adds to each, and whether that is within the noise."""
     figures: dict[str, Any] = {
         name: np.percentile(taken[:, row], QUANTILES).round(3).tolist() for row, name in enumerate(SERVERS)

@@ -29,7 +29,15 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from benchmarks.server.load import LoadPlan, RobotGroup, compiled, hello_file, ping_file, pnp_file, run_load
+from benchmarks.server.load import (
+    LoadPlan,
+    RobotGroup,
+    compile_generator,
+    hello_file,
+    ping_file,
+    pnp_file,
+    run_load,
+)
 from benchmarks.server.serving import BenchServer, cpu_of_tree_s, machine, private_bytes_of_tree
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import ConfigurationError
@@ -101,10 +109,10 @@ def step(site: ServingSite, folder: Path, codec: str, robots: int, seconds: floa
             opening_s=30.0, seed=robots,
         )
     )  # fmt: skip
-    found = report.groups[0]
+    load = report.groups[0]
     return CapacityStep(
-        robots=robots, ok=found.ok, failed=found.failed, lost=found.lost, unsent=found.unsent,
-        p50_ms=found.latency_ms.p50, p99_ms=found.latency_ms.p99, late_p99_ms=found.late_ms.p99,
+        robots=robots, ok=load.ok, failed=load.failed, lost=load.lost, unsent=load.unsent,
+        p50_ms=load.latency_ms.p50, p99_ms=load.latency_ms.p99, late_p99_ms=load.late_ms.p99,
         codes=report.codes, generator_cores=report.cpu_s / seconds,
     )  # fmt: skip
 
@@ -137,13 +145,13 @@ def search(try_robots: Callable[[int], CapacityStep], clock: Callable[[], float]
     return steps
 
 
-def print_step(found: CapacityStep) -> None:
+def print_step(tested: CapacityStep) -> None:
     """Print one line for a step."""
-    verdict = "carried" if found.is_carried else f"not carried {found.codes or ''}"
+    verdict = "carried" if tested.is_carried else f"not carried {tested.codes or ''}"
     print(
-        f"  {found.robots:6} robots: p50 {found.p50_ms:7.2f} p99 {found.p99_ms:7.2f} ms, {found.ok} ok, "
-        f"{found.failed} failed, {found.lost} lost, {found.unsent} unsent, late p99 {found.late_p99_ms:.2f} "
-        f"ms, generator {found.generator_cores:.2f} cores: {verdict}",
+        f"  {tested.robots:6} robots: p50 {tested.p50_ms:7.2f} p99 {tested.p99_ms:7.2f} ms, {tested.ok} ok, "
+        f"{tested.failed} failed, {tested.lost} lost, {tested.unsent} unsent, "
+        f"late p99 {tested.late_p99_ms:.2f} ms, generator {tested.generator_cores:.2f} cores: {verdict}",
         flush=True,
     )
 
@@ -152,7 +160,7 @@ def most_robots(workers: int, codec: str, seconds: float) -> dict[str, Any]:
     """Search directly, without a balancer."""
     with serving(workers) as (server, folder):
         site = ServingSite(port=server.port, path="/ws", workers=workers)
-        return found(site, folder, codec, seconds)
+        return find_capacity(site, folder, codec, seconds)
 
 
 async def most_robots_behind_balancer(servers: int, codec: str, seconds: float) -> dict[str, Any]:
@@ -165,18 +173,18 @@ async def most_robots_behind_balancer(servers: int, codec: str, seconds: float) 
             names = [cloud.issue_token(f"robot-{number}") for number in range(MOST)]
             tokens.write_text("\n".join(names))
             site = ServingSite(port=cloud.port, path="/ws", workers=servers, tokens=tokens)
-            return await asyncio.to_thread(found, site, folder, codec, seconds)
+            return await asyncio.to_thread(find_capacity, site, folder, codec, seconds)
 
 
-def found(site: ServingSite, folder: Path, codec: str, seconds: float) -> dict[str, Any]:
+def find_capacity(site: ServingSite, folder: Path, codec: str, seconds: float) -> dict[str, Any]:
     """Return the most robots that *site* carries, and all steps."""
     step(site, folder, codec, 20, 1.0)  # warms it up
     steps = search(lambda robots: step(site, folder, codec, robots, seconds), time.monotonic)
-    most = max((each.robots for each in steps if each.is_carried), default=0)
-    return {"workers": site.workers, "robots": most, "steps": [asdict(each) for each in steps]}
+    most = max((tested.robots for tested in steps if tested.is_carried), default=0)
+    return {"workers": site.workers, "robots": most, "steps": [asdict(tested) for tested in steps]}
 
 
-def connected(codec: str, seconds: float) -> dict[str, Any]:
+def measure_connected(codec: str, seconds: float) -> dict[str, Any]:
     """Return what 10,000 robots of which 500 are active need and see."""
     memory: dict[str, int] = {}
     cpu: dict[str, float] = {}
@@ -257,7 +265,7 @@ def main() -> None:
     report: dict[str, Any] = {"machine": machine(), "settings": settings, "codec": asked.codec}
     report |= {"balancer": asked.balancer, "seconds": asked.seconds, "searches": []}
     try:
-        compiled()
+        compile_generator()
         print(f"{report['machine']}; settings {settings}; {asked.codec}, steps of {asked.seconds:g} s")
         for workers in asked.workers:
             print(f"{workers} workers{', through the balancer' if asked.balancer else ''}", flush=True)
@@ -269,7 +277,7 @@ def main() -> None:
             bar = f" (bar {ROBOTS_BAR})" if workers == 2 else ""
             print(f"{workers} workers carry {made['robots']} robots at {FRAMES_PER_S:g} fps{bar}", flush=True)
         if not asked.search_only:
-            report["connected"] = connected(asked.codec, 2 * asked.seconds)
+            report["connected"] = measure_connected(asked.codec, 2 * asked.seconds)
             print_connected(report["connected"])
     except ConfigurationError as error:
         print(f"skipped: {error.message} ({error.hint})")

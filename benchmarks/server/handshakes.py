@@ -88,19 +88,19 @@ class Server:
     def status(self) -> dict[str, Any]:
         """Return the server's own numbers."""
         with urllib.request.urlopen(f"http://127.0.0.1:{self._control_port}/status") as answer:
-            found: dict[str, Any] = json.loads(answer.read())
-        return found
+            document: dict[str, Any] = json.loads(answer.read())
+        return document
 
 
 @contextmanager
-def served(
+def serve_tree(
     tree: Path | None, workers: int, *, tokens: bool, audit: bool, **session: float
 ) -> Iterator[Server]:
     """Start a server of *tree* (None: this one), and end it."""
     with tempfile.TemporaryDirectory() as folder:
         announce = Path(folder) / "announce.json"
         enrolled = EnrolledRobot(robot="enrolled", x=_x_of(SigningKey.of_robot(ROBOT_SEED)))
-        told = {
+        placement = {
             "announce": str(announce),
             "audit": str(Path(folder) / "audit") if audit else "",
             "settings": settings_of(workers, tokens=tokens, **session),
@@ -110,7 +110,7 @@ def served(
         environment = {**os.environ, **({} if tree is None else {"PYTHONPATH": str(tree)})}
         with (Path(folder) / "server.log").open("wb") as log:
             process = subprocess.Popen(
-                [sys.executable, "-c", SERVE, json.dumps(told)],
+                [sys.executable, "-c", SERVE, json.dumps(placement)],
                 stdout=log, stderr=log, env=environment, cwd=tree or Path.cwd(),
             )  # fmt: skip
         try:
@@ -129,15 +129,15 @@ def _x_of(key: SigningKey) -> str:
     return str(json.loads(key.public_json())["x"])
 
 
-def masked(opcode: int, payload: bytes) -> bytes:
+def mask_frame(opcode: int, payload: bytes) -> bytes:
     """Return one frame of a client, with the mask 0."""
     assert len(payload) < 126
     return bytes([0x80 | opcode, 0x80 | len(payload)]) + bytes(4) + payload
 
 
-HELLO = masked(2, make_codec(CODEC).encode(Hello()))
-BAD_MESSAGES = masked(2, b"?") * 16
-CLOSE = masked(8, (1000).to_bytes(2, "big"))
+HELLO = mask_frame(2, make_codec(CODEC).encode(Hello()))
+BAD_MESSAGES = mask_frame(2, b"?") * 16
+CLOSE = mask_frame(8, (1000).to_bytes(2, "big"))
 
 
 def request(address: tuple[str, int], token: str, path: str = "/ws") -> bytes:
@@ -195,9 +195,9 @@ def make_batch(server: Server, heads: list[bytes], status: bytes) -> None:
         client.send(head)
     is_accepted = status == b"101"
     for client in clients:
-        found = client.head()
-        if status not in found:
-            raise SystemExit(f"wanted {status!r}, got {found!r}")
+        answer_head = client.head()
+        if status not in answer_head:
+            raise SystemExit(f"wanted {status!r}, got {answer_head!r}")
         if is_accepted:
             client.send(HELLO)
     for client in clients:
@@ -240,8 +240,8 @@ def rows() -> list[tuple[str, bool, bytes, Callable[[], Heads]]]:
         return lambda: lambda address: request(address, token(signer, issued_s))
 
     def same(signer: str, name: str = "") -> Callable[[], Heads]:
-        told = token(signer, name=name)
-        return lambda: lambda address: request(address, told)
+        signed = token(signer, name=name)
+        return lambda: lambda address: request(address, signed)
 
     def plain(path: str) -> Callable[[], Heads]:
         return lambda: lambda address: request(address, "", path)
@@ -274,16 +274,16 @@ def measure(servers: dict[str, dict[bool, Server]], n: int, at_once: int, only: 
                 if number < 0 and "banned" in name:
                     ban(server, make_head(server.address).decode().partition("Bearer ")[2].split("\r\n")[0])
                 heads = [make_head(server.address) for _ in range(BATCH)]
-                before = settled(server)
+                before = wait_settled(server)
                 for first in range(0, BATCH, at_once):
                     make_batch(server, heads[first : first + at_once], status)
                 if number >= 0:
-                    taken[tree].append((settled(server) - before) / BATCH * 1e6)
-        figures[name] = {tree: figures_of(each) for tree, each in taken.items()}
+                    taken[tree].append((wait_settled(server) - before) / BATCH * 1e6)
+        figures[name] = {tree: figures_of(batches) for tree, batches in taken.items()}
     return figures
 
 
-def settled(server: Server) -> float:
+def wait_settled(server: Server) -> float:
     """Return the CPU seconds of *server* once it does nothing more."""
     before, deadline = -1.0, time.monotonic() + WAIT_S
     while before != (now := server.cpu_s()) and time.monotonic() < deadline:
@@ -317,7 +317,9 @@ def main() -> None:
     with ExitStack() as stack:
         servers = {
             name: {
-                tokens: stack.enter_context(served(tree, options.workers, tokens=tokens, audit=options.audit))
+                tokens: stack.enter_context(
+                    serve_tree(tree, options.workers, tokens=tokens, audit=options.audit)
+                )
                 for tokens in (False, True)
             }
             for name, tree in trees.items()
@@ -328,8 +330,8 @@ def main() -> None:
     print(f"load average {load[0]:.2f} before, {os.getloadavg()[0]:.2f} after; bar {BAR_US} us")
     print(f"{'CPU us of a handshake':34}{'':10}    p50    p95    p99   mean")
     for name, trees_of in figures.items():
-        for tree, each in trees_of.items():
-            print(f"{name:34}{tree:10}" + "".join(f"{value:7.0f}" for value in each.values()))
+        for tree, values in trees_of.items():
+            print(f"{name:34}{tree:10}" + "".join(f"{value:7.0f}" for value in values.values()))
     if options.out:
         report = {"n": options.n, "load": load, "at_once": options.at_once, "rows": figures}
         options.out.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")

@@ -66,9 +66,9 @@ def measure(server: Any, robots: int, tokens: bool) -> dict[str, Any]:
 
     clients = [join() for _ in range(WARM)]
     before, kernel_before = private_bytes(server.pids), kernel_tcp_bytes()
-    cpu_before = handshakes.settled(server)
+    cpu_before = handshakes.wait_settled(server)
     clients += [join() for _ in range(robots)]
-    joined_s = handshakes.settled(server)
+    joined_s = handshakes.wait_settled(server)
     spread = server.status()["robots_of_workers"]
     idle_before = server.cpu_s()
     time.sleep(WATCH_S)
@@ -104,7 +104,9 @@ def main() -> None:
     print(f"machine {platform.machine()}, {os.cpu_count()} cores, command {' '.join(sys.argv)}")
     for name, tree in (*((("base", options.base),) if options.base else ()), ("this tree", None)):
         idle = {"ping_interval_s": 600.0, "hello_timeout_s": 600.0}
-        with handshakes.served(tree, options.workers, tokens=options.tokens, audit=False, **idle) as server:
+        with handshakes.serve_tree(
+            tree, options.workers, tokens=options.tokens, audit=False, **idle
+        ) as server:
             reports[name] = measure(server, options.robots, options.tokens)
         for figure, value in reports[name].items():
             print(f"{name:10} {figure:22} {value}")

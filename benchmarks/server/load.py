@@ -1,6 +1,6 @@
 """The load generator `load.c` from Python: compile it at first use, write its files, run it, read its report.
 
-`compiled` raises ConfigurationError where there is no C compiler; a benchmark then says so and is skipped.
+`compile_generator` raises ConfigurationError without a C compiler; a benchmark then says so and is skipped.
 `run_load` waits for a run of fixed length.  `LoadProcess` is one that a benchmark ends itself, and whose
 samples are cut into windows afterwards.  Both end with their caller, and connect to loopback only.
 """
@@ -31,7 +31,7 @@ from rse_pf.wire import SUBPROTOCOLS, Command, Hello, Message, Ping, make_codec
 
 __all__ = [
     "OUTCOMES", "SAMPLE", "GroupReport", "LoadPlan", "LoadProcess", "LoadReport", "Percentiles", "RobotGroup",
-    "compiled", "hello_file", "ping_file", "pnp_file", "read_samples", "run_load", "write_messages",
+    "compile_generator", "hello_file", "ping_file", "pnp_file", "read_samples", "run_load", "write_messages",
 ]  # fmt: skip
 
 Mode = Literal["open", "early", "closed", "idle", "silent"]
@@ -54,7 +54,7 @@ _COMPILE_S, _MARGIN_S = 60.0, 20.0
 _REPLIES = {"zlib": "zlib", "json": "json", "bin": "msgpack", "peer": "peer"}
 
 
-def compiled(folder: Path = _BUILD) -> Path:
+def compile_generator(folder: Path = _BUILD) -> Path:
     """Return the compiled generator, compiling it where *folder* lacks this version.
 
     Raises:
@@ -88,12 +88,12 @@ def write_messages(file: Path, messages: Iterable[bytes]) -> Path:
 
 def hello_file(folder: Path, codec_name: str) -> Path:
     """Write the first message of a robot; return its file."""
-    return _encoded(folder / f"hello.{codec_name}", codec_name, [Hello()])
+    return _encode(folder / f"hello.{codec_name}", codec_name, [Hello()])
 
 
 def ping_file(folder: Path, codec_name: str) -> Path:
     """Write the ping of a robot; return its file."""
-    return _encoded(folder / f"ping.{codec_name}", codec_name, [Ping(sent_s=1.0)])
+    return _encode(folder / f"ping.{codec_name}", codec_name, [Ping(sent_s=1.0)])
 
 
 def pnp_file(folder: Path, codec_name: str, outlier_ratio: float, **fields: Any) -> Path:
@@ -107,10 +107,10 @@ def pnp_file(folder: Path, codec_name: str, outlier_ratio: float, **fields: Any)
         request = make_request(p.points_world, p.pixels, p.camera, binary=codec_name == "bin")
         commands.append(Command(id=seed, service="pnp", payload=request, keep=True, **fields))
     file = folder / f"pnp-{round(100 * outlier_ratio)}.{codec_name}"
-    return _encoded(file, codec_name, commands)
+    return _encode(file, codec_name, commands)
 
 
-def _encoded(file: Path, codec_name: str, messages: Sequence[Message]) -> Path:
+def _encode(file: Path, codec_name: str, messages: Sequence[Message]) -> Path:
     codec = make_codec(codec_name)
     return write_messages(file, [codec.encode(message) for message in messages])
 
@@ -185,10 +185,12 @@ class Percentiles:
     max: float
 
     @classmethod
-    def of(cls, found: dict[str, Any]) -> Percentiles:
+    def of(cls, document: dict[str, Any]) -> Percentiles:
         """Return what a report says."""
         names = ("p50", "p95", "p99", "p999", "max")
-        return cls(found["n"], *(math.nan if found[name] is None else float(found[name]) for name in names))
+        return cls(
+            document["n"], *(math.nan if document[name] is None else float(document[name]) for name in names)
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -234,15 +236,15 @@ class LoadReport:
     @classmethod
     def from_json(cls, text: str) -> LoadReport:
         """Read what the generator printed."""
-        found = json.loads(text)
+        document = json.loads(text)
         groups = tuple(
             GroupReport(
-                **{**each, "latency_ms": Percentiles.of(each["latency_ms"])}
-                | {"late_ms": Percentiles.of(each["late_ms"])}
+                **{**group, "latency_ms": Percentiles.of(group["latency_ms"])}
+                | {"late_ms": Percentiles.of(group["late_ms"])}
             )
-            for each in found.pop("groups")
+            for group in document.pop("groups")
         )
-        return cls(**{**found, "window_s": tuple(found["window_s"]), "groups": groups})
+        return cls(**{**document, "window_s": tuple(document["window_s"]), "groups": groups})
 
     def group(self, name: str) -> GroupReport:
         """Return the report of one group."""
@@ -270,7 +272,7 @@ class LoadProcess:
 
     def __enter__(self) -> LoadProcess:
         self._process = subprocess.Popen(
-            [*self._prefix, *self.plan.command(compiled())],
+            [*self._prefix, *self.plan.command(compile_generator())],
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
@@ -304,11 +306,11 @@ class LoadProcess:
         except subprocess.TimeoutExpired:
             self._process.kill()
         assert self._process.stdout is not None
-        told = self._process.stdout.read()
+        output = self._process.stdout.read()
         self._marks.join(_MARGIN_S)
-        if self._process.wait() != 0 or not told:
+        if self._process.wait() != 0 or not output:
             raise ConfigurationError("the load generator failed", hint=" ".join(self._errors)[-300:])
-        return LoadReport.from_json(told)
+        return LoadReport.from_json(output)
 
     def stop(self) -> LoadReport:
         """End the window now and return the report."""

@@ -230,7 +230,7 @@ async def probe(identity: dict[str, int], waits: dict[str, list[float]]) -> None
 def judge(generator: Generator, borders: Any, first: int) -> list[dict[str, Any]]:
     """Return the figures of every phase."""
     planned, answered, sent = (
-        np.array(each[first:]) for each in (generator.planned, generator.answered, generator.sent)
+        np.array(times[first:]) for times in (generator.planned, generator.answered, generator.sent)
     )
     outcome = np.array(generator.outcome[first:])
     waits, retry = answered - planned, np.array(generator.retry_after[first:])
@@ -240,7 +240,7 @@ def judge(generator: Generator, borders: Any, first: int) -> list[dict[str, Any]
         inside = (planned >= begin) & (planned < end)
         ok = inside & (outcome == "ok")
         refused = inside & (outcome != "ok")
-        told = refused & (outcome != "lost")
+        answered_refusals = refused & (outcome != "lost")
         rows.append(
             {
                 "offered_x": factor,
@@ -249,8 +249,8 @@ def judge(generator: Generator, borders: Any, first: int) -> list[dict[str, Any]
                 "wasted_percent": round(100 * float((ok & ~good).sum() / max(1, ok.sum())), 2),
                 "good_p50_ms": percentile(waits[ok], 50),
                 "good_p99_ms": percentile(waits[ok], 99),
-                "refused_p50_ms": percentile((answered - sent)[told], 50),
-                "refused_p99_ms": percentile((answered - sent)[told], 99),
+                "refused_p50_ms": percentile((answered - sent)[answered_refusals], 50),
+                "refused_p99_ms": percentile((answered - sent)[answered_refusals], 99),
                 "late_sends_p99_ms": percentile((sent - planned)[inside], 99),
                 "outcomes": dict(Counter(outcome[inside].tolist())),
                 "busy_without_retry_after": int((inside & (outcome == "busy") & ~retry).sum()),
@@ -378,8 +378,10 @@ def main() -> None:
     print(f"capacity {report['capacity_per_s']}/s; control port at most {report['control_max_ms']} ms")
     for row in report["phases"]:
         print(json.dumps(row))
-    for name, each in report["verdict"].items():
-        print(f"{name:28} {each['figure']:>9} {each['bar']:>8} {'holds' if each['holds'] else 'MISSED'}")
+    for name, judged in report["verdict"].items():
+        print(
+            f"{name:28} {judged['figure']:>9} {judged['bar']:>8} {'holds' if judged['holds'] else 'MISSED'}"
+        )
     print(f"load average {load[0]:.2f} before, {report['load_after'][0]:.2f} after")
     if args.out:
         args.out.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")

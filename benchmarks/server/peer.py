@@ -35,7 +35,7 @@ from typing import Any
 from benchmarks.server.load import (
     LoadPlan,
     RobotGroup,
-    compiled,
+    compile_generator,
     hello_file,
     pnp_file,
     run_load,
@@ -82,7 +82,7 @@ def missing(folder: Path | None) -> str:
         return "no --peer FOLDER with the paper's design"
     lacks = [str(folder / name) for name in _FILES if not (folder / name).exists()]
     lacks += ["nginx"] if _nginx() is None else []
-    lacks += [str(each) for each in (_MODULE, _HEADERS) if not each.exists()]
+    lacks += [str(source) for source in (_MODULE, _HEADERS) if not source.exists()]
     lacks += ["g++"] if shutil.which("g++") is None else []
     return f"the paper's design lacks {', '.join(lacks)}" if lacks else ""
 
@@ -145,8 +145,8 @@ def paper_design(sources: Path, folder: Path) -> Iterator[tuple[int, int]]:
         until = time.monotonic() + _START_S
         while not _listens(port):
             if process.poll() is not None or time.monotonic() > until:
-                told = (folder / "output").read_text(errors="replace")
-                raise ConfigurationError("nginx does not start", hint=told[-300:])
+                log_text = (folder / "output").read_text(errors="replace")
+                raise ConfigurationError("nginx does not start", hint=log_text[-300:])
             time.sleep(0.05)  # looks again, with a deadline
         yield port, process.pid
     finally:
@@ -186,14 +186,14 @@ def measure(
     report = run_load(plan, at)
     if report.connected < robots:
         raise ConfigurationError(f"{report.connected} of {robots} robots are connected", hint=str(report))
-    found = report.groups[0]
-    answers = found.answered_in_window
-    latency = found.latency_ms
+    load = report.groups[0]
+    answers = load.answered_in_window
+    latency = load.latency_ms
     return {
-        "system": server.codec, "outliers": outliers, "robots": robots, "ok": found.ok,
-        "failed": found.failed, "lost": found.lost, "unsent": found.unsent,
+        "system": server.codec, "outliers": outliers, "robots": robots, "ok": load.ok,
+        "failed": load.failed, "lost": load.lost, "unsent": load.unsent,
         "cpu_us": 1e6 * (cpu["end"] - cpu["begin"]) / answers if answers else math.nan,
-        "p50_ms": latency.p50, "p99_ms": latency.p99, "late_p99_ms": found.late_ms.p99,
+        "p50_ms": latency.p50, "p99_ms": latency.p99, "late_p99_ms": load.late_ms.p99,
         "generator_cpu_us": 1e6 * report.cpu_s / answers if answers else math.nan,
     }  # fmt: skip
 
@@ -216,7 +216,7 @@ def summarize(rounds: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Return one row for each load and system: medians of the rounds, and ratios to the paper's design."""
     rows: list[dict[str, Any]] = []
     for outliers, robots in itertools.product(OUTLIERS, (1, MANY)):
-        chosen = [each for each in rounds if (each["outliers"], each["robots"]) == (outliers, robots)]
+        chosen = [window for window in rounds if (window["outliers"], window["robots"]) == (outliers, robots)]
         peer = _medians(chosen, PEER)
         for system in SYSTEMS:
             row = _medians(chosen, system)
@@ -229,20 +229,20 @@ def summarize(rounds: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def _medians(rounds: list[dict[str, Any]], system: str) -> dict[str, Any]:
-    chosen = [each for each in rounds if each["system"] == system]
+    chosen = [window for window in rounds if window["system"] == system]
     times = ("cpu_us", "p50_ms", "p99_ms", "late_p99_ms", "generator_cpu_us")
-    row: dict[str, Any] = {name: statistics.median(each[name] for each in chosen) for name in times}
-    return row | {name: sum(each[name] for each in chosen) for name in ("ok", "failed", "lost", "unsent")}
+    row: dict[str, Any] = {name: statistics.median(window[name] for window in chosen) for name in times}
+    return row | {name: sum(window[name] for window in chosen) for name in ("ok", "failed", "lost", "unsent")}
 
 
 def bars(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Return each bar with what was measured and whether it holds."""
-    found = []
+    verdicts = []
 
     def bar(what: str, figure: float, limit: float, *, is_least: bool = True) -> None:
         holds = figure >= limit if is_least else figure <= limit
         sign = ">=" if is_least else "<="
-        found.append({"what": what, "figure": figure, "bar": f"{sign} {limit:g}", "holds": holds})
+        verdicts.append({"what": what, "figure": figure, "bar": f"{sign} {limit:g}", "holds": holds})
 
     for row in rows:
         system, outliers, robots = row["system"], row["outliers"], row["robots"]
@@ -254,7 +254,7 @@ def bars(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
             bar(f"p99 ratio, {about}", row["p99_ratio"], P99_BARS[system])
             bar(f"own p99 / p50, {about}", row["p99_ms"] / row["p50_ms"], SPREAD_BAR, is_least=False)
         bar(f"failed and lost, {about}", row["failed"] + row["lost"] + row["unsent"], 0, is_least=False)
-    return found
+    return verdicts
 
 
 def table(rows: list[dict[str, Any]]) -> str:
@@ -276,7 +276,7 @@ def table(rows: list[dict[str, Any]]) -> str:
 
 def run(sources: Path, rounds: int, seconds: float) -> dict[str, Any]:
     """Start both, measure, return the report; raises ConfigurationError where one does not start."""
-    compiled()
+    compile_generator()
     before = machine()
     with tempfile.TemporaryDirectory() as made, contextlib.ExitStack() as stack:
         folder = Path(made)
@@ -296,12 +296,12 @@ def run(sources: Path, rounds: int, seconds: float) -> dict[str, Any]:
         for server in servers:
             measure(server, OUTLIERS[0], 1, 0.5, 0)  # warms it up
         began = time.monotonic()
-        found = play(servers, rounds, seconds)
-    rows = summarize(found)
+        windows = play(servers, rounds, seconds)
+    rows = summarize(windows)
     return {
         "machine": before, "load_average_after": machine()["load_average"], "workers": WORKERS,
         "settings": UNLIMITED, "seconds": seconds, "took_s": round(time.monotonic() - began, 1),
-        "rows": rows, "bars": bars(rows), "rounds": found,
+        "rows": rows, "bars": bars(rows), "rounds": windows,
     }  # fmt: skip
 
 
@@ -331,9 +331,9 @@ def main() -> None:
             f"{WORKERS} workers each; {report['took_s']:g} s in all"
         )
         print(table(report["rows"]))
-        for each in report["bars"]:
-            verdict = "holds" if each["holds"] else "MISSED"
-            print(f"{each['what']:46} {each['figure']:8.2f}  {each['bar']:>6}  {verdict}")
+        for bar in report["bars"]:
+            verdict = "holds" if bar["holds"] else "MISSED"
+            print(f"{bar['what']:46} {bar['figure']:8.2f}  {bar['bar']:>6}  {verdict}")
     if asked.out is not None:
         asked.out.write_text(json.dumps(report, indent=1), encoding="utf-8")
 

@@ -76,8 +76,8 @@ def start(folder: str, **serving: object) -> tuple[subprocess.Popen[bytes], dict
 def status(identity: dict[str, int]) -> dict[str, float]:
     """Return the server's own numbers."""
     with urllib.request.urlopen(f"http://127.0.0.1:{identity['control_port']}/status") as answer:
-        found: dict[str, float] = json.loads(answer.read())
-    return found
+        document: dict[str, float] = json.loads(answer.read())
+    return document
 
 
 async def robot(url: str, codec_name: str, messages: list[bytes], times: list[float], plan: Plan) -> int:

@@ -40,9 +40,9 @@ _KEY_BYTES = 32
 def tree(pid: int) -> list[int]:
     """Return *pid* and the ids of all its living descendants."""
     family = [pid]
-    for each in family:
+    for member in family:
         try:
-            tasks = list(Path(f"/proc/{each}/task").iterdir())
+            tasks = list(Path(f"/proc/{member}/task").iterdir())
             family += [int(child) for task in tasks for child in (task / "children").read_text().split()]
         except OSError:  # it ended meanwhile
             continue
@@ -52,9 +52,9 @@ def tree(pid: int) -> list[int]:
 def cpu_of_tree_s(pid: int) -> float:
     """Return the user and system CPU seconds of *pid* and its living descendants."""
     ticks = 0
-    for each in tree(pid):
+    for child in tree(pid):
         try:
-            fields = Path(f"/proc/{each}/stat").read_text().rpartition(")")[2].split()
+            fields = Path(f"/proc/{child}/stat").read_text().rpartition(")")[2].split()
         except OSError:
             continue
         ticks += int(fields[11]) + int(fields[12])
@@ -64,9 +64,9 @@ def cpu_of_tree_s(pid: int) -> float:
 def private_bytes_of_tree(pid: int) -> int:
     """Return the memory that only one of *pid* and its descendants uses."""
     kilobytes = 0
-    for each in tree(pid):
+    for child in tree(pid):
         try:
-            lines = Path(f"/proc/{each}/smaps_rollup").read_text().splitlines()
+            lines = Path(f"/proc/{child}/smaps_rollup").read_text().splitlines()
         except OSError:
             continue
         kilobytes += sum(int(line.split()[1]) for line in lines if line.startswith("Private_"))
@@ -77,7 +77,7 @@ def machine() -> dict[str, Any]:
     """Return what a table of figures must say about the machine, now."""
     return {
         "cores": os.cpu_count(), "architecture": platform.machine(), "python": platform.python_version(),
-        "load_average": [round(each, 2) for each in os.getloadavg()],
+        "load_average": [round(average, 2) for average in os.getloadavg()],
     }  # fmt: skip
 
 

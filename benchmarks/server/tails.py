@@ -48,7 +48,7 @@ from benchmarks.server.load import (
     LoadPlan,
     LoadProcess,
     RobotGroup,
-    compiled,
+    compile_generator,
     hello_file,
     pnp_file,
     read_samples,
@@ -92,7 +92,7 @@ class LoadWindow:
     end_s: float
 
 
-def seen(samples: npt.NDArray[np.void], windows: Sequence[LoadWindow]) -> list[dict[str, Any]]:
+def summarise(samples: npt.NDArray[np.void], windows: Sequence[LoadWindow]) -> list[dict[str, Any]]:
     """Return what the robots saw in each window."""
     rows = []
     for window in windows:
@@ -111,21 +111,21 @@ def seen(samples: npt.NDArray[np.void], windows: Sequence[LoadWindow]) -> list[d
 
 def summary(name: str, windows: list[dict[str, Any]], outcomes: list[dict[str, Any]]) -> dict[str, Any]:
     """Return one row of the table."""
-    row: dict[str, Any] = {"row": name, "bar": BARS[name], "outcomes": _added(outcomes), "windows": windows}
+    row: dict[str, Any] = {"row": name, "bar": BARS[name], "outcomes": _add_up(outcomes), "windows": windows}
     for kind, is_loaded in (("quiet", False), ("loaded", True)):
         chosen = [window for window in windows if window["is_loaded"] == is_loaded]
         row[kind] = {
-            "windows": len(chosen), "n": sum(each["n"] for each in chosen),
-            "not_ok": sum(each["not_ok"] for each in chosen),
-            "p50_ms": statistics.median(each["p50_ms"] for each in chosen),
-            "p99_ms": statistics.median(each["p99_ms"] for each in chosen),
+            "windows": len(chosen), "n": sum(window["n"] for window in chosen),
+            "not_ok": sum(window["not_ok"] for window in chosen),
+            "p50_ms": statistics.median(window["p50_ms"] for window in chosen),
+            "p99_ms": statistics.median(window["p99_ms"] for window in chosen),
         }  # fmt: skip
     row["ratio"] = row["loaded"]["p99_ms"] / row["quiet"]["p99_ms"]
     row["holds"] = row["ratio"] <= row["bar"] and not row["loaded"]["not_ok"]
     return row
 
 
-def _added(outcomes: Sequence[dict[str, Any]]) -> dict[str, Any]:
+def _add_up(outcomes: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Return counts added up, and the largest of all other figures."""
     made: dict[str, Any] = {}
     for outcome in outcomes:
@@ -172,7 +172,7 @@ def alternate(
             windows.append(LoadWindow(is_loaded=True, begin_s=middle, end_s=time.monotonic()))
         load.stop()
     assert plan.samples is not None
-    return seen(read_samples(plan.samples), windows), outcomes
+    return summarise(read_samples(plan.samples), windows), outcomes
 
 
 @contextmanager
@@ -205,15 +205,15 @@ def bombs(rounds: int) -> dict[str, Any]:
 
             def go() -> dict[str, Any]:
                 try:
-                    told, _ = process.communicate("go\n", timeout=_ATTACK_S)
+                    output, _ = process.communicate("go\n", timeout=_ATTACK_S)
                 finally:
                     process.kill()
                     process.wait()
-                if not told:
+                if not output:
                     raise ConfigurationError("the process with the bombs failed", hint="see its output above")
-                found: dict[str, Any] = json.loads(told)
+                document: dict[str, Any] = json.loads(output)
                 grown = private_bytes_of_tree(server.pid) - memory
-                return {name: found[name] for name in ("tried", "refused", "ends", "slowest_s")} | {
+                return {name: document[name] for name in ("tried", "refused", "ends", "slowest_s")} | {
                     "grown_mib": grown / MIB
                 }
 
@@ -226,9 +226,9 @@ def bombs(rounds: int) -> dict[str, Any]:
 def generator(plan: LoadPlan) -> dict[str, Any]:
     """Run a second load generator at the lowest priority, and return its counts."""
     report = run_load(plan, prefix=_LOWEST_PRIORITY)
-    found = report.groups[0]
+    group = report.groups[0]
     return {
-        "ok": found.ok, "failed": found.failed, "lost": found.lost, "unsent": found.unsent,
+        "ok": group.ok, "failed": group.failed, "lost": group.lost, "unsent": group.unsent,
         "closed": report.closed, "refused": report.refused, "codes": report.codes,
     }  # fmt: skip
 
@@ -264,8 +264,8 @@ def silent(rounds: int) -> dict[str, Any]:
             sources=SILENT_SOURCES, first_source=NEIGHBOURS_FIRST_SOURCE, opening_s=SILENT_WINDOW_S,
         )  # fmt: skip
         plan = robots_of("calm", 100, folder, server.token, server.port)
-        found = alternate(plan, rounds, SILENT_WINDOW_S, lambda number: lambda: generator(neighbours))
-        return summary("silent", *found)
+        figures = alternate(plan, rounds, SILENT_WINDOW_S, lambda number: lambda: generator(neighbours))
+        return summary("silent", *figures)
 
 
 async def uploads(rounds: int) -> dict[str, Any]:
@@ -301,7 +301,7 @@ async def uploads(rounds: int) -> dict[str, Any]:
                     )
                 await asyncio.to_thread(load.stop)
             assert plan.samples is not None
-            return summary("uploads", seen(read_samples(plan.samples), windows), outcomes)
+            return summary("uploads", summarise(read_samples(plan.samples), windows), outcomes)
 
 
 ROWS: dict[str, Callable[[int], dict[str, Any]]] = {
@@ -336,7 +336,7 @@ def main() -> None:
     report: dict[str, Any] = {"machine": machine(), "settings": SETTINGS, "rows": []}
     began = time.monotonic()
     try:
-        compiled()
+        compile_generator()
         print(f"{report['machine']}; settings {SETTINGS}; {CODEC}; {UPLOADERS} uploaders", flush=True)
         for name in asked.only or ROWS:
             report["rows"].append(ROWS[name](asked.rounds))

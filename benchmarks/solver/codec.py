@@ -101,13 +101,13 @@ def _codec_row(name: str, problems: list[PnpProblem], registry: Registry, n: int
         "server encodes": lambda i: codec.encode(results[i]),
         "robot decodes": lambda i: as_type(codec.decode_from_server(answered[i]).reply, PnpReply),  # type: ignore[union-attr]
     }
-    times = _interleaved(list(stages.values()), n)
+    times = _time_interleaved(list(stages.values()), n)
     return {
         "codec": name,
         "matches": len(problems[0].pixels),
         "command_bytes": round(float(np.median([len(data) for data in sent]))),
         "result_bytes": round(float(np.median([len(data) for data in answered]))),
-        **{stage: _percentiles(each) for stage, each in zip(stages, times, strict=True)},
+        **{stage: _percentiles(times_us) for stage, times_us in zip(stages, times, strict=True)},
     }
 
 
@@ -130,17 +130,17 @@ def _handler_rows(problems: list[PnpProblem], registry: Registry, n: int) -> lis
     def solver(i: int) -> Any:
         return solve_pnp(requests[i].points_world, requests[i].pixels, requests[i].camera)
 
-    solved, *handled = _interleaved([solver, *(handler(name) for name in CODECS)], n)
+    solved, *handled = _time_interleaved([solver, *(handler(name) for name in CODECS)], n)
     return [
         {
             "codec": name,
             "matches": len(problems[0].pixels),
             "solver": _percentiles(solved),
-            "handler": _percentiles(each),
-            "ratio": float(np.median(each) / np.median(solved)),
+            "handler": _percentiles(times_us),
+            "ratio": float(np.median(times_us) / np.median(solved)),
             "bar": BARS[name],
         }
-        for name, each in zip(CODECS, handled, strict=True)
+        for name, times_us in zip(CODECS, handled, strict=True)
     ]
 
 
@@ -149,15 +149,15 @@ def _command(problem: PnpProblem, codec: str) -> Command:
     return Command(id=1, service="pnp", payload=request, stream="front", seq=1, deadline_ms=250.0)
 
 
-def _interleaved(calls: list[Callable[[int], Any]], n: int) -> list[list[float]]:
+def _time_interleaved(calls: list[Callable[[int], Any]], n: int) -> list[list[float]]:
     """Return *n* times of each call, in microseconds; A B C A B C, so that neighbours hit all alike."""
     times: list[list[float]] = [[] for _ in calls]
     for i in range(n + PROBLEMS):
-        for call, kept in zip(calls, times, strict=True):
+        for call, times_us in zip(calls, times, strict=True):
             started = time.thread_time_ns()
             call(i % PROBLEMS)
-            kept.append((time.thread_time_ns() - started) / 1e3)
-    return [kept[PROBLEMS:] for kept in times]
+            times_us.append((time.thread_time_ns() - started) / 1e3)
+    return [times_us[PROBLEMS:] for times_us in times]
 
 
 def _percentiles(times: list[float]) -> dict[str, float]:

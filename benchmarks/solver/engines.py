@@ -41,7 +41,7 @@ def cpu_us(work: Callable[[], Any]) -> tuple[float, Any]:
     return (time.thread_time_ns() - begin) / 1e3, result
 
 
-def solved(problem: PnpProblem, options: PnpOptions) -> PnpSolution | None:
+def solve(problem: PnpProblem, options: PnpOptions) -> PnpSolution | None:
     """Return the solution, or None where there is none."""
     try:
         return solve_pnp(problem.points_world, problem.pixels, problem.camera, options)
@@ -67,7 +67,7 @@ def measure_engines(problems: int) -> list[dict[str, Any]]:
             problem = make_problem(seed=seed, n=MATCHES, outlier_ratio=outlier_ratio)
             for engine in right:
                 options = PnpOptions(engine=engine)  # type: ignore[arg-type]
-                spent, solution = cpu_us(lambda p=problem, o=options: solved(p, o))  # type: ignore[misc]
+                spent, solution = cpu_us(lambda p=problem, o=options: solve(p, o))  # type: ignore[misc]
                 times[engine].append(spent)
                 right[engine] += is_right(problem, solution)
         for engine, spent_us in times.items():

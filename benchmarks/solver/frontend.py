@@ -57,9 +57,9 @@ class Way:
         results: list[Array] = [features.pixels, features.descriptors, features.points_camera]
         if self.before is not None:
             self.extract_us.append(spent_us)
-            spent_us, found = cpu_us(lambda: self.module.match(self.before, features, options))
+            spent_us, matches = cpu_us(lambda: self.module.match(self.before, features, options))
             self.match_us.append(spent_us)
-            results += [getattr(found, name) for name in ARRAYS]
+            results += [getattr(matches, name) for name in ARRAYS]
         self.before = features
         return [result.tobytes() for result in results]
 
@@ -84,21 +84,21 @@ def front_end_of(tree: Path) -> ModuleType:
 
 def ways(before: Path | None) -> list[Way]:
     """Return the reference and all ways of this checkout; without *before* its path without the library."""
-    found = [Way("numpy and OpenCV", frontend)]
+    modules = [Way("numpy and OpenCV", frontend)]
     if before is not None:
-        found.insert(0, Way("before", front_end_of(before)))
+        modules.insert(0, Way("before", front_end_of(before)))
     path = native.find_library()
     if path is None:
         raise SystemExit("the native core is not built: make -C native")
     try:
-        found += [
+        modules += [
             Way("core", frontend, open_front_end(path)),
             Way("core, AVX2", frontend, open_front_end(path, "avx2")),
             Way("core, portable", frontend, open_front_end(path, "portable")),
         ]
     except ConfigurationError as error:
         raise SystemExit(error.report()) from None
-    return found
+    return modules
 
 
 def rows(dataset: Dataset, frames: int) -> Iterator[int]:
@@ -127,7 +127,7 @@ def measure(dataset: Dataset, compared: list[Way], pairs: int, *, wide: bool) ->
         orb_us.append(cpu_us(partial(orb.detectAndCompute, gray, None))[0])
     whole = {way.name: np.add(way.extract_us, way.match_us) for way in compared}
     reference = np.median(whole[compared[0].name])
-    found = [
+    figures = [
         {
             "way": way.name,
             "n": len(way.match_us),
@@ -139,12 +139,12 @@ def measure(dataset: Dataset, compared: list[Way], pairs: int, *, wide: bool) ->
         }
         for way in compared
     ]
-    return [*found, {"way": "ORB alone", "n": len(orb_us), "frame_us": percentiles(orb_us)}]
+    return [*figures, {"way": "ORB alone", "n": len(orb_us), "frame_us": percentiles(orb_us)}]
 
 
 def percentiles(spent_us: Any) -> dict[str, float]:
     """Return p50, p95 and p99."""
-    return {f"p{each}": float(np.percentile(spent_us, each)) for each in (50, 95, 99)}
+    return {f"p{percent}": float(np.percentile(spent_us, percent)) for percent in (50, 95, 99)}
 
 
 def table(report: dict[str, Any]) -> str:

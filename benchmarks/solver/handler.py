@@ -68,27 +68,27 @@ def stages(codec_name: str, problems: list[PnpProblem], samples: int) -> dict[st
     ]
     messages = [codec.encode(Command(id=1, service="pnp", payload=request)) for request in requests]
     commands = [codec.decode_from_robot(message) for message in messages]
-    solutions = [solved(problem) for problem in problems]
+    solutions = [solve_problem(problem) for problem in problems]
     results = [Result(id=1, reply=PnpReply.of(solution)) for solution in solutions]
     payloads = [command.payload for command in commands if isinstance(command, Command)]
     work: dict[str, Callable[[int], Any]] = {
         "decode message": lambda i: codec.decode_from_robot(messages[i]),
         "payload to arrays": lambda i: as_type(payloads[i], PnpRequest),
-        "solve": lambda i: solved(problems[i]),
+        "solve": lambda i: solve_problem(problems[i]),
         "solution to reply": lambda i: PnpReply.of(solutions[i]),
         "encode reply": lambda i: codec.encode(results[i]),
     }
     spent: dict[str, list[float]] = {stage: [] for stage in work}
     for sample in range(samples):
         for stage, run in work.items():
-            solved(problems[(sample + PROBLEMS // 2) % PROBLEMS])
+            solve_problem(problems[(sample + PROBLEMS // 2) % PROBLEMS])
             began = time.thread_time_ns()
             run(sample % PROBLEMS)
             spent[stage].append((time.thread_time_ns() - began) / 1e3)
     return {stage: np.percentile(values, (50, 95, 99)).round(1).tolist() for stage, values in spent.items()}
 
 
-def solved(problem: PnpProblem) -> PnpSolution:
+def solve_problem(problem: PnpProblem) -> PnpSolution:
     """Solve with the service's defaults."""
     return solve_pnp(problem.points_world, problem.pixels, problem.camera)
 

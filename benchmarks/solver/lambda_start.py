@@ -88,8 +88,8 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as bytecode:
         for number in range(-1, RUNS):
             for name, tree in trees.items():
-                for kind, kept in (("bytecode", Path(bytecode)), ("compiling", None)):
-                    row = start(args.python, tree, kept, sent)
+                for kind, folder in (("bytecode", Path(bytecode)), ("compiling", None)):
+                    row = start(args.python, tree, folder, sent)
                     if number >= 0:  # the first run writes the bytecode
                         rows.setdefault(name + kind, []).append(row)
     figures = {
@@ -103,9 +103,9 @@ def main() -> None:
         for kind, taken in rows.items()
     }
     for kind, figure in figures.items():
-        for name, found in figure.items():
+        for name, value in figure.items():
             print(
-                f"{kind:<16} {name:<9} p50 {found['p50']:.3f}  max {found['max']:.3f} s of processor time "
+                f"{kind:<16} {name:<9} p50 {value['p50']:.3f}  max {value['max']:.3f} s of processor time "
                 f"(n = {RUNS})"
             )
     print(f"bar: all_s with bytecode within {BAR_S} s; load average before: {load[0]:.2f}")

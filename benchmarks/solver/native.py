@@ -90,25 +90,25 @@ def degenerate(number: int) -> Case:
     return Case(kind, problem.points_world, problem.pixels, None)
 
 
-def recorded(folder: Path) -> Iterator[Case]:
+def recorded_cases(folder: Path) -> Iterator[Case]:
     """Yield the matches of each frame with the one before; the truth where the recording has it."""
     from client_sdk.datasets import open_dataset
     from client_sdk.frontend import FrontEndOptions, extract, match
 
     options = FrontEndOptions()
-    for each in sorted(path for path in folder.iterdir() if (path / "rgb.txt").exists()):
-        dataset, before, before_row = open_dataset(each), None, 0
+    for recording in sorted(path for path in folder.iterdir() if (path / "rgb.txt").exists()):
+        dataset, before, before_row = open_dataset(recording), None, 0
         truth = dataset.truth if dataset.truth_kind == "ground truth" else None
         for row in range(len(dataset)):
             frame = dataset.read(row)
             features = extract(frame, options)
             if before is not None:
-                found = match(before, features, options)
-                if len(found) >= 4:
+                matches = match(before, features, options)
+                if len(matches) >= 4:
                     T = None
                     if truth is not None:
                         T = inverse(truth.T_world_camera[row]) @ truth.T_world_camera[before_row]
-                    yield Case(each.name, found.points_world, found.pixels, T, frame.camera)
+                    yield Case(recording.name, matches.points_world, matches.pixels, T, frame.camera)
             before, before_row = features, row
 
 
@@ -226,22 +226,22 @@ def compare(cases: Iterator[Case]) -> dict[str, Any]:
     errors_m: dict[str, list[float]] = {"poselib": [], "native": []}
     apart_m: list[float] = []
     lanes_differ = evidence_differs = 0
-    for each in cases:
-        old, ours, without_avx2, python = judgements(each)
+    for problem in cases:
+        old, ours, without_avx2, python = judgements(problem)
         lanes_differ += ours[:2] != without_avx2[:2] or not same_bytes(ours[2], without_avx2[2])
         evidence_differs += ours[:2] != python[:2]
-        row = tally.setdefault(each.kind, Counter())
+        row = tally.setdefault(problem.kind, Counter())
         row["n"] += 1
         if ours[0] != old[0]:
-            verdicts[f"{each.kind}: {old[0]} -> {ours[0]}"] += 1
+            verdicts[f"{problem.kind}: {old[0]} -> {ours[0]}"] += 1
         if ours[2] is not None and old[2] is not None:
             apart_m.append(pose_difference(ours[2].T_camera_world, old[2].T_camera_world)[0])
         right = {}
         for name, (verdict, _, solution) in (("poselib", old), ("native", ours)):
             row[f"{name} ok"] += verdict == "ok"
-            if solution is None or each.T_camera_world is None:
+            if solution is None or problem.T_camera_world is None:
                 continue
-            metres, degrees = pose_difference(solution.T_camera_world, each.T_camera_world)
+            metres, degrees = pose_difference(solution.T_camera_world, problem.T_camera_world)
             if metres < RIGHT_M and degrees < RIGHT_DEG:
                 right[name] = metres
                 row[f"{name} right"] += 1
@@ -255,7 +255,7 @@ def compare(cases: Iterator[Case]) -> dict[str, Any]:
     return {
         "kinds": {kind: dict(row) for kind, row in sorted(tally.items())},
         "all": dict(total),
-        "error_mm": {name: spread_mm(found) for name, found in errors_m.items() if found},
+        "error_mm": {name: spread_mm(values) for name, values in errors_m.items() if values},
         "apart_mm": spread_mm(apart_m) if apart_m else {},
         "other_verdict_than_0.1.0": dict(verdicts.most_common()),
         "other_bytes_without_avx2": lanes_differ,
@@ -266,15 +266,15 @@ def compare(cases: Iterator[Case]) -> dict[str, Any]:
 def normalised_errors(problems: int, outlier_ratio: float) -> dict[str, float]:
     """Return the mean of the squared errors in units of the covariance; 6 if it is honest."""
     solver, limits = native.native_solver(), engines.native_options(OPTIONS, LIMITS)
-    found = []
+    errors2 = []
     for seed in range(problems):
         p = make_problem(seed=seed, n=100, outlier_ratio=outlier_ratio)
         solution = solver.solve(p.points_world, p.pixels, KINECT, limits)
         D = p.T_camera_world @ inverse(solution.T_camera_world)
         turn = [D[2, 1] - D[1, 2], D[0, 2] - D[2, 0], D[1, 0] - D[0, 1]]
         xi = np.array([*D[:3, 3], *(0.5 * np.array(turn))])
-        found.append(float(xi @ np.linalg.solve(solution.covariance, xi)))
-    return {"n": problems, "outlier_ratio": outlier_ratio, "mean": float(np.mean(found))}
+        errors2.append(float(xi @ np.linalg.solve(solution.covariance, xi)))
+    return {"n": problems, "outlier_ratio": outlier_ratio, "mean": float(np.mean(errors2))}
 
 
 def table(report: dict[str, Any]) -> str:
@@ -315,7 +315,7 @@ def main() -> None:
         "normalised_errors": [normalised_errors(1000, 0.0), normalised_errors(1000, 0.3)],
     }
     if RECORDINGS.is_dir():
-        report["recordings"] = compare(recorded(RECORDINGS))
+        report["recordings"] = compare(recorded_cases(RECORDINGS))
     report["load_after"] = [round(load, 2) for load in os.getloadavg()]
     print(table(report))
     if arguments.out:

@@ -267,7 +267,7 @@ def _pairs(
         raise UsageError(f"{name}: no image of {bad} can be used: {reason}", hint="name another topic")
     wanted = [(topic, int(s), int(log)) for s, log in zip(colour.stamps_ns, colour.log_ns, strict=True)]
     if chosen.depth is None:
-        return [(each,) for each in wanted]
+        return [(row,) for row in wanted]
     rows = pair_stamps(colour.stamps_ns, depth.stamps_ns, round(1e9 * options.pair_within_s))
     if not rows:
         gap_s = nearest_gap_s(colour.stamps_ns, depth.stamps_ns)
@@ -358,7 +358,7 @@ def _notes(
     taken = [("colour", chosen.colour), ("depth", chosen.depth)]
     return (
         *(
-            f"{what}: {topic.name}, {formats[topic.name].encoding}, {_counted(topic.messages, 'message')}"
+            f"{what}: {topic.name}, {formats[topic.name].encoding}, {_count(topic.messages, 'message')}"
             for what, topic in taken
             if topic is not None
         ),
@@ -375,13 +375,13 @@ def _losses(
     unpaired = len(index.colour.stamps_ns) - len(pairs)
     if unpaired:
         names.append(
-            f"{_counted(unpaired, 'colour image')} without depth within {options.pair_within_s:g} s left out"
+            f"{_count(unpaired, 'colour image')} without depth within {options.pair_within_s:g} s left out"
         )
     if index.broken:
-        names.append(f"{_counted(index.broken, 'broken message')} left out; the first: {index.first_broken}")
+        names.append(f"{_count(index.broken, 'broken message')} left out; the first: {index.first_broken}")
     copies = index.colour.copies + (index.depth.copies if chosen.depth is not None else 0)
     if copies:
-        names.append(f"{_counted(copies, 'message')} with the time stamp of another left out")
+        names.append(f"{_count(copies, 'message')} with the time stamp of another left out")
     if not (index.colour.was_in_order and index.depth.was_in_order):
         names.append("the time stamps were not in order; frames are sorted by them")
     if index.uses_log_time:
@@ -391,5 +391,5 @@ def _losses(
     return tuple(names)
 
 
-def _counted(number: int, noun: str) -> str:
+def _count(number: int, noun: str) -> str:
     return f"{number} {noun}" if number == 1 else f"{number} {noun}s"

@@ -113,7 +113,7 @@ class BagFile(Closing):
         Raises:
             BrokenMessage: The bag cannot be read further.
         """
-        wanted = [each for each in self._reader.connections if each.topic in names]
+        wanted = [link for link in self._reader.connections if link.topic in names]
         if not wanted:
             return
         allowance = Allowance(self._size_bytes)

@@ -66,13 +66,13 @@ def choose_topics(
         UsageError: A topic is missing; the message lists those that were found.
     """
     images = [topic for topic in topics if topic.kind in _IMAGES and topic.messages]
-    of_colour = _chosen(topics, images, formats, "colour", colour, None)
+    of_colour = _choose(topics, images, formats, "colour", colour, None)
     of_depth = None
     if use_depth:
-        of_depth = _chosen(topics, images, formats, "depth", depth, formats[of_colour.name])
+        of_depth = _choose(topics, images, formats, "depth", depth, formats[of_colour.name])
     infos = [topic for topic in topics if topic.kind == CAMERA_INFO and topic.messages]
     if info is not None:
-        colour_info: Topic | None = _named(topics, info, {CAMERA_INFO})
+        colour_info: Topic | None = _find_named(topics, info, {CAMERA_INFO})
     else:
         colour_info = _info_of(of_colour, infos, formats, info_frames)
     return ChosenTopics(
@@ -107,7 +107,7 @@ def topics_line(topics: Sequence[Topic], formats: Mapping[str, ImageFormat]) -> 
     return f"{listed} and {more} more" if more > 0 else listed
 
 
-def _chosen(
+def _choose(
     topics: Sequence[Topic],
     images: Sequence[Topic],
     formats: Mapping[str, ImageFormat],
@@ -116,7 +116,7 @@ def _chosen(
     beside: ImageFormat | None,
 ) -> Topic:
     if named is not None:
-        topic = _named(topics, named, _IMAGES)
+        topic = _find_named(topics, named, _IMAGES)
         image_format = formats.get(named)
         if image_format is None:
             raise UsageError(f"{named} holds no image that can be read", hint="name another topic")
@@ -132,12 +132,12 @@ def _chosen(
         if wanted == "depth":
             hint = "use the colours alone with --no-depth, or " + hint
         raise UsageError(f"the bag has no {wanted}; its topics: {topics_line(topics, formats)}", hint=hint)
-    most = max(each.messages for each in good)
+    most = max(topic.messages for topic in good)
     return max(good, key=lambda each: _merit(each, formats[each.name], wanted, beside, most))
 
 
 def _merit(
-    topic: Topic, found: ImageFormat, wanted: str, beside: ImageFormat | None, most: int
+    topic: Topic, image: ImageFormat, wanted: str, beside: ImageFormat | None, most: int
 ) -> tuple[object, ...]:
     """Return what makes a topic the better choice, the weightiest first."""
     name = topic.name.lower()
@@ -146,18 +146,18 @@ def _merit(
     if wanted == "colour":
         is_colour = any(word in name for word in ("rgb", "color", "colour"))
         is_other = any(word in name for word in ("infra", "/ir/", "depth", "confidence", "fisheye"))
-        is_grey = found.encoding in ("mono8", "8UC1")
-        return enough, not is_other, is_colour, not is_grey, is_raw, topic.messages, _reversed(topic.name)
-    same_frame = beside is not None and found.frame == beside.frame
-    return enough, is_registered(topic), same_frame, is_raw, topic.messages, _reversed(topic.name)
+        is_grey = image.encoding in ("mono8", "8UC1")
+        return enough, not is_other, is_colour, not is_grey, is_raw, topic.messages, _short_first(topic.name)
+    same_frame = beside is not None and image.frame == beside.frame
+    return enough, is_registered(topic), same_frame, is_raw, topic.messages, _short_first(topic.name)
 
 
-def _reversed(name: str) -> tuple[int, ...]:
+def _short_first(name: str) -> tuple[int, ...]:
     """Return a key that prefers short names, and the first of the alphabet."""
     return (-len(name), *(-ord(letter) for letter in name))
 
 
-def _named(topics: Sequence[Topic], name: str, kinds: set[str]) -> Topic:
+def _find_named(topics: Sequence[Topic], name: str, kinds: set[str]) -> Topic:
     for topic in topics:
         if topic.name == name:
             if topic.kind not in kinds:
@@ -192,11 +192,11 @@ def _info_of(
         if info.name in wanted:
             return info
     frame = formats[topic.name].frame
-    return next((each for each in infos if frame and frames.get(each.name) == frame), None)
+    return next((topic for topic in infos if frame and frames.get(topic.name) == frame), None)
 
 
 def _poses(topics: Sequence[Topic], named: str | None) -> Topic | None:
     if named is not None:
-        return _named(topics, named, set(_POSES))
+        return _find_named(topics, named, set(_POSES))
     pose_topics = [topic for topic in topics if topic.kind == POSE and topic.messages > 1]
     return max(pose_topics, key=lambda each: each.messages, default=None)

@@ -51,22 +51,22 @@ def bound_reader() -> None:
     ros1, mcap, ros2 = modules
     lz4, zstd = importlib.import_module("lz4.frame").LZ4FrameDecompressor, ros2.zstd.ZstdDecompressor
     ros1.decompressors |= {
-        "bz2": functools.partial(_decompressed, bz2.BZ2Decompressor),
-        "lz4": functools.partial(_decompressed, lz4),
+        "bz2": functools.partial(_decompress, bz2.BZ2Decompressor),
+        "lz4": functools.partial(_decompress, lz4),
     }
     mcap.DECOMPRESSORS |= {
-        "lz4": functools.partial(_decompressed, lz4),
-        "zstd": functools.partial(_decompressed, zstd),
+        "lz4": functools.partial(_decompress, lz4),
+        "zstd": functools.partial(_decompress, zstd),
     }
     ros2.zstd = SimpleNamespace(
-        decompress=functools.partial(_decompressed, zstd),
+        decompress=functools.partial(_decompress, zstd),
         open=functools.partial(_CountedFile, ros2.zstd.open),
         ZstdError=ros2.zstd.ZstdError,
         ZstdDecompressor=zstd,
     )
 
 
-def _decompressed(make: Callable[[], Any], data: bytes, size: int | None = None) -> bytes:
+def _decompress(make: Callable[[], Any], data: bytes, size: int | None = None) -> bytes:
     """Return the content of all streams in *data*; raises ValueError above *size* or the bound."""
     parts: list[bytes] = []
     max_bytes = left = MAX_CHUNK_BYTES if size is None else min(size, MAX_CHUNK_BYTES)

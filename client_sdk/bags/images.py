@@ -108,7 +108,7 @@ def decode_colour(message: Any) -> npt.NDArray[np.uint8]:
     """
     cv2 = load_opencv()
     if not hasattr(message, "encoding"):
-        image = _decoded(cv2, np.asarray(message.data), cv2.IMREAD_COLOR)
+        image = _decode(cv2, np.asarray(message.data), cv2.IMREAD_COLOR)
         rgb: npt.NDArray[np.uint8] = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
         return rgb
     bytes_per_px, conversion = _COLOUR[message.encoding]
@@ -145,7 +145,7 @@ def decode_depth(message: Any, depth_scale: float) -> npt.NDArray[np.float32]:
         _, a, b = _COMPRESSED_DEPTH_HEADER.unpack(data[: _COMPRESSED_DEPTH_HEADER.size].tobytes())
         data = data[_COMPRESSED_DEPTH_HEADER.size :]
         is_quantised = message.format.startswith("32FC1")
-    image = _decoded(cv2, data, cv2.IMREAD_UNCHANGED)
+    image = _decode(cv2, data, cv2.IMREAD_UNCHANGED)
     if image.ndim != 2 or image.dtype != np.uint16:
         raise BrokenMessage("a depth image does not hold 16 bits of one channel")
     if not is_quantised:
@@ -156,7 +156,7 @@ def decode_depth(message: Any, depth_scale: float) -> npt.NDArray[np.float32]:
         return _metres_of_floats(np.where(image > 0, np.float32(a) / inverse, np.float32(0)))
 
 
-def _decoded(cv2: Any, data: npt.NDArray[np.uint8], flags: int) -> npt.NDArray[Any]:
+def _decode(cv2: Any, data: npt.NDArray[np.uint8], flags: int) -> npt.NDArray[Any]:
     try:
         image: npt.NDArray[Any] | None = cv2.imdecode(data, flags)
     except cv2.error as error:

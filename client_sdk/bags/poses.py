@@ -107,7 +107,7 @@ class TransformTree:
         """Return ``T_frame_other`` of two frames that are fixed to each other; None if they are not."""
         if frame.strip("/") == other.strip("/"):
             return np.eye(4)
-        ways = [self._fixed_way(each) for each in (frame, other)]
+        ways = [self._walk_fixed(end) for end in (frame, other)]
         for common, T_common_frame in ways[0].items():
             if common in ways[1]:
                 return inverse(T_common_frame) @ ways[1][common]
@@ -117,9 +117,9 @@ class TransformTree:
         """Return the poses of *frame* in its root at these times, where they are known."""
         return _path((stamp_ns, self.pose(frame, stamp_ns)) for stamp_ns in stamps_ns)
 
-    def _fixed_way(self, frame: str) -> dict[str, Array]:
+    def _walk_fixed(self, frame: str) -> dict[str, Array]:
         frame = frame.strip("/")
-        found = {frame: np.eye(4)}
+        way = {frame: np.eye(4)}
         T = np.eye(4)
         for _ in range(_MAX_DEPTH):
             edge = self._edges.get(frame)
@@ -128,8 +128,8 @@ class TransformTree:
                 break
             T = T_parent_child @ T
             frame = edge.parent
-            found[frame] = T
-        return found
+            way[frame] = T
+        return way
 
 
 class PoseTopic:

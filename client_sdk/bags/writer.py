@@ -137,13 +137,13 @@ def _write_map(
     count = 0
     with BagWriter(path, kind) as writer:
         events = []
-        for name, each in paths:
+        for name, recorded in paths:
             topic = "".join(letter if letter.isascii() and letter.isalnum() else "_" for letter in name)
-            stamps = [round(1e9 * float(stamp)) for stamp in each.timestamps_s]
+            stamps = [round(1e9 * float(stamp)) for stamp in recorded.timestamps_s]
             poses = [
-                writer.pose(stamp, frame, T) for stamp, T in zip(stamps, each.T_world_camera, strict=True)
+                writer.pose(stamp, frame, T) for stamp, T in zip(stamps, recorded.T_world_camera, strict=True)
             ]
-            for stamp, T, pose in zip(stamps, each.T_world_camera, poses, strict=True):
+            for stamp, T, pose in zip(stamps, recorded.T_world_camera, poses, strict=True):
                 moved = writer.transform(stamp, frame, f"{topic}_camera", T)
                 events.append((stamp, f"/{topic}/pose", POSE, pose))
                 events.append((stamp, "/tf", TF, writer.make(TF, transforms=[moved])))

@@ -167,9 +167,9 @@ def _pdf(picture: npt.NDArray[np.uint8], module_mm: float) -> bytes:
         f"<< /Length {len(content)} >>\nstream\n".encode("ascii") + content + b"endstream",
     ]
     data, places = b"%PDF-1.4\n", []
-    for number, each in enumerate(objects, start=1):
+    for number, pdf_object in enumerate(objects, start=1):
         places.append(len(data))
-        data += f"{number} 0 obj\n".encode("ascii") + each + b"\nendobj\n"
+        data += f"{number} 0 obj\n".encode("ascii") + pdf_object + b"\nendobj\n"
     table = "".join(f"{place:010d} 00000 n \n" for place in places)
     end = f"xref\n0 {len(places) + 1}\n0000000000 65535 f \n{table}trailer\n"
     end += f"<< /Size {len(places) + 1} /Root 1 0 R >>\nstartxref\n{len(data)}\n%%EOF\n"

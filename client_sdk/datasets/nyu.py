@@ -128,12 +128,12 @@ def raw_files(folder: Path, prefix: str) -> list[RawFile]:
 
     The published dump holds some truncated files.
     """
-    found = []
+    files = []
     for path in folder.glob(f"{prefix}-*.p[gp]m"):
         stamp = _STAMPED.match(path.name)
         if stamp and path.stat().st_size > COLOUR_CAMERA.width * COLOUR_CAMERA.height:
-            found.append(RawFile(float(stamp[1]), path))
-    return sorted(found)
+            files.append(RawFile(float(stamp[1]), path))
+    return sorted(files)
 
 
 def read_pnm(path: Path) -> npt.NDArray[Any]:
@@ -184,7 +184,7 @@ class LabelledFile:
             try:
                 names = _strings(file, "scenes")
             except _DAMAGE as error:
-                raise self._damaged() from error
+                raise self._damage_error() from error
         rows = [row for row, name in enumerate(names) if name == scene]
         if not rows:
             some = ", ".join(sorted(set(names))[:5]) or "none"
@@ -199,7 +199,7 @@ class LabelledFile:
                 rgb = np.ascontiguousarray(np.transpose(file["images"][row], (2, 1, 0)), dtype=np.uint8)
                 depth_m = np.ascontiguousarray(np.transpose(depths[row]), dtype=np.float32)
             except _DAMAGE as error:
-                raise self._damaged() from error
+                raise self._damage_error() from error
         depth_m[~np.isfinite(depth_m) | (depth_m >= _MAX_DEPTH_M)] = 0.0
         return rgb, depth_m
 
@@ -217,7 +217,7 @@ class LabelledFile:
             fits = is_complete and _holds_images(h5py, file)
         except _DAMAGE as error:
             file.close()
-            raise self._damaged() from error
+            raise self._damage_error() from error
         if not fits:
             file.close()
             problem = (
@@ -226,7 +226,7 @@ class LabelledFile:
             raise UsageError(f"{self.path} holds no {problem}", hint=_MAT_HINT)
         return file
 
-    def _damaged(self) -> UsageError:
+    def _damage_error(self) -> UsageError:
         return UsageError(f"{self.path} is damaged", hint=_MAT_HINT)
 
 
@@ -256,9 +256,9 @@ def _strings(file: Any, name: str) -> list[str]:
         return []
     if file[name].size > _MAX_IMAGES:
         raise ValueError(f"{name} names more than {_MAX_IMAGES} images")
-    found = []
+    texts = []
     for cell in np.asarray(file[name]).ravel():
         if file[cell].size > _MAX_LETTERS:
             raise ValueError(f"{name} holds no short texts")
-        found.append("".join(chr(code) for code in np.asarray(file[cell]).ravel()))
-    return found
+        texts.append("".join(chr(code) for code in np.asarray(file[cell]).ravel()))
+    return texts

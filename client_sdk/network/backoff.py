@@ -86,8 +86,8 @@ class Backoff:
         asked_s = after_s * self._random.uniform(1.0, _SPREAD)
         wait_s = self._bucket.wait_s(now)
         if is_move:
-            kept = _KEPT * self._bucket.burst
-            wait_s = max(wait_s, (kept + 1.0 - self._bucket.tokens) / self._bucket.rate)
+            least = _KEPT * self._bucket.burst
+            wait_s = max(wait_s, (least + 1.0 - self._bucket.tokens) / self._bucket.rate)
         return max(asked_s + self._own_s(now, last, valid_in_s), wait_s)
 
     def _own_s(self, now: float, last: Last, valid_in_s: float | None) -> float:

@@ -275,7 +275,7 @@ class Connection:
         best = self._choice.best(usable)
         if best is not None and self._main_tasks:
             self._choice.changed()
-            self._reconnected(usable[best])
+            self._take_socket(usable[best])
 
     # --- the main tasks -------------------------------------------------------------------------
 
@@ -341,9 +341,9 @@ class Connection:
     def _resume(self, region: Region) -> None:
         """Send the commands to *region* if no other one carries them."""
         if region.socket is not None and self._session.current is None:
-            self._reconnected(region.socket)
+            self._take_socket(region.socket)
 
-    def _reconnected(self, socket: RegionSocket) -> None:
+    def _take_socket(self, socket: RegionSocket) -> None:
         self.reconnects += 1
         self._adopt(socket)
         self._on_change("link-back", socket.state.server)
@@ -426,20 +426,20 @@ class Connection:
             if code == CLOSE_RATE:
                 self.last_error = "the server closed the connection: this robot exceeds its rate"
             elif socket.region.socket is socket and code == CLOSE_REVOKED:
-                socket.region.failed = self._cut_off()
+                socket.region.failed = self._cut_off_error()
             elif socket.region.socket is socket and code == CLOSE_REPLACED:
-                socket.region.failed = self._replaced(socket)
+                socket.region.failed = self._replaced_error(socket)
         finally:
             self._forget(socket)
 
-    def _cut_off(self) -> DialError:
+    def _cut_off_error(self) -> DialError:
         """Return what a cut-off means: a token of a later second may be accepted, the same one never."""
         is_fresh = callable(self.dialler.token)
         valid_from_s = self._pauses.wall_clock() + _LATER_SECOND_S if is_fresh else None
         error = Unauthorized("the token was revoked, or the robot was disabled", hint=ISSUE)
         return DialError(error, is_refusal=True, valid_from_s=valid_from_s)
 
-    def _replaced(self, socket: RegionSocket) -> DialError | None:
+    def _replaced_error(self, socket: RegionSocket) -> DialError | None:
         """Return the conflict with another program, None if this robot itself opened the newer connection."""
         is_double = self._is_double(socket)
         is_moving = socket.region.move_request is not None
@@ -570,8 +570,8 @@ class Connection:
         if self._session.current is None and not self._closed:
             self._use_standby()
             self._note_refusal()
-        for each in self._regions:
-            each.changed.set()
+        for known in self._regions:
+            known.changed.set()
 
     def _spawn(self, work: Coroutine[Any, Any, Any]) -> asyncio.Task[Any]:
         task = asyncio.get_running_loop().create_task(work)

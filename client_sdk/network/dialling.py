@@ -20,10 +20,10 @@ __all__ = [
     "ISSUE",
     "DialError",
     "dial_error_of",
-    "shown_address",
-    "unconnected",
+    "hide_password",
+    "unconnected_error",
     "unreachable",
-    "untrusted",
+    "untrusted_error",
 ]
 
 CHECK_RUNNING = "is the platform running? start it with rse-pf local start"
@@ -71,7 +71,7 @@ class DialError(Exception):
         self.valid_from_s = valid_from_s
 
 
-def unconnected(address: str, error: OSError) -> DialError:
+def unconnected_error(address: str, error: OSError) -> DialError:
     """Return the error of an attempt without a TCP connection to *address*."""
     is_answered = error.errno in _ANSWERED
     return DialError(_unreachable(address, error), is_unanswered=not is_answered)
@@ -87,7 +87,7 @@ def _unreachable(address: str, error: Exception) -> ConnectError:
     return ConnectError(f"cannot connect to {address}: {cause}", hint=CHECK_RUNNING)
 
 
-def untrusted(address: str, error: ssl.SSLCertVerificationError) -> DialError:
+def untrusted_error(address: str, error: ssl.SSLCertVerificationError) -> DialError:
     """Return the error of a server whose certificate this robot does not trust, or not now.
 
     A later attempt may succeed: in some networks another machine answers first, and clocks are set.
@@ -116,7 +116,7 @@ def dial_error_of(address: str, status: int, retry_after: str, body: bytes = b""
         if refusal is None:
             return DialError(_not_ours(address, status), after_s=after_s)
         return DialError(
-            _refused(address, status, refusal),
+            _refusal_error(address, status, refusal),
             is_refusal=True, after_s=after_s, cause=refusal.cause, valid_from_s=refusal.valid_from_s,
         )  # fmt: skip
     is_client_error = 300 <= status < 500 and status != 429
@@ -132,15 +132,15 @@ def _not_ours(address: str, status: int) -> RsePfError:
     return ConnectError(f"{address} answers {status}, and it is not an RSE-PF server that says so", hint=hint)
 
 
-def _refused(address: str, status: int, told: RefusedHandshake) -> RsePfError:
+def _refusal_error(address: str, status: int, handshake: RefusedHandshake) -> RsePfError:
     if status == 403:
         return Forbidden(f"{address} forbids this robot to connect", hint="ask the operator")
-    if told.cause:
-        return Unauthorized(told.message, hint=told.hint)
+    if handshake.cause:
+        return Unauthorized(handshake.message, hint=handshake.hint)
     return Unauthorized("the token is missing, wrong or expired", hint=ISSUE)
 
 
-def shown_address(url: str) -> str:
+def hide_password(url: str) -> str:
     """Return *url* without user name and password; raises UsageError if it is no WebSocket address."""
     parts = urlsplit(url)
     try:

@@ -21,13 +21,13 @@ from client_sdk.network.dialling import (
     CHECK_ADDRESS,
     DialError,
     dial_error_of,
-    shown_address,
-    unconnected,
+    hide_password,
+    unconnected_error,
     unreachable,
-    untrusted,
+    untrusted_error,
 )
 from client_sdk.network.tcp import TcpDialler
-from client_sdk.token_text import checked_token
+from client_sdk.token_text import strip_token
 from rse_pf.config import SessionSettings
 from rse_pf.errors import ConnectError, RsePfError, Unauthorized, UnsupportedProtocol
 from rse_pf.wire import SUBPROTOCOLS
@@ -108,7 +108,7 @@ class Dialler:
         if token is None:
             return None
         try:
-            return checked_token(token)
+            return strip_token(token)
         except Unauthorized as error:
             raise DialError(error, is_refusal=True) from None
 
@@ -119,7 +119,7 @@ class Dialler:
         try:
             made = await self._tcp.connect(parts.hostname or "", port, within_s)
         except OSError as error:
-            failed = unconnected(shown_address(url), error)
+            failed = unconnected_error(hide_password(url), error)
             if not failed.is_unanswered:
                 on_answered()
             raise failed from error
@@ -129,7 +129,7 @@ class Dialler:
     async def _handshake(
         self, url: str, token: str | None, on_answered: Callable[[], None]
     ) -> ClientConnection:
-        address, options = shown_address(url), websocket_options(self._settings)
+        address, options = hide_password(url), websocket_options(self._settings)
         options["sock"] = await self._connect(url, on_answered)
         if self.ssl_context is not None and url.startswith("wss:"):
             options["ssl"] = self.ssl_context
@@ -145,7 +145,7 @@ class Dialler:
             after = response.headers.get("Retry-After", "")
             raise dial_error_of(address, response.status_code, after, bytes(response.body or b"")) from error
         except ssl.SSLCertVerificationError as error:
-            raise untrusted(address, error) from error
+            raise untrusted_error(address, error) from error
         except (OSError, asyncio.TimeoutError, WebSocketException, EOFError) as error:
             raise unreachable(address, error) from error
         if websocket.subprotocol != self._subprotocol:

@@ -9,7 +9,7 @@ from typing import Any
 from websockets.asyncio.client import ClientConnection
 
 from client_sdk.network.backoff import Backoff
-from client_sdk.network.dialling import DialError, shown_address
+from client_sdk.network.dialling import DialError, hide_password
 from rse_pf.wire.client_session import ConnectionState
 
 __all__ = ["Region", "RegionSocket", "cancel_all", "either"]
@@ -21,7 +21,7 @@ class Region:
     def __init__(self, number: int, url: str, backoff: Backoff) -> None:
         self.number = number
         self.url = url
-        self.address = shown_address(url) if url else ""
+        self.address = hide_password(url) if url else ""
         self.backoff = backoff
         self.socket: RegionSocket | None = None
         self.since = 0.0

@@ -93,9 +93,9 @@ class RegionChoice:
         if other.better_since is None or now - other.compared > _GAP_S:
             other.better_since = now
         other.compared = now
-        return now - other.better_since >= self._needed_s(other, now)
+        return now - other.better_since >= self._pause_needed_s(other, now)
 
-    def _needed_s(self, region: _Region, now: float) -> float:
+    def _pause_needed_s(self, region: _Region, now: float) -> float:
         while region.losses and region.losses[0] <= now - _MEMORY_S:
             region.losses.popleft()
         return self._hold_s * 2.0 ** min(_MAX_DOUBLINGS, max(0, len(region.losses) - 1))

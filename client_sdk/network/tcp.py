@@ -55,7 +55,7 @@ class TcpDialler:
             loop = asyncio.get_running_loop()
             lookup = asyncio.ensure_future(loop.getaddrinfo(host, port, type=socket.SOCK_STREAM))
             self._lookups[key] = lookup
-            lookup.add_done_callback(lambda ended: self._looked_up(key, ended))
+            lookup.add_done_callback(lambda ended: self._take_lookup(key, ended))
         known = self._known.get(key)
         done, _ = await asyncio.wait({lookup}, timeout=within_s if known is None else _LOOKUP_S)
         if done and lookup.exception() is None:
@@ -66,16 +66,16 @@ class TcpDialler:
             return lookup.result()
         raise _nobody(f"no name server says where {host} is")
 
-    def _looked_up(self, key: tuple[str, int], ended: asyncio.Future[list[_Address]]) -> None:
+    def _take_lookup(self, key: tuple[str, int], ended: asyncio.Future[list[_Address]]) -> None:
         self._lookups.pop(key, None)
         if not ended.cancelled() and ended.exception() is None:
             self._known[key] = ended.result()
 
 
-async def _first_answer(found: list[_Address], until: float) -> socket.socket:
-    """Return the first connection of those to *found*, begun one after the other."""
+async def _first_answer(addresses: list[_Address], until: float) -> socket.socket:
+    """Return the first connection of those to *addresses*, begun one after the other."""
     loop = asyncio.get_running_loop()
-    rest, waiting = deque(found), set[asyncio.Task[socket.socket]]()
+    rest, waiting = deque(addresses), set[asyncio.Task[socket.socket]]()
     failed: OSError | None = None
     try:
         while rest or waiting:
@@ -83,7 +83,7 @@ async def _first_answer(found: list[_Address], until: float) -> socket.socket:
             if left_s <= 0:
                 break
             if rest:
-                waiting.add(loop.create_task(_connected(rest.popleft())))
+                waiting.add(loop.create_task(_connect(rest.popleft())))
             timeout_s = min(left_s, _NEXT_ADDRESS_S) if rest else left_s
             done, _ = await asyncio.wait(waiting, timeout=timeout_s, return_when=asyncio.FIRST_COMPLETED)
             for task in done:
@@ -99,7 +99,7 @@ async def _first_answer(found: list[_Address], until: float) -> socket.socket:
     raise failed or _nobody("nobody answers")
 
 
-async def _connected(address: _Address) -> socket.socket:
+async def _connect(address: _Address) -> socket.socket:
     family, kind, protocol, _, where = address
     made = socket.socket(family, kind, protocol)
     try:

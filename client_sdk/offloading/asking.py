@@ -137,7 +137,7 @@ class Asking:
                     turn = turns.popleft()
                     left_s = call.deadline_s - past_s
                     if self._can_be_in_time(turn, call, left_s):
-                        racing[self._spawn(self._asked(turn, call, left_s, why))] = turn
+                        racing[self._spawn(self._ask_place(turn, call, left_s, why))] = turn
                 if not racing:
                     continue
                 until_s = turns[0].after_s if turns else call.deadline_s
@@ -169,7 +169,7 @@ class Asking:
         expected_s = self._burst.expected_s(call.service)
         return expected_s is not None and expected_s < left_s
 
-    def _asked(self, turn: _Turn, call: Call, left_s: float, why: str) -> Coroutine[Any, Any, Ended]:
+    def _ask_place(self, turn: _Turn, call: Call, left_s: float, why: str) -> Coroutine[Any, Any, Ended]:
         if turn.place == "server":
             return self._ask_server(call)
         if turn.place == "burst":

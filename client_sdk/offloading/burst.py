@@ -184,10 +184,10 @@ class Burst:
             cause = getattr(error, "strerror", None) or str(error) or type(error).__name__
             return _failure("connect", f"cannot reach the burst function: {cause}"), False
         if response.status == _OK:
-            return self._decoded(response), response.headers.get(_COLD) == "true"
+            return self._decode(response), response.headers.get(_COLD) == "true"
         if response.status == _UNAUTHORIZED:
             self._token = None
-        return _refused(response), False
+        return _failure_of_status(response), False
 
     async def _fresh_token(self) -> str | None:
         now = self._clock()
@@ -198,7 +198,7 @@ class Burst:
             self._token = (now, token)
         return self._token[1]
 
-    def _decoded(self, response: _Response) -> Result | Failure:
+    def _decode(self, response: _Response) -> Result | Failure:
         wanted = f"application/{SUBPROTOCOLS[self._codec.name]}"
         if response.headers.get("content-type", "") != wanted:
             return _failure("connect", "what answers at the burst function's address is something else")
@@ -263,7 +263,7 @@ class Burst:
                 if is_reused and not getattr(error, "partial", b""):
                     raise _Stale from error
                 raise
-            status, headers = _parsed(head)
+            status, headers = _parse_head(head)
             size = headers.get("content-length", "")
             if not size.isdecimal() or int(size) > self._max_answer_bytes:
                 raise _BrokenHttp("an answer without a length, or too long")
@@ -285,7 +285,7 @@ class Burst:
         return self._default_context
 
 
-def _parsed(head: bytes) -> tuple[int, dict[str, str]]:
+def _parse_head(head: bytes) -> tuple[int, dict[str, str]]:
     """Return the status and the headers of a response, names in small letters."""
     first, *lines = head.decode("latin-1").split("\r\n")
     version, _, rest = first.partition(" ")
@@ -299,7 +299,7 @@ def _parsed(head: bytes) -> tuple[int, dict[str, str]]:
     return int(rest[:3]), headers
 
 
-def _refused(response: _Response) -> Failure:
+def _failure_of_status(response: _Response) -> Failure:
     """Return what an HTTP status other than 200 means."""
     after = response.headers.get("retry-after", "")
     after_ms = float(after) * 1e3 if after.isdecimal() and len(after) < 9 else None

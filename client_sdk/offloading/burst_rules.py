@@ -13,7 +13,7 @@ from urllib.parse import urlsplit
 
 from rse_pf.errors import UsageError
 
-__all__ = ["BurstRules", "burst_address", "checked_burst_url"]
+__all__ = ["BurstRules", "burst_address", "check_burst_url"]
 
 _DAY_S = 86400.0
 _FAILURES = 3
@@ -123,7 +123,7 @@ def burst_address(url: str, own_url: str) -> str | None:
     return url
 
 
-def checked_burst_url(url: str | None, own_url: str) -> str | None:
+def check_burst_url(url: str | None, own_url: str) -> str | None:
     """Return *url*, given by the user; raises UsageError if it is no address that may be used."""
     if url and burst_address(url, own_url or "ws://an-enrolment-names-it/ws") is None:
         raise UsageError(

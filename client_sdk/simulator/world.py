@@ -162,11 +162,11 @@ def with_equal_rooms(world: World, one: int, other: int) -> World:
         )
     faces = [face for face in world.faces if face.room != other]
     shift_m = (other - one) * ROOM_M
-    copies = [_shifted(face, other, shift_m) for face in world.faces if face.room == one]
+    copies = [_shift(face, other, shift_m) for face in world.faces if face.room == one]
     return World((*faces, *copies), world.textures)
 
 
-def _shifted(face: Face, room: int, shift_m: float) -> Face:
+def _shift(face: Face, room: int, shift_m: float) -> Face:
     if face.axis == 0:
         return replace(face, room=room, offset=face.offset + shift_m)
     low, high = (face.low[0] + shift_m, face.low[1]), (face.high[0] + shift_m, face.high[1])

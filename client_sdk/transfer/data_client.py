@@ -23,7 +23,7 @@ from typing import Any, BinaryIO
 from urllib.parse import urlsplit
 
 from client_sdk.enrolment import read_enrolment
-from client_sdk.token_text import checked_token
+from client_sdk.token_text import strip_token
 from rse_pf.errors import (
     BadRequest,
     CommandFailed,
@@ -335,7 +335,7 @@ class DataClient:
     def _request_once(self, method: str, path: str, body: bytes | None, headers: dict[str, str]) -> Response:
         if self._connection is None:
             self._connection = self._new_connection()
-        token = checked_token(self._token() if callable(self._token) else self._token)
+        token = strip_token(self._token() if callable(self._token) else self._token)
         self._connection.request(method, path, body, {"Authorization": f"Bearer {token}", **headers})
         answer = self._connection.getresponse()
         content = answer.read()

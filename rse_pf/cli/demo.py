@@ -20,7 +20,7 @@ from pathlib import Path
 from rse_pf.cli.extras import require
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import UsageError
-from rse_pf.recording.writer import recorded
+from rse_pf.recording.writer import with_recordings
 from rse_pf.terminal import counted, show
 
 __all__ = ["add_arguments", "run"]
@@ -108,7 +108,7 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     if args.live and args.merge:
         raise UsageError("--live and --merge exclude each other", hint="a live map needs no merge")
     require("demo --merge" if args.merge else "demo")
-    settings = recorded(settings, args.record)
+    settings = with_recordings(settings, args.record)
     from rse_pf.experiments.demo.run import DemoOptions, run_demo
     from rse_pf.pnp import usable_engine
 

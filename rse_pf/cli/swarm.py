@@ -78,7 +78,7 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     """Check the options and run the swarm."""
     from rse_pf.experiments.load.run import run_swarm
     from rse_pf.experiments.load.swarm import SwarmOptions
-    from rse_pf.recording.writer import recorded
+    from rse_pf.recording.writer import with_recordings
 
     if not (math.isfinite(args.seconds) and 0 < args.seconds <= _MAX_S):
         raise UsageError(
@@ -112,7 +112,7 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
             hint="start it with rse-pf local --record, or leave out --name and --url",
         )
     if platform is None:
-        settings = recorded(settings, args.record)
+        settings = with_recordings(settings, args.record)
     return run_swarm(
         options,
         settings,

@@ -150,13 +150,13 @@ class McapFile:
         start = self.size_bytes
         self._forget()
         self._write(b"".join((chunk, records, *indexes)))
-        found = b"".join(places)
+        entries = b"".join(places)
         end = _CHUNK_INDEX_END.pack(index_bytes, 0, len(records), len(records))
         self._chunk_indexes.append(
             _CHUNK_INDEX.pack(
-                _OP_CHUNK_INDEX, _CHUNK_INDEX.size - 9 + len(found) + len(end), *span, start, chunk_bytes,
-                len(found),
-            ) + found + end
+                _OP_CHUNK_INDEX, _CHUNK_INDEX.size - 9 + len(entries) + len(end), *span, start, chunk_bytes,
+                len(entries),
+            ) + entries + end
         )  # fmt: skip
         before = self._span or span
         self._span = min(before[0], span[0]), max(before[1], span[1])

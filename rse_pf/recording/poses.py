@@ -16,7 +16,7 @@ from typing import Any
 
 import msgspec
 
-__all__ = ["WORLD_FRAME", "answered_pose", "image", "inverse", "point_cloud", "pose_in_frame"]
+__all__ = ["WORLD_FRAME", "image", "inverse", "point_cloud", "pose_in_frame", "read_answered_pose"]
 
 WORLD_FRAME = "world"
 """The frame of the points of a robot's commands."""
@@ -53,7 +53,7 @@ _from_json = msgspec.json.Decoder(_PoseResult).decode
 _from_binary = msgspec.msgpack.Decoder(_BinaryPoseResult, ext_hook=_numbers).decode
 
 
-def answered_pose(text: bytes, *, is_binary: bool) -> Sequence[float] | None:
+def read_answered_pose(text: bytes, *, is_binary: bool) -> Sequence[float] | None:
     """Return the 16 numbers of ``T_camera_world`` (row-major) of a `pnp` result, None if it has none.
 
     Args:

@@ -182,9 +182,9 @@ class WireRecording:
         self.left_out = 0
         waiting: OrderedDict[str, RecordedCommand] = OrderedDict()
         sights: dict[str, _Sights] = {}
-        for sight in self._merged(wanted):
+        for sight in self._merge(wanted):
             if isinstance(sight.of, file_format.WireChannel):
-                yield from self._paired(sight, sight.of, waiting, sights)
+                yield from self._pair(sight, sight.of, waiting, sights)
             elif len(sights) < _MAX_CONNECTIONS:
                 sights.setdefault(sight.of[1], _Sights()).add(sight)
         yield from (self._with_sights(command, sights) for command in waiting.values())
@@ -202,7 +202,7 @@ class WireRecording:
         exact = bool(_COMMAND_ID.fullmatch(identity))
         before: dict[tuple[str, str], deque[RecordedCommand]] = {}
         commands_with_history: list[tuple[RecordedCommand, list[RecordedCommand]]] = []
-        for command in self.commands(self._wanted(identity) if exact else None):
+        for command in self.commands(self._plan_search(identity) if exact else None):
             if command.id == identity or (not exact and command.id.endswith(f":{identity}")):
                 commands_with_history.append(
                     (command, list(before.get((command.robot, command.service), ())))
@@ -222,14 +222,14 @@ class WireRecording:
             )
         return commands_with_history[0]
 
-    def _wanted(self, identity: str) -> Wanted | None:
+    def _plan_search(self, identity: str) -> Wanted | None:
         """Return what is read to find a command and its history, None if no summary knows its robot."""
         topic = file_format.wire_topic(identity.partition(":")[0], "up")
         robots = (robot_of(path, topic) for path in self.files)
         robot = next((candidate for candidate in robots if candidate), None)
         return None if robot is None else Wanted(robot=robot)
 
-    def _merged(self, wanted: Wanted | None) -> Iterator[_Sight]:
+    def _merge(self, wanted: Wanted | None) -> Iterator[_Sight]:
         """Yield the messages of all files; those of several recorders by their times."""
         streams = [list(files) for _, files in itertools.groupby(self.files, key=_recorder)]
         if len(streams) > _MAX_STREAMS:
@@ -247,7 +247,7 @@ class WireRecording:
                 raise
             self.cut.append(path)
 
-    def _paired(
+    def _pair(
         self,
         message: _Sight,
         channel: file_format.WireChannel,
@@ -278,23 +278,23 @@ class WireRecording:
         try:
             if codec == "bin":
                 check_size(data, self._budget)
-                found = _decode_binary(data)
+                envelope = _decode_binary(data)
             elif codec in CODECS:
                 check_size(data, self._budget)
-                found = _decode_json(inflate_within(data, self._budget) if codec == "zlib" else data)
+                envelope = _decode_json(inflate_within(data, self._budget) if codec == "zlib" else data)
             else:
                 raise BadMessage(f"no codec named {codec[:20]!r}")
         except (RsePfError, msgspec.DecodeError, ValueError, RecursionError):
             self.left_out += 1
             return "", None, ""
-        return found.type, found.id, found.service
+        return envelope.type, envelope.id, envelope.service
 
     @staticmethod
     def _with_sights(command: RecordedCommand, sights: dict[str, _Sights]) -> RecordedCommand:
         seen = sights.get(command.robot)
         if seen is None:
             return command
-        return _seen(command, seen.of("frames", command), seen.of("odometry", command))
+        return _add_images(command, seen.of("frames", command), seen.of("odometry", command))
 
 
 def open_recording(path: Path, session: SessionSettings | None = None) -> WireRecording:
@@ -405,7 +405,7 @@ def _codec(name: str, session: SessionSettings) -> Codec:
     return make_codec(name, session)
 
 
-def _seen(command: RecordedCommand, image: bytes | None, pose: bytes | None) -> RecordedCommand:
+def _add_images(command: RecordedCommand, image: bytes | None, pose: bytes | None) -> RecordedCommand:
     """Return *command* with what was seen; what cannot be read is left out."""
     thumbnail = None
     odometry = None
@@ -501,7 +501,7 @@ def _flat(path: Path, cut: list[Path], plan: ChunkPlan | None) -> Iterator[Any]:
         if not next(is_read):
             continue
         try:
-            data = _opened(record)
+            data = _decompress(record)
             record.compression = ""
             record.data = data
             yield from cast("list[Any]", breakup_chunk(record))
@@ -510,7 +510,7 @@ def _flat(path: Path, cut: list[Path], plan: ChunkPlan | None) -> Iterator[Any]:
             return
 
 
-def _opened(chunk: Any) -> bytes:
+def _decompress(chunk: Any) -> bytes:
     """Return the content of a chunk; raises ValueError if it is damaged, or longer than it may be."""
     size: int = chunk.uncompressed_size
     if size > _MAX_CHUNK_BYTES:

@@ -37,7 +37,7 @@ from rse_pf.recording.file_format import (
     wire_metadata,
     wire_topic,
 )
-from rse_pf.recording.poses import answered_pose, inverse, pose_in_frame
+from rse_pf.recording.poses import inverse, pose_in_frame, read_answered_pose
 from rse_pf.recording.redact import KEY_BYTES, ConnectionRedactor, Kept, Pseudonyms
 from rse_pf.recording.tap import (
     CLOSED,
@@ -141,7 +141,7 @@ class MessageRecorder:
         self._write(connection, direction, time_ns, stored)
         if stored is not None and stored.type == "result" and stored.service == "pnp":
             self._add_pose(
-                connection, time_ns, answered_pose(stored.text, is_binary=connection.codec == "bin")
+                connection, time_ns, read_answered_pose(stored.text, is_binary=connection.codec == "bin")
             )
 
     def take_plain(self, connection: RecordedConnection, time_ns: int, data: bytes) -> None:
@@ -157,9 +157,9 @@ class MessageRecorder:
             self._add_pose(connection, time_ns, pose)
 
     def _write(
-        self, connection: RecordedConnection, direction: Direction, time_ns: int, kept: Kept | None
+        self, connection: RecordedConnection, direction: Direction, time_ns: int, stored: Kept | None
     ) -> None:
-        if kept is None:
+        if stored is None:
             self.left_out += 1
             return
         channel = connection.channels.get(direction)
@@ -168,7 +168,7 @@ class MessageRecorder:
             channel = connection.channels[direction] = self.writer.channel(
                 wire_topic(connection.identity, direction), WIRE_ENCODING, wire_metadata(described)
             )
-        self.writer.add(channel, time_ns, kept.data)
+        self.writer.add(channel, time_ns, stored.data)
 
     def close(self, connection: RecordedConnection) -> None:
         """Take that a connection is over."""

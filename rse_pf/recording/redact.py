@@ -132,7 +132,7 @@ class ConnectionRedactor:
         self._names = names
         longest_first = sorted(names, key=len, reverse=True)
         self._in_text = re.compile(_either(longest_first)) if names else None
-        self._forms = [form.encode() for form in {form for name in names for form in _written(name)}]
+        self._forms = [form.encode() for form in {form for name in names for form in _spellings(name)}]
         self._secrets = [secret.encode() for secret in secrets if secret]
         self._marks = (_TOKEN_START, *self._secrets, *self._forms)
         self._open: OrderedDict[int, str] = OrderedDict()
@@ -140,21 +140,21 @@ class ConnectionRedactor:
     def up(self, data: bytes) -> Kept | None:
         """Return what is stored of a message of the robot, None if it is left out."""
         try:
-            text = self._inflated(data)
-            found = peek(self._text_codec, text)
-            if found is not None:
-                kind, identity, service = "command", found.id, found.service
+            text = self._inflate(data)
+            message = peek(self._text_codec, text)
+            if message is not None:
+                kind, identity, service = "command", message.id, message.service
             else:
                 head = self._head(text)
                 kind, identity, service = head.type, head.id or 0, head.service
             if kind == "command" and service in NAME_FREE_SERVICES:
                 self._remember(identity, service)
             elif kind not in _ALWAYS_UP:
-                return self._left_out()
+                return self._leave_out()
             stored = self._without_names(data, text, kind, service, from_robot=True)
         except _UNDECODABLE:
-            return self._left_out()
-        return stored or self._left_out()
+            return self._leave_out()
+        return stored or self._leave_out()
 
     def plain(self, identity: int, words: bytes, data: bytes) -> Kept | None:
         """Return what is stored of a `pnp` command that its server has read already.
@@ -173,12 +173,12 @@ class ConnectionRedactor:
     def pose(self, identity: int, data: bytes) -> Kept | None:
         """Return what is stored of the answer to command *identity*, in which no text is a robot's."""
         service = self._open.pop(identity, "")
-        return Kept(data, b"", "result", service) if service else self._left_out()
+        return Kept(data, b"", "result", service) if service else self._leave_out()
 
     def down(self, data: bytes) -> Kept | None:
         """Return what is stored of a message of the server, None if it is left out."""
         try:
-            text = self._inflated(data)
+            text = self._inflate(data)
             match = _RESULT.match(text) if self._is_text else None
             head = self._head(text) if match is None else _Head("result", int(match[1]))
             service = ""
@@ -187,17 +187,17 @@ class ConnectionRedactor:
             if head.type in ("result", "progress") or (head.type == "failure" and head.id is not None):
                 service = self._open.get(head.id or 0, "")
                 if not service:
-                    return self._left_out()
+                    return self._leave_out()
                 if head.type != "progress":
                     del self._open[head.id or 0]
             elif head.type not in _ALWAYS_DOWN and head.type != "failure":
-                return self._left_out()
+                return self._leave_out()
             stored = self._without_names(data, text, head.type, service, from_robot=False)
         except _UNDECODABLE:
-            return self._left_out()
-        return stored or self._left_out()
+            return self._leave_out()
+        return stored or self._leave_out()
 
-    def _left_out(self) -> Kept | None:
+    def _leave_out(self) -> Kept | None:
         self.left_out += 1
         return None
 
@@ -206,7 +206,7 @@ class ConnectionRedactor:
         if len(self._open) > _MAX_OPEN:  # of a robot that sends more than it may
             self._open.popitem(last=False)
 
-    def _inflated(self, data: bytes) -> bytes:
+    def _inflate(self, data: bytes) -> bytes:
         """Return the text of a message; raises ValueError if it is too long or damaged."""
         if not self._inflates:
             return data
@@ -233,15 +233,15 @@ class ConnectionRedactor:
         changes = {}
         for name in (*_TEXT_FIELDS, *_VALUE_FIELDS):
             before = getattr(message, name, None)
-            after = self._replaced(before, PROTOCOL_WORDS if name in _VALUE_FIELDS else frozenset())
+            after = self._replace(before, PROTOCOL_WORDS if name in _VALUE_FIELDS else frozenset())
             if after is not before:
                 changes[name] = after
         if not changes:  # by chance, in a number or a word of the protocol
             return Kept(data, text, kind, service)
         changed = self._codec.encode(msgspec.structs.replace(message, **changes))
-        return Kept(changed, self._inflated(changed), kind, service)
+        return Kept(changed, self._inflate(changed), kind, service)
 
-    def _replaced(self, value: Any, spared: frozenset[str]) -> Any:
+    def _replace(self, value: Any, spared: frozenset[str]) -> Any:
         """Return *value* with pseudonyms for names but for *spared* words; the same object if it has none."""
         if isinstance(value, str):
             if self._in_text is None or value in spared:
@@ -249,18 +249,16 @@ class ConnectionRedactor:
             text = self._in_text.sub(self._pseudonym, value)
             return value if text == value else text
         if isinstance(value, dict):
-            items = [
-                (self._replaced(key, spared), self._replaced(item, spared)) for key, item in value.items()
-            ]
+            items = [(self._replace(key, spared), self._replace(item, spared)) for key, item in value.items()]
             is_same = all(a is c and b is d for (a, b), (c, d) in zip(value.items(), items, strict=True))
             return value if is_same else dict(items)
         if isinstance(value, list):
-            parts = [self._replaced(item, spared) for item in value]
+            parts = [self._replace(item, spared) for item in value]
             return value if all(a is b for a, b in zip(value, parts, strict=True)) else parts
         return value
 
-    def _pseudonym(self, found: re.Match[str]) -> str:
-        return self._names[found.group()]
+    def _pseudonym(self, match: re.Match[str]) -> str:
+        return self._names[match.group()]
 
     def _is_clean(self, text: bytes) -> bool:
         """Return whether *text* has nothing that might be a token, a secret or a name."""
@@ -274,10 +272,10 @@ class ConnectionRedactor:
         if not isinstance(message, Welcome):
             return None
         changed = self._codec.encode(msgspec.structs.replace(message, robot=self.robot))
-        return Kept(changed, self._inflated(changed), "welcome", "")
+        return Kept(changed, self._inflate(changed), "welcome", "")
 
 
-def _written(name: str) -> set[str]:
+def _spellings(name: str) -> set[str]:
     """Return *name* as MessagePack and JSON write it."""
     return {name, json.dumps(name)[1:-1], json.dumps(name, ensure_ascii=False)[1:-1]}
 

@@ -36,7 +36,7 @@ from rse_pf.recording.file_format import (
 from rse_pf.recording.poses import image, point_cloud
 from rse_pf.recording.recorder_process import MessageRecorder, RecordedConnection
 from rse_pf.recording.redact import KEY_BYTES, Pseudonyms
-from rse_pf.recording.writer import RecordingWriter, checked_folder
+from rse_pf.recording.writer import RecordingWriter, make_folder
 from rse_pf.wire import PROTOCOL_VERSION, Codec, Welcome
 
 __all__ = ["RobotRecorder"]
@@ -129,7 +129,7 @@ class RobotRecorder:
             raise MissingExtra("mcap", "record")
         if self.thumbnails and importlib.util.find_spec("PIL") is None:
             raise MissingExtra("pillow", "local")
-        folder = checked_folder(self._folder)
+        folder = make_folder(self._folder)
         self._thread = threading.Thread(target=self._run, args=(folder,), name="recorder", daemon=True)
         self._thread.start()
 
@@ -143,16 +143,16 @@ class RobotRecorder:
     def opened(self, codec: Codec, token: str | None) -> int:
         """Return the number of a new connection; no message that holds *token* is recorded."""
         self._connections += 1
-        self._put(_Opened(self._connections, codec, token or ""))
+        self._enqueue(_Opened(self._connections, codec, token or ""))
         return self._connections
 
     def said(self, connection: int, direction: Direction, data: bytes) -> None:
         """Record a message of *connection*."""
-        self._put(_Said(connection, direction, time.time_ns(), data))
+        self._enqueue(_Said(connection, direction, time.time_ns(), data))
 
     def closed(self, connection: int) -> None:
         """Take that *connection* is over."""
-        self._put(_Closed(connection))
+        self._enqueue(_Closed(connection))
 
     def frame(
         self,
@@ -165,14 +165,14 @@ class RobotRecorder:
         small = None if rgb is None or not self.thumbnails else _small(rgb)
         pose = None if T_odom_camera is None else np.asarray(T_odom_camera, dtype=float).reshape(16).tolist()
         if small is not None or pose is not None:
-            self._put(_Seen(time.time_ns(), self._frames, timestamp_s, small, pose))
+            self._enqueue(_Seen(time.time_ns(), self._frames, timestamp_s, small, pose))
 
     def map(self, points: npt.NDArray[np.float32]) -> None:
         """Record the ``(n, 3)`` points of a map, metres; of more than 100,000 every so-many-th."""
         thinned = points[:: 1 + len(points) // _MAX_POINTS]
-        self._put(_Mapped(time.time_ns(), thinned.astype("<f4").tobytes()))
+        self._enqueue(_Mapped(time.time_ns(), thinned.astype("<f4").tobytes()))
 
-    def _put(self, entry: _Entry) -> None:
+    def _enqueue(self, entry: _Entry) -> None:
         if self._thread is None:
             return
         try:
@@ -218,7 +218,7 @@ class _Thread:
         elif isinstance(entry, _Opened):
             self._connections[entry.connection] = _Connection(entry)
         elif isinstance(entry, _Seen):
-            self._seen(entry)
+            self._record_image(entry)
         elif isinstance(entry, _Mapped):
             cloud = point_cloud(entry.points, entry.time_ns)
             self._recorder.writer.add_json(MAP_TOPIC, POINTS_SCHEMA, entry.time_ns, cloud)
@@ -258,7 +258,7 @@ class _Thread:
         for said in unnamed:
             self._recorder.take(made, said.direction, said.time_ns, said.data)
 
-    def _seen(self, seen: _Seen) -> None:
+    def _record_image(self, seen: _Seen) -> None:
         writer = self._recorder.writer
         if seen.rgb is not None:
             image_message = image(_jpeg(seen.rgb), seen.time_ns)

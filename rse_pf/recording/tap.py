@@ -196,7 +196,7 @@ class RecordingTap:
                     self._waiting_bytes -= written
                     self._rest = self._rest[written:]
                 elif self._entries:
-                    self._rest = memoryview(self._packed())
+                    self._rest = memoryview(self._pack())
                 else:
                     return
         except BlockingIOError:
@@ -219,7 +219,7 @@ class RecordingTap:
         self._is_waiting = True
         self._call_later(seconds, self.hand_over)
 
-    def _packed(self) -> bytes:
+    def _pack(self) -> bytes:
         """Return the next entries as they are in the pipe, a bounded copy of them."""
         parts: list[bytes] = []
         size = count = messages = 0

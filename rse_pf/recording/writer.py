@@ -30,7 +30,7 @@ from rse_pf.recording.file_format import (
 )
 from rse_pf.recording.mcap_file import McapFile
 
-__all__ = ["RecordingWriter", "checked_folder", "recorded"]
+__all__ = ["RecordingWriter", "make_folder", "with_recordings"]
 
 MAX_FILE_BYTES = 1 << 28
 """Size of a file at which the next one begins."""
@@ -40,7 +40,7 @@ _MAX_CHANNELS = 50_000
 _OWNER_ONLY = 0o600
 
 
-def recorded(settings: PlatformSettings, folder: Path | None) -> PlatformSettings:
+def with_recordings(settings: PlatformSettings, folder: Path | None) -> PlatformSettings:
     """Return *settings* with recordings in *folder*, unchanged if it is None and none are asked for.
 
     Raises:
@@ -52,10 +52,10 @@ def recorded(settings: PlatformSettings, folder: Path | None) -> PlatformSetting
         return settings
     if importlib.util.find_spec("mcap") is None:
         raise MissingExtra("mcap", "record")
-    return settings.replace(recording={"folder": str(checked_folder(Path(chosen)))})
+    return settings.replace(recording={"folder": str(make_folder(Path(chosen)))})
 
 
-def checked_folder(folder: Path) -> Path:
+def make_folder(folder: Path) -> Path:
     """Return the absolute path of *folder*, which is made if it is missing; recordings can be written there.
 
     Raises:

@@ -24,7 +24,7 @@ from benchmarks.server.load import (
     LoadProcess,
     LoadReport,
     RobotGroup,
-    compiled,
+    compile_generator,
     hello_file,
     read_samples,
     run_load,
@@ -123,7 +123,7 @@ class ScriptedServer:
 def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The generator, compiled with all warnings as errors."""
     try:
-        return compiled(tmp_path_factory.mktemp("load"))
+        return compile_generator(tmp_path_factory.mktemp("load"))
     except ConfigurationError as error:
         if "needs a C compiler" in error.message:
             pytest.skip(error.message)
@@ -138,7 +138,7 @@ def server() -> Iterator[ScriptedServer]:
 
 @pytest.fixture(autouse=True)
 def _compiled_here(program: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("benchmarks.server.load.compiled", lambda: program)
+    monkeypatch.setattr("benchmarks.server.load.compile_generator", lambda: program)
 
 
 def commands(folder: Path, codec_name: str, ids: int = IDS, payload: str = "") -> Path:
@@ -265,4 +265,4 @@ def test_says_that_a_compiler_is_missing(tmp_path: Path, monkeypatch: pytest.Mon
     monkeypatch.setenv("PATH", str(tmp_path))
 
     with pytest.raises(ConfigurationError, match="needs a C compiler"):
-        compiled(tmp_path)
+        compile_generator(tmp_path)

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from client_sdk.offloading.burst_rules import BurstRules, burst_address, checked_burst_url
+from client_sdk.offloading.burst_rules import BurstRules, burst_address, check_burst_url
 from rse_pf.errors import UsageError
 
 DAY_S = 86400.0
@@ -137,8 +137,8 @@ def test_a_token_goes_only_where_it_is_as_safe_as_at_the_servers(url: str, own: 
 
 def test_an_address_that_the_user_cannot_mean_is_refused_at_once():
     with pytest.raises(UsageError) as told:
-        checked_burst_url("robots.example/burst", "ws://robots.example/ws")
+        check_burst_url("robots.example/burst", "ws://robots.example/ws")
 
     assert "https://HOST/burst" in told.value.hint
-    assert checked_burst_url("", "ws://robots.example/ws") == ""
-    assert checked_burst_url(None, "ws://robots.example/ws") is None
+    assert check_burst_url("", "ws://robots.example/ws") == ""
+    assert check_burst_url(None, "ws://robots.example/ws") is None

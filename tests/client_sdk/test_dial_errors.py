@@ -7,7 +7,7 @@ import socket
 
 import pytest
 
-from client_sdk.network.dialling import dial_error_of, shown_address, unconnected, unreachable
+from client_sdk.network.dialling import dial_error_of, hide_password, unconnected_error, unreachable
 from rse_pf.auth.tokens import KeySet
 from rse_pf.backend.gateway.handshake import HandshakePolicy, HandshakeRequest, Rejected
 from rse_pf.config import PlatformSettings
@@ -83,7 +83,7 @@ def test_every_refusal_of_the_handshake_carries_the_mark():
     ],
 )
 def test_what_reaches_nobody_is_told_from_what_a_firewall_counts(error, is_unanswered):
-    assert unconnected("ws://host/ws", error).is_unanswered is is_unanswered
+    assert unconnected_error("ws://host/ws", error).is_unanswered is is_unanswered
 
 
 def test_a_connection_that_was_accepted_counts_whatever_came_then():
@@ -138,10 +138,10 @@ def test_the_wait_that_a_server_asks_for_is_bounded(header, after_s):
 
 
 def test_a_shown_address_holds_no_credentials():
-    assert shown_address("wss://robot:secret@host:443/ws?token=x") == "wss://host:443/ws"
+    assert hide_password("wss://robot:secret@host:443/ws?token=x") == "wss://host:443/ws"
 
 
 @pytest.mark.parametrize("url", ["http://host/ws", "ws:///ws", "ws://host:99999/ws", "host"])
 def test_an_address_that_is_no_websocket_address_is_refused(url):
     with pytest.raises(UsageError, match="not a WebSocket address"):
-        shown_address(url)
+        hide_password(url)

@@ -12,7 +12,7 @@ import pytest
 from fake_platform import FakePlatform
 
 import client_sdk
-from client_sdk.token_text import checked_token
+from client_sdk.token_text import strip_token
 from client_sdk.transfer.data_client import DataClient
 from rse_pf.config import SessionSettings
 from rse_pf.errors import ConnectError, Unauthorized
@@ -28,13 +28,13 @@ def robot(url: str, **options: Any) -> client_sdk.Robot:
 
 @pytest.mark.parametrize("around", ["{}\n", " {}", "\t{}\r\n"])
 def test_white_space_around_a_token_does_not_count(around: str) -> None:
-    assert checked_token(around.format(SECRET)) == SECRET
+    assert strip_token(around.format(SECRET)) == SECRET
 
 
 @pytest.mark.parametrize("wrong", [f"{SECRET}\n{SECRET}", f"{SECRET} x", f"{SECRET}\u00e9", "", " ", 7, None])
 def test_what_no_header_can_hold_is_refused_without_showing_it(wrong: object) -> None:
     with pytest.raises(Unauthorized) as told:
-        checked_token(wrong)
+        strip_token(wrong)
 
     assert "eyJ" not in str(told.value)
     assert "rse-pf token issue" in told.value.hint

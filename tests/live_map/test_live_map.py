@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from benchmarks.live.generated_drives import GeneratedDrive, GeneratedWorld, circle, measured_link, straight
+from benchmarks.live.generated_drives import GeneratedDrive, GeneratedWorld, circle, make_link, straight
 from rse_pf.errors import BadRequest
 from rse_pf.geometry import Array, exp_se3, inverse, pose_difference
 from rse_pf.live_map.events import (
@@ -194,7 +194,7 @@ def test_links_that_do_not_agree_join_nothing() -> None:
     rng = np.random.default_rng(3)
     for k in range(12, 18):
         off = exp_se3(np.r_[rng.uniform(-2, 2, 3), rng.uniform(-1, 1, 3)])
-        run.apply(LinksMeasured(keyframe=k, links=(measured_link(k - 12, world.step(k, k - 12) @ off),)))
+        run.apply(LinksMeasured(keyframe=k, links=(make_link(k - 12, world.step(k, k - 12) @ off),)))
 
     assert [each.robot for each in run.of(Joined)] == ["a"]
 
@@ -231,7 +231,7 @@ def test_planted_links_are_removed_soon_after_contrary_evidence() -> None:
     wrong = exp_se3([1.5, 0.3, 0.0, 0.0, 0.4, 0.0])
     for k in range(12, 16):
         planted = inverse(world.seen[k]) @ _moved(world, wrong) @ world.seen[k - 12]
-        run.apply(LinksMeasured(keyframe=k, links=(measured_link(k - 12, planted),)))
+        run.apply(LinksMeasured(keyframe=k, links=(make_link(k - 12, planted),)))
     assert [each.robot for each in run.of(Joined)] == ["a", "b"]
     later = 0
     while not run.of(LinkRemoved) and later < 20:
@@ -280,7 +280,7 @@ def test_a_robot_that_meets_in_the_second_of_equal_rooms_whom_it_met_in_the_firs
     for near in range(3 * steps):  # more than are ever compared at once
         k = first_b + near % steps
         other = (near % steps + near // steps) % steps
-        link = measured_link(other, inverse(world.seen[k]) @ inverse(shift) @ world.seen[other])
+        link = make_link(other, inverse(world.seen[k]) @ inverse(shift) @ world.seen[other])
         live_map.apply(LinksMeasured(keyframe=k, links=(link,)))
     assert live_map.alignment_of("b", 0).aligned  # type: ignore[union-attr]
     for number in range(steps):
@@ -421,7 +421,7 @@ def test_a_map_goes_on_from_the_version_that_it_became(joined: Run) -> None:
         again.apply(world.keyframe(drive, number))
         here = world.seen[offset + number]
         rows = sorted(range(newest), key=lambda row: _apart(world.seen[held[row]], here))[:3]
-        links = tuple(measured_link(row, inverse(here) @ world.seen[held[row]]) for row in rows)
+        links = tuple(make_link(row, inverse(here) @ world.seen[held[row]]) for row in rows)
         again.apply(LinksMeasured(keyframe=newest + number, links=links))
 
     assert [each.robot for each in again.of(Joined)] == ["c"]

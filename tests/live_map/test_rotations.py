@@ -8,7 +8,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from benchmarks.live.generated_drives import INFORMATION, GeneratedWorld, measured_link, straight
+from benchmarks.live.generated_drives import INFORMATION, GeneratedWorld, make_link, straight
 from rse_pf.backend.live_map.router import _check_keyframe, _request_of, _upgrade
 from rse_pf.errors import BadRequest, InternalError
 from rse_pf.geometry import Array, exp_se3, inverse, rigid, rigid_many
@@ -71,7 +71,7 @@ def test_a_rounded_pose_that_is_accepted_is_published_optimised_and_started_from
     T_exact = np.array([live_map.pose(i) for i in range(500)])
     for k in range(20, 500, 20):
         step = inverse(T_exact[k]) @ T_exact[k - 5]
-        live_map.apply(LinksMeasured(keyframe=k, links=(measured_link(k - 5, step),)))
+        live_map.apply(LinksMeasured(keyframe=k, links=(make_link(k - 5, step),)))
     version = live_map.to_version()
     data = encode_map(version)
     again = decode_map(data)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from rse_pf.recording.file_format import POINTS_SCHEMA, POSE_SCHEMA, SCHEMAS, encode_json
-from rse_pf.recording.poses import answered_pose, inverse, point_cloud, pose_in_frame
+from rse_pf.recording.poses import inverse, point_cloud, pose_in_frame, read_answered_pose
 from rse_pf.services.pnp import PnpReply
 from rse_pf.wire import Result, make_codec
 
@@ -57,7 +57,7 @@ def test_the_pose_of_an_answer_is_read_from_its_bytes(codec: str):
 
     data = make_codec(codec).encode(Result(id=1, reply=reply))
 
-    assert answered_pose(data, is_binary=codec == "bin") == pytest.approx(pose.tolist())
+    assert read_answered_pose(data, is_binary=codec == "bin") == pytest.approx(pose.tolist())
 
 
 @pytest.mark.parametrize(
@@ -67,7 +67,7 @@ def test_the_pose_of_an_answer_is_read_from_its_bytes(codec: str):
 def test_an_answer_without_a_pose_gives_none(codec: str, reply: object):
     data = make_codec(codec).encode(Result(id=1, reply=reply))
 
-    assert answered_pose(data, is_binary=codec == "bin") is None
+    assert read_answered_pose(data, is_binary=codec == "bin") is None
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,7 @@ from rse_pf.config import PlatformSettings
 from rse_pf.errors import UsageError
 from rse_pf.recording import writer as writer_module
 from rse_pf.recording.file_format import FileName
-from rse_pf.recording.writer import RecordingWriter, checked_folder, recorded
+from rse_pf.recording.writer import RecordingWriter, make_folder, with_recordings
 
 START = 1_700_000_000_000_000_000
 SECOND = 1_000_000_000
@@ -121,19 +121,19 @@ def test_a_folder_that_cannot_be_written_is_refused_in_one_line(tmp_path: Path, 
     (tmp_path / "file").write_text("")
 
     with pytest.raises(UsageError, match=message) as refused:
-        recorded(PlatformSettings(), tmp_path / folder)
+        with_recordings(PlatformSettings(), tmp_path / folder)
 
     assert refused.value.hint
     assert "\n" not in refused.value.message
 
 
 def test_a_folder_is_made_and_nothing_is_recorded_by_default(tmp_path: Path):
-    chosen = recorded(PlatformSettings(), tmp_path / "a" / "b")
+    chosen = with_recordings(PlatformSettings(), tmp_path / "a" / "b")
 
     assert chosen.recording.folder == str(tmp_path / "a" / "b")
-    assert checked_folder(tmp_path / "a" / "b").is_dir()
+    assert make_folder(tmp_path / "a" / "b").is_dir()
     assert names(tmp_path / "a" / "b") == []
-    assert recorded(PlatformSettings(), None) == PlatformSettings()
+    assert with_recordings(PlatformSettings(), None) == PlatformSettings()
 
 
 def test_the_name_of_a_file_says_when_and_where_it_was_begun():

@@ -12,7 +12,7 @@ from benchmarks.maps.services import (
     joined_poses,
     localise_row,
     origin_errors,
-    planted,
+    plant_wrong_links,
     robots_of,
 )
 from rse_pf.slam.map_merge import MergeOptions, merge_versions
@@ -44,7 +44,7 @@ def test_wrong_loops_change_the_error_by_less_than_a_tenth(recordings: Path, see
     versions = [robot.version for robot in robots.runs]
 
     clean = robots.ate_m(joined_poses(robots.runs, merge_versions(versions)))
-    merged = merge_versions(versions, propose=planted(0.1, seed))
+    merged = merge_versions(versions, propose=plant_wrong_links(0.1, seed))
 
     assert merged.joined == (0, 1, 2)
     assert robots.ate_m(joined_poses(robots.runs, merged)) <= 1.1 * clean

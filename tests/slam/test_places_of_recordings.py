@@ -14,7 +14,7 @@ from benchmarks.live.places import (
     kitchen_map,
     recall_rows,
     relocalise_row,
-    spaced,
+    space_out,
     verdicts_of,
     views_of,
 )
@@ -50,7 +50,7 @@ def test_no_keyframe_of_the_kitchen_is_larger_than_the_limit(kitchen):
 
 
 def test_the_vocabulary_of_rendered_worlds_finds_the_places_of_the_kitchen(kitchen):
-    dense = [kitchen[row] for row in spaced([view.T for view in kitchen], range(len(kitchen)))]
+    dense = [kitchen[row] for row in space_out([view.T for view in kitchen], range(len(kitchen)))]
 
     row = recall_rows(dense, kitchen[::3])[RED_KITCHEN]
 

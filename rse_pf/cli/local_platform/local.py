@@ -141,11 +141,11 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
         return _on_running(args, folder)
     require("local")
     from rse_pf.cli.local_platform.lan import chosen_address
-    from rse_pf.recording.writer import recorded
+    from rse_pf.recording.writer import with_recordings
 
     overrides = {"servers": args.servers, "port": args.port, "metrics_port": args.metrics_port}
     chosen = settings.replace(local={name: value for name, value in overrides.items() if value is not None})
-    chosen = recorded(_with_services(chosen, args), args.record)
+    chosen = with_recordings(_with_services(chosen, args), args.record)
     lan = chosen_address(args.lan)
     page = not args.no_page
     if args.foxglove:

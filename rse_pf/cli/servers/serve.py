@@ -19,7 +19,7 @@ from rse_pf.auth.trust_store import TrustStore
 from rse_pf.config import PlatformSettings, setting_rows
 from rse_pf.config.placement import ServerPlacement
 from rse_pf.errors import UsageError
-from rse_pf.recording.writer import recorded
+from rse_pf.recording.writer import with_recordings
 
 __all__ = ["add_arguments", "run"]
 
@@ -100,7 +100,7 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
         services["accept_weak_isolation"] = True
     chosen = settings.replace(serving=_given(args, _SETTINGS), services=services)
     if args.record is not None:
-        chosen = recorded(chosen, args.record)
+        chosen = with_recordings(chosen, args.record)
     placement = ServerPlacement.read(args.settings, chosen, **_given(args, _PLACEMENT))
     server_id = f"server-{os.getpid()}" if args.server_id is None else args.server_id
     if not 0 < len(server_id) <= 64 or not server_id.isprintable():

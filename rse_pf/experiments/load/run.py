@@ -29,7 +29,7 @@ from rse_pf.experiments.results.result_folder import (
     load_average,
     write_json,
 )
-from rse_pf.experiments.results.summary import answered_percent, percentiles, summarise
+from rse_pf.experiments.results.summary import percent_answered, percentiles, summarise
 from rse_pf.local.control.platform import LocalPlatform
 from rse_pf.terminal import show, show_page
 
@@ -87,8 +87,8 @@ def report_of(
     sent = max(1, len(result.commands))
     return {
         **summarise(result.commands),
-        "answered_percent": answered_percent(result.commands) or 0.0,
-        "answered_in_time_percent": answered_percent(result.commands, FAST_MS) or 0.0,
+        "answered_percent": percent_answered(result.commands) or 0.0,
+        "answered_in_time_percent": percent_answered(result.commands, FAST_MS) or 0.0,
         "in_time_ms": FAST_MS,
         "fps_per_robot": percentiles(_frame_rates(result.commands, options.fps)),
         "wrong_poses": result.wrong_poses,

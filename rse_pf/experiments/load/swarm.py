@@ -290,17 +290,17 @@ def records_of(rows: ResultRows, prefix: str) -> Iterator[CommandRecord]:
             robot=f"{prefix}-{int(number) + 1}",
             planned=round(planned, 6),
             sent=round(sent, 6),
-            answered=_known(answered, 6),
+            answered=_round_or_none(answered, 6),
             server=server,
             code=code,
             payload_bytes=int(size),
-            round_trip_ms=_known(1e3 * (answered - planned), 3) if code == "ok" else None,
-            up_ms=_known(up_ms, 3),
-            queue_ms=_known(queue_ms, 3),
-            compute_ms=_known(compute_ms, 3),
-            down_ms=_known(down_ms, 3),
+            round_trip_ms=_round_or_none(1e3 * (answered - planned), 3) if code == "ok" else None,
+            up_ms=_round_or_none(up_ms, 3),
+            queue_ms=_round_or_none(queue_ms, 3),
+            compute_ms=_round_or_none(compute_ms, 3),
+            down_ms=_round_or_none(down_ms, 3),
         )
 
 
-def _known(value: float, digits: int) -> float | None:
+def _round_or_none(value: float, digits: int) -> float | None:
     return None if math.isnan(value) else round(value, digits)

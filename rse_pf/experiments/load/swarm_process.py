@@ -42,7 +42,7 @@ __all__ = [
     "SwarmSpec",
     "is_right",
     "make_payloads",
-    "planned_s",
+    "plan_s",
     "run_swarm_process",
 ]  # fmt: skip
 
@@ -205,7 +205,7 @@ def is_right(problem: SolvedPayload, reply: Any) -> bool:
     return float(centres @ centres) <= _POSE_M**2 and cosine >= math.cos(_POSE_RAD)
 
 
-def planned_s(options: SwarmOptions, number: int, start_s: float, frame: int) -> float:
+def plan_s(options: SwarmOptions, number: int, start_s: float, frame: int) -> float:
     """Return when robot *number* sends *frame*: fixed before the run, spread evenly over the robots."""
     phase = (number * _PHASE) % 1.0
     return start_s + number * options.join_every_s + (frame + phase) / options.fps
@@ -262,7 +262,7 @@ class _Process:
             cpu_s = time.process_time() - self._cpu_s
             await asyncio.gather(*(robot.close() for robot in self._robots.values()))
             self._flush()
-            self.send(self._ended(cpu_s))
+            self.send(self._report_end(cpu_s))
         flushing.cancel()
         for task in list(self._tasks):
             task.cancel()
@@ -335,7 +335,7 @@ class _Process:
             self.send(self.rows)
             self.rows = ResultRows()
 
-    def _ended(self, cpu_s: float) -> SwarmEnded:
+    def _report_end(self, cpu_s: float) -> SwarmEnded:
         counts = Counter(wrong_poses=self.wrong_poses)
         for robot in self._robots.values():
             if robot.client is not None:
@@ -369,7 +369,7 @@ class _Robot:
         while not self._stopping:
             self.client = connect(
                 spec.url, token=self._token, codec=options.codec, settings=spec.session,
-                on_change=self._changed, random=jitter,
+                on_change=self._take_change, random=jitter,
             )  # fmt: skip
             try:
                 await self.client
@@ -377,7 +377,7 @@ class _Robot:
             except RsePfError as error:
                 process.report("join-failed", robot=self.name, code=error.code, why=error.message)
                 await asyncio.sleep(spec.session.reconnect_max_s)
-        first = planned_s(options, self._number, start_s, 0)
+        first = plan_s(options, self._number, start_s, 0)
         missed = max(0, math.ceil((time.monotonic() - first) * options.fps))
         if self._stopping:
             await self.close()
@@ -410,7 +410,7 @@ class _Robot:
             await self.client.close()
 
     def _plan(self, start_s: float, frame: int) -> None:
-        planned = planned_s(self._process.spec.options, self._number, start_s, frame)
+        planned = plan_s(self._process.spec.options, self._number, start_s, frame)
         loop = asyncio.get_running_loop()
         self._next = loop.call_at(planned, self._send, start_s, frame, planned)
 
@@ -422,7 +422,7 @@ class _Robot:
         sent = time.monotonic()
         try:
             self.client.post(
-                options.service, problem.payload, functools.partial(self._answered, identity, problem),
+                options.service, problem.payload, functools.partial(self._take_answer, identity, problem),
                 deadline_s=max(0.0, options.deadline_s - (sent - planned)), stream="pose", keep=options.keep,
             )  # fmt: skip
         except RsePfError as error:
@@ -433,7 +433,7 @@ class _Robot:
             self._has_joined = True
             process.report("robot-joined", robot=self.name, server=self.client.stats.server)
 
-    def _answered(self, identity: int, problem: SolvedPayload, event: Answered) -> None:
+    def _take_answer(self, identity: int, problem: SolvedPayload, event: Answered) -> None:
         times = self._waiting.pop(identity, None)
         if times is None:
             return  # the robot has left, and the command counts as lost
@@ -463,7 +463,7 @@ class _Robot:
     async def _token(self) -> str:
         return await self._process.token(self.name)
 
-    def _changed(self, what: str, why: str) -> None:
+    def _take_change(self, what: str, why: str) -> None:
         details = {"reason": why} if what == "link-lost" else {"server": why}
         self._process.report(what, robot=self.name, **details)
 

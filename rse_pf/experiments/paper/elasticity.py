@@ -37,9 +37,9 @@ __all__ = [
     "elasticity_figures",
     "elasticity_page",
     "emulated_cores",
+    "find_unjustified_scale_outs",
     "run_elasticity",
     "slowest_replacement_s",
-    "unjustified_scale_outs",
 ]
 
 _SHORT_BARS: Bars = {
@@ -375,9 +375,9 @@ def crashes(events: Sequence[Event]) -> list[dict[str, Any]]:
     return rows
 
 
-def slowest_replacement_s(found: Sequence[Mapping[str, Any]]) -> float | None:
+def slowest_replacement_s(replacements: Sequence[Mapping[str, Any]]) -> float | None:
     """Return the longest replacement time of `crashes`; None if there is none or one was never replaced."""
-    times = [crash["replaced_in_s"] for crash in found]
+    times = [crash["replaced_in_s"] for crash in replacements]
     return max(times) if times and None not in times else None
 
 
@@ -401,12 +401,12 @@ def busy_periods_before(
         sums[period] = [seconds + since, weighted + since * sample.cpu_percent]
     ended = math.floor((time_s + origin_s) / period_s + 1e-6)
     return [
-        sums[each][1] / sums[each][0] if each in sums and sums[each][0] > 0 else None
-        for each in range(ended - periods, ended)
+        sums[number][1] / sums[number][0] if number in sums and sums[number][0] > 0 else None
+        for number in range(ended - periods, ended)
     ]
 
 
-def unjustified_scale_outs(records: Records) -> list[str]:
+def find_unjustified_scale_outs(records: Records) -> list[str]:
     """Return a line for each scale-out for load that the samples before it do not justify."""
     parameters = parameters_of(records)
     wrong = []

@@ -174,7 +174,7 @@ class Harness:
 
     def busiest(self) -> Any:
         """Return the server with the most robots, an entry of `LocalPlatform.servers`."""
-        robots = {each.name: each.robots for each in self.samples[-1].servers} if self.samples else {}
+        robots = {row.name: row.robots for row in self.samples[-1].servers} if self.samples else {}
         servers = self.platform.servers
         if not servers:
             raise CommandFailed("no server is left", hint=f"look at {self.folder / 'platform'}/*.log")

@@ -24,7 +24,7 @@ from rse_pf.experiments.results.markdown import about_run, number, page, slashed
 from rse_pf.experiments.results.records import CommandRecord, Records, parameters_of, read_records
 from rse_pf.experiments.results.rerun import RERUN, rerun_plan
 from rse_pf.experiments.results.result_folder import RUN_FILES, finish_report, fresh_folder, load_average
-from rse_pf.experiments.results.summary import PAPER, ROUND_TRIP_PARTS, answered_percent, summary_of
+from rse_pf.experiments.results.summary import PAPER, ROUND_TRIP_PARTS, percent_answered, summary_of
 from rse_pf.local.faults.network_emulator import profile_named
 from rse_pf.terminal import show, show_page
 
@@ -124,7 +124,7 @@ def latency_figures(records: Records) -> dict[str, Any]:
         **{name: summary[name] for name in ROUND_TRIP_PARTS},
         "rest_ms_mean": _difference(trip["mean"], None if None in parts else sum(parts)),
         "over_the_link_ms_p50": _difference(trip["p50"], link_ms),
-        "answered_within_150_ms_percent": answered_percent(records.commands, 150.0),
+        "answered_within_150_ms_percent": percent_answered(records.commands, 150.0),
         "fps_per_robot": _frame_rates(records.commands),
         "against_paper": {
             name: _difference(summary[name]["mean"], PAPER[name]) for name in ("round_trip_ms", "compute_ms")
@@ -174,10 +174,10 @@ def _frame_rates(commands: Sequence[CommandRecord]) -> dict[str, float | None]:
         by_robot[command.robot].append(command)
     rates = []
     for own in by_robot.values():
-        planned = [each.planned for each in own]
+        planned = [record.planned for record in own]
         sending_s = max(planned) - min(planned)
         if sending_s > 0:  # n frames span n - 1 intervals
-            answered = sum(each.code == "ok" for each in own)
+            answered = sum(record.code == "ok" for record in own)
             rates.append(answered * (len(own) - 1) / len(own) / sending_s)
     if not rates:
         return {"mean": None, "least": None}

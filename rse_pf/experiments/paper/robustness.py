@@ -27,8 +27,8 @@ from rse_pf.experiments.results.rerun import RERUN, rerun_plan
 from rse_pf.experiments.results.result_folder import RUN_FILES, finish_report, fresh_folder, load_average
 from rse_pf.experiments.results.summary import (
     PAPER,
-    answered_percent,
     outage_figures,
+    percent_answered,
     percentiles,
     robots_on,
     summary_of,
@@ -39,11 +39,11 @@ from rse_pf.terminal import show
 __all__ = [
     "BARS",
     "RobustnessOptions",
-    "evened_out_s",
-    "missed_bars",
+    "find_missed_bars",
     "robustness_figures",
     "robustness_page",
     "run_robustness",
+    "time_until_even_s",
 ]
 
 FIGURE = "robustness.png"
@@ -147,7 +147,7 @@ async def _run(
 
 
 def _line(name: str, run: Mapping[str, Any]) -> str:
-    commands, outage, missed = run["commands"], run["gap_s"], missed_bars(run)
+    commands, outage, missed = run["commands"], run["gap_s"], find_missed_bars(run)
     return (
         f"{name:<15} {commands['sent']} commands, {commands['lost']} lost, {commands['twice']} twice, "
         f"{commands['failed']} failed; outage p50 {outage['p50']} s, p99 {outage['p99']} s; "
@@ -206,8 +206,8 @@ def robustness_figures(records: Records) -> dict[str, Any]:
         "commands": summary["commands"],
         "failures_by_code": summary["failures_by_code"],
         "wrong_poses": summary["wrong_poses"],
-        "answered_percent": answered_percent(records.commands),
-        "answered_within_1_s_percent": answered_percent(records.commands, 1000.0),
+        "answered_percent": percent_answered(records.commands),
+        "answered_within_1_s_percent": percent_answered(records.commands, 1000.0),
         "round_trip_ms": summary["round_trip_ms"],
         "gap_s": _outages(records, faults),
         "out_of_rotation_s": _out_of_rotation_s(records.events, faults),
@@ -221,7 +221,7 @@ def robustness_figures(records: Records) -> dict[str, Any]:
     return with_bars(figures, bars)
 
 
-def missed_bars(figures: Mapping[str, Any]) -> list[str]:
+def find_missed_bars(figures: Mapping[str, Any]) -> list[str]:
     """Return the figures that missed their targets."""
     return [name for name, bar in figures["bars"].items() if not bar["held"]]
 
@@ -261,7 +261,7 @@ def robustness_page(report: Mapping[str, Any]) -> str:
     )
 
 
-def evened_out_s(samples: Sequence[MonitorSample], since_s: float) -> float | None:
+def time_until_even_s(samples: Sequence[MonitorSample], since_s: float) -> float | None:
     """Return the time until the robots per healthy server were within 20 % of their mean, and stayed so.
 
     Seconds after *since_s*; None if that never happened.
@@ -299,11 +299,11 @@ def _scenario_figures(scenario: str, records: Records, faults: Sequence[Event]) 
     if scenario == "control-plane":
         return _adoption(records.events)
     if scenario == "wifi":
-        return _cut(records, faults)
+        return _measure_cut(records, faults)
     if scenario == "scale-out":
         new = [event for event in records.events if event["action"] == "server-healthy"]
         since = [float(event["time"]) for event in new if faults and event["time"] >= faults[0]["time"]]
-        return {"evened_out_s": evened_out_s(records.samples, since[-1]) if since else None}
+        return {"evened_out_s": time_until_even_s(records.samples, since[-1]) if since else None}
     if scenario == "random":
         return _growth(records.events)
     return {}
@@ -354,7 +354,7 @@ def _adoption(events: Sequence[Event]) -> dict[str, Any]:
     }
 
 
-def _cut(records: Records, faults: Sequence[Event]) -> dict[str, Any]:
+def _measure_cut(records: Records, faults: Sequence[Event]) -> dict[str, Any]:
     """Return the figures of a cut link: when both sides noticed, and the first answers after it healed."""
     healed = [float(event["time"]) for event in records.events if event["action"] == "healed"]
     noticed: dict[str, float] = {}
@@ -370,7 +370,7 @@ def _cut(records: Records, faults: Sequence[Event]) -> dict[str, Any]:
     return {
         "noticed_s": _spread(list(noticed.values())),
         "server_noticed_s": _after(records.events, "fault", "servers-empty")
-        or _emptied_s(records.samples, faults),
+        or _time_until_empty_s(records.samples, faults),
         "first_answer_after_heal_s": _spread(first),
         "stale_as_fresh": stale,
     }
@@ -381,7 +381,7 @@ def _spread(values: Sequence[float]) -> dict[str, Any]:
     return {name: figures[name] for name in ("n", "p50", "p99", "max")}
 
 
-def _emptied_s(samples: Sequence[MonitorSample], faults: Sequence[Event]) -> float | None:
+def _time_until_empty_s(samples: Sequence[MonitorSample], faults: Sequence[Event]) -> float | None:
     """Return the time from the fault until no server had a robot; None if that never happened."""
     for sample in samples:
         after = bool(faults) and sample.time >= faults[0]["time"]

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from rse_pf.errors import UsageError
-from rse_pf.experiments.paper.elasticity import elasticity_figures, unjustified_scale_outs
+from rse_pf.experiments.paper.elasticity import elasticity_figures, find_unjustified_scale_outs
 from rse_pf.experiments.paper.elasticity_as_cloud import KIND as AS_CLOUD
 from rse_pf.experiments.paper.elasticity_as_cloud import as_cloud_figures
 from rse_pf.experiments.paper.latency import latency_figures
@@ -106,14 +106,14 @@ def verify(folder: Path) -> list[FigureCheck]:
     """
     parts = report_folders(folder)
     if parts != [folder]:
-        return [_prefixed(part.name, check) for part in parts for check in verify(part)]
+        return [_prefix(part.name, check) for part in parts for check in verify(part)]
     report = read_report(folder)
     checks: list[FigureCheck] = []
     runs = run_folders(folder)
     for name, part in runs.items():
         reported = report if not name else report.get("runs", {}).get(name)
         if isinstance(reported, dict):
-            checks += [_prefixed(name, check) for check in _verify_run(part, reported)]
+            checks += [_prefix(name, check) for check in _verify_run(part, reported)]
         else:
             checks.append(FigureCheck(what=f"{name}: run", agrees=False, detail="is not in the report"))
     if "" not in runs:
@@ -144,7 +144,7 @@ def broken_invariants(records: Records) -> dict[str, str]:
         ),
     }
     if parameters_of(records)["kind"] == "elasticity":
-        wrong = unjustified_scale_outs(records)
+        wrong = find_unjustified_scale_outs(records)
         invariants["every scale-out follows the required busy samples"] = "; ".join(wrong)
     return invariants
 
@@ -172,7 +172,7 @@ _FROM_COMMANDS = {
 """Figures of an elasticity run that only its commands give."""
 
 
-def _prefixed(name: str, check: FigureCheck) -> FigureCheck:
+def _prefix(name: str, check: FigureCheck) -> FigureCheck:
     label = f"{name}: {check.what}" if name else check.what
     return FigureCheck(what=label, agrees=check.agrees, detail=check.detail)
 

@@ -75,7 +75,7 @@ def draw_latency(path: Path, figures: Mapping[str, Any], caption: str) -> None:
     figure, (bars, shares) = _pyplot().subplots(
         1, 2, figsize=(10.5, 4.8), layout="constrained", width_ratios=(1.1, 1.0)
     )
-    _stacked_bars(bars, figures)
+    _stack_bars(bars, figures)
     trip = figures["round_trip_ms"]
     names = ("p50", "p95", "p99", "max")
     values = [trip[name] or 0.0 for name in names]
@@ -213,7 +213,7 @@ def _round_trips(axis: Any, records: Records) -> None:
     done = [
         command for command in records.commands if command.code == "ok" and command.round_trip_ms is not None
     ]
-    edges, bins = _binned(done, records.commands)
+    edges, bins = _bin_commands(done, records.commands)
     middle = (edges[:-1] + edges[1:]) / 2
     for percent, colour, width in ((50, _BLUE, 1.6), (99, _ORANGE, 1.2)):
         values = [np.percentile([c.round_trip_ms or 0.0 for c in b], percent) if b else np.nan for b in bins]
@@ -263,11 +263,11 @@ def _server_number(name: str) -> tuple[int, str]:
     return (int(tail) if tail.isdigit() else 0, name)
 
 
-def _binned(
+def _bin_commands(
     commands: Sequence[CommandRecord], among: Sequence[CommandRecord]
 ) -> tuple[Any, list[list[CommandRecord]]]:
     """Return the edges of equal bins over the times of *among*, and the *commands* in each bin."""
-    planned = [each.planned for each in among] or [0.0, 1.0]
+    planned = [record.planned for record in among] or [0.0, 1.0]
     edges = np.linspace(min(planned), max(planned) + 1e-6, _BINS + 1)
     bins: list[list[CommandRecord]] = [[] for _ in range(_BINS)]
     for command in commands:
@@ -292,7 +292,7 @@ def _period_means(times: Sequence[float], values: Sequence[float], period_s: flo
 # --- latency and robustness ------------------------------------------------------------------
 
 
-def _stacked_bars(axis: Any, figures: Mapping[str, Any]) -> None:
+def _stack_bars(axis: Any, figures: Mapping[str, Any]) -> None:
     transmission = PAPER["round_trip_ms"] - PAPER["compute_ms"]
     axis.bar(0, transmission, color="#c9ced6", width=0.55, label=_TRANSMISSION)
     axis.bar(0, PAPER["compute_ms"], bottom=transmission, color=_PARTS_COLOURS["compute_ms"], width=0.55)

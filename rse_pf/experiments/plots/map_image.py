@@ -175,7 +175,7 @@ def _draw_path(draw: Any, view: _Observer, robot: RobotPath, colour: tuple[int, 
     line = [(float(x), float(y)) for x, y in view.project(robot.T_world_camera[:, :3, 3])]
     draw.line(line, fill=(255, 255, 255), width=9, joint="curve")
     draw.line(line, fill=colour, width=5, joint="curve")
-    for pose in _spaced(robot.T_world_camera):
+    for pose in _thin_out(robot.T_world_camera):
         _draw_camera(draw, view, pose, colour)
 
 
@@ -236,7 +236,7 @@ def _fitting(draw: Any, text: str, font: Any, max_px: float) -> str:
     return f"{text} ..."
 
 
-def _spaced(poses: Array) -> list[Array]:
+def _thin_out(poses: Array) -> list[Array]:
     """Return the first pose, and each that is far enough from the last one returned."""
     chosen = [poses[0]]
     for pose in poses[1:]:

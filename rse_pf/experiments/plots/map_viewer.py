@@ -98,7 +98,7 @@ def _draw(server: Any, version: MapVersion) -> None:
     server.scene.add_point_cloud(
         "/cloud", points=version.points[::every], colors=version.colours[::every], point_size=0.01
     )
-    robots = sorted({each.robot for each in version.keyframes})
+    robots = sorted({row.robot for row in version.keyframes})
     for keyframe in version.keyframes:
         T, camera = keyframe.T_world_camera, keyframe.camera
         x, y, z, w = to_quaternion(T[:3, :3])

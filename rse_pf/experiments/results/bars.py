@@ -16,10 +16,10 @@ def with_bars(figures: Mapping[str, Any], bars: Bars) -> dict[str, Any]:
 
     A figure without a value, None, does not hold.
     """
-    return {**figures, "bars": {name: _judged(figures, name, *bar) for name, bar in bars.items()}}
+    return {**figures, "bars": {name: _judge(figures, name, *bar) for name, bar in bars.items()}}
 
 
-def _judged(figures: Mapping[str, Any], name: str, bar: float, sense: str) -> dict[str, Any]:
+def _judge(figures: Mapping[str, Any], name: str, bar: float, sense: str) -> dict[str, Any]:
     value: Any = figures
     for step in name.split("/"):
         value = value[step]

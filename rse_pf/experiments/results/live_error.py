@@ -98,7 +98,7 @@ def live_figures(drives: Sequence[LiveDrive], version: MapVersion | None) -> dic
             )
             for drive in drives
         ],
-        "relocalisations": _summed(drive.end["relocalisations"] for drive in drives),
+        "relocalisations": _sum(drive.end["relocalisations"] for drive in drives),
         "keyframes_waiting": sum(drive.end["keyframes_waiting"] for drive in drives),
         "by_relocalisation": sum(frame["by"] == "relocalisation" for frame in given),
         "correction_ms": {
@@ -170,24 +170,24 @@ def alignment_errors(drives: Sequence[LiveDrive], version: MapVersion | None) ->
 
     The map is placed by the final trajectories; a robot without a truth, or not in the map, has no rows.
     """
-    final = [_matched(final_trajectory(drive, version), drive.truth) for drive in drives]
+    final = [_match_positions(final_trajectory(drive, version), drive.truth) for drive in drives]
     known = [pair for pair in final if pair is not None]
     if not known:
         return [(np.empty(0), np.empty(0)) for _ in drives]
     _, T = align(np.concatenate([pair[0] for pair in known]), np.concatenate([pair[1] for pair in known]))
-    found = []
+    errors = []
     for drive in drives:
         placed = [frame for frame in drive.frames if frame["T_map"] is not None]
         path = _trajectory(placed, "T_map")
         try:
             rows, truth_rows = associate(path, _truth(drive))
         except UsageError:
-            found.append((np.empty(0), np.empty(0)))
+            errors.append((np.empty(0), np.empty(0)))
             continue
         moved = path.positions[rows] @ T[:3, :3].T + T[:3, 3]
         distances = np.linalg.norm(moved - _truth(drive).positions[truth_rows], axis=1)
-        found.append((np.array([placed[row]["t"] for row in rows]), 100.0 * distances))
-    return found
+        errors.append((np.array([placed[row]["t"] for row in rows]), 100.0 * distances))
+    return errors
 
 
 def live_lines(live: Mapping[str, Any], robots: int) -> str:
@@ -255,7 +255,7 @@ def _join_frame(drive: LiveDrive) -> int | None:
     return next((row for row, frame in enumerate(drive.frames) if frame["by"] == "map"), None)
 
 
-def _matched(path: Trajectory, truth: Trajectory | None) -> tuple[Array, Array] | None:
+def _match_positions(path: Trajectory, truth: Trajectory | None) -> tuple[Array, Array] | None:
     """Return estimated and true positions ``(n, 3)``, or None if they do not match in time."""
     if truth is None:
         return None
@@ -267,7 +267,7 @@ def _matched(path: Trajectory, truth: Trajectory | None) -> tuple[Array, Array] 
 
 
 def _together_cm(paths: Iterable[Trajectory], drives: Sequence[LiveDrive]) -> float | None:
-    pairs = [_matched(path, drive.truth) for path, drive in zip(paths, drives, strict=True)]
+    pairs = [_match_positions(path, drive.truth) for path, drive in zip(paths, drives, strict=True)]
     known = [pair for pair in pairs if pair is not None]
     if not known or len(known) < len(pairs):
         return None
@@ -285,7 +285,7 @@ def _owners(drives: Sequence[LiveDrive]) -> list[str]:
     return list(dict.fromkeys(owner for _, owner in seen))
 
 
-def _summed(counts: Iterable[Mapping[str, int]]) -> dict[str, int]:
+def _sum(counts: Iterable[Mapping[str, int]]) -> dict[str, int]:
     total = Counter[str]()
     for count in counts:
         total.update(count)

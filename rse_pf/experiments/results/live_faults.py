@@ -167,7 +167,7 @@ def _new_owner_s(events: Sequence[Event]) -> float | None:
 
     From the fault, or from the release of the lease if its owner released it, to the next owner that serves.
     """
-    fault = next((each for each in events if each["action"] == "fault" and "owner" in each), None)
+    fault = next((entry for entry in events if entry["action"] == "fault" and "owner" in entry), None)
     if fault is None:
         return None
     waits, owner, gone_s = [], str(fault["owner"]), float(fault["time"])

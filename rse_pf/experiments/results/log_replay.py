@@ -67,7 +67,7 @@ def main() -> int:
     """Replay the log that the arguments name, and print what it holds as JSON."""
     objects, position = Path(sys.argv[1]), int(sys.argv[2])
     try:
-        logged = _replayed(objects, position)
+        logged = _replay(objects, position)
     except RsePfError as error:
         show(error.message)
         return _DAMAGED
@@ -75,7 +75,7 @@ def main() -> int:
     return 0
 
 
-def _replayed(objects: Path, position: int) -> LoggedMap:
+def _replay(objects: Path, position: int) -> LoggedMap:
     folder = map_folder(DEFAULT_TENANT, _MAP_NAME)
     log = _WholeLog(DirectoryStore(objects), folder, owner="", epoch=0)
     state = MapState(LIVE_MAP.empty(), 0)

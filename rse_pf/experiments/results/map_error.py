@@ -187,7 +187,7 @@ def merged_table(section: Mapping[str, Any]) -> list[str]:
 
 
 def _errors(robots: Sequence[JoinedRobot]) -> dict[str, Any]:
-    pairs = [_matched(robot) for robot in robots]
+    pairs = [_match_poses(robot) for robot in robots]
     if not robots or any(pair is None for pair in pairs):
         return {"ate_cm": None, "ate_before_cm": None, "ate_stiff_cm": None, "origins": []}
     known = [pair for pair in pairs if pair is not None]
@@ -213,7 +213,7 @@ def _errors(robots: Sequence[JoinedRobot]) -> dict[str, Any]:
     }
 
 
-def _matched(robot: JoinedRobot) -> tuple[Array, Array, Array] | None:
+def _match_poses(robot: JoinedRobot) -> tuple[Array, Array, Array] | None:
     """Return own, merged and true poses ``(n, 4, 4)`` of the frames whose truth is known."""
     if robot.truth is None:
         return None

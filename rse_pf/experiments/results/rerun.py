@@ -68,7 +68,7 @@ def rerun_figures(report: Mapping[str, Any], short: Mapping[str, Any]) -> list[F
     except (KeyError, TypeError, ValueError) as error:
         raise UsageError(f"the short form in the report is damaged: {error}", hint="restore it") from error
     return [
-        _reached(name, *limit, value=_at(short, name), reported=_at(report, name))
+        _check_bar(name, *limit, value=_at(short, name), reported=_at(report, name))
         for name, limit in limits.items()
     ]
 
@@ -80,7 +80,7 @@ def _limit(bar: str, slack: float) -> tuple[str, float]:
     return match[1], float(match[2]) * (slack if match[1] == "<=" else 1.0 / slack)
 
 
-def _reached(name: str, sense: str, limit: float, *, value: Any, reported: Any) -> FigureReached:
+def _check_bar(name: str, sense: str, limit: float, *, value: Any, reported: Any) -> FigureReached:
     is_reached = value is not None and (value <= limit if sense == "<=" else value >= limit)
     return FigureReached(
         name=name, value=value, bar=f"{sense} {limit:g}", reported=reported, is_reached=is_reached

@@ -67,11 +67,11 @@ def fresh_folder(folder: Path, written: Sequence[str]) -> Path:
         is_run = (folder / EVENTS).exists() or any(folder.glob(f"*/{EVENTS}"))
         if own != old or (old and not is_run):
             raise UsageError(f"{folder} holds other files", hint="name an empty folder with --out")
-        for each in old:
-            if each.is_dir() and not each.is_symlink():
-                shutil.rmtree(each)
+        for entry in old:
+            if entry.is_dir() and not entry.is_symlink():
+                shutil.rmtree(entry)
             else:
-                each.unlink()
+                entry.unlink()
     except OSError as error:
         raise UsageError(f"cannot write {folder}: {error.strerror}", hint="name another --out") from error
     return folder.resolve()

@@ -19,9 +19,9 @@ from rse_pf.experiments.results.records import CommandRecord, Records
 __all__ = [
     "PAPER",
     "ROUND_TRIP_PARTS",
-    "answered_percent",
     "longest_outages",
     "outage_figures",
+    "percent_answered",
     "percentiles",
     "robots_on",
     "summarise",
@@ -75,7 +75,7 @@ def summary_of(records: Records) -> dict[str, Any]:
     return summary
 
 
-def answered_percent(commands: Sequence[CommandRecord], within_ms: float | None = None) -> float | None:
+def percent_answered(commands: Sequence[CommandRecord], within_ms: float | None = None) -> float | None:
     """Return the share of commands with a result (at most *within_ms* after the plan); None without any."""
     if not commands:
         return None

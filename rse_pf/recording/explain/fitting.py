@@ -23,11 +23,11 @@ __all__ = [
     "Matches",
     "errors_px",
     "fit_of",
-    "fitted",
+    "fit_pose",
     "is_chance",
-    "refined",
+    "refine_pose",
     "robust_cost",
-    "solved",
+    "solve_or_refuse",
 ]
 
 _LAST_ROW = np.array([[0.0, 0.0, 0.0, 1.0]])
@@ -102,7 +102,7 @@ def fit_of(T_camera_world: Array, matches: Matches) -> Fit:
     return Fit(T_camera_world=T_camera_world, errors_px=errors, agrees=errors <= matches.tight_px)
 
 
-def fitted(
+def fit_pose(
     matches: Matches, *, iterations: int = _ITERATIONS, start: Array | None = None, polish: bool = False
 ) -> Fit | None:
     """Return the pose that most matches agree with, None if there is none.
@@ -127,14 +127,14 @@ def fitted(
     for pose in poses:
         tried = [fit_of(pose, matches)]
         if polish:
-            tried.append(fit_of(refined(pose, matches), matches))
-        for each in tried:
-            if best is None or each.count > best.count:
-                best = each
+            tried.append(fit_of(refine_pose(pose, matches), matches))
+        for trial in tried:
+            if best is None or trial.count > best.count:
+                best = trial
     return best
 
 
-def refined(T_camera_world: Array, matches: Matches) -> Array:
+def refine_pose(T_camera_world: Array, matches: Matches) -> Array:
     """Return the pose after iterated least squares with a Cauchy weight of ``tight_px``."""
     pose, camera = T_camera_world, matches.camera
     for _ in range(_REFINEMENTS):
@@ -177,7 +177,7 @@ def is_chance(n: int, count: int, tight_px: float, camera: Camera) -> bool:
     return count <= 3 or log10_false_alarms(n, count, tight_px**2, camera) > MAX_LOG10_FALSE_ALARMS
 
 
-def solved(matches: Matches, options: PnpOptions) -> PnpSolution | RsePfError:
+def solve_or_refuse(matches: Matches, options: PnpOptions) -> PnpSolution | RsePfError:
     """Return what the service answers to these matches, or its refusal."""
     try:
         return solve_pnp(matches.points, matches.pixels, matches.camera, options)

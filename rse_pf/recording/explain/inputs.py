@@ -18,7 +18,7 @@ from rse_pf.pnp import PnpOptions
 from rse_pf.recording.explain.causes import MatchesLike, PastCommand, ReplyLike, Timing
 from rse_pf.recording.explain.fitting import Matches
 
-__all__ = ["checked_history", "checked_matches", "checked_pose", "checked_reply", "checked_timing"]
+__all__ = ["check_history", "check_matches", "check_pose", "check_reply", "check_timing"]
 
 _TIGHT_PX = 3.0
 _USUAL_WIDTH_PX = 640.0
@@ -29,7 +29,7 @@ _MAX_S = 1e11
 _LONGEST_S = 1e5
 
 
-def checked_matches(matches: MatchesLike) -> tuple[Matches, PnpOptions]:
+def check_matches(matches: MatchesLike) -> tuple[Matches, PnpOptions]:
     """Return the finite rows, a thousand of them at most, and the options."""
     points = _rows(matches.points_world, 3)
     pixels = _rows(matches.pixels, 2)
@@ -69,7 +69,7 @@ def _depths(depths_m: Any, n: int) -> Array | None:
     return known
 
 
-def checked_pose(pose: Any) -> Array | None:
+def check_pose(pose: Any) -> Array | None:
     """Return a ``(4, 4)`` rigid pose, None if *pose* is none."""
     if pose is None:
         return None
@@ -77,26 +77,26 @@ def checked_pose(pose: Any) -> Array | None:
     return rigid(T.reshape(4, 4), _MAX_ABS) if T.size == 16 else None
 
 
-def checked_reply(reply: ReplyLike | None) -> ReplyLike | None:
+def check_reply(reply: ReplyLike | None) -> ReplyLike | None:
     """Return *reply*, None where its pose is no pose or its error no number."""
-    if reply is None or checked_pose(reply.T_camera_world) is None:
+    if reply is None or check_pose(reply.T_camera_world) is None:
         return None
     return reply if 0.0 <= reply.rmse_px <= _MAX_ABS else None
 
 
-def checked_history(history: Sequence[PastCommand] | None) -> tuple[PastCommand, ...]:
+def check_history(history: Sequence[PastCommand] | None) -> tuple[PastCommand, ...]:
     """Return the last commands, each without what is no pose."""
     return tuple(
         replace(
             past,
-            T_camera_world=checked_pose(past.T_camera_world),
-            T_odom_camera=checked_pose(past.T_odom_camera),
+            T_camera_world=check_pose(past.T_camera_world),
+            T_odom_camera=check_pose(past.T_odom_camera),
         )
         for past in (history or ())[-_MAX_HISTORY:]
     )
 
 
-def checked_timing(timing: Timing | None) -> Timing | None:
+def check_timing(timing: Timing | None) -> Timing | None:
     """Return *timing* without what is no time."""
     if timing is None:
         return None

@@ -14,7 +14,7 @@ import numpy as np
 from rse_pf.errors import InvalidCamera
 from rse_pf.geometry import Array, Camera, exp_se3, transform
 from rse_pf.recording.explain.causes import Cause, PoseExplanation
-from rse_pf.recording.explain.fitting import Fit, Mask, Matches, fitted
+from rse_pf.recording.explain.fitting import Fit, Mask, Matches, fit_pose
 
 __all__ = ["intrinsics"]
 
@@ -53,13 +53,13 @@ def intrinsics(matches: Matches, base: Fit | None, *, is_pair: bool) -> tuple[Po
     for camera, fit in starts:
         factor = camera.fx / matches.camera.fx
         for pair in (False, True) if is_pair and factor == 1.0 else (False,):
-            freed = _freed(matches, fit, math.log(factor), pair=pair)
+            freed = _free_camera(matches, fit, math.log(factor), pair=pair)
             if freed is not None and (best is None or freed.cost < best[0].cost):
                 best = (freed, pair)
     if best is None:
         return None
     freed, pair = best
-    return _judged(matches, base, freed, pair=pair)
+    return _judge(matches, base, freed, pair=pair)
 
 
 def _grid(matches: Matches, least: int) -> list[tuple[Camera, Fit]]:
@@ -73,7 +73,7 @@ def _grid(matches: Matches, least: int) -> list[tuple[Camera, Fit]]:
                 other = _camera(camera, factor, centre)
             except InvalidCamera:
                 continue
-            fit = fitted(replace(matches, camera=other), iterations=150)
+            fit = fit_pose(replace(matches, camera=other), iterations=150)
             if fit is not None and fit.count > max(least, _LEAST, 0 if best is None else best[1].count):
                 best = (other, fit)
     return [] if best is None else [best]
@@ -91,7 +91,7 @@ def _camera(camera: Camera, factor: float, centre: tuple[float, float]) -> Camer
     )  # fmt: skip
 
 
-def _freed(matches: Matches, fit: Fit, log_factor: float, *, pair: bool) -> _Freed | None:
+def _free_camera(matches: Matches, fit: Fit, log_factor: float, *, pair: bool) -> _Freed | None:
     """Fit pose, focal factor, principal point and one coefficient of radial distortion.
 
     The errors carry a Cauchy weight of ``tight_px``; the weak priors keep what the matches do not fix at 0.
@@ -214,7 +214,7 @@ def _project(matches: Matches, pose: Array, change: Array, *, pair: bool) -> Arr
     return np.array([u, v, z, x, y, z])
 
 
-def _judged(
+def _judge(
     matches: Matches, base: Fit | None, freed: _Freed, *, pair: bool
 ) -> tuple[PoseExplanation, int] | None:
     """Return the explanation if the other camera differs, is certain, and fits more or closer."""

@@ -11,9 +11,9 @@ import numpy.typing as npt
 from rse_pf.geometry import Array, pose_difference, transform
 from rse_pf.pnp.evidence import width_to_length
 from rse_pf.recording.explain.causes import Cause, PoseExplanation
-from rse_pf.recording.explain.fitting import Fit, Matches, fitted, is_chance, robust_cost
+from rse_pf.recording.explain.fitting import Fit, Matches, fit_pose, is_chance, robust_cost
 
-__all__ = ["distinct_rows", "duplicates", "line", "mirrored", "outliers", "plane", "stale_map"]
+__all__ = ["distinct_rows", "duplicates", "explain_mirror", "line", "outliers", "plane", "stale_map"]
 
 # Rows that agree to half a pixel and to half a centimetre say the same thing.
 _CELL_PX, _CELL_M = 0.5, 0.005
@@ -64,10 +64,10 @@ def duplicates(n: int, distinct: int, inliers: int) -> PoseExplanation | None:
     )
 
 
-def mirrored(matches: Matches, base: Fit | None) -> PoseExplanation | None:
+def explain_mirror(matches: Matches, base: Fit | None) -> PoseExplanation | None:
     """Return the explanation where the points fit clearly better after a reflection than as they are."""
     reflected = replace(matches, points=-matches.points)
-    fit = fitted(reflected, iterations=1000, polish=True)
+    fit = fit_pose(reflected, iterations=1000, polish=True)
     if fit is None or fit.count < _LEAST:
         return None
     count = 0 if base is None else base.count
@@ -172,7 +172,7 @@ def stale_map(matches: Matches, base: Fit) -> tuple[PoseExplanation, int] | None
     rest = matches.of(~base.agrees)
     if base.count < _LEAST or len(rest) < _LEAST:
         return None
-    second = fitted(rest, iterations=1000, polish=True)
+    second = fit_pose(rest, iterations=1000, polish=True)
     least = max(_LEAST, 0.3 * len(rest), 0.08 * len(matches))
     if second is None or second.count < least:
         return None

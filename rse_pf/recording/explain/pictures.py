@@ -26,7 +26,7 @@ def sharpness(thumbnail: bytes) -> Array | None:
     The directions are along the rows, along the columns, and both diagonals.  Blur along a direction lowers
     its number; brightness and contrast do not change it.  Pictures above 640x480 are refused undecoded.
     """
-    gray = _decoded(thumbnail)
+    gray = _decode(thumbnail)
     if gray is None:
         return None
     pictures = []
@@ -36,7 +36,7 @@ def sharpness(thumbnail: bytes) -> Array | None:
     return np.array(pictures)
 
 
-def _decoded(thumbnail: bytes) -> Array | None:
+def _decode(thumbnail: bytes) -> Array | None:
     try:
         from PIL import Image, UnidentifiedImageError
     except ImportError:

@@ -23,20 +23,20 @@ from rse_pf.recording.explain.causes import (
     Timing,
 )
 from rse_pf.recording.explain.clocks import late
-from rse_pf.recording.explain.fitting import Fit, Matches, fitted, solved
+from rse_pf.recording.explain.fitting import Fit, Matches, fit_pose, solve_or_refuse
 from rse_pf.recording.explain.inputs import (
-    checked_history,
-    checked_matches,
-    checked_pose,
-    checked_reply,
-    checked_timing,
+    check_history,
+    check_matches,
+    check_pose,
+    check_reply,
+    check_timing,
 )
 from rse_pf.recording.explain.intrinsics import intrinsics
 from rse_pf.recording.explain.matches import (
     distinct_rows,
     duplicates,
+    explain_mirror,
     line,
-    mirrored,
     outliers,
     plane,
     stale_map,
@@ -78,17 +78,17 @@ def explain(
         T_odom_camera: ``(4, 4)``, the robot's own odometry at the frame.
     """
     with np.errstate(all="ignore"):
-        return _ranked(
-            matches, checked_reply(reply), thumbnail, checked_history(history), checked_timing(timing),
-            checked_pose(T_odom_camera),
+        return _rank(
+            matches, check_reply(reply), thumbnail, check_history(history), check_timing(timing),
+            check_pose(T_odom_camera),
         )  # fmt: skip
 
 
-def _ranked(
+def _rank(
     matches: MatchesLike, reply: ReplyLike | None, thumbnail: bytes | None, history: Sequence[PastCommand],
     timing: Timing | None, T_odom_camera: Array | None,
 ) -> list[PoseExplanation]:  # fmt: skip
-    rows, options = checked_matches(matches)
+    rows, options = check_matches(matches)
     found_late, missing = late(timing)
     thumbnails = [past.thumbnail for past in history if past.thumbnail is not None]
     usual = [past.matches for past in history if past.matches]
@@ -120,15 +120,15 @@ def _by_matches(
 ) -> tuple[list[PoseExplanation], tuple[str, ...]]:  # fmt: skip
     """Return what the matches and the motion show, and what was missing for it."""
     distinct = rows.of(distinct_rows(rows))
-    start = None if reply is None else checked_pose(reply.T_camera_world)
-    base = fitted(distinct, iterations=1000, start=start, polish=True)
+    start = None if reply is None else check_pose(reply.T_camera_world)
+    base = fit_pose(distinct, iterations=1000, start=start, polish=True)
     count = 0 if base is None else base.count
-    is_pair = rows.depths_m is not None or _seen_from_origin(distinct)
+    is_pair = rows.depths_m is not None or _is_camera_frame(distinct)
     explanations: list[PoseExplanation | None] = [
         duplicates(len(rows), len(distinct), count),
         line(rows, base if len(distinct) >= _LEAST_ROWS else None),
     ]
-    reflected = mirrored(distinct, base)
+    reflected = explain_mirror(distinct, base)
     if reflected is not None:
         return [explanation for explanation in (*explanations, reflected) if explanation is not None], ()
     if count < _HEALTHY_SHARE * len(distinct):
@@ -165,7 +165,7 @@ def _rivals(
     tried = [row_order(rows, base, priors), intrinsics(rows, base, is_pair=is_pair)]
     if base is not None:
         tried.append(stale_map(rows, base))
-    rivals = sorted((each for each in tried if each is not None), key=lambda each: -each[1])
+    rivals = sorted((trial for trial in tried if trial is not None), key=lambda each: -each[1])
     result: list[PoseExplanation | None] = [outliers(rows, base)]
     for place, (explanation, explained) in enumerate(rivals):
         lower = 0.0 if place == 0 else 0.15 + 0.3 * (rivals[0][1] - explained) / len(rows)
@@ -174,7 +174,7 @@ def _rivals(
     return result
 
 
-def _seen_from_origin(rows: Matches) -> bool:
+def _is_camera_frame(rows: Matches) -> bool:
     """Return whether the world looks like a reference camera: all points lie in its image."""
     points = rows.points
     if float(np.mean(points[:, 2] > 0.05)) < 0.98:
@@ -194,7 +194,7 @@ def _seen_from_origin(rows: Matches) -> bool:
 
 def _weakness(rows: Matches, options: PnpOptions, reply: ReplyLike | None) -> tuple[str, float]:
     """Return why the pose is weak or was refused, and the deviation of its position, metres."""
-    answer = solved(rows, options)
+    answer = solve_or_refuse(rows, options)
     if isinstance(answer, RsePfError):
         return (answer.code if reply is None else reply.reason), math.inf
     assert isinstance(answer, PnpSolution)
@@ -209,7 +209,7 @@ def _nothing_found(rows: Matches, reply: ReplyLike | None) -> PoseExplanation:
         text = f"only {n} of {n + rows.left_out} rows hold usable numbers, and a pose needs {_LEAST_ROWS}"
         return PoseExplanation(cause=Cause.UNKNOWN, confidence=0.5, sentence=text, evidence=evidence)
     if reply is None:
-        fit = fitted(rows)
+        fit = fit_pose(rows)
         count = 0 if fit is None else fit.count
         evidence["inliers"] = float(count)
         text = (

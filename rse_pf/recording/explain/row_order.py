@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from rse_pf.geometry import Array, Camera, transform
 from rse_pf.recording.explain.causes import Cause, PoseExplanation
-from rse_pf.recording.explain.fitting import Fit, Mask, Matches, fit_of, fitted, is_chance
+from rse_pf.recording.explain.fitting import Fit, Mask, Matches, fit_of, fit_pose, is_chance
 
 __all__ = ["row_order"]
 
@@ -34,36 +34,41 @@ def row_order(
     count = 0 if base is None else base.count
     best: tuple[float, Fit, str] | None = None
     for fit, how in _candidates(matches, base, priors):
-        found = _found_elsewhere(matches, fit)
-        if best is None or found > best[0]:
-            best = (found, fit, how)
-        if found > max(_LEAST, _CLEAR_SHARE * np.count_nonzero(~fit.agrees)):
+        explained = _count_elsewhere(matches, fit)
+        if best is None or explained > best[0]:
+            best = (explained, fit, how)
+        if explained > max(_LEAST, _CLEAR_SHARE * np.count_nonzero(~fit.agrees)):
             break
     if best is None:
         return None
-    found, fit, how = best
+    explained, fit, how = best
     own = int(np.count_nonzero(fit.agrees))
     strays = len(matches) - own
     expected = _by_chance(matches, strays)
-    if found < _LEAST or found < _LEAST_SHARE * strays or found < 3.0 * expected or own + found < 1.3 * count:
+    if (
+        explained < _LEAST
+        or explained < _LEAST_SHARE * strays
+        or explained < 3.0 * expected
+        or own + explained < 1.3 * count
+    ):
         return None
-    if is_chance(len(matches), int(own + found - expected), matches.tight_px, matches.camera):
+    if is_chance(len(matches), int(own + explained - expected), matches.tight_px, matches.camera):
         return None
     shift, with_shift = _shift_of(matches, fit)
-    steady = with_shift > 0.5 * found
+    steady = with_shift > 0.5 * explained
     text = f", most of them {abs(shift)} row(s) {'later' if shift > 0 else 'earlier'}" if steady else ""
     return PoseExplanation(
         cause=Cause.ROW_ORDER,
-        confidence=min(0.96, 0.72 + 0.25 * found / max(1, strays)),
+        confidence=min(0.96, 0.72 + 0.25 * explained / max(1, strays)),
         sentence=(
-            f"{found:.0f} of {strays} points that miss their pixel find one in another row{text}: points and "
-            f"pixels are out of step ({how})"
+            f"{explained:.0f} of {strays} points that miss their pixel find one in another row{text}: "
+            f"points and pixels are out of step ({how})"
         ),
         evidence={
-            "found_elsewhere": float(found), "by_chance": expected, "agree_in_their_row": float(own),
+            "found_elsewhere": float(explained), "by_chance": expected, "agree_in_their_row": float(own),
             "row_shift": float(shift) if steady else 0.0,
         },
-    ), int(own + found)  # fmt: skip
+    ), int(own + explained)  # fmt: skip
 
 
 def _candidates(matches: Matches, base: Fit | None, priors: Sequence[Array]) -> Iterator[tuple[Fit, str]]:
@@ -75,16 +80,16 @@ def _candidates(matches: Matches, base: Fit | None, priors: Sequence[Array]) -> 
     orders = [(np.roll(rows, -shift), f"shifted by {shift}") for shift in _SHIFTS]
     orders.append((rows[::-1], "in reverse order"))
     for order, how in orders:
-        fit = fitted(_reordered(matches, order), iterations=150)
+        fit = fit_pose(_reorder(matches, order), iterations=150)
         if fit is not None and not is_chance(n, fit.count, matches.tight_px, matches.camera):
             yield fit_of(fit.T_camera_world, matches), how
     for prior in priors:
-        fit = _aligned_sets(matches, prior)
+        fit = _align_sets(matches, prior)
         if fit is not None:
             yield fit, "the robot's past gives the pose"
 
 
-def _reordered(matches: Matches, order: Rows) -> Matches:
+def _reorder(matches: Matches, order: Rows) -> Matches:
     other = matches.of(np.arange(len(matches)))
     return Matches(
         points=other.points, pixels=matches.pixels[order], camera=matches.camera,
@@ -92,19 +97,19 @@ def _reordered(matches: Matches, order: Rows) -> Matches:
     )  # fmt: skip
 
 
-def _projected(T_camera_world: Array, points: Array, camera: Camera) -> tuple[Array, Mask]:
+def _project(T_camera_world: Array, points: Array, camera: Camera) -> tuple[Array, Mask]:
     seen = transform(T_camera_world, points)
     front = seen[:, 2] > 0.05
     seen[~front, 2] = 1.0
     return camera.project(seen), front
 
 
-def _found_elsewhere(matches: Matches, fit: Fit) -> float:
+def _count_elsewhere(matches: Matches, fit: Fit) -> float:
     """Return how many points that miss their own pixel have another stray pixel, each pixel used once."""
     strays = np.flatnonzero(~fit.agrees)
     if not len(strays):
         return 0.0
-    projected, front = _projected(fit.T_camera_world, matches.points[strays], matches.camera)
+    projected, front = _project(fit.T_camera_world, matches.points[strays], matches.camera)
     nearest, distance = _nearest(projected, matches.pixels[strays])
     hits = front & (distance <= matches.tight_px)
     return float(len(np.unique(nearest[hits])))
@@ -127,7 +132,7 @@ def _by_chance(matches: Matches, strays: int) -> float:
 def _shift_of(matches: Matches, fit: Fit) -> tuple[int, int]:
     """Return the most common distance in rows between a point and its pixel, and how often it occurs."""
     strays = np.flatnonzero(~fit.agrees)
-    projected, front = _projected(fit.T_camera_world, matches.points[strays], matches.camera)
+    projected, front = _project(fit.T_camera_world, matches.points[strays], matches.camera)
     nearest, distance = _nearest(projected, matches.pixels[strays])
     hits = front & (distance <= matches.tight_px)
     if not hits.any():
@@ -137,10 +142,10 @@ def _shift_of(matches: Matches, fit: Fit) -> tuple[int, int]:
     return int(values[most]), int(counts[most])
 
 
-def _aligned_sets(matches: Matches, prior: Array) -> Fit | None:
+def _align_sets(matches: Matches, prior: Array) -> Fit | None:
     """Return the pose that brings all points onto pixels, whatever their rows, starting near *prior*."""
     camera = matches.camera
-    projected, front = _projected(prior, matches.points, camera)
+    projected, front = _project(prior, matches.points, camera)
     inside = (
         front
         & (np.abs(projected[:, 0] - camera.cx) < camera.width)
@@ -165,11 +170,11 @@ def _aligned_sets(matches: Matches, prior: Array) -> Fit | None:
             inlier_px=matches.inlier_px, tight_px=max(matches.tight_px, window_px / 4.0), depths_m=None,
             left_out=0,
         )  # fmt: skip
-        found = fitted(paired, polish=window_px < 15.0)
-        if found is None:
+        fit_of_pairs = fit_pose(paired, polish=window_px < 15.0)
+        if fit_of_pairs is None:
             return None
-        fit = fit_of(found.T_camera_world, matches)
-        moved, front = _projected(found.T_camera_world, points, camera)
+        fit = fit_of(fit_of_pairs.T_camera_world, matches)
+        moved, front = _project(fit_of_pairs.T_camera_world, points, camera)
     return fit
 
 

@@ -69,11 +69,11 @@ def case_parts(
     commands = [*(past for past in history if past.id.startswith(f"{connection}:")), command]
     start_ns = min(recorded.sent_ns for recorded in commands)
     parts: list[CasePart] = []
-    for each in commands:
+    for earlier in commands:
         try:
-            parts += _parts(each, start_ns, resolver)
+            parts += _parts(earlier, start_ns, resolver)
         except RsePfError as error:
-            if each is command:
+            if earlier is command:
                 raise BadRequest(
                     f"this command cannot be exported: {error.message}", hint="only those of pnp can be"
                 ) from error
@@ -162,10 +162,10 @@ def _parts(command: RecordedCommand, start_ns: int, resolver: Resolver) -> list[
     sent_ns = command.sent_ns - start_ns
     number = command.command.id
     mark = f"{_CONNECTION}:{number}"
-    found = []
+    parts = []
     if command.odometry is not None:
         pose = command.odometry
-        found.append(
+        parts.append(
             CasePart(
                 kind="odometry", time_ns=sent_ns,
                 data=file_format.encode_json({
@@ -182,15 +182,15 @@ def _parts(command: RecordedCommand, start_ns: int, resolver: Resolver) -> list[
         if data:
             image = {"command": mark, "timestamp": {"sec": 0, "nsec": 0}, "frame_id": _ROBOT}
             image |= {"format": "jpeg", "data": data}
-            found.append(CasePart(kind="frames", time_ns=sent_ns, data=file_format.encode_json(image)))
+            parts.append(CasePart(kind="frames", time_ns=sent_ns, data=file_format.encode_json(image)))
     encode = make_codec(command.codec).encode
     asked = encode(_nameless_command(command.command))
-    found.append(CasePart(kind="up", time_ns=sent_ns, data=asked))
+    parts.append(CasePart(kind="up", time_ns=sent_ns, data=asked))
     reply = command.reply
     if reply is not None and command.answered_ns is not None:
         answered = encode(_nameless_reply(reply, replace(command, command_bytes=asked), resolver))
-        found.append(CasePart(kind="down", time_ns=command.answered_ns - start_ns, data=answered))
-    return found
+        parts.append(CasePart(kind="down", time_ns=command.answered_ns - start_ns, data=answered))
+    return parts
 
 
 def _nameless_command(command: Command) -> Command:

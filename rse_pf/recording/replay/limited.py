@@ -151,25 +151,25 @@ def replayer(configuration: str) -> Handler:
     def answer(data: bytes) -> bytes:
         order = msgspec.msgpack.decode(data, type=_Order)
         path = Path(order.path)
-        found: Any
+        reply: Any
         if order.do == "overview":
-            found = run.overview(
+            reply = run.overview(
                 path, settings, solve=order.solve, overrides=order.overrides, worst=order.worst,
                 explain=order.explain,
             )  # fmt: skip
         elif order.do == "report":
-            found = run.report(
+            reply = run.report(
                 path, settings, order.identity, order.overrides, with_picture=order.with_picture
             )
         elif order.do == "case":
-            found = run.case_of(path, settings, order.identity)
+            reply = run.case_of(path, settings, order.identity)
         elif order.do == "find":
-            found = run.find(
+            reply = run.find(
                 path, settings, trace=order.trace, number=order.number, near_s=order.near_s,
                 command_bytes=order.command_bytes,
             )  # fmt: skip
         else:
             raise BadMessage(f"no order {order.do!r}")
-        return msgspec.msgpack.encode(found)
+        return msgspec.msgpack.encode(reply)
 
     return answer

@@ -60,7 +60,7 @@ def html_page(
 ) -> str:
     """Return the page of *reports*, below the table of *overview* if there is one."""
     parts = [_overview(overview)] if overview is not None else []
-    parts += [_report(each) for each in reports]
+    parts += [_report(report) for report in reports]
     return (
         "<!doctype html>\n"
         '<html lang="en">\n<head>\n<meta charset="utf-8">\n'
@@ -73,27 +73,27 @@ def html_page(
 
 
 def _overview(seen: Overview) -> str:
-    told = [
+    lines = [
         f"{counted(seen.commands, 'command')} of {counted(seen.robots, 'robot')} in {seen.seconds:.1f} s",
         f"{counted(seen.files, 'file')}",
     ]
     if seen.cut:
-        told.append(f"{counted(len(seen.cut), 'file')} cut off, read up to the last whole chunk")
+        lines.append(f"{counted(len(seen.cut), 'file')} cut off, read up to the last whole chunk")
     if seen.was_solved:
-        told.append(f"solved again: {seen.equal} equal to the byte, {seen.different} different")
+        lines.append(f"solved again: {seen.equal} equal to the byte, {seen.different} different")
     rows = [
         [
-            each.kind,
-            f"<code>{_text(each.id)}</code>",
-            _text(each.robot),
-            _text(each.what),
-            _first_cause(seen, each.id),
+            trouble.kind,
+            f"<code>{_text(trouble.id)}</code>",
+            _text(trouble.robot),
+            _text(trouble.what),
+            _first_cause(seen, trouble.id),
         ]
-        for each in seen.troubles
+        for trouble in seen.troubles
     ]
     table = _table(["what", "command", "robot", "what was seen", "likeliest cause"], rows)
     by_kind = ", ".join(f"{count} {_text(kind)}" for kind, count in seen.by_kind.items()) or "nothing"
-    return f'<p class="pale">{_text("; ".join(told))}</p>\n<h2>What went wrong: {by_kind}</h2>\n{table}'
+    return f'<p class="pale">{_text("; ".join(lines))}</p>\n<h2>What went wrong: {by_kind}</h2>\n{table}'
 
 
 def _first_cause(seen: Overview, identity: str) -> str:
@@ -138,31 +138,31 @@ def _equality(seen: CommandReport) -> str:
 
 
 def _circumstances(seen: CommandReport) -> str:
-    told = [f"{seen.robot} on {seen.server}" if seen.server else seen.robot, f"service {seen.service}"]
+    lines = [f"{seen.robot} on {seen.server}" if seen.server else seen.robot, f"service {seen.service}"]
     if seen.sent_s > 86400.0:
         when = datetime.fromtimestamp(min(seen.sent_s, 4e9), timezone.utc)
-        told.append(when.strftime("%Y-%m-%d %H:%M:%S UTC"))
+        lines.append(when.strftime("%Y-%m-%d %H:%M:%S UTC"))
     if seen.round_trip_ms is not None:
-        told.append(
+        lines.append(
             f"{seen.round_trip_ms:.1f} ms ({seen.queue_ms:.1f} ms in the queue, "
             f"{seen.compute_ms:.1f} ms of work)"
         )
-    told.append(f"{seen.command_bytes} bytes up and {seen.reply_bytes} down, codec {seen.codec}")
+    lines.append(f"{seen.command_bytes} bytes up and {seen.reply_bytes} down, codec {seen.codec}")
     if seen.version:
-        told.append(f"rse-pf {seen.version}")
-    return "; ".join(told)
+        lines.append(f"rse-pf {seen.version}")
+    return "; ".join(lines)
 
 
 def _causes(seen: CommandReport) -> str:
     if not seen.causes:
         return ""
     parts = ["<h3>Why</h3>\n"]
-    for each in seen.causes:
-        numbers = ", ".join(f"{name} {_number(value)}" for name, value in each.evidence.items())
+    for cause in seen.causes:
+        numbers = ", ".join(f"{name} {_number(value)}" for name, value in cause.evidence.items())
         parts.append(
-            f'<div class="cause"><p><strong>{_text(each.cause)}</strong> '
-            f'<span class="pale">(confidence {each.confidence:.2f})</span></p>'
-            f'<p>{_text(each.sentence)}</p><p class="pale">{_text(numbers)}</p></div>\n'
+            f'<div class="cause"><p><strong>{_text(cause.cause)}</strong> '
+            f'<span class="pale">(confidence {cause.confidence:.2f})</span></p>'
+            f'<p>{_text(cause.sentence)}</p><p class="pale">{_text(numbers)}</p></div>\n'
         )
     if seen.causes[0].missing:
         parts.append(f'<p class="pale">Not recorded: {_text("; ".join(seen.causes[0].missing))}.</p>\n')
@@ -173,12 +173,14 @@ def _picture(seen: CommandReport) -> str:
     if not seen.picture_png:
         return ""
     on = "the thumbnail of the frame" if seen.has_thumbnail else "an empty image: no thumbnail was recorded"
-    told = f"{seen.inliers} inliers of {seen.matches} matches" if seen.inliers else f"{seen.matches} matches"
+    caption = (
+        f"{seen.inliers} inliers of {seen.matches} matches" if seen.inliers else f"{seen.matches} matches"
+    )
     data = base64.b64encode(seen.picture_png).decode()
     return (
-        f'<h3>The matches</h3>\n<figure><img alt="{_text(told)}" src="data:image/png;base64,{data}">'
-        f"<figcaption>{_text(told)}, on {on}. Blue dots agree with the pose, orange crosses do not; a line "
-        "leads from a match to where the pose puts its point.</figcaption></figure>\n"
+        f'<h3>The matches</h3>\n<figure><img alt="{_text(caption)}" src="data:image/png;base64,{data}">'
+        f"<figcaption>{_text(caption)}, on {on}. Blue dots agree with the pose, orange crosses do not; a "
+        "line leads from a match to where the pose puts its point.</figcaption></figure>\n"
     )
 
 
@@ -254,17 +256,17 @@ def _rules(rules: Sequence[Rule]) -> str:
     if not rules:
         return ""
     rows = []
-    for each in rules:
-        says = "kept" if each.is_kept else ("refuses" if each.refuses else "weak")
-        relation = "at least" if each.at_least else "at most"
+    for rule in rules:
+        says = "kept" if rule.is_kept else ("refuses" if rule.refuses else "weak")
+        relation = "at least" if rule.at_least else "at most"
         rows.append(
             [
-                f'<span class="{"good" if each.is_kept else "bad"}">{says}</span>',
-                _text(each.name),
-                _text(each.about),
-                f"{_number(each.measured)} {_text(each.unit)}",
-                f"{relation} {_number(each.limit)} {_text(each.unit)}",
-                "" if math.isinf(each.margin) or each.margin > 1e4 else f"{each.margin:.2g}x",
+                f'<span class="{"good" if rule.is_kept else "bad"}">{says}</span>',
+                _text(rule.name),
+                _text(rule.about),
+                f"{_number(rule.measured)} {_text(rule.unit)}",
+                f"{relation} {_number(rule.limit)} {_text(rule.unit)}",
+                "" if math.isinf(rule.margin) or rule.margin > 1e4 else f"{rule.margin:.2g}x",
             ]
         )
     head = ["rule", "reason", "what is measured", "measured", "limit", "margin"]
@@ -275,13 +277,14 @@ def _attempts(title: str, first: str, attempts: Sequence[Attempt], seen: Command
     if not attempts:
         return ""
     rows = []
-    for each in attempts:
+    for attempt in attempts:
         moved = ""
-        if each.moved_m is not None and each.moved_deg is not None:
-            moved = f"{_number(1e3 * each.moved_m)} mm, {_number(each.moved_deg)} deg"
-        name = each.name or (seen.tried_name if seen is not None else "")
-        numbers = [str(each.inliers), f"{each.rmse_px:.2f}"] if each.inliers else ["", ""]
-        verdict = f'<span class="{_colour(each.verdict)}">{_text(_verdict(each.verdict, each.reason))}</span>'
+        if attempt.moved_m is not None and attempt.moved_deg is not None:
+            moved = f"{_number(1e3 * attempt.moved_m)} mm, {_number(attempt.moved_deg)} deg"
+        name = attempt.name or (seen.tried_name if seen is not None else "")
+        numbers = [str(attempt.inliers), f"{attempt.rmse_px:.2f}"] if attempt.inliers else ["", ""]
+        words = _text(_verdict(attempt.verdict, attempt.reason))
+        verdict = f'<span class="{_colour(attempt.verdict)}">{words}</span>'
         rows.append([f"<code>{_text(name)}</code>", verdict, *numbers, moved])
     head = [first, "verdict", "inliers", "rmse px", "apart from the recorded pose"]
     return f"<h3>{_text(title)}</h3>\n{_table(head, rows)}"

@@ -56,7 +56,7 @@ def match_picture(
     image = image_module.new("RGB", size, _BACKGROUND)
     if thumbnail is not None:
         try:
-            frame = _opened(thumbnail).convert("L").convert("RGB").resize(size)
+            frame = _decode(thumbnail).convert("L").convert("RGB").resize(size)
             image = image_module.blend(frame, image_module.new("RGB", size, _PALE), 0.35)
         except BadRequest:
             pass
@@ -87,7 +87,7 @@ def plain_thumbnail(thumbnail: bytes) -> bytes:
     Raises:
         BadRequest: It is no JPEG, or larger than thumbnails are.
     """
-    image = _opened(thumbnail)
+    image = _decode(thumbnail)
     image.info.clear()
     file = io.BytesIO()
     try:
@@ -116,7 +116,7 @@ def _draw_lines(draw: Any, seen: Array, projected: Array, agrees: npt.NDArray[np
         draw.line((x, y, u, v), fill=INLIER if is_inlier else MOVED, width=1)
 
 
-def _opened(thumbnail: bytes) -> Any:
+def _decode(thumbnail: bytes) -> Any:
     """Return the decoded image; raises BadRequest if it is no small JPEG."""
     image_module, _ = _pillow()
     if len(thumbnail) > _MAX_THUMBNAIL_BYTES:

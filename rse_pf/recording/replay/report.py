@@ -65,12 +65,12 @@ class CauseFound(msgspec.Struct, frozen=True, kw_only=True):
     missing: tuple[str, ...] = ()
 
     @classmethod
-    def of(cls, found: PoseExplanation) -> CauseFound:
-        """Return *found* as a value that travels between processes."""
-        numbers = {name: _plain(value) for name, value in found.evidence.items()}
+    def of(cls, explanation: PoseExplanation) -> CauseFound:
+        """Return *explanation* as a value that travels between processes."""
+        numbers = {name: _plain(value) for name, value in explanation.evidence.items()}
         return cls(
-            cause=found.cause.value, confidence=_plain(found.confidence), sentence=found.sentence,
-            evidence=numbers, missing=tuple(found.missing),
+            cause=explanation.cause.value, confidence=_plain(explanation.confidence),
+            sentence=explanation.sentence, evidence=numbers, missing=tuple(explanation.missing),
         )  # fmt: skip
 
 

@@ -127,7 +127,7 @@ class Resolver:
         if engine not in self._engines and not overrides.engine:
             return Again(why_not=f"the engine {engine} that solved it is not on this machine")
         if overrides.changes and command.service == _POSES_SERVICE:
-            answer = self._tried(command, overrides, engine)
+            answer = self._try(command, overrides, engine)
         else:
             registry = self._registry(engine if engine in self._engines else self._engines[0], free=False)
             answer = dispatch(registry, command, self._clock)
@@ -177,7 +177,7 @@ class Resolver:
                 return engine
         return self.default_engine
 
-    def _tried(self, command: Command, overrides: Overrides, engine: str) -> Result | Failure:
+    def _try(self, command: Command, overrides: Overrides, engine: str) -> Result | Failure:
         registry = self._registry(engine if engine in self._engines else self._engines[0], free=True)
         try:
             request = request_of(command.payload, registry.get(_POSES_SERVICE))

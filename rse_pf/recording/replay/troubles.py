@@ -74,12 +74,12 @@ class RobotHistory:
         """Return the worst that went wrong with *command*, None if all is well."""
         self._sent_s.append(command.sent_s)
         try:
-            found = self._judge(command)
+            verdict = self._judge(command)
         except RsePfError as error:
-            found = "failed", f"its bytes cannot be read: {error.message}", 0.0
-        if found is None:
+            verdict = "failed", f"its bytes cannot be read: {error.message}", 0.0
+        if verdict is None:
             return None
-        kind, what, size = found
+        kind, what, size = verdict
         return Trouble(
             id=command.id, robot=command.robot, sent_s=command.sent_s, kind=kind, what=what, size=size
         )

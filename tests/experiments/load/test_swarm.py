@@ -17,7 +17,7 @@ from rse_pf.experiments.load.swarm_process import (
     SolvedPayload,
     is_right,
     make_payloads,
-    planned_s,
+    plan_s,
 )
 from rse_pf.experiments.results.records import CommandRecord
 from rse_pf.geometry import exp_se3
@@ -51,12 +51,12 @@ def test_options_out_of_range_are_refused_with_a_hint(name: str, value: Any) -> 
 
 def test_send_times_are_fixed_before_the_run_and_evenly_spread_over_the_robots() -> None:
     robots = 100
-    phases = sorted(planned_s(options(), number, 0.0, 0) for number in range(robots))
+    phases = sorted(plan_s(options(), number, 0.0, 0) for number in range(robots))
     assert phases[0] >= 0.0
     assert phases[-1] < 0.2
     assert max(np.diff(phases)) < 3 * 0.2 / robots
-    assert planned_s(options(), 7, 100.0, 10) - planned_s(options(), 7, 100.0, 9) == pytest.approx(0.2)
-    assert planned_s(options(join_every_s=20.0), 3, 0.0, 0) >= 60.0
+    assert plan_s(options(), 7, 100.0, 10) - plan_s(options(), 7, 100.0, 9) == pytest.approx(0.2)
+    assert plan_s(options(join_every_s=20.0), 3, 0.0, 0) >= 60.0
 
 
 @pytest.mark.parametrize("codec_name", ["zlib", "json", "bin"])

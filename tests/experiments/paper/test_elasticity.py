@@ -10,7 +10,7 @@ from rse_pf.experiments.paper.elasticity import (
     busy_periods_before,
     crashes,
     elasticity_figures,
-    unjustified_scale_outs,
+    find_unjustified_scale_outs,
 )
 from rse_pf.experiments.results.records import CommandRecord, Records, run_sample
 from rse_pf.local.control.monitor import ServerSample
@@ -120,19 +120,19 @@ def test_periods_follow_the_clock_of_the_monitor():
 
 
 def test_a_scale_out_after_busy_periods_is_justified():
-    assert unjustified_scale_outs(run(events=[grow(4.05)], samples=BUSY)) == []
+    assert find_unjustified_scale_outs(run(events=[grow(4.05)], samples=BUSY)) == []
 
 
 def test_a_scale_out_without_enough_busy_periods_is_reported():
     calm = [reading(t / 2, 80.0 if t > 4 else 40.0) for t in range(1, 20)]
 
-    wrong = unjustified_scale_outs(run(events=[grow(4.05)], samples=calm))
+    wrong = find_unjustified_scale_outs(run(events=[grow(4.05)], samples=calm))
 
     assert wrong == ["at 4.05 s: 40.0 %, 80.0 % before it, 70 % is required"]
 
 
 def test_a_scale_out_without_samples_is_reported():
-    assert "none" in unjustified_scale_outs(run(events=[grow(30.0)], samples=BUSY))[0]
+    assert "none" in find_unjustified_scale_outs(run(events=[grow(30.0)], samples=BUSY))[0]
 
 
 def test_phases_split_the_commands_by_planned_time():

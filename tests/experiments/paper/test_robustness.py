@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from rse_pf.experiments.paper.robustness import BARS, evened_out_s, robustness_figures, robustness_page
+from rse_pf.experiments.paper.robustness import BARS, robustness_figures, robustness_page, time_until_even_s
 from rse_pf.experiments.results.records import CommandRecord, Records, run_sample
 from rse_pf.local.control.monitor import ServerSample
 
@@ -156,8 +156,8 @@ def robots(time_s, *counts):
 def test_evened_out_means_within_20_percent_of_the_mean_until_the_end():
     readings = [robots(1, 50, 50, 0), robots(2, 34, 33, 33), robots(3, 50, 30, 20), robots(4, 36, 36, 28)]
 
-    assert evened_out_s(readings, 0.5) == pytest.approx(3.5)
-    assert evened_out_s(readings[:3], 0.5) is None
+    assert time_until_even_s(readings, 0.5) == pytest.approx(3.5)
+    assert time_until_even_s(readings[:3], 0.5) is None
 
 
 def test_growth_of_memory_is_per_process():

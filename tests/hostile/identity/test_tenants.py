@@ -87,7 +87,7 @@ def test_robots_of_one_name_share_nothing_in_three_tenants(server: GuardedServer
     for area in ("states", "jobs", "objects"):
         found = tenants.owners(folder / "store", area)
         assert {f"{tenant}/{tenants.NAME}" for tenant in tenants.TENANTS} <= set(found)
-    assert "" not in tenants.logged(server.log)
+    assert "" not in tenants.count_logged(server.log)
 
 
 def test_each_robot_finds_its_own_state_again_after_a_restart(server: GuardedServer):

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import pytest
 
-from benchmarks.recording.planted_causes import PLANTED, healthy_case, planted_case, rendered
+from benchmarks.recording.planted_causes import PLANTED, healthy_case, plant_case, render_sequence
 from rse_pf.recording.explain import Cause, explain
 
 pytestmark = pytest.mark.slow
 
 
 def test_names_nearly_all_causes_in_a_rendered_world() -> None:
-    sequence = rendered(2)
-    cases = [(cause, planted_case(sequence, 500 + k, cause, 2)) for k, cause in enumerate(PLANTED)]
+    sequence = render_sequence(2)
+    cases = [(cause, plant_case(sequence, 500 + k, cause, 2)) for k, cause in enumerate(PLANTED)]
     cases += [(Cause.NONE, healthy_case(sequence, 600 + k)) for k in range(5)]
 
     named = [

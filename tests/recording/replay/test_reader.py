@@ -215,13 +215,13 @@ def test_a_command_is_found_without_opening_the_chunks_of_other_robots(
         (file,) = folder.iterdir()
         file.write_bytes(file.read_bytes()[:-1])
     opened: list[int] = []
-    original = reader._opened
+    original = reader._decompress
 
     def noting(chunk: Any) -> bytes:
         opened.append(1)
         return original(chunk)
 
-    monkeypatch.setattr(reader, "_opened", noting)
+    monkeypatch.setattr(reader, "_decompress", noting)
     recording = open_recording(folder)
     expected = {each.id: each for each in recording.commands()}
     every = len(opened)
