@@ -1,4 +1,4 @@
-"""What robots and tenants store: counted in one place, and reserved before it is written.
+"""Limit the bytes that robots and tenants store: counted in one place, and reserved before they are written.
 
 A robot is charged with its objects, its unfinished uploads and the versions of maps that it committed.  Its
 tenant is charged with all of that and with what nobody alone owns: old and new versions of maps; logs,

@@ -1,4 +1,4 @@
-"""Robot tokens: issue, verify; Ed25519-signed JWTs after the RFC 8725 profile.
+"""Robot tokens: issue, verify, and why one is refused; Ed25519-signed JWTs after the RFC 8725 profile.
 
 A key set maps ``kid`` to a public key; the algorithm is fixed, never read from a token.  A robot that is
 enrolled signs its own tokens; its tenant, scopes and quotas then come from the roster.  The time is an

@@ -1,4 +1,4 @@
-"""Where an operator's decisions are stored beside the public keys, and how servers load them.
+"""Where an operator's decisions are stored beside the public keys, and how often servers load them.
 
 `AccessControlStore` holds two objects, changed by compare-and-swap only: ``control/robots.json`` and
 ``control/deny.json``.  On one machine they lie in the folder of ``keys.json``, in a cloud in its bucket.

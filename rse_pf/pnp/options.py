@@ -1,4 +1,4 @@
-"""Options of a PnP request, and the limits below which a pose is called weak."""
+"""Options of a PnP request, such as the iterations of RANSAC, and the limits below which a pose is weak."""
 
 from __future__ import annotations
 

@@ -1,6 +1,7 @@
-"""The health of a server by its checks, as in a target group: consecutive results, after a grace period.
+"""The health of a server by its checks, as in a target group, and for how long a server may drain.
 
-The ALB, Envoy and this rule use the same settings.  The result of a check and the time are arguments.
+Consecutive results decide, after a grace period.  The ALB, Envoy and this rule use the same settings.  The
+result of a check and the time are arguments.
 """
 
 from __future__ import annotations
