@@ -58,7 +58,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="worker processes on this machine; 0 leaves all parts to job servers (batch.workers)",
     )  # fmt: skip
     merge.add_argument(
-        "--candidates", type=int, default=6, metavar="N", help="other keyframes tried for each"
+        "--candidates", type=int, default=8, metavar="N", help="other keyframes tried for each"
     )
     merge.add_argument("--no-icp", action="store_true", help="do not align clouds")
     merge.add_argument(

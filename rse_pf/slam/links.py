@@ -38,8 +38,13 @@ __all__ = [
 Refused = Counter[tuple[int, int, str]]
 """Number of keyframe pairs by map, other map and reason."""
 
-_MAX_PAIRS = 500_000
+_MAX_PAIRS = 700_000
 """Keyframe pairs that may be tried; each takes some milliseconds."""
+_WEAK_VARIANCE = 4.0
+"""In rendered worlds the errors of weak poses are 1.2 to 1.7 times, at most 2.7 times, their deviations.
+
+A merge takes them, as it sees all links at once: a third of the links between two maps are weak.
+"""
 _MIN_LOOP_LENGTH = 3
 """Keyframes of one robot that are closer than this along its trajectory are not a loop."""
 
@@ -55,7 +60,7 @@ class MergeOptions(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True
         BadRequest: A number is out of its range.
     """
 
-    candidates: int = 6
+    candidates: int = 8
     min_inliers: int = 40
     min_inlier_ratio: float = 0.5
     min_links: int = 3
@@ -173,7 +178,9 @@ def measure_pairs(
 ) -> tuple[list[LoopClosure], Refused]:
     """Return the links of *pairs* of rows that PnP could measure, in their order, and why others failed."""
     pose_options = RelativePoseOptions(
-        min_inliers=options.min_inliers, min_inlier_ratio=options.min_inlier_ratio
+        min_inliers=options.min_inliers,
+        min_inlier_ratio=options.min_inlier_ratio,
+        weak_variance=_WEAK_VARIANCE,
     )
     links: list[LoopClosure] = []
     failed: Refused = Counter()

@@ -49,6 +49,8 @@ class RelativePoseOptions:
     floor_m: float = 0.02
     floor_deg: float = 0.7
     """Smallest standard deviations for each axis: errors of depth and calibration are correlated."""
+    weak_variance: float = 0.0
+    """A pose that its evidence calls weak is a link with so many times its covariance; 0: it is none."""
 
     def floor(self) -> Array:
         """Return the ``(6, 6)`` covariance that every measured pose has at least."""
@@ -148,7 +150,7 @@ def measure_link(
 
     Returns:
         The relative pose, or the reason why there is none: "no-matches", "no-pose", "few-inliers",
-        "low-inlier-ratio", or the reason why the pose is weak.
+        "low-inlier-ratio", or the reason why the pose is weak, unless weak poses are links.
     """
     measured = measure_pose(reference, view, options)
     if isinstance(measured, str):
@@ -157,10 +159,12 @@ def measure_link(
         return "few-inliers"
     if measured.inliers < options.min_inlier_ratio * measured.matches:
         return "low-inlier-ratio"
-    if measured.solution.reason:
-        return measured.solution.reason
+    weak = measured.solution.reason
+    if weak and not options.weak_variance:
+        return weak
+    variance = options.weak_variance if weak else 1.0
     # T_b_a true = exp(xi) T_b_a, and its inverse has exp(-xi) on its right: the same covariance.
-    information = np.linalg.inv(measured.solution.covariance + options.floor())
+    information = np.linalg.inv(variance * measured.solution.covariance + options.floor())
     return RelativePose(
         T_a_b=inverse(measured.solution.T_camera_world),
         information=0.5 * (information + information.T),

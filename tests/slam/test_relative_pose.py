@@ -9,7 +9,14 @@ from rse_pf.geometry import Array, exp_se3, inverse, pose_difference, transform
 from rse_pf.maps.format import Keyframe
 from rse_pf.pnp import DepthNoise
 from rse_pf.pnp.problems import KINECT
-from rse_pf.slam.relative_pose import RelativePose, measure_link, reference_of, view_of_keyframe
+from rse_pf.slam.relative_pose import (
+    RelativePose,
+    RelativePoseOptions,
+    measure_link,
+    measure_pose,
+    reference_of,
+    view_of_keyframe,
+)
 
 pytest.importorskip("poselib")
 pytest.importorskip("faiss", reason="the extra maps is not installed")
@@ -29,11 +36,14 @@ def keyframe(number: int, pixels: Array, depth_m: Array, rng: np.random.Generato
     )  # fmt: skip
 
 
-def pair(seed: int, n: int = 150) -> tuple[Keyframe, Keyframe, Array]:
-    """Return two keyframes of the same points, and the pose of the second one in the first one."""
+def pair(seed: int, n: int = 150, top: float = 80.0) -> tuple[Keyframe, Keyframe, Array]:
+    """Return two keyframes of the same points, and the pose of the second one in the first one.
+
+    No pixel is above *top*; those of 385 and more are a narrow strip.
+    """
     rng = np.random.default_rng(seed)
     T_a_b = exp_se3(np.concatenate([rng.uniform(-0.2, 0.2, 3), rng.normal(size=3) * 0.08]))
-    pixels, depth_m = rng.uniform(80.0, [560.0, 400.0], (n, 2)), rng.uniform(1.5, 4.5, n)
+    pixels, depth_m = rng.uniform([80.0, top], [560.0, 400.0], (n, 2)), rng.uniform(1.5, 4.5, n)
     seen = transform(inverse(T_a_b), KINECT.back_project(pixels, depth_m))
     return keyframe(0, pixels, depth_m, rng), keyframe(1, KINECT.project(seen), seen[:, 2], rng), T_a_b
 
@@ -82,3 +92,31 @@ def test_a_reference_with_points_behind_its_camera_is_measured_by_pixels() -> No
     found = measured(with_depths(a, depth_m), b)
 
     assert pose_difference(found.T_a_b, T_a_b)[0] < 0.02
+
+
+def test_a_weak_pose_is_no_link_unless_its_covariance_is_given_a_factor() -> None:
+    a, b, _ = pair(4, top=385.0)
+    sought, view = reference_of(a), view_of_keyframe(b)
+    options = RelativePoseOptions(weak_variance=4.0)
+    pose = measure_pose(sought, view)
+
+    refused, link = measure_link(sought, view), measure_link(sought, view, options)
+
+    assert not isinstance(pose, str)
+    assert refused == pose.solution.reason != ""
+    assert isinstance(link, RelativePose)
+    covariance = 4.0 * pose.solution.covariance + options.floor()
+    np.testing.assert_allclose(np.linalg.inv(link.information), covariance, rtol=1e-6)
+
+
+def test_a_pose_that_is_not_weak_is_the_same_link_with_every_factor() -> None:
+    a, b, _ = pair(5)
+
+    links = [
+        measure_link(reference_of(a), view_of_keyframe(b), RelativePoseOptions(weak_variance=factor))
+        for factor in (0.0, 4.0)
+    ]
+
+    assert all(isinstance(link, RelativePose) for link in links)
+    one, other = (link.information for link in links if isinstance(link, RelativePose))
+    np.testing.assert_array_equal(one, other)
