@@ -15,7 +15,7 @@ import numpy as np
 
 from rse_pf.errors import PnpError
 from rse_pf.geometry import Array, adjoint, exp_se3, inverse, log_se3, pose_difference, transform
-from rse_pf.pnp import PnpOptions, solve_pnp
+from rse_pf.pnp import PnpOptions, PnpSolution, solve_pnp
 from rse_pf.slam.relative_pose import MeasuredPose, Reference, RelativePoseOptions, View, measure_pose
 
 __all__ = ["LocalisationOptions", "Localised", "PlacedKeyframe", "localise", "spread_candidates"]
@@ -137,10 +137,12 @@ def localise(
     best = placements[0]
     agreeing = [each for each in placements if _agree(each, best, options)]
     others = [each for each in placements if not _agree(each, best, options)]
-    reason = _weakness(agreeing, others, options)
+    solution = best.found.solution
     T_map_camera, covariance = _fused(agreeing)
     if view.depths_m is None and len(agreeing) > 1:
-        T_map_camera = _solved_together(agreeing, view, options)
+        solution = _solved_together(agreeing, view, options)
+        T_map_camera = best.T_map_keyframe @ inverse(solution.T_camera_world)
+    reason = _weakness(agreeing, others, solution, options)
     return Localised(
         verdict="weak" if reason else "ok", reason=reason, T_map_camera=T_map_camera, covariance=covariance,
         inliers=best.found.inliers, matches=best.found.matches, rmse_px=best.found.solution.rmse_px,
@@ -183,9 +185,12 @@ def _agree(one: _Placement, other: _Placement, options: LocalisationOptions) -> 
 
 
 def _weakness(
-    agreeing: Sequence[_Placement], others: Sequence[_Placement], options: LocalisationOptions
+    agreeing: Sequence[_Placement],
+    others: Sequence[_Placement],
+    solution: PnpSolution,
+    options: LocalisationOptions,
 ) -> str:
-    """Return why the placement of *agreeing* (best first) is not ok, "" if it is."""
+    """Return why the placement of *agreeing* (best first), solved as *solution*, is not ok, "" if it is."""
     best = agreeing[0].found
     if options.has_equal_rooms:
         return "ambiguous"
@@ -196,17 +201,20 @@ def _weakness(
         return "few-inliers"
     if best.inliers < options.measured.min_inlier_ratio * best.matches:
         return "low-inlier-ratio"
-    if best.solution.reason:
-        return best.solution.reason
+    if solution.reason:
+        return solution.reason
     if len(agreeing) < 2 and best.inliers < options.alone_inliers:
         return "one-keyframe"
     return ""
 
 
-def _solved_together(placements: Sequence[_Placement], view: View, options: LocalisationOptions) -> Array:
-    """Return the pose that fits the inliers of all *placements*, or that of the first one.
+def _solved_together(
+    placements: Sequence[_Placement], view: View, options: LocalisationOptions
+) -> PnpSolution:
+    """Return the solution that fits the inliers of all *placements*, or that of the first one.
 
-    Without depths a pose of one keyframe is no more exact than its few pixels; each has its own.
+    It is relative to the first keyframe.  Without depths a pose of one keyframe is no more exact than its few
+    pixels; each has its own.
     """
     best = placements[0]
     T_best_map = inverse(best.T_map_keyframe)
@@ -217,14 +225,12 @@ def _solved_together(placements: Sequence[_Placement], view: View, options: Loca
         points.append(transform(T_best_keyframe, placement.found.points_reference[inliers]))
         pixels.append(placement.found.pixels[inliers])
     try:
-        solution = solve_pnp(
+        return solve_pnp(
             np.concatenate(points), np.concatenate(pixels), view.camera,
             PnpOptions(inlier_px=options.measured.inlier_px),
         )  # fmt: skip
     except PnpError:
-        return best.T_map_camera
-    T_map_camera: Array = best.T_map_keyframe @ inverse(solution.T_camera_world)
-    return T_map_camera
+        return best.found.solution
 
 
 def _fused(placements: Sequence[_Placement]) -> tuple[Array, Array]:

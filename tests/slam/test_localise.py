@@ -12,6 +12,7 @@ from rse_pf.live_map.measure import reference_of_features, view_of_features
 from rse_pf.services.synthetic_maps import make_world
 from rse_pf.slam.keyframe import KeyframeFeatures, make_features
 from rse_pf.slam.localise import LocalisationOptions, Localised, PlacedKeyframe, localise, spread_candidates
+from rse_pf.slam.relative_pose import RelativePoseOptions
 
 
 def coded(keyframe) -> KeyframeFeatures:
@@ -158,3 +159,27 @@ def test_candidates_that_look_another_way_are_of_another_place():
     found = [(number, 0.5) for number in range(8)]
 
     assert spread_candidates(found, poses, 6, LocalisationOptions(of_place=2)) == [0, 1, 4, 5]
+
+
+def strip(number: int, left: float, right: float) -> PlacedKeyframe:
+    """Return a keyframe of `MAP` that has only the features between two columns."""
+    _, features, camera, T_map_keyframe = MAP[number]
+    rows = np.flatnonzero((features.pixels[:, 0] >= left) & (features.pixels[:, 0] < right))
+    part = KeyframeFeatures(
+        pixels=features.pixels[rows], depths_m=features.depths_m[rows], descriptors=features.descriptors[rows]
+    )
+    return PlacedKeyframe(
+        id=number, reference=reference_of_features(part, camera), T_map_keyframe=T_map_keyframe
+    )
+
+
+def test_keyframes_that_are_weak_alone_place_a_view_without_depths_together():
+    view = replace(view_of_features(VIEW, CAMERA), depths_m=None)
+    options = LocalisationOptions(alone_inliers=10, measured=RelativePoseOptions(min_inliers=12))
+    strips = [strip(1, 60.0, 100.0), strip(2, 360.0, 400.0)]
+
+    alone, together = localise(strips[:1], view, options), localise(strips, view, options)
+
+    assert (alone.verdict, alone.reason) == ("weak", "nearly-collinear")
+    assert (together.verdict, together.reason) == ("ok", "")
+    assert set(together.keyframes) == {1, 2}
