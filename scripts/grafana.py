@@ -29,7 +29,7 @@ _QUANTILES = (0.5, 0.95, 0.99)
 def all_metrics() -> list[Metric]:
     """Return the metrics of a platform with one server, histograms and counters before gauges."""
     worker = Metrics()
-    worker.count_answer("pnp", "ok", 0.01)
+    worker.count_answer("pnp", "ok", 0.01, "default", 0.01)
     for counter in (worker.shed, worker.handshakes, worker.closed):
         counter["example"] += 1
     worker.gauges.update(dict.fromkeys(GAUGE_HELP, 0.0))

@@ -7,14 +7,25 @@ contains the id of a robot.
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping
 from itertools import accumulate
 from typing import Any
 
 from rse_pf.errors import MissingExtra
 
-__all__ = ["BUCKETS_S", "GAUGE_HELP", "LongestRecently", "Metrics", "merge", "merge_isolation", "render"]
+__all__ = [
+    "BUCKETS_S",
+    "GAUGE_HELP",
+    "MAX_TENANTS",
+    "OTHER_TENANTS",
+    "LongestRecently",
+    "Metrics",
+    "merge",
+    "merge_isolation",
+    "render",
+    "tenant_cpu_s",
+]
 
 BUCKETS_S = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
 """Upper bounds of the duration histogram; the last bucket is open."""
@@ -51,6 +62,8 @@ GAUGE_HELP = {
     "control_refused": "requests to the control port that were refused for lack of its token",
 }
 """What each gauge means; a new gauge needs a line here."""
+MAX_TENANTS, OTHER_TENANTS = 100, "(others)"
+"""A worker counts so many tenants by name, the first that it sees, and all others together."""
 _GAUGES_OF_WORST = ("queue_oldest_s", "queue_ms", "loop_lag_s")
 _RECENT_S = 1.0
 
@@ -68,9 +81,35 @@ class Metrics:
         self.bytes_in = 0
         self.bytes_out = 0
         self.gauges: dict[str, float] = {}
+        self.tenant_cpu_s: dict[str, dict[str, float]] = {"commands": {}}
+        """Seconds of computing, by what computed and by tenant."""
+        self._commands_s = self.tenant_cpu_s["commands"]
+        self._tenants: set[str] = set()
 
-    def count_answer(self, service: str, result: str, duration_s: float) -> None:
-        """Count a final answer; *result* is ``ok`` or a failure code."""
+    def set_cpu(self, kind: str, seconds: Mapping[str, float]) -> None:
+        """Replace what was counted of a kind by what its processes have taken so far, by tenant."""
+        taken: defaultdict[str, float] = defaultdict(float)
+        for tenant, taken_s in seconds.items():
+            taken[self._label(tenant)] += taken_s
+        self.tenant_cpu_s[kind] = taken
+
+    def _label(self, tenant: str) -> str:
+        """Return the name by which a tenant is counted from now on."""
+        if tenant not in self._tenants and len(self._tenants) >= MAX_TENANTS:
+            return OTHER_TENANTS
+        self._tenants.add(tenant)
+        return tenant
+
+    def count_answer(
+        self, service: str, result: str, duration_s: float, tenant: str = "", computed_s: float = 0.0
+    ) -> None:
+        """Count a final answer; *result* is ``ok`` or a failure code, *computed_s* is charged to *tenant*."""
+        if computed_s:
+            try:
+                self._commands_s[tenant] += computed_s
+            except KeyError:
+                label = self._label(tenant)
+                self._commands_s[label] = self._commands_s.get(label, 0.0) + computed_s
         self.requests[service, result] += 1
         buckets = self.durations.get(service)
         if buckets is None:
@@ -89,6 +128,11 @@ class Metrics:
             "duration_sum_s": dict(self.duration_sum_s),
             "bytes": {"in": self.bytes_in, "out": self.bytes_out},
             "gauges": self.gauges,
+            "tenant_cpu_s": [
+                [tenant, kind, taken_s]
+                for kind, taken in self.tenant_cpu_s.items()
+                for tenant, taken_s in taken.items()
+            ],
         }
 
 
@@ -124,11 +168,14 @@ def merge(snapshots: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
     sums: dict[str, Counter[str]] = {
         name: Counter() for name in ("shed", "handshakes", "closed", "duration_sum_s", "bytes", "gauges")
     }
+    cpu_s: defaultdict[tuple[str, str], float] = defaultdict(float)
     durations: dict[str, list[int]] = {}
     worst = dict.fromkeys(_GAUGES_OF_WORST, 0.0)
     for snapshot in snapshots:
         for service, result, n in snapshot["requests"]:
             requests[service, result] += n
+        for tenant, kind, taken_s in snapshot["tenant_cpu_s"]:
+            cpu_s[tenant, kind] += taken_s
         for name, counter in sums.items():
             counter.update(snapshot[name])
         for service, buckets in snapshot["durations"].items():
@@ -142,7 +189,16 @@ def merge(snapshots: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
         **merged,
         "requests": [[service, result, n] for (service, result), n in requests.items()],
         "durations": durations,
+        "tenant_cpu_s": [[tenant, kind, taken_s] for (tenant, kind), taken_s in cpu_s.items()],
     }
+
+
+def tenant_cpu_s(merged: Mapping[str, Any]) -> dict[str, float]:
+    """Return the seconds of computing of each tenant, whatever computed, the largest first."""
+    taken: defaultdict[str, float] = defaultdict(float)
+    for tenant, _, taken_s in merged["tenant_cpu_s"]:
+        taken[tenant] += taken_s
+    return {tenant: round(taken[tenant], 3) for tenant in sorted(taken, key=taken.__getitem__, reverse=True)}
 
 
 def merge_isolation(snapshots: Iterable[Mapping[str, Any] | None]) -> dict[str, Any]:
@@ -209,6 +265,14 @@ def render(merged: Mapping[str, Any]) -> bytes:
                 "direction",
                 merged["bytes"],
             )
+            taken = CounterMetricFamily(
+                "rse_pf_tenant_cpu_seconds",
+                "seconds of computing, by tenant and by what computed: commands, sandboxes, jobs, live-maps",
+                labels=["tenant", "kind"],
+            )
+            for tenant, kind, taken_s in merged["tenant_cpu_s"]:
+                taken.add_metric([tenant, kind], taken_s)
+            yield taken
             for name, value in merged["gauges"].items():
                 yield GaugeMetricFamily(f"rse_pf_{name}", GAUGE_HELP.get(name, name), value=value)
             histogram = HistogramMetricFamily(

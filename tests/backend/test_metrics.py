@@ -4,7 +4,15 @@ from __future__ import annotations
 
 from prometheus_client.parser import text_string_to_metric_families
 
-from rse_pf.backend.metrics import GAUGE_HELP, Metrics, merge, render
+from rse_pf.backend.metrics import (
+    GAUGE_HELP,
+    MAX_TENANTS,
+    OTHER_TENANTS,
+    Metrics,
+    merge,
+    render,
+    tenant_cpu_s,
+)
 
 
 def worker(answers: list[tuple[str, str, float]], **gauges: float) -> dict:
@@ -75,3 +83,40 @@ def test_every_metric_has_a_type_and_a_help_text_of_at_least_three_words():
 
 def test_a_gauge_without_a_help_text_is_caught():
     assert undescribed(render(merge([worker([], brand_new=1.0)])).decode()) == ["rse_pf_brand_new"]
+
+
+def test_what_was_computed_for_each_tenant_is_added_up_over_workers_and_kinds():
+    first, second = Metrics(), Metrics()
+    first.count_answer("pnp", "ok", 0.3, "acme", 0.25)
+    first.count_answer("pnp", "no-consensus", 0.6, "acme", 0.5)
+    first.set_cpu("jobs", {"acme": 2.0, "rival": 1.0})
+    first.set_cpu("jobs", {"acme": 3.0, "rival": 1.0})
+    second.count_answer("pnp", "ok", 0.2, "rival", 0.125)
+    merged = merge([first.snapshot(), second.snapshot()])
+
+    families = {each.name: each for each in text_string_to_metric_families(render(merged).decode())}
+    samples = {
+        (sample.labels["tenant"], sample.labels["kind"]): sample.value
+        for sample in families["rse_pf_tenant_cpu_seconds"].samples
+        if sample.name.endswith("_total")
+    }
+    assert samples == {
+        ("acme", "commands"): 0.75, ("acme", "jobs"): 3.0,
+        ("rival", "commands"): 0.125, ("rival", "jobs"): 1.0,
+    }  # fmt: skip
+    assert list(tenant_cpu_s(merged).items()) == [("acme", 3.75), ("rival", 1.125)]
+
+
+def test_many_tenants_are_counted_as_others_and_nothing_is_lost():
+    metrics = Metrics()
+    for _ in range(2):
+        for number in range(3 * MAX_TENANTS):
+            metrics.count_answer("pnp", "ok", 1.0, f"t{number}", 1.0)
+    metrics.set_cpu("jobs", {f"t{number}": 1.0 for number in range(3 * MAX_TENANTS)})
+
+    merged = merge([metrics.snapshot()])
+
+    assert len(merged["tenant_cpu_s"]) == 2 * (MAX_TENANTS + 1)
+    taken = tenant_cpu_s(merged)
+    assert sum(taken.values()) == 9 * MAX_TENANTS
+    assert taken[OTHER_TENANTS] == 6 * MAX_TENANTS

@@ -122,12 +122,20 @@ class Answers:
             )
         return self._encode_fitting(queued, message)
 
-    def send(self, answer: EncodedAnswer, now: float) -> None:
-        """Write *answer*, unless its robot is gone; count and log it in any case."""
+    def send(self, answer: EncodedAnswer, now: float, *, counts_cpu: bool = True) -> None:
+        """Write *answer*, unless its robot is gone; count and log it in any case.
+
+        With *counts_cpu* its tenant is charged with the time that it was computed for.
+        """
         queued, message = answer.queued, answer.message
-        code = "ok" if isinstance(message, Result) else message.code
+        if isinstance(message, Result):
+            code, computed_s = "ok", message.compute_ms * 1e-3
+        else:
+            code, computed_s = message.code, now - queued.started_s if queued.started_s else 0.0
         service = self.label(queued.command.service)
-        self._context.metrics.count_answer(service, code, now - queued.received_s)
+        self._context.metrics.count_answer(
+            service, code, now - queued.received_s, queued.robot.tenant, computed_s if counts_cpu else 0.0
+        )
         connection: RobotConnection = queued.owner
         connection.answer(answer.data, queued.command.id)
         if connection.tap is not None and isinstance(queued.command.payload, msgspec.Struct):
@@ -149,7 +157,7 @@ class Answers:
             )  # fmt: skip
 
     def send_message(self, queued: QueuedCommand, message: Result | Failure) -> None:
-        """Send the answer of a sandbox or a job."""
+        """Send the answer of a sandbox, a job or a live map, which count their time themselves."""
         now = self._context.clocks.monotonic()
         if isinstance(message, Result):
             # A job does not say when it began, only how long it took.
@@ -158,7 +166,7 @@ class Answers:
             message = msgspec.structs.replace(
                 message, queue_ms=queue_ms, received_s=queued.received_s, sent_s=now
             )
-        self.send(self._encode(queued, message), now)
+        self.send(self._encode(queued, message), now, counts_cpu=False)
 
     def send_refusal(self, refusal: RefusedCommand, now: float) -> None:
         """Answer a command that ends without compute."""

@@ -99,6 +99,10 @@ class NoQueue:
         """Return nothing."""
         return {}
 
+    def cpu_by_tenant(self) -> dict[str, float]:
+        """Return nothing."""
+        return {}
+
     def subscribe(self, connection: RobotConnection, identity: int, topic: str) -> None:
         """Refuse every topic."""
         error = NotFound("this server offers no updates", hint="the operator has switched live maps off")
@@ -457,6 +461,10 @@ class Dispatcher:
             **({"sandboxes": float(isolation["sandboxes"])} if isolation else {}),
         }
         self._lag_s = 0.0
+        for kind, queue in (
+            ("sandboxes", self._sandboxes), ("jobs", self._jobs), ("live-maps", self._live_maps)
+        ):  # fmt: skip
+            self.context.metrics.set_cpu(kind, queue.cpu_by_tenant())
         return {**self.context.metrics.snapshot(), **({"isolation": isolation} if isolation else {})}
 
     # --- from the queue to an answer -----------------------------------------------------------

@@ -145,6 +145,7 @@ class JobServer:
             self._log.info(
                 "job", robot=request.robot, service=request.service, job=request.key[:16], code=code,
                 object=outcome.object[:16], compute_ms=round(outcome.compute_ms, 3), trace=request.trace,
+                cpu_s=round(outcome.cpu_s, 3),
             )  # fmt: skip
 
         job.thread = threading.Thread(target=work, name=f"job-{request.key[:8]}", daemon=True)

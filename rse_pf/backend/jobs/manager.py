@@ -11,6 +11,7 @@ import contextlib
 import threading
 import time
 from asyncio import AbstractEventLoop, TimerHandle
+from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
@@ -93,6 +94,7 @@ class JobManager:
         self._progress = progress
         self._new_owner = new_owner
         self._entries: dict[tuple[RobotId, str], _Entry] = {}
+        self._cpu_s: defaultdict[str, float] = defaultdict(float)
         self._leaving = False
         self._collector = RecordCollector(
             context.store,
@@ -225,6 +227,10 @@ class JobManager:
         entry.thread = threading.Thread(target=work, name=f"job-{entry.request.key[:8]}", daemon=True)
         entry.thread.start()
 
+    def cpu_by_tenant(self) -> dict[str, float]:
+        """Return the processor time of the jobs that ran here and have ended, by tenant."""
+        return dict(self._cpu_s)
+
     def _on_progress(self, entry: _Entry, done: float, what: str) -> None:
         entry.done, entry.what = done, what
         for waiter in entry.waiters:
@@ -251,6 +257,7 @@ class JobManager:
 
     def _on_outcome(self, entry: _Entry, outcome: JobOutcome) -> None:
         request = entry.request
+        self._cpu_s[request.robot.tenant] += outcome.cpu_s
         del self._entries[request.robot, request.key]
         waiters, entry.waiters = entry.waiters, []
         entry.signals.close()
@@ -260,6 +267,7 @@ class JobManager:
         self._log.info(
             "job", robot=request.robot, service=request.service, job=request.key[:16], code=code,
             object=outcome.object[:16], compute_ms=round(outcome.compute_ms, 3), trace=request.trace,
+            cpu_s=round(outcome.cpu_s, 3),
         )  # fmt: skip
         reply = None
         if outcome.reply is not None:

@@ -13,7 +13,7 @@ import signal
 import socket
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 from rse_pf.accounts import Accounts
@@ -37,6 +37,7 @@ from rse_pf.errors import (
     error_from_code,
 )
 from rse_pf.identity import object_name
+from rse_pf.linux import cpu_seconds
 from rse_pf.object_store import ObjectStore, digest_of
 
 __all__ = ["JobContext", "JobOutcome", "JobSignals", "run_job"]
@@ -76,6 +77,8 @@ class JobOutcome:
     """MessagePack; None if it is too large to be sent along."""
     compute_ms: float = 0.0
     error: RsePfError | None = None
+    cpu_s: float = 0.0
+    """Processor time of its process, if it ran here."""
 
     @property
     def is_given_up(self) -> bool:
@@ -256,7 +259,12 @@ class _JobRun:
         try:
             why = self._supervise(process)
         finally:
+            cpu_s = cpu_seconds(process.pid)
             exit_code = process.kill()  # all its messages have been read
+        outcome = self._outcome_of(why, exit_code)
+        return None if outcome is None else replace(outcome, cpu_s=cpu_s)
+
+    def _outcome_of(self, why: str, exit_code: int) -> JobOutcome | None:
         if why == "lost":
             return None
         if why == "given-up":

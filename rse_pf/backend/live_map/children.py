@@ -10,13 +10,14 @@ import asyncio
 import contextlib
 import functools
 import time
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable
 from typing import Any, Literal
 
 from rse_pf.backend.live_map.owner.process import OwnerOrder, OwnerProcess
 from rse_pf.backend.sandbox.ipc import FrameReader
 from rse_pf.backend.scheduling.fair_share import CLAIM_S, FairShare
+from rse_pf.linux import cpu_seconds
 
 __all__ = ["OwnerChild", "OwnerChildren"]
 
@@ -36,6 +37,8 @@ class OwnerChild:
         """Since when its map is only watched; None while robots send it commands."""
         self.is_leaving = False
         """It gives its map up."""
+        self.last_cpu_s = 0.0
+        """Its processor time, once it has ended."""
         self._clock = clock
         self.epoch: int | None = None
         """Of the owner, while it serves."""
@@ -46,12 +49,21 @@ class OwnerChild:
         self._ready: asyncio.Future[bool] = loop.create_future()
         self._outcome: asyncio.Future[Literal["serving", "lost"]] = loop.create_future()
         self.ended: asyncio.Future[int] = loop.create_future()
+        self._cpu_before_s = 0.0
         self._reader = loop.create_task(self._read())
 
     @property
     def pid(self) -> int:
         """The number of the process."""
         return self._process.pid
+
+    def begin_counting(self) -> None:
+        """Count its processor time from here on: what it has imported is nobody's."""
+        self._cpu_before_s = cpu_seconds(self.pid)
+
+    def cpu_s(self) -> float:
+        """Return its processor time, and that of its children that have ended; 0 if it is gone."""
+        return max(0.0, cpu_seconds(self.pid) - self._cpu_before_s)
 
     @property
     def is_ready(self) -> bool:
@@ -105,6 +117,7 @@ class OwnerChild:
         """Reap the process, which has ended or is killed."""
         if self.ended.done():
             return
+        self.last_cpu_s = self.cpu_s()
         code = self._process.kill()
         if not self._ready.done():
             self._ready.set_result(False)
@@ -138,6 +151,7 @@ class OwnerChildren:
         self._share = FairShare(max_owners)
         self._wanted_until_s = float("-inf")
         self._used: dict[OwnerChild, None] = {}
+        self._ended_cpu_s: defaultdict[str, float] = defaultdict(float)
         self._spare: OwnerChild | None = None
         self._timer: asyncio.TimerHandle | None = None
 
@@ -145,6 +159,13 @@ class OwnerChildren:
     def used(self) -> list[OwnerChild]:
         """Those that claim or serve a map."""
         return list(self._used)
+
+    def cpu_by_tenant(self) -> dict[str, float]:
+        """Return the processor time of all owners so far, of those that have ended too, by tenant."""
+        taken = self._ended_cpu_s.copy()
+        for child in self._used:
+            taken[child.tenant] += child.cpu_s()
+        return dict(taken)
 
     @property
     def is_making_room(self) -> bool:
@@ -172,6 +193,7 @@ class OwnerChildren:
         child, self._spare = self._spare, None
         if child is not None:
             child.tenant, child.unused_s = tenant, now if only_watched else None
+            child.begin_counting()
             self._used[child] = None
             child.on_end = functools.partial(self._lose, on_end)
             self._prepare_later()
@@ -225,6 +247,7 @@ class OwnerChildren:
 
     def _lose(self, on_end: Callable[[OwnerChild, int], None], child: OwnerChild, code: int) -> None:
         self._used.pop(child, None)
+        self._ended_cpu_s[child.tenant] += child.last_cpu_s
         on_end(child, code)
 
     def _lose_spare(self, child: OwnerChild, code: int) -> None:

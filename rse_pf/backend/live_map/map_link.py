@@ -604,6 +604,10 @@ class OwnerLinks:
         """Let the owners that this worker started release their leases: the server drains."""
         self._children.release()
 
+    def cpu_by_tenant(self) -> dict[str, float]:
+        """Return the processor time of the owners that this worker started, by tenant."""
+        return self._children.cpu_by_tenant()
+
     @property
     def children(self) -> list[OwnerChild]:
         """The owner processes that this worker has started and that claim or serve a map."""

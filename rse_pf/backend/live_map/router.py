@@ -265,6 +265,10 @@ class LiveMapRouter:
             "live_waiting": float(self.held),
         }
 
+    def cpu_by_tenant(self) -> dict[str, float]:
+        """Return the processor time of the owners that this worker started, by tenant."""
+        return self._owners.cpu_by_tenant()
+
     def give_up(self) -> None:
         """Leave the maps of this server to others: it drains."""
         self._owners.give_up()

@@ -145,6 +145,10 @@ class SandboxManager:
             "counts": dict(self._policy.counts),
         }
 
+    def cpu_by_tenant(self) -> dict[str, float]:
+        """Return for how long the sandboxes of each tenant have worked at requests, in seconds."""
+        return dict(self._policy.worked_s)
+
     def blocks(self) -> list[Block]:
         """Return the services and requests that are refused now after crashes, with their robots."""
         return self._policy.breaker.blocks(self._monotonic())

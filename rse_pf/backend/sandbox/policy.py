@@ -18,7 +18,7 @@ order.  The rules:
 from __future__ import annotations
 
 import math
-from collections import Counter, deque
+from collections import Counter, defaultdict, deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -181,6 +181,8 @@ class _Sandbox:
     """Deadline of the running call."""
     release_s: float = math.inf
     """End of the grace period; infinite while the robot is connected."""
+    asked_s: float | None = None
+    """When it was sent what it works at; None while it does nothing."""
     snapshots: dict[str, bytes | None] = field(default_factory=dict)
     """Last snapshot of each stateful service, as it stands in the store."""
     unsaved: SandboxReply | None = None
@@ -194,7 +196,8 @@ class _Sandbox:
 class SandboxPolicy:
     """All sandboxes of one worker; every event returns the actions that follow from it.
 
-    ``breaker`` knows what is refused after crashes, and ``counts`` what happened how often.
+    ``breaker`` knows what is refused after crashes, ``counts`` what happened how often, and ``worked_s`` for
+    how long the sandboxes of each tenant have worked at requests, whatever they answered.
     """
 
     def __init__(
@@ -214,6 +217,7 @@ class SandboxPolicy:
             keeps_snapshots: Whether there is a store for the state of services.
         """
         self.counts: Counter[str] = Counter()
+        self.worked_s: defaultdict[str, float] = defaultdict(float)
         self._kinds = kinds
         self._settings = settings
         self._max_sandboxes = max_sandboxes
@@ -306,8 +310,9 @@ class SandboxPolicy:
         call = sandbox.running
         if call is None or sandbox.state not in ("restoring", "running"):
             return self.on_violation(number, "it replied without a request")
+        self._count_work(sandbox, now)
         if sandbox.state == "restoring" and isinstance(outcome, SandboxReply):
-            self._send(sandbox, call)
+            self._send(sandbox, call, now)
         elif sandbox.state == "restoring":
             del sandbox.snapshots[call.service]  # its state is unknown: the next command restores again
             self._finish(sandbox, call, outcome, now)
@@ -349,9 +354,9 @@ class SandboxPolicy:
         else:
             sandbox.snapshots[call.service] = outcome
             if outcome is None:
-                self._send(sandbox, call)
+                self._send(sandbox, call, now)
             else:
-                sandbox.state = "restoring"
+                sandbox.state, sandbox.asked_s = "restoring", now
                 message = encode_message(["restore", call.service, outcome])
                 self._actions.append(SendMessage(number, message))
         return self._take_actions()
@@ -381,6 +386,7 @@ class SandboxPolicy:
             call = sandbox.running
             if sandbox.release_s <= now:
                 self.counts["released"] += 1
+                self._count_work(sandbox, now)
                 self._release(sandbox)
                 continue
             if call is not None and sandbox.late_s <= now:
@@ -448,6 +454,7 @@ class SandboxPolicy:
     def _release_ended(self, sandbox: _Sandbox, how: str, now: float, *, is_evidence: bool = True) -> None:
         """Release a sandbox whose process ended by itself or was killed; retry or answer its command."""
         call, why = sandbox.running, sandbox.fault or how
+        self._count_work(sandbox, now)
         self._release(sandbox)
         service, reason = "" if call is None else call.service, f"{why} ({how})"
         if sandbox.is_overrun:
@@ -526,12 +533,17 @@ class SandboxPolicy:
                 sandbox.state = "loading"
                 self._actions.append(LoadSnapshot(sandbox.number, call))
             else:
-                self._send(sandbox, call)
+                self._send(sandbox, call, now)
 
-    def _send(self, sandbox: _Sandbox, call: SandboxCall) -> None:
-        sandbox.state = "running"
+    def _send(self, sandbox: _Sandbox, call: SandboxCall, now: float) -> None:
+        sandbox.state, sandbox.asked_s = "running", now
         if not sandbox.fault:
             self._actions.append(SendMessage(sandbox.number, call.data))
+
+    def _count_work(self, sandbox: _Sandbox, now: float) -> None:
+        if sandbox.asked_s is not None:
+            self.worked_s[sandbox.robot.tenant] += now - sandbox.asked_s
+            sandbox.asked_s = None
 
     def _finish(
         self, sandbox: _Sandbox, call: SandboxCall, outcome: SandboxReply | RsePfError, now: float

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import functools
 from asyncio import TimerHandle
-from collections import Counter, deque
+from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
@@ -85,6 +85,7 @@ class ReloadingSandboxes:
         self._retiring: list[_Generation] = []
         self._next: _Generation | None = None
         self._give_up: TimerHandle | None = None
+        self._past_s: defaultdict[str, float] = defaultdict(float)
         self._past: Counter[str] = Counter()
         """What the sandboxes that are gone have counted."""
         self._current = _Generation(tuple(service.name for service in services))
@@ -161,6 +162,8 @@ class ReloadingSandboxes:
         if former in self._retiring and not former.unanswered and former.sandboxes is not None:
             self._retiring.remove(former)
             self._past.update(former.sandboxes.report()["counts"])
+            for tenant, worked_s in former.sandboxes.cpu_by_tenant().items():
+                self._past_s[tenant] += worked_s
             former.sandboxes.retire()
 
     # --- commands ------------------------------------------------------------------------------------
@@ -265,6 +268,14 @@ class ReloadingSandboxes:
             "counts": dict(counts),
             "services": list(self.names),
         }
+
+    def cpu_by_tenant(self) -> dict[str, float]:
+        """Return for how long the sandboxes of each tenant have worked at requests, in seconds."""
+        taken = self._past_s.copy()
+        for manager in self._all:
+            for tenant, worked_s in manager.cpu_by_tenant().items():
+                taken[tenant] += worked_s
+        return dict(taken)
 
     def blocks(self) -> list[Block]:
         """Return the services and requests that are refused now after crashes, with their robots."""

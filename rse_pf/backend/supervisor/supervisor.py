@@ -27,7 +27,7 @@ from rse_pf.backend.gateway.audit_recorder import ServerAudit
 from rse_pf.backend.gateway.migration import plan
 from rse_pf.backend.jobs.slots import make_pipe
 from rse_pf.backend.log import JsonLog
-from rse_pf.backend.metrics import merge, merge_isolation, render
+from rse_pf.backend.metrics import merge, merge_isolation, render, tenant_cpu_s
 from rse_pf.backend.rosbridge.peers import peer_channels
 from rse_pf.backend.supervisor.accepting import RobotAcceptor
 from rse_pf.backend.supervisor.control_http import (
@@ -415,6 +415,7 @@ class _Supervisor:
                 "bytes_out": int(merged["bytes"].get("out", 0)),
                 "moved": int(gauges.get("moved", 0)),
                 "cpu_s": self._cpu_s(merged["gauges"]),
+                "tenant_cpu_s": tenant_cpu_s(merged),
                 "worker_cpu_s": [cpu_seconds(worker.pid) for worker in self._workers],
                 "resident_bytes": sum(map(resident_bytes, self._pids())),
                 "emulated_cores": self._settings.serving.emulated_cores,

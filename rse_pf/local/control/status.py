@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import time
+from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -28,6 +29,8 @@ from rse_pf.terminal import printable
 __all__ = ["data_url", "platform_status", "status_table"]
 
 _TIMEOUT_S = 0.5
+_MAX_TENANTS = 5
+"""The table names those that took most; --json has all."""
 _COLUMNS = ("server", "pid", "state", "robots", "CPU %", "requests/s", "queue")
 
 
@@ -77,6 +80,14 @@ def status_table(status: Mapping[str, Any]) -> str:
         lines.append(f"data server  {process['name']} is {process['state']} (pid {process['pid']})")
     for role, process in (("load balancer", status["balancer"]), ("control plane", status["control_plane"])):
         lines.append(f"{role}  {'runs' if process['running'] else 'does not run'} (pid {process['pid']})")
+    taken: defaultdict[str, float] = defaultdict(float)
+    for server in status["servers"]:
+        for tenant, taken_s in server.get("tenant_cpu_s", {}).items():
+            taken[tenant] += taken_s
+    if len(taken) > 1:  # one tenant has what the servers have
+        most = sorted(taken, key=taken.__getitem__, reverse=True)[:_MAX_TENANTS]
+        shown = ", ".join(f"{tenant} {taken[tenant]:.1f} s" for tenant in most)
+        lines.append(f"computed for tenants  {shown}")
     lines += [disk["warning"] for disk in status.get("disks", ()) if disk["warning"]]
     lines.append(f"robots connect to  {status['url'] or 'nothing yet'}")
     if status["data_servers"] and status["url"]:
@@ -135,6 +146,7 @@ async def _server(server: ServerState, token: str | None, sample_s: float) -> di
         "cpu_percent": round(100 * (second["cpu_s"] - first["cpu_s"]) / (wall_s * cores), 1),
         "bytes_in": second["bytes_in"],
         "bytes_out": second["bytes_out"],
+        "tenant_cpu_s": second.get("tenant_cpu_s", {}),
     }
 
 

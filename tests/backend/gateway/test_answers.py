@@ -7,7 +7,7 @@ from backend.gateway.worker_parts import worker_parts
 
 from rse_pf.auth.tokens import Claims
 from rse_pf.backend.scheduling.scheduler import QueuedCommand
-from rse_pf.wire import Command, Result
+from rse_pf.wire import Command, Failure, Result
 
 
 def test_the_time_that_a_job_waited_is_not_the_servers_clock() -> None:
@@ -58,3 +58,22 @@ def test_an_unknown_service_is_answered_with_what_the_token_allows_and_nothing_e
 
         assert wire.sent[-1].code == "unknown-service"
         assert wire.sent[-1].message == f"no service named 'centriod'; this server offers {offered}"
+
+
+def test_the_time_of_a_command_counts_for_its_tenant_whether_it_succeeds_or_fails() -> None:
+    with worker_parts() as worker:
+        connection, _ = worker.join()
+        now = worker.loop.now
+        for identity, started_s, message in (
+            (1, now, Result(id=1, reply={}, compute_ms=250.0)),
+            (2, now - 0.5, Failure(id=2, code="no-consensus", message="m")),
+            (3, 0.0, Failure(id=3, code="busy", message="refused before it began")),
+        ):
+            command = Command(id=identity, service="echo", payload={})
+            queued = QueuedCommand(connection, connection.robot, command, 9, now - 1.0, 1e9)
+            queued.started_s = started_s
+            worker.answers.send(worker.answers._encode(queued, message), now)
+            worker.answers.send_message(queued, message)  # what computed it counts by itself
+
+        taken = worker.dispatcher.snapshot()["tenant_cpu_s"]
+        assert taken == [[connection.robot.tenant, "commands", pytest.approx(0.75)]]

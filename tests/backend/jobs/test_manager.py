@@ -35,6 +35,8 @@ WAIT_S = 20.0
 class FakeProcess:
     """The process of a job, which does what the test says."""
 
+    pid = 0
+
     def __init__(self, request: JobRequest) -> None:
         self.request = request
         self.connection, self._theirs = socket.socketpair()
@@ -121,8 +123,9 @@ def code(answer: Result | Failure) -> str:
     return "ok" if isinstance(answer, Result) else answer.code
 
 
-def test_two_commands_with_the_same_request_wait_for_the_same_run(make):
-    bench, owner = make(), robot()
+def test_two_commands_with_the_same_request_wait_for_the_same_run(make, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("rse_pf.backend.jobs.runner.cpu_seconds", lambda pid: 3.25)
+    bench, owner = make(), robot(tenant="acme")
     ask(bench, owner, 1)
     process = bench.process()
     ask(bench, owner, 2)
@@ -134,6 +137,7 @@ def test_two_commands_with_the_same_request_wait_for_the_same_run(make):
     assert len({each.object for each in bench.answers.values()}) == 1
     assert bench.started.empty()
     assert bench.jobs.known == 0
+    assert bench.jobs.cpu_by_tenant() == {"acme": 3.25}, "it was computed once"
 
 
 def test_the_same_request_of_another_robot_or_tenant_is_another_job(make):

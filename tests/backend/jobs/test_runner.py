@@ -40,6 +40,8 @@ DONE = ["done", 12.5, REPLY]
 class FakeProcess:
     """Sends *script* at once; then ends with *code* if *ends*."""
 
+    pid = 0
+
     def __init__(self, script: list[Any], *, ends: bool = True, code: int = 0) -> None:
         self.connection, self.theirs = socket.socketpair()
         self.killed = threading.Event()
@@ -140,6 +142,17 @@ def test_a_result_is_stored_before_it_is_reported(bench):
     assert bench.store.get(object_name(RobotId("default", "robot-1"), outcome.object)) == REPLY
     assert (bench.record.state, bench.record.reply) == ("done", outcome.object)
     assert [what for _, what in bench.told] == ["waits for its turn", "starts", "half"]
+
+
+@pytest.mark.parametrize("script", [[DONE], [], [["failed", "bad-request", "no", ""]]])
+def test_an_outcome_says_what_its_process_took_whatever_came_of_it(
+    bench, monkeypatch: pytest.MonkeyPatch, script: list[Any]
+):
+    monkeypatch.setattr("rse_pf.backend.jobs.runner.cpu_seconds", lambda pid: 3.25)
+
+    assert bench.run(lambda: FakeProcess(script)).cpu_s == 3.25
+    if script == [DONE]:
+        assert bench.run().cpu_s == 0.0, "a stored result was not computed again"
 
 
 def test_a_job_with_a_stored_result_is_not_run_again(bench):

@@ -32,6 +32,9 @@ class FakeOwners:
         self.gave_up = self.closed = False
         self._next: dict[tuple[str, str, RobotId], int] = {}
 
+    def cpu_by_tenant(self) -> dict[str, float]:
+        return {}
+
     async def request(
         self,
         tenant: str,

@@ -6,6 +6,8 @@ import asyncio
 import socket
 from collections.abc import Awaitable, Callable
 
+import pytest
+
 from rse_pf.backend.live_map.children import OwnerChild, OwnerChildren
 from rse_pf.backend.live_map.owner.process import OwnerOrder
 from rse_pf.backend.sandbox.ipc import encode_message
@@ -152,3 +154,24 @@ def test_a_process_that_is_told_to_be_used_is_not_the_first_to_go() -> None:
         assert child.unused_s == 7.0
 
     play(1, test)
+
+
+def test_the_processor_time_of_owners_counts_for_their_tenants_also_when_they_have_ended(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    taken_s = [0.0]
+    monkeypatch.setattr("rse_pf.backend.live_map.children.cpu_seconds", lambda pid: taken_s[0])
+
+    async def test(worker: Worker) -> None:
+        taken_s[0] = 1.0  # its imports
+        child = await worker.gets("acme")
+        taken_s[0] = 3.5
+        assert worker.children.cpu_by_tenant() == {"acme": 2.5}
+        child.kill()
+        taken_s[0] = 4.0
+        assert worker.children.cpu_by_tenant() == {"acme": 2.5}
+        await worker.gets("acme")
+        taken_s[0] = 4.25
+        assert worker.children.cpu_by_tenant() == {"acme": 2.75}
+
+    play(2, test)

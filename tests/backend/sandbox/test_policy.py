@@ -676,3 +676,30 @@ def test_what_the_store_says_after_the_sandbox_crashed_changes_nothing():
     policy.on_exit(1, "exit code 1", 1.1)
 
     assert policy.on_store_reply(1, call, None, 1.2) == []
+
+
+def test_the_time_that_a_sandbox_works_counts_for_its_tenant_whatever_comes_of_it():
+    policy = make_policy()
+    number = start(policy, make_call())
+    policy.on_reply(number, SandboxReply("y", 0.0), 2.0)
+    assert policy.worked_s == {"acme": 2.0}
+    policy.submit(make_call(now=10.0), 10.0)
+    policy.on_reply(number, BadRequest("no"), 13.0)
+    assert policy.worked_s == {"acme": 5.0}
+    policy.submit(make_call(now=20.0), 20.0)
+    policy.tick(40.0)
+    policy.on_exit(number, "killed", 41.0)
+
+    assert policy.worked_s == {"acme": 26.0}, "until it was killed for its deadline"
+
+
+def test_the_time_that_a_store_takes_is_nobodys():
+    policy = make_policy()
+    number = start(policy, make_call(service="counter"))
+    call = next(iter(policy._sandboxes.values())).running
+    assert call is not None
+    policy.on_store_reply(number, call, None, 5.0)
+    policy.on_reply(number, SandboxReply("y", 0.0, b"state"), 6.0)
+    policy.on_store_reply(number, call, None, 9.0)
+
+    assert policy.worked_s == {"acme": 1.0}

@@ -62,6 +62,9 @@ class Sandboxes:
     def report(self) -> dict[str, Any]:
         return {"sandboxes": 1, "missing_isolation": [], "open_breakers": [], "counts": {"crashes": 1}}
 
+    def cpu_by_tenant(self) -> dict[str, float]:
+        return {"acme": 1.5}
+
     def retire(self) -> None:
         self.is_retired = True
 
@@ -145,6 +148,7 @@ def test_a_robots_commands_keep_their_order_and_others_do_not_wait_for_them() ->
     fresh.reply()
     assert parts.answers == [(1, "ok"), (3, "ok"), (2, "ok")]
     assert parts.sandboxes.report()["counts"] == {"crashes": 2}, "counts of Prometheus never fall"
+    assert parts.sandboxes.cpu_by_tenant() == {"acme": 3.0}
 
 
 def test_a_service_that_was_removed_is_unknown_also_to_who_waited_for_it() -> None:
