@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from client_sdk.answers import Answer, PoseAnswer, decode_reply
     from client_sdk.blocking import BlockingRobot, connect_blocking
     from client_sdk.datasets import Dataset, open_dataset
-    from client_sdk.frontend import Frame, FrontEndOptions, PoseQuery, TrackedFrame, Tracker
+    from client_sdk.frontend import Frame, FrontEndOptions, PoseQuery, TrackedFrame
     from client_sdk.live import BlockingLiveMapper, Correction, LiveMapper, LiveOptions, OtherRobot
     from client_sdk.mapper import BlockingMapper, Mapper
     from client_sdk.mapping import MapOptions, PointMap, Trajectory
@@ -93,7 +93,7 @@ _HOMES = {
     "Robot": "robot",
     "Stats": "stats",
     "TrackedFrame": "frontend",
-    "Tracker": "frontend",
+    "Tracker": "tracking.tracker",
     "Trajectory": "mapping",
     "Updates": "updates",
     "connect": "robot",

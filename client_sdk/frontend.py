@@ -1,7 +1,6 @@
-"""The robot's visual front end: features, matches, and the queries for poses that are sent to the cloud.
+"""The robot's visual front end: frames, features, matches of two frames, and the queries for poses.
 
-`Tracker` is a state machine without input or output: frames and answers go in, pose queries and tracked
-frames come out.  There is one query at a time.  Its numbers are rounded exactly as they are sent.
+What a frame is matched with is decided in `client_sdk.tracking`.
 """
 
 from __future__ import annotations
@@ -17,21 +16,23 @@ import numpy.typing as npt
 from client_sdk.monocular.opencv import load_opencv
 from client_sdk.native_match import FrontEndCore, front_end_core
 from rse_pf.errors import UsageError
-from rse_pf.geometry import Array, Camera, inverse, pose_difference
+from rse_pf.geometry import Array, Camera
 
 __all__ = [
     "Correspondences",
+    "DescribedPixels",
     "Features",
     "Frame",
     "FrontEndOptions",
     "PoseQuery",
     "TrackedFrame",
-    "Tracker",
+    "describe",
     "extract",
     "load_opencv",
     "match",
     "points_at",
     "round_for_wire",
+    "spread_rows",
 ]
 
 # So many matches fit into a command of 10 kB.  Each takes 14 to 15 bytes with zlib in recordings, and 18 if
@@ -40,6 +41,10 @@ _MATCHES_OF_CODEC = {"zlib": 530, "bin": 400, "json": 220}
 
 # ORB's pyramid.
 _SCALE, _LEVELS = 1.2, 8
+_SCALES: Array = np.power(_SCALE, np.arange(_LEVELS, dtype=np.float64))
+_FAST, _FAST_SPREAD = 10, 7
+_SOUGHT, _CELL_PX = 3, 40
+"""So many times the features are sought, and spread over cells of this size."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -72,7 +77,8 @@ class FrontEndOptions:
     Defaults: measured on the red-kitchen recording at 5 and 10 Hz (ATE 4 to 5 cm).
 
     Attributes:
-        features: How many ORB features are sought in a frame.
+        features: How many ORB features a frame has.
+        is_spread: Whether they are spread over the image, or the strongest wherever they are.
         ratio: Lowe's ratio test: the best match must be this much closer than the second best.
         max_matches: The best by descriptor distance are sent, so that a command stays under 10 kB with zlib;
             other codecs need more bytes a match, see `sent_with`.
@@ -84,13 +90,16 @@ class FrontEndOptions:
         max_iterations: Of RANSAC.
         min_inliers: A pose with fewer is not accepted.
         max_jump_m: The largest plausible motion from one frame to the next.
-        keyframe_m: A frame farther from the last keyframe becomes one.
-        keyframe_deg: A frame turned further from the last keyframe becomes one.
-        keyframe_inliers: A frame with fewer inliers becomes a keyframe even if the robot hardly moved.
-        chain: Match against the last good frame, or against the last keyframe; the other one is the retry.
+        keyframe_m: A frame farther from every keyframe becomes one.
+        keyframe_deg: A frame turned further from every keyframe becomes one.
+        keyframe_share: A frame that sees a smaller share of what the last keyframe saw becomes one.
+        search_px: Radius around a predicted pixel in which a landmark is sought.
+        segment_after: A new segment begins after so many frames that show enough and no place that is known.
+        max_keyframes: So many are matched against at most; then older ones are thinned out.
     """
 
     features: int = 1000
+    is_spread: bool = True
     ratio: float = 0.75
     max_matches: int = 530
     min_depth_m: float = 0.3
@@ -98,12 +107,14 @@ class FrontEndOptions:
     depth_spread_percent: float = 5.0
     inlier_px: float = 3.0
     max_iterations: int = 1000
-    min_inliers: int = 12
+    min_inliers: int = 20
     max_jump_m: float = 0.5
-    keyframe_m: float = 0.2
-    keyframe_deg: float = 12.0
-    keyframe_inliers: int = 120
-    chain: Literal["frame", "keyframe"] = "frame"
+    keyframe_m: float = 0.15
+    keyframe_deg: float = 10.0
+    keyframe_share: float = 0.6
+    search_px: float = 40.0
+    segment_after: int = 10
+    max_keyframes: int = 1000
 
     def __post_init__(self) -> None:
         if self.min_inliers < 4 or self.max_matches < self.min_inliers or self.features < self.min_inliers:
@@ -142,7 +153,7 @@ class FrontEndOptions:
         change of view: 24, 32, 30 and 530 inliers on those four pairs, where 3000 features leave
         the first pair 11 to 13.  The jump limit is above the baseline.
         """
-        return cls(features=4000, ratio=0.8, inlier_px=4.0, max_iterations=1000, max_jump_m=1.5)
+        return cls(features=4000, is_spread=False, ratio=0.8, inlier_px=4.0, min_inliers=12, max_jump_m=1.5)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -150,12 +161,15 @@ class Features:
     """ORB features of one frame.
 
     ``pixels`` ``(n, 2)``; ``descriptors`` ``(n, 32)`` uint8; ``points_camera`` ``(n, 3)`` metres,
-    NaN where the depth cannot be trusted.
+    NaN where the depth cannot be trusted; ``turns`` ``(n, 2)``, cosine and sine of the orientation; ``sizes``
+    ``(n,)``, the scale of the pyramid's level, 1 for the finest.
     """
 
     pixels: Array
     descriptors: npt.NDArray[np.uint8]
     points_camera: Array
+    turns: Array
+    sizes: Array
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -176,57 +190,114 @@ class Correspondences:
 
 
 def extract(frame: Frame, options: FrontEndOptions) -> Features:
-    """Find ORB features and their points; deterministic.
+    """Find ORB features, spread over the image, and their points; deterministic.
+
+    Raises:
+        MissingExtra: OpenCV is not installed.
+    """
+    described = describe(frame.rgb, options.features, is_spread=options.is_spread)
+    return Features(
+        pixels=described.pixels, descriptors=described.descriptors, turns=described.turns,
+        sizes=described.sizes, points_camera=points_at(frame, described.pixels, options),
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class DescribedPixels:
+    """Keypoints of one image as `Features` has them, without depth."""
+
+    pixels: Array
+    descriptors: npt.NDArray[np.uint8]
+    turns: Array
+    sizes: Array
+
+
+def describe(rgb: npt.NDArray[np.uint8], count: int, *, is_spread: bool = True) -> DescribedPixels:
+    """Return *count* ORB features of an ``(h, w, 3)`` image; deterministic.
+
+    Args:
+        rgb: ``(h, w, 3)``.
+        count: The most features.
+        is_spread: Take the strongest of each cell of 40 px, with weak ones where there are no others; else
+            the strongest of the image.
 
     Raises:
         MissingExtra: OpenCV is not installed.
 
     Source:
-        Rublee et al., ICCV 2011; scale 1.2, 8 levels, FAST threshold 10.
+        Rublee et al., ICCV 2011; scale 1.2, 8 levels, FAST threshold 7, and 10 where features are not spread.
     """
     cv2 = load_opencv()
-    orb = cv2.ORB_create(nfeatures=options.features, scaleFactor=_SCALE, nlevels=_LEVELS, fastThreshold=10)
-    gray = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
-    core = front_end_core()
-    found = _described(cv2, orb, gray, core) if core is not None and _describes_alike(core) else None
-    pixels, descriptors = found or _described_by_opencv(cv2, orb, gray)
-    points_camera = points_at(frame, pixels, options)
-    return Features(pixels=pixels, descriptors=descriptors, points_camera=points_camera)
-
-
-_Described = tuple[Array, npt.NDArray[np.uint8]]
-
-
-def _described_by_opencv(cv2: Any, orb: Any, gray: npt.NDArray[np.uint8]) -> _Described:
-    """Return the pixels and the descriptors of an image's keypoints."""
-    keypoints, descriptors = orb.detectAndCompute(gray, None)
-    if not keypoints:
-        return np.empty((0, 2)), np.empty((0, 32), dtype=np.uint8)
-    return cv2.KeyPoint_convert(keypoints).astype(np.float64), descriptors
-
-
-def _described(cv2: Any, orb: Any, gray: npt.NDArray[np.uint8], core: FrontEndCore) -> _Described | None:
-    """Return the same, described by the native core; None where there is nothing that it can describe."""
+    gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
+    orb = _orb(cv2, _SOUGHT * count, _FAST_SPREAD) if is_spread else _orb(cv2, count, _FAST)
     keypoints = orb.detect(gray, None)
     if not keypoints:
-        return None
+        none = np.empty((0, 2))
+        return DescribedPixels(
+            pixels=none, descriptors=np.empty((0, 32), dtype=np.uint8), turns=none, sizes=np.empty(0)
+        )
     n = len(keypoints)
-    pixels = cv2.KeyPoint_convert(keypoints)
+    responses = np.fromiter(map(attrgetter("response"), keypoints), np.float64, n)
+    rows = spread_rows(cv2.KeyPoint_convert(keypoints), responses, gray.shape, count)
+    chosen = [keypoints[row] for row in rows] if is_spread else list(keypoints)
+    core = front_end_core()
+    descriptors = _described(cv2, gray, chosen, core) if core is not None and _describes_alike(core) else None
+    if descriptors is None:
+        chosen, descriptors = orb.compute(gray, chosen)
+    angles = np.radians(np.fromiter(map(attrgetter("angle"), chosen), np.float64, len(chosen)))
+    octaves = np.fromiter(map(attrgetter("octave"), chosen), np.int64, len(chosen))
+    return DescribedPixels(
+        pixels=cv2.KeyPoint_convert(chosen).astype(np.float64),
+        descriptors=descriptors,
+        turns=np.stack([np.cos(angles), np.sin(angles)], axis=1),
+        sizes=_SCALES[octaves],
+    )
+
+
+def spread_rows(pixels: Array, responses: Array, size: tuple[int, int], count: int) -> list[int]:
+    """Return the rows of the strongest keypoints of each cell of the image, *count* in all, ascending.
+
+    Args:
+        pixels: ``(n, 2)``.
+        responses: ``(n,)``, how strong a keypoint is.
+        size: Height and width of the image.
+        count: Rows of the first, then the second strongest of all cells, and so on.
+    """
+    across = -(-size[1] // _CELL_PX)
+    cells = (pixels[:, 1] // _CELL_PX * across + pixels[:, 0] // _CELL_PX).astype(np.int64)
+    order = np.lexsort((-responses, cells))
+    starts = np.flatnonzero(np.concatenate(([True], np.diff(cells[order]) != 0)))
+    rank = np.arange(len(order)) - np.repeat(starts, np.diff(np.append(starts, len(order))))
+    best = order[np.lexsort((-responses[order], rank))][:count]
+    rows: list[int] = np.sort(best).tolist()
+    return rows
+
+
+def _orb(cv2: Any, count: int, threshold: int) -> Any:
+    return cv2.ORB_create(nfeatures=count, scaleFactor=_SCALE, nlevels=_LEVELS, fastThreshold=threshold)
+
+
+def _described(
+    cv2: Any, gray: npt.NDArray[np.uint8], keypoints: list[Any], core: FrontEndCore
+) -> npt.NDArray[np.uint8] | None:
+    """Return the descriptors of keypoints by the native core; None where it cannot describe them."""
+    n = len(keypoints)
     angles_deg = np.fromiter(map(attrgetter("angle"), keypoints), np.float32, n)
     octaves = np.fromiter(map(attrgetter("octave"), keypoints), np.int32, n)
-    descriptors = core.describe(gray, pixels, angles_deg, octaves, scale=_SCALE, levels=_LEVELS)
-    return None if descriptors is None else (pixels.astype(np.float64), descriptors)
+    return core.describe(
+        gray, cv2.KeyPoint_convert(keypoints), angles_deg, octaves, scale=_SCALE, levels=_LEVELS
+    )
 
 
 @cache
 def _describes_alike(core: FrontEndCore) -> bool:
     """Say whether the core describes a picture as the installed OpenCV does, which may be another version."""
     cv2 = load_opencv()
-    orb = cv2.ORB_create(nfeatures=500, scaleFactor=_SCALE, nlevels=_LEVELS, fastThreshold=10)
     blocks = np.random.default_rng(1).integers(0, 256, (60, 80))
     gray = np.kron(blocks, np.ones((5, 5))).astype(np.uint8)
-    ours = _described(cv2, orb, gray, core)
-    return ours is not None and bool(np.array_equal(ours[1], _described_by_opencv(cv2, orb, gray)[1]))
+    keypoints, descriptors = _orb(cv2, 500, _FAST).detectAndCompute(gray, None)
+    ours = _described(cv2, gray, keypoints, core)
+    return ours is not None and bool(np.array_equal(ours, descriptors))
 
 
 def match(reference: Features, frame: Features, options: FrontEndOptions) -> Correspondences:
@@ -287,7 +358,7 @@ class PoseQuery:
     camera: Camera
     inlier_px: float
     max_iterations: int
-    against: Literal["frame", "keyframe"]
+    against: Literal["map", "frame", "keyframe", "segment"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -323,176 +394,6 @@ class TrackedFrame:
     def lost(self) -> bool:
         """Whether no pose was accepted."""
         return self.T_world_camera is None
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _View:
-    """A frame that other frames are matched against."""
-
-    features: Features
-    T_world_camera: Array
-
-
-class Tracker:
-    """Visual odometry as a state machine without I/O; one frame and one query at a time.
-
-    ::
-
-        step = tracker.prepare(frame)
-        while isinstance(step, PoseQuery):
-            T_camera_world, inliers = ...   # the PnP service's answer, or None, 0 on any failure
-            step = tracker.accept(step, T_camera_world, inliers)
-        # step is now the TrackedFrame
-
-    A frame is matched against the last good frame.  If the pose has too few inliers or jumps, it is
-    queried once more against the last keyframe.  If that fails, too, the frame is lost: it is
-    counted, and later frames are not matched against it.
-
-    ``frames`` counts the frames prepared so far, ``lost_frames`` those of them without an accepted pose.
-    """
-
-    def __init__(self, options: FrontEndOptions | None = None, T_world_start: Array | None = None) -> None:
-        self.options = options or FrontEndOptions()
-        self.frames = 0
-        self.lost_frames = 0
-        self.keyframes = 0
-        self._T_world_start = np.eye(4) if T_world_start is None else T_world_start
-        self._last: _View | None = None
-        self._keyframe: _View | None = None
-        self._lost_in_a_row = 0
-        self._frame: Frame  # set by `prepare`
-        self._features: Features
-        self._query: PoseQuery | None = None
-        self._to_try: list[Literal["frame", "keyframe"]] = []
-
-    @property
-    def keyframe_features(self) -> Features | None:
-        """The features of the last keyframe, None before the first."""
-        return None if self._keyframe is None else self._keyframe.features
-
-    @property
-    def last_features(self) -> Features | None:
-        """The features of the last frame that has a pose, None before the first."""
-        return None if self._last is None else self._last.features
-
-    def restart(self, T_world_start: Array) -> None:
-        """Forget what frames are matched against: the next frame with enough features is at *T_world_start*.
-
-        Raises:
-            UsageError: A query is open.
-        """
-        self._refuse_open_query()
-        self._T_world_start = T_world_start
-        self._last = self._keyframe = None
-        self._lost_in_a_row = 0
-
-    def prepare(self, frame: Frame) -> PoseQuery | TrackedFrame:
-        """Take the next frame; return a query, or the result for the frame if none is needed.
-
-        The first frame with enough features is the start and needs no query; a frame without enough
-        matches is lost without one.
-
-        Raises:
-            UsageError: The last query was not answered yet.
-        """
-        self._refuse_open_query()
-        self.frames += 1
-        self._frame, self._features = frame, extract(frame, self.options)
-        if self._last is None:
-            usable = int(np.isfinite(self._features.points_camera[:, 2]).sum())
-            if usable < self.options.min_inliers:
-                return self._lose(0)
-            return self._keep(self._T_world_start, inliers=0, matches=0, keyframe=True)
-        self._to_try = ["frame", "keyframe"] if self.options.chain == "frame" else ["keyframe", "frame"]
-        if self._last is self._keyframe:
-            self._to_try = ["keyframe"]
-        return self._next_query(0)
-
-    def accept(
-        self, query: PoseQuery, T_camera_world: Array | None, inliers: int = 0
-    ) -> PoseQuery | TrackedFrame:
-        """Take the answer to *query*; return another query, or the result for the frame.
-
-        Args:
-            query: The query that `prepare` or `accept` returned last.
-            T_camera_world: ``(4, 4)`` as the PnP service returns it, where world is the world of
-                the query (its reference camera); ``None`` if there was no answer.
-            inliers: How many correspondences agree with it.
-
-        Raises:
-            UsageError: *query* is not the open one.
-        """
-        if query is not self._query:
-            raise UsageError("this query is not the open one", hint="answer each query once, in order")
-        self._query = None
-        matches = len(query.correspondences)
-        if T_camera_world is not None and inliers >= self.options.min_inliers:
-            T_world_camera = self._view(query.against).T_world_camera @ inverse(T_camera_world)
-            if self._is_plausible(T_world_camera):
-                keyframe = self._is_keyframe(T_world_camera, inliers)
-                return self._keep(T_world_camera, inliers=inliers, matches=matches, keyframe=keyframe)
-        return self._next_query(matches)
-
-    def _refuse_open_query(self) -> None:
-        if self._query is not None:
-            raise UsageError(
-                f"the query of frame {self._query.timestamp_s:.3f} s is open",
-                hint="call accept with its answer, or with None",
-            )
-
-    def _next_query(self, matches: int) -> PoseQuery | TrackedFrame:
-        while self._to_try:
-            against = self._to_try.pop(0)
-            found = match(self._view(against).features, self._features, self.options)
-            if len(found) >= self.options.min_inliers:
-                self._query = PoseQuery(
-                    timestamp_s=self._frame.timestamp_s,
-                    correspondences=found,
-                    camera=self._frame.camera,
-                    inlier_px=self.options.inlier_px,
-                    max_iterations=self.options.max_iterations,
-                    against=against,
-                )
-                return self._query
-        return self._lose(matches)
-
-    def _is_plausible(self, T_world_camera: Array) -> bool:
-        last = self._view("frame").T_world_camera
-        limit_m = self.options.max_jump_m * (1 + self._lost_in_a_row)
-        moved_m = float(np.linalg.norm(T_world_camera[:3, 3] - last[:3, 3]))
-        return bool(np.isfinite(T_world_camera).all()) and moved_m <= limit_m
-
-    def _is_keyframe(self, T_world_camera: Array, inliers: int) -> bool:
-        moved_m, turned_deg = pose_difference(T_world_camera, self._view("keyframe").T_world_camera)
-        options = self.options
-        is_far = moved_m > options.keyframe_m or turned_deg > options.keyframe_deg
-        return is_far or inliers < options.keyframe_inliers
-
-    def _keep(self, T_world_camera: Array, *, inliers: int, matches: int, keyframe: bool) -> TrackedFrame:
-        self._last = _View(features=self._features, T_world_camera=T_world_camera)
-        self._lost_in_a_row = 0
-        if keyframe:
-            self._keyframe = self._last
-            self.keyframes += 1
-        return TrackedFrame(
-            frame=self._frame,
-            T_world_camera=T_world_camera,
-            keyframe=keyframe,
-            inliers=inliers,
-            matches=matches,
-        )
-
-    def _lose(self, matches: int) -> TrackedFrame:
-        self.lost_frames += 1
-        self._lost_in_a_row += 1
-        return TrackedFrame(
-            frame=self._frame, T_world_camera=None, keyframe=False, inliers=0, matches=matches
-        )
-
-    def _view(self, which: Literal["frame", "keyframe"]) -> _View:
-        view = self._last if which == "frame" else self._keyframe
-        assert view is not None
-        return view
 
 
 def points_at(frame: Frame, pixels: Array, options: FrontEndOptions) -> Array:

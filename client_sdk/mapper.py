@@ -18,13 +18,15 @@ import numpy as np
 import numpy.typing as npt
 
 from client_sdk.answers import PoseAnswer
-from client_sdk.frontend import Features, Frame, FrontEndOptions, PoseQuery, TrackedFrame, Tracker
+from client_sdk.frontend import Features, Frame, FrontEndOptions, PoseQuery, TrackedFrame
 from client_sdk.mapping import MapOptions, PointMap, Trajectory, write_ply, write_trajectory
 from client_sdk.monocular.scale import MarkerScale, OdometryScale
 from client_sdk.monocular_tracker import MonocularOptions, MonocularTracker
+from client_sdk.tracking.segments import DriveRecords, keyframe_of
+from client_sdk.tracking.tracker import Tracker
 from rse_pf.errors import ConfigurationError, RsePfError, UsageError
 from rse_pf.geometry import Array, Camera
-from rse_pf.maps.format import Keyframe, MapVersion, encode_map
+from rse_pf.maps.format import MapVersion, encode_map
 from rse_pf.pnp import PnpOptions
 
 __all__ = ["AskPose", "BlockingMapper", "FrameRecorder", "Mapper", "PoseSolver", "ask_robot"]
@@ -131,13 +133,11 @@ class Mapper:
         self._map_options = map_options or MapOptions()
         self._T_world_start = T_world_start
         self._tracker: Tracker | MonocularTracker | None = None
-        self._dense = PointMap(self._map_options)
+        self._records = DriveRecords(self._map_options)
         self._keyframes_of = keyframes_of
         self._adds_frames = adds_frames
         self._recorder = recorder
-        self._kept: list[Keyframe] = []
-        self._stamps: list[float] = []
-        self._poses: list[Array] = []
+        self._joined = 0
         self._is_metric = False
         self._one_frame = asyncio.Lock()
         self._round_trips_ms: list[float] = []
@@ -179,6 +179,7 @@ class Mapper:
                     step,
                     None if solution is None else solution.T_camera_world,
                     0 if solution is None else len(solution.inliers),
+                    is_weak=solution is not None and solution.verdict == "weak",
                 )
             return await asyncio.to_thread(self._finished, step, answer, failure, position_m)
 
@@ -187,17 +188,17 @@ class Mapper:
         """The map so far: dense with depth, else its landmarks."""
         tracker = self._tracker
         if not isinstance(tracker, MonocularTracker):
-            return self._dense
+            return self._records.first.cloud
         sparse = PointMap(self._map_options)
         sparse.add_points(*tracker.points())
         return sparse
 
     @property
     def trajectory(self) -> Trajectory:
-        """The poses so far, with all corrections."""
+        """The poses so far, with all corrections, of the first segment and all that was joined to it."""
         if isinstance(self._tracker, MonocularTracker):
             return self._tracker.trajectory()
-        return Trajectory(np.array(self._stamps), np.array(self._poses).reshape(-1, 4, 4))
+        return self._records.first.trajectory()
 
     @property
     def frames(self) -> int:
@@ -220,6 +221,11 @@ class Mapper:
         if self._tracker is None or isinstance(self._tracker, Tracker):
             return "metric, by depth" if self._tracker is not None else "unknown: no frame yet"
         return f"metric, by {self._scale.name}" if self._is_metric and self._scale else _UP_TO_SCALE
+
+    @property
+    def unrecognised(self) -> int:
+        """The number of lost frames since the last pose that show enough; a covered lens does not count."""
+        return self._tracker.unrecognised if isinstance(self._tracker, Tracker) else 0
 
     @property
     def features(self) -> Features | None:
@@ -246,6 +252,8 @@ class Mapper:
             "lost_frames": self.lost_frames,
             "frames_before_start": starting,
             "keyframes": self.keyframes,
+            "segments_apart": len(self._records.apart),
+            "frames_apart": sum(len(record.poses) for record in self._records.apart),
             "scale": self.scale,
             "unit": "unit of the map" if self.scale == _UP_TO_SCALE else "m",
             "path": round(trajectory.length_m, 3) if len(trajectory) > 1 else 0.0,
@@ -266,19 +274,23 @@ class Mapper:
         Raises:
             UsageError: No keyframe was kept: the frames have no depth, or *keyframes_of* is empty.
         """
-        if not self._kept:
+        record = self._records.first
+        if not record.keyframes:
             raise UsageError(
                 "no keyframe was kept, so there is no map to share",
                 hint="make the mapper with keyframes_of=ROBOT, and give it frames with depth",
             )
-        points, colours = self._dense.points(min_readings=_MIN_READINGS)
+        points, colours = record.cloud.points(min_readings=_MIN_READINGS)
         made_by = {"made_by": "mapper", "robot": self._keyframes_of}
-        version = MapVersion(keyframes=tuple(self._kept), points=points, colours=colours, provenance=made_by)
+        keyframes = tuple(replace(keyframe, id=number) for number, keyframe in enumerate(record.keyframes))
+        version = MapVersion(keyframes=keyframes, points=points, colours=colours, provenance=made_by)
         return encode_map(version)
 
     def save(self, folder: Path) -> dict[str, Any]:
         """Write ``map.ply``, ``trajectory.txt`` and ``report.json``; return the report.
 
+        Segments that were not joined to the first one have files of their own: ``map-2.ply``,
+        ``trajectory-2.txt`` and so on.
         A map with depth has the points that were read at least twice; the report counts those.
 
         Raises:
@@ -296,6 +308,9 @@ class Mapper:
             folder.mkdir(parents=True, exist_ok=True)
             write_ply(folder / "map.ply", points, colours, is_metric=is_metric)
             write_trajectory(folder / "trajectory.txt", self.trajectory, is_metric=is_metric)
+            for number, record in enumerate(self._records.apart, start=2):
+                write_ply(folder / f"map-{number}.ply", *record.cloud.points(), is_metric=True)
+                write_trajectory(folder / f"trajectory-{number}.txt", record.trajectory())
             text = json.dumps(report, indent=2) + "\n"
             (folder / "report.json").write_text(text, encoding="utf-8")
         except OSError as error:
@@ -323,7 +338,7 @@ class Mapper:
     ) -> TrackedFrame:
         """Complete the result of a frame, and add it to trajectory and map."""
         tracker, pose = self._tracker, tracked.T_world_camera
-        is_first = isinstance(tracker, Tracker) and pose is not None and not self._poses
+        is_first = isinstance(tracker, Tracker) and pose is not None and not self._records.first.poses
         reason = tracked.reason or (failure if pose is None else "")
         if pose is None and not reason:
             reason = f"only {tracked.matches} matches, or their pose is not plausible"
@@ -349,24 +364,20 @@ class Mapper:
         )
         if isinstance(tracker, MonocularTracker):
             return self._with_scale(tracker, done, position_m)
+        assert tracker is not None
         if pose is not None:
-            self._stamps.append(done.frame.timestamp_s)
-            self._poses.append(pose)
-            if self._adds_frames:
-                self._dense.add(done.frame, pose)
-            if done.keyframe and self._keyframes_of and tracker is not None:
-                self._keep(done, pose, tracker.keyframe_features)
-        return done
+            record = self._records.add(done, pose, into_cloud=self._adds_frames)
+            if done.keyframe and self._keyframes_of and tracker.last_features is not None:
+                record.keyframes.append(keyframe_of(done, pose, tracker.last_features, self._keyframes_of))
+        return self._with_joins(tracker, done)
 
-    def _keep(self, done: TrackedFrame, pose: Array, features: Features | None) -> None:
-        """Keep a keyframe for `encoded_map`."""
-        if features is not None:
-            keyframe = Keyframe(
-                id=len(self._kept), robot=self._keyframes_of, timestamp_s=done.frame.timestamp_s,
-                T_world_camera=pose, camera=done.frame.camera, pixels=features.pixels.astype(np.float32),
-                descriptors=features.descriptors, points_camera=features.points_camera.astype(np.float32),
-            )  # fmt: skip
-            self._kept.append(keyframe)
+    def _with_joins(self, tracker: Tracker, done: TrackedFrame) -> TrackedFrame:
+        """Move what was joined since the last frame; the poses that were returned before are corrected."""
+        joins = tracker.joins[self._joined :]
+        for join in joins:
+            self._records.join(join)
+        self._joined = len(tracker.joins)
+        return replace(done, corrected=bool(joins))
 
     def _with_scale(
         self, tracker: MonocularTracker, done: TrackedFrame, position_m: Array | None

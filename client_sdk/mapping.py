@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -97,8 +97,18 @@ class PointMap:
         points, colours = frame_points(frame, self.options)
         return self.add_points(transform(T_world_camera, points), colours)
 
+    def take(self, other: PointMap, T_world_other: Array) -> None:
+        """Add all voxels of another map, seen in its frame, each with its readings."""
+        means = other._means[: other._size]
+        points = transform(T_world_other, means[:, :3].astype(np.float64))
+        self._add(points, means[:, 3:], other._counts[: other._size])
+
     def add_points(self, points_world: Array, colours: npt.NDArray[np.uint8]) -> int:
         """Add ``(n, 3)`` points in metres and ``(n, 3)`` uint8 colours; return how many were used."""
+        return self._add(points_world, colours, np.ones(len(points_world), dtype=np.int32))
+
+    def _add(self, points_world: Array, colours: npt.NDArray[Any], readings: npt.NDArray[np.int32]) -> int:
+        """Add points that stand for so many readings each; return how many readings were used."""
         index = np.floor(points_world / self.options.voxel_m)
         inside = (np.abs(index) < _REACH).all(axis=1)
         index = index[inside].astype(np.int64) + _REACH
@@ -108,9 +118,10 @@ class PointMap:
         order = np.argsort(keys)
         keys = keys[order]
         first = np.flatnonzero(np.concatenate(([True], keys[1:] != keys[:-1])))
+        readings = readings[inside][order]
         values = np.concatenate((points_world[inside], colours[inside]), axis=1)[order]
-        sums = np.add.reduceat(values, first, axis=0)
-        counts = np.diff(np.append(first, len(keys)))
+        sums = np.add.reduceat(values * readings[:, None], first, axis=0)
+        counts = np.add.reduceat(readings, first)
         rows = self._rows_of(keys[first])
         has_row = rows >= 0
         self._average(rows[has_row], sums[has_row], counts[has_row])

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import numpy.typing as npt
 
-from client_sdk.frontend import Correspondences, Frame, PoseQuery, TrackedFrame, load_opencv, round_for_wire
+from client_sdk.frontend import Correspondences, Frame, PoseQuery, TrackedFrame, describe, round_for_wire
 from client_sdk.mapping import Trajectory
 from client_sdk.monocular.bundle import refine_pose, reprojection_errors
 from client_sdk.monocular.descriptors import match_all, match_near
@@ -23,8 +23,6 @@ from rse_pf.geometry import Array, inverse, pose_difference, transform
 
 __all__ = ["MonocularOptions", "MonocularTracker"]
 
-_SCALE, _LEVELS = 1.2, 8
-_CELL_PX = 40
 _START_DEPTH = 2.0
 """Median depth of the first landmarks in the arbitrary unit: fine enough for points rounded to 0.0001."""
 _MAX_STARTING = 30
@@ -121,7 +119,7 @@ class MonocularTracker:
         return self._next_query("")
 
     def accept(
-        self, query: PoseQuery, T_camera_world: Array | None, inliers: int = 0
+        self, query: PoseQuery, T_camera_world: Array | None, inliers: int = 0, *, is_weak: bool = False
     ) -> PoseQuery | TrackedFrame:
         """Take the answer to *query*; return another query, or the result for the frame.
 
@@ -129,6 +127,7 @@ class MonocularTracker:
             query: The query that `prepare` or `accept` returned last.
             T_camera_world: ``(4, 4)`` as the PnP service returns it; ``None`` if there was no answer.
             inliers: How many correspondences agree with it.
+            is_weak: Whether its evidence is weak: then the frame becomes no keyframe.
 
         Raises:
             UsageError: *query* is not the open one.
@@ -141,7 +140,7 @@ class MonocularTracker:
         found = self._refined(T_camera_world)
         if found is None:
             return self._next_query("too few landmarks agree with the pose")
-        return self._keep(*found, matches=len(query.correspondences))
+        return self._keep(*found, matches=len(query.correspondences), is_weak=is_weak)
 
     def trajectory(self) -> Trajectory:
         """Return all poses so far, in the order of time, as the keyframes are adjusted now."""
@@ -276,7 +275,7 @@ class MonocularTracker:
             camera=self._frame.camera,
             inlier_px=self.options.inlier_px,
             max_iterations=self.options.max_iterations,
-            against="frame" if how == "motion" else "keyframe",
+            against="map" if how == "motion" else "keyframe",
         )
         return self._query
 
@@ -314,7 +313,7 @@ class MonocularTracker:
     # --- results ---
 
     def _keep(
-        self, T_camera_world: Array, of_features: npt.NDArray[np.int64], *, matches: int
+        self, T_camera_world: Array, of_features: npt.NDArray[np.int64], *, matches: int, is_weak: bool
     ) -> TrackedFrame:
         assert self.map is not None
         inliers = int((of_features != NO_LANDMARK).sum())
@@ -324,7 +323,7 @@ class MonocularTracker:
             self._motion = T_camera_world @ inverse(self._last)
         self._lost_in_a_row = 0
         self._last = T_camera_world
-        keyframe = self._is_keyframe(T_camera_world, inliers)
+        keyframe = not is_weak and self._is_keyframe(T_camera_world, inliers)
         if keyframe:
             number = self.map.add_keyframe(self._features, T_camera_world, of_features)
             self.map.extend(number)
@@ -387,35 +386,10 @@ def _scaled(pose: Array, scale: float) -> Array:
 
 
 def _extract(frame: Frame, count: int) -> ViewFeatures:
-    """Return ORB features that are spread over the image, with the noise of their octaves."""
-    cv2 = load_opencv()
-    gray = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
-    orb = cv2.ORB_create(nfeatures=3 * count, scaleFactor=_SCALE, nlevels=_LEVELS, fastThreshold=7)
-    keypoints = orb.detect(gray, None)
-    if not keypoints:
-        return ViewFeatures(
-            pixels=np.empty((0, 2)), descriptors=np.empty((0, 32), dtype=np.uint8), sigma_px=np.empty(0),
-            colours=np.empty((0, 3), dtype=np.uint8),
-        )  # fmt: skip
-    pixels = cv2.KeyPoint_convert(keypoints)
-    response = np.array([each.response for each in keypoints])
-    chosen = _spread(pixels, response, frame.rgb.shape[:2], count)
-    kept, descriptors = orb.compute(gray, [keypoints[row] for row in chosen])
-    pixels = cv2.KeyPoint_convert(kept).astype(np.float64)
-    octaves = np.array([each.octave for each in kept])
-    columns, rows = np.rint(pixels).astype(np.int64).T
+    """Return ORB features that are spread over the image, with the noise of their levels."""
+    described = describe(frame.rgb, count)
+    columns, rows = np.rint(described.pixels).astype(np.int64).T
     return ViewFeatures(
-        pixels=pixels, descriptors=descriptors, sigma_px=_SCALE**octaves, colours=frame.rgb[rows, columns]
-    )
-
-
-def _spread(pixels: Array, response: Array, size: tuple[int, int], count: int) -> list[int]:
-    """Return the rows of the strongest keypoints of each cell, *count* in all."""
-    across = -(-size[1] // _CELL_PX)
-    cells = (pixels[:, 1] // _CELL_PX * across + pixels[:, 0] // _CELL_PX).astype(np.int64)
-    order = np.lexsort((-response, cells))
-    starts = np.flatnonzero(np.concatenate(([True], np.diff(cells[order]) != 0)))
-    rank = np.arange(len(order)) - np.repeat(starts, np.diff(np.append(starts, len(order))))
-    best = order[np.lexsort((-response[order], rank))][:count]
-    chosen: list[int] = np.sort(best).tolist()
-    return chosen
+        pixels=described.pixels, descriptors=described.descriptors, sigma_px=described.sizes,
+        colours=frame.rgb[rows, columns],
+    )  # fmt: skip

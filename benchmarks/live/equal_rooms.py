@@ -26,7 +26,7 @@ import numpy as np
 
 from benchmarks.live.one_process import DENSE
 from benchmarks.maps.recordings import pose_answer
-from client_sdk.frontend import Frame, PoseQuery, Tracker, extract
+from client_sdk.frontend import Frame, PoseQuery, extract
 from client_sdk.simulator import (
     SIMULATED_CAMERA,
     loop_trajectory,
@@ -34,6 +34,7 @@ from client_sdk.simulator import (
     render_along,
     with_equal_rooms,
 )
+from client_sdk.tracking.tracker import Tracker
 from rse_pf.geometry import Array, inverse
 from rse_pf.live_map.events import KeyframeAdded, MapStarted
 from rse_pf.live_map.live_map import LiveMap

@@ -24,7 +24,8 @@ import numpy as np
 from benchmarks.maps.recordings import ate_m, truth_of
 from benchmarks.maps.services import joined_poses, robots_of
 from client_sdk.datasets import Dataset, open_dataset
-from client_sdk.frontend import FrontEndOptions, PoseQuery, Tracker, extract, match
+from client_sdk.frontend import FrontEndOptions, PoseQuery, extract, match
+from client_sdk.tracking.tracker import Tracker
 from rse_pf.errors import PnpError
 from rse_pf.geometry import Array, inverse, pose_difference
 from rse_pf.pnp import PnpOptions, PnpSolution, refine_with_depth, solve_pnp

@@ -14,8 +14,9 @@ import numpy as np
 import numpy.typing as npt
 
 from client_sdk.datasets import Dataset, open_dataset
-from client_sdk.frontend import FrontEndOptions, PoseQuery, Tracker, extract
+from client_sdk.frontend import FrontEndOptions, PoseQuery, extract
 from client_sdk.mapping import MapOptions, PointMap
+from client_sdk.tracking.tracker import Tracker
 from rse_pf.errors import PnpError
 from rse_pf.geometry import Array, inverse
 from rse_pf.maps.format import Keyframe, MapVersion
@@ -27,6 +28,7 @@ __all__ = [
     "cloud_of",
     "drive",
     "frame_poses",
+    "judged_answer",
     "keyframe_of",
     "pose_answer",
     "red_kitchen",
@@ -63,7 +65,8 @@ def drive(dataset: Dataset, rows: Sequence[int], robot: str, options: FrontEndOp
         frame = dataset.read(row)
         step = tracker.prepare(frame)
         while isinstance(step, PoseQuery):
-            step = tracker.accept(step, *pose_answer(step))
+            pose, inliers, is_weak = judged_answer(step)
+            step = tracker.accept(step, pose, inliers, is_weak=is_weak)
         if step.T_world_camera is None:
             continue
         if step.keyframe:
@@ -110,6 +113,11 @@ def truth_of(dataset: Dataset, stamps_s: Sequence[float]) -> Array:
 
 def pose_answer(query: PoseQuery) -> tuple[Array | None, int]:
     """Return ``T_camera_world`` of a query and its inliers, as the platform does; None and 0 without one."""
+    return judged_answer(query)[:2]
+
+
+def judged_answer(query: PoseQuery) -> tuple[Array | None, int, bool]:
+    """Return what `pose_answer` does, and whether the pose is weak."""
     options = PnpOptions(inlier_px=query.inlier_px, max_iterations=query.max_iterations)
     matches = query.correspondences
     try:

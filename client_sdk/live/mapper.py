@@ -42,6 +42,8 @@ _FINAL = (*REFUSALS, BadRequest, UnsupportedProtocol)
 """A live map that answers so will not be joined by trying again."""
 _RETRY_S = 1.0
 _MAX_CORRECTIONS = 1000
+_NEVER = 1_000_000_000
+"""The tracker begins no segment of its own: a live map has to know of each."""
 _MAX_SENT = 100_000
 _JSON_FEATURES = 650
 """Plain JSON has bytes in base64, a third longer: 650 features and the rest of the message are 34 kB."""
@@ -69,7 +71,8 @@ class LiveOptions:
         keyframe_deg: or turned further; the tracker's own keyframes are apart from these.
         features: At most so many features of a keyframe are sent; 870 take 34 kB with zlib and bin, and
             `sent_with` lowers them for json.
-        segment_after: A new segment begins after so many lost frames in a row.
+        segment_after: A new segment begins after so many frames that show enough and no place that the robot
+            knows; a covered lens does not count.
         relocalise_s: While a segment is not aligned, the robot asks for its place so often at most; after six
             answers without any place, a quarter as often, since the map tries each of its keyframes, too.
         bytes_per_s: Share of the link that keyframes may take.
@@ -156,13 +159,13 @@ class LiveMapper:
         self._sender: KeyframeSender
         self._ask = ask
         self._mapper = Mapper(
-            ask=self._ask_first, camera=camera, options=options, depth=True, map_options=map_options,
+            ask=self._ask_first, camera=camera, depth=True,
+            options=replace(options or FrontEndOptions(), segment_after=_NEVER), map_options=map_options,
             T_world_start=T_world_start, adds_frames=False,
         )  # fmt: skip
         self._alignments = Alignments()
         self._segment = 0
         self._last_keyframe: Array | None = None
-        self._lost_in_a_row = 0
         self._is_corrected = False
         self._poses: list[tuple[float, int, Array]] = []
         self._made, self._dropped = 0, 0
@@ -255,14 +258,11 @@ class LiveMapper:
                 raise UsageError(
                     "a live map needs frames with depth", hint="use robot.mapper() for this camera"
                 )
-            if self._lost_in_a_row >= self.options.segment_after and self._poses:
+            if self._mapper.unrecognised >= self.options.segment_after and self._poses:
                 self._begin_segment()
             done = await self._mapper.track(frame)
             pose = done.T_world_camera
-            if pose is None:
-                self._lost_in_a_row += 1
-            else:
-                self._lost_in_a_row = 0
+            if pose is not None:
                 self._poses.append((frame.timestamp_s, self._segment, pose))
                 features = self._mapper.features
                 if features is not None and self._is_keyframe(pose):
@@ -439,7 +439,7 @@ class LiveMapper:
         self._mapper.restart(self._poses[-1][2])
         self._segment += 1
         self._sender.current_segment = self._segment
-        self._last_keyframe, self._lost_in_a_row = None, 0
+        self._last_keyframe = None
         self._relocalised_at, self._asked_in_vain = float("-inf"), 0
 
     def _is_keyframe(self, pose: Array) -> bool:

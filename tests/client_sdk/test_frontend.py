@@ -2,32 +2,23 @@
 
 from __future__ import annotations
 
-import json
-import zlib
 from collections import Counter
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from client_sdk.datasets import open_dataset
 from client_sdk.frontend import (
     Features,
     Frame,
     FrontEndOptions,
-    PoseQuery,
-    TrackedFrame,
-    Tracker,
     extract,
     match,
     round_for_wire,
 )
-from client_sdk.mapping import Trajectory
-from rse_pf.errors import PnpError, UsageError
-from rse_pf.experiments.results.trajectory_error import absolute_error, relative_error
-from rse_pf.geometry import Array, Camera, inverse, pose_difference, transform
-from rse_pf.pnp import PnpOptions, refine_with_depth, solve_pnp
+from rse_pf.errors import UsageError
+from rse_pf.geometry import Array, Camera, transform
+from rse_pf.pnp import PnpOptions
 from rse_pf.services.pnp import make_request
 from rse_pf.wire import Command, make_codec
 
@@ -56,31 +47,11 @@ def blank_frame() -> Frame:
     return Frame(timestamp_s=0.0, rgb=rgb, depth_m=np.full((240, 320), 2.0, np.float32), camera=CAMERA)
 
 
-def answer(query: PoseQuery) -> tuple[Array | None, int]:
-    options = PnpOptions(inlier_px=query.inlier_px, max_iterations=query.max_iterations)
-    found = query.correspondences
-    try:
-        solution = solve_pnp(found.points_world, found.pixels, query.camera, options)
-    except PnpError:
-        return None, 0
-    solution = refine_with_depth(solution, found.points_world, found.pixels, found.depths_m, query.camera)
-    return solution.T_camera_world, len(solution.inliers)
-
-
 def pushed(metres: float) -> Array:
     """Return ``T_camera_reference`` of a camera that moved along x."""
     pose = np.eye(4)
     pose[0, 3] = -metres
     return pose
-
-
-def run(
-    tracker: Tracker, frame: Frame, solve: Callable[[PoseQuery], tuple[Array | None, int]]
-) -> TrackedFrame:
-    step = tracker.prepare(frame)
-    while isinstance(step, PoseQuery):
-        step = tracker.accept(step, *solve(step))
-    return step
 
 
 def test_matches_of_a_known_motion_agree_with_it():
@@ -153,6 +124,8 @@ def test_no_pixel_is_matched_twice_and_the_best_are_kept():
         pixels=np.vstack((features.pixels, features.pixels)),
         descriptors=np.vstack((features.descriptors, features.descriptors)),
         points_camera=np.vstack((features.points_camera, features.points_camera)),
+        turns=np.vstack((features.turns, features.turns)),
+        sizes=np.hstack((features.sizes, features.sizes)),
     )
 
     every = match(doubled, features, OPTIONS)
@@ -180,102 +153,6 @@ def test_the_same_frame_gives_the_same_matches():
     )
     np.testing.assert_array_equal(first.points_world, second.points_world)
     np.testing.assert_array_equal(first.pixels, second.pixels)
-
-
-def test_a_chain_of_frames_follows_the_motion_and_keeps_keyframes():
-    tracker = Tracker()
-
-    tracked = [run(tracker, wall_frame(shift), answer) for shift in range(0, 63, 9)]
-
-    for number, each in enumerate(tracked):
-        assert each.T_world_camera is not None
-        moved, _ = pose_difference(each.T_world_camera, inverse(pushed(number * 9 * PX_M)))
-        assert moved < 0.01
-    assert [each.keyframe for each in tracked] == [
-        True,
-        False,
-        False,
-        False,
-        False,
-        False,
-        True,
-    ]  # at 0.216 m
-    assert (tracker.frames, tracker.lost_frames, tracker.keyframes) == (7, 0, 2)
-
-
-def test_a_start_pose_is_where_the_trajectory_begins():
-    start = inverse(pushed(3.0))
-    tracker = Tracker(T_world_start=start)
-
-    assert run(tracker, wall_frame(0), answer).T_world_camera is start
-    second = run(tracker, wall_frame(5), lambda query: (pushed(0.02), 400))
-
-    np.testing.assert_allclose(second.T_world_camera, start @ inverse(pushed(0.02)))
-
-
-@pytest.mark.parametrize(
-    "bad", [(pushed(0.02), 11), (pushed(0.6), 400), (None, 0), (np.full((4, 4), np.nan), 400)]
-)
-def test_a_bad_pose_is_asked_for_again_against_the_keyframe(bad: tuple[Array | None, int]):
-    tracker = Tracker()
-    run(tracker, wall_frame(0), answer)
-    run(tracker, wall_frame(10), answer)
-
-    first = tracker.prepare(wall_frame(20))
-    assert isinstance(first, PoseQuery)
-    second = tracker.accept(first, *bad)
-    assert isinstance(second, PoseQuery)
-    assert (first.against, second.against) == ("frame", "keyframe")
-    tracked = tracker.accept(second, pushed(0.08), 200)
-
-    assert isinstance(tracked, TrackedFrame)
-    np.testing.assert_allclose(tracked.T_world_camera, inverse(pushed(0.08)))
-
-
-def test_a_frame_that_fails_twice_is_lost_and_the_next_one_finds_the_last_good_one():
-    tracker = Tracker()
-    run(tracker, wall_frame(0), answer)
-    run(tracker, wall_frame(10), answer)
-
-    lost = run(tracker, wall_frame(20), lambda query: (None, 0))
-    found = run(tracker, wall_frame(30), answer)
-
-    assert lost.lost
-    assert lost.T_world_camera is None
-    assert tracker.lost_frames == 1
-    assert found.T_world_camera is not None
-    assert pose_difference(found.T_world_camera, inverse(pushed(30 * PX_M)))[0] < 0.01
-
-
-def test_a_frame_without_features_is_lost_without_a_query():
-    tracker = Tracker()
-    assert run(tracker, blank_frame(), answer).lost  # nothing to start from
-    assert not run(tracker, wall_frame(0), answer).lost
-    assert isinstance(tracker.prepare(blank_frame()), TrackedFrame)
-    assert tracker.lost_frames == 2
-
-
-def test_the_keyframe_chain_asks_the_keyframe_first():
-    tracker = Tracker(FrontEndOptions(chain="keyframe"))
-    run(tracker, wall_frame(0), answer)
-    run(tracker, wall_frame(10), answer)
-
-    step = tracker.prepare(wall_frame(20))
-
-    assert isinstance(step, PoseQuery)
-    assert step.against == "keyframe"
-
-
-def test_one_query_at_a_time():
-    tracker = Tracker()
-    run(tracker, wall_frame(0), answer)
-    query = tracker.prepare(wall_frame(10))
-    assert isinstance(query, PoseQuery)
-    with pytest.raises(UsageError, match="open"):
-        tracker.prepare(wall_frame(20))
-    tracker.accept(query, *answer(query))
-    with pytest.raises(UsageError, match="not the open one"):
-        tracker.accept(query, None)
 
 
 def test_options_that_cannot_work_and_frames_that_do_not_fit_are_refused():
@@ -316,61 +193,3 @@ def test_a_command_with_all_matches_is_below_10_kb(codec: str, preset: FrontEndO
 def test_an_unknown_codec_is_refused():
     with pytest.raises(UsageError, match="no codec named 'xml'"):
         FrontEndOptions().sent_with("xml")
-
-
-@pytest.mark.data
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("rate_hz", "ate_cm", "rpe_cm", "rpe_deg"), [(5, 3.4, 1.6, 0.55), (10, 3.4, 1.1, 0.4)]
-)
-def test_the_red_kitchen_is_tracked_as_well_as_when_it_was_measured(rate_hz, ate_cm, rpe_cm, rpe_deg):
-    if not (RECORDED / "7scenes_redkitchen").exists():
-        pytest.skip(f"no recordings at {RECORDED}")
-    dataset = open_dataset(RECORDED / "7scenes_redkitchen")
-    tracker, sizes, sizes_with_depths = Tracker(), [], []
-
-    def solve(query: PoseQuery) -> tuple[Array | None, int]:
-        found = query.correspondences
-        lists = {"points": found.points_world.ravel().tolist(), "pixels": found.pixels.ravel().tolist()}
-        sizes.append(_deflated_bytes(lists))
-        sizes_with_depths.append(_deflated_bytes(lists | {"depths": found.depths_m.tolist()}))
-        return answer(query)
-
-    tracked = [run(tracker, frame, solve) for frame in dataset.thinned(rate_hz)]
-
-    assert tracker.lost_frames == 0
-    assert dataset.truth is not None
-    stamps = np.array([each.frame.timestamp_s for each in tracked])
-    estimate = Trajectory(stamps, np.array([each.T_world_camera for each in tracked]))
-    relative = relative_error(estimate, dataset.truth)
-    assert 100 * absolute_error(estimate, dataset.truth).rmse_m <= ate_cm
-    assert 100 * relative.rmse_m <= rpe_cm
-    assert relative.rmse_deg <= rpe_deg
-    assert np.median(sizes) < 5_000
-    assert max(sizes_with_depths) < 10_000
-    assert np.median(sizes_with_depths) < 1.2 * np.median(sizes)
-
-
-def _deflated_bytes(lists: dict[str, list[float]]) -> int:
-    return len(zlib.compress(json.dumps(lists, separators=(",", ":")).encode()))
-
-
-@pytest.mark.data
-def test_the_five_wide_views_of_the_nyu_dining_room_are_joined():
-    if not (RECORDED / "nyu_dining_room").exists():
-        pytest.skip(f"no recordings at {RECORDED}")
-    dataset = open_dataset(RECORDED / "nyu_dining_room")
-    tracker = Tracker(FrontEndOptions.wide_baseline())
-
-    poses = [run(tracker, frame, answer).T_world_camera for frame in dataset]
-
-    assert dataset.truth is not None
-    reference = dataset.truth.T_world_camera
-    for row, (limit_m, limit_deg) in enumerate([(0.10, 1.5)] * 3 + [(0.025, 0.5)]):
-        first, second = poses[row], poses[row + 1]
-        assert first is not None
-        assert second is not None
-        expected = inverse(reference[row]) @ reference[row + 1]
-        metres, degrees = pose_difference(inverse(first) @ second, expected)
-        assert metres <= limit_m
-        assert degrees <= limit_deg

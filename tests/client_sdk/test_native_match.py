@@ -39,6 +39,15 @@ def use(monkeypatch: pytest.MonkeyPatch, core: FrontEndCore | None) -> None:
     monkeypatch.setattr(frontend, "front_end_core", lambda: core)
 
 
+def made_features(pixels: Array, descriptors: npt.NDArray[np.uint8], points_camera: Array) -> Features:
+    """Return features of which matches look at descriptors, pixels and points only."""
+    n = len(pixels)
+    return Features(
+        pixels=pixels, descriptors=descriptors, points_camera=points_camera, turns=np.zeros((n, 2)),
+        sizes=np.ones(n),
+    )  # fmt: skip
+
+
 def features(rng: np.random.Generator, n: int, *, distinct: int, noise: int = 0) -> Features:
     """Return features of which many have equal descriptors, columns and distances."""
     descriptors = np.random.default_rng(3).integers(0, 256, (distinct, 32), dtype=np.uint8)
@@ -50,7 +59,7 @@ def features(rng: np.random.Generator, n: int, *, distinct: int, noise: int = 0)
     points[rng.random(n) < 0.2, 2] = np.nan
     points[rng.random(n) < 0.05, 2] = np.inf
     pixels = np.round(rng.uniform(0, 640, (n, 2)) * rng.choice([1, 8])) / rng.choice([1, 8, 3])
-    return Features(pixels=pixels, descriptors=descriptors, points_camera=points)
+    return made_features(pixels, descriptors, points)
 
 
 def pairs() -> Iterator[tuple[Features, Features, FrontEndOptions]]:
@@ -61,7 +70,9 @@ def pairs() -> Iterator[tuple[Features, Features, FrontEndOptions]]:
         distinct = int(rng.choice([1, 3, 20, 700]))
         noise = int(rng.choice([0, 2, 12]))
         options = FrontEndOptions(
-            ratio=float(rng.choice([0.5, 0.75, 0.8, 1.0])), max_matches=int(rng.choice([12, 40, 700]))
+            ratio=float(rng.choice([0.5, 0.75, 0.8, 1.0])),
+            max_matches=int(rng.choice([12, 40, 700])),
+            min_inliers=12,
         )
         yield (
             features(rng, n, distinct=distinct, noise=noise),
@@ -97,13 +108,11 @@ def test_matches_are_those_of_opencv_to_the_last_bit_among_many_ties(core, monke
 @needs_library
 @pytest.mark.parametrize("rows", [[0, 255], [255, 0], [255, 255], [0, 0]])
 def test_all_bits_and_no_bit_may_differ(core, monkeypatch, rows):
-    zeros = Features(
-        pixels=np.ones((1, 2)), descriptors=np.zeros((1, 32), np.uint8), points_camera=np.ones((1, 3))
-    )
-    frame = Features(
-        pixels=np.array([[1.0, 2.0], [3.0, 4.0]]),
-        descriptors=np.repeat(np.uint8(rows)[:, None], 32, axis=1),
-        points_camera=np.ones((2, 3)),
+    zeros = made_features(np.ones((1, 2)), np.zeros((1, 32), np.uint8), np.ones((1, 3)))
+    frame = made_features(
+        np.array([[1.0, 2.0], [3.0, 4.0]]),
+        np.repeat(np.uint8(rows)[:, None], 32, axis=1),
+        np.ones((2, 3)),
     )
     use(monkeypatch, core)
 
@@ -270,10 +279,10 @@ def test_arrays_of_other_kinds_are_left_to_opencv(core):
 @needs_library
 def test_arrays_need_not_be_contiguous(core, monkeypatch):
     reference, frame, options = next(pairs())
-    spread = Features(
-        pixels=np.repeat(frame.pixels, 2, axis=0)[::2],
-        descriptors=np.asfortranarray(frame.descriptors),
-        points_camera=frame.points_camera[::-1][::-1],
+    spread = made_features(
+        np.repeat(frame.pixels, 2, axis=0)[::2],
+        np.asfortranarray(frame.descriptors),
+        frame.points_camera[::-1][::-1],
     )
     use(monkeypatch, core)
 

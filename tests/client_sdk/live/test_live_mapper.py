@@ -51,8 +51,17 @@ def times_s(robot: FakeLiveRobot) -> list[float]:
     return [decode_keyframe(request.keyframe).timestamp_s for request in robot.kept]
 
 
+def foreign(row: int) -> Frame:
+    """Return a frame of a place that the robot has never seen."""
+    frame = frame_at(row, depth=True)
+    return Frame(
+        timestamp_s=frame.timestamp_s, rgb=np.ascontiguousarray(255 - frame.rgb[:, ::-1]),
+        depth_m=frame.depth_m, camera=CAMERA,
+    )  # fmt: skip
+
+
 def dark(row: int) -> Frame:
-    """Return a frame without features."""
+    """Return a frame of a covered lens."""
     frame = frame_at(row, depth=True)
     return Frame(
         timestamp_s=frame.timestamp_s, rgb=np.zeros_like(frame.rgb), depth_m=frame.depth_m, camera=CAMERA
@@ -287,8 +296,8 @@ def test_a_map_that_begins_anew_gets_new_numbers_and_old_alignments_are_forgotte
             await robot.until(lambda: mapper.aligned)
 
             robot.restart_map()
-            await mapper.track(dark(5))
-            await mapper.track(dark(6))
+            await mapper.track(foreign(5))
+            await mapper.track(foreign(6))
             (again,) = await drive(mapper, range(7, 8))
             await robot.until(lambda: mapper.keyframes_waiting == 0)
 
@@ -315,7 +324,7 @@ def test_a_lost_robot_begins_a_segment_and_asks_where_it_is() -> None:
                 "T_map_camera": T_map_camera.ravel().tolist(),
                 "inliers": 80,
             }
-            assert [(await mapper.track(dark(row))).status for row in (3, 4)] == ["lost", "lost"]
+            assert [(await mapper.track(foreign(row))).status for row in (3, 4)] == ["lost", "lost"]
             before = mapper.trajectory.T_world_camera[-1]
             (found,) = await drive(mapper, range(5, 6))
             assert found.segment == 1
@@ -331,6 +340,20 @@ def test_a_lost_robot_begins_a_segment_and_asks_where_it_is() -> None:
             robot.tell("alignment/me", alignment("me", None, segment=1, reason="too few links"))
             robot.tell("alignment/me", alignment("me", T_MAP_ODOM, segment=1))
             await robot.until(lambda: mapper.aligned_by == "map")  # what the map found wins
+
+    run(work)
+
+
+def test_a_covered_lens_begins_no_segment_and_the_robot_finds_its_place_itself() -> None:
+    async def work(robot: FakeLiveRobot) -> None:
+        async with live_map(robot) as mapper:
+            await drive(mapper, range(6))
+            covered = [await mapper.track(dark(row)) for row in range(6, 16)]
+            (back,) = await drive(mapper, range(2, 3))
+
+            assert {tracked.status for tracked in covered} == {"lost"}
+            assert (back.status, back.segment) == ("tracked", 0)
+            np.testing.assert_allclose(back.T_world_camera[:3, 3], [2 * STEP_M, 0, 0], atol=0.02)
 
     run(work)
 

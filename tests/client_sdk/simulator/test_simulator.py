@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import client_sdk.simulator
-from client_sdk.frontend import PoseQuery, Tracker
+from client_sdk.frontend import PoseQuery
 from client_sdk.mapping import Trajectory
 from client_sdk.simulator import (
     SIMULATED_CAMERA,
@@ -22,6 +22,7 @@ from client_sdk.simulator import (
 )
 from client_sdk.simulator.camera import Painter, add_depth_noise
 from client_sdk.simulator.world import DEPTH_M, DOOR_Y_M, HEIGHT_M, ROOM_M, Face, make_world
+from client_sdk.tracking.tracker import Tracker
 from rse_pf.errors import UsageError
 from rse_pf.experiments.results.trajectory_error import absolute_error
 from rse_pf.geometry import Camera, pose_difference, transform

@@ -1,0 +1,331 @@
+"""The map that a tracker matches frames against: keyframes, and the landmarks that they measured.
+
+A landmark is a feature with depth.  Each frame that sees it again measures it again, and the measurements are
+fused by their noise.  Nothing is matched here, and no keyframe is ever moved but with its whole map.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from rse_pf.geometry import Array, Camera, transform
+from rse_pf.pnp import DepthNoise
+from rse_pf.slam.places import place_vector
+from rse_pf.slam.tracking import ImageFeatures, SoughtFeatures
+
+__all__ = ["NO_LANDMARK", "Expected", "KeyframeMap", "Landmarks", "View", "expect", "measure_points"]
+
+Rows = npt.NDArray[np.int64]
+
+NO_LANDMARK = -1
+_FIRST_ROOM = 4096
+_MIN_COSINE, _MAX_NEARER, _MAX_FARTHER = 0.6, 2.0, 2.0
+"""A landmark is not sought from a direction, or a distance, from which it would look different."""
+_NEAREST_M = 0.1
+_DEG_PER_M = 30.0
+"""A view that is turned by so many degrees shows as little of another one as a view a metre away."""
+_FUSED_FLOOR_M2 = 0.003**2 / 20.0
+"""Added to the variance of a landmark with each measurement: their errors are not independent."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class View:
+    """One image: its features, and their ``(n, 3)`` points in the camera's frame, NaN without depth."""
+
+    features: ImageFeatures
+    points_camera: Array
+    camera: Camera
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Landmarks:
+    """Points of the world that are sought in an image.
+
+    ``points`` ``(n, 3)``; ``spreads`` ``(n, 3, 3)`` their covariances; ``rays`` ``(n, 3)`` from where they
+    were seen last; ``turns`` ``(n, 3)`` their orientation there, in the world; ``sizes`` ``(n,)``;
+    ``numbers`` ``(n,)`` of the map, NO_LANDMARK for points that only the last image has.
+    """
+
+    points: Array
+    spreads: Array
+    descriptors: npt.NDArray[np.uint8]
+    rays: Array
+    turns: Array
+    sizes: Array
+    numbers: Rows
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Expected:
+    """Landmarks as a pose expects them in its image: ``rows`` of the landmarks, and the features."""
+
+    rows: Rows
+    features: SoughtFeatures
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Keyframe:
+    """``landmarks`` ``(n,)`` holds the landmark of each feature; ``own`` those that there are, sorted."""
+
+    view: View
+    landmarks: Rows
+    own: Rows
+
+
+def measure_points(
+    view: View, T_world_camera: Array, rows: Rows, noise: DepthNoise, pixel_px: float
+) -> tuple[Array, Array]:
+    """Return ``(n, 3)`` points in the world, and their ``(n, 3, 3)`` covariances by the noise."""
+    points, camera = view.points_camera[rows], view.camera
+    z = points[:, 2]
+    along = points / z[:, None]
+    spread = along[:, :, None] * along[:, None, :] * noise.variance_m2(z)[:, None, None]
+    pixel2 = (pixel_px * view.features.sizes[rows]) ** 2
+    spread[:, 0, 0] += pixel2 * (z / camera.fx) ** 2
+    spread[:, 1, 1] += pixel2 * (z / camera.fy) ** 2
+    rotation = T_world_camera[:3, :3]
+    return transform(T_world_camera, points), rotation @ spread @ rotation.T
+
+
+class KeyframeMap:
+    """Keyframes and landmarks of one odometry frame; at most *max_keyframes*, then older ones are thinned."""
+
+    def __init__(self, max_keyframes: int) -> None:
+        self._max_keyframes = max_keyframes
+        self._keyframes: list[_Keyframe] = []
+        self._poses: Array = np.empty((0, 4, 4))
+        self._places: npt.NDArray[np.float32] = np.empty((0, 0), dtype=np.float32)
+        self._count = 0
+        self._points: Array = np.empty((_FIRST_ROOM, 3))
+        self._spreads: Array = np.empty((_FIRST_ROOM, 3, 3))
+        self._descriptors: npt.NDArray[np.uint8] = np.empty((_FIRST_ROOM, 32), dtype=np.uint8)
+        self._rays: Array = np.empty((_FIRST_ROOM, 3))
+        self._turns: Array = np.empty((_FIRST_ROOM, 3))
+        self._sizes: Array = np.empty(_FIRST_ROOM)
+
+    def __len__(self) -> int:
+        return len(self._keyframes)
+
+    @property
+    def landmark_count(self) -> int:
+        """The number of landmarks."""
+        return self._count
+
+    def pose(self, keyframe: int) -> Array:
+        """Return ``T_world_camera`` of a keyframe."""
+        pose: Array = self._poses[keyframe]
+        return pose
+
+    def view(self, keyframe: int) -> View:
+        """Return the image of a keyframe."""
+        return self._keyframes[keyframe].view
+
+    def add_keyframe(
+        self, view: View, T_world_camera: Array, landmarks: Rows, noise: DepthNoise, pixel_px: float
+    ) -> Rows:
+        """Add a keyframe; its features with depth and without a landmark become landmarks.
+
+        Args:
+            view: The image.
+            T_world_camera: ``(4, 4)``.
+            landmarks: ``(n,)``, of each feature, or NO_LANDMARK.
+            noise: Of the depths.
+            pixel_px: Deviation of a pixel on the finest level.
+
+        Returns:
+            ``(n,)``, the landmark of each feature.
+        """
+        if len(self._keyframes) >= self._max_keyframes:
+            landmarks = self._thin(landmarks)
+        landmarks = landmarks.copy()
+        seen = np.flatnonzero(landmarks != NO_LANDMARK)
+        new = np.flatnonzero((landmarks == NO_LANDMARK) & np.isfinite(view.points_camera[:, 2]))
+        numbers = self._count + np.arange(len(new))
+        landmarks[new] = numbers
+        self._make_room(self._count + len(new))
+        self._count += len(new)
+        points, spreads = measure_points(view, T_world_camera, new, noise, pixel_px)
+        self._points[numbers], self._spreads[numbers] = points, spreads
+        for rows in (seen, new):
+            self._note_look(landmarks[rows], view, T_world_camera, rows)
+        keyframe = _Keyframe(view=view, landmarks=landmarks, own=np.sort(landmarks[landmarks != NO_LANDMARK]))
+        self._keyframes.append(keyframe)
+        self._poses = np.concatenate([self._poses, T_world_camera[None]])
+        place = place_vector(view.features.descriptors)[None]
+        self._places = np.concatenate([self._places, place]) if len(self._places) else place
+        return landmarks
+
+    def distances(self, T_world_camera: Array) -> tuple[Array, Array]:
+        """Return how far ``(k,)`` keyframes are from a pose: metres, and degrees."""
+        metres = np.linalg.norm(self._poses[:, :3, 3] - T_world_camera[:3, 3], axis=1)
+        cosines = (np.einsum("nij,ij->n", self._poses[:, :3, :3], T_world_camera[:3, :3]) - 1.0) / 2.0
+        return metres, np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0)))
+
+    def nearest(self, T_world_camera: Array, count: int) -> list[int]:
+        """Return the *count* keyframes whose views a pose shares most, and the newest one."""
+        metres, degrees = self.distances(T_world_camera)
+        chosen: list[int] = np.argsort(metres + degrees / _DEG_PER_M, kind="stable")[:count].tolist()
+        newest = len(self._keyframes) - 1
+        return chosen if newest in chosen else [*chosen, newest]
+
+    def most_alike(self, descriptors: npt.NDArray[np.uint8], count: int) -> list[int]:
+        """Return the *count* keyframes that look most like ``(n, 32)`` descriptors, best first."""
+        alike: list[int] = np.argsort(-(self._places @ place_vector(descriptors)), kind="stable").tolist()
+        return alike[:count]
+
+    def landmarks_of(self, keyframes: list[int]) -> Landmarks:
+        """Return the landmarks that any of the keyframes sees."""
+        own = [self._keyframes[number].own for number in keyframes]
+        return self._landmarks(np.unique(np.concatenate(own)) if own else np.empty(0, dtype=np.int64))
+
+    def landmarks_in(self, keyframe: int) -> tuple[Landmarks, npt.NDArray[np.uint8]]:
+        """Return the landmarks of one keyframe, with the descriptors that this keyframe has of them."""
+        record = self._keyframes[keyframe]
+        rows = np.flatnonzero(record.landmarks != NO_LANDMARK)
+        return self._landmarks(record.landmarks[rows]), record.view.features.descriptors[rows]
+
+    def landmarks_of_view(
+        self, view: View, T_world_camera: Array, landmarks: Rows, noise: DepthNoise, pixel_px: float
+    ) -> Landmarks:
+        """Return the landmarks of an image, and points of its own where it has depth and no landmark."""
+        rows = np.flatnonzero((landmarks != NO_LANDMARK) | np.isfinite(view.points_camera[:, 2]))
+        numbers = landmarks[rows]
+        points, spreads = measure_points(view, T_world_camera, rows, noise, pixel_px)
+        known = numbers != NO_LANDMARK
+        points[known], spreads[known] = self._points[numbers[known]], self._spreads[numbers[known]]
+        return Landmarks(
+            points=points, spreads=spreads, descriptors=view.features.descriptors[rows],
+            rays=points - T_world_camera[:3, 3], turns=_turns_in_world(view, T_world_camera, rows),
+            sizes=view.features.sizes[rows], numbers=numbers,
+        )  # fmt: skip
+
+    def fuse(
+        self, view: View, T_world_camera: Array, landmarks: Rows, noise: DepthNoise, pixel_px: float
+    ) -> None:
+        """Take what an image measured of ``(n,)`` landmarks of its features into the map."""
+        rows = np.flatnonzero((landmarks != NO_LANDMARK) & np.isfinite(view.points_camera[:, 2]))
+        if not len(rows):
+            return
+        numbers = landmarks[rows]
+        points, spreads = measure_points(view, T_world_camera, rows, noise, pixel_px)
+        before = self._spreads[numbers]
+        gain = before @ np.linalg.inv(before + spreads)
+        self._points[numbers] += np.einsum("nij,nj->ni", gain, points - self._points[numbers])
+        self._spreads[numbers] = (np.eye(3) - gain) @ before + _FUSED_FLOOR_M2 * np.eye(3)
+
+    def move(self, T_new_old: Array) -> None:
+        """Express the whole map in another frame."""
+        rotation, count = T_new_old[:3, :3], self._count
+        self._poses = T_new_old @ self._poses
+        self._points[:count] = transform(T_new_old, self._points[:count])
+        self._spreads[:count] = rotation @ self._spreads[:count] @ rotation.T
+        self._rays[:count] = self._rays[:count] @ rotation.T
+        self._turns[:count] = self._turns[:count] @ rotation.T
+
+    def take(self, other: KeyframeMap) -> int:
+        """Add all of another map in the same frame; return the number that its first landmark has here."""
+        first = self._count
+        for number, record in enumerate(other._keyframes):
+            landmarks = np.where(record.landmarks == NO_LANDMARK, NO_LANDMARK, record.landmarks + first)
+            self._keyframes.append(_Keyframe(view=record.view, landmarks=landmarks, own=record.own + first))
+            self._poses = np.concatenate([self._poses, other._poses[number][None]])
+        self._places = np.concatenate([self._places, other._places])
+        self._make_room(first + other._count)
+        self._count += other._count
+        for mine, theirs in zip(self._arrays(), other._arrays(), strict=True):
+            mine[first : self._count] = theirs[: other._count]
+        return first
+
+    def _landmarks(self, numbers: Rows) -> Landmarks:
+        return Landmarks(
+            points=self._points[numbers], spreads=self._spreads[numbers],
+            descriptors=self._descriptors[numbers], rays=self._rays[numbers], turns=self._turns[numbers],
+            sizes=self._sizes[numbers], numbers=numbers,
+        )  # fmt: skip
+
+    def _note_look(self, numbers: Rows, view: View, T_world_camera: Array, rows: Rows) -> None:
+        """Take how landmarks look in the newest keyframe that sees them."""
+        self._descriptors[numbers] = view.features.descriptors[rows]
+        self._rays[numbers] = self._points[numbers] - T_world_camera[:3, 3]
+        self._turns[numbers] = _turns_in_world(view, T_world_camera, rows)
+        self._sizes[numbers] = view.features.sizes[rows]
+
+    def _arrays(self) -> tuple[npt.NDArray[np.generic], ...]:
+        return (
+            self._points, self._spreads, self._descriptors, self._rays, self._turns, self._sizes
+        )  # fmt: skip
+
+    def _make_room(self, count: int) -> None:
+        if count <= len(self._points):
+            return
+        room = max(count, 2 * len(self._points))
+
+        def grown(array: npt.NDArray[np.generic]) -> npt.NDArray[np.generic]:
+            larger = np.empty((room, *array.shape[1:]), dtype=array.dtype)
+            larger[: self._count] = array[: self._count]
+            return larger
+
+        arrays = [grown(array) for array in self._arrays()]
+        self._points, self._spreads, self._descriptors = arrays[0], arrays[1], arrays[2]  # type: ignore[assignment]
+        self._rays, self._turns, self._sizes = arrays[3], arrays[4], arrays[5]  # type: ignore[assignment]
+
+    def _thin(self, current: Rows) -> Rows:
+        """Drop every second keyframe of the older half, and landmarks that none sees; renumber *current*."""
+        half = len(self._keyframes) // 2
+        stays = np.ones(len(self._keyframes), dtype=bool)
+        stays[:half:2] = False
+        keyframes = [record for record, is_kept in zip(self._keyframes, stays, strict=True) if is_kept]
+        is_seen = np.zeros(self._count + 1, dtype=bool)
+        for record in keyframes:
+            is_seen[record.own] = True
+        is_seen[current] = True
+        is_seen[self._count] = False  # where NO_LANDMARK points to
+        numbers = np.full(self._count + 1, NO_LANDMARK)
+        numbers[np.flatnonzero(is_seen)] = np.arange(int(is_seen.sum()))
+        rows = np.flatnonzero(is_seen)
+        for array in self._arrays():
+            array[: len(rows)] = array[rows]
+        self._count = len(rows)
+        self._keyframes = [
+            _Keyframe(view=record.view, landmarks=numbers[record.landmarks], own=np.sort(numbers[record.own]))
+            for record in keyframes
+        ]
+        self._poses, self._places = self._poses[stays], self._places[stays]
+        return numbers[current]
+
+
+def expect(landmarks: Landmarks, T_camera_world: Array, camera: Camera, margin_px: float) -> Expected:
+    """Return what a pose sees of landmarks: those ahead, in the image, and seen from such a place before."""
+    points = transform(T_camera_world, landmarks.points)
+    ahead = np.flatnonzero(points[:, 2] > _NEAREST_M)
+    pixels = camera.project(points[ahead])
+    u, v = pixels.T
+    inside = (
+        (u > -margin_px) & (u < camera.width + margin_px) & (v > -margin_px) & (v < camera.height + margin_px)
+    )
+    ahead, pixels = ahead[inside], pixels[inside]
+    distances = np.linalg.norm(points[ahead], axis=1)
+    # The ray of the last look, in this camera's frame.
+    rays = landmarks.rays[ahead] @ T_camera_world[:3, :3].T
+    before = np.linalg.norm(rays, axis=1)
+    cosines = (rays * points[ahead]).sum(axis=1) / np.maximum(distances * before, 1e-9)
+    is_alike = (
+        (cosines > _MIN_COSINE) & (distances < _MAX_FARTHER * before) & (before < _MAX_NEARER * distances)
+    )
+    rows, pixels = ahead[is_alike], pixels[is_alike]
+    turns = landmarks.turns[rows] @ T_camera_world[:2, :3].T
+    features = SoughtFeatures(
+        pixels=pixels,
+        descriptors=landmarks.descriptors[rows],
+        turns=turns / np.maximum(np.linalg.norm(turns, axis=1), 1e-9)[:, None],
+        sizes=landmarks.sizes[rows] * before[is_alike] / np.maximum(distances[is_alike], 1e-9),
+    )
+    return Expected(rows=rows, features=features)
+
+
+def _turns_in_world(view: View, T_world_camera: Array, rows: Rows) -> Array:
+    turned: Array = view.features.turns[rows] @ T_world_camera[:3, :2].T
+    return turned

@@ -1,0 +1,85 @@
+"""What a mapper keeps of each segment of a drive: poses, cloud and keyframes, until segments are joined."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from client_sdk.frontend import Features, TrackedFrame
+from client_sdk.mapping import MapOptions, PointMap, Trajectory
+from client_sdk.tracking.tracker import Join
+from rse_pf.geometry import Array, rigid
+from rse_pf.maps.format import Keyframe
+
+__all__ = ["DriveRecords", "SegmentRecord"]
+
+
+@dataclass(slots=True, kw_only=True, eq=False)
+class SegmentRecord:
+    """One segment: stamps in seconds, ``(4, 4)`` poses in its own frame, its cloud and its keyframes."""
+
+    cloud: PointMap
+    stamps_s: list[float] = field(default_factory=list)
+    poses: list[Array] = field(default_factory=list)
+    keyframes: list[Keyframe] = field(default_factory=list)
+
+    def trajectory(self) -> Trajectory:
+        """Return the poses in the order of time."""
+        order = np.argsort(self.stamps_s, kind="stable")
+        return Trajectory(np.array(self.stamps_s)[order], np.array(self.poses).reshape(-1, 4, 4)[order])
+
+
+class DriveRecords:
+    """The segments of one drive; the first one, 0, is what its user sees."""
+
+    def __init__(self, options: MapOptions) -> None:
+        self._options = options
+        self._segments: dict[int, SegmentRecord] = {0: SegmentRecord(cloud=PointMap(options))}
+
+    @property
+    def first(self) -> SegmentRecord:
+        """The first segment, with all that was joined to it."""
+        return self._segments[0]
+
+    @property
+    def apart(self) -> list[SegmentRecord]:
+        """The segments that were not joined to the first one, in their order."""
+        return [record for number, record in sorted(self._segments.items()) if number and record.poses]
+
+    def add(self, tracked: TrackedFrame, pose: Array, *, into_cloud: bool) -> SegmentRecord:
+        """Add a frame with its pose to its segment."""
+        record = self._segments.setdefault(tracked.segment, SegmentRecord(cloud=PointMap(self._options)))
+        record.stamps_s.append(tracked.frame.timestamp_s)
+        record.poses.append(pose)
+        if into_cloud:
+            record.cloud.add(tracked.frame, pose)
+        return record
+
+    def join(self, join: Join) -> None:
+        """Move all of a segment into the one that it lies in."""
+        record = self._segments.pop(join.segment, None)
+        if record is None:
+            return
+        into = self._segments.setdefault(join.into, SegmentRecord(cloud=PointMap(self._options)))
+        into.stamps_s += record.stamps_s
+        into.poses += [_moved(join.T_into_segment, pose) for pose in record.poses]
+        into.cloud.take(record.cloud, join.T_into_segment)
+        into.keyframes += [
+            replace(keyframe, T_world_camera=_moved(join.T_into_segment, keyframe.T_world_camera))
+            for keyframe in record.keyframes
+        ]
+
+
+def keyframe_of(tracked: TrackedFrame, pose: Array, features: Features, robot: str) -> Keyframe:
+    """Return a tracked frame as a keyframe of a map, without its number."""
+    return Keyframe(
+        id=0, robot=robot, timestamp_s=tracked.frame.timestamp_s, T_world_camera=pose,
+        camera=tracked.frame.camera, pixels=features.pixels.astype(np.float32),
+        descriptors=features.descriptors, points_camera=features.points_camera.astype(np.float32),
+    )  # fmt: skip
+
+
+def _moved(T_into_segment: Array, pose: Array) -> Array:
+    moved = rigid(T_into_segment @ pose)
+    return T_into_segment @ pose if moved is None else moved

@@ -1,0 +1,586 @@
+"""Track a camera with depth against the map of its keyframes, as a state machine without input or output.
+
+Frames and answers go in, pose queries and tracked frames come out; there is one query at a time.  Its numbers
+are rounded exactly as they are sent.  Poses are solved elsewhere, and drawn elsewhere.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from client_sdk.frontend import (
+    Correspondences,
+    Features,
+    Frame,
+    FrontEndOptions,
+    PoseQuery,
+    TrackedFrame,
+    extract,
+    round_for_wire,
+)
+from client_sdk.monocular.descriptors import match_all
+from client_sdk.tracking.keyframe_map import NO_LANDMARK, KeyframeMap, Landmarks, View, expect
+from client_sdk.tracking.noise import NoiseEstimate
+from rse_pf.errors import UsageError
+from rse_pf.geometry import Array, inverse, pose_difference, rigid, transform
+from rse_pf.pnp import DepthNoise
+from rse_pf.slam.tracking import (
+    ImageFeatures,
+    NearLimits,
+    Observations,
+    distinct_distances,
+    fit_pose,
+    match_near,
+)
+
+__all__ = ["Join", "Tracker"]
+
+Rows = npt.NDArray[np.int64]
+
+_PIXEL_PX = 1.0
+"""Deviation of a feature's pixel on the finest level; it grows with the size of the feature."""
+_LOCAL, _LATEST, _ALIKE = 6, 3, 5
+_MANY = 3
+"""A guided match with so many times the fewest inliers is worth a query."""
+_GUIDED_RATIO, _FOLLOWED_RATIO, _NEAR_RATIO, _CONFIRMED_RATIO, _CLEAR_RATIO = 0.35, 0.4, 0.25, 0.3, 0.5
+"""Shares of the matches that must agree: with a guided query, with the last frame, with a keyframe of the
+place where the camera was just now, with the map around a pose, and with a keyframe of any other place."""
+_CLEAR_INLIERS = 40
+_CONFIRM_PX = 8.0
+_ALL_RATIO, _ALL_DISTANCE = 0.8, 64
+_QUERIES = 3
+_ENOUGH = 120
+"""With so many landmarks of the map a pose needs no points of the last frame: a chain of frames drifts."""
+"""So many keyframes are asked for the place of one frame, those with the most matches first."""
+_JOIN_EVERY = 3
+_JOIN_M, _JOIN_DEG = 0.15, 4.0
+"""Two measurements of where a segment lies agree within this."""
+
+_Steps = Generator[PoseQuery, "_Answer", TrackedFrame]
+
+
+@dataclass(frozen=True, slots=True)
+class _Answer:
+    """The pose of the camera in the query's frame, or None; how many agree; and whether it is weak."""
+
+    T_camera_world: Array | None
+    inliers: int
+    is_weak: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Join:
+    """A segment lies in another one: poses of *segment* are ``T_into_segment @ pose`` in *into*."""
+
+    segment: int
+    into: int
+    T_into_segment: Array
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Seen:
+    """Landmarks that an image shows: rows of *landmarks*, and of its features."""
+
+    landmarks: Landmarks
+    rows: Rows
+    features: Rows
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Posed:
+    """An image with its pose, the landmark of each feature, and whether its pose may be trusted."""
+
+    view: View
+    T_world_camera: Array
+    landmarks: Rows
+    inliers: int
+    matches: int
+    is_weak: bool
+
+
+class Tracker:
+    """Visual odometry that knows where it has been; one frame and one query at a time.
+
+    ::
+
+        step = tracker.prepare(frame)
+        while isinstance(step, PoseQuery):
+            T_camera_world, inliers = ...   # the PnP service's answer, or None, 0 on any failure
+            step = tracker.accept(step, T_camera_world, inliers)
+        # step is now the TrackedFrame
+
+    A frame is matched near the pixels at which a constant velocity predicts the landmarks of the nearest
+    keyframes and of the last frame.  If no pose fits, it is matched with the last frame, then with the latest
+    keyframes and those that look most alike, wherever they are.  If nothing fits, the frame is lost, and the
+    next one is tried in the same order.  After `FrontEndOptions.segment_after` unrecognised frames a new
+    segment begins; it is joined to an older one when two images of it were found there.  A weak pose never
+    becomes a keyframe.
+
+    ``frames`` counts the frames prepared so far, ``lost_frames`` those of them without an accepted pose, and
+    ``unrecognised`` those since the last pose that show enough and no known place; a covered lens is none.
+    ``joins`` are the joins so far, in their order.
+    """
+
+    def __init__(
+        self,
+        options: FrontEndOptions | None = None,
+        T_world_start: Array | None = None,
+    ) -> None:
+        self.options = options or FrontEndOptions()
+        self.frames = 0
+        self.lost_frames = 0
+        self.keyframes = 0
+        self.unrecognised = 0
+        self.joins: list[Join] = []
+        self.noise = NoiseEstimate()
+        self._T_world_start = np.eye(4) if T_world_start is None else T_world_start
+        self._segments: dict[int, KeyframeMap] = {}
+        self._segment = -1
+        self._begun = 0
+        self._last: _Posed | None = None
+        self._T_last: Array = self._T_world_start
+        self._motion: Array = np.eye(4)
+        self._reference_seen = 0
+        self._lost_in_a_row = 0
+        self._place: tuple[int, Array] | None = None
+        self._frame: Frame  # set by `prepare`
+        self._features: Features
+        self._steps: _Steps | None = None
+        self._query: PoseQuery | None = None
+
+    @property
+    def last_features(self) -> Features | None:
+        """The features of the last frame, if that has a pose."""
+        return self._features if self._last is not None else None
+
+    @property
+    def segment(self) -> int:
+        """The number of the present segment, from 0."""
+        return max(0, self._segment)
+
+    def restart(self, T_world_start: Array) -> None:
+        """Forget what frames are matched against: the next frame with enough features is at *T_world_start*.
+
+        Raises:
+            UsageError: A query is open.
+        """
+        self._refuse_open_query()
+        self._T_world_start = self._T_last = T_world_start
+        self._segments.clear()
+        self._segment, self._last, self._place = -1, None, None
+        self._motion, self._lost_in_a_row, self._begun, self.unrecognised = np.eye(4), 0, 0, 0
+
+    def prepare(self, frame: Frame) -> PoseQuery | TrackedFrame:
+        """Take the next frame; return a query, or the result for the frame if none is needed.
+
+        The first frame with enough features is the start and needs no query; a frame without enough
+        matches is lost without one.
+
+        Raises:
+            UsageError: The last query was not answered yet.
+        """
+        self._refuse_open_query()
+        self.frames += 1
+        self._frame, self._features = frame, extract(frame, self.options)
+        self._steps = self._track(_view_of(frame, self._features))
+        return self._advance(None)
+
+    def accept(
+        self, query: PoseQuery, T_camera_world: Array | None, inliers: int = 0, *, is_weak: bool = False
+    ) -> PoseQuery | TrackedFrame:
+        """Take the answer to *query*; return another query, or the result for the frame.
+
+        Args:
+            query: The query that `prepare` or `accept` returned last.
+            T_camera_world: ``(4, 4)`` as the PnP service returns it, where world is the world of
+                the query (its reference camera); ``None`` if there was no answer.
+            inliers: How many correspondences agree with it.
+            is_weak: Whether its evidence is weak.
+
+        Raises:
+            UsageError: *query* is not the open one.
+        """
+        if query is not self._query:
+            raise UsageError("this query is not the open one", hint="answer each query once, in order")
+        self._query = None
+        return self._advance(_Answer(T_camera_world, inliers, is_weak))
+
+    def _refuse_open_query(self) -> None:
+        if self._query is not None:
+            raise UsageError(
+                f"the query of frame {self._query.timestamp_s:.3f} s is open",
+                hint="call accept with its answer, or with None",
+            )
+
+    def _advance(self, answer: _Answer | None) -> PoseQuery | TrackedFrame:
+        assert self._steps is not None
+        try:
+            self._query = next(self._steps) if answer is None else self._steps.send(answer)
+        except StopIteration as end:
+            self._steps = None
+            result: TrackedFrame = end.value
+            return result
+        return self._query
+
+    # --- one frame ---
+
+    def _track(self, view: View) -> _Steps:
+        """Return the result of a frame, and yield the queries that it needs."""
+        if not self._segments:
+            return self._begin_or_lose(view, matches=0)
+        posed, matches = None, 0
+        if self._last is not None:
+            for how in ("map", "frame"):
+                posed, tried = yield from self._follow(view, how)
+                matches = max(matches, tried)
+                if posed is not None:
+                    break
+        if posed is None:
+            posed, tried = yield from self._recognise(view)
+            matches = max(matches, tried)
+        if posed is None:
+            return self._begin_or_lose(view, matches)
+        keyframe = self._keep(posed)
+        if len(self._segments) > 1 and self.frames % _JOIN_EVERY == 0:
+            yield from self._seek_join(posed)
+        return self._result(posed, keyframe=keyframe)
+
+    def _follow(self, view: View, how: str) -> Generator[PoseQuery, _Answer, tuple[_Posed | None, int]]:
+        """Yield a query against what the last pose predicts, or against the last frame alone."""
+        assert self._last is not None
+        least = self.options.min_inliers
+        T_reference = _rotation_made(self._T_last @ self._motion) if how == "map" else self._T_last
+        if how == "map":
+            seen = self._seen(view, T_reference, self.options.search_px, _NEAR)
+            if len(seen) < _MANY * least:
+                return None, len(seen)
+        else:
+            seen = _seen_anywhere(self._of_last(), self._last_descriptors(), view)
+            if len(seen) < least:
+                return None, len(seen)
+        answer = yield self._make_query(view, seen, T_reference, "map" if how == "map" else "frame")
+        ratio = _GUIDED_RATIO if how == "map" else _FOLLOWED_RATIO
+        T = self._placed(answer, T_reference, len(seen), ratio)
+        if T is None or not self._is_plausible(T):
+            return None, len(seen)
+        return self._confirm(view, T, answer, len(seen), self._map()), len(seen)
+
+    def _recognise(self, view: View) -> Generator[PoseQuery, _Answer, tuple[_Posed | None, int]]:
+        """Yield queries against the latest and the most alike keyframes of all segments."""
+        candidates = []
+        for segment, number in self._candidates(view):
+            landmarks, descriptors = self._segments[segment].landmarks_in(number)
+            candidates.append((segment, number, _seen_anywhere(landmarks, descriptors, view)))
+        candidates.sort(key=lambda candidate: -len(candidate[2]))
+        most = len(candidates[0][2]) if candidates else 0
+        for segment, number, seen in candidates[:_QUERIES]:
+            if len(seen) < self.options.min_inliers:
+                break
+            known = self._segments[segment]
+            T_reference = known.pose(number)
+            answer = yield self._make_query(view, seen, T_reference, "keyframe")
+            T = self._placed(answer, T_reference, len(seen), 0.0)
+            if T is None:
+                continue
+            is_clear = answer.inliers >= max(_CLEAR_INLIERS, _CLEAR_RATIO * len(seen)) and not answer.is_weak
+            is_near = segment == self._segment and self._is_plausible(T)
+            if not (is_clear or (is_near and answer.inliers >= _NEAR_RATIO * len(seen))):
+                continue
+            posed = self._confirm(view, T, answer, len(seen), known)
+            if posed is not None:
+                if segment != self._segment:
+                    self._segment, self._last, self._place = segment, None, None
+                return posed, most
+        return None, most
+
+    def _candidates(self, view: View) -> Iterator[tuple[int, int]]:
+        """Yield the keyframes that may show what a frame shows: (segment, number)."""
+        descriptors = view.features.descriptors
+        for segment, known in self._segments.items():
+            numbers = known.most_alike(descriptors, _ALIKE)
+            if segment == self._segment:
+                numbers = [*range(len(known) - 1, max(-1, len(known) - 1 - _LATEST), -1), *numbers]
+            yield from ((segment, number) for number in dict.fromkeys(numbers))
+
+    def _seek_join(self, posed: _Posed) -> Generator[PoseQuery, _Answer, None]:
+        """Yield a query for the place of a tracked frame in another segment; join the two when two agree."""
+        options = []
+        for segment, known in self._segments.items():
+            if segment == self._segment:
+                continue
+            for number in known.most_alike(posed.view.features.descriptors, _ALIKE):
+                landmarks, descriptors = known.landmarks_in(number)
+                options.append((segment, number, _seen_anywhere(landmarks, descriptors, posed.view)))
+        segment, number, seen = max(options, key=lambda option: len(option[2]))
+        if len(seen) < _CLEAR_INLIERS:
+            return
+        T_reference = self._segments[segment].pose(number)
+        answer = yield self._make_query(posed.view, seen, T_reference, "segment")
+        T = self._placed(answer, T_reference, len(seen), _CLEAR_RATIO)
+        if T is None or answer.inliers < _CLEAR_INLIERS or answer.is_weak:
+            return
+        other = self._confirm(posed.view, T, answer, len(seen), self._segments[segment])
+        if other is None:
+            return
+        T_into_segment = _rotation_made(other.T_world_camera @ inverse(posed.T_world_camera))
+        before, self._place = self._place, (segment, T_into_segment)
+        if before is None or before[0] != segment:
+            return
+        apart_m, apart_deg = pose_difference(before[1], T_into_segment)
+        if apart_m <= _JOIN_M and apart_deg <= _JOIN_DEG:
+            self._join(segment, T_into_segment)
+
+    def _join(self, into: int, T_into_segment: Array) -> None:
+        """Make one segment of the present one and *into*, which keeps its frame."""
+        own = self._segments.pop(self._segment)
+        own.move(T_into_segment)
+        first = self._segments[into].take(own)
+        self.joins.append(Join(self._segment, into, T_into_segment))
+        self._segment, self._place = into, None
+        assert self._last is not None
+        last = self._last
+        moved = np.where(last.landmarks == NO_LANDMARK, NO_LANDMARK, last.landmarks + first)
+        self._T_last = _rotation_made(T_into_segment @ self._T_last)
+        self._last = _Posed(
+            view=last.view, T_world_camera=self._T_last, landmarks=moved, inliers=last.inliers,
+            matches=last.matches, is_weak=last.is_weak,
+        )  # fmt: skip
+
+    # --- matches and poses ---
+
+    def _map(self) -> KeyframeMap:
+        return self._segments[self._segment]
+
+    def _of_last(self) -> Landmarks:
+        assert self._last is not None
+        return self._map().landmarks_of_view(
+            self._last.view, self._T_last, self._last.landmarks, self.noise.noise, _PIXEL_PX
+        )
+
+    def _last_descriptors(self) -> npt.NDArray[np.uint8]:
+        return self._of_last().descriptors
+
+    def _seen(
+        self, view: View, T_world_camera: Array, radius_px: float, limits: NearLimits,
+        known: KeyframeMap | None = None, enough: int = 1_000_000,
+    ) -> _Seen:  # fmt: skip
+        """Match landmarks of the nearest keyframes and of the last frame near the pixels that a pose expects.
+
+        A feature that both show is taken as the last frame shows it.
+        """
+        T_camera_world = inverse(T_world_camera)
+        own = known is None or known is self._map()
+        known = known or self._map()
+        landmarks = known.landmarks_of(known.nearest(T_world_camera, _LOCAL))
+        rows, features = _match(landmarks, T_camera_world, view, radius_px, limits)
+        if self._last is None or not own or self._lost_in_a_row or len(rows) >= enough:
+            return _Seen(landmarks=landmarks, rows=rows, features=features)
+        recent = self._of_last()
+        recent_rows, recent_features = _match(recent, T_camera_world, view, radius_px, limits)
+        again = np.isin(features, recent_features) | np.isin(
+            landmarks.numbers[rows], recent.numbers[recent_rows]
+        )
+        rows, features = rows[~again], features[~again]
+        return _Seen(
+            landmarks=_joined(landmarks, recent),
+            rows=np.concatenate([rows, len(landmarks.numbers) + recent_rows]),
+            features=np.concatenate([features, recent_features]),
+        )
+
+    def _make_query(self, view: View, seen: _Seen, T_reference: Array, against: str) -> PoseQuery:
+        rows, features = seen.rows, seen.features
+        if len(rows) > self.options.max_matches:
+            even = np.linspace(0, len(rows) - 1, self.options.max_matches).astype(np.int64)
+            rows, features = rows[even], features[even]
+        leftmost = np.argsort(view.features.pixels[features, 0], kind="stable")
+        rows, features = rows[leftmost], features[leftmost]
+        points, pixels = round_for_wire(
+            transform(inverse(T_reference), seen.landmarks.points[rows]), view.features.pixels[features]
+        )
+        depths_m = np.nan_to_num(view.points_camera[features, 2], posinf=0.0, neginf=0.0).round(3)
+        if len(points) and points[:, 2].min() <= 0.01:
+            depths_m = np.zeros(len(points))  # a depth is compared with that of the reference camera
+        return PoseQuery(
+            timestamp_s=self._frame.timestamp_s,
+            correspondences=Correspondences(points_world=points, pixels=pixels, depths_m=depths_m),
+            camera=view.camera,
+            inlier_px=self.options.inlier_px,
+            max_iterations=self.options.max_iterations,
+            against=against,  # type: ignore[arg-type]
+        )
+
+    def _placed(self, answer: _Answer, T_reference: Array, matches: int, ratio: float) -> Array | None:
+        """Return ``T_world_camera`` of an answer, None if too few agree or it is no pose."""
+        asked = min(matches, self.options.max_matches)
+        if answer.T_camera_world is None or answer.inliers < max(self.options.min_inliers, ratio * asked):
+            return None
+        T_camera_reference = rigid(answer.T_camera_world)
+        return None if T_camera_reference is None else T_reference @ inverse(T_camera_reference)
+
+    def _is_plausible(self, T_world_camera: Array) -> bool:
+        limit_m = self.options.max_jump_m * (1 + self._lost_in_a_row)
+        moved_m = float(np.linalg.norm(T_world_camera[:3, 3] - self._T_last[:3, 3]))
+        return moved_m <= limit_m
+
+    def _confirm(
+        self, view: View, T_world_camera: Array, answer: _Answer, matches: int, known: KeyframeMap
+    ) -> _Posed | None:
+        """Match the local map near the pose, and fit the pose to all that agrees; None if little does."""
+        seen = self._seen(view, T_world_camera, _CONFIRM_PX, _CONFIRM, known, _ENOUGH)
+        least = self.options.min_inliers
+        if len(seen) < least:
+            return None
+        z = np.nan_to_num(view.points_camera[seen.features, 2], posinf=0.0, neginf=0.0)
+        noise: DepthNoise = self.noise.noise
+        observed = Observations(
+            points=seen.landmarks.points[seen.rows],
+            spreads=seen.landmarks.spreads[seen.rows],
+            pixels=view.features.pixels[seen.features],
+            pixels_px=_PIXEL_PX * view.features.sizes[seen.features],
+            depths_m=z,
+            depths_dev_m=np.sqrt(noise.variance_m2(z)),
+        )
+        fitted = fit_pose(observed, view.camera, inverse(T_world_camera))
+        agreeing = 0 if fitted is None else int(fitted.is_inlier.sum())
+        if fitted is None or agreeing < max(least, _CONFIRMED_RATIO * len(seen)):
+            return None
+        T_camera_world = rigid(fitted.T_camera_world)
+        if T_camera_world is None:
+            return None
+        inliers = np.flatnonzero(fitted.is_inlier)
+        self.noise.add(observed, inliers, T_camera_world)
+        landmarks = np.full(len(view.features), NO_LANDMARK)
+        landmarks[seen.features[inliers]] = seen.landmarks.numbers[seen.rows[inliers]]
+        return _Posed(
+            view=view, T_world_camera=inverse(T_camera_world), landmarks=landmarks, inliers=agreeing,
+            matches=max(matches, len(seen)), is_weak=answer.is_weak,
+        )  # fmt: skip
+
+    # --- results ---
+
+    def _keep(self, posed: _Posed) -> bool:
+        """Take a posed frame as the last one, and into the map; say whether it became a keyframe."""
+        known, T = self._map(), posed.T_world_camera
+        if self._lost_in_a_row or self._last is None:
+            self._motion = np.eye(4)
+        else:
+            self._motion = _rotation_made(inverse(self._T_last) @ T)
+        self._lost_in_a_row, self.unrecognised, self._T_last = 0, 0, T
+        keyframe = self._is_keyframe(posed)
+        if not posed.is_weak:
+            known.fuse(posed.view, T, posed.landmarks, self.noise.noise, _PIXEL_PX)
+        landmarks = posed.landmarks
+        if keyframe:
+            landmarks = known.add_keyframe(posed.view, T, landmarks, self.noise.noise, _PIXEL_PX)
+            self.keyframes += 1
+            self._reference_seen = posed.inliers
+        self._last = _Posed(
+            view=posed.view, T_world_camera=T, landmarks=landmarks, inliers=posed.inliers,
+            matches=posed.matches, is_weak=posed.is_weak,
+        )  # fmt: skip
+        return keyframe
+
+    def _is_keyframe(self, posed: _Posed) -> bool:
+        options = self.options
+        if posed.is_weak or posed.inliers < 2 * options.min_inliers:
+            return False
+        metres, degrees = self._map().distances(posed.T_world_camera)
+        is_new = bool(((metres > options.keyframe_m) | (degrees > options.keyframe_deg)).all())
+        landmarks = int((posed.landmarks != NO_LANDMARK).sum())
+        return is_new or landmarks < options.keyframe_share * self._reference_seen
+
+    def _begin_or_lose(self, view: View, matches: int) -> TrackedFrame:
+        """Begin a segment with a frame that has enough features with depth, if so many before were lost."""
+        usable = int(np.isfinite(view.points_camera[:, 2]).sum())
+        if usable < (_MANY if self._segments else 1) * self.options.min_inliers:
+            return self._lose(matches)
+        if self._segments:
+            self.unrecognised += 1
+            if self.unrecognised <= self.options.segment_after:
+                return self._lose(matches)
+        start = self._T_world_start if not self._segments else self._T_last
+        self._segment = self._begun
+        self._begun += 1
+        self._segments[self._segment] = KeyframeMap(self.options.max_keyframes)
+        none = np.full(len(view.features), NO_LANDMARK)
+        landmarks = self._map().add_keyframe(view, start, none, self.noise.noise, _PIXEL_PX)
+        self.keyframes += 1
+        self._last = _Posed(
+            view=view, T_world_camera=start, landmarks=landmarks, inliers=0, matches=0, is_weak=False
+        )
+        self._T_last, self._motion, self._place = start, np.eye(4), None
+        self._lost_in_a_row, self.unrecognised, self._reference_seen = 0, 0, usable // 2
+        return self._result(self._last, keyframe=True)
+
+    def _result(self, posed: _Posed, *, keyframe: bool) -> TrackedFrame:
+        is_apart = self._segment != min(self._segments)
+        return TrackedFrame(
+            frame=self._frame, T_world_camera=self._T_last, keyframe=keyframe, inliers=posed.inliers,
+            matches=posed.matches, segment=self.segment,
+            reason="in a segment that is not joined to the first one yet" if is_apart else "",
+        )  # fmt: skip
+
+    def _lose(self, matches: int) -> TrackedFrame:
+        self.lost_frames += 1
+        self._lost_in_a_row += 1
+        self._last = None
+        return TrackedFrame(
+            frame=self._frame, T_world_camera=None, keyframe=False, inliers=0, matches=matches,
+            segment=self.segment,
+        )  # fmt: skip
+
+
+_NEAR = NearLimits(radius_px=1.0)
+_CONFIRM = NearLimits(radius_px=1.0, ratio=0.9)
+
+
+def _match(
+    landmarks: Landmarks, T_camera_world: Array, view: View, radius_px: float, limits: NearLimits
+) -> tuple[Rows, Rows]:
+    expected = expect(landmarks, T_camera_world, view.camera, radius_px)
+    limits = NearLimits(radius_px=radius_px, ratio=limits.ratio)
+    rows, features = match_near(expected.features, view.features, limits)
+    return expected.rows[rows], features
+
+
+def _seen_anywhere(landmarks: Landmarks, descriptors: npt.NDArray[np.uint8], view: View) -> _Seen:
+    """Match landmarks with the features of an image by appearance alone."""
+    rows, features = match_all(
+        descriptors, view.features.descriptors, ratio=_ALL_RATIO, max_distance=_ALL_DISTANCE
+    )
+    return _Seen(landmarks=landmarks, rows=rows, features=features)
+
+
+def _joined(first: Landmarks, second: Landmarks) -> Landmarks:
+    return Landmarks(
+        points=np.concatenate([first.points, second.points]),
+        spreads=np.concatenate([first.spreads, second.spreads]),
+        descriptors=np.concatenate([first.descriptors, second.descriptors]),
+        rays=np.concatenate([first.rays, second.rays]),
+        turns=np.concatenate([first.turns, second.turns]),
+        sizes=np.concatenate([first.sizes, second.sizes]),
+        numbers=np.concatenate([first.numbers, second.numbers]),
+    )
+
+
+def _view_of(frame: Frame, features: Features) -> View:
+    image = ImageFeatures(
+        pixels=features.pixels, descriptors=features.descriptors, turns=features.turns, sizes=features.sizes,
+        distinct=distinct_distances(features.descriptors, features.pixels),
+    )  # fmt: skip
+    return View(features=image, points_camera=features.points_camera, camera=frame.camera)
+
+
+def _rotation_made(T: Array) -> Array:
+    """Return a pose with a true rotation: products drift from it, and `inverse` doubles the error."""
+    U, _, Vt = np.linalg.svd(T[:3, :3])
+    made: Array = T.copy()
+    made[:3, :3] = U @ Vt
+    return made

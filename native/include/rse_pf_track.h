@@ -1,0 +1,86 @@
+/* The C ABI of a tracker: matches near predicted pixels, and the pose that fits landmarks.
+ *
+ * Every function may be called from any thread, on arrays of its own.  Nothing is allocated, and equal
+ * arguments give equal bytes on every processor. */
+#ifndef RSE_PF_TRACK_H
+#define RSE_PF_TRACK_H
+
+#include <stdint.h>
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+#define RSE_PF_TRACK_ABI 1
+
+/* Return RSE_PF_TRACK_ABI of the library, to compare with the header's. */
+uint32_t rse_pf_track_abi(void);
+
+/* For each feature of an image write the least Hamming distance to another feature that is at least apart_px away
+ * in a row or a column, 256 without one, and return 0; -1 if a size does not fit.
+ *
+ * descriptors: rows x 32; pixels: rows x 2. */
+int32_t rse_pf_distinct(const uint8_t *descriptors, const double *pixels, int64_t rows, double apart_px,
+                        int32_t *distinct);
+
+typedef struct rse_pf_near_request {
+    uint32_t abi;
+    uint32_t flags;                 /* 0 */
+    int64_t sought_rows, rows;      /* of the sought features; of the image's */
+    const double *predicted;        /* sought_rows x 2: where they are expected */
+    const double *sought_turns;     /* sought_rows x 2: their expected orientation, unit vectors or shorter */
+    const double *sought_sizes;     /* sought_rows: their expected size, above 0 */
+    const uint8_t *sought;          /* sought_rows x 32 */
+    const double *pixels;           /* rows x 2 */
+    const double *turns;            /* rows x 2, unit vectors */
+    const double *sizes;            /* rows, above 0 */
+    const uint8_t *descriptors;     /* rows x 32 */
+    const int32_t *distinct;        /* rows, of rse_pf_distinct */
+    double radius_px;               /* of the search */
+    double ratio;                   /* the nearest must be this much nearer than the second within the radius */
+    double distinct_ratio;          /* and this much nearer than its own image's most similar feature */
+    double min_cosine;              /* between the expected orientation and that of the feature */
+    double max_size_ratio;          /* between the sizes, either way */
+    int64_t max_distance;           /* Hamming */
+} rse_pf_near_request;
+
+/* Numbers of 8 bytes that rse_pf_match_near works in. */
+#define RSE_PF_NEAR_WORKSPACE(sought_rows, rows) ((sought_rows) + 2 * (rows) + 4200)
+
+/* Match sought features to features of an image near predicted pixels; return the number of matches, -1 if a size
+ * does not fit.  The first of equals is taken; of the sought features that take one feature the nearest stays, the
+ * first of equals.  Writes the row of both for each match, by the rows of the sought features; there is room for
+ * min(sought_rows, rows). */
+int64_t rse_pf_match_near(const rse_pf_near_request *request, uint64_t *workspace, int64_t *sought_matched,
+                          int64_t *matched);
+
+typedef struct rse_pf_fit_request {
+    uint32_t abi;
+    uint32_t flags;           /* 0 */
+    int64_t rows;
+    const double *points;     /* rows x 3, metres, world */
+    const double *spreads;    /* rows x 6: upper triangle of the covariance of the point, square metres, world */
+    const double *pixels;     /* rows x 2 */
+    const double *pixels_px;  /* rows: deviation of the pixel */
+    const double *depths_m;   /* rows: depth along the optical axis, 0 where there is none */
+    const double *depths_dev; /* rows: deviation of that depth, metres; not read where there is none */
+    double fx, fy, cx, cy;
+    double cauchy2;           /* squared distance (in deviations) at which a row weighs half */
+    double gate2;             /* squared distance beyond which a row is no inlier */
+    double T_camera_world[16]; /* row-major: where the fit begins */
+} rse_pf_fit_request;
+
+typedef struct rse_pf_fit_result {
+    int64_t inliers;
+    double T_camera_world[16];
+    double information[36]; /* of the twist (metres, then radians) left of the pose, by the inliers */
+} rse_pf_fit_result;
+
+/* Fit the pose to pixels and depths by the noise of both and of the points, robustly, and write which rows are
+ * inliers (rows bytes, 0 or 1); return 0, 1 if some motion is free, -1 if a size or a number does not fit. */
+int32_t rse_pf_fit_pose(const rse_pf_fit_request *request, uint8_t *is_inlier, rse_pf_fit_result *result);
+
+#ifdef __cplusplus
+}
+#endif
+#endif

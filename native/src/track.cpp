@@ -1,0 +1,286 @@
+// A tracker's inner loops: features that resemble no other, matches near predicted pixels, and the pose that fits
+// landmarks.  rse_pf/slam/tracking.py has the same in numpy and says why.
+#include "rse_pf_track.h"
+
+#include <cstring>
+
+#define RSE_PF_ISA rse_pf_track_detail
+#pragma GCC diagnostic push
+#pragma GCC diagnostic ignored "-Wunused-function"
+#include "small.hpp"
+#pragma GCC diagnostic pop
+
+namespace {
+
+using namespace rse_pf_track_detail;
+
+constexpr int64_t kMaxRows = int64_t{1} << 24, kBytes = 32, kBits = 256;
+constexpr int64_t kCells = 64;
+constexpr double kCellPx = 40.0;
+constexpr uint64_t kNone = ~uint64_t{0};
+constexpr int kIterations = 10, kFirstGated = 3;
+constexpr double kConverged = 1e-6, kNearM = 0.05, kMaxAbs = 1e9;
+
+bool within(double value, double low, double high) { return value >= low && value <= high; }
+
+uint64_t word(const uint8_t* at) {
+    uint64_t value;
+    std::memcpy(&value, at, sizeof value);
+    return value;
+}
+
+int32_t hamming(const uint8_t* a, const uint8_t* b) {
+    int32_t sum = 0;
+    for (int64_t k = 0; k < kBytes; k += 8) sum += __builtin_popcountll(word(a + k) ^ word(b + k));
+    return sum;
+}
+
+// The cell of a place along one side; what lies outside is in the first or the last one.
+int64_t cell_of(double px) {
+    const double cell = px / kCellPx;
+    return cell >= 0.0 ? (cell < static_cast<double>(kCells) ? static_cast<int64_t>(cell) : kCells - 1) : 0;
+}
+
+struct Grid {
+    const uint64_t* starts;  // kCells * kCells + 1
+    const uint64_t* rows;
+};
+
+// Sort the features of the image by cell, those of one cell as they stand.
+Grid grid_of(const rse_pf_near_request& request, uint64_t* starts, uint64_t* rows) {
+    std::memset(starts, 0, static_cast<size_t>(kCells * kCells + 2) * sizeof *starts);
+    const auto cell = [&](int64_t row) {
+        return cell_of(request.pixels[2 * row + 1]) * kCells + cell_of(request.pixels[2 * row]);
+    };
+    for (int64_t row = 0; row < request.rows; ++row) ++starts[cell(row) + 2];
+    for (int64_t i = 0; i < kCells * kCells; ++i) starts[i + 2] += starts[i + 1];
+    for (int64_t row = 0; row < request.rows; ++row) rows[starts[cell(row) + 1]++] = static_cast<uint64_t>(row);
+    return {starts, rows};
+}
+
+bool fits(const rse_pf_near_request& request, int64_t sought, int64_t row) {
+    const double x = request.pixels[2 * row] - request.predicted[2 * sought];
+    const double y = request.pixels[2 * row + 1] - request.predicted[2 * sought + 1];
+    const double size = request.sizes[row], expected = request.sought_sizes[sought];
+    const double cosine = request.turns[2 * row] * request.sought_turns[2 * sought] +
+                          request.turns[2 * row + 1] * request.sought_turns[2 * sought + 1];
+    return x * x + y * y <= request.radius_px * request.radius_px && cosine >= request.min_cosine &&
+           size <= request.max_size_ratio * expected && expected <= request.max_size_ratio * size;
+}
+
+// The nearest feature (its distance above its row), and the distance of the second.
+struct Two {
+    uint64_t first = kNone, second = kNone;
+};
+
+Two nearest_of(const rse_pf_near_request& request, const Grid& grid, int64_t sought) {
+    Two two;
+    const double x = request.predicted[2 * sought], y = request.predicted[2 * sought + 1];
+    if (!(within(x, -kMaxAbs, kMaxAbs) && within(y, -kMaxAbs, kMaxAbs))) return two;
+    const int64_t left = cell_of(x - request.radius_px), right = cell_of(x + request.radius_px);
+    const int64_t bottom = cell_of(y + request.radius_px);
+    for (int64_t line = cell_of(y - request.radius_px); line <= bottom; ++line) {
+        const uint64_t end = grid.starts[line * kCells + right + 1];
+        for (uint64_t at = grid.starts[line * kCells + left]; at < end; ++at) {
+            const int64_t row = static_cast<int64_t>(grid.rows[at]);
+            if (!fits(request, sought, row)) continue;
+            const auto distance = static_cast<uint64_t>(
+                hamming(request.sought + kBytes * sought, request.descriptors + kBytes * row));
+            const uint64_t key = distance << 32 | static_cast<uint64_t>(row);
+            if (key < two.first) {
+                two.second = two.first;
+                two.first = key;
+            } else if (key < two.second) {
+                two.second = key;
+            }
+        }
+    }
+    return two;
+}
+
+bool is_clear(const rse_pf_near_request& request, const Two& two) {
+    if (two.first == kNone) return false;
+    const auto distance = static_cast<double>(two.first >> 32);
+    const int64_t row = static_cast<int64_t>(two.first & 0xffffffffu);
+    return distance <= static_cast<double>(request.max_distance) &&
+           distance < request.distinct_ratio * static_cast<double>(request.distinct[row]) &&
+           (two.second == kNone || distance < request.ratio * static_cast<double>(two.second >> 32));
+}
+
+struct Fit {
+    Normal normal;
+    int64_t inliers;
+};
+
+// Add the rows at one pose; the last pass takes inliers without their robust weights.
+Fit fit_of(const rse_pf_fit_request& request, const Pose& pose, bool is_gated, bool is_last, uint8_t* is_inlier) {
+    Fit fit = {};
+    for (int64_t i = 0; i < request.rows; ++i) {
+        const double* const X = request.points + 3 * i;
+        const double* const S = request.spreads + 6 * i;
+        const Vector3 p = rotated(pose.R, {X[0], X[1], X[2]}) + pose.t;
+        const double z = p.z > kNearM ? p.z : kNearM, depth = request.depths_m[i];
+        const double has = depth > 0.0 ? 1.0 : 0.0;
+        const double a = p.x / z, c = p.y / z, h0 = request.fx / z, h1 = request.fy / z;
+        const double r[3] = {request.pixels[2 * i] - (request.fx * a + request.cx),
+                             request.pixels[2 * i + 1] - (request.fy * c + request.cy), has * (depth - z)};
+        // Slopes of (u, v, z) by the point in the camera's frame, then by the point in the world.
+        const double J[3][3] = {{h0, 0.0, -(h0 * a)}, {0.0, h1, -(h1 * c)}, {0.0, 0.0, has}};
+        double A[3][3], AS[3][3], V[3][3];
+        for (int j = 0; j < 3; ++j)
+            for (int k = 0; k < 3; ++k)
+                A[j][k] = J[j][0] * pose.R[0][k] + J[j][1] * pose.R[1][k] + J[j][2] * pose.R[2][k];
+        const double C[3][3] = {{S[0], S[1], S[2]}, {S[1], S[3], S[4]}, {S[2], S[4], S[5]}};
+        for (int j = 0; j < 3; ++j)
+            for (int k = 0; k < 3; ++k) AS[j][k] = A[j][0] * C[0][k] + A[j][1] * C[1][k] + A[j][2] * C[2][k];
+        for (int j = 0; j < 3; ++j)
+            for (int k = j; k < 3; ++k) V[j][k] = AS[j][0] * A[k][0] + AS[j][1] * A[k][1] + AS[j][2] * A[k][2];
+        const double pixel2 = request.pixels_px[i] * request.pixels_px[i];
+        V[0][0] += pixel2;
+        V[1][1] += pixel2;
+        V[2][2] = has > 0.0 ? V[2][2] + request.depths_dev[i] * request.depths_dev[i] : 1.0;
+        const double m00 = V[1][1] * V[2][2] - V[1][2] * V[1][2], m01 = V[0][2] * V[1][2] - V[0][1] * V[2][2];
+        const double m02 = V[0][1] * V[1][2] - V[0][2] * V[1][1];
+        const double scale = 1.0 / (V[0][0] * m00 + V[0][1] * m01 + V[0][2] * m02);
+        const double w01 = m01 * scale, w02 = m02 * scale, w12 = (V[0][1] * V[0][2] - V[0][0] * V[1][2]) * scale;
+        const double W[3][3] = {{m00 * scale, w01, w02},
+                                {w01, (V[0][0] * V[2][2] - V[0][2] * V[0][2]) * scale, w12},
+                                {w02, w12, (V[0][0] * V[1][1] - V[0][1] * V[0][1]) * scale}};
+        double q[3];
+        for (int j = 0; j < 3; ++j) q[j] = W[j][0] * r[0] + W[j][1] * r[1] + W[j][2] * r[2];
+        const double distance2 = r[0] * q[0] + r[1] * q[1] + r[2] * q[2];
+        const bool is_in = distance2 < request.gate2 && p.z > kNearM;
+        if (is_inlier != nullptr) is_inlier[i] = is_in ? 1 : 0;
+        fit.inliers += is_in ? 1 : 0;
+        if (is_gated && !is_in) continue;
+        const double weight = is_last ? 1.0 : 1.0 / (1.0 + distance2 / request.cauchy2);
+        // By the twist: the point moves by rho + phi x point.
+        double B[3][6];
+        for (int j = 0; j < 3; ++j) {
+            B[j][0] = J[j][0];
+            B[j][1] = J[j][1];
+            B[j][2] = J[j][2];
+            B[j][3] = J[j][2] * p.y - J[j][1] * z;
+            B[j][4] = J[j][0] * z - J[j][2] * p.x;
+            B[j][5] = J[j][1] * p.x - J[j][0] * p.y;
+        }
+        for (int j = 0; j < 6; ++j) {
+            double u[3];
+            for (int k = 0; k < 3; ++k) u[k] = weight * (W[k][0] * B[0][j] + W[k][1] * B[1][j] + W[k][2] * B[2][j]);
+            for (int k = j; k < 6; ++k) fit.normal.A[j][k] += u[0] * B[0][k] + u[1] * B[1][k] + u[2] * B[2][k];
+            fit.normal.b[j] += weight * (B[0][j] * q[0] + B[1][j] * q[1] + B[2][j] * q[2]);
+        }
+    }
+    return fit;
+}
+
+bool is_whole(const rse_pf_fit_request& request) {
+    if (request.abi != RSE_PF_TRACK_ABI || request.rows < 0 || request.rows > kMaxRows || request.points == nullptr ||
+        request.spreads == nullptr || request.pixels == nullptr || request.pixels_px == nullptr ||
+        request.depths_m == nullptr || request.depths_dev == nullptr || !within(request.fx, 1e-9, kMaxAbs) ||
+        !within(request.fy, 1e-9, kMaxAbs) || !within(request.cx, -kMaxAbs, kMaxAbs) ||
+        !within(request.cy, -kMaxAbs, kMaxAbs) || !within(request.cauchy2, 1e-9, kMaxAbs) ||
+        !within(request.gate2, 0.0, kMaxAbs))
+        return false;
+    for (const double number : request.T_camera_world)
+        if (!within(number, -kMaxAbs, kMaxAbs)) return false;
+    for (int64_t i = 0; i < request.rows; ++i) {
+        if (!(within(request.pixels_px[i], 1e-3, 1e6) && within(request.depths_m[i], 0.0, 1e3))) return false;
+        if (request.depths_m[i] > 0.0 && !within(request.depths_dev[i], 1e-6, 1e3)) return false;
+        for (int k = 0; k < 3; ++k)
+            if (!within(request.points[3 * i + k], -kMaxAbs, kMaxAbs)) return false;
+        for (int k = 0; k < 2; ++k)
+            if (!within(request.pixels[2 * i + k], -kMaxAbs, kMaxAbs)) return false;
+        for (int k = 0; k < 6; ++k)
+            if (!within(request.spreads[6 * i + k], -kMaxAbs, kMaxAbs)) return false;
+    }
+    return true;
+}
+
+}  // namespace
+
+extern "C" {
+
+__attribute__((visibility("default"))) uint32_t rse_pf_track_abi(void) { return RSE_PF_TRACK_ABI; }
+
+__attribute__((visibility("default"))) int32_t rse_pf_distinct(const uint8_t* descriptors, const double* pixels,
+                                                               int64_t rows, double apart_px, int32_t* distinct) {
+    if (descriptors == nullptr || pixels == nullptr || distinct == nullptr || rows < 0 || rows > kMaxRows) return -1;
+    for (int64_t i = 0; i < rows; ++i) distinct[i] = static_cast<int32_t>(kBits);
+    for (int64_t i = 0; i < rows; ++i) {
+        int32_t least = distinct[i];
+        for (int64_t j = i + 1; j < rows; ++j) {
+            const int32_t distance = hamming(descriptors + kBytes * i, descriptors + kBytes * j);
+            if (distance >= least && distance >= distinct[j]) continue;
+            const double x = pixels[2 * i] - pixels[2 * j], y = pixels[2 * i + 1] - pixels[2 * j + 1];
+            if (!(x >= apart_px || -x >= apart_px || y >= apart_px || -y >= apart_px)) continue;
+            least = distance < least ? distance : least;
+            distinct[j] = distance < distinct[j] ? distance : distinct[j];
+        }
+        distinct[i] = least;
+    }
+    return 0;
+}
+
+__attribute__((visibility("default"))) int64_t rse_pf_match_near(const rse_pf_near_request* request,
+                                                                 uint64_t* workspace, int64_t* sought_matched,
+                                                                 int64_t* matched) {
+    const rse_pf_near_request& all = *request;
+    if (all.abi != RSE_PF_TRACK_ABI || all.sought_rows < 0 || all.sought_rows > kMaxRows || all.rows < 0 ||
+        all.rows > kMaxRows || all.predicted == nullptr || all.sought_turns == nullptr || all.sought_sizes == nullptr ||
+        all.sought == nullptr || all.pixels == nullptr || all.turns == nullptr || all.sizes == nullptr ||
+        all.descriptors == nullptr || all.distinct == nullptr || !within(all.radius_px, 0.0, kMaxAbs) ||
+        workspace == nullptr || sought_matched == nullptr || matched == nullptr)
+        return -1;
+    uint64_t* const nearest = workspace;  // of each sought feature
+    uint64_t* const takers = nearest + all.sought_rows;
+    uint64_t* const rows = takers + all.rows;
+    const Grid grid = grid_of(all, rows + all.rows, rows);
+    std::memset(takers, 0xff, static_cast<size_t>(all.rows) * sizeof *takers);
+    for (int64_t i = 0; i < all.sought_rows; ++i) {
+        const Two two = nearest_of(all, grid, i);
+        nearest[i] = kNone;
+        if (!is_clear(all, two)) continue;
+        nearest[i] = two.first & 0xffffffffu;
+        const uint64_t taker = (two.first >> 32) << 32 | static_cast<uint64_t>(i);
+        if (taker < takers[nearest[i]]) takers[nearest[i]] = taker;
+    }
+    int64_t count = 0;
+    for (int64_t i = 0; i < all.sought_rows; ++i) {
+        if (nearest[i] == kNone || (takers[nearest[i]] & 0xffffffffu) != static_cast<uint64_t>(i)) continue;
+        sought_matched[count] = i;
+        matched[count++] = static_cast<int64_t>(nearest[i]);
+    }
+    return count;
+}
+
+__attribute__((visibility("default"))) int32_t rse_pf_fit_pose(const rse_pf_fit_request* request, uint8_t* is_inlier,
+                                                               rse_pf_fit_result* result) {
+    if (is_inlier == nullptr || result == nullptr || !is_whole(*request)) return -1;
+    const double* const T = request->T_camera_world;
+    Pose pose = {{{T[0], T[1], T[2]}, {T[4], T[5], T[6]}, {T[8], T[9], T[10]}}, {T[3], T[7], T[11]}};
+    for (int i = 0; i < kIterations; ++i) {
+        const Fit fit = fit_of(*request, pose, i >= kFirstGated, false, nullptr);
+        double twist[6], largest = 0.0;
+        if (!solved(fit.normal, 0.0, twist)) return 1;
+        for (const double number : twist) {
+            if (!within(number, -1e6, 1e6)) return 1;
+            const double size = number < 0.0 ? -number : number;
+            largest = size > largest ? size : largest;
+        }
+        pose = moved_along(twist, pose);
+        if (largest < kConverged && i > kFirstGated) break;
+    }
+    const Fit fit = fit_of(*request, pose, true, true, is_inlier);
+    if (!is_finite(pose)) return 1;
+    result->inliers = fit.inliers;
+    for (int i = 0; i < 6; ++i)
+        for (int j = 0; j < 6; ++j)
+            result->information[6 * i + j] = i <= j ? fit.normal.A[i][j] : fit.normal.A[j][i];
+    const double out[16] = {pose.R[0][0], pose.R[0][1], pose.R[0][2], pose.t.x, pose.R[1][0], pose.R[1][1],
+                            pose.R[1][2], pose.t.y,     pose.R[2][0], pose.R[2][1], pose.R[2][2], pose.t.z,
+                            0.0,          0.0,          0.0,          1.0};
+    std::memcpy(result->T_camera_world, out, sizeof out);
+    return 0;
+}
+}

@@ -1,0 +1,340 @@
+"""What a tracker computes for each frame: matches near predicted pixels, and the pose that fits landmarks.
+
+Each function runs in the native core where its library is built, and in numpy elsewhere: matches are equal,
+poses agree to rounding.  Which landmarks are sought, and what is done with a pose, is decided elsewhere.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from rse_pf.errors import BadRequest
+from rse_pf.geometry import Array, Camera, exp_se3, skew
+from rse_pf.native_tracker import track_core
+
+__all__ = [
+    "FittedPose",
+    "ImageFeatures",
+    "NearLimits",
+    "Observations",
+    "SoughtFeatures",
+    "distinct_distances",
+    "fit_pose",
+    "fit_pose_by_numpy",
+    "match_near",
+    "match_near_by_numpy",
+    "pairs_within",
+]
+
+Rows = npt.NDArray[np.int64]
+Descriptors = npt.NDArray[np.uint8]
+
+_BITS = np.array([bin(value).count("1") for value in range(256)], dtype=np.uint8)
+_BAND = 1e6
+_NONE = 256
+_ITERATIONS, _FIRST_GATED, _CONVERGED = 10, 3, 1e-6
+_NEAR_M = 0.05
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ImageFeatures:
+    """Binary features of one image.
+
+    ``pixels`` ``(n, 2)``, undistorted; ``descriptors`` ``(n, 32)``; ``turns`` ``(n, 2)``, cosine and sine of
+    the orientation; ``sizes`` ``(n,)``, the scale of the pyramid's level, 1 for the finest; ``distinct``
+    ``(n,)`` as `distinct_distances` returns it.
+    """
+
+    pixels: Array
+    descriptors: Descriptors
+    turns: Array
+    sizes: Array
+    distinct: npt.NDArray[np.int32]
+
+    def __len__(self) -> int:
+        return len(self.pixels)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SoughtFeatures:
+    """Features that are expected in an image: their ``(m, 2)`` pixels, ``(m, 2)`` turns and ``(m,)`` sizes.
+
+    ``turns`` are cosine and sine of the expected orientation.
+    """
+
+    pixels: Array
+    descriptors: Descriptors
+    turns: Array
+    sizes: Array
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NearLimits:
+    """When a feature is the expected one.
+
+    Attributes:
+        radius_px: Around the expected pixel.
+        ratio: The most similar feature must be this much nearer than the second within the radius.
+        distinct_ratio: And this much nearer than the feature of its own image that resembles it most: a
+            carpet or a wall of tiles looks alike beyond the radius, too.
+        min_cosine: Between the expected orientation and its own.
+        max_size_ratio: Between the expected size and its own, either way.
+        max_distance: Largest Hamming distance, of 256 bits.
+    """
+
+    radius_px: float
+    ratio: float = 0.8
+    distinct_ratio: float = 0.8
+    min_cosine: float = 0.9
+    max_size_ratio: float = 1.35
+    max_distance: int = 60
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Observations:
+    """Landmarks and what one image measured of them.
+
+    Attributes:
+        points: ``(n, 3)`` metres, world.
+        spreads: ``(n, 3, 3)`` covariances of the points, square metres, world.
+        pixels: ``(n, 2)``.
+        pixels_px: ``(n,)`` deviations of the pixels.
+        depths_m: ``(n,)`` along the optical axis, 0 where there is none.
+        depths_dev_m: ``(n,)`` deviations of the depths; not read where there is none.
+    """
+
+    points: Array
+    spreads: Array
+    pixels: Array
+    pixels_px: Array
+    depths_m: Array
+    depths_dev_m: Array
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FittedPose:
+    """``T_camera_world``, the ``(6, 6)`` information of the twist on its left, and ``(n,)`` who agrees."""
+
+    T_camera_world: Array
+    information: Array
+    is_inlier: npt.NDArray[np.bool_]
+
+
+def distinct_distances(
+    descriptors: Descriptors, pixels: Array, apart_px: float = 6.0
+) -> npt.NDArray[np.int32]:
+    """Return the Hamming distance of each feature to the most similar other one of its image.
+
+    Features that are closer than *apart_px* in rows and columns are the same point, and are not compared.
+
+    Args:
+        descriptors: ``(n, 32)``.
+        pixels: ``(n, 2)``.
+        apart_px: Of two features that are compared.
+
+    Returns:
+        ``(n,)``, 256 where there is no other one.
+    """
+    core = track_core()
+    if core is not None:
+        return core.distinct(descriptors, np.asarray(pixels, dtype=np.float64), apart_px)
+    bits = np.unpackbits(descriptors, axis=1).astype(np.float32)
+    bits += bits
+    bits -= 1.0
+    distances = (_NONE - bits @ bits.T) / 2  # exact: whole numbers
+    apart = np.abs(pixels[:, None] - pixels[None]).max(axis=2) >= apart_px
+    distances[~apart] = _NONE
+    nearest: npt.NDArray[np.int32] = distances.min(axis=1, initial=_NONE).astype(np.int32)
+    return nearest
+
+
+def match_near(sought: SoughtFeatures, image: ImageFeatures, limits: NearLimits) -> tuple[Rows, Rows]:
+    """Return rows of *sought* and of *image* that match, by the rows of *sought*; deterministic, one to one.
+
+    Raises:
+        BadRequest: Shapes do not fit.
+    """
+    m, n = len(sought.pixels), len(image)
+    shapes = (
+        sought.pixels.shape, sought.descriptors.shape, sought.turns.shape, sought.sizes.shape,
+        image.pixels.shape, image.descriptors.shape, image.turns.shape, image.sizes.shape,
+        image.distinct.shape,
+    )  # fmt: skip
+    if shapes != ((m, 2), (m, 32), (m, 2), (m,), (n, 2), (n, 32), (n, 2), (n,), (n,)):
+        raise BadRequest("features of different numbers of rows", hint="give one row for each feature")
+    core = track_core()
+    if core is None:
+        return match_near_by_numpy(sought, image, limits)
+    return core.match_near(
+        (sought.pixels, sought.turns, sought.sizes, sought.descriptors),
+        (image.pixels, image.turns, image.sizes, image.descriptors, image.distinct),
+        (
+            limits.radius_px, limits.ratio, limits.distinct_ratio, limits.min_cosine,
+            limits.max_size_ratio, limits.max_distance,
+        ),
+    )  # fmt: skip
+
+
+def match_near_by_numpy(
+    sought: SoughtFeatures, image: ImageFeatures, limits: NearLimits
+) -> tuple[Rows, Rows]:
+    """Return what `match_near` does, without the native core, whose oracle this is."""
+    empty = np.empty(0, dtype=np.int64)
+    if not len(sought.pixels) or not len(image):
+        return empty, empty
+    rows, columns = pairs_within(sought.pixels, image.pixels, limits.radius_px)
+    a, b = sought.turns[rows], image.turns[columns]
+    expected, size = sought.sizes[rows], image.sizes[columns]
+    fits = (
+        (a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1] >= limits.min_cosine)
+        & (size <= limits.max_size_ratio * expected) & (expected <= limits.max_size_ratio * size)
+    )  # fmt: skip
+    rows, columns = rows[fits], columns[fits]
+    if not len(rows):
+        return empty, empty
+    distances = _BITS[sought.descriptors[rows] ^ image.descriptors[columns]].sum(axis=1, dtype=np.int64)
+    order = np.lexsort((columns, distances, rows))
+    rows, columns, distances = rows[order], columns[order], distances[order]
+    starts = np.flatnonzero(np.concatenate(([True], rows[1:] != rows[:-1])))
+    follows = np.minimum(starts + 1, len(rows) - 1)
+    has_second = (rows[follows] == rows[starts]) & (follows > starts)
+    best = distances[starts]
+    clear = (
+        (best <= limits.max_distance)
+        & (best < limits.distinct_ratio * image.distinct[columns[starts]])
+        & (~has_second | (best < limits.ratio * distances[follows]))
+    )
+    rows, columns, best = rows[starts][clear], columns[starts][clear], best[clear]
+    nearest_first = np.argsort(best, kind="stable")
+    _, firsts = np.unique(columns[nearest_first], return_index=True)
+    chosen = np.sort(nearest_first[firsts])
+    return rows[chosen].astype(np.int64), columns[chosen]
+
+
+def fit_pose(
+    observed: Observations,
+    camera: Camera,
+    T_camera_world: Array,
+    *,
+    cauchy: float = 2.5,
+    gate2: float = 11.3,
+) -> FittedPose | None:
+    """Return the pose that fits pixels, depths and landmarks by the noise of all; None if it is free.
+
+    Iterated least squares with a Cauchy weight; after three steps only rows within the gate count.
+
+    Args:
+        observed: Of one image.
+        camera: Its intrinsics.
+        T_camera_world: ``(4, 4)``, where the fit begins.
+        cauchy: Distance in standard deviations at which a row weighs half.
+        gate2: Squared distance beyond which a row does not agree: 11.3 keeps 99 % of three numbers.
+
+    Source:
+        Errors in variables after Segal et al., Generalized-ICP (RSS 2009), here with pixels and depths.
+    """
+    core = track_core()
+    if core is None:
+        return fit_pose_by_numpy(observed, camera, T_camera_world, cauchy=cauchy, gate2=gate2)
+    upper = observed.spreads[:, (0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2)]
+    fitted = core.fit_pose(
+        (observed.points, upper),
+        (observed.pixels, observed.pixels_px, observed.depths_m, observed.depths_dev_m),
+        camera, (cauchy * cauchy, gate2), T_camera_world,
+    )  # fmt: skip
+    if fitted is None:
+        return None
+    return FittedPose(T_camera_world=fitted[0], information=fitted[1], is_inlier=fitted[2])
+
+
+def fit_pose_by_numpy(
+    observed: Observations, camera: Camera, T_camera_world: Array, *, cauchy: float, gate2: float
+) -> FittedPose | None:
+    """Return what `fit_pose` does, without the native core, whose oracle this is."""
+    T = T_camera_world
+    for iteration in range(_ITERATIONS):
+        J, W, residual, distance2, is_inlier = _linearised(observed, camera, T, gate2)
+        weight = 1.0 / (1.0 + distance2 / cauchy**2)
+        if iteration >= _FIRST_GATED:
+            weight = weight * is_inlier
+        information = np.einsum("nia,nij,njb,n->ab", J, W, J, weight, optimize=True)
+        gradient = np.einsum("nia,nij,nj,n->a", J, W, residual, weight, optimize=True)
+        try:
+            np.linalg.cholesky(information)
+            twist = np.linalg.solve(information, gradient)
+        except np.linalg.LinAlgError:
+            return None
+        T = exp_se3(twist) @ T
+        if np.abs(twist).max() < _CONVERGED and iteration > _FIRST_GATED:
+            break
+    J, W, _, _, is_inlier = _linearised(observed, camera, T, gate2)
+    if not np.isfinite(T).all():
+        return None
+    information = np.einsum("nia,nij,njb,n->ab", J, W, J, is_inlier.astype(float), optimize=True)
+    return FittedPose(T_camera_world=T, information=information, is_inlier=is_inlier)
+
+
+def _linearised(
+    observed: Observations, camera: Camera, T: Array, gate2: float
+) -> tuple[Array, Array, Array, Array, npt.NDArray[np.bool_]]:
+    """Return slopes by the twist, weights, residuals, their squared distances, and who is within the gate."""
+    has_depth = observed.depths_m > 0.0
+    p = observed.points @ T[:3, :3].T + T[:3, 3]
+    is_ahead = p[:, 2] > _NEAR_M
+    p[:, 2] = np.maximum(p[:, 2], _NEAR_M)
+    x, y, z = p.T
+    n = len(p)
+    residual = np.stack(
+        [
+            observed.pixels[:, 0] - (camera.fx * x / z + camera.cx),
+            observed.pixels[:, 1] - (camera.fy * y / z + camera.cy),
+            np.where(has_depth, observed.depths_m - z, 0.0),
+        ],
+        axis=1,
+    )
+    by_point = np.zeros((n, 3, 3))
+    by_point[:, 0, 0], by_point[:, 0, 2] = camera.fx / z, -camera.fx * x / z**2
+    by_point[:, 1, 1], by_point[:, 1, 2] = camera.fy / z, -camera.fy * y / z**2
+    by_point[:, 2, 2] = has_depth
+    by_twist = np.concatenate([np.broadcast_to(np.eye(3), (n, 3, 3)), -skew(p)], axis=2)
+    by_world = by_point @ T[:3, :3]
+    variance = by_world @ observed.spreads @ by_world.transpose(0, 2, 1)
+    variance[:, (0, 1), (0, 1)] += (observed.pixels_px**2)[:, None]
+    variance[:, 2, 2] = np.where(has_depth, variance[:, 2, 2] + observed.depths_dev_m**2, 1.0)
+    W = np.linalg.inv(variance)
+    distance2 = np.einsum("ni,nij,nj->n", residual, W, residual)
+    return by_point @ by_twist, W, residual, distance2, (distance2 < gate2) & is_ahead
+
+
+def pairs_within(predicted: Array, pixels: Array, radius_px: float) -> tuple[Rows, Rows]:
+    """Return all pairs (row of predicted, row of pixels) within the radius.
+
+    The pixels are sorted by bands of rows, and by column within a band, so that each prediction looks at a
+    stretch of three bands only.
+    """
+    height = max(radius_px, 1.0)
+    key = _key(np.floor(pixels[:, 1] / height), pixels[:, 0])
+    order = np.argsort(key, kind="stable")
+    key = key[order]
+    band = np.floor(predicted[:, 1] / height)
+    pairs: list[tuple[Rows, Rows]] = []
+    for offset in (-1, 0, 1):
+        first = np.searchsorted(key, _key(band + offset, predicted[:, 0] - radius_px))
+        last = np.searchsorted(key, _key(band + offset, predicted[:, 0] + radius_px), side="right")
+        counts = last - first
+        rows = np.repeat(np.arange(len(predicted)), counts)
+        offsets = np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts)
+        columns = order[np.repeat(first, counts) + offsets]
+        apart = pixels[columns] - predicted[rows]
+        near = apart[:, 0] * apart[:, 0] + apart[:, 1] * apart[:, 1] <= radius_px * radius_px
+        pairs.append((rows[near], columns[near].astype(np.int64)))
+    return np.concatenate([rows for rows, _ in pairs]), np.concatenate([columns for _, columns in pairs])
+
+
+def _key(band: Array, x: Array) -> Array:
+    """Return numbers that sort by band, then by column; columns far outside stay in their band."""
+    key: Array = band * _BAND + np.clip(x, -0.4 * _BAND, 0.4 * _BAND)
+    return key

@@ -1,0 +1,283 @@
+"""The tracker with depth: its order of attempts, segments and joins, and recordings that turn quickly."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from client_sdk.datasets import open_dataset
+from client_sdk.frontend import Frame, FrontEndOptions, PoseQuery, TrackedFrame
+from client_sdk.mapping import Trajectory
+from client_sdk.monocular import descriptors
+from client_sdk.tracking.tracker import Tracker
+from rse_pf.errors import PnpError, UsageError
+from rse_pf.experiments.results.trajectory_error import absolute_error
+from rse_pf.geometry import Array, inverse, pose_difference
+from rse_pf.pnp import PnpOptions, refine_with_depth, solve_pnp
+from tests.client_sdk.mapper.flat_world import CAMERA, STEP_M, frame_at
+
+pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
+
+RECORDED = Path(__file__).parents[4] / "shared" / "data"
+Answer = tuple[Array | None, int]
+NO_ANSWER: Answer = (None, 0)
+
+
+def frame(row: int) -> Frame:
+    return frame_at(row, depth=True)
+
+
+def foreign(row: int) -> Frame:
+    """Return a frame of another place: the same world as a negative, mirrored."""
+    here = frame(row)
+    rgb = np.ascontiguousarray(255 - here.rgb[:, ::-1])
+    return Frame(timestamp_s=here.timestamp_s, rgb=rgb, depth_m=here.depth_m, camera=CAMERA)
+
+
+def covered(row: int) -> Frame:
+    here = frame(row)
+    return Frame(
+        timestamp_s=here.timestamp_s, rgb=np.zeros_like(here.rgb), depth_m=here.depth_m, camera=CAMERA
+    )
+
+
+def solve(query: PoseQuery) -> Answer:
+    found = query.correspondences
+    options = PnpOptions(inlier_px=query.inlier_px, max_iterations=query.max_iterations)
+    try:
+        solution = solve_pnp(found.points_world, found.pixels, query.camera, options)
+    except PnpError:
+        return NO_ANSWER
+    if found.depths_m.any():
+        solution = refine_with_depth(solution, found.points_world, found.pixels, found.depths_m, query.camera)
+    return solution.T_camera_world, len(solution.inliers)
+
+
+def run(tracker: Tracker, shown: Frame, answer: Callable[[PoseQuery], Answer] = solve) -> TrackedFrame:
+    step = tracker.prepare(shown)
+    while isinstance(step, PoseQuery):
+        step = tracker.accept(step, *answer(step))
+    return step
+
+
+def run_all(tracker: Tracker, frames: Iterable[Frame]) -> list[TrackedFrame]:
+    return [run(tracker, shown) for shown in frames]
+
+
+def at(row: int) -> Array:
+    pose = np.eye(4)
+    pose[0, 3] = row * STEP_M
+    return pose
+
+
+def assert_at(tracked: TrackedFrame, row: int, T_start: Array | None = None) -> None:
+    assert tracked.T_world_camera is not None
+    expected = at(row) if T_start is None else T_start @ at(row)
+    metres, degrees = pose_difference(tracked.T_world_camera, expected)
+    assert metres < 0.01
+    assert degrees < 0.5
+
+
+def test_poses_follow_the_motion_and_a_keyframe_is_far_from_every_other_one() -> None:
+    tracker = Tracker()
+
+    there = run_all(tracker, map(frame, range(12)))
+    made = tracker.keyframes
+    back = run_all(tracker, map(frame, range(10, -1, -1)))
+
+    for row, tracked in enumerate(there):
+        assert_at(tracked, row)
+    for row, tracked in zip(range(10, -1, -1), back, strict=True):
+        assert_at(tracked, row)
+    assert 2 <= made <= 5  # 0.35 m in steps of 0.15
+    assert tracker.keyframes == made
+    assert (tracker.frames, tracker.lost_frames) == (23, 0)
+
+
+def test_a_start_pose_is_where_the_trajectory_begins() -> None:
+    start = inverse(at(90))
+    tracker = Tracker(T_world_start=start)
+
+    assert run(tracker, frame(0)).T_world_camera is start
+    assert_at(run(tracker, frame(1)), 1, start)
+
+
+@pytest.mark.parametrize("bad", [NO_ANSWER, (at(40), 400), (np.full((4, 4), np.nan), 400), (at(0), 19)])
+def test_a_bad_answer_is_followed_by_the_last_frame_and_then_by_keyframes(bad: Answer) -> None:
+    tracker = Tracker()
+    run_all(tracker, map(frame, range(3)))
+    asked: list[str] = []
+
+    def answer(query: PoseQuery) -> Answer:
+        asked.append(query.against)
+        return bad if len(asked) < 3 else solve(query)
+
+    tracked = run(tracker, frame(3), answer)
+
+    assert asked == ["map", "frame", "keyframe"]
+    assert_at(tracked, 3)
+
+
+def test_a_lost_frame_has_no_pose_and_the_next_one_is_found_again() -> None:
+    tracker = Tracker()
+    run_all(tracker, map(frame, range(3)))
+
+    lost = run(tracker, frame(3), lambda query: NO_ANSWER)
+    found = run(tracker, frame(4))
+
+    assert lost.lost
+    assert tracker.lost_frames == 1
+    assert_at(found, 4)
+
+
+def test_a_frame_without_features_is_lost_without_a_query() -> None:
+    tracker = Tracker()
+    assert run(tracker, covered(0)).lost  # nothing to start from
+    assert not run(tracker, frame(0)).lost
+    assert isinstance(tracker.prepare(covered(1)), TrackedFrame)
+    assert tracker.lost_frames == 2
+
+
+def test_a_camera_that_was_carried_elsewhere_with_a_covered_lens_is_found_in_its_first_frame() -> None:
+    tracker = Tracker(FrontEndOptions(segment_after=3))
+    run_all(tracker, map(frame, range(25)))
+
+    while_covered = run_all(tracker, (covered(row) for row in range(30)))
+    found = run(tracker, frame(2))
+
+    assert all(tracked.lost for tracked in while_covered)
+    assert_at(found, 2)
+    assert found.segment == 0
+
+
+def test_a_video_that_was_cut_has_two_segments_which_are_joined_where_they_overlap() -> None:
+    tracker = Tracker(FrontEndOptions(segment_after=3))
+    run_all(tracker, map(frame, range(20)))
+
+    cut = run_all(tracker, (foreign(row) for row in range(8)))
+    assert [tracked.lost for tracked in cut[:3]] == [True] * 3
+    assert {tracked.segment for tracked in cut[3:]} == {1}
+    assert all("not joined" in tracked.reason for tracked in cut[3:])
+    assert tracker.joins == []
+
+    # Seen one after the other, so that the second segment shows a place of the first: a wall of both.
+    def both(row: int) -> Frame:
+        here, there = frame(row), foreign(row)
+        rgb = np.concatenate([here.rgb[:, :160], there.rgb[:, 160:]], axis=1)
+        return Frame(timestamp_s=here.timestamp_s, rgb=rgb, depth_m=here.depth_m, camera=CAMERA)
+
+    joined = run_all(tracker, [both(7)] * 12)
+
+    assert len(tracker.joins) == 1
+    assert (tracker.joins[0].segment, tracker.joins[0].into) == (1, 0)
+    assert joined[-1].segment == 0
+    assert joined[-1].reason == ""
+    assert_at(joined[-1], 7)
+
+
+def test_a_weak_pose_never_becomes_a_keyframe() -> None:
+    weak, strong = Tracker(), Tracker()
+    for row in range(15):
+        for tracker, is_weak in ((weak, row > 0), (strong, False)):
+            step = tracker.prepare(frame(row))
+            while isinstance(step, PoseQuery):
+                step = tracker.accept(step, *solve(step), is_weak=is_weak)
+            assert_at(step, row)
+
+    assert weak.keyframes == 1
+    assert strong.keyframes > 2
+
+
+def test_the_map_is_thinned_and_still_known() -> None:
+    tracker = Tracker(FrontEndOptions(max_keyframes=4, keyframe_m=0.05))
+    run_all(tracker, map(frame, range(40)))
+    back = run_all(tracker, (frame(row) for row in range(38, 25, -1)))
+
+    assert tracker.keyframes > 8
+    assert len(tracker._segments[0]) <= 4
+    for row, tracked in zip(range(38, 25, -1), back, strict=True):
+        assert_at(tracked, row)
+
+
+def test_one_query_at_a_time() -> None:
+    tracker = Tracker()
+    run(tracker, frame(0))
+    query = tracker.prepare(frame(1))
+    assert isinstance(query, PoseQuery)
+    with pytest.raises(UsageError, match="open"):
+        tracker.prepare(frame(2))
+    with pytest.raises(UsageError, match="open"):
+        tracker.restart(np.eye(4))
+    tracker.accept(query, *solve(query))
+    with pytest.raises(UsageError, match="not the open one"):
+        tracker.accept(query, None)
+
+
+def test_rotations_stay_rotations_over_a_long_drive() -> None:
+    tracker = Tracker()
+    poses = [run(tracker, frame(abs(20 - row % 40))).T_world_camera for row in range(200)]
+
+    for pose in poses:
+        assert pose is not None
+        np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-9)
+
+
+def test_matches_of_the_native_core_are_those_of_opencv(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(4)
+    first = rng.integers(0, 256, (300, 32), dtype=np.uint8)
+    second = first[rng.permutation(300)] ^ (rng.random((300, 32)) < 0.2).astype(np.uint8)
+    second[:40] = second[40:80]  # equal ones are no clear match
+
+    by_core = descriptors.match_all(first, second, max_distance=40)
+    monkeypatch.setattr(descriptors, "match_core", lambda: None)
+    by_opencv = descriptors.match_all(first, second, max_distance=40)
+
+    np.testing.assert_array_equal(by_core[0], by_opencv[0])
+    np.testing.assert_array_equal(by_core[1], by_opencv[1])
+    assert 100 < len(by_core[0]) < 300
+
+
+@pytest.mark.data
+@pytest.mark.parametrize(
+    ("name", "rate_hz", "most_lost", "ate_cm"),
+    [("tum_fr1_rpy_start", 10, 0, 3.0), ("tum_fr1_rpy_start", 5, 1, 4.0), ("7scenes_redkitchen", 5, 0, 3.6)],
+)
+def test_recordings_that_turn_quickly_are_not_lost(
+    name: str, rate_hz: float, most_lost: int, ate_cm: float
+) -> None:
+    if not (RECORDED / name).exists():
+        pytest.skip(f"no recording {name} at {RECORDED}")
+    dataset = open_dataset(RECORDED / name).thinned(rate_hz)
+    tracker = Tracker()
+
+    tracked = run_all(tracker, dataset)
+
+    posed = [(each.frame.timestamp_s, each.T_world_camera) for each in tracked if not each.lost]
+    estimate = Trajectory(np.array([stamp for stamp, _ in posed]), np.array([pose for _, pose in posed]))
+    assert dataset.truth is not None
+    assert tracker.lost_frames <= most_lost
+    assert 100 * absolute_error(estimate, dataset.truth).rmse_m <= ate_cm
+
+
+@pytest.mark.data
+def test_the_five_wide_views_of_the_nyu_dining_room_are_joined() -> None:
+    if not (RECORDED / "nyu_dining_room").exists():
+        pytest.skip(f"no recordings at {RECORDED}")
+    dataset = open_dataset(RECORDED / "nyu_dining_room")
+    tracker = Tracker(FrontEndOptions.wide_baseline())
+
+    poses = [run(tracker, shown).T_world_camera for shown in dataset]
+
+    assert dataset.truth is not None
+    reference = dataset.truth.T_world_camera
+    for row, (limit_m, limit_deg) in enumerate([(0.10, 1.5)] * 3 + [(0.025, 0.5)]):
+        first, second = poses[row], poses[row + 1]
+        assert first is not None
+        assert second is not None
+        expected = inverse(reference[row]) @ reference[row + 1]
+        metres, degrees = pose_difference(inverse(first) @ second, expected)
+        assert metres <= limit_m
+        assert degrees <= limit_deg
