@@ -123,7 +123,7 @@ def judged_answer(query: PoseQuery) -> tuple[Array | None, int, bool]:
     try:
         solution = solve_pnp(matches.points_world, matches.pixels, query.camera, options)
     except PnpError:
-        return None, 0
+        return None, 0, False
     solution = refine_with_depth(
         solution, matches.points_world, matches.pixels, matches.depths_m, query.camera
     )
