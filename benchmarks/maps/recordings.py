@@ -124,10 +124,11 @@ def judged_answer(query: PoseQuery) -> tuple[Array | None, int, bool]:
         solution = solve_pnp(matches.points_world, matches.pixels, query.camera, options)
     except PnpError:
         return None, 0, False
-    solution = refine_with_depth(
-        solution, matches.points_world, matches.pixels, matches.depths_m, query.camera
-    )
-    return solution.T_camera_world, len(solution.inliers)
+    if matches.depths_m.any():
+        solution = refine_with_depth(
+            solution, matches.points_world, matches.pixels, matches.depths_m, query.camera
+        )
+    return solution.T_camera_world, len(solution.inliers), solution.verdict == "weak"
 
 
 def frame_poses(run: Run, T_world_keyframe: Array) -> Array:
