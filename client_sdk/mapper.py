@@ -27,7 +27,7 @@ from client_sdk.tracking.tracker import Tracker
 from rse_pf.errors import ConfigurationError, RsePfError, UsageError
 from rse_pf.geometry import Array, Camera
 from rse_pf.maps.format import MapVersion, encode_map
-from rse_pf.pnp import PnpOptions
+from rse_pf.pnp import DepthNoise, PnpOptions
 
 __all__ = ["AskPose", "BlockingMapper", "FrameRecorder", "Mapper", "PoseSolver", "ask_robot"]
 
@@ -231,6 +231,11 @@ class Mapper:
     def features(self) -> Features | None:
         """The features of the last frame that has a pose; None before it, and without depth."""
         return self._tracker.last_features if isinstance(self._tracker, Tracker) else None
+
+    @property
+    def depth_noise(self) -> DepthNoise:
+        """The noise of the camera's depths, as it was measured on the way; a Kinect's without depth."""
+        return self._tracker.noise.noise if isinstance(self._tracker, Tracker) else DepthNoise()
 
     def restart(self, T_world_start: Array) -> None:
         """Begin a new odometry frame: the next frame is at *T_world_start*, whatever was seen before.

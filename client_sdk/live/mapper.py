@@ -474,7 +474,9 @@ class LiveMapper:
         rows = np.flatnonzero(np.isfinite(depths_m))[: self.options.features]
         keyframe = Keyframe(
             timestamp_s=frame.timestamp_s, T_odom_camera=T_odom_camera, camera=frame.camera,
-            features=make_features(features.pixels[rows], depths_m[rows], features.descriptors[rows]),
+            features=make_features(
+                features.pixels[rows], depths_m[rows], features.descriptors[rows], self._mapper.depth_noise
+            ),
         )  # fmt: skip
         return encode_keyframe(keyframe)
 

@@ -86,7 +86,7 @@ def view_of_features(features: KeyframeFeatures, camera: Camera) -> View:
     """Return the image of a keyframe in which the points of others are sought."""
     return View(
         camera=camera, pixels=features.pixels.astype(np.float64), descriptors=features.descriptors,
-        depths_m=features.depths_m.astype(np.float64),
+        depths_m=features.depths_m.astype(np.float64), noise=features.noise,
     )  # fmt: skip
 
 

@@ -16,6 +16,8 @@ All numbers are little-endian::
               (uint16; 32), number n (uint16), f (uint8): pixels count in units of 2**-f, 0 (uint8);
               n columns and n rows (uint16), n descriptors
     geometry  kind 3: what it holds (uint8; 1: depths), 0 (uint8), n (uint16); n depths in mm (uint16)
+    noise     kind 5, optional: deviation of a depth z in metres is base + growth * max(0, z - from)^2
+              (3 float64); a Kinect's where it is left out
 
 Blocks stand in the order of their kinds.
 """
@@ -24,13 +26,14 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
 from rse_pf.errors import BadRequest
 from rse_pf.geometry import Array, Camera, rigid
+from rse_pf.pnp import DepthNoise
 
 __all__ = [
     "MAX_BLOCKS",
@@ -58,7 +61,10 @@ _CAMERA = struct.Struct("<BBHH4d")
 _FEATURES = struct.Struct("<BBHHBB")
 _GEOMETRY = struct.Struct("<BBH")
 _CAMERA_KIND, _FEATURES_KIND, _GEOMETRY_KIND = 1, 2, 3
+_NOISE_KIND = 5
 _NAMES = {_CAMERA_KIND: "camera", _FEATURES_KIND: "features", _GEOMETRY_KIND: "geometry"}
+_NOISE = struct.Struct("<3d")
+_KINECT = DepthNoise()
 _REQUIRED = 1
 _PINHOLE, _ORB, _HAMMING, _DEPTH = 1, 1, 1, 1
 _DESCRIPTOR_BYTES = 32
@@ -75,12 +81,14 @@ class KeyframeFeatures:
     """Features of one image, all with depth, rounded as they are encoded.
 
     ``pixels`` ``(n, 2)`` float32, undistorted; ``depths_m`` ``(n,)`` float32, metres along the optical axis,
-    above 0; ``descriptors`` ``(n, 32)`` uint8 of ORB, which are compared by their Hamming distance.
+    above 0, with their ``noise`` as the robot measured it; ``descriptors`` ``(n, 32)`` uint8 of ORB, which
+    are compared by their Hamming distance.
     """
 
     pixels: npt.NDArray[np.float32]
     depths_m: npt.NDArray[np.float32]
     descriptors: npt.NDArray[np.uint8]
+    noise: DepthNoise = _KINECT
 
     def __len__(self) -> int:
         return len(self.depths_m)
@@ -92,7 +100,7 @@ class KeyframeFeatures:
 
 @dataclass(frozen=True, slots=True)
 class UnknownBlock:
-    """An optional block of a kind that this release does not know, above 3, kept as it came."""
+    """An optional block of a kind that this release does not know, 4 or above 5, kept as it came."""
 
     kind: int
     content: bytes
@@ -118,6 +126,7 @@ def make_features(
     pixels: npt.NDArray[np.floating],
     depths_m: npt.NDArray[np.floating],
     descriptors: npt.NDArray[np.uint8],
+    noise: DepthNoise = _KINECT,
 ) -> KeyframeFeatures:
     """Return the features of a keyframe; rows without a usable depth are left out.
 
@@ -129,6 +138,7 @@ def make_features(
         pixels: ``(n, 2)``, undistorted; rows outside 0..16383 px are left out.
         depths_m: ``(n,)`` metres along the optical axis; not finite or out of 0.01..65 m: none.
         descriptors: ``(n, 32)``.
+        noise: Of the depths.
 
     Raises:
         BadRequest: The shapes do not fit.
@@ -150,6 +160,7 @@ def make_features(
         pixels=(np.rint(pixels[rows].astype(np.float64) * scale) / scale).astype(np.float32),
         depths_m=(depths_mm[rows] / 1000.0).astype(np.float32),
         descriptors=np.ascontiguousarray(descriptors[rows], dtype=np.uint8),
+        noise=noise,
     )
 
 
@@ -160,8 +171,9 @@ def encode_keyframe(keyframe: Keyframe) -> bytes:
     fraction = _fraction_of(float(features.pixels.max(initial=0.0)))
     units = np.rint(features.pixels.T.astype(np.float64) * 2.0**fraction).astype("<u2")
     depths_mm = np.rint(features.depths_m.astype(np.float64) * 1000.0).astype("<u2")
+    has_noise = features.noise != _KINECT
     parts = [_HEAD.pack(
-        _MAGIC, _VERSION, 3 + len(keyframe.others), keyframe.timestamp_s,
+        _MAGIC, _VERSION, 3 + has_noise + len(keyframe.others), keyframe.timestamp_s,
         *keyframe.T_odom_camera[:3].ravel().tolist(),
     )]  # fmt: skip
     camera_numbers = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
@@ -174,8 +186,12 @@ def encode_keyframe(keyframe: Keyframe) -> bytes:
         (_GEOMETRY_KIND, _GEOMETRY.pack(_DEPTH, 0, n), depths_mm.tobytes()),
     ):  # fmt: skip
         parts += [_BLOCK.pack(kind, _REQUIRED, sum(map(len, contents))), *contents]
-    for block in keyframe.others:
-        parts += [_BLOCK.pack(block.kind, 0, len(block.content)), block.content]
+    optional = [(block.kind, block.content) for block in keyframe.others]
+    if has_noise:
+        noise = features.noise
+        optional.append((_NOISE_KIND, _NOISE.pack(noise.base_m, noise.growth_per_m, noise.from_m)))
+    for kind, content in sorted(optional, key=lambda block: block[0]):
+        parts += [_BLOCK.pack(kind, 0, len(content)), content]
     return b"".join(parts)
 
 
@@ -202,7 +218,7 @@ def decode_keyframe(data: bytes) -> Keyframe:
     known: dict[int, tuple[int, int]] = {}
     others = []
     for kind, begin, end in _blocks(data, count):
-        if kind in _NAMES:
+        if kind in _NAMES or kind == _NOISE_KIND:
             known[kind] = begin, end
         else:
             others.append(UnknownBlock(kind, bytes(data[begin:end])))
@@ -210,9 +226,12 @@ def decode_keyframe(data: bytes) -> Keyframe:
         if kind not in known:
             raise _refusal(f"it has no block of the {name}")
     camera = _camera(data, *known[_CAMERA_KIND])
+    features = _features(data, known[_FEATURES_KIND], known[_GEOMETRY_KIND], camera)
+    if _NOISE_KIND in known:
+        features = replace(features, noise=_noise(data, *known[_NOISE_KIND]))
     return Keyframe(
-        timestamp_s=timestamp_s, T_odom_camera=T_odom_camera, camera=camera,
-        features=_features(data, known[_FEATURES_KIND], known[_GEOMETRY_KIND], camera), others=tuple(others),
+        timestamp_s=timestamp_s, T_odom_camera=T_odom_camera, camera=camera, features=features,
+        others=tuple(others),
     )  # fmt: skip
 
 
@@ -241,8 +260,14 @@ def _blocks(data: bytes, count: int) -> Iterator[tuple[int, int, int]]:
         end = begin + size
         if end > len(data):
             raise _refusal(f"a block of {size} bytes goes on beyond its end")
-        if kind < max(1, last) or (kind == last and kind in _NAMES) or flags > _REQUIRED:
+        if (
+            kind < max(1, last)
+            or (kind == last and (kind in _NAMES or kind == _NOISE_KIND))
+            or flags > _REQUIRED
+        ):
             raise _refusal(f"block {kind} stands twice, after a later one, or has unknown flags")
+        if kind == _NOISE_KIND and flags & _REQUIRED:
+            raise _refusal("the block of the noise is optional")
         if kind not in _NAMES and flags & _REQUIRED:
             raise _refusal(
                 f"it needs block {kind}, which this release does not know",
@@ -265,6 +290,13 @@ def _camera(data: bytes, begin: int, end: int) -> Camera:
             f"camera {number} of model {model} is not known", "send undistorted pixels of one pinhole camera"
         )
     return Camera(fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height)
+
+
+def _noise(data: bytes, begin: int, end: int) -> DepthNoise:
+    if end - begin != _NOISE.size:
+        raise _refusal(f"a noise has {_NOISE.size} bytes, not {end - begin}")
+    base_m, growth_per_m, from_m = _NOISE.unpack_from(data, begin)
+    return DepthNoise(base_m=base_m, growth_per_m=growth_per_m, from_m=from_m)
 
 
 def _features(

@@ -15,7 +15,7 @@ from rse_pf.errors import PnpError
 from rse_pf.geometry import Array, Camera, inverse
 from rse_pf.maps.format import Keyframe
 from rse_pf.native_matcher import match_core
-from rse_pf.pnp import PnpOptions, PnpSolution, refine_with_depth, solve_pnp
+from rse_pf.pnp import DepthNoise, PnpOptions, PnpSolution, refine_with_depth, solve_pnp
 from rse_pf.slam.descriptors import Descriptors, hamming_matches
 
 __all__ = [
@@ -31,6 +31,7 @@ __all__ = [
     "view_of_keyframe",
 ]
 
+_KINECT = DepthNoise()
 _MAX_POINT_M = 1e5
 """No point of a keyframe is further away; PnP refuses all matches for one that is."""
 _NEAREST_M, _FARTHEST_M = 0.01, 100.0
@@ -61,13 +62,15 @@ class RelativePoseOptions:
 class View:
     """A camera image: ``(n, 2)`` undistorted pixels with their ``(n, 32)`` descriptors.
 
-    ``depths_m``, if there are any, are the ``(n,)`` depths at the pixels, 0 where there is none.
+    ``depths_m``, if there are any, are the ``(n,)`` depths at the pixels with their ``noise``, 0 where there
+    is none.
     """
 
     camera: Camera
     pixels: Array
     descriptors: Descriptors
     depths_m: Array | None = None
+    noise: DepthNoise = _KINECT
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -193,7 +196,7 @@ def measure_pose(
     except PnpError:
         return "no-pose"
     if view.depths_m is not None and points[:, 2].min() >= _NEAREST_M:
-        solution = refine_with_depth(solution, points, pixels, depths_m, view.camera)
+        solution = refine_with_depth(solution, points, pixels, depths_m, view.camera, view.noise)
     return MeasuredPose(solution=solution, points_reference=points, pixels=pixels)
 
 

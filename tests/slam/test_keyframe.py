@@ -14,6 +14,7 @@ import pytest
 
 from rse_pf.errors import BadRequest, InvalidCamera
 from rse_pf.geometry import Camera, exp_se3
+from rse_pf.pnp import DepthNoise
 from rse_pf.slam.keyframe import (
     MAX_BLOCKS,
     MAX_FEATURES,
@@ -56,6 +57,7 @@ def assert_equal(one: Keyframe, other: Keyframe) -> None:
         first, second = getattr(one.features, name), getattr(other.features, name)
         assert np.array_equal(first, second)
         assert first.dtype == second.dtype
+    assert one.features.noise == other.features.noise
 
 
 @pytest.mark.parametrize("n", [0, 1, 300, MAX_FEATURES])
@@ -138,6 +140,41 @@ def test_optional_blocks_that_are_not_known_are_kept_byte_for_byte() -> None:
 
     assert found.others == made.others
     assert encode_keyframe(found) == data
+
+
+def noisy(*numbers: float) -> bytes:
+    """Return a keyframe with a block of the noise that holds these numbers."""
+    whole = bytearray(encode_keyframe(keyframe()))
+    whole[3] += 1
+    content = struct.pack(f"<{len(numbers)}d", *numbers)
+    return bytes(whole) + struct.pack("<HHI", 5, 0, len(content)) + content
+
+
+def test_the_noise_of_the_depths_is_kept_among_blocks_that_are_not_known() -> None:
+    noise = DepthNoise(base_m=0.0024, growth_per_m=0.0038)
+    first = replace(keyframe(), others=(UnknownBlock(4, b"rig"), UnknownBlock(7, b"")))
+    first = replace(first, features=replace(first.features, noise=noise))
+
+    assert_equal(decode_keyframe(encode_keyframe(first)), first)
+    assert decode_keyframe(noisy(0.0024, 0.0038, 0.4)).features.noise == noise
+    assert encode_keyframe(decode_keyframe(noisy(0.0012, 0.0019, 0.4))) == encode_keyframe(keyframe())
+
+
+@pytest.mark.parametrize(
+    "numbers",
+    [
+        (math.nan, 0.0, 0.0),
+        (math.inf, 0.0, 0.0),
+        (0.0, 0.0, 0.0),
+        (0.001, -1.0, 0.0),
+        (0.001, 0.0, 1e9),
+        (1.0,),
+        (),
+    ],
+)
+def test_a_noise_that_no_camera_has_is_refused(numbers: tuple[float, ...]) -> None:
+    with pytest.raises(BadRequest):
+        decode_keyframe(noisy(*numbers))
 
 
 def test_a_required_block_that_is_not_known_is_refused_with_what_to_do() -> None:
