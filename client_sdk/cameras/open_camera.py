@@ -35,7 +35,7 @@ def open_camera(
         source: ``0`` (a device), a video, a stream ``rtsp://...``, a folder of images, a recording in TUM
             layout or of NYU, ``realsense``, or the ``.bag`` of a RealSense camera.
         intrinsics: Of the camera, or the file ``intrinsics.json``; folders and recordings may have their own.
-        rate_hz: Leave frames out so that no more than these remain.
+        rate_hz: Leave frames out so that so many per second remain; all of a source at this rate or a lower.
         depth: False leaves the depth out.
 
     Raises:
@@ -102,7 +102,8 @@ def _recording(path: Path, own: Intrinsics | None, rate_hz: float | None, depth:
         raise UsageError(
             f"{path} has intrinsics of its own, and they differ", hint="leave --intrinsics out for recordings"
         )
-    return source_of_frames(str(path), dataset, dataset.camera, has_depth=depth, rate_hz=rate_hz)
+    dataset = dataset if rate_hz is None else dataset.thinned(rate_hz)
+    return source_of_frames(str(path), dataset, dataset.camera, has_depth=depth)
 
 
 def _as_raw(frame: Frame) -> RawFrame:

@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from client_sdk.closing import Closing
 from client_sdk.datasets.intrinsics import Intrinsics, Undistortion
+from client_sdk.datasets.thinning import Thinning
 from client_sdk.frontend import Frame
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Camera
@@ -60,19 +61,17 @@ class RawSource(Closing):
         rate_hz: float | None = None,
         close: Callable[[], None] | None = None,
     ) -> None:
-        """Take images from *raw* at *rate_hz* at most; *close* releases what it reads from.
+        """Take images from *raw* at *rate_hz* as `Thinning` does; *close* releases what it reads from.
 
         Raises:
             UsageError: The rate is not above 0.
         """
-        if rate_hz is not None and not (math.isfinite(rate_hz) and rate_hz > 0):
-            raise UsageError(f"rate {rate_hz:g} is not above 0", hint="name frames per second, such as 10")
+        self._thinning = None if rate_hz is None else Thinning(rate_hz)
         self.name = name
         self.camera = intrinsics.camera
         self.has_depth = has_depth
         self._raw = raw
         self._undistortion = Undistortion(intrinsics)
-        self._period_s = 0.0 if rate_hz is None else 1.0 / rate_hz
         self._last_s = -math.inf
         self._close = close
         self._no_depth = np.zeros((self.camera.height, self.camera.width), dtype=np.float32)
@@ -96,7 +95,9 @@ class RawSource(Closing):
             raise StopIteration
         while True:
             timestamp_s, rgb, depth_m = next(self._raw)
-            if timestamp_s - self._last_s >= self._period_s - 1e-6 and timestamp_s > self._last_s:
+            if timestamp_s <= self._last_s:
+                continue
+            if self._thinning is None or self._thinning.plays(timestamp_s):
                 break
         self._last_s = timestamp_s
         for image in (rgb, rgb if depth_m is None else depth_m):

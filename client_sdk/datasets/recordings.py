@@ -19,6 +19,7 @@ from client_sdk.bags import Bag, is_bag, open_bag
 from client_sdk.bags.index import pair_stamps
 from client_sdk.datasets import nyu
 from client_sdk.datasets.intrinsics import Intrinsics, Undistortion, read_intrinsics
+from client_sdk.datasets.thinning import Thinning, median_interval_s
 from client_sdk.frontend import Frame
 from client_sdk.mapping import Trajectory, read_trajectory
 from client_sdk.monocular.opencv import MAX_IMAGE_PIXELS, load_opencv, read_image
@@ -69,14 +70,15 @@ class Dataset:
         return map(self.read, self.rows)
 
     def thinned(self, rate_hz: float) -> Dataset:
-        """Return the frames that are at least ``1 / rate_hz`` s apart by time stamp."""
-        if not (math.isfinite(rate_hz) and rate_hz > 0):
-            raise UsageError(f"rate {rate_hz:g} is not above 0", hint="name frames per second, such as 5")
-        rows: list[int] = []
-        for index, timestamp_s in enumerate(self.timestamps_s):
-            # A tolerance of one microsecond, because the stamps are decimal fractions.
-            if not rows or timestamp_s - self.timestamps_s[rows[-1]] >= 1.0 / rate_hz - 1e-6:
-                rows.append(index)
+        """Return frames at *rate_hz* on average; all of them at the recording's own rate, or a higher one.
+
+        Jitter drops none: `Thinning` says which frame serves which due time.
+
+        Raises:
+            UsageError: The rate is not above 0.
+        """
+        thinning = Thinning(rate_hz, interval_s=median_interval_s(self.timestamps_s))
+        rows = [index for index, stamp_s in enumerate(self.timestamps_s) if thinning.plays(stamp_s)]
         return self._only(rows)
 
     def share(self, robot: int, robots: int) -> Dataset:

@@ -40,7 +40,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="robots that share the recording (default: 3; with --data, but neither --merge nor --live: 1)",
     )
     parser.add_argument(
-        "--rate", type=float, default=5.0, metavar="HZ", help="frames per second (default: 5)"
+        "--rate",
+        type=float,
+        default=5.0,
+        metavar="HZ",
+        help="frames per second; the recording's own rate plays all (default: 5)",
     )
     parser.add_argument(
         "--engine",

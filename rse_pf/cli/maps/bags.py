@@ -91,12 +91,14 @@ def _from_bag(args: argparse.Namespace, settings: PlatformSettings) -> int:
     options = _options(args)
     from client_sdk.bags import open_bag
     from client_sdk.cameras import source_of_frames
+    from client_sdk.datasets.recordings import dataset_of_bag
 
     with at_work(f"reading {args.source}"):
         bag = open_bag(Path(args.source), options)
     show(*bag.notes)
+    frames = bag if args.rate is None else dataset_of_bag(bag).thinned(args.rate)
     with source_of_frames(
-        args.source, bag, bag.camera, has_depth=bag.has_depth, rate_hz=args.rate, close=bag.close
+        args.source, frames, bag.camera, has_depth=bag.has_depth, close=bag.close
     ) as source:
 
         def about(path: Trajectory) -> dict[str, Any]:

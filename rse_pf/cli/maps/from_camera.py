@@ -59,7 +59,7 @@ def add_drive_arguments(parser: argparse.ArgumentParser, out: Path) -> None:
         help="without depth: marker:MM (edge of an ArUco 4x4_50 marker) or odometry:FILE (TUM format)",
     )
     add("--no-depth", action="store_true", help="use the colours only")
-    add("--rate", type=float, metavar="HZ", help="leave out frames beyond this rate")
+    add("--rate", type=float, metavar="HZ", help="play so many frames per second (default: all)")
     add("--frames", type=int, metavar="N", help="stop after so many frames")
     add("--out", type=Path, default=out, metavar="DIR", help="results (default: %(default)s)")
     add(

@@ -99,15 +99,31 @@ def test_lens_distortion_is_removed_from_colour_and_depth(tmp_path: Path):
     assert frame.depth_m[23, 56] == np.float32(1.057)
 
 
-def test_a_rate_keeps_frames_far_enough_apart(tmp_path: Path):
+def test_a_rate_plays_the_frames_nearest_before_its_due_times(tmp_path: Path):
     dataset = open_dataset(write_tum(tmp_path / "x", [0.0, 0.1, 0.2, 0.3, 0.38, 0.5]))
 
-    assert dataset.thinned(5).timestamps_s == (0.0, 0.2, 0.5)
-    assert dataset.thinned(10).timestamps_s == (0.0, 0.1, 0.2, 0.3, 0.5)
-    assert [frame.timestamp_s for frame in dataset.thinned(5)] == [0.0, 0.2, 0.5]
+    assert dataset.thinned(5).timestamps_s == (0.0, 0.2, 0.38)
+    assert dataset.thinned(10).timestamps_s == dataset.timestamps_s
+    assert [frame.timestamp_s for frame in dataset.thinned(5)] == [0.0, 0.2, 0.38]
     for rate in (0.0, -1.0, float("nan")):
         with pytest.raises(UsageError):
             dataset.thinned(rate)
+
+
+@pytest.mark.data
+@pytest.mark.parametrize(
+    ("name", "played"),
+    [
+        ("tum_fr1_rpy_start", {60: 330, 30: 330, 15: 165, 10: 110, 5: 55}),
+        ("7scenes_redkitchen", {30: 250, 10: 250, 5: 125}),
+    ],
+)
+def test_rates_of_real_recordings(recordings: Path, name: str, played: dict[int, int]):
+    if not (recordings / name).exists():
+        pytest.skip(f"no recording {name}")
+    dataset = open_dataset(recordings / name)
+
+    assert {rate: len(dataset.thinned(rate)) for rate in played} == played
 
 
 def test_robots_take_contiguous_shares_that_cover_everything_once(tmp_path: Path):
