@@ -21,6 +21,7 @@ __all__ = ["TrackCore", "open_tracker", "track_core"]
 
 _ABI = 1
 _CELL_WORDS = 4200
+_NONE = 256
 _P, _I, _D = ctypes.c_void_p, ctypes.c_int64, ctypes.c_double
 
 
@@ -67,10 +68,10 @@ class TrackCore:
         self, descriptors: npt.NDArray[np.uint8], pixels: Array, apart_px: float
     ) -> npt.NDArray[np.int32]:
         """Return the distance of each feature to the most similar other one."""
-        descriptors, pixels = aligned(descriptors), aligned(pixels)
-        distances = np.empty(len(pixels), dtype=np.int32)
+        descriptors, pixels = aligned(descriptors, np.uint8), aligned(pixels, np.float64)
+        distances = np.full(len(pixels), _NONE, dtype=np.int32)
         self._distinct(
-            address_of(descriptors), address_of(pixels), len(pixels), apart_px, address_of(distances)
+            address_of(descriptors), address_of(pixels), len(pixels), float(apart_px), address_of(distances)
         )
         return distances
 
@@ -81,13 +82,16 @@ class TrackCore:
         limits: tuple[float, float, float, float, float, int],
     ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
         """Return the rows of the sought features and of the image's features that match."""
-        of_sought, of_image = [aligned(array) for array in sought], [aligned(array) for array in image]
+        of_sought = [*(aligned(array, np.float64) for array in sought[:3]), aligned(sought[3], np.uint8)]
+        of_image = [*(aligned(array, np.float64) for array in image[:3]), aligned(image[3], np.uint8)]
+        of_image.append(aligned(image[4], np.int32))
         m, n = len(sought[0]), len(image[0])
         rows, columns = np.empty(min(m, n), dtype=np.int64), np.empty(min(m, n), dtype=np.int64)
         workspace = self._workspace.words(m + 2 * n + _CELL_WORDS)
         request = _NearRequest(
-            _ABI, 0, m, n, *map(address_of, of_sought), *map(address_of, of_image), *limits
-        )
+            _ABI, 0, m, n, *map(address_of, of_sought), *map(address_of, of_image),
+            *map(float, limits[:-1]), int(min(max(limits[-1], -1), _NONE)),
+        )  # fmt: skip
         count = self._near(
             ctypes.byref(request), address_of(workspace), address_of(rows), address_of(columns)
         )
@@ -107,7 +111,8 @@ class TrackCore:
         result = _FitResult()
         request = _FitRequest(
             _ABI, 0, len(points[0]), *map(address_of, arrays),
-            camera.fx, camera.fy, camera.cx, camera.cy, *limits, (_D * 16)(*T_camera_world.ravel().tolist()),
+            camera.fx, camera.fy, camera.cx, camera.cy, *map(float, limits),
+            (_D * 16)(*T_camera_world.ravel().tolist()),
         )  # fmt: skip
         if self._fit(ctypes.byref(request), address_of(is_inlier), ctypes.byref(result)):
             return None

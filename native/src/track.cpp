@@ -19,7 +19,13 @@ constexpr int64_t kCells = 64;
 constexpr double kCellPx = 40.0;
 constexpr uint64_t kNone = ~uint64_t{0};
 constexpr int kIterations = 10, kFirstGated = 3;
-constexpr double kConverged = 1e-6, kNearM = 0.05, kMaxAbs = 1e9;
+constexpr double kConverged = 1e-6, kNearM = 0.05, kMaxAbs = 1e9, kMaxTwist = 1e6, kMaxDistance2 = 1e300;
+// Least eigenvalue of the information, scaled to a diagonal of 1, of which no motion is free: points on a line
+// have 1e-14 and less, a mark of 20 px, without depth, 1e-9.
+constexpr double kFree = 1e-12;
+constexpr int kInverseIterations = 6;
+// Added to a search: the sum of a pixel and a radius is rounded, and cells have borders.
+constexpr double kSlackPx = 1.0;
 
 bool within(double value, double low, double high) { return value >= low && value <= high; }
 
@@ -77,9 +83,9 @@ Two nearest_of(const rse_pf_near_request& request, const Grid& grid, int64_t sou
     Two two;
     const double x = request.predicted[2 * sought], y = request.predicted[2 * sought + 1];
     if (!(within(x, -kMaxAbs, kMaxAbs) && within(y, -kMaxAbs, kMaxAbs))) return two;
-    const int64_t left = cell_of(x - request.radius_px), right = cell_of(x + request.radius_px);
-    const int64_t bottom = cell_of(y + request.radius_px);
-    for (int64_t line = cell_of(y - request.radius_px); line <= bottom; ++line) {
+    const double reach = request.radius_px + kSlackPx;
+    const int64_t left = cell_of(x - reach), right = cell_of(x + reach), bottom = cell_of(y + reach);
+    for (int64_t line = cell_of(y - reach); line <= bottom; ++line) {
         const uint64_t end = grid.starts[line * kCells + right + 1];
         for (uint64_t at = grid.starts[line * kCells + left]; at < end; ++at) {
             const int64_t row = static_cast<int64_t>(grid.rows[at]);
@@ -149,10 +155,12 @@ Fit fit_of(const rse_pf_fit_request& request, const Pose& pose, bool is_gated, b
         double q[3];
         for (int j = 0; j < 3; ++j) q[j] = W[j][0] * r[0] + W[j][1] * r[1] + W[j][2] * r[2];
         const double distance2 = r[0] * q[0] + r[1] * q[1] + r[2] * q[2];
-        const bool is_in = distance2 < request.gate2 && p.z > kNearM;
+        // A covariance that is none gives no distance, or a negative one.
+        const bool is_distance = within(distance2, 0.0, kMaxDistance2);
+        const bool is_in = is_distance && distance2 < request.gate2 && p.z > kNearM;
         if (is_inlier != nullptr) is_inlier[i] = is_in ? 1 : 0;
         fit.inliers += is_in ? 1 : 0;
-        if (is_gated && !is_in) continue;
+        if (!is_distance || (is_gated && !is_in)) continue;
         const double weight = is_last ? 1.0 : 1.0 / (1.0 + distance2 / request.cauchy2);
         // By the twist: the point moves by rho + phi x point.
         double B[3][6];
@@ -174,6 +182,29 @@ Fit fit_of(const rse_pf_fit_request& request, const Pose& pose, bool is_gated, b
     return fit;
 }
 
+// Whether some motion is free, by inverse iteration towards the least eigenvalue; Golub and Van Loan, Sect. 8.2.
+bool has_free_motion(const Normal& normal) {
+    Normal scaled = {};
+    double scales[6];
+    for (int i = 0; i < 6; ++i) {
+        if (!within(normal.A[i][i], 1e-300, 1e300)) return true;
+        scales[i] = 1.0 / square_root(normal.A[i][i]);
+    }
+    for (int i = 0; i < 6; ++i) {
+        for (int j = i; j < 6; ++j) scaled.A[i][j] = normal.A[i][j] * scales[i] * scales[j];
+        scaled.b[i] = 1.0 / (1.0 + i);
+    }
+    double least = 0.0;
+    for (int k = 0; k < kInverseIterations; ++k) {
+        double x[6], size2 = 0.0;
+        if (!solved(scaled, 0.0, x)) return true;
+        for (const double number : x) size2 += number * number;
+        least = 1.0 / square_root(size2);
+        for (int i = 0; i < 6; ++i) scaled.b[i] = x[i] * least;
+    }
+    return !(least > kFree);
+}
+
 bool is_whole(const rse_pf_fit_request& request) {
     if (request.abi != RSE_PF_TRACK_ABI || request.rows < 0 || request.rows > kMaxRows || request.points == nullptr ||
         request.spreads == nullptr || request.pixels == nullptr || request.pixels_px == nullptr ||
@@ -191,8 +222,8 @@ bool is_whole(const rse_pf_fit_request& request) {
             if (!within(request.points[3 * i + k], -kMaxAbs, kMaxAbs)) return false;
         for (int k = 0; k < 2; ++k)
             if (!within(request.pixels[2 * i + k], -kMaxAbs, kMaxAbs)) return false;
-        for (int k = 0; k < 6; ++k)
-            if (!within(request.spreads[6 * i + k], -kMaxAbs, kMaxAbs)) return false;
+        for (int k = 0; k < 6; ++k)  // variances are not negative
+            if (!within(request.spreads[6 * i + k], k == 0 || k == 3 || k == 5 ? 0.0 : -kMaxAbs, kMaxAbs)) return false;
     }
     return true;
 }
@@ -225,6 +256,7 @@ __attribute__((visibility("default"))) int32_t rse_pf_distinct(const uint8_t* de
 __attribute__((visibility("default"))) int64_t rse_pf_match_near(const rse_pf_near_request* request,
                                                                  uint64_t* workspace, int64_t* sought_matched,
                                                                  int64_t* matched) {
+    if (request == nullptr) return -1;
     const rse_pf_near_request& all = *request;
     if (all.abi != RSE_PF_TRACK_ABI || all.sought_rows < 0 || all.sought_rows > kMaxRows || all.rows < 0 ||
         all.rows > kMaxRows || all.predicted == nullptr || all.sought_turns == nullptr || all.sought_sizes == nullptr ||
@@ -256,7 +288,7 @@ __attribute__((visibility("default"))) int64_t rse_pf_match_near(const rse_pf_ne
 
 __attribute__((visibility("default"))) int32_t rse_pf_fit_pose(const rse_pf_fit_request* request, uint8_t* is_inlier,
                                                                rse_pf_fit_result* result) {
-    if (is_inlier == nullptr || result == nullptr || !is_whole(*request)) return -1;
+    if (request == nullptr || is_inlier == nullptr || result == nullptr || !is_whole(*request)) return -1;
     const double* const T = request->T_camera_world;
     Pose pose = {{{T[0], T[1], T[2]}, {T[4], T[5], T[6]}, {T[8], T[9], T[10]}}, {T[3], T[7], T[11]}};
     for (int i = 0; i < kIterations; ++i) {
@@ -264,7 +296,7 @@ __attribute__((visibility("default"))) int32_t rse_pf_fit_pose(const rse_pf_fit_
         double twist[6], largest = 0.0;
         if (!solved(fit.normal, 0.0, twist)) return 1;
         for (const double number : twist) {
-            if (!within(number, -1e6, 1e6)) return 1;
+            if (!within(number, -kMaxTwist, kMaxTwist)) return 1;
             const double size = number < 0.0 ? -number : number;
             largest = size > largest ? size : largest;
         }
@@ -272,7 +304,7 @@ __attribute__((visibility("default"))) int32_t rse_pf_fit_pose(const rse_pf_fit_
         if (largest < kConverged && i > kFirstGated) break;
     }
     const Fit fit = fit_of(*request, pose, true, true, is_inlier);
-    if (!is_finite(pose)) return 1;
+    if (!is_finite(pose) || has_free_motion(fit.normal)) return 1;
     result->inliers = fit.inliers;
     for (int i = 0; i < 6; ++i)
         for (int j = 0; j < 6; ++j)

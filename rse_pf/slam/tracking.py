@@ -21,6 +21,7 @@ __all__ = [
     "NearLimits",
     "Observations",
     "SoughtFeatures",
+    "distinct_by_numpy",
     "distinct_distances",
     "fit_pose",
     "fit_pose_by_numpy",
@@ -37,6 +38,8 @@ _BAND = 1e6
 _NONE = 256
 _ITERATIONS, _FIRST_GATED, _CONVERGED = 10, 3, 1e-6
 _NEAR_M = 0.05
+_MAX_ABS, _MAX_TWIST, _MAX_DISTANCE2 = 1e9, 1e6, 1e300
+_FREE = 1e-12
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -137,16 +140,31 @@ def distinct_distances(
 
     Returns:
         ``(n,)``, 256 where there is no other one.
+
+    Raises:
+        BadRequest: Shapes do not fit, or descriptors are no bytes.
     """
+    if descriptors.shape != (len(pixels), 32) or descriptors.dtype != np.uint8 or pixels.shape[1:] != (2,):
+        raise BadRequest(
+            f"{len(pixels)} features with descriptors of shape {descriptors.shape}, {descriptors.dtype}",
+            hint="give 32 bytes and two pixel coordinates for each feature",
+        )
     core = track_core()
     if core is not None:
-        return core.distinct(descriptors, np.asarray(pixels, dtype=np.float64), apart_px)
+        return core.distinct(descriptors, pixels, apart_px)
+    return distinct_by_numpy(descriptors, pixels, apart_px)
+
+
+def distinct_by_numpy(descriptors: Descriptors, pixels: Array, apart_px: float) -> npt.NDArray[np.int32]:
+    """Return what `distinct_distances` does, without the native core, whose oracle this is."""
+    pixels = np.asarray(pixels, dtype=np.float64)
     bits = np.unpackbits(descriptors, axis=1).astype(np.float32)
     bits += bits
     bits -= 1.0
     distances = (_NONE - bits @ bits.T) / 2  # exact: whole numbers
-    apart = np.abs(pixels[:, None] - pixels[None]).max(axis=2) >= apart_px
-    distances[~apart] = _NONE
+    with np.errstate(invalid="ignore", over="ignore"):
+        apart = (np.abs(pixels[:, None] - pixels[None]) >= apart_px).any(axis=2)
+    distances[~apart | np.eye(len(pixels), dtype=bool)] = _NONE
     nearest: npt.NDArray[np.int32] = distances.min(axis=1, initial=_NONE).astype(np.int32)
     return nearest
 
@@ -154,8 +172,10 @@ def distinct_distances(
 def match_near(sought: SoughtFeatures, image: ImageFeatures, limits: NearLimits) -> tuple[Rows, Rows]:
     """Return rows of *sought* and of *image* that match, by the rows of *sought*; deterministic, one to one.
 
+    A feature or prediction at no finite place, or beyond 1e9 px, matches nothing.
+
     Raises:
-        BadRequest: Shapes do not fit.
+        BadRequest: Shapes or the radius do not fit, or descriptors are no bytes.
     """
     m, n = len(sought.pixels), len(image)
     shapes = (
@@ -165,6 +185,12 @@ def match_near(sought: SoughtFeatures, image: ImageFeatures, limits: NearLimits)
     )  # fmt: skip
     if shapes != ((m, 2), (m, 32), (m, 2), (m,), (n, 2), (n, 32), (n, 2), (n,), (n,)):
         raise BadRequest("features of different numbers of rows", hint="give one row for each feature")
+    if sought.descriptors.dtype != np.uint8 or image.descriptors.dtype != np.uint8:
+        raise BadRequest(
+            f"descriptors of {sought.descriptors.dtype} and {image.descriptors.dtype}", hint="give uint8"
+        )
+    if not 0.0 <= limits.radius_px <= _MAX_ABS:
+        raise BadRequest(f"a radius of {limits.radius_px:g} px", hint="give 0 to 1e9 px")
     core = track_core()
     if core is None:
         return match_near_by_numpy(sought, image, limits)
@@ -185,13 +211,17 @@ def match_near_by_numpy(
     empty = np.empty(0, dtype=np.int64)
     if not len(sought.pixels) or not len(image):
         return empty, empty
-    rows, columns = pairs_within(sought.pixels, image.pixels, limits.radius_px)
-    a, b = sought.turns[rows], image.turns[columns]
-    expected, size = sought.sizes[rows], image.sizes[columns]
-    fits = (
-        (a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1] >= limits.min_cosine)
-        & (size <= limits.max_size_ratio * expected) & (expected <= limits.max_size_ratio * size)
-    )  # fmt: skip
+    with np.errstate(invalid="ignore", over="ignore"):
+        rows, columns = pairs_within(
+            np.asarray(sought.pixels, np.float64), np.asarray(image.pixels, np.float64), limits.radius_px
+        )
+        a, b = np.asarray(sought.turns, np.float64)[rows], np.asarray(image.turns, np.float64)[columns]
+        expected = np.asarray(sought.sizes, np.float64)[rows]
+        size = np.asarray(image.sizes, np.float64)[columns]
+        fits = (
+            (a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1] >= limits.min_cosine)
+            & (size <= limits.max_size_ratio * expected) & (expected <= limits.max_size_ratio * size)
+        )  # fmt: skip
     rows, columns = rows[fits], columns[fits]
     if not len(rows):
         return empty, empty
@@ -224,7 +254,8 @@ def fit_pose(
 ) -> FittedPose | None:
     """Return the pose that fits pixels, depths and landmarks by the noise of all; None if it is free.
 
-    Iterated least squares with a Cauchy weight; after three steps only rows within the gate count.
+    Iterated least squares with a Cauchy weight; after three steps only rows within the gate count.  None as
+    well where a number is not finite, or beyond what any camera measures: 1e9 m or px, depths of 1 km.
 
     Args:
         observed: Of one image.
@@ -233,9 +264,21 @@ def fit_pose(
         cauchy: Distance in standard deviations at which a row weighs half.
         gate2: Squared distance beyond which a row does not agree: 11.3 keeps 99 % of three numbers.
 
+    Raises:
+        BadRequest: Shapes do not fit.
+
     Source:
         Errors in variables after Segal et al., Generalized-ICP (RSS 2009), here with pixels and depths.
     """
+    n = len(observed.points)
+    shapes = (
+        observed.points.shape, observed.spreads.shape, observed.pixels.shape, observed.pixels_px.shape,
+        observed.depths_m.shape, observed.depths_dev_m.shape, T_camera_world.shape,
+    )  # fmt: skip
+    if shapes != ((n, 3), (n, 3, 3), (n, 2), (n,), (n,), (n,), (4, 4)):
+        raise BadRequest(
+            "observations of different numbers of rows", hint="give one row for each landmark, and a 4x4 pose"
+        )
     core = track_core()
     if core is None:
         return fit_pose_by_numpy(observed, camera, T_camera_world, cauchy=cauchy, gate2=gate2)
@@ -254,27 +297,59 @@ def fit_pose_by_numpy(
     observed: Observations, camera: Camera, T_camera_world: Array, *, cauchy: float, gate2: float
 ) -> FittedPose | None:
     """Return what `fit_pose` does, without the native core, whose oracle this is."""
+    if not _is_whole(observed, camera, T_camera_world, (cauchy**2, gate2)):
+        return None
     T = T_camera_world
-    for iteration in range(_ITERATIONS):
-        J, W, residual, distance2, is_inlier = _linearised(observed, camera, T, gate2)
-        weight = 1.0 / (1.0 + distance2 / cauchy**2)
-        if iteration >= _FIRST_GATED:
-            weight = weight * is_inlier
-        information = np.einsum("nia,nij,njb,n->ab", J, W, J, weight, optimize=True)
-        gradient = np.einsum("nia,nij,nj,n->a", J, W, residual, weight, optimize=True)
-        try:
+    try:
+        for iteration in range(_ITERATIONS):
+            J, W, residual, distance2, is_inlier = _linearised(observed, camera, T, gate2)
+            weight = 1.0 / (1.0 + distance2 / cauchy**2)
+            if iteration >= _FIRST_GATED:
+                weight = weight * is_inlier
+            information = np.einsum("nia,nij,njb,n->ab", J, W, J, weight, optimize=True)
+            gradient = np.einsum("nia,nij,nj,n->a", J, W, residual, weight, optimize=True)
             np.linalg.cholesky(information)
             twist = np.linalg.solve(information, gradient)
-        except np.linalg.LinAlgError:
+            if not np.abs(twist).max() <= _MAX_TWIST:
+                return None
+            T = exp_se3(twist) @ T
+            if np.abs(twist).max() < _CONVERGED and iteration > _FIRST_GATED:
+                break
+        J, W, _, _, is_inlier = _linearised(observed, camera, T, gate2)
+        information = np.einsum("nia,nij,njb,n->ab", J, W, J, is_inlier.astype(float), optimize=True)
+        if not np.isfinite(T).all() or _has_free_motion(information):
             return None
-        T = exp_se3(twist) @ T
-        if np.abs(twist).max() < _CONVERGED and iteration > _FIRST_GATED:
-            break
-    J, W, _, _, is_inlier = _linearised(observed, camera, T, gate2)
-    if not np.isfinite(T).all():
+    except np.linalg.LinAlgError:
         return None
-    information = np.einsum("nia,nij,njb,n->ab", J, W, J, is_inlier.astype(float), optimize=True)
     return FittedPose(T_camera_world=T, information=information, is_inlier=is_inlier)
+
+
+def _is_whole(observed: Observations, camera: Camera, T: Array, limits: tuple[float, float]) -> bool:
+    """Return whether all numbers are finite and such as a camera measures."""
+    has_depth = observed.depths_m > 0.0
+    diagonals = observed.spreads[:, (0, 1, 2), (0, 1, 2)]
+    anything = (observed.points, observed.pixels, observed.spreads, np.array([camera.cx, camera.cy]), T)
+    within = (
+        (np.array([camera.fx, camera.fy, limits[0]]), 1e-9, _MAX_ABS), (np.array(limits[1]), 0.0, _MAX_ABS),
+        (diagonals, 0.0, _MAX_ABS), (observed.pixels_px, 1e-3, 1e6), (observed.depths_m, 0.0, 1e3),
+        (observed.depths_dev_m[has_depth], 1e-6, 1e3),
+    )  # fmt: skip
+    return all((np.abs(numbers) <= _MAX_ABS).all() for numbers in anything) and all(
+        ((numbers >= low) & (numbers <= high)).all() for numbers, low, high in within
+    )
+
+
+def _has_free_motion(information: Array) -> bool:
+    """Return whether the information, scaled to a diagonal of 1, has no least eigenvalue to speak of.
+
+    Points on a line have 1e-14 and less, a mark of 20 px, without depth, 1e-9.
+    """
+    diagonal = np.diag(information)
+    if not ((diagonal >= 1e-300) & (diagonal <= 1e300)).all():
+        return True
+    scales = 1.0 / np.sqrt(diagonal)
+    least = np.linalg.eigvalsh(information * scales[:, None] * scales)[0]
+    return not least > _FREE
 
 
 def _linearised(
@@ -306,6 +381,10 @@ def _linearised(
     variance[:, 2, 2] = np.where(has_depth, variance[:, 2, 2] + observed.depths_dev_m**2, 1.0)
     W = np.linalg.inv(variance)
     distance2 = np.einsum("ni,nij,nj->n", residual, W, residual)
+    # A covariance that is none gives no distance, or a negative one.
+    is_distance = (distance2 >= 0.0) & (distance2 <= _MAX_DISTANCE2)
+    W = np.where(is_distance[:, None, None], W, 0.0)
+    distance2 = np.where(is_distance, distance2, _MAX_DISTANCE2)
     return by_point @ by_twist, W, residual, distance2, (distance2 < gate2) & is_ahead
 
 
@@ -315,22 +394,24 @@ def pairs_within(predicted: Array, pixels: Array, radius_px: float) -> tuple[Row
     The pixels are sorted by bands of rows, and by column within a band, so that each prediction looks at a
     stretch of three bands only.
     """
-    height = max(radius_px, 1.0)
-    key = _key(np.floor(pixels[:, 1] / height), pixels[:, 0])
+    reach = radius_px + 1.0  # the sum of a pixel and a radius is rounded
+    known = np.flatnonzero((np.abs(predicted) <= _MAX_ABS).all(axis=1))
+    predicted = predicted[known]
+    key = _key(np.floor(pixels[:, 1] / reach), pixels[:, 0])
     order = np.argsort(key, kind="stable")
     key = key[order]
-    band = np.floor(predicted[:, 1] / height)
+    band = np.floor(predicted[:, 1] / reach)
     pairs: list[tuple[Rows, Rows]] = []
     for offset in (-1, 0, 1):
-        first = np.searchsorted(key, _key(band + offset, predicted[:, 0] - radius_px))
-        last = np.searchsorted(key, _key(band + offset, predicted[:, 0] + radius_px), side="right")
+        first = np.searchsorted(key, _key(band + offset, predicted[:, 0] - reach))
+        last = np.searchsorted(key, _key(band + offset, predicted[:, 0] + reach), side="right")
         counts = last - first
         rows = np.repeat(np.arange(len(predicted)), counts)
         offsets = np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts)
         columns = order[np.repeat(first, counts) + offsets]
         apart = pixels[columns] - predicted[rows]
         near = apart[:, 0] * apart[:, 0] + apart[:, 1] * apart[:, 1] <= radius_px * radius_px
-        pairs.append((rows[near], columns[near].astype(np.int64)))
+        pairs.append((known[rows[near]], columns[near].astype(np.int64)))
     return np.concatenate([rows for rows, _ in pairs]), np.concatenate([columns for _, columns in pairs])
 
 
