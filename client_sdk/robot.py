@@ -340,7 +340,7 @@ class Robot:
         from client_sdk.mapper import ask_robot
 
         codec = self._session.codec.name
-        bounded = (options or FrontEndOptions()).sent_with(codec)
+        bounded = (options or FrontEndOptions.live()).sent_with(codec)
         return LiveMapper(
             self, name, ask=ask_robot(self, deadline_s), camera=camera, options=bounded,
             live=(live or LiveOptions()).sent_with(codec),

@@ -49,7 +49,7 @@ from rse_pf.live_map.versions import encode_stored
 
 __all__ = ["Played", "main", "play"]
 
-DENSE = FrontEndOptions(keyframe_m=0.1, keyframe_deg=6.0)
+DENSE = FrontEndOptions(is_spread=False, keyframe_m=0.1, keyframe_deg=6.0)
 LATE_FRAMES = 2
 KITCHEN_CUTS = {"a": range(84), "b": range(84, 168), "c": range(168, 250)}
 FOREIGN = ("redwood_living_room", "nyu_dining_room", "tum_fr1_xyz_start", "7scenes_redkitchen")

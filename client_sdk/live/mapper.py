@@ -160,7 +160,7 @@ class LiveMapper:
         self._ask = ask
         self._mapper = Mapper(
             ask=self._ask_first, camera=camera, depth=True,
-            options=replace(options or FrontEndOptions(), segment_after=_NEVER), map_options=map_options,
+            options=replace(options or FrontEndOptions.live(), segment_after=_NEVER), map_options=map_options,
             T_world_start=T_world_start, adds_frames=False,
         )  # fmt: skip
         self._alignments = Alignments()

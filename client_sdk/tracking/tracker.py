@@ -52,9 +52,9 @@ place where the camera was just now, with the map around a pose, and with a keyf
 _CLEAR_INLIERS = 40
 _CONFIRM_PX = 8.0
 _ALL_RATIO, _ALL_DISTANCE = 0.8, 64
-_QUERIES = 3
 _ENOUGH = 120
 """With so many landmarks of the map a pose needs no points of the last frame: a chain of frames drifts."""
+_QUERIES = 3
 """So many keyframes are asked for the place of one frame, those with the most matches first."""
 _JOIN_EVERY = 3
 _JOIN_M, _JOIN_DEG = 0.15, 4.0

@@ -71,7 +71,8 @@ class DemoOptions:
     def frontend_options(self) -> FrontEndOptions:
         """The options of the trackers."""
         wide = self.frontend == "wide-baseline"
-        options = FrontEndOptions.wide_baseline() if wide else FrontEndOptions()
+        standard = FrontEndOptions.live() if self.live else FrontEndOptions()
+        options = FrontEndOptions.wide_baseline() if wide else standard
         return options.sent_with(self.codec)
 
 

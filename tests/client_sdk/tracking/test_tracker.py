@@ -243,7 +243,7 @@ def test_matches_of_the_native_core_are_those_of_opencv(monkeypatch: pytest.Monk
 @pytest.mark.data
 @pytest.mark.parametrize(
     ("name", "rate_hz", "most_lost", "ate_cm"),
-    [("tum_fr1_rpy_start", 10, 0, 3.0), ("tum_fr1_rpy_start", 5, 1, 4.0), ("7scenes_redkitchen", 5, 0, 3.6)],
+    [("tum_fr1_rpy_start", 10, 1, 3.1), ("tum_fr1_rpy_start", 5, 1, 4.0), ("7scenes_redkitchen", 5, 0, 3.6)],
 )
 def test_recordings_that_turn_quickly_are_not_lost(
     name: str, rate_hz: float, most_lost: int, ate_cm: float
