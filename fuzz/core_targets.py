@@ -1,4 +1,4 @@
-"""The fuzz targets of the native core's front end and depth refinement: any numbers, sizes and addresses.
+"""The fuzz targets of the native core's front end, depth refinement and tracker: any numbers and sizes.
 
 Each calls the library through the Python binding, and directly, with rooms of exactly the size that the C ABI
 asks for.  Without a library they do nothing.
@@ -19,11 +19,21 @@ from fuzz.meter import Meter
 from rse_pf.errors import ProtocolError
 from rse_pf.geometry import Array, Camera
 from rse_pf.native import address_of, find_library, load_part
+from rse_pf.native_tracker import TrackCore, open_tracker
 from rse_pf.pnp import PnpSolution
 from rse_pf.pnp.native_depth import DepthCore, RefinedPose, open_depth
 from rse_pf.pnp.problems import KINECT
+from rse_pf.slam.tracking import (
+    ImageFeatures,
+    NearLimits,
+    Observations,
+    SoughtFeatures,
+    distinct_by_numpy,
+    fit_pose_by_numpy,
+    match_near_by_numpy,
+)
 
-__all__ = ["depth", "describe", "match"]
+__all__ = ["depth", "describe", "match", "track"]
 
 Anything = npt.NDArray[Any]
 
@@ -294,6 +304,134 @@ def _describe_directly(
     out.check()
 
 
+def track(data: bytes, meter: Meter) -> None:
+    """Compare matches near pixels with those of numpy; any numbers give a finite pose or none."""
+    core = _track_core()
+    if len(data) < _HEAD or core is None:
+        return
+    m, n, kind, how = data[0] % 48, data[1] % 48, data[2], data[6]
+    body = data[_HEAD:]
+    numbers = _numbers(kind, body, 5 * (m + n))
+    bits = np.resize(np.frombuffer(body or b"\0", np.uint8), (m + n) * 32)
+    bits[: 32 * m : 7] ^= data[7]
+    bits = _cut(bits, how)
+    sides: list[tuple[Array, Array, Array, Anything]] = []
+    for rows, all_numbers, side in (
+        (m, numbers[: 5 * m], bits[: 32 * m]),
+        (n, numbers[5 * m :], bits[32 * m :]),
+    ):
+        pixels, turns, sizes = np.split(all_numbers, (2 * rows, 4 * rows))
+        if kind & 8:
+            turns, sizes = np.tile([1.0, 0.0], rows), np.ones(rows)
+        sides.append(
+            (
+                _cut(pixels, how).reshape(rows, 2), _cut(turns, how).reshape(rows, 2), _cut(sizes, how),
+                side.reshape(rows, 32),
+            )
+        )  # fmt: skip
+    sought, image = sides
+    apart_px = _STRANGE[data[3] % 5] if data[3] > 250 else data[3] / 8.0
+    distinct = meter.call(lambda _: core.distinct(image[3], image[0], apart_px), data, ProtocolError)
+    expect(distinct is not None, "no distances")
+    expect(np.array_equal(distinct, distinct_by_numpy(image[3], image[0], apart_px)), "other distances")
+    ratio = _STRANGE[data[5] % 5] if data[5] > 250 else data[5] / 128
+    limits = NearLimits(
+        radius_px=min(10.0 ** (data[4] / 28.0) - 1.0, 1e9), ratio=ratio, distinct_ratio=2.0 - ratio,
+        min_cosine=-1.0 if kind & 32 else 0.9, max_size_ratio=9.0 if kind & 64 else 1.35,
+        max_distance=data[7] + data[7] // 255,
+    )  # fmt: skip
+    numbers_of = (
+        limits.radius_px, limits.ratio, limits.distinct_ratio, limits.min_cosine, limits.max_size_ratio,
+        limits.max_distance,
+    )  # fmt: skip
+    found = meter.call(lambda _: core.match_near(sought, (*image, distinct), numbers_of), data, ProtocolError)
+    names = ("pixels", "turns", "sizes", "descriptors")
+    expected = match_near_by_numpy(
+        SoughtFeatures(**dict(zip(names, sought, strict=True))),
+        ImageFeatures(**dict(zip(names, image, strict=True)), distinct=distinct), limits,
+    )  # fmt: skip
+    expect(found is not None and _all_equal(found, expected), "matches are not those of numpy")
+    _near_directly(sought, (*image, distinct), numbers_of, len(expected[0]))
+    _fit(core, data, meter)
+
+
+def _near_directly(
+    sought: tuple[Anything, ...], image: tuple[Anything, ...], limits: tuple[float, ...], count: int
+) -> None:
+    near, distinct = _functions()["rse_pf_match_near"], _functions()["rse_pf_distinct"]
+    m, n = len(sought[0]), len(image[0])
+    arrays = [np.array(each) for each in (*sought, *image)]
+    rooms = _Room(8 * (m + 2 * n + 4200)), _Room(8 * min(m, n)), _Room(8 * min(m, n))
+
+    def called(abi: int, sought_rows: int, rows: int, radius_px: float) -> int:
+        request = np.zeros(2 + 1 + 9 + 5 + 1, dtype=np.int64)
+        request[:1].view(np.uint32)[:] = (abi, 0)
+        request[1:3] = sought_rows, rows
+        request[3:12] = [address_of(each) for each in arrays]
+        request[12:17].view(np.float64)[:] = (radius_px, *limits[1:5])
+        request[17] = limits[5]
+        answer: int = near(address_of(request), *(room.at for room in rooms))
+        return answer
+
+    expect(called(1, m, n, limits[0]) == count, "another number of matches without the binding")
+    expect(called(2, m, n, limits[0]) == -1, "another ABI is not refused")
+    for size in _HOSTILE_SIZES:
+        expect(called(1, size, n, 1.0) == called(1, m, size, 1.0) == -1, f"{size} rows are not refused")
+        answer = distinct(address_of(arrays[7]), address_of(arrays[4]), size, 6.0, rooms[0].at)
+        expect(answer == -1, f"{size} rows have distances")
+    for radius_px in (-1.0, float("nan"), float("inf")):
+        expect(called(1, m, n, radius_px) == -1, f"a radius of {radius_px} is not refused")
+    for room in rooms:
+        room.check()
+
+
+def _fit(core: TrackCore, data: bytes, meter: Meter) -> None:
+    n, kind = data[1] % 48, data[2]
+    numbers = _numbers(kind, data[_HEAD:], 16 + 14 * n)
+    T, points, spreads, pixels, deviations, depths_m, depths_dev_m = np.split(
+        numbers, np.cumsum((16, 3 * n, 6 * n, 2 * n, n, n))
+    )
+    if kind & 128:  # what a camera may measure
+        T, depths_m = np.eye(4).ravel(), np.clip(np.nan_to_num(depths_m), 0.0, 9.0)
+        points = np.clip(np.nan_to_num(points), -20.0, 20.0)
+        pixels = np.clip(np.nan_to_num(pixels), -900.0, 900.0)
+        spreads = np.tile([1e-4, 0.0, 0.0, 1e-4, 0.0, 1e-4], n) * (1.0 + data[4])
+        deviations, depths_dev_m = np.ones(n), np.full(n, 0.01)
+    full = spreads.reshape(n, 6)[:, (0, 1, 2, 1, 3, 4, 2, 4, 5)].reshape(n, 3, 3)
+    limits = (_STRANGE[data[5] % 5] if data[5] > 250 else 6.25, 11.3)
+    rows = points.reshape(n, 3), spreads.reshape(n, 6)
+    measured = pixels.reshape(n, 2), deviations, depths_m, depths_dev_m
+
+    def fitted(_: bytes) -> Any:
+        return core.fit_pose(rows, measured, _CAMERA, limits, T.reshape(4, 4))
+
+    found = meter.call(fitted, data, ProtocolError)
+    if found is not None:
+        pose, information, is_inlier = found
+        expect(bool(np.isfinite(pose).all() and np.isfinite(information).all()), "a pose that is not finite")
+        expect(
+            pose[3].tolist() == [0.0, 0.0, 0.0, 1.0] and np.array_equal(information, information.T), "no pose"
+        )
+        expect(is_inlier.shape == (n,) and bool(is_inlier.sum() >= 3), "a pose of two points")
+    observed = Observations(
+        points=rows[0], spreads=full, pixels=measured[0], pixels_px=deviations, depths_m=depths_m,
+        depths_dev_m=depths_dev_m,
+    )  # fmt: skip
+    with np.errstate(all="ignore"):
+        fit_pose_by_numpy(observed, _CAMERA, T.reshape(4, 4), cauchy=2.5, gate2=11.3)
+    fit, is_in, result = _functions()["rse_pf_fit_pose"], _Room(n), _Room(8 * (1 + 16 + 36))
+    arrays = [np.array(each) for each in (*rows, *measured)]
+    for size in _HOSTILE_SIZES:
+        request = np.zeros(2 + 6 + 6 + 16, dtype=np.int64)
+        request[:1].view(np.uint32)[:] = (1, 0)
+        request[1] = size
+        request[2:8] = [address_of(each) for each in arrays]
+        request[8:14].view(np.float64)[:] = (300.0, 300.0, 1.0, 1.0, 6.25, 11.3)
+        expect(fit(address_of(request), is_in.at, result.at) == -1, f"{size} rows are not refused")
+    is_in.check()
+    result.check()
+
+
 class _Room:
     """Memory of exactly *size* bytes for the library, with a pattern behind it."""
 
@@ -354,6 +492,12 @@ def _depth_cores() -> tuple[DepthCore, ...]:
 
 
 @cache
+def _track_core() -> TrackCore | None:
+    path = find_library()
+    return None if path is None else open_tracker(path)
+
+
+@cache
 def _functions() -> dict[str, Any]:
     """Return the functions of the C ABI; `open_front_end` and `open_depth` set the types of their own."""
     path = find_library()
@@ -371,4 +515,9 @@ def _functions() -> dict[str, Any]:
     )  # fmt: skip
     (refine,) = load_part(path, "depth", 1, "rse_pf_depth_refine")
     refine.argtypes, refine.restype = (pointer,) * 3, None
+    names = ("rse_pf_distinct", "rse_pf_match_near", "rse_pf_fit_pose")
+    found.update(zip(names, load_part(path, "track", 1, *names), strict=True))
+    found["rse_pf_distinct"].argtypes = (pointer, pointer, size, number, pointer)
+    found["rse_pf_match_near"].argtypes, found["rse_pf_match_near"].restype = (pointer,) * 4, size
+    found["rse_pf_fit_pose"].argtypes = (pointer,) * 3
     return {**found, "rse_pf_depth_refine": refine}

@@ -248,6 +248,16 @@ def _pictures() -> list[bytes]:
                 (120, 90, 6, 3, 0, 1), (100, 33, 0, 8, 4, 0))]  # fmt: skip
 
 
+def _tracks() -> list[bytes]:
+    rng = np.random.default_rng(6)
+    spots = rng.uniform(0.0, 90.0, 400).astype("<f8").tobytes()
+    return [bytes([m, n, kind, 48, radius, 200, misaligned, flipped]) + body
+            for m, n, kind, radius, misaligned, flipped in (
+                (40, 40, 8, 60, 0, 60), (9, 47, 3 | 32 | 64, 140, 1, 255), (47, 47, 1 | 8 | 128, 30, 0, 1),
+                (47, 30, 2 | 128, 252, 1, 80), (0, 0, 0, 0, 0, 0), (30, 1, 16 | 32 | 64, 90, 0, 30))
+            for body in (spots, rng.bytes(700))]  # fmt: skip
+
+
 def _live_keyframes() -> list[bytes]:
     version, _ = make_world(7, points=1500).walk("robot-1", np.linspace(0.0, 0.05, 2), seed=2)
     coded = [encode_stored(keyframe) for keyframe in version.keyframes]
@@ -257,6 +267,6 @@ def _live_keyframes() -> list[bytes]:
 _MADE = {
     "codec": _messages, "frames": _frames, "stream": _streams, "geometry": _problems, "maps": _maps,
     "keyframes": _keyframes, "snapshots": _sandbox_messages, "graph": _graphs, "cloud": _clouds,
-    "native": _messages, "match": _views, "depth": _depths, "describe": _pictures,
+    "native": _messages, "match": _views, "depth": _depths, "describe": _pictures, "track": _tracks,
     "live": _live_keyframes,
 }  # fmt: skip

@@ -221,5 +221,6 @@ TARGETS: dict[str, Target] = {
     "keyframes": map_targets.keyframes, "snapshots": map_targets.snapshots, "graph": map_targets.graph,
     "cloud": map_targets.cloud, "native": native_targets.native, "match": core_targets.match,
     "depth": core_targets.depth, "describe": core_targets.describe,
+    "track": core_targets.track,
     "live": live_targets.live,
 }  # fmt: skip

@@ -12,6 +12,7 @@
 #define RSE_PF_ISA checked
 #include "solve.hpp"
 #include "clock.hpp"
+#include "rse_pf_track.h"
 
 static int allocations = 0;
 extern "C" void* __real_aligned_alloc(size_t alignment, size_t size);
@@ -252,6 +253,105 @@ void check_hostile() {
     }
 }
 
+// The memory of each array ends behind its last number, so that the sanitizers notice a step too far.
+void check_matches_near() {
+    for (int i = 0; i < 3000; ++i) {
+        const auto m = static_cast<size_t>(random_bits() % 40), n = static_cast<size_t>(random_bits() % 40);
+        const int kind = static_cast<int>(random_bits() % 7);
+        std::vector<double> predicted(2 * m), sought_turns(2 * m), sought_sizes(m), pixels(2 * n), turns(2 * n), sizes(n);
+        for (auto* numbers : {&predicted, &sought_turns, &sought_sizes, &pixels, &turns, &sizes})
+            for (double& number : *numbers) number = hostile(kind);
+        std::vector<uint8_t> sought(32 * m), descriptors(32 * n);
+        for (auto* bytes : {&sought, &descriptors})
+            for (uint8_t& byte : *bytes) byte = static_cast<uint8_t>(random_bits() % 2);
+        std::vector<int32_t> distinct(n);
+        const uint8_t none = 0;
+        const double zero = 0.0;
+        const auto numbers_at = [&](const std::vector<double>& numbers) { return numbers.empty() ? &zero : numbers.data(); };
+        const uint8_t* const at = n == 0 ? &none : descriptors.data();
+        int32_t spare = 0;
+        expect(rse_pf_distinct(at, numbers_at(pixels), static_cast<int64_t>(n), 6.0, n == 0 ? &spare : distinct.data()) == 0,
+               "any features have distances");
+        rse_pf_near_request request = {};
+        request.abi = RSE_PF_TRACK_ABI;
+        request.sought_rows = static_cast<int64_t>(m);
+        request.rows = static_cast<int64_t>(n);
+        request.predicted = numbers_at(predicted);
+        request.sought_turns = numbers_at(sought_turns);
+        request.sought_sizes = numbers_at(sought_sizes);
+        request.sought = m == 0 ? &none : sought.data();
+        request.pixels = numbers_at(pixels);
+        request.turns = numbers_at(turns);
+        request.sizes = numbers_at(sizes);
+        request.descriptors = at;
+        request.distinct = n == 0 ? &spare : distinct.data();
+        request.radius_px = i % 2 == 0 ? 1e9 : uniform(0.0, 900.0);
+        request.ratio = request.distinct_ratio = uniform(0.5, 2.0);
+        request.min_cosine = -1e18;
+        request.max_size_ratio = 1e18;
+        request.max_distance = 256;
+        std::vector<uint64_t> workspace(RSE_PF_NEAR_WORKSPACE(m, n));
+        std::vector<int64_t> rows(std::min(m, n) + 1), columns(std::min(m, n) + 1);
+        const int64_t count = rse_pf_match_near(&request, workspace.data(), rows.data(), columns.data());
+        expect(count >= 0 && count <= static_cast<int64_t>(std::min(m, n)), "no more matches than features");
+        std::vector<bool> is_taken(n);
+        for (size_t k = 0; k < static_cast<size_t>(count); ++k) {
+            expect(rows[k] >= (k > 0 ? rows[k - 1] + 1 : 0) && rows[k] < request.sought_rows, "matches are in order");
+            expect(columns[k] >= 0 && columns[k] < request.rows, "a match is a feature");
+            expect(!is_taken[static_cast<size_t>(columns[k])], "a feature matches once");
+            is_taken[static_cast<size_t>(columns[k])] = true;
+        }
+        request.radius_px = -1.0;
+        expect(rse_pf_match_near(&request, workspace.data(), rows.data(), columns.data()) == -1, "a negative radius");
+    }
+}
+
+void check_fits() {
+    int fitted = 0;
+    for (int i = 0; i < 3000; ++i) {
+        const auto n = static_cast<size_t>(1 + random_bits() % 40);
+        const int kind = i % 2 == 0 ? -1 : static_cast<int>(random_bits() % 7);
+        std::vector<double> points(3 * n), spreads(6 * n), pixels(2 * n), ones(n, 1.0), depths(n);
+        for (size_t k = 0; k < n; ++k) {
+            const double z = uniform(1.0, 5.0), x = uniform(-0.5, 0.5) * z, y = uniform(-0.4, 0.4) * z;
+            points[3 * k] = x, points[3 * k + 1] = y, points[3 * k + 2] = z;
+            pixels[2 * k] = 500 * x / z + 320, pixels[2 * k + 1] = 500 * y / z + 240;
+            spreads[6 * k] = spreads[6 * k + 3] = spreads[6 * k + 5] = 1e-6;
+            depths[k] = k % 3 == 0 ? 0.0 : z;
+        }
+        if (kind >= 0)
+            for (auto* numbers : {&points, &spreads, &pixels, &ones, &depths})
+                if (random_bits() % 2 == 0) (*numbers)[random_bits() % numbers->size()] = hostile(kind);
+        rse_pf_fit_request request = {};
+        request.abi = RSE_PF_TRACK_ABI;
+        request.rows = static_cast<int64_t>(n);
+        request.points = points.data();
+        request.spreads = spreads.data();
+        request.pixels = pixels.data();
+        request.pixels_px = request.depths_dev = ones.data();
+        request.depths_m = depths.data();
+        request.fx = request.fy = 500;
+        request.cx = 320;
+        request.cy = 240;
+        request.cauchy2 = 6.25;
+        request.gate2 = 11.3;
+        for (size_t k = 0; k < 4; ++k) request.T_camera_world[5 * k] = 1.0;
+        request.T_camera_world[3] = kind < 0 ? 0.02 : hostile(kind);
+        std::vector<uint8_t> is_inlier(n);
+        rse_pf_fit_result result;
+        const int32_t status = rse_pf_fit_pose(&request, is_inlier.data(), &result);
+        expect(status == -1 || status == 0 || status == 1, "a fit has a status");
+        if (status != 0) continue;
+        for (const double number : result.T_camera_world) expect(std::isfinite(number), "a fitted pose is finite");
+        for (const double number : result.information) expect(std::isfinite(number), "information is finite");
+        expect(result.inliers == std::count(is_inlier.begin(), is_inlier.end(), 1), "inliers are counted");
+        if (kind >= 0) continue;
+        ++fitted;
+        if (n >= 6) expect(std::fabs(result.T_camera_world[3]) < 1e-6, "exact pixels give the pose");
+    }
+    expect(fitted > 1200, "most exact problems have a pose");
+}
+
 void check_allocations() {
     const int64_t n = 300;
     std::vector<double> points(3 * n), pixels(2 * n);
@@ -291,6 +391,8 @@ int main() {
     check_sampler();
     check_allocations();
     check_hostile();
+    check_matches_near();
+    check_fits();
     std::printf(failures == 0 ? "all checks passed (%s)\n" : "checks failed (%s)\n", rse_pf_native_lanes());
     return failures == 0 ? 0 : 1;
 }

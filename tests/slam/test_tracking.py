@@ -286,7 +286,8 @@ def observations(
     pixels = rng.uniform((20, 20), (620, 460), (n, 2))
     seen = CAMERA.back_project(pixels, rng.uniform(0.8, 5.0, n))
     if line:
-        seen = np.array([0.1, 0.2, 3.0]) + np.outer(rng.uniform(-1, 1, n), [0.9, -0.4, 0.7])
+        along = np.clip(rng.normal(size=3), -1.0, 1.0)
+        seen = np.array([0.1, 0.2, 3.0]) + np.outer(rng.uniform(-1, 1, n), along)
     points = transform(inverse(truth), seen)
     factors = rng.normal(size=(n, 3, 3)) * 0.004
     spreads = factors @ factors.transpose(0, 2, 1) + 1e-8 * np.eye(3)
@@ -296,6 +297,8 @@ def observations(
     measured = CAMERA.project(seen) + pixels_px[:, None] * rng.normal(size=(n, 2))
     depths_m = seen[:, 2] + depths_dev_m * rng.normal(size=n)
     depths_m[rng.random(n) < (0.3 if has_depth else 2.0)] = 0.0
+    if line:  # without noise: nothing but the free motion keeps the pose from being fitted
+        measured, depths_m = CAMERA.project(seen), np.where(depths_m > 0.0, seen[:, 2], 0.0)
     wrong = rng.random(n) < outliers
     measured[wrong] += rng.normal(size=(wrong.sum(), 2)) * 80.0
     observed = Observations(
@@ -354,8 +357,9 @@ def test_a_motion_that_nothing_holds_is_told(has_depth: bool) -> None:
             observed, _, start = observations(seed, n=n, has_depth=has_depth)
             assert fit_pose(observed, CAMERA, start) is None
         for n in (3, 40, 1000):
-            observed, _, start = observations(seed, n=n, has_depth=has_depth, line=True)
+            observed, truth, start = observations(seed, n=n, has_depth=has_depth, line=True)
             assert fit_pose(observed, CAMERA, start) is None
+            assert fit_pose(observed, CAMERA, truth) is None
 
 
 @pytest.mark.usefixtures("either")
@@ -435,6 +439,21 @@ def test_covariances_that_are_none_never_make_an_inlier_or_an_infinite_pose() ->
         if fitted is not None:
             assert np.isfinite(fitted.T_camera_world).all()
             assert np.isfinite(fitted.information).all()
+
+
+@pytest.mark.usefixtures("either")
+def test_a_squared_distance_below_zero_is_no_small_one() -> None:
+    observed, truth, _ = observations(5, has_depth=False)
+    spreads, pixels = observed.spreads.copy(), CAMERA.project(transform(truth, observed.points))
+    # In the camera's frame no covariance: x + y varies, x - y by less than nothing; and the pixel is off so.
+    spreads[7] = truth[:3, :3].T @ np.array([[0, 1e-2, 0], [1e-2, 0, 0], [0, 0, 0]]) @ truth[:3, :3]
+    spreads[7, (0, 1, 2), (0, 1, 2)] = np.maximum(spreads[7, (0, 1, 2), (0, 1, 2)], 0.0)
+    pixels[7] += (200.0, -200.0)
+
+    fitted = fit_pose(replace(observed, spreads=spreads, pixels=pixels), CAMERA, truth)
+
+    assert fitted is not None
+    assert np.flatnonzero(~fitted.is_inlier).tolist() == [7]
 
 
 @needs_library
