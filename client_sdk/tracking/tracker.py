@@ -7,7 +7,7 @@ are rounded exactly as they are sent.  Poses are solved elsewhere, and drawn els
 from __future__ import annotations
 
 from collections.abc import Generator, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -54,6 +54,8 @@ _CONFIRM_PX = 8.0
 _ALL_RATIO, _ALL_DISTANCE = 0.8, 64
 _ENOUGH = 120
 """With so many landmarks of the map a pose needs no points of the last frame: a chain of frames drifts."""
+_MOST_JUMPS = 4
+"""A camera that was lost for long may have moved by so many limits, or its place must be clear."""
 _QUERIES = 3
 """So many keyframes are asked for the place of one frame, those with the most matches first."""
 _JOIN_EVERY = 3
@@ -335,23 +337,25 @@ class Tracker:
             return
         apart_m, apart_deg = pose_difference(before[1], T_into_segment)
         if apart_m <= _JOIN_M and apart_deg <= _JOIN_DEG:
-            self._join(segment, T_into_segment)
+            if segment < self._segment:
+                self._join(self._segment, segment, T_into_segment)
+            else:  # the camera is back in the older segment: its poses stay
+                self._join(segment, self._segment, inverse(T_into_segment))
 
-    def _join(self, into: int, T_into_segment: Array) -> None:
-        """Make one segment of the present one and *into*, which keeps its frame."""
-        own = self._segments.pop(self._segment)
+    def _join(self, segment: int, into: int, T_into_segment: Array) -> None:
+        """Move all of *segment*, the newer one, into *into*, which keeps its frame."""
+        own = self._segments.pop(segment)
         own.move(T_into_segment)
         first = self._segments[into].take(own)
-        self.joins.append(Join(self._segment, into, T_into_segment))
-        self._segment, self._place = into, None
-        assert self._last is not None
+        self.joins.append(Join(segment, into, T_into_segment))
+        self._place = None
+        if segment != self._segment or self._last is None:
+            return
+        self._segment = into
+        self._T_last = _rotation_made(T_into_segment @ self._T_last)
         last = self._last
         moved = np.where(last.landmarks == NO_LANDMARK, NO_LANDMARK, last.landmarks + first)
-        self._T_last = _rotation_made(T_into_segment @ self._T_last)
-        self._last = _Posed(
-            view=last.view, T_world_camera=self._T_last, landmarks=moved, inliers=last.inliers,
-            matches=last.matches, is_weak=last.is_weak,
-        )  # fmt: skip
+        self._last = replace(last, T_world_camera=self._T_last, landmarks=moved)
 
     # --- matches and poses ---
 
@@ -425,7 +429,7 @@ class Tracker:
         return None if T_camera_reference is None else T_reference @ inverse(T_camera_reference)
 
     def _is_plausible(self, T_world_camera: Array) -> bool:
-        limit_m = self.options.max_jump_m * (1 + self._lost_in_a_row)
+        limit_m = self.options.max_jump_m * min(1 + self._lost_in_a_row, _MOST_JUMPS)
         moved_m = float(np.linalg.norm(T_world_camera[:3, 3] - self._T_last[:3, 3]))
         return moved_m <= limit_m
 

@@ -178,6 +178,26 @@ def test_a_video_that_was_cut_has_two_segments_which_are_joined_where_they_overl
     assert_at(joined[-1], 7)
 
 
+def test_a_camera_that_is_back_in_the_first_segment_keeps_its_poses_when_the_other_one_is_joined() -> None:
+    tracker = Tracker(FrontEndOptions(segment_after=3))
+    run_all(tracker, map(frame, range(20)))
+    run_all(tracker, (foreign(row) for row in range(8)))
+    back = run(tracker, frame(7))
+    assert back.segment == 0
+
+    def both(row: int) -> Frame:
+        here, there = frame(row), foreign(row)
+        rgb = np.concatenate([here.rgb[:, :160], there.rgb[:, 160:]], axis=1)
+        return Frame(timestamp_s=here.timestamp_s, rgb=rgb, depth_m=here.depth_m, camera=CAMERA)
+
+    shown = run_all(tracker, [both(7)] * 12)
+
+    assert [(join.segment, join.into) for join in tracker.joins] == [(1, 0)]
+    for tracked in shown:
+        assert tracked.segment == 0
+        assert_at(tracked, 7)
+
+
 def test_a_weak_pose_never_becomes_a_keyframe() -> None:
     weak, strong = Tracker(), Tracker()
     for row in range(15):
