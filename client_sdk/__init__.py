@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from client_sdk.offloading.offload import CloudFirst
     from client_sdk.robot import Robot, connect
     from client_sdk.stats import Stats
+    from client_sdk.tracking.tracker import Tracker
     from client_sdk.transfer.background_upload import BackgroundUploader
     from client_sdk.transfer.data_client import DataClient, DataOptions
     from client_sdk.transfer.map_merge import merge_maps
