@@ -25,7 +25,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.live.one_process import DENSE
-from benchmarks.maps.recordings import pose_answer
+from benchmarks.maps.recordings import judged_answer
 from client_sdk.frontend import Frame, PoseQuery, extract
 from client_sdk.simulator import (
     SIMULATED_CAMERA,
@@ -155,7 +155,8 @@ def _prepare(path: Path, seed: int) -> None:
 def _track(tracker: Tracker, frame: Frame) -> Array | None:
     step = tracker.prepare(frame)
     while isinstance(step, PoseQuery):
-        step = tracker.accept(step, *pose_answer(step))
+        pose, inliers, is_weak = judged_answer(step)
+        step = tracker.accept(step, pose, inliers, is_weak=is_weak)
     return step.T_world_camera
 
 

@@ -21,12 +21,11 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.maps.recordings import ate_m, truth_of
+from benchmarks.maps.recordings import ate_m, judged_answer, truth_of
 from benchmarks.maps.services import joined_poses, robots_of
 from client_sdk.datasets import Dataset, open_dataset
 from client_sdk.frontend import FrontEndOptions, PoseQuery, extract, match
 from client_sdk.tracking.tracker import Tracker
-from rse_pf.errors import PnpError
 from rse_pf.geometry import Array, inverse, pose_difference
 from rse_pf.pnp import PnpOptions, PnpSolution, refine_with_depth, solve_pnp
 from rse_pf.pnp.depth_refinement import refine_by_numpy
@@ -53,7 +52,8 @@ def recording_row(dataset: Dataset, options: FrontEndOptions, *, with_depth: boo
         step = tracker.prepare(frame)
         while isinstance(step, PoseQuery):
             sizes.append(_command_bytes(codec, step, with_depth=with_depth))
-            step = tracker.accept(step, *_answer(step, with_depth=with_depth))
+            pose, inliers, is_weak = judged_answer(step, with_depth=with_depth)
+            step = tracker.accept(step, pose, inliers, is_weak=is_weak)
         if step.T_world_camera is not None:
             poses.append(step.T_world_camera)
             stamps.append(frame.timestamp_s)
@@ -71,20 +71,6 @@ def recording_row(dataset: Dataset, options: FrontEndOptions, *, with_depth: boo
         "command_bytes_median": float(np.median(sizes)),
         "command_bytes_max": max(sizes),
     }
-
-
-def _answer(query: PoseQuery, *, with_depth: bool) -> tuple[Array | None, int]:
-    matches = query.correspondences
-    options = PnpOptions(inlier_px=query.inlier_px, max_iterations=query.max_iterations)
-    try:
-        solution = solve_pnp(matches.points_world, matches.pixels, query.camera, options)
-    except PnpError:
-        return None, 0
-    if with_depth:
-        solution = refine_with_depth(
-            solution, matches.points_world, matches.pixels, matches.depths_m, query.camera
-        )
-    return solution.T_camera_world, len(solution.inliers)
 
 
 def _command_bytes(codec: Any, query: PoseQuery, *, with_depth: bool) -> int:

@@ -30,7 +30,6 @@ __all__ = [
     "frame_poses",
     "judged_answer",
     "keyframe_of",
-    "pose_answer",
     "red_kitchen",
     "truth_of",
 ]
@@ -111,20 +110,18 @@ def truth_of(dataset: Dataset, stamps_s: Sequence[float]) -> Array:
     return np.asarray(dataset.truth.T_world_camera)[nearest]
 
 
-def pose_answer(query: PoseQuery) -> tuple[Array | None, int]:
-    """Return ``T_camera_world`` of a query and its inliers, as the platform does; None and 0 without one."""
-    return judged_answer(query)[:2]
+def judged_answer(query: PoseQuery, *, with_depth: bool = True) -> tuple[Array | None, int, bool]:
+    """Return ``T_camera_world`` of a query, its inliers, and whether it is weak, as the platform does.
 
-
-def judged_answer(query: PoseQuery) -> tuple[Array | None, int, bool]:
-    """Return what `pose_answer` does, and whether the pose is weak."""
+    Without a pose they are None, 0 and False.
+    """
     options = PnpOptions(inlier_px=query.inlier_px, max_iterations=query.max_iterations)
     matches = query.correspondences
     try:
         solution = solve_pnp(matches.points_world, matches.pixels, query.camera, options)
     except PnpError:
         return None, 0, False
-    if matches.depths_m.any():
+    if with_depth and matches.depths_m.any():
         solution = refine_with_depth(
             solution, matches.points_world, matches.pixels, matches.depths_m, query.camera
         )
