@@ -6,12 +6,15 @@ import numpy as np
 import pytest
 
 import rse_pf.slam.relative_pose as relative_pose
-from rse_pf.geometry import inverse, pose_difference
+from rse_pf.geometry import Array, exp_se3, inverse, pose_difference, transform
 from rse_pf.live_map.events import LinksMeasured, matrix_of
-from rse_pf.live_map.measure import joined_links, measure_links
+from rse_pf.live_map.measure import joined_links, measure_links, measure_stored
 from rse_pf.maps.format import Keyframe
+from rse_pf.pnp import DepthNoise
+from rse_pf.pnp.problems import KINECT
 from rse_pf.services.synthetic_maps import make_world
-from rse_pf.slam.keyframe import KeyframeFeatures, make_features
+from rse_pf.slam.keyframe import Keyframe as SentKeyframe
+from rse_pf.slam.keyframe import KeyframeFeatures, encode_keyframe, make_features
 from rse_pf.slam.relative_pose import RelativePoseOptions
 
 WORLD, TRUTH = make_world(3, points=4000).walk("r", np.array([0.0, 0.02, 0.04, 0.5]), seed=1)
@@ -113,3 +116,40 @@ def test_a_view_of_fewer_than_two_features_gives_no_link():
 
     assert measure_links((0, one, CAMERA), [numbered(1)]).failed == {"no-matches": 1}
     assert measure_links(numbered(1), [(0, one, CAMERA)]).failed == {"no-matches": 1}
+
+
+NOISY = DepthNoise(base_m=4 * DepthNoise().base_m, growth_per_m=4 * DepthNoise().growth_per_m)
+
+
+def noisy_pair(seed: int, noise: DepthNoise) -> tuple[bytes, bytes, Array]:
+    """Return two encoded keyframes of one scene, whose depths are as noisy as NOISY says, and ``T_a_b``.
+
+    *noise* is what the keyframes say.
+    """
+    rng = np.random.default_rng(seed)
+    T_a_b = exp_se3(np.concatenate([rng.uniform(-0.2, 0.2, 3), rng.normal(size=3) * 0.08]))
+    pixels, depths_m = rng.uniform([80.0, 80.0], [560.0, 400.0], (150, 2)), rng.uniform(1.5, 4.5, 150)
+    descriptors = rng.integers(0, 256, (150, 32), dtype=np.uint8)
+    seen = transform(inverse(T_a_b), KINECT.back_project(pixels, depths_m))
+
+    def encoded(pixels: Array, depths_m: Array) -> bytes:
+        pixels = pixels + 0.5 * rng.normal(size=pixels.shape)
+        depths_m = depths_m + rng.normal(size=len(depths_m)) * np.sqrt(NOISY.variance_m2(depths_m))
+        features = make_features(pixels, depths_m, descriptors, noise)
+        return encode_keyframe(
+            SentKeyframe(timestamp_s=0.0, T_odom_camera=np.eye(4), camera=KINECT, features=features)
+        )
+
+    return encoded(pixels, depths_m), encoded(KINECT.project(seen), seen[:, 2]), T_a_b
+
+
+def test_links_of_stored_keyframes_weigh_their_depths_by_the_noise_that_they_carry():
+    def median_error_m(noise: DepthNoise) -> float:
+        errors = []
+        for seed in range(40):
+            one, other, T_a_b = noisy_pair(seed, noise)
+            (link,) = measure_stored((0, one), [(1, other)]).links
+            errors.append(pose_difference(matrix_of(link.T_keyframe_other, 4, 4), T_a_b)[0])
+        return float(np.median(errors))
+
+    assert median_error_m(NOISY) < 0.8 * median_error_m(DepthNoise())

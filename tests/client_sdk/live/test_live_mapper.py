@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from client_sdk import connect
 from client_sdk.answers import PoseAnswer
-from client_sdk.frontend import Frame, PoseQuery, TrackedFrame
+from client_sdk.frontend import Frame, FrontEndOptions, PoseQuery, TrackedFrame, extract
 from client_sdk.live import BlockingLiveMapper, Correction, LiveMapper, LiveOptions
 from client_sdk.live.sender import keyframe_request
 from client_sdk.live.waiting_keyframes import Base, WaitingKeyframe, WaitingKeyframes, rebase
@@ -85,6 +86,30 @@ def test_a_keyframe_each_10_cm_is_kept_by_the_map_in_order() -> None:
         assert "live-leave" in robot.asked
 
     run(work)
+
+
+def test_keyframes_have_the_strongest_features_wherever_they_are() -> None:
+    def half_faint(row: int) -> Frame:
+        """Return a frame whose right half has a quarter of the contrast: weaker features are there, too."""
+        frame = frame_at(row, depth=True)
+        rgb = frame.rgb.copy()
+        rgb[:, 160:] = 128 + rgb[:, 160:] // 4
+        return Frame(timestamp_s=frame.timestamp_s, rgb=rgb, depth_m=frame.depth_m, camera=CAMERA)
+
+    async def work(robot: FakeLiveRobot) -> None:
+        async with live_map(robot) as mapper:
+            await mapper.track(half_faint(0))
+            await robot.until(lambda: len(robot.kept) == 1)
+        pixels = decode_keyframe(robot.kept[0].keyframe).features.pixels
+        spread = extract(half_faint(0), FrontEndOptions()).pixels
+
+        assert (pixels[:, 0] > 160).mean() < 0.1
+        assert (spread[:, 0] > 160).mean() > 0.3
+
+    run(work)
+    by_robot = connect("ws://127.0.0.1:1/ws").live_map("lab")._mapper._options
+    assert by_robot is not None
+    assert not by_robot.is_spread
 
 
 def test_the_robots_own_cloud_is_made_of_its_keyframes_beside_its_frames() -> None:

@@ -153,6 +153,24 @@ def test_a_camera_that_was_carried_elsewhere_with_a_covered_lens_is_found_in_its
     assert found.segment == 0
 
 
+@pytest.mark.parametrize(("row", "is_found"), [(15, True), (8, False)])
+def test_a_place_that_is_not_clear_is_believed_within_four_jumps_however_long_the_camera_was_lost(
+    row: int, is_found: bool
+) -> None:
+    tracker = Tracker(FrontEndOptions(max_jump_m=0.1))
+    run_all(tracker, map(frame, range(25)))
+    run_all(tracker, (covered(row) for row in range(30)))
+
+    def doubtful(query: PoseQuery) -> Answer:
+        pose, _ = solve(query)
+        return pose, int(0.4 * len(query.correspondences))
+
+    shown = run(tracker, frame(row), doubtful)
+
+    assert (24 - 15) * STEP_M < 0.4 < (24 - 8) * STEP_M
+    assert not shown.lost if is_found else shown.lost
+
+
 def test_a_video_that_was_cut_has_two_segments_which_are_joined_where_they_overlap() -> None:
     tracker = Tracker(FrontEndOptions(segment_after=3))
     run_all(tracker, map(frame, range(20)))
