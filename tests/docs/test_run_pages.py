@@ -25,7 +25,9 @@ pytestmark = [pytest.mark.system, pytest.mark.slow, pytest.mark.timeout(400)]
 
 ROOT = Path(__file__).parents[2]
 SOON_S = 120.0
-WHILE_A_PLATFORM_RUNS = ("docs/local.md", "docs/howto/robot_keys.md", "docs/howto/load_and_faults.md")
+WHILE_A_PLATFORM_RUNS = (
+    "docs/local.md", "docs/fleet_page.md", "docs/howto/robot_keys.md", "docs/howto/load_and_faults.md",
+)  # fmt: skip
 IN_THE_CHECKOUT = ("docs/architecture.md",)
 RUN_BY_CI = ("make demo", "make test", ". .venv/bin/activate", "cd ")
 """`.ci/run` executes them; here the environment is active already."""

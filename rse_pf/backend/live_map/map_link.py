@@ -320,6 +320,7 @@ class MapLink:
             if isinstance(error, ConnectionRefusedError) and self._welcomed == record.owner:
                 self._dead_epoch = record.epoch  # its port was open before: the process is gone
             return None
+        is_welcome = False
         try:
             check_certificate(writer.get_extra_info("ssl_object"), record.certificate)
             claims = LinkClaims(
@@ -330,7 +331,8 @@ class MapLink:
             writer.write(encode_message(["hello", make_token(key, claims)]))
             frames = FrameReader(MAX_LINK_BYTES)
             welcome = await asyncio.wait_for(_next_messages(reader, frames), _CONNECT_S)
-            if welcome[0] == ["welcome"]:
+            is_welcome = welcome[0] == ["welcome"]
+            if is_welcome:
                 self._welcomed = record.owner
                 for message in welcome[1:]:
                     self._take(message)
@@ -338,7 +340,9 @@ class MapLink:
             self._context.log.warning("live-link-refused", map=self.map_name, why=str(welcome[0])[:200])
         except (OSError, asyncio.TimeoutError, Unauthorized) as error:
             self._context.log.warning("live-link-failed", map=self.map_name, why=str(error)[:200])
-        writer.close()
+        finally:
+            if not is_welcome:  # also if the task is cancelled, or the key cannot be read
+                writer.close()
         return None
 
     async def _listen(self, record: LeaseRecord, reader: asyncio.StreamReader, frames: FrameReader) -> None:

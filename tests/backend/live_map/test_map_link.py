@@ -13,6 +13,7 @@ from typing import Any
 from rse_pf.backend.live_map.children import OwnerChild, OwnerChildren
 from rse_pf.backend.live_map.map_link import LinkContext, MapLink, begins_a_map
 from rse_pf.backend.live_map.owner.lease import LeaseRecord, OwnerLease, decode_lease, lease_name
+from rse_pf.backend.live_map.owner.link_security import server_context
 from rse_pf.backend.live_map.owner.process import OwnerOrder
 from rse_pf.backend.log import JsonLog
 from rse_pf.backend.sandbox.ipc import encode_message
@@ -171,6 +172,32 @@ def test_an_owner_whose_port_is_closed_is_replaced_at_once_by_those_who_were_con
         await until(lambda: (found := worker.lease()) is not None and found.epoch == 2)
         assert time.monotonic() - began_s < PlatformSettings().live.lease_s
         sent.cancel()
+
+    play(test)
+
+
+def test_a_link_that_ends_while_the_owner_has_not_welcomed_it_closes_its_connection() -> None:
+    async def test(worker: Worker) -> None:
+        is_greeted, is_gone = asyncio.Event(), asyncio.Event()
+
+        async def owner(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+            await reader.read(1)
+            is_greeted.set()
+            while await reader.read(1024):
+                pass
+            is_gone.set()
+            writer.close()
+
+        context, certificate = server_context("127.0.0.1", now_s=time.time())
+        server = await asyncio.start_server(owner, "127.0.0.1", 0, ssl=context)
+        elsewhere = OwnerLease(worker.store, LEASE, owner="b", server="there", clock=time.monotonic)
+        assert elsewhere.claim(None)
+        assert elsewhere.serve("127.0.0.1", server.sockets[0].getsockname()[1], certificate)
+        worker.link.set_watched(True)
+        await asyncio.wait_for(is_greeted.wait(), 10.0)
+        await worker.link.close()
+        await asyncio.wait_for(is_gone.wait(), 10.0)
+        server.close()
 
     play(test)
 
