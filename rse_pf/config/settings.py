@@ -167,7 +167,6 @@ class DataSettings:
     max_uploads: int = setting(32, doc="request bodies received at the same time; more are refused with 503 and Retry-After", low=1)
     background_bytes_per_s: int = setting(262144, unit="bytes/s", doc="rate at which a robot uploads keyframes in the background", low=1024)
     max_spool_bytes: int = setting(1073741824, unit="bytes", doc="keyframes that a robot keeps on its disk while it is offline", low=1024)
-    glacier_after_days: int = setting(90, unit="days", source="paper, Sect. 5.1", doc="what was not written for this long moves to Glacier Instant Retrieval, which is read like any object", low=30)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
