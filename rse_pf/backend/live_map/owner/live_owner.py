@@ -28,9 +28,8 @@ from rse_pf.backend.live_map.owner.log import (
 )
 from rse_pf.backend.live_map.owner.publisher import AUTOMATIC_NOTES, Publisher, version_to_start_from
 from rse_pf.backend.live_map.owner.replies import relocalise_reply, show_reply, version_reply
-from rse_pf.backend.live_map.owner.state import Applied, MapState, Measuring
+from rse_pf.backend.live_map.owner.state import Applied, MapState, Measuring, UpdateBook
 from rse_pf.backend.live_map.owner.threads import FIRST_RETRY_S, Urgency, next_retry_s
-from rse_pf.backend.live_map.owner.updates import UpdateBook
 from rse_pf.config import LiveSettings
 from rse_pf.errors import (
     BadRequest,

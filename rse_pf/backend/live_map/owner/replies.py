@@ -6,8 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 from rse_pf.backend.live_map.owner.lease import LeaseRecord
-from rse_pf.backend.live_map.owner.state import MapState
-from rse_pf.backend.live_map.owner.updates import upper_triangle
+from rse_pf.backend.live_map.owner.state import MapState, upper_triangle
 from rse_pf.identity import RobotId
 from rse_pf.live_map.events import matrix_bytes
 from rse_pf.maps.registry import MapRecord
