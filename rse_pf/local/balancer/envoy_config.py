@@ -148,6 +148,8 @@ def _listener(settings: PlatformSettings, port: int, lan: LanListener | None) ->
         "address": _address(settings.serving.host if lan is None else lan.address, port),
         # With the default a second Envoy would share a taken port in silence.
         "enable_reuse_port": False,
+        # Robots that are connected wait for no burst of new connections.
+        "max_connections_to_accept_per_socket_event": 1,
         # Behind a slow reader no more is kept, here and in the kernel, than a server would keep itself.
         "per_connection_buffer_limit_bytes": settings.serving.write_buffer_bytes,
         "socket_options": [_kernel_buffer(socket.SO_SNDBUF, settings), _unread_timeout(settings)],
