@@ -43,7 +43,8 @@ EXECUTED_IN = {
 }
 """Commands that need a store or a robot with a past: another test makes it, and runs them."""
 _START = re.compile(r"rse-pf local(?= --(?!lan)| *$)")
-_READY = re.compile(r"wss?://\S+")
+_READY, _PAGE = re.compile(r"wss?://\S+"), re.compile(r"fleet page +http\S+")
+"""What a platform prints when robots can connect, and when its page serves, a little later."""
 
 
 def todo() -> dict[str, list[Block]]:
@@ -73,7 +74,7 @@ class Reader:
         self._started: list[subprocess.Popen[str]] = []
 
     def start_platform(self, command: str, within: Path) -> None:
-        """Start a platform instead of the one that runs, and wait until it prints its address."""
+        """Start a platform instead of the one that runs, and wait until it prints its addresses."""
         self.leave()
         process = subprocess.Popen(
             ["bash", "-c", f"exec {command}"], cwd=within, env=self.environment, text=True,
@@ -91,7 +92,8 @@ class Reader:
 
         threading.Thread(target=read, daemon=True).start()
         told = ""
-        while not _READY.search(told):
+        ready = _READY if "--no-page" in command else _PAGE
+        while not ready.search(told):
             try:
                 line = lines.get(timeout=SOON_S)
             except Empty:
