@@ -18,10 +18,10 @@ if TYPE_CHECKING:
     from client_sdk.mapper import BlockingMapper, Mapper
     from client_sdk.mapping import MapOptions, PointMap, Trajectory
     from client_sdk.monocular.scale import MarkerScale, OdometryScale
-    from client_sdk.monocular_tracker import MonocularOptions
     from client_sdk.offloading.offload import CloudFirst
     from client_sdk.robot import Robot, connect
     from client_sdk.stats import Stats
+    from client_sdk.tracking.monocular_tracker import MonocularOptions
     from client_sdk.tracking.tracker import Tracker
     from client_sdk.transfer.background_upload import BackgroundUploader
     from client_sdk.transfer.data_client import DataClient, DataOptions
@@ -85,7 +85,7 @@ _HOMES = {
     "MapOptions": "mapping",
     "Mapper": "mapper",
     "MarkerScale": "monocular.scale",
-    "MonocularOptions": "monocular_tracker",
+    "MonocularOptions": "tracking.monocular_tracker",
     "OdometryScale": "monocular.scale",
     "OtherRobot": "live",
     "PointMap": "mapping",

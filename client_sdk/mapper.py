@@ -21,8 +21,8 @@ from client_sdk.answers import PoseAnswer
 from client_sdk.frontend import Features, Frame, FrontEndOptions, PoseQuery, TrackedFrame
 from client_sdk.mapping import MapOptions, PointMap, Trajectory, write_ply, write_trajectory
 from client_sdk.monocular.scale import MarkerScale, OdometryScale
-from client_sdk.monocular_tracker import MonocularOptions, MonocularTracker
-from client_sdk.tracking.segments import DriveRecords, keyframe_of
+from client_sdk.tracking.monocular_tracker import MonocularOptions, MonocularTracker
+from client_sdk.tracking.segments import DriveRecords, SegmentRecord, keyframe_of, tracker_record
 from client_sdk.tracking.tracker import Tracker
 from rse_pf.errors import ConfigurationError, RsePfError, UsageError
 from rse_pf.geometry import Array, Camera
@@ -138,7 +138,7 @@ class Mapper:
         self._adds_frames = adds_frames
         self._recorder = recorder
         self._joined = 0
-        self._is_metric = False
+        self._metric: set[int] = set()
         self._one_frame = asyncio.Lock()
         self._round_trips_ms: list[float] = []
         self._sources: Counter[str] = Counter()
@@ -189,9 +189,7 @@ class Mapper:
         tracker = self._tracker
         if not isinstance(tracker, MonocularTracker):
             return self._records.first.cloud
-        sparse = PointMap(self._map_options)
-        sparse.add_points(*tracker.points())
-        return sparse
+        return tracker_record(tracker, 0, self._map_options).cloud
 
     @property
     def trajectory(self) -> Trajectory:
@@ -220,7 +218,7 @@ class Mapper:
         """Where metres come from: ``metric, by depth``, ``metric, by ...``, or ``up to scale``."""
         if self._tracker is None or isinstance(self._tracker, Tracker):
             return "metric, by depth" if self._tracker is not None else "unknown: no frame yet"
-        return f"metric, by {self._scale.name}" if self._is_metric and self._scale else _UP_TO_SCALE
+        return f"metric, by {self._scale.name}" if 0 in self._metric and self._scale else _UP_TO_SCALE
 
     @property
     def unrecognised(self) -> int:
@@ -251,14 +249,14 @@ class Mapper:
         """Return the figures of the drive, as for ``report.json``."""
         trips = np.array(self._round_trips_ms)
         starting = self._tracker.starting_frames if isinstance(self._tracker, MonocularTracker) else 0
-        trajectory = self.trajectory
+        trajectory, apart = self.trajectory, self._apart()
         return {
             "frames": self.frames,
             "lost_frames": self.lost_frames,
             "frames_before_start": starting,
             "keyframes": self.keyframes,
-            "segments_apart": len(self._records.apart),
-            "frames_apart": sum(len(record.poses) for record in self._records.apart),
+            "segments_apart": len(apart),
+            "frames_apart": sum(len(record.poses) for record, _ in apart),
             "scale": self.scale,
             "unit": "unit of the map" if self.scale == _UP_TO_SCALE else "m",
             "path": round(trajectory.length_m, 3) if len(trajectory) > 1 else 0.0,
@@ -313,9 +311,10 @@ class Mapper:
             folder.mkdir(parents=True, exist_ok=True)
             write_ply(folder / "map.ply", points, colours, is_metric=is_metric)
             write_trajectory(folder / "trajectory.txt", self.trajectory, is_metric=is_metric)
-            for number, record in enumerate(self._records.apart, start=2):
-                write_ply(folder / f"map-{number}.ply", *record.cloud.points(), is_metric=True)
-                write_trajectory(folder / f"trajectory-{number}.txt", record.trajectory())
+            for number, (record, is_metric) in enumerate(self._apart(), start=2):
+                write_ply(folder / f"map-{number}.ply", *record.cloud.points(), is_metric=is_metric)
+                path = folder / f"trajectory-{number}.txt"
+                write_trajectory(path, record.trajectory(), is_metric=is_metric)
             text = json.dumps(report, indent=2) + "\n"
             (folder / "report.json").write_text(text, encoding="utf-8")
         except OSError as error:
@@ -323,6 +322,16 @@ class Mapper:
                 f"cannot write {folder}: {error.strerror}", hint="name another folder"
             ) from error
         return report
+
+    def _apart(self) -> list[tuple[SegmentRecord, bool]]:
+        """Return the segments that were not joined to the first one, and whether they are in metres."""
+        tracker = self._tracker
+        if not isinstance(tracker, MonocularTracker):
+            return [(record, True) for record in self._records.apart]
+        return [
+            (tracker_record(tracker, number, self._map_options), number in self._metric)
+            for number in tracker.segments[1:]
+        ]
 
     def _tracker_for(self, frame: Frame) -> Tracker | MonocularTracker:
         self.camera = self.camera or frame.camera
@@ -388,18 +397,21 @@ class Mapper:
         self, tracker: MonocularTracker, done: TrackedFrame, position_m: Array | None
     ) -> TrackedFrame:
         """Return the result in metres where they are known; a keyframe corrects poses that were returned."""
-        source, frame = self._scale, done.frame
+        source, frame, segment = self._scale, done.frame, done.segment
         corrected = done.keyframe
-        if source is not None and not self._is_metric:
+        self._metric.intersection_update(tracker.segments)
+        if source is not None and segment not in self._metric:
             source.observe(frame.timestamp_s, frame.rgb, position_m)
             if done.T_world_camera is not None:
-                path = tracker.trajectory()
+                path = tracker.trajectory(segment)
                 scale = source.metres_per_unit(path.timestamps_s, path.T_world_camera, frame.camera)
                 if scale is not None:
-                    tracker.rescale(scale)
-                    self._is_metric = corrected = True
-                    done = replace(done, T_world_camera=tracker.trajectory().T_world_camera[-1])
-        return replace(done, corrected=corrected, scale="metric" if self._is_metric else "up to scale")
+                    tracker.rescale(scale, segment)
+                    self._metric.add(segment)
+                    corrected = True
+                    done = replace(done, T_world_camera=tracker.trajectory(segment).T_world_camera[-1])
+        is_metric = segment in self._metric
+        return replace(done, corrected=corrected, scale="metric" if is_metric else "up to scale")
 
 
 class BlockingMapper:

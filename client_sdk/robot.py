@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from client_sdk.mapper import Mapper
     from client_sdk.mapping import MapOptions
     from client_sdk.monocular.scale import MarkerScale, OdometryScale
-    from client_sdk.monocular_tracker import MonocularOptions
+    from client_sdk.tracking.monocular_tracker import MonocularOptions
     from rse_pf.geometry import Camera
     from rse_pf.pnp import DepthNoise, PnpOptions
 

@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from rse_pf.geometry import Array, Camera, exp_se3
 
-__all__ = ["Bundle", "adjust", "refine_pose", "reprojection_errors"]
+__all__ = ["Bundle", "adjust", "reprojection_errors"]
 
 Rows = npt.NDArray[np.int64]
 
@@ -60,32 +60,6 @@ def reprojection_errors(
     residuals = _residuals(points, pixels, camera)
     distances = np.where(z > _MIN_DEPTH, np.hypot(residuals[:, 0], residuals[:, 1]), np.inf)
     return distances, z
-
-
-def refine_pose(
-    T_camera_world: Array,
-    points_world: Array,
-    pixels: Array,
-    sigma_px: Array,
-    camera: Camera,
-    *,
-    iterations: int = 8,
-) -> Array:
-    """Return the pose of one camera that agrees best with ``(n, 3)`` points, robustly (Gauss-Newton)."""
-    pose = T_camera_world
-    for _ in range(iterations):
-        points = _moved(pose, points_world)
-        J, _ = _jacobians(points, pose[:3, :3], camera)
-        residuals = _residuals(points, pixels, camera) / sigma_px[:, None]
-        J = J / sigma_px[:, None, None]
-        weights = _huber_weights(residuals) * (points[:, 2] > _MIN_DEPTH)
-        weighted = J * weights[:, None, None]
-        H = np.einsum("nij,nik->jk", weighted, J)
-        step = np.linalg.lstsq(H, -np.einsum("nij,ni->j", weighted, residuals), rcond=None)[0]
-        pose = exp_se3(step) @ pose
-        if np.abs(step).max() < 1e-7:
-            break
-    return pose
 
 
 def adjust(bundle: Bundle, camera: Camera, *, iterations: int = 8) -> tuple[Array, Array]:

@@ -1,6 +1,6 @@
-"""Match binary descriptors: all against all, or only near predicted pixels.
+"""Match binary descriptors, all against all.
 
-Deterministic.  Every match is one to one.
+Deterministic.  Every match is one to one; matches near predicted pixels are found by `rse_pf.slam.tracking`.
 """
 
 from __future__ import annotations
@@ -11,11 +11,9 @@ import numpy as np
 import numpy.typing as npt
 
 from client_sdk.monocular.opencv import load_opencv
-from rse_pf.geometry import Array
 from rse_pf.native_matcher import MatchCore, match_core
-from rse_pf.slam.tracking import pairs_within
 
-__all__ = ["match_all", "match_near"]
+__all__ = ["match_all"]
 
 Descriptors = npt.NDArray[np.uint8]
 Rows = npt.NDArray[np.int64]
@@ -57,45 +55,6 @@ def _all_by_core(
     order = np.argsort(rows, kind="stable")
     order = order[distances[order] <= max_distance]
     return rows[order], columns[order]
-
-
-def match_near(
-    predicted: Array,
-    wanted: Descriptors,
-    pixels: Array,
-    descriptors: Descriptors,
-    *,
-    radius_px: float,
-    ratio: float = 0.9,
-    max_distance: int = 50,
-) -> tuple[Rows, Rows]:
-    """Return rows of *wanted* and rows of *descriptors* that match within a radius of the prediction.
-
-    Args:
-        predicted: ``(m, 2)`` pixels where the wanted descriptors are expected.
-        wanted: ``(m, 32)``.
-        pixels: ``(n, 2)`` of the features of the image.
-        descriptors: ``(n, 32)``.
-        radius_px: Of the search.
-        ratio: The best must be this much closer than the second best within the radius.
-        max_distance: Largest Hamming distance.
-    """
-    empty = np.empty(0, dtype=np.int64)
-    if not len(predicted) or not len(pixels):
-        return empty, empty
-    rows, columns = pairs_within(predicted, pixels, radius_px)
-    if not len(rows):
-        return empty, empty
-    distances = _BITS[wanted[rows] ^ descriptors[columns]].sum(axis=1, dtype=np.int64)
-    order = np.lexsort((distances, rows))
-    rows, columns, distances = rows[order], columns[order], distances[order]
-    starts = np.flatnonzero(np.concatenate(([True], rows[1:] != rows[:-1])))
-    follows = np.minimum(starts + 1, len(rows) - 1)
-    has_second = (rows[follows] == rows[starts]) & (follows > starts)
-    second = np.where(has_second, distances[follows], 1 << 20)
-    best = distances[starts]
-    clear = (best <= max_distance) & (best < ratio * second)
-    return _one_to_one(rows[starts][clear], columns[starts][clear], best[clear])
 
 
 def _one_to_one(rows: Rows, columns: Rows, distances: npt.NDArray[Any]) -> tuple[Rows, Rows]:

@@ -1,4 +1,7 @@
-"""What a mapper keeps of each segment of a drive: poses, cloud and keyframes, until segments are joined."""
+"""What a mapper keeps of each segment of a drive: poses, cloud and keyframes, until segments are joined.
+
+A tracker without depth keeps its segments itself, since each keyframe corrects them; here is their record.
+"""
 
 from __future__ import annotations
 
@@ -8,11 +11,12 @@ import numpy as np
 
 from client_sdk.frontend import Features, TrackedFrame
 from client_sdk.mapping import MapOptions, PointMap, Trajectory
+from client_sdk.tracking.monocular_tracker import MonocularTracker
 from client_sdk.tracking.tracker import Join
 from rse_pf.geometry import Array, rigid
 from rse_pf.maps.format import Keyframe
 
-__all__ = ["DriveRecords", "SegmentRecord"]
+__all__ = ["DriveRecords", "SegmentRecord", "keyframe_of", "tracker_record"]
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
@@ -69,6 +73,14 @@ class DriveRecords:
             replace(keyframe, T_world_camera=_moved(join.T_into_segment, keyframe.T_world_camera))
             for keyframe in record.keyframes
         ]
+
+
+def tracker_record(tracker: MonocularTracker, segment: int, options: MapOptions) -> SegmentRecord:
+    """Return a segment of a tracker without depth, as it is corrected now; its cloud are the landmarks."""
+    cloud = PointMap(options)
+    cloud.add_points(*tracker.points(segment))
+    path = tracker.trajectory(segment)
+    return SegmentRecord(cloud=cloud, stamps_s=path.timestamps_s.tolist(), poses=list(path.T_world_camera))
 
 
 def keyframe_of(tracked: TrackedFrame, pose: Array, features: Features, robot: str) -> Keyframe:

@@ -25,7 +25,7 @@ from client_sdk.frontend import (
 from client_sdk.monocular.descriptors import match_all
 from client_sdk.tracking.keyframe_map import NO_LANDMARK, KeyframeMap, Landmarks, View, expect
 from client_sdk.tracking.noise import NoiseEstimate
-from rse_pf.errors import UsageError
+from client_sdk.tracking.queries import Answer, OneQuery, Steps
 from rse_pf.geometry import Array, inverse, pose_difference, rigid, transform
 from rse_pf.pnp import DepthNoise
 from rse_pf.slam.tracking import (
@@ -62,25 +62,18 @@ _JOIN_EVERY = 3
 _JOIN_M, _JOIN_DEG = 0.15, 4.0
 """Two measurements of where a segment lies agree within this."""
 
-_Steps = Generator[PoseQuery, "_Answer", TrackedFrame]
-
-
-@dataclass(frozen=True, slots=True)
-class _Answer:
-    """The pose of the camera in the query's frame, or None; how many agree; and whether it is weak."""
-
-    T_camera_world: Array | None
-    inliers: int
-    is_weak: bool
-
 
 @dataclass(frozen=True, slots=True)
 class Join:
-    """A segment lies in another one: poses of *segment* are ``T_into_segment @ pose`` in *into*."""
+    """A segment lies in another one: poses of *segment* are ``T_into_segment @ pose`` in *into*.
+
+    Without depth the lengths of *segment* are multiplied by *scale* before.
+    """
 
     segment: int
     into: int
     T_into_segment: Array
+    scale: float = 1.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -154,8 +147,7 @@ class Tracker:
         self._place: tuple[int, Array] | None = None
         self._frame: Frame  # set by `prepare`
         self._features: Features
-        self._steps: _Steps | None = None
-        self._query: PoseQuery | None = None
+        self._open = OneQuery()
 
     @property
     def last_features(self) -> Features | None:
@@ -173,7 +165,7 @@ class Tracker:
         Raises:
             UsageError: A query is open.
         """
-        self._refuse_open_query()
+        self._open.refuse_open()
         self._T_world_start = self._T_last = T_world_start
         self._segments.clear()
         self._segment, self._last, self._place = -1, None, None
@@ -188,11 +180,10 @@ class Tracker:
         Raises:
             UsageError: The last query was not answered yet.
         """
-        self._refuse_open_query()
+        self._open.refuse_open()
         self.frames += 1
         self._frame, self._features = frame, extract(frame, self.options)
-        self._steps = self._track(_view_of(frame, self._features))
-        return self._advance(None)
+        return self._open.begin(self._track(_view_of(frame, self._features)))
 
     def accept(
         self, query: PoseQuery, T_camera_world: Array | None, inliers: int = 0, *, is_weak: bool = False
@@ -209,31 +200,11 @@ class Tracker:
         Raises:
             UsageError: *query* is not the open one.
         """
-        if query is not self._query:
-            raise UsageError("this query is not the open one", hint="answer each query once, in order")
-        self._query = None
-        return self._advance(_Answer(T_camera_world, inliers, is_weak))
-
-    def _refuse_open_query(self) -> None:
-        if self._query is not None:
-            raise UsageError(
-                f"the query of frame {self._query.timestamp_s:.3f} s is open",
-                hint="call accept with its answer, or with None",
-            )
-
-    def _advance(self, answer: _Answer | None) -> PoseQuery | TrackedFrame:
-        assert self._steps is not None
-        try:
-            self._query = next(self._steps) if answer is None else self._steps.send(answer)
-        except StopIteration as end:
-            self._steps = None
-            result: TrackedFrame = end.value
-            return result
-        return self._query
+        return self._open.answer(query, Answer(T_camera_world, inliers, is_weak))
 
     # --- one frame ---
 
-    def _track(self, view: View) -> _Steps:
+    def _track(self, view: View) -> Steps:
         """Return the result of a frame, and yield the queries that it needs."""
         if not self._segments:
             return self._begin_or_lose(view, matches=0)
@@ -254,7 +225,7 @@ class Tracker:
             yield from self._seek_join(posed)
         return self._result(posed, keyframe=keyframe)
 
-    def _follow(self, view: View, how: str) -> Generator[PoseQuery, _Answer, tuple[_Posed | None, int]]:
+    def _follow(self, view: View, how: str) -> Generator[PoseQuery, Answer, tuple[_Posed | None, int]]:
         """Yield a query against what the last pose predicts, or against the last frame alone."""
         assert self._last is not None
         least = self.options.min_inliers
@@ -274,7 +245,7 @@ class Tracker:
             return None, len(seen)
         return self._confirm(view, T, answer, len(seen), self._map()), len(seen)
 
-    def _recognise(self, view: View) -> Generator[PoseQuery, _Answer, tuple[_Posed | None, int]]:
+    def _recognise(self, view: View) -> Generator[PoseQuery, Answer, tuple[_Posed | None, int]]:
         """Yield queries against the latest and the most alike keyframes of all segments."""
         candidates = []
         for segment, number in self._candidates(view):
@@ -311,7 +282,7 @@ class Tracker:
                 numbers = [*range(len(known) - 1, max(-1, len(known) - 1 - _LATEST), -1), *numbers]
             yield from ((segment, number) for number in dict.fromkeys(numbers))
 
-    def _seek_join(self, posed: _Posed) -> Generator[PoseQuery, _Answer, None]:
+    def _seek_join(self, posed: _Posed) -> Generator[PoseQuery, Answer, None]:
         """Yield a query for the place of a tracked frame in another segment; join the two when two agree."""
         options = []
         for segment, known in self._segments.items():
@@ -420,7 +391,7 @@ class Tracker:
             against=against,  # type: ignore[arg-type]
         )
 
-    def _placed(self, answer: _Answer, T_reference: Array, matches: int, ratio: float) -> Array | None:
+    def _placed(self, answer: Answer, T_reference: Array, matches: int, ratio: float) -> Array | None:
         """Return ``T_world_camera`` of an answer, None if too few agree or it is no pose."""
         asked = min(matches, self.options.max_matches)
         if answer.T_camera_world is None or answer.inliers < max(self.options.min_inliers, ratio * asked):
@@ -434,7 +405,7 @@ class Tracker:
         return moved_m <= limit_m
 
     def _confirm(
-        self, view: View, T_world_camera: Array, answer: _Answer, matches: int, known: KeyframeMap
+        self, view: View, T_world_camera: Array, answer: Answer, matches: int, known: KeyframeMap
     ) -> _Posed | None:
         """Match the local map near the pose, and fit the pose to all that agrees; None if little does."""
         seen = self._seen(view, T_world_camera, _CONFIRM_PX, _CONFIRM, known, _ENOUGH)

@@ -19,7 +19,6 @@ LONGER = frozenset({
     "client_sdk/live/sender.py: KeyframeSender.__init__",
     "client_sdk/mapper.py: Mapper.__init__",
     "client_sdk/mapper.py: PoseSolver.solve_pnp",
-    "client_sdk/monocular/descriptors.py: match_near",
     "client_sdk/network/connection.py: Connection.__init__",
     "client_sdk/network/dialling.py: DialError.__init__",
     "client_sdk/offloading/asking.py: Asking.__init__",

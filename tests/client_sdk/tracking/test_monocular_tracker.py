@@ -1,0 +1,233 @@
+"""The tracker without depth: starts, segments, joins with their scale, and loops."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from client_sdk.frontend import Frame, PoseQuery, TrackedFrame
+from client_sdk.mapping import Trajectory
+from client_sdk.tracking.keyframe_map import NO_LANDMARK
+from client_sdk.tracking.landmark_map import LandmarkMap, ViewFeatures
+from client_sdk.tracking.monocular_tracker import MonocularOptions, MonocularTracker
+from rse_pf.errors import PnpError, UsageError
+from rse_pf.geometry import Array, exp_se3, inverse, pose_difference, transform
+from rse_pf.pnp import PnpOptions, solve_pnp
+from rse_pf.slam.tracking import ImageFeatures, distinct_distances
+from tests.client_sdk.mapper.flat_world import CAMERA, frame_at
+
+pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
+
+OPTIONS = MonocularOptions(segment_after=3)
+
+
+def frame(row: int, stamp_s: float) -> Frame:
+    return replace(frame_at(row, depth=False), timestamp_s=stamp_s)
+
+
+def foreign(row: int, stamp_s: float) -> Frame:
+    """Return a frame of another place: the same world as a negative, mirrored."""
+    here = frame(row, stamp_s)
+    return replace(here, rgb=np.ascontiguousarray(255 - here.rgb[:, ::-1]))
+
+
+def covered(stamp_s: float) -> Frame:
+    here = frame(0, stamp_s)
+    return replace(here, rgb=np.zeros_like(here.rgb))
+
+
+def solve(query: PoseQuery) -> tuple[Array | None, int]:
+    found = query.correspondences
+    options = PnpOptions(inlier_px=query.inlier_px, max_iterations=query.max_iterations)
+    try:
+        solution = solve_pnp(found.points_world, found.pixels, query.camera, options)
+    except PnpError:
+        return None, 0
+    return solution.T_camera_world, len(solution.inliers)
+
+
+def run(tracker: MonocularTracker, shown: Frame) -> TrackedFrame:
+    step = tracker.prepare(shown)
+    while isinstance(step, PoseQuery):
+        step = tracker.accept(step, *solve(step))
+    return step
+
+
+def run_all(tracker: MonocularTracker, frames: Iterable[Frame]) -> list[TrackedFrame]:
+    return [run(tracker, shown) for shown in frames]
+
+
+def assert_places(path: Trajectory, rows: dict[float, int], tolerance: float = 0.05) -> None:
+    """Check that positions are those of the rows of the frames, in one unit of length."""
+    x = path.positions[:, 0]
+    wanted = np.array([rows[round(float(stamp_s), 6)] for stamp_s in path.timestamps_s], dtype=float)
+    steps = np.polyfit(wanted, x, 1)
+    assert np.abs(x - np.polyval(steps, wanted)).max() < tolerance * abs(steps[0]) * np.ptp(wanted)
+
+
+def test_a_start_that_waited_for_a_place_which_is_gone_begins_at_the_next_one() -> None:
+    tracker = MonocularTracker(OPTIONS)
+
+    # The camera looks elsewhere for a moment, and then moves on; frames 0 and 1 are of no use.
+    shown = [foreign(0, 0.0), foreign(0, 0.1), *(frame(row, 0.2 + row / 10) for row in range(8))]
+    done = run_all(tracker, shown)
+
+    assert done[-1].status == "tracked"
+    assert len(tracker.trajectory()) == 8
+    assert tracker.trajectory().timestamps_s[0] == pytest.approx(0.2)
+
+
+def test_the_motion_before_the_start_is_that_of_the_first_frames_after_it() -> None:
+    tracker = MonocularTracker(OPTIONS)
+
+    done = run_all(tracker, (frame(row, row / 10) for row in range(10)))
+
+    first = next(row for row, tracked in enumerate(done) if tracked.status == "tracked")
+    assert [tracked.status for tracked in done[first:]] == ["tracked"] * (10 - first)
+    assert_places(tracker.trajectory(), {row / 10: row for row in range(10)})
+
+
+def test_a_second_place_gets_a_segment_of_its_own_and_is_never_joined() -> None:
+    tracker = MonocularTracker(OPTIONS)
+    run_all(tracker, (frame(row, row / 10) for row in range(10)))
+
+    cut = run_all(tracker, (foreign(row, 1.0 + row / 10) for row in range(14)))
+
+    assert {tracked.status for tracked in cut[:3]} == {"lost"}
+    assert [tracked.segment for tracked in cut[6:]] == [1] * 8
+    assert all("not joined" in tracked.reason for tracked in cut[6:])
+    assert tracker.joins == []
+    assert tracker.segments == (0, 1)
+    assert tracker.lost_frames == 0  # those before the second start were placed by it
+    assert len(tracker.trajectory(0)) == 10
+    assert len(tracker.trajectory(1)) == 14
+
+
+def test_a_camera_that_is_back_goes_on_in_the_first_segment() -> None:
+    tracker = MonocularTracker(OPTIONS)
+    run_all(tracker, (frame(row, row / 10) for row in range(10)))
+    run_all(tracker, (foreign(row, 1.0 + row / 10) for row in range(14)))
+
+    back = run(tracker, frame(6, 3.0))
+
+    assert (back.segment, back.status, back.reason) == (0, "tracked", "")
+
+
+def test_a_covered_lens_begins_no_segment_and_the_map_goes_on_after_it() -> None:
+    tracker = MonocularTracker(OPTIONS)
+    run_all(tracker, (frame(row, row / 10) for row in range(10)))
+
+    while_covered = run_all(tracker, (covered(1.0 + row / 10) for row in range(30)))
+    uncovered = run(tracker, frame(3, 4.0))
+
+    assert {tracked.status for tracked in while_covered} == {"lost"}
+    assert (uncovered.status, uncovered.segment) == ("tracked", 0)
+    assert tracker.lost_frames == 30
+    assert_places(tracker.trajectory(), {**{row / 10: row for row in range(10)}, 4.0: 3})
+
+
+def test_a_segment_that_reaches_a_known_place_is_joined_in_the_unit_of_the_older_one() -> None:
+    tracker = MonocularTracker(OPTIONS, T_world_start=exp_se3([0.0, 0.0, 1.0, 0.0, 0.0, 0.0]))
+    run_all(tracker, (frame(row, row / 10) for row in range(8)))
+    tracker.rescale(3.0)  # so that the units differ
+    rows = {row / 10: row for row in range(8)}
+
+    # The cut: 26 frames on, where nothing of before is in view; then the way back to it.
+    back = list(range(60, 3, -1))
+    done = []
+    for number, row in enumerate(back):
+        rows[round(2.0 + number / 10, 6)] = row
+        done.append(run(tracker, frame(row, 2.0 + number / 10)))
+
+    assert [(join.segment, join.into) for join in tracker.joins] == [(1, 0)]
+    assert 2.0 < tracker.joins[0].scale < 4.5
+    assert tracker.segments == (0,)
+    assert (done[-1].segment, done[-1].reason) == (0, "")
+    path = tracker.trajectory()
+    assert len(path) == len(rows)
+    assert_places(path, rows)
+    assert np.median(np.abs(path.positions[:, 1:] - [0.0, 1.0])) < 0.05 * np.ptp(path.positions[:, 0])
+
+
+def test_one_query_at_a_time_and_one_camera() -> None:
+    tracker = MonocularTracker(OPTIONS)
+    run_all(tracker, (frame(row, row / 10) for row in range(8)))
+
+    query = tracker.prepare(frame(8, 0.8))
+    assert isinstance(query, PoseQuery)
+    with pytest.raises(UsageError, match="query"):
+        tracker.prepare(frame(9, 0.9))
+    while isinstance(query, PoseQuery):
+        query = tracker.accept(query, None)
+    assert query.status == "lost"
+    with pytest.raises(UsageError, match="another one"):
+        tracker.prepare(replace(frame(9, 0.9), camera=replace_focal(600.0)))
+
+
+def replace_focal(fx: float):  # type: ignore[no-untyped-def]
+    return type(CAMERA)(fx=fx, fy=fx, cx=CAMERA.cx, cy=CAMERA.cy, width=CAMERA.width, height=CAMERA.height)
+
+
+def map_of(poses: Array, world: Array) -> LandmarkMap:
+    """Return a map whose keyframes see all of *world*, with one descriptor for each point."""
+    made = LandmarkMap(CAMERA)
+    descriptors = np.random.default_rng(3).integers(0, 256, (len(world), 32), dtype=np.uint8)
+    for pose in poses:
+        pixels = CAMERA.project(transform(pose, world))
+        image = ImageFeatures(
+            pixels=pixels, descriptors=descriptors, turns=np.tile([1.0, 0.0], (len(world), 1)),
+            sizes=np.ones(len(world)), distinct=distinct_distances(descriptors, pixels),
+        )  # fmt: skip
+        colours = np.zeros((len(world), 3), dtype=np.uint8)
+        made.add_keyframe(ViewFeatures(image=image, colours=colours), pose, np.full(len(world), NO_LANDMARK))
+    rows = np.arange(len(world))
+    made.add_landmarks(world, (0, rows), (1, rows))
+    return made
+
+
+def side_by_side(count: int) -> tuple[Array, Array]:
+    rng = np.random.default_rng(4)
+    world = np.column_stack((rng.uniform(-0.5, 0.5, 60), rng.uniform(-0.4, 0.4, 60), rng.uniform(2, 3, 60)))
+    return np.stack([exp_se3([-0.02 * row, 0.0, 0.0, 0.0, 0.0, 0.0]) for row in range(count)]), world
+
+
+def test_a_map_that_moves_sees_its_points_at_the_same_pixels() -> None:
+    poses, world = side_by_side(3)
+    made = map_of(poses, world)
+
+    made.move(exp_se3([1.0, 2.0, 3.0, 0.2, 0.1, 0.3]), 2.5)
+
+    for keyframe in made.keyframes:
+        seen = CAMERA.project(transform(keyframe.T_camera_world, made.points))
+        np.testing.assert_allclose(seen, keyframe.features.image.pixels, atol=1e-6)
+
+
+def test_a_map_is_bent_by_all_at_its_newer_end_and_by_nothing_at_its_older_one() -> None:
+    poses, world = side_by_side(11)
+    made = map_of(poses, world)
+    T, scale = exp_se3([0.1, 0.0, 0.2, 0.0, 0.1, 0.0]), 1.3
+
+    made.bend(0, 10, T, scale)
+
+    np.testing.assert_allclose(made.keyframes[0].T_camera_world, poses[0], atol=1e-9)
+    centres = [inverse(keyframe.T_camera_world)[:3, 3] for keyframe in made.keyframes]
+    before = inverse(poses[10])[:3, 3]
+    np.testing.assert_allclose(centres[10], transform(T, scale * before[None])[0], atol=1e-9)
+    _, turned_deg = pose_difference(made.keyframes[5].T_camera_world, poses[5])
+    assert turned_deg == pytest.approx(np.degrees(0.05), abs=1e-6)
+
+
+def test_two_landmarks_at_one_feature_become_one_that_all_keyframes_see() -> None:
+    poses, world = side_by_side(4)
+    made = map_of(poses, world)
+    rows = np.arange(len(world))
+    made.add_landmarks(world + 1e-4, (2, rows), (3, rows))  # the same points, seen by two others
+
+    count = made.fuse(3, made.landmarks_of(0), 3.0)
+
+    assert count > 50
+    assert len(made) == 2 * len(world) - count
+    assert made.shared_with(2)[0] == made.shared_with(3)[0] == count
