@@ -355,7 +355,7 @@ export const connect = async (url, options = {}) => {
       // Not so long if the clock of this machine is set, which may make tokens valid, or if there is another token
       // or a network.
       while (now() < until && !error && trouble === before && isOnline() === wasOnline && Math.abs(clockOffset() - offset) < CLOCK_SET_S) {
-        await pause(min(0.25, until - now()));
+        await pause(0.1);
       }
       if (error) break;
       if (isOnline() !== wasOnline) failingAt = Infinity;
@@ -370,8 +370,11 @@ export const connect = async (url, options = {}) => {
         } catch (failed) {
           if (adoptedAt < 0 && (lasts(failed) || attempt >= FIRST_TRIES)) end(failed);
           note(failed);
-          if (!failed._isUnanswered) failingAt = min(failingAt, now());
-          else if (adoptedAt >= 0) attempt--;
+          // Whoever was not reached need not be spared.
+          if (failed._isUnanswered) {
+            failingAt = Infinity;
+            if (adoptedAt >= 0) attempt--;
+          } else failingAt = min(failingAt, now());
         }
       }
     }

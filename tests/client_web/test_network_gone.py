@@ -101,3 +101,22 @@ say({ second: await nextDial(5) });
 """)
 
     assert told["second"] >= 0.95, told
+
+
+def test_an_attempt_that_reached_nobody_ends_the_time_for_which_a_server_is_spared() -> None:
+    """A robot whose network went twice within seconds waited as if a server had refused it all the while."""
+    told = told_by("""
+globalThis.fetch = async () => ({ status: 200, json: async () => ({}) });
+let isRefused = true;
+await lose((socket) => isRefused && failAtOnce(socket), { connectTimeoutMs: 100 });
+await nextDial(5);
+isRefused = false;
+await nextDial(5);
+const now = performance.now.bind(performance);
+performance.now = () => now() + 60e3; // the first attempt was refused a minute ago
+isRefused = true;
+await nextDial(5);
+say({ gap: await nextDial(5) });
+""")
+
+    assert told["gap"] is not None, told
