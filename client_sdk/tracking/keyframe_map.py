@@ -6,7 +6,7 @@ fused by their noise.  Nothing is matched here, and no keyframe is ever moved bu
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
@@ -33,10 +33,14 @@ _FUSED_FLOOR_M2 = 0.003**2 / 20.0
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class View:
-    """One image: its features, and their ``(n, 3)`` points in the camera's frame, NaN without depth."""
+    """One image: its features, and their ``(n, 3)`` points in the camera's frame, NaN without depth.
+
+    ``sways`` ``(n, 3)`` is how far the points move for each second that the camera's readout takes longer.
+    """
 
     features: ImageFeatures
     points_camera: Array
+    sways: Array
     camera: Camera
 
 
@@ -46,7 +50,8 @@ class Landmarks:
 
     ``points`` ``(n, 3)``; ``spreads`` ``(n, 3, 3)`` their covariances; ``rays`` ``(n, 3)`` from where they
     were seen last; ``turns`` ``(n, 3)`` their orientation there, in the world; ``sizes`` ``(n,)``;
-    ``numbers`` ``(n,)`` of the map, NO_LANDMARK for points that only the last image has.
+    ``numbers`` ``(n,)`` of the map, NO_LANDMARK for points that only the last image has; ``sways`` ``(n, 3)``
+    how far they move for each second that the camera's readout takes longer, empty without depth.
     """
 
     points: Array
@@ -56,6 +61,7 @@ class Landmarks:
     turns: Array
     sizes: Array
     numbers: Rows
+    sways: Array = field(default_factory=lambda: np.empty((0, 3)))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -101,6 +107,7 @@ class KeyframeMap:
         self._count = 0
         self._points: Array = np.empty((_FIRST_ROOM, 3))
         self._spreads: Array = np.empty((_FIRST_ROOM, 3, 3))
+        self._sways: Array = np.empty((_FIRST_ROOM, 3))
         self._descriptors: npt.NDArray[np.uint8] = np.empty((_FIRST_ROOM, 32), dtype=np.uint8)
         self._rays: Array = np.empty((_FIRST_ROOM, 3))
         self._turns: Array = np.empty((_FIRST_ROOM, 3))
@@ -149,6 +156,7 @@ class KeyframeMap:
         self._count += len(new)
         points, spreads = measure_points(view, T_world_camera, new, noise, pixel_px)
         self._points[numbers], self._spreads[numbers] = points, spreads
+        self._sways[numbers] = view.sways[new] @ T_world_camera[:3, :3].T
         for rows in (seen, new):
             self._note_look(landmarks[rows], view, T_world_camera, rows)
         keyframe = _Keyframe(view=view, landmarks=landmarks, own=np.sort(landmarks[landmarks != NO_LANDMARK]))
@@ -196,8 +204,10 @@ class KeyframeMap:
         points, spreads = measure_points(view, T_world_camera, rows, noise, pixel_px)
         known = numbers != NO_LANDMARK
         points[known], spreads[known] = self._points[numbers[known]], self._spreads[numbers[known]]
+        sways = view.sways[rows] @ T_world_camera[:3, :3].T
+        sways[known] = self._sways[numbers[known]]
         return Landmarks(
-            points=points, spreads=spreads, descriptors=view.features.descriptors[rows],
+            points=points, spreads=spreads, sways=sways, descriptors=view.features.descriptors[rows],
             rays=points - T_world_camera[:3, 3], turns=_turns_in_world(view, T_world_camera, rows),
             sizes=view.features.sizes[rows], numbers=numbers,
         )  # fmt: skip
@@ -213,8 +223,14 @@ class KeyframeMap:
         points, spreads = measure_points(view, T_world_camera, rows, noise, pixel_px)
         before = self._spreads[numbers]
         gain = before @ np.linalg.inv(before + spreads)
+        sways = view.sways[rows] @ T_world_camera[:3, :3].T
         self._points[numbers] += np.einsum("nij,nj->ni", gain, points - self._points[numbers])
+        self._sways[numbers] += np.einsum("nij,nj->ni", gain, sways - self._sways[numbers])
         self._spreads[numbers] = (np.eye(3) - gain) @ before + _FUSED_FLOOR_M2 * np.eye(3)
+
+    def lengthen_readout(self, more_s: float) -> None:
+        """Move all landmarks to where they are if the camera reads an image for so many seconds longer."""
+        self._points[: self._count] += more_s * self._sways[: self._count]
 
     def move(self, T_new_old: Array) -> None:
         """Express the whole map in another frame."""
@@ -222,6 +238,7 @@ class KeyframeMap:
         self._poses = T_new_old @ self._poses
         self._points[:count] = transform(T_new_old, self._points[:count])
         self._spreads[:count] = rotation @ self._spreads[:count] @ rotation.T
+        self._sways[:count] = self._sways[:count] @ rotation.T
         self._rays[:count] = self._rays[:count] @ rotation.T
         self._turns[:count] = self._turns[:count] @ rotation.T
 
@@ -241,7 +258,7 @@ class KeyframeMap:
 
     def _landmarks(self, numbers: Rows) -> Landmarks:
         return Landmarks(
-            points=self._points[numbers], spreads=self._spreads[numbers],
+            points=self._points[numbers], spreads=self._spreads[numbers], sways=self._sways[numbers],
             descriptors=self._descriptors[numbers], rays=self._rays[numbers], turns=self._turns[numbers],
             sizes=self._sizes[numbers], numbers=numbers,
         )  # fmt: skip
@@ -255,7 +272,7 @@ class KeyframeMap:
 
     def _arrays(self) -> tuple[npt.NDArray[np.generic], ...]:
         return (
-            self._points, self._spreads, self._descriptors, self._rays, self._turns, self._sizes
+            self._points, self._spreads, self._sways, self._descriptors, self._rays, self._turns, self._sizes
         )  # fmt: skip
 
     def _make_room(self, count: int) -> None:
@@ -269,8 +286,9 @@ class KeyframeMap:
             return larger
 
         arrays = [grown(array) for array in self._arrays()]
-        self._points, self._spreads, self._descriptors = arrays[0], arrays[1], arrays[2]  # type: ignore[assignment]
-        self._rays, self._turns, self._sizes = arrays[3], arrays[4], arrays[5]  # type: ignore[assignment]
+        self._points, self._spreads, self._sways = arrays[0], arrays[1], arrays[2]  # type: ignore[assignment]
+        self._descriptors, self._rays = arrays[3], arrays[4]  # type: ignore[assignment]
+        self._turns, self._sizes = arrays[5], arrays[6]  # type: ignore[assignment]
 
     def _thin(self, current: Rows) -> Rows:
         """Drop every second keyframe of the older half, and landmarks that none sees; renumber *current*."""

@@ -26,14 +26,17 @@ from client_sdk.monocular.descriptors import match_all
 from client_sdk.tracking.keyframe_map import NO_LANDMARK, KeyframeMap, Landmarks, View, expect
 from client_sdk.tracking.noise import NoiseEstimate
 from client_sdk.tracking.queries import Answer, OneQuery, Steps
+from client_sdk.tracking.shutter import ReadoutEstimate, sways, turn_rate, without_shutter
 from rse_pf.geometry import Array, inverse, pose_difference, rigid, transform
 from rse_pf.pnp import DepthNoise
 from rse_pf.slam.tracking import (
+    FittedPose,
     ImageFeatures,
     NearLimits,
     Observations,
     distinct_distances,
     fit_pose,
+    fit_sway,
     match_near,
 )
 
@@ -56,6 +59,8 @@ _ENOUGH = 120
 """With so many landmarks of the map a pose needs no points of the last frame: a chain of frames drifts."""
 _MOST_JUMPS = 4
 """A camera that was lost for long may have moved by so many limits, or its place must be clear."""
+_LEAST_ROWS, _LEAST_INTERVAL_S = 30, 1e-3
+"""An image with fewer landmarks with depth says nothing of the shutter."""
 _QUERIES = 3
 """So many keyframes are asked for the place of one frame, those with the most matches first."""
 _JOIN_EVERY = 3
@@ -120,7 +125,7 @@ class Tracker:
 
     ``frames`` counts the frames prepared so far, ``lost_frames`` those of them without an accepted pose, and
     ``unrecognised`` those since the last pose that show enough and no known place; a covered lens is none.
-    ``joins`` are the joins so far, in their order.
+    ``joins`` are the joins so far, in their order; ``noise`` and ``readout`` are estimates of the camera's.
     """
 
     def __init__(
@@ -135,23 +140,28 @@ class Tracker:
         self.unrecognised = 0
         self.joins: list[Join] = []
         self.noise = NoiseEstimate()
+        self.readout = ReadoutEstimate()
         self._T_world_start = np.eye(4) if T_world_start is None else T_world_start
         self._segments: dict[int, KeyframeMap] = {}
         self._segment = -1
         self._begun = 0
         self._last: _Posed | None = None
         self._T_last: Array = self._T_world_start
+        self._last_s, self._more_s = 0.0, 0.0
         self._motion: Array = np.eye(4)
+        self._rate: Array = np.zeros(3)
+        self._first: tuple[Features, View] | None = None
         self._reference_seen = 0
         self._lost_in_a_row = 0
         self._place: tuple[int, Array] | None = None
         self._frame: Frame  # set by `prepare`
+        self._raw: Features
         self._features: Features
         self._open = OneQuery()
 
     @property
     def last_features(self) -> Features | None:
-        """The features of the last frame, if that has a pose."""
+        """The features of the last frame, without its rolling shutter, if that has a pose."""
         return self._features if self._last is not None else None
 
     @property
@@ -170,6 +180,7 @@ class Tracker:
         self._segments.clear()
         self._segment, self._last, self._place = -1, None, None
         self._motion, self._lost_in_a_row, self._begun, self.unrecognised = np.eye(4), 0, 0, 0
+        self._rate, self._first = np.zeros(3), None
 
     def prepare(self, frame: Frame) -> PoseQuery | TrackedFrame:
         """Take the next frame; return a query, or the result for the frame if none is needed.
@@ -182,8 +193,9 @@ class Tracker:
         """
         self._open.refuse_open()
         self.frames += 1
-        self._frame, self._features = frame, extract(frame, self.options)
-        return self._open.begin(self._track(_view_of(frame, self._features)))
+        self._frame, self._raw = frame, extract(frame, self.options)
+        self._features = self._raw
+        return self._open.begin(self._track(self._turned(_view_of(frame, self._raw), self._raw, self._rate)))
 
     def accept(
         self, query: PoseQuery, T_camera_world: Array | None, inliers: int = 0, *, is_weak: bool = False
@@ -412,17 +424,19 @@ class Tracker:
         least = self.options.min_inliers
         if len(seen) < least:
             return None
-        z = np.nan_to_num(view.points_camera[seen.features, 2], posinf=0.0, neginf=0.0)
-        noise: DepthNoise = self.noise.noise
-        observed = Observations(
-            points=seen.landmarks.points[seen.rows],
-            spreads=seen.landmarks.spreads[seen.rows],
-            pixels=view.features.pixels[seen.features],
-            pixels_px=_PIXEL_PX * view.features.sizes[seen.features],
-            depths_m=z,
-            depths_dev_m=np.sqrt(noise.variance_m2(z)),
-        )
+        observed = self._observe(view, seen)
         fitted = fit_pose(observed, view.camera, inverse(T_world_camera))
+        if fitted is not None and self._last is not None and known is self._map() and not self._lost_in_a_row:
+            T_fitted = inverse(fitted.T_camera_world)
+            rate = turn_rate(self._T_last, T_fitted, self._interval_s(), self._rate)
+            if self._first is not None and int(fitted.is_inlier.sum()) >= _CLEAR_INLIERS:
+                self._turn_first(*self._first, rate)
+                return self._confirm(view, T_fitted, answer, matches, self._map())
+            view = self._turned(view, self._raw, rate)
+            observed = self._observe(view, seen)
+            fitted = fit_pose(observed, view.camera, fitted.T_camera_world)
+            if fitted is not None:
+                self._learn_readout(view, seen, observed, fitted, rate)
         agreeing = 0 if fitted is None else int(fitted.is_inlier.sum())
         if fitted is None or agreeing < max(least, _CONFIRMED_RATIO * len(seen)):
             return None
@@ -438,6 +452,55 @@ class Tracker:
             matches=max(matches, len(seen)), is_weak=answer.is_weak,
         )  # fmt: skip
 
+    def _observe(self, view: View, seen: _Seen) -> Observations:
+        z = np.nan_to_num(view.points_camera[seen.features, 2], posinf=0.0, neginf=0.0)
+        noise: DepthNoise = self.noise.noise
+        return Observations(
+            points=seen.landmarks.points[seen.rows],
+            spreads=seen.landmarks.spreads[seen.rows],
+            pixels=view.features.pixels[seen.features],
+            pixels_px=_PIXEL_PX * view.features.sizes[seen.features],
+            depths_m=z,
+            depths_dev_m=np.sqrt(noise.variance_m2(z)),
+        )
+
+    # --- the shutter ---
+
+    def _interval_s(self) -> float:
+        return max(_LEAST_INTERVAL_S, self._frame.timestamp_s - self._last_s)
+
+    def _turned(self, view: View, raw: Features, rate: Array) -> View:
+        """Return an image without its rolling shutter, of a camera that turns at *rate*."""
+        features = without_shutter(raw, view.camera, self.readout.readout_s * rate)
+        return View(
+            features=replace(view.features, pixels=features.pixels),
+            points_camera=features.points_camera,
+            sways=sways(raw, features.points_camera, view.camera, rate),
+            camera=view.camera,
+        )
+
+    def _turn_first(self, raw: Features, view: View, rate: Array) -> None:
+        """Make the first keyframe of a segment again, now that a second image tells how the camera turned."""
+        assert self._last is not None
+        first = self._turned(view, raw, rate)
+        known = self._segments[self._segment] = KeyframeMap(self.options.max_keyframes)
+        none = np.full(len(first.features), NO_LANDMARK)
+        landmarks = known.add_keyframe(first, self._T_last, none, self.noise.noise, _PIXEL_PX)
+        self._last, self._first = replace(self._last, view=first, landmarks=landmarks), None
+
+    def _learn_readout(
+        self, view: View, seen: _Seen, observed: Observations, fitted: FittedPose, rate: Array
+    ) -> None:
+        """Correct the estimate of the readout by what an image with its pose tells."""
+        rows = np.flatnonzero(fitted.is_inlier & (observed.depths_m > 0.0))
+        if len(rows) < _LEAST_ROWS:
+            return
+        known = seen.landmarks.sways[seen.rows[rows]] @ fitted.T_camera_world[:3, :3].T
+        more_s, information = fit_sway(
+            observed.only(rows), known - view.sways[seen.features[rows]], view.camera, fitted.T_camera_world
+        )
+        self._more_s += self.readout.add(more_s, information, rate)
+
     # --- results ---
 
     def _keep(self, posed: _Posed) -> bool:
@@ -447,6 +510,11 @@ class Tracker:
             self._motion = np.eye(4)
         else:
             self._motion = _rotation_made(inverse(self._T_last) @ T)
+            self._rate = turn_rate(self._T_last, T, self._interval_s(), np.zeros(3))
+        self._last_s, self._first = self._frame.timestamp_s, None
+        self._features = replace(
+            self._raw, pixels=posed.view.features.pixels, points_camera=posed.view.points_camera
+        )
         self._lost_in_a_row, self.unrecognised, self._T_last = 0, 0, T
         keyframe = self._is_keyframe(posed)
         if not posed.is_weak:
@@ -460,6 +528,10 @@ class Tracker:
             view=posed.view, T_world_camera=T, landmarks=landmarks, inliers=posed.inliers,
             matches=posed.matches, is_weak=posed.is_weak,
         )  # fmt: skip
+        # After the image, which was measured with the readout of before, has become part of the map.
+        for segment in self._segments.values():
+            segment.lengthen_readout(self._more_s)
+        self._more_s = 0.0
         return keyframe
 
     def _is_keyframe(self, posed: _Posed) -> bool:
@@ -490,6 +562,7 @@ class Tracker:
         self._last = _Posed(
             view=view, T_world_camera=start, landmarks=landmarks, inliers=0, matches=0, is_weak=False
         )
+        self._first, self._last_s, self._rate = (self._raw, view), self._frame.timestamp_s, np.zeros(3)
         self._T_last, self._motion, self._place = start, np.eye(4), None
         self._lost_in_a_row, self.unrecognised, self._reference_seen = 0, 0, usable // 2
         return self._result(self._last, keyframe=True)
@@ -505,7 +578,7 @@ class Tracker:
     def _lose(self, matches: int) -> TrackedFrame:
         self.lost_frames += 1
         self._lost_in_a_row += 1
-        self._last = None
+        self._last, self._rate = None, np.zeros(3)
         return TrackedFrame(
             frame=self._frame, T_world_camera=None, keyframe=False, inliers=0, matches=matches,
             segment=self.segment,
@@ -537,6 +610,7 @@ def _joined(first: Landmarks, second: Landmarks) -> Landmarks:
     return Landmarks(
         points=np.concatenate([first.points, second.points]),
         spreads=np.concatenate([first.spreads, second.spreads]),
+        sways=np.concatenate([first.sways, second.sways]),
         descriptors=np.concatenate([first.descriptors, second.descriptors]),
         rays=np.concatenate([first.rays, second.rays]),
         turns=np.concatenate([first.turns, second.turns]),
@@ -550,7 +624,10 @@ def _view_of(frame: Frame, features: Features) -> View:
         pixels=features.pixels, descriptors=features.descriptors, turns=features.turns, sizes=features.sizes,
         distinct=distinct_distances(features.descriptors, features.pixels),
     )  # fmt: skip
-    return View(features=image, points_camera=features.points_camera, camera=frame.camera)
+    return View(
+        features=image, points_camera=features.points_camera, sways=np.zeros_like(features.points_camera),
+        camera=frame.camera,
+    )  # fmt: skip
 
 
 def _rotation_made(T: Array) -> Array:

@@ -25,6 +25,7 @@ __all__ = [
     "distinct_distances",
     "fit_pose",
     "fit_pose_by_numpy",
+    "fit_sway",
     "match_near",
     "match_near_by_numpy",
     "pairs_within",
@@ -40,6 +41,7 @@ _ITERATIONS, _FIRST_GATED, _CONVERGED = 10, 3, 1e-6
 _NEAR_M = 0.05
 _MAX_ABS, _MAX_TWIST, _MAX_DISTANCE2 = 1e9, 1e6, 1e300
 _FREE = 1e-12
+_OWN = 1e-9
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -115,6 +117,14 @@ class Observations:
     pixels_px: Array
     depths_m: Array
     depths_dev_m: Array
+
+    def only(self, rows: Rows) -> Observations:
+        """Return some of the rows."""
+        return Observations(
+            points=self.points[rows], spreads=self.spreads[rows], pixels=self.pixels[rows],
+            pixels_px=self.pixels_px[rows], depths_m=self.depths_m[rows],
+            depths_dev_m=self.depths_dev_m[rows],
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -322,6 +332,35 @@ def fit_pose_by_numpy(
     except np.linalg.LinAlgError:
         return None
     return FittedPose(T_camera_world=T, information=information, is_inlier=is_inlier)
+
+
+def fit_sway(
+    observed: Observations, sways: Array, camera: Camera, T_camera_world: Array, *, cauchy: float = 2.5
+) -> tuple[float, float]:
+    """Return by how much ``(n, 3)`` motions of the points explain what an image shows, and the information.
+
+    It is solved beside the pose, by one step from the pose that fits; 0 and 0 where nothing can be said.
+
+    Args:
+        observed: Of one image; rows that agree with the pose.
+        sways: ``(n, 3)``, how landmarks move in the camera's frame for a unit, less how measured points do.
+        camera: Its intrinsics.
+        T_camera_world: ``(4, 4)``, the pose that fits.
+        cauchy: As in `fit_pose`.
+    """
+    J, W, residual, distance2, _ = _linearised(observed, camera, T_camera_world, np.inf)
+    slopes = np.concatenate([J, J[:, :, :3] @ sways[:, :, None]], axis=2)
+    weighted = (W @ slopes) / (1.0 + distance2 / cauchy**2)[:, None, None]
+    information = np.tensordot(slopes, weighted, axes=((0, 1), (0, 1)))
+    gradient = np.tensordot(weighted, residual, axes=((0, 1), (0, 1)))
+    try:
+        by_pose = np.linalg.solve(information[:6, :6], information[:6, 6])
+    except np.linalg.LinAlgError:
+        return 0.0, 0.0
+    own = float(information[6, 6] - information[6, :6] @ by_pose)
+    if not own > _OWN * float(information[6, 6]):
+        return 0.0, 0.0
+    return float(gradient[6] - by_pose @ gradient[:6]) / own, own
 
 
 def _is_whole(observed: Observations, camera: Camera, T: Array, limits: tuple[float, float]) -> bool:
