@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from rse_pf.geometry import Array, Camera, exp_se3
 
-__all__ = ["Bundle", "adjust", "reprojection_errors"]
+__all__ = ["Bundle", "adjust"]
 
 Rows = npt.NDArray[np.int64]
 
@@ -46,20 +46,6 @@ class Bundle:
     points: Rows
     pixels: Array
     sigma_px: Array
-
-
-def reprojection_errors(
-    T_camera_world: Array, points_world: Array, pixels: Array, camera: Camera
-) -> tuple[Array, Array]:
-    """Return the ``(n,)`` distances in pixels and depths of ``(n, 3)`` points, each with its own pose.
-
-    *T_camera_world* is ``(n, 4, 4)`` or ``(4, 4)``; the distance of a point behind the camera is infinite.
-    """
-    points = _moved(T_camera_world, points_world)
-    z = points[:, 2]
-    residuals = _residuals(points, pixels, camera)
-    distances = np.where(z > _MIN_DEPTH, np.hypot(residuals[:, 0], residuals[:, 1]), np.inf)
-    return distances, z
 
 
 def adjust(bundle: Bundle, camera: Camera, *, iterations: int = 8) -> tuple[Array, Array]:

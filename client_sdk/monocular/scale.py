@@ -12,9 +12,9 @@ import numpy.typing as npt
 
 from client_sdk.monocular.bundle import Bundle, adjust
 from client_sdk.monocular.opencv import load_opencv
-from client_sdk.monocular.two_view import parallax_deg, triangulate
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Array, Camera, inverse
+from rse_pf.slam.triangulation import parallax_deg, triangulate
 
 __all__ = ["MarkerScale", "OdometryScale"]
 

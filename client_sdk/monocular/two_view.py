@@ -1,4 +1,4 @@
-"""Two views of one camera without depth: relative pose, triangulation, and whether they suffice for a start.
+"""Two views of one camera without depth: their relative pose, and whether they suffice for a start.
 
 The length of the translation is unknown to two views; it is 1 here.
 """
@@ -11,9 +11,10 @@ import numpy as np
 import numpy.typing as npt
 
 from client_sdk.monocular.opencv import load_opencv
-from rse_pf.geometry import Array, Camera, inverse, transform
+from rse_pf.geometry import Array, Camera, inverse
+from rse_pf.slam.triangulation import parallax_deg, triangulate
 
-__all__ = ["TwoViewStart", "parallax_deg", "start_from_two_views", "triangulate"]
+__all__ = ["TwoViewStart", "start_from_two_views"]
 
 _CONFIDENCE = 0.9999
 _MIN_SHARE = 0.5
@@ -95,50 +96,3 @@ def start_from_two_views(
     return TwoViewStart(
         T_second_first=pose, rows=rows[kept], points=points[kept], parallax_deg=median, reason=reason
     )
-
-
-def triangulate(
-    T_first_world: Array,
-    T_second_world: Array,
-    first: Array,
-    second: Array,
-    camera: Camera,
-    *,
-    max_error_px: float | Array = 2.0,
-) -> tuple[Array, npt.NDArray[np.bool_]]:
-    """Return the ``(n, 3)`` points that two views see, and which lie before both and agree with both.
-
-    Source:
-        Hartley and Zisserman 2004, Sect. 12.2 (linear triangulation, in normalised coordinates).
-    """
-    rays = [_normalised(pixels, camera) for pixels in (first, second)]
-    A = np.empty((len(first), 4, 4))
-    for row, (pose, ray) in enumerate(zip((T_first_world, T_second_world), rays, strict=True)):
-        A[:, 2 * row] = ray[:, :1] * pose[2] - pose[0]
-        A[:, 2 * row + 1] = ray[:, 1:] * pose[2] - pose[1]
-    # The smallest eigenvector of A^T A: with four well-scaled rows as good as the SVD, and faster.
-    homogeneous = np.linalg.eigh(A.transpose(0, 2, 1) @ A)[1][:, :, 0]
-    w = homogeneous[:, 3]
-    far = np.abs(w) < 1e-9
-    points = homogeneous[:, :3] / np.where(far, 1.0, w)[:, None]
-    good = ~far
-    for pose, pixels in ((T_first_world, first), (T_second_world, second)):
-        moved = transform(pose, points)
-        ahead = moved[:, 2] > 1e-3
-        moved[~ahead, 2] = 1.0
-        errors = np.linalg.norm(camera.project(moved) - pixels, axis=1)
-        good &= ahead & (errors <= max_error_px)
-    return points, good
-
-
-def parallax_deg(points: Array, first_centre: Array, second_centre: Array) -> Array:
-    """Return the ``(n,)`` degrees between the rays from two camera centres to ``(n, 3)`` points."""
-    one, two = points - first_centre, points - second_centre
-    lengths = np.linalg.norm(one, axis=1) * np.linalg.norm(two, axis=1)
-    cosines = np.einsum("ij,ij->i", one, two) / np.maximum(lengths, 1e-12)
-    angles: Array = np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0)))
-    return angles
-
-
-def _normalised(pixels: Array, camera: Camera) -> Array:
-    return (pixels - [camera.cx, camera.cy]) / [camera.fx, camera.fy]

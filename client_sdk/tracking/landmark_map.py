@@ -12,12 +12,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from client_sdk.monocular.bundle import Bundle, adjust, reprojection_errors
-from client_sdk.monocular.two_view import parallax_deg, triangulate
+from client_sdk.monocular.bundle import Bundle, adjust
 from client_sdk.tracking.keyframe_map import NO_LANDMARK, Landmarks, expect
 from rse_pf.geometry import Array, Camera, exp_se3, inverse, log_se3, transform
 from rse_pf.slam.places import PlaceVector, place_vector
 from rse_pf.slam.tracking import ImageFeatures, NearLimits, match_near
+from rse_pf.slam.triangulation import parallax_deg, reprojection_errors, triangulate
 
 __all__ = ["MIN_SHARED", "LandmarkLimits", "LandmarkMap", "ViewFeatures", "scaled"]
 
