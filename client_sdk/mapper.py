@@ -294,11 +294,16 @@ class Mapper:
 
         Segments that were not joined to the first one have files of their own: ``map-2.ply``,
         ``trajectory-2.txt`` and so on.
-        A map with depth has the points that were read at least twice; the report counts those.
+        A map with depth has the points that were read at least twice; the report counts those.  Without depth
+        all keyframes are adjusted together before, which takes seconds.
 
         Raises:
             UsageError: The folder cannot be written.
         """
+        if isinstance(self._tracker, MonocularTracker):
+            self._tracker.adjust()
+            for segment in self._metric:
+                self._make_metric(self._tracker, segment)
         report = self.report()
         # Several views have triangulated a landmark; a voxel of a dense map is trusted if it was read twice.
         least = 1 if isinstance(self._tracker, MonocularTracker) else _MIN_READINGS
@@ -397,21 +402,31 @@ class Mapper:
         self, tracker: MonocularTracker, done: TrackedFrame, position_m: Array | None
     ) -> TrackedFrame:
         """Return the result in metres where they are known; a keyframe corrects poses that were returned."""
-        source, frame, segment = self._scale, done.frame, done.segment
+        frame, segment = done.frame, done.segment
         corrected = done.keyframe
+        merged = tracker.loops + len(tracker.joins)
         self._metric.intersection_update(tracker.segments)
-        if source is not None and segment not in self._metric:
-            source.observe(frame.timestamp_s, frame.rgb, position_m)
-            if done.T_world_camera is not None:
-                path = tracker.trajectory(segment)
-                scale = source.metres_per_unit(path.timestamps_s, path.T_world_camera, frame.camera)
-                if scale is not None:
-                    tracker.rescale(scale, segment)
-                    self._metric.add(segment)
-                    corrected = True
-                    done = replace(done, T_world_camera=tracker.trajectory(segment).T_world_camera[-1])
+        if self._scale is not None and (segment not in self._metric or merged != self._joined):
+            if segment not in self._metric:
+                self._scale.observe(frame.timestamp_s, frame.rgb, position_m)
+            if done.T_world_camera is not None and self._make_metric(tracker, segment):
+                corrected = True
+                done = replace(done, T_world_camera=tracker.trajectory(segment).T_world_camera[-1])
+        self._joined = merged
         is_metric = segment in self._metric
         return replace(done, corrected=corrected, scale="metric" if is_metric else "up to scale")
+
+    def _make_metric(self, tracker: MonocularTracker, segment: int) -> bool:
+        """Scale a segment to metres, also after an adjustment of all; say whether the scale is known."""
+        if self._scale is None or self.camera is None:
+            return False
+        path = tracker.trajectory(segment)
+        scale = self._scale.metres_per_unit(path.timestamps_s, path.T_world_camera, self.camera)
+        if scale is None:
+            return False
+        tracker.rescale(scale, segment)
+        self._metric.add(segment)
+        return True
 
 
 class BlockingMapper:

@@ -39,6 +39,7 @@ class LandmarkLimits:
         window: Keyframes that a local adjustment moves.
         fixed: Further keyframes that see the same landmarks and take part with fixed poses.
         in_all: Landmarks that an adjustment of all keyframes takes, those seen most; the others follow.
+        max_in_all: Keyframes of a map beyond which they are no longer adjusted all together.
         min_parallax_deg: Smallest angle between the rays of a new landmark.
         outlier_sigma: Observations farther than this many standard deviations from the landmark are removed.
         pixel_sigma: Standard deviation of a feature of the finest octave, pixels.
@@ -51,6 +52,7 @@ class LandmarkLimits:
     window: int = 10
     fixed: int = 12
     in_all: int = 3000
+    max_in_all: int = 200
     min_parallax_deg: float = 1.0
     outlier_sigma: float = 2.45
     pixel_sigma: float = 1.0
@@ -176,7 +178,12 @@ class LandmarkMap:
         self._adjust(sorted(window), self.limits.fixed, iterations=5)
 
     def adjust_all(self, *, iterations: int = 12) -> None:
-        """Adjust every keyframe and every landmark; the first two keyframes keep their places."""
+        """Adjust every keyframe and every landmark; the first two keyframes keep their places.
+
+        A map of more than ``max_in_all`` keyframes stays as it is.
+        """
+        if len(self.keyframes) > self.limits.max_in_all:
+            return
         everything = list(range(len(self.keyframes)))
         self._adjust(everything, 0, iterations=iterations)
         self._adjust(everything, 0, iterations=iterations)

@@ -275,6 +275,19 @@ class MonocularTracker:
         own = self._segments[segment].map
         return transform(self._T_world_start, own.points[own.is_alive]), own.colours[own.is_alive]
 
+    def adjust(self) -> None:
+        """Adjust all keyframes and landmarks of each segment together, such as at the end of a drive.
+
+        It takes seconds, and poses that were returned before are corrected.
+
+        Raises:
+            UsageError: A query is open.
+        """
+        self._open.refuse_open()
+        for segment in self._segments.values():
+            segment.map.adjust_all(iterations=_MERGE_ITERATIONS)
+        self._last = self._similar = None
+
     def rescale(self, scale: float, segment: int = 0) -> None:
         """Multiply all lengths of a segment by *scale*, such as metres per unit."""
         if segment not in self._segments:
@@ -510,6 +523,7 @@ class MonocularTracker:
             own.bend(older, newer, bent.T, bent.scale)
         for keyframe in own.local(newer):
             own.fuse(keyframe, own.around(older), _CONFIRM_PX)
+        own.adjust_around(newer)
         own.adjust_all(iterations=_MERGE_ITERATIONS)
         self._similar = None
         if self._last is not None and relative is not None:

@@ -18,6 +18,7 @@ from client_sdk.mapper import BlockingMapper, Mapper
 from client_sdk.mapping import Trajectory, read_ply, read_trajectory
 from client_sdk.monocular.scale import OdometryScale
 from client_sdk.robot import Robot, connect
+from client_sdk.tracking.monocular_tracker import MonocularOptions
 from rse_pf.errors import Busy, MissingExtra, UsageError
 from rse_pf.experiments.results.trajectory_error import absolute_error
 from rse_pf.geometry import Camera
@@ -175,6 +176,35 @@ def test_a_lost_camera_without_depth_is_found_again_where_it_was() -> None:
     assert "matches" in lost.reason
     assert found.status == "tracked"
     assert mapper.lost_frames == 1
+
+
+def test_a_cut_without_depth_saves_the_second_place_apart(tmp_path: Path) -> None:
+    mapper = Mapper(
+        ask=solve, scale=OdometryScale(first_m=0.2), monocular=MonocularOptions(segment_after=3)
+    )  # fmt: skip
+    drive(mapper, range(9), depth=False, odometry=True)
+
+    async def go_on_elsewhere() -> list[TrackedFrame]:
+        done = []
+        for row in range(12):
+            there = frame_at(row, depth=False)
+            there = replace(
+                there, timestamp_s=1.0 + row / 10, rgb=np.ascontiguousarray(255 - there.rgb[:, ::-1])
+            )
+            done.append(await mapper.track(there))
+        return done
+
+    elsewhere = asyncio.run(go_on_elsewhere())
+    report = mapper.save(tmp_path)
+
+    assert (elsewhere[-1].segment, elsewhere[-1].scale) == (1, "up to scale")
+    assert (report["segments_apart"], report["frames_apart"]) == (1, 12)
+    assert len(mapper.trajectory) == 9
+    assert mapper.trajectory.positions[:, 0] == pytest.approx(STEP_M * np.arange(9), abs=0.01)
+    assert len(read_trajectory(tmp_path / "trajectory-2.txt")) == 12
+    assert "up to scale" in (tmp_path / "trajectory-2.txt").read_text()
+    assert "up to scale" not in (tmp_path / "trajectory.txt").read_text()
+    assert len(read_ply(tmp_path / "map-2.ply")[0]) > 100
 
 
 def test_saves_files_that_other_programs_read(tmp_path: Path) -> None:

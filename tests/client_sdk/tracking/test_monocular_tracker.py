@@ -4,17 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import replace
+from itertools import islice
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from benchmarks.maps.rgb_only import kitti_drive
 from client_sdk.frontend import Frame, PoseQuery, TrackedFrame
 from client_sdk.mapping import Trajectory
 from client_sdk.tracking.keyframe_map import NO_LANDMARK
 from client_sdk.tracking.landmark_map import LandmarkMap, ViewFeatures
 from client_sdk.tracking.monocular_tracker import MonocularOptions, MonocularTracker
 from rse_pf.errors import PnpError, UsageError
-from rse_pf.geometry import Array, exp_se3, inverse, pose_difference, transform
+from rse_pf.experiments.results.trajectory_error import absolute_error
+from rse_pf.geometry import Array, Camera, exp_se3, inverse, pose_difference, transform
 from rse_pf.pnp import PnpOptions, solve_pnp
 from rse_pf.slam.tracking import ImageFeatures, distinct_distances
 from tests.client_sdk.mapper.flat_world import CAMERA, frame_at
@@ -121,6 +125,7 @@ def test_a_covered_lens_begins_no_segment_and_the_map_goes_on_after_it() -> None
     run_all(tracker, (frame(row, row / 10) for row in range(10)))
 
     while_covered = run_all(tracker, (covered(1.0 + row / 10) for row in range(30)))
+    assert tracker.unrecognised == 0
     uncovered = run(tracker, frame(3, 4.0))
 
     assert {tracked.status for tracked in while_covered} == {"lost"}
@@ -137,11 +142,20 @@ def test_a_segment_that_reaches_a_known_place_is_joined_in_the_unit_of_the_older
 
     # The cut: 26 frames on, where nothing of before is in view; then the way back to it.
     back = list(range(60, 3, -1))
-    done = []
+    done, seen_there, unjoined_there = [], 0, 0
     for number, row in enumerate(back):
         rows[round(2.0 + number / 10, 6)] = row
-        done.append(run(tracker, frame(row, 2.0 + number / 10)))
+        step = tracker.prepare(frame(row, 2.0 + number / 10))
+        while isinstance(step, PoseQuery):
+            answer = solve(step)
+            if step.against == "segment" and answer[1] >= max(40, 0.5 * len(step.correspondences)):
+                seen_there += 1
+            step = tracker.accept(step, *answer)
+        if not tracker.joins:
+            unjoined_there = seen_there
+        done.append(step)
 
+    assert unjoined_there >= 1  # a single image could be wrong
     assert [(join.segment, join.into) for join in tracker.joins] == [(1, 0)]
     assert 2.0 < tracker.joins[0].scale < 4.5
     assert tracker.segments == (0,)
@@ -150,6 +164,30 @@ def test_a_segment_that_reaches_a_known_place_is_joined_in_the_unit_of_the_older
     assert len(path) == len(rows)
     assert_places(path, rows)
     assert np.median(np.abs(path.positions[:, 1:] - [0.0, 1.0])) < 0.05 * np.ptp(path.positions[:, 0])
+
+
+def test_an_older_place_that_is_seen_again_moves_what_drifted_away_from_it() -> None:
+    tracker = MonocularTracker(OPTIONS)
+    there = run_all(tracker, (frame(row, row / 10) for row in range(45)))
+    step_of = position(there[20])[0] / 20
+
+    # The left of these pictures shows rows 5 and more: the camera is 40 rows behind where it believes to be.
+    def both(row: int) -> Frame:
+        here, before = frame(row, row / 10), frame(row - 40, 0.0)
+        return replace(here, rgb=np.concatenate([before.rgb[:, :200], here.rgb[:, 200:]], axis=1))
+
+    run_all(tracker, (both(row) for row in range(45, 58)))
+
+    assert tracker.loops == 1
+    path = tracker.trajectory()
+    assert path.positions[0] == pytest.approx(np.zeros(3), abs=2 * step_of)
+    assert path.positions[-1, 0] < 30 * step_of  # and not 57
+
+
+def position(tracked: TrackedFrame) -> Array:
+    assert tracked.T_world_camera is not None
+    at: Array = tracked.T_world_camera[:3, 3]
+    return at
 
 
 def test_one_query_at_a_time_and_one_camera() -> None:
@@ -167,8 +205,22 @@ def test_one_query_at_a_time_and_one_camera() -> None:
         tracker.prepare(replace(frame(9, 0.9), camera=replace_focal(600.0)))
 
 
-def replace_focal(fx: float):  # type: ignore[no-untyped-def]
-    return type(CAMERA)(fx=fx, fy=fx, cx=CAMERA.cx, cy=CAMERA.cy, width=CAMERA.width, height=CAMERA.height)
+@pytest.mark.slow
+def test_a_car_that_drives_forward_is_posed_from_its_first_frame(recordings: Path) -> None:
+    drive = kitti_drive(recordings / "kitti_00_left_start")
+    tracker = MonocularTracker()
+
+    run_all(tracker, islice(drive.frames, 40))
+
+    path = tracker.trajectory()
+    assert len(path) >= 38
+    assert tracker.segments == (0,)
+    error_m = absolute_error(path, drive.truth, with_scale=True).rmse_m
+    assert error_m <= 0.015 * np.linalg.norm(drive.truth.positions[39])
+
+
+def replace_focal(fx: float) -> Camera:
+    return Camera(fx=fx, fy=fx, cx=CAMERA.cx, cy=CAMERA.cy, width=CAMERA.width, height=CAMERA.height)
 
 
 def map_of(poses: Array, world: Array) -> LandmarkMap:
@@ -218,6 +270,9 @@ def test_a_map_is_bent_by_all_at_its_newer_end_and_by_nothing_at_its_older_one()
     np.testing.assert_allclose(centres[10], transform(T, scale * before[None])[0], atol=1e-9)
     _, turned_deg = pose_difference(made.keyframes[5].T_camera_world, poses[5])
     assert turned_deg == pytest.approx(np.degrees(0.05), abs=1e-6)
+    middle = 0.5 * (before + centres[10])
+    apart = np.linalg.norm(centres[5] - middle) / np.linalg.norm(inverse(poses[5])[:3, 3] - before)
+    assert apart == pytest.approx(scale**0.5)
 
 
 def test_two_landmarks_at_one_feature_become_one_that_all_keyframes_see() -> None:
