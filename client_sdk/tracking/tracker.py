@@ -61,6 +61,8 @@ _MOST_JUMPS = 4
 """A camera that was lost for long may have moved by so many limits, or its place must be clear."""
 _LEAST_ROWS, _LEAST_INTERVAL_S = 30, 1e-3
 """An image with fewer landmarks with depth says nothing of the shutter."""
+_MOST_RATE = 3.0
+"""Radians a second.  A rate that a cut only seems to have would turn an image of 20 ms by 3.4 degrees."""
 _QUERIES = 3
 """So many keyframes are asked for the place of one frame, those with the most matches first."""
 _JOIN_EVERY = 3
@@ -95,7 +97,10 @@ class _Seen:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Posed:
-    """An image with its pose, the landmark of each feature, and whether its pose may be trusted."""
+    """An image with its pose, the landmark of each feature, and whether its pose may be trusted.
+
+    ``is_next`` says that the camera moved there from its last pose, so that its motion is known.
+    """
 
     view: View
     T_world_camera: Array
@@ -103,6 +108,7 @@ class _Posed:
     inliers: int
     matches: int
     is_weak: bool
+    is_next: bool = False
 
 
 class Tracker:
@@ -255,7 +261,8 @@ class Tracker:
         T = self._placed(answer, T_reference, len(seen), ratio)
         if T is None or not self._is_plausible(T):
             return None, len(seen)
-        return self._confirm(view, T, answer, len(seen), self._map()), len(seen)
+        image, is_next = self._image_at(view, T, is_near=True)
+        return self._confirm(image, T, answer, len(seen), self._map(), is_next=is_next), len(seen)
 
     def _recognise(self, view: View) -> Generator[PoseQuery, Answer, tuple[_Posed | None, int]]:
         """Yield queries against the latest and the most alike keyframes of all segments."""
@@ -278,7 +285,8 @@ class Tracker:
             is_near = segment == self._segment and self._is_plausible(T)
             if not (is_clear or (is_near and answer.inliers >= _NEAR_RATIO * len(seen))):
                 continue
-            posed = self._confirm(view, T, answer, len(seen), known)
+            image, is_next = self._image_at(view, T, is_near=is_near)
+            posed = self._confirm(image, T, answer, len(seen), known, is_next=is_next)
             if posed is not None:
                 if segment != self._segment:
                     self._segment, self._last, self._place = segment, None, None
@@ -364,7 +372,8 @@ class Tracker:
         """
         T_camera_world = inverse(T_world_camera)
         own = known is None or known is self._map()
-        known = known or self._map()
+        if known is None:
+            known = self._map()
         landmarks = known.landmarks_of(known.nearest(T_world_camera, _LOCAL))
         rows, features = _match(landmarks, T_camera_world, view, radius_px, limits)
         if self._last is None or not own or self._lost_in_a_row or len(rows) >= enough:
@@ -416,22 +425,36 @@ class Tracker:
         moved_m = float(np.linalg.norm(T_world_camera[:3, 3] - self._T_last[:3, 3]))
         return moved_m <= limit_m
 
+    def _image_at(self, view: View, T_world_camera: Array, *, is_near: bool) -> tuple[View, bool]:
+        """Return a frame's image at a pose, and whether the camera moved there from its last pose.
+
+        After a cut in a video it did not, and nothing is known of how fast it turns: its shutter stays.
+        """
+        rate = turn_rate(self._T_last, T_world_camera, self._interval_s(), np.zeros(3))
+        if is_near and self._last is not None and float(np.linalg.norm(rate)) <= _MOST_RATE:
+            return view, True
+        return self._turned(view, self._raw, np.zeros(3)), False
+
     def _confirm(
-        self, view: View, T_world_camera: Array, answer: Answer, matches: int, known: KeyframeMap
-    ) -> _Posed | None:
-        """Match the local map near the pose, and fit the pose to all that agrees; None if little does."""
+        self, view: View, T_world_camera: Array, answer: Answer, matches: int, known: KeyframeMap,
+        *, is_next: bool = False,
+    ) -> _Posed | None:  # fmt: skip
+        """Match the local map near the pose, and fit the pose to all that agrees; None if little does.
+
+        *is_next* says that the camera moved here from its last pose.
+        """
         seen = self._seen(view, T_world_camera, _CONFIRM_PX, _CONFIRM, known, _ENOUGH)
         least = self.options.min_inliers
         if len(seen) < least:
             return None
         observed = self._observe(view, seen)
         fitted = fit_pose(observed, view.camera, inverse(T_world_camera))
-        if fitted is not None and self._last is not None and known is self._map() and not self._lost_in_a_row:
+        if fitted is not None and is_next:
             T_fitted = inverse(fitted.T_camera_world)
             rate = turn_rate(self._T_last, T_fitted, self._interval_s(), self._rate)
             if self._first is not None and int(fitted.is_inlier.sum()) >= _CLEAR_INLIERS:
                 self._turn_first(*self._first, rate)
-                return self._confirm(view, T_fitted, answer, matches, self._map())
+                return self._confirm(view, T_fitted, answer, matches, self._map(), is_next=True)
             view = self._turned(view, self._raw, rate)
             observed = self._observe(view, seen)
             fitted = fit_pose(observed, view.camera, fitted.T_camera_world)
@@ -449,7 +472,7 @@ class Tracker:
         landmarks[seen.features[inliers]] = seen.landmarks.numbers[seen.rows[inliers]]
         return _Posed(
             view=view, T_world_camera=inverse(T_camera_world), landmarks=landmarks, inliers=agreeing,
-            matches=max(matches, len(seen)), is_weak=answer.is_weak,
+            matches=max(matches, len(seen)), is_weak=answer.is_weak, is_next=is_next,
         )  # fmt: skip
 
     def _observe(self, view: View, seen: _Seen) -> Observations:
@@ -510,7 +533,10 @@ class Tracker:
             self._motion = np.eye(4)
         else:
             self._motion = _rotation_made(inverse(self._T_last) @ T)
-            self._rate = turn_rate(self._T_last, T, self._interval_s(), np.zeros(3))
+            if not posed.is_next:
+                self._rate = np.zeros(3)
+            else:
+                self._rate = turn_rate(self._T_last, T, self._interval_s(), np.zeros(3))
         self._last_s, self._first = self._frame.timestamp_s, None
         self._features = replace(
             self._raw, pixels=posed.view.features.pixels, points_camera=posed.view.points_camera

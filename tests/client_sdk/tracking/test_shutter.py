@@ -57,17 +57,21 @@ def drive(monkeypatch: pytest.MonkeyPatch, readout_s: float, frames: int) -> tup
     """Track a camera; return the tracker, and the poses."""
     room, tracker, poses = Room(3), Tracker(), []
     for number in range(frames):
-        features = room.features(number * INTERVAL_S, readout_s)
-
-        def extract(frame: Frame, options: FrontEndOptions, features: Features = features) -> Features:
-            return features
-
-        monkeypatch.setattr(tracker_module, "extract", extract)
-        shown = Frame(timestamp_s=number * INTERVAL_S, rgb=IMAGE, depth_m=DEPTH, camera=KINECT)
-        pose = run(tracker, shown).T_world_camera
-        assert pose is not None
-        poses.append(pose)
+        poses.append(track(monkeypatch, tracker, number, room.features(number * INTERVAL_S, readout_s)))
     return tracker, poses
+
+
+def track(monkeypatch: pytest.MonkeyPatch, tracker: Tracker, number: int, features: Features) -> Array:
+    """Track the image that shows the features; return its pose."""
+
+    def extract(frame: Frame, options: FrontEndOptions) -> Features:
+        return features
+
+    monkeypatch.setattr(tracker_module, "extract", extract)
+    shown = Frame(timestamp_s=number * INTERVAL_S, rgb=IMAGE, depth_m=DEPTH, camera=KINECT)
+    pose = run(tracker, shown).T_world_camera
+    assert pose is not None
+    return pose
 
 
 def test_features_of_a_turning_camera_are_where_a_global_shutter_shows_them() -> None:
@@ -157,3 +161,16 @@ def test_a_camera_that_looks_around_is_tracked_whatever_its_shutter(
     assert max(degrees for _, degrees in errors) < most_deg
     assert tracker.last_features is not None
     assert (tracker.last_features.pixels == tracker._raw.pixels).all() == (tracker.readout.readout_s == 0.0)
+
+
+def test_a_cut_in_a_video_is_no_turn(monkeypatch: pytest.MonkeyPatch) -> None:
+    tracker, _ = drive(monkeypatch, READOUT_S, 90)
+    elsewhere_s = np.pi / 6.0
+
+    pose = track(monkeypatch, tracker, 90, Room(3).features(elsewhere_s, 0.0))
+
+    first, now = pose_at(np.array([0.0, elsewhere_s]))
+    _, apart_deg = pose_difference(pose, inverse(first) @ now)
+    assert pose_difference(inverse(first) @ now, np.eye(4))[1] > 15.0
+    assert apart_deg < 1.0
+    assert not tracker._rate.any()
