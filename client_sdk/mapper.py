@@ -7,6 +7,7 @@ no camera: it is given a function that answers pose queries, such as that of a c
 from __future__ import annotations
 
 import asyncio
+import functools
 import json
 from collections import Counter
 from collections.abc import Awaitable, Callable, Coroutine
@@ -159,7 +160,7 @@ class Mapper:
             if self._recorder is not None:
                 self._recorder.frame(frame.timestamp_s, frame.rgb)
             tracker = self._tracker_for(frame)
-            step = await asyncio.to_thread(tracker.prepare, frame)
+            step = await _in_thread(tracker, functools.partial(tracker.prepare, frame))
             answer: PoseAnswer | None = None
             failure = ""
             while isinstance(step, PoseQuery):
@@ -174,13 +175,14 @@ class Mapper:
                     _give_up(tracker, step)
                     raise
                 solution = None if answer is None else answer.solution
-                step = await asyncio.to_thread(
+                accept = functools.partial(
                     tracker.accept,
                     step,
                     None if solution is None else solution.T_camera_world,
                     0 if solution is None else len(solution.inliers),
                     is_weak=solution is not None and solution.verdict == "weak",
                 )
+                step = await _in_thread(tracker, accept)
             return await asyncio.to_thread(self._finished, step, answer, failure, position_m)
 
     @property
@@ -294,6 +296,7 @@ class Mapper:
 
         Segments that were not joined to the first one have files of their own: ``map-2.ply``,
         ``trajectory-2.txt`` and so on.
+
         A map with depth has the points that were read at least twice; the report counts those.  Without depth
         all keyframes are adjusted together before, which takes seconds.
 
@@ -464,6 +467,20 @@ class BlockingMapper:
     def save(self, folder: Path) -> dict[str, Any]:
         """Write the map, the trajectory and the report; see `Mapper.save`."""
         return self.mapper.save(folder)
+
+
+async def _in_thread(
+    tracker: Tracker | MonocularTracker, act: Callable[[], PoseQuery | TrackedFrame]
+) -> PoseQuery | TrackedFrame:
+    """Return the next step of a frame.  A cancellation waits for it, since the thread goes on anyway."""
+    work = asyncio.ensure_future(asyncio.to_thread(act))
+    try:
+        return await asyncio.shield(work)
+    except asyncio.CancelledError:
+        step = await work
+        if isinstance(step, PoseQuery):
+            _give_up(tracker, step)
+        raise
 
 
 def _give_up(tracker: Tracker | MonocularTracker, query: PoseQuery) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from client_sdk.cameras.folder import open_folder
-from client_sdk.cameras.opencv_video import open_video
+from client_sdk.cameras.opencv_video import is_video_file, open_video
 from client_sdk.cameras.realsense import open_realsense
 from client_sdk.cameras.source import RawFrame, RawSource
 from client_sdk.datasets import open_dataset
@@ -66,6 +66,7 @@ def open_camera(
         raw, has_depth = open_folder(path, own.depth_scale)
         has_depth = has_depth and depth
         return RawSource(word, _without_depth(raw, has_depth), own, has_depth=has_depth, rate_hz=rate_hz)
+    is_video_file(word)  # a name that is wrong is told before intrinsics that are missing
     if own is None:
         raise UsageError(
             f"the intrinsics of {word} are not known",

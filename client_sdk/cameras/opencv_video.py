@@ -14,10 +14,22 @@ from client_sdk.cameras.source import RawFrame, colour_of
 from client_sdk.monocular.opencv import MAX_IMAGE_PIXELS, load_opencv
 from rse_pf.errors import UsageError
 
-__all__ = ["open_video"]
+__all__ = ["is_video_file", "open_video"]
 
 _MAX_MISSES = 30
 """A device that gives no image so many times in a row has gone."""
+
+
+def is_video_file(source: str) -> bool:
+    """Say whether a source is a file, neither a device nor a stream.
+
+    Raises:
+        UsageError: There is no such file.
+    """
+    is_file = not source.isdigit() and "://" not in source
+    if is_file and not Path(source).is_file():
+        raise UsageError(f"there is no video {source}", hint="name a device number, a video or a folder")
+    return is_file
 
 
 def open_video(
@@ -30,10 +42,7 @@ def open_video(
         MissingExtra: OpenCV is not installed.
     """
     cv2 = load_opencv()
-    is_device = source.isdigit()
-    is_file = not is_device and "://" not in source
-    if is_file and not Path(source).is_file():
-        raise UsageError(f"there is no video {source}", hint="name a device number, a video or a folder")
+    is_device, is_file = source.isdigit(), is_video_file(source)
     if is_file and _is_text(Path(source)):
         raise UsageError(
             f"{source} is a text, not a video", hint="a playlist names other files: name the video itself"

@@ -275,6 +275,7 @@ def _of_an_empty_folder(folder: Path) -> None:
         (_of_no_video, "is a text, not a video"),
         (_of_an_empty_folder, "holds no image"),
         (lambda folder: open_camera(folder / "none.mp4", intrinsics=INTRINSICS), "there is no video"),
+        (lambda folder: open_camera(folder / "none.mp4"), "there is no video"),
         (lambda folder: open_camera(99, intrinsics=INTRINSICS), "camera 99 cannot be opened"),
         (lambda folder: open_camera(0), "intrinsics of 0 are not known"),
         (lambda folder: open_camera("x.mcap"), "ROS bag"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import threading
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,12 +14,12 @@ import pytest
 
 from client_sdk.answers import PoseAnswer
 from client_sdk.datasets import open_dataset
-from client_sdk.frontend import FrontEndOptions, PoseQuery, TrackedFrame
+from client_sdk.frontend import Frame, FrontEndOptions, PoseQuery, TrackedFrame
 from client_sdk.mapper import BlockingMapper, Mapper
 from client_sdk.mapping import Trajectory, read_ply, read_trajectory
 from client_sdk.monocular.scale import OdometryScale
 from client_sdk.robot import Robot, connect
-from client_sdk.tracking.monocular_tracker import MonocularOptions
+from client_sdk.tracking.monocular_tracker import MonocularOptions, MonocularTracker
 from rse_pf.errors import Busy, MissingExtra, UsageError
 from rse_pf.experiments.results.trajectory_error import absolute_error
 from rse_pf.geometry import Camera
@@ -271,3 +272,53 @@ def test_the_mapper_of_a_robot_asks_it_and_keeps_commands_of_its_codec_small(
     assert [each.status for each in drive(mapper, range(2), depth=True)] == ["first", "tracked"]
     assert asked[0][0] <= FrontEndOptions().sent_with("json").max_matches
     assert asked[0][1] == 0.5
+
+
+@pytest.mark.parametrize("depth", [True, False])
+def test_a_frame_that_is_cancelled_while_it_is_matched_leaves_no_query_open(
+    depth: bool, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    mapper = Mapper(ask=solve)
+    drive(mapper, range(9), depth=depth)
+    tracker = mapper._tracker
+    assert tracker is not None
+    prepare = tracker.prepare
+    begun, goes_on, ended = threading.Event(), threading.Event(), threading.Event()
+
+    def slow(frame: Frame) -> PoseQuery | TrackedFrame:
+        begun.set()
+        assert goes_on.wait(10.0)
+        step = prepare(frame)
+        ended.set()
+        return step
+
+    async def cancel() -> None:
+        tracking = asyncio.ensure_future(mapper.track(frame_at(9, depth=depth)))
+        await asyncio.to_thread(begun.wait, 10.0)
+        tracking.cancel()
+        asyncio.get_running_loop().call_soon(goes_on.set)
+        with pytest.raises(asyncio.CancelledError):
+            await tracking
+        assert await asyncio.to_thread(ended.wait, 10.0)
+
+    monkeypatch.setattr(tracker, "prepare", slow)
+    asyncio.run(cancel())
+    monkeypatch.undo()
+
+    assert mapper.save(tmp_path)["frames"] == 10
+    assert [done.status for done in drive(mapper, range(10, 11), depth=depth)] == ["tracked"]
+
+
+def test_all_keyframes_without_depth_are_adjusted_when_the_map_is_saved(tmp_path: Path) -> None:
+    mapper = Mapper(ask=solve, scale=OdometryScale(first_m=0.2))
+    drive(mapper, range(9), depth=False, odometry=True)
+    assert isinstance(mapper._tracker, MonocularTracker)
+    landmarks = mapper._tracker._segments[0].map
+    before = landmarks.points.copy()
+    landmarks.points += np.random.default_rng(1).normal(0.0, 0.02, before.shape)
+
+    mapper.save(tmp_path)
+
+    off_m = np.linalg.norm(landmarks.points - before, axis=1)[landmarks.is_alive]
+    assert np.median(off_m) < 0.01
+    assert mapper.trajectory.positions[:, 0] == pytest.approx(STEP_M * np.arange(9), abs=0.01)

@@ -79,6 +79,7 @@ def test_the_settings_that_decided_between_good_and_bad_are_set() -> None:
     assert retry["host_selection_retry_max_attempts"] == "8"
     assert min(breaker.values()) > 1024
     assert listener(made)["enable_reuse_port"] is False
+    assert listener(made)["max_connections_to_accept_per_socket_event"] == 1
 
 
 def test_health_checks_follow_the_settings() -> None:

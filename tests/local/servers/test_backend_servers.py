@@ -79,7 +79,7 @@ def test_an_announcement_of_an_earlier_run_is_not_believed(tmp_path: Path) -> No
 
 
 def test_a_server_that_ends_shows_the_last_line_of_its_log(tmp_path: Path) -> None:
-    script = "import sys; print('chatter'); sys.exit('no cheese today')"
+    script = "import sys; print('chatter', flush=True); sys.exit('no cheese today')"
 
     with pytest.raises(ConfigurationError, match="exit code 1: no cheese today") as told:
         with_server(tmp_path, script, lambda made: made.wait_ready("server-1", SOON_S))
