@@ -1,5 +1,5 @@
-"""How a camera with depth is tracked: the map of its keyframes, and the order in which a frame is matched.
+"""How a camera is tracked: the maps of its keyframes, and the order in which a frame is matched.
 
-Cameras and files are elsewhere, and so is who solves the poses.  A camera without depth is tracked by
-`client_sdk.tracking.monocular_tracker`.
+`client_sdk.tracking.tracker` is for a camera with depth, `client_sdk.tracking.monocular_tracker` for one without.
+Cameras and files are elsewhere, and so is who solves the poses.
 """
