@@ -21,11 +21,12 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.maps.recordings import ate_m, judged_answer, truth_of
+from benchmarks.maps.recordings import judged_answer, truth_of
 from benchmarks.maps.services import joined_poses, robots_of
 from client_sdk.datasets import Dataset, open_dataset
 from client_sdk.frontend import FrontEndOptions, PoseQuery, extract, match
 from client_sdk.tracking.tracker import Tracker
+from rse_pf.experiments.results.trajectory_error import ate_m
 from rse_pf.geometry import Array, inverse, pose_difference
 from rse_pf.pnp import PnpOptions, PnpSolution, refine_with_depth, solve_pnp
 from rse_pf.pnp.depth_refinement import refine_by_numpy

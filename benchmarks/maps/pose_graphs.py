@@ -24,8 +24,8 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.maps.recordings import ate_m
 from benchmarks.maps.services import robots_of
+from rse_pf.experiments.results.trajectory_error import ate_m
 from rse_pf.geometry import Array
 from rse_pf.services.synthetic_maps import make_sphere
 from rse_pf.slam import map_merge as join

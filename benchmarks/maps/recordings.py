@@ -5,7 +5,6 @@ Poses are solved in this process, without a platform; ground truth is used for e
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,7 +23,6 @@ from rse_pf.pnp import PnpOptions, refine_with_depth, solve_pnp
 
 __all__ = [
     "Run",
-    "ate_m",
     "cloud_of",
     "drive",
     "frame_poses",
@@ -147,15 +145,6 @@ def frame_poses(run: Run, T_world_keyframe: Array) -> Array:
         else:
             moved.append(first)
     return np.array(moved)
-
-
-def ate_m(T_estimate: Array, T_truth: Array) -> float:
-    """Return the rmse of positions after the best SE(3) alignment; Umeyama 1991 without scale."""
-    estimate, truth = T_estimate[:, :3, 3], T_truth[:, :3, 3]
-    a, b = estimate - estimate.mean(axis=0), truth - truth.mean(axis=0)
-    U, _, Vt = np.linalg.svd(b.T @ a)
-    rotation = U @ np.diag([1, 1, np.linalg.det(U @ Vt)]) @ Vt
-    return math.sqrt(float(((b - a @ rotation.T) ** 2).sum(axis=1).mean()))
 
 
 def cloud_of(dataset: Dataset, rows: Sequence[int], T_world_camera: Array, voxel_m: float = 0.01) -> PointMap:

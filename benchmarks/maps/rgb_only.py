@@ -36,23 +36,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from benchmarks.maps.recordings import judged_answer
-from benchmarks.maps.tracking import interpolated
 from client_sdk.answers import PoseAnswer
-from client_sdk.cameras.source import colour_of
 from client_sdk.datasets import Dataset, open_dataset
-from client_sdk.datasets.intrinsics import Intrinsics, Undistortion
-from client_sdk.frontend import Frame, PoseQuery, load_opencv
+from client_sdk.datasets.left_camera import open_euroc, open_kitti
+from client_sdk.frontend import Frame, PoseQuery
 from client_sdk.mapper import Mapper
 from client_sdk.mapping import Trajectory
-from client_sdk.monocular.opencv import read_image
 from client_sdk.monocular.scale import OdometryScale
 from client_sdk.simulator import render_frames, true_trajectory
 from client_sdk.tracking.monocular_tracker import MonocularTracker
-from rse_pf.experiments.results.trajectory_error import absolute_error
-from rse_pf.geometry import Array, Camera, from_quaternion
+from rse_pf.experiments.results.trajectory_error import absolute_error, interpolated
 from rse_pf.pnp import PnpOptions, solve_pnp
 from rse_pf.services.pnp import make_request
 from rse_pf.wire import Command, make_codec
@@ -61,7 +56,7 @@ __all__ = ["main"]
 
 _RECORDING = "7scenes_redkitchen"
 _MAX_ATE_CM, _MAX_LOST_PERCENT = 8.0, 5.0
-_KITTI, _EUROC = "kitti_00_left_start", "euroc_mh01_start/mav0"
+_KITTI, _EUROC = "kitti_00_left_start", "euroc_mh01_start"
 _MAX_KITCHEN_CM, _MAX_EUROC_CM = 4.5, 0.5
 _MIN_KITTI_POSED, _MAX_KITTI_PERCENT = 0.95, 1.5
 _MAX_AFTER_CUT_S, _MAX_RELOCALISE_S = 2.0, 1.0
@@ -92,82 +87,6 @@ def _world(seed: int) -> Drive:
         count=_WORLD_FRAMES,
         truth=true_trajectory(0, 1, _WORLD_FRAMES, seed),
     )
-
-
-def kitti_drive(folder: Path) -> Drive:
-    """Return a drive of the left camera in the layout of KITTI's odometry benchmark."""
-    numbers = [float(word) for word in (folder / "calib.txt").read_text().splitlines()[0].split()[1:]]
-    stamps_s = np.loadtxt(folder / "times.txt")
-    poses = np.tile(np.eye(4), (len(stamps_s), 1, 1))
-    poses[:, :3] = np.loadtxt(folder / "poses.txt").reshape(-1, 3, 4)[: len(stamps_s)]
-    paths = sorted((folder / "image_0").iterdir())[: len(stamps_s)]
-    height, width = _grey(paths[0]).shape[:2]
-    camera = Camera(
-        fx=numbers[0], fy=numbers[5], cx=numbers[2], cy=numbers[6], width=width, height=height
-    )  # fmt: skip
-    frames = _Images(paths=tuple(paths), stamps_s=tuple(stamps_s), camera=camera)
-    return Drive(
-        name="KITTI 00", frames=frames, count=len(stamps_s), truth=Trajectory(stamps_s, poses)
-    )  # fmt: skip
-
-
-def euroc_drive(folder: Path, every: int = 1) -> Drive:
-    """Return a drive of the left camera in EuRoC's layout, undistorted; *every* takes each n-th frame."""
-    sensor = dict(
-        line.split(":", 1) for line in (folder / "cam0/sensor.yaml").read_text().splitlines() if ":" in line
-    )
-    fx, fy, cx, cy = _numbers(sensor["intrinsics"])
-    width, height = _numbers(sensor["resolution"])
-    camera = Camera(fx=fx, fy=fy, cx=cx, cy=cy, width=int(width), height=int(height))
-    lens = Intrinsics(camera=camera, distortion=_numbers(sensor["distortion_coefficients"]))
-    text = (folder / "cam0/sensor.yaml").read_text()
-    T_body_camera = np.array(_numbers(text.split("data:", 1)[1].split("]")[0])).reshape(4, 4)
-    rows = [line.split(",") for line in (folder / "cam0/data.csv").read_text().splitlines()[1:]][::every]
-    first_ns = int(rows[0][0])
-    stamps_s = tuple((int(stamp) - first_ns) / 1e9 for stamp, _ in rows)
-    lines = (folder / "state_groundtruth_estimate0/data.csv").read_text().splitlines()[1:]
-    known_s = np.array([(int(line.split(",")[0]) - first_ns) / 1e9 for line in lines])
-    poses = np.array([_body_pose([float(word) for word in line.split(",")[1:8]]) for line in lines])
-    paths = tuple(folder / "cam0/data" / name.strip() for _, name in rows)
-    frames = _Images(paths=paths, stamps_s=stamps_s, camera=camera, lens=lens)
-    truth = Trajectory(known_s, poses @ T_body_camera)
-    return Drive(name=f"MH_01, {20 / every:g} Hz", frames=frames, count=len(rows), truth=truth)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Images:
-    """Grey images of one camera as frames without depth, undistorted where there is a lens."""
-
-    paths: tuple[Path, ...]
-    stamps_s: tuple[float, ...]
-    camera: Camera
-    lens: Intrinsics | None = None
-
-    def __iter__(self) -> Iterator[Frame]:
-        no_depth = np.zeros((self.camera.height, self.camera.width), dtype=np.float32)
-        undistort = None if self.lens is None else Undistortion(self.lens)
-        for stamp_s, path in zip(self.stamps_s, self.paths, strict=True):
-            rgb = _grey(path)
-            rgb = rgb if undistort is None else undistort.colour(rgb)
-            yield Frame(timestamp_s=float(stamp_s), rgb=rgb, depth_m=no_depth, camera=self.camera)
-
-
-def _grey(path: Path) -> npt.NDArray[np.uint8]:
-    image = read_image(path, load_opencv().IMREAD_GRAYSCALE)
-    assert image is not None, path
-    return colour_of(image, path.name)
-
-
-def _numbers(text: str) -> tuple[float, ...]:
-    return tuple(float(word) for word in text.split("#")[0].strip(" []\n").replace("\n", " ").split(","))
-
-
-def _body_pose(numbers: list[float]) -> Array:
-    pose = np.eye(4)
-    pose[:3, 3] = numbers[:3]
-    w, x, y, z = numbers[3:]
-    pose[:3, :3] = from_quaternion(np.array([x, y, z, w]))
-    return pose
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -276,7 +195,7 @@ def held_out_drives(recordings: Path) -> Iterator[Drive]:
             kitchen, rows=kitchen.rows[first::stride], timestamps_s=kitchen.timestamps_s[first::stride]
         )
         yield load_drive(chosen, f"kitchen, {10 / stride:.3g} Hz from frame {first}")
-    yield euroc_drive(recordings / _EUROC, every=2)
+    yield load_drive(open_euroc(recordings / _EUROC).thinned(10.0), "MH_01, 10 Hz")
 
 
 def row_of(drive: Drive, *, with_scale: bool) -> dict[str, Any]:
@@ -409,9 +328,9 @@ def main() -> int:
         )
         row = measure(load_drive(dataset, name), with_scale=False)
         judge(name, is_good=_is_within(row, _MAX_KITCHEN_CM))
-    row = measure(euroc_drive(args.recordings / _EUROC), with_scale=False)
+    row = measure(load_drive(open_euroc(args.recordings / _EUROC), "MH_01, 20 Hz"), with_scale=False)
     judge("MH_01", is_good=_is_within(row, _MAX_EUROC_CM))
-    row = measure(kitti_drive(args.recordings / _KITTI), with_scale=False)
+    row = measure(load_drive(open_kitti(args.recordings / _KITTI), "KITTI 00"), with_scale=False)
     is_posed = row["poses"] >= _MIN_KITTI_POSED * row["frames"]
     is_right = row["sim3_cm"] is not None and row["sim3_cm"] <= _MAX_KITTI_PERCENT * row["path_m"]
     judge("KITTI 00", is_good=is_posed and is_right)

@@ -26,7 +26,6 @@ import numpy as np
 
 from benchmarks.maps.recordings import (
     Run,
-    ate_m,
     cloud_of,
     drive,
     frame_poses,
@@ -34,6 +33,8 @@ from benchmarks.maps.recordings import (
     truth_of,
 )
 from client_sdk.datasets import Dataset, open_dataset
+from rse_pf.experiments.results import trajectory_error
+from rse_pf.experiments.results.trajectory_error import ate_m
 from rse_pf.geometry import Array, exp_se3, inverse, pose_difference
 from rse_pf.service import Report
 from rse_pf.services.mapping.localise import locate
@@ -123,8 +124,10 @@ def cloud_distances(
 
     poses = joined_poses(robots.runs, merged)
     rows = [row for run in robots.runs for row in run.rows]
-    align_poses = _alignment_of_positions if by_positions else alignment_of_poses
-    T_truth_merged = align_poses(poses, robots.truth)
+    if by_positions:
+        _, T_truth_merged = trajectory_error.align(poses[:, :3, 3], robots.truth[:, :3, 3])
+    else:
+        T_truth_merged = alignment_of_poses(poses, robots.truth)
     true_cloud = cloud_of(robots.dataset, rows[::every], robots.truth[::every]).points()[0]
     own_cloud = cloud_of(robots.dataset, rows[::every], T_truth_merged @ poses[::every]).points()[0]
     tree = small_gicp.KdTree(small_gicp.PointCloud(true_cloud.astype(np.float64)))
@@ -309,17 +312,6 @@ def alignment_of_poses(T_estimate: Array, T_truth: Array) -> Array:
     T = np.eye(4)
     T[:3, :3] = U @ Vt
     T[:3, 3] = (T_truth[:, :3, 3] - T_estimate[:, :3, 3] @ T[:3, :3].T).mean(axis=0)
-    return T
-
-
-def _alignment_of_positions(T_estimate: Array, T_truth: Array) -> Array:
-    """Return the rigid motion that brings the estimated positions closest to the true ones."""
-    estimate, truth = T_estimate[:, :3, 3], T_truth[:, :3, 3]
-    a, b = estimate - estimate.mean(axis=0), truth - truth.mean(axis=0)
-    U, _, Vt = np.linalg.svd(b.T @ a)
-    T = np.eye(4)
-    T[:3, :3] = U @ np.diag([1, 1, np.linalg.det(U @ Vt)]) @ Vt
-    T[:3, 3] = truth.mean(axis=0) - T[:3, :3] @ estimate.mean(axis=0)
     return T
 
 

@@ -27,9 +27,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from benchmarks.maps.recordings import RED_KITCHEN, ate_m, judged_answer
+from benchmarks.maps.recordings import RED_KITCHEN, judged_answer
 from client_sdk.datasets import Dataset, open_dataset
 from client_sdk.frontend import Frame, PoseQuery, TrackedFrame
 from client_sdk.mapping import Trajectory
@@ -37,7 +36,8 @@ from client_sdk.simulator import SIMULATED_CAMERA, true_trajectory
 from client_sdk.simulator.camera import Painter, add_depth_noise, add_image_noise
 from client_sdk.simulator.world import make_world
 from client_sdk.tracking.tracker import Join, Tracker
-from rse_pf.geometry import Array, exp_se3, inverse, log_se3, pose_difference
+from rse_pf.experiments.results.trajectory_error import ate_m, interpolated, motion_errors
+from rse_pf.geometry import Array, inverse
 
 __all__ = ["main"]
 
@@ -46,7 +46,7 @@ _FIRST_FRAMES = (0, 5, 11)
 _TURNING_BARS = {30: (0, 3.0), 15: (0, 3.3), 10: (0, 3.0), 7: None, 5: (1, 4.0), 4: None, 3: None}
 """By rate in Hz: most frames lost, and most cm of ATE."""
 _KITCHEN_BARS = {10: (0, 3.35), 5: None}
-_START_S, _STEP_S = 1.0, 1.0
+_START_S = 1.0
 _HARD_BEGINS_S = (0.0, 2.5, 4.5)
 """Seconds after the first frame of fr1/rpy; the number in this row seeds the world."""
 _HARD_FRAMES, _HARD_HZ, _EXPOSURE_S, _EXPOSED, _LIGHT = 60, 10.0, 1.0 / 60.0, 5, 0.5
@@ -132,28 +132,6 @@ def poses_of(tracked: list[TrackedFrame], joins: list[Join]) -> list[Array | Non
             pose = T_into_segment @ pose
         poses.append(pose if segment == 0 else None)
     return poses
-
-
-def interpolated(truth: Trajectory, stamps_s: npt.ArrayLike) -> Array:
-    """Return the ``(n, 4, 4)`` true poses at *stamps_s*, between the two around each."""
-    stamps, known = np.atleast_1d(np.asarray(stamps_s, dtype=float)), truth.timestamps_s
-    after = np.clip(np.searchsorted(known, stamps), 1, len(known) - 1)
-    shares = np.clip((stamps - known[after - 1]) / (known[after] - known[after - 1]), 0.0, 1.0)
-    start, end = truth.T_world_camera[after - 1], truth.T_world_camera[after]
-    between: Array = start @ exp_se3(shares[:, None] * log_se3(inverse(start) @ end))
-    return between
-
-
-def motion_errors(stamps_s: Array, poses: Array, true_poses: Array) -> tuple[Array, Array]:
-    """Return the errors of the motion from each pose to that nearest 1 s later, in metres and degrees."""
-    errors = []
-    half_s = 0.5 * float(np.median(np.diff(stamps_s)))
-    for row, stamp_s in enumerate(stamps_s):
-        later = int(np.argmin(np.abs(stamps_s - stamp_s - _STEP_S)))
-        if later > row and abs(stamps_s[later] - stamp_s - _STEP_S) <= half_s + 1e-3:
-            moved = inverse(poses[row]) @ poses[later]
-            errors.append(pose_difference(moved, inverse(true_poses[row]) @ true_poses[later]))
-    return np.array([metres for metres, _ in errors]), np.array([degrees for _, degrees in errors])
 
 
 def row_of(drive: Drive) -> dict[str, Any]:

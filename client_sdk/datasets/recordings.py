@@ -25,7 +25,7 @@ from client_sdk.mapping import Trajectory, read_trajectory
 from client_sdk.monocular.opencv import MAX_IMAGE_PIXELS, load_opencv, read_image
 from rse_pf.errors import UsageError
 from rse_pf.files import read_regular_file
-from rse_pf.geometry import Camera
+from rse_pf.geometry import Array, Camera
 
 __all__ = ["Dataset", "associate_stamps", "dataset_of_bag", "open_dataset", "read_colour"]
 
@@ -51,7 +51,8 @@ class Dataset:
 
     ``truth_kind`` is ``reference`` if the poses came with the source as an estimate.  ``read`` reads one of
     ``rows``; row *i* has the time stamp ``timestamps_s[i]`` of this dataset.  ``notes`` are sentences for the
-    user on what was assumed.
+    user on what was assumed.  ``T_body_camera`` is the pose of the camera in the body whose path was
+    measured, None where that is the camera itself, or not known.
     """
 
     name: str
@@ -62,6 +63,8 @@ class Dataset:
     rows: tuple[int, ...]
     read: Callable[[int], Frame]
     notes: tuple[str, ...] = ()
+    has_depth: bool = True
+    T_body_camera: Array | None = None
 
     def __len__(self) -> int:
         return len(self.rows)

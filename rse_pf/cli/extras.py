@@ -122,6 +122,7 @@ EXTRAS: dict[str, Extra] = {
 VERBS_NEED: dict[str, tuple[str, ...]] = {
     "demo": ("demo",),
     "demo --merge": ("demo", "maps"),
+    "compare": ("demo",),
     "experiment": ("experiments",),
     "local": ("local",),
     "local --foxglove": ("foxglove",),

@@ -37,6 +37,7 @@ ORDER = (
     "lambda_pnp",
     "stacks", "stacks.boot", "app",
     "experiments", "experiments.results", "experiments.plots", "experiments.load", "experiments.demo",
+    "experiments.compare",
     "experiments.paper", "cli",
 )  # fmt: skip
 """All packages and root modules, lowest first; ``rse_pf.`` is left out.

@@ -17,7 +17,7 @@ from rse_pf.errors import MissingExtra
 from rse_pf.geometry import Array
 from rse_pf.terminal import printable
 
-__all__ = ["COLOURS", "RobotPath", "draw_map"]
+__all__ = ["COLOURS", "SCALES_M", "RobotPath", "draw_map", "fitting", "pillow"]
 
 _WIDTH, _HEIGHT, _CAPTION, _MARGIN = 1600, 900, 64, 40
 _BACKGROUND, _INK, _WHITE = (228, 231, 236), (30, 34, 42), (255, 255, 255)
@@ -28,7 +28,7 @@ _MAX_LABELS = 8
 """With more robots the names are in the legend only."""
 _FOCAL = 1.35
 _CAMERA_EVERY_M = 0.5
-_SCALES_M = (1.0, 0.5, 2.0, 0.2, 5.0, 0.1, 10.0, 20.0, 50.0, 100.0, 0.05, 0.02, 0.01)
+SCALES_M = (1.0, 0.5, 2.0, 0.2, 5.0, 0.1, 10.0, 20.0, 50.0, 100.0, 0.05, 0.02, 0.01)
 _SCALE_PX = (80.0, 400.0)
 _LONG_SCENE = 1.25
 """A scene that is longer than wide by this ratio is seen from its side."""
@@ -60,7 +60,7 @@ def draw_map(
     Raises:
         MissingExtra: Pillow is not installed.
     """
-    image_module, draw_module, font_module = _pillow()
+    image_module, draw_module, font_module = pillow()
     robots = [replace(robot, name=printable(robot.name)) for robot in robots]
     up = _up(robots)
     shown = _below_ceiling(points_world, robots, up)
@@ -79,7 +79,7 @@ def draw_map(
                 place, robot.name, fill=_INK, font=small, anchor="mm", stroke_width=4, stroke_fill=_WHITE
             )
     scale_left = _draw_scale(draw, view, small, unit)
-    text = _fitting(draw, printable(caption), big, _WIDTH - 2 * _MARGIN)
+    text = fitting(draw, printable(caption), big, _WIDTH - 2 * _MARGIN)
     draw.text((_MARGIN, 18), text, fill=_INK, font=big)
     _draw_legend(draw, robots, small, scale_left - _MARGIN)
     image.save(path, format="PNG")
@@ -227,7 +227,7 @@ def _draw_legend(draw: Any, robots: list[RobotPath], font: Any, max_px: float) -
         left += 76 + length
 
 
-def _fitting(draw: Any, text: str, font: Any, max_px: float) -> str:
+def fitting(draw: Any, text: str, font: Any, max_px: float) -> str:
     """Return *text*, cut to *max_px*."""
     if draw.textlength(text, font=font) <= max_px:
         return text
@@ -258,7 +258,7 @@ def _draw_scale(draw: Any, view: _Observer, font: Any, unit: str) -> float:
     """Draw a bar of a round length, as long as it appears at the centre; return its left end."""
     ends = view.project(np.stack([view.centre, view.centre + view.axis_x]))
     one_px = max(float(np.linalg.norm(ends[1] - ends[0])), 1e-9)
-    units = next((m for m in _SCALES_M if _SCALE_PX[0] <= m * one_px <= _SCALE_PX[1]), 1.0)
+    units = next((m for m in SCALES_M if _SCALE_PX[0] <= m * one_px <= _SCALE_PX[1]), 1.0)
     length, label = min(units * one_px, _WIDTH / 2), f"{units:g} {unit}"
     right, y = _WIDTH - _MARGIN, _HEIGHT - 34
     draw.line([(right - length, y), (right, y)], fill=_INK, width=3)
@@ -286,7 +286,8 @@ def _below_ceiling(
     return np.asarray(heights < highest + _CEILING_M)
 
 
-def _pillow() -> tuple[Any, Any, Any]:
+def pillow() -> tuple[Any, Any, Any]:
+    """Return the modules of images, drawing and fonts; raises MissingExtra without Pillow."""
     try:
         from PIL import Image, ImageDraw, ImageFont
     except ImportError as error:

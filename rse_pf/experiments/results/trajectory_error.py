@@ -1,5 +1,6 @@
 """Errors of an estimated trajectory against the true one: ATE and RPE as the TUM benchmark defines them.
 
+`accuracy` is what ``rse-pf compare`` and the benchmarks report: the truth is interpolated to the frames.
 Pure functions: they change neither trajectory and read no files.
 """
 
@@ -13,20 +14,32 @@ import numpy.typing as npt
 
 from client_sdk.mapping import Trajectory
 from rse_pf.errors import UsageError
-from rse_pf.geometry import Array, inverse, rotation_angle_deg
+from rse_pf.geometry import Array, exp_se3, inverse, log_se3, pose_difference, rotation_angle_deg
 
 __all__ = [
     "AbsoluteError",
+    "Accuracy",
     "RelativeError",
     "absolute_error",
+    "accuracy",
     "align",
     "associate",
+    "ate_m",
+    "interpolated",
+    "motion_errors",
     "relative_error",
     "trajectory_figures",
+    "with_truth",
 ]
 
 MAX_STAMP_DIFFERENCE_S = 0.02
 """Poses further apart in time are not compared: the TUM benchmark's default (evo's is 0.01)."""
+MAX_TRUTH_GAP_S = 0.25
+"""A pose between two true ones that are further apart has no truth."""
+SAME_STAMP_S = 0.002
+"""A pose this close to a true one in time has it as its truth, also before the first and after the last."""
+STEP_S = 1.0
+"""The motion of the relative error."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -50,6 +63,134 @@ class RelativeError:
     max_m: float
     max_deg: float
     steps: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Accuracy:
+    """Errors of a trajectory whose poses all have a truth, after one alignment of the whole.
+
+    ``rpe_m`` and ``rpe_deg`` are of the motion over `STEP_S`, None if no two poses are that far apart; they
+    are in metres also where the scale was estimated.  ``compared`` are the estimated poses before the
+    alignment, ``aligned`` after it, ``truth`` the true ones of the same times; ``has_unit`` says whether
+    ``compared`` is in metres, so that no scale is left to be estimated.
+    """
+
+    ate_m: float
+    ate_max_m: float
+    rpe_m: float | None
+    rpe_deg: float | None
+    rpe_max_deg: float | None
+    poses: int
+    scale: float
+    has_unit: bool
+    compared: Trajectory
+    aligned: Trajectory
+    truth: Trajectory
+
+
+def accuracy(
+    estimate: Trajectory,
+    truth: Trajectory,
+    *,
+    with_scale: bool = False,
+    T_body_camera: Array | None = None,
+) -> Accuracy:
+    """Return the errors of an estimate against a truth that is interpolated to its time stamps.
+
+    Args:
+        estimate: Poses of a camera; those without truth are left out.
+        truth: True poses of the same camera, in any frame.
+        with_scale: Estimate a scale (Sim(3)), as where the estimate's unit is unknown; else SE(3).
+        T_body_camera: ``(4, 4)``, metres; both are compared as poses of the body.  With a scale, that of the
+            camera's path is applied before, since the body's place beside the camera is in metres.
+
+    Raises:
+        UsageError: Fewer than three poses have a truth.
+
+    Source:
+        Sturm et al., IROS 2012, eqs. 1 to 3; alignment after Umeyama, PAMI 1991.
+    """
+    rows = np.flatnonzero(with_truth(truth, estimate.timestamps_s))
+    if len(rows) < 3:
+        raise UsageError(
+            f"{len(rows)} poses have a true one at their time, an evaluation needs 3",
+            hint="check that recording and truth use the same clock",
+        )
+    stamps_s, poses = estimate.timestamps_s[rows], estimate.T_world_camera[rows].copy()
+    true_poses = interpolated(truth, stamps_s)
+    compared, scale = poses.copy(), 1.0
+    if with_scale:
+        scale, _ = align(poses[:, :3, 3], true_poses[:, :3, 3], with_scale=True)
+        poses[:, :3, 3] *= scale
+    if T_body_camera is not None:
+        T_camera_body = inverse(T_body_camera)
+        poses, true_poses = poses @ T_camera_body, true_poses @ T_camera_body
+        compared = poses
+    _, T_truth_estimate = align(poses[:, :3, 3], true_poses[:, :3, 3])
+    poses = T_truth_estimate @ poses
+    distances = np.linalg.norm(poses[:, :3, 3] - true_poses[:, :3, 3], axis=1)
+    metres, degrees = motion_errors(stamps_s, poses, true_poses)
+    return Accuracy(
+        ate_m=_rms(distances),
+        ate_max_m=float(distances.max()),
+        rpe_m=_rms(metres) if len(metres) else None,
+        rpe_deg=_rms(degrees) if len(degrees) else None,
+        rpe_max_deg=float(degrees.max()) if len(degrees) else None,
+        poses=len(rows),
+        scale=scale,
+        has_unit=T_body_camera is not None or not with_scale,
+        compared=Trajectory(stamps_s, compared),
+        aligned=Trajectory(stamps_s, poses),
+        truth=Trajectory(stamps_s, true_poses),
+    )
+
+
+def with_truth(truth: Trajectory, stamps_s: npt.ArrayLike) -> npt.NDArray[np.bool_]:
+    """Return which of the ``(n,)`` times have a truth: true poses on both sides, or one at the same time."""
+    stamps, known = np.asarray(stamps_s, dtype=float), np.sort(truth.timestamps_s)
+    if not len(known):
+        return np.zeros(len(stamps), dtype=bool)
+    after = np.searchsorted(known, stamps)
+    left, right = known[np.clip(after - 1, 0, None)], known[np.clip(after, None, len(known) - 1)]
+    is_between = (left <= stamps) & (stamps <= right) & (right - left <= MAX_TRUTH_GAP_S)
+    nearest = np.minimum(np.abs(left - stamps), np.abs(right - stamps))
+    return np.asarray(is_between | (nearest <= SAME_STAMP_S))
+
+
+def interpolated(truth: Trajectory, stamps_s: npt.ArrayLike) -> Array:
+    """Return the ``(n, 4, 4)`` true poses at *stamps_s*, on the twist between the two around each.
+
+    Before the first true pose and after the last one it is that pose.
+    """
+    order = np.argsort(truth.timestamps_s, kind="stable")
+    stamps, known = np.atleast_1d(np.asarray(stamps_s, dtype=float)), truth.timestamps_s[order]
+    poses = truth.T_world_camera[order]
+    after = np.clip(np.searchsorted(known, stamps), 1, len(known) - 1)
+    apart_s = np.maximum(known[after] - known[after - 1], 1e-9)
+    shares = np.clip((stamps - known[after - 1]) / apart_s, 0.0, 1.0)
+    start, end = poses[after - 1], poses[after]
+    between: Array = start @ exp_se3(shares[:, None] * log_se3(inverse(start) @ end))
+    return between
+
+
+def motion_errors(stamps_s: Array, poses: Array, true_poses: Array) -> tuple[Array, Array]:
+    """Return the errors of the motion from each pose to that `STEP_S` later, in metres and degrees."""
+    errors = []
+    half_s = 0.5 * float(np.median(np.diff(stamps_s)))
+    for row, stamp_s in enumerate(stamps_s):
+        later = int(np.argmin(np.abs(stamps_s - stamp_s - STEP_S)))
+        if later > row and abs(stamps_s[later] - stamp_s - STEP_S) <= half_s + 1e-3:
+            moved = inverse(poses[row]) @ poses[later]
+            errors.append(pose_difference(moved, inverse(true_poses[row]) @ true_poses[later]))
+    return np.array([metres for metres, _ in errors]), np.array([degrees for _, degrees in errors])
+
+
+def ate_m(T_estimate: Array, T_truth: Array) -> float:
+    """Return the rmse of the positions of ``(n, 4, 4)`` poses after the best SE(3) alignment."""
+    positions, wanted = T_estimate[:, :3, 3], T_truth[:, :3, 3]
+    _, T_truth_estimate = align(positions, wanted)
+    moved = positions @ T_truth_estimate[:3, :3].T + T_truth_estimate[:3, 3]
+    return _rms(np.linalg.norm(moved - wanted, axis=1))
 
 
 def absolute_error(

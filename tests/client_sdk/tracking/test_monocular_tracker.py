@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.maps.rgb_only import kitti_drive
+from client_sdk.datasets.left_camera import open_kitti
 from client_sdk.frontend import Frame, PoseQuery, TrackedFrame
 from client_sdk.mapping import Trajectory
 from client_sdk.tracking.keyframe_map import NO_LANDMARK
@@ -207,10 +207,11 @@ def test_one_query_at_a_time_and_one_camera() -> None:
 
 @pytest.mark.slow
 def test_a_car_that_drives_forward_is_posed_from_its_first_frame(recordings: Path) -> None:
-    drive = kitti_drive(recordings / "kitti_00_left_start")
+    drive = open_kitti(recordings / "kitti_00_left_start")
+    assert drive.truth is not None
     tracker = MonocularTracker()
 
-    run_all(tracker, islice(drive.frames, 40))
+    run_all(tracker, islice(drive, 40))
 
     path = tracker.trajectory()
     assert len(path) >= 38

@@ -11,10 +11,13 @@ from client_sdk.mapping import Trajectory, read_trajectory
 from rse_pf.errors import UsageError
 from rse_pf.experiments.results.trajectory_error import (
     absolute_error,
+    accuracy,
     align,
     associate,
+    interpolated,
     relative_error,
     trajectory_figures,
+    with_truth,
 )
 from rse_pf.geometry import exp_se3, inverse
 
@@ -106,6 +109,86 @@ def test_clocks_that_do_not_overlap_are_an_error():
     with pytest.raises(UsageError, match="0 poses match"):
         absolute_error(estimate, truth)
     assert trajectory_figures(estimate, truth)["ate_cm"] is None
+
+
+def screw(stamps_s: np.ndarray) -> np.ndarray:
+    """Return the poses of a camera that moves on one twist: 0.5 m and 40 degrees a second."""
+    return exp_se3(np.asarray(stamps_s)[:, None] * np.array([0.3, 0.4, 0.0, 0.0, 0.0, np.radians(40.0)]))
+
+
+def test_the_truth_is_interpolated_to_the_frames_and_not_the_nearest_one():
+    known_s = np.arange(0.0, 5.0, 0.1)
+    frames_s = np.sort(np.random.default_rng(2).uniform(0.0, 4.8, 60))
+    truth, estimate = Trajectory(known_s, screw(known_s)), Trajectory(frames_s, screw(frames_s))
+
+    errors = accuracy(estimate, truth)
+
+    assert errors.poses == len(frames_s)
+    assert errors.ate_m == pytest.approx(0.0, abs=1e-9)
+    assert errors.rpe_m == pytest.approx(0.0, abs=1e-9)
+    assert errors.rpe_deg == pytest.approx(0.0, abs=1e-5)
+
+
+def test_a_known_scale_is_not_estimated():
+    stamps_s = np.arange(0.0, 5.0, 0.1)
+    truth, estimate = Trajectory(stamps_s, screw(stamps_s)), Trajectory(stamps_s, screw(stamps_s))
+    estimate.T_world_camera[:, :3, 3] *= 1.05
+
+    metric, free = accuracy(estimate, truth), accuracy(estimate, truth, with_scale=True)
+
+    assert metric.scale == 1.0
+    assert metric.ate_m > 0.01
+    assert free.scale == pytest.approx(1 / 1.05)
+    assert free.ate_m == pytest.approx(0.0, abs=1e-9)
+    assert free.rpe_m == pytest.approx(0.0, abs=1e-9)
+    assert not free.has_unit
+
+
+def test_the_relative_error_is_of_the_motion_over_one_second():
+    stamps_s = np.arange(0.0, 5.0, 0.1)
+    truth = Trajectory(stamps_s, np.tile(np.eye(4), (len(stamps_s), 1, 1)))
+    turning = exp_se3(stamps_s[:, None] * np.array([0.02, 0, 0, 0, 0, np.radians(3.0)]))
+
+    errors = accuracy(Trajectory(stamps_s, turning), truth)
+
+    assert errors.rpe_deg == pytest.approx(3.0)
+    assert errors.rpe_m == pytest.approx(0.02, rel=1e-3)
+
+
+def test_the_body_is_compared_where_its_place_beside_the_camera_is_known():
+    stamps_s = np.arange(0.0, 5.0, 0.1)
+    T_body_camera = exp_se3(np.array([0.5, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    truth = Trajectory(stamps_s, screw(stamps_s))
+    wrong = screw(stamps_s) @ exp_se3(np.array([0, 0, 0, 0, 0, np.radians(4.0)]) * np.sin(stamps_s)[:, None])
+    estimate = Trajectory(stamps_s, wrong)
+
+    of_camera, of_body = accuracy(estimate, truth), accuracy(estimate, truth, T_body_camera=T_body_camera)
+
+    assert of_camera.ate_m == pytest.approx(0.0, abs=1e-9)
+    assert of_body.ate_m > 0.005
+    scaled = Trajectory(stamps_s, screw(stamps_s))
+    scaled.T_world_camera[:, :3, 3] *= 3.0
+    free = accuracy(scaled, truth, with_scale=True, T_body_camera=T_body_camera)
+    assert (free.ate_m, free.scale) == (pytest.approx(0.0, abs=1e-9), pytest.approx(1 / 3))
+
+
+def test_a_pose_in_a_gap_of_the_truth_or_outside_of_it_has_none():
+    known_s = np.array([0.0, 0.1, 0.2, 1.0, 1.1])
+    truth = Trajectory(known_s, screw(known_s))
+    asked_s = np.array([-0.5, -0.001, 0.15, 0.5, 1.0, 1.101, 1.2])
+
+    assert with_truth(truth, asked_s).tolist() == [False, True, True, False, True, True, False]
+    with pytest.raises(UsageError, match="0 poses have a true one"):
+        accuracy(Trajectory(known_s + 50.0, screw(known_s)), truth)
+
+
+def test_a_truth_in_any_order_is_interpolated_alike():
+    known_s = np.arange(0.0, 2.0, 0.1)
+    order = np.random.default_rng(1).permutation(len(known_s))
+
+    found = interpolated(Trajectory(known_s[order], screw(known_s[order])), [0.05, 1.234])
+
+    np.testing.assert_allclose(found, screw(np.array([0.05, 1.234])), atol=1e-9)
 
 
 @pytest.mark.data

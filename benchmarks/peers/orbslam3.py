@@ -1,0 +1,398 @@
+"""ORB-SLAM3 beside our tracker on the same frames, with the same errors: several runs, losses included.
+
+    python -m venv PEER && PEER/bin/pip install pyorbslam3==0.1.1 opencv-python-headless
+    python -m benchmarks.peers.vocabulary ../shared/data --out words.txt
+    python -m benchmarks.peers.orbslam3 --python PEER/bin/python --vocabulary words.txt --out comparison
+
+The peer runs in its own environment and process (`orbslam3_process.py`), gets images and gives trajectory
+files; nothing of it is imported here.  It is paced by its own threads, or by the time stamps at --speed times
+real time; our tracker runs as in `rse-pf compare`.  Writes ``report.json`` and ``report.md``, figures only;
+rows and parts that are not measured now are kept as they were.
+
+Defends nothing: both are reported, with every run.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import json
+import os
+import subprocess
+import tempfile
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from client_sdk.datasets import associate_stamps
+from client_sdk.datasets.intrinsics import Intrinsics, read_intrinsics
+from client_sdk.datasets.left_camera import read_euroc_camera
+from client_sdk.frontend import load_opencv
+from client_sdk.mapping import Trajectory, read_trajectory
+from rse_pf.config import PlatformSettings
+from rse_pf.errors import UsageError
+from rse_pf.experiments.compare.configurations import Configuration, configurations_of
+from rse_pf.experiments.compare.recordings import Drive, drives_of
+from rse_pf.experiments.compare.solvers import InProcessSolver
+from rse_pf.experiments.compare.tracking_run import longest_gap_s, track
+from rse_pf.experiments.results.markdown import page, table
+from rse_pf.experiments.results.result_folder import environment, load_average, write_json
+from rse_pf.experiments.results.trajectory_error import accuracy
+from rse_pf.geometry import Array, inverse
+
+__all__ = ["main"]
+
+Sensor = Literal["RGBD", "STEREO", "MONOCULAR"]
+_PROCESS = Path(__file__).with_name("orbslam3_process.py")
+_KITCHEN, _TURNING, _EUROC = "7scenes_redkitchen", "tum_fr1_rpy_start", "euroc_mh01_start"
+_KITTI_STEREO, _KITTI = "kitti_06_start", "kitti_00_left_start"
+_LONGEST_S = 600.0
+_MAX_STAMP_DIFFERENCE_S = 0.02
+_DEPTH_BASELINE_M, _TOO_FAR = 0.08, 40.0
+"""A Kinect's baseline, and the baselines beyond which a point is far: the values of ORB-SLAM3's examples."""
+_FEATURES: dict[Sensor, int] = {"RGBD": 1000, "STEREO": 1200, "MONOCULAR": 1000}
+_FEATURES_OF_KITTI = 2000
+"""As in ORB-SLAM3's examples for these recordings."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Row:
+    """A recording at a rate with a sensor; our configuration beside it, empty where we have none."""
+
+    recording: str
+    rates_hz: tuple[float, ...]
+    sensor: Sensor
+    ours: str
+
+
+ROWS = (
+    Row(recording=_TURNING, rates_hz=(30, 15, 10, 5), sensor="RGBD", ours="default"),
+    Row(recording=_KITCHEN, rates_hz=(10, 5), sensor="RGBD", ours="default"),
+    Row(recording=_KITCHEN, rates_hz=(10, 5), sensor="MONOCULAR", ours="without-depth"),
+    Row(recording=_EUROC, rates_hz=(20, 10, 5), sensor="STEREO", ours=""),
+    Row(recording=_EUROC, rates_hz=(20, 10), sensor="MONOCULAR", ours="without-depth"),
+    Row(recording=_KITTI_STEREO, rates_hz=(9.6,), sensor="STEREO", ours=""),
+    Row(recording=_KITTI_STEREO, rates_hz=(9.6,), sensor="MONOCULAR", ours="without-depth"),
+    Row(recording=_KITTI, rates_hz=(9.6,), sensor="MONOCULAR", ours="without-depth"),
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Job:
+    """What the peer gets: its settings, the images, and the pose of its camera in ours and in the body."""
+
+    settings: str
+    frames: list[tuple[float, str, str | None]]
+    T_camera_peer: Array
+
+
+def job_of(recordings: Path, drive: Drive, sensor: Sensor) -> Job:
+    """Return the peer's job for a drive."""
+    name, stamps_s = drive.dataset.name, drive.dataset.timestamps_s
+    folder, rows = recordings / name, drive.dataset.rows
+    same = np.eye(4)
+    if name in (_KITCHEN, _TURNING):
+        colours, depths = _listed(folder / "rgb.txt"), _listed(folder / "depth.txt")
+        pairs = associate_stamps(
+            [stamp for stamp, _ in colours], [stamp for stamp, _ in depths], _MAX_STAMP_DIFFERENCE_S
+        )
+        lens = read_intrinsics(folder / "intrinsics.json", with_depth_scale=True)
+        frames = [
+            (stamp, str(folder / colours[pairs[row][0]][1]), str(folder / depths[pairs[row][1]][1]))
+            for stamp, row in zip(stamps_s, rows, strict=True)
+        ]
+        more = [f"RGBD.DepthMapFactor: {lens.depth_scale:.1f}", *_baseline(_DEPTH_BASELINE_M)]
+        return Job(settings=_yaml(lens, sensor, drive.rate_hz, more), frames=frames, T_camera_peer=same)
+    if name == _EUROC:
+        images = folder / "mav0"
+        lens, T_body_left = read_euroc_camera(images / "cam0" / "sensor.yaml")
+        lines = (images / "cam0/data.csv").read_text().splitlines()[1:]
+        names = [line.split(",")[1].strip() for line in lines]
+        frames = [
+            (stamp, str(images / "cam0/data" / names[row]), str(images / "cam1/data" / names[row]))
+            for stamp, row in zip(stamps_s, rows, strict=True)
+        ]
+        if sensor == "MONOCULAR":
+            return Job(settings=_yaml(lens, sensor, drive.rate_hz, []), frames=frames, T_camera_peer=same)
+        right, T_body_right = read_euroc_camera(images / "cam1" / "sensor.yaml")
+        T_left_right = inverse(T_body_left) @ T_body_right
+        return Job(
+            settings=_yaml(lens, sensor, drive.rate_hz, _two_lenses(right, T_left_right)),
+            frames=frames, T_camera_peer=_rectified(lens, right, T_left_right),
+        )  # fmt: skip
+    left = sorted((folder / "image_0").iterdir())
+    frames = [
+        (stamp, str(left[row]), str(folder / "image_1" / left[row].name))
+        for stamp, row in zip(stamps_s, rows, strict=True)
+    ]
+    lens = Intrinsics(camera=drive.dataset.camera)
+    settings = _yaml(lens, sensor, drive.rate_hz, [])
+    if sensor == "STEREO":
+        numbers = [float(word) for word in (folder / "calib.txt").read_text().splitlines()[1].split()[1:]]
+        settings = _rectified_yaml(lens, drive.rate_hz, -numbers[3])
+    return Job(settings=settings, frames=frames, T_camera_peer=same)
+
+
+def run_peer(args: argparse.Namespace, drive: Drive, sensor: Sensor, job: Job) -> dict[str, Any]:
+    """Run the peer once in a process of its own; return its figures."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        (folder / "settings.yaml").write_text(job.settings)
+        frames = [(s, one, None if sensor == "MONOCULAR" else two) for s, one, two in job.frames]
+        plan = {
+            "vocabulary": str(args.vocabulary.resolve()), "settings": str(folder / "settings.yaml"),
+            "sensor": sensor, "speed": args.speed, "frames": frames, "out": name,
+        }  # fmt: skip
+        (folder / "job.json").write_text(json.dumps(plan))
+        with (folder / "log.txt").open("w") as log:
+            done = subprocess.run(
+                [str(args.python), str(_PROCESS), str(folder / "job.json")],
+                stdout=log, stderr=subprocess.STDOUT, timeout=_LONGEST_S, check=False,
+            )  # fmt: skip
+        if not (folder / "figures.json").exists():
+            tail = (folder / "log.txt").read_text(errors="replace").splitlines()[-3:]
+            return {"failed": f"exit code {done.returncode}: {' / '.join(tail)[:200]}"}
+        figures: dict[str, Any] = json.loads((folder / "figures.json").read_text())
+        figures["load_average"] = os.getloadavg()[0]
+        for which in ("final", "online"):
+            figures[which] = _scored(
+                read_trajectory(folder / f"{which}.txt"), drive, sensor, job.T_camera_peer
+            )
+    return figures
+
+
+def run_ours(configuration: Configuration, drive: Drive) -> dict[str, Any]:
+    """Run our tracker once, as `rse-pf compare` does; return its figures."""
+    run = asyncio.run(track(configuration, drive, InProcessSolver(PlatformSettings())))
+    return {
+        **run.figures,
+        **{f"{name}_ms": value for name, value in run.times_ms.items()},
+        "digest": run.digest,
+    }
+
+
+def _scored(estimate: Trajectory, drive: Drive, sensor: Sensor, T_camera_peer: Array) -> dict[str, Any]:
+    """Return poses, gap and errors of a trajectory of the peer's camera."""
+    dataset = drive.dataset
+    assert dataset.truth is not None
+    scored: dict[str, Any] = {
+        "posed": len(estimate),
+        "longest_gap_s": longest_gap_s(np.array(dataset.timestamps_s), estimate.timestamps_s),
+        "ate_cm": None, "rpe_cm": None, "rpe_deg": None,
+    }  # fmt: skip
+    body = None if dataset.T_body_camera is None else dataset.T_body_camera @ T_camera_peer
+    truth = Trajectory(dataset.truth.timestamps_s, dataset.truth.T_world_camera @ T_camera_peer)
+    try:
+        errors = accuracy(estimate, truth, with_scale=sensor == "MONOCULAR", T_body_camera=body)
+    except UsageError:
+        return scored
+    rpe_cm = None if errors.rpe_m is None else 100 * errors.rpe_m
+    return {**scored, "ate_cm": 100 * errors.ate_m, "rpe_cm": rpe_cm, "rpe_deg": errors.rpe_deg}
+
+
+def _listed(path: Path) -> list[tuple[float, str]]:
+    rows = [line.split() for line in path.read_text().splitlines() if line and not line.startswith("#")]
+    return sorted((float(stamp), name) for stamp, name in rows)
+
+
+def _yaml(lens: Intrinsics, sensor: Sensor, rate_hz: float, more: Sequence[str]) -> str:
+    """Return a settings file of ORB-SLAM3 (version 1.0)."""
+    camera = lens.camera
+    lines = [
+        "%YAML:1.0", 'File.version: "1.0"', 'Camera.type: "PinHole"', *_lens("Camera1", lens),
+        f"Camera.width: {camera.width}", f"Camera.height: {camera.height}",
+        f"Camera.fps: {max(1, round(rate_hz))}", "Camera.RGB: 1", f"Stereo.ThDepth: {_TOO_FAR}",
+        *more, *_shared_lines(_FEATURES_OF_KITTI if camera.width > 1000 else _FEATURES[sensor]),
+    ]  # fmt: skip
+    return "\n".join(lines) + "\n"
+
+
+def _rectified_yaml(lens: Intrinsics, rate_hz: float, baseline_fx: float) -> str:
+    """Return the older form of the settings of a rectified pair: the newer one crashes the peer (0.1.1)."""
+    camera = lens.camera
+    lines = [
+        "%YAML:1.0", 'Camera.type: "PinHole"', *_lens("Camera", lens),
+        *(f"Camera.{name}: 0.0" for name in ("k1", "k2", "p1", "p2")),
+        f"Camera.width: {camera.width}", f"Camera.height: {camera.height}",
+        f"Camera.fps: {float(rate_hz)}", "Camera.RGB: 1", f"Camera.bf: {baseline_fx!r}",
+        f"ThDepth: {_TOO_FAR}", *_shared_lines(_FEATURES_OF_KITTI),
+    ]  # fmt: skip
+    return "\n".join(lines) + "\n"
+
+
+def _shared_lines(features: int) -> list[str]:
+    viewer = {
+        "KeyFrameSize": 0.05, "KeyFrameLineWidth": 1.0, "GraphLineWidth": 0.9, "PointSize": 2.0,
+        "CameraSize": 0.08, "CameraLineWidth": 3.0, "ViewpointX": 0.0, "ViewpointY": -0.7, "ViewpointZ": -1.8,
+        "ViewpointF": 500.0,
+    }  # fmt: skip
+    return [
+        f"ORBextractor.nFeatures: {features}", "ORBextractor.scaleFactor: 1.2", "ORBextractor.nLevels: 8",
+        "ORBextractor.iniThFAST: 20", "ORBextractor.minThFAST: 7",
+        *(f"Viewer.{name}: {value}" for name, value in viewer.items()),
+    ]  # fmt: skip
+
+
+def _lens(name: str, lens: Intrinsics) -> list[str]:
+    camera = lens.camera
+    values = {"fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy}
+    values |= dict(zip(("k1", "k2", "p1", "p2", "k3"), lens.distortion, strict=False))
+    return [f"{name}.{each}: {float(value)!r}" for each, value in values.items()]
+
+
+def _baseline(metres: float) -> list[str]:
+    return [f"Stereo.b: {metres:.6f}"]
+
+
+def _two_lenses(right: Intrinsics, T_left_right: Array) -> list[str]:
+    numbers = ", ".join(f"{value:.12g}" if value % 1 else f"{value:.1f}" for value in T_left_right.ravel())
+    return [
+        *_lens("Camera2", right),
+        "Stereo.T_c1_c2: !!opencv-matrix", "  rows: 4", "  cols: 4", "  dt: f", f"  data: [{numbers}]",
+    ]  # fmt: skip
+
+
+def _rectified(left: Intrinsics, right: Intrinsics, T_left_right: Array) -> Array:
+    """Return the pose of the rectified left camera in the left one, as ORB-SLAM3 rectifies."""
+    T_right_left = inverse(T_left_right)
+    size = (left.camera.width, left.camera.height)
+    rotation = load_opencv().stereoRectify(
+        left.camera.matrix, np.array(left.distortion), right.camera.matrix, np.array(right.distortion), size,
+        T_right_left[:3, :3], T_right_left[:3, 3], alpha=-1,
+    )[0]  # fmt: skip
+    T_left_rectified = np.eye(4)
+    T_left_rectified[:3, :3] = rotation.T
+    return T_left_rectified
+
+
+def report_page(report: dict[str, Any]) -> str:
+    """Return ``report.md``."""
+    about = report["environment"]
+    head = (
+        "recording", "frames", "sensor", "who", "run", "posed", "longest gap s", "ATE cm",
+        "ATE cm, as returned", "RPE cm / deg over 1 s", "CPU ms a frame",
+    )  # fmt: skip
+    return page(
+        "# Our tracker beside ORB-SLAM3",
+        f"Commit {about['commit']}. {report['peer']}; {_pace(report['speed'])}; "
+        f"ours once: it is deterministic. {about['cores']} cores, {about['system']}, Python "
+        f"{about['python']}; load average {about['load_average']} before our runs, "
+        f"{report['load_average_after']} after them.",
+        table(head, [cells for row in report["rows"] for cells in _rows_of(row)]),
+    )
+
+
+def _pace(speed: float) -> str:
+    if speed:
+        return f"the peer ran at {speed:g} times real time"
+    return "the peer got each frame when all of its threads rested, which is not real time and favours it"
+
+
+def _rows_of(row: dict[str, Any]) -> Iterator[tuple[Any, ...]]:
+    """Yield the lines of a recording: ours, and each run of the peer."""
+    about = (row["name"], row["frames"], f"{row['sensor'].lower()}, {row['alignment']}")
+    ours = row.get("ours")
+    if ours is None:
+        yield (*about, "ours", "", "no such tracker", *[""] * 5)
+    else:
+        yield (
+            *about, "ours", 1, ours["posed"], _fixed(ours["longest_gap_s"]), _fixed(ours["ate_cm"]),
+            _fixed(ours["ate_online_cm"]), f"{_fixed(ours['rpe_cm'])} / {_fixed(ours['rpe_deg'])}",
+            f"{ours['robot_ms']:.0f} + {ours['server_ms']:.0f}",
+        )  # fmt: skip
+    for number, run in enumerate(row.get("peer", ()), start=1):
+        if "failed" in run:
+            yield (*about, "ORB-SLAM3", number, run["failed"].partition(":")[0], *[""] * 5)
+            continue
+        final, online = run["final"], run["online"]
+        yield (
+            *about, "ORB-SLAM3", number, f"{final['posed']} ({online['posed']} as returned)",
+            _fixed(final["longest_gap_s"]), _fixed(final["ate_cm"]), _fixed(online["ate_cm"]),
+            f"{_fixed(final['rpe_cm'])} / {_fixed(final['rpe_deg'])}", f"{run['cpu_ms_a_frame']:.0f}",
+        )  # fmt: skip
+
+
+def _fixed(value: float | None) -> str:
+    return "-" if value is None else f"{value:.2f}"
+
+
+def main() -> int:
+    """Run all rows and write the report."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--python", type=Path, required=True, help="of the environment of the peer")
+    parser.add_argument("--vocabulary", type=Path, required=True)
+    parser.add_argument("--recordings", type=Path, default=Path("../shared/data"))
+    parser.add_argument("--runs", type=int, default=3)
+    parser.add_argument(
+        "--speed",
+        type=float,
+        default=0.0,
+        help="times real time; 0 gives a frame when all threads rest (default)",
+    )
+    parser.add_argument("--only", default="", help="rows whose name and sensor contain this")
+    parser.add_argument(
+        "--part", choices=("both", "ours", "peer"), default="both", help="who is measured now"
+    )
+    parser.add_argument("--more", action="store_true", help="add runs of the peer to those that are there")
+    parser.add_argument("--out", type=Path, required=True, help="folder of the report")
+    args = parser.parse_args()
+    args.recordings, args.python = args.recordings.resolve(), args.python.absolute()
+    args.out.mkdir(parents=True, exist_ok=True)
+    load_opencv().setNumThreads(1)
+    file = args.out / "report.json"
+    report: dict[str, Any] = json.loads(file.read_text()) if file.exists() else {"experiment": "comparison"}
+    known = {(row["name"], row["sensor"]): row for row in report.get("rows", [])}
+    if args.part != "peer" or "environment" not in report:
+        report["environment"] = environment(PlatformSettings())
+    if args.part != "ours":
+        report |= {"peer": _about_peer(args), "speed": args.speed}
+    for row in ROWS:
+        for drive in drives_of([str(args.recordings / row.recording)], row.rates_hz):
+            key = (drive.name, row.sensor)
+            if args.only in f"{drive.name} {row.sensor}":
+                known[key] = {
+                    **known.get(key, {}),
+                    **_measured(args, row, drive, known.get(key, {}).get("peer", [])),
+                }
+                print(json.dumps(known[key]), flush=True)
+            report["rows"] = list(known.values())
+            report["load_average_after"] = load_average()
+            write_json(file, report)
+            (args.out / "report.md").write_text(report_page(report), encoding="utf-8")
+    return 0
+
+
+def _measured(
+    args: argparse.Namespace, row: Row, drive: Drive, earlier: Sequence[dict[str, Any]]
+) -> dict[str, Any]:
+    """Return what is measured now of a row; with --more, after the *earlier* runs of the peer."""
+    before = earlier if args.more else ()
+    measured: dict[str, Any] = {
+        "name": drive.name, "sensor": row.sensor, "frames": len(drive.dataset),
+        "alignment": "Sim(3)" if row.sensor == "MONOCULAR" else "SE(3)",
+    }  # fmt: skip
+    if args.part != "peer":
+        measured["ours"] = run_ours(configurations_of([row.ours])[0], drive) if row.ours else None
+    if args.part != "ours":
+        job = job_of(args.recordings, drive, row.sensor)
+        measured["peer"] = [*before, *(run_peer(args, drive, row.sensor, job) for _ in range(args.runs))]
+    return measured
+
+
+def _about_peer(args: argparse.Namespace) -> str:
+    """Return the version of the peer and the size of its vocabulary."""
+    version = ["-c", "from importlib.metadata import version; print(version('pyorbslam3'))"]
+    told = subprocess.run([str(args.python), *version], capture_output=True, text=True, check=True).stdout
+    words = sum(line.split()[1] == "1" for line in args.vocabulary.read_text().split("\n")[1:])
+    return (
+        f"pyorbslam3 {told.strip()} with a vocabulary of {words} words, trained on images of these recordings"
+    )
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

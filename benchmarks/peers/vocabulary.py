@@ -1,0 +1,139 @@
+"""Train a vocabulary for ORB-SLAM3 from images, as the text file that its library DBoW2 reads.
+
+ORB features of each image are clustered into a tree of 10 branches and 6 levels, by k-medians of bits; a word
+weighs the logarithm of images over images that show it.  Deterministic: the same images give the same file.
+The file belongs to the images, and is not committed.
+
+    python -m benchmarks.peers.vocabulary ../shared/data --every 5 --out words.txt
+
+Source:
+    Galvez-Lopez and Tardos, "Bags of Binary Words for Fast Place Recognition in Image Sequences", T-RO 2012.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from client_sdk.frontend import describe
+from client_sdk.monocular.opencv import load_opencv, read_image
+
+__all__ = ["Node", "main", "text_of", "train"]
+
+Bits = npt.NDArray[np.uint8]
+
+_BRANCHES, _LEVELS, _ROUNDS = 10, 6, 8
+_LEAST_SPLIT = 24
+"""A cluster of fewer descriptors is a word."""
+_FEATURES = 1000
+_TF_IDF, _L1 = 0, 0
+"""As DBoW2 numbers weighting and scoring."""
+_FOLDERS = ("rgb", "image_0", "data")
+"""Folders of colour or grey images in the layouts of TUM, KITTI and EuRoC."""
+
+
+@dataclass(slots=True, eq=False)
+class Node:
+    """A node of the tree: its ``(32,)`` descriptor, its parent's number, and its weight if it is a word."""
+
+    descriptor: Bits
+    parent: int
+    rows: npt.NDArray[np.int64]
+    depth: int
+    weight: float = 0.0
+    children: list[int] = field(default_factory=list)
+
+
+def train(descriptors: Bits, images: npt.NDArray[np.int64]) -> list[Node]:
+    """Return the nodes of the tree, the root first, each parent before its children.
+
+    Args:
+        descriptors: ``(n, 32)``.
+        images: ``(n,)``, the number of the image that shows each of them, from 0.
+    """
+    rng = np.random.default_rng(0)
+    nodes = [Node(np.zeros(32, np.uint8), parent=0, rows=np.arange(len(descriptors)), depth=0)]
+    for number, node in enumerate(nodes):  # the list grows while it is read: breadth first
+        if node.depth < _LEVELS and len(node.rows) >= _LEAST_SPLIT:
+            for centre, rows in _split(descriptors, node.rows, rng):
+                node.children.append(len(nodes))
+                nodes.append(Node(centre, parent=number, rows=rows, depth=node.depth + 1))
+        if not node.children:
+            shown_by = len(np.unique(images[node.rows]))
+            node.weight = float(np.log((images.max() + 1) / max(1, shown_by)))
+    return nodes
+
+
+def text_of(nodes: Sequence[Node]) -> str:
+    """Return the tree as DBoW2's text; its reader takes an empty last line for a node, so there is none."""
+    lines = [f"{_BRANCHES} {_LEVELS} {_L1} {_TF_IDF}"]
+    for node in nodes[1:]:
+        bits = " ".join(map(str, node.descriptor))
+        lines.append(f"{node.parent} {int(not node.children)} {bits} {node.weight:.6g}")
+    return "\n".join(lines)
+
+
+def _split(
+    descriptors: Bits, rows: npt.NDArray[np.int64], rng: np.random.Generator
+) -> Iterator[tuple[Bits, npt.NDArray[np.int64]]]:
+    """Yield the centre and the rows of each cluster of *rows*; nothing if they cannot be told apart."""
+    signs = np.unpackbits(descriptors[rows], axis=1).astype(np.float32) * 2 - 1
+    centres = signs[rng.choice(len(rows), size=min(_BRANCHES, len(rows)), replace=False)]
+    owner = np.zeros(len(rows), dtype=np.int64)
+    for _ in range(_ROUNDS):
+        nearest = (signs @ centres.T).argmax(axis=1)
+        if np.array_equal(nearest, owner):
+            break
+        owner = nearest
+        for each in np.unique(owner):
+            centres[each] = np.where(signs[owner == each].sum(axis=0) >= 0, 1.0, -1.0)
+    found = np.unique(owner)
+    if len(found) > 1:
+        for each in found:
+            yield np.packbits(centres[each] > 0), rows[owner == each]
+
+
+def _images(folders: Sequence[Path], every: int) -> list[Path]:
+    paths = [
+        path
+        for folder in folders
+        for path in sorted(folder.rglob("*"))
+        if path.parent.name in _FOLDERS and path.suffix in (".jpg", ".png")
+    ]
+    return paths[::every]
+
+
+def main() -> int:
+    """Train on the images below the folders, and write the file."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("folders", type=Path, nargs="+", metavar="FOLDER")
+    parser.add_argument("--every", type=int, default=5, help="take each n-th image (default: 5)")
+    parser.add_argument("--out", type=Path, required=True)
+    args = parser.parse_args()
+    began = time.perf_counter()
+    paths = _images(args.folders, args.every)
+    cv2 = load_opencv()
+    described = []
+    for path in paths:
+        image = read_image(path, cv2.IMREAD_COLOR)
+        assert image is not None, path
+        described.append(describe(image, _FEATURES, is_spread=True).descriptors)
+    images = np.repeat(np.arange(len(described)), [len(each) for each in described])
+    nodes = train(np.concatenate(described), images)
+    args.out.write_text(text_of(nodes), encoding="ascii")
+    words = sum(not node.children for node in nodes)
+    took_s = time.perf_counter() - began
+    print(f"{len(paths)} images, {len(images)} descriptors, {words} words in {took_s:.0f} s")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,113 @@
+"""The recordings that a comparison reads: all formats of the SDK, and rendered worlds by ``world:SEED``."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+from client_sdk.datasets import Dataset, open_dataset
+from client_sdk.datasets.left_camera import is_euroc, is_kitti, open_euroc, open_kitti
+from client_sdk.datasets.thinning import median_interval_s
+from client_sdk.frontend import Frame
+from client_sdk.simulator import RATE_HZ, SIMULATED_CAMERA, render_frames, true_trajectory
+from rse_pf.errors import UsageError
+
+__all__ = ["Drive", "drives_of", "open_recording"]
+
+_WORLD = re.compile(r"world:(\d{1,9})")
+_WORLD_FRAMES = 80
+_ABOVE = 1.05
+"""A rate that is so many times the recording's is above it."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Drive:
+    """A recording at one rate; ``rate_hz`` is that of its frames, ``notes`` what the user should know."""
+
+    dataset: Dataset
+    rate_hz: float
+    notes: tuple[str, ...] = ()
+
+    @property
+    def name(self) -> str:
+        """The recording and the rate, for people."""
+        return f"{self.dataset.name} at {self.rate_hz:.3g} Hz"
+
+
+def drives_of(words: Sequence[str], rates_hz: Sequence[float]) -> list[Drive]:
+    """Return each recording at each rate; without rates at its own.
+
+    Raises:
+        UsageError: A recording cannot be read, or two have one name.
+    """
+    drives: list[Drive] = []
+    names: dict[str, str] = {}
+    for word in words:
+        dataset = open_recording(word)
+        if dataset.name in names:
+            raise UsageError(
+                f"two recordings are called {dataset.name}: {names[dataset.name]} and {word}",
+                hint="name each once, or rename a folder",
+            )
+        names[dataset.name] = word
+        drives += _at_rates(dataset, rates_hz)
+    return drives
+
+
+def open_recording(word: str) -> Dataset:
+    """Return the recording that a path or ``world:SEED`` names.
+
+    Raises:
+        UsageError: It is none.
+    """
+    world = _WORLD.fullmatch(word)
+    if world is not None:
+        return _rendered(int(world[1]))
+    if word.startswith("world:"):
+        raise UsageError(f"{word} names no rendered world", hint="write world: and a seed, such as world:3")
+    path = Path(word)
+    if is_euroc(path):
+        return open_euroc(path)
+    if is_kitti(path):
+        return open_kitti(path)
+    return open_dataset(path)
+
+
+def _at_rates(dataset: Dataset, rates_hz: Sequence[float]) -> list[Drive]:
+    interval_s = median_interval_s(dataset.timestamps_s)
+    own_hz = 1.0 / interval_s if interval_s > 0 else 1.0
+    drives: list[Drive] = []
+    for rate_hz in rates_hz or (own_hz,):
+        notes = dataset.notes
+        if rate_hz > _ABOVE * own_hz:
+            notes = (
+                *notes,
+                f"--rate {rate_hz:g} is above the recording's {own_hz:.3g} Hz: all frames are played",
+            )
+        chosen = dataset.thinned(rate_hz)
+        if any(chosen.rows == other.dataset.rows for other in drives):
+            continue
+        drives.append(Drive(dataset=chosen, rate_hz=min(rate_hz, own_hz), notes=notes))
+    return drives
+
+
+def _rendered(seed: int) -> Dataset:
+    truth = true_trajectory(0, 1, _WORLD_FRAMES, seed)
+
+    @cache
+    def frames() -> list[Frame]:
+        return list(render_frames(0, 1, _WORLD_FRAMES, seed))
+
+    return Dataset(
+        name=f"world-{seed}",
+        camera=SIMULATED_CAMERA,
+        timestamps_s=tuple(truth.timestamps_s.tolist()),
+        truth=truth,
+        truth_kind="ground truth",
+        rows=tuple(range(_WORLD_FRAMES)),
+        read=lambda row: frames()[row],
+        notes=(f"rendered, {RATE_HZ:g} Hz: exact poses, a Kinect's noise",),
+    )

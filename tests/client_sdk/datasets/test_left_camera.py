@@ -1,0 +1,137 @@
+"""Readers of EuRoC and KITTI, on generated files with values computed by hand."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from client_sdk.datasets.left_camera import is_euroc, is_kitti, open_euroc, open_kitti
+from rse_pf.errors import UsageError
+from rse_pf.geometry import exp_se3
+
+cv2 = pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
+
+T_BS = exp_se3(np.array([0.1, -0.2, 0.3, 0.2, 0.1, -1.4]))
+SENSOR = """# a camera
+T_BS:
+  cols: 4
+  rows: 4
+  data: [{data}]
+resolution: [64, 48]
+intrinsics: [60.0, 61.0, 31.5, 23.5] #fu, fv, cu, cv
+distortion_coefficients: [0.0, 0.0, 0.0, 0.0]
+"""
+FIRST_NS = 1_403_636_579_763_555_584
+
+
+def write_euroc(folder: Path, frames: int = 3) -> Path:
+    images = folder / "mav0" / "cam0" / "data"
+    images.mkdir(parents=True)
+    data = ",\n  ".join(", ".join(repr(float(value)) for value in row) for row in T_BS)
+    (images.parent / "sensor.yaml").write_text(SENSOR.format(data=data))
+    stamps = [FIRST_NS + 50_000_000 * row for row in range(frames)]
+    lines = ["#timestamp [ns],filename", *(f"{stamp},{stamp}.png\r" for stamp in stamps)]
+    (images.parent / "data.csv").write_text("\n".join(lines) + "\n")
+    for row, stamp in enumerate(stamps):
+        cv2.imwrite(str(images / f"{stamp}.png"), np.full((48, 64), 10 * row, np.uint8))
+    truth = folder / "mav0" / "state_groundtruth_estimate0"
+    truth.mkdir()
+    half = np.sqrt(0.5)
+    rows = [f"{stamp},{row},2,3,{half},0,0,{half},0,0,0" for row, stamp in enumerate(stamps)]
+    (truth / "data.csv").write_text("\n".join(["#timestamp, p, q", *rows]) + "\n")
+    return folder
+
+
+def write_kitti(folder: Path, frames: int = 3, poses: Path | None = None) -> Path:
+    (folder / "image_0").mkdir(parents=True)
+    for row in range(frames):
+        cv2.imwrite(str(folder / "image_0" / f"{row:06}.png"), np.full((30, 90), row, np.uint8))
+    (folder / "calib.txt").write_text("P0: 70 0 44 0 0 71 14 0 0 0 1 0\nP1: 70 0 44 -9 0 71 14 0 0 0 1 0\n")
+    (folder / "times.txt").write_text("".join(f"{row / 10}\n" for row in range(frames)))
+    path = poses or folder / "poses.txt"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text("".join(f"1 0 0 {row} 0 1 0 0 0 0 1 5\n" for row in range(frames)))
+    return folder
+
+
+def test_euroc_gives_the_left_camera_and_its_own_true_poses(tmp_path: Path) -> None:
+    folder = write_euroc(tmp_path / "MH_01")
+
+    dataset = open_euroc(folder)
+
+    assert is_euroc(folder)
+    assert (dataset.name, len(dataset), dataset.has_depth) == ("MH_01", 3, False)
+    assert np.diff(dataset.timestamps_s) == pytest.approx([0.05, 0.05], abs=1e-6)
+    assert dataset.timestamps_s[0] == pytest.approx(FIRST_NS / 1e9, abs=1e-6)
+    assert list(dataset)[2].rgb[5, 5].tolist() == [20, 20, 20]
+    assert not next(iter(dataset)).depth_m.any()
+    turned = np.array([[0, -1, 0, 2], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]])
+    assert dataset.truth is not None
+    np.testing.assert_allclose(dataset.truth.T_world_camera[2], turned @ T_BS, atol=1e-12)
+    np.testing.assert_allclose(dataset.T_body_camera, T_BS)
+
+
+@pytest.mark.parametrize("is_apart", [False, True])
+def test_kitti_gives_the_left_camera_and_its_poses(tmp_path: Path, is_apart: bool) -> None:
+    apart = tmp_path / "poses" / "06.txt" if is_apart else None
+    folder = write_kitti(tmp_path / "sequences" / "06", poses=apart)
+
+    dataset = open_kitti(folder)
+
+    assert is_kitti(folder)
+    assert (dataset.name, dataset.timestamps_s, dataset.has_depth) == ("06", (0.0, 0.1, 0.2), False)
+    camera = dataset.camera
+    assert (camera.fx, camera.fy, camera.cx, camera.cy, camera.width) == (70.0, 71.0, 44.0, 14.0, 90)
+    assert dataset.truth is not None
+    assert dataset.truth.positions.tolist() == [[0, 0, 5], [1, 0, 5], [2, 0, 5]]
+    assert dataset.T_body_camera is None
+
+
+def test_recordings_without_truth_are_read(tmp_path: Path) -> None:
+    euroc, kitti = write_euroc(tmp_path / "e"), write_kitti(tmp_path / "k")
+    (euroc / "mav0/state_groundtruth_estimate0/data.csv").unlink()
+    (kitti / "poses.txt").unlink()
+
+    assert (open_euroc(euroc).truth, open_euroc(euroc).truth_kind) == (None, "none")
+    assert open_kitti(kitti).truth is None
+
+
+@pytest.mark.parametrize(
+    ("file", "text", "says"),
+    [
+        ("mav0/cam0/sensor.yaml", "intrinsics: [1, 2, 3]\n", "is not that of a camera"),
+        ("mav0/cam0/sensor.yaml", SENSOR.format(data="1, x"), "no number"),
+        ("mav0/cam0/data.csv", "#\n12\n", "less than 2 values"),
+        ("mav0/cam0/data.csv", "#\n", "has no images"),
+        ("mav0/cam0/data.csv", "2,b.png\n1,a.png\n", "do not ascend"),
+        ("mav0/cam0/data.csv", "x,a.png\n", "no number"),
+        ("mav0/state_groundtruth_estimate0/data.csv", "1,2,3\n", "less than 8 values"),
+    ],
+)
+def test_a_broken_file_of_euroc_is_one_line(tmp_path: Path, file: str, text: str, says: str) -> None:
+    folder = write_euroc(tmp_path / "x")
+    (folder / file).write_text(text)
+
+    with pytest.raises(UsageError, match=says):
+        open_euroc(folder)
+
+
+@pytest.mark.parametrize(
+    ("file", "text", "says"),
+    [
+        ("calib.txt", "P0: 1 2\n", "12 numbers of P0"),
+        ("calib.txt", "", "12 numbers of P0"),
+        ("times.txt", "0.0\nx\n", "no number"),
+        ("times.txt", "0.0\nnan\n", "not finite"),
+        ("times.txt", "0.2\n0.1\n0.0\n", "do not ascend"),
+        ("poses.txt", "1 2 3\n", "12 numbers for each image"),
+    ],
+)
+def test_a_broken_file_of_kitti_is_one_line(tmp_path: Path, file: str, text: str, says: str) -> None:
+    folder = write_kitti(tmp_path / "x")
+    (folder / file).write_text(text)
+
+    with pytest.raises(UsageError, match=says):
+        open_kitti(folder)

@@ -1,0 +1,114 @@
+"""Configurations by name and from files, and what is refused in one line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from client_sdk.frontend import FrontEndOptions
+from rse_pf.errors import UsageError
+from rse_pf.experiments.compare import configurations
+from rse_pf.experiments.compare.configurations import BUILT_IN, configurations_of
+
+toml = pytest.importorskip("tomllib", reason="Python 3.10 reads no TOML")
+
+
+def written(folder: Path, name: str, text: str) -> str:
+    path = folder / name
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text)
+    return str(path)
+
+
+def refusal(word: str) -> UsageError:
+    with pytest.raises(UsageError) as refused:
+        configurations_of([word])
+    assert "\n" not in refused.value.message
+    assert refused.value.hint
+    return refused.value
+
+
+def test_every_name_of_the_help_is_a_configuration() -> None:
+    names = [name.replace("-N", "-500") for name in BUILT_IN]
+
+    found = configurations_of(names)
+
+    assert [each.name for each in found] == names
+    assert found[names.index("features-500")].frontend.features == 500
+    assert found[names.index("features-500")].monocular.features == 500
+    assert found[names.index("without-depth")].depth is False
+    assert found[names.index("wide-baseline")].frontend == FrontEndOptions.wide_baseline()
+
+
+def test_a_table_changes_options_of_a_base(tmp_path: Path) -> None:
+    text = 'base = "wide-baseline"\ndepth = true\n[frontend]\nfeatures = 700\nratio = 1\n'
+
+    (found,) = configurations_of([written(tmp_path, "many.toml", text)])
+
+    assert (found.name, found.depth) == ("many", True)
+    assert (found.frontend.features, found.frontend.ratio, found.frontend.min_inliers) == (700, 1.0, 12)
+
+
+def test_a_python_file_sets_options_and_may_import_its_neighbour(tmp_path: Path) -> None:
+    written(tmp_path, "compared_neighbour.py", "MANY = 321\n")
+    text = "from compared_neighbour import MANY\nfrontend = {'features': MANY}\n"
+
+    (found,) = configurations_of([written(tmp_path, "mine.py", text)])
+
+    assert (found.name, found.frontend.features, found.slots) == ("mine", 321, {})
+
+
+def test_a_function_becomes_a_slot_as_soon_as_the_mapper_has_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Mapper:
+        """Takes features, and no loops."""
+
+        def __init__(self, features=None) -> None: ...
+
+    monkeypatch.setattr(configurations, "Mapper", Mapper)
+    good = written(tmp_path, "good.py", "def features(image): ...\n")
+    early = written(tmp_path, "early.py", "def loops(keyframes): ...\n")
+
+    assert list(configurations_of([good])[0].slots) == ["features"]
+    refused = refusal(early)
+    assert "takes no loops" in refused.message
+    assert "features" in (refused.hint or "")
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "says"),
+    [
+        ("a.toml", "features = 500\n", "sets features, which is no part"),
+        ("a.toml", "fronted = 500\n", "sets fronted"),
+        ("a.toml", "[frontend\n", "is no TOML"),
+        ("a.toml", "[frontend]\nfeatures = 'many'\n", "frontend.features = 'many' is no int"),
+        ("a.toml", "[frontend]\nfeatures = true\n", "frontend.features = True is no int"),
+        ("a.toml", "[frontend]\nfeatures = 5\n", "must not be below"),
+        ("a.toml", "[monocular]\nlimits = 5\n", "monocular has no option limits"),
+        ("a.toml", "frontend = 5\n", "frontend is no table"),
+        ("a.toml", "base = 'fast'\n", "no configuration 'fast'"),
+        ("a.toml", "depth = 1\n", "neither true nor false"),
+        ("a.py", "x = 1\n", "sets nothing"),
+        ("a.py", "features = 3\n", "features is no function"),
+        ("a.py", "\n1 / 0\n", "line 2: ZeroDivisionError: division by zero"),
+        ("a.py", "import nothing_of_this_name\n", "line 1: ModuleNotFoundError"),
+        ("a.py", "raise SystemExit(3)\n", "line 1: SystemExit: 3"),
+        ("a.py", "raise ValueError('two\\nlines')\n", "line 1: ValueError: two"),
+    ],
+)
+def test_a_broken_file_is_one_line_with_a_hint(tmp_path: Path, name: str, text: str, says: str) -> None:
+    word = written(tmp_path, name, text)
+
+    refused = refusal(word)
+
+    assert says in refused.message
+    assert word in refused.message
+
+
+def test_two_files_of_one_name_are_refused(tmp_path: Path) -> None:
+    words = [written(tmp_path / folder, "mine.toml", "depth = true\n") for folder in ("a", "b")]
+
+    with pytest.raises(UsageError, match="two configurations are called mine"):
+        configurations_of(words)

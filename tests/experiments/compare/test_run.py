@@ -1,0 +1,162 @@
+"""The whole comparison: table, JSON, picture, trajectories, the spread, and evo's figures."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from client_sdk.mapping import read_trajectory
+from rse_pf.config import PlatformSettings
+from rse_pf.experiments.compare import evo_figures, run
+from rse_pf.experiments.compare.configurations import configurations_of
+from rse_pf.experiments.compare.evo_figures import evo_ate_cm, evo_command
+from rse_pf.experiments.compare.report import row_of, runs_line, table_lines
+from rse_pf.experiments.compare.run import CompareOptions, run_compare
+from rse_pf.experiments.compare.solvers import InProcessSolver
+from rse_pf.experiments.compare.tracking_run import track
+from tests.experiments.compare.recordings import black, flat_drive
+
+pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
+image = pytest.importorskip("PIL.Image")
+
+SETTINGS = PlatformSettings()
+FAKE_EVO = """#!{python}
+import sys
+assert sys.argv[1] == "tum" and "--align" in sys.argv, sys.argv
+poses = [len([line for line in open(path) if line[0] != "#"]) for path in sys.argv[2:4]]
+assert poses[0] == poses[1] > 0, poses
+print("APE w.r.t. translation part (m)\\n\\n      mean\\t1.0\\n      rmse\\t0.012345\\n       std\\t0.1")
+"""
+
+
+def compare(folder: Path, *words: str, runs: int = 1, **drive: Any) -> dict[str, Any]:
+    """Run a comparison on the flat world; return its report."""
+    options = CompareOptions(
+        configurations=configurations_of(words), drives=[flat_drive(**drive)], runs=runs, out=folder
+    )
+    assert run_compare(options, SETTINGS) == 0
+    report: dict[str, Any] = json.loads((folder / "compare.json").read_text())
+    return report
+
+
+def steady(report: dict[str, Any]) -> list[Any]:
+    """Return all figures of a report that no clock gave."""
+    return [
+        {name: value for name, value in row["figures"].items() if not name.endswith("_ms")}
+        | {"poses": row["poses_digest"]}
+        for row in report["rows"]
+    ]
+
+
+@pytest.fixture(autouse=True)
+def without_evo(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No test depends on whether evo is installed."""
+    monkeypatch.setattr(run, "evo_command", lambda: None)
+
+
+def test_two_comparisons_give_the_same_figures(tmp_path: Path) -> None:
+    one, two = (
+        compare(tmp_path / "a", "default", "features-500"),
+        compare(tmp_path / "b", "features-500", "default"),
+    )
+
+    assert steady(one) == steady(two)[::-1]
+
+
+def test_it_writes_a_table_a_picture_and_the_trajectories(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    report = compare(tmp_path, "default", "without-depth", change=black)
+
+    told = capsys.readouterr().out
+    assert "flat at 10 Hz: 10 frames, 0.9 s; ground truth, SE(3) and Sim(3)" in told
+    assert "7 of 10" in told
+    assert "truth interpolated between true poses at most 0.25 s apart" in told
+    assert report["max_truth_gap_s"] == 0.25
+    assert [row["alignment"] for row in report["rows"]] == ["SE(3)", "Sim(3)"]
+    assert {"commit", "cores", "load_average", "load_average_after"} <= report["environment"].keys()
+    with image.open(tmp_path / "compare.png") as picture:
+        assert picture.size == (800, 640)
+    path = tmp_path / "trajectories" / "flat-10hz-default-1.txt"
+    assert len(read_trajectory(path)) == 7
+
+
+def test_several_runs_say_that_they_are_the_same(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    report = compare(tmp_path, "default", runs=2)
+
+    assert report["rows"][0]["same_poses_in_all_runs"] is True
+    assert "2 runs each, with the same poses to the last bit" in capsys.readouterr().out
+
+
+def test_runs_that_differ_show_the_least_and_the_largest_value() -> None:
+    drive = flat_drive()
+    (configuration,) = configurations_of(["default"])
+    runs = [
+        asyncio.run(track(configuration, flat_drive(change=change), InProcessSolver(SETTINGS)))
+        for change in (lambda row, frame: frame, black)
+    ]
+
+    row = row_of(configuration, drive, runs, [None, None])
+
+    assert row["figures"]["posed"] == (7, 10)
+    assert row["same_poses_in_all_runs"] is False
+    assert "7 to 10 of 10" in table_lines([row])[1]
+    assert "1 of 1 rows differ between runs" in runs_line([row], is_platform=False)
+
+
+def test_a_recording_without_truth_is_said_in_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    report = compare(tmp_path, "default", has_truth=False)
+
+    told = capsys.readouterr().out
+    assert "default: the recording has no truth: no ATE, no RPE" in told
+    assert "ATE cm" not in told
+    assert report["rows"][0]["figures"]["posed"] == [10, 10]
+    assert (tmp_path / "compare.png").stat().st_size > 0
+
+
+def test_evo_stands_beside_ours_where_its_command_is_found(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = tmp_path / "bin" / "evo_ape"
+    command.parent.mkdir()
+    command.write_text(FAKE_EVO.format(python=sys.executable))
+    command.chmod(0o755)
+    monkeypatch.setenv("PATH", str(command.parent))
+    monkeypatch.setattr(evo_figures.sys, "executable", str(tmp_path / "python"))
+    monkeypatch.setattr(run, "evo_command", evo_command)
+
+    report = compare(tmp_path / "out", "default")
+
+    assert report["rows"][0]["figures"]["evo_ate_cm"] == [1.2345, 1.2345]
+    assert "evo cm" in capsys.readouterr().out
+
+
+def test_an_evo_that_fails_gives_no_figure(tmp_path: Path) -> None:
+    command = tmp_path / "evo_ape"
+    command.write_text("#!/bin/sh\necho 'rmse 1.0'\nexit 1\n")
+    command.chmod(0o755)
+    done = asyncio.run(track(configurations_of(["default"])[0], flat_drive(), InProcessSolver(SETTINGS)))
+    assert done.errors is not None
+
+    assert evo_ate_cm(str(command), done.errors) is None
+    assert evo_ate_cm(str(tmp_path / "nothing"), done.errors) is None
+
+
+@pytest.mark.parametrize("words", [["default"], ["without-depth"]])
+def test_evo_itself_agrees_with_us(words: list[str]) -> None:
+    command = evo_command()
+    if command is None:
+        pytest.skip("evo_ape is not on the path: pip install evo, in any environment")
+    done = asyncio.run(track(configurations_of(words)[0], flat_drive(20), InProcessSolver(SETTINGS)))
+    assert done.errors is not None
+
+    found = evo_ate_cm(command, done.errors)
+
+    assert found == pytest.approx(100 * done.errors.ate_m, abs=1e-3)
