@@ -63,8 +63,9 @@ def run_compare(options: CompareOptions, settings: PlatformSettings) -> int:
     show(
         tolerance_line(),
         runs_line(rows, is_platform=options.platform),
-        f"CPU of a frame: robot without drawing and reading, OpenCV on one thread; server {solved_by}; load "
-        f"average {before['load_average'][0]:g} before, {load_average()[0]:g} after",
+        f"CPU of a frame: robot without reading its image, OpenCV on one thread; server: "
+        f"{'as its answers tell' if options.platform else 'with the codec'}; load average "
+        f"{before['load_average'][0]:g} before, {load_average()[0]:g} after",
         f"results: {options.out}/{REPORT}, {PICTURE}, {TRAJECTORIES}/",
     )
     return 0
