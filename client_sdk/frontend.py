@@ -15,8 +15,10 @@ import numpy.typing as npt
 
 from client_sdk.monocular.opencv import load_opencv
 from client_sdk.native_match import FrontEndCore, front_end_core
+from client_sdk.slots import FeaturesSlot
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Array, Camera
+from rse_pf.maps.descriptors import ORB, DescriptorKind, Descriptors
 
 __all__ = [
     "Correspondences",
@@ -167,18 +169,22 @@ class FrontEndOptions:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Features:
-    """ORB features of one frame.
+    """Features of one frame, ORB or those of a user.
 
-    ``pixels`` ``(n, 2)``; ``descriptors`` ``(n, 32)`` uint8; ``points_camera`` ``(n, 3)`` metres,
+    ``pixels`` ``(n, 2)``; ``descriptors`` ``(n, d)`` of one ``kind``; ``points_camera`` ``(n, 3)`` metres,
     NaN where the depth cannot be trusted; ``turns`` ``(n, 2)``, cosine and sine of the orientation; ``sizes``
-    ``(n,)``, the scale of the pyramid's level, 1 for the finest.
+    ``(n,)``, the scale of the pyramid's level, 1 for the finest.  Turns and sizes tell nothing unless the
+    features are *is_oriented* and *is_scaled*.
     """
 
     pixels: Array
-    descriptors: npt.NDArray[np.uint8]
+    descriptors: Descriptors
     points_camera: Array
     turns: Array
     sizes: Array
+    kind: DescriptorKind = ORB
+    is_oriented: bool = True
+    is_scaled: bool = True
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -198,16 +204,18 @@ class Correspondences:
         return len(self.pixels)
 
 
-def extract(frame: Frame, options: FrontEndOptions) -> Features:
-    """Find ORB features, spread over the image, and their points; deterministic.
+def extract(frame: Frame, options: FrontEndOptions, slot: FeaturesSlot | None = None) -> Features:
+    """Find ORB features, or those of *slot*, spread over the image, and their points; deterministic.
 
     Raises:
         MissingExtra: OpenCV is not installed.
+        UsageError: The features function failed, or returned no features.
     """
-    described = describe(frame.rgb, options.features, is_spread=options.is_spread)
+    described = describe(frame.rgb, options.features, is_spread=options.is_spread, slot=slot)
     return Features(
         pixels=described.pixels, descriptors=described.descriptors, turns=described.turns,
         sizes=described.sizes, points_camera=points_at(frame, described.pixels, options),
+        kind=described.kind, is_oriented=described.is_oriented, is_scaled=described.is_scaled,
     )  # fmt: skip
 
 
@@ -216,26 +224,35 @@ class DescribedPixels:
     """Keypoints of one image as `Features` has them, without depth."""
 
     pixels: Array
-    descriptors: npt.NDArray[np.uint8]
+    descriptors: Descriptors
     turns: Array
     sizes: Array
+    kind: DescriptorKind = ORB
+    is_oriented: bool = True
+    is_scaled: bool = True
 
 
-def describe(rgb: npt.NDArray[np.uint8], count: int, *, is_spread: bool = True) -> DescribedPixels:
-    """Return *count* ORB features of an ``(h, w, 3)`` image; deterministic.
+def describe(
+    rgb: npt.NDArray[np.uint8], count: int, *, is_spread: bool = True, slot: FeaturesSlot | None = None
+) -> DescribedPixels:
+    """Return *count* ORB features of an ``(h, w, 3)`` image, or those of *slot*; deterministic.
 
     Args:
         rgb: ``(h, w, 3)``.
         count: The most features.
         is_spread: Take the strongest of each cell of 40 px, with weak ones where there are no others; else
             the strongest of the image.
+        slot: A user's features; None for ORB.
 
     Raises:
         MissingExtra: OpenCV is not installed.
+        UsageError: The features function failed, or returned no features.
 
     Source:
         Rublee et al., ICCV 2011; scale 1.2, 8 levels, FAST threshold 7, and 10 where features are not spread.
     """
+    if slot is not None:
+        return _described_by(slot, rgb, count, is_spread=is_spread)
     cv2 = load_opencv()
     gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
     orb = _orb(cv2, _SOUGHT * count, _FAST_SPREAD) if is_spread else _orb(cv2, count, _FAST)
@@ -261,6 +278,21 @@ def describe(rgb: npt.NDArray[np.uint8], count: int, *, is_spread: bool = True) 
         turns=np.stack([np.cos(angles), np.sin(angles)], axis=1),
         sizes=_SCALES[octaves],
     )
+
+
+def _described_by(
+    slot: FeaturesSlot, rgb: npt.NDArray[np.uint8], count: int, *, is_spread: bool
+) -> DescribedPixels:
+    """Return a user's features, the best first, of which a keyframe takes as many as fit."""
+    found = slot(rgb)
+    n = len(found.pixels)
+    rows = np.arange(min(count, n))
+    if is_spread and n > count:
+        rows = np.array(spread_rows(found.pixels, found.scores, (rgb.shape[0], rgb.shape[1]), count))
+    return DescribedPixels(
+        pixels=found.pixels[rows], descriptors=found.descriptors[rows], turns=found.turns[rows],
+        sizes=found.sizes[rows], kind=slot.kind, is_oriented=slot.is_oriented, is_scaled=slot.is_scaled,
+    )  # fmt: skip
 
 
 def spread_rows(pixels: Array, responses: Array, size: tuple[int, int], count: int) -> list[int]:

@@ -22,6 +22,7 @@ from client_sdk.answers import PoseAnswer
 from client_sdk.frontend import Features, Frame, FrontEndOptions, PoseQuery, TrackedFrame
 from client_sdk.mapping import MapOptions, PointMap, Trajectory, write_ply, write_trajectory
 from client_sdk.monocular.scale import MarkerScale, OdometryScale
+from client_sdk.slots import FeaturesFunction, FeaturesSlot
 from client_sdk.tracking.monocular_tracker import MonocularOptions, MonocularTracker
 from client_sdk.tracking.segments import DriveRecords, SegmentRecord, keyframe_of, tracker_record
 from client_sdk.tracking.tracker import Tracker
@@ -107,6 +108,7 @@ class Mapper:
         keyframes_of: str = "",
         adds_frames: bool = True,
         recorder: FrameRecorder | None = None,
+        features: FeaturesFunction | None = None,
     ) -> None:
         """Start without frames.
 
@@ -124,6 +126,10 @@ class Mapper:
             adds_frames: Whether each frame with depth is added to the map; else the caller adds to `map`
                 what it wants.
             recorder: Gets each frame before it is tracked, and the points of each map that is saved.
+            features: Finds the features of an image; None for ORB.
+
+        Raises:
+            UsageError: *features* is no function, or has no name.
         """
         self.camera = camera
         self._ask = ask
@@ -138,6 +144,7 @@ class Mapper:
         self._keyframes_of = keyframes_of
         self._adds_frames = adds_frames
         self._recorder = recorder
+        self._slot = None if features is None else FeaturesSlot(features)
         self._joined = 0
         self._metric: set[int] = set()
         self._one_frame = asyncio.Lock()
@@ -350,9 +357,9 @@ class Mapper:
             )
         if self._tracker is None:
             if bool(frame.depth_m.any()) if self._depth is None else self._depth:
-                self._tracker = Tracker(self._options, T_world_start=self._T_world_start)
+                self._tracker = Tracker(self._options, self._T_world_start, self._slot)
             else:
-                self._tracker = MonocularTracker(self._monocular, T_world_start=self._T_world_start)
+                self._tracker = MonocularTracker(self._monocular, self._T_world_start, self._slot)
         return self._tracker
 
     def _finished(

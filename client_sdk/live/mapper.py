@@ -31,9 +31,10 @@ from client_sdk.live.sender import REFUSALS, KeyframeSender, LiveCaller, Myself
 from client_sdk.live.waiting_keyframes import Base, WaitingKeyframe, WaitingKeyframes
 from client_sdk.mapper import AskPose, Mapper
 from client_sdk.mapping import MapOptions, PointMap, Trajectory
+from client_sdk.slots import FeaturesFunction
 from rse_pf.errors import BadMessage, BadRequest, RsePfError, UnsupportedProtocol, UsageError
 from rse_pf.geometry import Array, Camera, pose_difference
-from rse_pf.slam.keyframe import Keyframe, encode_keyframe, make_features
+from rse_pf.slam.keyframe import MAX_FEATURES, Keyframe, encode_keyframe, make_features, most_features
 from rse_pf.wire.live_map import LiveRelocalise, RelocaliseReply, live_topic
 
 __all__ = ["KeyframeSent", "LiveMapper", "LiveOptions", "LiveRobot"]
@@ -134,6 +135,7 @@ class LiveMapper:
         live: LiveOptions | None = None,
         map_options: MapOptions | None = None,
         T_world_start: Array | None = None,
+        features: FeaturesFunction | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         """Describe the robot's part of a live map; ``async with`` joins it.
@@ -149,7 +151,11 @@ class LiveMapper:
             live: Of keyframes and their sending.
             map_options: Density of the robot's own cloud, to which keyframes are added.
             T_world_start: ``(4, 4)``, pose of the first camera in the odometry frame; None: the identity.
+            features: Finds the features of an image; None for ORB.  All robots of a map use the same.
             clock: Seconds, monotonic.
+
+        Raises:
+            UsageError: *features* is no function, or has no name.
         """
         self.name = name
         self.options = live or LiveOptions()
@@ -161,7 +167,7 @@ class LiveMapper:
         self._mapper = Mapper(
             ask=self._ask_first, camera=camera, depth=True,
             options=replace(options or FrontEndOptions.live(), segment_after=_NEVER), map_options=map_options,
-            T_world_start=T_world_start, adds_frames=False,
+            T_world_start=T_world_start, adds_frames=False, features=features,
         )  # fmt: skip
         self._alignments = Alignments()
         self._segment = 0
@@ -471,11 +477,13 @@ class LiveMapper:
     def _encode(self, frame: Frame, T_odom_camera: Array, features: Features) -> bytes:
         """Return a keyframe of the first features that have depth: those of the finest levels."""
         depths_m = features.points_camera[:, 2]
-        rows = np.flatnonzero(np.isfinite(depths_m))[: self.options.features]
+        most = self.options.features * most_features(features.kind) // MAX_FEATURES
+        rows = np.flatnonzero(np.isfinite(depths_m))[:most]
         keyframe = Keyframe(
             timestamp_s=frame.timestamp_s, T_odom_camera=T_odom_camera, camera=frame.camera,
             features=make_features(
-                features.pixels[rows], depths_m[rows], features.descriptors[rows], self._mapper.depth_noise
+                features.pixels[rows], depths_m[rows], features.descriptors[rows], self._mapper.depth_noise,
+                features.kind,
             ),
         )  # fmt: skip
         return encode_keyframe(keyframe)

@@ -1,4 +1,4 @@
-"""Match binary descriptors, all against all.
+"""Match descriptors of any kind, all against all.
 
 Deterministic.  Every match is one to one; matches near predicted pixels are found by `rse_pf.slam.tracking`.
 """
@@ -11,14 +11,13 @@ import numpy as np
 import numpy.typing as npt
 
 from client_sdk.monocular.opencv import load_opencv
+from rse_pf.maps.descriptors import ORB, Descriptors
 from rse_pf.native_matcher import MatchCore, match_core
+from rse_pf.slam.descriptors import best_matches, distances_of_pairs
 
 __all__ = ["match_all"]
 
-Descriptors = npt.NDArray[np.uint8]
 Rows = npt.NDArray[np.int64]
-
-_BITS = np.array([bin(value).count("1") for value in range(256)], dtype=np.uint8)
 
 
 def match_all(
@@ -26,14 +25,25 @@ def match_all(
 ) -> tuple[Rows, Rows]:
     """Return rows of *first* and of *second* that match: ratio test, one to one.
 
+    Args:
+        first: ``(n, d)``.
+        second: ``(m, d)``.
+        ratio: The nearest must be this much nearer than the second nearest.
+        max_distance: Of 256 bits; other binary descriptors by their bits, vectors have none.
+
     Raises:
-        MissingExtra: OpenCV is not installed.
+        MissingExtra: OpenCV is not installed, and the native core cannot match them.
     """
     if not len(first) or len(second) < 2:
         return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
+    if first.dtype != np.uint8:
+        rows, columns = best_matches(first, second, ratio)
+        order = np.argsort(rows, kind="stable")
+        return rows[order], columns[order]
     core = match_core()
-    if core is not None:
+    if core is not None and ORB.describes(first):
         return _all_by_core(core, first, second, ratio, max_distance)
+    max_distance = max_distance * first.shape[1] // ORB.size
     cv2 = load_opencv()
     distances, neighbours = cv2.batchDistance(first, second, cv2.CV_32S, normType=cv2.NORM_HAMMING, K=2)
     clear = (distances[:, 0] < ratio * distances[:, 1]) & (distances[:, 0] <= max_distance)
@@ -51,7 +61,7 @@ def _all_by_core(
     )
     assert matched is not None  # the arrays are of the kinds that it takes
     rows, columns = matched[0][:, 0].astype(np.int64), matched[1][:, 0].astype(np.int64)
-    distances = _BITS[first[rows] ^ second[columns]].sum(axis=1, dtype=np.int64)
+    distances = distances_of_pairs(first[rows], second[columns])
     order = np.argsort(rows, kind="stable")
     order = order[distances[order] <= max_distance]
     return rows[order], columns[order]

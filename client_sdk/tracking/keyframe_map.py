@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rse_pf.geometry import Array, Camera, transform
+from rse_pf.maps.descriptors import Descriptors
 from rse_pf.pnp import DepthNoise
 from rse_pf.slam.places import place_vector
 from rse_pf.slam.tracking import ImageFeatures, SoughtFeatures
@@ -56,7 +57,7 @@ class Landmarks:
 
     points: Array
     spreads: Array
-    descriptors: npt.NDArray[np.uint8]
+    descriptors: Descriptors
     rays: Array
     turns: Array
     sizes: Array
@@ -108,7 +109,7 @@ class KeyframeMap:
         self._points: Array = np.empty((_FIRST_ROOM, 3))
         self._spreads: Array = np.empty((_FIRST_ROOM, 3, 3))
         self._sways: Array = np.empty((_FIRST_ROOM, 3))
-        self._descriptors: npt.NDArray[np.uint8] = np.empty((_FIRST_ROOM, 32), dtype=np.uint8)
+        self._descriptors: Descriptors = np.empty((_FIRST_ROOM, 0), dtype=np.uint8)
         self._rays: Array = np.empty((_FIRST_ROOM, 3))
         self._turns: Array = np.empty((_FIRST_ROOM, 3))
         self._sizes: Array = np.empty(_FIRST_ROOM)
@@ -145,6 +146,9 @@ class KeyframeMap:
         Returns:
             ``(n,)``, the landmark of each feature.
         """
+        descriptors = view.features.descriptors
+        if not self._count:
+            self._descriptors = np.empty((len(self._points), descriptors.shape[1]), dtype=descriptors.dtype)
         if len(self._keyframes) >= self._max_keyframes:
             landmarks = self._thin(landmarks)
         landmarks = landmarks.copy()
@@ -162,7 +166,7 @@ class KeyframeMap:
         keyframe = _Keyframe(view=view, landmarks=landmarks, own=np.sort(landmarks[landmarks != NO_LANDMARK]))
         self._keyframes.append(keyframe)
         self._poses = np.concatenate([self._poses, T_world_camera[None]])
-        place = place_vector(view.features.descriptors)[None]
+        place = place_vector(descriptors)[None]
         self._places = np.concatenate([self._places, place]) if len(self._places) else place
         return landmarks
 
@@ -179,8 +183,8 @@ class KeyframeMap:
         newest = len(self._keyframes) - 1
         return chosen if newest in chosen else [*chosen, newest]
 
-    def most_alike(self, descriptors: npt.NDArray[np.uint8], count: int) -> list[int]:
-        """Return the *count* keyframes that look most like ``(n, 32)`` descriptors, best first."""
+    def most_alike(self, descriptors: Descriptors, count: int) -> list[int]:
+        """Return the *count* keyframes that look most like ``(n, d)`` descriptors, best first."""
         alike: list[int] = np.argsort(-(self._places @ place_vector(descriptors)), kind="stable").tolist()
         return alike[:count]
 
@@ -189,7 +193,7 @@ class KeyframeMap:
         own = [self._keyframes[number].own for number in keyframes]
         return self._landmarks(np.unique(np.concatenate(own)) if own else np.empty(0, dtype=np.int64))
 
-    def landmarks_in(self, keyframe: int) -> tuple[Landmarks, npt.NDArray[np.uint8]]:
+    def landmarks_in(self, keyframe: int) -> tuple[Landmarks, Descriptors]:
         """Return the landmarks of one keyframe, with the descriptors that this keyframe has of them."""
         record = self._keyframes[keyframe]
         rows = np.flatnonzero(record.landmarks != NO_LANDMARK)

@@ -15,6 +15,7 @@ import numpy.typing as npt
 from client_sdk.monocular.bundle import Bundle, adjust
 from client_sdk.tracking.keyframe_map import NO_LANDMARK, Landmarks, expect
 from rse_pf.geometry import Array, Camera, exp_se3, inverse, log_se3, transform
+from rse_pf.maps.descriptors import Descriptors
 from rse_pf.slam.places import PlaceVector, place_vector
 from rse_pf.slam.tracking import ImageFeatures, NearLimits, match_near
 from rse_pf.slam.triangulation import parallax_deg, reprojection_errors, triangulate
@@ -85,7 +86,7 @@ class LandmarkMap:
         self.limits = limits or LandmarkLimits()
         self.keyframes: list[_Keyframe] = []
         self.points: Array = np.empty((0, 3))
-        self.descriptors: npt.NDArray[np.uint8] = np.empty((0, 32), dtype=np.uint8)
+        self.descriptors: Descriptors = np.empty((0, 0), dtype=np.uint8)
         self.colours: npt.NDArray[np.uint8] = np.empty((0, 3), dtype=np.uint8)
         self.is_alive: npt.NDArray[np.bool_] = np.empty(0, dtype=bool)
         self._born: Rows = np.empty(0, dtype=np.int64)
@@ -98,6 +99,8 @@ class LandmarkMap:
 
     def add_keyframe(self, features: ViewFeatures, T_camera_world: Array, landmarks: Rows) -> int:
         """Add a keyframe whose features see *landmarks*, ``(n,)``, and return its number."""
+        if not len(self.points):
+            self.descriptors = features.image.descriptors[:0]
         self.keyframes.append(
             _Keyframe(
                 features=features,
@@ -148,13 +151,13 @@ class LandmarkMap:
         """Return the landmarks of a keyframe and of those that share landmarks with it."""
         return np.unique(np.concatenate([self.landmarks_of(keyframe) for keyframe in self.local(number)]))
 
-    def most_alike(self, descriptors: npt.NDArray[np.uint8], among: Rows) -> list[int]:
-        """Return keyframes of *among* in the order of how much they look like ``(n, 32)`` descriptors."""
+    def most_alike(self, descriptors: Descriptors, among: Rows) -> list[int]:
+        """Return keyframes of *among* in the order of how much they look like ``(n, d)`` descriptors."""
         places = np.stack([self.keyframes[number].place for number in among])
         alike: list[int] = among[np.argsort(-(places @ place_vector(descriptors)), kind="stable")].tolist()
         return alike
 
-    def landmarks_in(self, number: int) -> tuple[Rows, npt.NDArray[np.uint8]]:
+    def landmarks_in(self, number: int) -> tuple[Rows, Descriptors]:
         """Return the landmarks of one keyframe, and the descriptors that this keyframe has of them."""
         keyframe = self.keyframes[number]
         rows = np.flatnonzero(keyframe.landmarks != NO_LANDMARK)
@@ -206,6 +209,8 @@ class LandmarkMap:
     def take(self, other: LandmarkMap) -> tuple[int, int]:
         """Add all of another map in the same frame; return the numbers of its first keyframe and landmark."""
         keyframe, landmark = len(self.keyframes), len(self.points)
+        if not landmark:
+            self.descriptors = other.descriptors[:0]
         self.keyframes += [
             replace(
                 record,

@@ -25,6 +25,7 @@ from client_sdk.frontend import (
 from client_sdk.mapping import Trajectory
 from client_sdk.monocular.descriptors import match_all
 from client_sdk.monocular.two_view import TwoViewStart, start_from_two_views
+from client_sdk.slots import FeaturesSlot
 from client_sdk.tracking.keyframe_map import NO_LANDMARK, expect
 from client_sdk.tracking.landmark_map import MIN_SHARED, LandmarkLimits, LandmarkMap, ViewFeatures, scaled
 from client_sdk.tracking.queries import Answer, OneQuery, Steps
@@ -201,8 +202,14 @@ class MonocularTracker:
     known place; ``joins`` are the joins so far, ``loops`` counts the older places that corrected the map.
     """
 
-    def __init__(self, options: MonocularOptions | None = None, T_world_start: Array | None = None) -> None:
+    def __init__(
+        self,
+        options: MonocularOptions | None = None,
+        T_world_start: Array | None = None,
+        features: FeaturesSlot | None = None,
+    ) -> None:
         self.options = options or MonocularOptions()
+        self._slot = features
         self.frames = 0
         self.lost_frames = 0
         self.starting_frames = 0
@@ -243,7 +250,7 @@ class MonocularTracker:
         self.frames += 1
         self._frame = frame
         wider = max(1.0, frame.camera.width / _FEATURES_OF_PX)
-        return self._open.begin(self._track(_extract(frame, self._feature_count(wider))))
+        return self._open.begin(self._track(_extract(frame, self._feature_count(wider), self._slot)))
 
     def accept(
         self, query: PoseQuery, T_camera_world: Array | None, inliers: int = 0, *, is_weak: bool = False
@@ -759,12 +766,14 @@ def _agree(one: _Similarity, two: _Similarity, centre: Array, depth: float) -> b
     return apart <= _AGREE_DEPTH * depth and apart_deg <= _AGREE_DEG and ratio <= _AGREE_SCALE
 
 
-def _extract(frame: Frame, count: int) -> ViewFeatures:
-    """Return ORB features that are spread over the image."""
-    described = describe(frame.rgb, count)
-    columns, rows = np.rint(described.pixels).astype(np.int64).T
+def _extract(frame: Frame, count: int, slot: FeaturesSlot | None) -> ViewFeatures:
+    """Return features that are spread over the image."""
+    described = describe(frame.rgb, count, slot=slot)
+    last = np.array([frame.camera.width - 1, frame.camera.height - 1])
+    columns, rows = np.clip(np.rint(described.pixels).astype(np.int64), 0, last).T
     image = ImageFeatures(
         pixels=described.pixels, descriptors=described.descriptors, turns=described.turns,
         sizes=described.sizes, distinct=distinct_distances(described.descriptors, described.pixels),
+        is_oriented=described.is_oriented, is_scaled=described.is_scaled,
     )  # fmt: skip
     return ViewFeatures(image=image, colours=frame.rgb[rows, columns])

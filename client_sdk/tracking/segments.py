@@ -89,6 +89,7 @@ def keyframe_of(tracked: TrackedFrame, pose: Array, features: Features, robot: s
         id=0, robot=robot, timestamp_s=tracked.frame.timestamp_s, T_world_camera=pose,
         camera=tracked.frame.camera, pixels=features.pixels.astype(np.float32),
         descriptors=features.descriptors, points_camera=features.points_camera.astype(np.float32),
+        kind=features.kind,
     )  # fmt: skip
 
 

@@ -23,11 +23,13 @@ from client_sdk.frontend import (
     round_for_wire,
 )
 from client_sdk.monocular.descriptors import match_all
+from client_sdk.slots import FeaturesSlot
 from client_sdk.tracking.keyframe_map import NO_LANDMARK, KeyframeMap, Landmarks, View, expect
 from client_sdk.tracking.noise import NoiseEstimate
 from client_sdk.tracking.queries import Answer, OneQuery, Steps
 from client_sdk.tracking.shutter import ReadoutEstimate, sways, turn_rate, without_shutter
 from rse_pf.geometry import Array, inverse, pose_difference, rigid, transform
+from rse_pf.maps.descriptors import Descriptors
 from rse_pf.pnp import DepthNoise
 from rse_pf.slam.tracking import (
     FittedPose,
@@ -138,8 +140,10 @@ class Tracker:
         self,
         options: FrontEndOptions | None = None,
         T_world_start: Array | None = None,
+        features: FeaturesSlot | None = None,
     ) -> None:
         self.options = options or FrontEndOptions()
+        self._slot = features
         self.frames = 0
         self.lost_frames = 0
         self.keyframes = 0
@@ -199,7 +203,7 @@ class Tracker:
         """
         self._open.refuse_open()
         self.frames += 1
-        self._frame, self._raw = frame, extract(frame, self.options)
+        self._frame, self._raw = frame, extract(frame, self.options, self._slot)
         self._features = self._raw
         return self._open.begin(self._track(self._turned(_view_of(frame, self._raw), self._raw, self._rate)))
 
@@ -359,7 +363,7 @@ class Tracker:
             self._last.view, self._T_last, self._last.landmarks, self.noise.noise, _PIXEL_PX
         )
 
-    def _last_descriptors(self) -> npt.NDArray[np.uint8]:
+    def _last_descriptors(self) -> Descriptors:
         return self._of_last().descriptors
 
     def _seen(
@@ -624,7 +628,7 @@ def _match(
     return expected.rows[rows], features
 
 
-def _seen_anywhere(landmarks: Landmarks, descriptors: npt.NDArray[np.uint8], view: View) -> _Seen:
+def _seen_anywhere(landmarks: Landmarks, descriptors: Descriptors, view: View) -> _Seen:
     """Match landmarks with the features of an image by appearance alone."""
     rows, features = match_all(
         descriptors, view.features.descriptors, ratio=_ALL_RATIO, max_distance=_ALL_DISTANCE
@@ -649,6 +653,7 @@ def _view_of(frame: Frame, features: Features) -> View:
     image = ImageFeatures(
         pixels=features.pixels, descriptors=features.descriptors, turns=features.turns, sizes=features.sizes,
         distinct=distinct_distances(features.descriptors, features.pixels),
+        is_oriented=features.is_oriented, is_scaled=features.is_scaled,
     )  # fmt: skip
     return View(
         features=image, points_camera=features.points_camera, sways=np.zeros_like(features.points_camera),

@@ -72,6 +72,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="wide-baseline: for frames that are 0.4 to 0.8 m apart, such as those of NYU",
     )  # fmt: skip
     parser.add_argument(
+        "--features", metavar="MODULE:FUNCTION",
+        help="find features with this function instead of ORB: see docs/own_parts.md",
+    )  # fmt: skip
+    parser.add_argument(
         "--merge",
         action="store_true",
         help="merge the maps of all robots at the end; of one robot, close its loops",
@@ -112,6 +116,9 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     if args.live and args.merge:
         raise UsageError("--live and --merge exclude each other", hint="a live map needs no merge")
     require("demo --merge" if args.merge else "demo")
+    from client_sdk.slots import load_features
+
+    load_features(args.features)
     settings = with_recordings(settings, args.record)
     from rse_pf.experiments.demo.run import DemoOptions, run_demo
     from rse_pf.pnp import usable_engine
@@ -139,6 +146,7 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
         frames=args.frames,
         seed=args.seed,
         frontend=args.frontend,
+        features=args.features,
         merge=args.merge,
         live=args.live,
         quiet=args.quiet,

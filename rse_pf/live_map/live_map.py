@@ -51,6 +51,7 @@ from rse_pf.live_map.outcomes import (
 )
 from rse_pf.live_map.smoothing import SmoothedWindows, odometry_step, smooth_all
 from rse_pf.live_map.versions import version_of, whole_graph
+from rse_pf.maps.descriptors import DescriptorKind, check_alike
 from rse_pf.maps.format import MapVersion
 from rse_pf.slam.keyframe import Keyframe, check_sent, decode_keyframe
 from rse_pf.slam.localise import LocalisationOptions, Localised, localise, spread_candidates
@@ -75,6 +76,7 @@ class LiveMap:
         self._graph = Graph()
         self._places = PlaceIndex()
         self._parts = FeatureParts()
+        self._kind_of: tuple[int, DescriptorKind] | None = None
 
     @classmethod
     def restore(cls, snapshot: bytes, options: LiveMapOptions | None = None) -> LiveMap:
@@ -149,6 +151,18 @@ class LiveMap:
         """The number of events that were applied."""
         return self._graph.events
 
+    @property
+    def kind(self) -> DescriptorKind | None:
+        """Of the features of all keyframes, None while none is kept."""
+        if self._kind_of is None or not self._graph.held[self._kind_of[0]]:
+            held = np.flatnonzero(self._graph.held)
+            if not len(held):
+                return None
+            data = self._graph.keyframes[held[0]].data
+            assert data is not None
+            self._kind_of = int(held[0]), decode_keyframe(data).features.kind
+        return self._kind_of[1]
+
     def next_number(self, robot: str) -> int:
         """Return the number that the robot's next keyframe must have."""
         return self._graph.next_numbers.get(robot, 0)
@@ -172,7 +186,8 @@ class LiveMap:
         """Say whether a keyframe is the robot's next one; the map does not change.
 
         Raises:
-            BadRequest: It cannot be a keyframe: a pose, a camera, features, a time or a segment is absurd.
+            BadRequest: It cannot be a keyframe: a pose, a camera, features, a time or a segment is absurd; or
+                its features are of another kind than those of the map.
         """
         expected = self.next_number(event.robot)
         if event.number != expected:
@@ -187,6 +202,9 @@ class LiveMap:
             check_sent(event.keyframe)
         except InvalidCamera as error:
             raise BadRequest(error.message, hint=error.hint) from error
+        kind = self.kind
+        if kind is not None:
+            check_alike(kind, event.keyframe.features.kind, "the live map")
         return "new"
 
     def apply(self, event: Event) -> list[Outcome]:
@@ -262,8 +280,14 @@ class LiveMap:
         return self.relocalising(view)()
 
     def relocalising(self, view: Keyframe) -> Callable[[], Localised]:
-        """Return what does the work of `relocalise`; another thread may call it while the map changes."""
-        graph = self._graph
+        """Return what does the work of `relocalise`; another thread may call it while the map changes.
+
+        Raises:
+            BadRequest: The features of *view* are of another kind than those of the map.
+        """
+        graph, kind = self._graph, self.kind
+        if kind is not None:
+            check_alike(kind, view.features.kind, "the live map")
         aligned = np.flatnonzero(graph.held & self._aligned_mask())
         most = self.options.candidates
         # More are looked at, so that a second place that looks alike is compared, too.

@@ -90,7 +90,7 @@ def _version_of(graph: Graph, options: LiveMapOptions) -> MapVersion:
             Keyframe(
                 id=i, robot=_short_name(row.robot), timestamp_s=row.timestamp_s,
                 T_world_camera=graph.T[i].copy(), camera=seen.camera, pixels=seen.features.pixels,
-                descriptors=seen.features.descriptors,
+                descriptors=seen.features.descriptors, kind=seen.features.kind,
                 points_camera=seen.features.points_camera(seen.camera).astype(np.float32),
             )
         )  # fmt: skip
@@ -150,7 +150,9 @@ def _odometry(graph: Graph, ids: list[int], options: LiveMapOptions) -> list[Edg
 
 def encode_stored(keyframe: Keyframe) -> bytes:
     """Return a keyframe of a version as a robot would have sent it, its pose that in the version."""
-    features = make_features(keyframe.pixels, keyframe.points_camera[:, 2], keyframe.descriptors)
+    features = make_features(
+        keyframe.pixels, keyframe.points_camera[:, 2], keyframe.descriptors, kind=keyframe.kind
+    )
     return encode_keyframe(
         SentKeyframe(
             timestamp_s=keyframe.timestamp_s, T_odom_camera=keyframe.T_world_camera, camera=keyframe.camera,

@@ -30,6 +30,7 @@ from rse_pf.budget import (
 )
 from rse_pf.errors import BadMessage, BadRequest, LimitExceeded, RsePfError, message_of
 from rse_pf.geometry import Array, Camera, rigid
+from rse_pf.maps.descriptors import ORB, DescriptorKind, Descriptors, one_kind
 
 __all__ = ["Edge", "EdgeKind", "Keyframe", "MapLimits", "MapVersion", "decode_map", "encode_map"]
 
@@ -39,7 +40,6 @@ _MAGIC = b"RSEMAP1\n"
 _MAX_BYTES = 1 << 30
 _MAX_RATIO, _FREE_BYTES = 50.0, 1 << 20
 """Features and clouds deflate to half their size; only empty or hostile maps deflate to a fiftieth."""
-_DESCRIPTOR_BYTES = 32
 _MAX_ID = 2**63 - 1
 _MAX_NAME = 64
 _MAX_NUMBER, _MAX_TIME_S, _MAX_PIXEL, _MAX_INFORMATION = 1e9, 1e12, 1e5, 1e18
@@ -67,8 +67,9 @@ class Keyframe:
         id: Unique in its map.
         T_world_camera: ``(4, 4)`` float64, metres.
         pixels: ``(n, 2)`` float32, undistorted.
-        descriptors: ``(n, 32)`` uint8.
+        descriptors: ``(n, d)`` uint8 or int8, of one kind in a map.
         points_camera: ``(n, 3)`` float32 metres, camera frame; NaN rows where there is no depth.
+        kind: Of the descriptors.
 
     Raises:
         BadRequest: Shapes do not fit, or a number is not finite where it must be.
@@ -80,14 +81,16 @@ class Keyframe:
     T_world_camera: Array
     camera: Camera
     pixels: npt.NDArray[np.float32]
-    descriptors: npt.NDArray[np.uint8]
+    descriptors: Descriptors
     points_camera: npt.NDArray[np.float32]
+    kind: DescriptorKind = ORB
 
     def __post_init__(self) -> None:
         n = len(self.pixels)
         if not (
             self.pixels.shape == (n, 2)
-            and self.descriptors.shape == (n, _DESCRIPTOR_BYTES)
+            and len(self.descriptors) == n
+            and self.kind.describes(self.descriptors)
             and self.points_camera.shape == (n, 3)
         ):
             raise BadRequest(f"the arrays of keyframe {self.id} do not fit", hint="one row for each feature")
@@ -129,6 +132,10 @@ class MapVersion:
     """A complete map: immutable, a change makes a new version.
 
     ``points`` ``(m, 3)`` float32 metres, world frame; ``colours`` ``(m, 3)`` uint8.
+
+    Raises:
+        BadRequest: Two keyframes have one id or features of two kinds, an edge leads nowhere, or points and
+            colours do not fit.
     """
 
     keyframes: tuple[Keyframe, ...]
@@ -137,10 +144,16 @@ class MapVersion:
     colours: npt.NDArray[np.uint8] = field(default_factory=lambda: np.empty((0, 3), dtype=np.uint8))
     provenance: Mapping[str, Any] = field(default_factory=dict)
 
+    @property
+    def kind(self) -> DescriptorKind:
+        """Of the descriptors of all keyframes; ORB without any."""
+        return self.keyframes[0].kind if self.keyframes else ORB
+
     def __post_init__(self) -> None:
         ids = {keyframe.id for keyframe in self.keyframes}
         if len(ids) != len(self.keyframes):
             raise BadRequest("two keyframes of a map have one id", hint="assign unique ids")
+        one_kind((keyframe.kind for keyframe in self.keyframes), "the map")
         dangling = next((edge for edge in self.edges if edge.a not in ids or edge.b not in ids), None)
         if dangling is not None:
             raise BadRequest(
@@ -170,21 +183,30 @@ class _Edge(msgspec.Struct, frozen=True, kw_only=True):
     kind: EdgeKind
 
 
-class _Map(msgspec.Struct, frozen=True, kw_only=True):
+class _Kind(msgspec.Struct, frozen=True, array_like=True):
+    name: str
+    dtype: str
+    size: int
+
+
+class _Map(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     keyframes: list[_Keyframe]
     edges: list[_Edge]
     points: memoryview
     colours: memoryview
     provenance: msgspec.Raw
+    features: _Kind | None = None
+    """None for ORB."""
 
 
 def encode_map(version: MapVersion) -> bytes:
     """Return *version* as bytes; the same map gives the same bytes."""
+    kind = version.kind
     packed = _Map(
         keyframes=[
             _Keyframe(
                 id=k.id, robot=k.robot, timestamp_s=k.timestamp_s, pose=_raw(k.T_world_camera, "<f8"),
-                camera=k.camera, pixels=_view(k.pixels, "<f4"), descriptors=_view(k.descriptors, "u1"),
+                camera=k.camera, pixels=_view(k.pixels, "<f4"), descriptors=_view(k.descriptors, kind.dtype),
                 points=_view(k.points_camera, "<f4"),
             )
             for k in version.keyframes
@@ -198,6 +220,7 @@ def encode_map(version: MapVersion) -> bytes:
         points=_view(version.points, "<f4"),
         colours=_view(version.colours, "u1"),
         provenance=msgspec.Raw(msgspec.msgpack.encode(dict(version.provenance), order="deterministic")),
+        features=None if kind == ORB else _Kind(kind.name, kind.dtype, kind.size),
     )  # fmt: skip
     return _MAGIC + zlib.compress(msgspec.msgpack.encode(packed, order="deterministic"), 1)
 
@@ -221,9 +244,11 @@ def decode_map(data: bytes, max_bytes: int = _MAX_BYTES, limits: MapLimits | Non
     try:
         _check_sections(text, limits)
         packed = msgspec.msgpack.decode(memoryview(text).toreadonly(), type=_Map)
-        _check_features(packed.keyframes, limits)
+        named = packed.features
+        kind = ORB if named is None else DescriptorKind(named.name, named.dtype, named.size)
+        _check_features(packed.keyframes, limits, kind.size)
         return MapVersion(
-            keyframes=tuple(_keyframe(each) for each in packed.keyframes),
+            keyframes=tuple(_keyframe(each, kind) for each in packed.keyframes),
             edges=tuple(
                 Edge(
                     a=e.a, b=e.b, T_a_b=_array(e.step, "<f8", (4, 4)),
@@ -297,10 +322,10 @@ def _budget_of(name: str, items: int) -> Budget:
     )  # fmt: skip
 
 
-def _check_features(keyframes: list[_Keyframe], limits: MapLimits) -> None:
+def _check_features(keyframes: list[_Keyframe], limits: MapLimits, descriptor_bytes: int) -> None:
     total = 0
     for each in keyframes:
-        count = max(len(each.pixels) // 8, len(each.descriptors) // _DESCRIPTOR_BYTES, len(each.points) // 12)
+        count = max(len(each.pixels) // 8, len(each.descriptors) // descriptor_bytes, len(each.points) // 12)
         total += count
         if count > limits.keyframe_features or total > limits.features:
             raise LimitExceeded(
@@ -339,12 +364,12 @@ def _no_extension(kind: int, _: memoryview) -> Any:
     raise ValueError(f"it holds the extension {kind}")
 
 
-def _keyframe(k: _Keyframe) -> Keyframe:
+def _keyframe(k: _Keyframe, kind: DescriptorKind) -> Keyframe:
     return Keyframe(
         id=k.id, robot=k.robot, timestamp_s=k.timestamp_s, T_world_camera=_array(k.pose, "<f8", (4, 4)),
         camera=k.camera, pixels=_array(k.pixels, "<f4", (-1, 2)),
-        descriptors=_array(k.descriptors, "u1", (-1, _DESCRIPTOR_BYTES)),
-        points_camera=_array(k.points, "<f4", (-1, 3)),
+        descriptors=_array(k.descriptors, kind.dtype, (-1, kind.size)),
+        points_camera=_array(k.points, "<f4", (-1, 3)), kind=kind,
     )  # fmt: skip
 
 

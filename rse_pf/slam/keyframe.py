@@ -12,9 +12,10 @@ All numbers are little-endian::
     block     8 bytes: kind (uint16), flags (uint16; 1: required), size of its content (uint32); the content
     camera    kind 1: model (uint8; 1: pinhole), number in the rig (uint8; 0), width, height (uint16),
               fx, fy, cx, cy (float64)
-    features  kind 2: detector (uint8; 1: ORB), metric (uint8; 1: Hamming), bytes of a descriptor
-              (uint16; 32), number n (uint16), f (uint8): pixels count in units of 2**-f, 0 (uint8);
-              n columns and n rows (uint16), n descriptors
+    features  kind 2: detector (uint8; 1: ORB, 2: named), metric (uint8; 1: Hamming of bits, 2: squared
+              Euclidean distance of int8), bytes of a descriptor (uint16), number n (uint16), f (uint8):
+              pixels count in units of 2**-f, length of the name (uint8; 0 for ORB);
+              n columns and n rows (uint16), n descriptors, the name (ASCII)
     geometry  kind 3: what it holds (uint8; 1: depths), 0 (uint8), n (uint16); n depths in mm (uint16)
     noise     kind 5, optional: deviation of a depth z in metres is base + growth * max(0, z - from)^2
               (3 float64); a Kinect's where it is left out
@@ -33,6 +34,7 @@ import numpy.typing as npt
 
 from rse_pf.errors import BadRequest
 from rse_pf.geometry import Array, Camera, rigid
+from rse_pf.maps.descriptors import ORB, DescriptorKind, Descriptors
 from rse_pf.pnp import DepthNoise
 
 __all__ = [
@@ -46,12 +48,13 @@ __all__ = [
     "decode_keyframe",
     "encode_keyframe",
     "make_features",
+    "most_features",
 ]
 
 MAX_KEYFRAME_BYTES = 36_000
 """Size of one keyframe; the features that a robot sends by default take 33.3 kB of it."""
 MAX_FEATURES = 894
-"""Number of features of one keyframe."""
+"""Number of features of one keyframe; fewer of larger descriptors than ORB's, see `most_features`."""
 MAX_BLOCKS = 16
 
 _MAGIC, _VERSION = b"KF", 2
@@ -66,8 +69,11 @@ _NAMES = {_CAMERA_KIND: "camera", _FEATURES_KIND: "features", _GEOMETRY_KIND: "g
 _NOISE = struct.Struct("<3d")
 _KINECT = DepthNoise()
 _REQUIRED = 1
-_PINHOLE, _ORB, _HAMMING, _DEPTH = 1, 1, 1, 1
-_DESCRIPTOR_BYTES = 32
+_PINHOLE, _ORB, _NAMED, _DEPTH = 1, 1, 2, 1
+_METRICS = {"uint8": 1, "int8": 2}
+_FEATURE_BYTES = 6
+"""Of a feature, but for its descriptor."""
+_MAX_FEATURE_BYTES = MAX_FEATURES * (_FEATURE_BYTES + ORB.size)
 _FINEST, _COARSEST = 4, 2
 _NEAREST_MM, _FARTHEST_MM = 10, 65_535
 _BORDER_PX = 64
@@ -81,14 +87,14 @@ class KeyframeFeatures:
     """Features of one image, all with depth, rounded as they are encoded.
 
     ``pixels`` ``(n, 2)`` float32, undistorted; ``depths_m`` ``(n,)`` float32, metres along the optical axis,
-    above 0, with their ``noise`` as the robot measured it; ``descriptors`` ``(n, 32)`` uint8 of ORB, which
-    are compared by their Hamming distance.
+    above 0, with their ``noise`` as the robot measured it; ``descriptors`` ``(n, d)`` of one ``kind``.
     """
 
     pixels: npt.NDArray[np.float32]
     depths_m: npt.NDArray[np.float32]
-    descriptors: npt.NDArray[np.uint8]
+    descriptors: Descriptors
     noise: DepthNoise = _KINECT
+    kind: DescriptorKind = ORB
 
     def __len__(self) -> int:
         return len(self.depths_m)
@@ -122,31 +128,40 @@ class Keyframe:
     others: tuple[UnknownBlock, ...] = ()
 
 
+def most_features(kind: DescriptorKind) -> int:
+    """Return how many features of a kind a keyframe may have: 894 of ORB, 485 with 64 bytes, 253 with 128."""
+    return min(MAX_FEATURES, _MAX_FEATURE_BYTES // (_FEATURE_BYTES + kind.size))
+
+
 def make_features(
     pixels: npt.NDArray[np.floating],
     depths_m: npt.NDArray[np.floating],
-    descriptors: npt.NDArray[np.uint8],
+    descriptors: Descriptors,
     noise: DepthNoise = _KINECT,
+    kind: DescriptorKind = ORB,
 ) -> KeyframeFeatures:
     """Return the features of a keyframe; rows without a usable depth are left out.
 
     Pixels are rounded to 1/16 px (images wider than 4,095 px: 1/8, 1/4), depths to 1 mm.  Where there are
-    more than `MAX_FEATURES`, the first are kept: ORB gives those of the finest level first, which keep most
+    more than `most_features`, the first are kept: ORB gives those of the finest level first, which keep most
     links.
 
     Args:
         pixels: ``(n, 2)``, undistorted; rows outside 0..16383 px are left out.
         depths_m: ``(n,)`` metres along the optical axis; not finite or out of 0.01..65 m: none.
-        descriptors: ``(n, 32)``.
+        descriptors: ``(n, d)``.
         noise: Of the depths.
+        kind: Of the descriptors.
 
     Raises:
         BadRequest: The shapes do not fit.
     """
     n = len(depths_m)
-    if pixels.shape != (n, 2) or depths_m.shape != (n,) or descriptors.shape != (n, _DESCRIPTOR_BYTES):
+    fits = pixels.shape == (n, 2) and depths_m.shape == (n,) and len(descriptors) == n
+    if not (fits and kind.describes(descriptors)):
         raise BadRequest(
-            f"pixels {pixels.shape}, depths_m {depths_m.shape}, descriptors {descriptors.shape} do not fit",
+            f"pixels {pixels.shape}, depths_m {depths_m.shape}, descriptors {descriptors.shape} of "
+            f"{descriptors.dtype} do not fit features of {kind}",
             hint="give one row for each feature",
         )
     with np.errstate(invalid="ignore", over="ignore"):
@@ -154,13 +169,14 @@ def make_features(
         largest_px = pixels.max(axis=1, initial=-1.0)
         usable = (depths_mm >= _NEAREST_MM) & (depths_mm <= _FARTHEST_MM)
         usable &= (pixels.min(axis=1, initial=np.inf) >= 0.0) & (largest_px <= _largest_px(_COARSEST))
-    rows = np.flatnonzero(usable)[:MAX_FEATURES]
+    rows = np.flatnonzero(usable)[: most_features(kind)]
     scale = 2.0 ** _fraction_of(float(largest_px[rows].max(initial=0.0)))
     return KeyframeFeatures(
         pixels=(np.rint(pixels[rows].astype(np.float64) * scale) / scale).astype(np.float32),
         depths_m=(depths_mm[rows] / 1000.0).astype(np.float32),
-        descriptors=np.ascontiguousarray(descriptors[rows], dtype=np.uint8),
+        descriptors=np.ascontiguousarray(descriptors[rows]),
         noise=noise,
+        kind=kind,
     )
 
 
@@ -169,6 +185,7 @@ def encode_keyframe(keyframe: Keyframe) -> bytes:
     camera, features = keyframe.camera, keyframe.features
     n = len(features)
     fraction = _fraction_of(float(features.pixels.max(initial=0.0)))
+    name = b"" if features.kind == ORB else features.kind.name.encode()
     units = np.rint(features.pixels.T.astype(np.float64) * 2.0**fraction).astype("<u2")
     depths_mm = np.rint(features.depths_m.astype(np.float64) * 1000.0).astype("<u2")
     has_noise = features.noise != _KINECT
@@ -180,8 +197,8 @@ def encode_keyframe(keyframe: Keyframe) -> bytes:
     for kind, *contents in (
         (_CAMERA_KIND, _CAMERA.pack(_PINHOLE, 0, *camera_numbers)),
         (
-            _FEATURES_KIND, _FEATURES.pack(_ORB, _HAMMING, _DESCRIPTOR_BYTES, n, fraction, 0),
-            units.tobytes(), features.descriptors.tobytes(),
+            _FEATURES_KIND, _FEATURES.pack(*_kind_numbers(features.kind), n, fraction, len(name)),
+            units.tobytes(), features.descriptors.tobytes(), name,
         ),
         (_GEOMETRY_KIND, _GEOMETRY.pack(_DEPTH, 0, n), depths_mm.tobytes()),
     ):  # fmt: skip
@@ -306,16 +323,14 @@ def _features(
     (begin, end), (depths_begin, depths_end) = features, geometry
     if end - begin < _FEATURES.size or depths_end - depths_begin < _GEOMETRY.size:
         raise _refusal("the block of the features or of the geometry is too short")
-    detector, metric, descriptor_bytes, n, fraction, zero = _FEATURES.unpack_from(data, begin)
-    if (detector, metric, descriptor_bytes) != (_ORB, _HAMMING, _DESCRIPTOR_BYTES):
-        raise _refusal(
-            f"features of kind {detector} with {descriptor_bytes} bytes, metric {metric}, are not known",
-            "send ORB of 32 bytes",
-        )
-    if zero or not _COARSEST <= fraction <= _FINEST:
+    detector, metric, descriptor_bytes, n, fraction, name_bytes = _FEATURES.unpack_from(data, begin)
+    if not _COARSEST <= fraction <= _FINEST:
         raise _refusal(f"pixels in 2**-{fraction} are not known")
-    if n > MAX_FEATURES or end - begin != _FEATURES.size + n * (4 + _DESCRIPTOR_BYTES):
-        raise _refusal(f"{end - begin} bytes are not {n} features, of at most {MAX_FEATURES}")
+    if end - begin != _FEATURES.size + n * (4 + descriptor_bytes) + name_bytes:
+        raise _refusal(f"{end - begin} bytes are not {n} features with descriptors of {descriptor_bytes}")
+    kind = _kind(detector, metric, descriptor_bytes, bytes(data[end - name_bytes : end]))
+    if n > most_features(kind):
+        raise _refusal(f"{n} features of {kind} are above {most_features(kind)}")
     what, zero, depth_count = _GEOMETRY.unpack_from(data, depths_begin)
     if what != _DEPTH or zero:
         raise _refusal(f"geometry of kind {what} is not known", "send a depth for each feature")
@@ -332,13 +347,38 @@ def _features(
     if n and depths_mm.min() < _NEAREST_MM:
         raise _refusal(f"a depth is below {_NEAREST_MM} mm")
     descriptors = np.frombuffer(
-        data, dtype=np.uint8, count=n * _DESCRIPTOR_BYTES, offset=begin + _FEATURES.size + 4 * n
+        data, dtype=kind.dtype, count=n * kind.size, offset=begin + _FEATURES.size + 4 * n
     )
     return KeyframeFeatures(
         pixels=pixels,
         depths_m=(depths_mm / 1000.0).astype(np.float32),
-        descriptors=descriptors.reshape(n, _DESCRIPTOR_BYTES),
+        descriptors=descriptors.reshape(n, kind.size),
+        kind=kind,
     )
+
+
+def _kind_numbers(kind: DescriptorKind) -> tuple[int, int, int]:
+    """Return detector, metric and bytes of a descriptor."""
+    return (_ORB if kind == ORB else _NAMED), _METRICS[kind.dtype], kind.size
+
+
+def _kind(detector: int, metric: int, size: int, name: bytes) -> DescriptorKind:
+    """Return the kind whose numbers and name stand in a block; raises BadRequest."""
+    if (detector, metric, size, name) == (*_kind_numbers(ORB), b""):
+        return ORB
+    dtype = next((dtype for dtype, number in _METRICS.items() if number == metric), None)
+    if detector != _NAMED or dtype is None:
+        raise _refusal(
+            f"features of detector {detector}, metric {metric}, with {size} bytes are not known",
+            "send ORB of 32 bytes, or named features of bytes or int8",
+        )
+    try:
+        kind = DescriptorKind(name.decode("ascii", "replace"), dtype, size)
+    except BadRequest as error:
+        raise _refusal(error.message, error.hint) from error
+    if kind == ORB:
+        raise _refusal("it has ORB as named features", "send them as detector 1 without a name")
+    return kind
 
 
 def _fraction_of(widest_px: float) -> int:

@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from rse_pf.errors import BadRequest, LimitExceeded
 from rse_pf.geometry import Array, inverse
+from rse_pf.maps.descriptors import one_kind
 from rse_pf.maps.format import Keyframe, MapVersion
 from rse_pf.service import Report
 from rse_pf.slam.consistency import LinkEnds, LoopClosure, OdometryNoise, consistent, fits_prediction
@@ -92,7 +93,12 @@ class Atlas:
 
     @classmethod
     def of(cls, versions: Sequence[MapVersion]) -> Atlas:
-        """Return the atlas of *versions*, keyframes by map, robot and time."""
+        """Return the atlas of *versions*, keyframes by map, robot and time.
+
+        Raises:
+            BadRequest: They have features of two kinds.
+        """
+        one_kind((version.kind for version in versions if version.keyframes), "the first map")
         rows = [
             (which, keyframe)
             for which, version in enumerate(versions)

@@ -3,11 +3,14 @@
 The vocabulary is fixed and comes with the package, so a vector never changes when a map grows.  Vectors are
 computed in whole numbers: the same descriptors give the same bytes on every machine.  A search only proposes;
 poses decide.
+
+ORB has a vocabulary that was trained; descriptors of other kinds have one of random directions.
 """
 
 from __future__ import annotations
 
 import functools
+import hashlib
 import math
 from collections.abc import Iterable
 from pathlib import Path
@@ -16,6 +19,8 @@ import numpy as np
 import numpy.typing as npt
 
 from rse_pf.errors import BadRequest
+from rse_pf.maps.descriptors import ORB, Descriptors
+from rse_pf.slam.descriptors import as_vectors
 
 __all__ = ["PLACE_NUMBERS", "PLACE_WORDS_FILE", "PlaceIndex", "PlaceVector", "place_vector"]
 
@@ -32,24 +37,27 @@ _ROW_BYTES = 8 + 4 * PLACE_NUMBERS
 PlaceVector = npt.NDArray[np.float32]
 
 
-def place_vector(descriptors: npt.NDArray[np.uint8]) -> PlaceVector:
-    """Return the ``(512,)`` unit vector of a view with ``(n, 32)`` binary descriptors; zero without any.
+def place_vector(descriptors: Descriptors) -> PlaceVector:
+    """Return the ``(512,)`` unit vector of a view with ``(n, d)`` descriptors of any kind; zero without any.
 
     Source:
         Jegou et al., Aggregating local descriptors (VLAD), CVPR 2010, with their reduction by principal
         components (PAMI 2012) for each residual, its square root, and the intra-normalisation of Arandjelovic
         and Zisserman, CVPR 2013.
     """
-    words, directions, squares = _vocabulary()
-    bits = np.unpackbits(descriptors, axis=1).astype(np.float32)
-    bits += bits
-    bits -= 1.0
+    numbers = as_vectors(descriptors)
+    is_orb = ORB.describes(descriptors)
+    words, directions, squares = _vocabulary() if is_orb else _random_vocabulary(numbers.shape[1])
+    if not is_orb and len(numbers):
+        # Vectors that are never negative lie all in one direction.
+        numbers -= np.rint(numbers.sum(axis=0, dtype=np.float64) / len(numbers)).astype(np.float32)
     # Whole numbers below 2**24, so float32 is exact, in whatever order a machine adds them.
-    nearest = np.argmin(squares - (2.0 * _SCALE) * (bits @ words.T), axis=1)
-    of_word = np.zeros((len(bits), WORDS), dtype=np.float32)
-    of_word[np.arange(len(bits)), nearest] = 1.0
-    residuals = _SCALE * (of_word.T @ bits).astype(np.float64)
-    residuals -= of_word.sum(axis=0, dtype=np.float64)[:, None] * words
+    nearest = np.argmin(squares - (2.0 * _SCALE) * (numbers @ words.T), axis=1)
+    of_word = np.zeros((len(numbers), WORDS), dtype=np.float32)
+    of_word[np.arange(len(numbers)), nearest] = 1.0
+    residuals = _SCALE * (of_word.T @ numbers).astype(np.float64)
+    if is_orb:
+        residuals -= of_word.sum(axis=0, dtype=np.float64)[:, None] * words
     parts = np.matmul(residuals[:, None, :], directions)[:, 0]
     parts = np.sign(parts) * np.rint(np.sqrt(np.abs(parts)))
     lengths = np.sqrt((parts * parts).sum(axis=1))
@@ -103,7 +111,7 @@ class PlaceIndex:
         return index
 
     @staticmethod
-    def vector(descriptors: npt.NDArray[np.uint8]) -> PlaceVector:
+    def vector(descriptors: Descriptors) -> PlaceVector:
         """Return `place_vector` of *descriptors*."""
         return place_vector(descriptors)
 
@@ -177,3 +185,22 @@ def _vocabulary() -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float64], npt
     along = words[:, :, None] * (words @ common)[:, None, :] / squares[:, None, None]
     directions = np.rint(_FINENESS * (common - along))
     return words.astype(np.float32), directions, squares.astype(np.float32)
+
+
+@functools.lru_cache(maxsize=8)
+def _random_vocabulary(
+    dimensions: int,
+) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float64], npt.NDArray[np.float32]]:
+    """Return what `_vocabulary` does, of random signs, for descriptors that nothing was trained for.
+
+    They come from a hash, since the numbers of a random generator may change with its release.
+    """
+    count = WORDS + WORDS * PARTS
+    data = hashlib.shake_256(f"places {dimensions}".encode()).digest(count * dimensions // 8 + 1)
+    bits = np.unpackbits(np.frombuffer(data, dtype=np.uint8), count=count * dimensions)
+    signs = (2.0 * bits.astype(np.float64) - 1.0).reshape(count, dimensions)
+    words = signs[:WORDS].astype(np.float32)
+    directions = signs[WORDS:].reshape(WORDS, PARTS, dimensions).transpose(0, 2, 1)
+    # Across the word, times the number of dimensions: along it lies all that is nearest to it.
+    along = signs[:WORDS, :, None] * np.einsum("wd,wdp->wp", signs[:WORDS], directions)[:, None, :]
+    return words, dimensions * directions - along, np.zeros(WORDS, dtype=np.float32)

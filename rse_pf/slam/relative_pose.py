@@ -13,10 +13,11 @@ import numpy as np
 
 from rse_pf.errors import PnpError
 from rse_pf.geometry import Array, Camera, inverse
+from rse_pf.maps.descriptors import Descriptors
 from rse_pf.maps.format import Keyframe
 from rse_pf.native_matcher import match_core
 from rse_pf.pnp import DepthNoise, PnpOptions, PnpSolution, refine_with_depth, solve_pnp
-from rse_pf.slam.descriptors import Descriptors, hamming_matches
+from rse_pf.slam.descriptors import best_matches
 
 __all__ = [
     "MeasuredPose",
@@ -60,7 +61,7 @@ class RelativePoseOptions:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class View:
-    """A camera image: ``(n, 2)`` undistorted pixels with their ``(n, 32)`` descriptors.
+    """A camera image: ``(n, 2)`` undistorted pixels with their ``(n, d)`` descriptors of any kind.
 
     ``depths_m``, if there are any, are the ``(n,)`` depths at the pixels with their ``noise``, 0 where there
     is none.
@@ -77,7 +78,7 @@ class View:
 class Reference:
     """Points of a keyframe that are sought in other images: ``(n, 3)`` metres, camera frame, finite.
 
-    ``descriptors`` ``(n, 32)`` has one row for each point.
+    ``descriptors`` ``(n, d)`` has one row for each point.
     """
 
     points_camera: Array
@@ -205,11 +206,12 @@ def match_points(
 ) -> tuple[Array, Array, Array]:
     """Return the points of *reference* that *view* shows, ``(k, 3)``, with its pixels and depths there.
 
-    They are sorted from left to right, and rounded to 0.1 mm, 0.01 px and 1 mm.  The native core matches them
-    where its library is built, else faiss, in ten times the time.
+    They are sorted from left to right, and rounded to 0.1 mm, 0.01 px and 1 mm.  The native core matches ORB
+    where its library is built, else faiss, in ten times the time; vectors are matched by numpy.
 
     Raises:
-        MissingExtra: There is neither the native core nor faiss.
+        BadRequest: The descriptors are of two kinds.
+        MissingExtra: They are binary, and there is neither the native core nor faiss.
     """
     core = match_core()
     n = len(view.pixels)
@@ -224,7 +226,7 @@ def match_points(
         )  # fmt: skip
         if matched is not None:
             return matched
-    rows, columns = hamming_matches(reference.descriptors, view.descriptors, options.ratio)
+    rows, columns = best_matches(reference.descriptors, view.descriptors, options.ratio)
     rows, columns = rows[: options.max_matches], columns[: options.max_matches]
     leftmost = np.argsort(view.pixels[columns, 0], kind="stable")
     rows, columns = rows[leftmost], columns[leftmost]

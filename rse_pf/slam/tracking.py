@@ -6,14 +6,16 @@ poses agree to rounding.  Which landmarks are sought, and what is done with a po
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
 from rse_pf.errors import BadRequest
 from rse_pf.geometry import Array, Camera, exp_se3, skew
+from rse_pf.maps.descriptors import ORB, Descriptors
 from rse_pf.native_tracker import track_core
+from rse_pf.slam.descriptors import distance_matrix, distances_of_pairs, no_distance
 
 __all__ = [
     "FittedPose",
@@ -32,11 +34,9 @@ __all__ = [
 ]
 
 Rows = npt.NDArray[np.int64]
-Descriptors = npt.NDArray[np.uint8]
 
-_BITS = np.array([bin(value).count("1") for value in range(256)], dtype=np.uint8)
+_DTYPES = (np.uint8, np.int8)
 _BAND = 1e6
-_NONE = 256
 _ITERATIONS, _FIRST_GATED, _CONVERGED = 10, 3, 1e-6
 _NEAR_M = 0.05
 _MAX_ABS, _MAX_TWIST, _MAX_DISTANCE2 = 1e9, 1e6, 1e300
@@ -46,11 +46,12 @@ _OWN = 1e-9
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ImageFeatures:
-    """Binary features of one image.
+    """Features of one image.
 
-    ``pixels`` ``(n, 2)``, undistorted; ``descriptors`` ``(n, 32)``; ``turns`` ``(n, 2)``, cosine and sine of
+    ``pixels`` ``(n, 2)``, undistorted; ``descriptors`` ``(n, d)``; ``turns`` ``(n, 2)``, cosine and sine of
     the orientation; ``sizes`` ``(n,)``, the scale of the pyramid's level, 1 for the finest; ``distinct``
-    ``(n,)`` as `distinct_distances` returns it.
+    ``(n,)`` as `distinct_distances` returns it.  Turns and sizes tell nothing unless the features are
+    *is_oriented* and *is_scaled*.
     """
 
     pixels: Array
@@ -58,6 +59,8 @@ class ImageFeatures:
     turns: Array
     sizes: Array
     distinct: npt.NDArray[np.int32]
+    is_oriented: bool = True
+    is_scaled: bool = True
 
     def __len__(self) -> int:
         return len(self.pixels)
@@ -87,7 +90,8 @@ class NearLimits:
             carpet or a wall of tiles looks alike beyond the radius, too.
         min_cosine: Between the expected orientation and its own.
         max_size_ratio: Between the expected size and its own, either way.
-        max_distance: Largest Hamming distance, of 256 bits.
+        max_distance: Largest Hamming distance, of 256 bits; other binary descriptors by their bits.  Vectors
+            have none.
     """
 
     radius_px: float
@@ -139,28 +143,29 @@ class FittedPose:
 def distinct_distances(
     descriptors: Descriptors, pixels: Array, apart_px: float = 6.0
 ) -> npt.NDArray[np.int32]:
-    """Return the Hamming distance of each feature to the most similar other one of its image.
+    """Return the distance of each feature to the most similar other one of its image.
 
     Features that are closer than *apart_px* in rows and columns are the same point, and are not compared.
 
     Args:
-        descriptors: ``(n, 32)``.
+        descriptors: ``(n, d)``.
         pixels: ``(n, 2)``.
         apart_px: Of two features that are compared.
 
     Returns:
-        ``(n,)``, 256 where there is no other one.
+        ``(n,)``; where there is no other one a number above all distances, 256 of ORB.
 
     Raises:
-        BadRequest: Shapes do not fit, or descriptors are no bytes.
+        BadRequest: Shapes do not fit, or descriptors are neither uint8 nor int8.
     """
-    if descriptors.shape != (len(pixels), 32) or descriptors.dtype != np.uint8 or pixels.shape[1:] != (2,):
+    is_fit = descriptors.ndim == 2 and len(descriptors) == len(pixels) and pixels.shape[1:] == (2,)
+    if not is_fit or descriptors.dtype not in _DTYPES:
         raise BadRequest(
             f"{len(pixels)} features with descriptors of shape {descriptors.shape}, {descriptors.dtype}",
-            hint="give 32 bytes and two pixel coordinates for each feature",
+            hint="give a descriptor and two pixel coordinates for each feature",
         )
     core = track_core()
-    if core is not None:
+    if core is not None and ORB.describes(descriptors):
         return core.distinct(descriptors, pixels, apart_px)
     return distinct_by_numpy(descriptors, pixels, apart_px)
 
@@ -168,14 +173,11 @@ def distinct_distances(
 def distinct_by_numpy(descriptors: Descriptors, pixels: Array, apart_px: float) -> npt.NDArray[np.int32]:
     """Return what `distinct_distances` does, without the native core, whose oracle this is."""
     pixels = np.asarray(pixels, dtype=np.float64)
-    bits = np.unpackbits(descriptors, axis=1).astype(np.float32)
-    bits += bits
-    bits -= 1.0
-    distances = (_NONE - bits @ bits.T) / 2  # exact: whole numbers
+    distances, none = distance_matrix(descriptors, descriptors), no_distance(descriptors)
     with np.errstate(invalid="ignore", over="ignore"):
         apart = (np.abs(pixels[:, None] - pixels[None]) >= apart_px).any(axis=2)
-    distances[~apart | np.eye(len(pixels), dtype=bool)] = _NONE
-    nearest: npt.NDArray[np.int32] = distances.min(axis=1, initial=_NONE).astype(np.int32)
+    distances[~apart | np.eye(len(pixels), dtype=bool)] = none
+    nearest: npt.NDArray[np.int32] = distances.min(axis=1, initial=none).astype(np.int32)
     return nearest
 
 
@@ -188,21 +190,29 @@ def match_near(sought: SoughtFeatures, image: ImageFeatures, limits: NearLimits)
         BadRequest: Shapes or the radius do not fit, or descriptors are no bytes.
     """
     m, n = len(sought.pixels), len(image)
+    d = sought.descriptors.shape[1:]
     shapes = (
         sought.pixels.shape, sought.descriptors.shape, sought.turns.shape, sought.sizes.shape,
         image.pixels.shape, image.descriptors.shape, image.turns.shape, image.sizes.shape,
         image.distinct.shape,
     )  # fmt: skip
-    if shapes != ((m, 2), (m, 32), (m, 2), (m,), (n, 2), (n, 32), (n, 2), (n,), (n,)):
-        raise BadRequest("features of different numbers of rows", hint="give one row for each feature")
-    if sought.descriptors.dtype != np.uint8 or image.descriptors.dtype != np.uint8:
+    if len(d) != 1 or shapes != ((m, 2), (m, *d), (m, 2), (m,), (n, 2), (n, *d), (n, 2), (n,), (n,)):
         raise BadRequest(
-            f"descriptors of {sought.descriptors.dtype} and {image.descriptors.dtype}", hint="give uint8"
+            "features of different numbers of rows, or kinds", hint="give one row of each for each feature"
+        )
+    if sought.descriptors.dtype not in _DTYPES or image.descriptors.dtype != sought.descriptors.dtype:
+        raise BadRequest(
+            f"descriptors of {sought.descriptors.dtype} and {image.descriptors.dtype}",
+            hint="give uint8 or int8 of both",
         )
     if not 0.0 <= limits.radius_px <= _MAX_ABS:
         raise BadRequest(f"a radius of {limits.radius_px:g} px", hint="give 0 to 1e9 px")
+    if not image.is_oriented:
+        limits = replace(limits, min_cosine=-np.inf)
+    if not image.is_scaled:
+        limits = replace(limits, max_size_ratio=np.inf)
     core = track_core()
-    if core is None:
+    if core is None or not ORB.describes(image.descriptors):
         return match_near_by_numpy(sought, image, limits)
     return core.match_near(
         (sought.pixels, sought.turns, sought.sizes, sought.descriptors),
@@ -235,7 +245,10 @@ def match_near_by_numpy(
     rows, columns = rows[fits], columns[fits]
     if not len(rows):
         return empty, empty
-    distances = _BITS[sought.descriptors[rows] ^ image.descriptors[columns]].sum(axis=1, dtype=np.int64)
+    distances = distances_of_pairs(sought.descriptors[rows], image.descriptors[columns])
+    most = limits.max_distance * image.descriptors.shape[1] // ORB.size
+    if image.descriptors.dtype != np.uint8:
+        most = no_distance(image.descriptors)
     order = np.lexsort((columns, distances, rows))
     rows, columns, distances = rows[order], columns[order], distances[order]
     starts = np.flatnonzero(np.concatenate(([True], rows[1:] != rows[:-1])))
@@ -243,7 +256,7 @@ def match_near_by_numpy(
     has_second = (rows[follows] == rows[starts]) & (follows > starts)
     best = distances[starts]
     clear = (
-        (best <= limits.max_distance)
+        (best <= most)
         & (best < limits.distinct_ratio * image.distinct[columns[starts]])
         & (~has_second | (best < limits.ratio * distances[follows]))
     )

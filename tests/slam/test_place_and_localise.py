@@ -15,7 +15,7 @@ from rse_pf.services.builtin import builtin_services
 from rse_pf.services.mapping.localise import LocaliseOptions, LocaliseReply, LocaliseRequest, locate
 from rse_pf.services.mapping.place import MapIndex, PlaceReply, PlaceRequest, Within
 from rse_pf.services.synthetic_maps import make_world
-from rse_pf.slam.descriptors import hamming_matches
+from rse_pf.slam.descriptors import best_matches
 from rse_pf.slam.relative_pose import View
 from rse_pf.wire import Command, Failure, Result
 
@@ -115,7 +115,7 @@ def test_matches_are_closest_and_unambiguous_and_used_once() -> None:
     other = reference[order].copy()
     other[:, 0] ^= 1
 
-    rows, columns = hamming_matches(np.concatenate([reference, reference[:5]]), other, 0.75)
+    rows, columns = best_matches(np.concatenate([reference, reference[:5]]), other, 0.75)
 
     assert len(columns) == len(set(columns.tolist())) == 50
     np.testing.assert_array_equal(order[columns], rows % 50)

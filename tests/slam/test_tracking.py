@@ -269,7 +269,7 @@ def test_the_most_similar_feature_that_is_another_point_counts() -> None:
     assert distinct_distances(np.zeros((0, 32), np.uint8), np.zeros((0, 2))).tolist() == []
     nowhere = np.array([[np.nan, np.nan], [0.0, 0.0], [np.nan, 90.0]])
     assert distinct_distances(np.zeros((3, 32), np.uint8), nowhere).tolist() == [256, 0, 0]
-    for wrong in (np.zeros((3, 16), np.uint8), np.zeros((2, 32), np.uint8), np.zeros((3, 32))):
+    for wrong in (np.zeros(3, np.uint8), np.zeros((2, 32), np.uint8), np.zeros((3, 32))):
         with pytest.raises(BadRequest, match="3 features"):
             distinct_distances(wrong, np.zeros((3, 2)))
 

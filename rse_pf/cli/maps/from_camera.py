@@ -58,6 +58,10 @@ def add_drive_arguments(parser: argparse.ArgumentParser, out: Path) -> None:
         metavar="SOURCE",
         help="without depth: marker:MM (edge of an ArUco 4x4_50 marker) or odometry:FILE (TUM format)",
     )
+    add(
+        "--features", metavar="MODULE:FUNCTION",
+        help="find features with this function instead of ORB: see docs/own_parts.md",
+    )  # fmt: skip
     add("--no-depth", action="store_true", help="use the colours only")
     add("--rate", type=float, metavar="HZ", help="play so many frames per second (default: all)")
     add("--frames", type=int, metavar="N", help="stop after so many frames")
@@ -129,6 +133,9 @@ def map_source(
 
 def check_drive(args: argparse.Namespace) -> OdometryScale | MarkerScale | None:
     """Refuse options that contradict each other, and return the scale; raises UsageError."""
+    from client_sdk.slots import load_features
+
+    load_features(args.features)
     if args.frames is not None and args.frames < 2:
         raise UsageError(f"--frames {args.frames} is below 2", hint="leave it out to use all frames")
     if args.enrolment is not None and (args.url is not None or args.token_file is not None):
@@ -175,11 +182,13 @@ async def _drive(
     frames: FrameTable,
 ) -> Mapper:
     """Track all frames; Ctrl-C ends the drive, and what was mapped is kept."""
+    from client_sdk.slots import load_features
+
     stop = asyncio.Event()
     with contextlib.suppress(NotImplementedError, ValueError, RuntimeError):  # not in the main thread
         asyncio.get_running_loop().add_signal_handler(signal.SIGINT, stop.set)
     async with _robot(args, settings) as robot:
-        mapper = robot.mapper(scale=scale, depth=source.has_depth)
+        mapper = robot.mapper(scale=scale, depth=source.has_depth, features=load_features(args.features))
         status = _Status(time.monotonic)
         while not stop.is_set() and (args.frames is None or mapper.frames < args.frames):
             frame = await asyncio.to_thread(next, source, None)

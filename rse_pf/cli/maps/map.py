@@ -48,6 +48,7 @@ from rse_pf.errors import NotFound, UsageError
 from rse_pf.files import replace_file
 from rse_pf.geometry import Camera, rotation_angle_deg, to_quaternion
 from rse_pf.local.state import state_folder
+from rse_pf.maps.descriptors import check_alike
 from rse_pf.maps.format import MapVersion
 from rse_pf.maps.registry import MapOrigin, MapRecord, MapRegistry, difference
 from rse_pf.maps.removal import freed_bytes, superseded
@@ -55,6 +56,7 @@ from rse_pf.slam.map_export import FORMATS, export_map
 from rse_pf.terminal import at_work, counted, show, show_json
 
 if TYPE_CHECKING:
+    from client_sdk.slots import FeaturesSlot
     from rse_pf.services.mapping.localise import LocaliseReply
     from rse_pf.slam.relative_pose import View
 
@@ -165,6 +167,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--camera",
         metavar="FX,FY,CX,CY",
         help="camera of images, pixels (default: the camera of the map with the same image size)",
+    )
+    localise.add_argument(
+        "--features", metavar="MODULE:FUNCTION", help="with which the map was made (default: ORB)"
     )
 
 
@@ -323,6 +328,10 @@ def _localise(args: argparse.Namespace, maps: MapRegistry) -> int:
 
     if args.every < 1:
         raise UsageError(f"--every {args.every} is below 1", hint="1 takes every frame")
+    from client_sdk.slots import FeaturesSlot, load_features
+
+    features = load_features(args.features)
+    slot = None if features is None else FeaturesSlot(features)
     name, version = _version_of(args.name)
     data = maps.data(name, version)
     with at_work(f"reading {args.name}"):
@@ -330,7 +339,7 @@ def _localise(args: argparse.Namespace, maps: MapRegistry) -> int:
     frames = [each for word in args.frames for each in _frames(word, args.every)]
     found: list[dict[str, Any]] = []
     for each in frames:
-        location = locate(index, _view_of(each, version_map, args.camera))
+        location = locate(index, _view_of(each, version_map, args.camera, slot))
         found.append(_location_document(each.label, location))
         if not args.json:
             show(_location_line(found[-1]))
@@ -455,7 +464,7 @@ def _frames(word: str, every: int) -> Iterator[_NamedFrame]:
         yield _NamedFrame(label=f"{path.name}:{row}", path=path, row=row)
 
 
-def _view_of(named: _NamedFrame, version: MapVersion, camera: str | None) -> View:
+def _view_of(named: _NamedFrame, version: MapVersion, camera: str | None, slot: FeaturesSlot | None) -> View:
     from client_sdk.datasets import open_dataset, read_colour
     from client_sdk.frontend import Frame, FrontEndOptions, extract
     from rse_pf.slam.relative_pose import View
@@ -473,7 +482,8 @@ def _view_of(named: _NamedFrame, version: MapVersion, camera: str | None) -> Vie
         )
         nothing = np.zeros((height, width), dtype=np.float32)
         frame = Frame(timestamp_s=0.0, rgb=rgb, depth_m=nothing, camera=lens)
-    features = extract(frame, FrontEndOptions())
+    features = extract(frame, FrontEndOptions(), slot)
+    check_alike(version.kind, features.kind, "the map")
     return View(camera=frame.camera, pixels=features.pixels, descriptors=features.descriptors)
 
 

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from client_sdk.frontend import FrontEndOptions, TrackedFrame, extract
+from client_sdk.slots import FeaturesFunction, FeaturesSlot
 from client_sdk.transfer.background_upload import BackgroundUploader
 from client_sdk.transfer.data_client import DataClient
 from rse_pf.config import DataSettings
@@ -61,14 +62,22 @@ class KeyframeUploads:
 class KeyframeCollector:
     """Collects the keyframes of one robot."""
 
-    def __init__(self, robot: str, options: FrontEndOptions, uploads: KeyframeUploads) -> None:
+    def __init__(
+        self,
+        robot: str,
+        options: FrontEndOptions,
+        uploads: KeyframeUploads,
+        features: FeaturesFunction | None = None,
+    ) -> None:
         """Start without keyframes.
 
         Args:
             robot: Name of the robot, which its keyframes carry.
             options: Options of its tracker: features are extracted again with the same ones.
             uploads: Takes each keyframe, encoded as a map of one, and the map.
+            features: Its features function; None for ORB.
         """
+        self._slot = None if features is None else FeaturesSlot(features)
         self._robot = robot
         self._options = options
         self._uploads = uploads
@@ -81,7 +90,7 @@ class KeyframeCollector:
         """Add *tracked* if it is a keyframe."""
         if not tracked.keyframe or tracked.T_world_camera is None:
             return
-        features = extract(tracked.frame, self._options)
+        features = extract(tracked.frame, self._options, self._slot)
         keyframe = Keyframe(
             id=len(self._keyframes),
             robot=self._robot,
@@ -90,6 +99,7 @@ class KeyframeCollector:
             camera=tracked.frame.camera,
             pixels=features.pixels.astype(np.float32),
             descriptors=features.descriptors,
+            kind=features.kind,
             points_camera=features.points_camera.astype(np.float32),
         )
         self._keyframes.append(keyframe)

@@ -24,6 +24,7 @@ from client_sdk.mapper import Mapper, ask_robot
 from client_sdk.mapping import PointMap, Trajectory, write_ply, write_trajectory
 from client_sdk.offloading.offload import CloudFirst
 from client_sdk.robot import Robot
+from client_sdk.slots import load_features
 from rse_pf.config import DataSettings, SessionSettings
 from rse_pf.errors import RsePfError, error_of_system
 from rse_pf.experiments.child_process import ChildFailed, ChildReady, ParentPipe
@@ -54,6 +55,7 @@ class DemoOptions:
     frames: int | None = None
     seed: int = 0
     frontend: str = "standard"
+    features: str | None = None
     merge: bool = False
     live: bool = False
     quiet: bool = False
@@ -166,13 +168,16 @@ async def _run(spec: RobotSpec, pipe: ParentPipe) -> None:
             if options.live:
                 shared = LiveMapper(
                     robot, LIVE_NAME, ask=ask, options=options.frontend_options,
-                    live=LiveOptions().sent_with(options.codec),
+                    live=LiveOptions().sent_with(options.codec), features=load_features(options.features),
                     spool=spec.folder / "spool" if spec.has_offload else None,
                 )  # fmt: skip
                 mapper = await stack.enter_async_context(shared)
             else:
                 start = np.eye(4) if truth is None or options.merge else truth.T_world_camera[0]
-                mapper = Mapper(ask=ask, depth=True, options=options.frontend_options, T_world_start=start)
+                mapper = Mapper(
+                    ask=ask, depth=True, options=options.frontend_options, T_world_start=start,
+                    features=load_features(options.features),
+                )  # fmt: skip
             pipe.send(ChildReady(len(frames)))
             began = planned = await asyncio.to_thread(pipe.wait_start)
             collector = _collector(spec, pipe.token, lambda: drive.asking)
@@ -290,7 +295,8 @@ def _collector(
     if not spec.options.merge:
         return None
     uploads = KeyframeUploads(spec.url, token, spec.folder / "spool", spec.data_settings, is_busy)
-    return KeyframeCollector(spec.name, spec.options.frontend_options, uploads)
+    features = load_features(spec.options.features)
+    return KeyframeCollector(spec.name, spec.options.frontend_options, uploads, features)
 
 
 def _write(

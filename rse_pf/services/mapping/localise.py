@@ -10,7 +10,14 @@ import msgspec
 from rse_pf.errors import BadRequest
 from rse_pf.geometry import Camera
 from rse_pf.service import Registry
-from rse_pf.services.mapping.place import MapIndex, Within, check_comparisons, open_map, view_of
+from rse_pf.services.mapping.place import (
+    FeatureKind,
+    MapIndex,
+    Within,
+    check_comparisons,
+    open_map,
+    view_of,
+)
 from rse_pf.slam.descriptors import load_faiss
 from rse_pf.slam.localise import LocalisationOptions, PlacedKeyframe, localise, spread_candidates
 from rse_pf.slam.relative_pose import RelativePoseOptions, View, reference_of
@@ -63,6 +70,8 @@ class LocaliseRequest(msgspec.Struct, frozen=True, kw_only=True):
     descriptors: bytes
     within: Within | None = None
     options: LocaliseOptions | None = None
+    features: FeatureKind | None = None
+    """None for ORB."""
 
 
 class LocaliseReply(msgspec.Struct, frozen=True, kw_only=True):
@@ -129,8 +138,8 @@ def register(registry: Registry) -> None:
     @registry.service("localise", limited=True, warm_up=load_faiss)
     def answer(request: LocaliseRequest) -> LocaliseReply:
         """Find the camera's pose in a map."""
-        view = view_of(request.camera, request.pixels, request.descriptors)
         _, index = open_map(request.map)
+        view = view_of(request.camera, request.pixels, request.descriptors, request.features, index)
         check_comparisons(index, view, (request.options or LocaliseOptions()).candidates)
         found = locate(index, view, request.options, within=request.within)
         pose = None if found.T_map_camera is None else found.T_map_camera.ravel()

@@ -14,9 +14,10 @@ import numpy.typing as npt
 
 from rse_pf.errors import BadRequest, LimitExceeded
 from rse_pf.geometry import Camera
+from rse_pf.maps.descriptors import ORB, DescriptorKind, Descriptors, check_alike, descriptors_of, one_kind
 from rse_pf.maps.format import Keyframe, MapLimits, MapVersion, decode_map
 from rse_pf.service import Registry
-from rse_pf.slam.descriptors import Descriptors, descriptors_of, load_faiss
+from rse_pf.slam.descriptors import load_faiss
 from rse_pf.slam.places import PlaceIndex, place_vector
 from rse_pf.slam.relative_pose import View, measure_pose, reference_of
 from rse_pf.wire.arrays import Array, reshaped
@@ -25,6 +26,7 @@ __all__ = [
     "MAX_KEYFRAMES",
     "MAX_VIEW_FEATURES",
     "Candidate",
+    "FeatureKind",
     "MapIndex",
     "PlaceReply",
     "PlaceRequest",
@@ -44,7 +46,15 @@ MAX_FEATURES = 2_000_000
 MAX_VIEW_FEATURES = 20_000
 """Of the view of a request."""
 _MAX_COMPARISONS = 2_000_000_000
-"""Of one descriptor of the view with one of a candidate; they take about five seconds."""
+"""Of one descriptor of ORB of the view with one of a candidate; they take about five seconds."""
+
+
+class FeatureKind(msgspec.Struct, frozen=True, kw_only=True):
+    """What the descriptors of a view are, as `DescriptorKind` says."""
+
+    name: str
+    dtype: str
+    size: int
 
 
 class Within(msgspec.Struct, frozen=True, kw_only=True):
@@ -59,7 +69,8 @@ class Within(msgspec.Struct, frozen=True, kw_only=True):
 class PlaceRequest(msgspec.Struct, frozen=True, kw_only=True):
     """A view and the map to find it in.
 
-    ``map`` is an encoded map version; ``pixels`` ``2n`` undistorted; ``descriptors`` ``32n`` raw bytes.
+    ``map`` is an encoded map version; ``pixels`` ``2n`` undistorted; ``descriptors`` raw bytes: ``32n`` of
+    ORB.
     """
 
     map: bytes
@@ -70,6 +81,8 @@ class PlaceRequest(msgspec.Struct, frozen=True, kw_only=True):
     check: bool = True
     """Whether each candidate is checked by PnP; the candidates are then sorted by inliers."""
     within: Within | None = None
+    features: FeatureKind | None = None
+    """None for ORB."""
 
 
 class Candidate(msgspec.Struct, frozen=True, kw_only=True):
@@ -98,6 +111,7 @@ class MapIndex:
 
     def __init__(self, keyframes: Sequence[Keyframe]) -> None:
         self.keyframes = tuple(keyframes)
+        self.kind = one_kind((keyframe.kind for keyframe in self.keyframes), "the map")
         self.T_map_keyframe = np.array([keyframe.T_world_camera for keyframe in self.keyframes])
         self._places = PlaceIndex.of(place_vector(keyframe.descriptors) for keyframe in self.keyframes)
 
@@ -134,20 +148,30 @@ def open_map(data: bytes) -> tuple[MapVersion, MapIndex]:
     return version, MapIndex(version.keyframes)
 
 
-def view_of(camera: Camera, pixels: Array, descriptors: bytes) -> View:
-    """Return the view of a request; raises BadRequest or LimitExceeded."""
+def view_of(
+    camera: Camera, pixels: Array, descriptors: bytes, features: FeatureKind | None, index: MapIndex
+) -> View:
+    """Return the view of a request.
+
+    Raises:
+        BadRequest: Pixels and descriptors do not fit, or are of another kind than those of the map.
+        LimitExceeded: It has too many features.
+    """
+    kind = ORB if features is None else DescriptorKind(features.name, features.dtype, features.size)
+    check_alike(index.kind, kind, "the map")
     rows = reshaped("pixels", pixels, 2)
     if len(rows) > MAX_VIEW_FEATURES:
         raise LimitExceeded(
             f"a view of {len(rows)} features is above {MAX_VIEW_FEATURES}", hint="send the strongest ones"
         )
-    return View(camera=camera, pixels=rows, descriptors=descriptors_of(descriptors, len(rows)))
+    return View(camera=camera, pixels=rows, descriptors=descriptors_of(descriptors, len(rows), kind))
 
 
 def check_comparisons(index: MapIndex, view: View, candidates: int) -> None:
     """Raise LimitExceeded if matching *view* to *candidates* keyframes of *index* would take too long."""
     largest = max(len(each.descriptors) for each in index.keyframes)
     comparisons = min(candidates, len(index.keyframes)) * largest * len(view.pixels)
+    comparisons = comparisons * index.kind.size // ORB.size
     if comparisons > _MAX_COMPARISONS:
         raise LimitExceeded(
             f"{comparisons} comparisons of features are above {_MAX_COMPARISONS}",
@@ -165,8 +189,8 @@ def register(registry: Registry) -> None:
             raise BadRequest(
                 f"candidates = {request.candidates} is not within 1..100", hint="5 to 10 are enough"
             )
-        view = view_of(request.camera, request.pixels, request.descriptors)
         _, index = open_map(request.map)
+        view = view_of(request.camera, request.pixels, request.descriptors, request.features, index)
         if request.check:
             check_comparisons(index, view, request.candidates)
         rows = index.nearest(view.descriptors, request.candidates, request.within)

@@ -1,0 +1,254 @@
+"""A user's features: what a function may return, what is refused, and that a mapper tracks with them."""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from client_sdk.frontend import FrontEndOptions, describe
+from client_sdk.mapper import Mapper
+from client_sdk.slots import FeaturesSlot, FoundFeatures, load_features, load_function
+from rse_pf.errors import UsageError
+from rse_pf.maps.descriptors import ORB, DescriptorKind
+from rse_pf.maps.format import decode_map
+from tests.client_sdk.mapper.flat_world import STEP_M, frame_at
+from tests.client_sdk.mapper.test_mapper import solve
+
+IMAGE: npt.NDArray[np.uint8] = np.zeros((480, 640, 3), dtype=np.uint8)
+
+
+def found(n: int = 6, **other: Any) -> FoundFeatures:
+    rng = np.random.default_rng(n)
+    fields: dict[str, Any] = {
+        "pixels": rng.uniform(0, 400, (n, 2)), "scores": rng.uniform(0, 1, n),
+        "descriptors": rng.standard_normal((n, 64)).astype(np.float32), **other,
+    }  # fmt: skip
+    return FoundFeatures(**fields)
+
+
+def slot_of(result: Any, name: str = "mine") -> FeaturesSlot:
+    def function(_: npt.NDArray[np.uint8]) -> Any:
+        return result
+
+    function.__name__ = name
+    return FeaturesSlot(function)
+
+
+def orb_by_hand(rgb: npt.NDArray[np.uint8]) -> FoundFeatures:
+    import cv2
+
+    points, descriptors = cv2.ORB_create(1500).detectAndCompute(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), None)
+    return FoundFeatures(
+        pixels=cv2.KeyPoint_convert(points), scores=[p.response for p in points], descriptors=descriptors,
+        turns_deg=[p.angle for p in points], sizes=[1.2**p.octave for p in points],
+    )  # fmt: skip
+
+
+def sift(rgb: npt.NDArray[np.uint8]) -> FoundFeatures:
+    import cv2
+
+    gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
+    points, descriptors = cv2.SIFT_create(1500).detectAndCompute(gray, None)
+    return FoundFeatures(
+        pixels=cv2.KeyPoint_convert(points), scores=[p.response for p in points], descriptors=descriptors
+    )
+
+
+def test_features_come_back_best_first() -> None:
+    slot = slot_of(found(scores=[0.1, 0.9, 0.5, 0.2, 0.3, 0.4]))
+
+    features = slot(IMAGE)
+
+    assert features.scores.tolist() == [0.9, 0.5, 0.4, 0.3, 0.2, 0.1]
+    assert np.array_equal(features.pixels[0], np.asarray(found().pixels)[1])
+    assert (slot.kind, slot.is_oriented, slot.is_scaled) == (DescriptorKind("mine", "int8", 64), False, False)
+
+
+def test_floats_become_int8_of_one_length_and_keep_their_angles() -> None:
+    vectors = np.abs(np.random.default_rng(1).standard_normal((50, 128))) * np.linspace(1, 90, 50)[:, None]
+
+    short = slot_of(found(50, descriptors=vectors, scores=np.arange(50)[::-1]))(IMAGE).descriptors
+
+    assert short.dtype == np.int8
+    lengths = np.linalg.norm(short.astype(float), axis=1)
+    assert lengths.max() / lengths.min() < 1.03
+    unit = vectors / np.linalg.norm(vectors, axis=1)[:, None]
+    angles = np.degrees(np.arccos(np.clip((short / lengths[:, None] * unit).sum(axis=1), -1, 1)))
+    assert angles.max() < 3.0
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.int8])
+def test_bytes_stay_as_they_are(dtype: type) -> None:
+    bytes_ = np.random.default_rng(1).integers(0, 100, (6, 40)).astype(dtype)
+
+    slot = slot_of(found(descriptors=bytes_, scores=np.arange(6)[::-1]))
+
+    assert np.array_equal(slot(IMAGE).descriptors, bytes_)
+    assert slot.kind == DescriptorKind("mine", np.dtype(dtype).name, 40)
+
+
+HOSTILE: dict[str, tuple[Any, str]] = {
+    "nothing": (None, "returned NoneType, not FoundFeatures"),
+    "a tuple": ((1, 2, 3), "returned tuple"),
+    "pixels of three numbers": (found(pixels=np.ones((6, 3))), r"pixels of shape \(6, 3\), not \(n, 2\)"),
+    "flat pixels": (found(pixels=np.ones(12)), "pixels of shape"),
+    "pixels that are text": (found(pixels=[["a", "b"]] * 6), "pixels that are no numbers"),
+    "pixels that are not finite": (found(pixels=np.full((6, 2), np.nan)), "pixels that are not finite"),
+    "pixels outside": (found(pixels=np.full((6, 2), 640.0)), "6 pixels outside the image"),
+    "negative pixels": (found(pixels=np.full((6, 2), -1.0)), "6 pixels outside the image"),
+    "ragged pixels": (found(pixels=[[1, 2], [3]]), "pixels that are no numbers"),
+    "too many": (found(pixels=np.ones((100_001, 2))), "100001 features, above"),
+    "too few scores": (found(scores=np.ones(5)), r"scores of shape \(5,\), not \(6,\)"),
+    "scores that are not finite": (found(scores=[np.inf] * 6), "scores that are not finite"),
+    "no descriptors": (found(descriptors=None), r"descriptors of shape \(\)"),
+    "too few descriptors": (found(descriptors=np.ones((5, 64))), r"descriptors of shape \(5, 64\) for 6"),
+    "huge descriptors": (found(descriptors=np.ones((6, 100_000))), r"descriptors of shape \(6, 100000\)"),
+    "tiny descriptors": (found(descriptors=np.ones((6, 1))), r"descriptors of shape \(6, 1\)"),
+    "integers": (found(descriptors=np.ones((6, 64), dtype=np.int32)), "descriptors of int32"),
+    "text": (found(descriptors=np.full((6, 64), "a")), "descriptors of <U1"),
+    "NaN": (found(descriptors=np.full((6, 64), np.nan)), "descriptors that are not finite"),
+    "infinite": (found(descriptors=np.full((6, 64), np.inf)), "descriptors that are not finite"),
+    "zero": (found(descriptors=np.zeros((6, 64))), "not finite, or zero"),
+    "turns of another number": (found(turns_deg=[0.0]), "turns_deg of shape"),
+    "turns that are not finite": (found(turns_deg=[np.nan] * 6), "turns_deg that are not finite"),
+    "sizes of zero": (found(sizes=np.zeros(6)), "sizes that are not above 0"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("result", "why"), HOSTILE.values(), ids=HOSTILE)
+def test_what_cannot_be_features_is_refused_in_one_line(result: Any, why: str) -> None:
+    with pytest.raises(UsageError, match=f"the features function mine {why}|{why}") as refused:
+        slot_of(result)(IMAGE)
+    assert refused.value.hint
+    assert "\n" not in refused.value.message
+
+
+def test_a_function_that_fails_is_named_with_its_error() -> None:
+    def broken(_: npt.NDArray[np.uint8]) -> FoundFeatures:
+        raise ZeroDivisionError("by\nzero")
+
+    with pytest.raises(UsageError, match="features function broken failed: ZeroDivisionError: by") as refused:
+        FeaturesSlot(broken)(IMAGE)
+    assert "\n" not in refused.value.message
+    assert isinstance(refused.value.__cause__, ZeroDivisionError)
+
+
+def test_the_kind_must_not_change_on_the_way() -> None:
+    results = [found(), found(0, descriptors=None), found(descriptors=np.ones((6, 32), np.uint8))]
+
+    def changing(_: npt.NDArray[np.uint8]) -> FoundFeatures:
+        return results.pop(0)
+
+    slot = FeaturesSlot(changing)
+    slot(IMAGE)
+    assert len(slot(IMAGE).pixels) == 0
+    with pytest.raises(UsageError, match=r"returned changing \(32 bytes\) after changing \(64 dimensions\)"):
+        slot(IMAGE)
+
+
+@pytest.mark.parametrize("name", ["<lambda>", "a b", "x" * 33, "orb", "ORB"])
+def test_a_function_needs_a_name_that_features_can_have(name: str) -> None:
+    with pytest.raises(UsageError, match="name"):
+        slot_of(found(), name)
+    with pytest.raises(UsageError, match="takes a function, not a int"):
+        FeaturesSlot(3)  # type: ignore[arg-type]
+
+
+def test_features_are_spread_and_the_strongest_are_kept() -> None:
+    pixels = np.concatenate([np.full((50, 2), 10.0), [[500.0, 300.0]]])
+    slot = slot_of(
+        found(51, pixels=pixels, scores=np.linspace(1.0, 0.1, 51), descriptors=np.ones((51, 8), np.uint8))
+    )
+
+    spread = describe(IMAGE, 10, slot=slot)
+    strongest = describe(IMAGE, 10, is_spread=False, slot=slot)
+
+    assert len(spread.pixels) == len(strongest.pixels) == 10
+    assert [500.0, 300.0] in spread.pixels.tolist()
+    assert [500.0, 300.0] not in strongest.pixels.tolist()
+    assert spread.kind == slot.kind
+
+
+@pytest.mark.parametrize("function", [orb_by_hand, sift])
+@pytest.mark.parametrize("depth", [True, False])
+def test_a_mapper_tracks_with_the_features_of_its_user(function: Any, depth: bool) -> None:
+    pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
+    mapper = Mapper(ask=solve, features=function, keyframes_of="robot-1" if depth else "")
+
+    async def all_frames() -> list[str]:
+        return [(await mapper.track(frame_at(row, depth=depth))).status for row in range(8 if depth else 14)]
+
+    statuses = asyncio.run(all_frames())
+
+    assert statuses.count("tracked") >= 6, statuses
+    positions = mapper.trajectory.positions
+    if depth:
+        assert positions[:, 0] == pytest.approx(STEP_M * np.arange(8), abs=0.01)
+        assert decode_map(mapper.encoded_map()).kind.name == function.__name__
+    assert len(mapper.map) > 100
+
+
+def test_orb_by_hand_is_tracked_as_well_as_the_built_in_one() -> None:
+    pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
+    options = FrontEndOptions(is_spread=False)
+
+    def errors(features: Any) -> float:
+        mapper = Mapper(ask=solve, options=options, features=features)
+
+        async def play() -> None:
+            for row in range(8):
+                await mapper.track(frame_at(row, depth=True))
+
+        asyncio.run(play())
+        return float(np.abs(mapper.trajectory.positions[:, 0] - STEP_M * np.arange(8)).max())
+
+    assert errors(orb_by_hand) < 2.0 * errors(None) + 1e-3
+    assert ORB.name != "orb_by_hand"
+
+
+# --- names on the command line -----------------------------------------------------------------
+
+
+def test_a_function_is_found_in_the_working_directory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "own_features.py").write_text("def corners(rgb):\n    return None\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+
+    function = load_features("own_features:corners")
+
+    assert function is not None
+    assert function.__name__ == "corners"
+    assert load_features(None) is None
+
+
+@pytest.mark.parametrize(
+    ("name", "why"),
+    [
+        ("sift", "names no function"),
+        ("a b:c", "names no function"),
+        (":c", "names no function"),
+        ("nowhere_at_all:f", "cannot be loaded: ModuleNotFoundError"),
+        ("json:nothing", "cannot be loaded: AttributeError"),
+        ("broken_module:f", "cannot be loaded: SyntaxError"),
+        ("json:__name__", "takes a function, not a str"),
+    ],
+)
+def test_what_names_no_function_is_refused_in_one_line(
+    name: str, why: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "broken_module.py").write_text("def f(:\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    with pytest.raises(UsageError, match=why) as refused:
+        load_features(name)
+    assert refused.value.hint
+    assert "\n" not in refused.value.message
+    assert callable(load_function("json:dumps"))
