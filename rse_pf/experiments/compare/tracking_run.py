@@ -20,7 +20,6 @@ from rse_pf.experiments.compare.recordings import Drive
 from rse_pf.experiments.compare.solvers import MeteredSolver
 from rse_pf.experiments.results.trajectory_error import Accuracy, accuracy
 from rse_pf.geometry import Array
-from rse_pf.terminal import counted
 
 __all__ = ["TrackingRun", "longest_gap_s", "score", "track"]
 
@@ -125,7 +124,8 @@ def score(
     if truth is None or len(truth) < 2:
         return None, "the recording has no truth: no ATE, no RPE"
     if len(estimate) < _FEWEST:
-        return None, f"{counted(len(estimate), 'frame')} have a pose, an evaluation needs {_FEWEST}"
+        posed = f"{len(estimate)} of {len(drive.dataset)} frames have a pose"
+        return None, f"{posed}, an evaluation needs {_FEWEST}"
     try:
         return accuracy(estimate, truth, with_scale=not is_metric, T_body_camera=T_body_camera), ""
     except UsageError as error:

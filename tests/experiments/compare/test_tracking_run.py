@@ -87,7 +87,7 @@ def test_a_recording_in_which_nothing_is_tracked_says_so() -> None:
     done = run(flat_drive(change=lambda row, frame: replace(frame, rgb=np.zeros_like(frame.rgb))))
 
     assert (done.figures["posed"], done.figures["longest_gap_s"]) == (0, pytest.approx(0.9))
-    assert done.why == "0 frames have a pose, an evaluation needs 3"
+    assert done.why == "0 of 10 frames have a pose, an evaluation needs 3"
 
 
 def test_depth_that_is_asked_for_and_missing_is_refused() -> None:
