@@ -5,6 +5,7 @@ A reader of a replaced file sees the old content or the new one, never a part of
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import json
 import os
@@ -29,7 +30,9 @@ _OTHERS = 0o077
 _MAX_BYTES = 1 << 20
 
 
-def replace_file(path: Path, data: bytes | str, *, mode: int = _BY_UMASK, is_durable: bool = False) -> None:
+def replace_file(
+    path: Path | str, data: bytes | str, *, mode: int = _BY_UMASK, is_durable: bool = False
+) -> None:
     """Replace *path* by a file of *data* in one step, or raise OSError and leave it as it is.
 
     Args:
@@ -38,16 +41,18 @@ def replace_file(path: Path, data: bytes | str, *, mode: int = _BY_UMASK, is_dur
         mode: Permissions of the new file; the umask is taken off.
         is_durable: Whether content and name survive a power failure once this returns.
     """
-    temporary = path.with_name(f"{TEMPORARY_PREFIX}{secrets.token_hex(8)}")
+    folder = os.path.dirname(path) or "."
+    temporary = f"{folder}/{TEMPORARY_PREFIX}{secrets.token_hex(8)}"
     handle = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, mode)
     try:
         _write(handle, data, is_durable)
         os.replace(temporary, path)
     except BaseException:
-        temporary.unlink(missing_ok=True)
+        with contextlib.suppress(FileNotFoundError):
+            os.unlink(temporary)
         raise
     if is_durable:
-        sync_folder(path.parent)
+        sync_folder(folder)
 
 
 def replace_json(path: Path, value: Any, *, indent: int | None = None) -> None:
@@ -98,7 +103,7 @@ def read_private_file(path: Path, content: str, *, hint: str) -> bytes:
     return data
 
 
-def sync_folder(folder: Path) -> None:
+def sync_folder(folder: Path | str) -> None:
     """Make the names in *folder* survive a power failure."""
     handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
@@ -108,8 +113,11 @@ def sync_folder(folder: Path) -> None:
 
 
 def _write(handle: int, data: bytes | str, is_durable: bool) -> None:
-    with os.fdopen(handle, "wb") as file:
-        file.write(data.encode() if isinstance(data, str) else data)
-        file.flush()
+    try:
+        view = memoryview(data.encode() if isinstance(data, str) else data)
+        while view:
+            view = view[os.write(handle, view) :]
         if is_durable:
-            os.fsync(file.fileno())
+            os.fsync(handle)
+    finally:
+        os.close(handle)

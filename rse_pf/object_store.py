@@ -23,12 +23,15 @@ from pathlib import Path
 from typing import BinaryIO, Protocol, TypeVar, runtime_checkable
 
 from rse_pf.disk_reserve import SpareFiles, is_full
-from rse_pf.errors import Conflict, NotFound, StoreError, StoreFull, UsageError
+from rse_pf.errors import Busy, Conflict, NotFound, StoreError, StoreFull, UsageError
 from rse_pf.files import OWNER_ONLY, TEMPORARY_PREFIX, replace_file, sync_folder
+from rse_pf.page_cache import read_cached, start_writing
 
 __all__ = [
     "MIN_CHARGE_BYTES",
+    "CachedStore",
     "DirectoryStore",
+    "GrowingStore",
     "MeasuringStore",
     "MemoryStore",
     "ObjectInfo",
@@ -129,6 +132,30 @@ class ScratchStore(Protocol):
 
 
 @runtime_checkable
+class GrowingStore(Protocol):
+    """A store whose objects can grow, and get another name."""
+
+    def append(self, name: str, offset: int, data: bytes) -> None:
+        """Add *data* to an object of *offset* bytes, which is missing if that is 0.
+
+        It survives this process, but a crash of the machine may damage it.
+
+        Raises:
+            Conflict: The object has another size.
+            Busy: Another process writes it.
+        """
+
+    def adopt(self, name: str, source: str, size: int) -> None:
+        """Make the object *source* the object *name*, durably.
+
+        Raises:
+            NotFound: It is missing.
+            Conflict: It does not have *size* bytes.
+            Busy: Another process writes it.
+        """
+
+
+@runtime_checkable
 class MeasuringStore(Protocol):
     """A store that knows how much it holds without listing all of it each time."""
 
@@ -161,6 +188,14 @@ class PresigningStore(Protocol):
 
     def presigned_get(self, name: str, *, ttl_s: int) -> str:
         """Return a URL from which the object can be read."""
+
+
+@runtime_checkable
+class CachedStore(Protocol):
+    """A store that knows which objects it can read at once."""
+
+    def get_cached(self, name: str, max_bytes: int) -> bytes | None:
+        """Return the object; None if it is missing, longer, or must be waited for."""
 
 
 def read_range(store: ObjectStore, name: str, start: int, length: int) -> bytes:
@@ -315,7 +350,7 @@ class DirectoryStore:
 
     def __init__(self, folder: Path, spares: SpareFiles | None = None) -> None:
         """Describe the store; on a full disk `compare_and_swap` writes small JSON objects to *spares*."""
-        self._folder = folder
+        self._folder, self._root = folder, str(folder)
         self._spares = spares
         self._measured: dict[str, tuple[int, Usage, _Names]] = {}
 
@@ -324,11 +359,14 @@ class DirectoryStore:
         with _as_store_errors(name), self._find(name, _open) as file:
             return file.read()
 
+    def get_cached(self, name: str, max_bytes: int) -> bytes | None:
+        """Return the object if its name and its bytes are in memory."""
+        return read_cached(self._paths(name)[0], max_bytes)
+
     def get_range(self, name: str, start: int, length: int) -> bytes:
         """Return a part of the object."""
         with _as_store_errors(name), self._find(name, _open) as file:
-            file.seek(start)
-            return file.read(length)
+            return os.pread(file.fileno(), length, start)
 
     def put(self, name: str, data: bytes) -> None:
         """Store the object durably."""
@@ -342,10 +380,39 @@ class DirectoryStore:
         """Store the object durably; if *pieces* raises an error, nothing is stored."""
         self._write(name, lambda path: _replace_by_pieces(path, pieces))
 
+    def append(self, name: str, offset: int, data: bytes) -> None:
+        """Add *data* to the object; a lock on its file excludes other writers."""
+
+        def add(path: str) -> None:
+            with _locked(path, 0 if offset else os.O_CREAT, offset) as handle:
+                try:
+                    view, at = memoryview(data), offset
+                    while view:
+                        count = os.pwrite(handle, view, at)
+                        view, at = view[count:], at + count
+                except OSError:
+                    os.ftruncate(handle, offset)
+                    raise
+                start_writing(handle, offset, len(data))
+
+        self._write(name, add)
+
+    def adopt(self, name: str, source: str, size: int) -> None:
+        """Give the object *source* the name *name*, durably."""
+        grown = self._paths(source)[0]
+
+        def rename(path: str) -> None:
+            with _locked(grown, 0, size) as handle:
+                os.fsync(handle)
+                os.rename(grown, path)
+            sync_folder(os.path.dirname(path))
+
+        self._write(name, rename)
+
     def head(self, name: str) -> ObjectInfo:
         """Return size and name."""
         with _as_store_errors(name):
-            status = self._find(name, Path.lstat)
+            status = self._find(name, os.lstat)
         if not stat.S_ISREG(status.st_mode):
             raise NotFound(f"no object named {name!r}")
         return ObjectInfo(name=name, size=status.st_size)
@@ -395,16 +462,16 @@ class DirectoryStore:
     def delete(self, name: str) -> None:
         """Remove the object, and its folder if nothing else lies there; a missing one is no error."""
         paths = self._paths(name)
-        path, lock = paths[0], paths[0].with_name(f"{_LOCK}{paths[0].name}")
+        folder, lock = os.path.dirname(paths[0]), _lock_of(paths[0])
         with contextlib.suppress(NotFound), _as_store_errors(name):
             self.head(name)
-            with _hold_lock(lock) if lock.exists() else contextlib.nullcontext():
-                for candidate in paths:
-                    candidate.unlink(missing_ok=True)
-                lock.unlink(missing_ok=True)
-            if len(paths) == 1 and path.parent != self._folder:
+            with _hold_lock(lock) if os.path.exists(lock) else contextlib.nullcontext():
+                for path in (*paths, lock):
+                    with contextlib.suppress(FileNotFoundError):
+                        os.unlink(path)
+            if len(paths) == 1 and folder != self._root:
                 with contextlib.suppress(OSError):  # it is not empty
-                    path.parent.rmdir()
+                    os.rmdir(folder)
 
     def compare_and_swap(self, name: str, expected: bytes | None, data: bytes) -> None:
         """Replace the object if it still holds *expected*; a lock file excludes other writers."""
@@ -417,9 +484,9 @@ class DirectoryStore:
             if current != expected:
                 raise Conflict(f"{name!r} was changed meanwhile", hint="read it again and retry")
 
-        def swap(path: Path) -> None:
+        def swap(path: str) -> None:
             check()
-            lock = path.with_name(f"{_LOCK}{path.name}")
+            lock = _lock_of(path)
             # Written before it is locked: a process that is paused hardly ever holds the lock then.
             try:
                 with _temporary(path, [data]) as temporary, _hold_lock(lock):
@@ -430,8 +497,8 @@ class DirectoryStore:
                     raise
                 with _hold_lock(lock):
                     check()
-                    self._spares.replace(path, data)
-            sync_folder(path.parent)
+                    self._spares.replace(Path(path), data)
+            sync_folder(os.path.dirname(path))
 
         self._write(name, swap)
 
@@ -457,20 +524,25 @@ class DirectoryStore:
                 for name in filter(_DIGEST.fullmatch, self._scan(at)[0]):
                     path, old = self._paths(at + name)
                     with _as_store_errors(at + name):
-                        _make_folder(path.parent)
+                        changed = _make_folder(os.path.dirname(path))
                         with contextlib.suppress(FileNotFoundError):  # the robot removed it
-                            old.rename(path)
+                            os.rename(old, path)
                             moved += 1
+                        for folder in changed:
+                            sync_folder(folder)
         return moved
 
-    def _paths(self, name: str) -> tuple[Path, ...]:
+    def _paths(self, name: str) -> tuple[str, ...]:
         """Return where the object is written, and then where an earlier version may have written it."""
-        path = self._folder / check_name(name)
-        if not (name.startswith("objects/") and _DIGEST.fullmatch(path.name)):
+        path = f"{self._root}/{check_name(name)}"
+        if not name.startswith("objects/"):
             return (path,)
-        return path.parent / f"{_SHARD}{path.name[:2]}" / path.name, path
+        folder, _, last = path.rpartition("/")
+        if not _DIGEST.fullmatch(last):
+            return (path,)
+        return f"{folder}/{_SHARD}{last[:2]}/{last}", path
 
-    def _find(self, name: str, read: Callable[[Path], _T]) -> _T:
+    def _find(self, name: str, read: Callable[[str], _T]) -> _T:
         """Call *read* with the path of the object and return its result; raises OSError."""
         *first, last = self._paths(name)
         for path in [*first, *([last] if first else [])]:
@@ -478,19 +550,23 @@ class DirectoryStore:
                 return read(path)
         return read(first[0] if first else last)  # it may have been moved there meanwhile
 
-    def _write(self, name: str, write: Callable[[Path], None]) -> None:
-        """Call *write* for the path of the object; again if its folder was removed as empty meanwhile."""
+    def _write(self, name: str, write: Callable[[str], None]) -> None:
+        """Call *write* for the path of the object; again if there was no folder, which is made first."""
         path = self._paths(name)[0]
+        changed: list[str] = []
         with _as_store_errors(name):
             for tries_left in reversed(range(_WRITE_TRIES)):
                 try:
-                    _make_folder(path.parent)
                     write(path)
-                except FileNotFoundError:
+                except (FileNotFoundError, NotADirectoryError):
                     if not tries_left:
                         raise
+                    changed += _make_folder(os.path.dirname(path))
                 else:
                     break
+            # Last, because what was written is then in the same commit of the file system's journal.
+            for folder in reversed(changed):
+                sync_folder(folder)
 
     def _measure(self, prefix: str) -> tuple[Usage, _Names]:
         """Return the usage of the objects in the folder *prefix* itself, and the folders in it."""
@@ -551,37 +627,57 @@ class DirectoryStore:
                 yield ObjectInfo(name=name, size=os.lstat(f"{self._folder}/{place}").st_size)
 
 
-def _open(path: Path) -> BinaryIO:
+def _open(path: str) -> BinaryIO:
     return os.fdopen(os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC), "rb")
 
 
-def _make_folder(folder: Path) -> None:
-    """Create *folder* and its missing parents, each of them durably."""
+def _lock_of(path: str) -> str:
+    folder, _, last = path.rpartition("/")
+    return f"{folder}/{_LOCK}{last}"
+
+
+def _make_folder(folder: str) -> list[str]:
+    """Create *folder* and its missing parents; return the folders that the caller has to sync for that."""
     missing = []
-    while not folder.is_dir():
+    while not os.path.isdir(folder):
         missing.append(folder)
-        folder = folder.parent
-    for parent in reversed(missing):
+        folder = os.path.dirname(folder) or "."
+    for made in reversed(missing):
         try:
-            parent.mkdir()
+            os.mkdir(made)
         except FileExistsError as error:
-            if not stat.S_ISDIR(parent.lstat().st_mode):
+            if not stat.S_ISDIR(os.lstat(made).st_mode):
                 raise StoreError(
-                    f"{parent.name!r} is an object, not a folder", hint="choose another name"
+                    f"{os.path.basename(made)!r} is an object, not a folder", hint="choose another name"
                 ) from error
-        sync_folder(parent.parent)
-
-
-def _replace_by_pieces(path: Path, pieces: Iterator[bytes]) -> None:
-    with _temporary(path, pieces) as temporary:
-        os.replace(temporary, path)
-    sync_folder(path.parent)
+    return [os.path.dirname(made) or "." for made in reversed(missing)]
 
 
 @contextlib.contextmanager
-def _temporary(path: Path, pieces: Iterable[bytes]) -> Iterator[Path]:
+def _locked(path: str, flags: int, size: int) -> Iterator[int]:
+    """Yield a descriptor of the file *path*, locked; raises Conflict unless it has *size* bytes."""
+    handle = os.open(path, os.O_WRONLY | os.O_NOFOLLOW | os.O_CLOEXEC | flags, OWNER_ONLY)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        if not _is_at(path, handle) or os.fstat(handle).st_size != size:
+            raise Conflict("the upload was changed meanwhile", hint="ask for its progress")
+        yield handle
+    except BlockingIOError as error:
+        raise Busy("another server writes this upload", hint="retry later", retry_after_ms=1000.0) from error
+    finally:
+        os.close(handle)
+
+
+def _replace_by_pieces(path: str, pieces: Iterator[bytes]) -> None:
+    with _temporary(path, pieces) as temporary:
+        os.replace(temporary, path)
+    sync_folder(os.path.dirname(path))
+
+
+@contextlib.contextmanager
+def _temporary(path: str, pieces: Iterable[bytes]) -> Iterator[str]:
     """Write a file beside *path* durably; it is removed if the caller raises an error."""
-    temporary = path.with_name(f"{TEMPORARY_PREFIX}{secrets.token_hex(8)}")
+    temporary = f"{os.path.dirname(path)}/{TEMPORARY_PREFIX}{secrets.token_hex(8)}"
     handle = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, OWNER_ONLY)
     try:
         with os.fdopen(handle, "wb") as file:
@@ -591,24 +687,25 @@ def _temporary(path: Path, pieces: Iterable[bytes]) -> Iterator[Path]:
             os.fsync(handle)
         yield temporary
     except BaseException:
-        temporary.unlink(missing_ok=True)
+        with contextlib.suppress(FileNotFoundError):
+            os.unlink(temporary)
         raise
 
 
 @contextlib.contextmanager
-def _hold_lock(path: Path) -> Iterator[None]:
+def _hold_lock(path: str) -> Iterator[None]:
     """Hold the lock file *path*, which its holder may remove."""
     while True:
-        with path.open("wb") as file:
+        with open(path, "wb") as file:
             fcntl.flock(file, fcntl.LOCK_EX)
-            if _is_at(path, file):  # else it was removed while this writer waited
+            if _is_at(path, file.fileno()):  # else it was removed while this writer waited
                 yield
                 return
 
 
-def _is_at(path: Path, file: BinaryIO) -> bool:
+def _is_at(path: str, handle: int) -> bool:
     try:
-        return os.path.samestat(os.fstat(file.fileno()), path.lstat())
+        return os.path.samestat(os.fstat(handle), os.lstat(path))
     except FileNotFoundError:
         return False
 

@@ -81,7 +81,8 @@ class Service:
             messages = list(body)
         sent: list[Mapping[str, Any]] = []
         bearer = self.token(robot, tenant) if token is None else token
-        named = {"authorization": f"Bearer {bearer}", **(headers or {})}
+        frame = {} if body == b"" else {"transfer-encoding": "chunked"}
+        named = {"authorization": f"Bearer {bearer}", **frame, **(headers or {})}
         scope = {
             "type": "http", "method": method, "path": path, "query_string": query.encode("latin-1"),
             "headers": [(k.lower().encode("latin-1"), v.encode("latin-1")) for k, v in named.items()],

@@ -286,11 +286,7 @@ def test_a_served_connection_is_kept_longer_than_the_balancer_keeps_it() -> None
     protocol, transport = _connected(loop)
     for _ in range(2):
         protocol.data_received(b"GET / HTTP/1.1\r\nHost: a\r\n\r\n")
-        protocol.cycle.response_complete = True
-        protocol.conn.send(_response())
-        protocol.conn.send(_end())
-        protocol.conn.start_next_cycle()
-        protocol.on_response_complete()
+        protocol.on_answered(closes=False)
         loop.advance(BALANCER_IDLE_TIMEOUT_S + 5.0)
         assert transport.ended == ""
     loop.advance(KEEP_ALIVE_S)
@@ -315,9 +311,7 @@ class _Transport:
     def abort(self) -> None:
         self.ended = "cut"
 
-    def pause_reading(self) -> None: ...
-
-    resume_reading = pause_reading
+    def set_write_buffer_limits(self, high: int, low: int) -> None: ...
 
 
 def _connected(loop: FakeLoop) -> tuple[Any, _Transport]:
@@ -330,15 +324,3 @@ def _connected(loop: FakeLoop) -> tuple[Any, _Transport]:
     protocol, transport = made(config, ServerState(), {}, _loop=loop), _Transport()
     protocol.connection_made(transport)
     return protocol, transport
-
-
-def _response() -> Any:
-    import h11
-
-    return h11.Response(status_code=200, headers=[("content-length", "0")])
-
-
-def _end() -> Any:
-    import h11
-
-    return h11.EndOfMessage()

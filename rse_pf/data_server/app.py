@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import dataclasses
+import re
 import time
 import uuid
 from collections.abc import Awaitable, Callable, Mapping
@@ -108,44 +109,36 @@ class DataServer:
             store, settings.data, describe=describe, clock=clock,
             wall_clock=wall_clock, audit=audit,
         )  # fmt: skip
-        self._routes = [(route.pattern, route, getattr(self.handlers, route.operation)) for route in ROUTES]
+        self._routes: dict[str, list[tuple[re.Pattern[str], Route, Handler]]] = {}
+        for route in ROUTES:
+            handler = getattr(self.handlers, route.operation)
+            self._routes.setdefault(route.method, []).append((route.pattern, route, handler))
 
     async def __call__(self, scope: Mapping[str, Any], receive: Receive, send: Send) -> None:
-        """Handle one request; raises BadRequest for another protocol."""
+        """Handle one request; raises BadRequest for another protocol.
+
+        Cancelled when the robot closes the connection: work for it ends, and there is no reply.
+        """
         if scope["type"] != "http":
             raise BadRequest(f"{scope['type']} is not supported", hint="use HTTP")
         began = self._clock()
         request = HttpRequest(scope, receive, self._clock)
         line: dict[str, Any] = {"event": "request", "method": request.method}
-        work = asyncio.ensure_future(self._serve(request, line, send))
-        gone = asyncio.ensure_future(request.wait_until_gone())
         try:
-            await asyncio.wait((work, gone), return_when=asyncio.FIRST_COMPLETED)
-            if work.done():
-                work.result()
-            else:  # nobody waits for the reply
-                line["status"] = "disconnected"
-        finally:
-            work.cancel()
-            gone.cancel()
-            await asyncio.gather(work, gone, return_exceptions=True)
-        line |= {
-            "received_bytes": request.received_bytes,
-            "took_ms": round(1000 * (self._clock() - began), 2),
-        }
-        if request.path not in _PROBES:
-            self._log(line)
-
-    async def _serve(self, request: HttpRequest, line: dict[str, Any], send: Send) -> None:
-        """Reply to a request, which the robot may end at any time."""
-        with contextlib.ExitStack() as admitted:
-            try:
+            with contextlib.ExitStack() as admitted:
                 reply = await self._reply(request, line, admitted)
                 sent = await _send(reply, request, send)
-            except Disconnected:
-                line["status"] = "disconnected"
-            else:
-                line |= {"status": reply.status, "sent_bytes": sent}
+            line["status"], line["sent_bytes"] = reply.status, sent
+        except Disconnected:
+            line["status"] = "disconnected"
+        except asyncio.CancelledError:  # nobody waits for the reply
+            line["status"] = "disconnected"
+            raise
+        finally:
+            line["received_bytes"] = request.received_bytes
+            line["took_ms"] = round(1000 * (self._clock() - began), 2)
+            if request.path not in _PROBES:
+                self._log(line)
 
     async def _reply(
         self, request: HttpRequest, line: dict[str, Any], admitted: contextlib.ExitStack
@@ -200,15 +193,15 @@ class DataServer:
             raise
 
     def _find(self, request: HttpRequest) -> tuple[Route, Handler, dict[str, str]]:
-        for pattern, route, handler in self._routes:
+        for pattern, route, handler in self._routes.get(request.method, ()):
             match = pattern.fullmatch(request.path)
-            if match and route.method == request.method:
+            if match:
                 return route, handler, match.groupdict()
         raise MethodNotAllowed(", ".join(self._methods(request.path)))
 
     def _methods(self, path: str) -> list[str]:
         """Return the methods of *path*; raises NotFound if it has none."""
-        methods = [route.method for pattern, route, _ in self._routes if pattern.fullmatch(path)]
+        methods = [route.method for route in ROUTES if route.pattern.fullmatch(path)]
         if not methods:
             raise NotFound("no such path", hint="see /data/openapi.json")
         return methods

@@ -9,12 +9,12 @@ call of `check_wanted`.
 from __future__ import annotations
 
 import asyncio
-import contextvars
+import contextlib
+import queue
 import threading
 from collections import Counter, OrderedDict, deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from rse_pf.errors import Disconnected
@@ -30,17 +30,23 @@ _PER_ROBOT, _PER_TENANT = 1, 6
 @dataclass(slots=True, eq=False)
 class _Task:
     robot: RobotId
-    function: Callable[[], Any]
-    future: Future[Any] = field(default_factory=Future)
+    function: Callable[..., Any]
+    arguments: tuple[Any, ...]
+    loop: asyncio.AbstractEventLoop
+    future: asyncio.Future[Any]
     is_wanted: bool = True
 
 
-_current: contextvars.ContextVar[_Task | None] = contextvars.ContextVar("current", default=None)
+class _OfThread(threading.local):
+    task: _Task | None = None
+
+
+_current = _OfThread()
 
 
 def check_wanted() -> None:
     """Raise Disconnected if this thread works on a request whose robot has gone."""
-    task = _current.get()
+    task = _current.task
     if task is not None and not task.is_wanted:
         raise Disconnected("the robot closed the connection before the reply")
 
@@ -53,10 +59,15 @@ def while_wanted(items: Iterable[_T]) -> Iterator[_T]:
 
 
 class FairThreads:
-    """A pool of threads; `close` ends it."""
+    """A pool of threads, which start when they are needed; `close` ends it.
+
+    An executor of the standard library takes three times as long to hand work to a thread and back.
+    """
 
     def __init__(self, threads: int = _THREADS) -> None:
-        self._pool = ThreadPoolExecutor(threads, "data")
+        self._most = threads
+        self._threads: list[threading.Thread] = []
+        self._started: queue.SimpleQueue[_Task | None] = queue.SimpleQueue()
         self._free = threads
         self._lock = threading.Lock()  # held for some microseconds, never during work
         self._waiting: OrderedDict[RobotId, deque[_Task]] = OrderedDict()
@@ -65,12 +76,13 @@ class FairThreads:
 
     async def run(self, robot: RobotId, function: Callable[..., _T], *arguments: Any) -> _T:
         """Return ``function(*arguments)``, computed in a thread when it is the robot's turn."""
-        task = _Task(robot, lambda: function(*arguments))
+        loop = asyncio.get_running_loop()
+        task = _Task(robot, function, arguments, loop, loop.create_future())
         with self._lock:
             self._waiting.setdefault(robot, deque()).append(task)
             self._start()
         try:
-            result: _T = await asyncio.wrap_future(task.future)
+            result: _T = await task.future
         except asyncio.CancelledError:
             task.is_wanted = False
             raise
@@ -78,22 +90,32 @@ class FairThreads:
 
     def close(self) -> None:
         """Wait for the work that runs, and start no more."""
-        self._pool.shutdown(cancel_futures=True)
+        with self._lock:
+            self._free = 0
+            self._waiting.clear()
+        for _ in self._threads:
+            self._started.put(None)
+        for thread in self._threads:
+            thread.join()
 
     def _start(self) -> None:
         """Start what may run now; the lock is held."""
-        while self._free and (robot := self._next()) is not None:
-            queue = self._waiting[robot]
-            task = queue.popleft()
-            if queue:
+        while self._free > 0 and (robot := self._next()) is not None:
+            waiting = self._waiting[robot]
+            task = waiting.popleft()
+            if waiting:
                 self._waiting.move_to_end(robot)
             else:
                 del self._waiting[robot]
-            if task.future.set_running_or_notify_cancel():
+            if task.is_wanted:
                 self._free -= 1
                 self._robots[robot] += 1
                 self._tenants[robot.tenant] += 1
-                self._pool.submit(self._work, task)
+                self._started.put(task)
+                if len(self._threads) < min(self._most, self._most - self._free):
+                    thread = threading.Thread(target=self._work_on, name="data", daemon=True)
+                    self._threads.append(thread)
+                    thread.start()
 
     def _next(self) -> RobotId | None:
         """Return the robot whose turn it is; `_waiting` has the one first that was served least recently."""
@@ -104,17 +126,20 @@ class FairThreads:
                 best, fewest = robot, used
         return best
 
+    def _work_on(self) -> None:
+        while (task := self._started.get()) is not None:
+            self._work(task)
+
     def _work(self, task: _Task) -> None:
-        context = contextvars.Context()
-        context.run(_current.set, task)
+        _current.task = task
+        result, problem = None, None
         try:
-            result = context.run(task.function)
+            result = task.function(*task.arguments)
         except BaseException as error:  # noqa: BLE001 - it belongs to the one who waits
-            self._end(task)
-            task.future.set_exception(error)
-        else:
-            self._end(task)
-            task.future.set_result(result)
+            problem = error
+        self._end(task)
+        with contextlib.suppress(RuntimeError):  # the loop was closed: nobody waits
+            task.loop.call_soon_threadsafe(_settle, task.future, result, problem)
 
     def _end(self, task: _Task) -> None:
         with self._lock:
@@ -122,6 +147,15 @@ class FairThreads:
             _decrease(self._robots, task.robot)
             _decrease(self._tenants, task.robot.tenant)
             self._start()
+
+
+def _settle(future: asyncio.Future[Any], result: Any, problem: BaseException | None) -> None:
+    if future.done():
+        return  # it was cancelled
+    if problem is None:
+        future.set_result(result)
+    else:
+        future.set_exception(problem)
 
 
 def _decrease(counter: Counter[_T], key: _T) -> None:

@@ -43,7 +43,7 @@ from rse_pf.maps.charges import charge_name
 from rse_pf.maps.describe import MapSummary
 from rse_pf.maps.registry import MapContent, MapOrigin, MapRecord, MapRegistry
 from rse_pf.maps.removal import freed_bytes, superseded
-from rse_pf.object_store import ObjectStore, PresigningStore, read_range
+from rse_pf.object_store import CachedStore, ObjectStore, PresigningStore, read_range
 
 __all__ = ["Handler", "Handlers"]
 
@@ -52,6 +52,8 @@ _T = TypeVar("_T")
 Handler = Callable[[HttpRequest, Claims, dict[str, str]], Awaitable[HttpReply]]
 
 _PIECE_BYTES = 1 << 20
+_MAX_CACHED_BYTES = 1 << 16
+"""An object up to this size is read by the event loop if it is in memory: to ask a thread takes longer."""
 _MAX_JSON_BYTES = 16384
 _MAX_NOTE_LETTERS = 500
 _MAX_PAGE = 1000
@@ -122,8 +124,14 @@ class Handlers:
 
     async def get_object(self, request: HttpRequest, claims: Claims, path: dict[str, str]) -> HttpReply:
         """Return an object or a range of it."""
-        info = await self.threads.run(claims.robot, self.objects.head, claims, path["digest"])
-        return await self._content(request, claims.robot, info.name, info.size, path["digest"])
+        digest, store = path["digest"], self._store
+        name = self.objects.name(claims, digest)
+        if isinstance(store, CachedStore) and "range" not in request.headers:
+            data = store.get_cached(name, _MAX_CACHED_BYTES)
+            if data is not None:
+                return HttpReply(status=200, body=data, headers=_content_headers(digest), media_type=BYTES)
+        info = await self.threads.run(claims.robot, self.objects.head, claims, digest)
+        return await self._content(request, claims.robot, info.name, info.size, digest)
 
     async def head_object(self, request: HttpRequest, claims: Claims, path: dict[str, str]) -> HttpReply:
         """Return the size."""
@@ -317,10 +325,16 @@ class Handlers:
     async def _pieces(
         self, robot: RobotId, name: str, piece: bytes, start: int, end: int
     ) -> AsyncIterator[bytes]:
-        while start < end:
-            yield piece
-            start += len(piece)
-            piece = await self._piece(robot, name, start, end)
+        coming: asyncio.Task[bytes] | None = None
+        try:
+            while start < end:
+                start += len(piece)
+                coming = asyncio.ensure_future(self._piece(robot, name, start, end))  # while this one is sent
+                yield piece
+                piece = await coming
+        finally:
+            if coming is not None:
+                coming.cancel()
 
     async def _piece(self, robot: RobotId, name: str, start: int, end: int) -> bytes:
         """Return the bytes from *start* on, at most `_PIECE_BYTES`; none if there are none before *end*."""

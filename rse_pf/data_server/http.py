@@ -9,9 +9,10 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import re
+import sys
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeVar
 from urllib.parse import parse_qsl
 
 import msgspec
@@ -50,6 +51,7 @@ __all__ = [
     "requested_range",
 ]
 
+_T = TypeVar("_T")
 Receive = Callable[[], Awaitable[Mapping[str, Any]]]
 Send = Callable[[Mapping[str, Any]], Awaitable[None]]
 _MIN_BODY_BYTES_PER_S, _BODY_GRACE_S = 1024, 5.0
@@ -76,6 +78,8 @@ _STATUS: dict[type[RsePfError], int] = {
     QuotaExceeded: 413, Crashed: 413, BadRequest: 400, InvalidCamera: 400, Busy: 503, WorkerLost: 503,
     Archived: 409, StoreFull: 507, StoreError: 503,
 }  # fmt: skip
+_FRAMES = {"content-length", "transfer-encoding"}
+"""A request with none of these headers has no body."""
 _RANGE = re.compile(r"bytes=(\d{0,18})-(\d{0,18})")
 
 
@@ -107,22 +111,14 @@ class HttpRequest:
         self.headers = {
             name.decode("latin-1").lower(): value.decode("latin-1") for name, value in scope["headers"]
         }
-        self.query = dict(parse_qsl(scope["query_string"].decode("latin-1"), keep_blank_values=True))
+        query = scope["query_string"]
+        self.query = dict(parse_qsl(query.decode("latin-1"), keep_blank_values=True)) if query else {}
         self.received_bytes = 0
-        self._complete = asyncio.Event()
+        self.is_complete = not self.headers.keys() & _FRAMES
+        """Whether the whole request was read, or its connection was closed."""
+        self._whole: bytes | None = None
         self._receive = receive
         self._clock = clock
-
-    @property
-    def is_complete(self) -> bool:
-        """Whether the whole request was read, or its connection was closed."""
-        return self._complete.is_set()
-
-    async def wait_until_gone(self) -> None:
-        """Return when the connection is closed after the whole request was read."""
-        await self._complete.wait()
-        while (await self._receive())["type"] != "http.disconnect":
-            pass
 
     def header_number(self, name: str) -> int | None:
         """Return a header that is a whole number; None if it is missing; raises BadRequest."""
@@ -144,17 +140,19 @@ class HttpRequest:
         announced = self.header_number("content-length")
         if announced is not None and announced > max_bytes:
             raise _too_long(announced, max_bytes)
-        received = bytearray()
+        pieces = []
         async for piece in self._pieces():
-            received += piece
-            if len(received) > max_bytes:
-                raise _too_long(len(received), max_bytes)
-        return bytes(received)
+            pieces.append(piece)
+            if self.received_bytes > max_bytes:
+                raise _too_long(self.received_bytes, max_bytes)
+        if self._whole is not None:
+            return self._whole
+        return pieces[0] if len(pieces) == 1 else b"".join(pieces)
 
     async def drain_soon(self, max_bytes: int) -> bool:
         """Do the same as `drain`, for `_DRAIN_S` at the most: what is on its way can still be read."""
         try:
-            return await asyncio.wait_for(self.drain(max_bytes), _DRAIN_S)
+            return await _within(_DRAIN_S, self.drain(max_bytes))
         except asyncio.TimeoutError:
             return False
 
@@ -167,7 +165,7 @@ class HttpRequest:
         if "expect" in self.headers and not self.received_bytes:
             return
         with contextlib.suppress(asyncio.TimeoutError):
-            await asyncio.wait_for(self._drop(), _DISCARD_S)
+            await _within(_DISCARD_S, self._drop())
 
     async def _drop(self) -> None:
         remaining = _DISCARD_BYTES
@@ -193,16 +191,17 @@ class HttpRequest:
         began = self._clock()
         while not self.is_complete:
             try:
-                message = await asyncio.wait_for(self._receive(), BODY_TIMEOUT_S)
+                message = await _within(BODY_TIMEOUT_S, self._receive())
             except asyncio.TimeoutError:
                 raise _too_slow(f"no data for {BODY_TIMEOUT_S:g} s") from None
             if message["type"] == "http.disconnect":
-                self._complete.set()
+                self.is_complete = True
                 raise Disconnected("the robot closed the connection within its request")
             piece: bytes = message.get("body", b"")
+            self._whole = message.get("whole")  # of `OneRequestProtocol`, in one piece
             self.received_bytes += len(piece)
             if not message.get("more_body", False):
-                self._complete.set()
+                self.is_complete = True
             yield piece
             took_s, min_rate = self._clock() - began, _MIN_BODY_BYTES_PER_S
             if not self.is_complete and took_s > _BODY_GRACE_S and self.received_bytes < min_rate * took_s:
@@ -250,6 +249,14 @@ def requested_range(text: str | None, size: int) -> tuple[int, int] | None:
     if start >= size or start >= end:
         raise BadRequest(f"{text!r} lies outside of {size} bytes", hint="HEAD returns the size")
     return start, end
+
+
+async def _within(seconds: float, work: Awaitable[_T]) -> _T:
+    """Return what *work* returns; raises asyncio.TimeoutError after *seconds*."""
+    if sys.version_info >= (3, 11):  # which needs no task of its own for it
+        async with asyncio.timeout(seconds):
+            return await work
+    return await asyncio.wait_for(work, seconds)
 
 
 def _too_long(got: int, max_bytes: int) -> LimitExceeded:

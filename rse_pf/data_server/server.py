@@ -25,6 +25,7 @@ from rse_pf.config import PlatformSettings
 from rse_pf.data_server.app import DataServer
 from rse_pf.data_server.uploads import UPLOAD_TTL_S
 from rse_pf.errors import ConfigurationError, MissingExtra, StoreError
+from rse_pf.event_loop import run_in_loop
 from rse_pf.files import replace_json
 from rse_pf.http_connections import bounded_protocol
 from rse_pf.object_store import DirectoryStore, ObjectStore
@@ -76,7 +77,7 @@ def serve_data(
 
     Raises:
         ConfigurationError: The address is taken, or the audit log cannot be written.
-        MissingExtra: uvicorn is not installed.
+        MissingExtra: uvicorn or uvloop is not installed.
     """
     try:
         import uvicorn
@@ -87,15 +88,15 @@ def serve_data(
     app = DataServer(settings, store, keys=keys, log=_write_line, audit=log)
     listening = _listen(settings)
     config = uvicorn.Config(
-        app, http=bounded_protocol(most_idle=_MAX_IDLE), ws="none", lifespan="off", access_log=False,
-        log_level="warning", backlog=BACKLOG, server_header=False, date_header=False, proxy_headers=False,
-        timeout_graceful_shutdown=_STOP_TIMEOUT_S,
+        app, http=bounded_protocol(most_idle=_MAX_IDLE, ends_with_client=True), ws="none", lifespan="off",
+        access_log=False, log_level="warning", backlog=BACKLOG, server_header=False, date_header=False,
+        proxy_headers=False, timeout_graceful_shutdown=_STOP_TIMEOUT_S,
     )  # fmt: skip
     for number in (signal.SIGTERM, signal.SIGINT):
         # uvicorn repeats the signal to itself when it has ended; the exit code is 0 all the same
         signal.signal(number, lambda number, frame: None)
     try:
-        asyncio.run(_run(uvicorn.Server(config), app, store, listening, settings, announce))
+        run_in_loop(_run(uvicorn.Server(config), app, store, listening, settings, announce))
     finally:
         app.close()
         app.record_counted()

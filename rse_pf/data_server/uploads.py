@@ -12,7 +12,7 @@ import hashlib
 import itertools
 import re
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
 
 from rse_pf.accounts import Accounts
@@ -20,15 +20,18 @@ from rse_pf.auth.tokens import Claims
 from rse_pf.config import DataSettings
 from rse_pf.data_server.fair_threads import check_wanted, while_wanted
 from rse_pf.data_server.routes import Upload
+from rse_pf.data_server.running_hashes import RunningHashes
 from rse_pf.errors import BadRequest, Conflict, LimitExceeded, NotFound, QuotaExceeded
 from rse_pf.identity import object_name
 from rse_pf.object_store import (
+    GrowingStore,
     ObjectInfo,
     ObjectStore,
     PresigningStore,
     digest_of,
     put_pieces,
     put_scratch,
+    read_range,
 )
 
 __all__ = ["Objects"]
@@ -40,6 +43,7 @@ UPLOAD_TTL_S = 86_400.0
 """Of one robot."""
 _FEW_PARTS, _SHORT_PART_BYTES = 64, 65_536
 """An upload has at most so many parts, and one more for each so many bytes of the object."""
+_PIECE_BYTES = 1 << 20
 
 
 class Objects:
@@ -58,6 +62,7 @@ class Objects:
         self.accounts = Accounts(store, settings, clock=clock, wall_clock=wall_clock, check=check_wanted)
         self._lock = threading.Lock()  # of the dictionary, never held during work
         self._writing: dict[str, tuple[threading.Lock, int]] = {}
+        self._hashes = RunningHashes()
 
     def reservation(self, claims: Claims, size: int) -> AbstractContextManager[None]:
         """Return the context in which a robot writes *size* bytes; it raises QuotaExceeded or StoreFull."""
@@ -190,7 +195,7 @@ class Objects:
                     hint=f"DELETE it, begin again and send parts of {self._settings.part_bytes} bytes",
                 )
             if data:
-                put_scratch(self._store, f"{self._parts(claims, digest)}part-{offset:015d}", data)
+                self._store_part(name, f"{self._parts(claims, digest)}part-", parts, offset, data)
             if offset + len(data) == size:
                 self._assemble(claims, digest, name, size)
             return self._state(digest, size, offset + len(data))
@@ -216,32 +221,61 @@ class Objects:
     def _resume(self, claims: Claims, digest: str, name: str, size: int) -> Upload:
         """Return the state of an upload; complete one whose server ended after the last part was stored."""
         offset = sum(part.size for part in self._stored_parts(claims, digest))
+        if not offset and self._find(name) is not None:  # a server ended when the object had its name
+            self._drop(self._parts(claims, digest))
+            return self._state(digest, size, size)
         if offset == size:
             self._assemble(claims, digest, name, size)
         return self._state(digest, size, offset)
 
-    def _assemble(self, claims: Claims, digest: str, name: str, size: int) -> None:
-        def whole() -> Iterator[bytes]:
-            hashed, received = hashlib.sha256(), 0
-            for part in self._stored_parts(claims, digest):
-                data = self._store.get(part.name)
-                hashed.update(data)
-                received += len(data)
-                yield data
-            if received != size or hashed.hexdigest() != digest:
-                raise BadRequest("the parts do not have the digest of the upload", hint="upload it again")
+    def _store_part(
+        self, name: str, prefix: str, parts: Sequence[ObjectInfo], offset: int, data: bytes
+    ) -> None:
+        """Store a part: at the end of the only one before it if the store can do that."""
+        if isinstance(self._store, GrowingStore) and len(parts) < 2:
+            self._store.append(f"{prefix}{0:015d}", offset, data)
+            self._hashes.add(name, offset, data)
+        else:
+            put_scratch(self._store, f"{prefix}{offset:015d}", data)
 
+    def _assemble(self, claims: Claims, digest: str, name: str, size: int) -> None:
+        parts = list(self._stored_parts(claims, digest))
         try:
-            put_pieces(self._store, name, whole())
+            if isinstance(self._store, GrowingStore) and len(parts) == 1:
+                known = self._hashes.take(name, size)
+                if (known or self._hash_of(parts[0])) != digest:
+                    raise _wrong_digest()
+                self._store.adopt(name, parts[0].name, size)
+            else:
+                put_pieces(self._store, name, self._whole(parts, digest, size))
         except BadRequest:
             self._discard(claims, digest)
             raise
         self._drop(self._parts(claims, digest))
 
+    def _whole(self, parts: Sequence[ObjectInfo], digest: str, size: int) -> Iterator[bytes]:
+        """Yield the parts; raises BadRequest behind the last one if they are not the object."""
+        hashed, received = hashlib.sha256(), 0
+        for part in parts:
+            data = self._store.get(part.name)
+            hashed.update(data)
+            received += len(data)
+            yield data
+        if received != size or hashed.hexdigest() != digest:
+            raise _wrong_digest()
+
+    def _hash_of(self, part: ObjectInfo) -> str:
+        hashed = hashlib.sha256()
+        for start in range(0, part.size, _PIECE_BYTES):
+            check_wanted()
+            hashed.update(read_range(self._store, part.name, start, _PIECE_BYTES))
+        return hashed.hexdigest()
+
     def _discard(self, claims: Claims, digest: str) -> None:
         """Remove an upload that became no object."""
         size = self._find_size(claims, digest)
         self._drop(self._parts(claims, digest))
+        self._hashes.forget(self.name(claims, digest))
         if size is not None and not isinstance(self._store, PresigningStore):
             # else the robot may have a URL with which it can still store the object
             self.accounts.release(claims.robot, size)
@@ -305,3 +339,7 @@ class Objects:
                     self._writing[name] = lock, users
                 else:
                     del self._writing[name]
+
+
+def _wrong_digest() -> BadRequest:
+    return BadRequest("the parts do not have the digest of the upload", hint="upload it again")

@@ -268,13 +268,9 @@ class SlowList(MemoryStore):
 def test_work_ends_when_its_robot_closed_the_connection() -> None:
     store = SlowList()
     service = Service(small_settings(), store)
-    messages = [{"type": "http.request", "body": b"", "more_body": False}]
 
     async def receive() -> dict[str, Any]:
-        if not messages:
-            await asyncio.to_thread(store.listed.wait, 30)
-            return {"type": "http.disconnect"}
-        return messages.pop()
+        raise AssertionError("it has no body")
 
     async def send(message: Mapping[str, Any]) -> None:
         raise AssertionError("nobody reads this")
@@ -283,7 +279,14 @@ def test_work_ends_when_its_robot_closed_the_connection() -> None:
         "type": "http", "method": "GET", "path": "/data/v1/objects", "query_string": b"",
         "headers": [(b"authorization", f"Bearer {service.token()}".encode())],
     }  # fmt: skip
-    asyncio.run(service.app(scope, receive, send))
+
+    async def ask_and_leave() -> None:
+        work = asyncio.ensure_future(service.app(scope, receive, send))
+        await asyncio.to_thread(store.listed.wait, 30)
+        work.cancel()  # as `OneRequestProtocol` does
+        await asyncio.wait([work])
+
+    asyncio.run(ask_and_leave())
     store.gone.set()
     service.app.close()
 

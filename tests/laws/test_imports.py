@@ -13,10 +13,10 @@ from collections.abc import Iterator, Mapping
 import pytest
 
 ORDER = (
-    "rse_pf", "errors", "terminal", "linux", "one_thread", "limited_process", "files", "disk_reserve",
-    "geometry", "native",
+    "rse_pf", "errors", "event_loop", "terminal", "linux", "one_thread", "limited_process",
+    "files", "disk_reserve", "geometry", "native",
     "native_buffers", "native_matcher", "native_tracker", "token_bucket", "config",
-    "silent_connections", "http_connections", "budget", "wire", "scaling",
+    "silent_connections", "http_head", "http_connections", "page_cache", "budget", "wire", "scaling",
     "object_store", "identity", "crash_record", "maps", "accounts", "auth", "enrolment", "audit", "service",
     "pnp", "slam", "services.mapping", "live_map", "services.custom", "services",
     "recording", "recording.explain", "recording.replay",
@@ -113,7 +113,7 @@ PACKAGES: dict[str, tuple[str, ...]] = {
     "poselib": ("rse_pf/pnp/engines.py",),
     "picows": ("rse_pf/backend/gateway/websocket.py",),
     "aiofastnet": ("rse_pf/backend/",),
-    "uvloop": ("rse_pf/backend/",),
+    "uvloop": ("rse_pf/event_loop.py",),
     "prometheus_client": (
         "rse_pf/backend/",
         "rse_pf/data_server/",

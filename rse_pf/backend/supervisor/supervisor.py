@@ -53,12 +53,13 @@ from rse_pf.backend.supervisor.record_query import NOT_FOR_YOU, WRONG_RECORDING,
 from rse_pf.backend.supervisor.server_recording import ServerRecording, server_version
 from rse_pf.backend.supervisor.session_registry import SessionRegistry
 from rse_pf.backend.supervisor.trust_poller import poll_trust
-from rse_pf.backend.supervisor.worker import WorkerPlan, run_in_loop
+from rse_pf.backend.supervisor.worker import WorkerPlan
 from rse_pf.backend.supervisor.worker_handle import BUILTIN, RowsOrder, WorkerProcess, fork_workers
 from rse_pf.config import PlatformSettings
 from rse_pf.config.elasticity import MOVES_PER_S
 from rse_pf.config.placement import ServerPlacement
 from rse_pf.errors import ConfigurationError
+from rse_pf.event_loop import run_in_loop
 from rse_pf.files import replace_json
 from rse_pf.linux import cpu_seconds, raise_descriptor_limit, resident_bytes
 

@@ -18,7 +18,7 @@ import signal
 import socket
 import struct
 import time
-from collections.abc import Callable, Coroutine, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -73,7 +73,8 @@ from rse_pf.backend.supervisor.orders import (
 from rse_pf.backend.supervisor.robot_events import RobotEvents
 from rse_pf.backend.supervisor.robot_rows import MAX_ROBOT_ROWS, robot_rows
 from rse_pf.config import PlatformSettings, ServiceSettings
-from rse_pf.errors import ConfigurationError, MissingExtra, RsePfError, message_of
+from rse_pf.errors import ConfigurationError, RsePfError, message_of
+from rse_pf.event_loop import event_loop_maker
 from rse_pf.linux import die_with_parent, set_process_name
 from rse_pf.object_store import ObjectStore
 from rse_pf.recording.tap import RecordingTap, hand_pipe
@@ -81,7 +82,7 @@ from rse_pf.service import Registry
 from rse_pf.services.custom.installed import InstalledService, installed_services, published_services
 from rse_pf.services.loading import load_services
 
-__all__ = ["HANDOVER", "WorkerPlan", "event_loop_maker", "repeat_for", "run_in_loop", "run_worker"]
+__all__ = ["HANDOVER", "WorkerPlan", "repeat_for", "run_worker"]
 
 HANDOVER = struct.Struct("!Q46s")
 """A socket's number and the address of its peer, which travel with its descriptor."""
@@ -120,36 +121,11 @@ class WorkerPlan:
     """Socket on which the recorder takes the ends of pipes; None where nothing is recorded."""
 
 
-def event_loop_maker() -> Callable[[], asyncio.AbstractEventLoop]:
-    """Return the function that makes the event loop of a worker; raises MissingExtra."""
-    try:
-        import uvloop
-    except ImportError as error:
-        raise MissingExtra("uvloop", "backend") from error
-    make: Callable[[], asyncio.AbstractEventLoop] = uvloop.new_event_loop
-    return make
-
-
 def repeat_for(seconds: float, step: Callable[[], bool], clock: Callable[[], float]) -> None:
     """Call *step* once, and again until it returns False or *seconds* have passed."""
     until = clock() + seconds
     while step() and clock() < until:
         pass
-
-
-def run_in_loop(main: Coroutine[Any, Any, _T]) -> _T:
-    """Run *main* as `asyncio.run` does, in an event loop of `event_loop_maker`, and return its result."""
-    loop = event_loop_maker()()
-    asyncio.set_event_loop(loop)
-    try:
-        return loop.run_until_complete(main)
-    finally:
-        tasks = asyncio.all_tasks(loop)
-        for task in tasks:
-            task.cancel()
-        loop.run_until_complete(asyncio.gather(*tasks, return_exceptions=True))
-        asyncio.set_event_loop(None)
-        loop.close()
 
 
 def run_worker(plan: WorkerPlan, data: socket.socket, control: socket.socket) -> None:

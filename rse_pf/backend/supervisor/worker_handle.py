@@ -29,8 +29,9 @@ from rse_pf.backend.supervisor.orders import (
     WorkerOrder,
     encode_order,
 )
-from rse_pf.backend.supervisor.worker import HANDOVER, WorkerPlan, event_loop_maker, run_worker
+from rse_pf.backend.supervisor.worker import HANDOVER, WorkerPlan, run_worker
 from rse_pf.config import PlatformSettings
+from rse_pf.event_loop import event_loop_maker
 from rse_pf.services.loading import load_services
 
 __all__ = ["BUILTIN", "RowsOrder", "WorkerProcess", "fork_workers", "warm_up"]

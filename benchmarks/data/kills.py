@@ -1,0 +1,173 @@
+"""SIGKILL at each step of a PUT and of an upload in parts: what was acknowledged is there, and nothing else.
+
+    python -m benchmarks.data.kills [--kills 500] [--seed 1]
+
+A data service, forked from this process, kills itself at one of the calls by which its threads change the
+store: before it, after it, or in the middle of a write.  The next one goes on in the same folder.  After each
+kill all objects are read.
+
+Defends: every object that was acknowledged is there and whole, and no other bytes are visible as an object.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import hashlib
+import http.client
+import json
+import os
+import random
+import signal
+import sys
+import tempfile
+import threading
+import time
+import traceback
+from collections import Counter
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+from benchmarks.data.requests import HERE, KEY, token_of
+from rse_pf.config import PlatformSettings
+from rse_pf.data_server.routes import openapi_page
+from rse_pf.data_server.server import KeysFile, serve_data
+from rse_pf.object_store import DirectoryStore
+
+CALLS = (
+    "open", "write", "pwrite", "fsync", "replace", "rename", "mkdir", "close", "unlink", "rmdir", "ftruncate",
+    "lstat",
+)  # fmt: skip
+LAST_CALL, PUTS, PART_BYTES = 90, 4, 100_000
+_TIMEOUT_S = 30.0
+
+
+def die_at(number: int, place: int) -> None:
+    """Let the call *number* of the threads of this service kill it: before (0), after (1) or within (2)."""
+    counted = [0]
+
+    def patched(name: str, call: Callable[..., Any]) -> Callable[..., Any]:
+        def run(*arguments: Any, **named: Any) -> Any:
+            if threading.current_thread().name != "data":
+                return call(*arguments, **named)
+            counted[0] += 1
+            is_last = counted[0] == number
+            if is_last and place == 2 and name in ("write", "pwrite"):
+                handle, data, *rest = arguments
+                call(handle, data[: len(data) // 2], *rest)
+            if is_last and place != 1:
+                die(name)
+            result = call(*arguments, **named)
+            if is_last:
+                die(name)
+            return result
+
+        return run
+
+    def die(name: str) -> None:
+        os.write(2, f"killed {('before', 'after', 'within')[place]} {name}\n".encode())
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    for name in CALLS:
+        setattr(os, name, patched(name, getattr(os, name)))
+
+
+def serve(folder: Path, number: int, place: int) -> None:
+    """Serve in this process, which was forked, until it kills itself."""
+    log = os.open(folder / "log", os.O_WRONLY | os.O_CREAT | os.O_APPEND)
+    os.dup2(log, 2)
+    die_at(number, place)
+    serve_data(
+        PlatformSettings().replace(data={"port": 0}), DirectoryStore(folder / "objects"),
+        keys=KeysFile(folder / "keys.json"), announce=folder / "announce.json", audit=folder / "audit",
+    )  # fmt: skip
+
+
+def send(port: int, robot: str, source: random.Random) -> Iterator[tuple[str, bool]]:
+    """Send objects; yield the digest of each before it is sent, and again when it was acknowledged."""
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=_TIMEOUT_S)
+    token = {"Authorization": f"Bearer {token_of(robot)}"}
+
+    def ask(method: str, path: str, body: bytes, **headers: str) -> int:
+        connection.request(method, path, body, token | headers)
+        answer = connection.getresponse()
+        answer.read()
+        return answer.status
+
+    while True:
+        for _ in range(PUTS):
+            data = source.randbytes(source.choice((1, 4096, 70_000)))
+            digest = hashlib.sha256(data).hexdigest()
+            yield digest, False
+            if ask("PUT", f"/data/v1/objects/{digest}", data) in (200, 201):
+                yield digest, True
+        data = source.randbytes(3 * PART_BYTES)
+        digest = hashlib.sha256(data).hexdigest()
+        path = f"/data/v1/uploads/{digest}"
+        yield digest, False
+        ask("PUT", path, json.dumps({"size": len(data)}).encode())
+        for offset in range(0, len(data), PART_BYTES):
+            part = data[offset : offset + PART_BYTES]
+            status = ask("PATCH", path, part, **{"Upload-Offset": str(offset)})
+        if status == 201:
+            yield digest, True
+
+
+def check(folder: Path, sent: set[str], acknowledged: set[str]) -> list[str]:
+    """Return what is wrong with the objects in the store."""
+    store, seen, wrong = DirectoryStore(folder / "objects"), set(), []
+    for info in store.list("objects/"):
+        digest = info.name.rpartition("/")[2]
+        seen.add(digest)
+        if digest not in sent or hashlib.sha256(store.get(info.name)).hexdigest() != digest:
+            wrong.append(f"{info.name} is not what was sent")
+    return wrong + [f"{digest} was acknowledged and is lost" for digest in acknowledged - seen]
+
+
+def main() -> int:
+    """Kill, check, print."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--kills", type=int, default=500)
+    parser.add_argument("--seed", type=int, default=1)
+    options = parser.parse_args()
+    source, sent, acknowledged = random.Random(options.seed), set[str](), set[str]()
+    (HERE / "build").mkdir(exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=HERE / "build") as made:
+        folder = Path(made)
+        (folder / "keys.json").write_text(KEY.key_set().to_json())
+        openapi_page()  # once, not in each service
+        for kill in range(options.kills):
+            announcement = folder / "announce.json"
+            announcement.unlink(missing_ok=True)
+            child = os.fork()
+            if not child:
+                try:
+                    serve(folder, source.randrange(1, LAST_CALL), kill % 3)
+                finally:  # never back to the caller, which would remove the folder
+                    traceback.print_exc()
+                    os._exit(1)
+            source.random()
+            until = time.monotonic() + _TIMEOUT_S
+            while not announcement.exists() and time.monotonic() < until:  # a child that ended has a message
+                time.sleep(0.002)  # polls, with a deadline
+            port = json.loads(announcement.read_text())["port"]
+            with contextlib.suppress(OSError, http.client.HTTPException):
+                for digest, is_acknowledged in send(port, f"robot-{kill % 7}", source):
+                    (acknowledged if is_acknowledged else sent).add(digest)
+            assert os.waitpid(child, 0)[1] == signal.SIGKILL, "the service ended in another way"
+            wrong = check(folder, sent, acknowledged) if kill % 10 == 9 or kill > options.kills - 3 else []
+            if wrong:
+                print("\n".join(wrong))
+                return 1
+        places = Counter(line for line in (folder / "log").read_text().splitlines() if "killed" in line)
+    print(f"{options.kills} kills; {len(sent)} objects sent, {len(acknowledged)} acknowledged: all whole")
+    for place, count in sorted(places.items()):
+        print(f"{count:5} {place}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
