@@ -394,6 +394,8 @@ class Exchange:
         kind = message["type"]
         if self._start is None and kind == "http.response.start":
             self._start = message
+        elif self._is_answered and kind == "http.response.body" and not message.get("body"):
+            return  # the end of a body that was complete
         elif self._start is not None and kind == "http.response.body" and not self._is_answered:
             self._send_body(self._start, message.get("body", b""), bool(message.get("more_body")))
         else:
@@ -421,7 +423,8 @@ class Exchange:
             self._protocol.transport.write(parts[0])
         elif parts:
             self._protocol.transport.writelines(parts)
-        if more:
+        # The client has its reply when it has the last byte, and may send the next request at once.
+        if more and (self._unsent != 0 or not self._is_whole):
             return
         if self._unsent and not has_no_body:
             raise RuntimeError("the body is shorter than its Content-Length")

@@ -194,8 +194,8 @@ class PresigningStore(Protocol):
 class CachedStore(Protocol):
     """A store that knows which objects it can read at once."""
 
-    def get_cached(self, name: str, max_bytes: int) -> bytes | None:
-        """Return the object; None if it is missing, longer, or must be waited for."""
+    def get_cached(self, name: str, start: int, length: int) -> tuple[int, bytes] | None:
+        """Return the object's size, and at most *length* bytes from *start* on; None if that has to wait."""
 
 
 def read_range(store: ObjectStore, name: str, start: int, length: int) -> bytes:
@@ -359,9 +359,9 @@ class DirectoryStore:
         with _as_store_errors(name), self._find(name, _open) as file:
             return file.read()
 
-    def get_cached(self, name: str, max_bytes: int) -> bytes | None:
-        """Return the object if its name and its bytes are in memory."""
-        return read_cached(self._paths(name)[0], max_bytes)
+    def get_cached(self, name: str, start: int, length: int) -> tuple[int, bytes] | None:
+        """Return size and a part of the object if its name and these bytes are in memory."""
+        return read_cached(self._paths(name)[0], start, length)
 
     def get_range(self, name: str, start: int, length: int) -> bytes:
         """Return a part of the object."""

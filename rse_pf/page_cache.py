@@ -34,22 +34,23 @@ _sync_file_range.argtypes = (ctypes.c_int, ctypes.c_int64, ctypes.c_int64, ctype
 _WRITE = 2  # SYNC_FILE_RANGE_WRITE
 
 
-def read_cached(path: str, max_bytes: int) -> bytes | None:
-    """Return the whole file at *path*, which is no link; None if it may be absent, longer, or not in memory.
+def read_cached(path: str, start: int, length: int) -> tuple[int, bytes] | None:
+    """Return the size of the file at *path*, which is no link, and at most *length* bytes from *start* on.
 
-    Also None where the kernel or the file system cannot answer without waiting.
+    None if it may be absent or not in memory, or where the kernel or the file system cannot answer without
+    waiting.
     """
     descriptor = _syscall(_OPENAT2, _AT_FDCWD, path.encode(), ctypes.byref(_HOW), _SIZE)
     if descriptor < 0:
         return None
     try:
         status = os.fstat(descriptor)
-        size = status.st_size
-        if not stat.S_ISREG(status.st_mode) or size > max_bytes:
+        count = max(0, min(length, status.st_size - start))
+        if not stat.S_ISREG(status.st_mode):
             return None
-        data = bytearray(size)
-        got = os.preadv(descriptor, [data], 0, os.RWF_NOWAIT) if size else 0
-        return bytes(data) if got == size else None
+        data = bytearray(count)
+        got = os.preadv(descriptor, [data], start, os.RWF_NOWAIT) if count else 0
+        return (status.st_size, bytes(data)) if got == count else None
     except OSError:  # a part is not in memory, or the file system does not know
         return None
     finally:

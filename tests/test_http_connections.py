@@ -256,6 +256,28 @@ def test_mutated_requests_in_pieces_reach_the_application_only_as_they_are_under
     asyncio.run(asyncio.wait_for(run(), TIMEOUT_S))
 
 
+def test_a_client_that_has_the_last_byte_may_ask_again_before_the_application_has_ended() -> None:
+    class Late(Echo):
+        async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
+            headers = [(b"content-length", b"2")]
+            await send({"type": "http.response.start", "status": 200, "headers": headers})
+            await send({"type": "http.response.body", "body": b"ab", "more_body": True})
+            await self.hold.wait()
+            await send({"type": "http.response.body", "body": b""})
+            self.seen.append((scope["path"], b""))
+
+    async def run() -> None:
+        line = Line(Late())
+        line.app.hold.clear()
+        for _ in range(3):
+            assert (await line.send(GET)).endswith(b"\r\n\r\nab")
+        line.app.hold.set()
+        await settled()
+        assert (line.transport.ended, len(line.app.seen)) == ("", 3)
+
+    asyncio.run(run())
+
+
 def test_shutdown_closes_a_waiting_connection_at_once_and_a_busy_one_after_its_reply() -> None:
     async def run() -> None:
         idle, busy = Line(), Line()

@@ -47,9 +47,9 @@ from rse_pf.local.balancer.load_balancer import EnvoyLoadBalancer
 
 HERE = Path(__file__).resolve().parents[2]
 KEY = SigningKey.from_seed(b"k" * 32, "key-1")
-ROBOTS, PER_S, SECONDS, IDLE_S = 20, 100.0, 6.0, 5.0
+ROBOTS, PER_S, SECONDS, IDLE_S = 20, 100.0, 3.0, 3.0
 OBJECT_BYTES, STREAM_BYTES, MIB = 4096, 60_000_000, 1 << 20
-GREEDY_S, GREEDY_PER_S, VICTIM_PER_S, GREEDY_OBJECTS = 8.0, 50.0, 20.0, 50
+GREEDY_S, GREEDY_PER_S, VICTIM_PER_S = 8.0, 50.0, 20.0
 BARS = {
     "get_cpu_us": 400.0, "put_cpu_us": 800.0, "idle_cpu_ms_per_s": 3.0,
     "get_p50_ms": 2.0, "get_p99_ms": 15.0, "put_p50_ms": 6.0, "put_p99_ms": 40.0,

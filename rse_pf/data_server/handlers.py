@@ -51,9 +51,7 @@ _T = TypeVar("_T")
 # Gets a request, the claims of its token, and the parameters of its path.
 Handler = Callable[[HttpRequest, Claims, dict[str, str]], Awaitable[HttpReply]]
 
-_PIECE_BYTES = 1 << 20
-_MAX_CACHED_BYTES = 1 << 16
-"""An object up to this size is read by the event loop if it is in memory: to ask a thread takes longer."""
+_PIECE_BYTES = 1 << 19
 _MAX_JSON_BYTES = 16384
 _MAX_NOTE_LETTERS = 500
 _MAX_PAGE = 1000
@@ -124,22 +122,26 @@ class Handlers:
 
     async def get_object(self, request: HttpRequest, claims: Claims, path: dict[str, str]) -> HttpReply:
         """Return an object or a range of it."""
-        digest, store = path["digest"], self._store
-        name = self.objects.name(claims, digest)
-        if isinstance(store, CachedStore) and "range" not in request.headers:
-            data = store.get_cached(name, _MAX_CACHED_BYTES)
-            if data is not None:
-                return HttpReply(status=200, body=data, headers=_content_headers(digest), media_type=BYTES)
-        info = await self.threads.run(claims.robot, self.objects.head, claims, digest)
-        return await self._content(request, claims.robot, info.name, info.size, digest)
+        digest = path["digest"]
+        name, size = await self._head(claims, digest)
+        return await self._content(request, claims.robot, name, size, digest)
 
     async def head_object(self, request: HttpRequest, claims: Claims, path: dict[str, str]) -> HttpReply:
         """Return the size."""
-        info = await self.threads.run(claims.robot, self.objects.head, claims, path["digest"])
+        _, size = await self._head(claims, path["digest"])
         return HttpReply(
-            status=200, headers={**_content_headers(path["digest"]), "Content-Length": str(info.size)},
+            status=200, headers={**_content_headers(path["digest"]), "Content-Length": str(size)},
             media_type=BYTES,
         )  # fmt: skip
+
+    async def _head(self, claims: Claims, digest: str) -> tuple[str, int]:
+        """Return name and size of an object; raises NotFound."""
+        name = self.objects.name(claims, digest)
+        cached = self._store.get_cached(name, 0, 0) if isinstance(self._store, CachedStore) else None
+        if cached is not None:
+            return name, cached[0]
+        info = await self.threads.run(claims.robot, self.objects.head, claims, digest)
+        return info.name, info.size
 
     async def put_object(self, request: HttpRequest, claims: Claims, path: dict[str, str]) -> HttpReply:
         """Store a small object."""
@@ -316,11 +318,9 @@ class Handlers:
         headers = {**_content_headers(digest), "Content-Length": str(end - start)}
         if part:
             headers["Content-Range"] = f"bytes {start}-{end - 1}/{size}"
-        return HttpReply(
-            status=206 if part else 200, body=self._pieces(robot, name, first, start, end),
-            headers=headers,
-            media_type=BYTES,
-        )  # fmt: skip
+        is_all = len(first) == end - start
+        body = first if is_all else self._pieces(robot, name, first, start, end)
+        return HttpReply(status=206 if part else 200, body=body, headers=headers, media_type=BYTES)
 
     async def _pieces(
         self, robot: RobotId, name: str, piece: bytes, start: int, end: int
@@ -340,8 +340,12 @@ class Handlers:
         """Return the bytes from *start* on, at most `_PIECE_BYTES`; none if there are none before *end*."""
         if start >= end:
             return b""
-        length = min(_PIECE_BYTES, end - start)
-        piece: bytes = await self.threads.run(robot, read_range, self._store, name, start, length)
+        length, store = min(_PIECE_BYTES, end - start), self._store
+        cached = store.get_cached(name, start, length) if isinstance(store, CachedStore) else None
+        if cached is not None:  # a thread would take longer to be asked
+            piece = cached[1]
+        else:
+            piece = await self.threads.run(robot, read_range, store, name, start, length)
         if not piece:
             raise NotFound("the object was removed while it was read")
         return piece

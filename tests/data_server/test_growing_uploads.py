@@ -1,0 +1,183 @@
+"""Parts extend one file, which becomes the object, by any server and after any end of one."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+from pathlib import Path
+
+import pytest
+from fake_data_service import Answer, Service, small_settings
+
+from rse_pf.data_server.running_hashes import RunningHashes
+from rse_pf.errors import Busy, Conflict, NotFound
+from rse_pf.object_store import DirectoryStore, digest_of
+from rse_pf.page_cache import read_cached
+
+DATA = bytes(n % 251 for n in range(10_000))
+DIGEST = digest_of(DATA)
+UPLOAD, OBJECT = f"/data/v1/uploads/{DIGEST}", f"/data/v1/objects/{DIGEST}"
+PART = f"uploads/default/robot-1/{DIGEST}/part-{0:015d}"
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> DirectoryStore:
+    return DirectoryStore(tmp_path)
+
+
+@pytest.fixture
+def service(store: DirectoryStore) -> Service:
+    made = Service(small_settings(), store)
+    made.ask("PUT", UPLOAD, json.dumps({"size": len(DATA)}).encode())
+    return made
+
+
+def part(service: Service, start: int, end: int, data: bytes = DATA) -> Answer:
+    return service.ask("PATCH", UPLOAD, data[start:end], headers={"upload-offset": str(start)})
+
+
+def test_parts_extend_one_file_that_becomes_the_object(service: Service, store: DirectoryStore) -> None:
+    part(service, 0, 4096)
+    part(service, 4096, 8192)
+    names = [info.name for info in store.list("uploads/")]
+    before = os.stat(store._paths(PART)[0]).st_ino
+
+    assert names == [PART, PART.replace(f"part-{0:015d}", "size")]
+    assert part(service, 8192, 10_000).status == 201
+
+    (info,) = store.list("objects/")
+    assert os.stat(store._paths(info.name)[0]).st_ino == before
+    assert service.ask("GET", OBJECT).body == DATA
+    assert list(store.list("uploads/")) == []
+
+
+@pytest.mark.parametrize("restarts", [(0,), (1,), (0, 1)])
+def test_another_server_continues_the_file_and_judges_all_of_it(
+    service: Service, store: DirectoryStore, restarts: tuple[int, ...]
+) -> None:
+    for number, (start, end) in enumerate([(0, 4096), (4096, 8192), (8192, 10_000)]):
+        last = part(service, start, end)
+        if number in restarts:
+            service.restart()
+
+    assert last.status == 201
+    assert service.ask("GET", OBJECT).body == DATA
+
+
+def test_bytes_that_another_server_wrote_are_judged_too(service: Service, store: DirectoryStore) -> None:
+    part(service, 0, 4096)
+    store.append(PART, 4096, b"x" * 4096)  # by another server; this one knows a hash of the first part
+
+    assert part(service, 8192, 10_000).status == 400
+    assert list(store.list("objects/")) == list(store.list("uploads/")) == []
+
+
+def test_an_upload_goes_on_behind_a_part_of_which_a_half_was_written(
+    service: Service, store: DirectoryStore
+) -> None:
+    part(service, 0, 4096)
+    store.append(PART, 4096, DATA[4096:5000])  # then the server was killed
+    service.restart()
+
+    assert service.ask("HEAD", UPLOAD).headers["upload-offset"] == "5000"
+    assert part(service, 4096, 8192).status == 409
+    part(service, 5000, 9000)
+    assert part(service, 9000, 10_000).status == 201
+
+
+@pytest.mark.parametrize("method", ["HEAD", "PUT"])
+def test_an_upload_is_complete_whose_server_ended_when_the_object_had_its_name(
+    service: Service, store: DirectoryStore, method: str
+) -> None:
+    store.append(PART, 0, DATA)
+    store.adopt(f"objects/default/robot-1/{DIGEST}", PART, len(DATA))
+
+    body = json.dumps({"size": len(DATA)}).encode() if method == "PUT" else b""
+    assert service.ask(method, UPLOAD, body).headers["upload-offset"] == "10000"
+    assert list(store.list("uploads/")) == []
+    assert service.ask("GET", OBJECT).body == DATA
+
+
+def test_parts_of_an_earlier_version_are_assembled(service: Service, store: DirectoryStore) -> None:
+    store.put(PART, DATA[:4096])
+    store.put(PART.replace(f"{0:015d}", f"{4096:015d}"), DATA[4096:8192])
+
+    assert part(service, 8192, 10_000).status == 201
+    assert service.ask("GET", OBJECT).body == DATA
+
+
+def test_only_one_writer_extends_a_file_and_nobody_after_it_became_an_object(store: DirectoryStore) -> None:
+    store.append("uploads/a", 0, b"ab")
+    with open(store._paths("uploads/a")[0], "rb") as other:
+        fcntl.flock(other, fcntl.LOCK_EX)
+        with pytest.raises(Busy):
+            store.append("uploads/a", 2, b"c")
+        with pytest.raises(Busy):
+            store.adopt("objects/a", "uploads/a", 2)
+    for offset in (0, 1, 3):
+        with pytest.raises(Conflict):
+            store.append("uploads/a", offset, b"c")
+    with pytest.raises(Conflict):
+        store.adopt("objects/a", "uploads/a", 1)
+    store.append("uploads/a", 2, b"c")
+    store.adopt("objects/a", "uploads/a", 3)
+
+    with pytest.raises(NotFound):
+        store.append("uploads/a", 3, b"d")
+    with pytest.raises(NotFound):
+        store.adopt("objects/b", "uploads/a", 3)
+    assert store.get("objects/a") == b"abc"
+
+
+def test_a_full_disk_leaves_the_file_as_it_was(
+    store: DirectoryStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store.append("uploads/a", 0, b"ab")
+    write = os.pwrite
+
+    def fills(handle: int, data: bytes, at: int) -> int:
+        if at > 2:
+            raise OSError(28, "full")
+        return write(handle, data[:1], at)
+
+    monkeypatch.setattr(os, "pwrite", fills)
+    with pytest.raises(Exception, match="no space"):
+        store.append("uploads/a", 2, b"cd")
+
+    assert store.get("uploads/a") == b"ab"
+
+
+def test_a_hash_is_known_only_of_what_was_added_from_the_first_byte_on() -> None:
+    hashes = RunningHashes()
+    for start in range(0, 10_000, 2500):
+        hashes.add("whole", start, DATA[start : start + 2500])
+        hashes.add("late", start + 1, DATA[start : start + 2500])
+    hashes.add("gap", 0, DATA[:10])
+    hashes.add("gap", 20, DATA[20:])
+
+    assert [hashes.take(name, 10_000) for name in ("whole", "late", "gap", "whole")] == [
+        DIGEST,
+        None,
+        None,
+        None,
+    ]
+    hashes.add("again", 0, b"wrong")
+    hashes.add("again", 0, DATA)
+    assert hashes.take("again", 10_000) == DIGEST
+    hashes.add("forgotten", 0, DATA)
+    hashes.forget("forgotten")
+    assert hashes.take("forgotten", 10_000) is None
+
+
+def test_a_file_is_read_from_memory_as_it_is_or_not_at_all(tmp_path: Path) -> None:
+    path = tmp_path / "a"
+    path.write_bytes(DATA)
+    (tmp_path / "link").symlink_to(path)
+    (tmp_path / "empty").touch()
+
+    for start, length in ((0, 10_000), (0, 0), (9_000, 5000), (10_001, 5)):
+        found = read_cached(str(path), start, length)
+        assert found in ((10_000, DATA[start : start + length]), None), "a kernel may not know"
+    assert [read_cached(str(tmp_path / name), 0, 10) for name in ("link", "missing", ".")] == [None] * 3
+    assert read_cached(str(tmp_path / "empty"), 0, 10) in ((0, b""), None)
