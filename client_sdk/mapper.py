@@ -22,7 +22,7 @@ from client_sdk.answers import PoseAnswer
 from client_sdk.frontend import Features, Frame, FrontEndOptions, PoseQuery, TrackedFrame
 from client_sdk.mapping import MapOptions, PointMap, Trajectory, write_ply, write_trajectory
 from client_sdk.monocular.scale import MarkerScale, OdometryScale
-from client_sdk.slots import FeaturesFunction, FeaturesSlot
+from client_sdk.slots import FeaturesFunction, LoopsFunction, MotionFunction, OptimiserFunction, Slots
 from client_sdk.tracking.monocular_tracker import MonocularOptions, MonocularTracker
 from client_sdk.tracking.segments import DriveRecords, SegmentRecord, keyframe_of, tracker_record
 from client_sdk.tracking.tracker import Tracker
@@ -109,6 +109,9 @@ class Mapper:
         adds_frames: bool = True,
         recorder: FrameRecorder | None = None,
         features: FeaturesFunction | None = None,
+        motion: MotionFunction | None = None,
+        loops: LoopsFunction | None = None,
+        optimiser: OptimiserFunction | None = None,
     ) -> None:
         """Start without frames.
 
@@ -127,9 +130,12 @@ class Mapper:
                 what it wants.
             recorder: Gets each frame before it is tracked, and the points of each map that is saved.
             features: Finds the features of an image; None for ORB.
+            motion: Expects the pose of the next frame; None for a constant velocity.
+            loops: Describes an image, so that places are recognised; None takes its features.
+            optimiser: Adjusts keyframes and landmarks of a camera without depth; None for the built-in one.
 
         Raises:
-            UsageError: *features* is no function, or has no name.
+            UsageError: One of these is no function, or *features* has no name.
         """
         self.camera = camera
         self._ask = ask
@@ -144,7 +150,7 @@ class Mapper:
         self._keyframes_of = keyframes_of
         self._adds_frames = adds_frames
         self._recorder = recorder
-        self._slot = None if features is None else FeaturesSlot(features)
+        self._slots = Slots.of(features=features, motion=motion, loops=loops, optimiser=optimiser)
         self._joined = 0
         self._metric: set[int] = set()
         self._one_frame = asyncio.Lock()
@@ -357,9 +363,9 @@ class Mapper:
             )
         if self._tracker is None:
             if bool(frame.depth_m.any()) if self._depth is None else self._depth:
-                self._tracker = Tracker(self._options, self._T_world_start, self._slot)
+                self._tracker = Tracker(self._options, self._T_world_start, self._slots)
             else:
-                self._tracker = MonocularTracker(self._monocular, self._T_world_start, self._slot)
+                self._tracker = MonocularTracker(self._monocular, self._T_world_start, self._slots)
         return self._tracker
 
     def _finished(

@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from client_sdk.mapper import Mapper
     from client_sdk.mapping import MapOptions
     from client_sdk.monocular.scale import MarkerScale, OdometryScale
-    from client_sdk.slots import FeaturesFunction
+    from client_sdk.slots import FeaturesFunction, LoopsFunction, MotionFunction, OptimiserFunction
     from client_sdk.tracking.monocular_tracker import MonocularOptions
     from rse_pf.geometry import Camera
     from rse_pf.pnp import DepthNoise, PnpOptions
@@ -305,6 +305,9 @@ class Robot:
         T_world_start: npt.NDArray[np.float64] | None = None,
         keyframes_of: str = "",
         features: FeaturesFunction | None = None,
+        motion: MotionFunction | None = None,
+        loops: LoopsFunction | None = None,
+        optimiser: OptimiserFunction | None = None,
     ) -> Mapper:
         """Return a `Mapper` that asks this robot for its poses, within *deadline_s* each.
 
@@ -318,6 +321,7 @@ class Robot:
             ask=ask_robot(self, deadline_s), camera=camera, options=bounded, monocular=monocular,
             depth=depth, scale=scale, map_options=map_options, T_world_start=T_world_start,
             keyframes_of=keyframes_of, recorder=self._recorder, features=features,
+            motion=motion, loops=loops, optimiser=optimiser,
         )  # fmt: skip
 
     def live_map(
@@ -332,6 +336,8 @@ class Robot:
         map_options: MapOptions | None = None,
         T_world_start: npt.NDArray[np.float64] | None = None,
         features: FeaturesFunction | None = None,
+        motion: MotionFunction | None = None,
+        loops: LoopsFunction | None = None,
     ) -> LiveMapper:
         """Return a `LiveMapper` for ``async with robot.live_map(name) as mapper``.
 
@@ -348,7 +354,8 @@ class Robot:
             self, name, ask=ask_robot(self, deadline_s), camera=camera, options=bounded,
             live=(live or LiveOptions()).sent_with(codec),
             spool=None if spool is None else Path(spool), map_options=map_options,
-            T_world_start=T_world_start, features=features, clock=self._clock,
+            T_world_start=T_world_start, features=features, motion=motion, loops=loops,
+            clock=self._clock,
         )  # fmt: skip
 
     def record_frame(self, frame: Frame, T_odom_camera: npt.NDArray[np.float64] | None = None) -> None:

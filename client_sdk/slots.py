@@ -1,4 +1,4 @@
-"""Parts of the mapper that a user may bring: how features are found, and later what else is pluggable.
+"""Parts of the mapper that a user may bring: features, a motion model, places and an optimiser.
 
 A features function takes an image and returns `FoundFeatures`::
 
@@ -17,6 +17,7 @@ import importlib
 import math
 import re
 import sys
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,20 +26,31 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from client_sdk.monocular.bundle import Bundle
 from rse_pf.errors import BadRequest, UsageError
-from rse_pf.geometry import Array
+from rse_pf.geometry import Array, Camera, rigid
 from rse_pf.maps.descriptors import MAX_DESCRIPTOR_SIZE, ORB, DescriptorKind, Descriptors
+from rse_pf.slam.places import PlaceVector
 
 __all__ = [
     "CheckedFeatures",
     "FeaturesFunction",
     "FeaturesSlot",
     "FoundFeatures",
+    "LoopsFunction",
+    "LoopsSlot",
+    "MotionFunction",
+    "MotionSlot",
+    "OptimiserFunction",
+    "OptimiserSlot",
+    "Slots",
     "load_features",
     "load_function",
 ]
 
 _MAX_FOUND = 100_000
+_RECENT = 10
+_MIN_PLACE, _MAX_PLACE = 8, 4096
 _CLIP = 4.0
 """A vector's numbers are cut at so many times their root mean square, when it becomes int8."""
 
@@ -66,6 +78,17 @@ class FoundFeatures:
 
 FeaturesFunction = Callable[[npt.NDArray[np.uint8]], FoundFeatures]
 """Takes an ``(h, w, 3)`` uint8 image, red first.  Its ``name``, else its ``__name__``, names the features."""
+
+
+MotionFunction = Callable[[Array, Array, float], npt.ArrayLike]
+"""Takes ``(k,)`` stamps in seconds and ``(k, 4, 4)`` poses ``T_world_camera`` of the newest tracked frames,
+ten at most, oldest first, and the next stamp; returns its expected ``(4, 4)`` ``T_world_camera``."""
+LoopsFunction = Callable[[npt.NDArray[np.uint8]], npt.ArrayLike]
+"""Takes an ``(h, w, 3)`` uint8 image, red first, and returns a vector of 8 to 4,096 numbers: the smaller the
+angle between two vectors, the likelier the images show the same place."""
+OptimiserFunction = Callable[[Bundle, Camera, int], tuple[npt.ArrayLike, npt.ArrayLike]]
+"""Takes a bundle of a camera without depth, its intrinsics and the iterations that the built-in one would do;
+returns the adjusted ``(c, 4, 4)`` poses ``T_camera_world`` and ``(p, 3)`` points."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -199,6 +222,160 @@ class FeaturesSlot:
         return UsageError(
             f"the features function {self.name} {why}",
             hint="return FoundFeatures with a pixel, a score and a descriptor for each feature",
+        )
+
+
+class MotionSlot:
+    """A motion function with its checks, and the newest poses that it is given."""
+
+    def __init__(self, function: MotionFunction) -> None:
+        """Take a function; raises UsageError."""
+        self._function = _callable("motion", function)
+        self._recent: deque[tuple[float, Array]] = deque(maxlen=_RECENT)
+
+    def add(self, timestamp_s: float, T_world_camera: Array) -> None:
+        """Take the pose of a tracked frame."""
+        self._recent.append((timestamp_s, T_world_camera))
+
+    def clear(self) -> None:
+        """Forget the poses: the camera was lost, or its frame was moved."""
+        self._recent.clear()
+
+    def expected(self, timestamp_s: float) -> Array | None:
+        """Return ``T_world_camera`` as the function expects it at a time; None before any pose.
+
+        Raises:
+            UsageError: The function failed, or returned no pose.
+        """
+        if not self._recent:
+            return None
+        stamps_s = np.array([stamp_s for stamp_s, _ in self._recent])
+        poses = np.array([pose for _, pose in self._recent])
+        returned = _called("motion", self._function, stamps_s, poses, timestamp_s)
+        T = rigid(_numbers_of("motion", returned, (4, 4)))
+        if T is None:
+            raise UsageError(
+                "the motion function returned a matrix that is no pose",
+                hint="return T_world_camera: a rotation, a translation in metres, and 0 0 0 1",
+            )
+        return T
+
+
+class LoopsSlot:
+    """A loops function with its checks; its vectors have one length."""
+
+    def __init__(self, function: LoopsFunction) -> None:
+        """Take a function; raises UsageError."""
+        self._function = _callable("loops", function)
+        self._size = 0
+
+    def __call__(self, rgb: npt.NDArray[np.uint8]) -> PlaceVector:
+        """Return the unit vector of an image.
+
+        Raises:
+            UsageError: The function failed, or returned no such vector.
+        """
+        vector = _numbers_of("loops", _called("loops", self._function, rgb), (-1,))
+        length = float(np.linalg.norm(vector))
+        self._size = self._size or len(vector)
+        if len(vector) != self._size or not _MIN_PLACE <= len(vector) <= _MAX_PLACE or not length > 0.0:
+            raise UsageError(
+                f"the loops function returned {len(vector)} numbers of length {length:g}",
+                hint=f"return a vector of {_MIN_PLACE} to {_MAX_PLACE} numbers, always as many, not all 0",
+            )
+        return (vector / length).astype(np.float32)
+
+
+class OptimiserSlot:
+    """An optimiser with its checks; it is called as `client_sdk.monocular.bundle.adjust` is."""
+
+    def __init__(self, function: OptimiserFunction) -> None:
+        """Take a function; raises UsageError."""
+        self._function = _callable("optimiser", function)
+
+    def __call__(self, bundle: Bundle, camera: Camera, *, iterations: int = 8) -> tuple[Array, Array]:
+        """Return the adjusted poses ``T_camera_world`` and points.
+
+        Raises:
+            UsageError: The function failed, or returned no poses and points of these numbers.
+        """
+        returned = _called("optimiser", self._function, bundle, camera, iterations)
+        if not isinstance(returned, tuple) or len(returned) != 2:
+            raise UsageError(
+                f"the optimiser function returned {type(returned).__name__}, not poses and points",
+                hint="return T_camera_world and points_world of the bundle, adjusted",
+            )
+        poses = _numbers_of("optimiser", returned[0], bundle.T_camera_world.shape)
+        points = _numbers_of("optimiser", returned[1], bundle.points_world.shape)
+        made = [rigid(pose) for pose in poses]
+        if any(pose is None for pose in made):
+            raise UsageError(
+                "the optimiser function returned a matrix that is no pose", hint="keep rotations orthonormal"
+            )
+        return np.array(made).reshape(-1, 4, 4), points
+
+
+def _callable(slot: str, function: Any) -> Any:
+    if not callable(function):
+        raise UsageError(
+            f"{slot}= takes a function, not a {type(function).__name__}", hint="see docs/own_parts.md"
+        )
+    return function
+
+
+def _called(slot: str, function: Callable[..., Any], *arguments: Any) -> Any:
+    try:
+        return function(*arguments)
+    except Exception as error:
+        raise UsageError(
+            f"the {slot} function failed: {type(error).__name__}: {_line(error)}",
+            hint="call it with values of your own, or see docs/own_parts.md",
+        ) from error
+
+
+def _numbers_of(slot: str, given: Any, shape: tuple[int, ...]) -> Array:
+    """Return finite numbers of a shape, of which -1 is free; raises UsageError."""
+    try:
+        array = np.asarray(given, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise UsageError(f"the {slot} function returned no numbers", hint="return an array") from error
+    fits = array.ndim == len(shape) and all(b in (-1, a) for a, b in zip(array.shape, shape, strict=True))
+    if not fits or not np.isfinite(array).all():
+        raise UsageError(
+            f"the {slot} function returned an array of shape {array.shape}, or numbers that are not finite",
+            hint=f"return finite numbers of shape {shape}".replace("-1", "n"),
+        )
+    return array
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Slots:
+    """The parts of a tracker that its user brought; None for the built-in ones."""
+
+    features: FeaturesSlot | None = None
+    motion: MotionSlot | None = None
+    loops: LoopsSlot | None = None
+    optimiser: OptimiserSlot | None = None
+
+    @classmethod
+    def of(
+        cls,
+        *,
+        features: FeaturesFunction | None = None,
+        motion: MotionFunction | None = None,
+        loops: LoopsFunction | None = None,
+        optimiser: OptimiserFunction | None = None,
+    ) -> Slots:
+        """Return the slots of these functions.
+
+        Raises:
+            UsageError: One is no function, or the features have no name.
+        """
+        return cls(
+            features=None if features is None else FeaturesSlot(features),
+            motion=None if motion is None else MotionSlot(motion),
+            loops=None if loops is None else LoopsSlot(loops),
+            optimiser=None if optimiser is None else OptimiserSlot(optimiser),
         )
 
 

@@ -101,7 +101,7 @@ def run(folder: Path, out: Path, rounds: int) -> dict[str, Any]:
 def run_feature_robot(spec: RobotSpec, pipe: Connection) -> None:
     """Run a robot of the demo on frames whose features were computed beforehand; entry point of a process."""
     frames, features, truth = _read(Path(os.environ[_FEATURES]), spec.number)
-    frontend.extract = lambda frame, options: features[frame.timestamp_s]  # type: ignore[assignment]
+    frontend.extract = lambda frame, options, slot=None: features[frame.timestamp_s]  # type: ignore[assignment]
     mapping.PointMap.add = lambda *_: 0  # type: ignore[assignment, method-assign]
     demo_robot._load = lambda *_: (frames, truth, "ground truth")  # type: ignore[assignment]
     demo_robot.run_robot(spec, pipe)

@@ -31,7 +31,7 @@ from client_sdk.live.sender import REFUSALS, KeyframeSender, LiveCaller, Myself
 from client_sdk.live.waiting_keyframes import Base, WaitingKeyframe, WaitingKeyframes
 from client_sdk.mapper import AskPose, Mapper
 from client_sdk.mapping import MapOptions, PointMap, Trajectory
-from client_sdk.slots import FeaturesFunction
+from client_sdk.slots import FeaturesFunction, LoopsFunction, MotionFunction
 from rse_pf.errors import BadMessage, BadRequest, RsePfError, UnsupportedProtocol, UsageError
 from rse_pf.geometry import Array, Camera, pose_difference
 from rse_pf.slam.keyframe import MAX_FEATURES, Keyframe, encode_keyframe, make_features, most_features
@@ -136,6 +136,8 @@ class LiveMapper:
         map_options: MapOptions | None = None,
         T_world_start: Array | None = None,
         features: FeaturesFunction | None = None,
+        motion: MotionFunction | None = None,
+        loops: LoopsFunction | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         """Describe the robot's part of a live map; ``async with`` joins it.
@@ -152,10 +154,13 @@ class LiveMapper:
             map_options: Density of the robot's own cloud, to which keyframes are added.
             T_world_start: ``(4, 4)``, pose of the first camera in the odometry frame; None: the identity.
             features: Finds the features of an image; None for ORB.  All robots of a map use the same.
+            motion: Expects the pose of the next frame; None for a constant velocity.
+            loops: Describes an image, so that this robot finds its own places again; other robots are found
+                by the features.
             clock: Seconds, monotonic.
 
         Raises:
-            UsageError: *features* is no function, or has no name.
+            UsageError: One of these is no function, or *features* has no name.
         """
         self.name = name
         self.options = live or LiveOptions()
@@ -167,7 +172,8 @@ class LiveMapper:
         self._mapper = Mapper(
             ask=self._ask_first, camera=camera, depth=True,
             options=replace(options or FrontEndOptions.live(), segment_after=_NEVER), map_options=map_options,
-            T_world_start=T_world_start, adds_frames=False, features=features,
+            T_world_start=T_world_start, adds_frames=False, features=features, motion=motion,
+            loops=loops,
         )  # fmt: skip
         self._alignments = Alignments()
         self._segment = 0

@@ -7,13 +7,14 @@ system has six rows for each free camera.  Deterministic.  It does not decide wh
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
 
 from rse_pf.geometry import Array, Camera, exp_se3
 
-__all__ = ["Bundle", "adjust"]
+__all__ = ["Adjuster", "Bundle", "adjust"]
 
 Rows = npt.NDArray[np.int64]
 
@@ -46,6 +47,13 @@ class Bundle:
     points: Rows
     pixels: Array
     sigma_px: Array
+
+
+class Adjuster(Protocol):
+    """What adjusts a bundle as `adjust` does."""
+
+    def __call__(self, bundle: Bundle, camera: Camera, *, iterations: int = 8) -> tuple[Array, Array]:
+        """Return adjusted poses and points."""
 
 
 def adjust(bundle: Bundle, camera: Camera, *, iterations: int = 8) -> tuple[Array, Array]:

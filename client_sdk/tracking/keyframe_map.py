@@ -11,10 +11,10 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
+from client_sdk.tracking.place import Place
 from rse_pf.geometry import Array, Camera, transform
 from rse_pf.maps.descriptors import Descriptors
 from rse_pf.pnp import DepthNoise
-from rse_pf.slam.places import place_vector
 from rse_pf.slam.tracking import ImageFeatures, SoughtFeatures
 
 __all__ = ["NO_LANDMARK", "Expected", "KeyframeMap", "Landmarks", "View", "expect", "measure_points"]
@@ -43,6 +43,7 @@ class View:
     points_camera: Array
     sways: Array
     camera: Camera
+    place: Place
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -166,7 +167,7 @@ class KeyframeMap:
         keyframe = _Keyframe(view=view, landmarks=landmarks, own=np.sort(landmarks[landmarks != NO_LANDMARK]))
         self._keyframes.append(keyframe)
         self._poses = np.concatenate([self._poses, T_world_camera[None]])
-        place = place_vector(descriptors)[None]
+        place = view.place.vector()[None]
         self._places = np.concatenate([self._places, place]) if len(self._places) else place
         return landmarks
 
@@ -183,9 +184,9 @@ class KeyframeMap:
         newest = len(self._keyframes) - 1
         return chosen if newest in chosen else [*chosen, newest]
 
-    def most_alike(self, descriptors: Descriptors, count: int) -> list[int]:
-        """Return the *count* keyframes that look most like ``(n, d)`` descriptors, best first."""
-        alike: list[int] = np.argsort(-(self._places @ place_vector(descriptors)), kind="stable").tolist()
+    def most_alike(self, place: Place, count: int) -> list[int]:
+        """Return the *count* keyframes that look most like an image, best first."""
+        alike: list[int] = np.argsort(-(self._places @ place.vector()), kind="stable").tolist()
         return alike[:count]
 
     def landmarks_of(self, keyframes: list[int]) -> Landmarks:

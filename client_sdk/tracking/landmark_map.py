@@ -12,11 +12,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from client_sdk.monocular.bundle import Bundle, adjust
+from client_sdk.monocular.bundle import Adjuster, Bundle, adjust
 from client_sdk.tracking.keyframe_map import NO_LANDMARK, Landmarks, expect
+from client_sdk.tracking.place import Place
 from rse_pf.geometry import Array, Camera, exp_se3, inverse, log_se3, transform
 from rse_pf.maps.descriptors import Descriptors
-from rse_pf.slam.places import PlaceVector, place_vector
+from rse_pf.slam.places import PlaceVector
 from rse_pf.slam.tracking import ImageFeatures, NearLimits, match_near
 from rse_pf.slam.triangulation import parallax_deg, reprojection_errors, triangulate
 
@@ -62,10 +63,11 @@ class LandmarkLimits:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ViewFeatures:
-    """Features of one image, and their ``(n, 3)`` uint8 colours."""
+    """Features of one image, their ``(n, 3)`` uint8 colours, and its place."""
 
     image: ImageFeatures
     colours: npt.NDArray[np.uint8]
+    place: Place
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
@@ -79,10 +81,13 @@ class _Keyframe:
 
 
 class LandmarkMap:
-    """Keyframes and landmarks; ``camera`` took all of them."""
+    """Keyframes and landmarks; ``camera`` took all of them, and *adjuster* adjusts them as `adjust` does."""
 
-    def __init__(self, camera: Camera, limits: LandmarkLimits | None = None) -> None:
+    def __init__(
+        self, camera: Camera, limits: LandmarkLimits | None = None, adjuster: Adjuster = adjust
+    ) -> None:
         self.camera = camera
+        self._adjust_bundle = adjuster
         self.limits = limits or LandmarkLimits()
         self.keyframes: list[_Keyframe] = []
         self.points: Array = np.empty((0, 3))
@@ -106,7 +111,7 @@ class LandmarkMap:
                 features=features,
                 T_camera_world=T_camera_world,
                 landmarks=landmarks.copy(),
-                place=place_vector(features.image.descriptors),
+                place=features.place.vector(),
             )
         )
         seen = np.flatnonzero(landmarks != NO_LANDMARK)
@@ -151,10 +156,10 @@ class LandmarkMap:
         """Return the landmarks of a keyframe and of those that share landmarks with it."""
         return np.unique(np.concatenate([self.landmarks_of(keyframe) for keyframe in self.local(number)]))
 
-    def most_alike(self, descriptors: Descriptors, among: Rows) -> list[int]:
-        """Return keyframes of *among* in the order of how much they look like ``(n, d)`` descriptors."""
+    def most_alike(self, place: Place, among: Rows) -> list[int]:
+        """Return keyframes of *among* in the order of how much they look like an image."""
         places = np.stack([self.keyframes[number].place for number in among])
-        alike: list[int] = among[np.argsort(-(places @ place_vector(descriptors)), kind="stable")].tolist()
+        alike: list[int] = among[np.argsort(-(places @ place.vector()), kind="stable")].tolist()
         return alike
 
     def landmarks_in(self, number: int) -> tuple[Rows, Descriptors]:
@@ -448,13 +453,13 @@ class LandmarkMap:
     def _adjusted(self, bundle: Bundle, iterations: int) -> Bundle:
         """Return a bundle after its adjustment: by its landmarks that are seen most, if there are many."""
         if len(bundle.points_world) <= self.limits.in_all:
-            poses, points = adjust(bundle, self.camera, iterations=iterations)
+            poses, points = self._adjust_bundle(bundle, self.camera, iterations=iterations)
             return replace(bundle, T_camera_world=poses, points_world=points)
         seen = np.bincount(bundle.points, minlength=len(bundle.points_world))
         takes_part = np.zeros(len(seen), dtype=bool)
         takes_part[np.argsort(-seen, kind="stable")[: self.limits.in_all]] = True
         rows = takes_part[bundle.points]
-        poses, points = adjust(
+        poses, points = self._adjust_bundle(
             replace(
                 bundle, cameras=bundle.cameras[rows], points=bundle.points[rows], pixels=bundle.pixels[rows],
                 sigma_px=bundle.sigma_px[rows],
@@ -463,7 +468,7 @@ class LandmarkMap:
         )  # fmt: skip
         bundle = replace(bundle, T_camera_world=poses, points_world=points)
         everywhere = replace(bundle, is_fixed=np.ones(len(poses), dtype=bool))
-        _, points = adjust(everywhere, self.camera, iterations=iterations)
+        _, points = self._adjust_bundle(everywhere, self.camera, iterations=iterations)
         return replace(bundle, points_world=points)
 
 

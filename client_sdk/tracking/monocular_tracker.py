@@ -23,11 +23,13 @@ from client_sdk.frontend import (
     round_for_wire,
 )
 from client_sdk.mapping import Trajectory
+from client_sdk.monocular.bundle import adjust
 from client_sdk.monocular.descriptors import match_all
 from client_sdk.monocular.two_view import TwoViewStart, start_from_two_views
-from client_sdk.slots import FeaturesSlot
+from client_sdk.slots import Slots
 from client_sdk.tracking.keyframe_map import NO_LANDMARK, expect
 from client_sdk.tracking.landmark_map import MIN_SHARED, LandmarkLimits, LandmarkMap, ViewFeatures, scaled
+from client_sdk.tracking.place import place_of
 from client_sdk.tracking.queries import Answer, OneQuery, Steps
 from client_sdk.tracking.tracker import Join
 from rse_pf.errors import UsageError
@@ -206,10 +208,10 @@ class MonocularTracker:
         self,
         options: MonocularOptions | None = None,
         T_world_start: Array | None = None,
-        features: FeaturesSlot | None = None,
+        slots: Slots | None = None,
     ) -> None:
         self.options = options or MonocularOptions()
-        self._slot = features
+        self._slots = slots or Slots()
         self.frames = 0
         self.lost_frames = 0
         self.starting_frames = 0
@@ -250,7 +252,7 @@ class MonocularTracker:
         self.frames += 1
         self._frame = frame
         wider = max(1.0, frame.camera.width / _FEATURES_OF_PX)
-        return self._open.begin(self._track(_extract(frame, self._feature_count(wider), self._slot)))
+        return self._open.begin(self._track(_extract(frame, self._feature_count(wider), self._slots)))
 
     def accept(
         self, query: PoseQuery, T_camera_world: Array | None, inliers: int = 0, *, is_weak: bool = False
@@ -345,13 +347,20 @@ class MonocularTracker:
             matched = self._matched_with_last(features, self._last)
         else:
             radius = self.options.search_px * (_WIDER if how == "wide" else 1.0)
-            T_expected = self._motion @ self._last.T_camera_world
+            T_expected = self._expected(self._last)
             matched = _matched_near(self._own, features, T_expected, NearLimits(radius_px=radius))
             least *= _MANY
         if len(matched) < least:
             return None, f"only {len(matched)} matches with the map"
         answer = yield self._make_query(self._own, features, matched, "frame" if how == "frame" else "map")
         return self._confirm(self._own, features, answer, len(matched))
+
+    def _expected(self, last: _Posed) -> Array:
+        """Return ``T_camera_world`` as a user's motion function expects it, else by a constant velocity."""
+        motion = self._slots.motion
+        T = None if motion is None else motion.expected(self._frame.timestamp_s)
+        expected: Array = self._motion @ last.T_camera_world if T is None else inverse(T)
+        return expected
 
     def _matched_with_last(self, features: ViewFeatures, last: _Posed) -> _Matched:
         rows = np.flatnonzero(last.landmarks != NO_LANDMARK)
@@ -387,7 +396,7 @@ class MonocularTracker:
         """Yield the keyframes that may show what a frame shows: (segment, number)."""
         for segment, known in self._segments.items():
             count = len(known.map.keyframes)
-            numbers = known.map.most_alike(features.image.descriptors, np.arange(count))[:_ALIKE]
+            numbers = known.map.most_alike(features.place, np.arange(count))[:_ALIKE]
             if segment == self._segment:
                 numbers = [*range(count - 1, max(-1, count - 1 - _LATEST), -1), *numbers]
             yield from ((segment, number) for number in dict.fromkeys(numbers))
@@ -404,9 +413,9 @@ class MonocularTracker:
             (segment, number)
             for segment, known in self._segments.items()
             if segment != self._segment
-            for number in known.map.most_alike(
-                posed.features.image.descriptors, np.arange(len(known.map.keyframes))
-            )[:_ALIKE]
+            for number in known.map.most_alike(posed.features.place, np.arange(len(known.map.keyframes)))[
+                :_ALIKE
+            ]
         ]
         similar = yield from self._seek_place(posed, everywhere)
         if similar is None:
@@ -431,11 +440,13 @@ class MonocularTracker:
         apart = np.flatnonzero(own.shared_with(newest)[: max(0, newest - _LOOP_AGE)] < MIN_SHARED)
         if not len(apart) or newest < self._loop_from:
             return
-        alike = own.most_alike(posed.features.image.descriptors, apart)[:_LOOP_ALIKE]
+        alike = own.most_alike(posed.features.place, apart)[:_LOOP_ALIKE]
         similar = yield from self._seek_place(posed, [(self._segment, number) for number in alike])
         if similar is None:
             return
         self._motion = scaled(self._motion, similar.scale)
+        if self._slots.motion is not None:
+            self._slots.motion.clear()
         self._merge_places(similar.keyframe, newest, similar)
         self.loops += 1
         self._loop_from = newest + _LOOP_AGE
@@ -510,6 +521,8 @@ class MonocularTracker:
 
     def _move_last(self, T_new_old: Array, scale: float, first_landmark: int = 0) -> None:
         self._motion = scaled(self._motion, scale)
+        if self._slots.motion is not None:
+            self._slots.motion.clear()
         if self._last is not None:
             moved = np.where(
                 self._last.landmarks == NO_LANDMARK, NO_LANDMARK, self._last.landmarks + first_landmark
@@ -656,7 +669,7 @@ class MonocularTracker:
         """Begin a segment with two views; place the frames between them."""
         first_s, first = self._waiting[0]
         unit = _START_DEPTH / float(np.median(views.points[:, 2]))
-        made = LandmarkMap(self._frame.camera, self.options.limits)
+        made = LandmarkMap(self._frame.camera, self.options.limits, self._slots.optimiser or adjust)
         made.add_keyframe(first, np.eye(4), np.full(len(first.image), NO_LANDMARK))
         pose = scaled(views.T_second_first, unit)
         made.add_keyframe(features, pose, np.full(len(features.image), NO_LANDMARK))
@@ -711,6 +724,10 @@ class MonocularTracker:
             own.refer_to(number)
             made = own.map.keyframes[number]
             posed = replace(posed, T_camera_world=made.T_camera_world, landmarks=made.landmarks)
+        if self._slots.motion is not None:
+            if self._last is None or keyframe:  # lost before, or the map was adjusted
+                self._slots.motion.clear()
+            self._slots.motion.add(self._frame.timestamp_s, inverse(posed.T_camera_world))
         self._last = posed
         return keyframe
 
@@ -766,9 +783,9 @@ def _agree(one: _Similarity, two: _Similarity, centre: Array, depth: float) -> b
     return apart <= _AGREE_DEPTH * depth and apart_deg <= _AGREE_DEG and ratio <= _AGREE_SCALE
 
 
-def _extract(frame: Frame, count: int, slot: FeaturesSlot | None) -> ViewFeatures:
+def _extract(frame: Frame, count: int, slots: Slots) -> ViewFeatures:
     """Return features that are spread over the image."""
-    described = describe(frame.rgb, count, slot=slot)
+    described = describe(frame.rgb, count, slot=slots.features)
     last = np.array([frame.camera.width - 1, frame.camera.height - 1])
     columns, rows = np.clip(np.rint(described.pixels).astype(np.int64), 0, last).T
     image = ImageFeatures(
@@ -776,4 +793,5 @@ def _extract(frame: Frame, count: int, slot: FeaturesSlot | None) -> ViewFeature
         sizes=described.sizes, distinct=distinct_distances(described.descriptors, described.pixels),
         is_oriented=described.is_oriented, is_scaled=described.is_scaled,
     )  # fmt: skip
-    return ViewFeatures(image=image, colours=frame.rgb[rows, columns])
+    place = place_of(described.descriptors, frame.rgb, slots.loops)
+    return ViewFeatures(image=image, colours=frame.rgb[rows, columns], place=place)

@@ -23,9 +23,10 @@ from client_sdk.frontend import (
     round_for_wire,
 )
 from client_sdk.monocular.descriptors import match_all
-from client_sdk.slots import FeaturesSlot
+from client_sdk.slots import Slots
 from client_sdk.tracking.keyframe_map import NO_LANDMARK, KeyframeMap, Landmarks, View, expect
 from client_sdk.tracking.noise import NoiseEstimate
+from client_sdk.tracking.place import place_of
 from client_sdk.tracking.queries import Answer, OneQuery, Steps
 from client_sdk.tracking.shutter import ReadoutEstimate, sways, turn_rate, without_shutter
 from rse_pf.geometry import Array, inverse, pose_difference, rigid, transform
@@ -140,10 +141,10 @@ class Tracker:
         self,
         options: FrontEndOptions | None = None,
         T_world_start: Array | None = None,
-        features: FeaturesSlot | None = None,
+        slots: Slots | None = None,
     ) -> None:
         self.options = options or FrontEndOptions()
-        self._slot = features
+        self._slots = slots or Slots()
         self.frames = 0
         self.lost_frames = 0
         self.keyframes = 0
@@ -203,9 +204,9 @@ class Tracker:
         """
         self._open.refuse_open()
         self.frames += 1
-        self._frame, self._raw = frame, extract(frame, self.options, self._slot)
+        self._frame, self._raw = frame, extract(frame, self.options, self._slots.features)
         self._features = self._raw
-        return self._open.begin(self._track(self._turned(_view_of(frame, self._raw), self._raw, self._rate)))
+        return self._open.begin(self._track(self._turned(self._view(), self._raw, self._rate)))
 
     def accept(
         self, query: PoseQuery, T_camera_world: Array | None, inliers: int = 0, *, is_weak: bool = False
@@ -251,7 +252,7 @@ class Tracker:
         """Yield a query against what the last pose predicts, or against the last frame alone."""
         assert self._last is not None
         least = self.options.min_inliers
-        T_reference = _rotation_made(self._T_last @ self._motion) if how == "map" else self._T_last
+        T_reference = self._expected() if how == "map" else self._T_last
         if how == "map":
             seen = self._seen(view, T_reference, self.options.search_px, _NEAR)
             if len(seen) < _MANY * least:
@@ -267,6 +268,12 @@ class Tracker:
             return None, len(seen)
         image, is_next = self._image_at(view, T, is_near=True)
         return self._confirm(image, T, answer, len(seen), self._map(), is_next=is_next), len(seen)
+
+    def _expected(self) -> Array:
+        """Return ``T_world_camera`` as a user's motion function expects it, else by a constant velocity."""
+        motion = self._slots.motion
+        T = None if motion is None else motion.expected(self._frame.timestamp_s)
+        return _rotation_made(self._T_last @ self._motion) if T is None else T
 
     def _recognise(self, view: View) -> Generator[PoseQuery, Answer, tuple[_Posed | None, int]]:
         """Yield queries against the latest and the most alike keyframes of all segments."""
@@ -299,9 +306,8 @@ class Tracker:
 
     def _candidates(self, view: View) -> Iterator[tuple[int, int]]:
         """Yield the keyframes that may show what a frame shows: (segment, number)."""
-        descriptors = view.features.descriptors
         for segment, known in self._segments.items():
-            numbers = known.most_alike(descriptors, _ALIKE)
+            numbers = known.most_alike(view.place, _ALIKE)
             if segment == self._segment:
                 numbers = [*range(len(known) - 1, max(-1, len(known) - 1 - _LATEST), -1), *numbers]
             yield from ((segment, number) for number in dict.fromkeys(numbers))
@@ -312,7 +318,7 @@ class Tracker:
         for segment, known in self._segments.items():
             if segment == self._segment:
                 continue
-            for number in known.most_alike(posed.view.features.descriptors, _ALIKE):
+            for number in known.most_alike(posed.view.place, _ALIKE):
                 landmarks, descriptors = known.landmarks_in(number)
                 options.append((segment, number, _seen_anywhere(landmarks, descriptors, posed.view)))
         segment, number, seen = max(options, key=lambda option: len(option[2]))
@@ -347,6 +353,8 @@ class Tracker:
         if segment != self._segment or self._last is None:
             return
         self._segment = into
+        if self._slots.motion is not None:
+            self._slots.motion.clear()
         self._T_last = _rotation_made(T_into_segment @ self._T_last)
         last = self._last
         moved = np.where(last.landmarks == NO_LANDMARK, NO_LANDMARK, last.landmarks + first)
@@ -493,6 +501,20 @@ class Tracker:
 
     # --- the shutter ---
 
+    def _view(self) -> View:
+        """Return the image of the present frame, with its rolling shutter."""
+        features = self._raw
+        image = ImageFeatures(
+            pixels=features.pixels, descriptors=features.descriptors, turns=features.turns,
+            sizes=features.sizes, distinct=distinct_distances(features.descriptors, features.pixels),
+            is_oriented=features.is_oriented, is_scaled=features.is_scaled,
+        )  # fmt: skip
+        return View(
+            features=image, points_camera=features.points_camera, sways=np.zeros_like(features.points_camera),
+            camera=self._frame.camera,
+            place=place_of(features.descriptors, self._frame.rgb, self._slots.loops),
+        )  # fmt: skip
+
     def _interval_s(self) -> float:
         return max(_LEAST_INTERVAL_S, self._frame.timestamp_s - self._last_s)
 
@@ -504,6 +526,7 @@ class Tracker:
             points_camera=features.points_camera,
             sways=sways(raw, features.points_camera, view.camera, rate),
             camera=view.camera,
+            place=view.place,
         )
 
     def _turn_first(self, raw: Features, view: View, rate: Array) -> None:
@@ -542,6 +565,10 @@ class Tracker:
             else:
                 self._rate = turn_rate(self._T_last, T, self._interval_s(), np.zeros(3))
         self._last_s, self._first = self._frame.timestamp_s, None
+        if self._slots.motion is not None:
+            if self._lost_in_a_row or self._last is None:
+                self._slots.motion.clear()
+            self._slots.motion.add(self._frame.timestamp_s, T)
         self._features = replace(
             self._raw, pixels=posed.view.features.pixels, points_camera=posed.view.points_camera
         )
@@ -593,6 +620,9 @@ class Tracker:
             view=view, T_world_camera=start, landmarks=landmarks, inliers=0, matches=0, is_weak=False
         )
         self._first, self._last_s, self._rate = (self._raw, view), self._frame.timestamp_s, np.zeros(3)
+        if self._slots.motion is not None:
+            self._slots.motion.clear()
+            self._slots.motion.add(self._frame.timestamp_s, start)
         self._T_last, self._motion, self._place = start, np.eye(4), None
         self._lost_in_a_row, self.unrecognised, self._reference_seen = 0, 0, usable // 2
         return self._result(self._last, keyframe=True)
@@ -647,18 +677,6 @@ def _joined(first: Landmarks, second: Landmarks) -> Landmarks:
         sizes=np.concatenate([first.sizes, second.sizes]),
         numbers=np.concatenate([first.numbers, second.numbers]),
     )
-
-
-def _view_of(frame: Frame, features: Features) -> View:
-    image = ImageFeatures(
-        pixels=features.pixels, descriptors=features.descriptors, turns=features.turns, sizes=features.sizes,
-        distinct=distinct_distances(features.descriptors, features.pixels),
-        is_oriented=features.is_oriented, is_scaled=features.is_scaled,
-    )  # fmt: skip
-    return View(
-        features=image, points_camera=features.points_camera, sways=np.zeros_like(features.points_camera),
-        camera=frame.camera,
-    )  # fmt: skip
 
 
 def _rotation_made(T: Array) -> Array:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import sys
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +12,21 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from client_sdk.frontend import FrontEndOptions, describe
+from client_sdk.answers import PoseAnswer
+from client_sdk.frontend import FrontEndOptions, PoseQuery, TrackedFrame, describe
 from client_sdk.mapper import Mapper
-from client_sdk.slots import FeaturesSlot, FoundFeatures, load_features, load_function
+from client_sdk.monocular.bundle import Bundle, adjust
+from client_sdk.slots import (
+    FeaturesSlot,
+    FoundFeatures,
+    LoopsSlot,
+    OptimiserSlot,
+    Slots,
+    load_features,
+    load_function,
+)
 from rse_pf.errors import UsageError
+from rse_pf.geometry import Camera, exp_se3
 from rse_pf.maps.descriptors import ORB, DescriptorKind
 from rse_pf.maps.format import decode_map
 from tests.client_sdk.mapper.flat_world import STEP_M, frame_at
@@ -210,6 +222,170 @@ def test_orb_by_hand_is_tracked_as_well_as_the_built_in_one() -> None:
 
     assert errors(orb_by_hand) < 2.0 * errors(None) + 1e-3
     assert ORB.name != "orb_by_hand"
+
+
+# --- motion, places and the optimiser ----------------------------------------------------------
+
+
+def played(mapper: Mapper, rows: list[int], *, depth: bool = True) -> list[TrackedFrame]:
+    async def all_frames() -> list[TrackedFrame]:
+        return [await mapper.track(frame_at(row, depth=depth)) for row in rows]
+
+    return asyncio.run(all_frames())
+
+
+@pytest.mark.parametrize("depth", [True, False])
+def test_a_motion_function_gets_the_newest_poses_and_its_pose_is_used(depth: bool) -> None:
+    pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
+    asked: list[tuple[npt.NDArray[np.float64], npt.NDArray[np.float64], float]] = []
+
+    def motion(
+        stamps_s: npt.NDArray[np.float64], poses: npt.NDArray[np.float64], stamp_s: float
+    ) -> npt.NDArray[np.float64]:
+        asked.append((stamps_s, poses, stamp_s))
+        return poses[-1]
+
+    mapper = Mapper(ask=solve, motion=motion)
+    done = played(mapper, list(range(16)), depth=depth)
+
+    assert len(asked) >= 5
+    for stamps_s, poses, stamp_s in asked:
+        assert 1 <= len(stamps_s) == len(poses) <= 10
+        assert (np.diff(stamps_s) > 0).all()
+        assert stamps_s[-1] < stamp_s
+    stamps = [each.frame.timestamp_s for each in done]
+    assert asked[-1][2] == stamps[-1]
+    last = done[-2].T_world_camera
+    assert last is not None
+    if depth:
+        assert np.allclose(asked[-1][1][-1], last)
+
+
+def test_a_motion_function_that_is_far_off_costs_the_guided_match_only() -> None:
+    pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
+    kinds = Counter[str]()
+
+    async def ask(query: PoseQuery) -> PoseAnswer:
+        kinds[query.against] += 1
+        return await solve(query)
+
+    def motion(_: Any, poses: npt.NDArray[np.float64], __: float) -> npt.NDArray[np.float64]:
+        turned: npt.NDArray[np.float64] = poses[-1] @ exp_se3([0.0, 0.0, 0.0, 0.0, 2.0, 0.0])
+        return turned
+
+    done = played(Mapper(ask=ask, motion=motion), list(range(6)))
+
+    assert [each.status for each in done] == ["first", *["tracked"] * 5]
+    assert kinds["frame"] >= 5
+    assert kinds["map"] == 0
+
+
+@pytest.mark.parametrize(
+    ("returned", "why"),
+    [
+        (None, "an array of shape"),
+        (np.eye(3), r"an array of shape \(3, 3\)"),
+        (np.full((4, 4), np.nan), "not finite"),
+        (2 * np.eye(4), "a matrix that is no pose"),
+        ("text", "no numbers"),
+    ],
+)
+def test_what_is_no_pose_is_refused_and_the_next_frame_is_tracked(returned: Any, why: str) -> None:
+    pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
+    results = [returned, *[None] * 9]
+
+    def motion(_: Any, poses: npt.NDArray[np.float64], __: float) -> Any:
+        first = results.pop(0)
+        return first if len(results) == 9 else poses[-1]
+
+    mapper = Mapper(ask=solve, motion=motion)
+    played(mapper, [0])
+    with pytest.raises(UsageError, match=why) as refused:
+        played(mapper, [1])
+    assert refused.value.hint
+    assert "\n" not in refused.value.message
+    assert played(mapper, [2])[0].status == "tracked"
+
+
+@pytest.mark.parametrize("depth", [True, False])
+def test_a_loops_function_says_which_keyframes_are_tried(depth: bool) -> None:
+    pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
+    seen: list[tuple[int, ...]] = []
+
+    def mean_colours(rgb: npt.NDArray[np.uint8]) -> npt.NDArray[np.float64]:
+        seen.append(rgb.shape)
+        return rgb.reshape(-1, 3).mean(axis=0).repeat(4) + 1.0
+
+    mapper = Mapper(ask=solve, loops=mean_colours)
+    played(mapper, list(range(14)), depth=depth)
+
+    assert seen
+    assert len(seen) <= mapper.keyframes + 1
+    assert set(seen) == {frame_at(0, depth=True).rgb.shape}
+
+
+@pytest.mark.parametrize(
+    ("returned", "why"),
+    [
+        (np.zeros(64), "64 numbers of length 0"),
+        (np.ones(7), "7 numbers"),
+        (np.ones(4097), "4097 numbers"),
+        (np.ones((8, 8)), r"shape \(8, 8\)"),
+        (np.full(64, np.inf), "not finite"),
+    ],
+)
+def test_what_is_no_place_is_refused(returned: Any, why: str) -> None:
+    with pytest.raises(UsageError, match=why) as refused:
+        LoopsSlot(lambda _: returned)(IMAGE)
+    assert "\n" not in refused.value.message
+    sizes = [64, 65]
+    changing = LoopsSlot(lambda _: np.ones(sizes.pop(0)))
+    assert float(np.linalg.norm(changing(IMAGE))) == pytest.approx(1.0)
+    with pytest.raises(UsageError, match="65 numbers"):
+        changing(IMAGE)
+
+
+def test_an_optimiser_adjusts_a_camera_without_depth() -> None:
+    pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
+    sizes: list[int] = []
+
+    def own(bundle: Bundle, camera: Camera, iterations: int) -> tuple[Any, Any]:
+        sizes.append(len(bundle.pixels))
+        return adjust(bundle, camera, iterations=iterations)
+
+    with_own, built_in = Mapper(ask=solve, optimiser=own), Mapper(ask=solve)
+    for mapper in (with_own, built_in):
+        played(mapper, list(range(16)), depth=False)
+
+    assert sizes
+    assert np.allclose(with_own.trajectory.positions, built_in.trajectory.positions)
+
+
+@pytest.mark.parametrize(
+    ("returned", "why"),
+    [
+        (None, "NoneType, not poses and points"),
+        ((np.zeros((3, 4, 4)),), "not poses and points"),
+        ((np.zeros((3, 4, 4)), np.zeros((5, 3))), "a matrix that is no pose"),
+        ((np.tile(np.eye(4), (2, 1, 1)), np.zeros((5, 3))), r"shape \(2, 4, 4\)"),
+        ((np.tile(np.eye(4), (3, 1, 1)), np.full((5, 3), np.nan)), "not finite"),
+    ],
+)
+def test_an_optimiser_must_return_all_poses_and_points(returned: Any, why: str) -> None:
+    bundle = Bundle(
+        T_camera_world=np.tile(np.eye(4), (3, 1, 1)), is_fixed=np.ones(3, dtype=bool),
+        points_world=np.zeros((5, 3)), cameras=np.zeros(0, np.int64), points=np.zeros(0, np.int64),
+        pixels=np.zeros((0, 2)), sigma_px=np.zeros(0),
+    )  # fmt: skip
+    with pytest.raises(UsageError, match=why) as refused:
+        OptimiserSlot(lambda *_: returned)(bundle, frame_at(0, depth=True).camera)
+    assert "\n" not in refused.value.message
+
+
+def test_only_functions_are_slots() -> None:
+    for slot in ("motion", "loops", "optimiser"):
+        with pytest.raises(UsageError, match=f"{slot}= takes a function, not a int"):
+            Slots.of(**{slot: 3})  # type: ignore[arg-type]
 
 
 # --- names on the command line -----------------------------------------------------------------

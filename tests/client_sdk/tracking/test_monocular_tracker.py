@@ -16,6 +16,7 @@ from client_sdk.mapping import Trajectory
 from client_sdk.tracking.keyframe_map import NO_LANDMARK
 from client_sdk.tracking.landmark_map import LandmarkMap, ViewFeatures
 from client_sdk.tracking.monocular_tracker import MonocularOptions, MonocularTracker
+from client_sdk.tracking.place import place_of
 from rse_pf.errors import PnpError, UsageError
 from rse_pf.experiments.results.trajectory_error import absolute_error
 from rse_pf.geometry import Array, Camera, exp_se3, inverse, pose_difference, transform
@@ -235,7 +236,10 @@ def map_of(poses: Array, world: Array) -> LandmarkMap:
             sizes=np.ones(len(world)), distinct=distinct_distances(descriptors, pixels),
         )  # fmt: skip
         colours = np.zeros((len(world), 3), dtype=np.uint8)
-        made.add_keyframe(ViewFeatures(image=image, colours=colours), pose, np.full(len(world), NO_LANDMARK))
+        place = place_of(image.descriptors, np.empty((0, 0, 3), dtype=np.uint8), None)
+        made.add_keyframe(
+            ViewFeatures(image=image, colours=colours, place=place), pose, np.full(len(world), NO_LANDMARK)
+        )
     rows = np.arange(len(world))
     made.add_landmarks(world, (0, rows), (1, rows))
     return made

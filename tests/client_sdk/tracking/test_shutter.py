@@ -64,7 +64,7 @@ def drive(monkeypatch: pytest.MonkeyPatch, readout_s: float, frames: int) -> tup
 def track(monkeypatch: pytest.MonkeyPatch, tracker: Tracker, number: int, features: Features) -> Array:
     """Track the image that shows the features; return its pose."""
 
-    def extract(frame: Frame, options: FrontEndOptions) -> Features:
+    def extract(frame: Frame, options: FrontEndOptions, slot: object = None) -> Features:
         return features
 
     monkeypatch.setattr(tracker_module, "extract", extract)
