@@ -22,7 +22,7 @@ import msgspec
 import numpy as np
 
 from benchmarks.live.generated_drives import GeneratedDrive, GeneratedWorld, circle
-from benchmarks.maps.recordings import ate_m
+from rse_pf.experiments.results.trajectory_error import ate_m
 from rse_pf.geometry import Array, exp_se3
 from rse_pf.live_map.events import (
     Event,

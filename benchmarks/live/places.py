@@ -26,12 +26,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from benchmarks.maps.recordings import RED_KITCHEN, Run, ate_m, drive, frame_poses
+from benchmarks.maps.recordings import RED_KITCHEN, Run, drive, frame_poses
 from client_sdk.datasets import open_dataset
 from client_sdk.frontend import Frame, FrontEndOptions, extract
 from client_sdk.simulator import SIMULATED_CAMERA, true_trajectory
 from client_sdk.simulator.camera import Painter, add_depth_noise, add_image_noise
 from client_sdk.simulator.world import make_world
+from rse_pf.experiments.results.trajectory_error import ate_m
 from rse_pf.geometry import Array, Camera, inverse, pose_difference, rotation_angle_deg, transform
 from rse_pf.live_map.measure import measure_links, reference_of_features, view_of_features
 from rse_pf.maps.format import Keyframe, MapVersion
