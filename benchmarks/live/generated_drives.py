@@ -39,7 +39,8 @@ class GeneratedDrive:
 class GeneratedWorld:
     """Robots in one building; ``seen`` has the true pose of each keyframe in the map, by id.
 
-    With ``twin_m``, what is at x looks like what is at x + ``twin_m``.
+    With ``twin_m``, what is at x looks like what is at x + ``twin_m``.  Random wrong links have
+    ``wrong_inliers``.
     """
 
     seed: int
@@ -49,6 +50,7 @@ class GeneratedWorld:
     drift_m: float = 0.003
     drift_deg: float = 0.15
     twin_m: float | None = None
+    wrong_inliers: int = 100
     seen: list[Array] = field(default_factory=list)
     owners: list[tuple[str, int]] = field(default_factory=list)
 
@@ -107,7 +109,7 @@ class GeneratedWorld:
                 other = int(self.rng.integers(0, keyframe))
                 self.wrong_sent += 1
                 off = exp_se3(np.r_[self.rng.uniform(-3, 3, 3), self.rng.uniform(-1.5, 1.5, 3)])
-                links.append(make_link(other, self.step(keyframe, other) @ off))
+                links.append(make_link(other, self.step(keyframe, other) @ off, self.wrong_inliers))
         return LinksMeasured(keyframe=keyframe, links=tuple(links))
 
     def _poses(self, count: int) -> Array:
@@ -159,11 +161,11 @@ class GeneratedWorld:
                     yield self.links_of(len(self.seen) - 1, wrong)
 
 
-def make_link(other: int, T_keyframe_other: Array) -> MeasuredLink:
-    """Return a link with the noise that the map expects."""
+def make_link(other: int, T_keyframe_other: Array, inliers: int = 100) -> MeasuredLink:
+    """Return a link with the noise that the map expects, and two thirds of its matches as inliers."""
     return MeasuredLink(
         other=other, T_keyframe_other=matrix_bytes(T_keyframe_other), information=matrix_bytes(INFORMATION),
-        inliers=100, matches=150,
+        inliers=inliers, matches=3 * inliers // 2,
     )  # fmt: skip
 
 

@@ -28,9 +28,10 @@ from benchmarks.live.generated_drives import (
     meander,
     straight,
 )
-from benchmarks.maps.recordings import Run, ate_m, drive, frame_poses, red_kitchen, truth_of
+from benchmarks.maps.recordings import Run, drive, frame_poses, red_kitchen, truth_of
 from client_sdk.datasets import Dataset, open_dataset
 from client_sdk.frontend import FrontEndOptions
+from rse_pf.experiments.results.trajectory_error import ate_m
 from rse_pf.geometry import Array, exp_se3, inverse
 from rse_pf.live_map.events import Event, KeyframeAdded, LinksMeasured, MapStarted
 from rse_pf.live_map.live_map import LiveMap
@@ -186,10 +187,21 @@ def foreign(recordings: Path, runs: int) -> None:
 
 def wrong_links(runs: int) -> None:
     """State how many random wrong links are believed, and how long four planted ones are."""
+    waited = [_plant(seed) for seed in range(runs)]
+    print(
+        f"{runs} seeds: four planted links are removed after {np.median(waited):.0f} (most {max(waited)}) "
+        "keyframes with contrary links"
+    )
+    for inliers in (100, 20):
+        believed, sent = _random_links(runs, inliers)
+        print(f"{runs} seeds: {believed} of {sent} random wrong links of {inliers} inliers believed")
+
+
+def _random_links(runs: int, inliers: int) -> tuple[int, int]:
+    """Return how many random wrong links are believed, and how many there were."""
     believed = sent = 0
-    waited = []
     for seed in range(runs):
-        world = GeneratedWorld(seed=seed)
+        world = GeneratedWorld(seed=seed, wrong_inliers=inliers)
         live_map = LiveMap()
         drives = [world.drive(name, circle(2.0, 1.0, phase)) for name, phase in (("a", 0.0), ("b", 2.0))]
         for event in world.play(drives, wrong=0.4):
@@ -198,11 +210,7 @@ def wrong_links(runs: int) -> None:
             off = inverse(T_a_b) @ inverse(world.seen[a]) @ world.seen[b]
             believed += float(np.linalg.norm(off[:3, 3])) > 0.3
         sent += world.wrong_sent
-        waited.append(_plant(seed))
-    print(
-        f"{runs} seeds: {believed} of {sent} random wrong links believed; four planted links are removed "
-        f"after {np.median(waited):.0f} (most {max(waited)}) keyframes with contrary links"
-    )
+    return believed, sent
 
 
 def _plant(seed: int) -> int:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -18,7 +18,14 @@ from rse_pf.live_map.graph import Graph, LiveLink
 from rse_pf.live_map.options import LiveMapOptions
 from rse_pf.slam.consistency import LinkEnds, fits_prediction, largest_clique, round_trips_close
 
-__all__ = ["agreeing_between", "agreeing_by_odometry", "has_enough_ends", "judge_within"]
+__all__ = [
+    "agreeing_between",
+    "agreeing_by_odometry",
+    "has_enough_ends",
+    "is_strong",
+    "judge_within",
+    "weight_of",
+]
 
 _CONTRARY_LINKS = 24
 
@@ -44,7 +51,7 @@ def agreeing_between(
         # So that the links that are tested reach farther than a room.
         numbers = _spread(graph, numbers, one, 3.0 * graph.equal_rooms_m / options.tested_links)
     numbers = _tested(graph, numbers, options)
-    if len(numbers) < options.min_links:
+    if weight_of(graph, numbers, options) < options.min_links:
         return []
     for place, number in enumerate(numbers):
         unknown = [each for each in numbers[:place] if (each, number) not in graph.agreements]
@@ -55,16 +62,16 @@ def agreeing_between(
     for j, later in enumerate(numbers):
         for i, earlier in enumerate(numbers[:j]):
             agree[i, j] = agree[j, i] = graph.agreements[earlier, later]
-    return [numbers[row] for row in largest_clique(agree).tolist()]
+    return _heaviest(graph, numbers, agree, options)
 
 
 def has_enough_ends(graph: Graph, numbers: Sequence[int], options: LiveMapOptions) -> bool:
-    """Return whether links are many enough, and from different keyframes on both sides.
+    """Return whether links weigh enough, and are from different keyframes on both sides.
 
     The sides are components; or segments, within one component; or the keyframes that were measured and those
     they were compared with, within one segment.
     """
-    if len(numbers) < options.min_links:
+    if weight_of(graph, numbers, options) < options.min_links:
         return False
     first = graph.links[numbers[0]]
     is_within = graph.component_of(first.a) == graph.component_of(first.b)
@@ -77,6 +84,16 @@ def has_enough_ends(graph: Graph, numbers: Sequence[int], options: LiveMapOption
         measured.add(a if on_side else b)
         others.add(b if on_side else a)
     return min(len(measured), len(others)) >= options.min_ends
+
+
+def weight_of(graph: Graph, numbers: Iterable[int], options: LiveMapOptions) -> float:
+    """Return how much links count together: 1 for each that is strong, less for others."""
+    return sum(graph.links[number].weight(options.strong) for number in numbers)
+
+
+def is_strong(graph: Graph, number: int, options: LiveMapOptions) -> bool:
+    """Return whether a link counts whole."""
+    return graph.links[number].weight(options.strong) == 1.0
 
 
 def judge_within(
@@ -120,6 +137,18 @@ def agreeing_by_odometry(
         agree[j, :j] = _trips_close(graph, graph.T_odom, before, ends[near[j]], None, options)
     clique = largest_clique(agree | agree.T) if len(near) else near
     return sorted([number, *(others[near[each]] for each in clique.tolist())])
+
+
+def _heaviest(
+    graph: Graph, numbers: Sequence[int], agree: npt.NDArray[np.bool_], options: LiveMapOptions
+) -> list[int]:
+    """Return the largest set of *numbers* that agree, or that of the strong ones if it weighs more."""
+    strong = np.flatnonzero([is_strong(graph, number, options) for number in numbers])
+    every = [numbers[row] for row in largest_clique(agree).tolist()]
+    if len(strong) == len(numbers):
+        return every
+    of_strong = [numbers[strong[row]] for row in largest_clique(agree[np.ix_(strong, strong)]).tolist()]
+    return max(every, of_strong, key=lambda each: weight_of(graph, each, options))
 
 
 _Ends = tuple[int, int, Array, Array]

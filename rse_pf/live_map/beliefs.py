@@ -13,7 +13,9 @@ from rse_pf.live_map.agreement import (
     agreeing_between,
     agreeing_by_odometry,
     has_enough_ends,
+    is_strong,
     judge_within,
+    weight_of,
 )
 from rse_pf.live_map.graph import Graph, Segment
 from rse_pf.live_map.options import LiveMapOptions
@@ -25,6 +27,8 @@ __all__ = ["Changes", "disbelieve_contradicting", "judge_again", "judge_links", 
 _DOUBTFUL = 30.0
 """Squared misfit of a link, six degrees of freedom: one true link in 25,000 has more."""
 _JUDGED_AFTER_JOIN = 48
+_FIXED = 1e9
+"""Weight of links that are never removed."""
 _CONTRADICTIONS = 16
 """Of the last 32 keyframes of a robot; honest robots, also with 10 % of wheel slip, stay far below."""
 
@@ -49,10 +53,20 @@ def judge_links(graph: Graph, keyframe: int, numbers: list[int], options: LiveMa
     here = graph.component_of(keyframe)
     others = {number: _other_end(graph, number, keyframe) for number in numbers}
     within = [number for number in numbers if graph.component_of(others[number]) == here]
-    _judge_within(graph, within, options, changes)
+    _judge_within(graph, _strongest(graph, within, options), options, changes)
     for component in sorted({graph.component_of(i) for i in others.values()} - {here}):
         _try_join(graph, graph.component_of(keyframe), component, options, changes)
     return changes
+
+
+def _strongest(graph: Graph, numbers: list[int], options: LiveMapOptions) -> list[int]:
+    """Return the links of one keyframe without those beside a strong one to the same segment.
+
+    They would tell nothing new, at the cost of another judgement.
+    """
+    strong = [number for number in numbers if is_strong(graph, number, options)]
+    tied = {int(graph.of_segment[graph.links[number].b]) for number in strong}
+    return [n for n in numbers if n in strong or int(graph.of_segment[graph.links[n].b]) not in tied]
 
 
 def judge_again(graph: Graph, options: LiveMapOptions) -> Iterator[Changes]:
@@ -149,8 +163,13 @@ def _judge_within(graph: Graph, numbers: list[int], options: LiveMapOptions, cha
     changes.verdicts |= {
         "lookalike" if _is_lookalike(graph, number) else verdict
         for number, verdict in zip(numbers, verdicts, strict=True)
+        if is_strong(graph, number, options)
     }
-    _believe(graph, [n for n, verdict in zip(numbers, verdicts, strict=True) if verdict == "agrees"], changes)
+    agreeing = [number for number, verdict in zip(numbers, verdicts, strict=True) if verdict == "agrees"]
+    _believe(graph, [number for number in agreeing if is_strong(graph, number, options)], changes)
+    for number in agreeing:
+        if graph.links[number].state == "open" and not _has_strong_beside(graph, number, options):
+            _believe(graph, [number], changes)
     for number, verdict in zip(numbers, verdicts, strict=True):
         if verdict == "agrees" or number not in graph.links or graph.links[number].state != "open":
             continue
@@ -163,6 +182,18 @@ def _judge_within(graph: Graph, numbers: list[int], options: LiveMapOptions, cha
                 _believe(graph, agreeing, changes)
         else:
             _refute(graph, number, options, changes)
+
+
+def _has_strong_beside(graph: Graph, number: int, options: LiveMapOptions) -> bool:
+    """Return whether a strong believed link ties a keyframe of a link to the segment of the other one."""
+    link = graph.links[number]
+    for one, other in ((link.a, link.b), (link.b, link.a)):
+        for each in graph.links_at(one):
+            beside = graph.links[each]
+            end = beside.b if beside.a == one else beside.a
+            if graph.of_segment[end] == graph.of_segment[other] and is_strong(graph, each, options):
+                return True
+    return False
 
 
 def _refute(graph: Graph, number: int, options: LiveMapOptions, changes: Changes) -> None:
@@ -186,7 +217,7 @@ def _refute(graph: Graph, number: int, options: LiveMapOptions, changes: Changes
             each for each in _loops(graph, one)
             if each not in agreeing_by_odometry(graph, number, [each], options)
         ]  # fmt: skip
-        if contrary and len(contrary) < len(agreeing):
+        if contrary and weight_of(graph, contrary, options) < weight_of(graph, agreeing, options):
             _remove(graph, contrary, reason, changes)
             _believe(graph, agreeing, changes)
         return
@@ -194,14 +225,14 @@ def _refute(graph: Graph, number: int, options: LiveMapOptions, changes: Changes
         return
     refuted = False
     while graph.segments[one].component == graph.segments[other].component:
-        weakest = _weakest_bridge(graph, one, other)
-        if not weakest or len(weakest) >= len(agreeing):
+        weakest = _weakest_bridge(graph, one, other, options)
+        if not weakest or weight_of(graph, weakest, options) >= weight_of(graph, agreeing, options):
             break
         _remove(graph, weakest, reason, changes)
         refuted = True
     if refuted and graph.segments[one].component != graph.segments[other].component:
         _try_join(graph, graph.segments[one].component, graph.segments[other].component, options, changes)
-    elif not refuted and len(agreeing) >= options.lookalike_links:
+    elif not refuted and weight_of(graph, agreeing, options) >= options.lookalike_links:
         apart_m, walked = _off_m(graph, number), graph.walks(link.a, [link.b])[link.b]
         if apart_m > max(options.lookalike_m, walked * options.spacing_m * options.worst_drift):
             _note_lookalikes(graph, agreeing, apart_m, options, changes)
@@ -230,21 +261,21 @@ def _off_m(graph: Graph, number: int) -> float:
     return float(np.sqrt((off[:3, 3] ** 2).sum()))
 
 
-def _weakest_bridge(graph: Graph, one: int, other: int) -> list[int]:
-    """Return the fewest links that connect two segments on the path between *one* and *other* that has most.
+def _weakest_bridge(graph: Graph, one: int, other: int, options: LiveMapOptions) -> list[int]:
+    """Return the lightest links that connect two segments on the heaviest path between *one* and *other*.
 
     Links of the version that the map started from are never removed.
     """
     bridges = {pair: numbers for pair, numbers in graph.bridges().items() if pair[0] != pair[1]}
     strength = {
-        pair: len(numbers) + (10**9 if any(graph.links[n].fixed for n in numbers) else 0)
+        pair: _FIXED if any(graph.links[n].fixed for n in numbers) else weight_of(graph, numbers, options)
         for pair, numbers in bridges.items()
     }
     for least in sorted(set(strength.values()), reverse=True):
         path = _path(one, other, [pair for pair in strength if strength[pair] >= least])
         if path:
             pair = min(path, key=lambda each: (strength[each], each))
-            return [] if strength[pair] >= 10**9 else bridges[pair]
+            return [] if strength[pair] == _FIXED else bridges[pair]
     return []
 
 
@@ -304,7 +335,8 @@ def _ambiguity(graph: Graph, one: int, other: int, agreeing: list[int], options:
     if size_m and min(_spread_m(graph, telling, side) for side in (one, other)) <= size_m:
         return f"ambiguous: what it shares with others lies within {size_m:g} m, the size of equal rooms"
     rivals = agreeing_between(graph, one, other, options, frozenset(agreeing))
-    if 2 * len(rivals) >= len(agreeing) and has_enough_ends(graph, rivals, options):
+    are_many = 2.0 * weight_of(graph, rivals, options) >= weight_of(graph, agreeing, options)
+    if are_many and has_enough_ends(graph, rivals, options):
         first, second = (
             median_pose(np.array([_proposed(graph, n, one) for n in each])) for each in (agreeing, rivals)
         )
@@ -347,7 +379,7 @@ def _note_lookalikes(
     for pair, beside in sorted(graph.bridges().items()):
         fixed = any(graph.links[number].fixed for number in beside)
         telling = [number for number in beside if not _is_lookalike(graph, number)]
-        if pair[0] != pair[1] and not fixed and len(telling) < options.min_links:
+        if pair[0] != pair[1] and not fixed and weight_of(graph, telling, options) < options.min_links:
             _remove(graph, beside, "ambiguous: both ends look like another place", changes)
             for row in pair:
                 graph.segments[row].reason = "ambiguous: what it saw is in the map at several places"

@@ -19,6 +19,7 @@ import numpy.typing as npt
 from rse_pf.errors import BadRequest, message_of
 from rse_pf.geometry import Array
 from rse_pf.live_map.events import camera_of
+from rse_pf.slam.consistency import StrongLink
 from rse_pf.slam.keyframe_v1 import CameraNumbers, keyframe_of_v1
 
 __all__ = ["Graph", "LiveKeyframe", "LiveLink", "Segment", "variances_of"]
@@ -89,6 +90,10 @@ class LiveLink:
     fixed: bool = False
     state: LinkState = "open"
     doubts: int = 0
+
+    def weight(self, strong: StrongLink) -> float:
+        """Return how much the link counts, within 0..1; those of a version count whole."""
+        return 1.0 if self.fixed else strong.weight_of(self.inliers, self.matches)
 
 
 class Graph:

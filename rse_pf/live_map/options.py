@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from rse_pf.errors import ConfigurationError
-from rse_pf.slam.consistency import OdometryNoise
+from rse_pf.slam.consistency import OdometryNoise, StrongLink
 from rse_pf.slam.relative_pose import RelativePoseOptions
 
 __all__ = ["LiveMapOptions"]
@@ -16,7 +16,7 @@ class LiveMapOptions:
     """How a live map decides; an owner never changes them while a map lives.
 
     Attributes:
-        min_links: Two components are joined by so many links that agree pairwise.
+        min_links: Two components are joined by so many links that agree pairwise, parts of a link added up.
         min_ends: From so many different keyframes on both sides.
         tested_links: At most so many links of a pair of components are compared, the newest.
         links_of_keyframe: At most so many of them may share a keyframe.
@@ -35,6 +35,8 @@ class LiveMapOptions:
         doubts: A link that contradicts the graph in so many updates is removed.
         open_links: So many links that are not believed are kept, the newest.
         measured: What a measured relative pose needs to become a link.
+        strong: From where on it counts whole.  Others count in part, and are believed only where none that
+            counts whole ties the same keyframe to the same segment.
         candidates: So many keyframes are compared with a new one.
         apart_steps: Keyframes of one segment that are closer than this along the way are no loop.
         vague_steps: Beyond so many steps the graph is too vague to confirm a single link.
@@ -48,7 +50,7 @@ class LiveMapOptions:
         optimise_every: A whole optimisation is wanted at most once in so many keyframes.
     """
 
-    min_links: int = 3
+    min_links: float = 3.0
     min_ends: int = 2
     tested_links: int = 48
     links_of_keyframe: int = 4
@@ -66,7 +68,10 @@ class LiveMapOptions:
     told_deg: float = 0.05
     doubts: int = 8
     open_links: int = 400
-    measured: RelativePoseOptions = field(default_factory=lambda: RelativePoseOptions(min_inliers=30))
+    measured: RelativePoseOptions = field(
+        default_factory=lambda: RelativePoseOptions(min_inliers=15, min_inlier_ratio=0.3, min_matches=15)
+    )
+    strong: StrongLink = field(default_factory=StrongLink)
     candidates: int = 12
     apart_steps: float = 0.8
     vague_steps: float = 12.0

@@ -142,7 +142,9 @@ def edges_of(graph: Graph, ids: Iterable[int], options: LiveMapOptions) -> Edges
         T_a_b, information = np.empty((0, 4, 4)), np.empty((0, 6, 6))
     else:
         T_a_b = np.array([link.T_a_b for link in measured])
-        information = np.array([link.information for link in measured])
+        # What has half of the evidence is taken for half as exact.
+        weights = np.array([link.weight(options.strong) for link in measured])
+        information = weights[:, None, None] ** 2 * np.array([link.information for link in measured])
     return Edges(
         a=np.concatenate([a, np.array([link.a for link in measured], dtype=np.int64)]),
         b=np.concatenate([b, np.array([link.b for link in measured], dtype=np.int64)]),

@@ -18,6 +18,7 @@ __all__ = [
     "LinkEnds",
     "LoopClosure",
     "OdometryNoise",
+    "StrongLink",
     "consistent",
     "fits_prediction",
     "largest_clique",
@@ -37,6 +38,19 @@ class OdometryNoise:
 
     step_m: float = 0.02
     step_deg: float = 0.7
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StrongLink:
+    """The inliers, and their share of the matches, from which on a measured link counts whole."""
+
+    inliers: int = 30
+    ratio: float = 0.5
+
+    def weight_of(self, inliers: int, matches: int) -> float:
+        """Return how much a link counts beside others, within 0..1: its lesser share of both limits."""
+        share = inliers / matches if matches else 1.0
+        return min(1.0, inliers / self.inliers, share / self.ratio)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -46,6 +46,8 @@ class RelativePoseOptions:
     ratio: float = 0.75
     inlier_px: float = 3.0
     max_matches: int = 700
+    min_matches: int | None = None
+    """Fewer matches are not solved; None: half of ``min_inliers``."""
     min_inliers: int = 40
     min_inlier_ratio: float = 0.5
     floor_m: float = 0.02
@@ -190,7 +192,8 @@ def measure_pose(
         options: Of matches and inliers; the number of inliers is not judged here.
     """
     points, pixels, depths_m = match_points(reference, view, options)
-    if len(points) < max(4, options.min_inliers // 2):
+    least = options.min_inliers // 2 if options.min_matches is None else options.min_matches
+    if len(points) < max(4, least):
         return "no-matches"
     try:
         solution = solve_pnp(points, pixels, view.camera, _pnp_options(options.inlier_px))

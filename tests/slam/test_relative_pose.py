@@ -12,6 +12,7 @@ from rse_pf.pnp.problems import KINECT
 from rse_pf.slam.relative_pose import (
     RelativePose,
     RelativePoseOptions,
+    match_points,
     measure_link,
     measure_pose,
     reference_of,
@@ -120,3 +121,15 @@ def test_a_pose_that_is_not_weak_is_the_same_link_with_every_factor() -> None:
     assert all(isinstance(link, RelativePose) for link in links)
     one, other = (link.information for link in links if isinstance(link, RelativePose))
     np.testing.assert_array_equal(one, other)
+
+
+def test_fewer_matches_than_the_least_are_not_solved() -> None:
+    a, b, _ = pair(6)
+    sought, view = reference_of(a), view_of_keyframe(b)
+    matches = len(match_points(sought, view)[0])
+
+    few = measure_link(sought, view, RelativePoseOptions(min_inliers=15, min_matches=matches + 1))
+    enough = measure_link(sought, view, RelativePoseOptions(min_inliers=15, min_matches=matches))
+
+    assert few == "no-matches"
+    assert isinstance(enough, RelativePose)
