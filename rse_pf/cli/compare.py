@@ -1,9 +1,9 @@
 """Compare configurations of the tracker on recordings: accuracy, lost frames, bytes and CPU time.
 
-CONFIG is built in (default, live, wide-baseline, without-depth, features-500), or a file NAME.toml or NAME.py
-with options and functions of your own.  A recording is a folder in the layout of TUM, EuRoC or KITTI, NYU
-Depth V2, a ROS bag, or world:SEED, which is rendered.  Poses are solved in this process, so that every run
-gives the same.
+CONFIG is built in (default, live, wide-baseline, without-depth, features-500), a file NAME.toml or NAME.py
+with options and functions of your own, or module:function for features.  A recording is a folder in the
+layout of TUM, EuRoC or KITTI, NYU Depth V2, a ROS bag, or world:SEED, which is rendered.  Poses are solved in
+this process, so that every run gives the same.
 
 examples:
   rse-pf compare --data world:3
@@ -30,7 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument(
         "configs", nargs="*", default=["default"], metavar="CONFIG",
-        help="a name, or NAME.toml or NAME.py (default: default)",
+        help="a name, NAME.toml, NAME.py or MODULE:FUNCTION (default: default)",
     )  # fmt: skip
     parser.add_argument(
         "--data", "--recording", nargs="+", required=True, metavar="RECORDING",

@@ -1,4 +1,4 @@
-"""The configurations that are compared: built in by name, or a file ``NAME.toml`` or ``NAME.py``.
+"""The configurations that are compared: built in by name, a file ``NAME.toml`` or ``NAME.py``, or features.
 
 A Python file sets options and functions by names of its own module; it runs in this process, as the user who
 named it.  Whatever is wrong with a file is said in one line.
@@ -19,6 +19,7 @@ from typing import Any, TypeVar
 
 from client_sdk.frontend import FrontEndOptions
 from client_sdk.mapper import Mapper
+from client_sdk.slots import load_features
 from client_sdk.tracking.monocular_tracker import MonocularOptions
 from rse_pf.config.validation import did_you_mean
 from rse_pf.errors import RsePfError, UsageError
@@ -32,6 +33,7 @@ BUILT_IN = {
     "wide-baseline": "as rse-pf demo --frontend wide-baseline",
     "without-depth": "the colours only; the scale is unknown",
     "features-N": "with N features in each frame, such as features-500",
+    "MODULE:FUNCTION": "with features of your own, as for rse-pf demo --features",
 }
 """Name and one line of help."""
 SLOTS = ("features", "motion", "loops", "optimiser")
@@ -84,6 +86,11 @@ def failure_line(path: str, error: BaseException) -> str:
 
 def _configuration(word: str) -> Configuration:
     path = Path(word)
+    if ":" in word and path.suffix not in (".toml", ".py"):
+        features = load_features(word)
+        assert features is not None
+        file = inspect.getsourcefile(inspect.unwrap(features)) if inspect.isfunction(features) else None
+        return Configuration(name=word, slots={"features": features}, source=file or word)
     if path.suffix not in (".toml", ".py"):
         return _built_in(word)
     if not path.is_file():

@@ -88,13 +88,13 @@ async def track(
         began_s = time.process_time()
         try:
             done = await mapper.track(frame)
-        except RsePfError:
-            raise
         except Exception as error:
-            if not configuration.slots:
+            # A slot says what a function returned wrongly; what it raised is the cause.
+            cause = error.__cause__ if isinstance(error, RsePfError) else error
+            if not configuration.slots or cause is None:
                 raise
             raise UsageError(
-                f"frame {number} of {drive.name}: {failure_line(configuration.source, error)}",
+                f"frame {number} of {drive.name}: {failure_line(configuration.source, cause)}",
                 hint=f"correct {configuration.source}",
             ) from error
         took_s = time.process_time() - began_s

@@ -30,7 +30,7 @@ def refusal(word: str) -> UsageError:
 
 
 def test_every_name_of_the_help_is_a_configuration() -> None:
-    names = [name.replace("-N", "-500") for name in BUILT_IN]
+    names = [name.replace("-N", "-500") for name in BUILT_IN if name.islower() or name.endswith("-N")]
 
     found = configurations_of(names)
 
@@ -105,6 +105,18 @@ def test_a_broken_file_is_one_line_with_a_hint(tmp_path: Path, name: str, text: 
 
     assert says in refused.message
     assert word in refused.message
+
+
+def test_a_function_of_a_module_is_a_configuration_as_for_the_demo(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = written(tmp_path, "compared_features.py", "def mine(rgb): ...\n")
+    monkeypatch.chdir(tmp_path)
+
+    (found,) = configurations_of(["compared_features:mine"])
+
+    assert (found.name, found.source, list(found.slots)) == ("compared_features:mine", path, ["features"])
+    assert "cannot be loaded" in refusal("compared_features:other").message
 
 
 def test_two_files_of_one_name_are_refused(tmp_path: Path) -> None:

@@ -11,7 +11,6 @@ import pytest
 
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import UsageError
-from rse_pf.experiments.compare import tracking_run
 from rse_pf.experiments.compare.configurations import Configuration, configurations_of
 from rse_pf.experiments.compare.recordings import Drive
 from rse_pf.experiments.compare.solvers import InProcessSolver
@@ -95,25 +94,39 @@ def test_depth_that_is_asked_for_and_missing_is_refused() -> None:
         run(flat_drive(depth=False), replace(DEFAULT, depth=True))
 
 
-def test_a_function_of_the_user_that_fails_is_named_with_its_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+OWN = """
+import cv2
+from client_sdk.slots import FoundFeatures
+
+def features(rgb):
+    points, descriptors = cv2.ORB_create(700).detectAndCompute(rgb, None)
+    return FoundFeatures(
+        pixels=cv2.KeyPoint_convert(points), scores=[p.response for p in points], descriptors=descriptors
+    )
+"""
+
+
+def test_features_of_the_user_are_tracked(tmp_path: Path) -> None:
+    path = tmp_path / "own.py"
+    path.write_text(OWN)
+
+    done = run(flat_drive(), configurations_of([str(path)])[0])
+
+    assert done.figures["posed"] == 10
+    assert (done.figures["ate_cm"] or 99) < 1.0
+
+
+def test_a_function_of_the_user_that_fails_is_named_with_its_line(tmp_path: Path) -> None:
     path = tmp_path / "mine.py"
-    path.write_text("def features(image):\n    return image[0] / 'x'\n")
-    names: dict = {}
-    exec(compile(path.read_text(), str(path), "exec"), names)
+    path.write_text("def features(rgb):\n    return rgb / 'x'\n")
 
-    class Failing:
-        """A mapper with a slot."""
+    with pytest.raises(UsageError, match=r"frame 1 of flat at 10 Hz: .*mine\.py, line 2: \w*TypeError"):
+        run(flat_drive(), configurations_of([str(path)])[0])
 
-        def __init__(self, features=None, **options: object) -> None:
-            self.features = features
 
-        async def track(self, frame) -> None:
-            self.features([1.0])
+def test_features_that_are_none_are_refused_in_one_line(tmp_path: Path) -> None:
+    path = tmp_path / "mine.py"
+    path.write_text("def features(rgb):\n    return rgb\n")
 
-    monkeypatch.setattr(tracking_run, "Mapper", Failing)
-    configuration = replace(DEFAULT, name="mine", slots={"features": names["features"]}, source=str(path))
-
-    with pytest.raises(UsageError, match=r"frame 1 of flat at 10 Hz: .*mine\.py, line 2: TypeError"):
-        run(flat_drive(), configuration)
+    with pytest.raises(UsageError, match="returned ndarray, not FoundFeatures"):
+        run(flat_drive(), configurations_of([str(path)])[0])
