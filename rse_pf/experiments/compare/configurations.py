@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from client_sdk.frontend import FrontEndOptions
-from client_sdk.mapper import Mapper
 from client_sdk.slots import load_features
 from client_sdk.tracking.monocular_tracker import MonocularOptions
 from rse_pf.config.validation import did_you_mean
@@ -37,7 +36,7 @@ BUILT_IN = {
 }
 """Name and one line of help."""
 SLOTS = ("features", "motion", "loops", "optimiser")
-"""Functions that a Python file may set, as far as `Mapper` takes them."""
+"""Functions that a Python file may set: arguments of `Mapper`."""
 _OPTIONS = ("base", "depth", "frontend", "monocular")
 _FEATURES = re.compile(r"features-(\d{1,6})")
 _MIN_FEATURES, _MAX_FEATURES = 50, 20_000
@@ -140,14 +139,6 @@ def _from_values(
     depth = values.get("depth", start.depth)
     if depth is not None and not isinstance(depth, bool):
         raise UsageError(f"depth = {depth!r} is neither true nor false", hint="leave it out to use any")
-    known = set(inspect.signature(Mapper.__init__).parameters)
-    missing = [name for name in slots if name not in known]
-    if missing:
-        settable = ", ".join((*_OPTIONS, *(name for name in SLOTS if name in known)))
-        raise UsageError(
-            f"this version's mapper takes no {' and no '.join(missing)}",
-            hint=f"leave it out; a file may set {settable}",
-        )
     return Configuration(
         name=path.stem,
         frontend=_changed("frontend", start.frontend, values.get("frontend", {})),

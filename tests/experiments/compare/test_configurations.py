@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import inspect
 from pathlib import Path
 
 import pytest
 
 from client_sdk.frontend import FrontEndOptions
+from client_sdk.mapper import Mapper
 from rse_pf.errors import UsageError
-from rse_pf.experiments.compare import configurations
-from rse_pf.experiments.compare.configurations import BUILT_IN, configurations_of
+from rse_pf.experiments.compare.configurations import BUILT_IN, SLOTS, configurations_of
 
 toml = pytest.importorskip("tomllib", reason="Python 3.10 reads no TOML")
 
@@ -59,22 +60,13 @@ def test_a_python_file_sets_options_and_may_import_its_neighbour(tmp_path: Path)
     assert (found.name, found.frontend.features, found.slots) == ("mine", 321, {})
 
 
-def test_a_function_becomes_a_slot_as_soon_as_the_mapper_has_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    class Mapper:
-        """Takes features, and no loops."""
+def test_functions_of_a_file_become_slots_that_the_mapper_takes(tmp_path: Path) -> None:
+    text = "\n".join(f"def {name}(*given): ..." for name in SLOTS)
 
-        def __init__(self, features=None) -> None: ...
+    (found,) = configurations_of([written(tmp_path, "own.py", text)])
 
-    monkeypatch.setattr(configurations, "Mapper", Mapper)
-    good = written(tmp_path, "good.py", "def features(image): ...\n")
-    early = written(tmp_path, "early.py", "def loops(keyframes): ...\n")
-
-    assert list(configurations_of([good])[0].slots) == ["features"]
-    refused = refusal(early)
-    assert "takes no loops" in refused.message
-    assert "features" in (refused.hint or "")
+    assert list(found.slots) == list(SLOTS)
+    assert set(SLOTS) <= set(inspect.signature(Mapper).parameters)
 
 
 @pytest.mark.parametrize(
