@@ -145,6 +145,27 @@ def test_bytes_behind_a_request_are_no_request_and_end_the_connection(cut: int) 
     asyncio.run(run())
 
 
+def test_bytes_within_a_reply_end_the_connection_after_it() -> None:
+    class Slow(Echo):
+        async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
+            headers = [(b"content-length", b"4")]
+            await send({"type": "http.response.start", "status": 200, "headers": headers})
+            await send({"type": "http.response.body", "body": b"ab", "more_body": True})
+            await self.hold.wait()
+            await send({"type": "http.response.body", "body": b"cd"})
+
+    async def run() -> None:
+        line = Line(Slow())
+        line.app.hold.clear()
+        await line.send(GET, GET)
+        line.app.hold.set()
+        await settled()
+        assert line.transport.written == b"cd"
+        assert line.transport.ended == "closed"
+
+    asyncio.run(run())
+
+
 @pytest.mark.parametrize(
     "data",
     [b"\x16\x03\x01", b"get / HTTP/1.1\r\nHost: x\r\n\r\n", b"G" * MAX_HEAD_BYTES,

@@ -37,7 +37,7 @@ from rse_pf.object_store import DirectoryStore
 
 CALLS = (
     "open", "write", "pwrite", "fsync", "replace", "rename", "mkdir", "close", "unlink", "rmdir", "ftruncate",
-    "lstat",
+
 )  # fmt: skip
 LAST_CALL, PUTS, PART_BYTES = 90, 4, 100_000
 _TIMEOUT_S = 30.0
@@ -58,10 +58,11 @@ def die_at(number: int, place: int) -> None:
                 call(handle, data[: len(data) // 2], *rest)
             if is_last and place != 1:
                 die(name)
-            result = call(*arguments, **named)
-            if is_last:
-                die(name)
-            return result
+            try:
+                return call(*arguments, **named)
+            finally:
+                if is_last:
+                    die(name)
 
         return run
 

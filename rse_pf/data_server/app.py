@@ -124,24 +124,26 @@ class DataServer:
         began = self._clock()
         request = HttpRequest(scope, receive, self._clock)
         line: dict[str, Any] = {"event": "request", "method": request.method}
+        admitted: list[tuple[RobotId, bool]] = []
         try:
-            with contextlib.ExitStack() as admitted:
-                reply = await self._reply(request, line, admitted)
-                sent = await _send(reply, request, send)
-            line["status"], line["sent_bytes"] = reply.status, sent
+            reply = await self._reply(request, line, admitted)
+            sent = await _send(reply, request, send)
+            line |= {"status": reply.status, "sent_bytes": sent}
         except Disconnected:
             line["status"] = "disconnected"
         except asyncio.CancelledError:  # nobody waits for the reply
             line["status"] = "disconnected"
             raise
         finally:
+            for robot, has_body in admitted:
+                self._limits.end(robot, has_body=has_body)
             line["received_bytes"] = request.received_bytes
             line["took_ms"] = round(1000 * (self._clock() - began), 2)
             if request.path not in _PROBES:
                 self._log(line)
 
     async def _reply(
-        self, request: HttpRequest, line: dict[str, Any], admitted: contextlib.ExitStack
+        self, request: HttpRequest, line: dict[str, Any], admitted: list[tuple[RobotId, bool]]
     ) -> HttpReply:
         origin, shared_with = request.headers.get("origin", ""), ""
         try:
@@ -165,7 +167,7 @@ class DataServer:
         return shared_reply(reply, shared_with)
 
     async def _handle(
-        self, request: HttpRequest, line: dict[str, Any], admitted: contextlib.ExitStack
+        self, request: HttpRequest, line: dict[str, Any], admitted: list[tuple[RobotId, bool]]
     ) -> HttpReply:
         """Reply to a request; what *admitted* gets is given back when the reply was sent."""
         if is_preflight(request):
@@ -182,7 +184,7 @@ class DataServer:
         except TooManyRequests:
             await self._pause(_REFUSAL_PAUSE_S)  # each of its connections asks again only after this
             raise
-        admitted.callback(self._limits.end, claims.robot, has_body=has_body)
+        admitted.append((claims.robot, has_body))
         if not has_body and not await request.drain(self._settings.data.part_bytes):
             raise BadRequest("this request takes no body", hint="leave it out")
         try:

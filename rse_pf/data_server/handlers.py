@@ -51,7 +51,8 @@ _T = TypeVar("_T")
 # Gets a request, the claims of its token, and the parameters of its path.
 Handler = Callable[[HttpRequest, Claims, dict[str, str]], Awaitable[HttpReply]]
 
-_PIECE_BYTES = 1 << 19
+_PIECE_BYTES, _CACHED_PIECE_BYTES = 1 << 20, 1 << 19
+"""Bytes of an object that are read at once by a thread, and by the event loop from memory."""
 _MAX_JSON_BYTES = 16384
 _MAX_NOTE_LETTERS = 500
 _MAX_PAGE = 1000
@@ -79,6 +80,7 @@ class Handlers:
     ) -> None:
         """Make the handlers; *describe* returns what the map in an object that a robot sent holds."""
         self._store = store
+        self._cached = store if isinstance(store, CachedStore) else None
         self._audit = audit
         self._settings = settings
         self._wall_clock = wall_clock
@@ -123,8 +125,12 @@ class Handlers:
     async def get_object(self, request: HttpRequest, claims: Claims, path: dict[str, str]) -> HttpReply:
         """Return an object or a range of it."""
         digest = path["digest"]
-        name, size = await self._head(claims, digest)
-        return await self._content(request, claims.robot, name, size, digest)
+        name = self.objects.name(claims, digest)
+        if self._cached is not None and "range" not in request.headers:
+            cached = self._cached.get_cached(name, 0, _CACHED_PIECE_BYTES)
+            if cached is not None:  # a thread would take longer to be asked
+                return await self._content(request, claims.robot, name, cached[0], digest, cached[1])
+        return await self._content(request, claims.robot, *await self._head(claims, digest), digest)
 
     async def head_object(self, request: HttpRequest, claims: Claims, path: dict[str, str]) -> HttpReply:
         """Return the size."""
@@ -137,7 +143,7 @@ class Handlers:
     async def _head(self, claims: Claims, digest: str) -> tuple[str, int]:
         """Return name and size of an object; raises NotFound."""
         name = self.objects.name(claims, digest)
-        cached = self._store.get_cached(name, 0, 0) if isinstance(self._store, CachedStore) else None
+        cached = None if self._cached is None else self._cached.get_cached(name, 0, 0)
         if cached is not None:
             return name, cached[0]
         info = await self.threads.run(claims.robot, self.objects.head, claims, digest)
@@ -302,8 +308,15 @@ class Handlers:
         return MapRegistry(self._store, claims.robot.tenant, on_change=record_change, check=check_wanted)
 
     async def _content(
-        self, request: HttpRequest, robot: RobotId, name: str, size: int, digest: str
+        self,
+        request: HttpRequest,
+        robot: RobotId,
+        name: str,
+        size: int,
+        digest: str,
+        first: bytes | None = None,
     ) -> HttpReply:
+        """Reply with an object or a range of it; *first* is the first piece of the whole, if it is known."""
         store, ttl_s = self._store, PRESIGNED_URL_TTL_S
         if request.headers.get("x-accept-direct") == "1" and isinstance(store, PresigningStore):
             url = await self.threads.run(robot, lambda: store.presigned_get(name, ttl_s=ttl_s))
@@ -314,7 +327,8 @@ class Handlers:
             refused = failure_reply(error)
             return HttpReply(status=416, body=refused.body, headers={"Content-Range": f"bytes */{size}"})
         start, end = part or (0, size)
-        first = await self._piece(robot, name, start, end)  # an error is answered as one, before the header
+        if first is None:  # an error is answered as one, before the header
+            first = await self._piece(robot, name, start, end)
         headers = {**_content_headers(digest), "Content-Length": str(end - start)}
         if part:
             headers["Content-Range"] = f"bytes {start}-{end - 1}/{size}"
@@ -340,12 +354,13 @@ class Handlers:
         """Return the bytes from *start* on, at most `_PIECE_BYTES`; none if there are none before *end*."""
         if start >= end:
             return b""
-        length, store = min(_PIECE_BYTES, end - start), self._store
-        cached = store.get_cached(name, start, length) if isinstance(store, CachedStore) else None
-        if cached is not None:  # a thread would take longer to be asked
+        length = min(_PIECE_BYTES, end - start)
+        near = min(length, _CACHED_PIECE_BYTES)
+        cached = None if self._cached is None else self._cached.get_cached(name, start, near)
+        if cached is not None:
             piece = cached[1]
         else:
-            piece = await self.threads.run(robot, read_range, store, name, start, length)
+            piece = await self.threads.run(robot, read_range, self._store, name, start, length)
         if not piece:
             raise NotFound("the object was removed while it was read")
         return piece

@@ -57,6 +57,7 @@ class Objects:
         wall_clock: Callable[[], float],
     ) -> None:
         self._store = store
+        self._growing = store if isinstance(store, GrowingStore) else None
         self._settings = settings
         self._wall_clock = wall_clock
         self.accounts = Accounts(store, settings, clock=clock, wall_clock=wall_clock, check=check_wanted)
@@ -232,8 +233,8 @@ class Objects:
         self, name: str, prefix: str, parts: Sequence[ObjectInfo], offset: int, data: bytes
     ) -> None:
         """Store a part: at the end of the only one before it if the store can do that."""
-        if isinstance(self._store, GrowingStore) and len(parts) < 2:
-            self._store.append(f"{prefix}{0:015d}", offset, data)
+        if self._growing is not None and len(parts) < 2:
+            self._growing.append(f"{prefix}{0:015d}", offset, data)
             self._hashes.add(name, offset, data)
         else:
             put_scratch(self._store, f"{prefix}{offset:015d}", data)
@@ -241,11 +242,11 @@ class Objects:
     def _assemble(self, claims: Claims, digest: str, name: str, size: int) -> None:
         parts = list(self._stored_parts(claims, digest))
         try:
-            if isinstance(self._store, GrowingStore) and len(parts) == 1:
+            if self._growing is not None and len(parts) == 1:
                 known = self._hashes.take(name, size)
                 if (known or self._hash_of(parts[0])) != digest:
                     raise _wrong_digest()
-                self._store.adopt(name, parts[0].name, size)
+                self._growing.adopt(name, parts[0].name, size)
             else:
                 put_pieces(self._store, name, self._whole(parts, digest, size))
         except BadRequest:

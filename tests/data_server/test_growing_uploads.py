@@ -73,6 +73,16 @@ def test_bytes_that_another_server_wrote_are_judged_too(service: Service, store:
     assert list(store.list("objects/")) == list(store.list("uploads/")) == []
 
 
+def test_an_upload_that_another_server_ended_is_judged_by_what_is_stored(
+    service: Service, store: DirectoryStore
+) -> None:
+    part(service, 0, 4096)
+    store.append(PART, 4096, DATA[4096:])  # by another server, which was then killed
+
+    assert service.ask("HEAD", UPLOAD).headers["upload-offset"] == "10000"
+    assert service.ask("GET", OBJECT).body == DATA
+
+
 def test_an_upload_goes_on_behind_a_part_of_which_a_half_was_written(
     service: Service, store: DirectoryStore
 ) -> None:
