@@ -26,6 +26,7 @@ lock docs docs build
 lock release release build
 lock browser browser
 lock foxglove foxglove
+lock xfeat xfeat
 lock ros ros-dds
 lock batch batch build
 # A client of the conformance table, which the platform itself does not need.

@@ -74,6 +74,10 @@ EXTRAS: dict[str, Extra] = {
         modules={"cv2": "opencv-python-headless", "h5py": "h5py"},
         enables="cameras, recordings and NYU Depth V2 files",
     ),
+    "xfeat": Extra(
+        modules={"cv2": "opencv-python-headless", "onnxruntime": "onnxruntime"},
+        enables="learned features: examples/features/xfeat.py",
+    ),
     "realsense": Extra(
         modules={"cv2": "opencv-python-headless", "pyrealsense2": "pyrealsense2"},
         enables="Intel RealSense cameras",

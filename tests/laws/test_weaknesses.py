@@ -212,6 +212,7 @@ def test_every_locked_package_has_a_hash(repository: Path) -> None:
             "dev",
             "docs",
             "foxglove",
+            "xfeat",
             "localstack",
             "ros",
             "rosbridge",

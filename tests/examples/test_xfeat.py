@@ -1,0 +1,83 @@
+"""The example of learned features: its weights, and that it finds the same points in a warped image."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from client_sdk.monocular.descriptors import match_all
+from client_sdk.slots import FeaturesFunction, FeaturesSlot, FoundFeatures
+
+FOLDER = Path(__file__).parents[2] / "examples" / "features"
+
+
+@pytest.fixture(scope="module")
+def xfeat() -> FeaturesFunction:
+    pytest.importorskip("cv2", reason="needs the extra 'vision'")
+    pytest.importorskip("onnxruntime", reason="needs onnxruntime: pip install -r locks/xfeat.txt")
+    spec = importlib.util.spec_from_file_location("xfeat_example", FOLDER / "xfeat.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    function: FeaturesFunction = module.xfeat
+    return function
+
+
+def picture(height: int, width: int, seed: int = 3) -> npt.NDArray[np.uint8]:
+    """Return an image of overlapping boxes."""
+    rng = np.random.default_rng(seed)
+    image = np.full((height, width, 3), 128, dtype=np.uint8)
+    for _ in range(150):
+        x, y, w, h = rng.integers((0, 0, 8, 8), (width, height, 70, 70))
+        image[y : y + h, x : x + w] = rng.integers(0, 256, 3)
+    return image
+
+
+def test_the_weights_are_those_that_their_page_names() -> None:
+    page = (FOLDER / "xfeat_weights" / "README.md").read_text(encoding="utf-8")
+    named = re.search(r"xfeat\.onnx.* sha256 `([0-9a-f]{64})`", page)
+
+    assert named is not None
+    data = (FOLDER / "xfeat_weights" / "xfeat.onnx").read_bytes()
+    assert hashlib.sha256(data).hexdigest() == named[1]
+    assert "Apache License" in (FOLDER / "xfeat_weights" / "LICENSE").read_text(encoding="utf-8")
+
+
+def test_the_example_is_short() -> None:
+    assert len((FOLDER / "xfeat.py").read_text(encoding="utf-8").splitlines()) <= 40
+
+
+@pytest.mark.parametrize("shape", [(480, 640), (250, 333)])
+def test_it_finds_the_same_points_in_a_warped_image(xfeat: FeaturesFunction, shape: tuple[int, int]) -> None:
+    import cv2
+
+    image = picture(*shape)
+    warp = cv2.getRotationMatrix2D((shape[1] / 2, shape[0] / 2), 6.0, 1.1)
+    warped = cv2.warpAffine(image, warp, shape[::-1], borderMode=cv2.BORDER_REFLECT)
+    slot = FeaturesSlot(xfeat)
+
+    first, second = slot(image), slot(warped)
+    rows, columns = match_all(first.descriptors, second.descriptors)
+
+    expected = first.pixels[rows] @ warp[:, :2].T + warp[:, 2]
+    away = second.pixels[columns] - expected
+    near = np.linalg.norm(away, axis=1) < 3.0
+    assert (str(slot.kind), first.descriptors.dtype) == ("xfeat (64 dimensions)", np.int8)
+    assert near.sum() >= 60
+    assert near.mean() >= 0.7
+    assert np.abs(away[near].mean(axis=0)).max() < 0.3, "pixels are shifted"
+
+
+def test_an_image_without_anything_has_no_features(xfeat: FeaturesFunction) -> None:
+    found: Any = xfeat(np.full((64, 96, 3), 90, dtype=np.uint8))
+
+    assert isinstance(found, FoundFeatures)
+    assert len(FeaturesSlot(xfeat)(np.full((64, 96, 3), 90, dtype=np.uint8)).pixels) == len(found.pixels)
