@@ -291,3 +291,23 @@ def test_two_landmarks_at_one_feature_become_one_that_all_keyframes_see() -> Non
     assert count > 50
     assert len(made) == 2 * len(world) - count
     assert made.shared_with(2)[0] == made.shared_with(3)[0] == count
+
+
+def test_new_landmarks_are_found_near_and_far_by_the_depths_of_those_around_them() -> None:
+    """The image moves by 100 px where the world is near, by 25 px where it is far, and 30 px are searched."""
+    rng = np.random.default_rng(6)
+    left_px, count = np.repeat([(5.0, 105.0), (185.0, 285.0)], 60, axis=0), 120
+    pixels = np.column_stack([rng.uniform(*left_px.T), rng.uniform(5.0, 235.0, count)])
+    world = CAMERA.back_project(pixels, np.repeat([1.0, 4.0], 60))
+    first, second = exp_se3([0.2, 0.0, 0.0, 0.0, 0.0, 0.0]), np.eye(4)
+    made, free = map_of(np.stack([first, second]), world), np.arange(count) % 3 > 0
+    for keyframe in made.keyframes:
+        keyframe.landmarks[free] = NO_LANDMARK
+
+    made.extend(1)
+
+    found = made.keyframes[1].landmarks[free]
+    assert (found != NO_LANDMARK).mean() > 0.95
+    assert (found == made.keyframes[0].landmarks[free]).all()
+    known = found != NO_LANDMARK
+    np.testing.assert_allclose(made.points[found[known]], world[free][known], atol=1e-6)
