@@ -29,6 +29,7 @@ __all__ = [
     "PoseQuery",
     "TrackedFrame",
     "describe",
+    "describe_at",
     "extract",
     "load_opencv",
     "match",
@@ -45,6 +46,7 @@ _MATCHES_OF_CODEC = {"zlib": 530, "bin": 400, "json": 220}
 _SCALE, _LEVELS = 1.2, 8
 _SCALES: Array = np.power(_SCALE, np.arange(_LEVELS, dtype=np.float64))
 _FAST, _FAST_SPREAD = 10, 7
+_PATCH_PX = 31.0
 _SOUGHT, _CELL_PX = 3, 40
 """So many times the features are sought, and spread over cells of this size."""
 
@@ -293,6 +295,40 @@ def _described_by(
         pixels=found.pixels[rows], descriptors=found.descriptors[rows], turns=found.turns[rows],
         sizes=found.sizes[rows], kind=slot.kind, is_oriented=slot.is_oriented, is_scaled=slot.is_scaled,
     )  # fmt: skip
+
+
+def describe_at(
+    rgb: npt.NDArray[np.uint8], pixels: Array, turns: Array, sizes: Array
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.uint8]]:
+    """Return the ORB descriptors that an image has at given pixels, whether it has features there or not.
+
+    Args:
+        rgb: ``(h, w, 3)``.
+        pixels: ``(n, 2)``.
+        turns: ``(n, 2)``, cosine and sine of the orientations.
+        sizes: ``(n,)``, as `Features` has them; the nearest level of the pyramid is taken.
+
+    Returns:
+        The rows that could be described, none of which is near the edge, and ``(k, 32)`` descriptors.
+
+    Raises:
+        MissingExtra: OpenCV is not installed.
+    """
+    cv2 = load_opencv()
+    levels = np.clip(np.rint(np.log(sizes) / np.log(_SCALE)), 0, _LEVELS - 1).astype(int)
+    angles_deg = np.degrees(np.arctan2(turns[:, 1], turns[:, 0])) % 360.0
+    keypoints = [
+        cv2.KeyPoint(
+            float(u), float(v), float(_PATCH_PX * _SCALES[level]), float(angle), 1.0, int(level), row
+        )
+        for row, ((u, v), angle, level) in enumerate(zip(pixels, angles_deg, levels, strict=True))
+    ]
+    if keypoints:
+        gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
+        keypoints, descriptors = _orb(cv2, len(keypoints), _FAST).compute(gray, keypoints)
+    if not keypoints:
+        return np.empty(0, dtype=np.int64), np.empty((0, 32), dtype=np.uint8)
+    return np.fromiter(map(attrgetter("class_id"), keypoints), np.int64, len(keypoints)), descriptors
 
 
 def spread_rows(pixels: Array, responses: Array, size: tuple[int, int], count: int) -> list[int]:

@@ -25,6 +25,7 @@ from client_sdk.frontend import (
 from client_sdk.monocular.descriptors import match_all
 from client_sdk.slots import Slots
 from client_sdk.tracking.keyframe_map import NO_LANDMARK, KeyframeMap, Landmarks, View, expect
+from client_sdk.tracking.looks import share_alike
 from client_sdk.tracking.noise import NoiseEstimate
 from client_sdk.tracking.place import place_of
 from client_sdk.tracking.queries import Answer, OneQuery, Steps
@@ -56,6 +57,8 @@ _GUIDED_RATIO, _FOLLOWED_RATIO, _NEAR_RATIO, _CONFIRMED_RATIO, _CLEAR_RATIO = 0.
 """Shares of the matches that must agree: with a guided query, with the last frame, with a keyframe of the
 place where the camera was just now, with the map around a pose, and with a keyframe of any other place."""
 _CLEAR_INLIERS = 40
+_ALIKE_SHARE = 0.25
+"""Of the landmarks that the pose of a recognised place expects, so many look as expected at their pixels."""
 _CONFIRM_PX = 8.0
 _ALL_RATIO, _ALL_DISTANCE = 0.8, 64
 _ENOUGH = 120
@@ -298,7 +301,7 @@ class Tracker:
                 continue
             image, is_next = self._image_at(view, T, is_near=is_near)
             posed = self._confirm(image, T, answer, len(seen), known, is_next=is_next)
-            if posed is not None:
+            if posed is not None and self._looks_right(posed.T_world_camera, known):
                 if segment != self._segment:
                     self._segment, self._last, self._place = segment, None, None
                 return posed, most
@@ -330,7 +333,7 @@ class Tracker:
         if T is None or answer.inliers < _CLEAR_INLIERS or answer.is_weak:
             return
         other = self._confirm(posed.view, T, answer, len(seen), self._segments[segment])
-        if other is None:
+        if other is None or not self._looks_right(other.T_world_camera, self._segments[segment]):
             return
         T_into_segment = _rotation_made(other.T_world_camera @ inverse(posed.T_world_camera))
         before, self._place = self._place, (segment, T_into_segment)
@@ -486,6 +489,17 @@ class Tracker:
             view=view, T_world_camera=inverse(T_camera_world), landmarks=landmarks, inliers=agreeing,
             matches=max(matches, len(seen)), is_weak=answer.is_weak, is_next=is_next,
         )  # fmt: skip
+
+    def _looks_right(self, T_world_camera: Array, known: KeyframeMap) -> bool:
+        """Return whether a frame shows what a pose expects: matches alone never speak against one.
+
+        A user's features cannot be described where they were not found: they are believed.
+        """
+        if self._slots.features is not None:
+            return True
+        landmarks = known.landmarks_of(known.nearest(T_world_camera, _LOCAL))
+        share, count = share_alike(self._frame, landmarks, T_world_camera)
+        return count >= self.options.min_inliers and share >= _ALIKE_SHARE
 
     def _observe(self, view: View, seen: _Seen) -> Observations:
         z = np.nan_to_num(view.points_camera[seen.features, 2], posinf=0.0, neginf=0.0)

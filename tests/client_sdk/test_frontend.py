@@ -12,6 +12,8 @@ from client_sdk.frontend import (
     Features,
     Frame,
     FrontEndOptions,
+    describe,
+    describe_at,
     extract,
     match,
     round_for_wire,
@@ -20,6 +22,7 @@ from rse_pf.errors import UsageError
 from rse_pf.geometry import Array, Camera, transform
 from rse_pf.pnp import PnpOptions
 from rse_pf.services.pnp import make_request
+from rse_pf.slam.descriptors import distances_of_pairs
 from rse_pf.wire import Command, make_codec
 
 cv2 = pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
@@ -193,3 +196,15 @@ def test_a_command_with_all_matches_is_below_10_kb(codec: str, preset: FrontEndO
 def test_an_unknown_codec_is_refused():
     with pytest.raises(UsageError, match="no codec named 'xml'"):
         FrontEndOptions().sent_with("xml")
+
+
+def test_pixels_are_described_as_the_features_that_were_found_there():
+    rgb = wall_frame(0).rgb
+    found = describe(rgb, 300)
+
+    rows, descriptors = describe_at(rgb, found.pixels, found.turns, found.sizes)
+
+    assert len(rows) > 200
+    assert np.median(distances_of_pairs(descriptors, found.descriptors[rows])) <= 2  # angles are rounded
+    at_the_edge = describe_at(rgb, np.array([[2.0, 2.0]]), np.array([[1.0, 0.0]]), np.ones(1))
+    assert [len(part) for part in at_the_edge] == [0, 0]

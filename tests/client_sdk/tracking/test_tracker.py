@@ -319,3 +319,35 @@ def test_the_five_wide_views_of_the_nyu_dining_room_are_joined() -> None:
         metres, degrees = pose_difference(inverse(first) @ second, expected)
         assert metres <= limit_m
         assert degrees <= limit_deg
+
+
+def test_a_place_is_not_recognised_by_a_patch_that_looks_alike_while_all_else_is_missing() -> None:
+    """A wallpaper that repeats gives matches at another wall."""
+    tracker = Tracker()
+    run_all(tracker, map(frame, range(25)))
+    run_all(tracker, (covered(row) for row in range(3)))
+    here, there = frame(12), foreign(12)
+    rgb = there.rgb.copy()
+    rgb[60:200, 60:130] = here.rgb[60:200, 60:130]
+    answers: list[Answer] = []
+
+    def answer(query: PoseQuery) -> Answer:
+        answers.append(solve(query))
+        return answers[-1]
+
+    patch = run(tracker, Frame(timestamp_s=2.8, rgb=rgb, depth_m=here.depth_m, camera=CAMERA), answer)
+
+    assert any(pose is not None and inliers >= 40 for pose, inliers in answers)
+    assert patch.lost
+    assert_at(run(tracker, frame(12)), 12)
+
+
+def test_a_place_is_recognised_though_something_near_hides_most_of_it() -> None:
+    tracker = Tracker()
+    run_all(tracker, map(frame, range(25)))
+    run_all(tracker, (covered(row) for row in range(3)))
+    here, hand = frame(12), foreign(40)
+    rgb, depth_m = here.rgb.copy(), here.depth_m.copy()
+    rgb[:, 80:], depth_m[:, 80:] = hand.rgb[:, 80:], 0.4
+
+    assert_at(run(tracker, Frame(timestamp_s=2.8, rgb=rgb, depth_m=depth_m, camera=CAMERA)), 12)
