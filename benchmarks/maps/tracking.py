@@ -49,7 +49,7 @@ _KITCHEN_BARS = {10: (0, 3.35), 5: None}
 _START_S = 1.0
 _HARD_BEGINS_S = (0.0, 2.5, 4.5)
 """Seconds after the first frame of fr1/rpy; the number in this row seeds the world."""
-_HARD_FRAMES, _HARD_HZ, _EXPOSURE_S, _EXPOSED, _LIGHT = 60, 10.0, 1.0 / 60.0, 5, 0.5
+_HARD_S, _HARD_HZ, _EXPOSURE_S, _EXPOSED, _LIGHT = 6.0, 10.0, 1.0 / 60.0, 5, 0.5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -87,9 +87,9 @@ def mirrored(frame: Frame) -> Frame:
     )  # fmt: skip
 
 
-def hard_drive(motion: Trajectory, first_s: float, seed: int) -> Drive:
-    """Return the rendered drive of a camera that moves as *motion* does from *first_s* on."""
-    stamps_s = np.arange(_HARD_FRAMES) / _HARD_HZ
+def hard_drive(motion: Trajectory, first_s: float, seed: int, *, rate_hz: float = _HARD_HZ) -> Drive:
+    """Return the rendered drive of a camera that moves as *motion* does for 6 s from *first_s* on."""
+    stamps_s = np.arange(round(_HARD_S * rate_hz)) / rate_hz
     place = true_trajectory(0, 3, 1, seed).T_world_camera[0]
     origin = place @ inverse(interpolated(motion, first_s)[0])
     moments = np.linspace(-0.5, 0.5, _EXPOSED) * _EXPOSURE_S
