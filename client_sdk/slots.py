@@ -17,6 +17,7 @@ import importlib
 import math
 import re
 import sys
+import traceback
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -189,7 +190,10 @@ class FeaturesSlot:
         try:
             array = np.asarray(given, dtype=np.float64)
         except (TypeError, ValueError) as error:
-            raise self._refusal(f"returned {what} that are no numbers") from error
+            raise self._refusal(
+                f"returned {what} that are no numbers"
+                + ": cv2.KeyPoint_convert makes them of keypoints" * (what == "pixels")
+            ) from error
         if not array.size and shape[0] == -1:
             return np.empty((0, *shape[1:]))
         if array.ndim != len(shape) or any(b not in (-1, a) for a, b in zip(array.shape, shape, strict=True)):
@@ -408,13 +412,22 @@ def load_function(name: str) -> Any:
     if here not in sys.path:
         sys.path.insert(0, here)
     try:
-        return getattr(importlib.import_module(parts[1]), parts[2])
+        module = importlib.import_module(parts[1])
     except Exception as error:
         raise UsageError(
             f"{name} cannot be loaded: {type(error).__name__}: {_line(error)}",
             hint=f"is {parts[1].replace('.', '/')}.py in this folder, or installed?",
         ) from error
+    if not hasattr(module, parts[2]):
+        own = [word for word, value in vars(module).items() if callable(value) and not word.startswith("_")]
+        raise UsageError(
+            f"{parts[1]} has no function {parts[2]}", hint=f"it has {', '.join(sorted(own)[:8]) or 'none'}"
+        )
+    return getattr(module, parts[2])
 
 
 def _line(error: Exception) -> str:
-    return " ".join(str(error).split())[:200]
+    """Return the message of an error in one line, and the last line outside this module that raised it."""
+    frames = [f for f in traceback.extract_tb(error.__traceback__) if f.filename != __file__]
+    where = f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno})" if frames else ""
+    return " ".join(str(error).split())[:200] + where
