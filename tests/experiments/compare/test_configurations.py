@@ -108,7 +108,7 @@ def test_a_function_of_a_module_is_a_configuration_as_for_the_demo(
     (found,) = configurations_of(["compared_features:mine"])
 
     assert (found.name, found.source, list(found.slots)) == ("compared_features:mine", path, ["features"])
-    assert "cannot be loaded" in refusal("compared_features:other").message
+    assert "has no function other" in refusal("compared_features:other").message
 
 
 def test_two_files_of_one_name_are_refused(tmp_path: Path) -> None:
