@@ -25,6 +25,7 @@ from client_sdk.slots import (
     load_features,
     load_function,
 )
+from client_sdk.tracking.place import place_of
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Camera, exp_se3
 from rse_pf.maps.descriptors import ORB, DescriptorKind
@@ -323,6 +324,20 @@ def test_a_loops_function_says_which_keyframes_are_tried(depth: bool) -> None:
     assert seen
     assert len(seen) <= mapper.keyframes + 1
     assert set(seen) == {frame_at(0, depth=True).rgb.shape}
+
+
+def test_the_place_of_an_image_is_computed_once() -> None:
+    calls: list[int] = []
+
+    def loops(rgb: npt.NDArray[np.uint8]) -> npt.NDArray[np.float64]:
+        calls.append(len(rgb))
+        return np.ones(16)
+
+    place = place_of(ORB.none(), IMAGE, LoopsSlot(loops))
+
+    assert calls == []
+    assert np.array_equal(place.vector(), place.vector())
+    assert calls == [480]
 
 
 @pytest.mark.parametrize(

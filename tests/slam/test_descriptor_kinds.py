@@ -138,8 +138,10 @@ def test_features_near_a_pixel_are_matched_by_their_own_metric(kind: DescriptorK
         pixels=pixels, descriptors=descriptors, turns=np.zeros((n, 2)), sizes=np.full(n, 9.0),
         distinct=distinct_distances(descriptors, pixels), is_oriented=False, is_scaled=False,
     )  # fmt: skip
+    seen_again = descriptors.copy()
+    seen_again[:, :8] ^= 7  # as far as another look of the same point: above 60 for a vector
     sought = SoughtFeatures(
-        pixels=pixels + 3.0, descriptors=descriptors, turns=np.tile([0.0, 1.0], (n, 1)), sizes=np.ones(n)
+        pixels=pixels + 3.0, descriptors=seen_again, turns=np.tile([0.0, 1.0], (n, 1)), sizes=np.ones(n)
     )
 
     rows, columns = match_near(sought, image, NearLimits(radius_px=10.0))
