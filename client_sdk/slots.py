@@ -427,7 +427,9 @@ def load_function(name: str) -> Any:
 
 
 def _line(error: Exception) -> str:
-    """Return the message of an error in one line, and the last line outside this module that raised it."""
-    frames = [f for f in traceback.extract_tb(error.__traceback__) if f.filename != __file__]
+    """Return the message of an error in one line, and the last line of a user's file that led to it."""
+    passed = (__file__, importlib.__file__)
+    trace = traceback.extract_tb(error.__traceback__)
+    frames = [f for f in trace if f.filename not in passed and not f.filename.startswith("<")]
     where = f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno})" if frames else ""
     return " ".join(str(error).split())[:200] + where

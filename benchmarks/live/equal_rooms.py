@@ -25,8 +25,8 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.live.one_process import DENSE
-from benchmarks.maps.recordings import judged_answer
-from client_sdk.frontend import Frame, PoseQuery, extract
+from benchmarks.maps.recordings import track
+from client_sdk.frontend import Frame, extract
 from client_sdk.simulator import (
     SIMULATED_CAMERA,
     loop_trajectory,
@@ -140,7 +140,7 @@ def _prepare(path: Path, seed: int) -> None:
         for frame, T_world_camera in zip(
             render_along(truth, world, (seed, place)), truth.T_world_camera, strict=True
         ):
-            T_odom_camera = _track(tracker, frame)
+            T_odom_camera = track(tracker, frame).T_world_camera
             if T_odom_camera is not None:
                 keyframes.append(_encode(frame, T_odom_camera, float(len(keyframes))))
                 true.append(T_world_camera)
@@ -150,14 +150,6 @@ def _prepare(path: Path, seed: int) -> None:
     part = path.with_suffix(".part.npz")
     np.savez(part, **held)
     part.replace(path)
-
-
-def _track(tracker: Tracker, frame: Frame) -> Array | None:
-    step = tracker.prepare(frame)
-    while isinstance(step, PoseQuery):
-        pose, inliers, is_weak = judged_answer(step)
-        step = tracker.accept(step, pose, inliers, is_weak=is_weak)
-    return step.T_world_camera
 
 
 def _encode(frame: Frame, T_odom_camera: Array, timestamp_s: float) -> bytes:

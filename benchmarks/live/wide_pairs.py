@@ -26,9 +26,9 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.maps.recordings import judged_answer, red_kitchen, truth_of
+from benchmarks.maps.recordings import red_kitchen, track, truth_of
 from benchmarks.maps.stereo import euroc_stereo
-from client_sdk.frontend import Frame, FrontEndOptions, PoseQuery, describe, points_at
+from client_sdk.frontend import Frame, FrontEndOptions, describe, points_at
 from client_sdk.slots import FeaturesSlot, load_features
 from client_sdk.tracking.tracker import Tracker
 from rse_pf.geometry import Array, inverse, pose_difference
@@ -131,10 +131,7 @@ def sights_of(
     tracker = Tracker(options)
     sights = []
     for frame, T_world_camera in zip(frames, truth, strict=True):
-        step = tracker.prepare(frame)
-        while isinstance(step, PoseQuery):
-            pose, inliers, is_weak = judged_answer(step)
-            step = tracker.accept(step, pose, inliers, is_weak=is_weak)
+        step = track(tracker, frame)
         if step.T_world_camera is None:
             continue
         found = describe(frame.rgb, _FEATURES, is_spread=False, slot=slot)

@@ -13,8 +13,9 @@ import numpy as np
 import numpy.typing as npt
 
 from client_sdk.datasets import Dataset, open_dataset
-from client_sdk.frontend import FrontEndOptions, PoseQuery, extract
+from client_sdk.frontend import Frame, FrontEndOptions, PoseQuery, TrackedFrame, extract
 from client_sdk.mapping import MapOptions, PointMap
+from client_sdk.tracking.monocular_tracker import MonocularTracker
 from client_sdk.tracking.tracker import Tracker
 from rse_pf.errors import PnpError
 from rse_pf.geometry import Array, inverse
@@ -29,6 +30,7 @@ __all__ = [
     "judged_answer",
     "keyframe_of",
     "red_kitchen",
+    "track",
     "truth_of",
 ]
 
@@ -60,10 +62,7 @@ def drive(dataset: Dataset, rows: Sequence[int], robot: str, options: FrontEndOp
     poses, stamps, owner, views = [], [], [], []
     for row in rows:
         frame = dataset.read(row)
-        step = tracker.prepare(frame)
-        while isinstance(step, PoseQuery):
-            pose, inliers, is_weak = judged_answer(step)
-            step = tracker.accept(step, pose, inliers, is_weak=is_weak)
+        step = track(tracker, frame)
         if step.T_world_camera is None:
             continue
         if step.keyframe:
@@ -124,6 +123,15 @@ def judged_answer(query: PoseQuery, *, with_depth: bool = True) -> tuple[Array |
             solution, matches.points_world, matches.pixels, matches.depths_m, query.camera
         )
     return solution.T_camera_world, len(solution.inliers), solution.verdict == "weak"
+
+
+def track(tracker: Tracker | MonocularTracker, frame: Frame) -> TrackedFrame:
+    """Return the tracker's result for a frame, with poses solved as the service does."""
+    step = tracker.prepare(frame)
+    while isinstance(step, PoseQuery):
+        pose, inliers, is_weak = judged_answer(step)
+        step = tracker.accept(step, pose, inliers, is_weak=is_weak)
+    return step
 
 
 def frame_poses(run: Run, T_world_keyframe: Array) -> Array:

@@ -37,7 +37,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.maps.recordings import judged_answer
+from benchmarks.maps.recordings import track
 from client_sdk.answers import PoseAnswer
 from client_sdk.datasets import Dataset, open_dataset
 from client_sdk.datasets.left_camera import open_euroc, open_kitti
@@ -162,10 +162,7 @@ def cut_row(cut: Cut) -> dict[str, Any]:
     tracker = MonocularTracker()
     first_s = np.inf
     for frame in cut.frames:
-        step = tracker.prepare(frame)
-        while isinstance(step, PoseQuery):
-            pose, inliers, is_weak = judged_answer(step)
-            step = tracker.accept(step, pose, inliers, is_weak=is_weak)
+        step = track(tracker, frame)
         if step.T_world_camera is not None and frame.timestamp_s >= cut.seen_s:
             first_s = min(first_s, frame.timestamp_s)
     tracker.adjust()

@@ -28,9 +28,9 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.maps.recordings import RED_KITCHEN, judged_answer
+from benchmarks.maps.recordings import RED_KITCHEN, track
 from client_sdk.datasets import Dataset, open_dataset
-from client_sdk.frontend import Frame, PoseQuery, TrackedFrame
+from client_sdk.frontend import Frame, TrackedFrame
 from client_sdk.mapping import Trajectory
 from client_sdk.simulator import SIMULATED_CAMERA, true_trajectory
 from client_sdk.simulator.camera import Painter, add_depth_noise, add_image_noise
@@ -110,15 +110,6 @@ def hard_drive(motion: Trajectory, first_s: float, seed: int, *, rate_hz: float 
             )
 
     return Drive(frames=frames(), stamps_s=tuple(stamps_s.tolist()), truth=truth)
-
-
-def track(tracker: Tracker, frame: Frame) -> TrackedFrame:
-    """Return the tracker's result for a frame, with poses solved as the service does."""
-    step = tracker.prepare(frame)
-    while isinstance(step, PoseQuery):
-        pose, inliers, is_weak = judged_answer(step)
-        step = tracker.accept(step, pose, inliers, is_weak=is_weak)
-    return step
 
 
 def poses_of(tracked: list[TrackedFrame], joins: list[Join]) -> list[Array | None]:

@@ -35,8 +35,8 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from benchmarks.maps.recordings import RED_KITCHEN
-from benchmarks.maps.tracking import hard_drive, interpolated, poses_of, track
+from benchmarks.maps.recordings import RED_KITCHEN, track
+from benchmarks.maps.tracking import hard_drive, interpolated, poses_of
 from client_sdk.datasets import open_dataset
 from client_sdk.frontend import Frame, FrontEndOptions, TrackedFrame
 from client_sdk.simulator import render_along
