@@ -1,11 +1,10 @@
-"""Count how often two views of a recording are linked, and views localised in a map of another part of it.
+"""Count how many views of one half of a drive are localised in a map of the other half.
 
-Compares ORB with a user's features, for pairs of frames that lie apart, and for frames of one half of the
-drive in a map of the other half, whose poses are the true ones.  Keyframes have what fits into 36 kB.  A pose
-is right within 5 cm and 5 deg of the truth, near within 15 cm and 10 deg, else wrong.  Place search is
-compared with trying all keyframes.
+The map's poses are the true ones, and keyframes have what fits into 36 kB.  A pose is right within 5 cm and
+5 deg of the truth, near within 15 cm and 10 deg, else wrong.  Place search is compared with trying all
+keyframes.  `benchmarks.live.wide_pairs` counts the links of views that lie apart.
 
-    python -m benchmarks.maps.wide_baselines --data ../shared/data/7scenes_redkitchen --features xfeat:xfeat
+    python -m benchmarks.maps.relocalisation --data ../shared/data/7scenes_redkitchen --features xfeat:xfeat
 """
 
 from __future__ import annotations
@@ -32,7 +31,6 @@ from rse_pf.services.mapping.place import MapIndex
 from rse_pf.slam.keyframe import most_features
 from rse_pf.slam.relative_pose import (
     RelativePoseOptions,
-    measure_link,
     measure_pose,
     reference_of,
     view_of_keyframe,
@@ -43,12 +41,7 @@ __all__ = ["main"]
 RIGHT_M, RIGHT_DEG = 0.05, 5.0
 NEAR_M, NEAR_DEG = 0.15, 10.0
 LIMITS = {
-    "today": RelativePoseOptions(),
-    "15 inliers": RelativePoseOptions(min_inliers=15, min_inlier_ratio=0.0),
-    "15 inliers, a third": RelativePoseOptions(min_inliers=15, min_inlier_ratio=0.33),
-}
-LOCALISE_LIMITS = {
-    "today": LocaliseOptions(),
+    "default": LocaliseOptions(),
     "15 inliers": LocaliseOptions(min_inliers=15, min_inlier_ratio=0.0),
 }
 SHOWS_INLIERS = 15
@@ -60,8 +53,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--data", type=Path, required=True, help="a recording with depth and truth")
     parser.add_argument("--features", metavar="MODULE:FUNCTION", help="default: ORB alone")
-    parser.add_argument("--gaps", type=int, nargs="+", default=[60], help="frames between two views")
-    parser.add_argument("--pair-step", type=int, default=2, help="frames between two pairs")
     parser.add_argument("--map-step", type=int, default=4, help="frames between two keyframes of a map")
     parser.add_argument("--out", type=Path, help="write JSON")
     args = parser.parse_args(arguments)
@@ -70,10 +61,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     found: dict[str, Any] = {"data": args.data.name, "load": [os.getloadavg()[0]]}
     for name, slot in slots.items():
         views = keyframes_of(args.data, slot)
-        found[name] = {
-            "pairs": {gap: pairs(views, gap, args.pair_step) for gap in args.gaps},
-            "relocalised": relocalised(views, args.map_step),
-        }
+        found[name] = relocalised(views, args.map_step)
         print(json.dumps(found[name], indent=1), flush=True)
     found["load"].append(os.getloadavg()[0])
     if args.out:
@@ -99,19 +87,6 @@ def keyframes_of(folder: Path, slot: FeaturesSlot | None) -> list[Keyframe]:
     return made
 
 
-def pairs(views: Sequence[Keyframe], gap: int, step: int) -> dict[str, Any]:
-    """Return, for each of the limits, how many pairs are links, right, near or wrong."""
-    found: dict[str, Counter[str]] = {name: Counter() for name in LIMITS}
-    firsts = range(0, len(views) - gap, step)
-    for first in firsts:
-        a, b = views[first], views[first + gap]
-        true = inverse(a.T_world_camera) @ b.T_world_camera
-        for name, limits in LIMITS.items():
-            link = measure_link(reference_of(a), view_of_keyframe(b), limits)
-            found[name][link if isinstance(link, str) else _judged(link.T_a_b, true)] += 1
-    return {"pairs": len(firsts), **{name: dict(counts) for name, counts in found.items()}}
-
-
 def relocalised(views: Sequence[Keyframe], step: int) -> dict[str, Any]:
     """Return how many views of one half are found in a map of the other half, in both directions."""
     half = len(views) // 2
@@ -125,7 +100,7 @@ def relocalised(views: Sequence[Keyframe], step: int) -> dict[str, Any]:
 
 def _relocalise(index: MapIndex, keyframe: Keyframe, found: dict[str, Counter[str]]) -> None:
     view, true = view_of_keyframe(keyframe), keyframe.T_world_camera
-    for name, limits in LOCALISE_LIMITS.items():
+    for name, limits in LIMITS.items():
         for tried, options in (
             ("", limits), (", all keyframes", _with_candidates(limits, len(index.keyframes))),
         ):  # fmt: skip
