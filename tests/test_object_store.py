@@ -424,6 +424,51 @@ def test_a_full_disk_is_reported_and_leaves_the_old_version(
     assert [path.name for path in tmp_path.iterdir()] == ["a"]
 
 
+def put_by_parts(store: DirectoryStore, name: str) -> None:
+    store.append("uploads/u1", 0, b"first ")
+    store.append("uploads/u1", 6, b"second")
+    store.adopt(name, "uploads/u1", 12)
+
+
+@pytest.mark.parametrize(
+    "write",
+    [
+        lambda store, name: store.put(name, b"data"),
+        lambda store, name: store.put_pieces(name, iter([b"da", b"ta"])),
+        lambda store, name: store.compare_and_swap(name, None, b"data"),
+        put_by_parts,
+    ],
+    ids=["put", "put_pieces", "compare_and_swap", "append and adopt"],
+)
+def test_what_is_stored_is_synced_before_it_has_its_name_and_the_name_before_the_answer(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, write: Callable[[DirectoryStore, str], None]
+) -> None:
+    fsync, replace, rename = os.fsync, os.replace, os.rename
+    steps: list[tuple[str, int]] = []  # what happened, to which inode
+
+    def note_sync(handle: int) -> None:
+        fsync(handle)
+        steps.append(("synced", os.fstat(handle).st_ino))
+
+    def note_name(move: Callable[[str, str], None]) -> Callable[[str, str], None]:
+        def named(source: str, target: str) -> None:
+            move(source, target)
+            steps.append(("named", os.stat(target).st_ino))
+
+        return named
+
+    monkeypatch.setattr(os, "fsync", note_sync)
+    monkeypatch.setattr(os, "replace", note_name(replace))
+    monkeypatch.setattr(os, "rename", note_name(rename))
+    write(DirectoryStore(tmp_path), "maps/kitchen/head")
+
+    path = tmp_path / "maps" / "kitchen" / "head"
+    own, named = path.stat().st_ino, steps.index(("named", path.stat().st_ino))
+    assert ("synced", own) in steps[:named], "it has its name before its bytes are on the disk"
+    for folder in (path.parent, path.parent.parent, tmp_path):
+        assert ("synced", folder.stat().st_ino) in steps[named + 1 :], f"{folder.name} is not on the disk"
+
+
 CRASH = """
 import os, signal, sys
 from pathlib import Path
