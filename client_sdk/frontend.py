@@ -16,6 +16,7 @@ import numpy.typing as npt
 from client_sdk.monocular.opencv import load_opencv
 from client_sdk.native_match import FrontEndCore, front_end_core
 from client_sdk.slots import FeaturesSlot
+from client_sdk.stereo.view import StereoView
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Array, Camera
 from rse_pf.maps.descriptors import ORB, DescriptorKind, Descriptors
@@ -56,13 +57,15 @@ class Frame:
     """One undistorted colour image with registered depth.
 
     ``rgb`` is ``(h, w, 3)`` uint8, red first; ``depth_m`` is ``(h, w)`` float32, metres along
-    the optical axis, 0 where there is no reading.
+    the optical axis, 0 where there is no reading.  With *stereo*, ``rgb`` and ``camera`` are those of the
+    rectified left camera, and ``depth_m`` is all 0.
     """
 
     timestamp_s: float
     rgb: npt.NDArray[np.uint8]
     depth_m: npt.NDArray[np.float32]
     camera: Camera
+    stereo: StereoView | None = None
 
     def __post_init__(self) -> None:
         size = (self.camera.height, self.camera.width)
@@ -71,6 +74,11 @@ class Frame:
                 f"colour {self.rgb.shape} and depth {self.depth_m.shape} do not fit a camera of "
                 f"{size[1]}x{size[0]} px",
                 hint="give colour, registered depth and intrinsics of one size",
+            )
+        if self.stereo is not None and self.stereo.gray.shape != size:
+            raise UsageError(
+                f"a right image of {self.stereo.gray.shape} does not fit a left one of {size}",
+                hint="rectify both images of a pair to one size",
             )
 
 
