@@ -46,7 +46,7 @@ from rse_pf.errors import (
     WorkerLost,
     error_from_code,
 )
-from rse_pf.linux import die_with_parent, set_process_name
+from rse_pf.linux import die_with_parent, run_as_batch, set_process_name
 from rse_pf.one_thread import ONE_THREAD
 
 __all__ = ["DEFAULT_NICENESS", "Handler", "LimitedProcesses", "Overran", "ProcessLimits", "main"]
@@ -300,9 +300,7 @@ class _Template:
                 env={**os.environ, **ONE_THREAD},
             )  # fmt: skip
         self._generation += 1
-        with contextlib.suppress(OSError):
-            own = os.getpriority(os.PRIO_PROCESS, 0)
-            os.setpriority(os.PRIO_PROCESS, self._process.pid, own + self._niceness)
+        run_as_batch(self._process.pid, os.getpriority(os.PRIO_PROCESS, 0) + self._niceness)
         with contextlib.suppress(OSError):  # it has ended, which the next read shows
             self._channel.send(self._order)
 

@@ -9,8 +9,9 @@ is two windows of the same length: beside a neighbour that uses its full quota a
 Each neighbour is a process of its own, at the lowest priority: in the field it has its own machine.
 
 Attacks: ``leave`` (keyframe, live-leave, again and again), ``maps`` (a keyframe and a subscription to each of
-eight maps), ``keyframes`` (of one map, as fast as they are answered), ``topics`` (rosbridge: latched and
-throttled messages of 250 kB), ``objects`` (of eight bytes), ``versions`` (of one map), ``jobs`` (long ones).
+eight maps), ``keyframes`` (of one map, as fast as they are answered), ``descriptors`` (keyframes of 20 kinds
+that no robot makes), ``topics`` (rosbridge: latched and throttled messages of 250 kB), ``objects`` (of eight
+bytes), ``versions`` (of one map), ``jobs`` (long ones).
 
 Defends: for each attack the median over the pairs of the ratio of p99 is at most 1.3 for poses, keyframes and
 objects; none of them is refused; what the attacker's tenant stores grows to its quota and 64 MiB at most; the
@@ -244,6 +245,16 @@ async def _keyframes(robot: Robot, place: _Place) -> None:
         number += codes.count("ok")
 
 
+async def _descriptors(robot: Robot, place: _Place) -> None:
+    from tests.slam.test_descriptor_kinds import HOSTILE_KEYFRAMES
+
+    kinds = [
+        {"map": place.tag, "segment": 0, "number": 0, "keyframe": data} for data in HOSTILE_KEYFRAMES.values()
+    ]
+    while True:
+        await asyncio.gather(*(place.call(robot, "live-keyframe", request) for request in kinds))
+
+
 async def _topics(robot: Robot, place: _Place) -> None:
     text = "x" * 250_000
     headers = {"Authorization": f"Bearer {place.token}"}
@@ -315,7 +326,7 @@ async def _jobs(robot: Robot, place: _Place) -> None:
 FAIR = "fair"
 ATTACKS: dict[str, Neighbour] = {
     "leave": _leave, "maps": _maps, "keyframes": _keyframes, "topics": _topics, "objects": _objects,
-    "versions": _versions, "jobs": _jobs,
+    "versions": _versions, "jobs": _jobs, "descriptors": _descriptors,
 }  # fmt: skip
 
 

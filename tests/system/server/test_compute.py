@@ -136,6 +136,7 @@ async def test_the_processes_end_with_their_worker(server, gone):
         template = int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1])
         assert template not in (server.workers[0], server.process.pid)
         assert os.getpriority(os.PRIO_PROCESS, pid) > os.getpriority(os.PRIO_PROCESS, server.workers[0])
+        assert os.sched_getscheduler(pid) == os.SCHED_BATCH
         with contextlib.suppress(ProcessLookupError):
             os.kill(server.workers[0], 9)
 
