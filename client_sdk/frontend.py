@@ -13,6 +13,7 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
+from client_sdk.imu.samples import ImuSamples
 from client_sdk.monocular.opencv import load_opencv
 from client_sdk.native_match import FrontEndCore, front_end_core
 from client_sdk.slots import FeaturesSlot
@@ -58,7 +59,7 @@ class Frame:
 
     ``rgb`` is ``(h, w, 3)`` uint8, red first; ``depth_m`` is ``(h, w)`` float32, metres along
     the optical axis, 0 where there is no reading.  With *stereo*, ``rgb`` and ``camera`` are those of the
-    rectified left camera, and ``depth_m`` is all 0.
+    rectified left camera, and ``depth_m`` is all 0.  *imu* has the samples since the last frame.
     """
 
     timestamp_s: float
@@ -66,6 +67,7 @@ class Frame:
     depth_m: npt.NDArray[np.float32]
     camera: Camera
     stereo: StereoView | None = None
+    imu: ImuSamples | None = None
 
     def __post_init__(self) -> None:
         size = (self.camera.height, self.camera.width)

@@ -17,8 +17,8 @@ from pathlib import Path
 
 import numpy as np
 
-from client_sdk.datasets.intrinsics import Intrinsics, write_intrinsics
 from client_sdk.mapping import Trajectory, write_trajectory
+from client_sdk.rigs.intrinsics import Intrinsics, write_intrinsics
 from client_sdk.simulator import RATE_HZ, SIMULATED_CAMERA, render_frames, true_trajectory
 
 __all__ = ["main", "write_recording"]

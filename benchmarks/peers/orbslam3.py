@@ -28,10 +28,10 @@ from typing import Any, Literal
 import numpy as np
 
 from client_sdk.datasets import associate_stamps
-from client_sdk.datasets.intrinsics import Intrinsics, read_intrinsics
-from client_sdk.datasets.left_camera import read_euroc_camera
 from client_sdk.frontend import load_opencv
 from client_sdk.mapping import Trajectory, read_trajectory
+from client_sdk.rigs.benchmark_files import read_euroc_camera
+from client_sdk.rigs.intrinsics import Intrinsics, read_intrinsics
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import UsageError
 from rse_pf.experiments.compare.configurations import Configuration, configurations_of
@@ -127,7 +127,8 @@ def job_of(recordings: Path, drive: Drive, sensor: Sensor) -> Job:
         return Job(settings=_yaml(lens, sensor, drive.rate_hz, more), frames=frames, T_camera_peer=same)
     if name == _EUROC:
         images = folder / "mav0"
-        lens, T_body_left = read_euroc_camera(images / "cam0" / "sensor.yaml")
+        left = read_euroc_camera(images / "cam0" / "sensor.yaml", "left")
+        lens = left.lens
         lines = (images / "cam0/data.csv").read_text().splitlines()[1:]
         names = [line.split(",")[1].strip() for line in lines]
         frames = [
@@ -136,15 +137,15 @@ def job_of(recordings: Path, drive: Drive, sensor: Sensor) -> Job:
         ]
         if sensor == "MONOCULAR":
             return Job(settings=_yaml(lens, sensor, drive.rate_hz, []), frames=frames, T_camera_peer=same)
-        right, T_body_right = read_euroc_camera(images / "cam1" / "sensor.yaml")
-        T_left_right = inverse(T_body_left) @ T_body_right
+        right = read_euroc_camera(images / "cam1" / "sensor.yaml", "right")
+        T_left_right = inverse(left.T_body_camera) @ right.T_body_camera
         return Job(
-            settings=_yaml(lens, sensor, drive.rate_hz, _two_lenses(right, T_left_right)),
-            frames=frames, T_camera_peer=_rectified(lens, right, T_left_right),
+            settings=_yaml(lens, sensor, drive.rate_hz, _two_lenses(right.lens, T_left_right)),
+            frames=frames, T_camera_peer=_rectified(lens, right.lens, T_left_right),
         )  # fmt: skip
-    left = sorted((folder / "image_0").iterdir())
+    names = sorted(path.name for path in (folder / "image_0").iterdir())
     frames = [
-        (stamp, str(left[row]), str(folder / "image_1" / left[row].name))
+        (stamp, str(folder / "image_0" / names[row]), str(folder / "image_1" / names[row]))
         for stamp, row in zip(stamps_s, rows, strict=True)
     ]
     lens = Intrinsics(camera=drive.dataset.camera)
@@ -401,7 +402,8 @@ def main() -> int:
     if args.part != "ours":
         report |= {"peer": _about_peer(args), "speed": args.speed}
     for row in ROWS:
-        for drive in drives_of([str(args.recordings / row.recording)], row.rates_hz):
+        recording = str(args.recordings / row.recording)
+        for drive in drives_of([recording], row.rates_hz, camera="left", imu=False):
             key = (drive.name, row.sensor)
             if args.only in f"{drive.name} {row.sensor}":
                 known[key] = {

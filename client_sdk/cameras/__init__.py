@@ -5,7 +5,7 @@ Whatever yields a `Frame` belongs here; what a robot does with it does not.
 
 from client_sdk.cameras.open_camera import open_camera, source_of_frames
 from client_sdk.cameras.source import FrameSource
-from client_sdk.datasets.intrinsics import Intrinsics, read_intrinsics, write_intrinsics
+from client_sdk.rigs.intrinsics import Intrinsics, read_intrinsics, write_intrinsics
 
 __all__ = [
     "FrameSource",

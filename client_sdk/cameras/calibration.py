@@ -11,8 +11,8 @@ import numpy as np
 import numpy.typing as npt
 
 from client_sdk.cameras.board import Board, find_corners
-from client_sdk.datasets.intrinsics import Intrinsics
 from client_sdk.frontend import load_opencv
+from client_sdk.rigs.intrinsics import Intrinsics
 from rse_pf.errors import CommandFailed, UsageError
 from rse_pf.geometry import Array, Camera
 

@@ -12,8 +12,8 @@ from client_sdk.cameras.opencv_video import is_video_file, open_video
 from client_sdk.cameras.realsense import open_realsense
 from client_sdk.cameras.source import RawFrame, RawSource
 from client_sdk.datasets import open_dataset
-from client_sdk.datasets.intrinsics import Intrinsics, read_intrinsics
 from client_sdk.frontend import Frame
+from client_sdk.rigs.intrinsics import Intrinsics, read_intrinsics
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Camera
 

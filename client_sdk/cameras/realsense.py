@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from client_sdk.cameras.source import RawFrame
-from client_sdk.datasets.intrinsics import Intrinsics
+from client_sdk.rigs.intrinsics import Intrinsics
 from rse_pf.errors import MissingExtra, UsageError
 from rse_pf.geometry import Camera
 

@@ -14,9 +14,9 @@ import numpy as np
 import numpy.typing as npt
 
 from client_sdk.closing import Closing
-from client_sdk.datasets.intrinsics import Intrinsics, Undistortion
 from client_sdk.datasets.thinning import Thinning
 from client_sdk.frontend import Frame
+from client_sdk.rigs.intrinsics import Intrinsics, Undistortion
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Camera
 

@@ -1,8 +1,11 @@
-"""Recordings as frames: TUM RGB-D layout, NYU Depth V2.
+"""Recordings as frames: layouts of TUM RGB-D, EuRoC and KITTI, NYU Depth V2, ROS bags.
 
 Readers belong here; what a robot does with a frame does not.
 """
 
-from client_sdk.datasets.recordings import Dataset, associate_stamps, open_dataset, read_colour
+from client_sdk.datasets.dataset import Dataset
+from client_sdk.datasets.images import read_colour
+from client_sdk.datasets.recordings import associate_stamps, open_dataset
+from client_sdk.datasets.rig_recordings import CameraChoice
 
-__all__ = ["Dataset", "associate_stamps", "open_dataset", "read_colour"]
+__all__ = ["CameraChoice", "Dataset", "associate_stamps", "open_dataset", "read_colour"]

@@ -7,8 +7,7 @@ An image is read only when its frame is needed.  A path that cannot be used is r
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -18,16 +17,17 @@ import numpy.typing as npt
 from client_sdk.bags import Bag, is_bag, open_bag
 from client_sdk.bags.index import pair_stamps
 from client_sdk.datasets import nyu
-from client_sdk.datasets.intrinsics import Intrinsics, Undistortion, read_intrinsics
-from client_sdk.datasets.thinning import Thinning, median_interval_s
+from client_sdk.datasets.dataset import Dataset
+from client_sdk.datasets.images import read_image_file
+from client_sdk.datasets.rig_recordings import CameraChoice, is_euroc, is_kitti, open_euroc, open_kitti
 from client_sdk.frontend import Frame
 from client_sdk.mapping import Trajectory, read_trajectory
-from client_sdk.monocular.opencv import MAX_IMAGE_PIXELS, load_opencv, read_image
+from client_sdk.rigs.intrinsics import Intrinsics, Undistortion, read_intrinsics
 from rse_pf.errors import UsageError
 from rse_pf.files import read_regular_file
-from rse_pf.geometry import Array, Camera
+from rse_pf.geometry import Camera
 
-__all__ = ["Dataset", "associate_stamps", "dataset_of_bag", "open_dataset", "read_colour"]
+__all__ = ["associate_stamps", "dataset_of_bag", "open_dataset"]
 
 _MAX_LIST_BYTES = 64 << 20
 """Of ``rgb.txt`` and ``depth.txt``: a million images."""
@@ -45,72 +45,43 @@ _FREIBURG: dict[str, tuple[float, float, float, float, tuple[float, ...]]] = {
 _FREIBURG_DEPTH_SCALE = 5000.0
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Dataset:
-    """A recording: iterate over it to get its frames in order of time.
-
-    ``truth_kind`` is ``reference`` if the poses came with the source as an estimate.  ``read`` reads one of
-    ``rows``; row *i* has the time stamp ``timestamps_s[i]`` of this dataset.  ``notes`` are sentences for the
-    user on what was assumed.  ``T_body_camera`` is the pose of the camera in the body whose path was
-    measured, None where that is the camera itself, or not known.
-    """
-
-    name: str
-    camera: Camera
-    timestamps_s: tuple[float, ...]
-    truth: Trajectory | None
-    truth_kind: Literal["ground truth", "reference", "none"]
-    rows: tuple[int, ...]
-    read: Callable[[int], Frame]
-    notes: tuple[str, ...] = ()
-    has_depth: bool = True
-    T_body_camera: Array | None = None
-
-    def __len__(self) -> int:
-        return len(self.rows)
-
-    def __iter__(self) -> Iterator[Frame]:
-        return map(self.read, self.rows)
-
-    def thinned(self, rate_hz: float) -> Dataset:
-        """Return frames at *rate_hz* on average; all of them at the recording's own rate, or a higher one.
-
-        Jitter drops none: `Thinning` says which frame serves which due time.
-
-        Raises:
-            UsageError: The rate is not above 0.
-        """
-        thinning = Thinning(rate_hz, interval_s=median_interval_s(self.timestamps_s))
-        rows = [index for index, stamp_s in enumerate(self.timestamps_s) if thinning.plays(stamp_s)]
-        return self._only(rows)
-
-    def share(self, robot: int, robots: int) -> Dataset:
-        """Return the contiguous share of ``ceil(n / robots)`` frames of *robot* 0, 1, ..."""
-        if not 0 <= robot < robots:
-            raise UsageError(f"robot {robot} is not one of 0..{robots - 1}", hint="count robots from 0")
-        size = math.ceil(len(self) / robots)
-        return self._only(range(len(self))[robot * size : (robot + 1) * size])
-
-    def _only(self, indices: Sequence[int]) -> Dataset:
-        return replace(
-            self,
-            timestamps_s=tuple(self.timestamps_s[index] for index in indices),
-            rows=tuple(self.rows[index] for index in indices),
-        )
-
-
-def open_dataset(path: Path | str, *, scene: str | None = None) -> Dataset:
+def open_dataset(
+    path: Path | str,
+    *,
+    scene: str | None = None,
+    camera: CameraChoice | None = None,
+    imu: bool | None = None,
+) -> Dataset:
     """Detect the format of *path* and return its frames; images are read later.
 
-    Accepts a folder in TUM layout (``rgb.txt``, ``depth.txt``, with or without ``intrinsics.json``),
-    a raw NYU Depth V2 folder (``r-*.ppm``, ``d-*.pgm``), its labelled ``.mat`` file, of which
-    *scene* picks one scene, or a ROS bag.
+    Accepts a folder in TUM layout (``rgb.txt``, ``depth.txt``, with or without ``intrinsics.json``), a
+    recording of EuRoC or a sequence of KITTI's odometry benchmark, a raw NYU Depth V2 folder (``r-*.ppm``,
+    ``d-*.pgm``), its labelled ``.mat`` file, of which *scene* picks one scene, or a ROS bag.
+
+    Args:
+        path: The folder or file.
+        scene: Of the labelled file.
+        camera: ``stereo`` for both cameras of a rig, ``left`` for one; None for both where there are two.
+        imu: Whether frames carry samples of the IMU; None for yes where there is one.
 
     Raises:
-        UsageError: The path is none of these, or a part is missing or broken.
+        UsageError: The path is none of these, a part is missing or broken, or it has no such camera or IMU.
         MissingExtra: OpenCV, h5py or rosbags is needed and not installed.
     """
     path = Path(path)
+    if scene is None and is_euroc(path):
+        return open_euroc(path, camera=camera, imu=imu)
+    if scene is None and is_kitti(path):
+        return open_kitti(path, camera=camera, imu=imu)
+    dataset = _open_single(path, scene)
+    if camera == "stereo":
+        raise UsageError(f"{path} has one camera", hint="leave out --camera stereo")
+    if imu:
+        raise UsageError(f"{path} has no IMU", hint="leave out --imu")
+    return dataset
+
+
+def _open_single(path: Path, scene: str | None) -> Dataset:
     if scene is None and is_bag(path) and not (path / "rgb.txt").is_file():
         return dataset_of_bag(open_bag(path))
     if path.is_file():
@@ -118,7 +89,10 @@ def open_dataset(path: Path | str, *, scene: str | None = None) -> Dataset:
             raise UsageError(f"{path} is not a recording", hint="name a folder, a ROS bag or the .mat file")
         return _open_labelled(path, scene)
     if not path.is_dir():
-        raise UsageError(f"no folder {path}", hint="name a folder in TUM layout: rgb.txt, depth.txt, images")
+        raise UsageError(
+            f"no folder {path}",
+            hint="name a folder in the layout of TUM (rgb.txt, ...), EuRoC or KITTI",
+        )
     if scene is not None:
         raise UsageError(f"{path} has no scenes", hint="name scenes for the labelled .mat file only")
     if not (path / "rgb.txt").exists() and any(path.glob("d-*.pgm")):
@@ -138,16 +112,6 @@ def dataset_of_bag(bag: Bag) -> Dataset:
         read=bag.read,
         notes=bag.notes,
     )
-
-
-def read_colour(path: Path) -> npt.NDArray[np.uint8]:
-    """Return the colour image of a file, ``(h, w, 3)``, in the order red, green, blue.
-
-    Raises:
-        UsageError: The file is not an image.
-        MissingExtra: OpenCV is not installed.
-    """
-    return _read_image(path, is_depth=False)
 
 
 def associate_stamps(
@@ -183,8 +147,8 @@ def _open_tum(folder: Path) -> Dataset:
 
     def read(row: int) -> Frame:
         colour_row, depth_row = pairs[row]
-        rgb = _read_image(folder / colours[colour_row][1], is_depth=False)
-        png = _read_image(folder / depths[depth_row][1], is_depth=True)
+        rgb = read_image_file(folder / colours[colour_row][1], is_depth=False)
+        png = read_image_file(folder / depths[depth_row][1], is_depth=True)
         _check_size(rgb, camera, folder / colours[colour_row][1])
         _check_size(png, camera, folder / depths[depth_row][1])
         depth_m = png.astype(np.float32) / np.float32(intrinsics.depth_scale)
@@ -340,25 +304,3 @@ def _open_labelled(path: Path, scene: str | None) -> Dataset:
         rows=tuple(range(len(rows))),
         read=read,
     )
-
-
-# --- images ------------------------------------------------------------------------------------
-
-
-def _read_image(path: Path, *, is_depth: bool) -> npt.NDArray[Any]:
-    cv2 = load_opencv()
-    image = read_image(path, cv2.IMREAD_UNCHANGED if is_depth else cv2.IMREAD_COLOR)
-    if image is None:
-        raise UsageError(
-            f"cannot read the image {path}",
-            hint=f"unpack the recording again; an image has at most {MAX_IMAGE_PIXELS} pixels",
-        )
-    if not is_depth:
-        rgb: npt.NDArray[Any] = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
-        return rgb
-    if image.dtype != np.uint16 or image.ndim != 2:
-        raise UsageError(
-            f"{path} is not a 16-bit depth image",
-            hint="depth is one 16-bit channel, value / depth_scale in m",
-        )
-    return image

@@ -89,7 +89,7 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
 
 def _calibrate(args: argparse.Namespace, board: Board) -> int:
     from client_sdk.cameras.calibration import BoardViews, calibrate
-    from client_sdk.datasets.intrinsics import write_intrinsics
+    from client_sdk.rigs.intrinsics import write_intrinsics
 
     if not args.max_rms_px > 0:
         raise UsageError(f"--max-rms-px {args.max_rms_px:g} is not above 0", hint="good cameras reach 0.5")

@@ -6,10 +6,8 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
-from pathlib import Path
 
-from client_sdk.datasets import Dataset, open_dataset
-from client_sdk.datasets.left_camera import is_euroc, is_kitti, open_euroc, open_kitti
+from client_sdk.datasets import CameraChoice, Dataset, open_dataset
 from client_sdk.datasets.thinning import median_interval_s
 from client_sdk.frontend import Frame
 from client_sdk.simulator import RATE_HZ, SIMULATED_CAMERA, render_frames, true_trajectory
@@ -37,8 +35,16 @@ class Drive:
         return f"{self.dataset.name} at {self.rate_hz:.3g} Hz"
 
 
-def drives_of(words: Sequence[str], rates_hz: Sequence[float]) -> list[Drive]:
+def drives_of(
+    words: Sequence[str],
+    rates_hz: Sequence[float],
+    *,
+    camera: CameraChoice | None = None,
+    imu: bool | None = None,
+) -> list[Drive]:
     """Return each recording at each rate; without rates at its own.
+
+    *camera* and *imu* are those of `open_dataset`.
 
     Raises:
         UsageError: A recording cannot be read, or two have one name.
@@ -46,7 +52,7 @@ def drives_of(words: Sequence[str], rates_hz: Sequence[float]) -> list[Drive]:
     drives: list[Drive] = []
     names: dict[str, str] = {}
     for word in words:
-        dataset = open_recording(word)
+        dataset = open_recording(word, camera=camera, imu=imu)
         if dataset.name in names:
             raise UsageError(
                 f"two recordings are called {dataset.name}: {names[dataset.name]} and {word}",
@@ -57,7 +63,7 @@ def drives_of(words: Sequence[str], rates_hz: Sequence[float]) -> list[Drive]:
     return drives
 
 
-def open_recording(word: str) -> Dataset:
+def open_recording(word: str, *, camera: CameraChoice | None = None, imu: bool | None = None) -> Dataset:
     """Return the recording that a path or ``world:SEED`` names.
 
     Raises:
@@ -68,12 +74,7 @@ def open_recording(word: str) -> Dataset:
         return _rendered(int(world[1]))
     if word.startswith("world:"):
         raise UsageError(f"{word} names no rendered world", hint="write world: and a seed, such as world:3")
-    path = Path(word)
-    if is_euroc(path):
-        return open_euroc(path)
-    if is_kitti(path):
-        return open_kitti(path)
-    return open_dataset(path)
+    return open_dataset(word, camera=camera, imu=imu)
 
 
 def _at_rates(dataset: Dataset, rates_hz: Sequence[float]) -> list[Drive]:

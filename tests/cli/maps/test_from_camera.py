@@ -15,10 +15,10 @@ import pytest
 
 import client_sdk
 from client_sdk.answers import PoseAnswer
-from client_sdk.datasets.intrinsics import Intrinsics, write_intrinsics
 from client_sdk.frontend import TrackedFrame
 from client_sdk.mapper import Mapper, ask_robot
 from client_sdk.mapping import Trajectory, read_ply, read_trajectory, write_trajectory
+from client_sdk.rigs.intrinsics import Intrinsics, write_intrinsics
 from rse_pf.cli.main import main
 from rse_pf.cli.maps import from_camera
 from rse_pf.cli.maps.frame_table import FrameTable

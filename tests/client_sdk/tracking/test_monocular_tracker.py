@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from client_sdk.datasets.left_camera import open_kitti
+from client_sdk.datasets.rig_recordings import open_kitti
 from client_sdk.frontend import Frame, PoseQuery, TrackedFrame
 from client_sdk.mapping import Trajectory
 from client_sdk.tracking.keyframe_map import NO_LANDMARK

@@ -15,7 +15,7 @@ from tests.experiments.compare.recordings import flat_drive
 @pytest.fixture
 def flat(monkeypatch: pytest.MonkeyPatch) -> None:
     """A recording of 10 Hz behind every path."""
-    monkeypatch.setattr(recordings, "open_recording", lambda word: flat_drive(20).dataset)
+    monkeypatch.setattr(recordings, "open_recording", lambda word, **_: flat_drive(20).dataset)
 
 
 def test_a_rendered_world_has_a_name_and_a_seed() -> None:

@@ -3,10 +3,12 @@
 ::
 
     {"fx": 525.1, "fy": 525.3, "cx": 319.8, "cy": 240.1, "width": 640, "height": 480,
-     "distortion": [k1, k2, p1, p2, k3], "depth_scale": 1000, "rms_px": 0.31, "views": 24}
+     "model": "radial-tangential", "distortion": [k1, k2, p1, p2, k3],
+     "depth_scale": 1000, "rms_px": 0.31, "views": 24}
 
 Lengths are pixels.  ``distortion`` (OpenCV's order), ``depth_scale`` (units of a 16-bit depth image in a
-metre), ``rms_px`` and ``views`` (of the calibration) may be left out.
+metre), ``rms_px`` and ``views`` (of the calibration) may be left out, and ``model`` for all lenses but
+``fisheye`` (Kannala and Brandt), whose ``distortion`` is ``[k1, k2, k3, k4]``.
 """
 
 from __future__ import annotations
@@ -14,7 +16,7 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar, get_args
 
 import numpy as np
 
@@ -23,9 +25,11 @@ from client_sdk.image_map import ImageMap
 from client_sdk.monocular.opencv import MAX_IMAGE_PIXELS
 from rse_pf.errors import InvalidCamera, UsageError
 from rse_pf.files import read_regular_file
-from rse_pf.geometry import Camera
+from rse_pf.geometry import Array, Camera
 
-__all__ = ["Intrinsics", "Undistortion", "read_intrinsics", "write_intrinsics"]
+__all__ = ["Intrinsics", "LensModel", "Undistortion", "lens_maps", "read_intrinsics", "write_intrinsics"]
+
+LensModel = Literal["radial-tangential", "fisheye"]
 
 _T = TypeVar("_T", int, float)
 _MAX_FILE_BYTES = 1 << 20
@@ -38,6 +42,8 @@ _HINT = "it needs fx fy cx cy width height, and may have distortion [k1 k2 p1 p2
 class Intrinsics:
     """A camera, the distortion of its lens (0, 4 or 5 numbers) and the scale of its 16-bit depth images.
 
+    ``model`` says what the numbers of ``distortion`` are: k1 k2 p1 p2 k3 of a ``radial-tangential`` lens, or
+    k1 k2 k3 k4 of a ``fisheye`` (Kannala and Brandt, PAMI 2006, as OpenCV's fisheye module has it).
     ``rms_px`` and ``views`` tell how it was calibrated; None if unknown.
 
     Raises:
@@ -49,8 +55,17 @@ class Intrinsics:
     depth_scale: float = 1000.0
     rms_px: float | None = None
     views: int | None = None
+    model: LensModel = "radial-tangential"
 
     def __post_init__(self) -> None:
+        if self.model not in get_args(LensModel):
+            raise UsageError(
+                f"no lens model {self.model!r}", hint=f"write one of {', '.join(get_args(LensModel))}"
+            )
+        if self.model == "fisheye" and len(self.distortion) not in (0, 4):
+            raise UsageError(
+                f"{len(self.distortion)} distortion numbers of a fisheye", hint="give k1 k2 k3 k4"
+            )
         if len(self.distortion) not in (0, 4, 5) or not all(
             abs(coefficient) <= _MAX_DISTORTION for coefficient in self.distortion
         ):
@@ -96,6 +111,7 @@ def read_intrinsics(path: Path | str, *, with_depth_scale: bool = False) -> Intr
             depth_scale=float(depth_scale),
             rms_px=_optional(values.get("rms_px"), float),
             views=_optional(values.get("views"), int),
+            model=values.get("model", "radial-tangential"),
         )
     except FileNotFoundError as error:
         raise UsageError(
@@ -121,6 +137,8 @@ def write_intrinsics(path: Path | str, intrinsics: Intrinsics) -> None:
         "width": camera.width, "height": camera.height,
         "distortion": list(intrinsics.distortion), "depth_scale": intrinsics.depth_scale,
     }  # fmt: skip
+    if intrinsics.model != "radial-tangential":
+        values["model"] = intrinsics.model
     if intrinsics.rms_px is not None:
         values["rms_px"] = round(intrinsics.rms_px, 4)
     if intrinsics.views is not None:
@@ -135,12 +153,20 @@ class Undistortion(ImageMap):
     """Map images of a distorted lens to the pinhole camera of the same intrinsics."""
 
     def __init__(self, intrinsics: Intrinsics) -> None:
-        maps: tuple[Any, Any] | None = None
-        camera = intrinsics.camera
-        if any(intrinsics.distortion):
-            cv2 = load_opencv()
-            maps = cv2.initUndistortRectifyMap(
-                camera.matrix, np.array(intrinsics.distortion), None, camera.matrix,
-                (camera.width, camera.height), cv2.CV_32FC1,
-            )  # fmt: skip
-        super().__init__(maps)
+        distorts = intrinsics.model == "fisheye" or any(intrinsics.distortion)
+        super().__init__(lens_maps(intrinsics, np.eye(3), intrinsics.camera) if distorts else None)
+
+
+def lens_maps(lens: Intrinsics, rotation: Array, camera: Camera) -> tuple[Any, Any]:
+    """Return where pixels of a pinhole *camera*, turned by ``(3, 3)`` *rotation*, lie in images of *lens*.
+
+    Raises:
+        MissingExtra: OpenCV is not installed.
+    """
+    cv2 = load_opencv()
+    make = cv2.fisheye.initUndistortRectifyMap if lens.model == "fisheye" else cv2.initUndistortRectifyMap
+    maps: tuple[Any, Any] = make(
+        lens.camera.matrix, np.array(lens.distortion or (0.0,) * 4), rotation, camera.matrix,
+        (camera.width, camera.height), cv2.CV_32FC1,
+    )  # fmt: skip
+    return maps

@@ -1,0 +1,92 @@
+"""A recording as frames in the order of time, thinned out or shared among robots."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+from client_sdk.datasets.thinning import Thinning, median_interval_s
+from client_sdk.frontend import Frame
+from client_sdk.mapping import Trajectory
+from client_sdk.rigs.imu_track import ImuTrack
+from rse_pf.errors import UsageError
+from rse_pf.geometry import Array, Camera
+
+__all__ = ["Dataset"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Dataset:
+    """A recording: iterate over it to get its frames in order of time.
+
+    ``truth_kind`` is ``reference`` if the poses came with the source as an estimate.  ``read`` reads one of
+    ``rows``; row *i* has the time stamp ``timestamps_s[i]`` of this dataset.  ``notes`` are sentences for the
+    user on what was assumed.  ``T_body_camera`` is the pose of the camera in the body whose path was
+    measured, None where that is the camera itself, or not known.  With *has_stereo* the camera is the
+    rectified left one, and so is that of the truth.  ``imu`` holds all samples of an IMU; each frame that is
+    iterated over gets those since the frame before it in this dataset.
+    """
+
+    name: str
+    camera: Camera
+    timestamps_s: tuple[float, ...]
+    truth: Trajectory | None
+    truth_kind: Literal["ground truth", "reference", "none"]
+    rows: tuple[int, ...]
+    read: Callable[[int], Frame]
+    notes: tuple[str, ...] = ()
+    has_depth: bool = True
+    has_stereo: bool = False
+    T_body_camera: Array | None = None
+    imu: ImuTrack | None = None
+
+    @property
+    def has_imu(self) -> bool:
+        """Whether frames carry samples of an IMU."""
+        return self.imu is not None
+
+    @property
+    def sensors(self) -> str:
+        """What the frames show, for people: such as ``stereo + IMU``."""
+        seen = "stereo" if self.has_stereo else "colour + depth" if self.has_depth else "one lens"
+        return f"{seen} + IMU" if self.has_imu else seen
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def __iter__(self) -> Iterator[Frame]:
+        if self.imu is None:
+            yield from map(self.read, self.rows)
+            return
+        last_s = self.timestamps_s[0] if self.rows else 0.0
+        for row, stamp_s in zip(self.rows, self.timestamps_s, strict=True):
+            yield replace(self.read(row), imu=self.imu.between(last_s, stamp_s))
+            last_s = stamp_s
+
+    def thinned(self, rate_hz: float) -> Dataset:
+        """Return frames at *rate_hz* on average; all of them at the recording's own rate, or a higher one.
+
+        Jitter drops none: `Thinning` says which frame serves which due time.
+
+        Raises:
+            UsageError: The rate is not above 0.
+        """
+        thinning = Thinning(rate_hz, interval_s=median_interval_s(self.timestamps_s))
+        rows = [index for index, stamp_s in enumerate(self.timestamps_s) if thinning.plays(stamp_s)]
+        return self._only(rows)
+
+    def share(self, robot: int, robots: int) -> Dataset:
+        """Return the contiguous share of ``ceil(n / robots)`` frames of *robot* 0, 1, ..."""
+        if not 0 <= robot < robots:
+            raise UsageError(f"robot {robot} is not one of 0..{robots - 1}", hint="count robots from 0")
+        size = math.ceil(len(self) / robots)
+        return self._only(range(len(self))[robot * size : (robot + 1) * size])
+
+    def _only(self, indices: Sequence[int]) -> Dataset:
+        return replace(
+            self,
+            timestamps_s=tuple(self.timestamps_s[index] for index in indices),
+            rows=tuple(self.rows[index] for index in indices),
+        )

@@ -1,0 +1,46 @@
+"""All samples of an IMU of a recording or a device, from which each frame takes those since the last one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from client_sdk.imu.samples import ImuModel, ImuSamples
+from rse_pf.errors import UsageError
+from rse_pf.geometry import Array
+
+__all__ = ["ImuTrack"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ImuTrack:
+    """Samples on the clock of the camera: ``(n,)`` seconds, ``(n, 3)`` rad/s and m/s^2, and the model.
+
+    Raises:
+        UsageError: The shapes do not fit, a number is not finite, or times do not ascend.
+    """
+
+    timestamps_s: Array
+    gyro: Array
+    accel: Array
+    model: ImuModel
+
+    def __post_init__(self) -> None:
+        n = len(self.timestamps_s)
+        if self.gyro.shape != (n, 3) or self.accel.shape != (n, 3):
+            raise UsageError(
+                f"IMU: {n} times, gyro {self.gyro.shape} and accel {self.accel.shape} do not fit",
+                hint="give three rates and three accelerations for each time",
+            )
+        if not all(np.isfinite(each).all() for each in (self.timestamps_s, self.gyro, self.accel)):
+            raise UsageError("an IMU sample is not finite", hint="leave out samples that were not measured")
+        if not (np.diff(self.timestamps_s) > 0.0).all():
+            raise UsageError("the times of the IMU do not ascend", hint="sort the samples, each time once")
+
+    def between(self, since_s: float, until_s: float) -> ImuSamples:
+        """Return the samples from one at or before *since_s* to one at or after *until_s*."""
+        first = max(0, int(np.searchsorted(self.timestamps_s, since_s, side="right")) - 1)
+        last = int(np.searchsorted(self.timestamps_s, until_s, side="left")) + 1
+        rows = slice(first, last)
+        return ImuSamples(self.timestamps_s[rows], self.gyro[rows], self.accel[rows], self.model)
