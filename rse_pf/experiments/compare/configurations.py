@@ -207,7 +207,8 @@ def _read_python(path: Path) -> tuple[Mapping[str, Any], Mapping[str, Callable[.
             raise UsageError(f"{path}: {name} is no function", hint=f"write def {name}(...)")
     if not values and not slots:
         raise UsageError(
-            f"{path} sets nothing that is compared", hint=f"set one of {', '.join((*_OPTIONS, *SLOTS))}"
+            f"{path} sets nothing that is compared",
+            hint=f"set one of {', '.join((*_OPTIONS, *SLOTS))}, or name its function: {path.stem}:FUNCTION",
         )
     return values, slots
 

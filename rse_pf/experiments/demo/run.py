@@ -316,7 +316,8 @@ def _write_results(
 ) -> dict[str, Any]:
     commands = [command for robot in finished for command in robot.commands]
     write_commands(folder / COMMANDS, commands)
-    asked = {name: getattr(options, name) for name in ("rate_hz", "engine", "codec", "seed", "frontend")}
+    named = ("rate_hz", "engine", "codec", "seed", "frontend", "features")
+    asked = {name: getattr(options, name) for name in named}
     asked["data"] = None if options.data is None else options.data.name
     report = make_report(finished, commands, asked, before, load_average())
     if merged is not None:
