@@ -20,6 +20,8 @@ import numpy.typing as npt
 
 from client_sdk.answers import PoseAnswer
 from client_sdk.frontend import Features, Frame, FrontEndOptions, PoseQuery, TrackedFrame
+from client_sdk.imu.inertial import ImuScale, Inertial, correction, upright
+from client_sdk.imu.samples import ImuSamples
 from client_sdk.mapping import MapOptions, PointMap, Trajectory, write_ply, write_trajectory
 from client_sdk.monocular.scale import MarkerScale, OdometryScale
 from client_sdk.slots import FeaturesFunction, LoopsFunction, MotionFunction, OptimiserFunction, Slots
@@ -39,6 +41,8 @@ AskPose = Callable[[PoseQuery], Awaitable[PoseAnswer]]
 
 _MIN_READINGS = 2
 _UP_TO_SCALE = "up to scale"
+_LEVEL_GRAVITY: Array = np.array([0.0, 9.81, 0.0])
+_USUAL_DEPTH_M = 2.0
 
 
 class PoseSolver(Protocol):
@@ -108,6 +112,7 @@ class Mapper:
         keyframes_of: str = "",
         adds_frames: bool = True,
         recorder: FrameRecorder | None = None,
+        holds_world: bool = False,
         features: FeaturesFunction | None = None,
         motion: MotionFunction | None = None,
         loops: LoopsFunction | None = None,
@@ -121,14 +126,17 @@ class Mapper:
             options: For frames with depth.
             monocular: For frames without depth.
             depth: Whether to use depth; None means: if the first frame has some.
-            scale: For frames without depth: where metres come from; None means "up to scale".
+            scale: For frames without depth: where metres come from; None means from the IMU, if frames have
+                one, else "up to scale".
             map_options: Density of the map of frames with depth.
-            T_world_start: ``(4, 4)``, pose of the first camera; None means the identity.
+            T_world_start: ``(4, 4)``, pose of the first camera; None means the identity, or, with an IMU, a
+                world whose z points up, in which a level camera looks along x.
             keyframes_of: Name of the robot under which keyframes with depth are kept, about 50 kB each, for
                 `encoded_map`; empty keeps none.
             adds_frames: Whether each frame with depth is added to the map; else the caller adds to `map`
                 what it wants.
             recorder: Gets each frame before it is tracked, and the points of each map that is saved.
+            holds_world: Whether poses that were returned are never turned, when gravity becomes known better.
             features: Finds the features of an image; None for ORB.
             motion: Expects the pose of the next frame; None for a constant velocity.
             loops: Describes an image, so that places are recognised; None takes its features.
@@ -142,7 +150,9 @@ class Mapper:
         self._options = options
         self._monocular = monocular
         self._depth = depth
-        self._scale = scale
+        self._scale: OdometryScale | MarkerScale | ImuScale | None = scale
+        self._inertial: Inertial | None = None
+        self._is_upright, self._holds_world = False, holds_world or T_world_start is not None
         self._map_options = map_options or MapOptions()
         self._T_world_start = T_world_start
         self._tracker: Tracker | MonocularTracker | None = None
@@ -173,6 +183,8 @@ class Mapper:
             if self._recorder is not None:
                 self._recorder.frame(frame.timestamp_s, frame.rgb)
             tracker = self._tracker_for(frame)
+            if self._inertial is not None and frame.imu is not None:
+                self._inertial.add(frame.imu)
             step = await _in_thread(tracker, functools.partial(tracker.prepare, frame))
             answer: PoseAnswer | None = None
             failure = ""
@@ -236,6 +248,23 @@ class Mapper:
         return f"metric, by {self._scale.name}" if 0 in self._metric and self._scale else _UP_TO_SCALE
 
     @property
+    def imu(self) -> str:
+        """``none``, ``used``, ``not used yet``, or ``not used: `` and why, in one line."""
+        if self._inertial is None:
+            return "none"
+        if self._inertial.trouble:
+            return f"not used: {self._inertial.trouble}"
+        return "not used yet" if self._inertial.alignment is None else "used"
+
+    @property
+    def gravity(self) -> tuple[Array, float] | None:
+        """``(3,)`` m/s^2 in the world and the deviation of its direction, rad; None while it is not known."""
+        known = None if self._inertial is None else self._inertial.gravity
+        if known is None or self._inertial is None or self._inertial.alignment is None:
+            return None
+        return known, self._inertial.alignment.gravity_deviation
+
+    @property
     def unrecognised(self) -> int:
         """The number of lost frames since the last pose that show enough; a covered lens does not count."""
         return self._tracker.unrecognised if isinstance(self._tracker, Tracker) else 0
@@ -273,6 +302,7 @@ class Mapper:
             "segments_apart": len(apart),
             "frames_apart": sum(len(record.poses) for record, _ in apart),
             "scale": self.scale,
+            **({} if self._inertial is None else {"imu": self.imu}),
             "unit": "unit of the map" if self.scale == _UP_TO_SCALE else "m",
             "path": round(trajectory.length_m, 3) if len(trajectory) > 1 else 0.0,
             "map_points": len(self.map),
@@ -320,6 +350,9 @@ class Mapper:
             self._tracker.adjust()
             for segment in self._metric:
                 self._make_metric(self._tracker, segment)
+        elif self._tracker is not None and self._inertial is not None:
+            self._align(self._tracker)
+            self._make_upright(self._tracker)
         report = self.report()
         # Several views have triangulated a landmark; a voxel of a dense map is trusted if it was read twice.
         least = 1 if isinstance(self._tracker, MonocularTracker) else _MIN_READINGS
@@ -362,11 +395,44 @@ class Mapper:
                 hint="use one mapper for each camera, and give it the intrinsics of the frames",
             )
         if self._tracker is None:
+            if frame.imu is not None:
+                self._begin_inertial(frame.imu, frame.camera)
             if bool(frame.depth_m.any()) if self._depth is None else self._depth:
                 self._tracker = Tracker(self._options, self._T_world_start, self._slots)
             else:
                 self._tracker = MonocularTracker(self._monocular, self._T_world_start, self._slots)
         return self._tracker
+
+    def _begin_inertial(self, samples: ImuSamples, camera: Camera) -> None:
+        """Take the IMU of the first frame, which says where down is, and metres if nothing else does."""
+        self._inertial = Inertial(samples.model, camera)
+        self._inertial.add(samples)
+        self._slots = replace(self._slots, inertial=self._inertial)
+        self._scale = self._scale or ImuScale(self._inertial)
+        if self._T_world_start is None:
+            gravity = self._inertial.first_gravity()
+            self._T_world_start = upright(_LEVEL_GRAVITY if gravity is None else gravity)
+
+    def _align(self, tracker: Tracker) -> None:
+        """Find gravity and biases of a drive in metres."""
+        assert self._inertial is not None
+        path = self._records.first.trajectory()
+        depths_m = np.empty(0) if tracker.last_features is None else tracker.last_features.points_camera[:, 2]
+        depths_m = depths_m[np.isfinite(depths_m)]
+        depth_m = float(np.median(depths_m)) if len(depths_m) else _USUAL_DEPTH_M
+        self._inertial.align(path.timestamps_s, path.T_world_camera, depth_m, is_metric=True)
+
+    def _make_upright(self, tracker: Tracker | MonocularTracker) -> bool:
+        """Turn the world, if gravity is known, so that z points up; say whether it was turned."""
+        gravity = None if self._inertial is None else self._inertial.gravity
+        if gravity is None or self._holds_world:
+            return False
+        turned = correction(gravity)
+        tracker.turn(turned)
+        if isinstance(tracker, Tracker):
+            self._records.turn(turned)
+        self._is_upright = True
+        return True
 
     def _finished(
         self, tracked: TrackedFrame, answer: PoseAnswer | None, failure: str, position_m: Array | None
@@ -404,7 +470,20 @@ class Mapper:
             record = self._records.add(done, pose, into_cloud=self._adds_frames)
             if done.keyframe and self._keyframes_of and tracker.last_features is not None:
                 record.keyframes.append(keyframe_of(done, pose, tracker.last_features, self._keyframes_of))
-        return self._with_joins(tracker, done)
+        return self._with_gravity(tracker, self._with_joins(tracker, done))
+
+    def _with_gravity(self, tracker: Tracker, done: TrackedFrame) -> TrackedFrame:
+        """Turn the world once gravity is known; the poses that were returned before are corrected."""
+        inertial, pose = self._inertial, done.T_world_camera
+        if inertial is None or pose is None or not inertial.is_due(done.frame.timestamp_s):
+            return done
+        self._align(tracker)
+        if self._is_upright or inertial.gravity is None:
+            return done
+        T = correction(inertial.gravity)
+        if not self._make_upright(tracker):
+            return done
+        return replace(done, T_world_camera=T @ pose, corrected=True)
 
     def _with_joins(self, tracker: Tracker, done: TrackedFrame) -> TrackedFrame:
         """Move what was joined since the last frame; the poses that were returned before are corrected."""
@@ -422,7 +501,10 @@ class Mapper:
         corrected = done.keyframe
         merged = tracker.loops + len(tracker.joins)
         self._metric.intersection_update(tracker.segments)
-        if self._scale is not None and (segment not in self._metric or merged != self._joined):
+        is_due = self._scale is not None and self._scale.is_due(
+            frame.timestamp_s, is_known=segment in self._metric
+        )
+        if self._scale is not None and (is_due or merged != self._joined):
             if segment not in self._metric:
                 self._scale.observe(frame.timestamp_s, frame.rgb, position_m)
             if done.T_world_camera is not None and self._make_metric(tracker, segment):
@@ -437,11 +519,14 @@ class Mapper:
         if self._scale is None or self.camera is None:
             return False
         path = tracker.trajectory(segment)
-        scale = self._scale.metres_per_unit(path.timestamps_s, path.T_world_camera, self.camera)
+        depth = tracker.median_depth(segment)
+        scale = self._scale.metres_per_unit(path.timestamps_s, path.T_world_camera, self.camera, depth)
         if scale is None:
             return False
         tracker.rescale(scale, segment)
         self._metric.add(segment)
+        if segment == min(tracker.segments):
+            self._make_upright(tracker)
         return True
 
 

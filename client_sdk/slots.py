@@ -22,7 +22,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -45,6 +45,7 @@ __all__ = [
     "OptimiserFunction",
     "OptimiserSlot",
     "Slots",
+    "Turning",
     "load_features",
     "load_function",
 ]
@@ -229,6 +230,13 @@ class FeaturesSlot:
         )
 
 
+class Turning(Protocol):
+    """What knows how a camera turns between two times, such as an IMU."""
+
+    def turn(self, begin_s: float, end_s: float) -> Array | None:
+        """Return ``R_begin_end`` ``(3, 3)`` of the camera; None if it is not known."""
+
+
 class MotionSlot:
     """A motion function with its checks, and the newest poses that it is given."""
 
@@ -354,12 +362,13 @@ def _numbers_of(slot: str, given: Any, shape: tuple[int, ...]) -> Array:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Slots:
-    """The parts of a tracker that its user brought; None for the built-in ones."""
+    """The parts of a tracker that its user brought, None for the built-in ones; and what its IMU tells."""
 
     features: FeaturesSlot | None = None
     motion: MotionSlot | None = None
     loops: LoopsSlot | None = None
     optimiser: OptimiserSlot | None = None
+    inertial: Turning | None = None
 
     @classmethod
     def of(

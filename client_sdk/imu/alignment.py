@@ -20,6 +20,7 @@ from client_sdk.imu.preintegration import (
     right_jacobian_so3,
 )
 from client_sdk.imu.samples import ImuModel
+from rse_pf.errors import UsageError
 from rse_pf.geometry import Array, skew
 
 __all__ = ["GRAVITY_M_S2", "Alignment", "align", "bias_of_gyro"]
@@ -31,6 +32,7 @@ _GYRO_PRIOR, _ACCEL_PRIOR = 0.1, 0.2
 """Deviations of biases before anything is measured: rad/s, m/s^2."""
 _HUBER = 3.0
 """In standard deviations of each axis."""
+_BEYOND_DOUBT = 10.0
 _ITERATIONS, _CONVERGED, _MAX_DAMPING = 12, 1e-4, 1e8
 
 
@@ -49,7 +51,8 @@ class Alignment:
         bias_gyro: ``(n, 3)`` rad/s.
         bias_accel: ``(n, 3)`` m/s^2.
         bias_covariance: ``(6, 6)`` of the last biases of gyroscope and accelerometer.
-        misfit: Root of the squared residuals per degree of freedom: about 1 if all deviations are right.
+        misfit: Root of the squared residuals per degree of freedom, about 1 if the noise is as stated; all
+            deviations have been multiplied by what is above 1.
     """
 
     scale: float
@@ -89,7 +92,7 @@ def align(
     *,
     is_metric: bool = False,
 ) -> Alignment | None:
-    """Return the alignment of poses and preintegrated motions; None if no metres make them agree.
+    """Return the alignment of poses and preintegrated motions; None if they do not tell the scale.
 
     Args:
         T_world_camera: ``(n, 4, 4)``, n >= 5; translations in any unit, or in metres.
@@ -97,6 +100,9 @@ def align(
         model: Of the IMU.
         pose_noise: Standard deviations of a pose: rad, and units of the poses.
         is_metric: Whether the poses are in metres.
+
+    Raises:
+        UsageError: The scale is below 0 beyond doubt: what is measured points the wrong way.
     """
     bias = bias_of_gyro(T_world_camera[:, :3, :3] @ model.T_imu_camera[:3, :3].T, motions)
     first = _linear(T_world_camera, motions, model, bias, is_metric=is_metric)
@@ -140,6 +146,15 @@ def _linear(
     scale = 1.0 if is_metric else float(found[-1])
     gravity: Array = found[3 * n : 3 * n + 3]
     length = float(np.linalg.norm(gravity))
+    if not is_metric and scale < 0.0:
+        left = np.square(right - matrix @ found).sum() / max(1, len(right) - matrix.shape[1])
+        # Of the last unknown alone: the last row of R, as the QR decomposition leaves it.
+        deviation = float(np.sqrt(left)) / abs(float(np.asarray(np.linalg.qr(matrix, mode="r"))[-1, -1]))
+        if -scale > _BEYOND_DOUBT * deviation:
+            raise UsageError(
+                "the accelerometer measures the opposite of how the camera moves: an axis has the wrong sign",
+                hint="a resting accelerometer points up with 9.81; see T_imu_camera",
+            )
     if not scale > 0.0 or not length > 0.0:
         return None
     gravity = gravity * (GRAVITY_M_S2 / length)
@@ -218,6 +233,8 @@ class _Problem:
             return None
         inertial, seen = self._residuals(state)
         free = inertial.size + seen.size + 6 - _STATE * len(seen) - len(system.c)
+        misfit = float(np.sqrt((np.square(inertial).sum() + np.square(seen).sum()) / free))
+        covariance *= max(1.0, misfit) ** 2
         biases = covariance[_BG.start : _BA.stop, _BG.start : _BA.stop]
         tilt = covariance[_STATE + 1 :, _STATE + 1 :] if not self._is_metric else covariance[_STATE:, _STATE:]
         return Alignment(
@@ -227,7 +244,7 @@ class _Problem:
             gravity_deviation=float(np.sqrt(np.linalg.eigvalsh(tilt)[-1])),
             R_world_imu=state.R, positions_m=state.p, velocities=state.v,
             bias_gyro=state.biases[:, :3], bias_accel=state.biases[:, 3:], bias_covariance=biases,
-            misfit=float(np.sqrt((np.square(inertial).sum() + np.square(seen).sum()) / free)),
+            misfit=misfit,
         )  # fmt: skip
 
     def _cost(self, state: _State) -> float:

@@ -45,7 +45,7 @@ class ImuHistory:
             end_s: Later than *begin_s*.
             shift_s: Added to the interval, to get that on the clock of the IMU.
         """
-        rows = self._all()
+        rows = self.rows()
         begin_s, end_s = begin_s + shift_s, end_s + shift_s
         if len(rows) < 2 or not rows[0, 0] <= begin_s < end_s:
             return None
@@ -65,7 +65,27 @@ class ImuHistory:
         found = np.concatenate([ends[:1], inside, ends[1:]])
         return ImuSamples(found[:, 0], found[:, 1:4], found[:, 4:7], self.model)
 
-    def _all(self) -> Array:
+    def mean_gyro(self, begins_s: Array, ends_s: Array) -> Array:
+        """Return the mean rates ``(n, 3)`` of intervals on the clock of the IMU, rad/s."""
+        rows = self.rows()
+        dt = np.diff(rows[:, 0])[:, None]
+        turned = np.concatenate(
+            [np.zeros((1, 3)), np.cumsum(0.5 * dt * (rows[1:, 1:4] + rows[:-1, 1:4]), axis=0)]
+        )
+        both = [
+            np.stack([np.interp(stamps, rows[:, 0], turned[:, axis]) for axis in range(3)], axis=1)
+            for stamps in (begins_s, ends_s)
+        ]
+        rates: Array = (both[1] - both[0]) / (ends_s - begins_s)[:, None]
+        return rates
+
+    def mean_accel(self) -> Array | None:
+        """Return the mean ``(3,)`` of all accelerations, m/s^2; None without samples."""
+        rows = self.rows()
+        return rows[:, 4:7].mean(axis=0) if len(rows) else None
+
+    def rows(self) -> Array:
+        """Return all samples ``(n, 7)``: time, rates, accelerations."""
         if self._parts:
             self._rows = np.concatenate([self._rows, *self._parts])
             self._parts = []

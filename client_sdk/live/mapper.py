@@ -172,8 +172,8 @@ class LiveMapper:
         self._mapper = Mapper(
             ask=self._ask_first, camera=camera, depth=True,
             options=replace(options or FrontEndOptions.live(), segment_after=_NEVER), map_options=map_options,
-            T_world_start=T_world_start, adds_frames=False, features=features, motion=motion,
-            loops=loops,
+            T_world_start=T_world_start, adds_frames=False, holds_world=True, features=features,
+            motion=motion, loops=loops,
         )  # fmt: skip
         self._alignments = Alignments()
         self._segment = 0

@@ -69,7 +69,13 @@ class OdometryScale:
         if position_m is not None:
             self._seen[round(timestamp_s, 6)] = np.asarray(position_m, dtype=np.float64)
 
-    def metres_per_unit(self, timestamps_s: Array, T_world_camera: Array, camera: Camera) -> float | None:
+    def is_due(self, timestamp_s: float, *, is_known: bool) -> bool:
+        """Return whether the scale is sought: not after it is known."""
+        return not is_known
+
+    def metres_per_unit(
+        self, timestamps_s: Array, T_world_camera: Array, camera: Camera, depth: float
+    ) -> float | None:
         """Return the scale once *first_m* metres have passed since the first pose.
 
         Source:
@@ -118,7 +124,13 @@ class MarkerScale:
         for each, identity in zip(corners, () if identities is None else identities.ravel(), strict=True):
             self._seen[int(identity)][round(timestamp_s, 6)] = each.reshape(4, 2).astype(np.float64)
 
-    def metres_per_unit(self, timestamps_s: Array, T_world_camera: Array, camera: Camera) -> float | None:
+    def is_due(self, timestamp_s: float, *, is_known: bool) -> bool:
+        """Return whether the scale is sought: not after it is known."""
+        return not is_known
+
+    def metres_per_unit(
+        self, timestamps_s: Array, T_world_camera: Array, camera: Camera, depth: float
+    ) -> float | None:
         """Return the scale by the marker that is seen with the largest parallax."""
         found = [
             self._by_marker(views, timestamps_s, T_world_camera, camera) for views in self._seen.values()

@@ -225,6 +225,7 @@ class MonocularTracker:
         self._waiting: list[tuple[float, ViewFeatures]] = []
         self._last: _Posed | None = None
         self._motion: Array = np.eye(4)
+        self._last_s = 0.0
         self._similar: _Similarity | None = None
         self._loop_from = 0
         self._frame: Frame  # set by `prepare`
@@ -306,6 +307,15 @@ class MonocularTracker:
         if segment == self._segment:
             self._move_last(np.eye(4), scale)
 
+    def turn(self, T_new_old: Array) -> None:
+        """Turn the world, such as after gravity became known; poses that were returned before change."""
+        self._T_world_start = T_new_old @ self._T_world_start
+
+    def median_depth(self, segment: int = 0) -> float:
+        """Return the median depth of the landmarks around the newest frames of a segment, in its unit."""
+        known = self._segments.get(segment)
+        return 1.0 if known is None else known.map.median_depth(known.reference)
+
     @property
     def _own(self) -> _Segment:
         return self._segments[self._segment]
@@ -356,10 +366,19 @@ class MonocularTracker:
         return self._confirm(self._own, features, answer, len(matched))
 
     def _expected(self, last: _Posed) -> Array:
-        """Return ``T_camera_world`` as a user's motion function expects it, else by a constant velocity."""
-        motion = self._slots.motion
+        """Return ``T_camera_world`` as a user's motion function expects it, else by a constant velocity.
+
+        With an IMU the camera turns as the gyroscope measured it.
+        """
+        motion, inertial = self._slots.motion, self._slots.inertial
         T = None if motion is None else motion.expected(self._frame.timestamp_s)
-        expected: Array = self._motion @ last.T_camera_world if T is None else inverse(T)
+        if T is not None:
+            return inverse(T)
+        T_last_now = inverse(self._motion)
+        turned = None if inertial is None else inertial.turn(self._last_s, self._frame.timestamp_s)
+        if turned is not None:
+            T_last_now[:3, :3] = turned
+        expected: Array = inverse(T_last_now) @ last.T_camera_world
         return expected
 
     def _matched_with_last(self, features: ViewFeatures, last: _Posed) -> _Matched:
@@ -691,6 +710,7 @@ class MonocularTracker:
         )  # fmt: skip
         self._motion = np.eye(4) if before is None else second.T_camera_world @ inverse(before)
         self._last, self._similar, self.unrecognised, self._loop_from = posed, None, 0, 0
+        self._last_s = self._frame.timestamp_s
         return self._result(posed, keyframe=True)
 
     def _place_waiting(self, own: _Segment, T_second: Array) -> Array | None:
@@ -728,7 +748,7 @@ class MonocularTracker:
             if self._last is None or keyframe:  # lost before, or the map was adjusted
                 self._slots.motion.clear()
             self._slots.motion.add(self._frame.timestamp_s, inverse(posed.T_camera_world))
-        self._last = posed
+        self._last, self._last_s = posed, self._frame.timestamp_s
         return keyframe
 
     def _is_keyframe(self, posed: _Posed) -> bool:

@@ -28,6 +28,16 @@ class SegmentRecord:
     poses: list[Array] = field(default_factory=list)
     keyframes: list[Keyframe] = field(default_factory=list)
 
+    def take(self, other: SegmentRecord, T_own_other: Array) -> None:
+        """Add all of another segment."""
+        self.stamps_s += other.stamps_s
+        self.poses += [_moved(T_own_other, pose) for pose in other.poses]
+        self.cloud.take(other.cloud, T_own_other)
+        self.keyframes += [
+            replace(keyframe, T_world_camera=_moved(T_own_other, keyframe.T_world_camera))
+            for keyframe in other.keyframes
+        ]
+
     def trajectory(self) -> Trajectory:
         """Return the poses in the order of time."""
         order = np.argsort(self.stamps_s, kind="stable")
@@ -66,13 +76,13 @@ class DriveRecords:
         if record is None:
             return
         into = self._segments.setdefault(join.into, SegmentRecord(cloud=PointMap(self._options)))
-        into.stamps_s += record.stamps_s
-        into.poses += [_moved(join.T_into_segment, pose) for pose in record.poses]
-        into.cloud.take(record.cloud, join.T_into_segment)
-        into.keyframes += [
-            replace(keyframe, T_world_camera=_moved(join.T_into_segment, keyframe.T_world_camera))
-            for keyframe in record.keyframes
-        ]
+        into.take(record, join.T_into_segment)
+
+    def turn(self, T_new_old: Array) -> None:
+        """Turn the world of all segments."""
+        for number, record in self._segments.items():
+            self._segments[number] = SegmentRecord(cloud=PointMap(self._options))
+            self._segments[number].take(record, T_new_old)
 
 
 def tracker_record(tracker: MonocularTracker, segment: int, options: MapOptions) -> SegmentRecord:

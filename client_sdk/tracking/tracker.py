@@ -196,6 +196,23 @@ class Tracker:
         self._motion, self._lost_in_a_row, self._begun, self.unrecognised = np.eye(4), 0, 0, 0
         self._rate, self._first = np.zeros(3), None
 
+    def turn(self, T_new_old: Array) -> None:
+        """Turn the world, such as after gravity became known; poses that were returned before change.
+
+        Raises:
+            UsageError: A query is open.
+        """
+        self._open.refuse_open()
+        self._T_world_start = _rotation_made(T_new_old @ self._T_world_start)
+        self._T_last = _rotation_made(T_new_old @ self._T_last)
+        for known in self._segments.values():
+            known.move(T_new_old)
+        self._place = None
+        if self._last is not None:
+            self._last = replace(self._last, T_world_camera=self._T_last)
+        if self._slots.motion is not None:
+            self._slots.motion.clear()
+
     def prepare(self, frame: Frame) -> PoseQuery | TrackedFrame:
         """Take the next frame; return a query, or the result for the frame if none is needed.
 
@@ -273,10 +290,19 @@ class Tracker:
         return self._confirm(image, T, answer, len(seen), self._map(), is_next=is_next), len(seen)
 
     def _expected(self) -> Array:
-        """Return ``T_world_camera`` as a user's motion function expects it, else by a constant velocity."""
-        motion = self._slots.motion
+        """Return ``T_world_camera`` as a user's motion function expects it, else by a constant velocity.
+
+        With an IMU the camera turns as the gyroscope measured it.
+        """
+        motion, inertial = self._slots.motion, self._slots.inertial
         T = None if motion is None else motion.expected(self._frame.timestamp_s)
-        return _rotation_made(self._T_last @ self._motion) if T is None else T
+        if T is not None:
+            return T
+        T_last_now = self._motion.copy()
+        turned = None if inertial is None else inertial.turn(self._last_s, self._frame.timestamp_s)
+        if turned is not None:
+            T_last_now[:3, :3] = turned
+        return _rotation_made(self._T_last @ T_last_now)
 
     def _recognise(self, view: View) -> Generator[PoseQuery, Answer, tuple[_Posed | None, int]]:
         """Yield queries against the latest and the most alike keyframes of all segments."""

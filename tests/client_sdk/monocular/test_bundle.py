@@ -137,7 +137,7 @@ def test_odometry_gives_the_scale_after_its_first_metre() -> None:
     known = []
     for row, stamp in enumerate(stamps):
         scale.observe(float(stamp), nothing, None)
-        known.append(scale.metres_per_unit(stamps[: row + 1], poses[: row + 1], CAMERA))
+        known.append(scale.metres_per_unit(stamps[: row + 1], poses[: row + 1], CAMERA, 2.0))
 
     assert known[9] is None
     assert known[11] == pytest.approx(2.5)
@@ -162,10 +162,10 @@ def test_a_marker_gives_the_scale() -> None:
         scale.observe(k / 10, np.repeat(image[..., None], 3, axis=2), None)
     poses[:, :3, 3] /= unit_m
 
-    found = scale.metres_per_unit(np.arange(6) / 10, poses, CAMERA)
+    found = scale.metres_per_unit(np.arange(6) / 10, poses, CAMERA, 2.0)
 
     assert found == pytest.approx(unit_m, rel=0.02)
-    assert scale.metres_per_unit(np.arange(2) / 10, poses[:2], CAMERA) is None
+    assert scale.metres_per_unit(np.arange(2) / 10, poses[:2], CAMERA, 2.0) is None
 
 
 @pytest.mark.parametrize(
