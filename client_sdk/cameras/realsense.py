@@ -1,6 +1,7 @@
-"""Intel RealSense cameras, and the ``.bag`` files that they record: colour and registered depth.
+"""Intel RealSense cameras, and the ``.bag`` files that they record: colour and registered depth, or infrared.
 
-Depth is aligned to the colour image by librealsense; intrinsics come from the camera.  This module is tested
+Depth is aligned to the colour image by librealsense; intrinsics come from the camera.  The pair of infrared
+cameras is used with the projector off, whose dots move with the camera.  This module is tested
 with a stand-in of ``pyrealsense2`` only, not on a device.
 """
 
@@ -12,12 +13,13 @@ from typing import Any
 
 import numpy as np
 
-from client_sdk.cameras.source import RawFrame
+from client_sdk.cameras.source import RawFrame, RawPair, colour_of
 from client_sdk.rigs.intrinsics import Intrinsics
+from client_sdk.rigs.rig import Rig, RigCamera
 from rse_pf.errors import MissingExtra, UsageError
-from rse_pf.geometry import Camera
+from rse_pf.geometry import Camera, inverse
 
-__all__ = ["open_realsense"]
+__all__ = ["open_realsense", "open_realsense_stereo"]
 
 _SIZE, _RATE_HZ = (640, 480), 30
 _TIMEOUT_MS = 5000
@@ -33,10 +35,7 @@ def open_realsense(bag: Path | None = None) -> tuple[Iterator[RawFrame], Intrins
         MissingExtra: ``pyrealsense2`` is not installed.
         UsageError: There is no camera, or no such recording.
     """
-    try:
-        import pyrealsense2 as rs
-    except ImportError as error:
-        raise MissingExtra("pyrealsense2", "realsense") from error
+    rs = _load()
     if bag is not None and not bag.is_file():
         raise UsageError(f"there is no recording {bag}", hint="name a .bag file of a RealSense camera")
     config = rs.config()
@@ -45,26 +44,87 @@ def open_realsense(bag: Path | None = None) -> tuple[Iterator[RawFrame], Intrins
     else:
         config.enable_stream(rs.stream.depth, *_SIZE, rs.format.z16, _RATE_HZ)
         config.enable_stream(rs.stream.color, *_SIZE, rs.format.rgb8, _RATE_HZ)
-    pipeline = rs.pipeline()
-    try:
-        profile = pipeline.start(config)
-    except RuntimeError as error:
-        raise UsageError(
-            f"{bag or 'no RealSense camera'} cannot be opened: {error}",
-            hint="check the cable: USB 3 is needed",
-        ) from error
+    pipeline, profile = _started(rs, config, str(bag or "no RealSense camera"))
     if bag is not None:
         profile.get_device().as_playback().set_real_time(False)
     lens = profile.get_stream(rs.stream.color).as_video_stream_profile().get_intrinsics()
+    unit_m = float(profile.get_device().first_depth_sensor().get_depth_scale())
+    intrinsics = _lens(rs, lens, 1.0 / unit_m)
+    return _images(rs, pipeline, unit_m, is_file=bag is not None), intrinsics, pipeline.stop
+
+
+def open_realsense_stereo() -> tuple[Iterator[RawPair], Rig, Callable[[], None]]:
+    """Open the infrared cameras of the first RealSense camera.
+
+    Returns:
+        Its pairs of images, its rig, whose body is the left camera, and how to close it.
+
+    Raises:
+        MissingExtra: ``pyrealsense2`` is not installed.
+        UsageError: There is no camera.
+    """
+    rs = _load()
+    config = rs.config()
+    for side in (1, 2):
+        config.enable_stream(rs.stream.infrared, side, *_SIZE, rs.format.y8, _RATE_HZ)
+    pipeline, profile = _started(rs, config, "no RealSense camera")
+    profile.get_device().first_depth_sensor().set_option(rs.option.emitter_enabled, 0)
+    left, right = (profile.get_stream(rs.stream.infrared, side).as_video_stream_profile() for side in (1, 2))
+    extrinsics = left.get_extrinsics_to(right)
+    T_right_left = np.eye(4)
+    T_right_left[:3, :3] = np.array(extrinsics.rotation).reshape(3, 3).T  # librealsense: column after column
+    T_right_left[:3, 3] = extrinsics.translation
+    cameras = (
+        RigCamera(name="left", lens=_lens(rs, left.get_intrinsics(), 1000.0), T_body_camera=np.eye(4)),
+        RigCamera(
+            name="right", lens=_lens(rs, right.get_intrinsics(), 1000.0), T_body_camera=inverse(T_right_left)
+        ),
+    )
+    return _pairs(pipeline), Rig(cameras=cameras), pipeline.stop
+
+
+def _load() -> Any:
+    try:
+        import pyrealsense2 as rs
+    except ImportError as error:
+        raise MissingExtra("pyrealsense2", "realsense") from error
+    return rs
+
+
+def _started(rs: Any, config: Any, name: str) -> tuple[Any, Any]:
+    pipeline = rs.pipeline()
+    try:
+        return pipeline, pipeline.start(config)
+    except RuntimeError as error:
+        raise UsageError(
+            f"{name} cannot be opened: {error}", hint="check the cable: USB 3 is needed"
+        ) from error
+
+
+def _lens(rs: Any, lens: Any, depth_scale: float) -> Intrinsics:
     camera = Camera(
         fx=lens.fx, fy=lens.fy, cx=lens.ppx, cy=lens.ppy, width=int(lens.width), height=int(lens.height)
     )
-    unit_m = float(profile.get_device().first_depth_sensor().get_depth_scale())
     distorts = lens.model == rs.distortion.brown_conrady
-    intrinsics = Intrinsics(
-        camera=camera, distortion=tuple(lens.coeffs) if distorts else (), depth_scale=1.0 / unit_m
+    return Intrinsics(
+        camera=camera, distortion=tuple(lens.coeffs) if distorts else (), depth_scale=depth_scale
     )
-    return _images(rs, pipeline, unit_m, is_file=bag is not None), intrinsics, pipeline.stop
+
+
+def _pairs(pipeline: Any) -> Iterator[RawPair]:
+    while True:
+        try:
+            frames = pipeline.wait_for_frames(_TIMEOUT_MS)
+        except RuntimeError as error:
+            raise UsageError("the RealSense camera gives no more images", hint="check its cable") from error
+        left, right = frames.get_infrared_frame(1), frames.get_infrared_frame(2)
+        if left and right:
+            images = [np.array(each.get_data(), dtype=np.uint8) for each in (left, right)]
+            yield (
+                float(left.get_timestamp()) / 1e3,
+                colour_of(images[0], "realsense"),
+                colour_of(images[1], "realsense"),
+            )
 
 
 def _images(rs: Any, pipeline: Any, unit_m: float, *, is_file: bool) -> Iterator[RawFrame]:

@@ -8,35 +8,48 @@ from __future__ import annotations
 import asyncio
 import math
 from collections.abc import Callable, Iterator
-from typing import Protocol, runtime_checkable
+from dataclasses import dataclass
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
 
 from client_sdk.closing import Closing
 from client_sdk.datasets.thinning import Thinning
-from client_sdk.frontend import Frame
+from client_sdk.frontend import Frame, load_opencv
 from client_sdk.rigs.intrinsics import Intrinsics, Undistortion
+from client_sdk.rigs.rectification import Rectification
+from client_sdk.rigs.rig import Rig
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Camera
 
-__all__ = ["FrameSource", "RawFrame", "RawSource", "colour_of"]
+__all__ = [
+    "FrameSource", "FrameStream", "RawFrame", "RawPair", "RawSource", "SourceInfo", "StereoSource",
+    "colour_of", "no_depth",
+]  # fmt: skip
+
+_Item = TypeVar("_Item", bound=tuple[Any, ...])
 
 RawFrame = tuple[float, npt.NDArray[np.uint8], "npt.NDArray[np.float32] | None"]
 """Time stamp in seconds, ``(h, w, 3)`` colours, red first, and ``(h, w)`` metres or None; still distorted."""
+
+RawPair = tuple[float, npt.NDArray[np.uint8], npt.NDArray[np.uint8]]
+"""Time stamp in seconds, and ``(h, w, 3)`` colours of the left and the right camera, not rectified."""
 
 
 @runtime_checkable
 class FrameSource(Protocol):
     """An iterator of frames of one camera, in the order of time; the end of a device never comes.
 
-    ``camera`` is that of all frames; ``has_depth`` says whether they have depth; ``name`` is for people.
+    ``camera`` is that of all frames; ``has_depth`` and ``has_stereo`` say whether they have depth, or the
+    right image of a pair; ``name`` is for people.
     After `close`, which may be called again, the iterator is at its end.
     """
 
     name: str
     camera: Camera
     has_depth: bool
+    has_stereo: bool
 
     def __iter__(self) -> Iterator[Frame]:
         """Return the source itself."""
@@ -48,8 +61,77 @@ class FrameSource(Protocol):
         """Release the device or file."""
 
 
-class RawSource(Closing):
-    """A `FrameSource` over raw images: checks their size, undistorts them and thins them out."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SourceInfo:
+    """What `FrameSource` says of a source."""
+
+    name: str
+    camera: Camera
+    has_depth: bool = False
+    has_stereo: bool = False
+
+
+class FrameStream(Closing):
+    """A `FrameSource` over items ``(seconds, ...)``, each of which a function makes a frame of.
+
+    Items that do not ascend in time or are thinned out are dropped before a frame is made.
+    """
+
+    def __init__(
+        self,
+        about: SourceInfo,
+        items: Iterator[_Item],
+        make: Callable[[_Item], Frame],
+        *,
+        rate_hz: float | None = None,
+        close: Callable[[], None] | None = None,
+    ) -> None:
+        """Take items at *rate_hz* as `Thinning` does; *close* releases what they are read from.
+
+        Raises:
+            UsageError: The rate is not above 0.
+        """
+        self._thinning = None if rate_hz is None else Thinning(rate_hz)
+        self.name = about.name
+        self.camera = about.camera
+        self.has_depth = about.has_depth
+        self.has_stereo = about.has_stereo
+        self._items: Iterator[Any] = items
+        self._make: Callable[[Any], Frame] = make
+        self._last_s = -math.inf
+        self._close = close
+
+    def __iter__(self) -> FrameStream:
+        return self
+
+    def __aiter__(self) -> FrameStream:
+        return self
+
+    async def __anext__(self) -> Frame:
+        """Return the next frame; the camera is read in a thread, so that the connection is served."""
+        frame = await asyncio.to_thread(next, self, None)
+        if frame is None:
+            raise StopAsyncIteration
+        return frame
+
+    def __next__(self) -> Frame:
+        while True:
+            item = next(self._items)
+            timestamp_s = item[0]
+            if timestamp_s > self._last_s and (self._thinning is None or self._thinning.plays(timestamp_s)):
+                self._last_s = timestamp_s
+                return self._make(item)
+
+    def close(self) -> None:
+        """Release the device or file; the iterator is then at its end."""
+        self._items = iter(())
+        if self._close is not None:
+            self._close()
+            self._close = None
+
+
+class RawSource(FrameStream):
+    """A `FrameSource` over raw images: checks their size, and undistorts them."""
 
     def __init__(
         self,
@@ -61,45 +143,18 @@ class RawSource(Closing):
         rate_hz: float | None = None,
         close: Callable[[], None] | None = None,
     ) -> None:
-        """Take images from *raw* at *rate_hz* as `Thinning` does; *close* releases what it reads from.
+        """Take images from *raw*; the other arguments are those of `FrameStream`.
 
         Raises:
             UsageError: The rate is not above 0.
         """
-        self._thinning = None if rate_hz is None else Thinning(rate_hz)
-        self.name = name
-        self.camera = intrinsics.camera
-        self.has_depth = has_depth
-        self._raw = raw
+        about = SourceInfo(name=name, camera=intrinsics.camera, has_depth=has_depth)
+        super().__init__(about, raw, self._frame, rate_hz=rate_hz, close=close)
         self._undistortion = Undistortion(intrinsics)
-        self._last_s = -math.inf
-        self._close = close
-        self._no_depth = np.zeros((self.camera.height, self.camera.width), dtype=np.float32)
-        self._no_depth.flags.writeable = False
+        self._no_depth = no_depth(self.camera)
 
-    def __iter__(self) -> RawSource:
-        return self
-
-    def __aiter__(self) -> RawSource:
-        return self
-
-    async def __anext__(self) -> Frame:
-        """Return the next frame; the camera is read in a thread, so that the connection is served."""
-        frame = await asyncio.to_thread(next, self, None)
-        if frame is None:
-            raise StopAsyncIteration
-        return frame
-
-    def __next__(self) -> Frame:
-        if self._raw is None:
-            raise StopIteration
-        while True:
-            timestamp_s, rgb, depth_m = next(self._raw)
-            if timestamp_s <= self._last_s:
-                continue
-            if self._thinning is None or self._thinning.plays(timestamp_s):
-                break
-        self._last_s = timestamp_s
+    def _frame(self, raw: RawFrame) -> Frame:
+        timestamp_s, rgb, depth_m = raw
         for image in (rgb, rgb if depth_m is None else depth_m):
             height, width = image.shape[:2]
             if (width, height) != (self.camera.width, self.camera.height):
@@ -115,12 +170,48 @@ class RawSource(Closing):
             camera=self.camera,
         )
 
-    def close(self) -> None:
-        """Release the device or file; the iterator is then at its end."""
-        self._raw = iter(())
-        if self._close is not None:
-            self._close()
-            self._close = None
+
+class StereoSource(FrameStream):
+    """A `FrameSource` over raw pairs of images, which it rectifies."""
+
+    def __init__(
+        self,
+        name: str,
+        raw: Iterator[RawPair],
+        rig: Rig,
+        *,
+        rate_hz: float | None = None,
+        close: Callable[[], None] | None = None,
+    ) -> None:
+        """Take pairs from *raw*; the other arguments are those of `FrameStream`.
+
+        Raises:
+            UsageError: The rate is not above 0, or the rig has no stereo pair.
+        """
+        if rig.right is None:
+            raise UsageError(f"the rig of {name} has one camera", hint="calibrate both: --stereo")
+        self._rectification = Rectification(rig.left, rig.right)
+        about = SourceInfo(name=name, camera=self._rectification.camera, has_stereo=True)
+        super().__init__(about, raw, self._frame, rate_hz=rate_hz, close=close)
+        self._no_depth = no_depth(self.camera)
+
+    def _frame(self, raw: RawPair) -> Frame:
+        timestamp_s, left, right = raw
+        cv2 = load_opencv()
+        return Frame(
+            timestamp_s=timestamp_s,
+            rgb=self._rectification.left(left),
+            depth_m=self._no_depth,
+            camera=self.camera,
+            stereo=self._rectification.right(cv2.cvtColor(right, cv2.COLOR_RGB2GRAY)),
+        )
+
+
+def no_depth(camera: Camera) -> npt.NDArray[np.float32]:
+    """Return a depth image without a reading, which cannot be written to."""
+    depth_m = np.zeros((camera.height, camera.width), dtype=np.float32)
+    depth_m.flags.writeable = False
+    return depth_m
 
 
 def colour_of(image: npt.NDArray[np.uint8], name: str) -> npt.NDArray[np.uint8]:

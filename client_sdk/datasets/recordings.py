@@ -91,7 +91,7 @@ def _open_single(path: Path, scene: str | None) -> Dataset:
     if not path.is_dir():
         raise UsageError(
             f"no folder {path}",
-            hint="name a folder in the layout of TUM (rgb.txt, ...), EuRoC or KITTI",
+            hint="name a folder of TUM (rgb.txt, depth.txt, images), EuRoC or KITTI",
         )
     if scene is not None:
         raise UsageError(f"{path} has no scenes", hint="name scenes for the labelled .mat file only")

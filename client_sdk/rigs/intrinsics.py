@@ -13,7 +13,9 @@ metre), ``rms_px`` and ``views`` (of the calibration) may be left out, and ``mod
 
 from __future__ import annotations
 
+import contextlib
 import json
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, TypeVar, get_args
@@ -27,7 +29,10 @@ from rse_pf.errors import InvalidCamera, UsageError
 from rse_pf.files import read_regular_file
 from rse_pf.geometry import Array, Camera
 
-__all__ = ["Intrinsics", "LensModel", "Undistortion", "lens_maps", "read_intrinsics", "write_intrinsics"]
+__all__ = [
+    "Intrinsics", "LensModel", "Undistortion", "intrinsics_of", "lens_maps", "read_intrinsics", "read_json",
+    "told_with", "values_of", "write_intrinsics", "write_json",
+]  # fmt: skip
 
 LensModel = Literal["radial-tangential", "fisheye"]
 
@@ -97,32 +102,53 @@ def read_intrinsics(path: Path | str, *, with_depth_scale: bool = False) -> Intr
         UsageError: The file is missing, or lacks a number, or a number is impossible.
     """
     path = Path(path)
+    values = read_json(path, _HINT)
+    with told_with(path, _HINT):
+        if with_depth_scale:
+            values["depth_scale"]
+        return intrinsics_of(values)
+
+
+def read_json(path: Path, hint: str) -> Any:
+    """Return what a small file of JSON holds; raises UsageError."""
     try:
-        values = json.loads(read_regular_file(path, _MAX_FILE_BYTES))
-        camera = Camera(
-            **{name: float(values[name]) for name in ("fx", "fy", "cx", "cy")},
-            width=int(values["width"]),
-            height=int(values["height"]),
-        )
-        depth_scale = values["depth_scale"] if with_depth_scale else values.get("depth_scale", 1000.0)
-        return Intrinsics(
-            camera=camera,
-            distortion=tuple(float(value) for value in values.get("distortion", ())),
-            depth_scale=float(depth_scale),
-            rms_px=_optional(values.get("rms_px"), float),
-            views=_optional(values.get("views"), int),
-            model=values.get("model", "radial-tangential"),
-        )
+        return json.loads(read_regular_file(path, _MAX_FILE_BYTES))
     except FileNotFoundError as error:
         raise UsageError(
             f"there is no {path}", hint="make one: rse-pf camera calibrate SOURCE --board 9x6 --square-mm 25"
         ) from error
+    except (OSError, ValueError, RecursionError) as error:
+        raise UsageError(f"{path} is not a file of intrinsics", hint=hint) from error
+
+
+@contextlib.contextmanager
+def told_with(path: Path, hint: str) -> Iterator[None]:
+    """Turn what a wrong number raises into one line with the path."""
+    try:
+        yield
     except (InvalidCamera, UsageError) as error:
         raise UsageError(f"{path}: {error.message}", hint=error.hint) from error
     except KeyError as error:
-        raise UsageError(f"{path} has no {error.args[0]}", hint=_HINT) from error
-    except (OSError, ValueError, TypeError, AttributeError, OverflowError, RecursionError) as error:
-        raise UsageError(f"{path} is not a file of intrinsics", hint=_HINT) from error
+        raise UsageError(f"{path} has no {error.args[0]}", hint=hint) from error
+    except (ValueError, TypeError, AttributeError, OverflowError, RecursionError) as error:
+        raise UsageError(f"{path} is not a file of intrinsics", hint=hint) from error
+
+
+def intrinsics_of(values: Any) -> Intrinsics:
+    """Return the intrinsics of a JSON object; what is wrong with it raises as it comes, see `told_with`."""
+    camera = Camera(
+        **{name: float(values[name]) for name in ("fx", "fy", "cx", "cy")},
+        width=int(values["width"]),
+        height=int(values["height"]),
+    )
+    return Intrinsics(
+        camera=camera,
+        distortion=tuple(float(value) for value in values.get("distortion", ())),
+        depth_scale=float(values.get("depth_scale", 1000.0)),
+        rms_px=_optional(values.get("rms_px"), float),
+        views=_optional(values.get("views"), int),
+        model=values.get("model", "radial-tangential"),
+    )
 
 
 def _optional(value: Any, kind: type[_T]) -> _T | None:
@@ -131,6 +157,19 @@ def _optional(value: Any, kind: type[_T]) -> _T | None:
 
 def write_intrinsics(path: Path | str, intrinsics: Intrinsics) -> None:
     """Write the file that `read_intrinsics` reads; raises UsageError where it cannot be written."""
+    write_json(path, values_of(intrinsics))
+
+
+def write_json(path: Path | str, values: Any) -> None:
+    """Write a small file of JSON; raises UsageError where it cannot be written."""
+    try:
+        Path(path).write_text(json.dumps(values, indent=2) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise UsageError(f"cannot write {path}: {error.strerror}", hint="name another file") from error
+
+
+def values_of(intrinsics: Intrinsics) -> dict[str, Any]:
+    """Return the JSON object of `intrinsics_of`."""
     camera = intrinsics.camera
     values: dict[str, Any] = {
         "fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy,
@@ -143,10 +182,7 @@ def write_intrinsics(path: Path | str, intrinsics: Intrinsics) -> None:
         values["rms_px"] = round(intrinsics.rms_px, 4)
     if intrinsics.views is not None:
         values["views"] = intrinsics.views
-    try:
-        Path(path).write_text(json.dumps(values, indent=2) + "\n", encoding="utf-8")
-    except OSError as error:
-        raise UsageError(f"cannot write {path}: {error.strerror}", hint="name another file") from error
+    return values
 
 
 class Undistortion(ImageMap):

@@ -8,6 +8,7 @@ this process, so that every run gives the same.
 examples:
   rse-pf compare --data world:3
   rse-pf compare default features-500 mine.py --data recordings/kitchen --rate 10 5 --out out-compare
+  rse-pf compare --data recordings/MH_01 --camera left --no-imu
   rse-pf compare default without-depth --data recordings/kitchen recordings/MH_01 --runs 3
 """
 
@@ -18,6 +19,7 @@ import math
 from pathlib import Path
 
 from rse_pf.cli.extras import require
+from rse_pf.cli.sensors import add_sensor_arguments
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import UsageError
 
@@ -40,6 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--rate", nargs="+", type=float, default=[], metavar="HZ",
         help="play so many frames per second, one after the other (default: all)",
     )  # fmt: skip
+    add_sensor_arguments(parser)
     parser.add_argument(
         "--runs", type=int, default=1, metavar="N", help="run each so often, and show the spread (default: 1)"
     )
@@ -69,7 +72,8 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     from rse_pf.experiments.compare.run import CompareOptions, run_compare
 
     options = CompareOptions(
-        configurations=configurations_of(args.configs), drives=drives_of(args.data, args.rate),
+        configurations=configurations_of(args.configs),
+        drives=drives_of(args.data, args.rate, camera=args.camera, imu=args.imu),
         runs=args.runs, out=args.out, platform=args.platform,
     )  # fmt: skip
     return run_compare(options, settings)

@@ -18,6 +18,7 @@ import math
 from pathlib import Path
 
 from rse_pf.cli.extras import require
+from rse_pf.cli.sensors import add_sensor_arguments
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import UsageError
 from rse_pf.recording.writer import with_recordings
@@ -32,8 +33,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument(
         "--data", "--recording", type=Path, metavar="DIR",
-        help="a recording in TUM layout, NYU Depth V2, or a ROS bag",
+        help="a recording in the layout of TUM, EuRoC or KITTI, NYU Depth V2, or a ROS bag",
     )  # fmt: skip
+    add_sensor_arguments(parser)
     parser.add_argument(
         "--robots",
         type=int,
@@ -126,7 +128,7 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     if args.data is not None:
         from client_sdk.datasets import open_dataset
 
-        dataset = open_dataset(args.data)
+        dataset = open_dataset(args.data, camera=args.camera, imu=args.imu)
         show(*(f"note: {note}" for note in dataset.notes))
         thinned = dataset.thinned(args.rate)
         if len(thinned) < len(dataset):
@@ -138,6 +140,8 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
             raise UsageError(f"{args.data} has too few frames for {robots} robots", hint="use fewer robots")
     options = DemoOptions(
         data=args.data,
+        camera=args.camera,
+        imu=args.imu,
         robots=robots,
         rate_hz=args.rate,
         engine=usable_engine(args.engine),

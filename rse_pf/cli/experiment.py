@@ -23,6 +23,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
+from rse_pf.cli.sensors import add_sensor_arguments
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import UsageError
 from rse_pf.terminal import show
@@ -76,6 +77,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     latency.add_argument("--seconds", type=float, default=30.0, help="duration with all robots (default: 30)")
     mapping = parser.add_argument_group("map and live")
     mapping.add_argument("--data", type=Path, metavar="DIR", help="a recording (default: a rendered world)")
+    add_sensor_arguments(mapping)
     mapping.add_argument(
         "--frames", type=int, default=80, help="frames per robot, rendered world (default: 80)"
     )

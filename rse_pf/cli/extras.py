@@ -71,7 +71,7 @@ EXTRAS: dict[str, Extra] = {
         enables="the native core as a wheel, for machines without a compiler", is_for_users=False,
     ),
     "vision": Extra(
-        modules={"cv2": "opencv-python-headless", "h5py": "h5py"},
+        modules={"cv2": "opencv-python-headless", "h5py": "h5py", "yaml": "pyyaml"},
         enables="cameras, recordings and NYU Depth V2 files",
     ),
     "xfeat": Extra(
@@ -162,7 +162,7 @@ VERBS_NEED: dict[str, tuple[str, ...]] = {
 }
 """Verb, with the action or option that needs more, to extras."""
 
-_OPTIONAL = {"poselib", "segno", "h5py"}
+_OPTIONAL = {"poselib", "segno", "h5py", "yaml"}
 """Modules without which the verbs work: they solve, show or read in another way, or name the extra at use."""
 
 

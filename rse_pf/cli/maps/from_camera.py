@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
 from rse_pf.cli.maps.frame_table import FRAMES_FILE, FrameTable
+from rse_pf.cli.sensors import add_sensor_arguments
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import CommandFailed, UsageError
 from rse_pf.files import replace_file
@@ -44,15 +45,21 @@ def add_from_camera_arguments(parser: argparse.ArgumentParser) -> None:
     add(
         "source",
         metavar="SOURCE",
-        help="a device number (0), a video, a folder of images, a recording, or realsense",
+        help="a device (0), two (0,2), a video, a folder, a recording, realsense or realsense-stereo",
     )
+    add_sensor_arguments(parser)
     add_drive_arguments(parser, Path("out-camera"))
 
 
 def add_drive_arguments(parser: argparse.ArgumentParser, out: Path) -> None:
     """Declare what all sources of frames share; *out* is the default folder of results."""
     add = parser.add_argument
-    add("--intrinsics", type=Path, metavar="FILE", help="of the camera: see rse-pf camera calibrate")
+    add(
+        "--intrinsics",
+        type=Path,
+        metavar="FILE",
+        help="of the camera, or rig.json: see rse-pf camera calibrate",
+    )
     add(
         "--scale",
         metavar="SOURCE",
@@ -80,7 +87,12 @@ def run_from_camera(args: argparse.Namespace, settings: PlatformSettings) -> int
     from client_sdk.cameras import open_camera
 
     with open_camera(
-        args.source, intrinsics=args.intrinsics, rate_hz=args.rate, depth=not args.no_depth
+        args.source,
+        intrinsics=args.intrinsics,
+        rate_hz=args.rate,
+        depth=not args.no_depth,
+        camera=args.camera,
+        imu=args.imu,
     ) as source:
         return map_source(args, settings, source, scale)
 
@@ -93,10 +105,11 @@ def map_source(
     about: Callable[[Trajectory], dict[str, Any]] | None = None,
 ) -> int:
     """Track the frames of *source* and write the results; *about* adds to the report what it returns."""
-    if scale is not None and source.has_depth:
+    if scale is not None and (source.has_depth or source.has_stereo):
+        what, option = ("depth", "--no-depth") if source.has_depth else ("a pair of cameras", "--camera left")
         raise UsageError(
-            f"{args.source} has depth, so that its scale is known",
-            hint="leave out --scale, or add --no-depth",
+            f"{args.source} has {what}, so that its scale is known",
+            hint=f"leave out --scale, or add {option}",
         )
     from rse_pf.experiments.plots.map_image import RobotPath, draw_map
 

@@ -41,6 +41,7 @@ def row_of(
     return {
         "configuration": configuration.name,
         "recording": drive.dataset.name,
+        "sensors": drive.dataset.sensors,
         "rate_hz": round(drive.rate_hz, 3),
         "alignment": "SE(3)" if runs[0].is_metric else "Sim(3)",
         "truth": drive.dataset.truth_kind,
@@ -87,7 +88,7 @@ def drive_heading(drive: Drive, rows: Sequence[Mapping[str, Any]]) -> str:
     """Return the line above the rows of one drive."""
     dataset, stamps_s = drive.dataset, drive.dataset.timestamps_s
     kinds = list(dict.fromkeys(row["alignment"] for row in rows))
-    frames = f"{drive.name}: {len(dataset)} frames, {stamps_s[-1] - stamps_s[0]:.1f} s"
+    frames = f"{drive.name}, {dataset.sensors}: {len(dataset)} frames, {stamps_s[-1] - stamps_s[0]:.1f} s"
     if dataset.truth is None:
         return f"{frames}; no truth"
     where = "" if dataset.T_body_camera is None else " of the body"

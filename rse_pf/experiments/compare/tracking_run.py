@@ -6,7 +6,7 @@ import hashlib
 import tempfile
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -68,7 +68,7 @@ async def track(
         UsageError: The recording cannot be read, or a function of the configuration fails.
     """
     dataset = drive.dataset
-    if configuration.depth and not dataset.has_depth:
+    if configuration.depth and not (dataset.has_depth or dataset.has_stereo):
         raise UsageError(
             f"{configuration.name} needs depth, and {dataset.name} has none", hint="leave out depth = true"
         )
@@ -85,6 +85,8 @@ async def track(
     costs, tracked = _Costs(), []
     for number, frame in enumerate(dataset, start=1):
         sent, server_s, inside_s = solver.sent_bytes, solver.server_s, solver.inside_s
+        if configuration.depth is False and frame.stereo is not None:
+            frame = replace(frame, stereo=None)
         began_s = time.process_time()
         try:
             done = await mapper.track(frame)

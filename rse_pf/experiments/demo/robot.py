@@ -13,7 +13,7 @@ from contextlib import AsyncExitStack
 from dataclasses import dataclass, field, replace
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -33,6 +33,9 @@ from rse_pf.experiments.demo.live import LIVE_NAME, LiveRecorder
 from rse_pf.experiments.demo.merge import MAP_FILE
 from rse_pf.experiments.results.records import CommandRecord
 
+if TYPE_CHECKING:
+    from client_sdk.datasets import CameraChoice, Dataset
+
 __all__ = ["DemoOptions", "FrameDone", "RobotFinished", "RobotSpec", "run_robot"]
 
 _MIN_READINGS = 2
@@ -44,9 +47,14 @@ _LEAST_MERGE_FRAMES = 150
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DemoOptions:
-    """Options of the command line; ``data`` None means the rendered world."""
+    """Options of the command line.
+
+    ``data`` None means the rendered world; ``camera`` and ``imu`` None mean what the recording has.
+    """
 
     data: Path | None = None
+    camera: CameraChoice | None = None
+    imu: bool | None = None
     robots: int = 3
     rate_hz: float = 5.0
     engine: str = "native"
@@ -68,6 +76,14 @@ class DemoOptions:
         if self.frames or not (self.merge or self.live):
             return self.frames or _DEFAULT_FRAMES
         return max(_LEAST_MERGE_FRAMES, frames_to_overlap(self.robots))
+
+    def share(self, robot: int) -> Dataset:
+        """Return the frames of the recording that *robot* 0, 1, ... plays; raises UsageError."""
+        from client_sdk.datasets import open_dataset
+
+        assert self.data is not None
+        recording = open_dataset(self.data, camera=self.camera, imu=self.imu)
+        return recording.thinned(self.rate_hz).share(robot, self.robots)
 
     @property
     def frontend_options(self) -> FrontEndOptions:
@@ -130,6 +146,16 @@ class _Drive:
     """Whether a pose is requested at this moment: keyframes wait."""
 
 
+@dataclass(frozen=True, slots=True)
+class _Loaded:
+    """Frames to play, with the truth of them."""
+
+    frames: Any
+    truth: Trajectory | None
+    truth_kind: str
+    has_depth: bool
+
+
 def run_robot(spec: RobotSpec, pipe: Connection) -> None:
     """Load the frames, connect, wait for the start, track; the entry point of the process."""
     parent = ParentPipe(pipe, spec.name)
@@ -148,7 +174,8 @@ async def _run(spec: RobotSpec, pipe: ParentPipe) -> None:
     from client_sdk import connect
 
     options = spec.options
-    frames, truth, truth_kind = await asyncio.to_thread(_load, spec, pipe)
+    loaded = await asyncio.to_thread(_load, spec, pipe)
+    frames, truth = loaded.frames, loaded.truth
 
     async def token() -> str:
         return await asyncio.to_thread(pipe.fresh_token)
@@ -175,7 +202,7 @@ async def _run(spec: RobotSpec, pipe: ParentPipe) -> None:
             else:
                 start = np.eye(4) if truth is None or options.merge else truth.T_world_camera[0]
                 mapper = Mapper(
-                    ask=ask, depth=True, options=options.frontend_options, T_world_start=start,
+                    ask=ask, depth=loaded.has_depth, options=options.frontend_options, T_world_start=start,
                     features=load_features(options.features),
                 )  # fmt: skip
             pipe.send(ChildReady(len(frames)))
@@ -216,7 +243,7 @@ async def _run(spec: RobotSpec, pipe: ParentPipe) -> None:
                 commands=drive.commands,
                 trajectory=trajectory,
                 truth=truth,
-                truth_kind=truth_kind,
+                truth_kind=loaded.truth_kind,
                 stats={
                     "reconnects": robot.stats.reconnects,
                     "resent": robot.stats.resent,
@@ -271,14 +298,12 @@ def _since(began: float) -> float:
     return round(time.monotonic() - began, 6)
 
 
-def _load(spec: RobotSpec, pipe: ParentPipe) -> tuple[Any, Trajectory | None, str]:
-    """Return the frames, the true trajectory and its kind; the world is rendered before the start."""
+def _load(spec: RobotSpec, pipe: ParentPipe) -> _Loaded:
+    """Return the frames and the truth; the world is rendered before the start."""
     options, number = spec.options, spec.number
     if options.data is not None:
-        from client_sdk.datasets import open_dataset
-
-        recording = open_dataset(options.data).thinned(options.rate_hz).share(number, options.robots)
-        return recording, recording.truth, recording.truth_kind
+        recording = options.share(number)
+        return _Loaded(recording, recording.truth, recording.truth_kind, recording.has_depth)
     from client_sdk.simulator import render_frames, true_trajectory
 
     truth = true_trajectory(number, options.robots, options.frame_count, options.seed)
@@ -286,7 +311,7 @@ def _load(spec: RobotSpec, pipe: ParentPipe) -> tuple[Any, Trajectory | None, st
     for frame in render_frames(number, options.robots, options.frame_count, options.seed):
         frames.append(frame)
         pipe.send(FrameDone(len(frames)))
-    return frames, truth, "ground truth"
+    return _Loaded(frames, truth, "ground truth", True)
 
 
 def _collector(

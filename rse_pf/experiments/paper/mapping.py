@@ -89,9 +89,7 @@ def _truth(options: DemoOptions, row: int) -> tuple[Trajectory | None, int]:
 
         truth = true_trajectory(row, options.robots, options.frame_count, options.seed)
         return truth, options.frame_count
-    from client_sdk.datasets import open_dataset
-
-    share = open_dataset(options.data).thinned(options.rate_hz).share(row, options.robots)
+    share = options.share(row)
     return share.truth, len(share)
 
 

@@ -77,7 +77,7 @@ def test_it_writes_a_table_a_picture_and_the_trajectories(
     report = compare(tmp_path, "default", "without-depth", change=black)
 
     told = capsys.readouterr().out
-    assert "flat at 10 Hz: 10 frames, 0.9 s; ground truth, SE(3) and Sim(3)" in told
+    assert "flat at 10 Hz, colour + depth: 10 frames, 0.9 s; ground truth, SE(3) and Sim(3)" in told
     assert "7 of 10" in told
     assert "truth interpolated between true poses at most 0.25 s apart" in told
     assert report["max_truth_gap_s"] == 0.25
