@@ -20,7 +20,7 @@ import numpy.typing as npt
 
 from client_sdk.answers import PoseAnswer
 from client_sdk.frontend import Features, Frame, FrontEndOptions, PoseQuery, TrackedFrame
-from client_sdk.imu.inertial import ImuScale, Inertial, correction, upright
+from client_sdk.imu.inertial import ImuScale, Inertial, upright
 from client_sdk.imu.samples import ImuSamples
 from client_sdk.mapping import MapOptions, PointMap, Trajectory, write_ply, write_trajectory
 from client_sdk.monocular.scale import MarkerScale, OdometryScale
@@ -32,6 +32,7 @@ from rse_pf.errors import ConfigurationError, RsePfError, UsageError
 from rse_pf.geometry import Array, Camera
 from rse_pf.maps.format import MapVersion, encode_map
 from rse_pf.pnp import DepthNoise, PnpOptions
+from rse_pf.slam.inertial import KeyframeImu, upright_turn
 
 __all__ = ["AskPose", "BlockingMapper", "FrameRecorder", "Mapper", "PoseSolver", "ask_robot"]
 
@@ -152,6 +153,7 @@ class Mapper:
         self._depth = depth
         self._scale: OdometryScale | MarkerScale | ImuScale | None = scale
         self._inertial: Inertial | None = None
+        self._began_s = float("-inf")
         self._is_upright, self._holds_world = False, holds_world or T_world_start is not None
         self._map_options = map_options or MapOptions()
         self._T_world_start = T_world_start
@@ -257,12 +259,17 @@ class Mapper:
         return "not used yet" if self._inertial.alignment is None else "used"
 
     @property
-    def gravity(self) -> tuple[Array, float] | None:
-        """``(3,)`` m/s^2 in the world and the deviation of its direction, rad; None while it is not known."""
-        known = None if self._inertial is None else self._inertial.gravity
-        if known is None or self._inertial is None or self._inertial.alignment is None:
-            return None
-        return known, self._inertial.alignment.gravity_deviation
+    def gravity(self) -> Array | None:
+        """``(3,)`` m/s^2 in the world; None while it is not known."""
+        return None if self._inertial is None else self._inertial.gravity
+
+    def keyframe_imu(
+        self, T_world_camera: Array, since_s: float | None, timestamp_s: float
+    ) -> KeyframeImu | None:
+        """Return what a keyframe tells of the IMU, as `Inertial.keyframe` does; None while it is unknown."""
+        return (
+            None if self._inertial is None else self._inertial.keyframe(T_world_camera, since_s, timestamp_s)
+        )
 
     @property
     def unrecognised(self) -> int:
@@ -288,6 +295,10 @@ class Mapper:
         if not isinstance(self._tracker, Tracker):
             raise UsageError("only a camera with depth can start anew", hint="make another mapper")
         self._tracker.restart(T_world_start)
+        if self._inertial is not None:
+            stamps_s = self._records.first.stamps_s
+            self._began_s = max(stamps_s, default=self._began_s)
+            self._inertial.forget()
 
     def report(self) -> dict[str, Any]:
         """Return the figures of the drive, as for ``report.json``."""
@@ -417,17 +428,18 @@ class Mapper:
         """Find gravity and biases of a drive in metres."""
         assert self._inertial is not None
         path = self._records.first.trajectory()
+        first = int(np.searchsorted(path.timestamps_s, self._began_s, side="right"))
         depths_m = np.empty(0) if tracker.last_features is None else tracker.last_features.points_camera[:, 2]
         depths_m = depths_m[np.isfinite(depths_m)]
         depth_m = float(np.median(depths_m)) if len(depths_m) else _USUAL_DEPTH_M
-        self._inertial.align(path.timestamps_s, path.T_world_camera, depth_m, is_metric=True)
+        self._inertial.align(path.timestamps_s[first:], path.T_world_camera[first:], depth_m, is_metric=True)
 
     def _make_upright(self, tracker: Tracker | MonocularTracker) -> bool:
         """Turn the world, if gravity is known, so that z points up; say whether it was turned."""
         gravity = None if self._inertial is None else self._inertial.gravity
         if gravity is None or self._holds_world:
             return False
-        turned = correction(gravity)
+        turned = upright_turn(gravity)
         tracker.turn(turned)
         if isinstance(tracker, Tracker):
             self._records.turn(turned)
@@ -480,7 +492,7 @@ class Mapper:
         self._align(tracker)
         if self._is_upright or inertial.gravity is None:
             return done
-        T = correction(inertial.gravity)
+        T = upright_turn(inertial.gravity)
         if not self._make_upright(tracker):
             return done
         return replace(done, T_world_camera=T @ pose, corrected=True)

@@ -11,12 +11,13 @@ import numpy.typing as npt
 from client_sdk.imu.alignment import GRAVITY_M_S2, Alignment, align
 from client_sdk.imu.checks import RateCheck, check_rates, trouble_of_samples
 from client_sdk.imu.history import ImuHistory
-from client_sdk.imu.preintegration import Preintegration, exp_so3, preintegrate
+from client_sdk.imu.preintegration import Preintegration, exp_so3, log_so3, preintegrate
 from client_sdk.imu.samples import ImuModel, ImuSamples
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Array, Camera
+from rse_pf.slam.inertial import InertialMotion, KeyframeImu, upright_turn
 
-__all__ = ["ImuScale", "Inertial", "correction", "upright"]
+__all__ = ["ImuScale", "Inertial", "upright"]
 
 _STEP_S, _MOST_POSES, _FEWEST_POSES = 0.2, 150, 8
 """Poses so far apart are aligned, those of the last 30 seconds."""
@@ -27,9 +28,13 @@ _POSE_PX = 0.33
 _WELL_KNOWN = 0.015
 """Metres are known when their deviation is below this share."""
 _GRAVITY_RAD = math.radians(0.5)
-_MOST_MISFIT = 12.0
+_MOST_MISFIT, _MOST_MISFITS = 12.0, 3
+"""An IMU that does not agree so often in a row is not used: a wrong pose alone does not speak against it."""
 _SAME_BIAS = 0.005
 _RATES_S = 20.0
+_LONGEST_S = 10.0
+"""A longer motion between keyframes tells nothing, and is not sent."""
+_LEAST_GRAVITY_RAD = 1e-3
 _AT_REST = 0.25
 """The first samples point up if their length differs from gravity by less than this share."""
 
@@ -53,6 +58,7 @@ class Inertial:
         self._bias_gyro: Array = np.zeros(3)
         self._is_trusted = False
         self._due_s = float("-inf")
+        self._misfits = 0
         self._motions: dict[tuple[float, float], Preintegration | None] = {}
 
     def add(self, samples: ImuSamples) -> None:
@@ -73,6 +79,10 @@ class Inertial:
         R_imu_camera = self._history.model.T_imu_camera[:3, :3]
         turned: Array = R_imu_camera.T @ R @ R_imu_camera
         return turned
+
+    def forget(self) -> None:
+        """Forget where gravity is: the world of the poses is another one."""
+        self.alignment, self._due_s = None, float("-inf")
 
     def is_due(self, timestamp_s: float) -> bool:
         """Return whether it is time for another alignment."""
@@ -108,11 +118,13 @@ class Inertial:
             return None
         if found is None:
             return None
-        if found.misfit > _MOST_MISFIT:
+        self._misfits = self._misfits + 1 if found.misfit > _MOST_MISFIT else 0
+        if self._misfits >= _MOST_MISFITS:
             self.trouble = (
                 f"the accelerometer does not agree with the camera: {found.misfit:.1f} deviations apart; "
                 "are its axes, its unit and its noise right?"
             )
+        if self._misfits:
             return None
         self._bias_gyro = found.bias_gyro[-1]
         self.alignment = found
@@ -136,6 +148,35 @@ class Inertial:
             return None
         down: Array = -(self._history.model.T_imu_camera[:3, :3].T @ accel)
         return down
+
+    def keyframe(
+        self, T_world_camera: Array, since_s: float | None, timestamp_s: float
+    ) -> KeyframeImu | None:
+        """Return what a keyframe tells of the IMU; None while gravity is not known.
+
+        Args:
+            T_world_camera: ``(4, 4)``, its pose in the world of the last alignment.
+            since_s: Time of the previous keyframe of the segment; None if there is none.
+            timestamp_s: Its time.
+        """
+        gravity = self.gravity
+        if gravity is None or self.alignment is None or self.trouble:
+            return None
+        down = T_world_camera[:3, :3].T @ gravity
+        samples = None if since_s is None else self._history.between(since_s, timestamp_s, self.offset_s)
+        motion = None
+        if samples is not None and samples.timestamps_s[-1] - samples.timestamps_s[0] <= _LONGEST_S:
+            made = preintegrate(samples, self._bias_gyro, self.alignment.bias_accel[-1])
+            motion = InertialMotion(
+                duration_s=made.duration_s, rotation=log_so3(made.rotation[None])[0], velocity=made.velocity,
+                position=made.position, bias_gyro=made.bias_gyro, bias_accel=made.bias_accel,
+                covariance=made.covariance,
+            )  # fmt: skip
+        return KeyframeImu(
+            down_camera=down / np.linalg.norm(down),
+            deviation_rad=max(_LEAST_GRAVITY_RAD, self.alignment.gravity_deviation),
+            T_imu_camera=self._history.model.T_imu_camera, motion=motion,
+        )  # fmt: skip
 
     def _check(self, timestamps_s: Array, T_world_camera: Array) -> bool:
         """Say whether the IMU may be used; find its offset in time and a first bias of the gyroscope."""
@@ -216,21 +257,8 @@ def upright(gravity_camera: Array) -> Array:
     """
     made = np.eye(4)
     made[:3, :3] = _LEVEL
-    turned: Array = correction(_LEVEL @ gravity_camera) @ made
+    turned: Array = upright_turn(_LEVEL @ gravity_camera) @ made
     return turned
-
-
-def correction(gravity_world: Array) -> Array:
-    """Return the smallest rotation ``(4, 4)`` of a world after which its gravity ``(3,)`` points along -z."""
-    down = gravity_world / np.linalg.norm(gravity_world)
-    axis = np.cross(down, [0.0, 0.0, -1.0])
-    sine, cosine = float(np.linalg.norm(axis)), -float(down[2])
-    made = np.eye(4)
-    if sine < 1e-12:  # nothing to turn, or half a turn about any level axis
-        made[:3, :3] = np.diag([1.0, 1.0, 1.0] if cosine > 0.0 else [1.0, -1.0, -1.0])
-    else:
-        made[:3, :3] = exp_so3(axis / sine * math.atan2(sine, cosine))
-    return made
 
 
 def _spaced(timestamps_s: Array) -> list[int]:

@@ -178,6 +178,7 @@ class LiveMapper:
         self._alignments = Alignments()
         self._segment = 0
         self._last_keyframe: Array | None = None
+        self._last_keyframe_s: float | None = None
         self._is_corrected = False
         self._poses: list[tuple[float, int, Array]] = []
         self._made, self._dropped = 0, 0
@@ -451,7 +452,7 @@ class LiveMapper:
         self._mapper.restart(self._poses[-1][2])
         self._segment += 1
         self._sender.current_segment = self._segment
-        self._last_keyframe = None
+        self._last_keyframe = self._last_keyframe_s = None
         self._relocalised_at, self._asked_in_vain = float("-inf"), 0
 
     def _is_keyframe(self, pose: Array) -> bool:
@@ -465,7 +466,7 @@ class LiveMapper:
         waiting = self._waiting
         data = await asyncio.to_thread(self._encode, done.frame, pose, features)
         keyframe = WaitingKeyframe(waiting.next_index, self._segment, data)
-        self._last_keyframe = pose
+        self._last_keyframe, self._last_keyframe_s = pose, done.frame.timestamp_s
         await self._wait_for_cloud()
         self._adding = asyncio.ensure_future(asyncio.to_thread(self.map.add, done.frame, pose))
         if not await asyncio.to_thread(waiting.add, keyframe):
@@ -491,6 +492,7 @@ class LiveMapper:
                 features.pixels[rows], depths_m[rows], features.descriptors[rows], self._mapper.depth_noise,
                 features.kind,
             ),
+            imu=self._mapper.keyframe_imu(T_odom_camera, self._last_keyframe_s, frame.timestamp_s),
         )  # fmt: skip
         return encode_keyframe(keyframe)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -16,6 +17,7 @@ from rse_pf.live_map.graph import Graph, Segment
 from rse_pf.live_map.options import LiveMapOptions
 from rse_pf.live_map.smoothing import edges_of
 from rse_pf.maps.format import Edge, EdgeKind, Keyframe, MapVersion
+from rse_pf.slam.inertial import agreed_gravity, upright_turn
 from rse_pf.slam.keyframe import Keyframe as SentKeyframe
 from rse_pf.slam.keyframe import decode_keyframe, encode_keyframe, make_features
 from rse_pf.slam.pose_graph import PoseGraph, is_positive_definite
@@ -70,7 +72,8 @@ def started_from(version: MapVersion, source: str) -> MapStarted:
 def version_of(graph: Graph, options: LiveMapOptions) -> MapVersion:
     """Return the keyframes that are connected with the map's frame and keep their features, and their edges.
 
-    Odometry leads from each such keyframe of a segment to the next one.
+    Odometry leads from each such keyframe of a segment to the next one.  Where more than half of the robots
+    with an IMU agree on where down is, z of the version points up.
 
     Raises:
         InternalError: Something that the map holds does not fit into a version.
@@ -81,11 +84,14 @@ def version_of(graph: Graph, options: LiveMapOptions) -> MapVersion:
 
 def _version_of(graph: Graph, options: LiveMapOptions) -> MapVersion:
     ids = [i for i in _aligned(graph) if graph.held[i]]
-    keyframes = []
+    keyframes: list[Keyframe] = []
+    downs: dict[str, list[Array]] = {}
     for i in ids:
         row = graph.keyframes[i]
         assert row.data is not None
         seen = decode_keyframe(row.data)
+        if seen.imu is not None:
+            downs.setdefault(row.robot, []).append(graph.T[i, :3, :3] @ seen.imu.down_camera)
         keyframes.append(
             Keyframe(
                 id=i, robot=_short_name(row.robot), timestamp_s=row.timestamp_s,
@@ -94,6 +100,13 @@ def _version_of(graph: Graph, options: LiveMapOptions) -> MapVersion:
                 points_camera=seen.features.points_camera(seen.camera).astype(np.float32),
             )
         )  # fmt: skip
+    # A map that started from a version keeps the axes of that.
+    down = None if graph.source else agreed_gravity([np.array(each) for each in downs.values()])
+    if down is not None:
+        turn = upright_turn(down)
+        keyframes = [
+            replace(keyframe, T_world_camera=turn @ keyframe.T_world_camera) for keyframe in keyframes
+        ]
     kept = set(ids)
     edges = []
     for segment in _aligned_segments(graph):

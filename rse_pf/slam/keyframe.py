@@ -19,6 +19,7 @@ All numbers are little-endian::
     geometry  kind 3: what it holds (uint8; 1: depths), 0 (uint8), n (uint16); n depths in mm (uint16)
     noise     kind 5, optional: deviation of a depth z in metres is base + growth * max(0, z - from)^2
               (3 float64); a Kinect's where it is left out
+    IMU       kind 6, optional: gravity, and the motion since the last keyframe: `rse_pf.slam.inertial`
 
 Blocks stand in the order of their kinds.
 """
@@ -36,6 +37,7 @@ from rse_pf.errors import BadRequest
 from rse_pf.geometry import Array, Camera, rigid
 from rse_pf.maps.descriptors import ORB, DescriptorKind, Descriptors
 from rse_pf.pnp import DepthNoise
+from rse_pf.slam.inertial import KeyframeImu, decode_imu, encode_imu
 
 __all__ = [
     "MAX_BLOCKS",
@@ -64,7 +66,8 @@ _CAMERA = struct.Struct("<BBHH4d")
 _FEATURES = struct.Struct("<BBHHBB")
 _GEOMETRY = struct.Struct("<BBH")
 _CAMERA_KIND, _FEATURES_KIND, _GEOMETRY_KIND = 1, 2, 3
-_NOISE_KIND = 5
+_NOISE_KIND, _IMU_KIND = 5, 6
+_OPTIONAL = {_NOISE_KIND: "noise", _IMU_KIND: "IMU"}
 _NAMES = {_CAMERA_KIND: "camera", _FEATURES_KIND: "features", _GEOMETRY_KIND: "geometry"}
 _NOISE = struct.Struct("<3d")
 _KINECT = DepthNoise()
@@ -106,7 +109,7 @@ class KeyframeFeatures:
 
 @dataclass(frozen=True, slots=True)
 class UnknownBlock:
-    """An optional block of a kind that this release does not know, 4 or above 5, kept as it came."""
+    """An optional block of a kind that this release does not know, 4 or above 6, kept as it came."""
 
     kind: int
     content: bytes
@@ -118,7 +121,8 @@ class Keyframe:
 
     ``timestamp_s`` is in seconds since 1970.  ``T_odom_camera`` ``(4, 4)``, metres, maps the camera's frame
     to the odometry frame of the robot's segment; for a keyframe of a version it is the pose in that map.
-    ``others`` are the blocks that this release does not know.
+    ``imu`` tells where down is, if the robot has an IMU; ``others`` are the blocks that this release does not
+    know.
     """
 
     timestamp_s: float
@@ -126,6 +130,7 @@ class Keyframe:
     camera: Camera
     features: KeyframeFeatures
     others: tuple[UnknownBlock, ...] = ()
+    imu: KeyframeImu | None = None
 
 
 def most_features(kind: DescriptorKind) -> int:
@@ -189,8 +194,9 @@ def encode_keyframe(keyframe: Keyframe) -> bytes:
     units = np.rint(features.pixels.T.astype(np.float64) * 2.0**fraction).astype("<u2")
     depths_mm = np.rint(features.depths_m.astype(np.float64) * 1000.0).astype("<u2")
     has_noise = features.noise != _KINECT
+    blocks = len(_NAMES) + has_noise + (keyframe.imu is not None) + len(keyframe.others)
     parts = [_HEAD.pack(
-        _MAGIC, _VERSION, 3 + has_noise + len(keyframe.others), keyframe.timestamp_s,
+        _MAGIC, _VERSION, blocks, keyframe.timestamp_s,
         *keyframe.T_odom_camera[:3].ravel().tolist(),
     )]  # fmt: skip
     camera_numbers = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
@@ -207,6 +213,8 @@ def encode_keyframe(keyframe: Keyframe) -> bytes:
     if has_noise:
         noise = features.noise
         optional.append((_NOISE_KIND, _NOISE.pack(noise.base_m, noise.growth_per_m, noise.from_m)))
+    if keyframe.imu is not None:
+        optional.append((_IMU_KIND, encode_imu(keyframe.imu)))
     for kind, content in sorted(optional, key=lambda block: block[0]):
         parts += [_BLOCK.pack(kind, 0, len(content)), content]
     return b"".join(parts)
@@ -235,7 +243,7 @@ def decode_keyframe(data: bytes) -> Keyframe:
     known: dict[int, tuple[int, int]] = {}
     others = []
     for kind, begin, end in _blocks(data, count):
-        if kind in _NAMES or kind == _NOISE_KIND:
+        if kind in _NAMES or kind in _OPTIONAL:
             known[kind] = begin, end
         else:
             others.append(UnknownBlock(kind, bytes(data[begin:end])))
@@ -246,9 +254,13 @@ def decode_keyframe(data: bytes) -> Keyframe:
     features = _features(data, known[_FEATURES_KIND], known[_GEOMETRY_KIND], camera)
     if _NOISE_KIND in known:
         features = replace(features, noise=_noise(data, *known[_NOISE_KIND]))
+    imu = None
+    if _IMU_KIND in known:
+        begin, end = known[_IMU_KIND]
+        imu = decode_imu(bytes(data[begin:end]))
     return Keyframe(
         timestamp_s=timestamp_s, T_odom_camera=T_odom_camera, camera=camera, features=features,
-        others=tuple(others),
+        others=tuple(others), imu=imu,
     )  # fmt: skip
 
 
@@ -279,12 +291,12 @@ def _blocks(data: bytes, count: int) -> Iterator[tuple[int, int, int]]:
             raise _refusal(f"a block of {size} bytes goes on beyond its end")
         if (
             kind < max(1, last)
-            or (kind == last and (kind in _NAMES or kind == _NOISE_KIND))
+            or (kind == last and (kind in _NAMES or kind in _OPTIONAL))
             or flags > _REQUIRED
         ):
             raise _refusal(f"block {kind} stands twice, after a later one, or has unknown flags")
-        if kind == _NOISE_KIND and flags & _REQUIRED:
-            raise _refusal("the block of the noise is optional")
+        if kind in _OPTIONAL and flags & _REQUIRED:
+            raise _refusal(f"the block of the {_OPTIONAL[kind]} is optional")
         if kind not in _NAMES and flags & _REQUIRED:
             raise _refusal(
                 f"it needs block {kind}, which this release does not know",

@@ -132,7 +132,7 @@ def test_shapes_that_do_not_fit_are_refused() -> None:
 
 def test_optional_blocks_that_are_not_known_are_kept_byte_for_byte() -> None:
     made = replace(
-        keyframe(), others=(UnknownBlock(6, b"imu"), UnknownBlock(6, b""), UnknownBlock(65_535, bytes(200)))
+        keyframe(), others=(UnknownBlock(7, b"new"), UnknownBlock(7, b""), UnknownBlock(65_535, bytes(200)))
     )
     data = encode_keyframe(made)
 

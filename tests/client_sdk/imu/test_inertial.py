@@ -9,11 +9,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from client_sdk.imu.inertial import ImuScale, Inertial, correction, upright
+from client_sdk.imu.inertial import ImuScale, Inertial, upright
 from client_sdk.imu.preintegration import exp_so3
 from client_sdk.imu.samples import ImuModel, ImuSamples
 from client_sdk.simulator.inertial import InertialDrive, Motion, SimulatedImu
 from rse_pf.geometry import Array, Camera, exp_se3, inverse, rotation_angle_deg
+from rse_pf.slam.inertial import upright_turn
 
 CAMERA = Camera(fx=460.0, fy=460.0, cx=375.5, cy=239.5, width=752, height=480)
 MODEL = ImuModel(
@@ -169,7 +170,7 @@ def test_the_world_of_a_level_camera_has_z_up_and_x_ahead():
 def test_gravity_points_down_after_the_correction():
     rng = np.random.default_rng(1)
     for gravity in (*rng.normal(size=(20, 3)), np.array([0.0, 0.0, 5.0]), np.array([0.0, 0.0, -5.0])):
-        T = correction(gravity)
+        T = upright_turn(gravity)
         np.testing.assert_allclose(
             T[:3, :3] @ gravity / np.linalg.norm(gravity), [0.0, 0.0, -1.0], atol=1e-12
         )
