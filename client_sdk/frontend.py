@@ -17,10 +17,12 @@ from client_sdk.imu.samples import ImuSamples
 from client_sdk.monocular.opencv import load_opencv
 from client_sdk.native_match import FrontEndCore, front_end_core
 from client_sdk.slots import FeaturesSlot
+from client_sdk.stereo.depth import noise_of, stereo_points
 from client_sdk.stereo.view import StereoView
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Array, Camera
 from rse_pf.maps.descriptors import ORB, DescriptorKind, Descriptors
+from rse_pf.pnp import DepthNoise
 
 __all__ = [
     "Correspondences",
@@ -55,7 +57,7 @@ _SOUGHT, _CELL_PX = 3, 40
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Frame:
-    """One undistorted colour image with registered depth.
+    """One undistorted colour image with registered depth, or with the right image of a stereo pair.
 
     ``rgb`` is ``(h, w, 3)`` uint8, red first; ``depth_m`` is ``(h, w)`` float32, metres along
     the optical axis, 0 where there is no reading.  With *stereo*, ``rgb`` and ``camera`` are those of the
@@ -82,6 +84,11 @@ class Frame:
                 f"a right image of {self.stereo.gray.shape} does not fit a left one of {size}",
                 hint="rectify both images of a pair to one size",
             )
+
+    @property
+    def depth_noise(self) -> DepthNoise:
+        """The noise of the depths that the frame's features get, where the picture is clear."""
+        return DepthNoise() if self.stereo is None else noise_of(self.stereo, self.camera)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -436,8 +443,8 @@ def round_for_wire(points_world: Array, pixels: Array) -> tuple[Array, Array]:
 class PoseQuery:
     """One query for the PnP service: the pose of this camera in the reference camera's frame.
 
-    Solve with ``correspondences`` (their depths, too), ``camera``, ``inlier_px`` and ``max_iterations``,
-    then pass the answer to `Tracker.accept`.
+    Solve with ``correspondences`` (their depths, too), ``camera``, ``inlier_px``, ``max_iterations`` and
+    ``depth_noise`` (None: a Kinect's), then pass the answer to `Tracker.accept`.
     """
 
     timestamp_s: float
@@ -446,6 +453,7 @@ class PoseQuery:
     inlier_px: float
     max_iterations: int
     against: Literal["map", "frame", "keyframe", "segment"]
+    depth_noise: DepthNoise | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -486,8 +494,11 @@ class TrackedFrame:
 def points_at(frame: Frame, pixels: Array, options: FrontEndOptions) -> Array:
     """Return the ``(n, 3)`` points of the camera frame that *frame* shows at ``(n, 2)`` pixels.
 
-    The depth of a pixel is the median of its 3x3 patch, NaN where that is sparse, spread, near or far.
+    The depth of a pixel is the median of its 3x3 patch, NaN where that is sparse, spread, near or far.  A
+    stereo pair is matched, see `client_sdk.stereo.depth`.
     """
+    if frame.stereo is not None:
+        return stereo_points(frame.rgb, frame.stereo, frame.camera, pixels)
     core = front_end_core()
     if core is not None:
         found = core.points_at(

@@ -13,7 +13,7 @@ from collections import Counter
 from collections.abc import Awaitable, Callable, Coroutine
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -51,7 +51,8 @@ class PoseSolver(Protocol):
 
     async def solve_pnp(
         self, points_world: Array, pixels: Array, camera: Camera, options: PnpOptions | None = None, *,
-        depths_m: Array | None = None, deadline_s: float | None = None, keep: bool = False,
+        depths_m: Array | None = None, depth_noise: DepthNoise | None = None,
+        deadline_s: float | None = None, keep: bool = False,
     ) -> PoseAnswer:  # fmt: skip
         """Estimate the camera pose of one frame."""
 
@@ -77,6 +78,7 @@ def ask_robot(robot: PoseSolver, deadline_s: float | None = None) -> AskPose:
             query.camera,
             PnpOptions(inlier_px=query.inlier_px, max_iterations=query.max_iterations),
             depths_m=found.depths_m if found.depths_m.any() else None,
+            depth_noise=query.depth_noise,
             deadline_s=deadline_s,
             keep=True,
         )
@@ -95,8 +97,8 @@ class Mapper:
                 tracked = await mapper.track(frame)
             mapper.save(Path("out"))
 
-    Frames with depth give a dense map in metres.  Frames without depth (all zero) give landmarks, up to scale
-    unless *scale* knows a length.
+    Frames with depth give a dense map in metres, stereo pairs the points of their features.  Frames without
+    depth (all zero) give landmarks, up to scale unless *scale* knows a length.
     """
 
     def __init__(
@@ -164,6 +166,7 @@ class Mapper:
         self._recorder = recorder
         self._slots = Slots.of(features=features, motion=motion, loops=loops, optimiser=optimiser)
         self._joined = 0
+        self._depth_by: Literal["depth", "stereo"] = "depth"
         self._metric: set[int] = set()
         self._one_frame = asyncio.Lock()
         self._round_trips_ms: list[float] = []
@@ -246,7 +249,7 @@ class Mapper:
     def scale(self) -> str:
         """Where metres come from: ``metric, by depth``, ``metric, by ...``, or ``up to scale``."""
         if self._tracker is None or isinstance(self._tracker, Tracker):
-            return "metric, by depth" if self._tracker is not None else "unknown: no frame yet"
+            return f"metric, by {self._depth_by}" if self._tracker is not None else "unknown: no frame yet"
         return f"metric, by {self._scale.name}" if 0 in self._metric and self._scale else _UP_TO_SCALE
 
     @property
@@ -339,7 +342,7 @@ class Mapper:
                 "no keyframe was kept, so there is no map to share",
                 hint="make the mapper with keyframes_of=ROBOT, and give it frames with depth",
             )
-        points, colours = record.cloud.points(min_readings=_MIN_READINGS)
+        points, colours = record.cloud.points(min_readings=self._least_readings)
         made_by = {"made_by": "mapper", "robot": self._keyframes_of}
         keyframes = tuple(replace(keyframe, id=number) for number, keyframe in enumerate(record.keyframes))
         version = MapVersion(keyframes=keyframes, points=points, colours=colours, provenance=made_by)
@@ -365,9 +368,7 @@ class Mapper:
             self._align(self._tracker)
             self._make_upright(self._tracker)
         report = self.report()
-        # Several views have triangulated a landmark; a voxel of a dense map is trusted if it was read twice.
-        least = 1 if isinstance(self._tracker, MonocularTracker) else _MIN_READINGS
-        points, colours = self.map.points(min_readings=least)
+        points, colours = self.map.points(min_readings=self._least_readings)
         report["map_points"] = len(points)
         if self._recorder is not None:
             self._recorder.map(points)
@@ -387,6 +388,12 @@ class Mapper:
                 f"cannot write {folder}: {error.strerror}", hint="name another folder"
             ) from error
         return report
+
+    @property
+    def _least_readings(self) -> int:
+        """How often a voxel of the map must have been read to be trusted: twice, if the map is dense."""
+        is_sparse = isinstance(self._tracker, MonocularTracker) or self._depth_by == "stereo"
+        return 1 if is_sparse else _MIN_READINGS
 
     def _apart(self) -> list[tuple[SegmentRecord, bool]]:
         """Return the segments that were not joined to the first one, and whether they are in metres."""
@@ -408,7 +415,10 @@ class Mapper:
         if self._tracker is None:
             if frame.imu is not None:
                 self._begin_inertial(frame.imu, frame.camera)
-            if bool(frame.depth_m.any()) if self._depth is None else self._depth:
+            if frame.stereo is not None or (
+                bool(frame.depth_m.any()) if self._depth is None else self._depth
+            ):
+                self._depth_by = "depth" if frame.stereo is None else "stereo"
                 self._tracker = Tracker(self._options, self._T_world_start, self._slots)
             else:
                 self._tracker = MonocularTracker(self._monocular, self._T_world_start, self._slots)
@@ -479,7 +489,9 @@ class Mapper:
             return self._with_scale(tracker, done, position_m)
         assert tracker is not None
         if pose is not None:
-            record = self._records.add(done, pose, into_cloud=self._adds_frames)
+            record = self._records.add(done, pose)
+            if self._adds_frames:
+                self._records.add_to_cloud(done, pose, tracker.last_features)
             if done.keyframe and self._keyframes_of and tracker.last_features is not None:
                 record.keyframes.append(keyframe_of(done, pose, tracker.last_features, self._keyframes_of))
         return self._with_gravity(tracker, self._with_joins(tracker, done))

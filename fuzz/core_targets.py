@@ -33,13 +33,13 @@ from rse_pf.slam.tracking import (
     match_near_by_numpy,
 )
 
-__all__ = ["depth", "describe", "match", "track"]
+__all__ = ["HOSTILE_SIZES", "Room", "depth", "describe", "match", "track"]
 
 Anything = npt.NDArray[Any]
 
 _CAMERA = Camera(fx=300.0, fy=310.0, cx=3.5, cy=4.0, width=640, height=480)
 _HEAD = 8
-_HOSTILE_SIZES = (-1, -(2**63), 2**24 + 1, 2**31, 2**60, 2**63 - 1)
+HOSTILE_SIZES = (-1, -(2**63), 2**24 + 1, 2**31, 2**60, 2**63 - 1)
 _PATTERN, _BEHIND = 0xA5, 64
 _STRANGE = (float("nan"), float("inf"), -1.0, 0.0, 1e300)
 
@@ -83,7 +83,7 @@ def _match_directly(arrays: list[Anything], ratio: float, limit: int, count: int
     matches = _functions()["rse_pf_match"]
     n, m = len(reference), len(frame)
     room = min(n, m, max(limit, 0))
-    rooms = [_Room(8 * words) for words in (3 * n + 5 * m + 64, 3 * room, 2 * room, room)]
+    rooms = [Room(8 * words) for words in (3 * n + 5 * m + 64, 3 * room, 2 * room, room)]
     # A room for one number more where there is none: a null pointer is refused.
     behind = [each.at for each in rooms]
 
@@ -95,7 +95,7 @@ def _match_directly(arrays: list[Anything], ratio: float, limit: int, count: int
         return answer
 
     expect(called(n, m) == count, "another number of matches without the binding")
-    for size in _HOSTILE_SIZES:
+    for size in HOSTILE_SIZES:
         expect(called(size, m) == -1 and called(n, size) == -1, f"{size} rows are not refused")
     for each in rooms:
         each.check()
@@ -144,8 +144,8 @@ def _points_at(core: FrontEndCore, data: bytes, pixels: Array) -> None:
     expected = _points_by_numpy(depth_m, pixels, low, high, spread)
     expect(found is not None and _all_equal((found,), (expected,)), "points are not those of numpy")
     points_at, copies = _functions()["rse_pf_points_at"], (np.array(depth_m), np.array(pixels))
-    room = _Room(24 * len(pixels))
-    for wide, high_, rows in ((size, 3, 1) for size in _HOSTILE_SIZES):
+    room = Room(24 * len(pixels))
+    for wide, high_, rows in ((size, 3, 1) for size in HOSTILE_SIZES):
         for sizes in ((wide, high_, rows), (high_, wide, rows), (width, height, wide)):
             answer = points_at(
                 address_of(copies[0]), *sizes[:2], address_of(copies[1]), sizes[2], *[1.0] * 7, room.at
@@ -224,14 +224,14 @@ def _check_refined(pose: RefinedPose, start: Array) -> None:
 def _refine_hostile_sizes(inliers: Anything, points: Array) -> None:
     refine = _functions()["rse_pf_depth_refine"]
     numbers, rows = np.ones(3 * len(points) + 1), np.array(inliers)
-    for size in _HOSTILE_SIZES:
+    for size in HOSTILE_SIZES:
         for n, k in ((size, 1), (1, size), (size, size)):
             request = np.zeros(2 + 4 + 8 + 16, dtype=np.int64)
             request[:1].view(np.uint32)[:] = (1, 0)
             request[1:3] = n, k
             request[3:7] = address_of(numbers), address_of(numbers), address_of(numbers), address_of(rows)
             request[7:15].view(np.float64)[:] = (300.0, 300.0, 1.0, 1.0, 1e-3, 0.0, 0.0, 1.0)
-            result, work = _Room(8 * (2 + 16 + 36)), _Room(8 * 11 * 5)
+            result, work = Room(8 * (2 + 16 + 36)), Room(8 * 11 * 5)
             refine(address_of(request), work.at, result.at)
             expect(result.first() == 2, f"{n} rows with {k} inliers are not refused")
             result.check()
@@ -285,7 +285,7 @@ def _describe_directly(
     turned = np.nan_to_num(angles_deg.astype(np.float64))
     cosines, sines = np.cos(turned).astype(np.float32), np.sin(turned).astype(np.float32)
     scales = np.full(max(levels, 1), 1.0, np.float32) * np.float32(min(scale, 1e30))
-    work, out = _Room(8 * (3 * width * height // 8 + 7 * width + 64)), _Room(32 * n)
+    work, out = Room(8 * (3 * width * height // 8 + 7 * width + 64)), Room(32 * n)
 
     def called(width: int, height: int, levels: int, rows: int) -> int:
         answer: int = call(
@@ -295,7 +295,7 @@ def _describe_directly(
         return answer
 
     called(width, height, levels, n)
-    for size in _HOSTILE_SIZES:
+    for size in HOSTILE_SIZES:
         expect(called(size, 50, 8, n) == called(50, size, 8, n) == -1, f"a side of {size} is not refused")
         expect(called(width, height, 8, size) == -1, f"{size} keypoints are not refused")
     for levels in (-1, 0, 33, 2**31 - 1):
@@ -361,7 +361,7 @@ def _near_directly(
     near, distinct = _functions()["rse_pf_match_near"], _functions()["rse_pf_distinct"]
     m, n = len(sought[0]), len(image[0])
     arrays = [np.array(each) for each in (*sought, *image)]
-    rooms = _Room(8 * (m + 2 * n + 4200)), _Room(8 * min(m, n)), _Room(8 * min(m, n))
+    rooms = Room(8 * (m + 2 * n + 4200)), Room(8 * min(m, n)), Room(8 * min(m, n))
 
     def called(abi: int, sought_rows: int, rows: int, radius_px: float) -> int:
         request = np.zeros(2 + 1 + 9 + 5 + 1, dtype=np.int64)
@@ -375,7 +375,7 @@ def _near_directly(
 
     expect(called(1, m, n, limits[0]) == count, "another number of matches without the binding")
     expect(called(2, m, n, limits[0]) == -1, "another ABI is not refused")
-    for size in _HOSTILE_SIZES:
+    for size in HOSTILE_SIZES:
         expect(called(1, size, n, 1.0) == called(1, m, size, 1.0) == -1, f"{size} rows are not refused")
         answer = distinct(address_of(arrays[7]), address_of(arrays[4]), size, 6.0, rooms[0].at)
         expect(answer == -1, f"{size} rows have distances")
@@ -419,9 +419,9 @@ def _fit(core: TrackCore, data: bytes, meter: Meter) -> None:
     )  # fmt: skip
     with np.errstate(all="ignore"):
         fit_pose_by_numpy(observed, _CAMERA, T.reshape(4, 4), cauchy=2.5, gate2=11.3)
-    fit, is_in, result = _functions()["rse_pf_fit_pose"], _Room(n), _Room(8 * (1 + 16 + 36))
+    fit, is_in, result = _functions()["rse_pf_fit_pose"], Room(n), Room(8 * (1 + 16 + 36))
     arrays = [np.array(each) for each in (*rows, *measured)]
-    for size in _HOSTILE_SIZES:
+    for size in HOSTILE_SIZES:
         request = np.zeros(2 + 6 + 6 + 16, dtype=np.int64)
         request[:1].view(np.uint32)[:] = (1, 0)
         request[1] = size
@@ -432,7 +432,7 @@ def _fit(core: TrackCore, data: bytes, meter: Meter) -> None:
     result.check()
 
 
-class _Room:
+class Room:
     """Memory of exactly *size* bytes for the library, with a pattern behind it."""
 
     def __init__(self, size: int) -> None:

@@ -258,6 +258,16 @@ def _tracks() -> list[bytes]:
             for body in (spots, rng.bytes(700))]  # fmt: skip
 
 
+def _pairs() -> list[bytes]:
+    rng = np.random.default_rng(8)
+    noise = rng.bytes(40 * 96)
+    return [bytes([height, width, rows, most, shift, limits, misaligned, 1]) + body
+            for height, width, rows, most, shift, limits, misaligned in (
+                (40, 96, 30, 20, 5, 9, 0), (30, 200, 12, 255, 17, 0, 1), (13, 13, 4, 1, 0, 3, 0),
+                (1, 90, 5, 9, 1, 1, 0), (40, 30, 0, 8, 2, 255, 1), (60, 90, 40, 60, 30, 251, 0))
+            for body in (noise, bytes(200), rng.bytes(90))]  # fmt: skip
+
+
 def _live_keyframes() -> list[bytes]:
     version, _ = make_world(7, points=1500).walk("robot-1", np.linspace(0.0, 0.05, 2), seed=2)
     coded = [encode_stored(keyframe) for keyframe in version.keyframes]
@@ -268,5 +278,6 @@ _MADE = {
     "codec": _messages, "frames": _frames, "stream": _streams, "geometry": _problems, "maps": _maps,
     "keyframes": _keyframes, "snapshots": _sandbox_messages, "graph": _graphs, "cloud": _clouds,
     "native": _messages, "match": _views, "depth": _depths, "describe": _pictures, "track": _tracks,
+    "stereo": _pairs,
     "live": _live_keyframes,
 }  # fmt: skip

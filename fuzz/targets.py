@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from fuzz import core_targets, live_targets, map_targets, native_targets
+from fuzz import core_targets, live_targets, map_targets, native_targets, stereo_targets
 from fuzz.checks import Target, TargetFailure, expect
 from fuzz.meter import Meter
 from rse_pf.backend.gateway.frames import (
@@ -221,6 +221,6 @@ TARGETS: dict[str, Target] = {
     "keyframes": map_targets.keyframes, "snapshots": map_targets.snapshots, "graph": map_targets.graph,
     "cloud": map_targets.cloud, "native": native_targets.native, "match": core_targets.match,
     "depth": core_targets.depth, "describe": core_targets.describe,
-    "track": core_targets.track,
+    "track": core_targets.track, "stereo": stereo_targets.stereo,
     "live": live_targets.live,
 }  # fmt: skip

@@ -362,7 +362,7 @@ def load_part(path: Path, part: str, abi: int, *functions: str) -> list[Any]:
 
     Args:
         path: Of the library.
-        part: ``native`` (the solver), ``codec``, ``depth``, ``match`` or ``track``;
+        part: ``native`` (the solver), ``codec``, ``depth``, ``match``, ``track`` or ``stereo``;
             ``rse_pf_PART_abi`` is its version.
         abi: The version that the caller needs.
         functions: Their names.

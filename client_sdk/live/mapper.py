@@ -32,6 +32,7 @@ from client_sdk.live.waiting_keyframes import Base, WaitingKeyframe, WaitingKeyf
 from client_sdk.mapper import AskPose, Mapper
 from client_sdk.mapping import MapOptions, PointMap, Trajectory
 from client_sdk.slots import FeaturesFunction, LoopsFunction, MotionFunction
+from client_sdk.tracking.segments import add_to_cloud
 from rse_pf.errors import BadMessage, BadRequest, RsePfError, UnsupportedProtocol, UsageError
 from rse_pf.geometry import Array, Camera, pose_difference
 from rse_pf.slam.keyframe import MAX_FEATURES, Keyframe, encode_keyframe, make_features, most_features
@@ -267,9 +268,10 @@ class LiveMapper:
         if not self._is_open:
             raise UsageError("this live map is not joined", hint="use async with robot.live_map(...)")
         async with self._one_frame:
-            if self.frames == 0 and not frame.depth_m.any():
+            if self.frames == 0 and frame.stereo is None and not frame.depth_m.any():
                 raise UsageError(
-                    "a live map needs frames with depth", hint="use robot.mapper() for this camera"
+                    "a live map needs frames with depth, or stereo pairs",
+                    hint="use robot.mapper() for this camera",
                 )
             if self._mapper.unrecognised >= self.options.segment_after and self._poses:
                 self._begin_segment()
@@ -468,7 +470,9 @@ class LiveMapper:
         keyframe = WaitingKeyframe(waiting.next_index, self._segment, data)
         self._last_keyframe, self._last_keyframe_s = pose, done.frame.timestamp_s
         await self._wait_for_cloud()
-        self._adding = asyncio.ensure_future(asyncio.to_thread(self.map.add, done.frame, pose))
+        self._adding = asyncio.ensure_future(
+            asyncio.to_thread(add_to_cloud, self.map, done.frame, pose, features, True)
+        )
         if not await asyncio.to_thread(waiting.add, keyframe):
             self._dropped += 1
             return

@@ -11,6 +11,7 @@ from client_sdk.simulator.drive import (
     loop_trajectory,
     render_along,
     render_frames,
+    render_pairs,
     true_trajectory,
 )
 from client_sdk.simulator.world import World, make_world, with_equal_rooms
@@ -25,6 +26,7 @@ __all__ = [
     "make_world",
     "render_along",
     "render_frames",
+    "render_pairs",
     "true_trajectory",
     "with_equal_rooms",
 ]

@@ -15,12 +15,13 @@ from client_sdk.frontend import Frame
 from client_sdk.mapping import Trajectory
 from client_sdk.simulator.camera import Painter, add_depth_noise, add_image_noise
 from client_sdk.simulator.world import ROOM_M, ROOMS, World, make_world
+from client_sdk.stereo.view import StereoView
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Array, Camera
 
 __all__ = [
     "RATE_HZ", "SIMULATED_CAMERA", "STEP_M", "frames_to_overlap", "loop_trajectory", "render_along",
-    "render_frames", "true_trajectory",
+    "render_frames", "render_pairs", "true_trajectory",
 ]  # fmt: skip
 
 RATE_HZ = 5.0
@@ -61,6 +62,24 @@ def render_along(truth: Trajectory, world: World, noise: Sequence[int]) -> Itera
             rgb=add_image_noise(colour, rng),
             depth_m=add_depth_noise(depth_m, cosine, rng),
             camera=SIMULATED_CAMERA,
+        )
+
+
+def render_pairs(truth: Trajectory, world: World, noise: Sequence[int], baseline_m: float) -> Iterator[Frame]:
+    """Yield the frames of a rectified stereo camera whose left one is on *truth*, as `render_along`."""
+    painter, right = Painter(world, SIMULATED_CAMERA), np.eye(4)
+    right[0, 3] = baseline_m
+    for row in range(len(truth)):
+        rng, pose = np.random.default_rng([*noise, row]), truth.T_world_camera[row]
+        left, beside = (add_image_noise(painter.draw(T)[0], rng) for T in (pose, pose @ right))
+        # Weights of brightness after ITU-R BT.601.
+        gray = np.rint(beside @ np.array([0.299, 0.587, 0.114])).astype(np.uint8)
+        yield Frame(
+            timestamp_s=float(truth.timestamps_s[row]),
+            rgb=left,
+            depth_m=np.zeros(left.shape[:2], dtype=np.float32),
+            camera=SIMULATED_CAMERA,
+            stereo=StereoView(gray, baseline_m),
         )
 
 

@@ -12,12 +12,21 @@ import numpy as np
 import numpy.typing as npt
 
 from client_sdk.tracking.place import Place
-from rse_pf.geometry import Array, Camera, transform
+from rse_pf.geometry import Array, Camera, inverse, transform
 from rse_pf.maps.descriptors import Descriptors
 from rse_pf.pnp import DepthNoise
 from rse_pf.slam.tracking import ImageFeatures, SoughtFeatures
 
-__all__ = ["NO_LANDMARK", "Expected", "KeyframeMap", "Landmarks", "View", "expect", "measure_points"]
+__all__ = [
+    "NO_LANDMARK",
+    "Expected",
+    "KeyframeMap",
+    "Landmarks",
+    "View",
+    "between",
+    "expect",
+    "measure_points",
+]
 
 Rows = npt.NDArray[np.int64]
 
@@ -37,6 +46,7 @@ class View:
     """One image: its features, and their ``(n, 3)`` points in the camera's frame, NaN without depth.
 
     ``sways`` ``(n, 3)`` is how far the points move for each second that the camera's readout takes longer.
+    ``is_stereo`` says that the depths are those of disparities, whose noise has no floor.
     """
 
     features: ImageFeatures
@@ -44,6 +54,7 @@ class View:
     sways: Array
     camera: Camera
     place: Place
+    is_stereo: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -83,14 +94,29 @@ class _Keyframe:
     own: Rows
 
 
+def between(measured_m: Array, expected_m: Array) -> Array:
+    """Return the depths at which the noise of measured depths is taken where others are expected.
+
+    What is measured too near would seem the better measurement, and draw the map nearer.  At the geometric
+    mean, the deviation of a depth is exactly that of its disparity.
+    """
+    mean: Array = np.sqrt(measured_m * np.clip(expected_m, 0.25 * measured_m, 4.0 * measured_m))
+    return mean
+
+
 def measure_points(
-    view: View, T_world_camera: Array, rows: Rows, noise: DepthNoise, pixel_px: float
-) -> tuple[Array, Array]:
-    """Return ``(n, 3)`` points in the world, and their ``(n, 3, 3)`` covariances by the noise."""
+    view: View, T_world_camera: Array, rows: Rows, noise: DepthNoise, pixel_px: float,
+    expected_m: Array | None = None,
+) -> tuple[Array, Array]:  # fmt: skip
+    """Return ``(n, 3)`` points in the world, and their ``(n, 3, 3)`` covariances by the noise.
+
+    *expected_m* are ``(n,)`` depths where the points are known already.
+    """
     points, camera = view.points_camera[rows], view.camera
     z = points[:, 2]
     along = points / z[:, None]
-    spread = along[:, :, None] * along[:, None, :] * noise.variance_m2(z)[:, None, None]
+    variance = noise.variance_m2(z if expected_m is None else between(z, expected_m))
+    spread = along[:, :, None] * along[:, None, :] * variance[:, None, None]
     pixel2 = (pixel_px * view.features.sizes[rows]) ** 2
     spread[:, 0, 0] += pixel2 * (z / camera.fx) ** 2
     spread[:, 1, 1] += pixel2 * (z / camera.fy) ** 2
@@ -225,7 +251,8 @@ class KeyframeMap:
         if not len(rows):
             return
         numbers = landmarks[rows]
-        points, spreads = measure_points(view, T_world_camera, rows, noise, pixel_px)
+        known = transform(inverse(T_world_camera), self._points[numbers])[:, 2] if view.is_stereo else None
+        points, spreads = measure_points(view, T_world_camera, rows, noise, pixel_px, known)
         before = self._spreads[numbers]
         gain = before @ np.linalg.inv(before + spreads)
         sways = view.sways[rows] @ T_world_camera[:3, :3].T

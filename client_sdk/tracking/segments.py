@@ -9,14 +9,17 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from client_sdk.frontend import Features, TrackedFrame
+from client_sdk.frontend import Features, Frame, TrackedFrame
 from client_sdk.mapping import MapOptions, PointMap, Trajectory
 from client_sdk.tracking.monocular_tracker import MonocularTracker
 from client_sdk.tracking.tracker import Join
-from rse_pf.geometry import Array, rigid
+from rse_pf.geometry import Array, rigid, transform
 from rse_pf.maps.format import Keyframe
 
-__all__ = ["DriveRecords", "SegmentRecord", "keyframe_of", "tracker_record"]
+__all__ = ["DriveRecords", "SegmentRecord", "add_to_cloud", "keyframe_of", "tracker_record"]
+
+_CLOUD_SHARE = 0.05
+"""Largest deviation of a stereo pair's depth in the cloud, as a share of the depth."""
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
@@ -61,14 +64,16 @@ class DriveRecords:
         """The segments that were not joined to the first one, in their order."""
         return [record for number, record in sorted(self._segments.items()) if number and record.poses]
 
-    def add(self, tracked: TrackedFrame, pose: Array, *, into_cloud: bool) -> SegmentRecord:
+    def add(self, tracked: TrackedFrame, pose: Array) -> SegmentRecord:
         """Add a frame with its pose to its segment."""
         record = self._segments.setdefault(tracked.segment, SegmentRecord(cloud=PointMap(self._options)))
         record.stamps_s.append(tracked.frame.timestamp_s)
         record.poses.append(pose)
-        if into_cloud:
-            record.cloud.add(tracked.frame, pose)
         return record
+
+    def add_to_cloud(self, tracked: TrackedFrame, pose: Array, features: Features | None) -> None:
+        """Add what a frame shows to the cloud of its segment, see the function."""
+        add_to_cloud(self._segments[tracked.segment].cloud, tracked.frame, pose, features, tracked.keyframe)
 
     def join(self, join: Join) -> None:
         """Move all of a segment into the one that it lies in."""
@@ -91,6 +96,27 @@ def tracker_record(tracker: MonocularTracker, segment: int, options: MapOptions)
     cloud.add_points(*tracker.points(segment))
     path = tracker.trajectory(segment)
     return SegmentRecord(cloud=cloud, stamps_s=path.timestamps_s.tolist(), poses=list(path.T_world_camera))
+
+
+def add_to_cloud(
+    cloud: PointMap, frame: Frame, pose: Array, features: Features | None, is_keyframe: bool
+) -> None:
+    """Add what a frame shows at a pose to a cloud.
+
+    Of a stereo pair these are the points of a keyframe's features whose depth is known to 5 %: they are what
+    it has measured, and a dense match of both images would take longer than all else.
+    """
+    if frame.stereo is None:
+        cloud.add(frame, pose)
+    elif features is not None and is_keyframe:
+        points = features.points_camera
+        with np.errstate(invalid="ignore"):
+            deviation_m = 2.0 * np.sqrt(frame.depth_noise.variance_m2(points[:, 2]))
+            rows = np.flatnonzero(deviation_m <= _CLOUD_SHARE * points[:, 2])
+        columns, lines = np.rint(features.pixels[rows]).astype(np.int64).T
+        size = np.array([frame.camera.width, frame.camera.height]) - 1
+        colours = frame.rgb[np.clip(lines, 0, size[1]), np.clip(columns, 0, size[0])]
+        cloud.add_points(transform(pose, points[rows]), colours)
 
 
 def keyframe_of(tracked: TrackedFrame, pose: Array, features: Features, robot: str) -> Keyframe:

@@ -24,7 +24,7 @@ from client_sdk.frontend import (
 )
 from client_sdk.monocular.descriptors import match_all
 from client_sdk.slots import Slots
-from client_sdk.tracking.keyframe_map import NO_LANDMARK, KeyframeMap, Landmarks, View, expect
+from client_sdk.tracking.keyframe_map import NO_LANDMARK, KeyframeMap, Landmarks, View, between, expect
 from client_sdk.tracking.looks import share_alike
 from client_sdk.tracking.noise import NoiseEstimate
 from client_sdk.tracking.place import place_of
@@ -60,6 +60,8 @@ _CLEAR_INLIERS = 40
 _ALIKE_SHARE = 0.25
 """Of the landmarks that the pose of a recognised place expects, so many look as expected at their pixels."""
 _CONFIRM_PX = 8.0
+_FAR_PX = 160.0
+"""Radius of the last search around the last pose: a camera that turned otherwise is 10 degrees off."""
 _ALL_RATIO, _ALL_DISTANCE = 0.8, 64
 _ENOUGH = 120
 """With so many landmarks of the map a pose needs no points of the last frame: a chain of frames drifts."""
@@ -71,6 +73,10 @@ _MOST_RATE = 3.0
 """Radians a second.  A rate that a cut only seems to have would turn an image of 20 ms by 3.4 degrees."""
 _QUERIES = 3
 """So many keyframes are asked for the place of one frame, those with the most matches first."""
+_STEREO_MATCHES = 250
+"""Of one query: a stereo pair has depths at many features, and the robot fits all of them itself."""
+_JUMP_SHARE = 0.15
+"""Of the median depth."""
 _JOIN_EVERY = 3
 _JOIN_M, _JOIN_DEG = 0.15, 4.0
 """Two measurements of where a segment lies agree within this."""
@@ -226,6 +232,7 @@ class Tracker:
         self.frames += 1
         self._frame, self._raw = frame, extract(frame, self.options, self._slots.features)
         self._features = self._raw
+        self.noise.model = frame.depth_noise
         return self._open.begin(self._track(self._turned(self._view(), self._raw, self._rate)))
 
     def accept(
@@ -253,7 +260,7 @@ class Tracker:
             return self._begin_or_lose(view, matches=0)
         posed, matches = None, 0
         if self._last is not None:
-            for how in ("map", "frame"):
+            for how in ("map", "frame", "far") if self._frame.stereo is not None else ("map", "frame"):
                 posed, tried = yield from self._follow(view, how)
                 matches = max(matches, tried)
                 if posed is not None:
@@ -273,16 +280,17 @@ class Tracker:
         assert self._last is not None
         least = self.options.min_inliers
         T_reference = self._expected() if how == "map" else self._T_last
-        if how == "map":
-            seen = self._seen(view, T_reference, self.options.search_px, _NEAR)
-            if len(seen) < _MANY * least:
+        if how != "frame":
+            radius_px = self.options.search_px if how == "map" else _FAR_PX
+            seen = self._seen(view, T_reference, radius_px, _NEAR)
+            if len(seen) < (_MANY if how == "map" else 1) * least:
                 return None, len(seen)
         else:
             seen = _seen_anywhere(self._of_last(), self._last_descriptors(), view)
             if len(seen) < least:
                 return None, len(seen)
-        answer = yield self._make_query(view, seen, T_reference, "map" if how == "map" else "frame")
-        ratio = _GUIDED_RATIO if how == "map" else _FOLLOWED_RATIO
+        answer = yield self._make_query(view, seen, T_reference, "frame" if how == "frame" else "map")
+        ratio = _FOLLOWED_RATIO if how == "frame" else _GUIDED_RATIO
         T = self._placed(answer, T_reference, len(seen), ratio)
         if T is None or not self._is_plausible(T):
             return None, len(seen)
@@ -432,9 +440,9 @@ class Tracker:
         )
 
     def _make_query(self, view: View, seen: _Seen, T_reference: Array, against: str) -> PoseQuery:
-        rows, features = seen.rows, seen.features
-        if len(rows) > self.options.max_matches:
-            even = np.linspace(0, len(rows) - 1, self.options.max_matches).astype(np.int64)
+        rows, features, most = seen.rows, seen.features, self._most_matches()
+        if len(rows) > most:
+            even = np.linspace(0, len(rows) - 1, most).astype(np.int64)
             rows, features = rows[even], features[even]
         leftmost = np.argsort(view.features.pixels[features, 0], kind="stable")
         rows, features = rows[leftmost], features[leftmost]
@@ -451,20 +459,33 @@ class Tracker:
             inlier_px=self.options.inlier_px,
             max_iterations=self.options.max_iterations,
             against=against,  # type: ignore[arg-type]
+            depth_noise=None if self._frame.stereo is None else self.noise.noise,
         )
+
+    def _most_matches(self) -> int:
+        most = self.options.max_matches
+        return most if self._frame.stereo is None else min(most, _STEREO_MATCHES)
 
     def _placed(self, answer: Answer, T_reference: Array, matches: int, ratio: float) -> Array | None:
         """Return ``T_world_camera`` of an answer, None if too few agree or it is no pose."""
-        asked = min(matches, self.options.max_matches)
+        asked = min(matches, self._most_matches())
         if answer.T_camera_world is None or answer.inliers < max(self.options.min_inliers, ratio * asked):
             return None
         T_camera_reference = rigid(answer.T_camera_world)
         return None if T_camera_reference is None else T_reference @ inverse(T_camera_reference)
 
     def _is_plausible(self, T_world_camera: Array) -> bool:
-        limit_m = self.options.max_jump_m * min(1 + self._lost_in_a_row, _MOST_JUMPS)
+        jump_m = max(self.options.max_jump_m, self._scene_jump_m())
+        limit_m = jump_m * min(1 + self._lost_in_a_row, _MOST_JUMPS)
         moved_m = float(np.linalg.norm(T_world_camera[:3, 3] - self._T_last[:3, 3]))
         return moved_m <= limit_m
+
+    def _scene_jump_m(self) -> float:
+        """Return how far a stereo pair may move at once among what it sees: that of a car sees far."""
+        z = self._raw.points_camera[:, 2]
+        if self._frame.stereo is None or not np.isfinite(z).any():
+            return 0.0
+        return _JUMP_SHARE * float(np.median(z[np.isfinite(z)]))
 
     def _image_at(self, view: View, T_world_camera: Array, *, is_near: bool) -> tuple[View, bool]:
         """Return a frame's image at a pose, and whether the camera moved there from its last pose.
@@ -488,7 +509,7 @@ class Tracker:
         least = self.options.min_inliers
         if len(seen) < least:
             return None
-        observed = self._observe(view, seen)
+        observed = self._observe(view, seen, T_world_camera)
         fitted = fit_pose(observed, view.camera, inverse(T_world_camera))
         if fitted is not None and is_next:
             T_fitted = inverse(fitted.T_camera_world)
@@ -497,9 +518,9 @@ class Tracker:
                 self._turn_first(*self._first, rate)
                 return self._confirm(view, T_fitted, answer, matches, self._map(), is_next=True)
             view = self._turned(view, self._raw, rate)
-            observed = self._observe(view, seen)
+            observed = self._observe(view, seen, T_fitted)
             fitted = fit_pose(observed, view.camera, fitted.T_camera_world)
-            if fitted is not None:
+            if fitted is not None and self._frame.stereo is None:
                 self._learn_readout(view, seen, observed, fitted, rate)
         agreeing = 0 if fitted is None else int(fitted.is_inlier.sum())
         if fitted is None or agreeing < max(least, _CONFIRMED_RATIO * len(seen)):
@@ -527,16 +548,19 @@ class Tracker:
         share, count = share_alike(self._frame, landmarks, T_world_camera)
         return count >= self.options.min_inliers and share >= _ALIKE_SHARE
 
-    def _observe(self, view: View, seen: _Seen) -> Observations:
+    def _observe(self, view: View, seen: _Seen, T_world_camera: Array) -> Observations:
         z = np.nan_to_num(view.points_camera[seen.features, 2], posinf=0.0, neginf=0.0)
         noise: DepthNoise = self.noise.noise
+        at_m = z
+        if view.is_stereo:
+            at_m = between(z, transform(inverse(T_world_camera), seen.landmarks.points[seen.rows])[:, 2])
         return Observations(
             points=seen.landmarks.points[seen.rows],
             spreads=seen.landmarks.spreads[seen.rows],
             pixels=view.features.pixels[seen.features],
             pixels_px=_PIXEL_PX * view.features.sizes[seen.features],
             depths_m=z,
-            depths_dev_m=np.sqrt(noise.variance_m2(z)),
+            depths_dev_m=np.sqrt(noise.variance_m2(at_m)),
         )
 
     # --- the shutter ---
@@ -553,6 +577,7 @@ class Tracker:
             features=image, points_camera=features.points_camera, sways=np.zeros_like(features.points_camera),
             camera=self._frame.camera,
             place=place_of(features.descriptors, self._frame.rgb, self._slots.loops),
+            is_stereo=self._frame.stereo is not None,
         )  # fmt: skip
 
     def _interval_s(self) -> float:
@@ -561,12 +586,11 @@ class Tracker:
     def _turned(self, view: View, raw: Features, rate: Array) -> View:
         """Return an image without its rolling shutter, of a camera that turns at *rate*."""
         features = without_shutter(raw, view.camera, self.readout.readout_s * rate)
-        return View(
+        return replace(
+            view,
             features=replace(view.features, pixels=features.pixels),
             points_camera=features.points_camera,
             sways=sways(raw, features.points_camera, view.camera, rate),
-            camera=view.camera,
-            place=view.place,
         )
 
     def _turn_first(self, raw: Features, view: View, rate: Array) -> None:
@@ -581,7 +605,10 @@ class Tracker:
     def _learn_readout(
         self, view: View, seen: _Seen, observed: Observations, fitted: FittedPose, rate: Array
     ) -> None:
-        """Correct the estimate of the readout by what an image with its pose tells."""
+        """Correct the estimate of the readout by what an image with its pose tells.
+
+        Stereo cameras have global shutters, and a pair that is not simultaneous would look like a readout.
+        """
         rows = np.flatnonzero(fitted.is_inlier & (observed.depths_m > 0.0))
         if len(rows) < _LEAST_ROWS:
             return

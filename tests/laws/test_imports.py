@@ -15,7 +15,7 @@ import pytest
 ORDER = (
     "rse_pf", "errors", "event_loop", "terminal", "linux", "one_thread", "limited_process",
     "files", "disk_reserve", "geometry", "native",
-    "native_buffers", "native_matcher", "native_tracker", "token_bucket", "config",
+    "native_buffers", "native_matcher", "native_tracker", "native_stereo", "token_bucket", "config",
     "silent_connections", "http_head", "http_connections", "page_cache", "budget", "wire", "scaling",
     "object_store", "identity", "crash_record", "maps", "accounts", "auth", "enrolment", "audit", "service",
     "pnp", "slam", "services.mapping", "live_map", "services.custom", "services",

@@ -62,7 +62,7 @@ class InProcessSolver:
         request = make_request(
             found.points_world, found.pixels, query.camera,
             PnpOptions(inlier_px=query.inlier_px, max_iterations=query.max_iterations),
-            depths_m=found.depths_m if found.depths_m.any() else None,
+            depths_m=found.depths_m if found.depths_m.any() else None, depth_noise=query.depth_noise,
         )  # fmt: skip
         sent = self._codec.encode(Command(id=self._commands, service="pnp", payload=request))
         self.sent_bytes += len(sent)
