@@ -494,7 +494,7 @@ class LiveMapper:
             timestamp_s=frame.timestamp_s, T_odom_camera=T_odom_camera, camera=frame.camera,
             features=make_features(
                 features.pixels[rows], depths_m[rows], features.descriptors[rows], self._mapper.depth_noise,
-                features.kind,
+                features.kind, 0.0 if frame.stereo is None else frame.camera.fx * frame.stereo.baseline_m,
             ),
             imu=self._mapper.keyframe_imu(T_odom_camera, self._last_keyframe_s, frame.timestamp_s),
         )  # fmt: skip

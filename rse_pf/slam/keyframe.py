@@ -16,7 +16,10 @@ All numbers are little-endian::
               Euclidean distance of int8), bytes of a descriptor (uint16), number n (uint16), f (uint8):
               pixels count in units of 2**-f, length of the name (uint8; 0 for ORB);
               n columns and n rows (uint16), n descriptors, the name (ASCII)
-    geometry  kind 3: what it holds (uint8; 1: depths), 0 (uint8), n (uint16); n depths in mm (uint16)
+    geometry  kind 3: what it holds (uint8), 0 (uint8), n (uint16), and for
+              1, depths: n depths in mm (uint16);
+              2, disparities of a stereo pair: focal length in px times baseline in m (float64), n
+              disparities in 1/64 px (uint16): depths beyond 65 m are kept
     noise     kind 5, optional: deviation of a depth z in metres is base + growth * max(0, z - from)^2
               (3 float64); a Kinect's where it is left out
     IMU       kind 6, optional: gravity, and the motion since the last keyframe: `rse_pf.slam.inertial`
@@ -65,6 +68,7 @@ _BLOCK = struct.Struct("<HHI")
 _CAMERA = struct.Struct("<BBHH4d")
 _FEATURES = struct.Struct("<BBHHBB")
 _GEOMETRY = struct.Struct("<BBH")
+_F_BASELINE = struct.Struct("<d")
 _CAMERA_KIND, _FEATURES_KIND, _GEOMETRY_KIND = 1, 2, 3
 _NOISE_KIND, _IMU_KIND = 5, 6
 _OPTIONAL = {_NOISE_KIND: "noise", _IMU_KIND: "IMU"}
@@ -78,7 +82,12 @@ _FEATURE_BYTES = 6
 """Of a feature, but for its descriptor."""
 _MAX_FEATURE_BYTES = MAX_FEATURES * (_FEATURE_BYTES + ORB.size)
 _FINEST, _COARSEST = 4, 2
+_DISPARITY, _PER_PX = 2, 64
 _NEAREST_MM, _FARTHEST_MM = 10, 65_535
+_NEAREST_M, _FARTHEST_M = 0.01, 1000.0
+"""Of depths by disparities: poses are refined with depths up to 1 km."""
+_LEAST_F_BASELINE, _MOST_F_BASELINE = 0.05, 1e5
+"""Of 50 px and 1 mm, and of 10,000 px and 10 m."""
 _BORDER_PX = 64
 """Undistorted pixels may lie so far beyond the image."""
 _MAX_TIME_S = 1e12
@@ -91,6 +100,8 @@ class KeyframeFeatures:
 
     ``pixels`` ``(n, 2)`` float32, undistorted; ``depths_m`` ``(n,)`` float32, metres along the optical axis,
     above 0, with their ``noise`` as the robot measured it; ``descriptors`` ``(n, d)`` of one ``kind``.
+    ``f_baseline`` is that of the stereo pair, pixels times metres, whose disparities are encoded; 0 for a
+    depth camera.
     """
 
     pixels: npt.NDArray[np.float32]
@@ -98,6 +109,7 @@ class KeyframeFeatures:
     descriptors: Descriptors
     noise: DepthNoise = _KINECT
     kind: DescriptorKind = ORB
+    f_baseline: float = 0.0
 
     def __len__(self) -> int:
         return len(self.depths_m)
@@ -144,19 +156,24 @@ def make_features(
     descriptors: Descriptors,
     noise: DepthNoise = _KINECT,
     kind: DescriptorKind = ORB,
+    f_baseline: float = 0.0,
 ) -> KeyframeFeatures:
     """Return the features of a keyframe; rows without a usable depth are left out.
 
-    Pixels are rounded to 1/16 px (images wider than 4,095 px: 1/8, 1/4), depths to 1 mm.  Where there are
+    Pixels are rounded to 1/16 px (images wider than 4,095 px: 1/8, 1/4), depths to 1 mm, or their disparities
+    to 1/64 px.  Where there are
     more than `most_features`, the first are kept: ORB gives those of the finest level first, which keep most
     links.
 
     Args:
         pixels: ``(n, 2)``, undistorted; rows outside 0..16383 px are left out.
-        depths_m: ``(n,)`` metres along the optical axis; not finite or out of 0.01..65 m: none.
+        depths_m: ``(n,)`` metres along the optical axis; not finite or out of 0.01..65 m (of a stereo pair:
+            0.01..1000 m): none.
         descriptors: ``(n, d)``.
         noise: Of the depths.
         kind: Of the descriptors.
+        f_baseline: Focal length in pixels times baseline in metres of the stereo pair that measured the
+            depths; 0 for a depth camera.
 
     Raises:
         BadRequest: The shapes do not fit.
@@ -170,19 +187,30 @@ def make_features(
             hint="give one row for each feature",
         )
     with np.errstate(invalid="ignore", over="ignore"):
-        depths_mm = np.rint(np.asarray(depths_m, dtype=np.float64) * 1000.0)
+        rounded_m = _rounded_depths(np.asarray(depths_m, dtype=np.float64), f_baseline)
         largest_px = pixels.max(axis=1, initial=-1.0)
-        usable = (depths_mm >= _NEAREST_MM) & (depths_mm <= _FARTHEST_MM)
+        usable = np.isfinite(rounded_m)
         usable &= (pixels.min(axis=1, initial=np.inf) >= 0.0) & (largest_px <= _largest_px(_COARSEST))
     rows = np.flatnonzero(usable)[: most_features(kind)]
     scale = 2.0 ** _fraction_of(float(largest_px[rows].max(initial=0.0)))
     return KeyframeFeatures(
         pixels=(np.rint(pixels[rows].astype(np.float64) * scale) / scale).astype(np.float32),
-        depths_m=(depths_mm[rows] / 1000.0).astype(np.float32),
+        depths_m=rounded_m[rows].astype(np.float32),
         descriptors=np.ascontiguousarray(descriptors[rows]),
         noise=noise,
         kind=kind,
+        f_baseline=f_baseline,
     )
+
+
+def _rounded_depths(depths_m: Array, f_baseline: float) -> Array:
+    """Return depths as they are encoded, NaN where they cannot be."""
+    if f_baseline == 0.0:
+        steps = np.rint(depths_m * 1000.0)
+        return np.where((steps >= _NEAREST_MM) & (steps <= _FARTHEST_MM), steps / 1000.0, np.nan)
+    steps = np.rint(_PER_PX * f_baseline / np.where(depths_m > 0.0, depths_m, np.nan))
+    found = f_baseline * _PER_PX / np.where((steps >= 1) & (steps <= 65_535), steps, np.nan)
+    return np.where((found >= _NEAREST_M) & (found <= _FARTHEST_M), found, np.nan)
 
 
 def encode_keyframe(keyframe: Keyframe) -> bytes:
@@ -192,7 +220,6 @@ def encode_keyframe(keyframe: Keyframe) -> bytes:
     fraction = _fraction_of(float(features.pixels.max(initial=0.0)))
     name = b"" if features.kind == ORB else features.kind.name.encode()
     units = np.rint(features.pixels.T.astype(np.float64) * 2.0**fraction).astype("<u2")
-    depths_mm = np.rint(features.depths_m.astype(np.float64) * 1000.0).astype("<u2")
     has_noise = features.noise != _KINECT
     blocks = len(_NAMES) + has_noise + (keyframe.imu is not None) + len(keyframe.others)
     parts = [_HEAD.pack(
@@ -206,7 +233,7 @@ def encode_keyframe(keyframe: Keyframe) -> bytes:
             _FEATURES_KIND, _FEATURES.pack(*_kind_numbers(features.kind), n, fraction, len(name)),
             units.tobytes(), features.descriptors.tobytes(), name,
         ),
-        (_GEOMETRY_KIND, _GEOMETRY.pack(_DEPTH, 0, n), depths_mm.tobytes()),
+        (_GEOMETRY_KIND, *_geometry_of(features)),
     ):  # fmt: skip
         parts += [_BLOCK.pack(kind, _REQUIRED, sum(map(len, contents))), *contents]
     optional = [(block.kind, block.content) for block in keyframe.others]
@@ -218,6 +245,15 @@ def encode_keyframe(keyframe: Keyframe) -> bytes:
     for kind, content in sorted(optional, key=lambda block: block[0]):
         parts += [_BLOCK.pack(kind, 0, len(content)), content]
     return b"".join(parts)
+
+
+def _geometry_of(features: KeyframeFeatures) -> tuple[bytes, bytes]:
+    """Return the head and the numbers of the block of the geometry."""
+    depths, n = features.depths_m.astype(np.float64), len(features)
+    if features.f_baseline == 0.0:
+        return _GEOMETRY.pack(_DEPTH, 0, n), np.rint(depths * 1000.0).astype("<u2").tobytes()
+    head = _GEOMETRY.pack(_DISPARITY, 0, n) + _F_BASELINE.pack(features.f_baseline)
+    return head, np.rint(_PER_PX * features.f_baseline / depths).astype("<u2").tobytes()
 
 
 def decode_keyframe(data: bytes) -> Keyframe:
@@ -343,30 +379,51 @@ def _features(
     kind = _kind(detector, metric, descriptor_bytes, bytes(data[end - name_bytes : end]))
     if n > most_features(kind):
         raise _refusal(f"{n} features of {kind} are above {most_features(kind)}")
-    what, zero, depth_count = _GEOMETRY.unpack_from(data, depths_begin)
-    if what != _DEPTH or zero:
-        raise _refusal(f"geometry of kind {what} is not known", "send a depth for each feature")
-    if depth_count != n or depths_end - depths_begin != _GEOMETRY.size + 2 * n:
-        raise _refusal(
-            f"{depth_count} depths in {depths_end - depths_begin} bytes are not those of {n} features"
-        )
+    depths_m, f_baseline = _depths(data, depths_begin, depths_end, n)
     units = np.frombuffer(data, dtype="<u2", count=2 * n, offset=begin + _FEATURES.size).reshape(2, n)
     pixels = (units.T * np.float32(2.0**-fraction)).astype(np.float32, copy=False)
-    depths_mm = np.frombuffer(data, dtype="<u2", count=n, offset=depths_begin + _GEOMETRY.size)
     widest, highest = (camera.width + _BORDER_PX) << fraction, (camera.height + _BORDER_PX) << fraction
     if n and (units[0].max() > widest or units[1].max() > highest):
         raise _refusal(f"a pixel lies outside the image of {camera.width}x{camera.height} px")
-    if n and depths_mm.min() < _NEAREST_MM:
-        raise _refusal(f"a depth is below {_NEAREST_MM} mm")
     descriptors = np.frombuffer(
         data, dtype=kind.dtype, count=n * kind.size, offset=begin + _FEATURES.size + 4 * n
     )
     return KeyframeFeatures(
         pixels=pixels,
-        depths_m=(depths_mm / 1000.0).astype(np.float32),
+        depths_m=depths_m,
         descriptors=descriptors.reshape(n, kind.size),
         kind=kind,
+        f_baseline=f_baseline,
     )
+
+
+def _depths(data: bytes, begin: int, end: int, n: int) -> tuple[npt.NDArray[np.float32], float]:
+    """Return the depths of *n* features, and the f b of their stereo pair or 0; raises BadRequest."""
+    what, zero, count = _GEOMETRY.unpack_from(data, begin)
+    if what not in (_DEPTH, _DISPARITY) or zero:
+        raise _refusal(f"geometry of kind {what} is not known", "send a depth for each feature")
+    first = begin + _GEOMETRY.size + (_F_BASELINE.size if what == _DISPARITY else 0)
+    if count != n or end - first != 2 * n:
+        raise _refusal(f"{count} depths in {end - begin} bytes are not those of {n} features")
+    steps = np.frombuffer(data, dtype="<u2", count=n, offset=first)
+    if what == _DEPTH:
+        if n and steps.min() < _NEAREST_MM:
+            raise _refusal(f"a depth is below {_NEAREST_MM} mm")
+        return (steps / 1000.0).astype(np.float32), 0.0
+    f_baseline: float = _F_BASELINE.unpack_from(data, begin + _GEOMETRY.size)[0]
+    if not _LEAST_F_BASELINE <= f_baseline <= _MOST_F_BASELINE:
+        raise _refusal(
+            f"its focal length times baseline {f_baseline:g} is that of no stereo pair",
+            "send pixels times metres",
+        )
+    least, most = int(steps.min(initial=65_535)), int(steps.max(initial=1))
+    nearest, farthest = (f_baseline * _PER_PX / max(step, 1) for step in (most, least))
+    if n and (least < 1 or nearest < _NEAREST_M or farthest > _FARTHEST_M):
+        raise _refusal(
+            f"depths of {nearest:g} to {farthest:g} m are not within {_NEAREST_M:g}..{_FARTHEST_M:g} m",
+            "leave out features whose disparity is too small",
+        )
+    return (f_baseline * _PER_PX / steps).astype(np.float32), f_baseline
 
 
 def _kind_numbers(kind: DescriptorKind) -> tuple[int, int, int]:

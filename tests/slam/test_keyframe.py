@@ -223,6 +223,86 @@ def with_blocks(count: int, size: int = 0) -> bytes:
 GEOMETRY_AT = FEATURES_AT + 8 + 20 * 36 + BLOCK
 
 
+F_BASELINE = 380.0
+"""Of KITTI: 707 px times 0.54 m."""
+
+
+def stereo_keyframe(n: int = 20) -> Keyframe:
+    """Return a keyframe of a stereo pair whose points are 1.5 to 300 m away."""
+    pixels, _, descriptors = random_features(n)
+    depths_m = 1.5 * 200.0 ** np.linspace(0.0, 1.0, n)
+    noise = DepthNoise(base_m=1e-5, growth_per_m=0.2 / F_BASELINE, from_m=0.0)
+    features = make_features(pixels, depths_m, descriptors, noise, f_baseline=F_BASELINE)
+    return Keyframe(timestamp_s=1.8e9, T_odom_camera=POSE, camera=CAMERA, features=features)
+
+
+@pytest.mark.parametrize("n", [0, 1, 300, MAX_FEATURES])
+def test_a_keyframe_of_a_stereo_pair_comes_back_as_it_was(n: int) -> None:
+    made = stereo_keyframe(n)
+    data = encode_keyframe(made)
+
+    found = decode_keyframe(data)
+
+    assert_equal(found, made)
+    assert found.features.f_baseline == F_BASELINE
+    assert encode_keyframe(found) == data
+    assert len(data) <= 35_000
+
+
+def test_points_of_a_stereo_pair_beyond_65_m_are_kept_to_a_64th_of_a_pixel() -> None:
+    found = decode_keyframe(encode_keyframe(stereo_keyframe(100))).features
+
+    assert len(found) == 100
+    assert float(found.depths_m.max()) == pytest.approx(300.0, rel=0.01)
+    error_px = F_BASELINE / found.depths_m - F_BASELINE / (1.5 * 200.0 ** np.linspace(0.0, 1.0, 100))
+    assert float(np.abs(error_px).max()) <= 0.5 / 64 + 1e-4
+
+
+def test_depths_that_no_disparity_has_are_left_out() -> None:
+    depths_m = np.array([0.0, -1.0, math.nan, math.inf, 0.3, 5.0, 999.0, 1001.0])
+    pixels, _, descriptors = random_features(len(depths_m))
+
+    kept = make_features(pixels, depths_m, descriptors, f_baseline=F_BASELINE).depths_m
+
+    # 0.3 m would have 1,267 px, and uint16 holds 1,023 of them.
+    np.testing.assert_allclose(kept, [5.0], rtol=0.01)
+    assert len(make_features(pixels, depths_m, descriptors, f_baseline=48.0)) == 2
+
+
+def test_the_bytes_of_disparities_are_those_of_the_protocol() -> None:
+    data = encode_keyframe(stereo_keyframe(2))
+    at = FEATURES_AT + 8 + 2 * 36 + BLOCK
+
+    assert data[at : at + 4] == bytes([2, 0, 2, 0])
+    assert struct.unpack_from("<d2H", data, at + 4) == (F_BASELINE, 16_213, 81)
+
+
+STEREO = encode_keyframe(stereo_keyframe())
+DISPARITIES_AT = FEATURES_AT + 8 + 20 * 36 + BLOCK + 4
+
+
+@pytest.mark.parametrize(
+    ("at", "form", "value", "why"),
+    [
+        (DISPARITIES_AT, "<d", math.nan, "of no stereo pair"),
+        (DISPARITIES_AT, "<d", -F_BASELINE, "of no stereo pair"),
+        (DISPARITIES_AT, "<d", math.inf, "of no stereo pair"),
+        (DISPARITIES_AT, "<d", 0.0, "of no stereo pair"),
+        (DISPARITIES_AT, "<d", 1e6, "of no stereo pair"),
+        (DISPARITIES_AT, "<d", 1e4, "are not within"),
+        (DISPARITIES_AT, "<d", 0.06, "are not within"),
+        (DISPARITIES_AT + 8, "<H", 0, "are not within"),
+        (DISPARITIES_AT + 8, "<H", 1, "are not within"),
+        (DISPARITIES_AT - 4, "<B", 1, "depths in 52 bytes"),
+        (DISPARITIES_AT - 2, "<H", 24, "24 depths"),
+    ],
+)
+def test_hostile_disparities_are_refused_with_a_hint(at: int, form: str, value: float, why: str) -> None:
+    with pytest.raises(BadRequest, match=why) as refused:
+        decode_keyframe(changed(at, form, value, STEREO))
+    assert refused.value.hint
+
+
 @pytest.mark.parametrize(
     ("data", "why"),
     [
@@ -256,7 +336,7 @@ GEOMETRY_AT = FEATURES_AT + 8 + 20 * 36 + BLOCK
         (changed(FEATURES_AT + 6, "<B", 200), r"2\*\*-200 are not known"),
         (changed(FEATURES_AT + 7, "<B", 1), "bytes are not 20 features"),
         (changed(FEATURES_AT + 8, "<H", 65_535), "outside the image of 640x480"),
-        (changed(GEOMETRY_AT, "<B", 2), "geometry of kind 2 is not known"),
+        (changed(GEOMETRY_AT, "<B", 7), "geometry of kind 7 is not known"),
         (changed(GEOMETRY_AT + 2, "<H", 19), "19 depths"),
         (changed(GEOMETRY_AT + 4, "<H", 9), "below 10 mm"),
     ],
