@@ -82,6 +82,7 @@ def open_camera(
         )
     if _is_recording(path):
         dataset = open_dataset(path, camera=camera, imu=imu)
+        dataset.check()
         if isinstance(own, Rig) or (own is not None and own.camera != dataset.camera):
             raise UsageError(
                 f"{path} has intrinsics of its own, and they differ",

@@ -6,7 +6,9 @@ It knows no device and no file format.
 from __future__ import annotations
 
 import asyncio
+import itertools
 import math
+from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, Protocol, TypeVar, runtime_checkable
@@ -17,6 +19,7 @@ import numpy.typing as npt
 from client_sdk.closing import Closing
 from client_sdk.datasets.thinning import Thinning
 from client_sdk.frontend import Frame, load_opencv
+from client_sdk.rigs.checks import check_pairs
 from client_sdk.rigs.intrinsics import Intrinsics, Undistortion
 from client_sdk.rigs.rectification import Rectification
 from client_sdk.rigs.rig import Rig
@@ -28,6 +31,8 @@ __all__ = [
     "colour_of", "no_depth",
 ]  # fmt: skip
 
+_LOOKED_AT = 8
+"""Frames of a pair of cameras whose images are compared at the start."""
 _Item = TypeVar("_Item", bound=tuple[Any, ...])
 
 RawFrame = tuple[float, npt.NDArray[np.uint8], "npt.NDArray[np.float32] | None"]
@@ -194,6 +199,19 @@ class StereoSource(FrameStream):
         about = SourceInfo(name=name, camera=self._rectification.camera, has_stereo=True)
         super().__init__(about, raw, self._frame, rate_hz=rate_hz, close=close)
         self._no_depth = no_depth(self.camera)
+        self._ahead: deque[Frame] | None = None
+
+    def __next__(self) -> Frame:
+        """Return the next frame; the first ones are compared before one is given out."""
+        if self._ahead is None:
+            self._ahead = deque()
+            for _ in range(_LOOKED_AT):
+                try:
+                    self._ahead.append(super().__next__())
+                except StopIteration:
+                    break
+            check_pairs(itertools.pairwise(self._ahead), self.name)
+        return self._ahead.popleft() if self._ahead else super().__next__()
 
     def _frame(self, raw: RawPair) -> Frame:
         timestamp_s, left, right = raw

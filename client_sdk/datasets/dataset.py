@@ -10,6 +10,7 @@ from typing import Literal
 from client_sdk.datasets.thinning import Thinning, median_interval_s
 from client_sdk.frontend import Frame
 from client_sdk.mapping import Trajectory
+from client_sdk.rigs.checks import check_pairs, spread_pairs
 from client_sdk.rigs.imu_track import ImuTrack
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Array, Camera
@@ -64,6 +65,15 @@ class Dataset:
         for row, stamp_s in zip(self.rows, self.timestamps_s, strict=True):
             yield replace(self.read(row), imu=self.imu.between(last_s, stamp_s))
             last_s = stamp_s
+
+    def check(self) -> None:
+        """Look at some stereo pairs, and refuse a rig that is wrong; other recordings are not looked at.
+
+        Raises:
+            UsageError: The cameras are swapped, not synchronised, or rectified wrongly.
+        """
+        if self.has_stereo:
+            check_pairs(spread_pairs(self.rows, self.read), self.name)
 
     def thinned(self, rate_hz: float) -> Dataset:
         """Return frames at *rate_hz* on average; all of them at the recording's own rate, or a higher one.

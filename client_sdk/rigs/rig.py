@@ -122,8 +122,10 @@ def _set_pose(owner: object, field: str, name: str) -> None:
     given = np.asarray(getattr(owner, field), dtype=np.float64)
     pose = rigid(given, _MAX_ARM_M) if given.shape == (4, 4) else None
     if pose is None:
+        length = float(np.linalg.norm(given[:3, 3])) if given.shape == (4, 4) else 0.0
+        unit = ": in millimetres?" if _MAX_ARM_M < length <= 1e3 * _MAX_ARM_M else ""
         raise UsageError(
-            f"{name} is no rigid motion within {_MAX_ARM_M:g} m",
+            f"{name} is no rigid motion within {_MAX_ARM_M:g} m{unit}",
             hint="give 4 rows of 4 numbers: a rotation, metres, and 0 0 0 1",
         )
     object.__setattr__(owner, field, pose)

@@ -129,6 +129,7 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
         from client_sdk.datasets import open_dataset
 
         dataset = open_dataset(args.data, camera=args.camera, imu=args.imu)
+        dataset.check()
         show(*(f"note: {note}" for note in dataset.notes))
         thinned = dataset.thinned(args.rate)
         if len(thinned) < len(dataset):

@@ -8,6 +8,7 @@ examples:
   rse-pf camera board --board 9x6 --square-mm 25 --out board.pdf
   rse-pf camera calibrate 0 --board 9x6 --square-mm 25 --out intrinsics.json
   rse-pf camera calibrate images/*.png --board 9x6 --square-mm 25
+  rse-pf camera calibrate --stereo 0 2 --board 9x6 --square-mm 25 --out rig.json
   rse-pf camera check 0
 """
 
@@ -53,7 +54,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     calibrate = actions.add_parser("calibrate", parents=[board], help="write the intrinsics of a camera")
     calibrate.add_argument("sources", nargs="+", metavar="SOURCE", help="a device number, a video, or images")
     calibrate.add_argument(
-        "--out", type=Path, default=Path("intrinsics.json"), metavar="FILE", help="default: %(default)s"
+        "--stereo", action="store_true",
+        help="two devices, videos or folders, or one whose images show both cameras side by side",
+    )  # fmt: skip
+    calibrate.add_argument(
+        "--out", type=Path, metavar="FILE", help="default: intrinsics.json; with --stereo: rig.json"
     )
     calibrate.add_argument(
         "--max-rms-px", type=float, default=1.0, metavar="PX", help="refuse a larger error (default: 1)"
@@ -91,10 +96,14 @@ def _calibrate(args: argparse.Namespace, board: Board) -> int:
     from client_sdk.cameras.calibration import BoardViews, calibrate
     from client_sdk.rigs.intrinsics import write_intrinsics
 
+    if args.out is None:
+        args.out = Path("rig.json" if args.stereo else "intrinsics.json")
     if not args.max_rms_px > 0:
         raise UsageError(f"--max-rms-px {args.max_rms_px:g} is not above 0", hint="good cameras reach 0.5")
     if not args.out.absolute().parent.is_dir():
         raise UsageError(f"there is no folder {args.out.absolute().parent}", hint="create it")
+    if args.stereo:
+        return _calibrate_stereo(args, board)
     views = BoardViews(board)
     is_live = len(args.sources) == 1 and args.sources[0].isdigit()
     for image in _raw_images(args.sources):
@@ -115,6 +124,53 @@ def _calibrate(args: argparse.Namespace, board: Board) -> int:
         f"reprojection error {calibration.rms_px:.3f} px rms over {calibration.views} views",
     )
     return 0
+
+
+def _calibrate_stereo(args: argparse.Namespace, board: Board) -> int:
+    from client_sdk.cameras.stereo_calibration import PairViews, calibrate_pair
+    from client_sdk.rigs.rig_file import write_rig
+
+    views = PairViews(board)
+    is_live = all(source.isdigit() for source in args.sources)
+    for left, right in _raw_pairs(args.sources):
+        views.add(left, right)
+        show_progress(
+            f"{len(views.pairs)} of {_WANTED_VIEWS} views of both in {views.left.images} pairs; "
+            "move and tilt the board",
+            is_over=False,
+        )
+        if len(views.pairs) >= _WANTED_VIEWS or (is_live and views.left.images >= _LIVE_IMAGES):
+            break
+    show_progress(f"{len(views.pairs)} views of both; computing", is_over=True)
+    found = calibrate_pair(views, max_rms_px=args.max_rms_px)
+    write_rig(args.out, found.rig)
+    show(
+        f"{args.out}: baseline {1e3 * found.baseline_m:.2f} mm; reprojection error {found.rms_px:.3f} px rms "
+        f"over {found.views} views of both cameras",
+        *(
+            f"{each.name}: fx {each.lens.camera.fx:.2f}  fy {each.lens.camera.fy:.2f}, "
+            f"{each.lens.rms_px:.3f} px rms over {each.lens.views} views"
+            for each in found.rig.cameras
+        ),
+    )
+    return 0
+
+
+def _raw_pairs(sources: list[str]) -> Iterator[tuple[npt.NDArray[np.uint8], npt.NDArray[np.uint8]]]:
+    """Yield grey images of both cameras."""
+    if len(sources) > 2:
+        raise UsageError(
+            f"{len(sources)} sources of a pair", hint="name two devices, videos or folders, or one of both"
+        )
+    folder = Path(sources[0])
+    if len(sources) == 1 and (folder / "left").is_dir() and (folder / "right").is_dir():
+        sources = [str(folder / "left"), str(folder / "right")]
+    if len(sources) == 2:
+        yield from zip(_raw_images(sources[:1]), _raw_images(sources[1:]), strict=False)
+        return
+    for image in _raw_images(sources):
+        half = image.shape[1] // 2
+        yield np.ascontiguousarray(image[:, :half]), np.ascontiguousarray(image[:, half : 2 * half])
 
 
 def _raw_images(sources: list[str]) -> Iterator[npt.NDArray[np.uint8]]:

@@ -74,7 +74,9 @@ def open_recording(word: str, *, camera: CameraChoice | None = None, imu: bool |
         return _rendered(int(world[1]))
     if word.startswith("world:"):
         raise UsageError(f"{word} names no rendered world", hint="write world: and a seed, such as world:3")
-    return open_dataset(word, camera=camera, imu=imu)
+    dataset = open_dataset(word, camera=camera, imu=imu)
+    dataset.check()
+    return dataset
 
 
 def _at_rates(dataset: Dataset, rates_hz: Sequence[float]) -> list[Drive]:

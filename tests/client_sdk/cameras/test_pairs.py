@@ -1,0 +1,94 @@
+"""Stereo cameras as sources: folders of pairs, side-by-side images, two videos."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from client_sdk.cameras import Intrinsics, Rig, RigCamera, open_camera, write_rig
+from rse_pf.errors import UsageError
+from rse_pf.geometry import Array, Camera
+
+cv2 = pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
+
+CAMERA = Camera(fx=60.0, fy=60.0, cx=31.5, cy=23.5, width=64, height=48)
+FRAMES = 12
+
+
+def moved(x: float) -> Array:
+    pose = np.eye(4)
+    pose[0, 3] = x
+    return pose
+
+
+RIG = Rig(
+    cameras=tuple(
+        RigCamera(name=name, lens=Intrinsics(camera=CAMERA), T_body_camera=moved(x))
+        for name, x in (("left", 0.0), ("right", 0.1))
+    )
+)
+
+
+def images(folder: Path) -> Path:
+    for side, value in (("left", 100), ("right", 200)):
+        (folder / side).mkdir()
+        for row in range(FRAMES):
+            cv2.imwrite(str(folder / side / f"{row}.png"), np.full((48, 64), value + row, np.uint8))
+    write_rig(folder / "rig.json", RIG)
+    return folder
+
+
+def video(path: Path, values: list[int]) -> Path:
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 10.0, (64 * len(values), 48))
+    for _ in range(FRAMES):
+        writer.write(np.hstack([np.full((48, 64, 3), value, np.uint8) for value in values]))
+    writer.release()
+    return path
+
+
+def test_a_folder_of_pairs_gives_all_of_them_in_order(tmp_path: Path) -> None:
+    with open_camera(images(tmp_path)) as source:
+        assert (source.has_stereo, source.has_depth) == (True, False)
+        frames = list(source)
+
+    assert [int(frame.rgb[0, 0, 0]) for frame in frames] == list(range(100, 100 + FRAMES))
+    assert [int(frame.stereo.gray[0, 0]) for frame in frames if frame.stereo] == list(
+        range(200, 200 + FRAMES)
+    )
+    assert frames[0].stereo is not None
+    assert frames[0].stereo.baseline_m == pytest.approx(0.1)
+
+
+def test_one_camera_of_a_pair_can_be_taken(tmp_path: Path) -> None:
+    with open_camera(images(tmp_path), camera="left") as source:
+        assert not source.has_stereo
+        assert next(source).stereo is None
+
+
+@pytest.mark.parametrize("is_beside", [True, False])
+def test_videos_of_both_cameras_are_paired(tmp_path: Path, is_beside: bool) -> None:
+    if is_beside:
+        word = str(video(tmp_path / "both.avi", [100, 200]))
+    else:
+        word = f"{video(tmp_path / 'a.avi', [100])},{video(tmp_path / 'b.avi', [200])}"
+
+    with open_camera(word, intrinsics=RIG) as source:
+        frames = list(source)
+
+    assert len(frames) == FRAMES
+    assert frames[3].stereo is not None
+    assert int(frames[3].rgb[5, 5, 0]) == pytest.approx(100, abs=3)
+    assert int(frames[3].stereo.gray[5, 5]) == pytest.approx(200, abs=3)
+
+
+def test_a_missing_partner_and_images_of_another_size_are_one_line(tmp_path: Path) -> None:
+    folder = images(tmp_path)
+    (folder / "right" / "3.png").unlink()
+    with pytest.raises(UsageError, match=r"3 is missing in .*right"):
+        open_camera(folder)
+    cv2.imwrite(str(folder / "right" / "3.png"), np.zeros((48, 64), np.uint8))
+    cv2.imwrite(str(folder / "left" / "0.png"), np.zeros((48, 48), np.uint8))
+    with pytest.raises(UsageError, match="the left image is 48x48 px, its camera 64x48 px"):
+        next(open_camera(folder))
