@@ -19,6 +19,7 @@ import asyncio
 import json
 import os
 import subprocess
+import sys
 import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -27,7 +28,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from client_sdk.datasets import associate_stamps
+from client_sdk.datasets import CameraChoice, associate_stamps
 from client_sdk.frontend import load_opencv
 from client_sdk.mapping import Trajectory, read_trajectory
 from client_sdk.rigs.benchmark_files import read_euroc_camera
@@ -63,6 +64,8 @@ _NOT_COMPARABLE = """\
 - Only the first part of each recording was played, as JPEG: no figure replaces one of the papers."""
 
 Sensor = Literal["RGBD", "STEREO", "MONOCULAR"]
+_EXAMPLES = ("sift:sift", "xfeat:xfeat")
+_EXAMPLES_FOLDER = Path(__file__).resolve().parents[2] / "examples" / "features"
 _PROCESS = Path(__file__).with_name("orbslam3_process.py")
 _KITCHEN, _TURNING, _EUROC = "7scenes_redkitchen", "tum_fr1_rpy_start", "euroc_mh01_start"
 _KITTI_STEREO, _KITTI = "kitti_06_start", "kitti_00_left_start"
@@ -79,21 +82,25 @@ _FEATURES_OF_KITTI = 2000
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Row:
-    """A recording at a rate with a sensor; our configuration beside it, empty where we have none."""
+    """A recording at a rate with a sensor; our configuration beside it, empty where we have none.
+
+    ``features`` are examples of features, which are compared, too.
+    """
 
     recording: str
     rates_hz: tuple[float, ...]
     sensor: Sensor
     ours: str
+    features: tuple[str, ...] = ()
 
 
 ROWS = (
-    Row(recording=_TURNING, rates_hz=(30, 15, 10, 5), sensor="RGBD", ours="default"),
-    Row(recording=_KITCHEN, rates_hz=(10, 5), sensor="RGBD", ours="default"),
+    Row(recording=_TURNING, rates_hz=(30, 15, 10, 5), sensor="RGBD", ours="default", features=_EXAMPLES),
+    Row(recording=_KITCHEN, rates_hz=(10, 5), sensor="RGBD", ours="default", features=_EXAMPLES),
     Row(recording=_KITCHEN, rates_hz=(10, 5), sensor="MONOCULAR", ours="without-depth"),
-    Row(recording=_EUROC, rates_hz=(20, 10, 5), sensor="STEREO", ours=""),
+    Row(recording=_EUROC, rates_hz=(20, 10, 5), sensor="STEREO", ours="default"),
     Row(recording=_EUROC, rates_hz=(20, 10), sensor="MONOCULAR", ours="without-depth"),
-    Row(recording=_KITTI_STEREO, rates_hz=(9.6,), sensor="STEREO", ours=""),
+    Row(recording=_KITTI_STEREO, rates_hz=(9.6,), sensor="STEREO", ours="default"),
     Row(recording=_KITTI_STEREO, rates_hz=(9.6,), sensor="MONOCULAR", ours="without-depth"),
     Row(recording=_KITTI, rates_hz=(9.6,), sensor="MONOCULAR", ours="without-depth"),
 )
@@ -343,11 +350,13 @@ def _rows_of(row: dict[str, Any]) -> Iterator[tuple[Any, ...]]:
     if ours is None:
         yield (*about, "ours", "", "no such tracker", *[""] * 5)
     else:
-        yield (
-            *about, "ours", 1, ours["posed"], _fixed(ours["longest_gap_s"]), _fixed(ours["ate_cm"]),
-            _fixed(ours["ate_online_cm"]), f"{_fixed(ours['rpe_cm'])} / {_fixed(ours['rpe_deg'])}",
-            f"{ours['robot_ms']:.0f} + {ours['server_ms']:.0f}",
-        )  # fmt: skip
+        others = {f"ours, {name}": run for name, run in row.get("with_features", {}).items()}
+        for who, run in {"ours": ours, **others}.items():
+            yield (
+                *about, who, 1, run["posed"], _fixed(run["longest_gap_s"]), _fixed(run["ate_cm"]),
+                _fixed(run["ate_online_cm"]), f"{_fixed(run['rpe_cm'])} / {_fixed(run['rpe_deg'])}",
+                f"{run['robot_ms']:.0f} + {run['server_ms']:.0f}",
+            )  # fmt: skip
     for number, run in enumerate(row.get("peer", ()), start=1):
         if "failed" in run:
             yield (*about, "ORB-SLAM3", number, run["failed"].partition(":")[0], *[""] * 5)
@@ -394,6 +403,7 @@ def main() -> int:
     args.recordings, args.python = args.recordings.resolve(), args.python.absolute()
     args.out.mkdir(parents=True, exist_ok=True)
     load_opencv().setNumThreads(1)
+    sys.path.append(str(_EXAMPLES_FOLDER))
     file = args.out / "comparison.json"
     report: dict[str, Any] = json.loads(file.read_text()) if file.exists() else {"experiment": "comparison"}
     known = {(row["name"], row["sensor"]): row for row in report.get("rows", [])}
@@ -403,12 +413,17 @@ def main() -> int:
         report |= {"peer": _about_peer(args), "speed": args.speed}
     for row in ROWS:
         recording = str(args.recordings / row.recording)
-        for drive in drives_of([recording], row.rates_hz, camera="left", imu=False):
+        camera: CameraChoice = "stereo" if row.sensor == "STEREO" else "left"
+        for drive, own in zip(
+            drives_of([recording], row.rates_hz, camera="left", imu=False),
+            drives_of([recording], row.rates_hz, camera=camera, imu=False),
+            strict=True,
+        ):
             key = (drive.name, row.sensor)
             if args.only in f"{drive.name} {row.sensor}":
                 known[key] = {
                     **known.get(key, {}),
-                    **_measured(args, row, drive, known.get(key, {}).get("peer", [])),
+                    **_measured(args, row, drive, own, known.get(key, {}).get("peer", [])),
                 }
                 print(json.dumps(known[key]), flush=True)
             report["rows"] = list(known.values())
@@ -419,16 +434,19 @@ def main() -> int:
 
 
 def _measured(
-    args: argparse.Namespace, row: Row, drive: Drive, earlier: Sequence[dict[str, Any]]
+    args: argparse.Namespace, row: Row, drive: Drive, own: Drive, earlier: Sequence[dict[str, Any]]
 ) -> dict[str, Any]:
-    """Return what is measured now of a row; with --more, after the *earlier* runs of the peer."""
+    """Return what is measured now of a row, ours on *own*; with --more, after *earlier* runs of the peer."""
     before = earlier if args.more else ()
     measured: dict[str, Any] = {
         "name": drive.name, "sensor": row.sensor, "frames": len(drive.dataset),
         "alignment": "Sim(3)" if row.sensor == "MONOCULAR" else "SE(3)",
     }  # fmt: skip
     if args.part != "peer":
-        measured["ours"] = run_ours(configurations_of([row.ours])[0], drive) if row.ours else None
+        measured["ours"] = run_ours(configurations_of([row.ours])[0], own) if row.ours else None
+        measured["with_features"] = {
+            name.partition(":")[0]: run_ours(configurations_of([name])[0], own) for name in row.features
+        }
     if args.part != "ours":
         job = job_of(args.recordings, drive, row.sensor)
         measured["peer"] = [*before, *(run_peer(args, drive, row.sensor, job) for _ in range(args.runs))]
