@@ -29,6 +29,7 @@ __all__ = [
     "rigid",
     "rigid_many",
     "rotation_angle_deg",
+    "scaled",
     "skew",
     "to_quaternion",
     "transform",
@@ -123,6 +124,13 @@ def inverse(T_a_b: Array) -> Array:
     T_b_a[..., :3, 3:] = -(rotation @ T_a_b[..., :3, 3:])
     T_b_a[..., 3, 3] = 1.0
     return T_b_a
+
+
+def scaled(T: Array, scale: float | Array) -> Array:
+    """Return poses ``(..., 4, 4)`` whose translations are multiplied by *scale*, one number or ``(...)``."""
+    made: Array = T.copy()
+    made[..., :3, 3] *= np.asarray(scale)[..., None]
+    return made
 
 
 def rigid(T: Array, max_m: float = _MAX_M) -> Array | None:

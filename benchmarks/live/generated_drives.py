@@ -11,28 +11,34 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from itertools import pairwise
 
+import msgspec
 import numpy as np
 
-from rse_pf.geometry import Array, Camera, exp_se3, inverse
-from rse_pf.live_map.events import KeyframeAdded, LinksMeasured, MeasuredLink, matrix_bytes
-from rse_pf.slam.keyframe import Keyframe, encode_keyframe, make_features
+from rse_pf.geometry import Array, Camera, exp_se3, inverse, scaled
+from rse_pf.live_map.events import KeyframeAdded, LinksMeasured, MeasuredLink, matrix_bytes, matrix_of
+from rse_pf.slam.keyframe import Keyframe, encode_keyframe, make_features, make_scaleless_features
 
 __all__ = ["GeneratedDrive", "GeneratedWorld", "circle", "make_link", "meander", "straight"]
 
 CAMERA = Camera(fx=525.0, fy=525.0, cx=319.5, cy=239.5, width=640, height=480)
 STEP_M = 0.1
 LINK_SIGMA_M, LINK_SIGMA_DEG = 0.01, 0.4
+SCALE_SIGMA = 0.03
 INFORMATION = np.diag([0.02**-2] * 3 + [math.radians(0.7) ** -2] * 3)
 
 
 @dataclass(slots=True, eq=False)
 class GeneratedDrive:
-    """A robot that follows a path: its true poses, and its odometry, which drifts."""
+    """A robot that follows a path: its true poses, and its odometry, which drifts.
+
+    With ``unit_m`` the odometry and the depths are in a unit of so many metres, which nobody is told.
+    """
 
     robot: str
     T_world_camera: Array
     T_odom_camera: Array
     segment: int = 0
+    unit_m: float | None = None
 
 
 @dataclass(eq=False)
@@ -52,6 +58,7 @@ class GeneratedWorld:
     twin_m: float | None = None
     wrong_inliers: int = 100
     seen: list[Array] = field(default_factory=list)
+    units_m: list[float | None] = field(default_factory=list)
     owners: list[tuple[str, int]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -62,7 +69,9 @@ class GeneratedWorld:
         self._stack: Array = np.empty((0, 4, 4))
         self._stacked: tuple[list[Array], int] = ([], 0)
 
-    def drive(self, robot: str, positions: Array, segment: int = 0) -> GeneratedDrive:
+    def drive(
+        self, robot: str, positions: Array, segment: int = 0, unit_m: float | None = None
+    ) -> GeneratedDrive:
         """Return a robot's drive through ``(n, 2)`` positions, looking where it goes."""
         ahead = np.diff(positions, axis=0, append=positions[-1:] + (positions[-1:] - positions[-2:-1]))
         headings = np.unwrap(np.arctan2(ahead[:, 1], ahead[:, 0]))
@@ -72,18 +81,21 @@ class GeneratedWorld:
         for one, other in pairwise(true):
             odometry.append(odometry[-1] @ inverse(one) @ other @ exp_se3(sigma * self.rng.normal(size=6)))
         return GeneratedDrive(
-            robot=robot, T_world_camera=true, T_odom_camera=np.array(odometry), segment=segment
+            robot=robot, T_world_camera=true, T_odom_camera=scaled(np.array(odometry), 1.0 / (unit_m or 1.0)),
+            segment=segment, unit_m=unit_m,
         )  # fmt: skip
 
     def keyframe(self, drive: GeneratedDrive, number: int, first: int = 0) -> KeyframeAdded:
         """Return keyframe *number* of a drive as an event, and note its true pose."""
         self.seen.append(drive.T_world_camera[number])
         self.owners.append((drive.robot, number))
+        self.units_m.append(drive.unit_m)
         pixels = self.rng.uniform(0, 470, (self.features, 2))
         depths_m = self.rng.uniform(1, 4, self.features)
         keyframe = Keyframe(
             timestamp_s=0.2 * number, T_odom_camera=drive.T_odom_camera[number], camera=CAMERA,
-            features=make_features(pixels, depths_m, self._descriptors),
+            features=make_features(pixels, depths_m, self._descriptors) if drive.unit_m is None
+            else make_scaleless_features(pixels, depths_m / drive.unit_m, self._descriptors),
         )  # fmt: skip
         return KeyframeAdded(
             robot=drive.robot, segment=drive.segment, number=first + number, data=encode_keyframe(keyframe)
@@ -109,7 +121,8 @@ class GeneratedWorld:
                 other = int(self.rng.integers(0, keyframe))
                 self.wrong_sent += 1
                 off = exp_se3(np.r_[self.rng.uniform(-3, 3, 3), self.rng.uniform(-1.5, 1.5, 3)])
-                links.append(make_link(other, self.step(keyframe, other) @ off, self.wrong_inliers))
+                made = make_link(other, self.step(keyframe, other) @ off, self.wrong_inliers)
+                links.append(self.in_units(keyframe, made))
         return LinksMeasured(keyframe=keyframe, links=tuple(links))
 
     def _poses(self, count: int) -> Array:
@@ -148,7 +161,23 @@ class GeneratedWorld:
     def true_link(self, keyframe: int, other: int) -> MeasuredLink:
         """Return a link as PnP measures it."""
         sigma = np.array([LINK_SIGMA_M] * 3 + [math.radians(LINK_SIGMA_DEG)] * 3)
-        return make_link(other, self.step(keyframe, other) @ exp_se3(sigma * self.rng.normal(size=6)))
+        link = make_link(other, self.step(keyframe, other) @ exp_se3(sigma * self.rng.normal(size=6)))
+        return self.in_units(keyframe, link)
+
+    def in_units(self, keyframe: int, link: MeasuredLink, ratio: float = 1.0) -> MeasuredLink:
+        """Return a link in metres as it is between keyframes whose units differ, its scale *ratio* wrong."""
+        here, there = self.units_m[keyframe], self.units_m[link.other]
+        if here is None and there is None:
+            return link
+        T, information = matrix_of(link.T_keyframe_other, 4, 4), matrix_of(link.information, 6, 6)
+        if here is not None and there is not None:
+            T, stretch = scaled(T, 1.0 / here), np.array([here] * 3 + [1.0] * 3)
+            information = stretch[:, None] * information * stretch
+        log_ratio = math.log((there or 1.0) / (here or 1.0) * ratio) + SCALE_SIGMA * self.rng.normal()
+        return msgspec.structs.replace(
+            link, T_keyframe_other=matrix_bytes(T), information=matrix_bytes(information),
+            scale=(log_ratio, SCALE_SIGMA**2),
+        )  # fmt: skip
 
     def play(
         self, drives: list[GeneratedDrive], wrong: float = 0.0

@@ -15,13 +15,13 @@ import numpy.typing as npt
 from client_sdk.monocular.bundle import Adjuster, Bundle, adjust
 from client_sdk.tracking.keyframe_map import NO_LANDMARK, Landmarks, expect
 from client_sdk.tracking.place import Place
-from rse_pf.geometry import Array, Camera, exp_se3, inverse, log_se3, transform
+from rse_pf.geometry import Array, Camera, exp_se3, inverse, log_se3, scaled, transform
 from rse_pf.maps.descriptors import Descriptors
 from rse_pf.slam.places import PlaceVector
 from rse_pf.slam.tracking import ImageFeatures, NearLimits, match_near
 from rse_pf.slam.triangulation import parallax_deg, reprojection_errors, triangulate
 
-__all__ = ["MIN_SHARED", "LandmarkLimits", "LandmarkMap", "ViewFeatures", "scaled"]
+__all__ = ["MIN_SHARED", "LandmarkLimits", "LandmarkMap", "ViewFeatures"]
 
 Rows = npt.NDArray[np.int64]
 
@@ -470,13 +470,6 @@ class LandmarkMap:
         everywhere = replace(bundle, is_fixed=np.ones(len(poses), dtype=bool))
         _, points = self._adjust_bundle(everywhere, self.camera, iterations=iterations)
         return replace(bundle, points_world=points)
-
-
-def scaled(pose: Array, scale: float) -> Array:
-    """Return a pose whose translation is multiplied by *scale*."""
-    made: Array = pose.copy()
-    made[:3, 3] *= scale
-    return made
 
 
 def _turned(rotation: Array) -> Array:

@@ -28,12 +28,12 @@ from client_sdk.monocular.descriptors import match_all
 from client_sdk.monocular.two_view import TwoViewStart, start_from_two_views
 from client_sdk.slots import Slots
 from client_sdk.tracking.keyframe_map import NO_LANDMARK, expect
-from client_sdk.tracking.landmark_map import MIN_SHARED, LandmarkLimits, LandmarkMap, ViewFeatures, scaled
+from client_sdk.tracking.landmark_map import MIN_SHARED, LandmarkLimits, LandmarkMap, ViewFeatures
 from client_sdk.tracking.place import place_of
 from client_sdk.tracking.queries import Answer, OneQuery, Steps
 from client_sdk.tracking.tracker import Join
 from rse_pf.errors import UsageError
-from rse_pf.geometry import Array, inverse, pose_difference, rigid, transform
+from rse_pf.geometry import Array, inverse, pose_difference, rigid, scaled, transform
 from rse_pf.slam.tracking import (
     ImageFeatures,
     NearLimits,

@@ -9,14 +9,21 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from rse_pf.geometry import Array, inverse
+from rse_pf.geometry import Array, inverse, scaled
 from rse_pf.live_map.graph import Graph, LiveLink
 from rse_pf.live_map.options import LiveMapOptions
-from rse_pf.slam.consistency import LinkEnds, fits_prediction, largest_clique, round_trips_close
+from rse_pf.slam.consistency import (
+    LinkEnds,
+    fits_prediction,
+    largest_clique,
+    round_trips_close,
+    scale_fits,
+)
 
 __all__ = [
     "agreeing_between",
@@ -24,10 +31,15 @@ __all__ = [
     "has_enough_ends",
     "is_strong",
     "judge_within",
+    "scale_into",
+    "step_into",
     "weight_of",
+    "with_metres",
 ]
 
 _CONTRARY_LINKS = 24
+_KNOWN_SCALE = 0.03
+"""Deviation of the logarithm of a scale that a graph knows: the first links leave 1 to 3 %."""
 
 
 def agreeing_between(
@@ -38,6 +50,8 @@ def agreeing_between(
     Two links agree if the round trip over both is the identity, as `round_trips_close` says; the
     poses within a component are those of the graph.  Links whose agreement is known are not compared again.
 
+    Where one of the components has no metres, two links agree if their scales do, too.
+
     Source:
         Mangelson et al., Pairwise consistent measurement set maximization, ICRA 2018.
     """
@@ -47,6 +61,8 @@ def agreeing_between(
         if number not in leave_out
         and {graph.component_of(graph.links[number].a), graph.component_of(graph.links[number].b)} == pair
     ]  # fmt: skip
+    one = with_metres(graph, one, other)
+    numbers = _of_fitting_scale(graph, numbers, options)
     if graph.equal_rooms_m:
         # So that the links that are tested reach farther than a room.
         numbers = _spread(graph, numbers, one, 3.0 * graph.equal_rooms_m / options.tested_links)
@@ -105,16 +121,47 @@ def judge_within(
     """
     links = [graph.links[number] for number in numbers]
     predicted = inverse(graph.T[[link.a for link in links]]) @ graph.T[[link.b for link in links]]
+    fitting = set(_of_fitting_scale(graph, numbers, options, walked))
     steps = np.maximum(np.array(walked), 1.0)
     # On a round way of a given length no point is farther than its diameter.
     apart_m = np.sqrt((predicted[:, :3, 3] ** 2).sum(axis=1))
     lever_m = np.maximum(apart_m, options.spacing_m * steps / math.pi)
-    measured = _ends_of([_oriented(link, True) for link in links])
+    measured = _ends_of([_oriented(graph, link, True) for link in links])
     agrees = fits_prediction(predicted, measured, steps, lever_m, options.judged)
+    agrees &= np.array([number in fitting for number in numbers], dtype=np.bool_)
     return [
         "contrary" if not ok else "vague" if far else "agrees"
         for ok, far in zip(agrees.tolist(), (steps > options.vague_steps).tolist(), strict=True)
     ]
+
+
+def with_metres(graph: Graph, one: int, other: int) -> int:
+    """Return which of two components the other one is expressed in: the first, or the one with metres."""
+    return other if graph.has_scales and graph.is_metric(other) and not graph.is_metric(one) else one
+
+
+def scale_into(graph: Graph, number: int, stay: int) -> tuple[float, float]:
+    """Return the logarithm of how long the unit of a link's other component is in that of *stay*.
+
+    And its variance; both are 0 where both components are metric, so that nothing is to be measured.
+    """
+    link = graph.links[number]
+    a, b = graph.segment_of(link.a), graph.segment_of(link.b)
+    if link.scale is None or (graph.is_metric(a.component) and graph.is_metric(b.component)):
+        return 0.0, 0.0
+    log_ratio = link.scale[0] + math.log(a.scale / b.scale)
+    return (log_ratio if a.component == stay else -log_ratio), link.scale[1]
+
+
+def step_into(graph: Graph, number: int, stay: int, log_scale: float) -> _Ends:
+    """Return a link from component *stay* to another one, lengths in the unit of *stay*.
+
+    *log_scale* is how long the unit of the other one is in that.
+    """
+    link = graph.links[number]
+    row, forward = graph.unit_of(link), graph.component_of(link.a) == stay
+    length = 1.0 if row < 0 else graph.segments[row].scale * (1.0 if forward else math.exp(log_scale))
+    return _directed(link, forward, length)
 
 
 def agreeing_by_odometry(
@@ -127,7 +174,9 @@ def agreeing_by_odometry(
     others = _tested(graph, sorted({*numbers} - {number}), options)[-_CONTRARY_LINKS:]
     if not others:
         return [number]
-    row = int(graph.of_segment[graph.links[number].a])
+    row, beyond = (int(graph.of_segment[i]) for i in (graph.links[number].a, graph.links[number].b))
+    if graph.segments[beyond].is_metric and not graph.segments[row].is_metric:
+        row = beyond
     ends = [_ends(graph, each, row) for each in others]
     last = _ends(graph, number, row)
     near = np.flatnonzero(_trips_close(graph, graph.T_odom, ends, last, None, options))
@@ -151,7 +200,36 @@ def _heaviest(
     return max(every, of_strong, key=lambda each: weight_of(graph, each, options))
 
 
-_Ends = tuple[int, int, Array, Array]
+class _Ends(NamedTuple):
+    """Both ends of a link, the step from one to the other with its variances, and its scale if it has one."""
+
+    a: int
+    b: int
+    T_a_b: Array
+    variances: Array
+    scale: tuple[float, float] | None = None
+
+
+def _of_fitting_scale(
+    graph: Graph, numbers: Sequence[int], options: LiveMapOptions, walked: Sequence[float] | None = None
+) -> list[int]:
+    """Return the links whose scale is that of the graph, where it is known, after *walked* steps."""
+    fitting = []
+    for place, number in enumerate(numbers):
+        link = graph.links[number]
+        if link.scale is None:
+            fitting.append(number)
+            continue
+        a, b = graph.segment_of(link.a), graph.segment_of(link.b)
+        if a.component != b.component and not all(graph.is_metric(each.component) for each in (a, b)):
+            fitting.append(number)
+            continue
+        steps = 0.0 if walked is None else walked[place]
+        variance = link.scale[1] + _KNOWN_SCALE**2 + steps * options.judged.step_scale**2
+        off = link.scale[0] + math.log(a.scale / b.scale)
+        if scale_fits(np.array(off**2), np.array(variance)):
+            fitting.append(number)
+    return fitting
 
 
 def _tested(graph: Graph, numbers: list[int], options: LiveMapOptions) -> list[int]:
@@ -183,8 +261,8 @@ def _compare(graph: Graph, number: int, others: list[int], one: int, options: Li
     """Return whether each of *others* agrees with link *number*; all connect component *one* with another."""
     last = _ends_between(graph, number, one)
     ends = [_ends_between(graph, each, one) for each in others]
-    along_a = graph.walks(last[0], [end[0] for end in ends])
-    along_b = graph.walks(last[1], [end[1] for end in ends])
+    along_a = graph.walks(last.a, [end.a for end in ends])
+    along_b = graph.walks(last.b, [end.b for end in ends])
     return [
         bool(is_close) for is_close in _trips_close(graph, graph.T, ends, last, (along_a, along_b), options)
     ]
@@ -201,34 +279,55 @@ def _trips_close(
     """
     links = _ends_of(ends)
     if along is None:
-        way_a, way_b = graph.way[links.a] - graph.way[last[0]], graph.way[links.b] - graph.way[last[1]]
+        way_a, way_b = graph.way[links.a] - graph.way[last.a], graph.way[links.b] - graph.way[last.b]
         walked = np.abs(way_a) + np.abs(way_b)
     else:
-        walked = np.array([along[0][a] + along[1][b] for a, b, _, _ in ends])
+        walked = np.array([along[0][end.a] + along[1][end.b] for end in ends])
     return round_trips_close(T, links, _ends_of([last]), walked, options.judged)
 
 
 def _ends_of(ends: Sequence[_Ends]) -> LinkEnds:
+    scales = [end.scale for end in ends if end.scale is not None]
     return LinkEnds(
-        a=np.array([a for a, _, _, _ in ends], dtype=np.int64),
-        b=np.array([b for _, b, _, _ in ends], dtype=np.int64),
-        T_a_b=np.array([T_a_b for _, _, T_a_b, _ in ends]),
-        variances=np.array([variances for _, _, _, variances in ends]),
+        a=np.array([end.a for end in ends], dtype=np.int64),
+        b=np.array([end.b for end in ends], dtype=np.int64),
+        T_a_b=np.array([end.T_a_b for end in ends]),
+        variances=np.array([end.variances for end in ends]),
+        scales=np.array(scales) if scales else None,
     )
 
 
 def _ends_between(graph: Graph, number: int, one: int) -> _Ends:
-    link = graph.links[number]
-    return _oriented(link, graph.component_of(link.a) == one)
+    """Return a link from component *one* to another, in the unit of *one*."""
+    log_scale, variance = scale_into(graph, number, one)
+    ends = step_into(graph, number, one, log_scale)
+    return ends._replace(scale=(log_scale, variance)) if variance else ends
 
 
 def _ends(graph: Graph, number: int, row: int) -> _Ends:
+    """Return a link from segment *row*, in the unit of its odometry; that of the other end is apart."""
     link = graph.links[number]
-    return _oriented(link, int(graph.of_segment[link.a]) == row)
+    forward = int(graph.of_segment[link.a]) == row
+    if link.scale is None or graph.of_segment[link.a] == graph.of_segment[link.b]:
+        return _directed(link, forward, 1.0)
+    log_ratio, variance = link.scale
+    log_scale = log_ratio if forward else -log_ratio
+    is_in_other = graph.unit_of(link) >= 0 and not forward
+    ends = _directed(link, forward, math.exp(log_scale) if is_in_other else 1.0)
+    return ends._replace(scale=(log_scale, variance))
 
 
-def _oriented(link: LiveLink, forward: bool) -> _Ends:
-    """Return both ends of a link, its step from the first to the second, and its variances."""
+def _oriented(graph: Graph, link: LiveLink, forward: bool) -> _Ends:
+    """Return a link within one component, in the unit of that."""
+    row = -1 if link.scale is None else graph.unit_of(link)
+    return _directed(link, forward, 1.0 if row < 0 else graph.segments[row].scale)
+
+
+def _directed(link: LiveLink, forward: bool, length: float) -> _Ends:
+    """Return both ends of a link, its step from the first to the second times *length*, and its variances."""
+    T_a_b, variances = link.T_a_b, link.variances
+    if length != 1.0:
+        T_a_b, variances = scaled(T_a_b, length), variances * np.array([length**2] * 3 + [1.0] * 3)
     if forward:
-        return link.a, link.b, link.T_a_b, link.variances
-    return link.b, link.a, inverse(link.T_a_b), link.variances
+        return _Ends(link.a, link.b, T_a_b, variances)
+    return _Ends(link.b, link.a, inverse(T_a_b), variances)

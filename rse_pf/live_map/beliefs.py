@@ -2,25 +2,29 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from itertools import groupby
+from itertools import groupby, pairwise
 
 import numpy as np
 
-from rse_pf.geometry import Array, inverse, median_pose
+from rse_pf.geometry import Array, inverse, median_pose, scaled
 from rse_pf.live_map.agreement import (
     agreeing_between,
     agreeing_by_odometry,
     has_enough_ends,
     is_strong,
     judge_within,
+    scale_into,
+    step_into,
     weight_of,
+    with_metres,
 )
 from rse_pf.live_map.graph import Graph, Segment
 from rse_pf.live_map.options import LiveMapOptions
 from rse_pf.live_map.outcomes import Ambiguous, LinkBelieved, LinkRemoved, Outcome
-from rse_pf.live_map.smoothing import SmoothedWindows, smooth_around
+from rse_pf.live_map.smoothing import SmoothedWindows, odometry_step, smooth_around
 
 __all__ = ["Changes", "disbelieve_contradicting", "judge_again", "judge_links", "smooth_changes"]
 
@@ -250,14 +254,15 @@ def _loops(graph: Graph, row: int) -> list[int]:
 def _apart_m(graph: Graph, number: int) -> float:
     """Return by how much odometry contradicts a link within a segment."""
     link = graph.links[number]
-    off = inverse(link.T_a_b) @ inverse(graph.T_odom[link.a]) @ graph.T_odom[link.b]
+    from_a, to_b = graph.odometry([link.a, link.b])
+    off = inverse(graph.step_of(link)) @ inverse(from_a) @ to_b
     return float(np.sqrt((off[:3, 3] ** 2).sum()))
 
 
 def _off_m(graph: Graph, number: int) -> float:
     """Return by how much the graph contradicts a link."""
     link = graph.links[number]
-    off = inverse(link.T_a_b) @ inverse(graph.T[link.a]) @ graph.T[link.b]
+    off = inverse(graph.step_of(link)) @ inverse(graph.T[link.a]) @ graph.T[link.b]
     return float(np.sqrt((off[:3, 3] ** 2).sum()))
 
 
@@ -311,10 +316,12 @@ def _try_join(graph: Graph, one: int, other: int, options: LiveMapOptions, chang
         return
     root = graph.segments[graph.root].component if graph.root >= 0 else -1
     stay, moving = (other, one) if other == root or (one != root and other < one) else (one, other)
-    T_stay_moving = median_pose(np.array([_proposed(graph, number, stay) for number in agreeing]))
+    stay, moving = (stay, moving) if with_metres(graph, stay, moving) == stay else (moving, stay)
+    log_scale = _scale_of_moving(graph, agreeing, stay)
+    T_stay_moving = median_pose(np.array([_proposed(graph, number, stay, log_scale) for number in agreeing]))
     for segment in graph.segments:
         if segment.component == moving and segment.keyframes:
-            graph.T[segment.keyframes] = T_stay_moving @ graph.T[segment.keyframes]
+            _move(graph, segment, T_stay_moving, math.exp(log_scale), options)
     _believe(graph, agreeing, changes)
     graph.connect()
     graph.forget_agreements()
@@ -326,19 +333,45 @@ def _try_join(graph: Graph, one: int, other: int, options: LiveMapOptions, chang
     _judge_within(graph, beside[-_JUDGED_AFTER_JOIN:], options, changes)
 
 
+def _scale_of_moving(graph: Graph, numbers: list[int], stay: int) -> float:
+    """Return the logarithm of how long the unit of the component that joins *stay* is in that, by links."""
+    return float(np.median([scale_into(graph, number, stay)[0] for number in numbers]))
+
+
+def _move(
+    graph: Graph, segment: Segment, T_stay_moving: Array, scale: float, options: LiveMapOptions
+) -> None:
+    """Express a segment in another frame, its lengths multiplied by *scale*."""
+    ids = segment.keyframes
+    if scale == 1.0:
+        graph.T[ids] = T_stay_moving @ graph.T[ids]
+        return
+    graph.T[ids] = T_stay_moving @ scaled(graph.T[ids], scale)
+    segment.scale *= scale
+    # Steps of the noise are metres, too.
+    for last, here in pairwise(ids):
+        step = scaled(inverse(graph.T_odom[last]) @ graph.T_odom[here], segment.scale)
+        graph.way[here] = graph.way[last] + odometry_step(step, options)
+
+
 def _ambiguity(graph: Graph, one: int, other: int, agreeing: list[int], options: LiveMapOptions) -> str:
     """Return why links that agree cannot tell which of several equal places is seen, "" if they can."""
     telling = [number for number in agreeing if not _is_lookalike(graph, number)]
     if not has_enough_ends(graph, telling, options):
         return "ambiguous: what it sees is in the map at several places"
     size_m = graph.equal_rooms_m
-    if size_m and min(_spread_m(graph, telling, side) for side in (one, other)) <= size_m:
+    sides = [side for side in (one, other) if not graph.has_scales or graph.is_metric(side)]
+    if size_m and min((_spread_m(graph, telling, side) for side in sides), default=0.0) <= size_m:
         return f"ambiguous: what it shares with others lies within {size_m:g} m, the size of equal rooms"
     rivals = agreeing_between(graph, one, other, options, frozenset(agreeing))
     are_many = 2.0 * weight_of(graph, rivals, options) >= weight_of(graph, agreeing, options)
     if are_many and has_enough_ends(graph, rivals, options):
+        stay = with_metres(graph, one, other)
         first, second = (
-            median_pose(np.array([_proposed(graph, n, one) for n in each])) for each in (agreeing, rivals)
+            median_pose(
+                np.array([_proposed(graph, n, stay, _scale_of_moving(graph, each, stay)) for n in each])
+            )
+            for each in (agreeing, rivals)
         )
         if float(np.sqrt(((first - second)[:3, 3] ** 2).sum())) > options.lookalike_m:
             return f"ambiguous: {len(agreeing)} links say one place, {len(rivals)} another"
@@ -389,13 +422,14 @@ def _is_lookalike(graph: Graph, number: int) -> bool:
     return graph.links[number].a in graph.lookalikes or graph.links[number].b in graph.lookalikes
 
 
-def _proposed(graph: Graph, number: int, stay: int) -> Array:
-    """Return the pose of the moving component's frame in that of the staying one, by one link."""
-    link = graph.links[number]
-    a, b, T_a_b = link.a, link.b, link.T_a_b
-    if graph.component_of(a) != stay:
-        a, b, T_a_b = b, a, inverse(T_a_b)
-    T_stay_moving: Array = graph.T[a] @ T_a_b @ inverse(graph.T[b])
+def _proposed(graph: Graph, number: int, stay: int, log_scale: float) -> Array:
+    """Return the pose of the moving component's frame in that of the staying one, by one link.
+
+    The lengths of the moving one are multiplied by the exponential of *log_scale* before.
+    """
+    ends = step_into(graph, number, stay, log_scale)
+    T_moving = graph.T[ends.b] if log_scale == 0.0 else scaled(graph.T[ends.b], math.exp(log_scale))
+    T_stay_moving: Array = graph.T[ends.a] @ ends.T_a_b @ inverse(T_moving)
     return T_stay_moving
 
 

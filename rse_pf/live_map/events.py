@@ -56,14 +56,20 @@ class KeyframeAdded(msgspec.Struct, frozen=True, kw_only=True, dict=True, tag="k
         return decode_keyframe(self.data)
 
 
-class MeasuredLink(msgspec.Struct, frozen=True, kw_only=True):
-    """A measured relative pose to keyframe ``other``, with its ``(6, 6)`` information."""
+class MeasuredLink(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """A measured relative pose to keyframe ``other``, with its ``(6, 6)`` information.
+
+    ``scale`` is the logarithm, with its variance, of how long the unit of the other keyframe is in that of
+    this one; none between two in metres.  Lengths are metres if one of the two is, else in the unit of this
+    one.
+    """
 
     other: int
     T_keyframe_other: bytes
     information: bytes
     inliers: int
     matches: int
+    scale: tuple[float, float] | None = None
 
 
 class LinksMeasured(msgspec.Struct, frozen=True, kw_only=True, tag="links"):

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import heapq
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rse_pf.errors import BadRequest, message_of
-from rse_pf.geometry import Array
+from rse_pf.geometry import Array, scaled
 from rse_pf.live_map.events import camera_of
 from rse_pf.slam.consistency import StrongLink
 from rse_pf.slam.keyframe_v1 import CameraNumbers, keyframe_of_v1
@@ -31,6 +31,7 @@ _MAX_WALK = 200.0
 """Steps of odometry beyond which two keyframes tell nothing about each other."""
 _MAX_VISITED = 250
 _MAX_REMOVED = 2000
+_SCALES = "scales"
 _CARRIED = 0xFFFF
 """Contradictions of the newest 16 keyframes count in the robot's next segment, too."""
 
@@ -70,6 +71,12 @@ class Segment:
     """A bit for each of the last 32 keyframes with links within the component: whether all contradict it."""
     disbelieved: bool = False
     """Whether its links are no longer taken, since it kept contradicting itself."""
+    is_metric: bool = True
+    """Whether its odometry and its depths are in metres."""
+    scale: float = 1.0
+    """How long its unit is in that of its component: in metres where that is metric."""
+    told_scale: float = 1.0
+    """The scale that was last told with ``told``."""
 
 
 @dataclass(slots=True, eq=False)
@@ -77,7 +84,9 @@ class LiveLink:
     """A measured relative pose of keyframes ``a`` and ``b``; ``a`` is the one that was measured.
 
     ``variances`` ``(6,)`` are of the twist (square metres, square radians); ``doubts`` counts the updates in
-    a row in which the link contradicted the graph.
+    a row in which the link contradicted the graph.  ``scale`` is the logarithm, with its variance, of how
+    long the unit of *b* is in that of *a*, None between two in metres; lengths are metres if one of the two
+    is, else in the unit of *a*.
     """
 
     a: int
@@ -90,6 +99,7 @@ class LiveLink:
     fixed: bool = False
     state: LinkState = "open"
     doubts: int = 0
+    scale: tuple[float, float] | None = None
 
     def weight(self, strong: StrongLink) -> float:
         """Return how much the link counts, within 0..1; those of a version count whole."""
@@ -169,6 +179,36 @@ class Graph:
         """``(n,)``, whether the features are kept."""
         return self._held[: self._size]
 
+    def is_metric(self, component: int) -> bool:
+        """Return whether the lengths of a component are metres: a segment of it has some."""
+        return any(
+            each.component == component and each.is_metric and each.keyframes for each in self.segments
+        )
+
+    def segment_of(self, i: int) -> Segment:
+        """Return the segment of keyframe *i*, which is not forgotten."""
+        return self.segments[int(self._of_segment[i])]
+
+    def unit_of(self, link: LiveLink) -> int:
+        """Return the row of the segment in whose unit a link is, -1 if it is in metres."""
+        a, b = self.segment_of(link.a), self.segment_of(link.b)
+        return -1 if a.is_metric or b.is_metric else int(self._of_segment[link.a])
+
+    def step_of(self, link: LiveLink) -> Array:
+        """Return ``T_a_b`` of a link within one component, in the unit of that."""
+        row = self.unit_of(link)
+        return link.T_a_b if row < 0 else scaled(link.T_a_b, self.segments[row].scale)
+
+    def odometry(self, ids: Sequence[int]) -> Array:
+        """Return ``(n, 4, 4)`` poses in the frames of their odometry, in the unit of the component."""
+        T = self.T_odom[np.asarray(ids, dtype=np.int64)]
+        return scaled(T, np.array([self.segment_of(i).scale for i in ids])) if self.has_scales else T
+
+    @property
+    def has_scales(self) -> bool:
+        """Whether the unit of a segment is unknown."""
+        return not all(each.is_metric for each in self.segments)
+
     def add(self, keyframe: LiveKeyframe, row: int, T_odom: Array, T: Array, way: float) -> int:
         """Append a keyframe to segment *row*; return its id."""
         if self._size == len(self._way):
@@ -237,6 +277,13 @@ class Graph:
                 self.remove_link(number)
             self.forget_agreements()
 
+    def find_segment(self, robot: str, number: int) -> Segment | None:
+        """Return a robot's segment, None if there is none or nothing is left of it."""
+        for each in self.segments:
+            if (each.robot, each.segment) == (robot, number) and not each.version and each.keyframes:
+                return each
+        return None
+
     def segment_row(self, robot: str, number: int) -> int:
         """Return the row of a robot's segment; it begins if there is none."""
         newest = self.newest.get(robot)
@@ -298,7 +345,7 @@ class Graph:
             component = self.segments[row].component
             beside = (
                 other for other, each in enumerate(self.segments)
-                if other != row and each.component == component and each.keyframes
+                if other != row and each.component == component and each.keyframes and each.is_metric
             )  # fmt: skip
             self.root = next(beside, row)
         self.connect()
@@ -421,6 +468,8 @@ class Graph:
     def encode(self, extra: dict[str, bytes], with_data: bool = True) -> bytes:
         """Return everything as bytes, with *extra* byte strings beside it."""
         believed = {str(i): numbers for i, numbers in sorted(self._links_of.items()) if numbers}
+        if self.has_scales:  # a map in metres has the bytes that it had before there were others
+            extra = {**extra, _SCALES: self._encode_scales()}
         packed = _Packed(
             version=_VERSION,
             keyframes=[
@@ -511,7 +560,38 @@ class Graph:
         graph.equal_rooms_m = packed.equal_rooms_m
         graph.lookalikes = set(packed.lookalikes)
         graph._links_of = {int(i): numbers for i, numbers in packed.links_of}
-        return graph, dict(packed.extra)
+        extra = dict(packed.extra)
+        graph._take_scales(extra.pop(_SCALES, b""))
+        return graph, extra
+
+    def _encode_scales(self) -> bytes:
+        links = {**self.links, **self.removed}
+        return msgspec.msgpack.encode(
+            _PackedScales(
+                segments=[
+                    (row, each.scale, each.told_scale)
+                    for row, each in enumerate(self.segments) if not each.is_metric
+                ],
+                links=[(n, *each.scale) for n, each in sorted(links.items()) if each.scale is not None],
+            )
+        )  # fmt: skip
+
+    def _take_scales(self, data: bytes) -> None:
+        """Take what `_encode_scales` encoded; raises BadRequest."""
+        if not data:
+            return
+        try:
+            packed = msgspec.msgpack.decode(data, type=_PackedScales)
+            for row, scale, told_scale in packed.segments:
+                segment = self.segments[row]
+                segment.is_metric, segment.scale, segment.told_scale = False, scale, told_scale
+            for number, log_ratio, variance in packed.links:
+                link = self.links[number] if number in self.links else self.removed[number]
+                link.scale = log_ratio, variance
+        except (msgspec.MsgspecError, LookupError) as error:
+            raise BadRequest(
+                f"the snapshot is damaged: {message_of(error)}", hint="take the older one"
+            ) from error
 
 
 _PackedLink = tuple[int, int, int, bytes, bytes, int, int, bool, LinkState, int]
@@ -545,6 +625,13 @@ class _Packed(msgspec.Struct, kw_only=True):
     def cameras(self) -> list[CameraNumbers]:
         """Return no cameras: they are in the bytes of the keyframes."""
         return []
+
+
+class _PackedScales(msgspec.Struct, kw_only=True):
+    """What segments without metres add to a snapshot; the scales of links are logarithms with variances."""
+
+    segments: list[tuple[int, float, float]]
+    links: list[tuple[int, float, float]]
 
 
 class _PackedV1(_Packed, kw_only=True):

@@ -8,6 +8,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Callable, Collection
+from dataclasses import replace
 from functools import partial
 from typing import Literal
 
@@ -15,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rse_pf.errors import BadRequest, InvalidCamera
-from rse_pf.geometry import Array, inverse
+from rse_pf.geometry import Array, inverse, scaled
 from rse_pf.live_map.beliefs import (
     Changes,
     disbelieve_contradicting,
@@ -36,7 +37,13 @@ from rse_pf.live_map.events import (
 )
 from rse_pf.live_map.feature_parts import FeatureParts, SnapshotParts
 from rse_pf.live_map.graph import Graph, LiveKeyframe, LiveLink, Segment, variances_of
-from rse_pf.live_map.measure import StoredView, measure_stored, placed_keyframe, view_of_features
+from rse_pf.live_map.measure import (
+    StoredView,
+    measure_stored,
+    placed_keyframe,
+    sought_per_unit,
+    view_of_features,
+)
 from rse_pf.live_map.options import LiveMapOptions
 from rse_pf.live_map.outcomes import (
     Added,
@@ -62,6 +69,7 @@ from rse_pf.slam.pose_graph import PoseGraph
 __all__ = ["LiveMap"]
 
 _MAX_SEGMENT = 2**31
+UP_TO_SCALE = "up to scale: no robot with metres has seen what it sees"
 
 
 class LiveMap:
@@ -198,8 +206,16 @@ class LiveMap:
                 f"segment {event.segment} is not within {oldest}..{_MAX_SEGMENT - 1}",
                 hint="count segments upwards, one for each time that tracking starts again",
             )
+        known = self._graph.find_segment(event.robot, event.segment)
+        if known is not None and known.is_metric != event.keyframe.features.is_metric:
+            raise BadRequest(
+                f"segment {event.segment} has keyframes with and without metres",
+                hint="begin a new segment where depths begin or end",
+            )
+        features = event.keyframe.features
+        scale = sought_per_unit(features) if known is None else known.scale
         try:
-            check_sent(event.keyframe)
+            check_sent(event.keyframe, 1.0 if features.is_metric else scale)
         except InvalidCamera as error:
             raise BadRequest(error.message, hint=error.hint) from error
         kind = self.kind
@@ -292,11 +308,20 @@ class LiveMap:
         most = self.options.candidates
         # More are looked at, so that a second place that looks alike is compared, too.
         found = self._places.nearest(PlaceIndex.vector(view.features.descriptors), 6 * most, aligned)
-        chosen = [(self._stored(i), graph.T[i].copy()) for i in spread_candidates(found, graph.T, most)]
-        views = [(stored, T) for stored, T in chosen if stored is not None]
+        chosen = [
+            (self._stored(i), graph.T[i].copy(), graph.segment_of(i).scale)
+            for i in spread_candidates(found, graph.T, most)
+        ]
+        views = [(stored, T, scale) for stored, T, scale in chosen if stored is not None]
         options = LocalisationOptions(has_equal_rooms=graph.equal_rooms_m > 0.0)
-        image = view_of_features(view.features, view.camera)
-        return lambda: localise([placed_keyframe(stored, T) for stored, T in views], image, options)
+        image, sought = view_of_features(view.features, view.camera), sought_per_unit(view.features)
+
+        def find() -> Localised:
+            placed = [placed_keyframe(stored, T, scale) for stored, T, scale in views]
+            found = localise(placed, image, options)
+            return found if found.scale is None else replace(found, scale=found.scale * sought)
+
+        return find
 
     def alignments(self) -> list[Alignment]:
         """Return where the newest segment of each robot lies."""
@@ -304,10 +329,8 @@ class LiveMap:
 
     def alignment_of(self, robot: str, segment: int) -> Alignment | None:
         """Return where a segment lies, None if nothing of it is in the map."""
-        for each in self._graph.segments:
-            if (each.robot, each.segment) == (robot, segment) and each.keyframes:
-                return self._alignment(each)
-        return None
+        found = self._graph.find_segment(robot, segment)
+        return None if found is None else self._alignment(found)
 
     def to_version(self) -> MapVersion:
         """Return the keyframes and links that are connected with the map's frame, as a version."""
@@ -322,9 +345,18 @@ class LiveMap:
         row = graph.segment_row(event.robot, event.segment)
         segment = graph.segments[row]
         T, way = T_odom, 0.0
-        if segment.keyframes:
+        if not segment.keyframes:
+            segment.is_metric = keyframe.features.is_metric
+            if not segment.is_metric:
+                # Lengths begin as if the median depth were that of a room, so that noise fits.
+                segment.scale = sought_per_unit(keyframe.features)
+                segment.reason = UP_TO_SCALE
+                T = scaled(T_odom, segment.scale)
+        else:
             last = segment.keyframes[-1]
             step = inverse(graph.T_odom[last]) @ T_odom
+            if not segment.is_metric:
+                step = scaled(step, segment.scale)
             T = graph.T[last] @ step
             way = float(graph.way[last]) + odometry_step(step, options)
         i = graph.add(
@@ -337,7 +369,7 @@ class LiveMap:
         self._places.add(i, PlaceIndex.vector(keyframe.features.descriptors))
         graph.next_numbers[event.robot] = event.number + 1
         graph.newest[event.robot] = row
-        if graph.root < 0:
+        if graph.root < 0 and segment.is_metric:
             graph.root = row
         # A keyframe goes on from the last one, so only the first of an aligned segment tells something.
         is_told = segment.told is not None or not self._is_aligned(row)
@@ -357,6 +389,7 @@ class LiveMap:
                 LiveLink(
                     a=k, b=link.other, T_a_b=np.array(matrix_of(link.T_keyframe_other, 4, 4)),
                     information=each, inliers=link.inliers, matches=link.matches, variances=variances,
+                    scale=link.scale,
                 )
             )
             for link, each, variances in zip(kept, information, variances_of(information), strict=True)
@@ -413,7 +446,7 @@ class LiveMap:
             self._places.remove(i)
         graph.newest.pop(robot, None)
         if graph.root < 0 or not graph.segments[graph.root].keyframes:
-            alive = [row for row, each in enumerate(graph.segments) if each.keyframes]
+            alive = [row for row, each in enumerate(graph.segments) if each.keyframes and each.is_metric]
             graph.root = next((row for row in alive if row in beside), alive[0] if alive else -1)
         graph.connect()
         return [*self._judge_again(), *self._tell(None)]
@@ -426,7 +459,7 @@ class LiveMap:
             self._smooth(changes)
             outcomes += [each for each in changes.outcomes if isinstance(each, Ambiguous)]
         smooth_all(graph, self.options)
-        if graph.links:
+        if graph.links and graph.root >= 0:
             outcomes.append(OptimiseWanted(misfit=0.0))
         return outcomes
 
@@ -472,7 +505,7 @@ class LiveMap:
         if window is None:
             return None
         due = len(graph) - graph.optimised_at >= self.options.optimise_every
-        if window.strained and due:
+        if window.strained and due and graph.root >= 0:
             graph.optimised_at = len(graph)
             changes.outcomes.append(OptimiseWanted(misfit=window.misfit))
         return window
@@ -486,6 +519,8 @@ class LiveMap:
             if not self._is_aligned(row):
                 if segment.told is not None:
                     segment.told = None
+                    if not segment.reason and not graph.is_metric(segment.component):
+                        segment.reason = UP_TO_SCALE
                     if not segment.reason:
                         segment.reason = "the links that aligned it were removed"
                     outcomes.append(
@@ -498,13 +533,14 @@ class LiveMap:
             elif not is_new:
                 continue
             segment.told, segment.reason = T_map_odom, ""
+            segment.told_scale = segment.scale
             covariance = window.covariance(graph, segment.keyframes[-1]) if window is not None else None
             if covariance is not None:
                 segment.covariance = covariance
             outcomes.append(
                 Corrected(
                     robot=segment.robot, segment=segment.segment, T_map_odom=T_map_odom,
-                    covariance=segment.covariance, cause=cause,
+                    covariance=segment.covariance, cause=cause, scale=_scale_of(segment),
                 )
             )  # fmt: skip
         return outcomes
@@ -514,7 +550,7 @@ class LiveMap:
         graph, options = self._graph, self.options
         rows = [row for row in graph.newest.values() if graph.segments[row].keyframes]
         newest = [graph.segments[row].keyframes[-1] for row in rows]
-        T = graph.T[newest] @ inverse(graph.T_odom[newest])
+        T = graph.T[newest] @ inverse(graph.odometry(newest))
         told = T.copy()
         for place, row in enumerate(rows):
             T_told = graph.segments[row].told
@@ -524,6 +560,9 @@ class LiveMap:
         traces = (T[:, :3, :3] * told[:, :3, :3]).sum(axis=(1, 2))
         least_trace = 1.0 + 2.0 * math.cos(math.radians(options.told_deg))
         changed = (moved2_m2 > options.told_m**2) | (traces < least_trace)
+        if graph.has_scales:
+            scales = [(graph.segments[row].scale, graph.segments[row].told_scale) for row in rows]
+            changed |= np.array([abs(math.log(now / told)) > options.told_scale for now, told in scales])
         return list(zip(rows, T, changed.tolist(), strict=True))
 
     def _cull(self, k: int) -> list[Outcome]:
@@ -595,4 +634,12 @@ class LiveMap:
         return Alignment(
             robot=segment.robot, segment=segment.segment, aligned=aligned, reason=segment.reason,
             T_map_odom=segment.told, covariance=segment.covariance if aligned else None,
+            scale=_scale_of(segment, is_told=True) if aligned else None,
         )  # fmt: skip
+
+
+def _scale_of(segment: Segment, is_told: bool = False) -> float | None:
+    """Return how many metres the unit of an aligned segment is, None of one in metres."""
+    if segment.is_metric:
+        return None
+    return segment.told_scale if is_told else segment.scale

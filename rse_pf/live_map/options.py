@@ -31,7 +31,8 @@ class LiveMapOptions:
             beyond that adds up over all of its segments,
         smoothing_most: and from so many on only the smallest window is taken for it.
         told_m: A correction is told from this change of the alignment on,
-        told_deg: or from this rotation.
+        told_deg: or from this rotation,
+        told_scale: or from this change of the logarithm of its scale.
         doubts: A link that contradicts the graph in so many updates is removed.
         open_links: So many links that are not believed are kept, the newest.
         measured: What a measured relative pose needs to become a link.
@@ -66,6 +67,7 @@ class LiveMapOptions:
     smoothing_most: int = 2_000
     told_m: float = 0.001
     told_deg: float = 0.05
+    told_scale: float = 0.002
     doubts: int = 8
     open_links: int = 400
     measured: RelativePoseOptions = field(

@@ -41,7 +41,9 @@ class Joined:
 class Corrected:
     """The alignment of an aligned segment moved, because of keyframe ``cause`` = (robot, number).
 
-    ``covariance`` ``(6, 6)`` is of the twist (metres, radians) on the left of ``T_map_odom``.
+    ``covariance`` ``(6, 6)`` is of the twist (metres, radians) on the left of ``T_map_odom``.  ``scale`` is
+    how many metres the unit of the segment is, by which its lengths are multiplied before; None if it has
+    metres.
     """
 
     robot: str
@@ -49,6 +51,7 @@ class Corrected:
     T_map_odom: Array
     covariance: Array
     cause: tuple[str, int] | None
+    scale: float | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -102,7 +105,10 @@ class Culled:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Alignment:
-    """Where the newest segment of a robot lies in the map, or the reason why that is unknown."""
+    """Where the newest segment of a robot lies in the map, or the reason why that is unknown.
+
+    ``scale`` is that of `Corrected`.
+    """
 
     robot: str
     segment: int
@@ -110,6 +116,7 @@ class Alignment:
     reason: str
     T_map_odom: Array | None
     covariance: Array | None
+    scale: float | None = None
 
 
 Outcome = (

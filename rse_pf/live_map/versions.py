@@ -9,13 +9,14 @@ from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
+import numpy.typing as npt
 
 from rse_pf.errors import BadMessage, BadRequest, InternalError, LimitExceeded
-from rse_pf.geometry import Array, inverse
+from rse_pf.geometry import inverse
 from rse_pf.live_map.events import MapStarted, StartKeyframe, StartLink, matrix_bytes
 from rse_pf.live_map.graph import Graph, Segment
 from rse_pf.live_map.options import LiveMapOptions
-from rse_pf.live_map.smoothing import edges_of
+from rse_pf.live_map.smoothing import edges_of, link_information
 from rse_pf.maps.format import Edge, EdgeKind, Keyframe, MapVersion
 from rse_pf.slam.inertial import agreed_gravity, upright_turn
 from rse_pf.slam.keyframe import Keyframe as SentKeyframe
@@ -97,7 +98,7 @@ def _version_of(graph: Graph, options: LiveMapOptions) -> MapVersion:
                 id=i, robot=_short_name(row.robot), timestamp_s=row.timestamp_s,
                 T_world_camera=graph.T[i].copy(), camera=seen.camera, pixels=seen.features.pixels,
                 descriptors=seen.features.descriptors, kind=seen.features.kind,
-                points_camera=seen.features.points_camera(seen.camera).astype(np.float32),
+                points_camera=_points_m(seen, graph.segment_of(i)),
             )
         )  # fmt: skip
     # A map that started from a version keeps the axes of that.
@@ -117,7 +118,10 @@ def _version_of(graph: Graph, options: LiveMapOptions) -> MapVersion:
             across = graph.of_segment[link.a] != graph.of_segment[link.b]
             kind: EdgeKind = "odometry" if link.fixed else "merge" if across else "loop"
             edges.append(
-                Edge(a=link.a, b=link.b, T_a_b=link.T_a_b, information=link.information, kind=kind)
+                Edge(
+                    a=link.a, b=link.b, T_a_b=graph.step_of(link), information=link_information(graph, link),
+                    kind=kind,
+                )
             )  # fmt: skip
     provenance = {"made_by": "live", "from": graph.source}
     return MapVersion(keyframes=tuple(keyframes), edges=tuple(edges), provenance=provenance)
@@ -134,6 +138,14 @@ def whole_graph(graph: Graph, options: LiveMapOptions) -> tuple[PoseGraph, list[
         information=edges.information, robust=edges.numbers >= 0, ids=np.array(ids, dtype=np.int64),
     )  # fmt: skip
     return pose_graph, ids
+
+
+def _points_m(seen: SentKeyframe, segment: Segment) -> npt.NDArray[np.float32]:
+    """Return the points of a keyframe in metres, not a number where it has no depth."""
+    points = seen.features.points_camera(seen.camera)
+    if not segment.is_metric:
+        points = np.where(seen.features.depths_m[:, None] > 0.0, segment.scale * points, np.nan)
+    return points.astype(np.float32)
 
 
 def _aligned_segments(graph: Graph) -> list[Segment]:
@@ -155,9 +167,10 @@ def _odometry(graph: Graph, ids: list[int], options: LiveMapOptions) -> list[Edg
     spread = np.array([options.drift.step_m] * 3 + [math.radians(options.drift.step_deg)] * 3) ** -2.0
     edges = []
     for a, b in pairwise(ids):
-        T: Array = graph.T_odom if graph.next_in_segment(a) == b else graph.T
+        is_next = graph.next_in_segment(a) == b
+        from_a, to_b = graph.odometry([a, b]) if is_next else graph.T[[a, b]]
         walked = float(graph.way[b] - graph.way[a])
-        edges.append(Edge(a=a, b=b, T_a_b=inverse(T[a]) @ T[b], information=np.diag(spread / walked)))
+        edges.append(Edge(a=a, b=b, T_a_b=inverse(from_a) @ to_b, information=np.diag(spread / walked)))
     return edges
 
 

@@ -7,12 +7,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
-from rse_pf.geometry import Array, inverse, log_se3
+from rse_pf.geometry import Array, inverse, log_se3, scaled
 
 __all__ = [
     "LinkEnds",
@@ -23,10 +23,13 @@ __all__ = [
     "fits_prediction",
     "largest_clique",
     "round_trips_close",
+    "scale_fits",
 ]
 
 _CHI2_3_99 = 11.345
 """99 % of the squared Mahalanobis norms of a 3-vector lie below."""
+_CHI2_1_99 = 6.635
+"""The same of one number."""
 _MANY_ROWS = 128
 _MAX_BRANCHES = 200_000
 """Limit of the clique search; beyond it the best clique so far is returned."""
@@ -34,10 +37,14 @@ _MAX_BRANCHES = 200_000
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OdometryNoise:
-    """Drift of odometry: standard deviations for each axis from one keyframe to the next (a random walk)."""
+    """Drift of odometry: standard deviations for each axis from one keyframe to the next (a random walk).
+
+    ``step_scale`` is that of the logarithm of the scale of a camera without depth.
+    """
 
     step_m: float = 0.02
     step_deg: float = 0.7
+    step_scale: float = 0.005
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -69,13 +76,16 @@ class LoopClosure:
 class LinkEnds:
     """*m* links as arrays: from rows *a* to rows *b*, ``T_a_b`` ``(m, 4, 4)``, variances ``(m, 6)``.
 
-    The variances are of the twist (square metres, square radians).
+    The variances are of the twist (square metres, square radians).  Where the poses of all ends *b* have
+    another unit than those of all ends *a*, in which ``T_a_b`` is, ``scales`` ``(m, 2)`` are the logarithm of
+    how long it is in that, and its variance.
     """
 
     a: npt.NDArray[np.int64]
     b: npt.NDArray[np.int64]
     T_a_b: Array
     variances: Array
+    scales: Array | None = None
 
     @classmethod
     def of(cls, links: Sequence[LoopClosure]) -> LinkEnds:
@@ -90,8 +100,9 @@ class LinkEnds:
 
     def rows(self, which: slice | npt.NDArray[np.int64]) -> LinkEnds:
         """Return some of the links."""
-        return LinkEnds(
-            a=self.a[which], b=self.b[which], T_a_b=self.T_a_b[which], variances=self.variances[which]
+        return replace(
+            self, a=self.a[which], b=self.b[which], T_a_b=self.T_a_b[which], variances=self.variances[which],
+            scales=None if self.scales is None else self.scales[which],
         )  # fmt: skip
 
     @property
@@ -137,6 +148,9 @@ def round_trips_close(
     separately, at 99 %, against the noise of both links and of the odometry between them; rotation noise acts
     on translation with the length of the path as its lever.
 
+    Where their frames have different units, the scales of two links that agree do, too; the trip is judged by
+    their mean.
+
     Args:
         T: ``(n, 4, 4)``, poses of keyframes; all ends *a* in one frame, and all ends *b* in one.
         links: The *m* links.
@@ -149,12 +163,23 @@ def round_trips_close(
     """
     along_b = inverse(T[last.b]) @ T[links.b]
     along_a = inverse(T[links.a]) @ T[last.a]
+    off2, scale2, apart2 = np.zeros(1), np.zeros(1), np.ones(1)
+    if links.scales is not None and last.scales is not None:
+        off, apart2 = (links.scales - last.scales)[:, 0], links.scales[:, 1] + last.scales[:, 1]
+        # The mean by the information of both.
+        log_scale = last.scales[:, 0] + off * last.scales[:, 1] / apart2
+        along_b = scaled(along_b, np.exp(log_scale))
+        off2, scale2 = off**2, links.scales[:, 1] * last.scales[:, 1] / apart2
     trip = log_se3(last.T_a_b @ along_b @ inverse(links.T_a_b) @ along_a)
     lever_m2 = (along_a[:, :3, 3] ** 2).sum(axis=1) + (along_b[:, :3, 3] ** 2).sum(axis=1)
     m2, rad2 = links.mean_variances
     last_m2, last_rad2 = last.mean_variances
     rad2 = rad2 + last_rad2 + walked * math.radians(noise.step_deg) ** 2
-    return within_noise(trip, m2 + last_m2 + walked * noise.step_m**2 + rad2 * lever_m2, rad2)
+    m2 = m2 + last_m2 + walked * noise.step_m**2 + rad2 * lever_m2
+    if links.scales is None:
+        return within_noise(trip, m2, rad2)
+    m2 = m2 + scale2 * (along_b[:, :3, 3] ** 2).sum(axis=1)
+    return within_noise(trip, m2, rad2) & scale_fits(off2, apart2 + walked * noise.step_scale**2)
 
 
 def fits_prediction(
@@ -173,6 +198,12 @@ def fits_prediction(
     m2, rad2 = links.mean_variances
     turned2 = walked * math.radians(noise.step_deg) ** 2
     return within_noise(off, m2 + walked * noise.step_m**2 + turned2 * lever_m**2, rad2 + turned2)
+
+
+def scale_fits(off2: Array, variance: Array) -> npt.NDArray[np.bool_]:
+    """Return whether squares ``(m,)`` of logarithms of scales are noise of these variances, at 99 %."""
+    fits: npt.NDArray[np.bool_] = off2 <= _CHI2_1_99 * variance
+    return fits
 
 
 def within_noise(xi: Array, m2: Array, rad2: Array) -> npt.NDArray[np.bool_]:

@@ -20,6 +20,8 @@ All numbers are little-endian::
               1, depths: n depths in mm (uint16);
               2, disparities of a stereo pair: focal length in px times baseline in m (float64), n
               disparities in 1/64 px (uint16): depths beyond 65 m are kept
+              3, depths of a segment without scale: the unit (float64), in the unknown unit of length that
+              T_odom_camera has, too; n depths in this unit (uint16; 0: none)
     noise     kind 5, optional: deviation of a depth z in metres is base + growth * max(0, z - from)^2
               (3 float64); a Kinect's where it is left out
     IMU       kind 6, optional: gravity, and the motion since the last keyframe: `rse_pf.slam.inertial`
@@ -53,6 +55,7 @@ __all__ = [
     "decode_keyframe",
     "encode_keyframe",
     "make_features",
+    "make_scaleless_features",
     "most_features",
 ]
 
@@ -69,6 +72,7 @@ _CAMERA = struct.Struct("<BBHH4d")
 _FEATURES = struct.Struct("<BBHHBB")
 _GEOMETRY = struct.Struct("<BBH")
 _F_BASELINE = struct.Struct("<d")
+_UNIT = struct.Struct("<d")
 _CAMERA_KIND, _FEATURES_KIND, _GEOMETRY_KIND = 1, 2, 3
 _NOISE_KIND, _IMU_KIND = 5, 6
 _OPTIONAL = {_NOISE_KIND: "noise", _IMU_KIND: "IMU"}
@@ -76,7 +80,8 @@ _NAMES = {_CAMERA_KIND: "camera", _FEATURES_KIND: "features", _GEOMETRY_KIND: "g
 _NOISE = struct.Struct("<3d")
 _KINECT = DepthNoise()
 _REQUIRED = 1
-_PINHOLE, _ORB, _NAMED, _DEPTH = 1, 1, 2, 1
+_PINHOLE, _ORB, _NAMED = 1, 1, 2
+_DEPTH, _SCALELESS = 1, 3
 _METRICS = {"uint8": 1, "int8": 2}
 _FEATURE_BYTES = 6
 """Of a feature, but for its descriptor."""
@@ -88,6 +93,9 @@ _NEAREST_M, _FARTHEST_M = 0.01, 1000.0
 """Of depths by disparities: poses are refined with depths up to 1 km."""
 _LEAST_F_BASELINE, _MOST_F_BASELINE = 0.05, 1e5
 """Of 50 px and 1 mm, and of 10,000 px and 10 m."""
+_FAR_MEDIANS = 16.0
+"""A landmark so many times as far as the median one has no depth: its place is not known well."""
+_MIN_UNIT, _MAX_UNIT = 1e-9, 1e3
 _BORDER_PX = 64
 """Undistorted pixels may lie so far beyond the image."""
 _MAX_TIME_S = 1e12
@@ -102,6 +110,9 @@ class KeyframeFeatures:
     above 0, with their ``noise`` as the robot measured it; ``descriptors`` ``(n, d)`` of one ``kind``.
     ``f_baseline`` is that of the stereo pair, pixels times metres, whose disparities are encoded; 0 for a
     depth camera.
+
+    With a ``unit``, the depths are no metres but in the length of the robot's segment, whose scale nobody
+    knows; they are multiples of ``unit``, 0 where there is none.
     """
 
     pixels: npt.NDArray[np.float32]
@@ -110,12 +121,18 @@ class KeyframeFeatures:
     noise: DepthNoise = _KINECT
     kind: DescriptorKind = ORB
     f_baseline: float = 0.0
+    unit: float | None = None
 
     def __len__(self) -> int:
         return len(self.depths_m)
 
+    @property
+    def is_metric(self) -> bool:
+        """Whether depths, and the pose of the keyframe, are in metres."""
+        return self.unit is None
+
     def points_camera(self, camera: Camera) -> Array:
-        """Return the ``(n, 3)`` points, metres, in the frame of *camera*, which took the image."""
+        """Return the ``(n, 3)`` points in the frame of *camera*, which took the image, as the depths are."""
         return camera.back_project(self.pixels.astype(np.float64), self.depths_m.astype(np.float64))
 
 
@@ -131,10 +148,10 @@ class UnknownBlock:
 class Keyframe:
     """Where an image was taken and what it shows.
 
-    ``timestamp_s`` is in seconds since 1970.  ``T_odom_camera`` ``(4, 4)``, metres, maps the camera's frame
-    to the odometry frame of the robot's segment; for a keyframe of a version it is the pose in that map.
-    ``imu`` tells where down is, if the robot has an IMU; ``others`` are the blocks that this release does not
-    know.
+    ``timestamp_s`` is in seconds since 1970.  ``T_odom_camera`` ``(4, 4)``, metres (or the unit of its
+    features' depths), maps the camera's frame to the odometry frame of the robot's segment; for a keyframe of
+    a version it is the pose in that map.  ``imu`` tells where down is, if the robot has an IMU; ``others`` are
+    the blocks that this release does not know.
     """
 
     timestamp_s: float
@@ -178,23 +195,13 @@ def make_features(
     Raises:
         BadRequest: The shapes do not fit.
     """
-    n = len(depths_m)
-    fits = pixels.shape == (n, 2) and depths_m.shape == (n,) and len(descriptors) == n
-    if not (fits and kind.describes(descriptors)):
-        raise BadRequest(
-            f"pixels {pixels.shape}, depths_m {depths_m.shape}, descriptors {descriptors.shape} of "
-            f"{descriptors.dtype} do not fit features of {kind}",
-            hint="give one row for each feature",
-        )
+    _check_shapes(pixels, depths_m, descriptors, kind)
     with np.errstate(invalid="ignore", over="ignore"):
         rounded_m = _rounded_depths(np.asarray(depths_m, dtype=np.float64), f_baseline)
-        largest_px = pixels.max(axis=1, initial=-1.0)
-        usable = np.isfinite(rounded_m)
-        usable &= (pixels.min(axis=1, initial=np.inf) >= 0.0) & (largest_px <= _largest_px(_COARSEST))
+        usable = np.isfinite(rounded_m) & _has_pixel(pixels)
     rows = np.flatnonzero(usable)[: most_features(kind)]
-    scale = 2.0 ** _fraction_of(float(largest_px[rows].max(initial=0.0)))
     return KeyframeFeatures(
-        pixels=(np.rint(pixels[rows].astype(np.float64) * scale) / scale).astype(np.float32),
+        pixels=_rounded(pixels[rows]),
         depths_m=rounded_m[rows].astype(np.float32),
         descriptors=np.ascontiguousarray(descriptors[rows]),
         noise=noise,
@@ -211,6 +218,76 @@ def _rounded_depths(depths_m: Array, f_baseline: float) -> Array:
     steps = np.rint(_PER_PX * f_baseline / np.where(depths_m > 0.0, depths_m, np.nan))
     found = f_baseline * _PER_PX / np.where((steps >= 1) & (steps <= 65_535), steps, np.nan)
     return np.where((found >= _NEAREST_M) & (found <= _FARTHEST_M), found, np.nan)
+
+
+def make_scaleless_features(
+    pixels: npt.NDArray[np.floating],
+    depths: npt.NDArray[np.floating],
+    descriptors: Descriptors,
+    kind: DescriptorKind = ORB,
+) -> KeyframeFeatures:
+    """Return the features of a keyframe whose segment has no scale, those with a depth first.
+
+    Args:
+        pixels: ``(n, 2)``, undistorted; rows outside 0..16383 px are left out.
+        depths: ``(n,)`` along the optical axis, in the length of the segment; none: not finite, not above 0.
+        descriptors: ``(n, d)``.
+        kind: Of the descriptors.
+
+    Raises:
+        BadRequest: The shapes do not fit, or no float64 of sensible size is a unit of these depths.
+    """
+    _check_shapes(pixels, depths, descriptors, kind)
+    with np.errstate(invalid="ignore"):
+        usable, known = _has_pixel(pixels), np.where(np.isfinite(depths) & (depths > 0.0), depths, 0.0)
+    has_depth = usable & (known > 0.0)
+    farthest = _FAR_MEDIANS * float(np.median(known[has_depth])) if has_depth.any() else 1.0
+    unit = min(farthest, float(known[has_depth].max(initial=0.0)) or 1.0) / _FARTHEST_MM
+    if not _MIN_UNIT <= unit <= _MAX_UNIT:
+        raise BadRequest(
+            f"depths up to {unit * _FARTHEST_MM:g} have no unit within {_MIN_UNIT:g}..{_MAX_UNIT:g}",
+            hint="choose a unit of the segment in which depths are around 1",
+        )
+    steps = np.rint(np.where(has_depth & (known <= farthest), known, 0.0) / unit)
+    steps = np.where(steps <= _FARTHEST_MM, steps, 0.0)
+    order = np.concatenate([np.flatnonzero(usable & (steps > 0)), np.flatnonzero(usable & (steps == 0))])
+    rows = order[: most_features(kind)]
+    return KeyframeFeatures(
+        pixels=_rounded(pixels[rows]),
+        depths_m=(steps[rows] * unit).astype(np.float32),
+        descriptors=np.ascontiguousarray(descriptors[rows]),
+        kind=kind,
+        unit=unit,
+    )
+
+
+def _check_shapes(
+    pixels: npt.NDArray[np.floating],
+    depths: npt.NDArray[np.floating],
+    descriptors: Descriptors,
+    kind: DescriptorKind,
+) -> None:
+    n = len(depths)
+    fits = pixels.shape == (n, 2) and depths.shape == (n,) and len(descriptors) == n
+    if not (fits and kind.describes(descriptors)):
+        raise BadRequest(
+            f"pixels {pixels.shape}, depths_m {depths.shape}, descriptors {descriptors.shape} of "
+            f"{descriptors.dtype} do not fit features of {kind}",
+            hint="give one row for each feature",
+        )
+
+
+def _has_pixel(pixels: npt.NDArray[np.floating]) -> npt.NDArray[np.bool_]:
+    """Return whether the form of the bytes holds each pixel."""
+    is_positive = pixels.min(axis=1, initial=np.inf) >= 0.0
+    held: npt.NDArray[np.bool_] = is_positive & (pixels.max(axis=1, initial=-1.0) <= _largest_px(_COARSEST))
+    return held
+
+
+def _rounded(pixels: npt.NDArray[np.floating]) -> npt.NDArray[np.float32]:
+    scale = 2.0 ** _fraction_of(float(pixels.max(initial=0.0)))
+    rounded: npt.NDArray[np.float32] = (np.rint(pixels.astype(np.float64) * scale) / scale).astype(np.float32)
+    return rounded
 
 
 def encode_keyframe(keyframe: Keyframe) -> bytes:
@@ -250,6 +327,9 @@ def encode_keyframe(keyframe: Keyframe) -> bytes:
 def _geometry_of(features: KeyframeFeatures) -> tuple[bytes, bytes]:
     """Return the head and the numbers of the block of the geometry."""
     depths, n = features.depths_m.astype(np.float64), len(features)
+    if features.unit is not None:
+        head = _GEOMETRY.pack(_SCALELESS, 0, n) + _UNIT.pack(features.unit)
+        return head, np.rint(depths / features.unit).astype("<u2").tobytes()
     if features.f_baseline == 0.0:
         return _GEOMETRY.pack(_DEPTH, 0, n), np.rint(depths * 1000.0).astype("<u2").tobytes()
     head = _GEOMETRY.pack(_DISPARITY, 0, n) + _F_BASELINE.pack(features.f_baseline)
@@ -288,6 +368,8 @@ def decode_keyframe(data: bytes) -> Keyframe:
             raise _refusal(f"it has no block of the {name}")
     camera = _camera(data, *known[_CAMERA_KIND])
     features = _features(data, known[_FEATURES_KIND], known[_GEOMETRY_KIND], camera)
+    if _NOISE_KIND in known and not features.is_metric:
+        raise _refusal("it has a noise in metres, and depths without scale", "leave the noise out")
     if _NOISE_KIND in known:
         features = replace(features, noise=_noise(data, *known[_NOISE_KIND]))
     imu = None
@@ -300,12 +382,12 @@ def decode_keyframe(data: bytes) -> Keyframe:
     )  # fmt: skip
 
 
-def check_sent(keyframe: Keyframe) -> None:
+def check_sent(keyframe: Keyframe, metres_per_unit: float = 1.0) -> None:
     """Raise BadRequest if a robot cannot have made *keyframe*: it is over 1,000 km from its start.
 
     A keyframe of a version may be: its map can have the origin of a state's survey.
     """
-    if not (np.abs(keyframe.T_odom_camera[:3, 3]) <= _MAX_ODOMETRY_M).all():
+    if not (np.abs(metres_per_unit * keyframe.T_odom_camera[:3, 3]) <= _MAX_ODOMETRY_M).all():
         raise _refusal(
             f"T_odom_camera is more than {_MAX_ODOMETRY_M:.0f} m from the start",
             "send metres of the odometry",
@@ -379,7 +461,7 @@ def _features(
     kind = _kind(detector, metric, descriptor_bytes, bytes(data[end - name_bytes : end]))
     if n > most_features(kind):
         raise _refusal(f"{n} features of {kind} are above {most_features(kind)}")
-    depths_m, f_baseline = _depths(data, depths_begin, depths_end, n)
+    depths, f_baseline, unit = _depths(data, depths_begin, depths_end, n)
     units = np.frombuffer(data, dtype="<u2", count=2 * n, offset=begin + _FEATURES.size).reshape(2, n)
     pixels = (units.T * np.float32(2.0**-fraction)).astype(np.float32, copy=False)
     widest, highest = (camera.width + _BORDER_PX) << fraction, (camera.height + _BORDER_PX) << fraction
@@ -390,26 +472,39 @@ def _features(
     )
     return KeyframeFeatures(
         pixels=pixels,
-        depths_m=depths_m,
+        depths_m=depths,
         descriptors=descriptors.reshape(n, kind.size),
         kind=kind,
         f_baseline=f_baseline,
+        unit=unit,
     )
 
 
-def _depths(data: bytes, begin: int, end: int, n: int) -> tuple[npt.NDArray[np.float32], float]:
-    """Return the depths of *n* features, and the f b of their stereo pair or 0; raises BadRequest."""
+def _depths(data: bytes, begin: int, end: int, n: int) -> tuple[npt.NDArray[np.float32], float, float | None]:
+    """Return the depths of *n* features, the f b of their stereo pair or 0, and their unit or None.
+
+    Raises:
+        BadRequest: They are malformed or absurd.
+    """
     what, zero, count = _GEOMETRY.unpack_from(data, begin)
-    if what not in (_DEPTH, _DISPARITY) or zero:
+    if what not in (_DEPTH, _DISPARITY, _SCALELESS) or zero:
         raise _refusal(f"geometry of kind {what} is not known", "send a depth for each feature")
-    first = begin + _GEOMETRY.size + (_F_BASELINE.size if what == _DISPARITY else 0)
+    first = begin + _GEOMETRY.size + (0 if what == _DEPTH else _UNIT.size)
     if count != n or end - first != 2 * n:
         raise _refusal(f"{count} depths in {end - begin} bytes are not those of {n} features")
     steps = np.frombuffer(data, dtype="<u2", count=n, offset=first)
     if what == _DEPTH:
         if n and steps.min() < _NEAREST_MM:
             raise _refusal(f"a depth is below {_NEAREST_MM} mm")
-        return (steps / 1000.0).astype(np.float32), 0.0
+        return (steps / 1000.0).astype(np.float32), 0.0, None
+    if what == _SCALELESS:
+        unit: float = _UNIT.unpack_from(data, begin + _GEOMETRY.size)[0]
+        if not _MIN_UNIT <= unit <= _MAX_UNIT:
+            raise _refusal(
+                f"its unit of depth {unit:g} is not within {_MIN_UNIT:g}..{_MAX_UNIT:g}",
+                "choose a unit of the segment in which depths are around 1",
+            )
+        return (steps * unit).astype(np.float32), 0.0, unit
     f_baseline: float = _F_BASELINE.unpack_from(data, begin + _GEOMETRY.size)[0]
     if not _LEAST_F_BASELINE <= f_baseline <= _MOST_F_BASELINE:
         raise _refusal(
@@ -423,7 +518,7 @@ def _depths(data: bytes, begin: int, end: int, n: int) -> tuple[npt.NDArray[np.f
             f"depths of {nearest:g} to {farthest:g} m are not within {_NEAREST_M:g}..{_FARTHEST_M:g} m",
             "leave out features whose disparity is too small",
         )
-    return (f_baseline * _PER_PX / steps).astype(np.float32), f_baseline
+    return (f_baseline * _PER_PX / steps).astype(np.float32), f_baseline, None
 
 
 def _kind_numbers(kind: DescriptorKind) -> tuple[int, int, int]:

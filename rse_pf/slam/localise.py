@@ -16,7 +16,14 @@ import numpy as np
 from rse_pf.errors import PnpError
 from rse_pf.geometry import Array, adjoint, exp_se3, inverse, log_se3, pose_difference, transform
 from rse_pf.pnp import PnpOptions, PnpSolution, solve_pnp
-from rse_pf.slam.relative_pose import MeasuredPose, Reference, RelativePoseOptions, View, measure_pose
+from rse_pf.slam.relative_pose import (
+    MeasuredPose,
+    Reference,
+    RelativePoseOptions,
+    View,
+    measure_pose,
+    scale_between,
+)
 
 __all__ = ["LocalisationOptions", "Localised", "PlacedKeyframe", "localise", "spread_candidates"]
 
@@ -63,7 +70,8 @@ class Localised:
     "one-keyframe", or one of PnP); or ``none`` with a reason ("no-candidates", "no-pose") and without a pose.
     ``covariance`` ``(6, 6)`` is of the twist (metres, radians) on the left of ``T_map_camera``.  ``inliers``,
     ``matches`` and ``rmse_px`` are those of the best keyframe; ``keyframes`` are the ids of those that agree,
-    best first.
+    best first.  ``scale`` is how many metres the unit of the view's depths is, None if that is a metre;
+    without it such a view is ``weak`` with the reason "no-scale".
     """
 
     verdict: Literal["ok", "weak", "none"]
@@ -74,6 +82,7 @@ class Localised:
     matches: int = 0
     rmse_px: float = 0.0
     keyframes: tuple[int, ...] = ()
+    scale: float | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -139,14 +148,17 @@ def localise(
     others = [each for each in placements if not _agree(each, best, options)]
     solution = best.found.solution
     T_map_camera, covariance = _fused(agreeing)
-    if view.depths_m is None and len(agreeing) > 1:
+    if (view.depths_m is None or not view.is_metric) and len(agreeing) > 1:
         solution = _solved_together(agreeing, view, options)
         T_map_camera = best.T_map_keyframe @ inverse(solution.T_camera_world)
     reason = _weakness(agreeing, others, solution, options)
+    scale = None if view.is_metric else _scale_of(agreeing, options)
+    if scale is None and not view.is_metric:
+        reason = reason or "no-scale"
     return Localised(
         verdict="weak" if reason else "ok", reason=reason, T_map_camera=T_map_camera, covariance=covariance,
         inliers=best.found.inliers, matches=best.found.matches, rmse_px=best.found.solution.rmse_px,
-        keyframes=tuple(each.keyframe for each in agreeing),
+        keyframes=tuple(each.keyframe for each in agreeing), scale=scale,
     )  # fmt: skip
 
 
@@ -177,6 +189,16 @@ def spread_candidates(
         if len(chosen) == count:
             break
     return chosen
+
+
+def _scale_of(placements: Sequence[_Placement], options: LocalisationOptions) -> float | None:
+    """Return how long the unit of the view is in that of placements that agree, None if none tells."""
+    measured = [scale_between(each.found, options.measured) for each in placements]
+    known = [each for each in measured if each is not None]
+    if not known:
+        return None
+    weights = np.array([1.0 / each.variance for each in known])
+    return math.exp(float(weights @ [each.log_ratio for each in known] / weights.sum()))
 
 
 def _agree(one: _Placement, other: _Placement, options: LocalisationOptions) -> bool:

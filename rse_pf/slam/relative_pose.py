@@ -12,7 +12,7 @@ from functools import lru_cache
 import numpy as np
 
 from rse_pf.errors import PnpError
-from rse_pf.geometry import Array, Camera, inverse
+from rse_pf.geometry import Array, Camera, adjoint, inverse, transform
 from rse_pf.maps.descriptors import Descriptors
 from rse_pf.maps.format import Keyframe
 from rse_pf.native_matcher import match_core
@@ -21,14 +21,17 @@ from rse_pf.slam.descriptors import best_matches
 
 __all__ = [
     "MeasuredPose",
+    "MeasuredScale",
     "Reference",
     "RelativePose",
     "RelativePoseOptions",
     "View",
     "match_points",
+    "measure_inverse_link",
     "measure_link",
     "measure_pose",
     "reference_of",
+    "scale_between",
     "view_of_keyframe",
 ]
 
@@ -37,6 +40,12 @@ _MAX_POINT_M = 1e5
 """No point of a keyframe is further away; PnP refuses all matches for one that is."""
 _NEAREST_M, _FARTHEST_M = 0.01, 100.0
 """Depths that a depth camera may measure; the depth of anything else is left out."""
+_MIN_RATIOS = 12
+"""Points with a depth in both keyframes from which on they tell a scale."""
+_MAX_RATIO_SPREAD = 0.15
+"""Deviation of the logarithms of the depths' ratios beyond which they tell none."""
+_SCALE_FLOOR = 0.01
+"""Smallest deviation of the logarithm of a scale: errors of landmarks of one keyframe are correlated."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -66,7 +75,7 @@ class View:
     """A camera image: ``(n, 2)`` undistorted pixels with their ``(n, d)`` descriptors of any kind.
 
     ``depths_m``, if there are any, are the ``(n,)`` depths at the pixels with their ``noise``, 0 where there
-    is none.
+    is none.  They are in another unit than those of other views unless the view ``is_metric``.
     """
 
     camera: Camera
@@ -74,6 +83,7 @@ class View:
     descriptors: Descriptors
     depths_m: Array | None = None
     noise: DepthNoise = _KINECT
+    is_metric: bool = True
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -91,13 +101,14 @@ class Reference:
 class MeasuredPose:
     """``T_view_reference`` by PnP and depth, and the matches it was found among.
 
-    ``points_reference`` ``(k, 3)`` are metres, in the frame of the reference; ``pixels`` ``(k, 2)`` are those
-    of the view.
+    ``points_reference`` ``(k, 3)`` are metres, in the frame of the reference; ``pixels`` ``(k, 2)`` and
+    ``depths_view`` ``(k,)``, 0 where there is none, are those of the view.
     """
 
     solution: PnpSolution
     points_reference: Array
     pixels: Array
+    depths_view: Array
 
     @property
     def matches(self) -> int:
@@ -110,18 +121,33 @@ class MeasuredPose:
         return len(self.solution.inliers)
 
 
+@dataclass(frozen=True, slots=True)
+class MeasuredScale:
+    """The logarithm of how long the unit of one keyframe is in that of another, and its variance."""
+
+    log_ratio: float
+    variance: float
+
+    @property
+    def inverse(self) -> MeasuredScale:
+        """How long the unit of the other keyframe is in that of the one."""
+        return MeasuredScale(-self.log_ratio, self.variance)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class RelativePose:
     """``T_a_b`` between two keyframes, its ``(6, 6)`` information, and the number of inliers and matches.
 
     The information is the inverse covariance of the twist (metres, radians) in
-    ``log(inverse(T_a_b) @ T_a_b_true)``.
+    ``log(inverse(T_a_b) @ T_a_b_true)``.  ``scale``, where the keyframes have different units, is that of the
+    unit of *b* in the unit of *a*.
     """
 
     T_a_b: Array
     information: Array
     inliers: int
     matches: int
+    scale: MeasuredScale | None = None
 
 
 _DEFAULT = RelativePoseOptions()
@@ -156,7 +182,8 @@ def measure_link(
 
     Returns:
         The relative pose, or the reason why there is none: "no-matches", "no-pose", "few-inliers",
-        "low-inlier-ratio", or the reason why the pose is weak, unless weak poses are links.
+        "low-inlier-ratio", "no-scale" where the view is not metric and the depths of both do not tell a
+        ratio, or the reason why the pose is weak, unless weak poses are links.
     """
     measured = measure_pose(reference, view, options)
     if isinstance(measured, str):
@@ -168,6 +195,9 @@ def measure_link(
     weak = measured.solution.reason
     if weak and not options.weak_variance:
         return weak
+    scale = None if view.is_metric else scale_between(measured, options)
+    if scale is None and not view.is_metric:
+        return "no-scale"
     variance = options.weak_variance if weak else 1.0
     # T_b_a true = exp(xi) T_b_a, and its inverse has exp(-xi) on its right: the same covariance.
     information = np.linalg.inv(variance * measured.solution.covariance + options.floor())
@@ -176,7 +206,50 @@ def measure_link(
         information=0.5 * (information + information.T),
         inliers=measured.inliers,
         matches=measured.matches,
+        scale=scale,
     )
+
+
+def measure_inverse_link(
+    reference: Reference, view: View, options: RelativePoseOptions = _DEFAULT
+) -> RelativePose | str:
+    """Return the pose of *reference* (b) relative to *view* (a), as `measure_link` does of the view."""
+    found = measure_link(reference, view, options)
+    if isinstance(found, str):
+        return found
+    # inverse(T exp(xi)) = inverse(T) exp(-Ad(T) xi).
+    back = adjoint(inverse(found.T_a_b))
+    information = back.T @ found.information @ back
+    return RelativePose(
+        T_a_b=inverse(found.T_a_b), information=0.5 * (information + information.T), inliers=found.inliers,
+        matches=found.matches, scale=None if found.scale is None else found.scale.inverse,
+    )  # fmt: skip
+
+
+def scale_between(measured: MeasuredPose, options: RelativePoseOptions = _DEFAULT) -> MeasuredScale | None:
+    """Return how long the unit of the view's depths is in that of the reference's points.
+
+    It is the median of the ratios of depths among the inliers; None if too few of them have a depth, or they
+    do not agree.  What the pose may be wrong by along the axis of the view counts, too.
+    """
+    rows = measured.solution.inliers[measured.depths_view[measured.solution.inliers] > 0.0]
+    expected = transform(measured.solution.T_camera_world, measured.points_reference[rows])[:, 2]
+    known = measured.depths_view[rows]
+    is_before = expected > 0.0
+    if np.count_nonzero(is_before) < _MIN_RATIOS:
+        return None
+    ratios = np.log(expected[is_before] / known[is_before])
+    log_ratio = float(np.median(ratios))
+    spread = 1.4826 * float(np.median(np.abs(ratios - log_ratio)))
+    if spread > _MAX_RATIO_SPREAD:
+        return None
+    along = math.sqrt(float(measured.solution.covariance[2, 2])) + options.floor_m
+    variance = (
+        0.5 * math.pi * spread**2 / len(ratios)
+        + _SCALE_FLOOR**2
+        + (along / float(np.median(expected[is_before]))) ** 2
+    )
+    return MeasuredScale(log_ratio, variance)
 
 
 def measure_pose(
@@ -184,7 +257,8 @@ def measure_pose(
 ) -> MeasuredPose | str:
     """Return ``T_view_reference``, or the reason why there is none: "no-matches" or "no-pose".
 
-    The pose is refined with the depths of *view*, if it has any and all matched points lie before the camera.
+    The pose is refined with the depths of *view*, if it has any, is metric, and all matched points lie before
+    the camera.
 
     Args:
         reference: Whose points are sought.
@@ -199,9 +273,9 @@ def measure_pose(
         solution = solve_pnp(points, pixels, view.camera, _pnp_options(options.inlier_px))
     except PnpError:
         return "no-pose"
-    if view.depths_m is not None and points[:, 2].min() >= _NEAREST_M:
+    if view.depths_m is not None and view.is_metric and points[:, 2].min() >= _NEAREST_M:
         solution = refine_with_depth(solution, points, pixels, depths_m, view.camera, view.noise)
-    return MeasuredPose(solution=solution, points_reference=points, pixels=pixels)
+    return MeasuredPose(solution=solution, points_reference=points, pixels=pixels, depths_view=depths_m)
 
 
 def match_points(

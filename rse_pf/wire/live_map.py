@@ -110,7 +110,10 @@ class LiveRelocaliseV1(_Value, frozen=True, kw_only=True):
 
 
 class RelocaliseReply(_Value, frozen=True, kw_only=True):
-    """The pose with its verdict, and why it is not ``ok``; ``none`` comes without a pose."""
+    """The pose with its verdict, and why it is not ``ok``; ``none`` comes without a pose.
+
+    ``scale`` is how many metres the unit of the keyframe is, none if it is a metre.
+    """
 
     verdict: Literal["ok", "weak", "none"]
     reason: str = ""
@@ -119,6 +122,7 @@ class RelocaliseReply(_Value, frozen=True, kw_only=True):
     inliers: int = 0
     matches: int = 0
     version: int = 0
+    scale: float | None = None
 
 
 class LiveForget(_Value, frozen=True, kw_only=True):
@@ -169,7 +173,11 @@ class MapCause(_Value, frozen=True, kw_only=True):
 
 
 class AlignmentUpdate(_Value, frozen=True, kw_only=True):
-    """Payload of the key ``alignment/ROBOT``: where a robot's odometry frame lies in the map."""
+    """Payload of the key ``alignment/ROBOT``: where a robot's odometry frame lies in the map.
+
+    ``scale`` is how many metres the unit of the segment is, by which its lengths are multiplied before
+    ``T_map_odom``; none if it is a metre.
+    """
 
     robot: str
     segment: int
@@ -179,6 +187,7 @@ class AlignmentUpdate(_Value, frozen=True, kw_only=True):
     covariance: Array | None = None
     version: int = 0
     cause: MapCause | None = None
+    scale: float | None = None
 
 
 class PoseUpdate(_Value, frozen=True, kw_only=True):

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import math
 import secrets
 import time
 from collections.abc import Mapping, Sequence
@@ -91,11 +92,15 @@ class LiveFeed:
 
 
 class RobotPaths:
-    """Where each robot of a live map has been, in its odometry frame, which corrections move as a whole."""
+    """Where each robot of a live map has been, in its odometry frame, which corrections move as a whole.
+
+    They are metres: where a robot has none, what its unit is found to be stretches its path.
+    """
 
     def __init__(self) -> None:
         """Know no robot yet."""
         self._T_map_odom: dict[str, tuple[Any, Any]] = {}
+        self._scales: dict[str, tuple[Any, float]] = {}
         self._paths: dict[str, dict[str, Any]] = {}
 
     def take(self, value: Mapping[str, Any]) -> dict[str, Any] | None:
@@ -104,6 +109,7 @@ class RobotPaths:
         T_map_odom, T_map_camera = value.get("T_map_odom"), value.get("T_map_camera")
         if value.get("kind") == "alignment" and value.get("aligned") and _is_matrix(T_map_odom):
             self._T_map_odom[robot] = (segment, T_map_odom)
+            self._stretch(robot, segment, value.get("scale"))
         known = self._T_map_odom.get(robot)
         if (
             value.get("kind") != "pose"
@@ -118,6 +124,16 @@ class RobotPaths:
             path = self._paths[robot] = {"segment": segment, "points": []}
         path["points"] = [*path["points"], _position_in_odometry(known[1], T_map_camera)][-_MAX_PATH:]
         return path
+
+    def _stretch(self, robot: str, segment: Any, scale: Any) -> None:
+        """Take how many metres the unit of a robot's segment is, if it has one."""
+        if not isinstance(scale, float) or not 0.0 < scale < math.inf:
+            return
+        before, path = self._scales.get(robot), self._paths.get(robot)
+        self._scales[robot] = segment, scale
+        if before is not None and path is not None and before[0] == segment == path["segment"]:
+            stretch = scale / before[1]
+            path["points"] = [[stretch * each for each in point] for point in path["points"]]
 
 
 def plain(value: Any) -> Any:

@@ -102,6 +102,14 @@ MESSAGES: dict[str, Message] = {
             "cause": {"robot": "robot-2", "number": 17},
         },
     ),
+    "update-of-an-alignment-with-a-scale": Update(
+        id=8, topic="live/warehouse", seq=3, key="alignment/robot-7",
+        payload={
+            "kind": "alignment", "robot": "robot-7", "segment": 2, "aligned": True, "reason": "",
+            "T_map_odom": np.array([1, 0, 0, 0.5, 0, 1, 0, -2.0, 0, 0, 1, 0.25, 0, 0, 0, 1.0]),
+            "covariance": np.arange(1, 22) / 64, "version": 1236, "cause": None, "scale": 0.52,
+        },
+    ),
     "update-of-an-unaligned-robot": Update(
         id=8, topic="live/warehouse", seq=4, key="alignment/robot-7",
         payload={

@@ -16,6 +16,7 @@ __all__ = ["relocalise_reply", "show_missing", "show_reply", "version_reply"]
 
 def relocalise_reply(found: Any, version: int) -> dict[str, Any]:
     """Return the answer to a robot that asked where it is; *found* is a `Localised`."""
+    scale = {} if found.scale is None else {"scale": found.scale}
     return {
         "verdict": found.verdict,
         "reason": found.reason,
@@ -24,6 +25,7 @@ def relocalise_reply(found: Any, version: int) -> dict[str, Any]:
         "inliers": found.inliers,
         "matches": found.matches,
         "version": version,
+        **scale,
     }
 
 

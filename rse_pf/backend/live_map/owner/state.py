@@ -23,7 +23,7 @@ from rse_pf.backend.live_map.owner.threads import Threads, Urgency
 from rse_pf.backend.live_map.owner.whole_fit import WholeFit
 from rse_pf.backend.log import JsonLog
 from rse_pf.errors import BadRequest, NotFound
-from rse_pf.geometry import Array
+from rse_pf.geometry import Array, scaled
 from rse_pf.live_map.events import (
     Event,
     KeyframeAdded,
@@ -345,6 +345,8 @@ class UpdateBook:
                 "covariance": None if each.covariance is None else upper_triangle(each.covariance),
                 "cause": None if cause is None else {"robot": self._name_of(cause[0]), "number": cause[1]},
             }  # fmt: skip
+            if each.scale is not None:
+                payload["scale"] = each.scale
             told += self._put(payload)
         gone = {
             f"{kind}/{self._name_of(folder)}" for kind in ("alignment", "pose") for folder in self._alignments
@@ -358,7 +360,7 @@ class UpdateBook:
         found = self._alignments.get(event.robot)
         if found is None or not found.aligned or found.segment != event.segment or found.T_map_odom is None:
             return []
-        T_map_camera = found.T_map_odom @ event.keyframe.T_odom_camera
+        T_map_camera = found.T_map_odom @ scaled(event.keyframe.T_odom_camera, found.scale or 1.0)
         return self._put(
             {
                 "kind": "pose",
