@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rse_pf.errors import BadMessage, BadRequest, InternalError, LimitExceeded
-from rse_pf.geometry import inverse
+from rse_pf.geometry import Array, inverse
 from rse_pf.live_map.events import MapStarted, StartKeyframe, StartLink, matrix_bytes
 from rse_pf.live_map.graph import Graph, Segment
 from rse_pf.live_map.options import LiveMapOptions

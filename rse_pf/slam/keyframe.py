@@ -150,8 +150,8 @@ class Keyframe:
 
     ``timestamp_s`` is in seconds since 1970.  ``T_odom_camera`` ``(4, 4)``, metres (or the unit of its
     features' depths), maps the camera's frame to the odometry frame of the robot's segment; for a keyframe of
-    a version it is the pose in that map.  ``imu`` tells where down is, if the robot has an IMU; ``others`` are
-    the blocks that this release does not know.
+    a version it is the pose in that map.  ``imu`` tells where down is, if the robot has an IMU; ``others``
+    are the blocks that this release does not know.
     """
 
     timestamp_s: float
