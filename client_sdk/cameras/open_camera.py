@@ -28,7 +28,7 @@ from client_sdk.rigs.rig_file import read_calibration, read_rig
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Camera
 
-__all__ = ["open_camera", "source_of_frames"]
+__all__ = ["is_recording", "open_camera", "source_of_frames"]
 
 _ROS = {".mcap", ".db3"}
 
@@ -80,7 +80,7 @@ def open_camera(
             f"{word} is a ROS bag",
             hint="read it with rse-pf map from-bag (extra bags)",
         )
-    if _is_recording(path):
+    if is_recording(path):
         dataset = open_dataset(path, camera=camera, imu=imu)
         dataset.check()
         if isinstance(own, Rig) or (own is not None and own.camera != dataset.camera):
@@ -134,7 +134,8 @@ def source_of_frames(
     return FrameStream(about, ((frame.timestamp_s, frame) for frame in frames), make, close=close)
 
 
-def _is_recording(path: Path) -> bool:
+def is_recording(path: Path) -> bool:
+    """Say whether a path is a recording that lists its images, or a labelled file."""
     is_listed = (path / "depth.txt").is_file() or any(path.glob("d-*.pgm"))
     return path.suffix == ".mat" or is_listed or is_euroc(path) or is_kitti(path)
 

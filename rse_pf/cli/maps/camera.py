@@ -233,10 +233,12 @@ def _frames(source: str) -> Iterator[tuple[float, npt.NDArray[np.uint8], bool]]:
     """Yield time stamp, colours and whether there is depth; a video and a device need no intrinsics here."""
     from client_sdk.cameras import open_camera
     from client_sdk.cameras.folder import open_folder
+    from client_sdk.cameras.open_camera import is_recording
     from client_sdk.cameras.opencv_video import open_video
 
     path = Path(source)
-    if path.is_dir() and not (path / "rgb.txt").exists() and not any(path.glob("d-*.pgm")):
+    has_pairs = (path / "left").is_dir() and (path / "right").is_dir()
+    if path.is_dir() and not has_pairs and not is_recording(path) and not (path / "rgb.txt").exists():
         images, _ = open_folder(path, 1000.0)
         yield from ((stamp, rgb, depth_m is not None) for stamp, rgb, depth_m in images)
     elif source == "realsense" or path.is_dir() or path.suffix in (".bag", ".mat", ".mcap", ".db3"):
