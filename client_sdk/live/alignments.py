@@ -6,13 +6,14 @@ tracking that was lost begins a new one.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
 
 from rse_pf.errors import BadMessage
-from rse_pf.geometry import Array, inverse
+from rse_pf.geometry import Array, inverse, scaled
 from rse_pf.wire import as_type
 from rse_pf.wire.live_map import AlignmentUpdate, MapUpdate, PoseUpdate, RelocaliseReply
 
@@ -29,13 +30,22 @@ class SegmentAlignment:
     """Where one odometry frame lies in the map; ``reason`` says why that is unknown.
 
     ``covariance`` ``(6, 6)`` is of the twist (metres, radians) on the left of ``T_map_odom`` ``(4, 4)``.  An
-    alignment by relocalisation comes from one keyframe, and holds until the map has its own.
+    alignment by relocalisation comes from one keyframe, and holds until the map has its own.  ``scale`` is
+    how many metres the unit of the odometry frame is; its lengths are multiplied by it before.
     """
 
     T_map_odom: Array | None = None
     covariance: Array | None = None
     by: AlignedBy = "nothing"
     reason: str = NOT_ASKED
+    scale: float = 1.0
+
+    def in_map(self, T_odom_camera: Array) -> Array | None:
+        """Return a pose of the odometry frame in the map, metres; None while it is not aligned."""
+        if self.T_map_odom is None:
+            return None
+        placed: Array = self.T_map_odom @ scaled(T_odom_camera, self.scale)
+        return placed
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -43,7 +53,8 @@ class Correction:
     """The alignment of a segment changed: every later ``T_map_camera`` uses the new one.
 
     ``before`` and ``after`` are ``T_map_odom`` ``(4, 4)``, None where the segment was or is not aligned.
-    ``cause`` is the robot and the number of the keyframe that made the map change, if one did.
+    ``cause`` is the robot and the number of the keyframe that made the map change, if one did.  ``scale`` is
+    how many metres the unit of the segment is, 1 where it has metres.
     """
 
     segment: int
@@ -54,6 +65,7 @@ class Correction:
     reason: str
     version: int
     cause: tuple[str, int] | None
+    scale: float = 1.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -132,10 +144,11 @@ class Alignments:
                 self._segments[segment] = SegmentAlignment(reason=why)
             return None
         found = SegmentAlignment(
-            T_map_odom=_pose(reply.T_map_camera) @ inverse(T_odom_camera),
+            T_map_odom=_pose(reply.T_map_camera) @ inverse(scaled(T_odom_camera, _scale(reply.scale))),
             covariance=_covariance(reply.covariance),
             by="relocalisation",
             reason="",
+            scale=_scale(reply.scale),
         )
         self.version = max(self.version, reply.version)
         return self._set(segment, found, None)
@@ -173,6 +186,7 @@ class Alignments:
             covariance=_covariance(update.covariance),
             by="map",
             reason="",
+            scale=_scale(update.scale),
         )
         return self._set(segment, found, update)
 
@@ -180,10 +194,11 @@ class Alignments:
         self, segment: int, found: SegmentAlignment, update: AlignmentUpdate | None
     ) -> Correction | None:
         """Keep *found*, and return the correction if the transform changed."""
-        before = self.of(segment).T_map_odom
+        before, scale = self.of(segment).T_map_odom, self.of(segment).scale
         self._segments[segment] = found
         after = found.T_map_odom
-        if before is after or (before is not None and after is not None and np.array_equal(before, after)):
+        is_equal = before is not None and after is not None and np.array_equal(before, after)
+        if before is after or (is_equal and scale == found.scale):
             return None
         cause = None if update is None or update.cause is None else (update.cause.robot, update.cause.number)
         return Correction(
@@ -195,6 +210,7 @@ class Alignments:
             reason=found.reason,
             version=self.version,
             cause=cause,
+            scale=found.scale,
         )
 
 
@@ -207,6 +223,15 @@ def _pose(numbers: Any) -> Array:
     if pose.shape != (16,) or not np.isfinite(pose).all():
         raise BadMessage("a pose needs 16 finite numbers", hint="update the server")
     return pose.reshape(4, 4)
+
+
+def _scale(scale: float | None) -> float:
+    """Return how many metres a unit is; raises BadMessage where it is none."""
+    if scale is None:
+        return 1.0
+    if not 0.0 < scale < math.inf:
+        raise BadMessage("a scale is above 0 and finite", hint="update the server")
+    return scale
 
 
 def _covariance(numbers: Any) -> Array | None:

@@ -371,9 +371,9 @@ class LiveMapper:
     def map_trajectory(self) -> Trajectory:
         """The poses of all segments that are aligned, in the map, by the newest alignment of each."""
         placed = [
-            (stamp, T_map_odom @ pose)
+            (stamp, T_map_camera)
             for stamp, segment, pose in self._poses
-            if (T_map_odom := self._alignments.of(segment).T_map_odom) is not None
+            if (T_map_camera := self._alignments.of(segment).in_map(pose)) is not None
         ]
         return Trajectory(
             np.array([stamp for stamp, _ in placed]), np.array([pose for _, pose in placed]).reshape(-1, 4, 4)
@@ -570,11 +570,11 @@ class LiveMapper:
 
     def _place_in_map(self, done: TrackedFrame) -> TrackedFrame:
         """Return the result with its place in the map by the alignment of this moment."""
-        T_map_odom, pose = self.T_map_odom, done.T_world_camera
+        pose = done.T_world_camera
         placed = replace(
             done,
             segment=self._segment,
-            T_map_camera=None if T_map_odom is None or pose is None else T_map_odom @ pose,
+            T_map_camera=None if pose is None else self._alignments.of(self._segment).in_map(pose),
             corrected=self._is_corrected,
         )
         self._is_corrected = False
