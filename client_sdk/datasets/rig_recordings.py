@@ -243,7 +243,14 @@ def _asl(folder: Path) -> Path:
 def _euroc_images(folder: Path) -> tuple[list[Path], Array]:
     rows = _csv(folder / "data.csv", 2)
     stamps_s = read_numbers(folder / "data.csv", [row[0] for row in rows]) / 1e9
-    return [folder / "data" / row[1].strip() for row in rows], stamps_s
+    names = [row[1].strip() for row in rows]
+    outside = [name for name in names if Path(name).name != name]
+    if outside:
+        raise UsageError(
+            f"{folder / 'data.csv'} names {outside[0]!r}, which is no image of its folder data",
+            hint="write the name of a file alone",
+        )
+    return [folder / "data" / name for name in names], stamps_s
 
 
 def _kitti_images(folder: Path) -> list[Path]:

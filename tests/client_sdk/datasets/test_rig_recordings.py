@@ -223,6 +223,8 @@ def test_recordings_without_truth_are_read(tmp_path: Path) -> None:
         ("mav0/cam0/data.csv", "#\n", "has no images"),
         ("mav0/cam0/data.csv", "2,b.png\n1,a.png\n", "do not ascend"),
         ("mav0/cam0/data.csv", "x,a.png\n", "no number"),
+        ("mav0/cam0/data.csv", "1,../a.png\n", "no image of its folder"),
+        ("mav0/cam0/data.csv", "1,/etc/a.png\n", "no image of its folder"),
         ("mav0/state_groundtruth_estimate0/data.csv", "1,2,3\n", "less than 8 values"),
     ],
 )
