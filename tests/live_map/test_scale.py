@@ -10,10 +10,11 @@ import msgspec
 import numpy as np
 import pytest
 
-from benchmarks.live.generated_drives import GeneratedDrive, GeneratedWorld, circle, straight
+from benchmarks.live.generated_drives import GeneratedDrive, GeneratedWorld, circle, make_link, straight
 from benchmarks.live.hostile_robot import play, without
 from rse_pf.errors import BadRequest
 from rse_pf.geometry import Array, exp_se3, inverse, pose_difference, scaled
+from rse_pf.live_map.agreement import scale_into, step_into
 from rse_pf.live_map.events import (
     Event,
     LinksMeasured,
@@ -28,6 +29,7 @@ from rse_pf.live_map.live_map import UP_TO_SCALE, LiveMap
 from rse_pf.live_map.measure import measure_links
 from rse_pf.live_map.outcomes import Corrected, Joined
 from rse_pf.services.synthetic_maps import make_world
+from rse_pf.slam.consistency import LinkEnds, OdometryNoise, round_trips_close
 from rse_pf.slam.keyframe import KeyframeFeatures, make_features, make_scaleless_features
 from rse_pf.slam.smoother import ScaleTerms, smooth
 
@@ -232,6 +234,47 @@ def test_rooms_of_a_stated_size_are_measured_in_metres() -> None:
 
     assert at_m
     assert at_m[0] > 4.0
+
+
+@pytest.mark.parametrize("units_m", [(0.5, 3.0), (None, 3.0), (0.5, None)])
+def test_a_link_says_one_place_whichever_of_its_ends_was_measured(
+    units_m: tuple[float | None, float | None],
+) -> None:
+    world, live_map = GeneratedWorld(seed=12), LiveMap()
+    for name, phase, unit_m in zip("ab", (0.0, 0.3), units_m, strict=True):
+        live_map.apply(world.keyframe(world.drive(name, circle(1.0, 0.5, phase), unit_m=unit_m), 3))
+    graph = live_map._graph
+    live_map.apply(LinksMeasured(keyframe=1, links=(world.in_units(1, make_link(0, world.step(1, 0))),)))
+    live_map.apply(LinksMeasured(keyframe=0, links=(world.in_units(0, make_link(1, world.step(0, 1))),)))
+
+    for stay in (0, 1) if None not in units_m else (units_m.index(None),):
+        moving, unit_m = 1 - stay, units_m[stay] or 1.0
+        for number, link in graph.links.items():
+            assert link.scale is not None
+            true = math.log((units_m[1 - link.a] or 1.0) / (units_m[link.a] or 1.0))
+            link.scale = true, link.scale[1]
+            log_scale, variance = scale_into(graph, number, stay)
+            ends = step_into(graph, number, stay, log_scale)
+            length = graph.segments[stay].scale / unit_m
+            assert variance > 0.0
+            assert (ends.a, ends.b) == (stay, moving)
+            np.testing.assert_allclose(ends.T_a_b, scaled(world.step(stay, moving), length), atol=1e-9)
+
+
+def test_links_of_one_place_whose_scales_differ_do_not_agree() -> None:
+    T = np.array([np.eye(4)] * 2)
+
+    def ends(log_scale: float) -> LinkEnds:
+        return LinkEnds(
+            a=np.array([0]), b=np.array([1]), T_a_b=np.eye(4)[None], variances=np.full((1, 6), 1e-4),
+            scales=np.array([[log_scale, 0.03**2]]),
+        )  # fmt: skip
+
+    def agree(other: float) -> bool:
+        return bool(round_trips_close(T, ends(0.7), ends(other), np.zeros(1), OdometryNoise())[0])
+
+    assert agree(0.75)
+    assert not agree(0.9)
 
 
 # --- measured from features ---
