@@ -28,12 +28,15 @@ from client_sdk.bags.index import BagIndex, nearest_gap_s, pair_stamps, read_ind
 from client_sdk.bags.lens import Lens, Rectifier, lens_of
 from client_sdk.bags.message_types import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, POSE
 from client_sdk.bags.registration import register_depth
+from client_sdk.bags.stereo import pair_of
 from client_sdk.bags.stream import ImageStream
 from client_sdk.closing import Closing
-from client_sdk.frontend import Frame
+from client_sdk.frontend import Frame, load_opencv
 from client_sdk.mapping import Trajectory
+from client_sdk.rigs.rectification import Rectification
+from client_sdk.rigs.rig import Rig, RigCamera
 from rse_pf.errors import UsageError
-from rse_pf.geometry import Array, Camera
+from rse_pf.geometry import Array, Camera, inverse
 
 __all__ = ["Bag", "BagOptions", "open_bag"]
 
@@ -46,14 +49,17 @@ class BagOptions:
     """How a bag is read; a topic that is not named is found by its type.
 
     Attributes:
-        colour: Topic of the colours.
+        colour: Topic of the colours; of a stereo pair, the left camera.
         depth: Topic of the depth.
+        right: Topic of the right camera of a stereo pair.
         info: Topic of the camera of the colours.
         truth: Topic of true poses: PoseStamped, PoseWithCovarianceStamped or Odometry.
         lens: The camera, instead of that in the bag.
+        rig: The cameras of a stereo pair, or the one camera, instead of those in the bag.
         depth_scale: Units of a 16-bit depth image in a metre.
-        pair_within_s: Colour and depth belong together up to this difference of their time stamps.
-        use_depth: False leaves the depth out.
+        pair_within_s: Colour and depth, or left and right, belong together up to this difference of stamps.
+        use_depth: False leaves the depth out, and takes one camera unless *right* is named.
+        use_stereo: None takes a pair where there is no depth; True takes it always, False its left camera.
 
     Raises:
         UsageError: A number is not above 0.
@@ -61,12 +67,15 @@ class BagOptions:
 
     colour: str | None = None
     depth: str | None = None
+    right: str | None = None
     info: str | None = None
     truth: str | None = None
     lens: Lens | None = None
+    rig: Rig | None = None
     depth_scale: float = 1000.0
     pair_within_s: float = 0.02
     use_depth: bool = True
+    use_stereo: bool | None = None
 
     def __post_init__(self) -> None:
         for name, value in (("depth_scale", self.depth_scale), ("pair_within_s", self.pair_within_s)):
@@ -97,7 +106,13 @@ class Bag(Closing):
     _rectify_depth: Rectifier
     _depth_scale: float
     _registration: tuple[Camera, Array] | None = None
+    _rectification: Rectification | None = None
     _no_depth: npt.NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 0), dtype=np.float32))
+
+    @property
+    def has_stereo(self) -> bool:
+        """Whether frames are stereo pairs; then the camera is the rectified left one."""
+        return self._rectification is not None
 
     def __len__(self) -> int:
         return len(self._pairs)
@@ -113,13 +128,29 @@ class Bag(Closing):
         """
         raw = self._stream.take(self._pairs[row])
         try:
-            rgb = self._rectify_colour.colour(decode_colour(self._file.parse(raw[0])))
+            colours = decode_colour(self._file.parse(raw[0]))
+            if self._rectification is not None:
+                return self._stereo_frame(row, self._rectification, colours, raw[1])
+            rgb = self._rectify_colour.colour(colours)
             depth_m = self._depth_of(raw)
         except BrokenMessage as error:
             raise UsageError(
                 f"{self.name} at {self.timestamps_s[row]:.6f} s: {error}", hint="record the bag again"
             ) from error
         return Frame(timestamp_s=self.timestamps_s[row], rgb=rgb, depth_m=depth_m, camera=self.camera)
+
+    def _stereo_frame(
+        self, row: int, rectify: Rectification, colours: npt.NDArray[np.uint8], raw: RawMessage
+    ) -> Frame:
+        cv2 = load_opencv()
+        gray = cv2.cvtColor(decode_colour(self._file.parse(raw)), cv2.COLOR_RGB2GRAY)
+        return Frame(
+            timestamp_s=self.timestamps_s[row],
+            rgb=rectify.left(colours),
+            depth_m=self._no_depth,
+            camera=self.camera,
+            stereo=rectify.right(gray),
+        )
 
     def _depth_of(self, raw: list[RawMessage]) -> npt.NDArray[np.float32]:
         if not self.has_depth:
@@ -160,17 +191,22 @@ def _open(file: BagFile, options: BagOptions) -> Bag:
         {topic: frame for topic, (frame, _) in infos.items()},
         colour=options.colour,
         depth=options.depth,
+        right=options.right,
         info=options.info,
         poses=options.truth,
         use_depth=options.use_depth,
+        use_stereo=options.use_stereo,
     )
     lens = _lens_of_colour(file, chosen, infos, options, formats)
-    camera = lens.camera
     index = read_index(file, chosen, formats)
+    rectification, T_left_camera = _rectification(file, chosen, formats, infos, index, options)
+    camera = lens.camera if rectification is None else rectification.camera
     pairs = _pairs(name, index, chosen, options)
     rectify_depth, registration, note = _depth_way(file, chosen, formats, infos, lens, index)
     stamps_ns = [pair[0][1] for pair in pairs]
     truth, truth_kind, truth_note = _truth(chosen, formats, index, stamps_ns)
+    if truth is not None:
+        truth = Trajectory(truth.timestamps_s, truth.T_world_camera @ T_left_camera)
     no_depth = np.zeros((camera.height, camera.width), dtype=np.float32)
     no_depth.flags.writeable = False
     return Bag(
@@ -182,6 +218,7 @@ def _open(file: BagFile, options: BagOptions) -> Bag:
         truth_kind=truth_kind,
         notes=(
             *_notes(chosen, formats, lens, options),
+            *_pair_note(rectification),
             *note,
             truth_note,
             *_losses(index, pairs, chosen, options),
@@ -190,10 +227,11 @@ def _open(file: BagFile, options: BagOptions) -> Bag:
         _file=file,
         _stream=ImageStream(file, list({pair[0] for pair in pairs[0]}), use_log_time=index.uses_log_time),
         _pairs=tuple(pairs),
-        _rectify_colour=Rectifier(lens, camera),
+        _rectify_colour=Rectifier(lens, lens.camera),
         _rectify_depth=rectify_depth,
         _depth_scale=options.depth_scale,
         _registration=registration,
+        _rectification=rectification,
         _no_depth=no_depth,
     )
 
@@ -237,6 +275,8 @@ def _lens_of_colour(
 ) -> Lens:
     if options.lens is not None:
         return options.lens
+    if options.rig is not None:
+        return Lens.of(options.rig.left.lens)
     info = chosen.colour_info
     if info is None or info.name not in infos:
         raise UsageError(
@@ -245,41 +285,103 @@ def _lens_of_colour(
             hint="name its topic with --info TOPIC, or give a file with --intrinsics",
         )
     lens = lens_of(file.parse(infos[info.name][1]), info.name, is_rectified=is_rectified(chosen.colour))
-    size = formats[chosen.colour.name].size
-    if size is not None and size != (lens.camera.width, lens.camera.height):
+    _check_size(chosen.colour.name, formats, info.name, lens.camera)
+    return lens
+
+
+def _check_size(topic: str, formats: Mapping[str, ImageFormat], source: str, camera: Camera) -> None:
+    size = formats[topic].size
+    if size is not None and size != (camera.width, camera.height):
         raise UsageError(
-            f"{chosen.colour.name} has images of {size[0]}x{size[1]} px, {info.name} is for "
-            f"{lens.camera.width}x{lens.camera.height} px",
+            f"{topic} has images of {size[0]}x{size[1]} px, {source} is for "
+            f"{camera.width}x{camera.height} px",
             hint="give intrinsics of that size: --intrinsics intrinsics.json",
         )
-    return lens
+
+
+def _rectification(
+    file: BagFile,
+    chosen: ChosenTopics,
+    formats: dict[str, ImageFormat],
+    infos: _Lenses,
+    index: BagIndex,
+    options: BagOptions,
+) -> tuple[Rectification | None, Array]:
+    """Return how a pair is rectified, and ``(4, 4)`` its left camera's pose in the one as it is."""
+    if chosen.right is None:
+        return None, np.eye(4)
+    if options.rig is not None:
+        left, right = options.rig.left, options.rig.right
+        if right is None:
+            raise UsageError("the rig has one camera", hint="give a rig of two, or take one: --no-depth")
+        _check_size(chosen.colour.name, formats, "the rig", left.lens.camera)
+        _check_size(chosen.right.name, formats, "the rig", right.lens.camera)
+    else:
+        if options.lens is not None:
+            raise UsageError(
+                "the intrinsics are those of one camera, and a pair needs two",
+                hint="give --intrinsics rig.json, or take one camera: --no-depth",
+            )
+        left, right = _pair_of_bag(file, chosen, formats, infos, index)
+    rectification = Rectification(left, right)
+    return rectification, inverse(left.T_body_camera) @ rectification.T_body_camera
+
+
+def _pair_of_bag(
+    file: BagFile,
+    chosen: ChosenTopics,
+    formats: dict[str, ImageFormat],
+    infos: _Lenses,
+    index: BagIndex,
+) -> tuple[RigCamera, RigCamera]:
+    left, right = chosen.colour_info, chosen.right_info
+    assert chosen.right is not None
+    if left is None or right is None or right.name not in infos:
+        raise UsageError(
+            f"the bag has no camera_info for {chosen.right.name}; its topics: "
+            f"{topics_line(file.topics, formats)}",
+            hint="give both cameras with --intrinsics rig.json, or take one: --no-depth",
+        )
+    messages = [
+        (info.name, file.parse(infos[info.name][1]), is_rectified(topic))
+        for info, topic in ((left, chosen.colour), (right, chosen.right))
+    ]
+    frames = [formats[topic.name].frame for topic in (chosen.colour, chosen.right)]
+    are_apart = frames[0].strip("/") != frames[1].strip("/")
+    pair = pair_of(messages[0], messages[1], index.tree.between(*frames) if are_apart else None)
+    _check_size(chosen.right.name, formats, right.name, pair[1].lens.camera)
+    return pair
 
 
 def _pairs(
     name: str, index: BagIndex, chosen: ChosenTopics, options: BagOptions
 ) -> list[tuple[tuple[str, int, int], ...]]:
     """Return what each frame is made of: topic, stamp and time of writing of its colours and its depth."""
-    colour, depth = index.colour, index.depth
-    topic = chosen.colour.name
-    if not len(colour.stamps_ns) or not len(depth.stamps_ns):
-        bad = topic if not len(colour.stamps_ns) or chosen.depth is None else chosen.depth.name
+    colour, second = index.colour, index.second
+    topic, partner_topic = chosen.colour.name, chosen.second
+    if not len(colour.stamps_ns) or not len(second.stamps_ns):
+        bad = topic if not len(colour.stamps_ns) or partner_topic is None else partner_topic.name
         reason = index.first_broken or index.ended or "it has no message"
         raise UsageError(f"{name}: no image of {bad} can be used: {reason}", hint="name another topic")
     wanted = [(topic, int(s), int(log)) for s, log in zip(colour.stamps_ns, colour.log_ns, strict=True)]
-    if chosen.depth is None:
+    if partner_topic is None:
         return [(row,) for row in wanted]
-    rows = pair_stamps(colour.stamps_ns, depth.stamps_ns, round(1e9 * options.pair_within_s))
+    rows = pair_stamps(colour.stamps_ns, second.stamps_ns, round(1e9 * options.pair_within_s))
     if not rows:
-        gap_s = nearest_gap_s(colour.stamps_ns, depth.stamps_ns)
+        gap_s = nearest_gap_s(colour.stamps_ns, second.stamps_ns)
         raise UsageError(
-            f"{name}: no image of {topic} has depth within {options.pair_within_s:g} s; "
+            f"{name}: no image of {topic} has {_partner(chosen)} within {options.pair_within_s:g} s; "
             f"the nearest is {gap_s:.3f} s away",
             hint="widen it with --pair-within S, or check that both drivers use the same clock",
         )
     return [
-        (wanted[row], (chosen.depth.name, int(depth.stamps_ns[partner]), int(depth.log_ns[partner])))
+        (wanted[row], (partner_topic.name, int(second.stamps_ns[partner]), int(second.log_ns[partner])))
         for row, partner in rows
     ]
+
+
+def _partner(chosen: ChosenTopics) -> str:
+    return "depth" if chosen.right is None else "a right one"
 
 
 def _depth_way(
@@ -352,10 +454,13 @@ def _notes(
 ) -> tuple[str, ...]:
     camera = lens.camera
     where = (
-        chosen.colour_info.name if options.lens is None and chosen.colour_info else "the file of intrinsics"
+        chosen.colour_info.name
+        if options.lens is None and options.rig is None and chosen.colour_info
+        else "the file of intrinsics"
     )
     distorted = "distorted, so images are undistorted" if lens.distortion else "no distortion"
-    taken = [("colour", chosen.colour), ("depth", chosen.depth)]
+    first = "colour" if chosen.right is None else "left"
+    taken = [(first, chosen.colour), ("right", chosen.right), ("depth", chosen.depth)]
     return (
         *(
             f"{what}: {topic.name}, {formats[topic.name].encoding}, {_count(topic.messages, 'message')}"
@@ -367,6 +472,16 @@ def _notes(
     )
 
 
+def _pair_note(rectification: Rectification | None) -> tuple[str, ...]:
+    if rectification is None:
+        return ()
+    camera = rectification.camera
+    return (
+        f"stereo pair: baseline {rectification.baseline_m:.4g} m, rectified to fx {camera.fx:.6g} "
+        f"cx {camera.cx:.6g} cy {camera.cy:.6g}",
+    )
+
+
 def _losses(
     index: BagIndex, pairs: list[tuple[tuple[str, int, int], ...]], chosen: ChosenTopics, options: BagOptions
 ) -> tuple[str, ...]:
@@ -375,14 +490,15 @@ def _losses(
     unpaired = len(index.colour.stamps_ns) - len(pairs)
     if unpaired:
         names.append(
-            f"{_count(unpaired, 'colour image')} without depth within {options.pair_within_s:g} s left out"
+            f"{_count(unpaired, 'colour image' if chosen.right is None else 'left image')} without "
+            f"{_partner(chosen)} within {options.pair_within_s:g} s left out"
         )
     if index.broken:
         names.append(f"{_count(index.broken, 'broken message')} left out; the first: {index.first_broken}")
-    copies = index.colour.copies + (index.depth.copies if chosen.depth is not None else 0)
+    copies = index.colour.copies + (index.second.copies if chosen.second is not None else 0)
     if copies:
         names.append(f"{_count(copies, 'message')} with the time stamp of another left out")
-    if not (index.colour.was_in_order and index.depth.was_in_order):
+    if not (index.colour.was_in_order and index.second.was_in_order):
         names.append("the time stamps were not in order; frames are sorted by them")
     if index.uses_log_time:
         names.append("all time stamps are 0; the times of recording are used")

@@ -28,18 +28,30 @@ _IMAGES = {IMAGE, COMPRESSED_IMAGE}
 _POSES = (POSE, POSE_WITH_COVARIANCE, ODOMETRY)
 _TF = {TF, TF_OF_ROS1}
 _MOST_LISTED = 12
+_SIDES = (("left", "right"), ("cam0", "cam1"), ("infra1", "infra2"), ("image_0", "image_1"))
+"""What drivers and data sets call the two cameras of a pair."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ChosenTopics:
-    """The topics that a map is made of; None where there is none, and tf as the names of its topics."""
+    """The topics that a map is made of; None where there is none, and tf as the names of its topics.
+
+    Of a stereo pair, *colour* is the left camera.
+    """
 
     colour: Topic
     depth: Topic | None
+    right: Topic | None
     colour_info: Topic | None
     depth_info: Topic | None
+    right_info: Topic | None
     poses: Topic | None
     tf: tuple[str, ...]
+
+    @property
+    def second(self) -> Topic | None:
+        """What belongs to each image of *colour*: depth, or the right image."""
+        return self.right if self.depth is None else self.depth
 
 
 def choose_topics(
@@ -49,36 +61,62 @@ def choose_topics(
     *,
     colour: str | None = None,
     depth: str | None = None,
+    right: str | None = None,
     info: str | None = None,
     poses: str | None = None,
     use_depth: bool = True,
+    use_stereo: bool | None = None,
 ) -> ChosenTopics:
     """Return the topics of a map.
+
+    A stereo pair is taken by itself where there is no depth, and where names tell of exactly one pair.
 
     Args:
         topics: All topics of the bag.
         formats: Name of an image topic to what its first message is.
         info_frames: Name of a ``CameraInfo`` topic to its frame.
-        colour: The user's choice, and so are *depth*, *info* (the camera of the colours) and *poses*.
-        use_depth: False leaves the depth out.
+        colour: The user's choice, and so are *depth*, *right*, *info* (the camera of the colours), *poses*.
+        use_depth: False leaves the depth out, and takes one camera unless *right* is named.
+        use_stereo: True takes the pair instead of depth; False takes the left camera of a pair alone.
 
     Raises:
         UsageError: A topic is missing; the message lists those that were found.
     """
     images = [topic for topic in topics if topic.kind in _IMAGES and topic.messages]
-    of_colour = _choose(topics, images, formats, "colour", colour, None)
+    has_depth = any(formats[each.name].holds == "depth" for each in images if each.name in formats)
+    pair = None
+    if right is not None or use_stereo or (use_depth and depth is None and not has_depth):
+        pair = _choose_pair(topics, images, formats, colour, right)
+    if pair is None and use_stereo:
+        raise UsageError(
+            f"the bag has no pair of cameras, or several; its topics: {topics_line(topics, formats)}",
+            hint="name both: --colour TOPIC of the left one, --right TOPIC",
+        )
+    if pair is not None and depth is not None:
+        raise UsageError(f"{depth} and a right camera are not used together", hint="leave out one of both")
+    if pair is None:
+        of_colour, of_right = _choose(topics, images, formats, "colour", colour, None), None
+        if colour is None:  # of a pair, the left one
+            lefts = {other.name: one for one, other in _pairs(images, formats)}
+            of_colour = lefts.get(of_colour.name, of_colour)
+    else:
+        of_colour, of_right = pair[0], None if use_stereo is False else pair[1]
     of_depth = None
-    if use_depth:
+    if use_depth and pair is None:
         of_depth = _choose(topics, images, formats, "depth", depth, formats[of_colour.name])
     infos = [topic for topic in topics if topic.kind == CAMERA_INFO and topic.messages]
     if info is not None:
         colour_info: Topic | None = _find_named(topics, info, {CAMERA_INFO})
     else:
         colour_info = _info_of(of_colour, infos, formats, info_frames)
+    right_info = None if of_right is None else _info_of(of_right, infos, formats, info_frames)
     return ChosenTopics(
         colour=of_colour,
         depth=of_depth,
+        right=of_right,
         colour_info=colour_info,
+        # Both cameras of a pair may bear one frame, which must not lend the right one the lens of the left.
+        right_info=None if right_info == colour_info else right_info,
         depth_info=None if of_depth is None else _info_of(of_depth, infos, formats, info_frames),
         poses=_poses(topics, poses),
         tf=tuple(topic.name for topic in topics if topic.kind in _TF),
@@ -130,10 +168,58 @@ def _choose(
     if not good:
         hint = f"{_encodings(wanted)}; or name the topic: --{wanted} TOPIC"
         if wanted == "depth":
-            hint = "use the colours alone with --no-depth, or " + hint
+            hint = f"use the colours alone with --no-depth, or two cameras with --right TOPIC, or {hint}"
         raise UsageError(f"the bag has no {wanted}; its topics: {topics_line(topics, formats)}", hint=hint)
     most = max(topic.messages for topic in good)
     return max(good, key=lambda each: _merit(each, formats[each.name], wanted, beside, most))
+
+
+def _choose_pair(
+    topics: Sequence[Topic],
+    images: Sequence[Topic],
+    formats: Mapping[str, ImageFormat],
+    left: str | None,
+    right: str | None,
+) -> tuple[Topic, Topic] | None:
+    """Return the left and the right topic of the one pair that there is, or that the user names."""
+    pairs = _pairs(images, formats)
+    if right is not None:
+        of_right = _choose(topics, images, formats, "colour", right, None)
+        if left is None:
+            partners = [one for one, other in pairs if other.name == right]
+            if not partners:
+                raise UsageError(
+                    f"no left camera belongs to {right} by its name", hint="name it: --colour TOPIC"
+                )
+            left = partners[0].name
+        if left == right:
+            raise UsageError(f"{left} is both cameras of the pair", hint="name two topics")
+        return _choose(topics, images, formats, "colour", left, None), of_right
+    if left is not None:
+        return next((pair for pair in pairs if pair[0].name == left), None)
+    if len({_base(one).rpartition("/")[0] for one, _ in pairs}) != 1:
+        return None
+    most = max(one.messages for one, _ in pairs)
+    return max(pairs, key=lambda pair: _merit(pair[0], formats[pair[0].name], "colour", None, most))
+
+
+def _pairs(images: Sequence[Topic], formats: Mapping[str, ImageFormat]) -> list[tuple[Topic, Topic]]:
+    """Return all left and right topics of one kind whose names differ by the side alone."""
+    good = {
+        (each.name, each.kind): each
+        for each in images
+        if each.name in formats and formats[each.name].holds == "colour"
+    }
+    pairs = []
+    for (name, kind), left in good.items():
+        for one, other in _SIDES:
+            head, found, tail = name.rpartition(one)
+            names = (name.replace(one, other), f"{head}{other}{tail}") if found else ()
+            partner = next((good[each, kind] for each in names if (each, kind) in good), None)
+            if partner is not None:
+                pairs.append((left, partner))
+                break
+    return pairs
 
 
 def _merit(

@@ -36,10 +36,13 @@ class ImageStamps:
 
 @dataclass(slots=True, eq=False)
 class BagIndex:
-    """What one pass over a bag found; ``broken`` messages were left out, ``ended`` says why it stopped."""
+    """What one pass over a bag found; ``broken`` messages were left out, ``ended`` says why it stopped.
+
+    ``second`` are the images of depth or of the right camera; those of the colours where there is neither.
+    """
 
     colour: ImageStamps
-    depth: ImageStamps
+    second: ImageStamps
     tree: TransformTree
     poses: PoseTopic
     broken: int = 0
@@ -68,8 +71,8 @@ class _Collected:
 def read_index(file: BagFile, chosen: ChosenTopics, formats: dict[str, ImageFormat]) -> BagIndex:
     """Read the bag once, and return what it holds of the chosen topics."""
     images = {chosen.colour.name: _Collected()}
-    if chosen.depth is not None:
-        images[chosen.depth.name] = _Collected()
+    if chosen.second is not None:
+        images[chosen.second.name] = _Collected()
     tree, poses, broken, first_broken, ended = TransformTree(), PoseTopic(), 0, "", ""
     pose_topic = None if chosen.poses is None else chosen.poses.name
     names = {*images, *chosen.tf, *([] if pose_topic is None else [pose_topic])}
@@ -100,7 +103,7 @@ def read_index(file: BagFile, chosen: ChosenTopics, formats: dict[str, ImageForm
     stamps = [image.finish(use_log_time=no_stamps) for image in images.values()]
     return BagIndex(
         colour=stamps[0],
-        depth=stamps[-1],
+        second=stamps[-1],
         tree=tree,
         poses=poses,
         broken=broken,

@@ -9,10 +9,11 @@ import numpy as np
 
 from client_sdk.frontend import load_opencv
 from client_sdk.image_map import ImageMap
+from client_sdk.rigs.intrinsics import Intrinsics
 from rse_pf.errors import InvalidCamera, UsageError
-from rse_pf.geometry import Camera
+from rse_pf.geometry import Array, Camera
 
-__all__ = ["Lens", "Rectifier", "lens_of"]
+__all__ = ["Lens", "Rectifier", "lens_of", "numbers_of"]
 
 _BROWN = {"plumb_bob", "rational_polynomial", "rational_polynomial_thin_prism", "brown_conrady"}
 _FISHEYE = {"equidistant", "kannala_brandt4", "fisheye"}
@@ -27,6 +28,15 @@ class Lens:
     distortion: tuple[float, ...] = ()
     is_fisheye: bool = False
 
+    @classmethod
+    def of(cls, intrinsics: Intrinsics) -> Lens:
+        """Return the lens of a calibration."""
+        return cls(
+            camera=intrinsics.camera,
+            distortion=intrinsics.distortion,
+            is_fisheye=intrinsics.model == "fisheye",
+        )
+
 
 def lens_of(message: Any, topic: str, *, is_rectified: bool) -> Lens:
     """Return the lens of a ``CameraInfo``; that of rectified images has the matrix P and no distortion.
@@ -34,8 +44,7 @@ def lens_of(message: Any, topic: str, *, is_rectified: bool) -> Lens:
     Raises:
         UsageError: The camera is not calibrated, or the model of its lens is unknown.
     """
-    fields = {name: getattr(message, name, None) for name in ("k", "p", "d", "K", "P", "D")}
-    K, P, D = (np.ravel(_first(fields[low], fields[low.upper()])) for low in ("k", "p", "d"))
+    K, P, D = (numbers_of(message, name) for name in "kpd")
     if is_rectified and np.any(P):
         fx, cx, fy, cy = P[0], P[2], P[5], P[6]
         D = np.zeros(0)
@@ -87,5 +96,6 @@ class Rectifier(ImageMap):
         )
 
 
-def _first(low: Any, high: Any) -> Any:
-    return low if low is not None else high
+def numbers_of(message: Any, name: str) -> Array:
+    """Return ``d``, ``k``, ``r`` or ``p`` of a ``CameraInfo``; ROS 1 calls them by capital letters."""
+    return np.ravel(getattr(message, name if hasattr(message, name) else name.upper()))

@@ -14,7 +14,7 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from client_sdk.bags import Bag, is_bag, open_bag
+from client_sdk.bags import Bag, BagOptions, is_bag, open_bag
 from client_sdk.bags.index import pair_stamps
 from client_sdk.datasets import nyu
 from client_sdk.datasets.dataset import Dataset
@@ -73,6 +73,13 @@ def open_dataset(
         return open_euroc(path, camera=camera, imu=imu)
     if scene is None and is_kitti(path):
         return open_kitti(path, camera=camera, imu=imu)
+    if scene is None and _is_bag(path):
+        use_stereo = None if camera is None else camera == "stereo"
+        bag = open_bag(path, BagOptions(use_stereo=use_stereo))
+        if imu:
+            bag.close()
+            raise UsageError(f"{path} has no IMU", hint="leave out --imu")
+        return dataset_of_bag(bag)
     dataset = _open_single(path, scene)
     if camera == "stereo":
         raise UsageError(f"{path} has one camera", hint="leave out --camera stereo")
@@ -81,9 +88,11 @@ def open_dataset(
     return dataset
 
 
+def _is_bag(path: Path) -> bool:
+    return is_bag(path) and not (path / "rgb.txt").is_file()
+
+
 def _open_single(path: Path, scene: str | None) -> Dataset:
-    if scene is None and is_bag(path) and not (path / "rgb.txt").is_file():
-        return dataset_of_bag(open_bag(path))
     if path.is_file():
         if path.suffix != ".mat":
             raise UsageError(f"{path} is not a recording", hint="name a folder, a ROS bag or the .mat file")
@@ -111,6 +120,8 @@ def dataset_of_bag(bag: Bag) -> Dataset:
         rows=tuple(range(len(bag))),
         read=bag.read,
         notes=bag.notes,
+        has_depth=bag.has_depth,
+        has_stereo=bag.has_stereo,
     )
 
 

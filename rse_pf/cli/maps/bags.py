@@ -59,13 +59,17 @@ def run_bags(args: argparse.Namespace, settings: PlatformSettings) -> int:
 def _add_from_bag(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("source", metavar="BAG", help="a .bag, .db3 or .mcap file, or the folder of a ROS 2 bag")
-    add("--colour", metavar="TOPIC", help="topic of the colours (default: found by its type)")
+    add(
+        "--colour", metavar="TOPIC",
+        help="topic of the colours, or of the left camera (default: found by its type)",
+    )  # fmt: skip
+    add("--right", metavar="TOPIC", help="topic of the right camera (default: by its name, without depth)")
     add("--depth", metavar="TOPIC", help="topic of the depth (default: found by its type)")
     add("--info", metavar="TOPIC", help="topic of the camera of the colours (default: beside them)")
     add("--truth", metavar="TOPIC", help="topic of true poses (default: tf, or a PoseStamped topic)")
     add(
         "--pair-within", type=float, default=0.02, metavar="S",
-        help="colour and depth belong together up to this difference of time (default: %(default)s s)",
+        help="images belong together up to this difference of time (default: %(default)s s)",
     )  # fmt: skip
     add(
         "--depth-scale", type=float, default=1000.0, metavar="N",
@@ -96,17 +100,29 @@ def _from_bag(args: argparse.Namespace, settings: PlatformSettings) -> int:
     with at_work(f"reading {args.source}"):
         bag = open_bag(Path(args.source), options)
     show(*bag.notes)
-    frames = bag if args.rate is None else dataset_of_bag(bag).thinned(args.rate)
+    frames = dataset_of_bag(bag)
+    if args.rate is not None:
+        frames = frames.thinned(args.rate)
     with source_of_frames(
-        args.source, frames, bag.camera, has_depth=bag.has_depth, close=bag.close
+        args.source,
+        frames,
+        bag.camera,
+        has_depth=bag.has_depth,
+        has_stereo=bag.has_stereo,
+        close=bag.close,
     ) as source:
+        frames.check()
 
         def about(path: Trajectory) -> dict[str, Any]:
             return {
                 "bag": args.source,
                 "topics": {
                     name: topic.name
-                    for name, topic in (("colour", bag.chosen.colour), ("depth", bag.chosen.depth))
+                    for name, topic in (
+                        ("colour", bag.chosen.colour),
+                        ("right", bag.chosen.right),
+                        ("depth", bag.chosen.depth),
+                    )
                     if topic is not None
                 },
                 "notes": list(bag.notes),
@@ -162,18 +178,18 @@ def export_bag(file: Path, version: MapVersion) -> int:
 
 def _options(args: argparse.Namespace) -> BagOptions:
     from client_sdk.bags import BagOptions, Lens
-    from client_sdk.cameras import read_intrinsics
+    from client_sdk.rigs.intrinsics import Intrinsics
+    from client_sdk.rigs.rig_file import read_calibration
 
-    lens = None
-    if args.intrinsics is not None:
-        own = read_intrinsics(args.intrinsics)
-        lens = Lens(camera=own.camera, distortion=own.distortion)
+    own = None if args.intrinsics is None else read_calibration(args.intrinsics)
     return BagOptions(
         colour=args.colour,
         depth=args.depth,
         info=args.info,
         truth=args.truth,
-        lens=lens,
+        right=args.right,
+        lens=Lens.of(own) if isinstance(own, Intrinsics) else None,
+        rig=None if isinstance(own, Intrinsics) else own,
         depth_scale=args.depth_scale,
         pair_within_s=args.pair_within,
         use_depth=not args.no_depth,

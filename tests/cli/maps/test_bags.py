@@ -53,6 +53,40 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
+@pytest.fixture
+def stereo_bag(folder: Path) -> Path:
+    """A bag of a pair without depth: the right camera sits where the left one is a step later."""
+    K = np.array([CAMERA.fx, 0, CAMERA.cx, 0, CAMERA.fy, CAMERA.cy, 0, 0, 1.0])
+    with BagWriter(folder / "pair.bag", "ros1") as w:
+        for row in range(6):
+            stamp = stamp_of(row)
+            for side, ahead in (("left", 0), ("right", 1)):
+                P = np.zeros((3, 4))
+                P[:, :3] = CAMERA.matrix
+                P[0, 3] = -CAMERA.fx * STEP_M * ahead
+                info = camera_info(w, stamp, k=K, p=P.ravel(), width=CAMERA.width, height=CAMERA.height)
+                image = raw_image(w, stamp, frame_at(row + ahead, depth=False).rgb, "rgb8")
+                w.write(f"/{side}/camera_info", CAMERA_INFO, stamp, info)
+                w.write(f"/{side}/image_rect_color", IMAGE, stamp, image)
+            moved = transforms(w, stamp, "world", "eye", (STEP_M * row, 0, 0))
+            w.write("/tf", TF, stamp, moved)
+    return folder / "pair.bag"
+
+
+def test_a_bag_of_a_stereo_pair_becomes_a_map_in_metres(
+    stereo_bag: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code = main(["map", "from-bag", "pair.bag", *PLATFORM])
+
+    out = capsys.readouterr().out
+    assert code == 0, out
+    report = json.loads(Path("out-bag/report.json").read_text())
+    assert report["topics"] == {"colour": "/left/image_rect_color", "right": "/right/image_rect_color"}
+    assert report["unit"] == "m"
+    assert report["ate_cm"] < 1.0
+    assert "left: /left/image_rect_color, rgb8, 6 messages" in out
+
+
 def test_a_bag_becomes_a_map_with_its_error_against_tf(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
