@@ -114,8 +114,8 @@ class Heard:
         self.at.append(time.monotonic())
         self._more.set()
 
-    async def until(self, what: str, within_s: float = 20.0) -> None:
-        """Return when *what* is sent from now on."""
+    async def until(self, what: str, within_s: float = 50.0) -> None:
+        """Return when *what* is sent from now on: jobs have what other processes leave of the machine."""
         self._more.clear()
         seen = len(self.told)
         until = time.monotonic() + within_s
