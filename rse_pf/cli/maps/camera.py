@@ -17,6 +17,7 @@ from __future__ import annotations
 import argparse
 import itertools
 import math
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -203,34 +204,40 @@ def _check(args: argparse.Namespace) -> int:
     """Look at some frames and say what they are; the exit code is 1 if most are blurred."""
     if args.frames < 2:
         raise UsageError(f"--frames {args.frames} is below 2", hint="60 is two seconds of a webcam")
-    stamps, blur, size, with_depth = [], [], (0, 0), 0
-    for stamp, rgb, has_depth in itertools.islice(_frames(args.source), args.frames):
+    stamps, blur, size = [], [], (0, 0)
+    lengths: Counter[str] = Counter()
+    for stamp, rgb, length in itertools.islice(_frames(args.source), args.frames):
         stamps.append(stamp)
         blur.append(_sharpness(_gray(rgb)))
-        size, with_depth = (rgb.shape[1], rgb.shape[0]), with_depth + has_depth
+        lengths[length] += 1
+        size = (rgb.shape[1], rgb.shape[0])
     if len(stamps) < 2:
         raise UsageError(f"{args.source} gives {len(stamps)} frames", hint="a check needs 2 or more")
     unsharp = [number for number, value in enumerate(blur, 1) if value < _BLURRED]
     rate_hz = (len(stamps) - 1) / max(stamps[-1] - stamps[0], 1e-9)
     figures: dict[str, Any] = {
         "source": args.source, "width": size[0], "height": size[1], "frames": len(stamps),
-        "rate_hz": round(rate_hz, 2), "with_depth": with_depth, "blurred": len(unsharp),
+        "rate_hz": round(rate_hz, 2), "with_depth": lengths["depth"],
+        "with_stereo": lengths["a stereo pair"], "blurred": len(unsharp),
         "sharpness_median": round(float(np.median(blur)), 1),
     }  # fmt: skip
     if args.json:
         show_json(figures)
     else:
-        depth = "depth" if with_depth else "no depth"
+        length = next(filter(None, lengths), "no depth")
         show(
-            f"{args.source}: {size[0]}x{size[1]} px, {rate_hz:.1f} frames per second, {depth}",
+            f"{args.source}: {size[0]}x{size[1]} px, {rate_hz:.1f} frames per second, {length}",
             f"{len(unsharp)} of the first {len(stamps)} frames are blurred or empty"
             + (f": {named_frames(unsharp)}" if unsharp else ""),
         )
     return 1 if len(unsharp) > len(stamps) / 2 else 0
 
 
-def _frames(source: str) -> Iterator[tuple[float, npt.NDArray[np.uint8], bool]]:
-    """Yield time stamp, colours and whether there is depth; a video and a device need no intrinsics here."""
+def _frames(source: str) -> Iterator[tuple[float, npt.NDArray[np.uint8], str]]:
+    """Yield time stamp, colours, and ``depth``, ``a stereo pair`` or nothing.
+
+    A video and a device need no intrinsics here.
+    """
     from client_sdk.cameras import open_camera
     from client_sdk.cameras.folder import open_folder
     from client_sdk.cameras.open_camera import is_recording
@@ -240,14 +247,20 @@ def _frames(source: str) -> Iterator[tuple[float, npt.NDArray[np.uint8], bool]]:
     has_pairs = (path / "left").is_dir() and (path / "right").is_dir()
     if path.is_dir() and not has_pairs and not is_recording(path) and not (path / "rgb.txt").exists():
         images, _ = open_folder(path, 1000.0)
-        yield from ((stamp, rgb, depth_m is not None) for stamp, rgb, depth_m in images)
-    elif source == "realsense" or path.is_dir() or path.suffix in (".bag", ".mat", ".mcap", ".db3"):
+        yield from ((stamp, rgb, "" if depth_m is None else "depth") for stamp, rgb, depth_m in images)
+    elif (
+        source in ("realsense", "realsense-stereo")
+        or path.is_dir()
+        or path.suffix in (".bag", ".mat", ".mcap", ".db3")
+    ):
         with open_camera(source) as frames:
-            yield from ((frame.timestamp_s, frame.rgb, bool(frame.depth_m.any())) for frame in frames)
+            for frame in frames:
+                by_depth = "depth" if frame.depth_m.any() else ""
+                yield frame.timestamp_s, frame.rgb, by_depth if frame.stereo is None else "a stereo pair"
     else:
         images, close = open_video(source)
         try:
-            yield from ((stamp, rgb, False) for stamp, rgb, _ in images)
+            yield from ((stamp, rgb, "") for stamp, rgb, _ in images)
         finally:
             close()
 

@@ -173,6 +173,23 @@ def test_check_says_size_rate_depth_and_blur(tmp_path: Path, capsys: pytest.Capt
     assert "3 of the first 3 frames are blurred or empty: frames 1-3" in out
 
 
+def test_check_says_that_a_recording_has_pairs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    kitti = tmp_path / "06"
+    for camera in ("image_0", "image_1"):
+        (kitti / camera).mkdir(parents=True)
+        for row in range(3):
+            cv2.imwrite(str(kitti / camera / f"{row:06}.png"), np.full((48, 64), 128, np.uint8))
+    (kitti / "times.txt").write_text("0.0\n0.1\n0.2\n")
+    (kitti / "calib.txt").write_text("P0: 60 0 32 0 0 60 24 0 0 0 1 0\nP1: 60 0 32 -30 0 60 24 0 0 0 1 0\n")
+
+    main(["camera", "check", str(kitti)])
+    main(["camera", "check", str(kitti), "--json"])
+
+    line, _, figures = capsys.readouterr().out.splitlines()
+    assert line.endswith("64x48 px, 10.0 frames per second, a stereo pair")
+    assert (json.loads(figures)["with_stereo"], json.loads(figures)["with_depth"]) == (3, 0)
+
+
 @pytest.mark.parametrize(
     ("words", "code", "sentence"),
     [
