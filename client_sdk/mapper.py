@@ -280,6 +280,11 @@ class Mapper:
         return self._tracker.unrecognised if isinstance(self._tracker, Tracker) else 0
 
     @property
+    def landmark_tracker(self) -> MonocularTracker | None:
+        """The tracker of a camera without depth; None with depth, and before the first frame."""
+        return self._tracker if isinstance(self._tracker, MonocularTracker) else None
+
+    @property
     def features(self) -> Features | None:
         """The features of the last frame that has a pose; None before it, and without depth."""
         return self._tracker.last_features if isinstance(self._tracker, Tracker) else None

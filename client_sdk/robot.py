@@ -38,7 +38,8 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
     from client_sdk.frontend import Frame, FrontEndOptions
-    from client_sdk.live.mapper import LiveMapper, LiveOptions
+    from client_sdk.live.mapper import LiveMapper
+    from client_sdk.live.options import LiveOptions
     from client_sdk.mapper import Mapper
     from client_sdk.mapping import MapOptions
     from client_sdk.monocular.scale import MarkerScale, OdometryScale
@@ -330,6 +331,7 @@ class Robot:
         *,
         deadline_s: float | None = None,
         camera: Camera | None = None,
+        depth: bool | None = None,
         spool: str | Path | None = None,
         options: FrontEndOptions | None = None,
         live: LiveOptions | None = None,
@@ -345,13 +347,14 @@ class Robot:
         of the tenant that do the same.  The other arguments are those of `LiveMapper`.
         """
         from client_sdk.frontend import FrontEndOptions
-        from client_sdk.live.mapper import LiveMapper, LiveOptions
+        from client_sdk.live.mapper import LiveMapper
+        from client_sdk.live.options import LiveOptions
         from client_sdk.mapper import ask_robot
 
         codec = self._session.codec.name
         bounded = (options or FrontEndOptions.live()).sent_with(codec)
         return LiveMapper(
-            self, name, ask=ask_robot(self, deadline_s), camera=camera, options=bounded,
+            self, name, ask=ask_robot(self, deadline_s), camera=camera, depth=depth, options=bounded,
             live=(live or LiveOptions()).sent_with(codec),
             spool=None if spool is None else Path(spool), map_options=map_options,
             T_world_start=T_world_start, features=features, motion=motion, loops=loops,

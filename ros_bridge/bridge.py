@@ -254,7 +254,7 @@ async def connected_bridge(
             mapper = robot.mapper(depth=bool(options.depth))
             yield Bridge(mapper, options, publish, is_ros1=is_ros1, robot=robot)
             return
-        async with robot.live_map(options.map) as live:
+        async with robot.live_map(options.map, depth=True) as live:
             yield Bridge(live, options, publish, is_ros1=is_ros1, robot=robot)
 
 

@@ -82,6 +82,8 @@ class BridgeOptions:
             )
         if not self.colour or not self.info:
             raise UsageError("a topic of colours and its camera_info are needed", hint="colour, info")
+        if self.map and not self.depth:
+            raise UsageError("a live map needs a topic of depth", hint="name it with depth, or leave map out")
 
     @staticmethod
     def of(values: Mapping[str, Any]) -> BridgeOptions:

@@ -5,6 +5,7 @@ Tracking belongs to `client_sdk.mapper`; the map itself and its owner belong to 
 
 from client_sdk.live.alignments import Correction, OtherRobot
 from client_sdk.live.blocking import BlockingLiveMapper
-from client_sdk.live.mapper import LiveMapper, LiveOptions
+from client_sdk.live.mapper import LiveMapper
+from client_sdk.live.options import LiveOptions
 
 __all__ = ["BlockingLiveMapper", "Correction", "LiveMapper", "LiveOptions", "OtherRobot"]

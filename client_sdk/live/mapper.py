@@ -8,6 +8,10 @@ that the map finds moves it.  ``tracked.T_map_camera`` is the same pose in the m
 aligned.  It uses the alignment of the moment, and whatever changes that is a `Correction`: it is in
 `LiveMapper.corrections` before a pose uses it, and the first such pose says ``corrected``.  A new ``segment``
 begins when tracking was lost: it continues at the last known pose, and is aligned on its own.
+
+**Frames without depth** are tracked up to scale.  A keyframe is sent when it has settled, in the unit of its
+segment; the map finds how many metres that is (`metres_per_unit`), and ``tracked.T_map_camera`` is metres as
+soon as the segment is aligned, while ``tracked.T_world_camera`` stays in the segment's unit.
 """
 
 from __future__ import annotations
@@ -27,18 +31,29 @@ import numpy as np
 from client_sdk.answers import PoseAnswer
 from client_sdk.frontend import Features, Frame, FrontEndOptions, PoseQuery, TrackedFrame
 from client_sdk.live.alignments import Alignments, Correction, OtherRobot
+from client_sdk.live.keyframe_chain import KeyframeChain
+from client_sdk.live.options import LiveOptions
 from client_sdk.live.sender import REFUSALS, KeyframeSender, LiveCaller, Myself
 from client_sdk.live.waiting_keyframes import Base, WaitingKeyframe, WaitingKeyframes
 from client_sdk.mapper import AskPose, Mapper
 from client_sdk.mapping import MapOptions, PointMap, Trajectory
 from client_sdk.slots import FeaturesFunction, LoopsFunction, MotionFunction
+from client_sdk.tracking.monocular_tracker import MonocularTracker, SeenKeyframe
 from client_sdk.tracking.segments import add_to_cloud
 from rse_pf.errors import BadMessage, BadRequest, RsePfError, UnsupportedProtocol, UsageError
 from rse_pf.geometry import Array, Camera, pose_difference
-from rse_pf.slam.keyframe import MAX_FEATURES, Keyframe, encode_keyframe, make_features, most_features
+from rse_pf.maps.descriptors import DescriptorKind
+from rse_pf.slam.keyframe import (
+    MAX_FEATURES,
+    Keyframe,
+    encode_keyframe,
+    make_features,
+    make_scaleless_features,
+    most_features,
+)
 from rse_pf.wire.live_map import LiveRelocalise, RelocaliseReply, live_topic
 
-__all__ = ["KeyframeSent", "LiveMapper", "LiveOptions", "LiveRobot"]
+__all__ = ["KeyframeSent", "LiveMapper", "LiveRobot"]
 
 _FINAL = (*REFUSALS, BadRequest, UnsupportedProtocol)
 """A live map that answers so will not be joined by trying again."""
@@ -47,8 +62,6 @@ _MAX_CORRECTIONS = 1000
 _NEVER = 1_000_000_000
 """The tracker begins no segment of its own: a live map has to know of each."""
 _MAX_SENT = 100_000
-_JSON_FEATURES = 650
-"""Plain JSON has bytes in base64, a third longer: 650 features and the rest of the message are 34 kB."""
 _OFTEN_IN_VAIN, _RARELY = 6, 4.0
 """After so many answers without a place a robot asks so many times as rarely."""
 
@@ -62,46 +75,6 @@ class LiveRobot(LiveCaller, Protocol):
 
     def subscribe(self, topic: str) -> Any:
         """Return an async iterator of keys and payloads."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LiveOptions:
-    """How a robot takes part in a live map.
-
-    Attributes:
-        keyframe_m: A frame farther from the last keyframe becomes one,
-        keyframe_deg: or turned further; the tracker's own keyframes are apart from these.
-        features: At most so many features of a keyframe are sent; 870 take 34 kB with zlib and bin, and
-            `sent_with` lowers them for json.
-        segment_after: A new segment begins after so many frames that show enough and no place that the robot
-            knows; a covered lens does not count.
-        relocalise_s: While a segment is not aligned, the robot asks for its place so often at most; after six
-            answers without any place, a quarter as often, since the map tries each of its keyframes, too.
-        bytes_per_s: Share of the link that keyframes may take.
-        deadline_s: Of one attempt to send a keyframe, and of a relocalisation.
-        leave_s: How long leaving waits until the map has every keyframe.
-    """
-
-    keyframe_m: float = 0.1
-    keyframe_deg: float = 6.0
-    features: int = 870
-    segment_after: int = 5
-    relocalise_s: float = 0.5
-    bytes_per_s: float = 262_144.0
-    deadline_s: float = 5.0
-    leave_s: float = 5.0
-
-    def __post_init__(self) -> None:
-        numbers = (
-            self.keyframe_m, self.keyframe_deg, self.features, self.segment_after, self.relocalise_s,
-            self.bytes_per_s, self.deadline_s,
-        )  # fmt: skip
-        if min(numbers) <= 0 or self.leave_s < 0:
-            raise UsageError("a number of LiveOptions is not above 0", hint="leave it out for the default")
-
-    def sent_with(self, codec: str) -> LiveOptions:
-        """Return these options with as many features as fit into 34 kB in *codec* of the connection."""
-        return replace(self, features=min(self.features, _JSON_FEATURES)) if codec == "json" else self
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,6 +104,7 @@ class LiveMapper:
         *,
         ask: AskPose,
         camera: Camera | None = None,
+        depth: bool | None = None,
         spool: Path | None = None,
         options: FrontEndOptions | None = None,
         live: LiveOptions | None = None,
@@ -148,6 +122,8 @@ class LiveMapper:
             name: Of the map: small letters, digits and hyphens.
             ask: Answers pose queries.
             camera: Frames of another camera are refused; None takes that of the first frame.
+            depth: Whether to use depth; None means: if the first frame has some, or is a stereo pair.  With
+                True a first frame without depth is refused.
             spool: Folder of keyframes that wait for the map, which survive a restart of this program, for
                 this robot alone; None keeps them in memory.
             options: Of the tracker.
@@ -171,12 +147,14 @@ class LiveMapper:
         self._sender: KeyframeSender
         self._ask = ask
         self._mapper = Mapper(
-            ask=self._ask_first, camera=camera, depth=True,
+            ask=self._ask_first, camera=camera, depth=depth,
             options=replace(options or FrontEndOptions.live(), segment_after=_NEVER), map_options=map_options,
             T_world_start=T_world_start, adds_frames=False, holds_world=True, features=features,
             motion=motion, loops=loops,
         )  # fmt: skip
         self._alignments = Alignments()
+        self._has_depth = depth
+        self._chain: KeyframeChain | None = None
         self._segment = 0
         self._last_keyframe: Array | None = None
         self._last_keyframe_s: float | None = None
@@ -262,20 +240,25 @@ class LiveMapper:
         """Return the pose of the next frame in the odometry frame and in the map, or why there is none.
 
         Raises:
-            UsageError: The frame is of another camera, or the first one has no depth; or the spool's disk is
-                full.
+            UsageError: The frame is of another camera, or the first one lacks the depth of *depth*; or the
+                spool's disk is full.
         """
         if not self._is_open:
             raise UsageError("this live map is not joined", hint="use async with robot.live_map(...)")
         async with self._one_frame:
-            if self.frames == 0 and frame.stereo is None and not frame.depth_m.any():
+            is_first, has_depth = self.frames == 0, frame.stereo is not None or frame.depth_m.any()
+            if is_first and self._has_depth and not has_depth:
                 raise UsageError(
-                    "a live map needs frames with depth, or stereo pairs",
-                    hint="use robot.mapper() for this camera",
+                    "the first frame has no depth",
+                    hint="wait for depth, or leave depth=True out for one lens",
                 )
             if self._mapper.unrecognised >= self.options.segment_after and self._poses:
+                self._mapper.restart(self._poses[-1][2])
                 self._begin_segment()
             done = await self._mapper.track(frame)
+            tracker = self._mapper.landmark_tracker
+            if tracker is not None and done.T_world_camera is not None:
+                done = await self._chained(tracker, done, done.T_world_camera)
             pose = done.T_world_camera
             if pose is not None:
                 self._poses.append((frame.timestamp_s, self._segment, pose))
@@ -296,8 +279,18 @@ class LiveMapper:
 
     @property
     def T_map_odom(self) -> Array | None:
-        """``(4, 4)``: where the present odometry frame lies in the map; None while that is unknown."""
+        """``(4, 4)``: where the present odometry frame lies in the map; None while that is unknown.
+
+        Lengths of the odometry frame are multiplied by `metres_per_unit` before.
+        """
         return self._alignments.of(self._segment).T_map_odom
+
+    @property
+    def metres_per_unit(self) -> float | None:
+        """How many metres the unit of the present odometry frame is; None while that is unknown."""
+        if self._mapper.landmark_tracker is None:
+            return 1.0
+        return self._alignments.of(self._segment).scale if self.aligned else None
 
     @property
     def covariance(self) -> Array | None:
@@ -359,12 +352,15 @@ class LiveMapper:
 
     @property
     def map(self) -> PointMap:
-        """The robot's own cloud of its keyframes, in its odometry frame; the newest may be missing."""
+        """The robot's own cloud of its keyframes, in its odometry frame; the newest may be missing.
+
+        Without depth: its landmarks, as those of `Mapper.map`.
+        """
         return self._mapper.map
 
     @property
     def trajectory(self) -> Trajectory:
-        """The poses so far, in the odometry frame."""
+        """The poses so far, in the odometry frame; without depth as the tracker has corrected them."""
         return self._mapper.trajectory
 
     @property
@@ -396,8 +392,10 @@ class LiveMapper:
 
     @property
     def scale(self) -> str:
-        """Where metres come from."""
-        return self._mapper.scale
+        """Where metres come from: as `Mapper.scale`, ``metric, by the live map``, or ``up to scale`` yet."""
+        if self._mapper.landmark_tracker is None:
+            return self._mapper.scale
+        return "metric, by the live map" if self.aligned else "up to scale"
 
     def report(self) -> dict[str, Any]:
         """Return the figures of the drive: those of `Mapper.report`, and ``live``."""
@@ -410,6 +408,8 @@ class LiveMapper:
                 "aligned": self.aligned,
                 "aligned_by": self.aligned_by,
                 "reason": self.reason,
+                "scale": self.scale,
+                "metres_per_unit": self.metres_per_unit,
                 "keyframes": self._made,
                 "keyframes_kept": len(self.sent_keyframes),
                 "keyframes_waiting": len(self._waiting),
@@ -450,8 +450,7 @@ class LiveMapper:
             self._sender.note_pose_answered()
 
     def _begin_segment(self) -> None:
-        """Begin an odometry frame of its own at the last known pose."""
-        self._mapper.restart(self._poses[-1][2])
+        """Take that an odometry frame of its own begins."""
         self._segment += 1
         self._sender.current_segment = self._segment
         self._last_keyframe = self._last_keyframe_s = None
@@ -465,14 +464,29 @@ class LiveMapper:
 
     async def _keep(self, done: TrackedFrame, pose: Array, features: Features) -> None:
         """Make a keyframe of a tracked frame, and queue it for the map."""
-        waiting = self._waiting
         data = await asyncio.to_thread(self._encode, done.frame, pose, features)
-        keyframe = WaitingKeyframe(waiting.next_index, self._segment, data)
         self._last_keyframe, self._last_keyframe_s = pose, done.frame.timestamp_s
         await self._wait_for_cloud()
         self._adding = asyncio.ensure_future(
             asyncio.to_thread(add_to_cloud, self.map, done.frame, pose, features, True)
         )
+        await self._queue(data, pose)
+
+    async def _chained(self, tracker: MonocularTracker, done: TrackedFrame, pose: Array) -> TrackedFrame:
+        """Return a frame of a camera without depth with its pose in the odometry; queue settled keyframes."""
+        chain = self._chain = self._chain or KeyframeChain(tracker)
+        if chain.follow():
+            self._begin_segment()
+        for seen, T_odom_camera in chain.settled():
+            data = await asyncio.to_thread(self._encode_settled, seen, T_odom_camera)
+            self._last_keyframe_s = seen.timestamp_s
+            await self._queue(data, T_odom_camera)
+        return replace(done, T_world_camera=chain.pose(pose), scale="up to scale")
+
+    async def _queue(self, data: bytes, pose: Array) -> None:
+        """Queue a keyframe for the map."""
+        waiting = self._waiting
+        keyframe = WaitingKeyframe(waiting.next_index, self._segment, data)
         if not await asyncio.to_thread(waiting.add, keyframe):
             self._dropped += 1
             return
@@ -488,8 +502,7 @@ class LiveMapper:
     def _encode(self, frame: Frame, T_odom_camera: Array, features: Features) -> bytes:
         """Return a keyframe of the first features that have depth: those of the finest levels."""
         depths_m = features.points_camera[:, 2]
-        most = self.options.features * most_features(features.kind) // MAX_FEATURES
-        rows = np.flatnonzero(np.isfinite(depths_m))[:most]
+        rows = np.flatnonzero(np.isfinite(depths_m))[: self._most(features.kind)]
         keyframe = Keyframe(
             timestamp_s=frame.timestamp_s, T_odom_camera=T_odom_camera, camera=frame.camera,
             features=make_features(
@@ -499,6 +512,23 @@ class LiveMapper:
             imu=self._mapper.keyframe_imu(T_odom_camera, self._last_keyframe_s, frame.timestamp_s),
         )  # fmt: skip
         return encode_keyframe(keyframe)
+
+    def _encode_settled(self, seen: SeenKeyframe, T_odom_camera: Array) -> bytes:
+        """Return a keyframe without scale: its features with a landmark first, then those without."""
+        assert self._mapper.camera is not None
+        image, rows = seen.image, np.argsort(np.isnan(seen.depths), kind="stable")[: self._most(seen.kind)]
+        keyframe = Keyframe(
+            timestamp_s=seen.timestamp_s, T_odom_camera=T_odom_camera, camera=self._mapper.camera,
+            features=make_scaleless_features(
+                image.pixels[rows], seen.depths[rows], image.descriptors[rows], seen.kind
+            ),
+            imu=self._mapper.keyframe_imu(seen.T_world_camera, self._last_keyframe_s, seen.timestamp_s),
+        )  # fmt: skip
+        return encode_keyframe(keyframe)
+
+    def _most(self, kind: DescriptorKind) -> int:
+        """Return how many features of a kind are sent."""
+        return self.options.features * most_features(kind) // MAX_FEATURES
 
     def _relocalise(self, keyframe: WaitingKeyframe, pose: Array) -> None:
         """Ask where in the map a keyframe is, if its segment is not aligned and the map has others."""

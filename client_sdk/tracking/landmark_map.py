@@ -378,10 +378,18 @@ class LandmarkMap:
 
     def median_depth(self, number: int) -> float:
         """Return the median depth of the landmarks that a keyframe sees, 1 if it sees none."""
-        seen = self.landmarks_of(number)
-        if not len(seen):
-            return 1.0
-        return float(np.median(transform(self.keyframes[number].T_camera_world, self.points[seen])[:, 2]))
+        depths = self.depths(number)
+        depths = depths[np.isfinite(depths)]
+        return float(np.median(depths)) if len(depths) else 1.0
+
+    def depths(self, number: int) -> Array:
+        """Return the ``(n,)`` depths of a keyframe's features by their landmarks, NaN where there is none."""
+        keyframe = self.keyframes[number]
+        seen = keyframe.landmarks != NO_LANDMARK
+        depths = np.full(len(seen), np.nan)
+        points = self.points[keyframe.landmarks[seen]]
+        depths[seen] = transform(keyframe.T_camera_world, points)[:, 2]
+        return depths
 
     def _observation_counts(self) -> Rows:
         counts = np.zeros(len(self.points), dtype=np.int64)

@@ -34,6 +34,7 @@ from client_sdk.tracking.queries import Answer, OneQuery, Steps
 from client_sdk.tracking.tracker import Join
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Array, inverse, pose_difference, rigid, scaled, transform
+from rse_pf.maps.descriptors import ORB, DescriptorKind
 from rse_pf.slam.tracking import (
     ImageFeatures,
     NearLimits,
@@ -43,7 +44,7 @@ from rse_pf.slam.tracking import (
     match_near,
 )
 
-__all__ = ["MonocularOptions", "MonocularTracker"]
+__all__ = ["MonocularOptions", "MonocularTracker", "SeenKeyframe"]
 
 Rows = npt.NDArray[np.int64]
 
@@ -103,6 +104,21 @@ class MonocularOptions:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SeenKeyframe:
+    """A keyframe as it is adjusted now: time in seconds, ``(4, 4)`` pose in the world, features of a kind.
+
+    ``depths`` ``(n,)`` are those of the features along the optical axis, in the unit of the segment, NaN
+    where no landmark is known.
+    """
+
+    timestamp_s: float
+    T_world_camera: Array
+    image: ImageFeatures
+    kind: DescriptorKind
+    depths: Array
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Placed:
     """A pose relative to a keyframe, so that later adjustments of the keyframe move it, too."""
 
@@ -150,9 +166,13 @@ class _Similarity:
 
 @dataclass(slots=True, kw_only=True, eq=False)
 class _Segment:
-    """One map, the frames that were placed in it, and the keyframe around which frames are tracked."""
+    """One map, the frames that were placed in it, and the keyframe around which frames are tracked.
+
+    ``unit`` says by what the lengths around the newest frames were multiplied since the segment began.
+    """
 
     map: LandmarkMap
+    unit: float = 1.0
     placed: list[_Placed] = field(default_factory=list)
     reference: int = 0
     reference_seen: int = 0
@@ -170,6 +190,7 @@ class _Segment:
     def move(self, T_new_old: Array, scale: float) -> None:
         """Express all in another frame, after lengths are multiplied."""
         self.map.move(T_new_old, scale)
+        self.unit *= scale
         self.placed = [
             replace(placed, T_keyframe_camera=scaled(placed.T_keyframe_camera, scale))
             for placed in self.placed
@@ -201,7 +222,8 @@ class MonocularTracker:
 
     ``frames`` counts the frames, ``lost_frames`` those without a pose after the first start,
     ``starting_frames`` those before it; ``unrecognised`` those since the last pose that show enough and no
-    known place; ``joins`` are the joins so far, ``loops`` counts the older places that corrected the map.
+    known place; ``joins`` are the joins so far, ``loop_scales`` those by which an older place corrected the
+    lengths around the newest frames.
     """
 
     def __init__(
@@ -216,7 +238,7 @@ class MonocularTracker:
         self.lost_frames = 0
         self.starting_frames = 0
         self.unrecognised = 0
-        self.loops = 0
+        self.loop_scales: list[float] = []
         self.joins: list[Join] = []
         self._T_world_start = np.eye(4) if T_world_start is None else T_world_start
         self._segments: dict[int, _Segment] = {}
@@ -235,6 +257,42 @@ class MonocularTracker:
     def keyframes(self) -> int:
         """The number of keyframes."""
         return sum(len(segment.map.keyframes) for segment in self._segments.values())
+
+    @property
+    def loops(self) -> int:
+        """The number of older places that corrected the map."""
+        return len(self.loop_scales)
+
+    @property
+    def segment(self) -> int:
+        """The number of the segment of the newest pose."""
+        return self._segment
+
+    @property
+    def unit(self) -> float:
+        """By what the lengths around the newest frames of this segment were multiplied since it began."""
+        return self._own.unit
+
+    @property
+    def segment_keyframes(self) -> int:
+        """The number of keyframes of this segment."""
+        return len(self._own.map.keyframes)
+
+    def keyframe(self, number: int) -> SeenKeyframe:
+        """Return a keyframe of this segment."""
+        own, keyframe = self._own, self._own.map.keyframes[number]
+        return SeenKeyframe(
+            timestamp_s=next(placed.timestamp_s for placed in own.placed if placed.keyframe == number),
+            T_world_camera=self.keyframe_pose(number),
+            image=keyframe.features.image,
+            kind=ORB if self._slots.features is None else self._slots.features.kind,
+            depths=own.map.depths(number),
+        )
+
+    def keyframe_pose(self, number: int) -> Array:
+        """Return the ``(4, 4)`` pose of a keyframe of this segment in the world, as it is adjusted now."""
+        pose: Array = self._T_world_start @ inverse(self._own.map.keyframes[number].T_camera_world)
+        return pose
 
     @property
     def segments(self) -> tuple[int, ...]:
@@ -467,7 +525,8 @@ class MonocularTracker:
         if self._slots.motion is not None:
             self._slots.motion.clear()
         self._merge_places(similar.keyframe, newest, similar)
-        self.loops += 1
+        self._own.unit *= similar.scale
+        self.loop_scales.append(similar.scale)
         self._loop_from = newest + _LOOP_AGE
 
     def _seek_place(

@@ -17,7 +17,7 @@ parser.add_argument("--map", default="warehouse", help="name of the live map (de
 
 async def main(args: argparse.Namespace) -> str | None:
     with open_camera(args.source, intrinsics=args.intrinsics) as camera:
-        async with connect(enrolment=args.enrolment) as robot, robot.live_map(args.map) as mapper:
+        async with connect(enrolment=args.enrolment) as robot, robot.live_map(args.map, depth=True) as mapper:
             async for frame in camera:
                 done = await mapper.track(frame)
                 if done.corrected:

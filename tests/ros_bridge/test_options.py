@@ -24,6 +24,7 @@ def test_parameters_come_as_words_and_numbers() -> None:
         ({"queue_frames": 0}, "queue_frames = 0"),
         ({"namespace": "a b"}, "is no name of ROS"),
         ({"colour": ""}, "a topic of colours"),
+        ({"map": "hall", "depth": ""}, "a live map needs a topic of depth"),
     ],
 )
 def test_a_wrong_parameter_is_one_line(values: dict[str, object], said: str) -> None:

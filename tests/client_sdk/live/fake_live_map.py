@@ -20,9 +20,12 @@ from rse_pf.wire.live_map import KeyframeRequest, LiveRelocalise
 __all__ = ["FakeLiveRobot", "alignment", "solve"]
 
 
-def alignment(robot: str, T_map_odom: Array | None, *, segment: int = 0, reason: str = "") -> dict[str, Any]:
+def alignment(
+    robot: str, T_map_odom: Array | None, *, segment: int = 0, reason: str = "", scale: float | None = None
+) -> dict[str, Any]:
     """Return the payload of an alignment; None is none."""
     return {
+        **({} if scale is None else {"scale": scale}),
         "kind": "alignment", "robot": robot, "segment": segment, "aligned": T_map_odom is not None,
         "reason": reason, "T_map_odom": None if T_map_odom is None else T_map_odom.ravel().tolist(),
         "covariance": None if T_map_odom is None else (1e-4 * np.eye(6))[np.triu_indices(6)].tolist(),

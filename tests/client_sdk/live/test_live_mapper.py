@@ -487,14 +487,11 @@ def test_a_program_without_asyncio_uses_the_same_mapper() -> None:
         loop.close()
 
 
-def test_frames_without_depth_and_a_map_that_is_not_joined_are_refused() -> None:
+def test_a_map_that_is_not_joined_is_refused() -> None:
     async def work(robot: FakeLiveRobot) -> None:
         mapper = live_map(robot)
         with pytest.raises(UsageError, match="not joined"):
             await mapper.track(frame_at(0, depth=True))
-        async with mapper:
-            with pytest.raises(UsageError, match="with depth"):
-                await mapper.track(frame_at(0, depth=False))
 
     run(work)
 

@@ -180,6 +180,7 @@ def test_an_older_place_that_is_seen_again_moves_what_drifted_away_from_it() -> 
     run_all(tracker, (both(row) for row in range(45, 58)))
 
     assert tracker.loops == 1
+    assert tracker.unit == pytest.approx(tracker.loop_scales[0])
     path = tracker.trajectory()
     assert path.positions[0] == pytest.approx(np.zeros(3), abs=2 * step_of)
     assert path.positions[-1, 0] < 30 * step_of  # and not 57
