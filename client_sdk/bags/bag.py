@@ -24,6 +24,7 @@ from client_sdk.bags.choose import (
     topics_line,
 )
 from client_sdk.bags.images import ImageFormat, decode_colour, decode_depth, format_of
+from client_sdk.bags.imu import ImuMount, imu_track
 from client_sdk.bags.index import BagIndex, nearest_gap_s, pair_stamps, read_index
 from client_sdk.bags.lens import Lens, Rectifier, lens_of
 from client_sdk.bags.message_types import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, POSE
@@ -33,6 +34,7 @@ from client_sdk.bags.stream import ImageStream
 from client_sdk.closing import Closing
 from client_sdk.frontend import Frame, load_opencv
 from client_sdk.mapping import Trajectory
+from client_sdk.rigs.imu_track import ImuTrack, with_imu
 from client_sdk.rigs.rectification import Rectification
 from client_sdk.rigs.rig import Rig, RigCamera
 from rse_pf.errors import UsageError
@@ -54,12 +56,14 @@ class BagOptions:
         right: Topic of the right camera of a stereo pair.
         info: Topic of the camera of the colours.
         truth: Topic of true poses: PoseStamped, PoseWithCovarianceStamped or Odometry.
+        imu: Topic of the IMU.
         lens: The camera, instead of that in the bag.
-        rig: The cameras of a stereo pair, or the one camera, instead of those in the bag.
+        rig: The cameras of a stereo pair, or the one camera, and the IMU, instead of those in the bag.
         depth_scale: Units of a 16-bit depth image in a metre.
         pair_within_s: Colour and depth, or left and right, belong together up to this difference of stamps.
         use_depth: False leaves the depth out, and takes one camera unless *right* is named.
         use_stereo: None takes a pair where there is no depth; True takes it always, False its left camera.
+        use_imu: None takes an IMU where it can be used; True refuses a bag without one, False takes none.
 
     Raises:
         UsageError: A number is not above 0.
@@ -70,12 +74,14 @@ class BagOptions:
     right: str | None = None
     info: str | None = None
     truth: str | None = None
+    imu: str | None = None
     lens: Lens | None = None
     rig: Rig | None = None
     depth_scale: float = 1000.0
     pair_within_s: float = 0.02
     use_depth: bool = True
     use_stereo: bool | None = None
+    use_imu: bool | None = None
 
     def __post_init__(self) -> None:
         for name, value in (("depth_scale", self.depth_scale), ("pair_within_s", self.pair_within_s)):
@@ -87,6 +93,7 @@ class BagOptions:
 class Bag(Closing):
     """The frames of a bag: iterate over it, or read one by its row; close it, or use it in ``with``.
 
+    Frames that are iterated over carry the samples of ``imu``; those that are read do not.
     ``notes`` are sentences for the user: which topics were taken, and what was left out.  ``truth_kind`` is
     ``reference`` for poses that another program estimated.
     """
@@ -99,6 +106,7 @@ class Bag(Closing):
     truth_kind: Literal["ground truth", "reference", "none"]
     notes: tuple[str, ...]
     chosen: ChosenTopics
+    imu: ImuTrack | None
     _file: BagFile
     _stream: ImageStream
     _pairs: tuple[tuple[tuple[str, int, int], ...], ...]
@@ -118,7 +126,7 @@ class Bag(Closing):
         return len(self._pairs)
 
     def __iter__(self) -> Iterator[Frame]:
-        return map(self.read, range(len(self)))
+        return with_imu(map(self.read, range(len(self))), self.imu)
 
     def read(self, row: int) -> Frame:
         """Return a frame; rows in ascending order are read without seeking.
@@ -195,7 +203,9 @@ def _open(file: BagFile, options: BagOptions) -> Bag:
         info=options.info,
         poses=options.truth,
         use_depth=options.use_depth,
+        imu=options.imu,
         use_stereo=options.use_stereo,
+        use_imu=options.use_imu is not False,
     )
     lens = _lens_of_colour(file, chosen, infos, options, formats)
     index = read_index(file, chosen, formats)
@@ -207,6 +217,7 @@ def _open(file: BagFile, options: BagOptions) -> Bag:
     truth, truth_kind, truth_note = _truth(chosen, formats, index, stamps_ns)
     if truth is not None:
         truth = Trajectory(truth.timestamps_s, truth.T_world_camera @ T_left_camera)
+    imu, imu_notes = _imu(chosen, formats, index, np.array(stamps_ns) / 1e9, T_left_camera, options)
     no_depth = np.zeros((camera.height, camera.width), dtype=np.float32)
     no_depth.flags.writeable = False
     return Bag(
@@ -219,11 +230,13 @@ def _open(file: BagFile, options: BagOptions) -> Bag:
         notes=(
             *_notes(chosen, formats, lens, options),
             *_pair_note(rectification),
+            *imu_notes,
             *note,
             truth_note,
             *_losses(index, pairs, chosen, options),
         ),
         chosen=chosen,
+        imu=imu,
         _file=file,
         _stream=ImageStream(file, list({pair[0] for pair in pairs[0]}), use_log_time=index.uses_log_time),
         _pairs=tuple(pairs),
@@ -470,6 +483,39 @@ def _notes(
         f"camera: {where}, {camera.width}x{camera.height} px, fx {camera.fx:g} fy {camera.fy:g} "
         f"cx {camera.cx:g} cy {camera.cy:g}, {distorted}",
     )
+
+
+def _imu(
+    chosen: ChosenTopics,
+    formats: Mapping[str, ImageFormat],
+    index: BagIndex,
+    frames_s: Array,
+    T_left_camera: Array,
+    options: BagOptions,
+) -> tuple[ImuTrack | None, tuple[str, ...]]:
+    """Return the samples of the IMU and what to say; one that cannot be used is refused if it is wanted."""
+    if chosen.imu is None:
+        if options.use_imu:
+            raise UsageError("the bag has no IMU", hint="leave out --imu")
+        return None, ()
+    frame, imu_frame = formats[chosen.colour.name].frame, index.imu.frame
+    try:
+        track, note = imu_track(
+            index.imu,
+            chosen.imu.name,
+            frames_s,
+            ImuMount(
+                T_left_camera=T_left_camera,
+                T_left_imu=index.tree.between(frame, imu_frame) if imu_frame else None,
+                rig=options.rig,
+            ),
+            use_log_time=index.uses_log_time,
+        )
+    except UsageError as error:
+        if options.use_imu or options.imu is not None:
+            raise
+        return None, (f"the IMU is not used: {error.message}",)
+    return track, (note,)
 
 
 def _pair_note(rectification: Rectification | None) -> tuple[str, ...]:

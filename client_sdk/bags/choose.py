@@ -14,6 +14,7 @@ from client_sdk.bags.message_types import (
     CAMERA_INFO,
     COMPRESSED_IMAGE,
     IMAGE,
+    IMU,
     ODOMETRY,
     POSE,
     POSE_WITH_COVARIANCE,
@@ -46,6 +47,7 @@ class ChosenTopics:
     depth_info: Topic | None
     right_info: Topic | None
     poses: Topic | None
+    imu: Topic | None
     tf: tuple[str, ...]
 
     @property
@@ -64,8 +66,10 @@ def choose_topics(
     right: str | None = None,
     info: str | None = None,
     poses: str | None = None,
+    imu: str | None = None,
     use_depth: bool = True,
     use_stereo: bool | None = None,
+    use_imu: bool = True,
 ) -> ChosenTopics:
     """Return the topics of a map.
 
@@ -75,9 +79,10 @@ def choose_topics(
         topics: All topics of the bag.
         formats: Name of an image topic to what its first message is.
         info_frames: Name of a ``CameraInfo`` topic to its frame.
-        colour: The user's choice, and so are *depth*, *right*, *info* (the camera of the colours), *poses*.
+        colour: The user's choice, and so are *depth*, *right*, *poses*, *imu*, and *info* (of the colours).
         use_depth: False leaves the depth out, and takes one camera unless *right* is named.
         use_stereo: True takes the pair instead of depth; False takes the left camera of a pair alone.
+        use_imu: False leaves the IMU out.
 
     Raises:
         UsageError: A topic is missing; the message lists those that were found.
@@ -119,6 +124,7 @@ def choose_topics(
         right_info=None if right_info == colour_info else right_info,
         depth_info=None if of_depth is None else _info_of(of_depth, infos, formats, info_frames),
         poses=_poses(topics, poses),
+        imu=_imu(topics, imu) if use_imu else None,
         tf=tuple(topic.name for topic in topics if topic.kind in _TF),
     )
 
@@ -286,3 +292,15 @@ def _poses(topics: Sequence[Topic], named: str | None) -> Topic | None:
         return _find_named(topics, named, set(_POSES))
     pose_topics = [topic for topic in topics if topic.kind == POSE and topic.messages > 1]
     return max(pose_topics, key=lambda each: each.messages, default=None)
+
+
+def _imu(topics: Sequence[Topic], named: str | None) -> Topic | None:
+    """Return the IMU with most messages; topics that drivers name after one half of it do not count."""
+    if named is not None:
+        return _find_named(topics, named, {IMU})
+    whole = [
+        topic
+        for topic in topics
+        if topic.kind == IMU and topic.messages and not any(half in topic.name for half in ("gyro", "accel"))
+    ]
+    return max(whole, key=lambda each: (each.messages, _short_first(each.name)), default=None)

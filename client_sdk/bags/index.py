@@ -1,6 +1,7 @@
 """What a bag holds, found by reading it once: time stamps, broken images, transforms and poses.
 
-Images are checked but not decoded, and none is kept: memory grows by 16 bytes for an image.
+Images are checked but not decoded, and none is kept: memory grows by 16 bytes for an image, and by 64 for a
+sample of an IMU.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import numpy.typing as npt
 from client_sdk.bags.bag_file import BagFile, BrokenMessage
 from client_sdk.bags.choose import ChosenTopics
 from client_sdk.bags.images import ImageFormat, check_image
+from client_sdk.bags.imu import ImuReadings
 from client_sdk.bags.poses import PoseTopic, TransformTree
 
 __all__ = ["BagIndex", "ImageStamps", "nearest_gap_s", "pair_stamps", "read_index"]
@@ -45,6 +47,7 @@ class BagIndex:
     second: ImageStamps
     tree: TransformTree
     poses: PoseTopic
+    imu: ImuReadings
     broken: int = 0
     first_broken: str = ""
     ended: str = ""
@@ -75,7 +78,8 @@ def read_index(file: BagFile, chosen: ChosenTopics, formats: dict[str, ImageForm
         images[chosen.second.name] = _Collected()
     tree, poses, broken, first_broken, ended = TransformTree(), PoseTopic(), 0, "", ""
     pose_topic = None if chosen.poses is None else chosen.poses.name
-    names = {*images, *chosen.tf, *([] if pose_topic is None else [pose_topic])}
+    imu, imu_topic = ImuReadings(), None if chosen.imu is None else chosen.imu.name
+    names = {*images, *chosen.tf, *(each for each in (pose_topic, imu_topic) if each is not None)}
     messages = file.messages(names)
     while True:
         try:
@@ -91,6 +95,8 @@ def read_index(file: BagFile, chosen: ChosenTopics, formats: dict[str, ImageForm
                 check_image(message, formats[raw.topic])
                 images[raw.topic].stamps_ns.append(file.stamp_ns(raw))
                 images[raw.topic].log_ns.append(raw.log_ns)
+            elif raw.topic == imu_topic:
+                imu.add(message, file.stamp_ns(raw), raw.log_ns)
             elif raw.topic == pose_topic:
                 poses.add(message)
             else:
@@ -106,6 +112,7 @@ def read_index(file: BagFile, chosen: ChosenTopics, formats: dict[str, ImageForm
         second=stamps[-1],
         tree=tree,
         poses=poses,
+        imu=imu,
         broken=broken,
         first_broken=first_broken,
         ended=ended,

@@ -14,6 +14,7 @@ import numpy.typing as npt
 from client_sdk.bags.bag_file import BrokenMessage
 from client_sdk.bags.message_types import (
     DIAGNOSTICS,
+    IMU,
     PATH,
     POINT_CLOUD,
     POSE,
@@ -122,6 +123,21 @@ class MessageMaker:
     def transforms(self, moved: list[Any]) -> Any:
         """Return a ``TFMessage`` of messages of `transform`."""
         return self.make(TF, transforms=moved)
+
+    def imu(self, stamp_ns: int, frame: str, gyro: Array, accel: Array) -> Any:
+        """Return an ``Imu`` without orientation: ``(3,)`` rad/s and ``(3,)`` m/s^2 in the axes of *frame*."""
+        none = np.zeros(9)
+        none[0] = -1.0  # ROS's word for "not measured"
+        return self.make(
+            IMU,
+            header=self.header(stamp_ns, frame),
+            orientation=self._numbers("Quaternion", np.array([0.0, 0.0, 0.0, 1.0]), "xyzw"),
+            orientation_covariance=none,
+            angular_velocity=self._numbers("Vector3", gyro, "xyz"),
+            angular_velocity_covariance=np.zeros(9),
+            linear_acceleration=self._numbers("Vector3", accel, "xyz"),
+            linear_acceleration_covariance=np.zeros(9),
+        )
 
     def cloud(
         self, stamp_ns: int, frame: str, points: npt.NDArray[np.float32], colours: npt.NDArray[np.uint8]

@@ -17,6 +17,7 @@ __all__ = [
     "COMPRESSED_IMAGE",
     "DIAGNOSTICS",
     "IMAGE",
+    "IMU",
     "ODOMETRY",
     "PATH",
     "POINT_CLOUD",
@@ -30,6 +31,7 @@ __all__ = [
 IMAGE = "sensor_msgs/msg/Image"
 COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
+IMU = "sensor_msgs/msg/Imu"
 TF = "tf2_msgs/msg/TFMessage"
 TF_OF_ROS1 = "tf/msg/tfMessage"
 POSE = "geometry_msgs/msg/PoseStamped"
@@ -67,6 +69,12 @@ _COMMON = {
         "uint32 step\nuint8[] data"
     ),
     COMPRESSED_IMAGE: "std_msgs/Header header\nstring format\nuint8[] data",
+    IMU: (
+        "std_msgs/Header header\ngeometry_msgs/Quaternion orientation\n"
+        "float64[9] orientation_covariance\ngeometry_msgs/Vector3 angular_velocity\n"
+        "float64[9] angular_velocity_covariance\ngeometry_msgs/Vector3 linear_acceleration\n"
+        "float64[9] linear_acceleration_covariance"
+    ),
     "sensor_msgs/msg/RegionOfInterest": (
         "uint32 x_offset\nuint32 y_offset\nuint32 height\nuint32 width\nbool do_rectify"
     ),

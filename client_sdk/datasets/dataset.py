@@ -11,7 +11,7 @@ from client_sdk.datasets.thinning import Thinning, median_interval_s
 from client_sdk.frontend import Frame
 from client_sdk.mapping import Trajectory
 from client_sdk.rigs.checks import check_pairs, spread_pairs
-from client_sdk.rigs.imu_track import ImuTrack
+from client_sdk.rigs.imu_track import ImuTrack, with_imu
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Array, Camera
 
@@ -58,13 +58,7 @@ class Dataset:
         return len(self.rows)
 
     def __iter__(self) -> Iterator[Frame]:
-        if self.imu is None:
-            yield from map(self.read, self.rows)
-            return
-        last_s = self.timestamps_s[0] if self.rows else 0.0
-        for row, stamp_s in zip(self.rows, self.timestamps_s, strict=True):
-            yield replace(self.read(row), imu=self.imu.between(last_s, stamp_s))
-            last_s = stamp_s
+        return with_imu(map(self.read, self.rows), self.imu)
 
     def check(self) -> None:
         """Look at some stereo pairs, and refuse a rig that is wrong; other recordings are not looked at.

@@ -75,11 +75,7 @@ def open_dataset(
         return open_kitti(path, camera=camera, imu=imu)
     if scene is None and _is_bag(path):
         use_stereo = None if camera is None else camera == "stereo"
-        bag = open_bag(path, BagOptions(use_stereo=use_stereo))
-        if imu:
-            bag.close()
-            raise UsageError(f"{path} has no IMU", hint="leave out --imu")
-        return dataset_of_bag(bag)
+        return dataset_of_bag(open_bag(path, BagOptions(use_stereo=use_stereo, use_imu=imu)))
     dataset = _open_single(path, scene)
     if camera == "stereo":
         raise UsageError(f"{path} has one camera", hint="leave out --camera stereo")
@@ -122,6 +118,7 @@ def dataset_of_bag(bag: Bag) -> Dataset:
         notes=bag.notes,
         has_depth=bag.has_depth,
         has_stereo=bag.has_stereo,
+        imu=bag.imu,
     )
 
 

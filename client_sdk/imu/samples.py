@@ -13,9 +13,9 @@ import numpy as np
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Array, rigid
 
-__all__ = ["ImuModel", "ImuSamples"]
+__all__ = ["MAX_SAMPLES", "ImuModel", "ImuSamples"]
 
-_MAX_SAMPLES = 100_000
+MAX_SAMPLES = 100_000
 """Of one frame: 20 seconds of an IMU of 5 kHz."""
 _LEAST_HZ, _MOST_HZ = 10.0, 10_000.0
 _MAX_ARM_M = 10.0
@@ -101,9 +101,9 @@ class ImuSamples:
                 "do not fit",
                 hint="give three rates and three accelerations for each time",
             )
-        if n > _MAX_SAMPLES:
+        if n > MAX_SAMPLES:
             raise UsageError(
-                f"{n} IMU samples of one frame are above {_MAX_SAMPLES}",
+                f"{n} IMU samples of one frame are above {MAX_SAMPLES}",
                 hint="give those since the last frame",
             )
         if not all(np.isfinite(each).all() for each in (self.timestamps_s, self.gyro, self.accel)):

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from client_sdk.frontend import Frame
 from client_sdk.imu.samples import ImuModel, ImuSamples
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Array
 
-__all__ = ["ImuTrack"]
+__all__ = ["ImuTrack", "with_imu"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -44,3 +46,16 @@ class ImuTrack:
         last = int(np.searchsorted(self.timestamps_s, until_s, side="left")) + 1
         rows = slice(first, last)
         return ImuSamples(self.timestamps_s[rows], self.gyro[rows], self.accel[rows], self.model)
+
+
+def with_imu(frames: Iterable[Frame], track: ImuTrack | None) -> Iterator[Frame]:
+    """Yield frames, each with the samples since the one before it; None leaves them as they are."""
+    last_s = None
+    for frame in frames:
+        if track is None:
+            yield frame
+            continue
+        yield replace(
+            frame, imu=track.between(frame.timestamp_s if last_s is None else last_s, frame.timestamp_s)
+        )
+        last_s = frame.timestamp_s

@@ -65,6 +65,9 @@ def _add_from_bag(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     add("--right", metavar="TOPIC", help="topic of the right camera (default: by its name, without depth)")
     add("--depth", metavar="TOPIC", help="topic of the depth (default: found by its type)")
+    imu = parser.add_mutually_exclusive_group()
+    imu.add_argument("--imu", metavar="TOPIC", help="topic of the IMU (default: found by its type)")
+    imu.add_argument("--no-imu", action="store_true", help="leave the IMU out")
     add("--info", metavar="TOPIC", help="topic of the camera of the colours (default: beside them)")
     add("--truth", metavar="TOPIC", help="topic of true poses (default: tf, or a PoseStamped topic)")
     add(
@@ -122,6 +125,7 @@ def _from_bag(args: argparse.Namespace, settings: PlatformSettings) -> int:
                         ("colour", bag.chosen.colour),
                         ("right", bag.chosen.right),
                         ("depth", bag.chosen.depth),
+                        ("imu", None if bag.imu is None else bag.chosen.imu),
                     )
                     if topic is not None
                 },
@@ -188,6 +192,8 @@ def _options(args: argparse.Namespace) -> BagOptions:
         info=args.info,
         truth=args.truth,
         right=args.right,
+        imu=args.imu,
+        use_imu=False if args.no_imu else None,
         lens=Lens.of(own) if isinstance(own, Intrinsics) else None,
         rig=None if isinstance(own, Intrinsics) else own,
         depth_scale=args.depth_scale,

@@ -1,0 +1,137 @@
+"""The IMU of a bag: ``sensor_msgs/Imu`` as samples on the clock of its stamps.
+
+Readings are kept as numbers, at most `_MAX_SAMPLES` of them.
+"""
+
+from __future__ import annotations
+
+import math
+from array import array
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from client_sdk.bags.bag_file import BrokenMessage
+from client_sdk.imu.samples import MAX_SAMPLES
+from client_sdk.rigs.imu_track import ImuTrack
+from client_sdk.rigs.rig import Rig, RigImu
+from rse_pf.errors import UsageError
+from rse_pf.geometry import Array
+
+__all__ = ["ImuMount", "ImuReadings", "imu_track"]
+
+_MAX_SAMPLES = 2_000_000
+"""Two hours and a half at 200 Hz, 128 MB."""
+_USUAL_NOISE = {"gyro_noise": 1e-3, "gyro_walk": 1e-4, "accel_noise": 6e-3, "accel_walk": 3e-3}
+"""Of a small MEMS IMU as in depth cameras: four times the densities in the data sheet of Bosch's BMI055
+(0.014 degree/s/sqrt(Hz), 150 ug/sqrt(Hz)), because a robot shakes; walks as EuRoC's, or five times that."""
+_HINT = "leave the IMU out with --no-imu, or give its place and noise with --intrinsics rig.json"
+
+
+class ImuReadings:
+    """What the messages of a topic hold; ``frame`` is that of the first one."""
+
+    def __init__(self) -> None:
+        self.frame = ""
+        self.ignored = 0
+        self._stamps_ns = array("q")
+        self._log_ns = array("q")
+        self._values = array("d")
+
+    def __len__(self) -> int:
+        return len(self._stamps_ns)
+
+    def add(self, message: Any, stamp_ns: int, log_ns: int) -> None:
+        """Add a message.
+
+        Raises:
+            BrokenMessage: It lacks rates or accelerations, or a number is not finite.
+        """
+        if message.angular_velocity_covariance[0] == -1 or message.linear_acceleration_covariance[0] == -1:
+            raise BrokenMessage("a message of an IMU has no rates, or no accelerations")
+        gyro, accel = message.angular_velocity, message.linear_acceleration
+        numbers = (gyro.x, gyro.y, gyro.z, accel.x, accel.y, accel.z)
+        if not all(map(math.isfinite, numbers)):
+            raise BrokenMessage("a sample of an IMU is not finite")
+        if len(self) >= _MAX_SAMPLES:
+            self.ignored += 1
+            return
+        if not len(self):
+            self.frame = str(message.header.frame_id)
+        self._stamps_ns.append(stamp_ns)
+        self._log_ns.append(log_ns)
+        self._values.extend(numbers)
+
+    def sorted(self, *, use_log_time: bool) -> tuple[Array, Array]:
+        """Return ``(n,)`` ascending seconds, each once, and ``(n, 6)`` rates and accelerations."""
+        stamps_ns = np.frombuffer(self._log_ns if use_log_time else self._stamps_ns, dtype=np.int64)
+        unique, rows = np.unique(stamps_ns, return_index=True)
+        return unique / 1e9, np.frombuffer(self._values).reshape(-1, 6)[rows]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ImuMount:
+    """Where the IMU and the camera of the frames sit.
+
+    Attributes:
+        T_left_camera: ``(4, 4)``, pose of the camera of the frames in the (left) camera of the bag.
+        T_left_imu: ``(4, 4)``, pose of the IMU in that; None if tf does not tell.
+        rig: Of the user; what it says of the IMU is taken before tf and the usual noise.
+    """
+
+    T_left_camera: Array
+    T_left_imu: Array | None
+    rig: Rig | None
+
+
+def imu_track(
+    readings: ImuReadings, topic: str, frames_s: Array, mount: ImuMount, *, use_log_time: bool
+) -> tuple[ImuTrack, str]:
+    """Return the samples for frames of a camera, and a sentence about them.
+
+    Args:
+        readings: Of the topic.
+        topic: Its name.
+        frames_s: ``(n,)``, times of the frames, ascending.
+        mount: Of the IMU.
+        use_log_time: Take the times of writing.
+
+    Raises:
+        UsageError: The IMU cannot be used.
+    """
+    rig = mount.rig
+    stamps_s, values = readings.sorted(use_log_time=use_log_time)
+    if len(stamps_s) < 2:
+        raise UsageError(f"{topic} has fewer than 2 samples that can be used", hint=_HINT)
+    if rig is not None:
+        stamps_s = stamps_s - rig.left.time_offset_s
+    within = np.searchsorted(stamps_s, frames_s)
+    if within[0] == within[-1]:
+        raise UsageError(f"no sample of {topic} lies between the first and the last frame", hint=_HINT)
+    most = int(np.diff(within).max())
+    if most > MAX_SAMPLES // 2:
+        raise UsageError(f"{topic} has {most} samples between two frames", hint=_HINT)
+    noise, whose = _noise(topic, stamps_s, mount.T_left_imu, rig)
+    T_body_left = np.eye(4) if rig is None else rig.left.T_body_camera
+    model = noise.model(T_body_left @ mount.T_left_camera)
+    track = ImuTrack(
+        stamps_s, np.ascontiguousarray(values[:, :3]), np.ascontiguousarray(values[:, 3:]), model
+    )
+    left_out = f", {readings.ignored} more left out" if readings.ignored else ""
+    return track, f"IMU: {topic}, {len(stamps_s)} samples, {model.rate_hz:.0f} Hz, {whose}{left_out}"
+
+
+def _noise(topic: str, stamps_s: Array, T_left_imu: Array | None, rig: Rig | None) -> tuple[RigImu, str]:
+    """Return place and noise of the IMU, and whose they are."""
+    if rig is not None and rig.imu is not None:
+        return rig.imu, "as the file of intrinsics states it"
+    if T_left_imu is None:
+        raise UsageError(
+            f"no tf_static joins the frame of {topic} with that of the camera: its place is not known",
+            hint=_HINT,
+        )
+    T_body_left = np.eye(4) if rig is None else rig.left.T_body_camera
+    rate_hz = 1.0 / float(np.median(np.diff(stamps_s)))
+    noise = RigImu(T_body_imu=T_body_left @ T_left_imu, rate_hz=rate_hz, **_USUAL_NOISE)
+    return noise, "the noise of a small MEMS IMU is assumed"
