@@ -45,6 +45,7 @@ def make_report(
         "keyframes": sum(robot.keyframes for robot in finished),
         "weak_poses": sum(robot.weak_poses for robot in finished),
         "truth": finished[0].truth_kind,
+        "up_to_scale": [number for number, robot in enumerate(finished, start=1) if not robot.is_metric],
         **accuracy,
         "matches": _median([m for robot in finished for m in robot.matches]),
         "inliers": _median([i for robot in finished for i in robot.inliers]),
@@ -101,7 +102,12 @@ def closing_lines(report: Mapping[str, Any], folder: Path) -> str:
         f"{commands['answered']} of {counted(commands['sent'], 'command')} answered, {commands['lost']} lost"
     )
     known = [value for value in report["ate_cm"] if value is not None]
-    second = f"ATE {_list(known)} cm over paths of {_list(report['path_m'])} m\n" if known else ""
+    paths = [value for value in report["path_m"] if value is not None]
+    second = f"ATE {_list(known)} cm over paths of {_list(paths)} m\n" if known else ""
+    if report["up_to_scale"]:
+        second += (
+            f"up to scale, with neither depth, a second camera nor an IMU: {_robots(report['up_to_scale'])}\n"
+        )
     shown = _relative(folder)
     files = f"{shown}/map.png, " if (folder / "map.png").exists() else ""
     third = ""
@@ -134,7 +140,15 @@ def advice(report: Mapping[str, Any]) -> str:
     return f"many frames were lost, because they overlap too little with the frame before: {ways}\n"
 
 
+def _robots(numbers: Sequence[int]) -> str:
+    return ", ".join(f"robot-{number}" for number in numbers)
+
+
 def _errors(robot: RobotFinished) -> dict[str, float | None]:
+    """Return the errors and the length of a path; a path in a unit of its own has neither."""
+    names = ("ate_cm", "rpe_cm", "rpe_deg", "ate_percent_of_path", "path_m")
+    if not robot.is_metric:
+        return dict.fromkeys(names)
     figures = trajectory_figures(robot.trajectory, robot.truth)
     ate_cm, path_m = figures["ate_cm"], figures["path_m"] or 1e-9
     return {**figures, "ate_percent_of_path": None if ate_cm is None else round(ate_cm / path_m, 4)}

@@ -118,7 +118,10 @@ class FrameDone:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RobotFinished:
-    """From the robot: its figures at the end; its map and trajectory are in its folder."""
+    """From the robot: its figures at the end; its map and trajectory are in its folder.
+
+    Without *is_metric* the trajectory is in a unit of its own.
+    """
 
     frames: int
     lost_frames: int
@@ -133,6 +136,7 @@ class RobotFinished:
     truth: Trajectory | None
     truth_kind: str
     stats: dict[str, Any] = field(default_factory=dict)
+    is_metric: bool = True
 
 
 @dataclass(slots=True)
@@ -249,8 +253,15 @@ async def _run(spec: RobotSpec, pipe: ParentPipe) -> None:
                     "resent": robot.stats.resent,
                     "keyframes_uploaded": uploaded,
                 },
+                is_metric=_is_metric(mapper),
             )
         )
+
+
+def _is_metric(mapper: Mapper | LiveMapper) -> bool:
+    """Return whether poses of the odometry are metres; those of one lens in a live map never are."""
+    in_metres = mapper.scale.startswith("metric")
+    return in_metres and (isinstance(mapper, Mapper) or mapper.metres_per_unit == 1.0)
 
 
 async def _solve(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -50,6 +51,18 @@ def test_without_a_truth_no_errors_are_reported():
     made = report(None)
     assert made["ate_cm"] == [None]
     assert "ATE" not in closing_lines(made, Path("out"))
+
+
+def test_a_path_without_metres_has_neither_a_length_nor_errors():
+    made = make_report(
+        [finished(walk()), replace(finished(walk()), is_metric=False)], [COMMAND], {"rate_hz": 5.0},
+        {"settings_digest": "d", "load_average": [0]}, [0],
+    )  # fmt: skip
+    text = closing_lines(made, Path("out"))
+
+    assert (made["ate_cm"][1], made["path_m"][1], made["up_to_scale"]) == (None, None, [2])
+    assert made["ate_cm"][0] is not None
+    assert "up to scale, with neither depth, a second camera nor an IMU: robot-2\n" in text
 
 
 def test_the_report_has_the_documented_fields():
