@@ -645,8 +645,10 @@ def _make_folder(folder: str) -> list[str]:
     for made in reversed(missing):
         try:
             os.mkdir(made)
+        except FileNotFoundError:
+            break  # a remover took its parent meanwhile: the caller tries again
         except FileExistsError as error:
-            if not stat.S_ISDIR(os.lstat(made).st_mode):
+            if os.path.lexists(made) and not os.path.isdir(made):
                 raise StoreError(
                     f"{os.path.basename(made)!r} is an object, not a folder", hint="choose another name"
                 ) from error
