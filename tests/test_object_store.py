@@ -406,6 +406,25 @@ def test_writers_and_removers_of_one_folder_never_disturb_each_other(tmp_path: P
     assert names(store) == []
 
 
+@pytest.mark.parametrize("error", [FileExistsError, FileNotFoundError])
+def test_a_folder_that_a_remover_takes_while_it_is_made_is_made_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: type[OSError]
+) -> None:
+    store, mkdir, made = DirectoryStore(tmp_path), os.mkdir, []
+
+    def first_taken(path: str) -> None:
+        made.append(path)
+        if len(made) == 1:  # another writer made it, and a remover took it, or its parent, at once
+            raise error(path)
+        mkdir(path)
+
+    monkeypatch.setattr(os, "mkdir", first_taken)
+    store.put_scratch("uploads/a/1", b"x")
+
+    assert len(made) > 1
+    assert names(store) == ["uploads/a/1"]
+
+
 @pytest.mark.parametrize("code", [errno.ENOSPC, errno.EDQUOT])
 def test_a_full_disk_is_reported_and_leaves_the_old_version(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: int

@@ -69,10 +69,10 @@ class View:
 
 
 def views_of(source: str, frames: Iterable[Frame], poses: Iterable[Array | None]) -> list[View]:
-    """Return frames as views."""
+    """Return frames as views, with the features that live maps send."""
     views = []
     for row, frame, T in zip(count(), frames, poses, strict=False):
-        extracted = extract(frame, FrontEndOptions())
+        extracted = extract(frame, FrontEndOptions.live())
         features = make_features(extracted.pixels, extracted.points_camera[:, 2], extracted.descriptors)
         data = encode_keyframe(
             SentKeyframe(

@@ -260,8 +260,7 @@ async def _run(spec: RobotSpec, pipe: ParentPipe) -> None:
 
 def _is_metric(mapper: Mapper | LiveMapper) -> bool:
     """Return whether poses of the odometry are metres; those of one lens in a live map never are."""
-    in_metres = mapper.scale.startswith("metric")
-    return in_metres and (isinstance(mapper, Mapper) or mapper.metres_per_unit == 1.0)
+    return mapper.scale.startswith("metric") and getattr(mapper, "metres_per_unit", 1.0) == 1.0
 
 
 async def _solve(

@@ -13,7 +13,7 @@ from client_sdk.answers import PoseAnswer
 from client_sdk.frontend import Frame, FrontEndOptions, PoseQuery, extract, points_at
 from client_sdk.mapper import Mapper
 from client_sdk.simulator import SIMULATED_CAMERA, make_world, render_pairs, true_trajectory
-from client_sdk.stereo.depth import noise_of
+from client_sdk.stereo.depth import noise_of, stereo_points
 from client_sdk.stereo.view import StereoView
 from client_sdk.tracking.tracker import Tracker
 from rse_pf.config import PlatformSettings
@@ -59,6 +59,29 @@ def test_a_stereo_drive_is_tracked_in_metres(pairs: Sequence[Frame]) -> None:
     assert len(mapper.map) > 500
     assert mapper.report()["scale"] == "metric, by stereo"
     assert mapper.encoded_map()
+
+
+@pytest.mark.parametrize(("disparity_px", "is_far"), [(2.0, False), (1.5, False), (0.5, True)])
+def test_what_is_farther_than_a_disparity_of_a_pixel_has_no_depth(disparity_px: float, is_far: bool) -> None:
+    blocks = np.random.default_rng(1).integers(0, 256, (48, 64))
+    left = np.kron(blocks, np.ones((10, 10))).astype(np.uint8)
+    whole, part = divmod(disparity_px, 1.0)
+    near, farther = (np.roll(left, -int(whole) - step, axis=1) for step in (0, 1))
+    right = np.rint((1.0 - part) * near + part * farther).astype(np.uint8)
+    pixels = np.stack(np.meshgrid(np.arange(100, 540, 10), np.arange(100, 380, 10)), axis=-1).reshape(-1, 2)
+
+    points = stereo_points(
+        np.repeat(left[..., None], 3, axis=2), StereoView(right, BASELINE_M), SIMULATED_CAMERA,
+        pixels.astype(np.float64),
+    )  # fmt: skip
+
+    z = points[np.isfinite(points[:, 2]), 2]
+    if is_far:
+        assert len(z) == 0
+    else:
+        expected_m = SIMULATED_CAMERA.fx * BASELINE_M / disparity_px
+        assert len(z) > 0.5 * len(pixels)
+        assert np.median(z) == pytest.approx(expected_m, rel=0.02)
 
 
 def test_the_cloud_of_a_stereo_drive_lies_on_the_walls(pairs: Sequence[Frame]) -> None:

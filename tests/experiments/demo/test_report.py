@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from client_sdk.mapping import Trajectory
 from rse_pf.experiments.demo.report import advice, closing_lines, demo_page, is_lost, make_report
-from rse_pf.experiments.demo.robot import RobotFinished
+from rse_pf.experiments.demo.robot import RobotFinished, _is_metric
 from rse_pf.experiments.results.records import CommandRecord
 
 COMMAND = CommandRecord(
@@ -63,6 +64,20 @@ def test_a_path_without_metres_has_neither_a_length_nor_errors():
     assert (made["ate_cm"][1], made["path_m"][1], made["up_to_scale"]) == (None, None, [2])
     assert made["ate_cm"][0] is not None
     assert "up to scale, with neither depth, a second camera nor an IMU: robot-2\n" in text
+
+
+@pytest.mark.parametrize(
+    ("mapper", "expected"),
+    [
+        (SimpleNamespace(scale="metric, by depth"), True),
+        (SimpleNamespace(scale="up to scale"), False),
+        (SimpleNamespace(scale="metric, by stereo", metres_per_unit=1.0), True),
+        (SimpleNamespace(scale="metric, by the live map", metres_per_unit=0.28), False),
+        (SimpleNamespace(scale="up to scale", metres_per_unit=None), False),
+    ],
+)
+def test_a_drive_is_in_metres_if_its_odometry_is(mapper: SimpleNamespace, expected: bool) -> None:
+    assert _is_metric(mapper) is expected
 
 
 def test_the_report_has_the_documented_fields():
