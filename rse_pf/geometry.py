@@ -21,11 +21,15 @@ __all__ = [
     "Camera",
     "adjoint",
     "exp_se3",
+    "exp_so3",
     "from_quaternion",
     "inverse",
+    "left_jacobian_so3",
     "log_se3",
+    "log_so3",
     "median_pose",
     "pose_difference",
+    "right_jacobian_so3",
     "rigid",
     "rigid_many",
     "rotation_angle_deg",
@@ -45,6 +49,7 @@ _LAST_ROW_TOLERANCE = 1e-5
 _MAX_M = 1e9
 _NEAR_HALF_A_TURN = -0.999
 """Cosine of 177.4 degrees."""
+_SMALL_TURN = 1e-4
 
 # No sensor of a robot is wider; a larger value is taken for a mistake in the unit.
 _MAX_IMAGE_PX = 16384
@@ -319,3 +324,34 @@ def from_quaternion(q: npt.ArrayLike) -> Array:
             [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
         ]
     )
+
+
+def exp_so3(phi: Array) -> Array:
+    """Return the rotations ``(..., 3, 3)`` of rotation vectors ``(..., 3)``."""
+    rotations: Array = exp_se3(np.concatenate([np.zeros_like(phi), phi], axis=-1))[..., :3, :3]
+    return rotations
+
+
+def log_so3(R: Array) -> Array:
+    """Return the rotation vectors ``(n, 3)`` of rotations ``(n, 3, 3)``."""
+    T = np.zeros((len(R), 4, 4))
+    T[:, :3, :3], T[:, 3, 3] = R, 1.0
+    return log_se3(T)[:, 3:]
+
+
+def right_jacobian_so3(phi: Array) -> Array:
+    """Return ``(..., 3, 3)`` J with ``Exp(phi + d) = Exp(phi) Exp(J d)``, of ``(..., 3)``; Forster, eq. 8."""
+    return left_jacobian_so3(-phi)
+
+
+def left_jacobian_so3(phi: Array) -> Array:
+    """Return ``(..., 3, 3)`` J with ``Exp(phi + d) = Exp(J d) Exp(phi)``, of ``(..., 3)``."""
+    squared = np.square(phi).sum(axis=-1)
+    angle = np.sqrt(squared)
+    is_small = angle < _SMALL_TURN
+    safe = np.where(is_small, 1.0, angle)
+    a = np.where(is_small, 0.5 - squared / 24.0, 2.0 * np.square(np.sin(0.5 * safe) / safe))
+    b = np.where(is_small, 1.0 / 6.0, (safe - np.sin(safe)) / safe**3)
+    K = skew(phi)
+    J: Array = np.eye(3) + a[..., None, None] * K + b[..., None, None] * (K @ K)
+    return J

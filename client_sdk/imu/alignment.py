@@ -12,16 +12,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from client_sdk.imu.preintegration import (
-    Preintegration,
-    exp_so3,
-    left_jacobian_so3,
-    log_so3,
-    right_jacobian_so3,
-)
+from client_sdk.imu.preintegration import Preintegration
 from client_sdk.imu.samples import ImuModel
 from rse_pf.errors import UsageError
-from rse_pf.geometry import Array, skew
+from rse_pf.geometry import Array, exp_so3, left_jacobian_so3, log_so3, right_jacobian_so3, skew
 
 __all__ = ["GRAVITY_M_S2", "Alignment", "align", "bias_of_gyro"]
 

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from client_sdk.imu.history import ImuHistory
-from client_sdk.imu.preintegration import log_so3
-from rse_pf.geometry import Array, rotation_angle_deg
+from rse_pf.geometry import Array, log_so3, rotation_angle_deg
 
 __all__ = ["RateCheck", "check_rates", "trouble_of_samples"]
 

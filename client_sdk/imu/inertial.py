@@ -11,10 +11,10 @@ import numpy.typing as npt
 from client_sdk.imu.alignment import GRAVITY_M_S2, Alignment, align
 from client_sdk.imu.checks import RateCheck, check_rates, trouble_of_samples
 from client_sdk.imu.history import ImuHistory
-from client_sdk.imu.preintegration import Preintegration, exp_so3, log_so3, preintegrate
+from client_sdk.imu.preintegration import Preintegration, preintegrate
 from client_sdk.imu.samples import ImuModel, ImuSamples
 from rse_pf.errors import UsageError
-from rse_pf.geometry import Array, Camera
+from rse_pf.geometry import Array, Camera, exp_so3, log_so3
 from rse_pf.slam.inertial import InertialMotion, KeyframeImu, upright_turn
 
 __all__ = ["ImuScale", "Inertial", "upright"]

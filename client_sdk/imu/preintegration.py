@@ -18,11 +18,10 @@ import numpy as np
 
 from client_sdk.imu.samples import ImuSamples
 from rse_pf.errors import UsageError
-from rse_pf.geometry import Array, exp_se3, log_se3, skew
+from rse_pf.geometry import Array, exp_so3, right_jacobian_so3, skew
 
-__all__ = ["Preintegration", "exp_so3", "left_jacobian_so3", "log_so3", "preintegrate", "right_jacobian_so3"]
+__all__ = ["Preintegration", "preintegrate"]
 
-_SMALL = 1e-4
 _PHI, _V, _P, _BG, _BA = (slice(3 * number, 3 * number + 3) for number in range(5))
 
 
@@ -106,34 +105,3 @@ def preintegrate(samples: ImuSamples, bias_gyro: Array, bias_accel: Array) -> Pr
         covariance=covariance[:9, :9], jacobian=transition[:9, 9:],
         bias_gyro=np.array(bias_gyro, dtype=np.float64), bias_accel=np.array(bias_accel, dtype=np.float64),
     )  # fmt: skip
-
-
-def exp_so3(phi: Array) -> Array:
-    """Return the rotations ``(..., 3, 3)`` of rotation vectors ``(..., 3)``."""
-    rotations: Array = exp_se3(np.concatenate([np.zeros_like(phi), phi], axis=-1))[..., :3, :3]
-    return rotations
-
-
-def log_so3(R: Array) -> Array:
-    """Return the rotation vectors ``(n, 3)`` of rotations ``(n, 3, 3)``."""
-    T = np.zeros((len(R), 4, 4))
-    T[:, :3, :3], T[:, 3, 3] = R, 1.0
-    return log_se3(T)[:, 3:]
-
-
-def right_jacobian_so3(phi: Array) -> Array:
-    """Return ``(..., 3, 3)`` J with ``Exp(phi + d) = Exp(phi) Exp(J d)``, of ``(..., 3)``; Forster, eq. 8."""
-    return left_jacobian_so3(-phi)
-
-
-def left_jacobian_so3(phi: Array) -> Array:
-    """Return ``(..., 3, 3)`` J with ``Exp(phi + d) = Exp(J d) Exp(phi)``, of ``(..., 3)``."""
-    squared = np.square(phi).sum(axis=-1)
-    angle = np.sqrt(squared)
-    is_small = angle < _SMALL
-    safe = np.where(is_small, 1.0, angle)
-    a = np.where(is_small, 0.5 - squared / 24.0, 2.0 * np.square(np.sin(0.5 * safe) / safe))
-    b = np.where(is_small, 1.0 / 6.0, (safe - np.sin(safe)) / safe**3)
-    K = skew(phi)
-    J: Array = np.eye(3) + a[..., None, None] * K + b[..., None, None] * (K @ K)
-    return J

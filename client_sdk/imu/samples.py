@@ -13,7 +13,7 @@ import numpy as np
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Array, rigid
 
-__all__ = ["MAX_SAMPLES", "ImuModel", "ImuSamples"]
+__all__ = ["MAX_SAMPLES", "ImuModel", "ImuSamples", "check_samples"]
 
 MAX_SAMPLES = 100_000
 """Of one frame: 20 seconds of an IMU of 5 kHz."""
@@ -94,22 +94,31 @@ class ImuSamples:
     model: ImuModel
 
     def __post_init__(self) -> None:
-        n = len(self.timestamps_s)
-        if self.timestamps_s.shape != (n,) or self.gyro.shape != (n, 3) or self.accel.shape != (n, 3):
-            raise UsageError(
-                f"IMU: times {self.timestamps_s.shape}, gyro {self.gyro.shape} and accel {self.accel.shape} "
-                "do not fit",
-                hint="give three rates and three accelerations for each time",
-            )
+        n = check_samples(self.timestamps_s, self.gyro, self.accel)
         if n > MAX_SAMPLES:
             raise UsageError(
                 f"{n} IMU samples of one frame are above {MAX_SAMPLES}",
                 hint="give those since the last frame",
             )
-        if not all(np.isfinite(each).all() for each in (self.timestamps_s, self.gyro, self.accel)):
-            raise UsageError("an IMU sample is not finite", hint="leave out samples that were not measured")
-        if n and not (np.diff(self.timestamps_s) > 0.0).all():
-            raise UsageError("the times of the IMU do not ascend", hint="sort the samples, each time once")
 
     def __len__(self) -> int:
         return len(self.timestamps_s)
+
+
+def check_samples(timestamps_s: Array, gyro: Array, accel: Array) -> int:
+    """Return the number n of samples: ``(n,)`` seconds, ``(n, 3)`` rad/s and m/s^2.
+
+    Raises:
+        UsageError: The shapes do not fit, a number is not finite, or times do not ascend.
+    """
+    n = len(timestamps_s)
+    if timestamps_s.shape != (n,) or gyro.shape != (n, 3) or accel.shape != (n, 3):
+        raise UsageError(
+            f"IMU: times {timestamps_s.shape}, gyro {gyro.shape} and accel {accel.shape} do not fit",
+            hint="give three rates and three accelerations for each time",
+        )
+    if not all(np.isfinite(each).all() for each in (timestamps_s, gyro, accel)):
+        raise UsageError("an IMU sample is not finite", hint="leave out samples that were not measured")
+    if not (np.diff(timestamps_s) > 0.0).all():
+        raise UsageError("the times of the IMU do not ascend", hint="sort the samples, each time once")
+    return n

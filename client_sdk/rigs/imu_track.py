@@ -8,8 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from client_sdk.frontend import Frame
-from client_sdk.imu.samples import ImuModel, ImuSamples
-from rse_pf.errors import UsageError
+from client_sdk.imu.samples import ImuModel, ImuSamples, check_samples
 from rse_pf.geometry import Array
 
 __all__ = ["ImuTrack", "with_imu"]
@@ -29,16 +28,7 @@ class ImuTrack:
     model: ImuModel
 
     def __post_init__(self) -> None:
-        n = len(self.timestamps_s)
-        if self.gyro.shape != (n, 3) or self.accel.shape != (n, 3):
-            raise UsageError(
-                f"IMU: {n} times, gyro {self.gyro.shape} and accel {self.accel.shape} do not fit",
-                hint="give three rates and three accelerations for each time",
-            )
-        if not all(np.isfinite(each).all() for each in (self.timestamps_s, self.gyro, self.accel)):
-            raise UsageError("an IMU sample is not finite", hint="leave out samples that were not measured")
-        if not (np.diff(self.timestamps_s) > 0.0).all():
-            raise UsageError("the times of the IMU do not ascend", hint="sort the samples, each time once")
+        check_samples(self.timestamps_s, self.gyro, self.accel)
 
     def between(self, since_s: float, until_s: float) -> ImuSamples:
         """Return the samples from one at or before *since_s* to one at or after *until_s*."""

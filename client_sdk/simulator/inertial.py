@@ -11,9 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from client_sdk.imu.preintegration import exp_so3, right_jacobian_so3
 from client_sdk.imu.samples import ImuModel, ImuSamples
-from rse_pf.geometry import Array
+from rse_pf.geometry import Array, exp_so3, right_jacobian_so3
 
 __all__ = ["GRAVITY", "InertialDrive", "Motion", "SimulatedImu"]
 
