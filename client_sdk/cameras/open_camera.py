@@ -104,6 +104,11 @@ def open_camera(
         raw, has_depth = open_folder(path, own.depth_scale)
         has_depth = has_depth and depth
         return RawSource(word, _without_depth(raw, has_depth), own, has_depth=has_depth, rate_hz=rate_hz)
+    if word.count(",") == 1 and not path.exists():
+        raise UsageError(
+            f"{word} names two cameras, and no rig",
+            hint=f"rse-pf camera calibrate --stereo {word.replace(',', ' ')}; then --intrinsics rig.json",
+        )
     is_video_file(word)  # a name that is wrong is told before intrinsics that are missing
     if own is None:
         raise UsageError(

@@ -53,7 +53,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     board.add_argument("--charuco", action="store_true", help="a ChArUco board instead of a chessboard")
     calibrate = actions.add_parser("calibrate", parents=[board], help="write the intrinsics of a camera")
-    calibrate.add_argument("sources", nargs="+", metavar="SOURCE", help="a device number, a video, or images")
+    calibrate.add_argument(
+        "sources",
+        nargs="+",
+        metavar="SOURCE",
+        help="a device number, a video, or images; with --stereo two of them",
+    )
     calibrate.add_argument(
         "--stereo", action="store_true",
         help="two devices, videos or folders, or one whose images show both cameras side by side",

@@ -325,6 +325,8 @@ def _of_an_empty_folder(folder: Path) -> None:
         (lambda folder: open_camera(folder / "none.mp4"), "there is no video"),
         (lambda folder: open_camera(99, intrinsics=INTRINSICS), "camera 99 cannot be opened"),
         (lambda folder: open_camera(0), "intrinsics of 0 are not known"),
+        (lambda folder: open_camera("0,2"), "0,2 names two cameras, and no rig"),
+        (lambda folder: open_camera("0,2", intrinsics=INTRINSICS), "0,2 names two cameras, and no rig"),
         (lambda folder: open_camera("x.mcap"), "ROS bag"),
         (lambda folder: open_camera(video(folder), intrinsics=INTRINSICS, rate_hz=0.0), "rate 0"),
     ],
