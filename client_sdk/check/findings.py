@@ -17,7 +17,16 @@ _DEVIATIONS = 3.0
 
 
 class FaultKind(str, Enum):
-    """What can be wrong with a drive."""
+    """What can be wrong with a drive, and what the value of a finding of that kind is.
+
+    Of ``focal_length``, ``depth_scale`` and ``baseline`` the relative error of the setting; of
+    ``principal_point`` its error, px, the larger of both.  ``distortion`` is the ``k1`` that the images still
+    have.  ``depth_offset`` says by how many metres depths are too large; ``depth_delay`` by how many seconds
+    the depth of a frame is older than its colours; ``stamp_delay`` by how many seconds the stamps of images
+    are later than those of odometry, truth or IMU.  ``blur``, ``dark``, ``repeated`` and ``missing`` are
+    shares of the frames; ``jitter`` is the deviation of the interval, relative.  ``two_cameras`` and
+    ``moving_focal_length`` are by how much focal lengths differ, relative.  Others are 1.
+    """
 
     FOCAL_LENGTH = "focal_length"
     PRINCIPAL_POINT = "principal_point"

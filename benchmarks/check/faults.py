@@ -1,0 +1,278 @@
+"""Plant a known fault into the frames of a drive: calibration, depth, times and images.
+
+Values are in the convention of `client_sdk.check.findings.FaultKind`.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from client_sdk.check.findings import FaultKind
+from client_sdk.frontend import Frame
+from rse_pf.geometry import Camera
+
+__all__ = ["FAULTS", "Fault", "plant"]
+
+_DARK_BRIGHTNESS = 12.0
+_STRETCH = 10
+"""Frames of a stretch that is dark, or of one of two cameras."""
+
+Plant = Callable[[Iterable[Frame]], Iterator[Frame]]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Fault:
+    """One fault at one of three severities.
+
+    ``value`` is what a finding should say, None where only its kind counts; ``needs`` is empty, ``depth`` or
+    ``odometry``.
+    """
+
+    name: str
+    kind: FaultKind
+    severity: int
+    value: float | None
+    plant: Plant
+    needs: str = ""
+
+
+def plant(frames: Iterable[Frame], kind: FaultKind, severity: int) -> Iterator[Frame]:
+    """Return frames with the first fault of a kind at severity 1, 2 or 3."""
+    fault = next(each for each in FAULTS if each.kind is kind and each.severity == severity)
+    return fault.plant(frames)
+
+
+def _each(change: Callable[[Frame], Frame]) -> Plant:
+    return lambda frames: map(change, frames)
+
+
+def _camera(frame: Frame, **changed: float) -> Frame:
+    camera = frame.camera
+    values: dict[str, Any] = {name: getattr(camera, name) for name in ("fx", "fy", "cx", "cy")}
+    for name, value in changed.items():
+        values[name] = values[name] * (1.0 + value) if name in ("fx", "fy") else values[name] + value
+    return replace(frame, camera=Camera(**values, width=camera.width, height=camera.height))
+
+
+def _focal(share: float) -> Plant:
+    return _each(partial(_camera, fx=share))
+
+
+def _both_focal(share: float) -> Plant:
+    return _each(partial(_camera, fx=share, fy=share))
+
+
+def _principal(offset_px: float) -> Plant:
+    return _each(partial(_camera, cx=offset_px))
+
+
+def _remapped(frame: Frame, x: npt.NDArray[np.float32], y: npt.NDArray[np.float32]) -> Frame:
+    rgb = cv2.remap(frame.rgb, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    depth_m = cv2.remap(frame.depth_m, x, y, cv2.INTER_NEAREST)
+    return replace(frame, rgb=np.asarray(rgb, np.uint8), depth_m=np.asarray(depth_m, np.float32))
+
+
+def _distorted(k1: float) -> Plant:
+    """Return frames as a lens with *k1* gives them, magnified so far that no border is empty."""
+
+    def change(frame: Frame) -> Frame:
+        camera = frame.camera
+        rows, columns = np.mgrid[: camera.height, : camera.width].astype(np.float64)
+        corner = np.hypot((camera.width / 2) / camera.fx, (camera.height / 2) / camera.fy)
+        zoom = 1.0 if k1 > 0 else 1.0 / (1.0 + 1.3 * k1 * corner**2)
+        x, y = (columns - camera.cx) / (zoom * camera.fx), (rows - camera.cy) / (zoom * camera.fy)
+        bent = np.hypot(x, y)
+        straight = bent.copy()
+        for _ in range(30):
+            straight = bent / (1.0 + k1 * straight**2)
+        scale = np.where(bent > 0, straight / np.maximum(bent, 1e-12), 1.0)
+        seen_x = (x * scale * camera.fx + camera.cx).astype(np.float32)
+        seen_y = (y * scale * camera.fy + camera.cy).astype(np.float32)
+        changed = _remapped(frame, seen_x, seen_y)
+        return _camera(changed, fx=zoom - 1.0, fy=zoom - 1.0)
+
+    return _each(change)
+
+
+def _zoomed(frame: Frame, zoom: float) -> Frame:
+    """Return what a camera with *zoom* times the focal length sees."""
+    camera = frame.camera
+    rows, columns = np.mgrid[: camera.height, : camera.width].astype(np.float32)
+    x = (columns - np.float32(camera.cx)) / np.float32(zoom) + np.float32(camera.cx)
+    y = (rows - np.float32(camera.cy)) / np.float32(zoom) + np.float32(camera.cy)
+    return _remapped(frame, x, y)
+
+
+def _two_cameras(zoom: float, stretch: int | None) -> Plant:
+    """Return frames of two cameras with one calibration: in stretches, or the second half."""
+
+    def changed(frames: Iterable[Frame]) -> Iterator[Frame]:
+        every = list(frames)
+        turn = stretch or max(1, (len(every) + 1) // 2)
+        for row, frame in enumerate(every):
+            yield _zoomed(frame, zoom) if row // turn % 2 else frame
+
+    return changed
+
+
+def _moving_focal(share: float) -> Plant:
+    def changed(frames: Iterable[Frame]) -> Iterator[Frame]:
+        every = list(frames)
+        for row, frame in enumerate(every):
+            yield _zoomed(frame, 1.0 + share * row / max(1, len(every) - 1))
+
+    return changed
+
+
+def _depth(scale: float, offset_m: float) -> Plant:
+    def change(frame: Frame) -> Frame:
+        depth_m = np.where(frame.depth_m > 0, frame.depth_m * scale + offset_m, 0.0)
+        return replace(frame, depth_m=np.maximum(depth_m, 0.0).astype(np.float32))
+
+    return _each(change)
+
+
+def _late_depth(delay_s: float) -> Plant:
+    """Return frames whose depth is that of the frame nearest to *delay_s* earlier."""
+
+    def changed(frames: Iterable[Frame]) -> Iterator[Frame]:
+        earlier: deque[tuple[float, npt.NDArray[np.float32]]] = deque()
+        for frame in frames:
+            earlier.append((frame.timestamp_s, frame.depth_m))
+            wanted = frame.timestamp_s - delay_s
+            while len(earlier) > 1 and abs(earlier[1][0] - wanted) <= abs(earlier[0][0] - wanted):
+                earlier.popleft()
+            if abs(earlier[0][0] - wanted) < 0.6 * delay_s or earlier[0][0] <= wanted:
+                yield replace(frame, depth_m=earlier[0][1])
+
+    return changed
+
+
+def _stamped(delay_s: float) -> Plant:
+    return _each(lambda frame: replace(frame, timestamp_s=frame.timestamp_s + delay_s))
+
+
+def _some(change: Callable[[Frame, npt.NDArray[np.uint8] | None], Frame], every: int) -> Plant:
+    """Return frames of which each *every*-th is changed; *change* gets the image before it."""
+
+    def changed(frames: Iterable[Frame]) -> Iterator[Frame]:
+        before: npt.NDArray[np.uint8] | None = None
+        for row, frame in enumerate(frames):
+            yield change(frame, before) if row % every == every - 1 else frame
+            before = frame.rgb
+
+    return changed
+
+
+def _blurred(length_px: int, every: int = 2) -> Plant:
+    kernel = np.zeros((length_px, length_px), np.float32)
+    kernel[length_px // 2] = 1.0 / length_px
+
+    def change(frame: Frame, _: object) -> Frame:
+        turned = kernel if int(1e3 * frame.timestamp_s) % 400 < 200 else kernel.T
+        return replace(frame, rgb=np.asarray(cv2.filter2D(frame.rgb, -1, turned), np.uint8))
+
+    return _some(change, every)
+
+
+def _repeated(every: int) -> Plant:
+    return _some(lambda frame, before: frame if before is None else replace(frame, rgb=before), every)
+
+
+def _dark(share: float) -> Plant:
+    """Return frames of which a share, in stretches, has a twentieth of the light."""
+
+    def changed(frames: Iterable[Frame]) -> Iterator[Frame]:
+        period = round(_STRETCH / share)
+        for row, frame in enumerate(frames):
+            if row % period < _STRETCH:
+                dark = np.rint(frame.rgb * (_DARK_BRIGHTNESS / 255.0)).astype(np.uint8)
+                frame = replace(frame, rgb=dark)
+            yield frame
+
+    return changed
+
+
+def _missing(*rows: int) -> Plant:
+    """Return frames of which these of each ten are missing."""
+    return lambda frames: (frame for row, frame in enumerate(frames) if row % 10 not in rows)
+
+
+def _jittered(share: float) -> Plant:
+    """Return frames whose stamps are moved by up to a share of the interval, either way."""
+
+    def changed(frames: Iterable[Frame]) -> Iterator[Frame]:
+        every, rng = list(frames), np.random.default_rng(6)
+        step_s = float(np.median(np.diff([frame.timestamp_s for frame in every])))
+        for frame in every:
+            yield replace(frame, timestamp_s=frame.timestamp_s + step_s * share * float(rng.uniform(-1, 1)))
+
+    return changed
+
+
+def _mirrored(*, colour: bool, depth: bool) -> Plant:
+    def change(frame: Frame) -> Frame:
+        return replace(
+            frame,
+            rgb=np.ascontiguousarray(frame.rgb[:, ::-1]) if colour else frame.rgb,
+            depth_m=np.ascontiguousarray(frame.depth_m[:, ::-1]) if depth else frame.depth_m,
+        )
+
+    return _each(change)
+
+
+def _listed() -> Iterator[Fault]:
+    def three(
+        kind: FaultKind, name: str, faults: list[tuple[float | None, Plant]], needs: str = ""
+    ) -> Iterator[Fault]:
+        for severity, (value, planted) in enumerate(faults, 1):
+            yield Fault(
+                name=f"{name}-{severity}", kind=kind, severity=severity, value=value, plant=planted,
+                needs=needs,
+            )  # fmt: skip
+
+    kinds, half = FaultKind, 0.5
+    yield from three(kinds.FOCAL_LENGTH, "fx", [(v, _focal(v)) for v in (0.03, -0.06, 0.10)])
+    yield from three(kinds.PRINCIPAL_POINT, "cx", [(v, _principal(v)) for v in (8.0, 15.0, -30.0)])
+    yield from three(kinds.DISTORTION, "k1", [(v, _distorted(v)) for v in (-0.06, 0.10, -0.15)])
+    yield from three(
+        kinds.DEPTH_SCALE, "depth-scale", [(v, _depth(1.0 / (1.0 + v), 0.0)) for v in (0.03, -0.10, 4.0)],
+        "odometry",
+    )  # fmt: skip
+    yield from three(
+        kinds.DEPTH_OFFSET, "depth-offset", [(v, _depth(1.0, v)) for v in (0.03, -0.05, 0.10)], "depth"
+    )
+    yield from three(kinds.DEPTH_DELAY, "depth-late", [(v, _late_depth(v)) for v in (0.1, 0.2, 0.3)], "depth")
+    yield from three(
+        kinds.STAMP_DELAY, "stamps-late", [(v, _stamped(v)) for v in (0.05, 0.1, -0.2)], "odometry"
+    )
+    yield from three(kinds.BLUR, "blur", [(half, _blurred(px)) for px in (9, 15, 25)])
+    yield from three(
+        kinds.MIRRORED, "mirrored",
+        [(None, _mirrored(colour=c, depth=d)) for c, d in ((True, True), (False, True), (True, False))],
+        "odometry",
+    )  # fmt: skip
+    yield from three(
+        kinds.TWO_CAMERAS, "two-cameras",
+        [(z - 1.0, _two_cameras(z, s)) for z, s in ((1.1, None), (1.1, _STRETCH), (1.25, None))],
+    )  # fmt: skip
+    yield from three(kinds.FOCAL_LENGTH, "f", [(v, _both_focal(v)) for v in (0.03, -0.06, 0.10)])
+    yield from three(kinds.REPEATED, "repeated", [(1.0 / n, _repeated(n)) for n in (6, 3, 2)])
+    yield from three(
+        kinds.MISSING, "missing", [(len(r) / 10, _missing(*r)) for r in ((4,), (4, 7, 8), (2, 6, 7, 8))]
+    )
+    yield from three(kinds.DARK, "dark", [(v, _dark(v)) for v in (0.1, 0.25, 0.5)])
+    yield from three(kinds.JITTER, "jitter", [(None, _jittered(v)) for v in (0.25, 0.35, 0.45)])
+    yield from three(kinds.MOVING_FOCAL_LENGTH, "focus", [(v, _moving_focal(v)) for v in (0.03, 0.06, 0.12)])
+
+
+FAULTS: tuple[Fault, ...] = tuple(_listed())
+"""Each of the kinds at three severities; faults of one kind are told apart by their names."""
