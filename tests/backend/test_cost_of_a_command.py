@@ -12,7 +12,7 @@ import pytest
 from backend.gateway.worker_parts import WorkerParts, worker_parts
 
 from rse_pf.auth.tokens import Claims
-from rse_pf.backend.gateway.dispatcher import Dispatcher
+from rse_pf.backend.gateway.stateless_queue import StatelessQueue
 from rse_pf.backend.scheduling.scheduler import INLINE_BYTES
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import TooFewCorrespondences
@@ -132,7 +132,7 @@ def test_the_shortest_way_answers_and_counts_as_the_queue_does(
             return play(worker, claims)
 
     shortest = outcome()
-    monkeypatch.setattr(Dispatcher, "_runs_at_once", lambda self, queued: False)
+    monkeypatch.setattr(StatelessQueue, "runs_at_once", lambda self, queued: False)
     queued = outcome()
 
     assert shortest == queued

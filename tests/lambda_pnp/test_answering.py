@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import itertools
 import json
-import math
 import zlib
 from collections.abc import Callable
 from pathlib import Path
@@ -169,7 +168,7 @@ def over_the_websocket(body: bytes) -> Failure:
             allowed_s = command.deadline_ms / 1e3
         queued = QueuedCommand(None, RobotId("default", "robot-1"), command, len(body), 0.0, allowed_s)
         admission = Admission(SETTINGS.session)
-        refused = admission.judge(queued, None, QueueBacklog(), math.inf)
+        refused = admission.judge(queued, None, QueueBacklog())
         if refused is not None:
             told = failure_of(refused.error, command, server="lambda")
         else:

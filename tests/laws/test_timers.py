@@ -24,6 +24,7 @@ LIVE_AS_LONG_AS_THE_PROCESS = {
     "rse_pf/backend/compute/lane.py": {"ComputeLane"},
     "rse_pf/backend/gateway/audit_recorder.py": {"AuditRecorder"},
     "rse_pf/backend/gateway/dispatcher.py": {"Dispatcher"},
+    "rse_pf/backend/gateway/stateless_queue.py": {"StatelessQueue"},
     "rse_pf/backend/gateway/migration.py": {"Migration"},
     "rse_pf/backend/live_map/subscriptions.py": {"Subscriptions"},
     "rse_pf/backend/rosbridge/peers.py": {"WorkerPeers", "_Peers"},

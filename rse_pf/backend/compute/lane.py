@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable
 from typing import Generic, Protocol, TypeVar
 
 from rse_pf.backend.compute.limited_services import LimitedServices
+from rse_pf.backend.scheduling.command_queue import CommandQueue, QueueReport
 from rse_pf.backend.scheduling.scheduler import (
     QUEUE_TARGET_S,
     QueueBacklog,
@@ -47,7 +48,7 @@ class _Answers(Protocol[Answer]):
         """Answer a command that is given up at *now*."""
 
 
-class ComputeLane(Generic[Answer]):
+class ComputeLane(CommandQueue, Generic[Answer]):
     """Commands of limited services that wait or run."""
 
     def __init__(
@@ -90,11 +91,6 @@ class ComputeLane(Generic[Answer]):
         """Commands that wait or run."""
         return self._scheduler.waiting + self._scheduler.running
 
-    @property
-    def max_delay_s(self) -> float:
-        """How long a command may wait now; see `Scheduler.max_delay_s`."""
-        return self._scheduler.max_delay_s
-
     def offers(self, service: str) -> bool:
         """Return whether *service* is a limited one."""
         return service in self._names
@@ -116,18 +112,23 @@ class ComputeLane(Generic[Answer]):
         self._refuse_all(self._scheduler.submit(queued), now)
         self._start()
 
+    def withdraw(self, owner: object, command_id: int) -> None:
+        """Do nothing: the command is answered before its deadline."""
+
     def leave(self, owner: object) -> list[QueuedCommand]:
         """Drop the waiting commands of a connection that ended, and return them; what runs goes on."""
         return self._scheduler.leave(owner)
 
-    def report(self) -> dict[str, float]:
+    def report(self) -> QueueReport:
         """Return gauges for /metrics."""
-        return {
-            "compute_queue": float(self._scheduler.waiting),
-            "compute_running": float(self._scheduler.running),
-            "compute_cpu_s": self._limited.cpu_s(),
-            "compute_blocked_robots": float(self._limited.blocked_robots(self._monotonic())),
-        }
+        return QueueReport(
+            gauges={
+                "compute_queue": float(self._scheduler.waiting),
+                "compute_running": float(self._scheduler.running),
+                "compute_cpu_s": self._limited.cpu_s(),
+                "compute_blocked_robots": float(self._limited.blocked_robots(self._monotonic())),
+            }
+        )
 
     def close(self) -> None:
         """End the threads when they have nothing left, and the processes at once."""

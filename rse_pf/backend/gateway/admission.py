@@ -2,7 +2,7 @@
 
 Rate (`RobotRates`), the backlog of the whole server (`Scheduler.retry_unread_ms`) and size are judged before
 a message is decoded, because a refusal is then cheaper than decoding.  Scope, deadline and the backlog of the
-robot are judged once the command is known, whether it goes to the scheduler, to a sandbox or to a job.
+robot are judged once the command is known, in whichever queue it waits then.
 Values go in and decisions come out: there is no clock, no queue and no connection here.
 """
 
@@ -26,7 +26,7 @@ from rse_pf.backend.scheduling.scheduler import (
 from rse_pf.config import SessionSettings
 from rse_pf.errors import Busy, Forbidden
 
-__all__ = ["DECODER_FULL", "TOO_FAST", "TOO_LATE", "Admission", "UnreadRefusal"]
+__all__ = ["DECODER_FULL", "TOO_FAST", "TOO_LATE", "Admission", "UnreadRefusal", "is_in_scope"]
 
 MAX_QUEUE_PER_ROBOT = 8
 """Queued commands of one robot, as many as may be unanswered by default; more are refused."""
@@ -76,16 +76,8 @@ class Admission:
         share = _SUSPECTS_SHARE if bad_messages else 1.0
         return not unread_bytes or unread_bytes + size_bytes <= share * _MAX_UNREAD_BYTES
 
-    def is_in_scope(self, service: str, claims: Claims) -> bool:
-        """Return whether a token allows commands to *service*."""
-        return not claims.scopes or scopes_allow(claims.scopes, f"services:{service}")
-
     def judge(
-        self,
-        queued: QueuedCommand,
-        claims: Claims | None,
-        backlog: QueueBacklog,
-        max_delay_s: float,
+        self, queued: QueuedCommand, claims: Claims | None, backlog: QueueBacklog
     ) -> RefusedCommand | None:
         """Return why a decoded command is refused; None if it is admitted.
 
@@ -93,10 +85,9 @@ class Admission:
             queued: The command, with the times of its arrival and of its deadline.
             claims: The claims of the robot's token; None where no token is required.
             backlog: The commands that would delay *queued* in the queue that it would join.
-            max_delay_s: The longest time that commands may wait now; see `Scheduler.max_delay_s`.
         """
         service = queued.command.service
-        if claims is not None and not self.is_in_scope(service, claims):
+        if claims is not None and not is_in_scope(service, claims):
             forbidden = Forbidden(
                 f"this token does not hold the scope services:{service}", hint="issue one that does"
             )
@@ -111,7 +102,12 @@ class Admission:
                 retry_after_ms=retry_after_ms(backlog.waiting * backlog.turn_s),
             )
             return RefusedCommand(queued, busy, "robot-queue")
-        if backlog.delay_s > max_wait_s(allowed_s, max_delay_s):
+        if backlog.delay_s > max_wait_s(allowed_s, backlog.max_delay_s):
             busy = Busy(BEHIND, hint=BEHIND_HINT, retry_after_ms=retry_after_ms(backlog.delay_s))
             return RefusedCommand(queued, busy, "behind")
         return None
+
+
+def is_in_scope(service: str, claims: Claims) -> bool:
+    """Return whether a token allows commands to *service*."""
+    return not claims.scopes or scopes_allow(claims.scopes, f"services:{service}")

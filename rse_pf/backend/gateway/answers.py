@@ -20,7 +20,7 @@ from rse_pf.backend.scheduling.scheduler import QueuedCommand, RefusedCommand
 from rse_pf.errors import Busy, InternalError, LimitExceeded, RsePfError, UnknownService
 from rse_pf.recording.tap import RecordingTap
 from rse_pf.service import Registry, dispatch, failure_of, unknown_service
-from rse_pf.wire import Codec, Command, Failure, Result
+from rse_pf.wire import Command, Failure, Result
 from rse_pf.wire.envelope import Envelope, encode_refusal
 
 __all__ = ["Answers", "EncodedAnswer"]
@@ -59,8 +59,8 @@ class Answers:
             if objects.store is not None and takes_objects(service.request_type)
         )
         """Services whose payloads may name stored objects."""
+        self.registry = registry
         self._context = context
-        self._registry = registry
         self._services = services
         self._monotonic = context.clocks.monotonic
         self._logs_frequent = context.log.writes("debug")
@@ -78,7 +78,7 @@ class Answers:
         if command.service in self.with_objects:
             return self._compute_with_objects(queued)
         message = dispatch(
-            self._registry, command, self._monotonic, server=self._context.server_id,
+            self.registry, command, self._monotonic, server=self._context.server_id,
             on_defect=self._log_defect, received_s=queued.received_s,
         )  # fmt: skip
         if isinstance(message, Failure) and message.code == UnknownService.code:
@@ -89,18 +89,18 @@ class Answers:
         """Return the error of a service that is not offered; it names the services that the token allows."""
         owner: RobotConnection = queued.owner
         scopes = () if owner.claims is None else owner.claims.scopes
-        offered = [name for name in self._registry.names if scopes_allow(scopes, f"services:{name}")]
+        offered = [name for name in self.registry.names if scopes_allow(scopes, f"services:{name}")]
         return unknown_service(queued.command.service, offered)
 
     def _compute_with_objects(self, queued: QueuedCommand) -> EncodedAnswer:
         """Compute the answer of a service whose payload may refer to stored objects; it may block."""
         started = self._monotonic()
         try:
-            command = self.objects.resolve_references(queued.command, self._registry, queued.owner)
+            command = self.objects.resolve_references(queued.command, self.registry, queued.owner)
         except RsePfError as error:
             return self._encode_failure(queued, error)
         message = dispatch(
-            self._registry,
+            self.registry,
             command,
             self._monotonic,
             server=self._context.server_id,
@@ -176,20 +176,20 @@ class Answers:
     def send_unread_refusal(
         self,
         connection: RobotConnection,
-        codec: Codec,
         envelope: Envelope | None,
         refusal: UnreadRefusal,
         retry_after_ms: float,
         size_bytes: int,
     ) -> None:
         """Answer a message that is not decoded; *envelope* tells which command it is, if that is known."""
-        context = self._context
+        context, session = self._context, connection.session
+        assert session is not None
         context.metrics.shed[refusal.reason] += 1
         failure = Failure(
             id=None if envelope is None else envelope.id, code=Busy.code, message=refusal.message,
             hint=refusal.hint, retry_after_ms=retry_after_ms, server=context.server_id,
         )  # fmt: skip
-        data = encode_refusal(codec, failure)
+        data = encode_refusal(session.codec, failure)
         connection.write(data)
         if envelope is None:
             return

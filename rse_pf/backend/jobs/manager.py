@@ -26,7 +26,8 @@ from rse_pf.backend.jobs.record_gc import RECORD_TTL_S, RecordCollector
 from rse_pf.backend.jobs.runner import WAITING, JobContext, JobOutcome, JobSignals, run_job
 from rse_pf.backend.ports import Log
 from rse_pf.backend.robot_store import quota_bytes
-from rse_pf.backend.scheduling.scheduler import QueuedCommand
+from rse_pf.backend.scheduling.command_queue import CommandQueue, QueueReport, unmeasured_backlog
+from rse_pf.backend.scheduling.scheduler import QueueBacklog, QueuedCommand
 from rse_pf.errors import BadRequest, Busy, Cancelled, RsePfError, StoreError
 from rse_pf.identity import RobotId
 from rse_pf.service import failure_of
@@ -61,7 +62,7 @@ class _Entry:
     is_displaced: bool = False
 
 
-class JobManager:
+class JobManager(CommandQueue):
     """The jobs that robots of one worker wait for, on whichever server they run."""
 
     def __init__(
@@ -104,17 +105,14 @@ class JobManager:
         )
         self._settings_digest = settings_digest_of(context.settings)
 
-    @property
-    def known(self) -> int:
-        """Jobs that run here, wait for a slot, or are followed while another server runs them."""
-        return len(self._entries)
+    held = 0
+    """No job keeps a server from ending: others go on with it."""
 
-    @property
-    def waiting(self) -> int:
-        """Jobs of these that run nowhere yet."""
-        return sum(entry.what == WAITING for entry in self._entries.values())
+    def offers(self, service: str) -> bool:
+        """Return whether *service* is a long one."""
+        return service in self._context.services
 
-    def submit(self, queued: QueuedCommand) -> None:
+    def submit(self, queued: QueuedCommand, now: float) -> None:
         """Start the job of *queued*, unless it runs or is done already; the answer comes later.
 
         While the server drains nothing is answered: the robot sends the command again to another server.
@@ -150,16 +148,16 @@ class JobManager:
         entry.waiters.append(waiter)
         self._send_progress(entry, waiter)
 
-    def waiting_of(self, robot: RobotId) -> int:
-        """Return how many commands of *robot* have no answer yet."""
-        entries = [entry for entry in self._entries.values() if entry.request.robot == robot]
-        return sum(len(entry.waiters) + len(entry.resubmitted) for entry in entries)
+    def backlog(self, queued: QueuedCommand) -> QueueBacklog:
+        """Return how many commands of the robot have no answer yet."""
+        entries = [entry for entry in self._entries.values() if entry.request.robot == queued.robot]
+        return unmeasured_backlog(sum(len(entry.waiters) + len(entry.resubmitted) for entry in entries))
 
-    def withdraw(self, connection: Any, identity: int) -> None:
+    def withdraw(self, owner: Any, command_id: int) -> None:
         """Cancel one command; its job ends unless another command waits for it."""
         for entry in list(self._entries.values()):
             for waiter in list(entry.waiters):
-                if waiter.queued.owner is connection and waiter.queued.command.id == identity:
+                if waiter.queued.owner is owner and waiter.queued.command.id == command_id:
                     if len(entry.waiters) == 1:
                         entry.signals.cancel()
                         return
@@ -167,11 +165,12 @@ class JobManager:
                     self._fail(waiter.queued, Cancelled("the robot cancelled the command"))
                     return
 
-    def forget_connection(self, connection: Any) -> None:
+    def leave(self, owner: Any) -> list[QueuedCommand]:
         """Forget the commands of a connection that ended; their jobs go on until the robot reconnects."""
         for entry in self._entries.values():
-            entry.waiters = [waiter for waiter in entry.waiters if waiter.queued.owner is not connection]
-            entry.resubmitted = [queued for queued in entry.resubmitted if queued.owner is not connection]
+            entry.waiters = [waiter for waiter in entry.waiters if waiter.queued.owner is not owner]
+            entry.resubmitted = [queued for queued in entry.resubmitted if queued.owner is not owner]
+        return []
 
     def give_up(self) -> None:
         """Leave all jobs to other servers, and accept no more."""
@@ -227,9 +226,16 @@ class JobManager:
         entry.thread = threading.Thread(target=work, name=f"job-{entry.request.key[:8]}", daemon=True)
         entry.thread.start()
 
-    def cpu_by_tenant(self) -> dict[str, float]:
-        """Return the processor time of the jobs that ran here and have ended, by tenant."""
-        return dict(self._cpu_s)
+    def report(self) -> QueueReport:
+        """Return how many jobs are known here, on whichever server they run, and how many run nowhere yet.
+
+        The processor time is that of the jobs that ran here and have ended.
+        """
+        pending = sum(entry.what == WAITING for entry in self._entries.values())
+        return QueueReport(
+            gauges={"jobs": float(len(self._entries)), "jobs_pending": float(pending)},
+            cpu_s={"jobs": dict(self._cpu_s)},
+        )
 
     def _on_progress(self, entry: _Entry, done: float, what: str) -> None:
         entry.done, entry.what = done, what
@@ -282,7 +288,7 @@ class JobManager:
             )  # fmt: skip
             self._answer(waiter.queued, result)
         for queued in entry.resubmitted:
-            self.submit(queued)
+            self.submit(queued, self._context.clock())
 
     def _fail(self, queued: QueuedCommand, error: RsePfError) -> None:
         self._answer(queued, failure_of(error, queued.command, server=self._context.server_id))

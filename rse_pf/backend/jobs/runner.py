@@ -60,6 +60,8 @@ class JobContext:
     server_id: str
     start: Callable[[JobRequest], JobProcess]
     clock: Callable[[], float]
+    services: frozenset[str] = frozenset()
+    """Names of the long services, of which robots may ask."""
     queue: JobQueue | None = None
     """Where jobs that wait are offered to job servers; None where there are none."""
     finished: Callable[[JobRequest], None] | None = None

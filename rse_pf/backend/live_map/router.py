@@ -19,7 +19,8 @@ from rse_pf.backend.live_map.garbage import GarbageCounts
 from rse_pf.backend.live_map.map_link import OwnerLinks
 from rse_pf.backend.live_map.subscriptions import Reader, Subscriptions
 from rse_pf.backend.ports import WorkerContext
-from rse_pf.backend.scheduling.scheduler import QueuedCommand
+from rse_pf.backend.scheduling.command_queue import CommandQueue, QueueReport, unmeasured_backlog
+from rse_pf.backend.scheduling.scheduler import QueueBacklog, QueuedCommand
 from rse_pf.errors import (
     BadMessage,
     BadRequest,
@@ -69,8 +70,11 @@ _JUDGED_BY_OWNER = (KEYFRAME, RELOCALISE)
 """Of these the owner judges the request; its other errors are those of the map, and count against nobody."""
 
 
-class LiveMapRouter:
+class LiveMapRouter(CommandQueue):
     """The live maps as the robots of one worker see them."""
+
+    judges_scope = True
+    """By the name of the map."""
 
     def __init__(
         self,
@@ -109,15 +113,14 @@ class LiveMapRouter:
         """Return whether *service* is a command to a live map."""
         return service in LIVE_SERVICES
 
-    def waiting_of(self, robot: RobotId) -> int:
-        """Return how many commands of *robot* have no answer yet."""
-        return self._waiting.get(robot, 0)
+    def backlog(self, queued: QueuedCommand) -> QueueBacklog:
+        """Return how many commands of the robot have no answer yet."""
+        return unmeasured_backlog(self._waiting.get(queued.robot, 0))
 
     # --- commands ------------------------------------------------------------------------------
 
-    def submit(self, queued: QueuedCommand) -> None:
+    def submit(self, queued: QueuedCommand, now: float) -> None:
         """Pass a command to the owner of its map; the answer comes later, or at once if it is refused."""
-        now = self._monotonic()
         try:
             self._check_garbage(queued.robot, now)
             held = self._held_of_tenant.get(queued.robot.tenant, 0) + queued.size_bytes
@@ -242,9 +245,13 @@ class LiveMapRouter:
         """End a subscription."""
         self._subscriptions.end(connection, identity)
 
-    def left(self, connection: Reader) -> None:
+    def withdraw(self, owner: Any, command_id: int) -> None:
+        """Do nothing: the owner of the map answers before the deadline."""
+
+    def leave(self, owner: Reader) -> list[QueuedCommand]:
         """Forget the subscriptions of a connection that ended; its keyframes go on to their map."""
-        self._subscriptions.left(connection)
+        self._subscriptions.left(owner)
+        return []
 
     def update(self, tenant: str, map_name: str, payload: dict[str, Any]) -> None:
         """Take an update of an owner; ``key`` is that of "latest wins" and no part of the payload."""
@@ -255,28 +262,31 @@ class LiveMapRouter:
 
     # --- the whole -----------------------------------------------------------------------------
 
-    def report(self) -> dict[str, float]:
-        """Return the gauges of this worker."""
+    def report(self) -> QueueReport:
+        """Return the gauges of this worker, and the processor time of the owners that it started."""
         subscriptions = self._subscriptions
-        return {
-            "subscriptions": float(len(subscriptions)),
-            "updates": float(subscriptions.sent),
-            "updates_replaced": float(subscriptions.replaced),
-            "live_waiting": float(self.held),
-        }
-
-    def cpu_by_tenant(self) -> dict[str, float]:
-        """Return the processor time of the owners that this worker started, by tenant."""
-        return self._owners.cpu_by_tenant()
+        return QueueReport(
+            gauges={
+                "subscriptions": float(len(subscriptions)),
+                "updates": float(subscriptions.sent),
+                "updates_replaced": float(subscriptions.replaced),
+                "live_waiting": float(self.held),
+            },
+            cpu_s={"live-maps": self._owners.cpu_by_tenant()},
+        )
 
     def give_up(self) -> None:
         """Leave the maps of this server to others: it drains."""
         self._owners.give_up()
 
-    async def close(self) -> None:
-        """End what waits, and the connections to owners."""
+    def close(self) -> None:
+        """End what waits."""
         for task in list(self._tasks):
             task.cancel()
+
+    async def wait_closed(self) -> None:
+        """Close, wait for what waited, and end the connections to owners."""
+        self.close()
         await asyncio.gather(*self._tasks, return_exceptions=True)
         await self._owners.close()
 

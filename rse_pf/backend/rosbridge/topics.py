@@ -143,7 +143,7 @@ class RosbridgeTopics:
             for send in session.refuse(op, error):
                 client.write(send.data)
 
-    def forget_client(self, client: Client) -> None:
+    def leave(self, client: Client) -> None:
         """Forget a client whose connection ended."""
         for key in list(self._of_client.get(client, ())):
             topic = self._topics[key]

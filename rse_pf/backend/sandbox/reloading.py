@@ -17,7 +17,8 @@ from typing import Any, Protocol
 
 from rse_pf.backend.sandbox.circuit_breaker import Block
 from rse_pf.backend.sandbox.manager import SandboxHost, SandboxManager
-from rse_pf.backend.scheduling.scheduler import QueuedCommand
+from rse_pf.backend.scheduling.command_queue import CommandQueue, QueueReport, unmeasured_backlog
+from rse_pf.backend.scheduling.scheduler import QueueBacklog, QueuedCommand
 from rse_pf.identity import RobotId
 from rse_pf.service import failure_of, unknown_service
 from rse_pf.services.custom.installed import InstalledService
@@ -46,8 +47,8 @@ class _Generation:
     unanswered: Counter[RobotId] = field(default_factory=Counter)
 
 
-class ReloadingSandboxes:
-    """What the dispatcher knows as the sandboxes of its worker."""
+class ReloadingSandboxes(CommandQueue):
+    """The queue of installed services: what the dispatcher knows of the sandboxes of its worker."""
 
     def __init__(
         self,
@@ -172,7 +173,7 @@ class ReloadingSandboxes:
         """Return whether *service* is one of those that run."""
         return service in self._current.names
 
-    def submit(self, queued: QueuedCommand) -> None:
+    def submit(self, queued: QueuedCommand, now: float) -> None:
         """Run *queued* in its robot's sandbox; the answer comes through the callback."""
         if self._is_held(queued.robot):
             self._waiting.setdefault(queued.robot, deque()).append(queued)
@@ -209,16 +210,20 @@ class ReloadingSandboxes:
         for queued in self._waiting.pop(robot, ()):
             self._run(queued)
 
+    def withdraw(self, owner: Any, command_id: int) -> None:
+        """Do nothing: the command is answered before its deadline."""
+
     # --- robots --------------------------------------------------------------------------------------
 
-    def add_connection(self, robot: RobotId) -> None:
-        """Note a connection of *robot*."""
-        self._connections[robot] += 1
+    def enter(self, owner: Any) -> None:
+        """Note a connection, whose robot keeps its sandbox."""
+        self._connections[owner.robot] += 1
         for sandboxes in self._all:
-            sandboxes.add_connection(robot)
+            sandboxes.add_connection(owner.robot)
 
-    def remove_connection(self, robot: RobotId) -> None:
+    def leave(self, owner: Any) -> list[QueuedCommand]:
         """Note the end of a connection; nobody waits for the commands of a robot that has none."""
+        robot = owner.robot
         self._connections[robot] -= 1
         is_gone = self._connections[robot] <= 0
         if is_gone:
@@ -230,6 +235,7 @@ class ReloadingSandboxes:
             for generation in (self._current, *self._retiring):
                 del generation.unanswered[robot]
                 self._loop.call_soon(self._end_if_idle, generation)
+        return []
 
     def close(self) -> None:
         """End every sandbox and the zygotes."""
@@ -249,11 +255,13 @@ class ReloadingSandboxes:
         """Commands that wait or run."""
         return sum(manager.held for manager in self._all) + sum(map(len, self._waiting.values()))
 
-    def waiting_of(self, robot: RobotId) -> int:
-        """Return how many commands of *robot* wait."""
-        return sum(manager.waiting_of(robot) for manager in self._all) + len(self._waiting.get(robot, ()))
+    def backlog(self, queued: QueuedCommand) -> QueueBacklog:
+        """Return how many commands of the robot wait."""
+        robot = queued.robot
+        here = len(self._waiting.get(robot, ()))
+        return unmeasured_backlog(here + sum(manager.waiting_of(robot) for manager in self._all))
 
-    def report(self) -> dict[str, Any]:
+    def report(self) -> QueueReport:
         """Return the state and the counts of this worker's sandboxes for /readyz and /metrics."""
         reports = [manager.report() for manager in self._all]
         counts = Counter(self._past)
@@ -261,21 +269,23 @@ class ReloadingSandboxes:
             counts.update(report["counts"])
         current = self._current.sandboxes
         newest = {} if current is None else current.report()
-        return {
-            "sandboxes": sum(report["sandboxes"] for report in reports),
+        count = sum(report["sandboxes"] for report in reports)
+        isolation = {
+            "sandboxes": count,
             "missing_isolation": newest.get("missing_isolation", []),
             "open_breakers": newest.get("open_breakers", []),
             "counts": dict(counts),
             "services": list(self.names),
         }
-
-    def cpu_by_tenant(self) -> dict[str, float]:
-        """Return for how long the sandboxes of each tenant have worked at requests, in seconds."""
-        taken = self._past_s.copy()
+        worked = self._past_s.copy()
         for manager in self._all:
             for tenant, worked_s in manager.cpu_by_tenant().items():
-                taken[tenant] += worked_s
-        return dict(taken)
+                worked[tenant] += worked_s
+        return QueueReport(
+            gauges={"sandboxes": float(count)},
+            cpu_s={"sandboxes": dict(worked)},
+            sections={"isolation": isolation},
+        )
 
     def blocks(self) -> list[Block]:
         """Return the services and requests that are refused now after crashes, with their robots."""

@@ -92,11 +92,13 @@ class QueueBacklog(NamedTuple):
         waiting: How many commands of the robot wait in the same queue.
         delay_s: The time until the command's turn.
         turn_s: The time that each turn takes; 0 where it is not measured and nothing waits.
+        max_delay_s: How long a command with little time may wait now; see `Scheduler.max_delay_s`.
     """
 
     waiting: int = 0
     delay_s: float = 0.0
     turn_s: float = 0.0
+    max_delay_s: float = math.inf
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,11 +150,10 @@ class Scheduler:
         All numbers are 0 for a frame that replaces another one, which does not make the queue longer.
         """
         robot = self._robots.get(queued.robot)
-        if robot is None:
-            return QueueBacklog(0, self._delay_s(queued.robot, None), self.turn_s)
-        if _replaceable(robot.waiting, queued) is not None:
+        if robot is not None and _replaceable(robot.waiting, queued) is not None:
             return QueueBacklog()
-        return QueueBacklog(len(robot.waiting), self._delay_s(queued.robot, robot), self.turn_s)
+        waiting = 0 if robot is None else len(robot.waiting)
+        return QueueBacklog(waiting, self._delay_s(queued.robot, robot), self.turn_s, self.max_delay_s)
 
     def retry_unread_ms(self, robot_id: RobotId, allowed_s: float) -> float:
         """Return when a robot may try again whose next command, not decoded yet, would wait too long.

@@ -28,11 +28,10 @@ from rse_pf.auth.trust_store import key_set_from_snapshot
 from rse_pf.aws.storage import open_data_store
 from rse_pf.backend.compute.lane import ComputeLane
 from rse_pf.backend.compute.limited_services import LimitedServices, limited_processes
-from rse_pf.backend.gateway.admission import Admission
 from rse_pf.backend.gateway.answers import Answers, EncodedAnswer
 from rse_pf.backend.gateway.audit_recorder import AuditRecorder
 from rse_pf.backend.gateway.connection import RobotConnection
-from rse_pf.backend.gateway.dispatcher import CommandQueues, Dispatcher, NoQueue
+from rse_pf.backend.gateway.dispatcher import Dispatcher
 from rse_pf.backend.gateway.handshake import HandshakePolicy
 from rse_pf.backend.gateway.migration import Migration
 from rse_pf.backend.gateway.token_watch import TokenWatch
@@ -53,7 +52,7 @@ from rse_pf.backend.rosbridge.topics import RosbridgeTopics
 from rse_pf.backend.sandbox.circuit_breaker import Block
 from rse_pf.backend.sandbox.manager import SandboxHost, SandboxManager
 from rse_pf.backend.sandbox.reloading import Answer, OnReady, ReloadingSandboxes
-from rse_pf.backend.scheduling.scheduler import Scheduler
+from rse_pf.backend.scheduling.command_queue import CommandQueue
 from rse_pf.backend.supervisor.orders import (
     BlocksOrder,
     DrainOrder,
@@ -194,20 +193,19 @@ class _Worker:
         self._live_maps = (
             None if store is None or not settings.live.max_owners else _live_maps(context, answers, store)
         )
+        queues: list[CommandQueue | None] = [
+            self._sandboxes,
+            self._live_maps,
+            self._compute(plan, context, registry, answers),
+            self._jobs(plan, answers) if has_jobs(settings) else None,
+        ]
         self._dispatcher = Dispatcher(
             context,
-            registry=registry,
-            admission=Admission(settings.session),
-            queues=CommandQueues(
-                scheduler=Scheduler(),
-                compute=self._compute(plan, context, registry, answers),
-                sandboxes=self._sandboxes or NoQueue(),
-                jobs=self._jobs(plan, answers) if has_jobs(settings) else NoQueue(),
-                live_maps=self._live_maps or NoQueue(),
-                topics=self._topics(plan, registry.names) if settings.serving.rosbridge else NoQueue(),
-            ),
             answers=answers,
             token_watch=self._token_watch,
+            queues=[queue for queue in queues if queue is not None],
+            updates=self._live_maps,
+            topics=self._topics(plan, registry.names) if settings.serving.rosbridge else None,
         )
         self._migration = Migration(connections, loop=loop, now=time.monotonic, choose=secrets.choice)
         self._index = plan.index
@@ -353,6 +351,7 @@ class _Worker:
             server_id=plan.server_id,
             start=spawner(plan.services, settings),
             clock=time.monotonic,
+            services=frozenset(service.name for service in self._registry if service.kind == "long"),
             queue=JobQueue(store, settings) if settings.serving.offer_jobs else None,
         )
         return JobManager(
@@ -453,7 +452,7 @@ class _Worker:
         self._dispatcher.close_all()
         if self._live_maps is not None:
             with contextlib.suppress(asyncio.TimeoutError):
-                await asyncio.wait_for(self._live_maps.close(), _CLOSE_TIMEOUT_S)
+                await asyncio.wait_for(self._live_maps.wait_closed(), _CLOSE_TIMEOUT_S)
         until = time.monotonic() + _CLOSE_TIMEOUT_S
         while self._dispatcher.connections and time.monotonic() < until:
             await asyncio.sleep(_POLL_S)

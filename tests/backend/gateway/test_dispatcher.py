@@ -12,12 +12,13 @@ from backend.gateway.worker_parts import BINARY, UNIX_S, WorkerParts, worker_par
 from backend.scheduling.admitted import fall_behind, queued
 from fakes import FakeWire
 
-from rse_pf.backend.scheduling.scheduler import QueuedCommand
+from rse_pf.backend.scheduling.command_queue import CommandQueue, QueueReport, unmeasured_backlog
+from rse_pf.backend.scheduling.scheduler import QueueBacklog, QueuedCommand
 from rse_pf.config import PlatformSettings
 from rse_pf.identity import RobotId, object_name
 from rse_pf.object_store import MemoryStore, digest_of
 from rse_pf.service import Registry
-from rse_pf.wire import Command, Failure, Move, Ping, Pong, Result, Welcome
+from rse_pf.wire import Cancel, Command, Failure, Move, Ping, Pong, Result, Welcome
 
 SETTINGS = PlatformSettings()
 
@@ -326,34 +327,64 @@ def test_a_message_without_a_recognisable_id_is_refused_without_one(worker: Work
     assert (wire.sent[-1].code, wire.sent[-1].id) == ("busy", None)
 
 
-class Queue:
-    """Sandboxes or jobs that keep what is submitted."""
+class Queue(CommandQueue):
+    """Keeps what is submitted, and notes what else it is told."""
 
     held = 0
 
-    def __init__(self, waiting: int = 0) -> None:
-        self.submitted: list[Any] = []
+    def __init__(self, service: str, waiting: int = 0) -> None:
+        self.submitted: list[QueuedCommand] = []
+        self.told: list[Any] = []
+        self._service = service
         self._waiting = waiting
 
     def offers(self, service: str) -> bool:
-        return service == "installed"
+        return service == self._service
 
-    def waiting_of(self, robot: str) -> int:
-        return self._waiting
+    def backlog(self, queued: QueuedCommand) -> QueueBacklog:
+        return unmeasured_backlog(self._waiting)
 
-    def submit(self, command: Any) -> None:
-        self.submitted.append(command)
+    def submit(self, queued: QueuedCommand, now: float) -> None:
+        self.submitted.append(queued)
 
-    def report(self) -> dict[str, Any]:
-        return {}
+    def withdraw(self, owner: Any, command_id: int) -> None:
+        self.told.append(("withdraw", owner, command_id))
 
-    def add_connection(self, robot: Any) -> None: ...
+    def enter(self, owner: Any) -> None:
+        self.told.append(("enter", owner))
 
-    remove_connection = forget_connection = add_connection
+    def leave(self, owner: Any) -> list[QueuedCommand]:
+        self.told.append(("leave", owner))
+        return [queued for queued in self.submitted if queued.owner is owner]
 
-    def close(self) -> None: ...
+    def report(self) -> QueueReport:
+        return QueueReport(gauges={self._service: 1.0}, cpu_s={self._service: {"acme": 2.0}})
 
-    give_up = close
+    def give_up(self) -> None:
+        self.told.append("give-up")
+
+    def close(self) -> None:
+        self.told.append("close")
+
+
+def test_each_queue_learns_of_connections_withdrawals_and_the_end_of_the_server():
+    queues = [Queue("one"), Queue("two")]
+    with worker_parts(queues=queues) as worker:
+        connection, _ = worker.join()
+        worker.say(connection, Command(id=7, service="two", payload={}))
+        worker.say(connection, Cancel(id=7))
+        report = worker.dispatcher.snapshot()
+        worker.dispatcher.move_all("drain", 500.0)
+        connection.on_socket_end()
+        connection.on_socket_end()
+
+    for queue in queues:
+        assert queue.told == [
+            ("enter", connection), ("withdraw", connection, 7), "give-up", ("leave", connection), "close",
+        ]  # fmt: skip
+    assert [len(queue.submitted) for queue in queues] == [0, 1]
+    assert worker.metrics.requests["unknown", "disconnected"] == 1
+    assert (report["gauges"]["one"], report["gauges"]["two"]) == (1.0, 1.0)
 
 
 @pytest.mark.parametrize("service", ["installed", "long", "echo"])
@@ -363,8 +394,8 @@ class Queue:
 def test_every_kind_of_command_passes_the_same_admission(
     service: str, deadline_ms: float, waiting: int, code: str
 ):
-    sandboxes, jobs = Queue(waiting), Queue(waiting)
-    with worker_parts(register=register, sandboxes=sandboxes, jobs=jobs) as worker:
+    sandboxes, jobs = Queue("installed", waiting), Queue("long", waiting)
+    with worker_parts(register=register, queues=[sandboxes, jobs]) as worker:
         connection, wire = worker.join()
         if service == "echo":
             for number in range(waiting):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
@@ -13,25 +13,18 @@ from fakes import FakeLoop, FakeWire
 from rse_pf.auth.tokens import KeySet
 from rse_pf.backend.compute.lane import ComputeLane
 from rse_pf.backend.compute.limited_services import LimitedServices
-from rse_pf.backend.gateway.admission import Admission
 from rse_pf.backend.gateway.answers import Answers, EncodedAnswer
 from rse_pf.backend.gateway.audit_recorder import AuditRecorder
 from rse_pf.backend.gateway.connection import RobotConnection
-from rse_pf.backend.gateway.dispatcher import (
-    CommandQueues,
-    Dispatcher,
-    JobQueue,
-    LiveMapQueue,
-    NoQueue,
-    SandboxQueue,
-    TopicQueue,
-)
+from rse_pf.backend.gateway.dispatcher import Dispatcher
 from rse_pf.backend.gateway.handshake import Accepted, HandshakePolicy
 from rse_pf.backend.gateway.token_watch import TokenWatch
+from rse_pf.backend.live_map.router import LiveMapRouter
 from rse_pf.backend.log import JsonLog
 from rse_pf.backend.object_refs import ObjectRefs
 from rse_pf.backend.ports import Clocks, WorkerContext
-from rse_pf.backend.scheduling.scheduler import Scheduler
+from rse_pf.backend.rosbridge.topics import RosbridgeTopics
+from rse_pf.backend.scheduling.command_queue import CommandQueue
 from rse_pf.config import PlatformSettings
 from rse_pf.identity import RobotId
 from rse_pf.limited_process import LimitedProcesses
@@ -56,10 +49,9 @@ class WorkerParts:
         codec: str = "bin",
         register: Callable[[Registry], None] | None = None,
         store: MemoryStore | None = None,
-        sandboxes: SandboxQueue | None = None,
-        jobs: JobQueue | None = None,
-        live_maps: Callable[[WorkerContext, Answers], LiveMapQueue] | None = None,
-        topics: Callable[[WorkerContext], TopicQueue] | None = None,
+        queues: Sequence[CommandQueue] = (),
+        live_maps: Callable[[WorkerContext, Answers], LiveMapRouter] | None = None,
+        topics: Callable[[WorkerContext], RosbridgeTopics] | None = None,
         processes: LimitedProcesses | None = None,
         emulated_cores: float = 0.0,
     ) -> None:
@@ -81,8 +73,6 @@ class WorkerParts:
         echo.register(self.registry)
         if register is not None:
             register(self.registry)
-        self.scheduler = Scheduler()
-        self.admission = Admission(self.settings.session)
         self.handshake = HandshakePolicy(self.settings, keys)
         self.context = WorkerContext(
             settings=self.settings,
@@ -106,21 +96,18 @@ class WorkerParts:
             tell=lambda **message: self.told.append(message),
             recorder=AuditRecorder(self.clocks, loop=self.loop, tell=self.told.append, is_on=False),
         )
+        updates = None if live_maps is None else live_maps(self.context, self.answers)
+        lane = None if processes is None else self._lane(processes)
         self.dispatcher = Dispatcher(
             self.context,
-            registry=self.registry,
-            admission=self.admission,
-            queues=CommandQueues(
-                scheduler=self.scheduler,
-                compute=NoQueue() if processes is None else self._lane(processes),
-                sandboxes=sandboxes or NoQueue(),
-                jobs=jobs or NoQueue(),
-                live_maps=NoQueue() if live_maps is None else live_maps(self.context, self.answers),
-                topics=NoQueue() if topics is None else topics(self.context),
-            ),
             answers=self.answers,
             token_watch=self.token_watch,
+            queues=[queue for queue in (*queues, updates, lane) if queue is not None],
+            updates=updates,
+            topics=None if topics is None else topics(self.context),
         )
+        self.scheduler = self.dispatcher.stateless.scheduler
+        self.admission = self.dispatcher.admission
         self.decoder = self.dispatcher.decoder
 
     def _lane(self, processes: LimitedProcesses) -> ComputeLane[EncodedAnswer]:

@@ -116,7 +116,11 @@ def robot(name: str = "robot-1", tenant: str = "default") -> Any:
 
 def ask(bench: Bench, owner: Any, identity: int, value: int = 1) -> None:
     command = Command(id=identity, service="long", payload={"value": value})
-    bench.jobs.submit(QueuedCommand(owner, owner.robot, command, 10, 100.0, 105.0))
+    bench.jobs.submit(QueuedCommand(owner, owner.robot, command, 10, 100.0, 105.0), 100.0)
+
+
+def known(bench: Bench) -> float:
+    return bench.jobs.report().gauges["jobs"]
 
 
 def code(answer: Result | Failure) -> str:
@@ -136,8 +140,8 @@ def test_two_commands_with_the_same_request_wait_for_the_same_run(make, monkeypa
     assert {each.reply["value"] for each in bench.answers.values()} == {1}
     assert len({each.object for each in bench.answers.values()}) == 1
     assert bench.started.empty()
-    assert bench.jobs.known == 0
-    assert bench.jobs.cpu_by_tenant() == {"acme": 3.25}, "it was computed once"
+    assert known(bench) == 0
+    assert bench.jobs.report().cpu_s == {"jobs": {"acme": 3.25}}, "it was computed once"
 
 
 def test_the_same_request_of_another_robot_or_tenant_is_another_job(make):
@@ -157,7 +161,7 @@ def test_more_jobs_than_may_wait_are_refused_with_a_retry_time(make):
 
     assert code(bench.answers[2]) == "busy"
     assert bench.answers[2].retry_after_ms > 0
-    assert bench.jobs.known == 2
+    assert known(bench) == 2
 
 
 def test_the_newest_job_of_a_robot_with_many_is_displaced_by_another_robot(make):
@@ -194,7 +198,7 @@ def test_the_offer_of_a_displaced_job_is_withdrawn(make):
 
     ask(bench, other_robot, 10, value=10)
 
-    bench.run_until(lambda: bench.jobs.known == 4 and offers() == ["a", "a", "a", "b"])
+    bench.run_until(lambda: known(bench) == 4 and offers() == ["a", "a", "a", "b"])
 
 
 def test_progress_is_sent_at_once_then_at_most_twice_a_second_and_never_repeated(make):
@@ -270,8 +274,8 @@ def test_a_job_goes_on_without_its_robot_which_finds_it_after_reconnecting(make)
     bench, owner = make(), robot()
     ask(bench, owner, 1)
     process = bench.process()
-    bench.jobs.forget_connection(owner)
-    assert bench.jobs.known == 1
+    bench.jobs.leave(owner)
+    assert known(bench) == 1
 
     again = robot()
     ask(bench, again, 7)
@@ -288,11 +292,11 @@ def test_a_draining_server_answers_no_job_because_the_robot_asks_another(make):
     bench.process()
 
     bench.jobs.give_up()
-    bench.run_until(lambda: bench.jobs.known == 0)
+    bench.run_until(lambda: known(bench) == 0)
     ask(bench, owner, 2)
 
     assert bench.answers == {}
-    assert bench.jobs.known == 0
+    assert known(bench) == 0
 
 
 def test_old_records_are_deleted_when_a_job_ends(make):

@@ -90,7 +90,7 @@ class Parts:
         owner = connection or FakeReader()
         now = self.context.clocks.monotonic()
         command = Command(id=len(self.answers), service=service, payload=payload, trace="t")
-        self.router.submit(QueuedCommand(owner, owner.robot, command, size_bytes, now, now + allowed_s))
+        self.router.submit(QueuedCommand(owner, owner.robot, command, size_bytes, now, now + allowed_s), now)
 
     async def ask(self, service: str, payload: Any, **more: Any) -> Result | Failure:
         before = len(self.answers)
@@ -98,6 +98,12 @@ class Parts:
         while len(self.answers) == before:
             await asyncio.sleep(0)
         return self.answers[-1]
+
+
+def waiting(parts: Parts) -> int:
+    """Return how many commands of the robot *r* wait."""
+    probe = QueuedCommand(None, RobotId("default", "r"), Command(id=0, service="live-show"), 0, 0.0, 1.0)
+    return parts.router.backlog(probe).waiting
 
 
 def with_router(test: Callable[[Parts], Awaitable[None]], now: list[float] | None = None) -> None:
@@ -112,7 +118,7 @@ def with_router(test: Callable[[Parts], Awaitable[None]], now: list[float] | Non
             )  # fmt: skip
             parts = Parts(context)
             await asyncio.wait_for(test(parts), 20.0)
-            await parts.router.close()
+            await parts.router.wait_closed()
             assert parts.owners.closed
 
     asyncio.run(run())
@@ -291,9 +297,9 @@ def test_an_owner_that_does_not_answer_ends_with_the_deadline() -> None:
 
         assert isinstance(answer, Failure)
         assert answer.code == "expired"
-        assert (parts.router.held, parts.router.waiting_of(RobotId("default", "r"))) == (1, 1)
+        assert (parts.router.held, waiting(parts)) == (1, 1)
         await asyncio.sleep(0)
-        assert (parts.router.held, parts.router.waiting_of(RobotId("default", "r"))) == (0, 0)
+        assert (parts.router.held, waiting(parts)) == (0, 0)
 
     with_router(test)
 
@@ -399,9 +405,9 @@ def test_two_workers_tell_their_robots_the_same() -> None:
             assert updates["map"] == {"kind": "map", "keyframes": 3}
             np.testing.assert_array_equal(updates["alignment/here"]["T_map_odom"], np.eye(4).ravel())
             np.testing.assert_array_equal(updates["alignment/here"]["covariance"], np.arange(21.0))
-        assert parts.router.report()["subscriptions"] == 1.0
-        assert parts.router.report()["updates"] == 2.0
-        await other.router.close()
+        assert parts.router.report().gauges["subscriptions"] == 1.0
+        assert parts.router.report().gauges["updates"] == 2.0
+        await other.router.wait_closed()
 
     with_router(test)
 
@@ -458,7 +464,7 @@ def test_a_token_to_watch_a_map_subscribes_to_it_and_starts_no_owner() -> None:
 
         parts.router.subscribe(driver, 3, "live/m")
         assert parts.owners.may_start == {("default", "m"): True}
-        parts.router.left(driver)
+        parts.router.leave(driver)
         assert parts.owners.may_start == {("default", "m"): False}
         parts.owners.on_update("default", "m", {"kind": "map", "keyframes": 1})
 
@@ -573,7 +579,7 @@ def test_closing_ends_what_waits() -> None:
         parts.router.give_up()
 
         with suppress(asyncio.CancelledError):
-            await parts.router.close()
+            await parts.router.wait_closed()
 
         assert parts.owners.gave_up
         assert parts.router.held == 0

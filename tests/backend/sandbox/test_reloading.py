@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -19,6 +20,7 @@ from rse_pf.services.custom.installed import InstalledService
 from rse_pf.wire import Command, Failure, Result
 
 ROBOT, OTHER = RobotId("default", "r"), RobotId("default", "o")
+CONNECTION = SimpleNamespace(robot=ROBOT)
 
 
 class Log:
@@ -71,6 +73,10 @@ class Sandboxes:
     close = retire
 
 
+def queued(command: Command, robot: RobotId = ROBOT) -> QueuedCommand:
+    return QueuedCommand(None, robot, command, 0, 0.0, 1.0)
+
+
 class Parts:
     """Sandboxes that may be replaced, and what they made, answered and logged."""
 
@@ -100,7 +106,11 @@ class Parts:
 
     def call(self, number: int, service: str = "a", robot: RobotId = ROBOT) -> None:
         command = Command(id=number, service=service, payload={})
-        self.sandboxes.submit(QueuedCommand(None, robot, command, 0, 0.0, 1.0))
+        self.sandboxes.submit(queued(command, robot), 0.0)
+
+    def waiting(self) -> int:
+        probe = queued(Command(id=0, service="a", payload={}))
+        return self.sandboxes.backlog(probe).waiting
 
     def settle(self) -> None:
         self.loop.advance(0.001)
@@ -115,7 +125,7 @@ def services(*names: str) -> list[InstalledService]:
 
 def test_the_former_services_answer_until_the_new_ones_are_ready() -> None:
     parts = Parts("a")
-    parts.sandboxes.add_connection(ROBOT)
+    parts.sandboxes.enter(CONNECTION)
     parts.sandboxes.replace(services("a", "b"))
 
     parts.call(1)
@@ -139,7 +149,7 @@ def test_a_robots_commands_keep_their_order_and_others_do_not_wait_for_them() ->
 
     former, fresh = parts.made
     assert [each.command.id for each in fresh.queued] == [3]
-    assert (parts.sandboxes.held, parts.sandboxes.waiting_of(ROBOT)) == (3, 2)
+    assert (parts.sandboxes.held, parts.waiting()) == (3, 2)
     former.reply()
     parts.settle()
     assert [each.command.id for each in fresh.queued] == [3, 2]
@@ -147,8 +157,10 @@ def test_a_robots_commands_keep_their_order_and_others_do_not_wait_for_them() ->
     fresh.reply()
     fresh.reply()
     assert parts.answers == [(1, "ok"), (3, "ok"), (2, "ok")]
-    assert parts.sandboxes.report()["counts"] == {"crashes": 2}, "counts of Prometheus never fall"
-    assert parts.sandboxes.cpu_by_tenant() == {"acme": 3.0}
+    assert parts.sandboxes.report().sections["isolation"]["counts"] == {"crashes": 2}, (
+        "counts of Prometheus never fall"
+    )
+    assert parts.sandboxes.report().cpu_s == {"sandboxes": {"acme": 3.0}}
 
 
 def test_a_service_that_was_removed_is_unknown_also_to_who_waited_for_it() -> None:
@@ -199,24 +211,24 @@ def test_services_that_never_get_ready_are_given_up_and_a_newer_list_replaces_th
 
 def test_nobody_waits_for_a_robot_that_has_left() -> None:
     parts = Parts("a")
-    parts.sandboxes.add_connection(ROBOT)
+    parts.sandboxes.enter(CONNECTION)
     parts.call(1)
     parts.sandboxes.replace(services("a"))
     parts.made[1].on_ready(())
     parts.call(2)
 
-    parts.sandboxes.remove_connection(ROBOT)
+    parts.sandboxes.leave(CONNECTION)
     parts.settle()
 
     assert parts.made[0].is_retired
-    assert parts.sandboxes.waiting_of(ROBOT) == 0
+    assert parts.waiting() == 0
     assert parts.made[1].queued == []
 
 
 def test_the_first_services_are_started_when_they_come_and_a_failure_of_the_start_is_told() -> None:
     parts = Parts()
     assert parts.made == []
-    assert parts.sandboxes.report()["sandboxes"] == 0
+    assert parts.sandboxes.report().gauges["sandboxes"] == 0
 
     parts.sandboxes.replace(services("a"))
     parts.made[0].on_ready(())

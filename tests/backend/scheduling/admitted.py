@@ -26,7 +26,7 @@ class AdmittedScheduler(Scheduler):
         self._admission = Admission(SessionSettings(), max_queue=max_queue)
 
     def submit(self, command: QueuedCommand, now: float = 0.0) -> list[RefusedCommand]:
-        refusal = self._admission.judge(command, None, self.backlog(command), self.max_delay_s)
+        refusal = self._admission.judge(command, None, self.backlog(command))
         if refusal is None:
             return super().submit(command)
         if refusal.reason == "behind":

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import pytest
@@ -16,7 +15,7 @@ from rse_pf.config import SessionSettings
 from rse_pf.identity import RobotId
 
 ADMITTED: dict[str, Any] = {
-    "queued": queued("r", within=1.0), "claims": None, "backlog": QueueBacklog(), "max_delay_s": math.inf,
+    "queued": queued("r", within=1.0), "claims": None, "backlog": QueueBacklog(),
 }  # fmt: skip
 
 
@@ -50,7 +49,7 @@ def test_a_command_that_breaks_no_limit_is_admitted(admission: Admission):
         ({"queued": queued("r", within=0.0)}, "expired", "expired"),
         ({"backlog": QueueBacklog(4, 0.0, 0.3)}, "robot-queue", "busy"),
         ({"backlog": QueueBacklog(0, 0.6, 0.1)}, "behind", "busy"),
-        ({"backlog": QueueBacklog(0, 0.5, 0.1), "max_delay_s": 0.025}, "behind", "busy"),
+        ({"backlog": QueueBacklog(0, 0.5, 0.1, 0.025)}, "behind", "busy"),
     ],
 )
 def test_a_command_beyond_a_limit_is_refused_for_its_reason(

@@ -1,0 +1,236 @@
+"""The queue of stateless services: its commands are computed in the event loop or in a solver thread.
+
+Nothing but the computation of an answer (`Answers.compute`) runs outside of the event loop.
+"""
+
+from __future__ import annotations
+
+from asyncio import TimerHandle
+
+from rse_pf.backend.gateway.admission import TOO_LATE, is_in_scope
+from rse_pf.backend.gateway.answers import Answers, EncodedAnswer
+from rse_pf.backend.gateway.connection import RobotConnection
+from rse_pf.backend.metrics import LongestRecently
+from rse_pf.backend.ports import WorkerContext
+from rse_pf.backend.scheduling.command_queue import CommandQueue, QueueReport
+from rse_pf.backend.scheduling.cpu_throttle import BATCH_S, CpuThrottle
+from rse_pf.backend.scheduling.scheduler import (
+    INLINE_BYTES,
+    QUEUE_TARGET_S,
+    QueueBacklog,
+    QueuedCommand,
+    RefusedCommand,
+    Scheduler,
+)
+from rse_pf.backend.scheduling.thread_pool import SOLVER_THREADS, SolverThreads
+from rse_pf.wire.envelope import Envelope
+
+__all__ = ["StatelessQueue"]
+
+
+class StatelessQueue(CommandQueue):
+    """Commands of stateless services that wait or run."""
+
+    def __init__(self, context: WorkerContext, answers: Answers) -> None:
+        """Start the solver threads; they do nothing before the first command.
+
+        Args:
+            context: The settings, clocks and event loop of the worker.
+            answers: Computes and sends answers; its registry names the services.
+        """
+        clocks, loop = context.clocks, context.loop
+        self.scheduler = Scheduler()
+        self._answers = answers
+        self._registry = answers.registry
+        services = [
+            service for service in self._registry if service.kind == "stateless" and not service.limited
+        ]
+        self._names = frozenset(service.name for service in services)
+        self._cheap = frozenset(
+            service.name for service in services if service.cheap and service.name not in answers.with_objects
+        )
+        """Services that `runs_at_once` may run: in the event loop, without asking a store before."""
+        self._loop = loop
+        self._monotonic = clocks.monotonic
+        self._throttle = CpuThrottle(
+            context.settings.serving.emulated_cores, now=clocks.monotonic(), cpu=clocks.cpu
+        )
+        self._threads = SolverThreads(
+            SOLVER_THREADS,
+            answers.compute,
+            lambda answer: loop.call_soon_threadsafe(self._on_computed, answer),
+        )
+        self._waits = LongestRecently()
+        self._ran_inline = False
+        self._throttle_timer: TimerHandle | None = None
+        self._sweep_timer: TimerHandle | None = None
+        self._batched: list[tuple[RobotConnection, Envelope, float, int]] = []
+
+    @property
+    def held(self) -> int:
+        """Commands that wait or run."""
+        return self.scheduler.waiting + self.scheduler.running
+
+    def offers(self, service: str) -> bool:
+        """Return whether *service* is a stateless one that runs in this process."""
+        return service in self._names
+
+    def backlog(self, queued: QueuedCommand) -> QueueBacklog:
+        """Return the commands that would delay *queued*, see `Scheduler.backlog`."""
+        return self.scheduler.backlog(queued)
+
+    def note_refused(self, now: float) -> None:
+        """Count a command that was not queued because it would have waited too long."""
+        self.scheduler.note_refused(now)
+
+    def submit(self, queued: QueuedCommand, now: float) -> None:
+        """Queue *queued*, which was admitted, and start the commands whose turn it is."""
+        self._refuse(self.scheduler.submit(queued), now)
+        self._start()
+
+    def withdraw(self, owner: object, command_id: int) -> None:
+        """Do nothing: the command is answered soon in any case."""
+
+    def leave(self, owner: object) -> list[QueuedCommand]:
+        """Drop the waiting commands of a connection that ended, and return them; what runs goes on."""
+        return self.scheduler.leave(owner)
+
+    def report(self) -> QueueReport:
+        """Return gauges for /metrics."""
+        now = self._monotonic()
+        oldest_wait_s = self.scheduler.oldest_wait_s(now)
+        return QueueReport(
+            gauges={
+                "queue": float(self.scheduler.waiting),
+                "queue_oldest_s": oldest_wait_s,
+                "queue_ms": max(self._waits.longest_s(now), oldest_wait_s) * 1e3,
+                "in_flight": float(self.scheduler.running),
+            }
+        )
+
+    def close(self) -> None:
+        """End the threads when they have nothing left."""
+        self._threads.close()
+
+    def runs_at_once(self, queued: QueuedCommand) -> bool:
+        """Answer a cheap command of an idle server without a place in the queue; False if it has to be
+        queued or refused.
+
+        The shortest way of a command.  It decides, counts and answers as `submit` does for any other.
+        """
+        service = queued.command.service
+        claims = queued.owner.claims
+        if (
+            self._ran_inline
+            or service not in self._cheap
+            or queued.size_bytes > INLINE_BYTES
+            or self._throttle.is_on
+            or (claims is not None and not is_in_scope(service, claims))
+        ):
+            return False
+        now = self._monotonic()
+        if not self.scheduler.start_unqueued(queued, now):
+            return False
+        self._waits.note(now - queued.received_s, now)
+        self._begin_inline()
+        answer = self._answers.compute(queued)
+        now = self._monotonic()
+        self.scheduler.finish_unqueued(queued, now)
+        self._answers.send(answer, now)
+        return True
+
+    def refuse_unread(
+        self, connection: RobotConnection, envelope: Envelope, retry_ms: float, size_bytes: int
+    ) -> None:
+        """Refuse a message that is not decoded, because the server is behind.
+
+        Args:
+            connection: Of the robot.
+            envelope: What could be read of the message.
+            retry_ms: When the robot may try again, see `Scheduler.retry_unread_ms`.
+            size_bytes: Length of the message.
+        """
+        self.scheduler.note_refused(self._monotonic())
+        if self._throttle_timer is None:
+            self._answers.send_unread_refusal(connection, envelope, TOO_LATE, retry_ms, size_bytes)
+        else:
+            if not self._batched:
+                self._loop.call_later(BATCH_S, self._send_batch)
+            self._batched.append((connection, envelope, retry_ms, size_bytes))
+
+    # --- from the queue to an answer -----------------------------------------------------------
+
+    def _begin_inline(self) -> None:
+        """Keep every other command from running in this round of the event loop."""
+        self._ran_inline = True
+        self._loop.call_soon(self._next_round)
+
+    def _start(self) -> None:
+        """Start the commands whose turn it is, as many as threads and the throttle allow."""
+        scheduler = self.scheduler
+        while not self._ran_inline and scheduler.waiting and scheduler.running < SOLVER_THREADS:
+            now = self._monotonic()
+            wait_s = self._throttle.wait_s(now)
+            if wait_s > 0:
+                if self._throttle_timer is None:
+                    self._throttle_timer = self._loop.call_later(wait_s, self._go_on)
+                break
+            queued, refusals = scheduler.start(now)
+            if refusals:
+                self._refuse(refusals, now)
+            if queued is not None:
+                self._waits.note(now - queued.received_s, now)
+                self._run(queued)
+        if scheduler.waiting and self._sweep_timer is None:
+            self._sweep_timer = self._loop.call_later(QUEUE_TARGET_S / 2, self._sweep)
+
+    def _run(self, queued: QueuedCommand) -> None:
+        """Compute the answer to *queued*; in the event loop only one in each of its rounds.
+
+        Otherwise a slow round would hide the queue in the kernel, where its length cannot be seen.
+        """
+        command = queued.command
+        answers = self._answers
+        service = self._registry.get(command.service)
+        may_refer = command.service in answers.with_objects
+        asks_store = may_refer and answers.objects.has_references(command, service)
+        if not asks_store and self.scheduler.runs_inline(cheap=service.cheap, size_bytes=queued.size_bytes):
+            self._begin_inline()
+            self._finish(answers.compute(queued))
+        else:
+            self._threads.run(queued)
+
+    def _on_computed(self, answer: EncodedAnswer) -> None:
+        self._finish(answer)
+        self._start()
+
+    def _finish(self, answer: EncodedAnswer) -> None:
+        now = self._monotonic()
+        self.scheduler.done(answer.queued, now)
+        self._answers.send(answer, now)
+
+    def _refuse(self, refusals: list[RefusedCommand], now: float) -> None:
+        for refusal in refusals:
+            self._answers.send_refusal(refusal, now)
+
+    # --- timers --------------------------------------------------------------------------------
+
+    def _next_round(self) -> None:
+        self._ran_inline = False
+        if self.scheduler.waiting:
+            self._start()
+
+    def _go_on(self) -> None:
+        self._throttle_timer = None
+        self._start()
+
+    def _send_batch(self) -> None:
+        batched, self._batched = self._batched, []
+        for connection, envelope, retry_ms, size_bytes in batched:
+            self._answers.send_unread_refusal(connection, envelope, TOO_LATE, retry_ms, size_bytes)
+
+    def _sweep(self) -> None:
+        self._sweep_timer = None
+        now = self._monotonic()
+        self._refuse(self.scheduler.sweep(now), now)
+        self._start()
