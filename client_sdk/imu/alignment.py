@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from client_sdk.imu.checks import GRAVITY_M_S2, MOST_OFF_M_S2, off_gravity
 from client_sdk.imu.preintegration import Preintegration
 from client_sdk.imu.samples import ImuModel
 from rse_pf.errors import UsageError
@@ -19,7 +20,6 @@ from rse_pf.geometry import Array, exp_so3, left_jacobian_so3, log_so3, right_ja
 
 __all__ = ["GRAVITY_M_S2", "Alignment", "align", "bias_of_gyro"]
 
-GRAVITY_M_S2 = 9.81
 _STATE = 15
 _T, _P, _V, _BG, _BA = (slice(3 * number, 3 * number + 3) for number in range(5))
 _GYRO_PRIOR, _ACCEL_PRIOR = 0.1, 0.2
@@ -141,19 +141,35 @@ def _linear(
     gravity: Array = found[3 * n : 3 * n + 3]
     length = float(np.linalg.norm(gravity))
     if not is_metric and scale < 0.0:
-        left = np.square(right - matrix @ found).sum() / max(1, len(right) - matrix.shape[1])
-        # Of the last unknown alone: the last row of R, as the QR decomposition leaves it.
-        deviation = float(np.sqrt(left)) / abs(float(np.asarray(np.linalg.qr(matrix, mode="r"))[-1, -1]))
-        if -scale > _BEYOND_DOUBT * deviation:
+        deviations = _last_deviations(matrix, right - matrix @ found, 1)
+        if -scale > _BEYOND_DOUBT * deviations[0]:
             raise UsageError(
                 "the accelerometer measures the opposite of how the camera moves: an axis has the wrong sign",
                 hint="a resting accelerometer points up with 9.81; see T_imu_camera",
             )
     if not scale > 0.0 or not length > 0.0:
         return None
+    if abs(length - GRAVITY_M_S2) > MOST_OFF_M_S2:
+        deviations = _last_deviations(matrix, right - matrix @ found, 3 if is_metric else 4)
+        if abs(length - GRAVITY_M_S2) - MOST_OFF_M_S2 > _BEYOND_DOUBT * deviations[:3].max():
+            raise UsageError(
+                off_gravity(length, "of gravity beside the camera"),
+                hint="calibrate the accelerometer; at rest it must read 9.81 m/s^2",
+            )
     gravity = gravity * (GRAVITY_M_S2 / length)
     velocities: Array = found[: 3 * n].reshape(n, 3)
     return scale, gravity, velocities
+
+
+def _last_deviations(matrix: Array, residuals: Array, count: int) -> Array:
+    """Return the ``(count,)`` standard deviations of the last unknowns of a linear problem."""
+    left = np.square(residuals).sum() / max(1, len(residuals) - matrix.shape[1])
+    # The last rows of R, as the QR decomposition leaves it, hold these unknowns alone.
+    R = np.asarray(np.linalg.qr(matrix, mode="r"))[-count:, -count:]
+    if not np.abs(np.diag(R)).min() > 0.0:
+        return np.full(count, np.inf)
+    deviations: Array = np.sqrt(left * np.square(np.linalg.inv(R)).sum(axis=1))
+    return deviations
 
 
 def _moved(motions: Sequence[Preintegration]) -> Array:

@@ -7,12 +7,18 @@ from dataclasses import dataclass
 import numpy as np
 
 from client_sdk.imu.history import ImuHistory
+from client_sdk.imu.samples import ImuModel
 from rse_pf.geometry import Array, log_so3, rotation_angle_deg
 
-__all__ = ["RateCheck", "check_rates", "trouble_of_samples"]
+__all__ = ["GRAVITY_M_S2", "MOST_OFF_M_S2", "RateCheck", "check_rates", "off_gravity", "trouble_of_samples"]
 
-_GRAVITY = 9.81
+GRAVITY_M_S2 = 9.81
+MOST_OFF_M_S2 = 0.6
+"""So far may the bias of an accelerometer make gravity seem longer or shorter: three deviations of a bias."""
 _FEWEST_SAMPLES, _FEWEST_RATES = 100, 30
+_REST_S, _FEWEST_RESTS = 0.5, 3
+_REST_NOISES, _REST_GYRO, _REST_ACCEL = 3.0, 0.02, 0.1
+"""At rest samples scatter by less than these rad/s or m/s^2, and so many times their noise."""
 _MISSING, _SATURATED = 0.05, 0.01
 _LEAST_RATE = 0.04
 """rad/s, deviation about two axes: slower turns do not tell axes apart."""
@@ -58,9 +64,40 @@ def trouble_of_samples(history: ImuHistory) -> str:
     length = float(np.linalg.norm(rows[:, 4:7], axis=1).mean())
     if 0.7 < length < 1.3:
         return f"the accelerometer reads {length:.2f} on average: in g, where m/s^2 are needed"
-    if not 0.7 * _GRAVITY < length < 1.5 * _GRAVITY:
+    if not 0.7 * GRAVITY_M_S2 < length < 1.5 * GRAVITY_M_S2:
         return f"the accelerometer reads {length:.1f} m/s^2 on average, where gravity is 9.8"
-    return ""
+    at_rest = _accel_at_rest(rows, model)
+    return "" if at_rest is None else off_gravity(at_rest, "at rest")
+
+
+def off_gravity(length: float, where: str) -> str:
+    """Return in one line by how much an accelerometer is wrong that measures gravity as *length* m/s^2.
+
+    Empty if a bias may explain it.  One direction of gravity does not tell a scale from a bias.
+    """
+    off = length - GRAVITY_M_S2
+    if abs(off) <= MOST_OFF_M_S2:
+        return ""
+    share, much = 100.0 * abs(off) / GRAVITY_M_S2, "much" if off > 0.0 else "little"
+    return (
+        f"the accelerometer reads {length:.2f} m/s^2 {where}, {share:.0f} % too {much}: its scale is wrong, "
+        f"or it has a bias of {abs(off):.1f} m/s^2"
+    )
+
+
+def _accel_at_rest(rows: Array, model: ImuModel) -> float | None:
+    """Return the median length of accelerations where neither they nor the rates change; None if never."""
+    size = round(_REST_S * model.rate_hz)
+    count = len(rows) // size
+    if count < _FEWEST_RESTS:
+        return None
+    parts = rows[: count * size].reshape(count, size, 7)
+    scatter, white = parts[:, :, 1:].std(axis=1), _REST_NOISES * model.rate_hz**0.5
+    gyro, accel = _REST_GYRO + white * model.gyro_noise, _REST_ACCEL + white * model.accel_noise
+    rests = (scatter[:, :3] <= gyro).all(axis=1) & (scatter[:, 3:] <= accel).all(axis=1)
+    if rests.sum() < _FEWEST_RESTS:
+        return None
+    return float(np.median(np.linalg.norm(parts[rests, :, 4:].mean(axis=1), axis=1)))
 
 
 def check_rates(

@@ -153,6 +153,32 @@ def test_a_bad_imu_is_named_in_one_line_and_not_used(change, line):
     assert made.inertial.turn(1.0, 1.05) is None
 
 
+@pytest.mark.parametrize("factor", [0.9, 1.1])
+@pytest.mark.parametrize("rests_s", [0.0, 4.0])
+@pytest.mark.parametrize("seed", [3, 6])
+def test_an_accelerometer_with_a_wrong_scale_is_named(factor, rests_s, seed, monkeypatch):
+    monkeypatch.setitem(globals(), "SEED", seed)
+    made = driven(change=lambda s: replace(s, accel=factor * s.accel), motion=Motion(rests_s=rests_s))
+
+    assert re.search("the accelerometer reads .*(9|10|11) % too (much|little)", made.inertial.trouble)
+    assert ("too much" if factor > 1.0 else "too little") in made.inertial.trouble
+    assert ("at rest" in made.inertial.trouble) == (rests_s > 0.0)
+    assert re.search(r"or it has a bias of (0\.9|1\.0|1\.1) m/s", made.inertial.trouble)
+    assert all(scale is None for scale in made.scales)
+
+
+@pytest.mark.parametrize("rests_s", [0.0, 4.0])
+def test_an_accelerometer_with_a_usual_bias_is_used(rests_s):
+    made = driven(
+        10.0,
+        change=lambda s: replace(s, accel=s.accel + np.array([0.2, -0.2, 0.2])),
+        motion=Motion(rests_s=rests_s),
+    )
+
+    assert made.inertial.trouble == ""
+    assert made.scale_error < 0.015
+
+
 def test_a_transposed_mount_is_named():
     made = driven(change=lambda s: replace(s, model=replace(MODEL, T_imu_camera=inverse(MODEL.T_imu_camera))))
 
