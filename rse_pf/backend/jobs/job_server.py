@@ -15,6 +15,7 @@ from rse_pf.backend.jobs.runner import WAITING, JobContext, JobOutcome, JobSigna
 from rse_pf.backend.ports import Log
 from rse_pf.errors import StoreError
 from rse_pf.identity import RobotId
+from rse_pf.lease import ObjectRecords
 
 __all__ = ["JobServer"]
 
@@ -98,7 +99,7 @@ class JobServer:
         context = self._context
         if name not in self._watched:
             owner = self._new_owner()
-            self._watched[name] = (JobLease(context.store, name, owner, context.clock), owner)
+            self._watched[name] = (JobLease(ObjectRecords(context.store), name, owner, context.clock), owner)
         lease, _ = self._watched[name]
         try:
             record = lease.read()

@@ -1,8 +1,4 @@
-"""The lease of a job: one record in the object store that changes by compare-and-swap only.
-
-The owner renews the record; others who wait for the job watch it with their own clocks, so that the clocks of
-two machines are never compared.  Of two processes that take the same job one succeeds.  Time is an argument.
-"""
+"""The record of a job, and who may run it: what a lease (`rse_pf.lease`) means for jobs."""
 
 from __future__ import annotations
 
@@ -12,9 +8,9 @@ from typing import Any, Literal
 
 import msgspec
 
-from rse_pf.errors import BadMessage, BadRequest, Conflict, NotFound, StoreError
+from rse_pf.errors import BadMessage, BadRequest, StoreError
 from rse_pf.identity import RobotId
-from rse_pf.object_store import ObjectStore
+from rse_pf.lease import Lease, VersionedStore
 from rse_pf.wire.arrays import binary_encode_hook
 
 __all__ = [
@@ -23,7 +19,6 @@ __all__ = [
     "JobRecord",
     "Verdict",
     "decode_record",
-    "encode_record",
     "job_key",
     "record_name",
     "renewal_s",
@@ -62,7 +57,6 @@ class JobRecord(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     """Unix time when a garbage collection first saw the record as it is; 0 after each write of its owner."""
 
 
-encode_record = msgspec.json.Encoder().encode
 _decode = msgspec.json.Decoder(JobRecord).decode
 
 
@@ -125,28 +119,28 @@ def verdict_on(record: JobRecord | None, *, unchanged_s: float, lease_s: float, 
 class JobLease:
     """One process's view of the record of one job, and its lease on it."""
 
-    def __init__(self, store: ObjectStore, name: str, owner: str, clock: Callable[[], float]) -> None:
+    def __init__(self, store: VersionedStore, name: str, owner: str, clock: Callable[[], float]) -> None:
         """Read nothing yet.
 
         Args:
             store: Shared by all servers.
-            name: Object name of the record.
+            name: Name of the record.
             owner: Name that is unique to this process and this job.
             clock: Seconds, monotonic.
         """
-        self.record: JobRecord | None = None
         self.is_watched = False
-        self._store = store
-        self._name = name
         self._owner = owner
-        self._clock = clock
-        self._data: bytes | None = None
-        self._changed_s = clock()
+        self._lease = Lease(store, name, decode_record, clock)
+
+    @property
+    def record(self) -> JobRecord | None:
+        """The record as it was read or written last."""
+        return self._lease.record
 
     @property
     def unchanged_s(self) -> float:
         """The time since the record changed last, in seconds."""
-        return self._clock() - self._changed_s
+        return self._lease.unchanged_s
 
     @property
     def is_ours(self) -> bool:
@@ -155,14 +149,7 @@ class JobLease:
 
     def read(self) -> JobRecord | None:
         """Read the record; raises StoreError."""
-        try:
-            data: bytes | None = self._store.get(self._name)
-        except NotFound:
-            data = None
-        self._note(data)
-        if self.record is not None and self.record.state == "running":
-            self.is_watched = True
-        return self.record
+        return self._watch(self._lease.read())
 
     def take(self) -> bool:
         """Become the owner; False if another process did first.
@@ -171,41 +158,37 @@ class JobLease:
         """
         before = self.record
         tries = before.tries + 1 if before is not None and before.state == "running" else 1
-        return self._swap(JobRecord(state="running", owner=self._owner, tries=tries))
+        return self._write(JobRecord(state="running", owner=self._owner, tries=tries))
 
     def renew(self, share: float, what: str) -> bool:
         """Renew the lease with the progress; False if the job was taken or cancelled meanwhile."""
-        assert self.record is not None
+        if self.record is None or not self.is_ours:
+            return False
         beat = msgspec.structs.replace(
             self.record, beat=self.record.beat + 1, share=share, what=what, marked_s=0.0
         )
-        return self._swap(beat) and not beat.cancel
+        return self._write(beat) and not beat.cancel
 
     def end(self, record: JobRecord) -> bool:
         """Replace the lease by the outcome of the job; False if it is no longer ours."""
         while self.is_ours:
-            if self._swap(msgspec.structs.replace(record, owner=self._owner)):
+            if self._write(msgspec.structs.replace(record, owner=self._owner)):
                 return True
         return False
 
     def ask_to_cancel(self) -> None:
         """Ask the owner of the lease to cancel the job, because the robot cancelled it."""
         while self.record is not None and self.record.state == "running" and not self.record.cancel:
-            if self._swap(msgspec.structs.replace(self.record, cancel=True)):
+            if self._write(msgspec.structs.replace(self.record, cancel=True)):
                 return
 
-    def _swap(self, record: JobRecord) -> bool:
-        data = encode_record(record)
-        try:
-            self._store.compare_and_swap(self._name, self._data, data)
-        except Conflict:
-            self.read()
-            return False
-        self._note(data)
-        return True
+    def _write(self, record: JobRecord) -> bool:
+        is_written = self._lease.write(record)
+        if not is_written:
+            self._watch(self.record)
+        return is_written
 
-    def _note(self, data: bytes | None) -> None:
-        if data != self._data:
-            self._data = data
-            self._changed_s = self._clock()
-        self.record = None if data is None else decode_record(self._name, data)
+    def _watch(self, record: JobRecord | None) -> JobRecord | None:
+        if record is not None and record.state == "running":
+            self.is_watched = True
+        return record

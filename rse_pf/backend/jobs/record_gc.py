@@ -13,8 +13,9 @@ from collections.abc import Callable
 
 import msgspec
 
-from rse_pf.backend.jobs.lease import JobRecord, decode_record, encode_record
+from rse_pf.backend.jobs.lease import JobRecord, decode_record
 from rse_pf.errors import StoreError
+from rse_pf.lease import Lease, ObjectRecords
 from rse_pf.object_store import ObjectStore
 
 __all__ = ["RECORD_TTL_S", "RecordCollector"]
@@ -73,18 +74,19 @@ class RecordCollector:
             self._lock.release()
 
     def _collect(self, name: str) -> bool:
+        lease = Lease(ObjectRecords(self._store), name, decode_record, self._clock)
         try:
-            data = self._store.get(name)
-            record, now = decode_record(name, data), self._wall_clock()
+            record, now = lease.read(), self._wall_clock()
+            if record is None:
+                return False
             if not record.marked_s:
-                marked = msgspec.structs.replace(record, marked_s=now)
-                self._store.compare_and_swap(name, data, encode_record(marked))
+                lease.write(msgspec.structs.replace(record, marked_s=now))
                 return False
             if now - record.marked_s < self._ttl_s:
                 return False
-            tombstone = JobRecord(state="swept", owner="", marked_s=now)
-            self._store.compare_and_swap(name, data, encode_record(tombstone))
+            if not lease.write(JobRecord(state="swept", owner="", marked_s=now)):
+                return False
             self._store.delete(name)
         except StoreError:
-            return False  # changed meanwhile, or the store failed: the next round reads it again
+            return False  # the next round reads it again
         return True

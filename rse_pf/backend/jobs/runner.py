@@ -37,6 +37,7 @@ from rse_pf.errors import (
     error_from_code,
 )
 from rse_pf.identity import object_name
+from rse_pf.lease import ObjectRecords
 from rse_pf.linux import cpu_seconds
 from rse_pf.object_store import ObjectStore, digest_of
 
@@ -149,7 +150,7 @@ def run_job(
         watched: View of the job's record under the name *owner*, if the caller has watched it before.
     """
     name = record_name(request.robot, request.key)
-    lease = watched or JobLease(context.store, name, owner, context.clock)
+    lease = watched or JobLease(ObjectRecords(context.store), name, owner, context.clock)
     try:
         outcome = _follow_or_run(request, context, signals, tell, lease)
     except StoreError as error:

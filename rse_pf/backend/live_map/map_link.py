@@ -22,7 +22,6 @@ import msgspec
 from rse_pf.backend.live_map.children import OwnerChild, OwnerChildren
 from rse_pf.backend.live_map.owner.lease import (
     LeaseRecord,
-    LeaseWatch,
     decode_lease,
     lease_name,
     tenant_folder,
@@ -53,6 +52,7 @@ from rse_pf.errors import (
     error_from_code,
 )
 from rse_pf.identity import RobotId
+from rse_pf.lease import Lease, ObjectRecords, Versioned
 from rse_pf.object_store import ObjectStore
 from rse_pf.wire.live_map import SHOW, KeyframeRequest, LiveRequest, LiveStart
 
@@ -143,7 +143,8 @@ class MapLink:
         self._context = context
         self._on_update = on_update
         self._on_end = on_end
-        self._watch = LeaseWatch(lease_name(tenant, map_name), context.clock)
+        self._records = ObjectRecords(context.store)
+        self._lease = Lease(self._records, lease_name(tenant, map_name), decode_lease, context.clock)
         self._numbers = itertools.count(1)
         self._pending: dict[int, _Pending] = {}
         self._writer: asyncio.StreamWriter | None = None
@@ -208,7 +209,7 @@ class MapLink:
         try:
             while self._is_needed():
                 try:
-                    self._watch.note(await self._context.call(self._read_lease))
+                    self._lease.note(await self._context.call(self._read_lease))
                     await self._advance()
                 except StoreError as error:
                     self._tell_state("waiting for the store")
@@ -219,7 +220,7 @@ class MapLink:
 
     async def _advance(self) -> None:
         """Do what the lease asks for: connect, take the map over, or wait."""
-        record, lease_s = self._watch.record, self._context.settings.lease_s
+        record, lease_s = self._lease.record, self._context.settings.lease_s
         if record is None or record.state == "stopped":
             self._refuse_what_needs_a_map(is_stopped=record is not None)
             if not any(each.begins for each in self._pending.values()):
@@ -228,7 +229,7 @@ class MapLink:
                 await self._pause(_WATCH_POLL_S)
                 return
         is_dead = record is not None and record.epoch == self._dead_epoch
-        unchanged_s = max(lease_s, self._watch.unchanged_s) if is_dead else self._watch.unchanged_s
+        unchanged_s = max(lease_s, self._lease.unchanged_s) if is_dead else self._lease.unchanged_s
         verdict = verdict_on(record, unchanged_s=unchanged_s, lease_s=lease_s)
         if verdict == "claim" and not self._may_start:
             self._tell_state("idle")
@@ -264,10 +265,13 @@ class MapLink:
             await self._pause(_POLL_S)
             return
         order = OwnerOrder(
-            tenant=self.tenant, map_name=self.map_name, server=self._context.server_id, known=self._watch.data
+            tenant=self.tenant,
+            map_name=self.map_name,
+            server=self._context.server_id,
+            known=self._lease.known,
         )
         self.child = child
-        silent_s, began_s = self._watch.unchanged_s, self._context.clock()
+        silent_s, began_s = self._lease.unchanged_s, self._context.clock()
         has_won = await child.claim(order)
         self._context.log.info(
             "live-map-claimed", map=self.map_name, tenant=self.tenant, has_won=has_won,
@@ -352,7 +356,7 @@ class MapLink:
         try:
             while self._is_needed():
                 reading = reading or asyncio.ensure_future(reader.read(_READ_BYTES))
-                silent_s = self._watch.unchanged_s
+                silent_s = self._lease.unchanged_s
                 await asyncio.wait({reading}, timeout=max(_POLL_S, _PREPARE_SHARE * lease_s - silent_s))
                 if reading.done():
                     with contextlib.suppress(OSError):
@@ -364,7 +368,7 @@ class MapLink:
                         if goes_on:
                             continue
                     return
-                if self._watch.unchanged_s >= _PREPARE_SHARE * lease_s:
+                if self._lease.unchanged_s >= _PREPARE_SHARE * lease_s:
                     self._prepare()
                     if await self._is_given_up(record):
                         return
@@ -378,14 +382,14 @@ class MapLink:
         While the store fails it stays the owner: nobody can replace it.
         """
         try:
-            self._watch.note(await self._context.call(self._read_lease))
+            self._lease.note(await self._context.call(self._read_lease))
         except StoreError:
             self._tell_state("waiting for the store")
             return False
-        now = self._watch.record
+        now = self._lease.record
         if now is None or now.owner != record.owner or now.state != record.state:
             return True
-        return self._watch.unchanged_s >= self._context.settings.lease_s
+        return self._lease.unchanged_s >= self._context.settings.lease_s
 
     def _take(self, message: list[Any]) -> bool:
         """Take a message of the owner; return False if it gives the map up."""
@@ -407,7 +411,7 @@ class MapLink:
                 if self.is_watched:
                     self._on_update(payload)
             case ["beat", int(beat)]:
-                self._watch.note_beat(beat)
+                self._lease.note_beat(beat)
             case ["moving"]:
                 return False
         return True
@@ -471,11 +475,8 @@ class MapLink:
             return True
         return self._context.clock() - self._used_s < _LINGER_S
 
-    def _read_lease(self) -> bytes | None:
-        try:
-            return self._context.store.get(self._watch.name)
-        except NotFound:
-            return None
+    def _read_lease(self) -> Versioned | None:
+        return self._records.get(self._lease.name)
 
     async def _pause(self, seconds: float) -> None:
         """Wait, but not longer than until something is asked for."""
@@ -653,12 +654,11 @@ class OwnerLinks:
         return self._key
 
     def _list(self, tenant: str) -> list[dict[str, Any]]:
-        found = []
+        found, records = [], ObjectRecords(self._store)
         for name in self._store.folders(tenant_folder(tenant)):
-            object_name = lease_name(tenant, name)
-            try:
-                record = decode_lease(object_name, self._store.get(object_name))
-            except NotFound:
+            lease = Lease(records, lease_name(tenant, name), decode_lease, self._context.clock)
+            record = lease.read()
+            if record is None:
                 continue
             found.append(
                 {"name": name, "state": _STATES[record.state], "owner": record.owner, "server": record.server}

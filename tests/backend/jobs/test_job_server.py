@@ -22,6 +22,7 @@ from rse_pf.backend.sandbox.ipc import encode_message
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import StoreError
 from rse_pf.identity import RobotId
+from rse_pf.lease import ObjectRecords
 from rse_pf.object_store import MemoryStore
 from tests.backend.jobs.test_runner import FakeProcess
 
@@ -122,7 +123,9 @@ def test_a_job_server_takes_no_more_jobs_than_it_has_slots(bench: Bench) -> None
 def test_the_job_of_a_job_server_that_died_is_taken_after_its_lease(bench: Bench) -> None:
     request = a_request()
     bench.queue.offer(request)
-    dead = JobLease(bench.store, record_name(request.robot, request.key), "dead", time.monotonic)
+    dead = JobLease(
+        ObjectRecords(bench.store), record_name(request.robot, request.key), "dead", time.monotonic
+    )
     dead.read()
     assert dead.take()
     server = bench.job_server([DONE])

@@ -14,7 +14,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from rse_pf.backend.jobs.lease import JobRecord, encode_record
+from rse_pf.backend.jobs.lease import JobRecord
 from rse_pf.backend.jobs.manager import JobManager
 from rse_pf.backend.jobs.process import JobRequest
 from rse_pf.backend.jobs.queue import JobQueue
@@ -302,7 +302,7 @@ def test_a_draining_server_answers_no_job_because_the_robot_asks_another(make):
 def test_old_records_are_deleted_when_a_job_ends(make):
     bench, owner = make(), robot()
     old = "jobs/default/robot-9/" + "0" * 64
-    bench.store.put(old, encode_record(JobRecord(state="done", owner="", marked_s=1.0)))
+    bench.store.put(old, msgspec.json.encode(JobRecord(state="done", owner="", marked_s=1.0)))
     ask(bench, owner, 1)
 
     bench.process().done()

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import msgspec
 import pytest
 
-from rse_pf.backend.jobs.lease import JobLease, JobRecord, decode_record, encode_record, verdict_on
+from rse_pf.backend.jobs.lease import JobLease, JobRecord, decode_record, verdict_on
 from rse_pf.backend.jobs.record_gc import RecordCollector
 from rse_pf.errors import StoreError
+from rse_pf.lease import ObjectRecords
 from rse_pf.object_store import MemoryStore
 
 LIFE_S, LEASE_S = 1000.0, 5.0
@@ -27,7 +29,7 @@ class Bench:
         )  # fmt: skip
 
     def lease(self) -> JobLease:
-        lease = JobLease(self.store, NAME, "us", lambda: self.now)
+        lease = JobLease(ObjectRecords(self.store), NAME, "us", lambda: self.now)
         lease.read()
         return lease
 
@@ -42,7 +44,7 @@ class Bench:
 
 
 def put(store: MemoryStore, record: JobRecord, name: str = NAME) -> None:
-    store.put(name, encode_record(record))
+    store.put(name, msgspec.json.encode(record))
 
 
 @pytest.mark.parametrize("state", ["done", "failed", "given-up", "running"])
@@ -76,7 +78,7 @@ def test_a_request_between_tombstone_and_deletion_waits_and_then_gets_a_new_run(
 
     class Watched(MemoryStore):
         def delete(self, name: str) -> None:
-            reader = JobLease(self, NAME, "reader", lambda: bench.now)
+            reader = JobLease(ObjectRecords(self), NAME, "reader", lambda: bench.now)
             record = reader.read()
             asked.append(verdict_on(record, unchanged_s=0.0, lease_s=LEASE_S, is_watched=reader.is_watched))
             super().delete(name)

@@ -19,6 +19,7 @@ from rse_pf.backend.sandbox.ipc import encode_message
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import Conflict, StoreError
 from rse_pf.identity import RobotId, object_name
+from rse_pf.lease import ObjectRecords
 from rse_pf.object_store import MemoryStore, digest_of
 
 SETTINGS = PlatformSettings.from_dict(
@@ -115,7 +116,7 @@ def code(outcome: JobOutcome) -> str:
 
 
 def another(bench: Bench) -> JobLease:
-    lease = JobLease(bench.store, NAME, "another", Clock())
+    lease = JobLease(ObjectRecords(bench.store), NAME, "another", Clock())
     lease.read()
     return lease
 

@@ -20,6 +20,7 @@ from rse_pf.backend.sandbox.ipc import encode_message
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import Busy, NotFound
 from rse_pf.identity import RobotId
+from rse_pf.lease import ObjectRecords
 from rse_pf.object_store import MemoryStore
 from rse_pf.wire.live_map import KeyframeRequest, LiveMapRequest, LiveStart
 from tests.backend.live_map.fake_map import keyframe_request
@@ -44,7 +45,11 @@ class PlayedProcess:
     def claim(self, order: OwnerOrder) -> None:
         self.claims += 1
         lease = OwnerLease(
-            self._store, LEASE, owner=f"owner-{id(self)}", server=order.server, clock=time.monotonic
+            ObjectRecords(self._store),
+            LEASE,
+            owner=f"owner-{id(self)}",
+            server=order.server,
+            clock=time.monotonic,
         )
         if lease.claim(order.known) and lease.serve("127.0.0.1", 1, "c"):
             self.say("serving", lease.record.epoch)
@@ -141,7 +146,9 @@ def test_an_owner_elsewhere_is_used_before_the_own_process_is_ready() -> None:
         await until(lambda: worker.started)  # it never gets ready
         with socket.create_server(("127.0.0.1", 0)) as listener:
             listener.setblocking(False)
-            elsewhere = OwnerLease(worker.store, LEASE, owner="b", server="there", clock=time.monotonic)
+            elsewhere = OwnerLease(
+                ObjectRecords(worker.store), LEASE, owner="b", server="there", clock=time.monotonic
+            )
             assert elsewhere.claim(None)
             assert elsewhere.serve("127.0.0.1", listener.getsockname()[1], "c")
             connection, _ = await asyncio.get_running_loop().sock_accept(listener)
@@ -154,7 +161,9 @@ def test_an_owner_elsewhere_is_used_before_the_own_process_is_ready() -> None:
 
 def owner_on_a_closed_port(worker: Worker) -> None:
     """Let another server have the lease, with a port where nobody listens."""
-    elsewhere = OwnerLease(worker.store, LEASE, owner="b", server="there", clock=time.monotonic)
+    elsewhere = OwnerLease(
+        ObjectRecords(worker.store), LEASE, owner="b", server="there", clock=time.monotonic
+    )
     assert elsewhere.claim(None)
     with socket.create_server(("127.0.0.1", 0)) as listener:
         port = listener.getsockname()[1]
@@ -190,7 +199,9 @@ def test_a_link_that_ends_while_the_owner_has_not_welcomed_it_closes_its_connect
 
         context, certificate = server_context("127.0.0.1", now_s=time.time())
         server = await asyncio.start_server(owner, "127.0.0.1", 0, ssl=context)
-        elsewhere = OwnerLease(worker.store, LEASE, owner="b", server="there", clock=time.monotonic)
+        elsewhere = OwnerLease(
+            ObjectRecords(worker.store), LEASE, owner="b", server="there", clock=time.monotonic
+        )
         assert elsewhere.claim(None)
         assert elsewhere.serve("127.0.0.1", server.sockets[0].getsockname()[1], certificate)
         worker.link.set_watched(True)
@@ -219,7 +230,9 @@ def test_an_owner_whose_port_was_never_reached_keeps_its_lease() -> None:
 
 def test_who_may_only_watch_starts_no_process_and_is_told_that_the_map_is_idle() -> None:
     async def test(worker: Worker) -> None:
-        lease = OwnerLease(worker.store, LEASE, owner="b", server="there", clock=time.monotonic)
+        lease = OwnerLease(
+            ObjectRecords(worker.store), LEASE, owner="b", server="there", clock=time.monotonic
+        )
         assert lease.claim(None)
         assert lease.release()
         worker.link.set_watched(True, may_start=False)

@@ -1,27 +1,22 @@
-"""The lease of a live map: one record in the object store that changes by compare-and-swap only.
-
-The owner renews the record; others watch it with their own clocks, so that the clocks of two machines are
-never compared.  Of two processes that claim the same map one succeeds.  Time is an argument.
-"""
+"""The record of a live map, and who may own it: what a lease (`rse_pf.lease`) means for live maps."""
 
 from __future__ import annotations
 
-import contextlib
 import re
 from collections.abc import Callable
 from typing import Literal
 
 import msgspec
 
-from rse_pf.errors import BadRequest, Conflict, NotFound, StoreError
-from rse_pf.object_store import ObjectStore, name_segment
+from rse_pf.errors import BadRequest, StoreError
+from rse_pf.lease import Lease, Versioned, VersionedStore
+from rse_pf.object_store import name_segment
 
 __all__ = [
     "INTERNAL_KEY",
     "LeaseRecord",
     "LeaseState",
     "LeaseVerdict",
-    "LeaseWatch",
     "OwnerLease",
     "decode_lease",
     "lease_name",
@@ -65,7 +60,6 @@ class LeaseRecord(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True)
     tries: int = 0
 
 
-_encode = msgspec.json.Encoder().encode
 _decode = msgspec.json.Decoder(LeaseRecord).decode
 
 
@@ -119,45 +113,11 @@ def verdict_on(record: LeaseRecord | None, *, unchanged_s: float, lease_s: float
     return "connect" if record.state == "serving" and unchanged_s < lease_s else "wait"
 
 
-class LeaseWatch:
-    """What a process that is not the owner knows of a lease."""
-
-    def __init__(self, name: str, clock: Callable[[], float]) -> None:
-        """Know nothing yet; *clock* returns seconds, monotonic."""
-        self.name = name
-        self.data: bytes | None = None
-        self.record: LeaseRecord | None = None
-        self._clock = clock
-        self._changed_s = clock()
-        self._heard = -1
-
-    @property
-    def unchanged_s(self) -> float:
-        """For how long this process has known the lease unchanged, in seconds."""
-        return self._clock() - self._changed_s
-
-    def note(self, data: bytes | None) -> None:
-        """Take what was read from the store; a renewal that the owner has told is no change."""
-        if data == self.data:
-            return
-        before, self.data = self.record, data
-        now = self.record = None if data is None else decode_lease(self.name, data)
-        if before is None or now is None or (now.owner, now.state) != (before.owner, before.state):
-            self._heard = -1
-        if now is None or now.beat > self._heard:
-            self._changed_s = self._clock()
-
-    def note_beat(self, beat: int) -> None:
-        """Take that the owner itself told of renewal number *beat*."""
-        self._heard = max(beat, self._heard)
-        self._changed_s = self._clock()
-
-
 class OwnerLease:
     """The lease in the hands of the process that claims it.  Blocking; for one thread at a time."""
 
     def __init__(
-        self, store: ObjectStore, name: str, *, owner: str, server: str, clock: Callable[[], float]
+        self, store: VersionedStore, name: str, *, owner: str, server: str, clock: Callable[[], float]
     ) -> None:
         """Read nothing yet.
 
@@ -169,32 +129,28 @@ class OwnerLease:
             clock: Seconds, monotonic.
         """
         self.record = LeaseRecord(state="starting", owner=owner, epoch=0, server=server)
-        self._store = store
-        self._name = name
-        self._clock = clock
-        self._data: bytes | None = None
-        self._renewed_s = float("-inf")
+        """As it was written last; also after another owner replaced it."""
+        self._lease = Lease(store, name, decode_lease, clock)
 
     @property
     def age_s(self) -> float:
         """Seconds since the begin of the last write that succeeded: nobody took the map before that."""
-        return self._clock() - self._renewed_s
+        return self._lease.age_s
 
-    def claim(self, known: bytes | None) -> bool:
-        """Become the owner if the record still holds *known*; False if another process was first."""
-        before = None if known is None else decode_lease(self._name, known)
-        self._data = known
+    def claim(self, known: Versioned | None) -> bool:
+        """Become the owner if the record is still *known*; False if another process was first."""
+        before = self._lease.note(known)
         if before is None:
-            return self._swap(msgspec.structs.replace(self.record, epoch=1))
+            return self._put(msgspec.structs.replace(self.record, epoch=1))
         has_ended = before.state in ("released", "stopped")
         tries = 0 if has_ended else before.tries + 1
-        return self._swap(
+        return self._put(
             msgspec.structs.replace(self.record, epoch=before.epoch + 1, base=before.base, tries=tries)
         )
 
     def serve(self, address: str, port: int, certificate: str) -> bool:
         """Tell where the owner listens; False if the map was taken over."""
-        return self._swap(
+        return self._write(
             msgspec.structs.replace(
                 self.record, state="serving", address=address, port=port, certificate=certificate
             )
@@ -207,37 +163,29 @@ class OwnerLease:
             is_settled: The owner has served for a while: earlier crashes no longer count.
         """
         tries = 0 if is_settled else self.record.tries
-        return self._swap(msgspec.structs.replace(self.record, beat=self.record.beat + 1, tries=tries))
+        return self._write(msgspec.structs.replace(self.record, beat=self.record.beat + 1, tries=tries))
 
     def release(self) -> bool:
         """Let any server take the map at once; False if one has."""
-        return self._swap(msgspec.structs.replace(self.record, state="released", tries=0))
+        return self._write(msgspec.structs.replace(self.record, state="released", tries=0))
 
     def stop(self, base: int) -> bool:
         """End the map: what the log holds up to position *base* belongs to it no longer."""
-        return self._swap(msgspec.structs.replace(self.record, state="stopped", base=base, tries=0))
+        return self._write(msgspec.structs.replace(self.record, state="stopped", base=base, tries=0))
 
-    def _swap(self, record: LeaseRecord) -> bool:
-        """Replace the record; False if it is another's.
+    def _write(self, record: LeaseRecord) -> bool:
+        """Replace our record; False if it is another's; raises StoreError if nothing is known."""
+        return self._is_ours and self._put(record)
 
-        A write whose answer was lost counts by what it left, so the record is read before it is given up.
-
-        Raises:
-            StoreError: The store fails; nothing is known.
-        """
-        began_s = self._clock()
-        data = _encode(record)
-        try:
-            self._store.compare_and_swap(self._name, self._data, data)
-        except Conflict:
-            found: bytes | None = None
-            with contextlib.suppress(NotFound):
-                found = self._store.get(self._name)
-            if found != data:
-                if found is None or decode_lease(self._name, found).owner != record.owner:
-                    return False
-                self._data = found  # an earlier write, whose answer was lost
-                self._store.compare_and_swap(self._name, found, data)
-        self._data, self.record = data, record
-        self._renewed_s = began_s
+    def _put(self, record: LeaseRecord) -> bool:
+        """Replace the record that is known; False if there is another's."""
+        while not self._lease.write(record):
+            if not self._is_ours:
+                return False
+            # The answer to an earlier write was lost: nobody else writes a record with this owner.
+        self.record = record
         return True
+
+    @property
+    def _is_ours(self) -> bool:
+        return self._lease.record is not None and self._lease.record.owner == self.record.owner

@@ -47,6 +47,7 @@ from rse_pf.backend.sandbox.ipc import FrameReader, encode_message, receive
 from rse_pf.config import PlatformSettings
 from rse_pf.config.placement import live_ports
 from rse_pf.errors import StoreError
+from rse_pf.lease import ObjectRecords, Versioned
 from rse_pf.linux import die_with_parent, set_process_name
 from rse_pf.maps.registry import MapRegistry
 from rse_pf.object_store import ObjectStore
@@ -72,7 +73,7 @@ class OwnerOrder(msgspec.Struct, frozen=True, kw_only=True):
     tenant: str
     map_name: str
     server: str
-    known: bytes | None
+    known: Versioned | None
 
 
 class OwnerProcess:
@@ -187,8 +188,8 @@ class _Process:
         self._threads = OwnerThreads()
         self._log = JsonLog(level=settings.serving.log_level, server=order.server, wall_clock=time.time)
         self._lease = OwnerLease(
-            store, lease_name(order.tenant, order.map_name), owner=self._name, server=order.server,
-            clock=time.monotonic,
+            ObjectRecords(store), lease_name(order.tenant, order.map_name), owner=self._name,
+            server=order.server, clock=time.monotonic,
         )  # fmt: skip
 
     async def run(self) -> None:
