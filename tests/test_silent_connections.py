@@ -16,8 +16,8 @@ from fakes import FakeLoop
 from lambda_pnp.local_front import LocalFront
 from rse_pf.backend.live_map.owner.link_security import client_context, server_context
 from rse_pf.backend.live_map.owner.server import listen
-from rse_pf.backend.supervisor.control_http import ControlReply, serve_control
 from rse_pf.config.front_door import BALANCER_IDLE_TIMEOUT_S
+from rse_pf.control_http import ControlReply, serve_control
 from rse_pf.http_connections import bounded_protocol
 from rse_pf.local.control.control_port import serve_control_port
 from rse_pf.silent_connections import (

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import asyncio
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlencode
 
-from rse_pf.auth.control_token import bearer, read_control_token
-from rse_pf.errors import BadRequest, Busy, CommandFailed, UsageError
+from rse_pf.auth.control_token import read_control_token
+from rse_pf.errors import BadRequest, Busy, CommandFailed
 from rse_pf.local.processes import is_alive
+from rse_pf.local.servers.control_client import ControlPort
 from rse_pf.local.state import read_state
 
 __all__ = ["ACTIONS", "LocalOperations"]
@@ -25,9 +25,7 @@ ACTIONS = {
     "roll": (),
 }
 """Action to its parameters."""
-_LOOPBACK = "127.0.0.1"
 _SILENCE_S = 300.0
-_MAX_LINE_BYTES = 1 << 20
 _FAILED = "operation-failed"
 
 
@@ -58,27 +56,15 @@ class LocalOperations:
         query = urlencode({name: parameters[name] for name in ACTIONS[action]})
         try:
             return await self._ask(state.status_port, token, f"/{action}?{query}")
-        except (OSError, ValueError, EOFError, asyncio.TimeoutError) as error:
+        except OSError as error:
             raise Busy(
                 "the control plane does not answer", hint="see rse-pf local status", retry_after_ms=1000
             ) from error
 
     async def _ask(self, port: int, token: str, target: str) -> Mapping[str, Any]:
-        reader, writer = await asyncio.open_connection(_LOOPBACK, port, limit=_MAX_LINE_BYTES)
-        try:
-            head = f"POST {target} HTTP/1.1\r\nHost: {_LOOPBACK}\r\nAuthorization: {bearer(token)}\r\n"
-            writer.write(f"{head}Content-Length: 0\r\n\r\n".encode())
-            status = int((await reader.readuntil(b"\r\n\r\n")).split(b" ", 2)[1])
-            last: Mapping[str, Any] = {}
-            while line := await asyncio.wait_for(reader.readline(), _SILENCE_S):
-                last = json.loads(line)
-        finally:
-            writer.close()
-        if status != 200:
-            raise UsageError(
-                str(last.get("message", f"the control plane answers {status}")),
-                hint=str(last.get("hint", "")),
-            )
+        last: Mapping[str, Any] = {}
+        async for event in ControlPort(port, token).follow(target, silence_s=_SILENCE_S):
+            last = event
         if last.get("event") == _FAILED:
             raise CommandFailed(str(last.get("message", "")), hint=str(last.get("hint", "")))
         return last

@@ -16,7 +16,8 @@ ORDER = (
     "rse_pf", "errors", "event_loop", "terminal", "linux", "one_thread", "limited_process",
     "files", "disk_reserve", "geometry", "native",
     "native_buffers", "native_matcher", "native_tracker", "native_stereo", "token_bucket", "config",
-    "silent_connections", "http_head", "http_connections", "page_cache", "budget", "wire", "scaling",
+    "silent_connections", "control_http", "http_head", "http_connections", "page_cache", "budget", "wire",
+    "scaling",
     "object_store", "lease", "identity", "crash_record", "maps", "accounts", "auth", "enrolment", "audit",
     "service",
     "pnp", "slam", "services.mapping", "live_map", "services.custom", "services",
@@ -56,6 +57,7 @@ ONLY: dict[str, set[str]] = {
     "lambda_pnp": _BELOW - {"scaling", "aws"},
     "local": {
         "config",
+        "control_http",
         "scaling",
         "errors",
         "auth",

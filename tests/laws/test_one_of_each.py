@@ -1,4 +1,4 @@
-"""One idea has one place: queues of commands."""
+"""One idea has one place: queues of commands, leases, servers and clients of control ports."""
 
 from __future__ import annotations
 
@@ -7,6 +7,9 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 BACKEND = "rse_pf/backend"
+CONTROL_SERVER = "rse_pf/control_http.py"
+CONTROL_CLIENT = "rse_pf/local/servers/control_client.py"
+LEASE = "rse_pf/lease.py"
 PROTOCOL = "CommandQueue"
 
 
@@ -69,3 +72,41 @@ def test_a_second_kind_of_queue_is_caught() -> None:
 
     assert beside_the_protocol({"x.py": text}) == {"x.py: Waiting"}
     assert beside_the_protocol({"x.py": text.replace("Waiting", "Waiting(CommandQueue)")}) == set()
+
+
+def product(repository: Path) -> dict[str, str]:
+    """Return the modules of the product, by their paths."""
+    return {
+        path.relative_to(repository).as_posix(): path.read_text(encoding="utf-8")
+        for path in sorted((repository / "rse_pf").rglob("*.py"))
+    }
+
+
+def with_own_http(tree: Mapping[str, str], opener: str) -> set[str]:
+    """Return the modules of *tree* that call *opener* of asyncio and write or read HTTP themselves."""
+    return {path for path, text in tree.items() if f"asyncio.{opener}(" in text and "HTTP/1.1" in text}
+
+
+def with_own_lease(tree: Mapping[str, str]) -> set[str]:
+    """Return the modules of *tree* that count renewals, and swap the record themselves."""
+    return {path for path, text in tree.items() if "compare_and_swap(" in text and "beat" in text}
+
+
+def test_there_is_one_server_of_control_ports_and_one_client(repository: Path) -> None:
+    tree = product(repository)
+
+    assert with_own_http(tree, "start_server") == {CONTROL_SERVER}
+    assert with_own_http(tree, "open_connection") == {CONTROL_CLIENT}
+
+
+def test_there_is_one_lease(repository: Path) -> None:
+    assert with_own_lease(product(repository)) == {LEASE}
+
+
+def test_a_second_server_client_or_lease_is_caught() -> None:
+    server = "server = await asyncio.start_server(talk)\nwriter.write(b'HTTP/1.1 200 OK')"
+    lease = "store.compare_and_swap(name, known, encode(replace(record, beat=record.beat + 1)))"
+
+    assert with_own_http({"x.py": server}, "start_server") == {"x.py"}
+    assert with_own_http({"x.py": server.replace("start_server", "open_connection")}, "open_connection")
+    assert with_own_lease({"x.py": lease}) == {"x.py"}

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from rse_pf.backend.supervisor.control_http import ControlRequest
 from rse_pf.backend.supervisor.orders import RecordOrder
+from rse_pf.control_http import ControlRequest
 
 __all__ = ["NOT_FOR_YOU", "WRONG_RECORDING", "RecordQuery", "may_record", "record_query"]
 

@@ -6,13 +6,11 @@ While no job waits, its slots work for batches that invite workers (`rse_pf.batc
 from __future__ import annotations
 
 import asyncio
-import json
 import os
 import secrets
 import signal
 import time
 from pathlib import Path
-from typing import Any
 
 from rse_pf.auth.control_token import carries_token
 from rse_pf.aws.storage import open_data_store
@@ -22,11 +20,11 @@ from rse_pf.backend.jobs.queue import JobQueue
 from rse_pf.backend.jobs.runner import JobContext
 from rse_pf.backend.jobs.slots import JobSlots, make_pipe
 from rse_pf.backend.log import JsonLog
-from rse_pf.backend.supervisor.control_http import ControlReply, ControlRequest, serve_control
 from rse_pf.backend.supervisor.worker_handle import BUILTIN
 from rse_pf.batch.helpers import BatchHelpers
 from rse_pf.config import PlatformSettings
 from rse_pf.config.placement import ServerPlacement, batch_ports
+from rse_pf.control_http import ControlReply, ControlRequest, json_reply, serve_control
 from rse_pf.errors import ConfigurationError, RsePfError, UsageError
 from rse_pf.files import replace_json
 
@@ -154,11 +152,11 @@ class _Service:
     async def _answer(self, ask: ControlRequest) -> ControlReply:
         page = (ask.method, ask.path)
         if page == ("GET", "/healthz"):
-            return _json({"server": self._server_id, "settings": self._settings.digest()})
+            return json_reply({"server": self._server_id, "settings": self._settings.digest()})
         if page == ("GET", "/readyz"):
-            return _json({"state": self._state}, status=200 if self._state == "ready" else 503)
+            return json_reply({"state": self._state}, status=200 if self._state == "ready" else 503)
         if self._token is not None and not carries_token(ask.authorization, self._token):
-            return _json({"code": "unauthorized"}, status=401)
+            return json_reply({"code": "unauthorized"}, status=401)
         if page == ("GET", "/metrics"):
             # A batch that works here is a job, too; the servers of the robots count the jobs that wait.
             jobs = self._jobs.running + bool(self._helpers.pids)
@@ -166,9 +164,5 @@ class _Service:
             return ControlReply(body=lines.encode(), content_type="text/plain; version=0.0.4")
         if page == ("POST", "/drain"):
             self._over.set()
-            return _json({"state": "draining"})
-        return _json({"code": "not-found"}, status=404)
-
-
-def _json(value: dict[str, Any], status: int = 200) -> ControlReply:
-    return ControlReply(status=status, body=json.dumps(value).encode())
+            return json_reply({"state": "draining"})
+        return json_reply({"code": "not-found"}, status=404)

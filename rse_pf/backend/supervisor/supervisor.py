@@ -30,14 +30,6 @@ from rse_pf.backend.log import JsonLog
 from rse_pf.backend.metrics import merge, merge_isolation, render, tenant_cpu_s
 from rse_pf.backend.rosbridge.peers import peer_channels
 from rse_pf.backend.supervisor.accepting import RobotAcceptor
-from rse_pf.backend.supervisor.control_http import (
-    ControlReply,
-    ControlRequest,
-    json_reply,
-    number_of,
-    refused_reply,
-    serve_control,
-)
 from rse_pf.backend.supervisor.listener import bound_socket, check_authentication
 from rse_pf.backend.supervisor.orders import (
     BlocksOrder,
@@ -58,6 +50,14 @@ from rse_pf.backend.supervisor.worker_handle import BUILTIN, RowsOrder, WorkerPr
 from rse_pf.config import PlatformSettings
 from rse_pf.config.elasticity import MOVES_PER_S
 from rse_pf.config.placement import ServerPlacement
+from rse_pf.control_http import (
+    ControlReply,
+    ControlRequest,
+    json_reply,
+    number_of,
+    refused_reply,
+    serve_control,
+)
 from rse_pf.errors import ConfigurationError
 from rse_pf.event_loop import run_in_loop
 from rse_pf.files import replace_json

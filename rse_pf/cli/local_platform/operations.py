@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-import http.client
-import json
-from collections.abc import Callable, Iterator, Mapping
+import asyncio
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlencode
 
-from rse_pf.auth.control_token import bearer, read_control_token
+from rse_pf.auth.control_token import read_control_token
 from rse_pf.errors import CommandFailed, UsageError
 from rse_pf.local.processes import is_alive
+from rse_pf.local.servers.control_client import ControlPort
 from rse_pf.local.state import PlatformState
 
 __all__ = ["operate"]
 
-_LOOPBACK = "127.0.0.1"
 _SILENCE_S = 300.0
 """Longer than a server takes to start, and a drain to end."""
 _OVER, _FAILED = "operation-over", "operation-failed"
@@ -36,35 +35,24 @@ def operate(
             f"the control plane of platform {state.name!r} does not run",
             hint=f"start it, it takes over what runs: rse-pf local --name {state.name}",
         )
+    port = ControlPort(state.status_port, read_control_token(Path(state.control_token_file)))
     last: Mapping[str, Any] = {}
-    for event in _events(state, f"/{action}?{urlencode(parameters)}"):
-        last = event
-        take(event)
+
+    async def follow() -> None:
+        nonlocal last
+        async for event in port.follow(f"/{action}?{urlencode(parameters)}", silence_s=_SILENCE_S):
+            last = event
+            take(event)
+
+    try:
+        asyncio.run(follow())
+    except ConnectionError as error:
+        raise CommandFailed(
+            f"the control plane does not answer: {error}", hint="see rse-pf local status"
+        ) from error
     if last.get("event") == _FAILED:
         raise CommandFailed(f"{action} failed: {last['message']}", hint=str(last["hint"]))
     if last.get("event") != _OVER:
         raise CommandFailed(
             f"the control plane ended before {action} was over", hint="see rse-pf local status and logs"
         )
-
-
-def _events(state: PlatformState, target: str) -> Iterator[Mapping[str, Any]]:
-    connection = http.client.HTTPConnection(_LOOPBACK, state.status_port, timeout=_SILENCE_S)
-    token = read_control_token(Path(state.control_token_file))
-    try:
-        connection.request("POST", target, headers={"Authorization": bearer(token)})
-        reply = connection.getresponse()
-        if reply.status != 200:
-            document = json.loads(reply.read())
-            raise UsageError(
-                str(document.get("message", f"the control plane answers {reply.status}")),
-                hint=str(document.get("hint", "is it of this version?")),
-            )
-        for line in reply:
-            yield json.loads(line)
-    except (OSError, http.client.HTTPException, ValueError) as error:
-        raise CommandFailed(
-            f"the control plane does not answer: {error}", hint="see rse-pf local status"
-        ) from error
-    finally:
-        connection.close()

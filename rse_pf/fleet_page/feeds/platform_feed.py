@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from rse_pf.audit.chain import Entry
-from rse_pf.auth.control_token import bearer, read_control_token
+from rse_pf.auth.control_token import read_control_token
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import RsePfError
 from rse_pf.fleet_page.feeds.audit_log import AuditRows
@@ -36,14 +36,12 @@ from rse_pf.terminal import printable
 
 __all__ = ["LocalFeed", "fleet_document", "group_of", "moved_robots"]
 
-_LOOPBACK = "127.0.0.1"
 _ROBOTS_EVERY_S = 1.0
 _METRICS_EVERY_S = 5.0
 _LOGS_EVERY_S = 0.3
 _AUDIT_EVERY_S = 0.5
 _AGAIN_S = 0.5
 _ASK_S = 2.0
-_MAX_LINE_BYTES = 1 << 20
 _HISTORY = 600
 _MAX_TEXT = 300
 _MAX_TOLD_MOVES = 50
@@ -104,28 +102,17 @@ class LocalFeed:
             return
         self._settings = platform_settings(self._folder) or PlatformSettings()
         token = read_control_token(Path(state.control_token_file))
-        reader, writer = await asyncio.open_connection(_LOOPBACK, state.status_port, limit=_MAX_LINE_BYTES)
-        try:
-            writer.write(
-                f"GET /watch HTTP/1.1\r\nHost: {_LOOPBACK}\r\nAuthorization: {bearer(token)}\r\n\r\n".encode()
-            )
-            head = await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), _ASK_S)
-            if head.split(b" ", 2)[1] != b"200":
-                raise ConnectionError("the control plane refuses")
-            self._connected = True
-            self._watched_s = (time.time(), math.inf)
-            self._hub.put("link", "control_plane", {"connected": True, "time_s": time.time()})
-            while True:
-                line = await asyncio.wait_for(reader.readline(), _ASK_S + 3.0)
-                if not line:
-                    return
-                message = json.loads(line)
+        port = ControlPort(state.status_port, token)
+        async with contextlib.aclosing(port.follow("/watch", silence_s=_ASK_S + 3.0, method="GET")) as told:
+            async for message in told:
+                if not self._connected:
+                    self._connected = True
+                    self._watched_s = (time.time(), math.inf)
+                    self._hub.put("link", "control_plane", {"connected": True, "time_s": time.time()})
                 if "state" in message:
                     self._take(message["state"])
                 else:
                     self._event(message)
-        finally:
-            writer.close()
 
     def _take(self, state: Mapping[str, Any]) -> None:
         now = time.time()

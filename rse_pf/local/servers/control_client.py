@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import asyncio
 import json
+from collections.abc import AsyncGenerator
 from dataclasses import dataclass
 from typing import Any
 
 from rse_pf.auth.control_token import bearer
+from rse_pf.errors import UsageError
 
 __all__ = ["ControlPort", "ControlPortReply"]
 
@@ -63,7 +65,7 @@ class ControlPort:
             except (OSError, EOFError, ValueError, asyncio.LimitOverrunError, asyncio.TimeoutError) as error:
                 self.close()
                 raise ConnectionError(
-                    f"no answer from port {self._port}: {error or type(error).__name__}"
+                    f"no answer from port {self._port}: {str(error) or type(error).__name__}"
                 ) from error
             except BaseException:
                 self.close()
@@ -79,6 +81,37 @@ class ControlPort:
             return None
         finally:
             self.close()
+
+    async def follow(
+        self, target: str, *, silence_s: float, method: str = "POST"
+    ) -> AsyncGenerator[dict[str, Any], None]:
+        """Yield the events of an operation until it is over, over a connection of its own.
+
+        Raises:
+            UsageError: The port refuses.
+            ConnectionError: Nobody listens, the reply is no HTTP, or nothing came for *silence_s*.
+        """
+        writer: asyncio.StreamWriter | None = None
+        try:
+            reader, writer = await asyncio.open_connection(_LOOPBACK, self._port, limit=_MAX_BODY_BYTES)
+            writer.write(f"{method} {target} HTTP/1.1\r\n{self._headers}Connection: close\r\n\r\n".encode())
+            head = await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), silence_s)
+            status = int(head.split(b" ", 2)[1])
+            while line := await asyncio.wait_for(reader.readline(), silence_s):
+                event = json.loads(line)
+                if status != 200:
+                    raise UsageError(
+                        str(event.get("message", f"the control plane answers {status}")),
+                        hint=str(event.get("hint", "is it of this version?")),
+                    )
+                yield event
+        except (OSError, EOFError, ValueError, LookupError, asyncio.TimeoutError) as error:
+            raise ConnectionError(
+                f"no answer from port {self._port}: {str(error) or type(error).__name__}"
+            ) from error
+        finally:
+            if writer is not None:
+                writer.close()
 
     def close(self) -> None:
         """Close the connection."""

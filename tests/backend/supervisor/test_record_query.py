@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from rse_pf.backend.supervisor.control_http import ControlRequest
 from rse_pf.backend.supervisor.orders import RecordOrder
 from rse_pf.backend.supervisor.record_query import may_record, record_query
+from rse_pf.control_http import ControlRequest
 
 
 def asked(*, is_local: bool = True, **query: str) -> ControlRequest:

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from rse_pf.errors import UsageError
 from rse_pf.local.servers.control_client import ControlPort
 
 SOON_S = 10.0
@@ -136,3 +137,36 @@ def _quietly(talk: Talk) -> Talk:
             writer.close()
 
     return quiet
+
+
+def test_events_are_followed_until_the_operation_is_over() -> None:
+    heads: list[str] = []
+
+    async def talk(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        heads.append((await reader.readuntil(b"\r\n\r\n")).decode())
+        writer.write(b'HTTP/1.1 200 OK\r\n\r\n{"event": "a"}\n{"event": "over"}\n')
+        writer.close()
+
+    async def work(port: ControlPort) -> list[str]:
+        return [event["event"] async for event in port.follow("/drain?server=a", silence_s=SOON_S)]
+
+    assert with_server(talk, work) == ["a", "over"]
+    assert heads[0].startswith("POST /drain?server=a HTTP/1.1\r\n")
+    assert "Connection: close\r\n" in heads[0], "else a refusal would keep the connection, and the caller"
+
+
+def test_a_refused_operation_says_why_and_a_silent_one_ends() -> None:
+    async def refuse(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        await reader.readuntil(b"\r\n\r\n")
+        writer.write(page(b'{"message": "no such server", "hint": "see the list"}\n').replace(b"200", b"409"))
+
+    async def say_nothing(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        await reader.read()
+
+    async def follow(port: ControlPort) -> list[Any]:
+        return [event async for event in port.follow("/drain", silence_s=AT_ONCE_S)]
+
+    with pytest.raises(UsageError, match="no such server"):
+        with_server(_quietly(refuse), follow)
+    with pytest.raises(ConnectionError, match="no answer"):
+        with_server(_quietly(say_nothing), follow)

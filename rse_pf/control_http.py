@@ -1,4 +1,4 @@
-"""Serve the control port: a very small HTTP/1.1 server for health checks, metrics and drain.
+"""Serve control ports: a very small HTTP/1.1 server for health checks, metrics, drain and other operations.
 
 A request has at most 8 KiB of head and no chunked body.  A connection's first one must be complete within
 `FIRST_REQUEST_S`, and each further one within `KEEP_ALIVE_S` of the answer before.
@@ -7,9 +7,10 @@ A request has at most 8 KiB of head and no chunked body.  A connection's first o
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import ipaddress
 import json
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import AsyncGenerator, Awaitable, Callable, Mapping
 from dataclasses import dataclass, field
 from http import HTTPStatus
 from typing import Any
@@ -21,6 +22,8 @@ __all__ = ["ControlReply", "ControlRequest", "json_reply", "number_of", "refused
 
 _MAX_HEAD_BYTES = 8192
 _MAX_BODY_BYTES = 65536
+_WRITE_S = 5.0
+"""A client that takes longer to read what was written is cut."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -36,17 +39,18 @@ class ControlRequest:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ControlReply:
-    """One response."""
+    """One response: *body*, or *events*, a JSON object a line as they come, and the connection ends then."""
 
     status: int = 200
     body: bytes = b""
     content_type: str = "application/json"
     headers: Mapping[str, str] = field(default_factory=dict)
+    events: AsyncGenerator[Mapping[str, Any], None] | None = None
 
 
 def json_reply(value: Any, *, status: int = 200, headers: dict[str, str] | None = None) -> ControlReply:
     """Return *value* as JSON."""
-    return ControlReply(status=status, body=json.dumps(value).encode() + b"\n", headers=headers or {})
+    return ControlReply(status=status, body=_line(value), headers=headers or {})
 
 
 def refused_reply(status: int, code: str, hint: str) -> ControlReply:
@@ -94,8 +98,9 @@ async def serve_control(
         except (
             OSError,
             ValueError,
-            asyncio.IncompleteReadError,
+            EOFError,
             asyncio.LimitOverrunError,
+            asyncio.TimeoutError,
             asyncio.CancelledError,
         ):
             # A malformed request ends its own connection only; at the end of the loop asyncio would log an
@@ -136,15 +141,22 @@ async def _exchange(
         authorization=headers.get("authorization", ""),
     )
     keep = version == "HTTP/1.1" and headers.get("connection", "").lower() != "close"
-    _write(writer, method, await answer(ask), keep=keep)
-    await writer.drain()
+    reply = await answer(ask)
+    _write(writer, method, reply, keep=keep and reply.events is None)
+    if reply.events is not None:
+        async with contextlib.aclosing(reply.events) as events:
+            async for event in events:
+                writer.write(_line(event))
+                await asyncio.wait_for(writer.drain(), _WRITE_S)
+        return False
+    await asyncio.wait_for(writer.drain(), _WRITE_S)
     return keep
 
 
 def _write(writer: asyncio.StreamWriter, method: str, answer: ControlReply, *, keep: bool) -> None:
     headers = {
         "Content-Type": answer.content_type,
-        "Content-Length": str(len(answer.body)),
+        **({} if answer.events is not None else {"Content-Length": str(len(answer.body))}),
         "Cache-Control": "no-store",
         "Connection": "keep-alive" if keep else "close",
         **answer.headers,
@@ -153,3 +165,7 @@ def _write(writer: asyncio.StreamWriter, method: str, answer: ControlReply, *, k
     lines += [f"{name}: {value}" for name, value in headers.items()]
     body = b"" if method == "HEAD" else answer.body
     writer.write("\r\n".join(lines).encode("latin-1") + b"\r\n\r\n" + body)
+
+
+def _line(value: Any) -> bytes:
+    return json.dumps(value, default=str).encode() + b"\n"

@@ -6,7 +6,7 @@ import asyncio
 
 import pytest
 
-from rse_pf.backend.supervisor.control_http import ControlReply, ControlRequest, serve_control
+from rse_pf.control_http import ControlReply, ControlRequest, serve_control
 
 pytestmark = pytest.mark.system
 
