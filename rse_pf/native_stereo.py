@@ -19,7 +19,7 @@ from rse_pf.native import address_of, aligned, load_part, open_found
 
 __all__ = ["StereoCore", "StereoRequest", "open_stereo", "stereo_core"]
 
-_ABI = 1
+_ABI, _PORTABLE = 1, 1
 _P, _I, _D = ctypes.c_void_p, ctypes.c_int64, ctypes.c_double
 
 
@@ -34,10 +34,14 @@ class StereoRequest(ctypes.Structure):
 
 
 class StereoCore:
-    """The stereo part of one loaded library; every thread may call it."""
+    """The stereo part of one loaded library; every thread may call it.
 
-    def __init__(self, disparities: Callable[..., int]) -> None:
+    ``portable`` forbids AVX2, which changes no byte of the result.
+    """
+
+    def __init__(self, disparities: Callable[..., int], *, portable: bool = False) -> None:
         self._disparities = disparities
+        self._flags = _PORTABLE if portable else 0
 
     def disparities(
         self,
@@ -65,8 +69,8 @@ class StereoCore:
         found = np.empty(len(pixels))
         height, width = left.shape
         request = StereoRequest(
-            _ABI, 0, width, height, address_of(left), address_of(right), len(pixels), address_of(pixels),
-            *limits, most_px, left_right_px,
+            _ABI, self._flags, width, height, address_of(left), address_of(right), len(pixels),
+            address_of(pixels), *limits, most_px, left_right_px,
         )  # fmt: skip
         if self._disparities(ctypes.byref(request), address_of(found)):
             raise BadRequest(
@@ -75,15 +79,11 @@ class StereoCore:
         return found
 
 
-def open_stereo(path: Path) -> StereoCore:
-    """Load the library at *path*.
-
-    Raises:
-        ConfigurationError: As `load_part` says.
-    """
+def open_stereo(path: Path, *, portable: bool = False) -> StereoCore:
+    """Load the library at *path*; *portable* forbids AVX2; raises ConfigurationError as `load_part` says."""
     (disparities,) = load_part(path, "stereo", _ABI, "rse_pf_disparities")
     disparities.argtypes, disparities.restype = (_P, _P), ctypes.c_int32
-    return StereoCore(disparities)
+    return StereoCore(disparities, portable=portable)
 
 
 @cache

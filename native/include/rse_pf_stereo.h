@@ -16,12 +16,15 @@ extern "C" {
 /* The largest disparity that may be sought. */
 #define RSE_PF_STEREO_MOST 1024
 
+/* Use no instructions beyond those that every processor has. */
+#define RSE_PF_STEREO_PORTABLE 1u
+
 /* Return RSE_PF_STEREO_ABI of the library, to compare with the header's. */
 uint32_t rse_pf_stereo_abi(void);
 
 typedef struct rse_pf_stereo_request {
     uint32_t abi;
-    uint32_t flags;            /* 0 */
+    uint32_t flags;            /* 0, or RSE_PF_STEREO_PORTABLE */
     int64_t width, height;     /* 1..65536 */
     const uint8_t *left;       /* height x width, row-major */
     const uint8_t *right;      /* height x width */

@@ -10,7 +10,8 @@ from client_sdk.simulator import SIMULATED_CAMERA, make_world, true_trajectory
 from client_sdk.simulator.camera import Painter, add_image_noise
 from rse_pf.errors import BadRequest
 from rse_pf.geometry import Array
-from rse_pf.native_stereo import stereo_core
+from rse_pf.native import find_library
+from rse_pf.native_stereo import open_stereo, stereo_core
 from rse_pf.pnp import DepthNoise
 from rse_pf.slam import stereo as stereo_module
 from rse_pf.slam.stereo import StereoOptions, disparities, disparities_by_numpy, stereo_noise
@@ -87,6 +88,26 @@ def test_the_native_core_agrees_with_numpy(pair: tuple[Gray, Gray, Array], most:
 
     assert np.isfinite(found).any()
     np.testing.assert_allclose(found, expected, atol=1e-9, equal_nan=True)
+
+
+@needs_library
+@pytest.mark.parametrize("most", [16, 64, 1024])
+def test_the_processor_changes_no_byte_of_a_disparity(pair: tuple[Gray, Gray, Array], most: int) -> None:
+    """The darkest and brightest patches have the largest sums."""
+    left, right, _ = pair
+    rng = np.random.default_rng(3)
+    harsh = (255 * (rng.uniform(size=left.shape) < 0.995)).astype(np.uint8)
+    pixels = np.concatenate([textured(left, 400), rng.uniform(-20, 660, (400, 2))])
+    path = find_library()
+    assert path is not None
+    wide, portable = open_stereo(path), open_stereo(path, portable=True)
+    limits = (1.0, 0.64, 0.8)
+
+    for one, other in ((left, right), (harsh, np.roll(harsh, -7, axis=1))):
+        found = wide.disparities(one, other, pixels, limits, most, 1)
+
+        assert np.isfinite(found).any()
+        assert found.tobytes() == portable.disparities(one, other, pixels, limits, most, 1).tobytes()
 
 
 @pytest.mark.parametrize("fraction", np.linspace(0.0, 0.875, 8).tolist())
