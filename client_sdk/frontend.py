@@ -464,7 +464,9 @@ class TrackedFrame:
     ``starting`` before a camera without depth has moved enough; ``reason`` says why there is no pose, or why
     it is weak.  `Mapper.track` fills the rest: ``covariance`` ``(6, 6)`` of the twist (metres, radians) on
     the left of the pose of the last query, who solved it, and how long that took.  ``corrected`` says that
-    poses that were returned before have changed: read the trajectory again.
+    poses that were returned before have changed: read the trajectory again.  Where the world itself was
+    turned since the last frame, such as upright, ``T_new_old`` ``(4, 4)`` is its motion: what was returned
+    before is ``T_new_old @ T_world_camera`` now.
 
     In a live map, ``T_map_camera`` is the pose in the map, None until ``segment``, the present odometry
     frame, is aligned; ``corrected`` says that its alignment has changed since the last frame.
@@ -482,6 +484,7 @@ class TrackedFrame:
     source: Literal["cloud", "burst", "robot", "none"] = "none"
     round_trip_ms: float | None = None
     corrected: bool = False
+    T_new_old: Array | None = None
     T_map_camera: Array | None = None
     segment: int = 0
 

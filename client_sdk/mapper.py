@@ -512,7 +512,7 @@ class Mapper:
         T = upright_turn(inertial.gravity)
         if not self._make_upright(tracker):
             return done
-        return replace(done, T_world_camera=T @ pose, corrected=True)
+        return replace(done, T_world_camera=T @ pose, corrected=True, T_new_old=T)
 
     def _with_joins(self, tracker: Tracker, done: TrackedFrame) -> TrackedFrame:
         """Move what was joined since the last frame; the poses that were returned before are corrected."""

@@ -82,7 +82,7 @@ async def track(
         adds_frames=False,
         **slots,
     )
-    costs, tracked = _Costs(), []
+    costs, tracked = _Costs(), list[tuple[float, int, Array | None]]()
     for number, frame in enumerate(dataset, start=1):
         sent, server_s, inside_s = solver.sent_bytes, solver.server_s, solver.inside_s
         if configuration.depth is False and frame.stereo is not None:
@@ -103,6 +103,9 @@ async def track(
         costs.sent_bytes.append(solver.sent_bytes - sent)
         costs.robot_ms.append(1e3 * (took_s - (solver.inside_s - inside_s)))
         costs.server_ms.append(1e3 * (solver.server_s - server_s))
+        if done.T_new_old is not None:
+            # A turned world is no error of the poses before: a robot turns what it has with it.
+            tracked = [(at_s, each, _turned(done.T_new_old, pose)) for at_s, each, pose in tracked]
         tracked.append((frame.timestamp_s, done.segment, done.T_world_camera))
         progress(number)
     began_s = time.process_time()
@@ -110,6 +113,10 @@ async def track(
         report = mapper.save(Path(folder))
     finish_ms = 1e3 * (time.process_time() - began_s)
     return _run_of(mapper, report, drive, costs, tracked, finish_ms)
+
+
+def _turned(T_new_old: Array, pose: Array | None) -> Array | None:
+    return None if pose is None else T_new_old @ pose
 
 
 def longest_gap_s(stamps_s: Array, posed_s: Array) -> float:

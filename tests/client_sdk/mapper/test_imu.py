@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import asyncio
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from client_sdk.frontend import Frame, TrackedFrame
+from client_sdk.imu.inertial import Inertial
 from client_sdk.imu.samples import ImuModel, ImuSamples
 from client_sdk.mapper import Mapper
 from rse_pf.geometry import Array, exp_se3, inverse
@@ -83,6 +85,38 @@ def test_frames_are_tracked_on_in_a_world_that_was_turned():
     assert moved[0, 3] == pytest.approx(4 * STEP_M, abs=0.02)
     np.testing.assert_allclose(mapper.trajectory.T_world_camera[0], turned @ first, atol=1e-9)
     assert len(mapper.map) > 2000
+
+
+@pytest.fixture
+def leaning_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the first samples tell a false gravity, and the motion the true one after the fourth frame."""
+    monkeypatch.setattr(Inertial, "first_gravity", lambda inertial: np.array([0.0, 9.0, 4.0]))
+    monkeypatch.setattr(Inertial, "is_due", lambda inertial, timestamp_s: timestamp_s > 0.25)
+    monkeypatch.setattr(Inertial, "align", align_by_first_pose)
+    monkeypatch.setattr(
+        Inertial, "gravity", property(lambda inertial: getattr(inertial, "found_gravity", None))
+    )
+
+
+def align_by_first_pose(inertial: Any, timestamps_s: Array, poses: Array, depth: float, **kind: bool) -> None:
+    inertial.found_gravity = 9.81 * poses[0, :3, :3] @ DOWN
+
+
+@pytest.mark.usefixtures("leaning_first")
+def test_a_turn_of_the_world_is_told_so_that_poses_before_it_compare():
+    done = drive(Mapper(ask=solve), range(6), depth=True)
+
+    turns = [each.T_new_old for each in done if each.T_new_old is not None]
+    assert [each.T_new_old is not None for each in done] == [each.corrected for each in done]
+    assert [each.corrected for each in done] == [row == 3 for row in range(6)]
+    assert abs(float(down_in(done[2].T_world_camera)[2] + 1.0)) > 0.01
+    np.testing.assert_allclose(down_in(done[5].T_world_camera), [0.0, 0.0, -1.0], atol=0.02)
+    first, last = done[2].T_world_camera, done[5].T_world_camera
+    assert first is not None
+    assert last is not None
+    moved = inverse(turns[0] @ first) @ last
+    np.testing.assert_allclose(moved[:3, 3], [3 * STEP_M, 0.0, 0.0], atol=0.02)
+    np.testing.assert_allclose(moved[:3, :3], np.eye(3), atol=0.02)
 
 
 def test_without_an_imu_the_world_is_that_of_the_first_camera():

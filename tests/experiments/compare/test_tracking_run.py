@@ -15,6 +15,7 @@ from rse_pf.experiments.compare.configurations import Configuration, configurati
 from rse_pf.experiments.compare.recordings import Drive
 from rse_pf.experiments.compare.solvers import InProcessSolver
 from rse_pf.experiments.compare.tracking_run import TrackingRun, longest_gap_s, track
+from tests.client_sdk.mapper.test_imu import leaning_first, with_imu  # noqa: F401
 from tests.experiments.compare.recordings import black, flat_drive
 
 pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
@@ -38,6 +39,15 @@ def test_all_frames_of_an_easy_drive_have_a_pose_near_the_truth() -> None:
     assert (done.figures["bytes_a_keyframe"] or 0) > 1_000
     assert done.times_ms["robot"] > 0
     assert done.times_ms["server"] > 0
+
+
+@pytest.mark.usefixtures("leaning_first")
+def test_a_world_that_is_turned_in_mid_drive_is_no_error_of_the_poses_before() -> None:
+    done = run(flat_drive(change=lambda row, frame: with_imu(frame)))
+
+    assert done.figures["ate_cm"] is not None
+    assert done.figures["ate_cm"] < 0.5
+    assert done.figures["ate_online_cm"] == pytest.approx(done.figures["ate_cm"])
 
 
 def test_lost_frames_count_in_posed_and_in_the_gap() -> None:
