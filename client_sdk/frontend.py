@@ -20,7 +20,7 @@ from client_sdk.slots import FeaturesSlot
 from client_sdk.stereo.depth import noise_of, stereo_points
 from client_sdk.stereo.view import StereoView
 from rse_pf.errors import UsageError
-from rse_pf.geometry import Array, Camera
+from rse_pf.geometry import Array, Camera, body_poses
 from rse_pf.maps.descriptors import ORB, DescriptorKind, Descriptors
 from rse_pf.pnp import DepthNoise
 
@@ -62,6 +62,7 @@ class Frame:
     ``rgb`` is ``(h, w, 3)`` uint8, red first; ``depth_m`` is ``(h, w)`` float32, metres along
     the optical axis, 0 where there is no reading.  With *stereo*, ``rgb`` and ``camera`` are those of the
     rectified left camera, and ``depth_m`` is all 0.  *imu* has the samples since the last frame.
+    *T_body_camera* ``(4, 4)``, metres, is the pose of the camera in the body of its rig, None without a rig.
     """
 
     timestamp_s: float
@@ -70,6 +71,7 @@ class Frame:
     camera: Camera
     stereo: StereoView | None = None
     imu: ImuSamples | None = None
+    T_body_camera: Array | None = None
 
     def __post_init__(self) -> None:
         size = (self.camera.height, self.camera.width)
@@ -487,6 +489,12 @@ class TrackedFrame:
     T_new_old: Array | None = None
     T_map_camera: Array | None = None
     segment: int = 0
+
+    @property
+    def T_world_body(self) -> Array | None:
+        """The pose ``(4, 4)`` of the body of the rig; None without a pose, a rig, or metres."""
+        pose, mount = self.T_world_camera, self.frame.T_body_camera
+        return None if pose is None or mount is None or self.scale != "metric" else body_poses(pose, mount)
 
     @property
     def lost(self) -> bool:

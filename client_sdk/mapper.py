@@ -149,6 +149,7 @@ class Mapper:
             UsageError: One of these is no function, or *features* has no name.
         """
         self.camera = camera
+        self.T_body_camera: Array | None = None
         self._ask = ask
         self._options = options
         self._monocular = monocular
@@ -322,6 +323,7 @@ class Mapper:
             "frames_apart": sum(len(record.poses) for record, _ in apart),
             "scale": self.scale,
             **({} if self._inertial is None else {"imu": self.imu}),
+            **({} if self.T_body_camera is None else {"T_body_camera": self.T_body_camera.tolist()}),
             "unit": "unit of the map" if self.scale == _UP_TO_SCALE else "m",
             "path": round(trajectory.length_m, 3) if len(trajectory) > 1 else 0.0,
             "map_points": len(self.map),
@@ -356,6 +358,8 @@ class Mapper:
     def save(self, folder: Path) -> dict[str, Any]:
         """Write ``map.ply``, ``trajectory.txt`` and ``report.json``; return the report.
 
+        With a rig, ``trajectory-body.txt`` has the poses of its body, where they are in metres.
+
         Segments that were not joined to the first one have files of their own: ``map-2.ply``,
         ``trajectory-2.txt`` and so on.
 
@@ -381,11 +385,13 @@ class Mapper:
         try:
             folder.mkdir(parents=True, exist_ok=True)
             write_ply(folder / "map.ply", points, colours, is_metric=is_metric)
-            write_trajectory(folder / "trajectory.txt", self.trajectory, is_metric=is_metric)
+            body = self.T_body_camera
+            path = folder / "trajectory.txt"
+            write_trajectory(path, self.trajectory, is_metric=is_metric, T_body_camera=body)
             for number, (record, is_metric) in enumerate(self._apart(), start=2):
                 write_ply(folder / f"map-{number}.ply", *record.cloud.points(), is_metric=is_metric)
                 path = folder / f"trajectory-{number}.txt"
-                write_trajectory(path, record.trajectory(), is_metric=is_metric)
+                write_trajectory(path, record.trajectory(), is_metric=is_metric, T_body_camera=body)
             text = json.dumps(report, indent=2) + "\n"
             (folder / "report.json").write_text(text, encoding="utf-8")
         except OSError as error:
@@ -412,6 +418,8 @@ class Mapper:
 
     def _tracker_for(self, frame: Frame) -> Tracker | MonocularTracker:
         self.camera = self.camera or frame.camera
+        if self.T_body_camera is None:
+            self.T_body_camera = frame.T_body_camera
         if frame.camera != self.camera:
             raise UsageError(
                 f"a frame of {frame.camera.width}x{frame.camera.height} px is of another camera",

@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from rse_pf.errors import BadRequest, UsageError
 from rse_pf.files import read_regular_file
-from rse_pf.geometry import Array, from_quaternion, to_quaternion, transform
+from rse_pf.geometry import Array, body_poses, from_quaternion, to_quaternion, transform
 from rse_pf.slam.ply import decode_ply, encode_ply
 
 if TYPE_CHECKING:
@@ -30,6 +30,8 @@ __all__ = [
     "write_trajectory",
 ]
 
+BODY_SUFFIX = "-body"
+"""Behind the name of a trajectory of a camera: that of the body of its rig."""
 _MAX_TRAJECTORY_BYTES = 256 << 20
 _EMPTY = -1
 # Voxels on either side of the origin: three signed indices of 21 bits fill one int64 key.
@@ -279,14 +281,26 @@ class Trajectory:
         return float(np.linalg.norm(np.diff(self.positions, axis=0), axis=1).sum())
 
 
-def write_trajectory(path: Path, trajectory: Trajectory, *, is_metric: bool = True) -> None:
+def write_trajectory(
+    path: Path, trajectory: Trajectory, *, is_metric: bool = True, T_body_camera: Array | None = None
+) -> None:
     """Write a trajectory in TUM format: ``timestamp tx ty tz qx qy qz qw``.
 
-    *is_metric* says whether the unit is metres, or arbitrary: the file says the same in a comment.
+    *is_metric* says whether the unit is metres, or arbitrary: the file says the same in a comment.  In metres
+    and with the pose *T_body_camera* ``(4, 4)`` of the camera on a rig, a file beside it has the poses of the
+    body: ``trajectory-body.txt`` for ``trajectory.txt``.
     """
     unit = "metres" if is_metric else "up to scale: the unit is arbitrary"
-    lines = [f"# timestamp tx ty tz qx qy qz qw  (T_world_camera, {unit})"]
-    for timestamp_s, pose in zip(trajectory.timestamps_s, trajectory.T_world_camera, strict=True):
+    _write_poses(path, trajectory.timestamps_s, trajectory.T_world_camera, f"T_world_camera, {unit}")
+    if T_body_camera is not None and is_metric:
+        bodies = body_poses(trajectory.T_world_camera, T_body_camera)
+        beside = path.with_name(f"{path.stem}{BODY_SUFFIX}{path.suffix}")
+        _write_poses(beside, trajectory.timestamps_s, bodies, f"T_world_body, {unit}")
+
+
+def _write_poses(path: Path, timestamps_s: Array, poses: Array, about: str) -> None:
+    lines = [f"# timestamp tx ty tz qx qy qz qw  ({about})"]
+    for timestamp_s, pose in zip(timestamps_s, poses, strict=True):
         numbers = [*pose[:3, 3], *to_quaternion(pose[:3, :3])]
         lines.append(f"{timestamp_s:.6f} " + " ".join(f"{number:.9f}" for number in numbers))
     path.write_text("\n".join(lines) + "\n", encoding="ascii")

@@ -20,6 +20,7 @@ __all__ = [
     "Array",
     "Camera",
     "adjoint",
+    "body_poses",
     "exp_se3",
     "exp_so3",
     "from_quaternion",
@@ -129,6 +130,12 @@ def inverse(T_a_b: Array) -> Array:
     T_b_a[..., :3, 3:] = -(rotation @ T_a_b[..., :3, 3:])
     T_b_a[..., 3, 3] = 1.0
     return T_b_a
+
+
+def body_poses(T_world_camera: Array, T_body_camera: Array) -> Array:
+    """Return ``T_world_body`` ``(..., 4, 4)`` of the poses of a camera that is mounted at *T_body_camera*."""
+    T_world_body: Array = T_world_camera @ inverse(T_body_camera)
+    return T_world_body
 
 
 def scaled(T: Array, scale: float | Array) -> Array:

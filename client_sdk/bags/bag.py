@@ -158,6 +158,7 @@ class Bag(Closing):
             depth_m=self._no_depth,
             camera=self.camera,
             stereo=rectify.right(gray),
+            T_body_camera=rectify.T_body_camera,
         )
 
     def _depth_of(self, raw: list[RawMessage]) -> npt.NDArray[np.float32]:

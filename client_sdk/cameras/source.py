@@ -222,6 +222,7 @@ class StereoSource(FrameStream):
             depth_m=self._no_depth,
             camera=self.camera,
             stereo=self._rectification.right(cv2.cvtColor(right, cv2.COLOR_RGB2GRAY)),
+            T_body_camera=self._rectification.T_body_camera,
         )
 
 

@@ -58,7 +58,10 @@ class Dataset:
         return len(self.rows)
 
     def __iter__(self) -> Iterator[Frame]:
-        return with_imu(map(self.read, self.rows), self.imu)
+        frames: Iterator[Frame] = map(self.read, self.rows)
+        if self.T_body_camera is not None:
+            frames = (replace(frame, T_body_camera=self.T_body_camera) for frame in frames)
+        return with_imu(frames, self.imu)
 
     def check(self) -> None:
         """Look at some stereo pairs, and refuse a rig that is wrong; other recordings are not looked at.

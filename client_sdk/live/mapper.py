@@ -420,6 +420,11 @@ class LiveMapper:
             },
         }
 
+    @property
+    def T_body_camera(self) -> Array | None:
+        """The ``(4, 4)`` pose of the camera in the body of its rig, metres; None without a rig."""
+        return self._mapper.T_body_camera
+
     def save(self, folder: Path) -> dict[str, Any]:
         """Write the robot's own cloud and trajectory as `Mapper.save` does; return its report."""
         return self._mapper.save(folder)

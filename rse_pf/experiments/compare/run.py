@@ -131,7 +131,8 @@ async def _run(
     run = await track(configuration, drive, solver, progress)
     name = f"{drive.dataset.name}-{drive.rate_hz:.3g}hz-{configuration.name}-{number}.txt"
     path = options.out / TRAJECTORIES / _NOT_PLAIN.sub("_", name)
-    write_trajectory(path, run.trajectory, is_metric=run.is_metric)
+    body = drive.dataset.T_body_camera
+    write_trajectory(path, run.trajectory, is_metric=run.is_metric, T_body_camera=body)
     return run
 
 

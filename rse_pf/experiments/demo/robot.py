@@ -21,7 +21,7 @@ from client_sdk.answers import PoseAnswer
 from client_sdk.frontend import Frame, FrontEndOptions, PoseQuery, TrackedFrame
 from client_sdk.live import LiveMapper, LiveOptions
 from client_sdk.mapper import Mapper, ask_robot
-from client_sdk.mapping import PointMap, Trajectory, write_ply, write_trajectory
+from client_sdk.mapping import Trajectory, write_ply, write_trajectory
 from client_sdk.offloading.offload import CloudFirst
 from client_sdk.robot import Robot
 from client_sdk.slots import load_features
@@ -233,7 +233,7 @@ async def _run(spec: RobotSpec, pipe: ParentPipe) -> None:
         if recorder is not None:
             await recorder.finish(spec.folder, truth)
         trajectory = mapper.trajectory
-        uploaded = await asyncio.to_thread(_write, spec.folder, mapper.map, trajectory, collector)
+        uploaded = await asyncio.to_thread(_write, spec.folder, mapper, trajectory, collector)
         pipe.send(
             RobotFinished(
                 frames=mapper.frames,
@@ -335,12 +335,17 @@ def _collector(
 
 
 def _write(
-    folder: Path, point_map: PointMap, trajectory: Trajectory, collector: KeyframeCollector | None
+    folder: Path, mapper: Mapper | LiveMapper, trajectory: Trajectory, collector: KeyframeCollector | None
 ) -> int:
     """Write the files of the robot, upload its map, and return how many keyframes were uploaded."""
-    points, colours = point_map.points(min_readings=_MIN_READINGS)
+    points, colours = mapper.map.points(min_readings=_MIN_READINGS)
     write_ply(folder / "map.ply", points, colours)
-    write_trajectory(folder / "trajectory.txt", trajectory)
+    write_trajectory(
+        folder / "trajectory.txt",
+        trajectory,
+        is_metric=_is_metric(mapper),
+        T_body_camera=mapper.T_body_camera,
+    )
     if collector is None:
         return 0
     data = collector.encoded_map(points, colours)

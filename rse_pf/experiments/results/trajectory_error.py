@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from client_sdk.mapping import Trajectory
 from rse_pf.errors import UsageError
-from rse_pf.geometry import Array, exp_se3, inverse, log_se3, pose_difference, rotation_angle_deg
+from rse_pf.geometry import Array, body_poses, exp_se3, inverse, log_se3, pose_difference, rotation_angle_deg
 
 __all__ = [
     "AbsoluteError",
@@ -123,8 +123,7 @@ def accuracy(
         scale, _ = align(poses[:, :3, 3], true_poses[:, :3, 3], with_scale=True)
         poses[:, :3, 3] *= scale
     if T_body_camera is not None:
-        T_camera_body = inverse(T_body_camera)
-        poses, true_poses = poses @ T_camera_body, true_poses @ T_camera_body
+        poses, true_poses = body_poses(poses, T_body_camera), body_poses(true_poses, T_body_camera)
         compared = poses
     _, T_truth_estimate = align(poses[:, :3, 3], true_poses[:, :3, 3])
     poses = T_truth_estimate @ poses

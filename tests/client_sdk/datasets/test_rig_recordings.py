@@ -101,6 +101,7 @@ def test_euroc_gives_the_left_camera_and_its_own_true_poses(tmp_path: Path) -> N
     assert dataset.truth is not None
     np.testing.assert_allclose(dataset.truth.T_world_camera[2], turned @ T_BS, atol=1e-12)
     np.testing.assert_allclose(dataset.T_body_camera, T_BS)
+    assert all(np.array_equal(frame.T_body_camera, T_BS) for frame in dataset)
 
 
 def test_a_stereo_pair_of_euroc_is_rectified_and_its_truth_turned_with_it(tmp_path: Path) -> None:

@@ -16,13 +16,13 @@ from client_sdk.answers import PoseAnswer
 from client_sdk.datasets import open_dataset
 from client_sdk.frontend import Frame, FrontEndOptions, PoseQuery, TrackedFrame
 from client_sdk.mapper import BlockingMapper, Mapper
-from client_sdk.mapping import Trajectory, read_ply, read_trajectory
+from client_sdk.mapping import Trajectory, read_ply, read_trajectory, write_trajectory
 from client_sdk.monocular.scale import OdometryScale
 from client_sdk.robot import Robot, connect
 from client_sdk.tracking.monocular_tracker import MonocularOptions, MonocularTracker
 from rse_pf.errors import Busy, MissingExtra, UsageError
 from rse_pf.experiments.results.trajectory_error import absolute_error
-from rse_pf.geometry import Camera
+from rse_pf.geometry import Camera, exp_se3
 from rse_pf.pnp import PnpOptions, refine_with_depth, solve_pnp
 from tests.client_sdk.mapper.flat_world import STEP_M, frame_at
 
@@ -322,3 +322,38 @@ def test_all_keyframes_without_depth_are_adjusted_when_the_map_is_saved(tmp_path
     off_m = np.linalg.norm(landmarks.points - before, axis=1)[landmarks.is_alive]
     assert np.median(off_m) < 0.01
     assert mapper.trajectory.positions[:, 0] == pytest.approx(STEP_M * np.arange(9), abs=0.01)
+
+
+def test_a_rig_gives_the_poses_of_its_body_beside_those_of_its_camera(tmp_path):
+    T_body_camera = exp_se3(np.array([0.1, -0.2, 0.3, 0.4, -1.0, 0.7]))
+    mapper = Mapper(ask=solve)
+
+    async def all_frames():
+        return [
+            await mapper.track(replace(frame_at(row, depth=True), T_body_camera=T_body_camera))
+            for row in range(3)
+        ]
+
+    done = asyncio.run(all_frames())
+    report = mapper.save(tmp_path)
+
+    np.testing.assert_allclose(report["T_body_camera"], T_body_camera)
+    cameras, bodies = (read_trajectory(tmp_path / f"trajectory{end}.txt") for end in ("", "-body"))
+    for row, each in enumerate(done):
+        assert each.T_world_body is not None
+        np.testing.assert_allclose(each.T_world_body @ T_body_camera, each.T_world_camera, atol=1e-12)
+        np.testing.assert_allclose(bodies.T_world_camera[row], each.T_world_body, atol=1e-8)
+    np.testing.assert_allclose(bodies.timestamps_s, cameras.timestamps_s)
+    assert "T_world_body, metres" in (tmp_path / "trajectory-body.txt").read_text()
+
+
+def test_without_metres_or_a_rig_there_is_no_pose_of_a_body(tmp_path):
+    plain = asyncio.run(Mapper(ask=solve).track(frame_at(0, depth=True)))
+    rigged = replace(plain, frame=replace(plain.frame, T_body_camera=np.eye(4)))
+
+    assert plain.T_world_body is None
+    assert rigged.T_world_body is not None
+    assert replace(rigged, scale="up to scale").T_world_body is None
+    path = Trajectory(np.zeros(1), np.eye(4)[None])
+    write_trajectory(tmp_path / "trajectory.txt", path, is_metric=False, T_body_camera=np.eye(4))
+    assert [each.name for each in tmp_path.iterdir()] == ["trajectory.txt"]
