@@ -229,7 +229,10 @@ class Bridge:
 
     def _silence(self, before: Counter[str]) -> str:
         """Return which topics of images sent nothing since *before*, where no frame came."""
-        topics = {"colour": self._options.colour, "depth": self._options.depth}
+        partner = self._options.partner
+        topics = {"colour": self._options.colour}
+        if partner:
+            topics[partner] = str(getattr(self._options, partner))
         now = self._incoming.received
         silent = [
             self._options.named(name) for role, name in topics.items() if name and now[role] == before[role]
@@ -251,7 +254,7 @@ async def connected_bridge(
     """
     async with _connect(options) as robot:
         if not options.map:
-            mapper = robot.mapper(depth=bool(options.depth))
+            mapper = robot.mapper(depth=options.partner == "depth")
             yield Bridge(mapper, options, publish, is_ros1=is_ros1, robot=robot)
             return
         async with robot.live_map(options.map, depth=True) as live:

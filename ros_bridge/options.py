@@ -6,7 +6,7 @@ import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, Literal
 
 from rse_pf.errors import UsageError
 
@@ -29,6 +29,11 @@ class BridgeOptions:
         colour: Topic of the colours: ``Image``, or ``CompressedImage`` if its name ends with ``compressed``.
         depth: Topic of depth that is registered to the colours, ``compressedDepth`` likewise; empty: none.
         info: Topic of the ``CameraInfo`` of the colours.
+        right: Topic of the right images of a stereo pair, whose left ones are the colours; then depth is not
+            used.  Empty: no pair.
+        right_info: Topic of the ``CameraInfo`` of the right images.
+        imu: Topic of an IMU (``sensor_msgs/Imu``), whose place and noise the rig tells; empty: none.
+        rig: File of the rig, such as ``rse-pf camera calibrate --stereo`` writes; empty: by ``CameraInfo``.
         depth_scale: Units of a 16-bit depth image in a metre.
         pair_within_s: Colour and depth belong together up to this difference of their time stamps.
         queue_frames: So many frames wait while another is tracked; the oldest is dropped and counted.
@@ -54,6 +59,10 @@ class BridgeOptions:
     colour: str = "camera/color/image_raw"
     depth: str = "camera/aligned_depth_to_color/image_raw"
     info: str = "camera/color/camera_info"
+    right: str = ""
+    right_info: str = ""
+    imu: str = ""
+    rig: str = ""
     depth_scale: float = 1000.0
     pair_within_s: float = 0.02
     queue_frames: int = 5
@@ -82,8 +91,33 @@ class BridgeOptions:
             )
         if not self.colour or not self.info:
             raise UsageError("a topic of colours and its camera_info are needed", hint="colour, info")
-        if self.map and not self.depth:
-            raise UsageError("a live map needs a topic of depth", hint="name it with depth, or leave map out")
+        if self.map and not self.partner:
+            raise UsageError(
+                "a live map needs a topic of depth, or of right images",
+                hint="name it with depth or right, or leave map out",
+            )
+        if self.right and not (self.right_info or self.rig):
+            raise UsageError(
+                "a stereo pair needs the camera_info of its right images", hint="name right_info, or a rig"
+            )
+        if self.imu and not self.rig:
+            raise UsageError(
+                "where the IMU sits, and its noise, are not known", hint="name a file rig.json with rig"
+            )
+
+    @property
+    def partner(self) -> Literal["right", "depth", ""]:
+        """The role of what belongs to each colour image: its right one, or depth; empty: nothing."""
+        return "right" if self.right else "depth" if self.depth else ""
+
+    def check_rig(self, *, has_right: bool, has_imu: bool) -> None:
+        """Raise UsageError if the file of the rig lacks what has a topic."""
+        for topic, name, is_there in ((self.right, "right camera", has_right), (self.imu, "IMU", has_imu)):
+            if topic and not is_there:
+                raise UsageError(
+                    f"{self.rig} has no {name}, and {topic} is one",
+                    hint="add it to the file, see docs/cameras.md",
+                )
 
     @staticmethod
     def of(values: Mapping[str, Any]) -> BridgeOptions:

@@ -13,12 +13,13 @@ from rse_pf.terminal import show
 
 __all__ = ["end_by_signal", "run_until", "taken"]
 
-_ROLES: tuple[Role, ...] = ("info", "depth", "colour")
+_ROLES: tuple[Role, ...] = ("info", "right_info", "imu", "right", "depth", "colour")
 
 
 def taken(options: BridgeOptions) -> list[tuple[Role, str, str]]:
     """Return role, name and type of each topic that is subscribed to, the camera first."""
-    topics = ((role, str(getattr(options, role))) for role in _ROLES)
+    left_out = {"depth", "right"} - {options.partner}
+    topics = ((role, str(getattr(options, role))) for role in _ROLES if role not in left_out)
     return [(role, options.named(topic), kind_of(role, topic)) for role, topic in topics if topic]
 
 

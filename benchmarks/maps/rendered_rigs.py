@@ -28,6 +28,7 @@ import numpy.typing as npt
 from client_sdk.frontend import Frame, load_opencv
 from client_sdk.imu.samples import ImuSamples
 from client_sdk.mapper import Mapper
+from client_sdk.mapping import Trajectory
 from client_sdk.rigs.intrinsics import Intrinsics
 from client_sdk.rigs.rectification import Rectification
 from client_sdk.rigs.rig import RigCamera, RigImu
@@ -182,7 +183,7 @@ async def drive_rig(kind: LensKind, seed: int, seconds: float, rate_hz: float) -
     T_world_left = drive.T_world_camera(stamps_s)
     T_world_left[:, :3, 3] += [0.5 * ROOM_M, 0.5 * DEPTH_M, _HEIGHT_M]
     T_world_body = T_world_left @ inverse(rig.left.T_body_camera)
-    truth = T_world_body @ rectification.T_body_camera
+    truth = Trajectory(stamps_s, T_world_body @ rectification.T_body_camera)
     mapper = Mapper(ask=InProcessSolver(PlatformSettings()).ask, adds_frames=False)
     lost, last_s = 0, float(stamps_s[0]) - 0.2
     for frame in render(rig, rectification, make_world(seed), T_world_body, stamps_s, seed):
@@ -191,13 +192,13 @@ async def drive_rig(kind: LensKind, seed: int, seconds: float, rate_hz: float) -
         samples = ImuSamples(taken.timestamps_s + late_s, taken.gyro, taken.accel, model)
         tracked = await mapper.track(replace(frame, imu=samples))
         lost, last_s = lost + tracked.lost, now_s
-    return _judged(mapper, imu, truth, stamps_s, late_s, lost, time.process_time() - began_s)
+    return _judged(mapper, imu, truth, late_s, lost, time.process_time() - began_s)
 
 
 def _judged(
-    mapper: Mapper, imu: SimulatedImu, truth: Array, stamps_s: Array, late_s: float, lost: int, took_s: float
+    mapper: Mapper, imu: SimulatedImu, truth: Trajectory, late_s: float, lost: int, took_s: float
 ) -> Driven:
-    path = mapper.trajectory
+    path, stamps_s = mapper.trajectory, truth.timestamps_s
     rows = np.searchsorted(stamps_s, path.timestamps_s - 1e-6)
     inertial = mapper._inertial
     assert inertial is not None
@@ -208,8 +209,8 @@ def _judged(
         biases = np.concatenate([found.bias_gyro[-1], found.bias_accel[-1]])
         deviations = float((np.abs(biases - true) / np.sqrt(np.diag(found.bias_covariance))).max())
     return Driven(
-        ate_cm=100.0 * ate_m(path.T_world_camera, truth[rows]),
-        path_m=float(np.linalg.norm(np.diff(truth[:, :3, 3], axis=0), axis=1).sum()),
+        ate_cm=100.0 * ate_m(path.T_world_camera, truth.T_world_camera[rows]),
+        path_m=truth.length_m,
         lost=lost, imu=mapper.imu, deviations=deviations,
         offset_error_s=None if found is None else inertial.offset_s - late_s, took_s=took_s,
     )  # fmt: skip

@@ -19,7 +19,7 @@ from client_sdk.rigs.rig import Rig, RigImu
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Array
 
-__all__ = ["ImuMount", "ImuReadings", "imu_track"]
+__all__ = ["ImuMount", "ImuReadings", "imu_track", "numbers_of_imu"]
 
 _MAX_SAMPLES = 2_000_000
 """Two hours and a half at 200 Hz, 128 MB."""
@@ -48,12 +48,7 @@ class ImuReadings:
         Raises:
             BrokenMessage: It lacks rates or accelerations, or a number is not finite.
         """
-        if message.angular_velocity_covariance[0] == -1 or message.linear_acceleration_covariance[0] == -1:
-            raise BrokenMessage("a message of an IMU has no rates, or no accelerations")
-        gyro, accel = message.angular_velocity, message.linear_acceleration
-        numbers = (gyro.x, gyro.y, gyro.z, accel.x, accel.y, accel.z)
-        if not all(map(math.isfinite, numbers)):
-            raise BrokenMessage("a sample of an IMU is not finite")
+        numbers = numbers_of_imu(message)
         if len(self) >= _MAX_SAMPLES:
             self.ignored += 1
             return
@@ -68,6 +63,21 @@ class ImuReadings:
         stamps_ns = np.frombuffer(self._log_ns if use_log_time else self._stamps_ns, dtype=np.int64)
         unique, rows = np.unique(stamps_ns, return_index=True)
         return unique / 1e9, np.frombuffer(self._values).reshape(-1, 6)[rows]
+
+
+def numbers_of_imu(message: Any) -> tuple[float, ...]:
+    """Return the three rates and three accelerations of a ``sensor_msgs/Imu``, rad/s and m/s^2.
+
+    Raises:
+        BrokenMessage: It lacks some of them, or a number is not finite.
+    """
+    if message.angular_velocity_covariance[0] == -1 or message.linear_acceleration_covariance[0] == -1:
+        raise BrokenMessage("a message of an IMU has no rates, or no accelerations")
+    gyro, accel = message.angular_velocity, message.linear_acceleration
+    numbers = (gyro.x, gyro.y, gyro.z, accel.x, accel.y, accel.z)
+    if not all(map(math.isfinite, numbers)):
+        raise BrokenMessage("a sample of an IMU is not finite")
+    return numbers
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

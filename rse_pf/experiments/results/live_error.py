@@ -45,6 +45,13 @@ LIVE_MAP = "live.rsemap"
 TRUTH = "truth.txt"
 
 
+_UP_TO_SCALE = "up to scale"
+_NO_METRES = (
+    "no robot has metres, so a place in the map is known of none: all have one lens alone\n"
+    "  hint: let one of them have depth, a stereo pair or an IMU: --camera stereo, --imu\n"
+)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class LiveDrive:
     """The records of one robot, in the order of time; times are seconds since the start of all robots."""
@@ -90,6 +97,7 @@ def live_figures(drives: Sequence[LiveDrive], version: MapVersion | None) -> dic
         "online_ate_cm": _together_cm(online, drives),
         "joined": sum(_join_frame(drive) is not None for drive in drives),
         "join_frame": [_join_frame(drive) for drive in drives],
+        "without_metres": sum(drive.end.get("scale") == _UP_TO_SCALE for drive in drives),
         "aligned_percent": _percent(sum(frame["T_map"] is not None for frame in given), len(given)),
         "aligned_percent_by_robot": [
             _percent(
@@ -202,6 +210,7 @@ def live_lines(live: Mapping[str, Any], robots: int) -> str:
     return (
         f"{live['joined']} of {robots} in one live map of {live['keyframes']} keyframes; {errors}"
         f"{live['aligned_percent']} % of the poses aligned; {times if delay['n'] else 'no correction'}\n"
+        + (_NO_METRES if live.get("without_metres") == robots else "")
     )
 
 

@@ -108,6 +108,24 @@ def test_errors_are_not_told_while_a_robot_has_not_joined(tmp_path: Path) -> Non
     assert "1 of 2" in live_lines(live, 2)
 
 
+@pytest.mark.parametrize(
+    ("scales", "says"), [(("up to scale", "up to scale"), True), (("up to scale", "metric, by depth"), False)]
+)
+def test_a_map_of_robots_with_one_lens_says_why_none_joined(
+    tmp_path: Path, scales: tuple[str, str], says: bool
+) -> None:
+    for number, scale in enumerate(scales):
+        name = f"robot-{number + 1}"
+        write_drive(tmp_path, name, number, joins_at=None, off_m=0.0)
+        path = tmp_path / name / LIVE_RECORDS
+        path.write_text(path.read_text().replace('"event": "end"', f'"event": "end", "scale": "{scale}"'))
+
+    lines = live_lines(live_figures(read_live_drives(tmp_path, ["robot-1", "robot-2"]), None), 2)
+
+    assert ("no robot has metres" in lines) == says
+    assert ("hint: let one of them have depth" in lines) == says
+
+
 def test_damaged_records_are_told(tmp_path: Path) -> None:
     (tmp_path / "robot-1").mkdir()
     (tmp_path / "robot-1" / LIVE_RECORDS).write_text('{"event": "tea"}\n')
