@@ -1,0 +1,483 @@
+"""Adjust the keyframes of a drive together with the calibration of their camera.
+
+Gauss-Newton over poses, landmarks and calibration with robust weights; landmarks are eliminated by the Schur
+complement.  What a value means for a user, and which matches are believed, is decided elsewhere.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from rse_pf.errors import BadRequest, DegenerateGeometry
+from rse_pf.geometry import Array, Camera, exp_se3, inverse, skew
+
+__all__ = ["UNKNOWNS", "Calibrated", "DriveObservations", "adjust_with_calibration", "triangulated"]
+
+Rows = npt.NDArray[np.int64]
+
+UNKNOWNS = ("fx", "fy", "cx", "cy", "k1", "offset", "delay", "readout", "curve")
+"""Logarithms of the ratios of focal lengths, pixels, radial distortion, metres that depth is too large and
+seconds that it is late, seconds from the first row of a rolling shutter to the last, and metres that depth is
+too large for each square metre of it."""
+PRIOR = np.array([0.15, 0.15, 40.0, 40.0, 0.15, 0.15, 0.3, 0.02, 0.01])
+"""Standard deviations of the unknowns before the drive is seen."""
+_ZOOM_PRIOR = 0.15
+_CAUCHY = 2.0
+_ITERATIONS, _CONVERGED = 12, 1e-4
+_FIRST_DAMPING, _MOST_DAMPING = 1e-4, 1e4
+_NEAR_M = 0.02
+_BEHIND = 1e3
+_BLOCKS, _CELLS = 6, 6
+_MAD = 1.4826
+_MOST_TURN_RAD, _MEAN_INFORMATION = 0.5, 1e8
+_SAMPLES = 8
+_POSE_INFORMATION, _POINT_INFORMATION = 1.0, 1e-3
+"""Far below what any drive tells: they fix position, and scale where nothing is metric."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class DriveObservations:
+    """Landmarks and where keyframes see them.
+
+    Attributes:
+        camera: Intrinsics as they are set.
+        keyframes: ``(n,)``, row of the keyframe of each observation.
+        landmarks: ``(n,)``, row of its landmark; a keyframe sees one at most once.
+        pixels: ``(n, 2)``.
+        pixels_px: ``(n,)`` deviations of the pixels.
+        depths_m: ``(n,)`` along the optical axis, NaN where there is none.
+        depths_dev_m: ``(n,)`` deviations of the depths; not read where there is none.
+        rates_m_s: ``(n,)``, how the depth at the pixel changes with time; 0 where that is not known.
+        twists_s: ``(k, 6)``, how the pose of each keyframe changes in a second, as a twist on its left; 0
+            where that is not known.
+    """
+
+    camera: Camera
+    keyframes: Rows
+    landmarks: Rows
+    pixels: Array
+    pixels_px: Array
+    depths_m: Array
+    depths_dev_m: Array
+    rates_m_s: Array
+    twists_s: Array
+
+    def __post_init__(self) -> None:
+        n = len(self.keyframes)
+        shapes = (
+            self.landmarks.shape, self.pixels_px.shape, self.depths_m.shape, self.depths_dev_m.shape,
+            self.rates_m_s.shape,
+        )  # fmt: skip
+        if shapes != ((n,),) * 5 or self.pixels.shape != (n, 2):
+            raise BadRequest(
+                "observations of different numbers of rows", hint="give one row for each observation"
+            )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Calibrated:
+    """The result of `adjust_with_calibration`.
+
+    Attributes:
+        values: ``(9,)`` of `UNKNOWNS`; those that were not free are 0.
+        covariance: ``(9, 9)`` of the values, inflated to what the residuals show.
+        zooms: ``(k,)`` logarithms of the focal length of each keyframe beside the common one.
+        zooms_covariance: ``(k, k)``.
+        T_camera_world: ``(k, 4, 4)``.
+        points_world: ``(l, 3)``.
+        bends_m: ``(9, k, 3)``, how the keyframes' positions move where an unknown is held one too large.
+        noise_m: How well the drive tells its positions: root mean square after alignment.
+        cost: Robust sum of squares.
+        has_metres: Whether depths tell the scale; else paths are compared up to scale.
+        pixel_factor, depth_factor: Residuals against the deviations of the observations.
+    """
+
+    values: Array
+    covariance: Array
+    zooms: Array
+    zooms_covariance: Array
+    T_camera_world: Array
+    points_world: Array
+    bends_m: Array
+    noise_m: float
+    cost: float
+    has_metres: bool
+    pixel_factor: float
+    depth_factor: float
+
+    @property
+    def deviations(self) -> Array:
+        """``(9,)`` standard deviations of the values."""
+        deviations: Array = np.sqrt(np.diag(self.covariance))
+        return deviations
+
+    def bend_m(self, error: Array) -> float:
+        """Return how far a calibration that is wrong by *error* ``(9,)`` bends the drive, after alignment."""
+        moved = np.tensordot(error, self.bends_m, axes=1)
+        return _rms_aligned(inverse(self.T_camera_world)[:, :3, 3], moved, has_metres=self.has_metres)
+
+
+def triangulated(observed: DriveObservations, T_camera_world: Array, count: int) -> Array:
+    """Return ``(count, 3)`` landmarks from depths where there are some, and from rays elsewhere."""
+    camera, T = observed.camera, T_camera_world[observed.keyframes]
+    rays = camera.back_project(observed.pixels, np.ones(len(T)))
+    rotated = np.einsum("nji,nj->ni", T[:, :3, :3], rays)
+    centres = -np.einsum("nji,nj->ni", T[:, :3, :3], T[:, :3, 3])
+    has_depth = np.isfinite(observed.depths_m)
+    weight = np.where(has_depth, np.square(observed.depths_dev_m, where=has_depth, out=np.ones(len(T))), 1.0)
+    points = centres + np.nan_to_num(observed.depths_m)[:, None] * rotated
+    unit = rotated / np.linalg.norm(rotated, axis=1, keepdims=True)
+    across = np.eye(3) - unit[:, :, None] * unit[:, None, :]
+    A = _summed(across, observed.landmarks, count)
+    b = _summed(np.einsum("nij,nj->ni", across, centres), observed.landmarks, count)
+    near: Array = np.where(has_depth, 1.0 / weight, 0.0)
+    A += _summed(near[:, None, None] * np.eye(3), observed.landmarks, count)
+    b += _summed(near[:, None] * points, observed.landmarks, count)
+    found = np.linalg.solve(A + 1e-9 * np.eye(3), b[:, :, None])[:, :, 0]
+    return found.astype(np.float64, copy=False)
+
+
+def adjust_with_calibration(
+    observed: DriveObservations, T_camera_world: Array, points_world: Array, free: tuple[str, ...],
+    *, zooms: bool = False, values: Array | None = None, iterations: int = _ITERATIONS,
+) -> Calibrated:  # fmt: skip
+    """Return poses, landmarks and calibration that agree best with pixels and depths.
+
+    A pixel is ``f e^(a + zoom) x (1 + k1 r^2) + c + d``; a measured depth is ``z + offset + rate * delay``.
+
+    Args:
+        observed: Of all keyframes.
+        T_camera_world: ``(k, 4, 4)``, where the adjustment begins.
+        points_world: ``(l, 3)``, as `triangulated` returns them.
+        free: Which of `UNKNOWNS` are adjusted; the others are 0.
+        zooms: Whether each keyframe has a focal length of its own.
+        values: ``(9,)``, where the calibration begins; None for 0.
+        iterations: At most so many.
+
+    Raises:
+        DegenerateGeometry: The linear system has no solution.
+
+    Source:
+        Triggs et al., "Bundle Adjustment - A Modern Synthesis", 2000, Sect. 6; deviations by the sandwich of
+        White, Econometrica 1980, over stretches of the drive.
+    """
+    unknown = set(free) - set(UNKNOWNS)
+    if unknown:
+        raise BadRequest(f"no unknown named {sorted(unknown)}", hint=f"choose of {', '.join(UNKNOWNS)}")
+    system = _System(observed, len(T_camera_world), len(points_world), free, zooms=zooms)
+    begin = np.zeros(len(UNKNOWNS)) if values is None else values
+    state = _State(T_camera_world.copy(), points_world.copy(), begin.copy(), np.zeros(system.k))
+
+    damping = _FIRST_DAMPING
+    system.rescale(state)
+    cost = system.cost(state)
+    try:
+        for iteration in range(iterations):
+            system.linearise(state)
+            moved, moved_cost = state, np.inf
+            while damping <= _MOST_DAMPING:
+                moved = system.step(state, damping)
+                moved_cost = system.cost(moved)
+                if moved_cost < cost:
+                    break
+                damping *= 10.0
+            if not moved_cost < cost:
+                break
+            is_done = cost - moved_cost < _CONVERGED * cost
+            state, cost, damping = moved, moved_cost, max(damping * 0.1, 1e-9)
+            if iteration in (1, 4):
+                system.rescale(state)
+                cost = system.cost(state)
+            elif is_done and iteration > 4:
+                break
+        system.rescale(state)
+        system.linearise(state)
+        return system.result(state)
+    except np.linalg.LinAlgError as error:
+        raise DegenerateGeometry(
+            "the keyframes of this drive do not determine their poses",
+            hint="move more, and past more texture",
+        ) from error
+
+
+@dataclass(frozen=True, slots=True)
+class _State:
+    T: Array
+    points: Array
+    values: Array
+    zooms: Array
+
+
+class _System:
+    """The normal equations of a drive, with observations in the order of their landmarks."""
+
+    def __init__(
+        self,
+        observed: DriveObservations,
+        keyframes: int,
+        landmarks: int,
+        free: tuple[str, ...],
+        *,
+        zooms: bool,
+    ) -> None:
+        self._free = np.flatnonzero([name in free for name in UNKNOWNS])
+        self._c, self._m = 7 if zooms else 6, len(self._free)
+        order = np.argsort(observed.landmarks, kind="stable")
+        self.k, self.l = keyframes, landmarks
+        self.keyframes, self.landmarks = observed.keyframes[order], observed.landmarks[order]
+        self.pixels, self.pixels_px = observed.pixels[order], observed.pixels_px[order]
+        self.has_depth = np.isfinite(observed.depths_m[order])
+        self.depths_m = np.where(self.has_depth, observed.depths_m[order], 0.0)
+        self.depths_dev_m = np.where(self.has_depth, observed.depths_dev_m[order], 1.0)
+        self.rates_m_s = np.where(self.has_depth, observed.rates_m_s[order], 0.0)
+        self.camera = observed.camera
+        twists = observed.twists_s[self.keyframes]
+        self.rates, self.turns = twists[:, :3], twists[:, 3:]
+        self.moments = self.pixels[:, 1:] / self.camera.height - 0.5
+        self.pixel_factor = self.depth_factor = 1.0
+        self._of_keyframe = [np.flatnonzero(self.keyframes == row) for row in range(keyframes)]
+
+    def residuals(self, state: _State) -> tuple[Array, Array]:
+        """Return ``(n, 3)`` residuals of pixel and depth in their units, and points in the camera."""
+        T = state.T[self.keyframes]
+        seen = np.einsum("nij,nj->ni", T[:, :3, :3], state.points[self.landmarks]) + T[:, :3, 3]
+        z = np.maximum(seen[:, 2], _NEAR_M)
+        a, b, cx, cy, k1, offset, delay, readout, curve = state.values
+        x, y = seen[:, 0] / z, seen[:, 1] / z
+        bent = 1.0 + k1 * (x * x + y * y)
+        zoom = np.exp(state.zooms[self.keyframes])
+        residual = np.empty((len(z), 3))
+        residual[:, 0] = (
+            self.camera.fx * np.exp(a) * zoom * x * bent + self.camera.cx + cx - self.pixels[:, 0]
+        )
+        residual[:, 1] = (
+            self.camera.fy * np.exp(b) * zoom * y * bent + self.camera.cy + cy - self.pixels[:, 1]
+        )
+        if readout:
+            later = seen + readout * self.moments * (self.rates + np.cross(self.turns, seen))
+            later_z = np.maximum(later[:, 2], _NEAR_M)
+            residual[:, 0] += self.camera.fx * (later[:, 0] / later_z - x)
+            residual[:, 1] += self.camera.fy * (later[:, 1] / later_z - y)
+        residual[:, 2] = np.where(
+            self.has_depth,
+            seen[:, 2] + offset + curve * seen[:, 2] ** 2 - self.rates_m_s * delay - self.depths_m,
+            0.0,
+        )
+        return residual, seen
+
+    def _scales(self) -> Array:
+        return np.stack(
+            [
+                1.0 / (self.pixel_factor * self.pixels_px), 1.0 / (self.pixel_factor * self.pixels_px),
+                np.where(self.has_depth, 1.0 / (self.depth_factor * self.depths_dev_m), 0.0),
+            ],
+            axis=1,
+        )  # fmt: skip
+
+    def rescale(self, state: _State) -> None:
+        """Take the deviations of pixels and depths from their residuals."""
+        residual, _ = self.residuals(state)
+        pixels = np.abs(residual[:, :2] / self.pixels_px[:, None])
+        self.pixel_factor = max(0.05, _MAD * float(np.median(pixels)))
+        if self.has_depth.sum() > 20:
+            depths = np.abs(residual[:, 2] / self.depths_dev_m)[self.has_depth]
+            self.depth_factor = max(0.1, _MAD * float(np.median(depths)))
+
+    def cost(self, state: _State) -> float:
+        residual, seen = self.residuals(state)
+        whitened = np.square(residual * self._scales())
+        squares = np.stack([whitened[:, :2].sum(axis=1), whitened[:, 2]])
+        each = _CAUCHY**2 * np.log1p(squares / _CAUCHY**2)
+        each[0] = np.where(seen[:, 2] > _NEAR_M, each[0], _BEHIND)
+        priors = ((state.values / PRIOR) ** 2).sum() + ((state.zooms / _ZOOM_PRIOR) ** 2).sum()
+        return float(each.sum() + priors)
+
+    def linearise(self, state: _State) -> None:
+        """Take weighted Jacobians and residuals."""
+        residual, seen = self.residuals(state)
+        z = np.maximum(seen[:, 2], _NEAR_M)
+        n = len(z)
+        a, b, _, _, k1 = state.values[:5]
+        x, y = seen[:, 0] / z, seen[:, 1] / z
+        r2 = x * x + y * y
+        bent = 1.0 + k1 * r2
+        zoom = np.exp(state.zooms[self.keyframes])
+        fx, fy = self.camera.fx * np.exp(a) * zoom, self.camera.fy * np.exp(b) * zoom
+        J_xy = np.empty((n, 2, 2))
+        J_xy[:, 0, 0], J_xy[:, 0, 1] = fx * (bent + 2 * k1 * x * x), fx * 2 * k1 * x * y
+        J_xy[:, 1, 0], J_xy[:, 1, 1] = fy * 2 * k1 * x * y, fy * (bent + 2 * k1 * y * y)
+        J_seen = np.zeros((n, 3, 3))
+        J_seen[:, :2, :2] = J_xy / z[:, None, None]
+        J_seen[:, :2, 2] = -(J_xy @ np.stack([x, y], axis=1)[:, :, None])[:, :, 0] / z[:, None]
+        J_seen[:, 2, 2] = 1.0 + 2.0 * state.values[8] * seen[:, 2]
+        J_c = np.zeros((n, 3, 7))
+        J_c[:, :, :3] = J_seen
+        J_c[:, :, 3:6] = -J_seen @ skew(seen)
+        J_v = np.zeros((n, 3, len(UNKNOWNS)))
+        J_v[:, 0, 0], J_v[:, 1, 1] = fx * x * bent, fy * y * bent
+        J_c[:, 0, 6], J_c[:, 1, 6] = J_v[:, 0, 0], J_v[:, 1, 1]
+        J_v[:, 0, 2] = J_v[:, 1, 3] = 1.0
+        J_v[:, 0, 4], J_v[:, 1, 4] = fx * x * r2, fy * y * r2
+        moving = self.moments * (self.rates + np.cross(self.turns, seen))
+        J_v[:, :2, 7] = (J_seen[:, :2] @ moving[:, :, None])[:, :, 0]
+        J_v[:, 2, 5], J_v[:, 2, 6], J_v[:, 2, 8] = 1.0, -self.rates_m_s, seen[:, 2] ** 2
+        scales = self._scales()
+        whitened = residual * scales
+        pixel = 1.0 / (1.0 + (whitened[:, :2] ** 2).sum(axis=1) / _CAUCHY**2)
+        depth = 1.0 / (1.0 + whitened[:, 2] ** 2 / _CAUCHY**2)
+        in_front = seen[:, 2] > _NEAR_M
+        weights = np.sqrt(np.stack([pixel, pixel, depth], axis=1) * in_front[:, None])
+        rows = (weights * scales)[:, :, None]
+        J_p = (J_seen @ state.T[self.keyframes, :3, :3]) * rows
+        self._J = J_c[:, :, : self._c] * rows, J_v[:, :, self._free] * rows, J_p
+        self._r = whitened * weights
+        self._normal()
+
+    def _normal(self) -> None:
+        J_c, J_v, J_p = self._J
+        c, m, split = self._c, self._m, self._c * self.k
+        size = split + m
+        self._H, self._g = np.zeros((size, size)), np.zeros(size)
+        E = np.zeros((size, self.l, 3))
+        W_c, W_v = J_c.transpose(0, 2, 1) @ J_p, J_v.transpose(0, 2, 1) @ J_p
+        for row, own in enumerate(self._of_keyframe):
+            at = slice(c * row, c * row + c)
+            stacked, others = J_c[own].reshape(-1, c), J_v[own].reshape(-1, m)
+            r = self._r[own].ravel()
+            self._H[at, at] = stacked.T @ stacked
+            self._H[at, split:] = stacked.T @ others
+            self._H[split:, at] = self._H[at, split:].T
+            self._H[split:, split:] += others.T @ others
+            self._g[at] = stacked.T @ r
+            self._g[split:] += others.T @ r
+            E[at, self.landmarks[own]] = W_c[own].transpose(1, 0, 2)
+        E[split:] = _summed(W_v, self.landmarks, self.l).transpose(1, 0, 2)
+        self._E = E.reshape(size, -1)
+        self._Hpp = _summed(J_p.transpose(0, 2, 1) @ J_p, self.landmarks, self.l)
+        self._gp = _summed((J_p.transpose(0, 2, 1) @ self._r[:, :, None])[:, :, 0], self.landmarks, self.l)
+
+    def _reduced(self, damping: float) -> tuple[Array, Array, Array]:
+        """Return the reduced matrix with priors, ``E Hpp^-1``, and ``Hpp^-1``."""
+        size = len(self._g)
+        damped = self._Hpp * (1.0 + damping * np.eye(3)) + _POINT_INFORMATION * np.eye(3)
+        P: Array = np.linalg.inv(damped).astype(np.float64, copy=False)
+        E = self._E.reshape(size, self.l, 3)
+        Y = (E.transpose(1, 0, 2) @ P).transpose(1, 0, 2).reshape(size, -1)
+        S = self._H - Y @ self._E.T
+        diagonal = np.arange(size)
+        S[diagonal, diagonal] += damping * self._H[diagonal, diagonal] + self._prior()
+        if self._c == 7:
+            # The mean of the zooms is the common focal length's.
+            zoom = 7 * np.arange(self.k) + 6
+            S[np.ix_(zoom, zoom)] += _MEAN_INFORMATION / self.k
+        return S, Y, P
+
+    def _prior(self) -> Array:
+        own = np.full((self.k, self._c), _POSE_INFORMATION)
+        own[:, 6:] = 1.0 / _ZOOM_PRIOR**2
+        return np.concatenate([own.ravel(), 1.0 / PRIOR[self._free] ** 2])
+
+    def step(self, state: _State, damping: float) -> _State:
+        """Return the state after one damped step."""
+        S, Y, P = self._reduced(damping)
+        k, c = self.k, self._c
+        now = np.zeros((k, c))
+        now[:, 6:] = state.zooms[:, None]
+        pull = self._prior() * np.concatenate([now.ravel(), state.values[self._free]])
+        d = np.linalg.solve(S, Y @ self._gp.ravel() - self._g - pull)
+        back = -(self._gp + (self._E.T @ d).reshape(-1, 3))
+        own = d[: c * k].reshape(k, c)
+        limit = min(1.0, _MOST_TURN_RAD / max(float(np.abs(own[:, 3:6]).max()), 1e-12))
+        values = state.values.copy()
+        values[self._free] += limit * d[c * k :]
+        return _State(
+            exp_se3(limit * own[:, :6]) @ state.T,
+            state.points + limit * (P @ back[:, :, None])[:, :, 0],
+            values,
+            state.zooms + limit * own[:, 6] if c == 7 else state.zooms,
+        )
+
+    def result(self, state: _State) -> Calibrated:
+        """Return the state with its deviations."""
+        S, Y, _ = self._reduced(0.0)
+        k, c, m, split = self.k, self._c, self._m, self._c * self.k
+        whole: Array = np.linalg.inv(S).astype(np.float64, copy=False)
+        rows = np.arange(split, split + m)
+        if c == 7:
+            rows = np.concatenate([rows, 7 * np.arange(k) + 6])
+        own = whole[rows][:, rows]
+        growth = np.sqrt(self._inflation(whole[rows], Y, np.diag(own)))
+        own = own * growth[:, None] * growth[None]
+        covariance: Array = np.zeros((len(UNKNOWNS), len(UNKNOWNS)))
+        zooms_covariance: Array = np.zeros((k, k))
+        covariance[np.ix_(self._free, self._free)] = own[:m, :m]
+        if c == 7:
+            zooms_covariance = own[m:, m:]
+        # Held one too large, an unknown moves the poses by this.
+        pulled = -np.linalg.solve(S[:split, :split], S[:split, split:]).reshape(k, c, m)
+        # The centre -R^T t moves by -R^T rho with a twist (rho, phi) on the left.
+        slopes = -state.T[:, :3, :3].transpose(0, 2, 1)
+        bends = np.zeros((len(UNKNOWNS), k, 3))
+        bends[self._free] = np.einsum("kij,kjv->vki", slopes, pulled[:, :3])
+        return Calibrated(
+            values=state.values, covariance=covariance, zooms=state.zooms, zooms_covariance=zooms_covariance,
+            T_camera_world=state.T, points_world=state.points, bends_m=bends,
+            noise_m=self._noise(state, whole[:split, :split], slopes), cost=self.cost(state),
+            has_metres=self._has_metres(), pixel_factor=self.pixel_factor, depth_factor=self.depth_factor,
+        )  # fmt: skip
+
+    def _inflation(self, rows: Array, Y: Array, variances: Array) -> Array:
+        """Return by how much variances grow where errors of one stretch of the drive go together."""
+        k, split = self.k, self._c * self.k
+        of_points = (rows @ Y).reshape(len(rows), self.l, 3)
+        of_cameras = rows[:, :split].reshape(len(rows), k, self._c)
+        pull_c, pull_v, pull_p = ((J.transpose(0, 2, 1) @ self._r[:, :, None])[:, :, 0] for J in self._J)
+        moved = pull_v @ rows[:, split:].T
+        for column in range(len(rows)):
+            moved[:, column] += (of_cameras[column, self.keyframes] * pull_c).sum(axis=1)
+            moved[:, column] -= (of_points[column, self.landmarks] * pull_p).sum(axis=1)
+        across, down = self.camera.width / _CELLS, self.camera.height / _CELLS
+        cells = (np.clip(self.pixels // (across, down), 0, _CELLS - 1) @ (1, _CELLS)).astype(np.int64)
+        grown = np.ones(len(rows))
+        for clusters, count in (
+            (self.landmarks, self.l), (self.keyframes * min(_BLOCKS, k) // k, min(_BLOCKS, k)),
+            (cells, _CELLS**2),
+        ):  # fmt: skip
+            squares = (_summed(moved, clusters, count) ** 2).sum(axis=0) * count / max(1, count - 1)
+            grown += np.maximum(squares / np.maximum(variances, 1e-30) - 1.0, 0.0)
+        return grown
+
+    def _has_metres(self) -> bool:
+        return bool(self.has_depth.any())
+
+    def _noise(self, state: _State, covariance: Array, slopes: Array) -> float:
+        values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
+        root = vectors * np.sqrt(np.maximum(values, 0.0))
+        drawn = root @ np.random.default_rng(3).standard_normal((len(root), _SAMPLES))
+        moved = np.einsum("kij,kjs->ski", slopes, drawn.reshape(self.k, self._c, _SAMPLES)[:, :3])
+        positions = inverse(state.T)[:, :3, 3]
+        metres = self._has_metres()
+        squares = [_rms_aligned(positions, each, has_metres=metres) ** 2 for each in moved]
+        return float(np.sqrt(np.mean(squares)))
+
+
+def _rms_aligned(positions: Array, moved: Array, *, has_metres: bool) -> float:
+    """Return the root mean square of small motions after the best small motion of all, and scale if free."""
+    at = positions - positions.mean(axis=0)
+    J = np.concatenate([np.tile(np.eye(3), (len(at), 1, 1)), -skew(at)], axis=2).reshape(-1, 6)
+    if not has_metres:
+        J = np.column_stack([J, at.ravel()])
+    flat = moved.reshape(-1)
+    left = flat - J @ np.linalg.lstsq(J, flat, rcond=None)[0]
+    return float(np.sqrt((left**2).sum() / len(at)))
+
+
+def _summed(values: Array, rows: Rows, count: int) -> Array:
+    """Return sums of ``(n, ...)`` values over equal rows, ``(count, ...)``."""
+    flat = values.reshape(len(values), -1)
+    total = np.stack([np.bincount(rows, column, count) for column in flat.T], axis=1)
+    summed: Array = total.astype(np.float64, copy=False).reshape(count, *values.shape[1:])
+    return summed

@@ -1,0 +1,75 @@
+"""Tests of the judges of a calibration, on drives of exact points with one fault each."""
+
+from __future__ import annotations
+
+import pytest
+from made_drives import Made, make_store
+
+from client_sdk.check.calibration import CalibrationJudgement, judge_calibration
+from client_sdk.check.findings import FaultKind, Finding, order
+from client_sdk.check.keyframes import KeyframeStore
+
+
+def judged(made: Made) -> CalibrationJudgement:
+    return judge_calibration(make_store(made))
+
+
+def first(made: Made) -> Finding:
+    judgement = judged(made)
+    return order(judgement.findings, judgement.noise_m)[0]
+
+
+@pytest.mark.parametrize(
+    ("made", "kind", "value"),
+    [
+        (Made(seed=1, fx=0.05), FaultKind.FOCAL_LENGTH, 0.05),
+        (Made(seed=2, fx=-0.1), FaultKind.FOCAL_LENGTH, -0.1),
+        (Made(seed=3, cx_px=15.0), FaultKind.PRINCIPAL_POINT, 15.0),
+        (Made(seed=4, k1=-0.15), FaultKind.DISTORTION, -0.15),
+        (Made(seed=5, offset_m=0.1), FaultKind.DEPTH_OFFSET, 0.1),
+        (Made(seed=6, delay_s=0.1), FaultKind.DEPTH_DELAY, 0.1),
+        (Made(seed=7, delay_s=-0.3), FaultKind.DEPTH_DELAY, -0.3),
+        (Made(seed=8, flip=True), FaultKind.MIRRORED, 1.0),
+        (Made(seed=9, zoom_after=1.1), FaultKind.TWO_CAMERAS, 0.1),
+        (Made(seed=10, fx=0.1, has_depth=False), FaultKind.FOCAL_LENGTH, 0.1),
+    ],
+)
+def test_a_planted_fault_is_the_first_finding_with_its_value(
+    made: Made, kind: FaultKind, value: float
+) -> None:
+    finding = first(made)
+
+    assert finding.kind is kind
+    assert abs(finding.value - value) < max(3.0 * finding.deviation, 0.01 * abs(value))
+    assert abs(finding.value - value) <= 0.2 * abs(value)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_healthy_drive_has_no_finding(seed: int) -> None:
+    assert judged(Made(seed=20 + seed, has_depth=seed % 3 != 0)).findings == ()
+
+
+def test_a_focal_length_comes_with_the_number_to_set() -> None:
+    finding = first(Made(seed=1, fx=0.05))
+
+    assert finding.correction["fx"] == pytest.approx(525.0 / 1.05, abs=6.0)
+    assert "fx = " in finding.fix
+
+
+def test_a_drive_that_does_not_turn_cannot_tell_the_focal_length_and_says_so() -> None:
+    told = {each.kind: each for each in judged(Made(turn=0.02, roll=0.02)).cannot_tell}
+
+    focal = told[FaultKind.FOCAL_LENGTH]
+    assert "turns by" in focal.reason
+    assert "vertical axis" in focal.reason
+    assert focal.within is not None
+    assert focal.within > 0.06
+    assert not judged(Made()).cannot_tell
+
+
+def test_a_drive_of_few_views_cannot_tell_anything_and_does_not_fail() -> None:
+    for store in (KeyframeStore(), make_store(Made(views=3))):
+        judgement = judge_calibration(store)
+
+        assert judgement.findings == ()
+        assert FaultKind.FOCAL_LENGTH in {each.kind for each in judgement.cannot_tell}

@@ -1,0 +1,65 @@
+"""Tests of the observer of a drive: which frames it keeps, and that it takes any."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from client_sdk.check.findings import FaultKind
+from client_sdk.check.keyframes import KeyframeStore, depths_at, matched
+from client_sdk.check.observer import DriveObserver
+from client_sdk.frontend import Frame
+from client_sdk.simulator import render_frames
+
+
+def frames(count: int) -> list[Frame]:
+    return list(render_frames(0, 1, count, 3))
+
+
+def test_a_frame_that_shows_the_same_is_not_kept() -> None:
+    seen, store = frames(9), KeyframeStore()
+
+    for row in range(5):
+        store.add(replace(seen[0], timestamp_s=float(row)), None)
+    store.add(replace(seen[8], timestamp_s=9.0), None)
+
+    assert store.frames == 6
+    assert [keyframe.row for keyframe in store.keyframes] == [0, 5]
+
+
+def test_depths_around_a_keyframe_are_those_of_other_frames_at_its_pixels() -> None:
+    seen, store = frames(9), KeyframeStore()
+
+    for frame in seen:
+        store.add(frame, None)
+
+    middle = next(keyframe for keyframe in store.keyframes if 2 <= keyframe.row <= 6)
+    offsets = sorted(round(each[0], 3) for each in middle.around)
+    assert offsets == [-0.4, -0.2, 0.0, 0.2, 0.4]
+    later = {round(offset, 3): depths for offset, depths in middle.around}[0.2]
+    np.testing.assert_array_equal(later, depths_at(seen[middle.row + 1].depth_m, middle.pixels))
+
+
+def test_matches_need_no_calibration() -> None:
+    seen, store = frames(9)[::8], KeyframeStore()
+    for frame in seen:
+        store.add(frame, None)
+
+    one, other = matched(*store.keyframes)
+
+    moved = np.linalg.norm(store.keyframes[0].pixels[one] - store.keyframes[1].pixels[other], axis=1)
+    assert len(one) > 100
+    assert np.median(moved) < 60.0
+
+
+def test_an_empty_and_a_still_drive_are_reported_without_a_finding() -> None:
+    assert DriveObserver().finish().findings == ()
+    observer, frame = DriveObserver(), frames(1)[0]
+    for row in range(12):
+        observer.add(replace(frame, timestamp_s=0.2 * row))
+
+    report = observer.finish()
+
+    assert report.frames == 12
+    assert FaultKind.FOCAL_LENGTH in {each.kind for each in report.cannot_tell}
