@@ -68,7 +68,6 @@ def judge_calibration(store: KeyframeStore) -> CalibrationJudgement:
             return _untold("too few views that show the same", has_depth=has_depth)
         zoomed = adjust_with_calibration(
             model.observed, found.T_camera_world, found.points_world, free, zooms=True, values=found.values,
-            iterations=6,
         )  # fmt: skip
     except DegenerateGeometry:
         return _untold("views that do not determine their poses", has_depth=has_depth)

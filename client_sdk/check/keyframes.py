@@ -45,8 +45,7 @@ class Keyframe:
     ``row`` counts frames; ``depths_m`` ``(4, n)`` at the features in each of `FLIPS`, NaN where there is none
     or an edge, and ``noise`` is that of depth.  ``T_world_camera`` is the pose that was tracked, None where
     it was lost, and ``twist_s`` ``(6,)`` how its inverse changes in a second, a twist on the left.
-    ``around``
-    holds ``(seconds later, (n,) depths at the features)`` of frames near in time, itself among them.
+    ``around`` holds ``(seconds later, (n,) depths at the features)`` of frames near in time.
     """
 
     row: int

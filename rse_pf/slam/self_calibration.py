@@ -26,7 +26,7 @@ PRIOR = np.array([0.15, 0.15, 40.0, 40.0, 0.15, 0.15, 0.3, 0.02, 0.01])
 """Standard deviations of the unknowns before the drive is seen."""
 _ZOOM_PRIOR = 0.15
 _CAUCHY = 2.0
-_ITERATIONS, _CONVERGED = 12, 1e-4
+_ITERATIONS, _ZOOM_ITERATIONS, _CONVERGED = 12, 6, 1e-4
 _FIRST_DAMPING, _MOST_DAMPING = 1e-4, 1e4
 _NEAR_M = 0.02
 _BEHIND = 1e3
@@ -142,11 +142,12 @@ def triangulated(observed: DriveObservations, T_camera_world: Array, count: int)
 
 def adjust_with_calibration(
     observed: DriveObservations, T_camera_world: Array, points_world: Array, free: tuple[str, ...],
-    *, zooms: bool = False, values: Array | None = None, iterations: int = _ITERATIONS,
+    *, zooms: bool = False, values: Array | None = None,
 ) -> Calibrated:  # fmt: skip
     """Return poses, landmarks and calibration that agree best with pixels and depths.
 
-    A pixel is ``f e^(a + zoom) x (1 + k1 r^2) + c + d``; a measured depth is ``z + offset + rate * delay``.
+    A pixel is ``f e^(a + zoom) x (1 + k1 r^2) + c + d``; a measured depth is
+    ``z + offset + curve z^2 - rate * delay``.
 
     Args:
         observed: Of all keyframes.
@@ -155,7 +156,6 @@ def adjust_with_calibration(
         free: Which of `UNKNOWNS` are adjusted; the others are 0.
         zooms: Whether each keyframe has a focal length of its own.
         values: ``(9,)``, where the calibration begins; None for 0.
-        iterations: At most so many.
 
     Raises:
         DegenerateGeometry: The linear system has no solution.
@@ -175,7 +175,7 @@ def adjust_with_calibration(
     system.rescale(state)
     cost = system.cost(state)
     try:
-        for iteration in range(iterations):
+        for iteration in range(_ZOOM_ITERATIONS if zooms else _ITERATIONS):
             system.linearise(state)
             moved, moved_cost = state, np.inf
             while damping <= _MOST_DAMPING:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 
@@ -13,12 +14,13 @@ from client_sdk.frontend import Frame
 from client_sdk.simulator import render_frames
 
 
-def frames(count: int) -> list[Frame]:
-    return list(render_frames(0, 1, count, 3))
+@cache
+def frames() -> tuple[Frame, ...]:
+    return tuple(render_frames(0, 1, 9, 3))
 
 
 def test_a_frame_that_shows_the_same_is_not_kept() -> None:
-    seen, store = frames(9), KeyframeStore()
+    seen, store = frames(), KeyframeStore()
 
     for row in range(5):
         store.add(replace(seen[0], timestamp_s=float(row)), None)
@@ -29,7 +31,7 @@ def test_a_frame_that_shows_the_same_is_not_kept() -> None:
 
 
 def test_depths_around_a_keyframe_are_those_of_other_frames_at_its_pixels() -> None:
-    seen, store = frames(9), KeyframeStore()
+    seen, store = frames(), KeyframeStore()
 
     for frame in seen:
         store.add(frame, None)
@@ -42,7 +44,7 @@ def test_depths_around_a_keyframe_are_those_of_other_frames_at_its_pixels() -> N
 
 
 def test_matches_need_no_calibration() -> None:
-    seen, store = frames(9)[::8], KeyframeStore()
+    seen, store = frames()[::8], KeyframeStore()
     for frame in seen:
         store.add(frame, None)
 
@@ -55,7 +57,7 @@ def test_matches_need_no_calibration() -> None:
 
 def test_an_empty_and_a_still_drive_are_reported_without_a_finding() -> None:
     assert DriveObserver().finish().findings == ()
-    observer, frame = DriveObserver(), frames(1)[0]
+    observer, frame = DriveObserver(), frames()[0]
     for row in range(12):
         observer.add(replace(frame, timestamp_s=0.2 * row))
 
