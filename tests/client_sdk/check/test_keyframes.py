@@ -1,4 +1,4 @@
-"""Tests of the observer of a drive: which frames it keeps, and that it takes any."""
+"""Tests of the keyframes of a drive: which frames are kept, and what of them."""
 
 from __future__ import annotations
 
@@ -7,9 +7,7 @@ from functools import cache
 
 import numpy as np
 
-from client_sdk.check.findings import FaultKind
 from client_sdk.check.keyframes import KeyframeStore, depths_at, matched
-from client_sdk.check.observer import DriveObserver
 from client_sdk.frontend import Frame
 from client_sdk.simulator import render_frames
 
@@ -53,15 +51,3 @@ def test_matches_need_no_calibration() -> None:
     moved = np.linalg.norm(store.keyframes[0].pixels[one] - store.keyframes[1].pixels[other], axis=1)
     assert len(one) > 100
     assert np.median(moved) < 60.0
-
-
-def test_an_empty_and_a_still_drive_are_reported_without_a_finding() -> None:
-    assert DriveObserver().finish().findings == ()
-    observer, frame = DriveObserver(), frames()[0]
-    for row in range(12):
-        observer.add(replace(frame, timestamp_s=0.2 * row))
-
-    report = observer.finish()
-
-    assert report.frames == 12
-    assert FaultKind.FOCAL_LENGTH in {each.kind for each in report.cannot_tell}
