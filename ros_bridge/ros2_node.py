@@ -1,8 +1,4 @@
-"""The bridge as a node of ROS 2: messages travel through rclpy as CDR bytes, and are read by the core alone.
-
-Not yet run against a ROS 2: there was none where this was written.  What is tested is the core, with the
-same bytes; nothing of this file is.
-"""
+"""The bridge as a node of ROS 2: messages pass rclpy as CDR bytes, and are read by the core alone."""
 
 from __future__ import annotations
 
@@ -17,10 +13,13 @@ from ros_bridge.options import BridgeOptions
 from ros_bridge.outgoing import Message, advertised
 from ros_bridge.shell import end_by_signal, run_until, taken
 from rse_pf.errors import UsageError
+from rse_pf.terminal import show
 
 __all__ = ["run_ros2_node"]
 
 _CALL_S = 30.0
+_OF_ROS = ("use_sim_time", "start_type_description_service")
+"""Parameters that each node of ROS 2 has."""
 
 
 def run_ros2_node(arguments: list[str], options: dict[str, Any]) -> int:
@@ -37,14 +36,15 @@ def run_ros2_node(arguments: list[str], options: dict[str, Any]) -> int:
             f"rclpy cannot be imported: {error}",
             hint="source the setup.bash of your ROS 2, and use its Python, 3.10 or newer",
         ) from error
-    rclpy.init(args=["rse-pf-ros", *arguments])
+    signals = importlib.import_module("rclpy.signals").SignalHandlerOptions.NO  # asyncio has them
+    rclpy.init(args=["rse-pf-ros", *arguments], signal_handler_options=signals)
     node = rclpy.create_node(
         "rse_pf_bridge", allow_undeclared_parameters=True,
         automatically_declare_parameters_from_overrides=True,
     )  # fmt: skip
     try:
         own = {name: parameter.value for name, parameter in node.get_parameters_by_prefix("").items()}
-        own = {name: value for name, value in own.items() if name != "use_sim_time" and "." not in name}
+        own = {name: value for name, value in own.items() if name not in _OF_ROS and "." not in name}
         namespace = str(node.get_namespace()).strip("/")
         bridge_options = BridgeOptions.of({"namespace": namespace, **own, **options})
         return asyncio.run(_run(rclpy, node, bridge_options))
@@ -56,13 +56,11 @@ def run_ros2_node(arguments: list[str], options: dict[str, Any]) -> int:
 async def _run(rclpy: Any, node: Any, options: BridgeOptions) -> int:
     """Bridge until a signal; the exit code is 0."""
     ended = end_by_signal()
-    publishers = {
-        topic: node.create_publisher(_class_of(kind), topic, _quality(kept=latched))
-        for topic, kind, latched in advertised(options)
-    }
+    publishers = _publishers(node, options)
 
     def publish(message: Message) -> None:
-        publishers[message.topic].publish(message.data)
+        if message.topic in publishers:
+            publishers[message.topic].publish(message.data)
 
     async with connected_bridge(options, publish, is_ros1=False) as bridge:
         for role, topic, kind in taken(options):
@@ -78,6 +76,17 @@ async def _run(rclpy: Any, node: Any, options: BridgeOptions) -> int:
         finally:
             executor.shutdown()
     return 0
+
+
+def _publishers(node: Any, options: BridgeOptions) -> dict[str, Any]:
+    """Return a publisher for each topic; one whose type is not installed is left out, and said."""
+    publishers = {}
+    for topic, kind, latched in advertised(options):
+        try:
+            publishers[topic] = node.create_publisher(_class_of(kind), topic, _quality(kept=latched))
+        except UsageError as error:
+            show(f"{topic} is not published: {error.message} ({error.hint})")
+    return publishers
 
 
 def _offer(node: Any, bridge: Bridge, loop: asyncio.AbstractEventLoop) -> None:

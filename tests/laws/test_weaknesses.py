@@ -215,6 +215,7 @@ def test_every_locked_package_has_a_hash(repository: Path) -> None:
             "xfeat",
             "localstack",
             "ros",
+            "ros2",
             "rosbridge",
             "infra",
             "lambda",

@@ -11,20 +11,16 @@ import signal
 import socket
 import subprocess
 import sys
-import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, TypedDict
 
-import numpy as np
 import pytest
 
 from benchmarks.maps.bags import write_recording
-from client_sdk import connect
-from client_sdk.bags import BagOptions, open_bag
 from client_sdk.bags.message_types import load_types
 from rse_pf.config import PlatformSettings
 from rse_pf.local.control.platform import LocalPlatform
+from tests.ros_bridge.programs import Line, Program, own_run, poses, tell_delay, worst_mm
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
 
@@ -33,68 +29,6 @@ _DIST = Path("/usr/lib/python3/dist-packages")
 _FRAMES = 60
 _TOPICS = {"colour": "/camera/image_raw", "depth": "/camera/aligned_depth", "info": "/camera/camera_info"}
 _NEEDED = ("rospy", "geometry_msgs", "nav_msgs", "sensor_msgs", "tf2_msgs", "diagnostic_msgs")
-
-
-class Line(TypedDict, total=False):
-    """A line of the listener."""
-
-    kind: str
-    stamp: int
-    at: float
-    frame: str
-    child: str
-    position: list[float]
-    values: dict[str, str]
-
-
-class Program:
-    """A process whose lines are kept; it is ended with its group."""
-
-    def __init__(self, words: list[str], env: dict[str, str]) -> None:
-        self.lines: list[str] = []
-        self._changed = threading.Condition()
-        self.process = subprocess.Popen(
-            words,
-            env=env,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-            bufsize=1,
-            start_new_session=True,
-        )
-        self._reader = threading.Thread(target=self._read, daemon=True)
-        self._reader.start()
-
-    def _read(self) -> None:
-        assert self.process.stdout is not None
-        for line in self.process.stdout:
-            with self._changed:
-                self.lines.append(line)
-                self._changed.notify_all()
-
-    def until(self, enough: Callable[[list[str]], bool], timeout_s: float = 60) -> None:
-        """Wait for lines; fail with all of them after *timeout_s*."""
-        with self._changed:
-            assert self._changed.wait_for(lambda: enough(self.lines), timeout_s), "".join(self.lines[-20:])
-
-    def heard(self, kind: str) -> list[Line]:
-        """Return the lines of a kind that a listener wrote."""
-        found: list[Line] = [json.loads(line) for line in list(self.lines) if line.startswith("{")]
-        return [line for line in found if line["kind"] == kind]
-
-    def end(self, number: int = signal.SIGINT) -> int:
-        """End the process, and return its exit code."""
-        if self.process.poll() is None:
-            os.killpg(self.process.pid, number)
-            try:
-                self.process.wait(15)
-            except subprocess.TimeoutExpired:
-                os.killpg(self.process.pid, signal.SIGKILL)
-        code = self.process.wait(15)
-        self._reader.join(15)
-        if self.process.stdout is not None and not self._reader.is_alive():
-            self.process.stdout.close()
-        return code
 
 
 class Ros:
@@ -184,70 +118,47 @@ async def _drive(ros: Ros, bag: Path, folder: Path) -> None:
     token_file = folder / "token"
     async with LocalPlatform(PlatformSettings(), port=0, servers=2, state=folder / "platform") as platform:
         token_file.write_text(platform.issue_token("ros-1"), encoding="ascii")
-        expected = await _own_run(bag, platform)
+        expected = await own_run(bag, platform)
 
         master = await asyncio.to_thread(ros.master)
         listener = await asyncio.to_thread(ros.listener, _TOPICS["colour"])
         bridge = await asyncio.to_thread(ros.bridge, platform.url, token_file)
 
         first = await _played(ros, bag, listener, _FRAMES)
-        assert _worst_mm(first, expected) <= 1.0
+        assert worst_mm(first, expected) <= 1.0
         assert {line["frame"] for line in first} == {"map"}
         assert {(line["frame"], line["child"]) for line in listener.heard("tf")} >= {("map", "odom")}
         assert listener.heard("path")
         assert listener.heard("cloud")
-        _tell_delay(listener)
+        tell_delay(listener)
         await asyncio.to_thread(bridge.end)
         assert bridge.lines[-1] == f"{_FRAMES} frames, 0 lost\n"
 
         bridge = await asyncio.to_thread(ros.bridge, platform.url, token_file)
         player = ros.play(bag, 0.5)
-        await asyncio.to_thread(listener.until, _poses(_FRAMES + 10))
+        await asyncio.to_thread(listener.until, poses(_FRAMES + 10))
         platform.kill(await _server_of_the_robot(platform))
-        await asyncio.to_thread(listener.until, _poses(_FRAMES + 20))
+        await asyncio.to_thread(listener.until, poses(_FRAMES + 20))
         master.end(signal.SIGKILL)
-        await asyncio.to_thread(listener.until, _poses(2 * _FRAMES))
+        await asyncio.to_thread(listener.until, poses(2 * _FRAMES))
         await asyncio.to_thread(player.end)
         second = listener.heard("pose")[_FRAMES:]
-        assert _worst_mm(second, expected) <= 1.0
+        assert worst_mm(second, expected) <= 1.0
 
         await asyncio.to_thread(ros.master)
         await asyncio.to_thread(bridge.until, lambda lines: any("registered again" in each for each in lines))
         late = await asyncio.to_thread(ros.listener)
         player = ros.play(bag, 0.5)
-        await asyncio.to_thread(late.until, _poses(1))
+        await asyncio.to_thread(late.until, poses(1))
         await asyncio.to_thread(player.end)
         assert await asyncio.to_thread(bridge.end) == 0
 
 
-async def _own_run(bag: Path, platform: LocalPlatform) -> dict[int, np.ndarray[Any, Any]]:
-    """Return the positions that the SDK alone finds, by time stamps."""
-    with open_bag(bag, BagOptions()) as opened:
-        async with connect(platform.url, token=platform.issue_token("sdk")) as robot:
-            mapper = robot.mapper()
-            for frame in opened:
-                await mapper.track(frame)
-    path = mapper.trajectory
-    assert len(path) == _FRAMES
-    return {round(1e9 * s / 1e6): p for s, p in zip(path.timestamps_s, path.positions, strict=True)}
-
-
 async def _played(ros: Ros, bag: Path, listener: Program, poses: int) -> list[Line]:
     player = ros.play(bag, 0.5)
-    await asyncio.to_thread(listener.until, _poses(poses))
+    await asyncio.to_thread(listener.until, poses(poses))
     await asyncio.to_thread(player.end)
     return listener.heard("pose")
-
-
-def _poses(number: int) -> Callable[[list[str]], bool]:
-    return lambda lines: sum('"kind": "pose"' in line for line in lines) >= number
-
-
-def _worst_mm(heard: list[Line], expected: dict[int, np.ndarray[Any, Any]]) -> float:
-    """Return the largest distance from the SDK's own poses of the same time stamps, millimetres."""
-    by_ms = {round(line["stamp"] / 1e6): line["position"] for line in heard}
-    assert by_ms.keys() == expected.keys()
-    return 1e3 * max(float(np.linalg.norm(np.array(by_ms[ms]) - expected[ms])) for ms in expected)
 
 
 async def _server_of_the_robot(platform: LocalPlatform) -> str:
@@ -255,11 +166,3 @@ async def _server_of_the_robot(platform: LocalPlatform) -> str:
     pages = {each.name: await platform.backend_servers.status(each) for each in platform.servers}
     (name,) = (name for name, page in pages.items() if page is not None and page["robots"])
     return name
-
-
-def _tell_delay(listener: Program) -> None:
-    """Print how long after its image a pose came, and how long the mapper needed of that."""
-    came = {line["stamp"]: line["at"] for line in listener.heard("image")}
-    delays = [1e3 * (line["at"] - came[line["stamp"]]) for line in listener.heard("pose")]
-    tracking = listener.heard("status")[-1]["values"]["track ms (median)"]
-    print(f"image to pose: median {np.median(delays):.1f} ms, of which the mapper took {tracking} ms")

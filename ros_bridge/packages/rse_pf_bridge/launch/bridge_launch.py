@@ -1,6 +1,6 @@
 """Start the bridge in ROS 2: ros2 launch rse_pf_bridge/launch/bridge_launch.py url:=... token_file:=...
 
-Not yet run against a ROS 2.
+Not yet run: no ros2 launch was at hand.
 """
 
 import sys
