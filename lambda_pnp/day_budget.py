@@ -17,6 +17,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 from datetime import datetime, timezone
 from random import Random
+from typing import NamedTuple
 
 from lambda_pnp.keys import signed_request
 from rse_pf.config import BurstSettings
@@ -24,7 +25,7 @@ from rse_pf.config.resource_names import BUDGET_NAME
 from rse_pf.errors import Busy, QuotaExceeded, RsePfError
 from rse_pf.identity import RobotId
 
-__all__ = ["Claim", "DayBudget", "claim_in_bucket"]
+__all__ = ["BucketAccess", "Claim", "DayBudget", "claim_in_bucket"]
 
 Claim = Callable[[str, int, int], int]
 """Given a day, a number and the most of that day, takes up to that number and returns what was left of it."""
@@ -94,16 +95,40 @@ class DayBudget:
         self._is_spent = self._lease < 1
 
 
+def _now() -> datetime:
+    return datetime.now(timezone.utc)
+
+
+def _send(request: urllib.request.Request) -> tuple[int, str, bytes]:
+    try:
+        with urllib.request.urlopen(request, timeout=_TIMEOUT_S) as answer:
+            return answer.status, answer.headers.get("ETag", ""), answer.read(_MAX_BYTES)
+    except urllib.error.HTTPError as error:
+        with error:
+            return error.code, "", b""
+
+
+class BucketAccess(NamedTuple):
+    """How the bucket is asked, and by which clock.
+
+    Attributes:
+        now: Returns the time, UTC.
+        send: Returns status, ETag and body of a request to S3.
+        sleep: Waits for so many seconds, before a further try.
+        random: Returns a number of 0 to 1, for the length of the waits.
+    """
+
+    now: Callable[[], datetime] = _now
+    send: Callable[[urllib.request.Request], tuple[int, str, bytes]] = _send
+    sleep: Callable[[float], None] = time.sleep
+    random: Callable[[], float] = _RANDOM.random
+
+
+_S3 = BucketAccess()
+
+
 def claim_in_bucket(
-    environment: Mapping[str, str],
-    day: str,
-    wanted: int,
-    most: int,
-    *,
-    now: Callable[[], datetime] = lambda: datetime.now(timezone.utc),
-    send: Callable[[urllib.request.Request], tuple[int, str, bytes]] | None = None,
-    sleep: Callable[[float], None] = time.sleep,
-    random: Callable[[], float] = _RANDOM.random,
+    environment: Mapping[str, str], day: str, wanted: int, most: int, access: BucketAccess = _S3
 ) -> int:
     """Take up to *wanted* commands of *day* in the artifact bucket; return how many of *most* were left.
 
@@ -112,15 +137,12 @@ def claim_in_bucket(
         day: ``YYYY-MM-DD``, UTC.
         wanted: Commands.
         most: Commands of the whole day.
-        now: Returns the time, UTC.
-        send: Returns status, ETag and body of a request; None asks S3.
-        sleep: Waits for so many seconds, before a further try.
-        random: Returns a number of 0 to 1, for the length of the waits.
+        access: To the bucket.
 
     Raises:
         OSError: The bucket cannot be asked, or others keep changing the object.
     """
-    send = send or _send
+    now, send, sleep, random = access
     for number in range(_TRIES):
         if number:
             sleep(_WAIT_S * number * random())
@@ -152,15 +174,6 @@ def _read_granted(body: bytes, day: str) -> int:
     if recorded_day > day:
         raise OSError("the budget in the bucket is of a later day")
     return granted if recorded_day == day else 0
-
-
-def _send(request: urllib.request.Request) -> tuple[int, str, bytes]:
-    try:
-        with urllib.request.urlopen(request, timeout=_TIMEOUT_S) as answer:
-            return answer.status, answer.headers.get("ETag", ""), answer.read(_MAX_BYTES)
-    except urllib.error.HTTPError as error:
-        with error:
-            return error.code, "", b""
 
 
 def _quota_error(whose: str, commands: int, rest_ms: float) -> QuotaExceeded:

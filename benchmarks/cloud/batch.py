@@ -194,7 +194,7 @@ def _in_workers(
         engine.start()
         up_s = time.monotonic() - began
         options = MergeOptions(candidates=args.candidates)
-        result = BatchMerge(store, engine, settings, options=options, report=kill).run(names)
+        result = BatchMerge(store, engine, settings, options=options).run(names, kill)
     finally:
         engine.close()
         cluster.stop()

@@ -24,6 +24,7 @@ import re
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -53,6 +54,7 @@ __all__ = [
     "OPERATOR",
     "RESERVE_BYTES",
     "SYNC_S",
+    "AuditBounds",
     "AuditLog",
     "audit_folder",
     "chain_names",
@@ -91,6 +93,26 @@ _Ending = Literal["empty", "complete", "torn", "torn-first-line", "unreadable"]
 _REASONS = {"empty": "interrupted", "torn-first-line": "torn"}
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AuditBounds:
+    """How large an audit log may become, and how long it may wait.
+
+    Attributes:
+        max_bytes: A file that has grown longer is set aside, and the chain goes on in the next.
+        sync_s: How long an entry may wait for the disk.
+        max_buffered: How many entries may wait for the disk; further ones are dropped and counted.
+        heads_s: How often a log that was started records the heads of the control plane and of operators.
+    """
+
+    max_bytes: int = MAX_FILE_BYTES
+    sync_s: float = SYNC_S
+    max_buffered: int = _MAX_BUFFERED
+    heads_s: float = HEADS_S
+
+
+_BOUNDS = AuditBounds()
+
+
 class AuditLog:
     """The only writer of the chain *who* in *folder*."""
 
@@ -100,10 +122,7 @@ class AuditLog:
         who: str,
         *,
         wall_clock: Callable[[], float],
-        max_bytes: int = MAX_FILE_BYTES,
-        sync_s: float = SYNC_S,
-        max_buffered: int = _MAX_BUFFERED,
-        heads_s: float = HEADS_S,
+        bounds: AuditBounds = _BOUNDS,
         on_problem: Callable[[str], None] = lambda problem: None,
     ) -> None:
         """Describe a log; nothing is opened yet.
@@ -112,10 +131,7 @@ class AuditLog:
             folder: Created with mode 0700 if it is missing.
             who: Names the writer; letters that a file name may not have become ``_``.
             wall_clock: Unix seconds.
-            max_bytes: A file that has grown longer is set aside, and the chain goes on in the next.
-            sync_s: How long an entry may wait for the disk.
-            max_buffered: How many entries may wait for the disk; further ones are dropped and counted.
-            heads_s: How often a log that was started records the heads of the control plane and of operators.
+            bounds: Its sizes and times.
             on_problem: Called once with a sentence when writing fails.
         """
         self.who = _UNSAFE.sub("_", who)[:64]
@@ -123,10 +139,7 @@ class AuditLog:
         self.dropped = 0
         self._folder = folder
         self._wall_clock = wall_clock
-        self._max_bytes = max_bytes
-        self._sync_s = sync_s
-        self._max_buffered = max_buffered
-        self._heads_s = heads_s
+        self._bounds = bounds
         self._others = [] if self.who == CONTROL_PLANE else sorted({CONTROL_PLANE, OPERATOR} - {self.who})
         self._recorded: dict[str, str] = {}
         self._heads = HeadsFile(folder, self.who, lambda: _heads_in(folder))
@@ -195,7 +208,7 @@ class AuditLog:
         """Buffer several entries."""
         with self._buffer_lock:
             for note in notes:
-                if len(self._buffered) >= self._max_buffered:
+                if len(self._buffered) >= self._bounds.max_buffered:
                     self.dropped += 1
                 else:
                     self._buffered.append(note)
@@ -312,7 +325,7 @@ class AuditLog:
         self.head, self._size = head, self._size + len(data)
         if 2 * (self._reserved - self._size) < RESERVE_BYTES:
             self._reserve()
-        if self._size > self._max_bytes and not self._is_short:
+        if self._size > self._bounds.max_bytes and not self._is_short:
             self._rotate()
 
     def _reserve(self) -> None:
@@ -343,8 +356,8 @@ class AuditLog:
             gaps = [note for note in notes if note.action == GAP]
             self.dropped += sum(int(note.detail["entries"] or 0) for note in gaps)
             self._buffered = [note for note in notes if note not in gaps] + self._buffered
-            self.dropped += max(0, len(self._buffered) - self._max_buffered)
-            del self._buffered[self._max_buffered :]
+            self.dropped += max(0, len(self._buffered) - self._bounds.max_buffered)
+            del self._buffered[self._bounds.max_buffered :]
 
     def _keep_head(self) -> None:
         """Write the head into the file of heads; one that was lost is made again, and that is recorded."""
@@ -407,13 +420,13 @@ class AuditLog:
         return self._folder / f"{self.who}.jsonl"
 
     def _write_on(self) -> None:
-        heads_due_s = time.monotonic() + self._heads_s
+        heads_due_s = time.monotonic() + self._bounds.heads_s
         while not self._closed.is_set():
             self._wake.wait(max(0.0, heads_due_s - time.monotonic()))
             if time.monotonic() >= heads_due_s:
                 self._record_others()
-                heads_due_s = time.monotonic() + self._heads_s
-            self._closed.wait(self._sync_s)
+                heads_due_s = time.monotonic() + self._bounds.heads_s
+            self._closed.wait(self._bounds.sync_s)
             self._wake.clear()
             self.flush()
             if self._failed or self._is_short:
@@ -435,7 +448,7 @@ def record_once(
         ConfigurationError: The entry could not be written; if the disk was full, the next writer records a
             gap.
     """
-    log = AuditLog(folder, who, wall_clock=wall_clock, max_bytes=MAX_FILE_BYTES, sync_s=0.0)
+    log = AuditLog(folder, who, wall_clock=wall_clock, bounds=AuditBounds(sync_s=0.0))
     log.open(_LOCK_TIMEOUT_S)
     log.add([Note(time=wall_clock(), actor=who, action=action, subject=subject, detail=detail)])
     log.close()

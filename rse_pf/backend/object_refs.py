@@ -140,37 +140,33 @@ class ObjectRefs:
         )
         return msgspec.structs.replace(command, payload=payload)
 
-    def store_large_reply(
-        self, answer: Result | Failure, sent: Result | Failure, who: Owner
-    ) -> Result | Failure:
-        """Store the reply of *answer* if it is too large for a message; blocks for the store.
+    def store_large_reply(self, result: Result, too_large: Failure, who: Owner) -> Result | Failure:
+        """Store the reply of *result*, which is too large for a message; blocks for the store.
 
         Args:
-            answer: The answer of the service.
-            sent: The message that would be sent to the robot: *answer*, or the failure that takes its place.
-                A failure with the code of `LimitExceeded` says that the reply is too large.
+            result: Of the service.
+            too_large: The failure that the robot gets if the reply cannot be stored.
             who: The robot, whose quota the stored reply counts for.
 
         Returns:
-            *answer* with the digest of the stored reply in its place; *sent* if nothing has to be stored, if
-            there is no store or it fails, or if the reply is too large for the store as well; the failure of
-            the quota if the reply is beyond that of the robot or of its tenant.
+            *result* with the digest of the stored reply instead of the reply; *too_large* if there is no
+            store, if it fails, or if the reply is too large for it as well; the failure of the quota if the
+            reply is beyond that of the robot or of its tenant.
         """
-        is_too_large = isinstance(sent, Failure) and sent.code == LimitExceeded.code
-        if self.store is None or not isinstance(answer, Result) or not is_too_large:
-            return sent
-        reply = msgspec.msgpack.encode(answer.reply, enc_hook=binary_encode_hook)
+        if self.store is None:
+            return too_large
+        reply = msgspec.msgpack.encode(result.reply, enc_hook=binary_encode_hook)
         if len(reply) > self.settings.max_object_bytes_per_command:
-            return sent
+            return too_large
         max_bytes = quota_bytes(who.claims, self.data.quota_bytes)
         accounts = Accounts(self.store, self.data)
         try:
             digest = store_within_quota(self.store, accounts, who.robot, reply, max_bytes)
         except QuotaExceeded as error:
-            return msgspec.structs.replace(sent, code=error.code, message=error.message, hint=error.hint)
+            return msgspec.structs.replace(too_large, code=error.code, message=error.message, hint=error.hint)
         except StoreError:
-            return sent  # the reply is too large in any case
-        return msgspec.structs.replace(answer, reply=None, object=digest)
+            return too_large
+        return msgspec.structs.replace(result, reply=None, object=digest)
 
 
 # --- where references may stand -----------------------------------------------------------------------

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter, defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -87,8 +87,6 @@ class BatchMerge:
         options: MergeOptions | None = None,
         align_clouds: bool = True,
         two_levels: bool = True,
-        clock: Callable[[], float] = time.monotonic,
-        report: Report = ignore_progress,
     ) -> None:
         """Compute nothing yet.
 
@@ -99,8 +97,6 @@ class BatchMerge:
             options: How to merge; None means the defaults.
             align_clouds: Whether overlapping clouds are aligned, too.
             two_levels: Whether each map's pose graph is optimised by itself before the whole one.
-            clock: Seconds, monotonic.
-            report: Called with the progress; may raise Cancelled.
         """
         self._store = store
         self._engine = engine
@@ -108,8 +104,7 @@ class BatchMerge:
         self._options = options or MergeOptions()
         self._align_clouds = align_clouds
         self._two_levels = two_levels
-        self._clock = clock
-        self._report = report
+        self._report: Report = ignore_progress
         self._seconds: defaultdict[str, float] = defaultdict(float)
         self._maps: tuple[str, ...] = ()
         self._own: list[str] = []
@@ -120,8 +115,12 @@ class BatchMerge:
         self._computed = self._found = 0
         self._share = 0.0
 
-    def run(self, maps: Sequence[str]) -> BatchMergeResult:
+    def run(self, maps: Sequence[str], report: Report = ignore_progress) -> BatchMergeResult:
         """Merge the objects *maps*, encoded map versions whose names have their digests.
+
+        Args:
+            maps: Names of the objects.
+            report: Called with the progress; may raise Cancelled.
 
         Raises:
             BadRequest: An object is no map, or has no keyframes.
@@ -129,6 +128,7 @@ class BatchMerge:
             RsePfError: Those who compute are gone, or a part failed; the same call continues.
         """
         self._maps = tuple(maps)
+        self._report = report
         versions = self._versions()
         steps = MergeSteps(
             propose=self._propose, select=self._select, align=self._align, optimise=self._optimise,
@@ -188,9 +188,9 @@ class BatchMerge:
 
         on_done(0)
         self._own += [part.name for part in parts]
-        began = self._clock()
+        began = time.monotonic()
         self._engine.run(missing, on_done)
-        self._seconds[kind] += self._clock() - began
+        self._seconds[kind] += time.monotonic() - began
         self._computed += len(missing)
         self._found += known
         return [read_result(self._store, part.name) for part in parts]
@@ -306,9 +306,9 @@ class BatchMerge:
         self, graph: PoseGraph, of_map: npt.NDArray[np.int64], options: OptimiseOptions
     ) -> OptimisedGraph:
         if not self._two_levels:
-            began = self._clock()
+            began = time.monotonic()
             whole = optimise_graph(graph, options)
-            self._seconds["optimise"] += self._clock() - began
+            self._seconds["optimise"] += time.monotonic() - began
             return whole
         within = graphs_within(graph, of_map)
         with_edges = [inner for _, inner in within if len(inner.a)]

@@ -132,13 +132,11 @@ def _merge(args: argparse.Namespace, settings: PlatformSettings) -> int:
         store, settings, cluster, key, on_event=lambda text: show(text, error=True),
         on_start=invitation.announce if invitation is not None else None,
     )  # fmt: skip
-    merge = BatchMerge(
-        store, engine, settings, options=options, align_clouds=not args.no_icp, report=merge_progress
-    )  # fmt: skip
+    merge = BatchMerge(store, engine, settings, options=options, align_clouds=not args.no_icp)
     began = time.perf_counter()
     try:
         engine.start()
-        result = merge.run(inputs)
+        result = merge.run(inputs, merge_progress)
     finally:
         engine.close()
         cluster.stop()

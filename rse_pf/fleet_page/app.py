@@ -12,6 +12,7 @@ import dataclasses
 import json
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, MutableMapping
+from dataclasses import dataclass
 from typing import Any
 from urllib.parse import parse_qsl
 
@@ -22,7 +23,7 @@ from rse_pf.fleet_page.page_sessions import PageSessions, Role
 from rse_pf.fleet_page.static_files import StaticFile
 from rse_pf.terminal import printable
 
-__all__ = ["CONTENT_SECURITY_POLICY", "FleetApp", "PageActions"]
+__all__ = ["CONTENT_SECURITY_POLICY", "FleetApp", "PageAccess", "PageActions"]
 
 CONTENT_SECURITY_POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src 'self' data:; "
@@ -72,37 +73,48 @@ class _Request:
         self.session = self.headers.get("authorization", "").removeprefix("Bearer ")
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PageAccess:
+    """Who may ask for the page.
+
+    Attributes:
+        sessions: Those who may read and operate.
+        admin_token: Returns the token of the control ports, for which new keys are made.
+        hosts: Returns ``NAME:PORT`` of this page, under which browsers may ask for it.
+    """
+
+    sessions: PageSessions
+    admin_token: Callable[[], str]
+    hosts: Callable[[], frozenset[str]]
+
+
 class FleetApp:
-    """The application; ``hosts`` are the names under which browsers may ask for it."""
+    """The application."""
 
     def __init__(
         self,
         hub: Hub,
-        sessions: PageSessions,
+        access: PageAccess,
         files: Mapping[str, StaticFile],
         actions: PageActions,
         *,
-        admin_token: Callable[[], str],
-        hosts: Callable[[], frozenset[str]],
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         """Serve nothing yet.
 
         Args:
             hub: What is told.
-            sessions: Who may read and operate.
+            access: Who may ask.
             files: Of the page, by path.
             actions: What the page can ask for.
-            admin_token: Returns the token of the control ports, for which new keys are made.
-            hosts: Returns ``NAME:PORT`` of this page.
             clock: Seconds of sessions and keys.
         """
         self._hub = hub
-        self._sessions = sessions
+        self._sessions = access.sessions
         self._files = files
         self._actions = actions
-        self._admin_token = admin_token
-        self._hosts = hosts
+        self._admin_token = access.admin_token
+        self._hosts = access.hosts
         self._clock = clock
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:

@@ -16,7 +16,7 @@ from typing import Any
 from rse_pf.auth.control_token import read_control_token
 from rse_pf.errors import ConfigurationError, MissingExtra
 from rse_pf.files import replace_json
-from rse_pf.fleet_page.app import FleetApp, PageActions
+from rse_pf.fleet_page.app import FleetApp, PageAccess, PageActions
 from rse_pf.fleet_page.hub import MAX_PAGES, Hub
 from rse_pf.fleet_page.page_sessions import PageSessions
 from rse_pf.fleet_page.static_files import page_files
@@ -84,7 +84,8 @@ def serve_page(
     def admin_token() -> str:
         return fallback if platform is None else read_control_token(control_token_file(platform))
 
-    app = FleetApp(hub, sessions, page_files(), actions, hosts=lambda: hosts, admin_token=admin_token)
+    access = PageAccess(sessions=sessions, admin_token=admin_token, hosts=lambda: hosts)
+    app = FleetApp(hub, access, page_files(), actions)
     config = uvicorn.Config(
         app, http=bounded_protocol(most=_MAX_SILENT, most_idle=_MAX_SILENT), ws="none", lifespan="off",
         access_log=False, log_level="critical",

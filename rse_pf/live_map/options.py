@@ -20,19 +20,19 @@ class LiveMapOptions:
         min_ends: From so many different keyframes on both sides.
         tested_links: At most so many links of a pair of components are compared, the newest.
         links_of_keyframe: At most so many of them may share a keyframe.
-        spacing_m: Odometry noise is stated for steps of this length,
-        spacing_deg: or of this rotation; it grows with the square root of the way.
+        spacing_m: Odometry noise is stated for steps of this length; it grows with the root of the way.
+        spacing_deg: Odometry noise is stated for steps of this rotation, too.
         drift: Of odometry in the graph.
         judged: Of odometry when links are compared: larger, since a true link must not be refused.
         cauchy: Width of the robust kernel on links, in standard deviations.
         windows: Numbers of keyframes that the smoother moves; the next larger one is taken if the border of
             the window would move by more than ``border_m`` or ``border_deg``.
         smoothing_each: Keyframes in windows that a robot's keyframe may cause on average; what it causes
-            beyond that adds up over all of its segments,
-        smoothing_most: and from so many on only the smallest window is taken for it.
-        told_m: A correction is told from this change of the alignment on,
-        told_deg: or from this rotation,
-        told_scale: or from this change of the logarithm of its scale.
+            beyond that adds up over all of its segments.
+        smoothing_most: From this sum on, only the smallest window is taken for the robot.
+        told_m: A correction is told if the alignment moved by at least this length.
+        told_deg: A correction is told if the alignment turned by at least this angle.
+        told_scale: A correction is told if the logarithm of the scale changed by at least this.
         doubts: A link that contradicts the graph in so many updates is removed.
         open_links: So many links that are not believed are kept, the newest.
         measured: What a measured relative pose needs to become a link.
@@ -41,9 +41,9 @@ class LiveMapOptions:
         candidates: So many keyframes are compared with a new one.
         apart_steps: Keyframes of one segment that are closer than this along the way are no loop.
         vague_steps: Beyond so many steps the graph is too vague to confirm a single link.
-        same_place_m: Keyframes closer than this,
-        same_place_deg: and turned less than this,
-        same_place_most: of which there are more than so many, are redundant.
+        same_place_m: Keyframes are of one place if they are closer than this.
+        same_place_deg: Keyframes of one place differ by less than this rotation.
+        same_place_most: Keyframes of one place beyond this number are redundant.
         lookalike_m: Two places that look the same are told apart from this distance on.
         lookalike_most_m: What is nearer to them than this may look like something else, too.
         lookalike_links: So many links that agree prove it between two robots, against believed ones.

@@ -261,7 +261,7 @@ def run_recorder(plan: RecorderPlan) -> None:
         Path(plan.folder).mkdir(parents=True, exist_ok=True)
     writer = RecordingWriter(
         Path(plan.folder), plan.server, started_ns=plan.started_ns,
-        max_bytes=plan.max_bytes, metadata=plan.metadata, version=plan.version,
+        max_bytes=plan.max_bytes, metadata={**plan.metadata, "version": plan.version},
     )  # fmt: skip
     recorder = MessageRecorder(writer, Pseudonyms(_key(plan.key)), session, plan.server)
     recorder.event(time.time_ns(), "recording-started", restarts=plan.restarts)

@@ -185,8 +185,8 @@ class RobotRecorder:
         bounds = RecordingSettings()
         writer = RecordingWriter(
             folder, "robot", started_ns=time.time_ns(),
-            max_bytes=bounds.max_bytes, metadata={"side": "robot", "protocol": str(PROTOCOL_VERSION)},
-            version=self._version,
+            max_bytes=bounds.max_bytes,
+            metadata={"side": "robot", "protocol": str(PROTOCOL_VERSION), "version": self._version},
         )  # fmt: skip
         thread = _Thread(
             MessageRecorder(writer, Pseudonyms(secrets.token_bytes(KEY_BYTES)), self._session, "")

@@ -95,7 +95,6 @@ class RecordingWriter:
         max_file_bytes: int = MAX_FILE_BYTES,
         max_bytes: int,
         metadata: Mapping[str, str] | None = None,
-        version: str = "",
     ) -> None:
         """Write nothing yet.
 
@@ -105,8 +104,7 @@ class RecordingWriter:
             started_ns: Unix time, ns; part of the names of the files.
             max_file_bytes: Size at which the next file begins.
             max_bytes: Size of all recordings of the folder above which the oldest are deleted.
-            metadata: Further values for the metadata record of each file.
-            version: Of the platform.
+            metadata: Further values for the metadata record of each file; ``version`` is the platform's.
         """
         self.dropped = 0
         self._waiting = 0
@@ -115,13 +113,13 @@ class RecordingWriter:
         self._server = server
         self._started = datetime.fromtimestamp(started_ns / 1e9, timezone.utc)
         self._max_file_bytes, self._max_bytes = max_file_bytes, max_bytes
-        self._library = f"{LIBRARY} {version}".strip()
+        further = {"version": "", **(metadata or {})}
+        self._library = f"{LIBRARY} {further['version']}".strip()
         self._metadata = {
             "format": str(FORMAT_VERSION),
-            "version": version,
             "server": server,
             "started_s": f"{started_ns / 1e9:.6f}",
-            **(metadata or {}),
+            **further,
         }
         self._number = 0
         self._file: McapFile | None = None

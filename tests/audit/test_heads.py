@@ -11,7 +11,15 @@ import pytest
 
 from rse_pf.audit.chain import GENESIS, HEADS, Head
 from rse_pf.audit.heads import HeadsFile, read_heads, write_heads
-from rse_pf.audit.log import AuditLog, chain_names, files_of, grown_heads, newest_head, record_once
+from rse_pf.audit.log import (
+    AuditBounds,
+    AuditLog,
+    chain_names,
+    files_of,
+    grown_heads,
+    newest_head,
+    record_once,
+)
 from rse_pf.audit.verify import check_folder, entries_of
 
 WRITERS = ("control-plane", "data", "operator", "server-1")
@@ -27,7 +35,9 @@ def folder(tmp_path: Path) -> Path:
 
 
 def write(folder: Path, who: str, n: int) -> None:
-    log = AuditLog(folder, who, wall_clock=lambda: 1e9, max_bytes=700, sync_s=0.001).open()
+    log = AuditLog(
+        folder, who, wall_clock=lambda: 1e9, bounds=AuditBounds(max_bytes=700, sync_s=0.001)
+    ).open()
     for number in range(n):
         log.record("auth.accepted", f"robot-{number}")
         log.flush()
@@ -206,7 +216,9 @@ def test_many_writers_at_once_have_a_line_each(tmp_path: Path) -> None:
 def test_a_writer_that_runs_records_the_heads_of_the_control_plane_and_of_operators(tmp_path: Path) -> None:
     for who in ("control-plane", "operator", "server-2"):
         record_once(tmp_path, who, "x", wall_clock=lambda: 1e9)
-    log = AuditLog(tmp_path, "server-1", wall_clock=lambda: 1e9, sync_s=0.001, heads_s=0.001).open()
+    log = AuditLog(
+        tmp_path, "server-1", wall_clock=lambda: 1e9, bounds=AuditBounds(sync_s=0.001, heads_s=0.001)
+    ).open()
     told = threading.Event()
     real = log.flush
 

@@ -16,6 +16,7 @@ import pytest
 from rse_pf.audit.chain import HEADS, Head
 from rse_pf.audit.log import (
     RESERVE_BYTES,
+    AuditBounds,
     AuditLog,
     chain_names,
     files_of,
@@ -27,8 +28,15 @@ from rse_pf.audit.verify import check_chain, check_folder, entries_of
 from rse_pf.errors import ConfigurationError
 
 
-def log_in(folder: Path, who: str = "server-1", *, max_bytes: int = 1 << 20, **options: Any) -> AuditLog:
-    return AuditLog(folder, who, wall_clock=lambda: 1e9, max_bytes=max_bytes, sync_s=0.001, **options)
+def log_in(
+    folder: Path,
+    who: str = "server-1",
+    *,
+    on_problem: Callable[[str], None] = lambda problem: None,
+    **bounds: Any,
+) -> AuditLog:
+    chosen = AuditBounds(**{"max_bytes": 1 << 20, "sync_s": 0.001, **bounds})
+    return AuditLog(folder, who, wall_clock=lambda: 1e9, bounds=chosen, on_problem=on_problem)
 
 
 def write(folder: Path, n: int, who: str = "server-1", max_bytes: int = 1 << 20) -> None:
@@ -167,7 +175,9 @@ def test_names_of_servers_cannot_leave_the_folder(tmp_path: Path):
 
 def test_entries_reach_the_disk_in_the_background(tmp_path: Path):
     synced = threading.Event()
-    log = AuditLog(tmp_path, "s", wall_clock=lambda: 1e9, max_bytes=1 << 20, sync_s=0.001).open()
+    log = AuditLog(
+        tmp_path, "s", wall_clock=lambda: 1e9, bounds=AuditBounds(max_bytes=1 << 20, sync_s=0.001)
+    ).open()
     real = log.flush
 
     def flush() -> None:
@@ -274,8 +284,9 @@ def test_record_once_writes_one_entry_and_releases_the_log(tmp_path: Path):
 @pytest.mark.system
 def test_a_writer_that_is_killed_leaves_a_chain_that_goes_on(tmp_path: Path):
     code = (
-        "import sys, time; from pathlib import Path; from rse_pf.audit.log import AuditLog\n"
-        "log = AuditLog(Path(sys.argv[1]), 'server-1', wall_clock=time.time, max_bytes=20000, sync_s=0.0)\n"
+        "import sys, time; from pathlib import Path; from rse_pf.audit.log import AuditBounds, AuditLog\n"
+        "log = AuditLog(Path(sys.argv[1]), 'server-1', wall_clock=time.time,"
+        " bounds=AuditBounds(max_bytes=20000, sync_s=0.0))\n"
         "log.open().start()\n"
         "while True:\n"
         "    log.record('auth.accepted', 'robot-1')\n"

@@ -57,7 +57,7 @@ def test_a_merge_survives_its_workers_and_its_scheduler(tmp_path: Path, versions
 
     try:
         engine.start()
-        found = BatchMerge(store, engine, settings, report=report).run(["a", "b"])
+        found = BatchMerge(store, engine, settings).run(["a", "b"], report)
     finally:
         engine.close()
         cluster.stop()

@@ -120,9 +120,7 @@ def test_a_finished_merge_leaves_nothing_in_the_store() -> None:
 
 def test_progress_never_goes_back() -> None:
     store, shares = a_store(), []
-    BatchMerge(store, InProcessEngine(store), SETTINGS, report=lambda done, what: shares.append(done)).run(
-        NAMES
-    )
+    BatchMerge(store, InProcessEngine(store), SETTINGS).run(NAMES, lambda done, what: shares.append(done))
 
     assert shares == sorted(shares)
     assert shares[-1] == 1.0

@@ -11,7 +11,7 @@ import pytest
 from fake_data_service import KEY, Service, small_settings
 
 from rse_pf.audit.chain import REFUSAL_BURST, Entry
-from rse_pf.audit.log import AuditLog, files_of
+from rse_pf.audit.log import AuditBounds, AuditLog, files_of
 from rse_pf.audit.verify import check_folder, entries_of
 from rse_pf.data_server.app import DataServer
 from rse_pf.data_server.server import _write_line
@@ -26,7 +26,9 @@ class Recorded(Service):
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self.log = AuditLog(folder, "data", wall_clock=lambda: 1e9, max_bytes=1 << 20, sync_s=0.1).open()
+        self.log = AuditLog(
+            folder, "data", wall_clock=lambda: 1e9, bounds=AuditBounds(max_bytes=1 << 20, sync_s=0.1)
+        ).open()
         super().__init__(small_settings(), MemoryStore())
 
     def restart(self) -> None:

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from rse_pf.errors import UsageError
-from rse_pf.fleet_page.app import CONTENT_SECURITY_POLICY, FleetApp, PageActions
+from rse_pf.fleet_page.app import CONTENT_SECURITY_POLICY, FleetApp, PageAccess, PageActions
 from rse_pf.fleet_page.hub import MAX_PAGES, Hub
 from rse_pf.fleet_page.page_sessions import MAX_SESSIONS, PageSessions
 from rse_pf.fleet_page.static_files import page_files
@@ -30,10 +30,11 @@ class Page:
         self.hub = Hub()
         self.sessions = PageSessions(secret=lambda: f"secret-{next(numbers)}")
         self.done: list[tuple[str, dict[str, str]]] = []
-        self.app = FleetApp(
-            self.hub, self.sessions, FILES, PageActions(operate=self._operate, page=self._page),
-            admin_token=lambda: ADMIN, hosts=lambda: frozenset((HOST,)), clock=lambda: 0.0,
-        )  # fmt: skip
+        access = PageAccess(
+            sessions=self.sessions, admin_token=lambda: ADMIN, hosts=lambda: frozenset((HOST,))
+        )
+        actions = PageActions(operate=self._operate, page=self._page)
+        self.app = FleetApp(self.hub, access, FILES, actions, clock=lambda: 0.0)
 
     async def _operate(self, action: str, parameters: Mapping[str, str]) -> Mapping[str, Any]:
         if action == "drain":

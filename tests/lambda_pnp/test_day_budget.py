@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
-from lambda_pnp.day_budget import DayBudget, claim_in_bucket
+from lambda_pnp.day_budget import BucketAccess, DayBudget, claim_in_bucket
 from lambda_pnp.keys import signed_request
 from rse_pf.config import BurstSettings
 from rse_pf.errors import Busy, QuotaExceeded
@@ -60,7 +60,7 @@ class Bucket:
             return 200, "", b""
 
     def claim(self, day: str, wanted: int, most: int) -> int:
-        return claim_in_bucket(ENVIRONMENT, day, wanted, most, now=lambda: NOON, send=self.send)
+        return claim_in_bucket(ENVIRONMENT, day, wanted, most, BucketAccess(now=lambda: NOON, send=self.send))
 
 
 def budget(bucket: Bucket, *, robot: int = 10**6, every: int = 10**6) -> DayBudget:
@@ -129,10 +129,8 @@ def test_an_execution_whose_lease_is_taken_by_others_waits_longer_each_time(
     bucket.before_put = meanwhile
 
     def claim() -> int:
-        return claim_in_bucket(
-            ENVIRONMENT, "2026-11-23", 50, 1000, now=lambda: NOON, send=bucket.send, sleep=waits.append,
-            random=lambda: 0.5,
-        )  # fmt: skip
+        access = BucketAccess(now=lambda: NOON, send=bucket.send, sleep=waits.append, random=lambda: 0.5)
+        return claim_in_bucket(ENVIRONMENT, "2026-11-23", 50, 1000, access)
 
     if is_granted:
         assert claim() == 50

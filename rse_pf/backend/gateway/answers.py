@@ -221,10 +221,13 @@ class Answers:
     def _encode_fitting(self, queued: QueuedCommand, message: Result | Failure) -> EncodedAnswer:
         """Encode *message*; blocks for the store if the reply is too large for a message."""
         answer = self._encode(queued, message)
-        if answer.message is message:
+        failure = answer.message
+        if not isinstance(message, Result) or not isinstance(failure, Failure):
             return answer
-        stored = self.objects.store_large_reply(message, answer.message, queued.owner)
-        return answer if stored is answer.message else self._encode(queued, stored)
+        if failure.code != LimitExceeded.code:
+            return answer
+        stored = self.objects.store_large_reply(message, failure, queued.owner)
+        return answer if stored is failure else self._encode(queued, stored)
 
     def _encode(self, queued: QueuedCommand, message: Result | Failure) -> EncodedAnswer:
         codec, command = queued.owner.session.codec, queued.command

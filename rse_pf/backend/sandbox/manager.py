@@ -114,8 +114,7 @@ class SandboxManager:
         self._timer: TimerHandle | None = None
         self._timer_s = math.inf
         self._zygote = ZygoteClient(
-            services, settings, loop=host.loop, log=host.log, on_gone=self._on_gone, on_lost=self._on_lost,
-            on_ready=on_ready,
+            services, settings, loop=host.loop, log=host.log, listener=self, on_ready=on_ready,
         )  # fmt: skip
 
     @property
@@ -207,10 +206,12 @@ class SandboxManager:
 
     # --- events ------------------------------------------------------------------------------------
 
-    def _on_gone(self, number: int, how: str) -> None:
+    def on_gone(self, number: int, how: str) -> None:
+        """Sandbox *number* ended; *how* says by what."""
         self._execute(self._policy.on_exit(number, how, self._monotonic()))
 
-    def _on_lost(self) -> None:
+    def on_lost(self) -> None:
+        """The zygote ended, and every sandbox with it."""
         self._execute(self._policy.on_all_exited("the zygote ended", self._monotonic()))
 
     def _on_fault(self, number: int, why: str) -> None:
@@ -293,7 +294,7 @@ class SandboxManager:
         is_ordered = self._zygote.create(number, channel.theirs, channel.their_output)
         channel.start()
         if not is_ordered:
-            self._on_gone(number, "the zygote is overloaded")
+            self.on_gone(number, "the zygote is overloaded")
 
     def _answer_of(self, call: SandboxCall, outcome: SandboxReply | RsePfError) -> Result | Failure:
         command = call.queued.command

@@ -15,19 +15,30 @@ import sys
 import tempfile
 from asyncio import AbstractEventLoop
 from collections.abc import Callable, Sequence
+from typing import Protocol
 
 from rse_pf.backend.ports import Log
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import ConfigurationError
 from rse_pf.services.custom.installed import InstalledService
 
-__all__ = ["ZygoteClient"]
+__all__ = ["ZygoteClient", "ZygoteListener"]
 
 SCRATCH_BYTES = 1 << 24
 """Scratch folder of one sandbox, in its memory; it holds at most one file per 4,096 bytes of this."""
 _MAX_MESSAGE = 1 << 16
 _END_S = 0.5
 """Time that a zygote has to end its sandboxes before it is killed."""
+
+
+class ZygoteListener(Protocol):
+    """Learns of the ends of sandboxes."""
+
+    def on_gone(self, number: int, how: str) -> None:
+        """Sandbox *number* ended; *how* says by what."""
+
+    def on_lost(self) -> None:
+        """The zygote ended, and every sandbox with it; a new one is starting."""
 
 
 class ZygoteClient:
@@ -40,8 +51,7 @@ class ZygoteClient:
         *,
         loop: AbstractEventLoop,
         log: Log,
-        on_gone: Callable[[int, str], None],
-        on_lost: Callable[[], None],
+        listener: ZygoteListener,
         on_ready: Callable[[tuple[str, ...] | None], None] | None = None,
     ) -> None:
         """Start it and wait until it is ready.
@@ -51,8 +61,7 @@ class ZygoteClient:
             settings: Limits of sandboxes.
             loop: Event loop of the worker.
             log: Log of the worker.
-            on_gone: Called with the number of a sandbox that ended, and how it ended.
-            on_lost: Called when the zygote ended, and every sandbox with it; a new one is starting then.
+            listener: Learns of the ends of sandboxes.
             on_ready: If given, nothing blocks: it is called once, with the means of isolation that are
                 missing, or with None if the zygote ended before.  The caller judges them.
 
@@ -64,8 +73,7 @@ class ZygoteClient:
         self._settings = settings
         self._loop = loop
         self._log = log
-        self._on_gone = on_gone
-        self._on_lost = on_lost
+        self._listener = listener
         self._handles: dict[int, int] = {}
         """Descriptors of the processes of sandboxes, by number."""
         self._paused: set[int] = set()
@@ -192,7 +200,7 @@ class ZygoteClient:
                     return
                 self._launch()
                 self._listen()
-                self._on_lost()
+                self._listener.on_lost()
                 return
             report = json.loads(message)
             if report["event"] == "ready":
@@ -203,7 +211,7 @@ class ZygoteClient:
                 self._on_created(report["id"], *handles)
             elif report["event"] == "gone":
                 self._forget(report["id"])
-                self._on_gone(report["id"], report["how"])
+                self._listener.on_gone(report["id"], report["how"])
 
     def _tell_ready(self, missing: tuple[str, ...] | None) -> bool:
         """Call `on_ready` once, outside of this call; return whether there was one."""

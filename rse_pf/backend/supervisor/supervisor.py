@@ -15,6 +15,7 @@ import socket
 import time
 from collections.abc import Awaitable, Callable, Mapping
 from contextlib import suppress
+from dataclasses import dataclass
 from functools import partial
 from operator import attrgetter
 from pathlib import Path
@@ -141,10 +142,12 @@ def serve(
             recording.hand_over()
             try:
                 with ServerAudit(audit, server_id) as records:
+                    identity = _Identity(
+                        server_id=server_id, digest=digest, announce=announce, control_token=control_token
+                    )
                     supervisor = _Supervisor(
-                        settings, workers=workers, trust=trust, server_id=server_id, announce=announce,
-                        listener=listener, digest=digest, records=records,
-                        control_token=control_token, others=recording.pids,
+                        settings, identity, _Processes(workers=workers, others=recording.pids),
+                        trust=trust, listener=listener, records=records,
                     )  # fmt: skip
                     return run_in_loop(supervisor.run())
             finally:
@@ -152,27 +155,44 @@ def serve(
                     worker.kill()
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Identity:
+    """By what a server is known: its id, the digest of its settings, its announcement, its control token."""
+
+    server_id: str
+    digest: str
+    announce: Path | None
+    control_token: str | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Processes:
+    """The processes of a server beside the supervisor: workers, and the ids of the others."""
+
+    workers: list[WorkerProcess]
+    others: list[int]
+
+    def pids(self) -> list[int]:
+        return [os.getpid(), *(worker.pid for worker in self.workers), *self.others]
+
+
 class _Supervisor:
     def __init__(
         self,
         settings: PlatformSettings,
+        identity: _Identity,
+        processes: _Processes,
         *,
-        workers: list[WorkerProcess],
         trust: TrustStore | None,
-        server_id: str,
-        announce: Path | None,
         listener: socket.socket,
-        digest: str,
         records: ServerAudit,
-        control_token: str | None,
-        others: list[int],
     ) -> None:
         self._settings = settings
-        self._others = others
-        self._digest = digest
-        self._server_id = server_id
+        self._processes = processes
+        self._digest = identity.digest
+        self._server_id = identity.server_id
         self._records = records
-        self._announce = announce
+        self._announce = identity.announce
         self._port = listener.getsockname()[1]
         self._state = "starting"
         self._began = time.monotonic()
@@ -191,10 +211,10 @@ class _Supervisor:
             on_refused=lambda reason: self._log.warning("accept-failed", reason=reason),
         )  # fmt: skip
         self._control_refused = 0
-        self._control_token = control_token
-        self._log = JsonLog(level=settings.serving.log_level, server=server_id, wall_clock=time.time)
+        self._control_token = identity.control_token
+        self._log = JsonLog(level=settings.serving.log_level, server=identity.server_id, wall_clock=time.time)
         records.complain_to(lambda problem: self._log.error("audit", reason=problem))
-        self._workers = workers
+        self._workers = processes.workers
 
     async def run(self) -> int:
         loop = asyncio.get_running_loop()
@@ -383,7 +403,7 @@ class _Supervisor:
         merged["gauges"].update(
             {
                 "cpu_s": self._cpu_s(merged["gauges"]),
-                "resident_bytes": float(sum(map(resident_bytes, self._pids()))),
+                "resident_bytes": float(sum(map(resident_bytes, self._processes.pids()))),
                 "ready": float(self._state == "ready"),
                 "accept_pauses": float(self._acceptor.pauses),
                 "control_refused": float(self._control_refused),
@@ -418,7 +438,7 @@ class _Supervisor:
                 "cpu_s": self._cpu_s(merged["gauges"]),
                 "tenant_cpu_s": tenant_cpu_s(merged),
                 "worker_cpu_s": [cpu_seconds(worker.pid) for worker in self._workers],
-                "resident_bytes": sum(map(resident_bytes, self._pids())),
+                "resident_bytes": sum(map(resident_bytes, self._processes.pids())),
                 "emulated_cores": self._settings.serving.emulated_cores,
                 "settings": self._digest,
                 "isolation": merge_isolation(worker.report for worker in self._workers),
@@ -553,12 +573,9 @@ class _Supervisor:
         merged["closed"]["unauthenticated"] = merged["closed"].get("unauthenticated", 0) + self._acceptor.cut
         return merged
 
-    def _pids(self) -> list[int]:
-        return [os.getpid(), *(worker.pid for worker in self._workers), *self._others]
-
     def _cpu_s(self, gauges: Mapping[str, float]) -> float:
         """Return the CPU seconds of the server and of its limited processes, which the workers report."""
-        return round(sum(map(cpu_seconds, self._pids())) + gauges.get("compute_cpu_s", 0.0), 3)
+        return round(sum(map(cpu_seconds, self._processes.pids())) + gauges.get("compute_cpu_s", 0.0), 3)
 
 
 _load_of = attrgetter("load")

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from botocore.exceptions import ClientError
 
-from rse_pf.audit.log import AuditLog, files_of
+from rse_pf.audit.log import AuditBounds, AuditLog, files_of
 from rse_pf.audit.verify import Verdict, check_folder
 from rse_pf.aws.account import Account
 from rse_pf.aws.clients import MAX_TRIES, make_client
@@ -58,7 +58,9 @@ class ShipperSetup:
 
     def write(self, count: int, who: str = INSTANCE) -> None:
         """Write so many entries, each to the disk by itself; files are set aside on the way."""
-        log = AuditLog(self.folder, who, wall_clock=lambda: 1e9, max_bytes=SMALL, sync_s=0.0).open()
+        log = AuditLog(
+            self.folder, who, wall_clock=lambda: 1e9, bounds=AuditBounds(max_bytes=SMALL, sync_s=0.0)
+        ).open()
         for number in range(count):
             log.record("auth.accepted", f"robot-{number}")
             log.flush()
@@ -199,7 +201,9 @@ def test_a_log_rewritten_after_its_upload_is_detected(setup: ShipperSetup, tmp_p
     setup.shipper.ship()
     for name in (f"{INSTANCE}.jsonl", "heads"):
         (setup.folder / name).unlink()
-    log = AuditLog(setup.folder, INSTANCE, wall_clock=lambda: 2e9, max_bytes=SMALL, sync_s=0.0).open()
+    log = AuditLog(
+        setup.folder, INSTANCE, wall_clock=lambda: 2e9, bounds=AuditBounds(max_bytes=SMALL, sync_s=0.0)
+    ).open()
     log.record("nothing.happened")
     log.close()
     setup.shipper.ship()

@@ -41,10 +41,10 @@ class Reports:
     def __init__(self) -> None:
         self.ends: asyncio.Queue[tuple[int, str]] = asyncio.Queue()
 
-    def gone(self, number: int, how: str) -> None:
+    def on_gone(self, number: int, how: str) -> None:
         self.ends.put_nowait((number, how))
 
-    def lost(self) -> None:
+    def on_lost(self) -> None:
         self.ends.put_nowait((-1, "lost"))
 
 
@@ -55,7 +55,7 @@ def run(test: Callable[[ZygoteClient, Reports, Log], Any]) -> None:
         reports, log, loop = Reports(), Log(), asyncio.get_running_loop()
         failures: list[dict[str, Any]] = []
         loop.set_exception_handler(lambda _, context: failures.append(context))
-        zygote = ZygoteClient([], SETTINGS, loop=loop, log=log, on_gone=reports.gone, on_lost=reports.lost)
+        zygote = ZygoteClient([], SETTINGS, loop=loop, log=log, listener=reports)
         try:
             await asyncio.wait_for(test(zygote, reports, log), WAIT_S)
         finally:

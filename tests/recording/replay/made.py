@@ -55,8 +55,8 @@ class Made:
         self.folder, self.server, self.now_ns = folder, server, start_ns
         self.writer = RecordingWriter(
             folder, server, started_ns=start_ns, max_file_bytes=max_file_bytes, max_bytes=1 << 40,
-            version="9.9.9",
             metadata={
+                "version": "9.9.9",
                 "side": side, "engine": settings.pnp.engine,
                 "pnp": json.dumps(dataclasses.asdict(settings.pnp)),
             },

@@ -170,7 +170,7 @@ class MapState:
 
 
 def _guarded(act: Callable[[], _T]) -> _T | None:
-    """Return what *act* returns; None after a defect: what only looks must not end the owner."""
+    """Return what *act* returns, None after a defect: a measurement must not end the owner."""
     try:
         return act()
     except MemoryError:
@@ -228,7 +228,7 @@ def _from_snapshot(log: LiveLog, kind: MapKind) -> MapState:
 def candidates_of(waiting: int) -> int | None:
     """Return with how many others a keyframe is compared while *waiting* others wait; None for all.
 
-    What is found enters the log, so a replay does not depend on it.
+    A replay does not depend on it, because the links that are found are in the log.
     """
     if waiting <= _FEW_WAIT:
         return None
@@ -252,11 +252,11 @@ class Measuring:
 
         Args:
             state: The map.
-            threads: In which to look.
-            submit: Lets an event enter the log.
+            threads: The threads that measure.
+            submit: Appends an event to the log.
             fit: Fits the whole graph.
-            json_log: Of the server.
-            name: Of the map.
+            json_log: The log of the server.
+            name: Name of the map.
         """
         self._state, self._threads, self._submit = state, threads, submit
         self._fit, self._json_log, self._name = fit, json_log, name
