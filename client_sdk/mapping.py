@@ -14,7 +14,16 @@ import numpy.typing as npt
 
 from rse_pf.errors import BadRequest, UsageError
 from rse_pf.files import read_regular_file
-from rse_pf.geometry import Array, body_poses, from_quaternion, to_quaternion, transform
+from rse_pf.geometry import (
+    Array,
+    body_poses,
+    exp_se3,
+    from_quaternion,
+    inverse,
+    log_se3,
+    to_quaternion,
+    transform,
+)
 from rse_pf.slam.ply import decode_ply, encode_ply
 
 if TYPE_CHECKING:
@@ -279,6 +288,21 @@ class Trajectory:
     def length_m(self) -> float:
         """The length of the path, metres."""
         return float(np.linalg.norm(np.diff(self.positions, axis=0), axis=1).sum())
+
+    def at(self, stamps_s: npt.ArrayLike) -> Array:
+        """Return the ``(n, 4, 4)`` poses at *stamps_s*, on the twist between the two around each.
+
+        Before the first pose and after the last one it is that pose; there must be two or more.
+        """
+        order = np.argsort(self.timestamps_s, kind="stable")
+        stamps, known = np.atleast_1d(np.asarray(stamps_s, dtype=float)), self.timestamps_s[order]
+        poses = self.T_world_camera[order]
+        after = np.clip(np.searchsorted(known, stamps), 1, len(known) - 1)
+        apart_s = np.maximum(known[after] - known[after - 1], 1e-9)
+        shares = np.clip((stamps - known[after - 1]) / apart_s, 0.0, 1.0)
+        start, end = poses[after - 1], poses[after]
+        between: Array = start @ exp_se3(shares[:, None] * log_se3(inverse(start) @ end))
+        return between
 
 
 def write_trajectory(

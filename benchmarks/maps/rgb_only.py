@@ -47,7 +47,7 @@ from client_sdk.mapping import Trajectory
 from client_sdk.monocular.scale import OdometryScale
 from client_sdk.simulator import render_frames, true_trajectory
 from client_sdk.tracking.monocular_tracker import MonocularTracker
-from rse_pf.experiments.results.trajectory_error import absolute_error, interpolated
+from rse_pf.experiments.results.trajectory_error import absolute_error
 from rse_pf.pnp import PnpOptions, solve_pnp
 from rse_pf.services.pnp import make_request
 from rse_pf.wire import Command, make_codec
@@ -141,9 +141,7 @@ def cuts(recordings: Path) -> Iterator[Cut]:
         ("two rendered worlds, and back", [first, second, first], 160, known, 2),
     ]  # fmt: skip
     for name, shown, cut, within_s, segments in parts:
-        poses = [
-            interpolated(drive.truth, [frame.timestamp_s for frame in frames]) for drive, frames in shown
-        ]
+        poses = [drive.truth.at([frame.timestamp_s for frame in frames]) for drive, frames in shown]
         frames = [frame for _, some in shown for frame in some]
         stamps_s = np.arange(len(frames)) / 10
         yield Cut(
@@ -257,7 +255,7 @@ def row_of(drive: Drive, *, with_scale: bool) -> dict[str, Any]:
         "sim3_scale": None,
     }
     if len(adjusted) >= _MIN_POSES:
-        at_frames = Trajectory(adjusted.timestamps_s, interpolated(truth, adjusted.timestamps_s))
+        at_frames = Trajectory(adjusted.timestamps_s, truth.at(adjusted.timestamps_s))
         similar = absolute_error(adjusted, at_frames, with_scale=True)
         before = absolute_error(tracked, at_frames, with_scale=True)
         row |= {"sim3_cm": 100 * similar.rmse_m, "sim3_scale": similar.scale}

@@ -36,7 +36,7 @@ from client_sdk.simulator import SIMULATED_CAMERA, true_trajectory
 from client_sdk.simulator.camera import Painter, add_depth_noise, add_image_noise
 from client_sdk.simulator.world import make_world
 from client_sdk.tracking.tracker import Join, Tracker
-from rse_pf.experiments.results.trajectory_error import ate_m, interpolated, motion_errors
+from rse_pf.experiments.results.trajectory_error import ate_m, motion_errors
 from rse_pf.geometry import Array, inverse
 
 __all__ = ["main"]
@@ -91,16 +91,16 @@ def hard_drive(motion: Trajectory, first_s: float, seed: int, *, rate_hz: float 
     """Return the rendered drive of a camera that moves as *motion* does for 6 s from *first_s* on."""
     stamps_s = np.arange(round(_HARD_S * rate_hz)) / rate_hz
     place = true_trajectory(0, 3, 1, seed).T_world_camera[0]
-    origin = place @ inverse(interpolated(motion, first_s)[0])
+    origin = place @ inverse(motion.at(first_s)[0])
     moments = np.linspace(-0.5, 0.5, _EXPOSED) * _EXPOSURE_S
-    truth = Trajectory(stamps_s, origin @ interpolated(motion, first_s + stamps_s))
+    truth = Trajectory(stamps_s, origin @ motion.at(first_s + stamps_s))
 
     def frames() -> Iterator[Frame]:
         painter = Painter(make_world(seed), SIMULATED_CAMERA)
         for row, stamp_s in enumerate(stamps_s):
             rng = np.random.default_rng([seed, 99, row])
             _, depth_m, cosine = painter.draw(truth.T_world_camera[row])
-            poses = origin @ interpolated(motion, first_s + stamp_s + moments)
+            poses = origin @ motion.at(first_s + stamp_s + moments)
             colour = np.mean([painter.draw(pose)[0] for pose in poses], axis=0, dtype=np.float32)
             yield Frame(
                 timestamp_s=float(stamp_s),
@@ -137,7 +137,7 @@ def row_of(drive: Drive) -> dict[str, Any]:
     ]
     stamps_s = np.array([s for s, pose in zip(drive.stamps_s, poses, strict=True) if pose is not None])
     estimate = np.array([pose for pose in poses if pose is not None])
-    true_poses = interpolated(drive.truth, stamps_s)
+    true_poses = drive.truth.at(stamps_s)
     metres, degrees = motion_errors(stamps_s, estimate, true_poses)
     return {
         "frames": len(tracked),

@@ -36,7 +36,7 @@ import numpy as np
 import numpy.typing as npt
 
 from benchmarks.maps.recordings import RED_KITCHEN, track
-from benchmarks.maps.tracking import hard_drive, interpolated, poses_of
+from benchmarks.maps.tracking import hard_drive, poses_of
 from client_sdk.datasets import open_dataset
 from client_sdk.frontend import Frame, FrontEndOptions, TrackedFrame
 from client_sdk.simulator import render_along
@@ -341,7 +341,7 @@ def _recorded(
     return Scene(
         read=lambda row: dataset.read(dataset.rows[row]),
         stamps_s=stamps_s,
-        T_world_camera=interpolated(dataset.truth, stamps_s),
+        T_world_camera=dataset.truth.at(stamps_s),
         every=every,
         first_s=first_s,
         step_s=step_s,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -37,10 +38,12 @@ _EXPLAINED = 0.5
 class RateCheck:
     """What the rates of a gyroscope are beside those of a camera; ``trouble`` is empty if all is well.
 
-    ``offset_s`` is by how much the clock of the IMU is ahead; ``bias_gyro`` ``(3,)`` is in rad/s.
+    ``fault`` is empty unless axes or clock cause the trouble.  ``offset_s`` is by how much the clock of the
+    IMU is ahead; ``bias_gyro`` ``(3,)`` is in rad/s.
     """
 
     trouble: str
+    fault: Literal["", "axes", "offset"]
     offset_s: float
     bias_gyro: Array
 
@@ -143,8 +146,10 @@ def check_rates(
     explained = float(
         np.sqrt(np.square(rates_only @ Q.T / ratio - seen_only).sum() / np.square(seen_only).sum())
     )
+    fault, trouble = _trouble_of(ratio, Q, explained, best, is_mirrored=is_mirrored)
     return RateCheck(
-        trouble=_trouble_of(ratio, Q, explained, best, is_mirrored=is_mirrored),
+        trouble=trouble,
+        fault=fault,
         offset_s=best if abs(best - offset_s) > _LEAST_OFFSET_S else offset_s,
         bias_gyro=bias,
     )
@@ -170,24 +175,26 @@ def _best_offset(history: ImuHistory, begins_s: Array, ends_s: Array, seen: Arra
     return float(shifts[peak]) + 0.5 * _OFFSET_STEP_S * (before - after) / (before - 2.0 * at + after)
 
 
-def _trouble_of(ratio: float, Q: Array, left: float, offset_s: float, *, is_mirrored: bool) -> str:
-    """Return what is wrong in one line; *left* is the share of the rates that no rotation explains."""
+def _trouble_of(
+    ratio: float, Q: Array, left: float, offset_s: float, *, is_mirrored: bool
+) -> tuple[Literal["", "axes", "offset"], str]:
+    """Return what is wrong, see `RateCheck`; *left* is the share of the rates that no rotation explains."""
     if left > _EXPLAINED:
-        return "the gyroscope does not turn as the camera does, at any offset in time within 100 ms"
+        return "", "the gyroscope does not turn as the camera does, at any offset in time within 100 ms"
     if ratio > 40.0:
-        return (
+        return "", (
             f"the gyroscope reads {ratio:.0f} times what the camera turns: in degrees, where rad/s are needed"
         )
     if not 1.0 / _RATIO < ratio < _RATIO:
-        return f"the gyroscope reads {ratio:.2f} times what the camera turns: is its unit rad/s?"
+        return "", f"the gyroscope reads {ratio:.2f} times what the camera turns: is its unit rad/s?"
     if is_mirrored:
-        return "an axis of the gyroscope has the wrong sign, or two are swapped: they are left-handed"
+        return "axes", "an axis of the gyroscope has the wrong sign, or two are swapped: they are left-handed"
     angle = rotation_angle_deg(Q)
     if angle > _WRONG_DEG:
-        return (
+        return "axes", (
             f"the axes of the IMU are turned by {angle:.0f} degrees from what T_imu_camera says: "
             "are two of them swapped?"
         )
     if abs(offset_s) > _REFUSED_OFFSET_S:
-        return f"the clock of the IMU is {1e3 * offset_s:.0f} ms off that of the camera"
-    return ""
+        return "offset", f"the clock of the IMU is {1e3 * offset_s:.0f} ms off that of the camera"
+    return "", ""

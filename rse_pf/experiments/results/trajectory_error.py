@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from client_sdk.mapping import Trajectory
 from rse_pf.errors import UsageError
-from rse_pf.geometry import Array, body_poses, exp_se3, inverse, log_se3, pose_difference, rotation_angle_deg
+from rse_pf.geometry import Array, body_poses, inverse, pose_difference, rotation_angle_deg
 
 __all__ = [
     "AbsoluteError",
@@ -25,7 +25,6 @@ __all__ = [
     "align",
     "associate",
     "ate_m",
-    "interpolated",
     "motion_errors",
     "relative_error",
     "trajectory_figures",
@@ -117,7 +116,7 @@ def accuracy(
             hint="check that recording and truth use the same clock",
         )
     stamps_s, poses = estimate.timestamps_s[rows], estimate.T_world_camera[rows].copy()
-    true_poses = interpolated(truth, stamps_s)
+    true_poses = truth.at(stamps_s)
     compared, scale = poses.copy(), 1.0
     if with_scale:
         scale, _ = align(poses[:, :3, 3], true_poses[:, :3, 3], with_scale=True)
@@ -154,22 +153,6 @@ def with_truth(truth: Trajectory, stamps_s: npt.ArrayLike) -> npt.NDArray[np.boo
     is_between = (left <= stamps) & (stamps <= right) & (right - left <= MAX_TRUTH_GAP_S)
     nearest = np.minimum(np.abs(left - stamps), np.abs(right - stamps))
     return np.asarray(is_between | (nearest <= SAME_STAMP_S))
-
-
-def interpolated(truth: Trajectory, stamps_s: npt.ArrayLike) -> Array:
-    """Return the ``(n, 4, 4)`` true poses at *stamps_s*, on the twist between the two around each.
-
-    Before the first true pose and after the last one it is that pose.
-    """
-    order = np.argsort(truth.timestamps_s, kind="stable")
-    stamps, known = np.atleast_1d(np.asarray(stamps_s, dtype=float)), truth.timestamps_s[order]
-    poses = truth.T_world_camera[order]
-    after = np.clip(np.searchsorted(known, stamps), 1, len(known) - 1)
-    apart_s = np.maximum(known[after] - known[after - 1], 1e-9)
-    shares = np.clip((stamps - known[after - 1]) / apart_s, 0.0, 1.0)
-    start, end = poses[after - 1], poses[after]
-    between: Array = start @ exp_se3(shares[:, None] * log_se3(inverse(start) @ end))
-    return between
 
 
 def motion_errors(stamps_s: Array, poses: Array, true_poses: Array) -> tuple[Array, Array]:

@@ -14,7 +14,6 @@ from rse_pf.experiments.results.trajectory_error import (
     accuracy,
     align,
     associate,
-    interpolated,
     relative_error,
     trajectory_figures,
     with_truth,
@@ -186,7 +185,7 @@ def test_a_truth_in_any_order_is_interpolated_alike():
     known_s = np.arange(0.0, 2.0, 0.1)
     order = np.random.default_rng(1).permutation(len(known_s))
 
-    found = interpolated(Trajectory(known_s[order], screw(known_s[order])), [0.05, 1.234])
+    found = Trajectory(known_s[order], screw(known_s[order])).at([0.05, 1.234])
 
     np.testing.assert_allclose(found, screw(np.array([0.05, 1.234])), atol=1e-9)
 

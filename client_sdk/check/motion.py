@@ -1,0 +1,450 @@
+"""Compare how a camera moved with an odometry, a truth or an IMU: delay of stamps, scale, axes, mirrors.
+
+What is compared are motions over short times, so that neither drift nor the choice of a world matters.  Where
+a lens or its depth is wrong, give the poses that were adjusted for that.
+
+Source:
+    Rotation between two sets of vectors after Kabsch, Acta Cryst. A32, 1976; the equation A X = X B of a
+    mounted camera after Tsai and Lenz, IEEE Trans. Robotics and Automation 5, 1989.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from client_sdk.check.findings import CannotTell, FaultKind, Finding
+from client_sdk.imu.checks import RateCheck, check_rates, trouble_of_samples
+from client_sdk.imu.history import ImuHistory
+from client_sdk.mapping import Trajectory
+from rse_pf.geometry import Array, inverse, log_se3, rotation_angle_deg
+
+__all__ = ["MotionReference", "check_imu", "check_motion", "nothing_to_compare"]
+
+_LEAST_STEP_S, _LONGEST_STEP_S = 0.45, 1.0
+_MOST_PAIRS, _FEWEST_PAIRS, _BLOCKS = 600, 20, 10
+_MOST_DELAY_S, _DELAY_STEP_S, _DELAY_FLOOR_S, _LEAST_DELAY_S, _VAGUE_S = 0.5, 0.02, 0.003, 0.01, 0.04
+_EXPLAINED = 0.5
+"""Motions that fit leave less of their mean square than this share."""
+_BETTER, _ALIKE, _DEVIATIONS = 0.5, 1.2, 3.0
+_FITS_WELL = 0.15
+"""Axes are judged where a rotation, or a mirror, leaves less than this share."""
+_TURNED_DEG, _NEAR_AXES_DEG = 20.0, 15.0
+_SEGMENT_M, _SEGMENT_S, _FEWEST_SEGMENTS = 0.25, 6.0, 12
+_ARM_M, _CAMERA_ARM_M = 0.5, 0.02
+_LEAST_SCALE = 0.01
+_OUTLIER = 4.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class MotionReference:
+    """What the motion of a camera is compared with.
+
+    Attributes:
+        path: Poses, metres, of the camera or of what it is mounted on.
+        name: For people, such as ``odometry``.
+        is_camera: Whether they are poses of the camera itself, its z along the optical axis.
+        scale_deviation: How well its metres are known, relative.
+    """
+
+    path: Trajectory
+    name: str = "odometry"
+    is_camera: bool = True
+    scale_deviation: float = 0.004
+
+
+def nothing_to_compare(*, has_depth: bool) -> list[CannotTell]:
+    """Return what a drive without odometry, truth and IMU cannot tell."""
+    without = "no odometry, truth or IMU beside the images"
+    untold = [
+        CannotTell(FaultKind.STAMP_DELAY, f"{without}: there is no second clock"),
+        CannotTell(FaultKind.MIRRORED, f"{without}: a mirrored drive looks like one in a mirrored world"),
+        CannotTell(FaultKind.SWAPPED_AXES, f"{without}: there are no other axes"),
+    ]
+    if has_depth:
+        untold.append(CannotTell(FaultKind.DEPTH_SCALE, f"{without}: nothing else knows a metre"))
+    return untold
+
+
+def check_imu(history: ImuHistory, stamps_s: Array, T_world_camera: Array) -> tuple[list[Finding], list[str]]:
+    """Return what is wrong with an IMU beside ``(n, 4, 4)`` poses of the camera, and notes for people."""
+    trouble = trouble_of_samples(history)
+    if trouble:
+        return [], [f"IMU: {trouble}"]
+    check = check_rates(history, stamps_s, T_world_camera[:, :3, :3], 0.0) if len(stamps_s) > 1 else None
+    if check is None:
+        return [], ["IMU: the camera turns too little to compare it with the gyroscope"]
+    return _imu_findings(check), [f"IMU: {check.trouble}"] if check.trouble and not check.fault else []
+
+
+def check_motion(
+    stamps_s: Array,
+    T_world_camera: Array,
+    reference: MotionReference,
+    segments: Array | None = None,
+    *,
+    has_metres: bool = True,
+) -> tuple[list[Finding], list[CannotTell]]:
+    """Return what is wrong with the motion of a camera beside *reference*, and what cannot be told.
+
+    Args:
+        stamps_s: ``(n,)``, ascending.
+        T_world_camera: ``(n, 4, 4)``, as they were tracked.
+        reference: What it is compared with.
+        segments: ``(n,)``; poses of different segments are not compared.  None for one segment.
+        has_metres: Whether the poses are in metres by a depth that can be wrong, not up to scale.
+    """
+    pairs = _pairs(stamps_s, segments)
+    least_s, most_s = reference.path.timestamps_s.min(), reference.path.timestamps_s.max()
+    covered = (stamps_s[pairs[:, 0]] - _MOST_DELAY_S >= least_s) & (
+        stamps_s[pairs[:, 1]] + _MOST_DELAY_S <= most_s
+    )
+    pairs = pairs[covered]
+    if len(pairs) < _FEWEST_PAIRS:
+        reason = f"{reference.name} and camera have {len(pairs)} motions in common"
+        return [], [CannotTell(FaultKind.STAMP_DELAY, reason), CannotTell(FaultKind.MIRRORED, reason)]
+    seen = _twists(T_world_camera[pairs[:, 0]], T_world_camera[pairs[:, 1]], *stamps_s[pairs.T])
+    fits = _fits(seen, stamps_s[pairs], reference)
+    best = min(range(len(fits)), key=lambda row: fits[row].cost)
+    if fits[best].left > _EXPLAINED:
+        reason = f"the camera does not move as {reference.name} says, at any delay within 0.5 s"
+        return [], [CannotTell(FaultKind.STAMP_DELAY, reason), CannotTell(FaultKind.DEPTH_SCALE, reason)]
+    findings, untold = _delay(fits, seen, reference)
+    axes, vague = _axes(fits[best], reference)
+    findings += axes
+    untold += vague
+    if has_metres and not any(each.kind is FaultKind.MIRRORED for each in axes):
+        scale, vague = _scale(
+            stamps_s - _DELAYS_S[best], T_world_camera, segments, reference, fits[best].rotation
+        )
+        findings += scale
+        untold += vague
+    return findings, untold
+
+
+# --- motions ----------------------------------------------------------------------------------------------
+
+_DELAYS_S: Array = np.arange(-_MOST_DELAY_S, _MOST_DELAY_S + 1e-9, _DELAY_STEP_S)
+
+
+def _pairs(stamps_s: Array, segments: Array | None) -> npt.NDArray[np.int64]:
+    """Return ``(m, 2)`` rows of poses that are a short time apart, spread over the drive."""
+    later = np.searchsorted(stamps_s, stamps_s + _LEAST_STEP_S)
+    rows = np.arange(len(stamps_s))
+    usable = later < len(stamps_s)
+    rows, later = rows[usable], later[usable]
+    usable = stamps_s[later] - stamps_s[rows] <= _LONGEST_STEP_S
+    if segments is not None:
+        usable &= segments[rows] == segments[later]
+    pairs = np.stack([rows[usable], later[usable]], axis=1)
+    return np.asarray(pairs[:: max(1, -(-len(pairs) // _MOST_PAIRS))], dtype=np.int64)
+
+
+def _twists(begins: Array, ends: Array, begins_s: Array, ends_s: Array) -> Array:
+    """Return the mean velocities ``(m, 6)`` of the motions from *begins* to *ends*: m/s, then rad/s."""
+    twists: Array = log_se3(inverse(begins) @ ends) / (ends_s - begins_s)[:, None]
+    return twists
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Fit:
+    """How the motions of the camera fit those of a reference at one delay.
+
+    ``squares`` ``(m,)`` are of the residuals, in units of the noise, with the best ``rotation``
+    ``R_camera_reference``; ``plain`` the same for equal axes, ``mirrored`` for the best ``mirror``: left and
+    right of a camera's own axes, or any of other axes.  ``power`` is the square of the motions.
+    """
+
+    power: float
+    rotation: Array
+    mirror: Array
+    squares: Array
+    mirrored: Array
+    plain: Array
+
+    @property
+    def best(self) -> Array:
+        """The squares ``(m,)`` of what explains the motions better, rotation or mirror."""
+        return self.mirrored if self.mirrored.sum() < _BETTER * self.squares.sum() else self.squares
+
+    @property
+    def cost(self) -> float:
+        """The sum of the best squares."""
+        return float(self.best.sum())
+
+    @property
+    def left(self) -> float:
+        """The share of the motions that neither a rotation nor a mirror explains."""
+        return self.cost / max(self.power, 1e-12)
+
+
+def _fits(seen: Array, stamps_s: Array, reference: MotionReference) -> list[_Fit]:
+    """Return the fits at all of `_DELAYS_S`."""
+    measured, path = [], reference.path
+    for delay_s in _DELAYS_S.tolist():
+        begins_s, ends_s = stamps_s[:, 0] - delay_s, stamps_s[:, 1] - delay_s
+        measured.append(_twists(path.at(begins_s), path.at(ends_s), begins_s, ends_s))
+    noise = np.array([1.0, 1.0])
+    kept = np.ones(len(seen), dtype=bool)
+    fits: list[_Fit] = []
+    for _ in range(3):
+        fits = [_fit(seen, each, noise, kept, is_camera=reference.is_camera) for each in measured]
+        best = min(range(len(fits)), key=lambda row: fits[row].cost)
+        parts = _residuals(seen, measured[best], fits[best])
+        size = np.linalg.norm(parts.reshape(-1, 2, 3), axis=2)
+        typical = np.maximum(np.median(size[kept], axis=0), 1e-6)
+        kept = (size <= _OUTLIER * typical).all(axis=1)
+        noise = typical
+    return fits
+
+
+def _fit(seen: Array, measured: Array, noise: Array, kept: Array, *, is_camera: bool) -> _Fit:
+    weights = np.repeat(1.0 / noise, 3) * kept[:, None]
+    one, other = seen * weights, measured * weights
+    other[:, :3] *= _ratio(seen[kept, :3], measured[kept, :3])
+    # Translations are vectors; a mirror turns rates the other way than it turns vectors.
+    U, _, Vt = np.linalg.svd(one[:, :3].T @ other[:, :3] + one[:, 3:].T @ other[:, 3:])
+    rotation = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    V, _, Wt = np.linalg.svd(one[:, :3].T @ other[:, :3] - one[:, 3:].T @ other[:, 3:])
+    mirror = V @ np.diag([1.0, 1.0, -np.linalg.det(V @ Wt)]) @ Wt
+    mirror = np.diag([-1.0, 1.0, 1.0]) if is_camera else mirror
+    return _Fit(
+        power=float(np.square(one).sum()), rotation=rotation, mirror=mirror,
+        squares=_squares(one, other, rotation), mirrored=_squares(one, other, mirror),
+        plain=_squares(one, other, np.eye(3)),
+    )  # fmt: skip
+
+
+def _squares(one: Array, other: Array, axes: Array) -> Array:
+    squares: Array = np.square(one - _turned(other, axes)).sum(axis=1)
+    return squares
+
+
+def _turned(twists: Array, axes: Array) -> Array:
+    """Return velocities ``(m, 6)`` in other *axes* ``(3, 3)``, a rotation or a mirror."""
+    sign = np.sign(np.linalg.det(axes))
+    return np.concatenate([twists[:, :3] @ axes.T, sign * twists[:, 3:] @ axes.T], axis=1)
+
+
+def _residuals(seen: Array, measured: Array, fit: _Fit) -> Array:
+    scaled = measured.copy()
+    scaled[:, :3] *= _ratio(seen[:, :3], measured[:, :3])
+    left: Array = seen - _turned(scaled, fit.mirror if fit.best is fit.mirrored else fit.rotation)
+    return left
+
+
+def _ratio(one: Array, other: Array) -> float:
+    return float(np.sqrt(np.square(one).sum() / max(np.square(other).sum(), 1e-12)))
+
+
+# --- what they say ----------------------------------------------------------------------------------------
+
+
+def _delay(
+    fits: list[_Fit], seen: Array, reference: MotionReference
+) -> tuple[list[Finding], list[CannotTell]]:
+    """Return by how much the stamps of images are late."""
+    squares = np.array([fit.best for fit in fits])
+    blocks = np.arange(squares.shape[1]) * _BLOCKS // squares.shape[1]
+    total = squares.sum(axis=1)
+    without = [total - squares[:, blocks == block].sum(axis=1) for block in range(_BLOCKS)]
+    delay_s, deviation_s = _jackknife(_lowest(total), np.array([_lowest(each) for each in without]))
+    deviation_s = math.hypot(deviation_s, _DELAY_FLOOR_S)
+    if deviation_s > _VAGUE_S:
+        reason = f"neither speed nor turn changes enough beside {reference.name}: delay within "
+        within_s = _DEVIATIONS * deviation_s
+        return [], [CannotTell(FaultKind.STAMP_DELAY, f"{reason}{1e3 * within_s:.0f} ms", within_s)]
+    if abs(delay_s) < max(_LEAST_DELAY_S, _DEVIATIONS * deviation_s):
+        return [], []
+    speed_m_s = float(np.sqrt(np.square(seen[:, :3]).sum(axis=1).mean()))
+    finding = Finding(
+        kind=FaultKind.STAMP_DELAY, value=delay_s, deviation=deviation_s, unit="s",
+        cost_m=abs(delay_s) * speed_m_s,
+        sentence=f"the time stamps of the images are {1e3 * abs(delay_s):.0f} +- {1e3 * deviation_s:.0f} ms "
+        f"{'later' if delay_s > 0 else 'earlier'} than those of {reference.name}",
+        fix=f"{'subtract' if delay_s > 0 else 'add'} {1e3 * abs(delay_s):.0f} ms, or take the time of the "
+        "exposure for both",
+    )  # fmt: skip
+    return [finding], []
+
+
+def _lowest(costs: Array) -> float:
+    """Return the delay of the lowest cost, between the steps by a parabola."""
+    at = int(np.argmin(costs))
+    if not 0 < at < len(costs) - 1:
+        return float(_DELAYS_S[at])
+    before, here, after = costs[at - 1 : at + 2]
+    bend = before - 2.0 * here + after
+    return float(_DELAYS_S[at] + (0.5 * _DELAY_STEP_S * (before - after) / bend if bend > 0 else 0.0))
+
+
+def _jackknife(whole: float, parts: Array) -> tuple[float, float]:
+    """Return a value and its deviation, from the values without each of the blocks."""
+    n = len(parts)
+    return whole, float(np.sqrt((n - 1) / n * np.square(parts - parts.mean()).sum()))
+
+
+def _is_better(one: Array, other: Array) -> bool:
+    """Return whether squares *one* are clearly below *other*, in most parts of the drive."""
+    blocks = np.arange(len(one)) * _BLOCKS // len(one)
+    gains = np.array([(other - one)[blocks == block].sum() for block in range(_BLOCKS)])
+    doubt = float(gains.std(ddof=1)) * math.sqrt(_BLOCKS)
+    return bool(one.sum() < _BETTER * other.sum() and gains.sum() > _DEVIATIONS * doubt)
+
+
+def _axes(fit: _Fit, reference: MotionReference) -> tuple[list[Finding], list[CannotTell]]:
+    """Return whether the images are mirrored, or the axes of camera and reference differ."""
+    if fit.left > _FITS_WELL:
+        return [], [CannotTell(FaultKind.MIRRORED, f"the camera moves only roughly as {reference.name} says")]
+    own = fit.plain if reference.is_camera else fit.squares
+    if _is_better(fit.mirrored, own) and fit.mirrored.sum() < _ALIKE * fit.squares.sum():
+        finding = Finding(
+            kind=FaultKind.MIRRORED, value=1.0, deviation=0.0, unit="", cost_m=None,
+            sentence=f"the images are mirrored: beside {reference.name} the camera turns the other way than "
+            "it moves",
+            fix="switch off the mirror of the camera or driver, and record again",
+        )  # fmt: skip
+        return [finding], []
+    untold: list[CannotTell] = []
+    if not _is_better(own, fit.mirrored):
+        plane = f"beside {reference.name} the camera moves and turns in one plane: a mirror changes nothing"
+        untold.append(CannotTell(FaultKind.MIRRORED, plane))
+    if not reference.is_camera:
+        reason = f"how the camera is mounted in the frame of {reference.name} is not known"
+        return [], [*untold, CannotTell(FaultKind.SWAPPED_AXES, reason)]
+    angle = rotation_angle_deg(fit.rotation)
+    if angle < _TURNED_DEG or not _is_better(fit.squares, fit.plain):
+        return [], untold
+    named = _named_axes(fit.rotation)
+    finding = Finding(
+        kind=FaultKind.SWAPPED_AXES, value=1.0, deviation=0.0, unit="", cost_m=None,
+        sentence=f"the axes of {reference.name} are turned by {angle:.0f} degrees from those of the camera"
+        + (f": its {named} are the camera's x, y, z" if named else ""),
+        fix="give poses of the camera, with x right, y down and z ahead, or correct the mounting",
+    )  # fmt: skip
+    return [finding], untold
+
+
+def _named_axes(rotation: Array) -> str:
+    """Return which axes of the reference are the camera's x, y, z, such as ``-y, -z, x``; empty if none."""
+    rows = np.abs(rotation).argmax(axis=1)
+    named = np.zeros((3, 3))
+    named[range(3), rows] = np.sign(rotation[range(3), rows])
+    is_whole = sorted(rows.tolist()) == [0, 1, 2]
+    if not is_whole or rotation_angle_deg(named.T @ rotation) > _NEAR_AXES_DEG:
+        return ""
+    return ", ".join(("-" if rotation[row, at] < 0 else "") + "xyz"[at] for row, at in enumerate(rows))
+
+
+def _scale(
+    stamps_s: Array,
+    T_world_camera: Array,
+    segments: Array | None,
+    reference: MotionReference,
+    rotation: Array,
+) -> tuple[list[Finding], list[CannotTell]]:
+    """Return by how much metres of the camera differ from those of the reference."""
+    path = reference.path
+    inside = (stamps_s >= path.timestamps_s.min()) & (stamps_s <= path.timestamps_s.max())
+    rows = _segments(stamps_s, path.at(stamps_s)[:, :3, 3], segments, inside)
+    if len(rows) < _FEWEST_SEGMENTS:
+        reason = f"{len(rows)} parts of the path are {_SEGMENT_M:g} m long beside {reference.name}"
+        return [], [CannotTell(FaultKind.DEPTH_SCALE, reason)]
+    A = inverse(path.at(stamps_s[rows[:, 0]])) @ path.at(stamps_s[rows[:, 1]])
+    B = inverse(T_world_camera[rows[:, 0]]) @ T_world_camera[rows[:, 1]]
+    arm_m = _CAMERA_ARM_M if reference.is_camera else _ARM_M
+    kept = np.ones(len(rows), dtype=bool)
+    for _ in range(4):
+        scale, left = _solved(A, B, rotation, arm_m, kept)
+        kept = left <= _OUTLIER * max(float(np.median(left[kept])), 1e-6)
+    blocks = np.arange(len(rows)) * _BLOCKS // len(rows)
+    without = np.array(
+        [_solved(A, B, rotation, arm_m, kept & (blocks != each))[0] for each in range(_BLOCKS)]
+    )
+    scale, deviation = _jackknife(_solved(A, B, rotation, arm_m, kept)[0], without)
+    if not 1e-3 < scale < 1e3:
+        return [], [CannotTell(FaultKind.DEPTH_SCALE, f"paths of camera and {reference.name} do not fit")]
+    deviation = math.hypot(deviation, reference.scale_deviation * scale)
+    value = scale - 1.0
+    if abs(value) < max(_LEAST_SCALE, _DEVIATIONS * deviation):
+        vague = _DEVIATIONS * deviation
+        reason = f"parts of the path differ from {reference.name}: depth scale within {100 * vague:.0f} %"
+        return [], [CannotTell(FaultKind.DEPTH_SCALE, reason, vague)] if vague > 0.05 else []
+    positions = path.at(stamps_s[inside])[:, :3, 3]
+    reach_m = float(np.sqrt(np.square(positions - positions.mean(axis=0)).sum(axis=1).mean()))
+    finding = Finding(
+        kind=FaultKind.DEPTH_SCALE, value=value, deviation=deviation, unit="relative",
+        cost_m=abs(1.0 / scale - 1.0) * reach_m,
+        sentence=f"the depth scale is set {_times(scale, deviation)}: depths are {1.0 / scale:.3g} times "
+        f"what {reference.name} says",
+        fix=f"divide depth_scale in intrinsics.json by {scale:.4g}; 1000 is for mm, 5000 for TUM",
+    )  # fmt: skip
+    return [finding], []
+
+
+def _times(scale: float, deviation: float) -> str:
+    if 0.5 < scale < 2.0:
+        return (
+            f"{100 * abs(scale - 1):.1f} +- {100 * deviation:.1f} % too {'large' if scale > 1 else 'small'}"
+        )
+    return f"to {scale:.3g} +- {deviation:.2g} times what it should be"
+
+
+def _segments(
+    stamps_s: Array, positions: Array, segments: Array | None, inside: Array
+) -> npt.NDArray[np.int64]:
+    """Return ``(m, 2)`` rows between which the reference moves far enough."""
+    pairs: list[tuple[int, int]] = []
+    every = max(1, len(stamps_s) // _MOST_PAIRS)
+    for begin in range(0, len(stamps_s), every):
+        for end in itertools.count(begin + 1):
+            if end >= len(stamps_s) or stamps_s[end] - stamps_s[begin] > _SEGMENT_S:
+                break
+            if segments is not None and segments[end] != segments[begin]:
+                break
+            if np.linalg.norm(positions[end] - positions[begin]) >= _SEGMENT_M:
+                if inside[begin] and inside[end]:
+                    pairs.append((begin, end))
+                break
+    return np.array(pairs, dtype=np.int64).reshape(-1, 2)
+
+
+def _solved(A: Array, B: Array, rotation: Array, arm_m: float, kept: Array) -> tuple[float, Array]:
+    """Return metres of the reference in a metre of the camera, and the residuals ``(m,)``, metres.
+
+    Solves ``(R_A - I) t + t_A = s R t_B`` for the arm ``t``, which is about *arm_m* long, and ``s``.
+    """
+    R_reference_camera = rotation.T
+    moved = B[:, :3, 3] @ R_reference_camera.T
+    rows = np.concatenate([np.eye(3) - A[:, :3, :3], moved[:, :, None]], axis=2)
+    wanted = A[:, :3, 3]
+    system, right = rows[kept].reshape(-1, 4), wanted[kept].reshape(-1)
+    typical_m = 0.01
+    prior = np.diag([typical_m / arm_m] * 3 + [0.0])
+    found = np.linalg.lstsq(np.vstack([system, prior]), np.concatenate([right, np.zeros(4)]), rcond=None)[0]
+    return float(found[3]), np.linalg.norm(rows @ found - wanted, axis=1)
+
+
+# --- the IMU ----------------------------------------------------------------------------------------------
+
+
+def _imu_findings(check: RateCheck) -> list[Finding]:
+    """Return the findings of a comparison with a gyroscope."""
+    if not check.fault:
+        return []
+    kind = FaultKind.STAMP_DELAY if check.fault == "offset" else FaultKind.SWAPPED_AXES
+    is_late = check.fault == "offset"
+    # An IMU whose clock is ahead has later stamps: those of the images are earlier.
+    return [
+        Finding(
+            kind=kind, value=-check.offset_s if is_late else 1.0,
+            deviation=_DELAY_FLOOR_S if is_late else 0.0, unit="s" if is_late else "",
+            cost_m=None, sentence=check.trouble,
+            fix="correct the time offset of the rig" if is_late
+            else "correct T_imu_camera of the rig; mirrored images turn axes as well",
+        )
+    ]  # fmt: skip
