@@ -88,6 +88,7 @@ def check_motion(
     segments: Array | None = None,
     *,
     has_metres: bool = True,
+    has_stereo: bool = False,
 ) -> tuple[list[Finding], list[CannotTell]]:
     """Return what is wrong with the motion of a camera beside *reference*, and what cannot be told.
 
@@ -97,6 +98,7 @@ def check_motion(
         reference: What it is compared with.
         segments: ``(n,)``; poses of different segments are not compared.  None for one segment.
         has_metres: Whether the poses are in metres by a depth that can be wrong, not up to scale.
+        has_stereo: Whether that depth is of a pair of cameras, with a baseline.
     """
     pairs = _pairs(stamps_s, segments)
     least_s, most_s = reference.path.timestamps_s.min(), reference.path.timestamps_s.max()
@@ -119,7 +121,12 @@ def check_motion(
     untold += vague
     if has_metres and not any(each.kind is FaultKind.MIRRORED for each in axes):
         scale, vague = _scale(
-            stamps_s - _DELAYS_S[best], T_world_camera, segments, reference, fits[best].rotation
+            stamps_s - _DELAYS_S[best],
+            T_world_camera,
+            segments,
+            reference,
+            fits[best].rotation,
+            has_stereo=has_stereo,
         )
         findings += scale
         untold += vague
@@ -346,6 +353,8 @@ def _scale(
     segments: Array | None,
     reference: MotionReference,
     rotation: Array,
+    *,
+    has_stereo: bool,
 ) -> tuple[list[Finding], list[CannotTell]]:
     """Return by how much metres of the camera differ from those of the reference."""
     path = reference.path
@@ -376,9 +385,17 @@ def _scale(
         return [], [CannotTell(FaultKind.DEPTH_SCALE, reason, vague)] if vague > 0.05 else []
     positions = path.at(stamps_s[inside])[:, :3, 3]
     reach_m = float(np.sqrt(np.square(positions - positions.mean(axis=0)).sum(axis=1).mean()))
+    cost_m = abs(1.0 / scale - 1.0) * reach_m
+    if has_stereo:
+        # Metres of a pair grow with its baseline, those of a depth image shrink with its scale.
+        sentence = f"the baseline is set {_times(1.0 / scale, deviation / scale**2)} beside {reference.name}"
+        finding = Finding(
+            kind=FaultKind.BASELINE, value=1.0 / scale - 1.0, deviation=deviation / scale**2, unit="relative",
+            cost_m=cost_m, sentence=sentence, fix=f"multiply the baseline of the rig by {scale:.4g}",
+        )  # fmt: skip
+        return [finding], []
     finding = Finding(
-        kind=FaultKind.DEPTH_SCALE, value=value, deviation=deviation, unit="relative",
-        cost_m=abs(1.0 / scale - 1.0) * reach_m,
+        kind=FaultKind.DEPTH_SCALE, value=value, deviation=deviation, unit="relative", cost_m=cost_m,
         sentence=f"the depth scale is set {_times(scale, deviation)}: depths are {1.0 / scale:.3g} times "
         f"what {reference.name} says",
         fix=f"divide depth_scale in intrinsics.json by {scale:.4g}; 1000 is for mm, 5000 for TUM",

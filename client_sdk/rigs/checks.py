@@ -6,6 +6,8 @@ Features of both images are matched over the whole image, so that a wrong rig ca
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -14,7 +16,7 @@ from client_sdk.frontend import DescribedPixels, Frame, describe, load_opencv
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Array
 
-__all__ = ["check_pairs", "spread_pairs"]
+__all__ = ["PairFault", "check_pairs", "fault_of_pairs", "spread_pairs"]
 
 _FEATURES = 600
 _RATIO = 0.8
@@ -37,44 +39,70 @@ def spread_pairs(rows: Sequence[int], read: Callable[[int], Frame]) -> Iterable[
         yield read(rows[place]), read(rows[place + 1])
 
 
-def check_pairs(pairs: Iterable[tuple[Frame, Frame]], name: str) -> None:
-    """Look at stereo frames, each with a later one, and refuse a rig that is wrong.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PairFault:
+    """What is wrong with a rig; ``value`` is the share of swapped matches, the delay, s, or the rows, px."""
 
-    Where the images show too little, nothing is said.
+    what: Literal["swapped", "late", "rows"]
+    value: float
+    unit: str
+    message: str
+    hint: str
+
+
+def check_pairs(pairs: Iterable[tuple[Frame, Frame]], name: str) -> None:
+    """Refuse a rig that is wrong, see `fault_of_pairs`.
 
     Raises:
         UsageError: The images are swapped, the right one is of another time, or rows do not fit.
         MissingExtra: OpenCV is not installed.
     """
+    fault = fault_of_pairs(pairs)
+    if fault is not None:
+        raise UsageError(f"{name}: {fault.message}", hint=fault.hint)
+
+
+def fault_of_pairs(pairs: Iterable[tuple[Frame, Frame]]) -> PairFault | None:
+    """Look at stereo frames, each with a later one, and return what is wrong with their rig.
+
+    Where the images show too little, nothing is said.
+
+    Raises:
+        MissingExtra: OpenCV is not installed.
+    """
     across, off, flow = (np.concatenate(each) for each in _measured(pairs))
     if len(off) < _FEWEST:
-        return
+        return None
     swapped = float(np.mean(across < _SWAPPED_PX))
     if swapped > _SWAPPED_SHARE:
-        raise UsageError(
-            f"{name}: {100 * swapped:.0f} % of what both cameras see lies farther right in the right image: "
+        return PairFault(
+            what="swapped", value=swapped, unit="share",
+            message=f"{100 * swapped:.0f} % of what both cameras see lies farther right in the right image: "
             "the cameras are swapped",
             hint="exchange left and right, in the rig or in the images",
-        )
+        )  # fmt: skip
     known = np.isfinite(flow)
     low_px, high_px = np.percentile(off, (10, 90))
     # Rows that all differ the same way do so by a rotation: a delay shows as the motion goes.
     is_turned = bool(low_px * high_px > 0.0 and min(abs(low_px), abs(high_px)) > _MAX_OFF_PX)
     late_s = None if is_turned else _late_s(off[known], flow[known])
     if late_s is not None:
-        raise UsageError(
-            f"{name}: the right image is taken {1e3 * abs(late_s):.0f} ms "
+        return PairFault(
+            what="late", value=late_s, unit="s",
+            message=f"the right image is taken {1e3 * abs(late_s):.0f} ms "
             f"{'after' if late_s > 0 else 'before'} the left one: the cameras are not synchronised",
             hint="trigger both cameras together, or take one: --camera left",
-        )
+        )  # fmt: skip
     typical_px = float(np.median(np.abs(off)))
     if typical_px > _MAX_OFF_PX:
         swap = "the cameras are swapped, or " if swapped > _MAYBE_SWAPPED_SHARE else ""
-        raise UsageError(
-            f"{name}: rows of the two images differ by {typical_px:.1f} px in the median, above "
+        return PairFault(
+            what="rows", value=typical_px, unit="px",
+            message=f"rows of the two images differ by {typical_px:.1f} px in the median, above "
             f"{_MAX_OFF_PX:g} px: {swap}the rectification does not fit",
             hint="calibrate the pair again: rse-pf camera calibrate --stereo; or take one: --camera left",
-        )
+        )  # fmt: skip
+    return None
 
 
 def _measured(pairs: Iterable[tuple[Frame, Frame]]) -> tuple[list[Array], list[Array], list[Array]]:

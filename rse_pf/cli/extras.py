@@ -126,6 +126,7 @@ EXTRAS: dict[str, Extra] = {
 VERBS_NEED: dict[str, tuple[str, ...]] = {
     "demo": ("demo",),
     "demo --merge": ("demo", "maps"),
+    "check": ("demo",),
     "compare": ("demo",),
     "experiment": ("experiments",),
     "local": ("local",),

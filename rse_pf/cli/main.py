@@ -25,6 +25,7 @@ __all__ = ["VERBS", "Parser", "main", "parser_of", "verb_module"]
 
 VERBS = {
     "demo": "let robots build point-cloud maps through the platform, on this machine",
+    "check": "say what is wrong with a drive: calibration, depth, times, images, axes",
     "compare": "compare configurations of the tracker on recordings: errors, bytes, CPU time",
     "experiment": "repeat the experiments of Section 6 of the paper, or verify a run from its records",
     "local": "run the platform on this machine: load balancer and backend servers",

@@ -36,6 +36,7 @@ SHOWS_NO_TEXT_OF_ROBOTS = {
     "fleet": "prints an address of this machine",
     "batch": "shows names of the operator's own files, and figures",
     "demo": "its robots have names that it makes itself",
+    "check": "shows what was typed, and figures of recordings",
     "compare": "shows what was typed, and figures of recordings",
     "swarm": "its robots have names that it makes itself",
     "settings": "shows the operator's own file",

@@ -14,8 +14,8 @@ from rse_pf.cli.main import VERBS, main
 from rse_pf.config import PlatformSettings, settings_page
 
 EMPTY = [
-    "demo", "compare", "experiment", "local", "fleet", "swarm", "token", "robot", "service", "serve", "data",
-    "camera", "map", "batch", "replay", "audit", "cloud", "settings", "doctor", "errors",
+    "demo", "check", "compare", "experiment", "local", "fleet", "swarm", "token", "robot", "service", "serve",
+    "data", "camera", "map", "batch", "replay", "audit", "cloud", "settings", "doctor", "errors",
 ]  # fmt: skip
 HELP_S = 0.3
 
@@ -41,7 +41,7 @@ def _alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ("words", "first", "hint"),
     [
         ("lcoal", "no verb 'lcoal'", "did you mean local?"),
-        ("xyzzy", "no verb 'xyzzy'", "known are demo, compare, experiment"),
+        ("xyzzy", "no verb 'xyzzy'", "known are demo, check, compare"),
         ("--settings a.json serve", "--settings stands before the verb", "rse-pf VERB OPTIONS"),
         ("serve --prot 1", "unrecognized arguments: --prot", "did you mean --port?"),
         ("serve --prot=1", "unrecognized arguments: --prot", "did you mean --port?"),

@@ -100,8 +100,14 @@ def _map(keyframes: int) -> bytes:
 
 WRONG_INPUTS: tuple[WrongInput, ...] = (
     WrongInput("demos", USAGE, "no verb 'demos'", "did you mean demo?"),
-    WrongInput("xyzzy", USAGE, "no verb 'xyzzy'", "known are demo, compare"),
+    WrongInput("xyzzy", USAGE, "no verb 'xyzzy'", "known are demo, check"),
     WrongInput("--out x demo", USAGE, "--out stands before the verb", "rse-pf VERB OPTIONS"),
+    WrongInput("check", USAGE, "arguments are required: SOURCE", "rse-pf check --help"),
+    WrongInput("check typo", USAGE, "there is no typo", "name a file"),
+    WrongInput("check rec-empty", USAGE, "rec-empty/rgb.txt lists no image", "a line for each image"),
+    WrongInput("check rec-empty --frames 1", USAGE, "--frames 1 is below 2", "leave it out"),
+    WrongInput("check rec-empty --write nowhere/a.json", USAGE, "there is no folder", "create it"),
+    WrongInput("check rec-empty --odometry typo", USAGE, "typo", "TUM"),
     WrongInput("compare", USAGE, "arguments are required: --data", "rse-pf compare --help"),
     WrongInput("compare --data typo", USAGE, "no folder typo", "rgb.txt, depth.txt"),
     WrongInput("compare --data world:three", USAGE, "world:three names no rendered world", "world:3"),

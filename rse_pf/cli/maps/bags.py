@@ -98,6 +98,7 @@ def _from_bag(args: argparse.Namespace, settings: PlatformSettings) -> int:
     options = _options(args)
     from client_sdk.bags import open_bag
     from client_sdk.cameras import source_of_frames
+    from client_sdk.check.motion import MotionReference
     from client_sdk.datasets.recordings import dataset_of_bag
 
     with at_work(f"reading {args.source}"):
@@ -133,7 +134,10 @@ def _from_bag(args: argparse.Namespace, settings: PlatformSettings) -> int:
                 **_errors(path, bag.truth, bag.truth_kind),
             }
 
-        return map_source(args, settings, source, scale, about)
+        reference = None
+        if bag.truth is not None and len(bag.truth) > 1:
+            reference = MotionReference(path=bag.truth, name="the poses of the bag", is_camera=False)
+        return map_source(args, settings, source, scale, about, reference)
 
 
 def _to_bag(args: argparse.Namespace) -> int:

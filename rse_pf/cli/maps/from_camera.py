@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
+from rse_pf.cli.drive_check import DriveCheck, add_check_argument
 from rse_pf.cli.maps.frame_table import FRAMES_FILE, FrameTable
 from rse_pf.cli.sensors import add_sensor_arguments
 from rse_pf.config import PlatformSettings
@@ -27,6 +28,7 @@ from rse_pf.terminal import show, show_progress
 if TYPE_CHECKING:
     from client_sdk import MarkerScale, OdometryScale, Robot, TrackedFrame
     from client_sdk.cameras import FrameSource
+    from client_sdk.check.motion import MotionReference
     from client_sdk.mapper import Mapper
     from client_sdk.mapping import Trajectory
 
@@ -72,6 +74,7 @@ def add_drive_arguments(parser: argparse.ArgumentParser, out: Path) -> None:
     add("--no-depth", action="store_true", help="use the colours only")
     add("--rate", type=float, metavar="HZ", help="play so many frames per second (default: all)")
     add("--frames", type=int, metavar="N", help="stop after so many frames")
+    add_check_argument(parser)
     add("--out", type=Path, default=out, metavar="DIR", help="results (default: %(default)s)")
     add(
         "--url", action="append",
@@ -103,8 +106,12 @@ def map_source(
     source: FrameSource,
     scale: OdometryScale | MarkerScale | None,
     about: Callable[[Trajectory], dict[str, Any]] | None = None,
+    reference: MotionReference | None = None,
 ) -> int:
-    """Track the frames of *source* and write the results; *about* adds to the report what it returns."""
+    """Track the frames of *source* and write the results.
+
+    *about* adds to the report what it returns; the motion is compared with that of *reference*.
+    """
     if scale is not None and (source.has_depth or source.has_stereo):
         what, option = ("depth", "--no-depth") if source.has_depth else ("a pair of cameras", "--camera left")
         raise UsageError(
@@ -115,10 +122,15 @@ def map_source(
 
     _make_folder(args.out)
     frames = FrameTable()
-    mapper = asyncio.run(_drive(args, settings, source, scale, frames))
+    check = DriveCheck(is_wanted=args.check, is_thinned=args.rate is not None)
+    mapper = asyncio.run(_drive(args, settings, source, scale, frames, check))
     report = mapper.save(args.out)
+    checked = check.finish(reference)
     if about is not None:
         report = {**report, **about(mapper.trajectory)}
+    if checked is not None:
+        report["check"] = checked
+    if about is not None or checked is not None:
         replace_file(args.out / "report.json", (json.dumps(report, indent=2) + "\n").encode())
     frames.write(args.out / FRAMES_FILE)
     points, colours = mapper.map.points()
@@ -135,6 +147,7 @@ def map_source(
         f"{report['map_points']} points; path {report['path']:.2f} {unit}; scale: {mapper.scale}"
         + ("" if trip is None else f"; round trip p50 {trip} ms"),
         *frames.lines(),
+        *check.lines(checked),
         f"results: {args.out}/map.ply, map.png, trajectory.txt, {FRAMES_FILE}, report.json",
     )
     if posed <= (1 - _MOST) * report["frames"]:
@@ -193,6 +206,7 @@ async def _drive(
     source: FrameSource,
     scale: Any,
     frames: FrameTable,
+    check: DriveCheck,
 ) -> Mapper:
     """Track all frames; Ctrl-C ends the drive, and what was mapped is kept."""
     from client_sdk.slots import load_features
@@ -209,6 +223,7 @@ async def _drive(
                 break
             tracked = await mapper.track(frame)
             frames.add(tracked)
+            await asyncio.to_thread(check.add, frame, tracked)
             status.show(mapper, tracked)
         status.end()
     if not mapper.frames:

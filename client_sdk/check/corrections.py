@@ -1,0 +1,45 @@
+"""Apply to the intrinsics of a camera what a check found for certain."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+
+from client_sdk.check.findings import FaultKind, Finding
+from client_sdk.rigs.intrinsics import Intrinsics
+from rse_pf.geometry import Camera
+
+__all__ = ["corrected"]
+
+_CAMERA = ("fx", "fy", "cx", "cy")
+_LENS = ("k1", "k2", "p1", "p2", "k3")
+
+
+def corrected(intrinsics: Intrinsics, findings: Iterable[Finding]) -> tuple[Intrinsics, tuple[str, ...]]:
+    """Return intrinsics with the corrections of *findings*, and what was changed, for people.
+
+    Distortion is corrected where there was none: that of a lens which is undistorted already would have to be
+    composed with what is left.
+    """
+    changed: list[str] = []
+    camera, lens = intrinsics.camera, intrinsics.distortion
+    values = {name: getattr(camera, name) for name in _CAMERA}
+    scale = intrinsics.depth_scale
+    for finding in findings:
+        if not finding.is_certain:
+            continue
+        for name in _CAMERA:
+            if name in finding.correction:
+                changed.append(f"{name} {values[name]:.2f} to {finding.correction[name]:.2f}")
+                values[name] = finding.correction[name]
+        if any(name in finding.correction for name in _LENS) and not any(lens):
+            lens = tuple(finding.correction.get(name, 0.0) for name in _LENS)
+            changed.append("distortion none to " + ", ".join(f"{each:.4f}" for each in lens))
+        if finding.kind is FaultKind.DEPTH_SCALE:
+            right = scale / (1.0 + finding.value)
+            changed.append(f"depth_scale {scale:.6g} to {right:.6g}")
+            scale = right
+    made = Camera(**values, width=camera.width, height=camera.height)
+    # What the calibration said of its error is not true of other numbers.
+    same = replace(intrinsics, rms_px=None, views=None) if changed else intrinsics
+    return replace(same, camera=made, distortion=lens, depth_scale=scale), tuple(changed)

@@ -1,0 +1,109 @@
+"""Watch a drive frame by frame, and say at its end what is wrong with it.
+
+Small things only are kept: figures of images and poses.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from client_sdk.check.findings import CannotTell, CheckReport, FaultKind, Finding, order
+from client_sdk.check.images import FrameStatistics
+from client_sdk.check.motion import MotionReference, check_imu, check_motion, nothing_to_compare
+from client_sdk.frontend import Frame, TrackedFrame
+from client_sdk.imu.history import ImuHistory
+from client_sdk.rigs.checks import PairFault
+from rse_pf.geometry import Array
+
+__all__ = ["DriveObserver"]
+
+
+class DriveObserver:
+    """Take all frames of a drive in order, with what was tracked of them, and judge them together."""
+
+    def __init__(self, reference: MotionReference | None = None, *, is_thinned: bool = False) -> None:
+        """Start without frames.
+
+        Args:
+            reference: An odometry or truth, which may be set later, before `finish`.
+            is_thinned: Whether frames were left out on purpose.
+        """
+        self.reference = reference
+        self._images = FrameStatistics(is_thinned=is_thinned)
+        self._history: ImuHistory | None = None
+        self._poses: list[tuple[float, Array, int]] = []
+        self._has_depth = self._has_stereo = self._is_metric = False
+        self._pair_fault: PairFault | None = None
+
+    def add(self, frame: Frame, tracked: TrackedFrame | None = None) -> None:
+        """Look at the next frame; *tracked* has the pose that a mapper gave it, if there is one.
+
+        Raises:
+            MissingExtra: OpenCV is not installed.
+        """
+        self._images.add(frame.timestamp_s, frame.rgb)
+        self._has_stereo |= frame.stereo is not None
+        self._has_depth |= frame.stereo is None and bool(frame.depth_m[::16, ::16].any())
+        if frame.imu is not None and len(frame.imu):
+            self._history = self._history or ImuHistory(frame.imu.model)
+            self._history.add(frame.imu)
+        if tracked is not None and tracked.T_world_camera is not None:
+            self._is_metric = tracked.scale == "metric"
+            self._poses.append((frame.timestamp_s, tracked.T_world_camera, tracked.segment))
+
+    def add_pairs(self, fault: PairFault | None) -> None:
+        """Take what `client_sdk.rigs.checks.fault_of_pairs` found in stereo pairs of the drive."""
+        self._pair_fault = fault
+
+    def finish(self) -> CheckReport:
+        """Return what is wrong with the drive, worst first, and what it cannot tell."""
+        findings, untold = self._images.findings()
+        notes: list[str] = []
+        if self._pair_fault is not None:
+            findings.append(_of_pairs(self._pair_fault))
+        moved, cannot, noted = self._motion()
+        return CheckReport(
+            findings=order([*findings, *moved]),
+            cannot_tell=(*untold, *cannot),
+            frames=len(self._images),
+            notes=(*notes, *noted),
+        )
+
+    def _motion(self) -> tuple[list[Finding], list[CannotTell], list[str]]:
+        """Return what odometry, truth and IMU say of the motion."""
+        by_depth = self._has_depth or self._has_stereo
+        if self.reference is None and self._history is None:
+            return [], nothing_to_compare(has_depth=by_depth), []
+        if len(self._poses) < 2:
+            reason = "no pose was tracked to be compared with another motion"
+            return [], [CannotTell(FaultKind.STAMP_DELAY, reason), CannotTell(FaultKind.MIRRORED, reason)], []
+        order_s = np.argsort([each[0] for each in self._poses], kind="stable")
+        stamps_s = np.array([each[0] for each in self._poses])[order_s]
+        poses = np.array([each[1] for each in self._poses])[order_s]
+        segments = np.array([each[2] for each in self._poses])[order_s]
+        findings: list[Finding] = []
+        untold: list[CannotTell] = []
+        notes: list[str] = []
+        if self._history is not None:
+            findings, notes = check_imu(self._history, stamps_s, poses)
+        if self.reference is not None:
+            by_reference, untold = check_motion(
+                stamps_s, poses, self.reference, segments,
+                has_metres=by_depth and self._is_metric, has_stereo=self._has_stereo,
+            )  # fmt: skip
+            findings = [*findings, *by_reference]
+        elif by_depth:
+            untold.append(nothing_to_compare(has_depth=True)[-1])
+        return findings, untold, notes
+
+
+def _of_pairs(fault: PairFault) -> Finding:
+    """Return the finding of a rig that is wrong."""
+    kinds = {
+        "swapped": FaultKind.SWAPPED_CAMERAS, "late": FaultKind.STAMP_DELAY,
+        "rows": FaultKind.BASELINE,
+    }  # fmt: skip
+    return Finding(
+        kind=kinds[fault.what], value=fault.value, deviation=0.0, unit=fault.unit, cost_m=None,
+        sentence=fault.message, fix=fault.hint,
+    )  # fmt: skip

@@ -1,0 +1,222 @@
+"""Say what is wrong with a drive: calibration, depth, times, images, axes; by how much, and what to do.
+
+SOURCE is a recording, a ROS bag, a folder of images, a video, a device, or the results of a map that was
+checked while it was made.  The whole of it is tracked here; no platform is needed.  Findings are worst first;
+what this drive cannot tell is said with the reason.  The exit code is 1 if something is wrong.
+
+examples:
+  rse-pf check recordings/kitchen
+  rse-pf check kitchen.mcap --odometry odometry.txt --out out-check
+  rse-pf check video.mp4 --intrinsics intrinsics.json --write better.json
+  rse-pf check out-camera
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rse_pf.cli.drive_check import check_lines
+from rse_pf.cli.extras import require
+from rse_pf.cli.sensors import add_sensor_arguments
+from rse_pf.config import PlatformSettings
+from rse_pf.errors import UsageError
+from rse_pf.files import read_regular_file, replace_file
+from rse_pf.terminal import show, show_json, show_progress
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from client_sdk.check.findings import CheckReport
+    from client_sdk.check.motion import MotionReference
+    from client_sdk.frontend import Frame
+    from client_sdk.rigs.checks import PairFault
+    from client_sdk.rigs.intrinsics import Intrinsics
+
+__all__ = ["add_arguments", "run"]
+
+_MOST_LIVE = 3000
+"""A device is looked at for so many frames unless --frames says another number."""
+_MAX_REPORT_BYTES = 16 << 20
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    add = parser.add_argument
+    add("source", metavar="SOURCE", help="a recording, bag, folder, video, device, or results of a map")
+    add("--intrinsics", type=Path, metavar="FILE", help="of the camera, if the source has none of its own")
+    add(
+        "--odometry", type=Path, metavar="FILE",
+        help="compare the motion with this path (TUM format; default: the truth of the source)",
+    )  # fmt: skip
+    add_sensor_arguments(parser)
+    add("--no-depth", action="store_true", help="use the colours only")
+    add("--frames", type=int, metavar="N", help="stop after so many frames")
+    add(
+        "--write",
+        type=Path,
+        metavar="FILE",
+        help="write intrinsics.json with the corrections that are certain",
+    )
+    add("--out", type=Path, metavar="DIR", help="write report.json to this folder")
+    add("--json", action="store_true", help="print the report as JSON")
+
+
+def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
+    """Check one drive; the exit code is 1 if something is wrong with it."""
+    if args.frames is not None and args.frames < 2:
+        raise UsageError(f"--frames {args.frames} is below 2", hint="leave it out to look at all frames")
+    if args.write is not None and not args.write.absolute().parent.is_dir():
+        raise UsageError(f"there is no folder {args.write.absolute().parent}", hint="create it")
+    results = Path(args.source) / "report.json"
+    if results.is_file() and (Path(args.source) / "trajectory.txt").is_file():
+        return _show_results(args, results)
+    require("check")
+    if args.out is not None:
+        try:
+            args.out.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise UsageError(
+                f"cannot make {args.out}: {error.strerror}", hint="name another --out"
+            ) from error
+    report, own = _checked(args, settings)
+    told = report.to_dict()
+    if args.out is not None:
+        replace_file(args.out / "report.json", (json.dumps(told, indent=2) + "\n").encode())
+    written = [] if args.write is None else _write(args.write, report, own)
+    if args.json:
+        show_json(told, indent=2)
+    else:
+        show(*check_lines(told, is_whole=True), *written)
+    return 1 if report.findings else 0
+
+
+def _show_results(args: argparse.Namespace, file: Path) -> int:
+    """Show what was found while a map was made: its results have no images."""
+    try:
+        told = json.loads(read_regular_file(file, _MAX_REPORT_BYTES)).get("check")
+    except (OSError, ValueError, AttributeError) as error:
+        raise UsageError(f"{file} is not a report of a map", hint="check the recording itself") from error
+    if not isinstance(told, dict):
+        raise UsageError(
+            f"{args.source} was not checked while it was made, and its results have no images",
+            hint="check the recording itself, or make the map without --no-check",
+        )
+    if args.write is not None or args.out is not None:
+        raise UsageError("results of a map are shown only", hint="check the recording for --write and --out")
+    if args.json:
+        show_json(told, indent=2)
+    else:
+        show(*check_lines(told, is_whole=True))
+    return 1 if told.get("findings") else 0
+
+
+def _checked(args: argparse.Namespace, settings: PlatformSettings) -> tuple[CheckReport, Intrinsics]:
+    """Track the source, and return what is wrong with it and the intrinsics that it has now."""
+    from client_sdk.bags import is_bag
+    from client_sdk.cameras import open_camera
+    from client_sdk.cameras.open_camera import is_recording
+    from client_sdk.datasets import open_dataset
+    from client_sdk.rigs.intrinsics import Intrinsics
+
+    path = Path(args.source)
+    if not (path.exists() and (is_recording(path) or is_bag(path) or (path / "rgb.txt").is_file())):
+        reference = None if args.odometry is None else _odometry(args.odometry)
+        with open_camera(
+            args.source, intrinsics=args.intrinsics, depth=not args.no_depth, camera=args.camera, imu=args.imu
+        ) as source:
+            most = args.frames or (_MOST_LIVE if str(args.source).isdigit() else None)
+            report = _watched(source, settings, reference, None, has_depth=source.has_depth, most=most)
+            return report, _base(args, Intrinsics(camera=source.camera))
+    dataset = open_dataset(path, camera=args.camera, imu=args.imu)
+    show(*(f"note: {note}" for note in dataset.notes), error=True)
+    fault: PairFault | None = None
+    if dataset.has_stereo:
+        from client_sdk.rigs.checks import fault_of_pairs, spread_pairs
+
+        fault = fault_of_pairs(spread_pairs(dataset.rows, dataset.read))
+    if args.odometry is not None:
+        reference = _odometry(args.odometry)
+    else:
+        reference = _truth(dataset, is_camera=not is_bag(path))
+    has_depth = dataset.has_depth and not args.no_depth
+    report = _watched(iter(dataset), settings, reference, fault, has_depth=has_depth, most=args.frames)
+    return report, _base(args, Intrinsics(camera=dataset.camera))
+
+
+def _truth(dataset: Any, *, is_camera: bool) -> MotionReference | None:
+    from client_sdk.check.motion import MotionReference
+
+    if dataset.truth is None or len(dataset.truth) < 2:
+        return None
+    name = "the truth" if dataset.truth_kind == "ground truth" else "the reference poses"
+    return MotionReference(path=dataset.truth, name=name, is_camera=is_camera)
+
+
+def _odometry(path: Path) -> MotionReference:
+    from client_sdk.check.motion import MotionReference
+    from client_sdk.mapping import read_trajectory
+
+    read = read_trajectory(path)
+    if len(read) < 2:
+        raise UsageError(f"{path} holds {len(read)} poses", hint="a motion needs 2 or more")
+    return MotionReference(path=read, is_camera=False)
+
+
+def _watched(
+    frames: Iterator[Frame],
+    settings: PlatformSettings,
+    reference: MotionReference | None,
+    fault: PairFault | None,
+    *,
+    has_depth: bool,
+    most: int | None,
+) -> CheckReport:
+    """Track all frames in this process, and return what is wrong with them."""
+    from client_sdk.check.observer import DriveObserver
+    from client_sdk.mapper import Mapper
+    from rse_pf.experiments.compare.solvers import InProcessSolver
+
+    observer = DriveObserver(reference)
+    observer.add_pairs(fault)
+    mapper = Mapper(ask=InProcessSolver(settings).ask, depth=has_depth, adds_frames=False)
+
+    async def drive() -> None:
+        for count, frame in enumerate(frames, 1):
+            observer.add(frame, await mapper.track(frame))
+            if count % 10 == 0:
+                show_progress(f"{count} frames, {mapper.lost_frames} lost", is_over=False)
+            if most is not None and count >= most:
+                break
+
+    asyncio.run(drive())
+    show_progress("", is_over=False)
+    if not mapper.frames:
+        raise UsageError("the source gives no frame", hint="look at it: rse-pf camera check SOURCE")
+    return observer.finish()
+
+
+def _base(args: argparse.Namespace, seen: Intrinsics) -> Intrinsics:
+    """Return the intrinsics that corrections apply to: those of the user or the folder, else *seen*."""
+    from client_sdk.rigs.intrinsics import Intrinsics
+    from client_sdk.rigs.rig_file import read_calibration
+
+    own = Path(args.source) / "intrinsics.json"
+    file = args.intrinsics or (own if own.is_file() else None)
+    known = None if file is None else read_calibration(file)
+    return known if isinstance(known, Intrinsics) else seen
+
+
+def _write(file: Path, report: CheckReport, own: Intrinsics) -> list[str]:
+    """Write the intrinsics with what is certain, and return what was changed."""
+    from client_sdk.check.corrections import corrected
+    from client_sdk.rigs.intrinsics import write_intrinsics
+
+    intrinsics, changes = corrected(own, report.findings)
+    if not changes:
+        return [f"{file} was not written: no finding changes intrinsics"]
+    write_intrinsics(file, intrinsics)
+    return [f"{file}: {', '.join(changes)}"]

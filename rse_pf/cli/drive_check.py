@@ -1,0 +1,90 @@
+"""The check of a drive beside the commands that make maps: it costs little, and never fails them."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, TypeVar
+
+if TYPE_CHECKING:
+    from client_sdk.check.motion import MotionReference
+    from client_sdk.check.observer import DriveObserver
+    from client_sdk.frontend import Frame, TrackedFrame
+
+__all__ = ["DriveCheck", "add_check_argument", "check_lines"]
+
+_T = TypeVar("_T")
+
+
+def add_check_argument(parser: argparse.ArgumentParser) -> None:
+    """Declare ``--no-check``."""
+    parser.add_argument(
+        "--no-check", dest="check", action="store_false", help="do not check calibration, times and images"
+    )
+
+
+def check_lines(told: Mapping[str, Any], *, is_whole: bool = False) -> list[str]:
+    """Return a report for people: each finding with its fix; *is_whole* adds cost and what cannot be told."""
+    findings: Sequence[Mapping[str, Any]] = told.get("findings") or []
+    untold: Sequence[Mapping[str, Any]] = told.get("cannot_tell") or []
+    lines = []
+    for each in findings:
+        cost = each.get("cost")
+        bends = "" if cost is None else f"; it bends the path by about {100 * cost:.1f} cm"
+        lines.append(f"check: {each.get('sentence')}{bends}; {each.get('fix')}")
+    kinds = sorted({str(each.get("kind")) for each in untold})
+    if not findings:
+        vague = "" if is_whole or not kinds else f"; this drive cannot tell {', '.join(kinds)}"
+        lines.append(f"check: nothing wrong found in {told.get('frames')} frames{vague}")
+    if is_whole:
+        lines += [f"cannot tell {each.get('kind')}: {each.get('reason')}" for each in untold]
+        lines += [f"note: {each}" for each in told.get("notes") or []]
+    return lines
+
+
+class DriveCheck:
+    """A `DriveObserver` whose errors end the check and nothing else."""
+
+    def __init__(self, *, is_wanted: bool, is_thinned: bool = False) -> None:
+        self._observer: DriveObserver | None = None
+        self._failed = ""
+        if is_wanted:
+            self._observer = self._tried(lambda: _observer(is_thinned=is_thinned))
+
+    def add(self, frame: Frame, tracked: TrackedFrame) -> None:
+        """Look at the next frame."""
+        observer = self._observer
+        if observer is not None:
+            self._tried(lambda: observer.add(frame, tracked))
+
+    def finish(self, reference: MotionReference | None = None) -> dict[str, Any] | None:
+        """Return what ``report.json`` holds of the check; None if it was not wanted."""
+        observer = self._observer
+        if observer is not None:
+            observer.reference = reference
+            report = self._tried(observer.finish)
+            if report is not None:
+                return report.to_dict()
+        return {"failed": self._failed} if self._failed else None
+
+    @staticmethod
+    def lines(told: Mapping[str, Any] | None) -> list[str]:
+        """Return the short form of what `finish` returned."""
+        if told is None:
+            return []
+        failed = told.get("failed")
+        return [f"check: it failed ({failed}); --no-check leaves it out"] if failed else check_lines(told)
+
+    def _tried(self, work: Callable[[], _T]) -> _T | None:
+        try:
+            return work()
+        except Exception as error:  # noqa: BLE001  a check must not cost the map that was driven
+            self._failed = f"{type(error).__name__}: {error}".splitlines()[0][:200]
+            self._observer = None
+            return None
+
+
+def _observer(*, is_thinned: bool) -> DriveObserver:
+    from client_sdk.check.observer import DriveObserver
+
+    return DriveObserver(is_thinned=is_thinned)

@@ -1,0 +1,129 @@
+"""The verb check: findings with fixes, corrections, reports, and what results of a map say."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+import pytest
+
+from client_sdk.check.corrections import corrected
+from client_sdk.check.findings import FaultKind, Finding
+from client_sdk.rigs.intrinsics import Intrinsics
+from rse_pf.cli.drive_check import DriveCheck, add_check_argument, check_lines
+from rse_pf.cli.main import main
+from rse_pf.geometry import Camera
+
+CAMERA = Camera(fx=500.0, fy=500.0, cx=320.0, cy=240.0, width=640, height=480)
+
+
+def finding(kind: FaultKind, value: float, deviation: float = 0.001, **correction: float) -> Finding:
+    return Finding(
+        kind=kind, value=value, deviation=deviation, unit="relative", cost_m=0.2, sentence="it is off",
+        fix="set it", correction=correction,
+    )  # fmt: skip
+
+
+def test_what_is_certain_corrects_the_intrinsics_and_nothing_else_does() -> None:
+    own = Intrinsics(camera=CAMERA, depth_scale=5000.0, rms_px=0.3, views=20)
+
+    made, changes = corrected(
+        own,
+        [
+            finding(FaultKind.DEPTH_SCALE, 4.0),
+            finding(FaultKind.FOCAL_LENGTH, 0.1, fx=454.5),
+            finding(FaultKind.PRINCIPAL_POINT, 0.1, deviation=0.1, cx=999.0),
+        ],
+    )
+
+    assert (made.depth_scale, made.camera.fx, made.camera.cx) == (1000.0, 454.5, 320.0)
+    assert made.rms_px is None
+    assert len(changes) == 2
+
+
+def test_distortion_is_not_added_to_that_of_a_lens() -> None:
+    bent = Intrinsics(camera=CAMERA, distortion=(0.1, 0.0, 0.0, 0.0))
+    found = [finding(FaultKind.DISTORTION, -0.1, k1=-0.1)]
+
+    assert corrected(bent, found) == (bent, ())
+    assert corrected(Intrinsics(camera=CAMERA), found)[0].distortion[0] == -0.1
+
+
+def test_lines_say_what_it_costs_and_what_to_do() -> None:
+    told = {"findings": [finding(FaultKind.BLUR, 0.5).to_dict()], "cannot_tell": [], "frames": 9}
+
+    assert check_lines(told) == ["check: it is off; it bends the path by about 20.0 cm; set it"]
+
+
+def test_an_error_of_the_check_is_one_line_and_costs_no_map(monkeypatch: pytest.MonkeyPatch) -> None:
+    check = DriveCheck(is_wanted=True)
+    check.add(None, None)  # type: ignore[arg-type]  # a frame that it cannot read
+    told = check.finish()
+
+    (line,) = check.lines(told)
+    assert line.startswith("check: it failed (AttributeError")
+    assert "--no-check" in line
+
+
+def test_no_check_leaves_it_out() -> None:
+    parser = argparse.ArgumentParser()
+    add_check_argument(parser)
+    check = DriveCheck(is_wanted=parser.parse_args(["--no-check"]).check)
+
+    assert check.finish() is None
+    assert check.lines(None) == []
+
+
+def test_results_of_a_map_say_what_was_found(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "trajectory.txt").write_text("# none\n")
+    told = {"findings": [finding(FaultKind.BLUR, 0.5).to_dict()], "cannot_tell": [], "frames": 9}
+    (tmp_path / "report.json").write_text(json.dumps({"frames": 9, "check": told}))
+
+    assert main(["check", str(tmp_path)]) == 1
+    assert "it is off" in capsys.readouterr().out
+
+
+def test_results_that_were_not_checked_name_the_recording(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "trajectory.txt").write_text("# none\n")
+    (tmp_path / "report.json").write_text('{"frames": 9}')
+
+    assert main(["check", str(tmp_path)]) == 2
+    assert "check the recording itself" in capsys.readouterr().err
+
+
+def test_a_rendered_recording_with_a_wrong_depth_scale_is_corrected(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cv2 = pytest.importorskip("cv2")
+    import numpy as np
+
+    from client_sdk.mapping import write_trajectory
+    from client_sdk.simulator import render_frames, true_trajectory
+
+    (tmp_path / "rgb").mkdir()
+    (tmp_path / "depth").mkdir()
+    names = {"rgb": "", "depth": ""}
+    for row, frame in enumerate(render_frames(0, 1, 40, 3)):
+        images = {"rgb": frame.rgb[:, :, ::-1], "depth": np.uint16(np.rint(1000 * frame.depth_m))}
+        for kind, image in images.items():
+            cv2.imwrite(str(tmp_path / kind / f"{row:03}.png"), image)
+            names[kind] += f"{frame.timestamp_s:.4f} {kind}/{row:03}.png\n"
+    for kind, lines in names.items():
+        (tmp_path / f"{kind}.txt").write_text(lines)
+    write_trajectory(tmp_path / "groundtruth.txt", true_trajectory(0, 1, 40, 3))
+    camera = {"fx": 525, "fy": 525, "cx": 319.5, "cy": 239.5, "width": 640, "height": 480}
+    (tmp_path / "intrinsics.json").write_text(json.dumps({**camera, "depth_scale": 1100}))
+
+    code = main(
+        ["check", str(tmp_path), "--out", str(tmp_path / "out"), "--write", str(tmp_path / "better.json")]
+    )
+
+    report = json.loads((tmp_path / "out/report.json").read_text())
+    assert code == 1
+    assert report["findings"][0]["kind"] == "depth_scale"
+    assert report["findings"][0]["value"] == pytest.approx(0.1, abs=0.02)
+    assert json.loads((tmp_path / "better.json").read_text())["depth_scale"] == pytest.approx(1000, rel=0.02)
+    assert "depth scale is set" in capsys.readouterr().out
