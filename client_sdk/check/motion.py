@@ -34,7 +34,7 @@ _BETTER, _ALIKE, _DEVIATIONS = 0.5, 1.2, 3.0
 _FITS_WELL = 0.15
 """Axes are judged where a rotation, or a mirror, leaves less than this share."""
 _TURNED_DEG, _NEAR_AXES_DEG = 20.0, 15.0
-_SEGMENT_M, _SEGMENT_S, _FEWEST_SEGMENTS = 0.25, 6.0, 12
+_SEGMENT_M, _SEGMENT_S, _FEWEST_SEGMENTS, _FEWEST_ADJUSTED = 0.25, 6.0, 12, 16
 _ARM_M, _CAMERA_ARM_M = 0.5, 0.02
 _LEAST_SCALE = 0.01
 _OUTLIER = 4.0
@@ -89,6 +89,7 @@ def check_motion(
     *,
     has_metres: bool = True,
     has_stereo: bool = False,
+    adjusted: tuple[Array, Array] | None = None,
 ) -> tuple[list[Finding], list[CannotTell]]:
     """Return what is wrong with the motion of a camera beside *reference*, and what cannot be told.
 
@@ -99,6 +100,8 @@ def check_motion(
         segments: ``(n,)``; poses of different segments are not compared.  None for one segment.
         has_metres: Whether the poses are in metres by a depth that can be wrong, not up to scale.
         has_stereo: Whether that depth is of a pair of cameras, with a baseline.
+        adjusted: ``(k,)`` stamps and ``(k, 4, 4)`` poses of keyframes, adjusted with the calibration:
+            metres are compared by them, since a wrong lens bends the others.
     """
     pairs = _pairs(stamps_s, segments)
     least_s, most_s = reference.path.timestamps_s.min(), reference.path.timestamps_s.max()
@@ -120,14 +123,12 @@ def check_motion(
     findings += axes
     untold += vague
     if has_metres and not any(each.kind is FaultKind.MIRRORED for each in axes):
+        by_keyframes = adjusted is not None and len(adjusted[0]) >= _FEWEST_ADJUSTED
+        own_s, poses = adjusted if by_keyframes and adjusted is not None else (stamps_s, T_world_camera)
         scale, vague = _scale(
-            stamps_s - _DELAYS_S[best],
-            T_world_camera,
-            segments,
-            reference,
-            fits[best].rotation,
-            has_stereo=has_stereo,
-        )
+            own_s - _DELAYS_S[best], poses, None if by_keyframes else segments, reference,
+            fits[best].rotation, has_stereo=has_stereo,
+        )  # fmt: skip
         findings += scale
         untold += vague
     return findings, untold

@@ -1,14 +1,16 @@
 """Watch a drive frame by frame, and say at its end what is wrong with it.
 
-Small things only are kept: figures of images and poses.
+Small things only are kept: figures of images, poses, features of some frames and depths around them.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
+from client_sdk.check.calibration import CalibrationJudgement, judge_calibration
 from client_sdk.check.findings import CannotTell, CheckReport, FaultKind, Finding, order
 from client_sdk.check.images import FrameStatistics
+from client_sdk.check.keyframes import KeyframeStore
 from client_sdk.check.motion import MotionReference, check_imu, check_motion, nothing_to_compare
 from client_sdk.frontend import Frame, TrackedFrame
 from client_sdk.imu.history import ImuHistory
@@ -16,6 +18,9 @@ from client_sdk.rigs.checks import PairFault
 from rse_pf.geometry import Array
 
 __all__ = ["DriveObserver"]
+
+_HIDING = {FaultKind.MIRRORED, FaultKind.TWO_CAMERAS}
+"""While the calibration has one of these, the tracked motion is not that of the camera."""
 
 
 class DriveObserver:
@@ -29,6 +34,7 @@ class DriveObserver:
             is_thinned: Whether frames were left out on purpose.
         """
         self.reference = reference
+        self._store = KeyframeStore()
         self._images = FrameStatistics(is_thinned=is_thinned)
         self._history: ImuHistory | None = None
         self._poses: list[tuple[float, Array, int]] = []
@@ -42,6 +48,7 @@ class DriveObserver:
             MissingExtra: OpenCV is not installed.
         """
         self._images.add(frame.timestamp_s, frame.rgb)
+        self._store.add(frame, None if tracked is None else tracked.T_world_camera)
         self._has_stereo |= frame.stereo is not None
         self._has_depth |= frame.stereo is None and bool(frame.depth_m[::16, ::16].any())
         if frame.imu is not None and len(frame.imu):
@@ -58,22 +65,32 @@ class DriveObserver:
     def finish(self) -> CheckReport:
         """Return what is wrong with the drive, worst first, and what it cannot tell."""
         findings, untold = self._images.findings()
-        notes: list[str] = []
+        calibration = judge_calibration(self._store)
+        findings += calibration.findings
+        untold += calibration.cannot_tell
         if self._pair_fault is not None:
             findings.append(_of_pairs(self._pair_fault))
-        moved, cannot, noted = self._motion()
+        moved, cannot, noted = self._motion(calibration)
         return CheckReport(
-            findings=order([*findings, *moved]),
+            findings=order([*findings, *moved], calibration.noise_m),
             cannot_tell=(*untold, *cannot),
             frames=len(self._images),
-            notes=(*notes, *noted),
+            notes=tuple(noted),
         )
 
-    def _motion(self) -> tuple[list[Finding], list[CannotTell], list[str]]:
+    def _motion(self, calibration: CalibrationJudgement) -> tuple[list[Finding], list[CannotTell], list[str]]:
         """Return what odometry, truth and IMU say of the motion."""
         by_depth = self._has_depth or self._has_stereo
         if self.reference is None and self._history is None:
             return [], nothing_to_compare(has_depth=by_depth), []
+        hidden = _HIDING & {each.kind for each in order(calibration.findings)}
+        if hidden:
+            reason = f"{min(each.value for each in hidden)} bends the motion that would be compared"
+            return (
+                [],
+                [CannotTell(FaultKind.STAMP_DELAY, reason), CannotTell(FaultKind.DEPTH_SCALE, reason)],
+                [],
+            )
         if len(self._poses) < 2:
             reason = "no pose was tracked to be compared with another motion"
             return [], [CannotTell(FaultKind.STAMP_DELAY, reason), CannotTell(FaultKind.MIRRORED, reason)], []
@@ -90,6 +107,7 @@ class DriveObserver:
             by_reference, untold = check_motion(
                 stamps_s, poses, self.reference, segments,
                 has_metres=by_depth and self._is_metric, has_stereo=self._has_stereo,
+                adjusted=(calibration.stamps_s, calibration.T_world_camera),
             )  # fmt: skip
             findings = [*findings, *by_reference]
         elif by_depth:
