@@ -13,6 +13,7 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -23,7 +24,7 @@ from client_sdk.imu.history import ImuHistory
 from client_sdk.mapping import Trajectory
 from rse_pf.geometry import Array, inverse, log_se3, rotation_angle_deg
 
-__all__ = ["MotionReference", "check_imu", "check_motion", "nothing_to_compare"]
+__all__ = ["CameraMotion", "MotionReference", "check_imu", "check_motion", "nothing_to_compare"]
 
 _LEAST_STEP_S, _LONGEST_STEP_S = 0.45, 1.0
 _MOST_PAIRS, _FEWEST_PAIRS, _BLOCKS = 600, 20, 10
@@ -81,28 +82,29 @@ def check_imu(history: ImuHistory, stamps_s: Array, T_world_camera: Array) -> tu
     return _imu_findings(check), [f"IMU: {check.trouble}"] if check.trouble and not check.fault else []
 
 
-def check_motion(
-    stamps_s: Array,
-    T_world_camera: Array,
-    reference: MotionReference,
-    segments: Array | None = None,
-    *,
-    has_metres: bool = True,
-    has_stereo: bool = False,
-    adjusted: tuple[Array, Array] | None = None,
-) -> tuple[list[Finding], list[CannotTell]]:
-    """Return what is wrong with the motion of a camera beside *reference*, and what cannot be told.
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class CameraMotion:
+    """How a camera moved.
 
-    Args:
+    Attributes:
         stamps_s: ``(n,)``, ascending.
         T_world_camera: ``(n, 4, 4)``, as they were tracked.
-        reference: What it is compared with.
         segments: ``(n,)``; poses of different segments are not compared.  None for one segment.
-        has_metres: Whether the poses are in metres by a depth that can be wrong, not up to scale.
-        has_stereo: Whether that depth is of a pair of cameras, with a baseline.
-        adjusted: ``(k,)`` stamps and ``(k, 4, 4)`` poses of keyframes, adjusted with the calibration:
-            metres are compared by them, since a wrong lens bends the others.
+        metres: Where metres come from that can be wrong; ``none`` up to scale.
+        adjusted: ``(k,)`` stamps and ``(k, 4, 4)`` poses of keyframes, adjusted with the calibration: metres
+            are compared by them, since a wrong lens bends the others.
     """
+
+    stamps_s: Array
+    T_world_camera: Array
+    segments: Array | None = None
+    metres: Literal["depth", "stereo", "none"] = "depth"
+    adjusted: tuple[Array, Array] | None = None
+
+
+def check_motion(motion: CameraMotion, reference: MotionReference) -> tuple[list[Finding], list[CannotTell]]:
+    """Return what is wrong with the motion of a camera beside *reference*, and what cannot be told."""
+    stamps_s, T_world_camera, segments = motion.stamps_s, motion.T_world_camera, motion.segments
     pairs = _pairs(stamps_s, segments)
     least_s, most_s = reference.path.timestamps_s.min(), reference.path.timestamps_s.max()
     covered = (stamps_s[pairs[:, 0]] - _MOST_DELAY_S >= least_s) & (
@@ -122,13 +124,14 @@ def check_motion(
     axes, vague = _axes(fits[best], reference)
     findings += axes
     untold += vague
-    if has_metres and not any(each.kind is FaultKind.MIRRORED for each in axes):
-        by_keyframes = adjusted is not None and len(adjusted[0]) >= _FEWEST_ADJUSTED
-        own_s, poses = adjusted if by_keyframes and adjusted is not None else (stamps_s, T_world_camera)
-        scale, vague = _scale(
-            own_s - _DELAYS_S[best], poses, None if by_keyframes else segments, reference,
-            fits[best].rotation, has_stereo=has_stereo,
-        )  # fmt: skip
+    if motion.metres != "none" and not any(each.kind is FaultKind.MIRRORED for each in axes):
+        moved_s, poses = stamps_s, T_world_camera
+        if motion.adjusted is not None and len(motion.adjusted[0]) >= _FEWEST_ADJUSTED:
+            (moved_s, poses), segments = motion.adjusted, None
+        by_metres = CameraMotion(
+            stamps_s=moved_s - _DELAYS_S[best], T_world_camera=poses, segments=segments, metres=motion.metres
+        )
+        scale, vague = _scale(by_metres, reference, fits[best].rotation)
         findings += scale
         untold += vague
     return findings, untold
@@ -349,15 +352,10 @@ def _named_axes(rotation: Array) -> str:
 
 
 def _scale(
-    stamps_s: Array,
-    T_world_camera: Array,
-    segments: Array | None,
-    reference: MotionReference,
-    rotation: Array,
-    *,
-    has_stereo: bool,
+    motion: CameraMotion, reference: MotionReference, rotation: Array
 ) -> tuple[list[Finding], list[CannotTell]]:
     """Return by how much metres of the camera differ from those of the reference."""
+    stamps_s, T_world_camera, segments = motion.stamps_s, motion.T_world_camera, motion.segments
     path = reference.path
     inside = (stamps_s >= path.timestamps_s.min()) & (stamps_s <= path.timestamps_s.max())
     rows = _segments(stamps_s, path.at(stamps_s)[:, :3, 3], segments, inside)
@@ -387,7 +385,7 @@ def _scale(
     positions = path.at(stamps_s[inside])[:, :3, 3]
     reach_m = float(np.sqrt(np.square(positions - positions.mean(axis=0)).sum(axis=1).mean()))
     cost_m = abs(1.0 / scale - 1.0) * reach_m
-    if has_stereo:
+    if motion.metres == "stereo":
         # Metres of a pair grow with its baseline, those of a depth image shrink with its scale.
         sentence = f"the baseline is set {_times(1.0 / scale, deviation / scale**2)} beside {reference.name}"
         finding = Finding(

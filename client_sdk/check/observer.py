@@ -5,13 +5,21 @@ Small things only are kept: figures of images, poses, features of some frames an
 
 from __future__ import annotations
 
+from typing import Literal
+
 import numpy as np
 
 from client_sdk.check.calibration import CalibrationJudgement, judge_calibration
 from client_sdk.check.findings import CannotTell, CheckReport, FaultKind, Finding, order
 from client_sdk.check.images import FrameStatistics
 from client_sdk.check.keyframes import KeyframeStore
-from client_sdk.check.motion import MotionReference, check_imu, check_motion, nothing_to_compare
+from client_sdk.check.motion import (
+    CameraMotion,
+    MotionReference,
+    check_imu,
+    check_motion,
+    nothing_to_compare,
+)
 from client_sdk.frontend import Frame, TrackedFrame
 from client_sdk.imu.history import ImuHistory
 from client_sdk.rigs.checks import PairFault
@@ -104,15 +112,20 @@ class DriveObserver:
         if self._history is not None:
             findings, notes = check_imu(self._history, stamps_s, poses)
         if self.reference is not None:
-            by_reference, untold = check_motion(
-                stamps_s, poses, self.reference, segments,
-                has_metres=by_depth and self._is_metric, has_stereo=self._has_stereo,
+            motion = CameraMotion(
+                stamps_s=stamps_s, T_world_camera=poses, segments=segments, metres=self._metres(),
                 adjusted=(calibration.stamps_s, calibration.T_world_camera),
             )  # fmt: skip
+            by_reference, untold = check_motion(motion, self.reference)
             findings = [*findings, *by_reference]
         elif by_depth:
             untold.append(nothing_to_compare(has_depth=True)[-1])
         return findings, untold, notes
+
+    def _metres(self) -> Literal["depth", "stereo", "none"]:
+        if not self._is_metric or not (self._has_depth or self._has_stereo):
+            return "none"
+        return "stereo" if self._has_stereo else "depth"
 
 
 def _of_pairs(fault: PairFault) -> Finding:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from client_sdk.check.findings import FaultKind, Finding
-from client_sdk.check.motion import MotionReference, check_imu, check_motion, nothing_to_compare
+from client_sdk.check.motion import CameraMotion, MotionReference, check_imu, check_motion, nothing_to_compare
 from client_sdk.imu.history import ImuHistory
 from client_sdk.imu.samples import ImuModel
 from client_sdk.mapping import Trajectory
@@ -40,7 +40,10 @@ def odometry() -> Trajectory:
 
 def found(T: Array, path: Trajectory | None = None, **changed: bool) -> dict[FaultKind, Finding]:
     reference = MotionReference(path=path or odometry(), **changed)
-    return {each.kind: each for each in check_motion(stamps(), T, reference)[0]}
+    return {
+        each.kind: each
+        for each in check_motion(CameraMotion(stamps_s=stamps(), T_world_camera=T), reference)[0]
+    }
 
 
 def test_a_healthy_drive_has_no_finding() -> None:
@@ -95,7 +98,9 @@ def test_a_drive_at_one_speed_without_turns_tells_no_delay() -> None:
 
     noise = rng.standard_normal((len(stamps_s), 6)) * np.repeat((1e-3, 5e-4), 3)
     reference = MotionReference(path=Trajectory(known_s, straight(known_s)))
-    findings, untold = check_motion(stamps_s, straight(stamps_s) @ exp_se3(noise), reference)
+    findings, untold = check_motion(
+        CameraMotion(stamps_s=stamps_s, T_world_camera=straight(stamps_s) @ exp_se3(noise)), reference
+    )
 
     assert findings == []
     assert {FaultKind.STAMP_DELAY, FaultKind.MIRRORED} <= {each.kind for each in untold}
@@ -106,7 +111,8 @@ def test_paths_that_have_nothing_in_common_are_not_compared() -> None:
     other = InertialDrive(MODEL, Motion(), seed=99).T_world_camera(known_s)
 
     findings, untold = check_motion(
-        stamps(), tracked(stamps()), MotionReference(path=Trajectory(known_s, other))
+        CameraMotion(stamps_s=stamps(), T_world_camera=tracked(stamps())),
+        MotionReference(path=Trajectory(known_s, other)),
     )
 
     assert findings == []
