@@ -57,6 +57,16 @@ class MotionReference:
     is_camera: bool = True
     scale_deviation: float = 0.004
 
+    @classmethod
+    def of_truth(
+        cls, path: Trajectory | None, kind: str, *, is_camera: bool = True
+    ) -> MotionReference | None:
+        """Return the true poses of a recording as a reference; None where there are none."""
+        if path is None or len(path) < 2:
+            return None
+        name = "the truth" if kind == "ground truth" else "the reference poses"
+        return cls(path=path, name=name, is_camera=is_camera)
+
 
 def nothing_to_compare(*, has_depth: bool) -> list[CannotTell]:
     """Return what a drive without odometry, truth and IMU cannot tell."""

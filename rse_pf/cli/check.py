@@ -17,9 +17,9 @@ import argparse
 import asyncio
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from rse_pf.cli.drive_check import check_lines
+from client_sdk.check.drive_check import check_lines
 from rse_pf.cli.extras import require
 from rse_pf.cli.sensors import add_sensor_arguments
 from rse_pf.config import PlatformSettings
@@ -119,6 +119,7 @@ def _checked(args: argparse.Namespace, settings: PlatformSettings) -> tuple[Chec
     from client_sdk.bags import is_bag
     from client_sdk.cameras import open_camera
     from client_sdk.cameras.open_camera import is_recording
+    from client_sdk.check.motion import MotionReference
     from client_sdk.datasets import open_dataset
     from client_sdk.rigs.intrinsics import Intrinsics
 
@@ -141,19 +142,10 @@ def _checked(args: argparse.Namespace, settings: PlatformSettings) -> tuple[Chec
     if args.odometry is not None:
         reference = _odometry(args.odometry)
     else:
-        reference = _truth(dataset, is_camera=not is_bag(path))
+        reference = MotionReference.of_truth(dataset.truth, dataset.truth_kind, is_camera=not is_bag(path))
     has_depth = dataset.has_depth and not args.no_depth
     report = _watched(iter(dataset), settings, reference, fault, has_depth=has_depth, most=args.frames)
     return report, _base(args, Intrinsics(camera=dataset.camera))
-
-
-def _truth(dataset: Any, *, is_camera: bool) -> MotionReference | None:
-    from client_sdk.check.motion import MotionReference
-
-    if dataset.truth is None or len(dataset.truth) < 2:
-        return None
-    name = "the truth" if dataset.truth_kind == "ground truth" else "the reference poses"
-    return MotionReference(path=dataset.truth, name=name, is_camera=is_camera)
 
 
 def _odometry(path: Path) -> MotionReference:

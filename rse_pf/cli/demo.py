@@ -18,7 +18,7 @@ import math
 from pathlib import Path
 
 from rse_pf.cli.extras import require
-from rse_pf.cli.sensors import add_sensor_arguments
+from rse_pf.cli.sensors import add_check_argument, add_sensor_arguments
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import UsageError
 from rse_pf.recording.writer import with_recordings
@@ -89,6 +89,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--record", type=Path, metavar="DIR",
         help="record what robots and servers say in DIR, for rse-pf replay (recording.folder)",
     )  # fmt: skip
+    add_check_argument(parser)
     parser.add_argument("--quiet", action="store_true", help="no progress bars")
 
 
@@ -155,5 +156,6 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
         merge=args.merge,
         live=args.live,
         quiet=args.quiet,
+        check=args.check,
     )
     return run_demo(options, settings)

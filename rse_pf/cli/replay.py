@@ -37,6 +37,8 @@ __all__ = ["add_arguments", "run"]
 
 _SHOWN, _IN_PAGE, _EXPLAINED_IN_JSON = 20, 5, 500
 _ENGINES = ("native", "poselib", "opencv")
+_OF_A_DRIVE = ("blur", "depth_scale", "intrinsics")
+"""Causes that ``rse-pf check`` judges over a whole drive."""
 _IDENTITY = re.compile(r"([0-9a-f]{16}:)?\d{1,16}")
 
 
@@ -153,7 +155,7 @@ def _show_overview(overview: Overview, args: argparse.Namespace) -> None:
             show(f"  and {overview.different - _SHOWN} more; --json lists them")
     bad = sum(overview.by_kind.values())
     if not bad:
-        show("nothing went wrong")
+        show("no command went wrong; whether calibration, times and images are right, rse-pf check says")
         return
     told = ", ".join(f"{count} {kind}" for kind, count in overview.by_kind.items())
     show("", f"went wrong: {told}; worst first:")
@@ -171,11 +173,21 @@ def _overview_json(overview: Overview) -> dict[str, Any]:
     import msgspec
 
     plain: dict[str, Any] = msgspec.to_builtins(overview)
-    explained: dict[str, Any] = plain.pop("causes")
+    explained: dict[str, list[dict[str, Any]]] = {
+        name: list(found) for name, found in plain.pop("causes").items()
+    }
     causes: dict[str, int] = {}
-    for found in overview.causes.values():
-        if found:
-            causes[found[0].cause] = causes.get(found[0].cause, 0) + 1
+    wrong = {trouble.id for trouble in overview.troubles}
+    for name, found in explained.items():
+        if name not in wrong and found:
+            # A pose that is right by its own evidence does not tell the calibration of a drive.
+            found[:] = [each for each in found if each["cause"] not in _OF_A_DRIVE]
+            likeliest = found[0]["cause"] if found else "none"
+        elif found:
+            likeliest = found[0]["cause"]
+        else:
+            continue
+        causes[likeliest] = causes.get(likeliest, 0) + 1
     ordered = sorted(causes, key=lambda each: (each == "none", -causes[each]))
     findings = [{"id": name, "causes": found} for name, found in explained.items()]
     return {**plain, "causes": ordered, "causes_count": causes, "findings": findings}

@@ -1,11 +1,11 @@
-"""The options that say which sensors of a recording are used: ``--camera`` and ``--imu``."""
+"""The options that say which sensors of a drive are used, and whether it is checked."""
 
 from __future__ import annotations
 
 import argparse
 from typing import Any
 
-__all__ = ["add_sensor_arguments"]
+__all__ = ["add_check_argument", "add_sensor_arguments"]
 
 
 def add_sensor_arguments(parser: argparse.ArgumentParser | argparse._ArgumentGroup) -> None:
@@ -19,3 +19,10 @@ def add_sensor_arguments(parser: argparse.ArgumentParser | argparse._ArgumentGro
         "--imu", action=argparse.BooleanOptionalAction, default=None,
         help="use the IMU, or do not (default: where there is one)",
     )  # fmt: skip
+
+
+def add_check_argument(parser: argparse.ArgumentParser) -> None:
+    """Declare ``--no-check``."""
+    parser.add_argument(
+        "--no-check", dest="check", action="store_false", help="do not check calibration, times and images"
+    )

@@ -9,10 +9,11 @@ from pathlib import Path
 import pytest
 
 from client_sdk.check.corrections import corrected
+from client_sdk.check.drive_check import DriveCheck, check_lines
 from client_sdk.check.findings import FaultKind, Finding
 from client_sdk.rigs.intrinsics import Intrinsics
-from rse_pf.cli.drive_check import DriveCheck, add_check_argument, check_lines
 from rse_pf.cli.main import main
+from rse_pf.cli.sensors import add_check_argument
 from rse_pf.geometry import Camera
 
 CAMERA = Camera(fx=500.0, fy=500.0, cx=320.0, cy=240.0, width=640, height=480)

@@ -134,9 +134,7 @@ def _from_bag(args: argparse.Namespace, settings: PlatformSettings) -> int:
                 **_errors(path, bag.truth, bag.truth_kind),
             }
 
-        reference = None
-        if bag.truth is not None and len(bag.truth) > 1:
-            reference = MotionReference(path=bag.truth, name="the poses of the bag", is_camera=False)
+        reference = MotionReference.of_truth(bag.truth, bag.truth_kind, is_camera=False)
         return map_source(args, settings, source, scale, about, reference)
 
 

@@ -17,9 +17,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
-from rse_pf.cli.drive_check import DriveCheck, add_check_argument
+from client_sdk.check.drive_check import DriveCheck
 from rse_pf.cli.maps.frame_table import FRAMES_FILE, FrameTable
-from rse_pf.cli.sensors import add_sensor_arguments
+from rse_pf.cli.sensors import add_check_argument, add_sensor_arguments
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import CommandFailed, UsageError
 from rse_pf.files import replace_file
@@ -97,7 +97,20 @@ def run_from_camera(args: argparse.Namespace, settings: PlatformSettings) -> int
         camera=args.camera,
         imu=args.imu,
     ) as source:
-        return map_source(args, settings, source, scale)
+        return map_source(args, settings, source, scale, reference=_reference(args))
+
+
+def _reference(args: argparse.Namespace) -> MotionReference | None:
+    """Return the true poses of a recording, for the check alone."""
+    from client_sdk.cameras.open_camera import is_recording
+    from client_sdk.check.motion import MotionReference
+    from client_sdk.datasets import open_dataset
+
+    path = Path(args.source)
+    if not args.check or not is_recording(path):
+        return None
+    recording = open_dataset(path, camera=args.camera, imu=args.imu)
+    return MotionReference.of_truth(recording.truth, recording.truth_kind)
 
 
 def map_source(

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from client_sdk.check.drive_check import DriveCheck
 from rse_pf.experiments.demo.robot import RobotFinished
 from rse_pf.experiments.results.live_error import live_lines, live_table
 from rse_pf.experiments.results.map_error import merged_lines, merged_table
@@ -115,6 +116,8 @@ def closing_lines(report: Mapping[str, Any], folder: Path) -> str:
         third = merged_lines(report["merged"])
         files = f"{shown}/map_merged.png, {shown}/merged.ply, "
         third += f"show the merged map: rse-pf map show merged --store dir:{shown}/platform/objects\n"
+    for name, told in report.get("checks", {}).items():
+        third += "".join(f"{name}: {line}\n" for line in DriveCheck.lines(told))
     if "live" in report:
         third += live_lines(report["live"], report["robots"])
     return (

@@ -18,6 +18,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from client_sdk.answers import PoseAnswer
+from client_sdk.check.drive_check import DriveCheck
+from client_sdk.check.motion import MotionReference
 from client_sdk.frontend import Frame, FrontEndOptions, PoseQuery, TrackedFrame
 from client_sdk.live import LiveMapper, LiveOptions
 from client_sdk.mapper import Mapper, ask_robot
@@ -67,6 +69,8 @@ class DemoOptions:
     merge: bool = False
     live: bool = False
     quiet: bool = False
+    check: bool = False
+    """Whether drives of a recording are checked."""
 
     @property
     def frame_count(self) -> int:
@@ -137,6 +141,8 @@ class RobotFinished:
     truth_kind: str
     stats: dict[str, Any] = field(default_factory=dict)
     is_metric: bool = True
+    check: dict[str, Any] | None = None
+    """What the check of the drive found; None if there was none."""
 
 
 @dataclass(slots=True)
@@ -158,6 +164,7 @@ class _Loaded:
     truth: Trajectory | None
     truth_kind: str
     has_depth: bool
+    is_thinned: bool = False
 
 
 def run_robot(spec: RobotSpec, pipe: Connection) -> None:
@@ -213,6 +220,9 @@ async def _run(spec: RobotSpec, pipe: ParentPipe) -> None:
             began = planned = await asyncio.to_thread(pipe.wait_start)
             collector = _collector(spec, pipe.token, lambda: drive.asking)
             recorder = LiveRecorder(shared, time.monotonic, began) if options.live else None
+            check = DriveCheck(
+                is_wanted=options.check and options.data is not None, is_thinned=loaded.is_thinned
+            )
             first_s = time.monotonic()
             waiting = iter(frames)
             following: asyncio.Future[Any] = asyncio.ensure_future(asyncio.to_thread(next, waiting, None))
@@ -228,6 +238,7 @@ async def _run(spec: RobotSpec, pipe: ParentPipe) -> None:
                 if done.T_world_camera is not None and collector is not None:
                     await asyncio.to_thread(collector.add, done)
                 drive.tracked.append(done)
+                await asyncio.to_thread(check.add, frame, done)
                 pipe.send(FrameDone(row + 1))
             took_s = time.monotonic() - first_s
         if recorder is not None:
@@ -254,6 +265,9 @@ async def _run(spec: RobotSpec, pipe: ParentPipe) -> None:
                     "keyframes_uploaded": uploaded,
                 },
                 is_metric=_is_metric(mapper),
+                check=await asyncio.to_thread(
+                    check.finish, MotionReference.of_truth(truth, loaded.truth_kind, is_camera=False)
+                ),
             )
         )
 
@@ -313,7 +327,8 @@ def _load(spec: RobotSpec, pipe: ParentPipe) -> _Loaded:
     options, number = spec.options, spec.number
     if options.data is not None:
         recording = options.share(number)
-        return _Loaded(recording, recording.truth, recording.truth_kind, recording.has_depth)
+        is_thinned = int(np.ptp(recording.rows)) >= len(recording)
+        return _Loaded(recording, recording.truth, recording.truth_kind, recording.has_depth, is_thinned)
     from client_sdk.simulator import render_frames, true_trajectory
 
     truth = true_trajectory(number, options.robots, options.frame_count, options.seed)

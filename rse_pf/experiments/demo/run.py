@@ -322,6 +322,9 @@ def _write_results(
     report = make_report(finished, commands, asked, before, load_average())
     if merged is not None:
         report["merged"] = merged
+    checks = {_name(number): robot.check for number, robot in enumerate(finished) if robot.check is not None}
+    if checks:
+        report["checks"] = checks
     if options.live:
         drives = read_live_drives(folder, [_name(number) for number in range(len(finished))])
         report["live"] = live_figures(drives, read_live_map(folder))

@@ -1,8 +1,7 @@
-"""The check of a drive beside the commands that make maps: it costs little, and never fails them."""
+"""The check of a drive beside what makes a map of it: it costs little, and never fails that."""
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -11,16 +10,9 @@ if TYPE_CHECKING:
     from client_sdk.check.observer import DriveObserver
     from client_sdk.frontend import Frame, TrackedFrame
 
-__all__ = ["DriveCheck", "add_check_argument", "check_lines"]
+__all__ = ["DriveCheck", "check_lines"]
 
 _T = TypeVar("_T")
-
-
-def add_check_argument(parser: argparse.ArgumentParser) -> None:
-    """Declare ``--no-check``."""
-    parser.add_argument(
-        "--no-check", dest="check", action="store_false", help="do not check calibration, times and images"
-    )
 
 
 def check_lines(told: Mapping[str, Any], *, is_whole: bool = False) -> list[str]:
@@ -85,6 +77,7 @@ class DriveCheck:
 
 
 def _observer(*, is_thinned: bool) -> DriveObserver:
+    # What a check needs is imported where one is wanted.
     from client_sdk.check.observer import DriveObserver
 
     return DriveObserver(is_thinned=is_thinned)
