@@ -89,6 +89,13 @@ def test_values_lie_within_three_of_their_deviations_over_many_drives() -> None:
     assert np.sqrt((off**2).mean()) > 0.4
 
 
+def test_deviations_are_small_where_the_drive_tells() -> None:
+    found = adjusted(8, planted())
+
+    limits = np.array([0.006, 0.006, 3.0, 3.0, 0.006, 0.03, 0.004, 0.006, 0.004])
+    assert (found.deviations < limits).all()
+
+
 def test_a_good_calibration_is_found_good() -> None:
     found = adjusted(3, np.zeros(len(UNKNOWNS)))
 
