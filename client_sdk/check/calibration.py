@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from client_sdk.check.drive_model import DepthReading, DriveModel, best_reading, drive_model
+from client_sdk.check.drive_model import DepthReading, DriveModel, best_reading, drive_model, nearest_delay
 from client_sdk.check.findings import CannotTell, FaultKind, Finding
 from client_sdk.check.keyframes import FLIPS, KeyframeStore, Tracks, tracks_of
 from client_sdk.check.zooms import judge_zooms
@@ -72,7 +72,7 @@ def judge_calibration(store: KeyframeStore) -> CalibrationJudgement:
     except DegenerateGeometry:
         return _untold("views that do not determine their poses", has_depth=has_depth)
     times_s = np.array([keyframes[row].timestamp_s for row in model.rows])
-    zoom = judge_zooms(zoomed, times_s, found, _worse(found))
+    zoom = judge_zooms(zoomed, times_s, found, _worse(zoomed))
     found = found if zoom is None else zoomed
     deviations = _honest(found)
     kinds = _of_colour(found, deviations, model) if zoom is None else [zoom]
@@ -92,16 +92,18 @@ def _adjusted(
 ) -> tuple[DriveModel | None, Calibrated | None, DepthReading]:
     """Adjust a drive, and again with the delay of its depth that this finds, if that is another image."""
     by_depth = store.has_depth or store.has_stereo
-    model = found = None
-    for _ in range(3):
+    reading = DepthReading(reading.flip, nearest_delay(store.keyframes, reading.delay_s))
+    tried_s = [reading.delay_s]
+    while True:
         model = drive_model(store.keyframes, tracks, reading, by_depth=by_depth)
         if model is None:
             return None, None, reading
         found = adjust_with_calibration(model.observed, model.T_camera_world, model.points_world, free)
-        more_s = float(found.values[_DELAY])
-        if reading.flip or abs(more_s) < 0.02:
+        late_s = nearest_delay(store.keyframes, reading.delay_s + float(found.values[_DELAY]))
+        if reading.flip or late_s in tried_s:
             break
-        reading = DepthReading(delay_s=float(np.clip(reading.delay_s + more_s, -0.4, 0.4)))
+        tried_s.append(late_s)
+        reading = DepthReading(delay_s=late_s)
     return model, found, reading
 
 

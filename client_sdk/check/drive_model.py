@@ -13,7 +13,7 @@ from client_sdk.frontend import load_opencv
 from rse_pf.geometry import Array, Camera, inverse, transform
 from rse_pf.slam.self_calibration import DriveObservations, triangulated
 
-__all__ = ["DepthReading", "DriveModel", "best_reading", "drive_model"]
+__all__ = ["DepthReading", "DriveModel", "best_reading", "drive_model", "nearest_delay"]
 
 Rows = npt.NDArray[np.int64]
 
@@ -22,7 +22,7 @@ _PNP_PX, _PNP_TRIALS = 8.0, 100
 _PIXEL_PX = 0.7
 _LEAST_SHARE = 0.3
 _FAR_S = 0.07
-_FASTEST_M_S = 3.0
+_FASTEST_M_S, _REACHES_S = 3.0, (0.3, 0.2, 0.1)
 _ZOOMS = (1.25, 0.8)
 _MISS = 6.0
 """What an observation costs in a frame whose pose could not be found."""
@@ -64,6 +64,19 @@ def best_reading(keyframes: list[Keyframe], tracks: Tracks) -> DepthReading:
         if score < least:
             best, least = reading, score
     return best
+
+
+def nearest_delay(keyframes: list[Keyframe], delay_s: float) -> float:
+    """Return the delay nearest to one at which there are depth images: a multiple of their interval."""
+    steps_s = [
+        abs(apart_s) for keyframe in keyframes for apart_s, _ in keyframe.around if abs(apart_s) > 1e-3
+    ]
+    if not steps_s:
+        return 0.0
+    ordered = np.sort(steps_s)
+    interval_s = float(np.median(ordered[ordered < 1.5 * ordered[len(ordered) // 50]]))
+    longest = float(ordered[-1]) // interval_s
+    return interval_s * float(np.clip(np.rint(delay_s / interval_s), -longest, longest))
 
 
 def drive_model(
@@ -144,12 +157,23 @@ def _read_depths(keyframe: Keyframe, reading: DepthReading) -> tuple[Array, Arra
     at = int(np.argmin(np.abs(apart_s - reading.delay_s)))
     if abs(apart_s[at] - reading.delay_s) > _FAR_S:
         return np.full(n, np.nan), np.zeros(n)
-    before, now, after = (around[row] for row in (max(0, at - 1), at, min(len(around) - 1, at + 1)))
-    rates = (after[1] - before[1]) / max(after[0] - before[0], 1e-3)
+    now = around[at]
+    rates = np.full(n, np.nan)
+    # Far images first: the noise of a rate from near ones would pull the delay towards none.
+    for reach_s in _REACHES_S:
+        before, after = (around[row] for row in _ends(apart_s, at, reach_s))
+        if after[0] > before[0]:
+            rates = np.where(np.isfinite(rates), rates, (after[1] - before[1]) / (after[0] - before[0]))
     rates = np.where(np.abs(rates) < _FASTEST_M_S, rates, 0.0)
     # A depth between two images is that of the nearest one, moved on: a mean of both would have less noise
     # than either, and attract the delay.
     return now[1] + rates * (reading.delay_s - now[0]), rates
+
+
+def _ends(apart_s: Array, at: int, reach_s: float) -> tuple[int, int]:
+    """Return the first and the last row within a time of row *at*; of ascending times."""
+    low = int(np.searchsorted(apart_s, apart_s[at] - reach_s - 1e-3))
+    return low, int(np.searchsorted(apart_s, apart_s[at] + reach_s + 1e-3)) - 1
 
 
 def _chained(
