@@ -23,7 +23,8 @@ class Made:
     """What a drive is like; the set calibration is ``CAMERA``, and the faults are what it lacks.
 
     ``focal`` and ``principal_px`` are added to the true camera; ``zoom_after`` is the factor of the second
-    half; ``turn`` and ``roll`` scale how the camera turns.
+    half, or of every second stretch of so many views; ``depth_noise`` is that of a Kinect times so much;
+    ``turn`` and ``roll`` scale how the camera turns.
     """
 
     seed: int = 0
@@ -35,6 +36,8 @@ class Made:
     delay_s: float = 0.0
     flip: bool = False
     zoom_after: float = 1.0
+    zoom_stretch: int = 0
+    depth_noise: float = 1.0
     turn: float = 0.5
     roll: float = 0.3
     has_depth: bool = True
@@ -52,7 +55,8 @@ def make_store(made: Made) -> KeyframeStore:
     store.frames = 3 * made.views
     for view in range(made.views):
         time_s = 0.3 * view
-        zoom = made.zoom_after if view >= made.views // 2 else 1.0
+        is_second = view // (made.zoom_stretch or made.views // 2) % 2 == 1
+        zoom = made.zoom_after if is_second else 1.0
         store.keyframes.append(_keyframe(made, rng, points, looks, phases, time_s, zoom))
     return store
 
@@ -88,7 +92,7 @@ def _seen_at(made: Made, camera: Camera, T_world_camera: Array, pixels: Array) -
 
 
 def _measured(made: Made, rng: np.random.Generator, depths: Array) -> Array:
-    noise = np.sqrt(DepthNoise().variance_m2(depths))
+    noise = made.depth_noise * np.sqrt(DepthNoise().variance_m2(depths))
     return depths + made.offset_m + noise * rng.standard_normal(len(depths))
 
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 from made_drives import Made, make_store
 
 from client_sdk.check.calibration import CalibrationJudgement, judge_calibration
+from client_sdk.check.drive_model import DepthReading, drive_model
 from client_sdk.check.findings import FaultKind, Finding, order
-from client_sdk.check.keyframes import KeyframeStore
+from client_sdk.check.keyframes import KeyframeStore, tracks_of
 
 
 def judged(made: Made) -> CalibrationJudgement:
@@ -31,6 +33,7 @@ def first(made: Made) -> Finding:
         (Made(seed=7, delay_s=-0.3), FaultKind.DEPTH_DELAY, -0.3),
         (Made(seed=8, flip=True), FaultKind.MIRRORED, 1.0),
         (Made(seed=9, zoom_after=1.1), FaultKind.TWO_CAMERAS, 0.1),
+        (Made(seed=9, zoom_after=1.1, zoom_stretch=3), FaultKind.TWO_CAMERAS, 0.1),
         (Made(seed=10, fx=0.1, has_depth=False), FaultKind.FOCAL_LENGTH, 0.1),
     ],
 )
@@ -42,6 +45,18 @@ def test_a_planted_fault_is_the_first_finding_with_its_value(
     assert finding.kind is kind
     assert abs(finding.value - value) < max(3.0 * finding.deviation, 0.01 * abs(value))
     assert abs(finding.value - value) <= 0.2 * abs(value)
+
+
+def test_the_noise_of_depths_hardly_reaches_their_rates() -> None:
+    """Rates as noisy as they are large would pull the delay of depth towards none."""
+    rates = []
+    for depth_noise in (0.0, 4.0):
+        store = make_store(Made(seed=6, depth_noise=depth_noise))
+        model = drive_model(store.keyframes, tracks_of(store.keyframes), DepthReading())
+        assert model is not None
+        rates.append(model.observed.rates_m_s)
+
+    assert np.median(np.abs(rates[1] - rates[0])) < 0.15
 
 
 @pytest.mark.parametrize("seed", range(4))
