@@ -191,9 +191,8 @@ def _dark(share: float) -> Plant:
     """Return frames of which a share, in stretches, has a twentieth of the light."""
 
     def changed(frames: Iterable[Frame]) -> Iterator[Frame]:
-        period = round(_STRETCH / share)
         for row, frame in enumerate(frames):
-            if row % period < _STRETCH:
+            if row % (2 * _STRETCH) < 2 * _STRETCH * share:
                 dark = np.rint(frame.rgb * (_DARK_BRIGHTNESS / 255.0)).astype(np.uint8)
                 frame = replace(frame, rgb=dark)
             yield frame

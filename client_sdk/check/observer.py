@@ -27,8 +27,8 @@ from rse_pf.geometry import Array
 
 __all__ = ["DriveObserver"]
 
-_HIDING = {FaultKind.MIRRORED, FaultKind.TWO_CAMERAS}
-"""While the calibration has one of these, the tracked motion is not that of the camera."""
+_HIDING = {FaultKind.MIRRORED, FaultKind.TWO_CAMERAS, FaultKind.REPEATED}
+"""While a drive has one of these, the tracked motion is not that of the camera at its stamps."""
 
 
 class DriveObserver:
@@ -78,7 +78,7 @@ class DriveObserver:
         untold += calibration.cannot_tell
         if self._pair_fault is not None:
             findings.append(_of_pairs(self._pair_fault))
-        moved, cannot, noted = self._motion(calibration)
+        moved, cannot, noted = self._motion(calibration, findings)
         return CheckReport(
             findings=order([*findings, *moved], calibration.noise_m),
             cannot_tell=(*untold, *cannot),
@@ -86,12 +86,14 @@ class DriveObserver:
             notes=tuple(noted),
         )
 
-    def _motion(self, calibration: CalibrationJudgement) -> tuple[list[Finding], list[CannotTell], list[str]]:
+    def _motion(
+        self, calibration: CalibrationJudgement, known: list[Finding]
+    ) -> tuple[list[Finding], list[CannotTell], list[str]]:
         """Return what odometry, truth and IMU say of the motion."""
         by_depth = self._has_depth or self._has_stereo
         if self.reference is None and self._history is None:
             return [], nothing_to_compare(has_depth=by_depth), []
-        hidden = _HIDING & {each.kind for each in order(calibration.findings)}
+        hidden = _HIDING & {each.kind for each in order(known)}
         if hidden:
             reason = f"{min(each.value for each in hidden)} bends the motion that would be compared"
             return (
