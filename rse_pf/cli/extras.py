@@ -61,6 +61,16 @@ EXTRAS: dict[str, Extra] = {
         modules={"foxglove": "foxglove-sdk"}, enables="the live view in Foxglove", includes=("local",)
     ),
     "ros": Extra(modules={}, enables="robots of ROS: rse-pf-ros", includes=("bags", "keys")),
+    "ros2": Extra(
+        modules={
+            name: f"ros-{name.replace('_', '-')}"
+            for name in (
+                "rclpy", "rmw_fastrtps_cpp", "rmw_implementation", "diagnostic_msgs", "geometry_msgs",
+                "nav_msgs", "sensor_msgs", "std_msgs", "std_srvs",
+            )
+        },
+        enables="a ROS 2 from PyPI for rse-pf-ros", includes=("ros",),
+    ),
     "ros-dds": Extra(
         modules=_same("cyclonedds"), enables="robots of ROS 2 over DDS, without ROS", includes=("ros",)
     ),
