@@ -15,7 +15,7 @@ from ros_bridge.shell import end_by_signal, run_until, taken
 from rse_pf.errors import UsageError
 from rse_pf.terminal import show
 
-__all__ = ["run_ros2_node"]
+__all__ = ["publishers_of", "run_ros2_node"]
 
 _CALL_S = 30.0
 _OF_ROS = ("use_sim_time", "start_type_description_service")
@@ -56,7 +56,7 @@ def run_ros2_node(arguments: list[str], options: dict[str, Any]) -> int:
 async def _run(rclpy: Any, node: Any, options: BridgeOptions) -> int:
     """Bridge until a signal; the exit code is 0."""
     ended = end_by_signal()
-    publishers = _publishers(node, options)
+    publishers = publishers_of(node, options)
 
     def publish(message: Message) -> None:
         if message.topic in publishers:
@@ -78,7 +78,7 @@ async def _run(rclpy: Any, node: Any, options: BridgeOptions) -> int:
     return 0
 
 
-def _publishers(node: Any, options: BridgeOptions) -> dict[str, Any]:
+def publishers_of(node: Any, options: BridgeOptions) -> dict[str, Any]:
     """Return a publisher for each topic; one whose type is not installed is left out, and said."""
     publishers = {}
     for topic, kind, latched in advertised(options):

@@ -72,9 +72,9 @@ def judge_calibration(store: KeyframeStore) -> CalibrationJudgement:
     except DegenerateGeometry:
         return _untold("views that do not determine their poses", has_depth=has_depth)
     times_s = np.array([keyframes[row].timestamp_s for row in model.rows])
-    zoom = judge_zooms(zoomed, times_s, found, _worse(zoomed))
+    zoom = judge_zooms(zoomed, times_s, found, _depth_error_factor(zoomed))
     found = found if zoom is None else zoomed
-    deviations = _honest(found)
+    deviations = _whole_deviations(found)
     kinds = _of_colour(found, deviations, model) if zoom is None else [zoom]
     if store.has_depth:
         kinds += list(_of_depth(found, deviations, reading))
@@ -107,13 +107,13 @@ def _adjusted(
     return model, found, reading
 
 
-def _honest(found: Calibrated) -> Array:
+def _whole_deviations(found: Calibrated) -> Array:
     """Return ``(7,)`` deviations with what the adjustment does not know."""
     own: Array = found.deviations[: len(_FLOOR)]
-    return np.hypot(_INFLATION * own, _worse(found) * _FLOOR)
+    return np.hypot(_INFLATION * own, _depth_error_factor(found) * _FLOOR)
 
 
-def _worse(found: Calibrated) -> float:
+def _depth_error_factor(found: Calibrated) -> float:
     """Return how much larger the errors of depth are than the noise of a Kinect, 1 at least."""
     return max(1.0, found.depth_factor / _USUAL_DEPTH_FACTOR)
 
@@ -156,7 +156,7 @@ def _focal(found: Calibrated, deviations: Array, camera: Camera) -> Finding | No
     )
     return Finding(
         kind=FaultKind.FOCAL_LENGTH, value=errors[worst], deviation=float(deviations[worst]), unit="relative",
-        cost_m=cost_m, sentence=f"the focal length {told}, which bends this drive by {100 * cost_m:.1f} cm",
+        cost_m=cost_m, sentence=f"the focal length {told}",
         fix="set " + ", ".join(f"{name} = {value:.1f}" for name, value in right.items()),
         correction=right,
     )  # fmt: skip
@@ -177,7 +177,7 @@ def _principal(found: Calibrated, deviations: Array, camera: Camera) -> Finding 
     return Finding(
         kind=FaultKind.PRINCIPAL_POINT, value=-float(found.values[worst]),
         deviation=float(deviations[worst]), unit="px", cost_m=cost_m,
-        sentence=f"the principal point {told}, which bends this drive by {100 * cost_m:.1f} cm",
+        sentence=f"the principal point {told}",
         fix="set " + ", ".join(f"{name} = {value:.1f}" for name, value in right.items()),
         correction={name: float(value) for name, value in right.items()},
     )  # fmt: skip
@@ -195,7 +195,7 @@ def _distortion(found: Calibrated, deviations: Array, camera: Camera) -> Finding
         kind=FaultKind.DISTORTION, value=k1, deviation=float(deviations[_K1]), unit="relative", cost_m=cost_m,
         sentence=(
             f"the images are not undistorted: k1 = {k1:+.3f} (+- {deviations[_K1]:.3f}) is left, "
-            f"{corner_px:.0f} px in the corners, which bends this drive by {100 * cost_m:.1f} cm"
+            f"{corner_px:.0f} px in the corners"
         ),
         fix=f"add k1 = {k1:+.3f} to the distortion, or undistort once if it was done twice",
         correction={"k1": k1},
@@ -220,7 +220,7 @@ def _of_depth(found: Calibrated, deviations: Array, reading: DepthReading) -> It
                 cost_m=cost_m, fix=f"subtract {offset_m:+.3f} m from every depth before it is used",
                 sentence=(
                     f"depths are {100 * abs(offset_m):.1f} cm too {_size(offset_m)} "
-                    f"(+- {100 * deviations[_OFFSET]:.1f}), which bends this drive by {100 * cost_m:.1f} cm"
+                    f"(+- {100 * deviations[_OFFSET]:.1f})"
                 ),
             )  # fmt: skip
     delay_s = reading.delay_s + float(found.values[_DELAY])

@@ -150,14 +150,6 @@ class CheckReport:
             "notes": list(self.notes),
         }
 
-    def lines(self) -> tuple[str, ...]:
-        """Return the short form: each finding with its fix, or that nothing is wrong."""
-        if self.findings:
-            return tuple(f"check: {each.sentence}; {each.fix}" for each in self.findings)
-        kinds = sorted({each.kind.value for each in self.cannot_tell})
-        untold = f"; this drive cannot tell {', '.join(kinds)}" if kinds else ""
-        return (f"check: nothing wrong found in {self.frames} frames{untold}",)
-
 
 def order(findings: Iterable[Finding], noise_m: float = 0.0) -> tuple[Finding, ...]:
     """Return the findings that are certain and matter, worst first, one of each kind.

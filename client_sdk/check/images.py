@@ -100,6 +100,11 @@ class FrameStatistics:
         """Return which frames ``(n,)`` are too dark to show anything."""
         return np.array(self._bright) < _DARK_LEVEL
 
+    def empty(self) -> npt.NDArray[np.bool_]:
+        """Return which frames ``(n,)`` show no edge at all: a plain wall, or nothing."""
+        empty: npt.NDArray[np.bool_] = np.isnan(np.array(self._sharpness).reshape(-1, 2)).all(axis=1)
+        return empty
+
     def repeated(self) -> npt.NDArray[np.bool_]:
         """Return which frames ``(n,)`` have the image of the frame before, while the camera moves."""
         change = np.array(self._change)

@@ -8,8 +8,8 @@ import numpy as np
 import numpy.typing as npt
 
 from client_sdk.check.findings import FaultKind, Finding
-from rse_pf.geometry import Array
-from rse_pf.slam.self_calibration import Calibrated
+from rse_pf.geometry import Array, inverse
+from rse_pf.slam.self_calibration import Calibrated, rms_after_alignment
 
 __all__ = ["judge_zooms"]
 
@@ -101,12 +101,6 @@ def _slope(zooms: Array, times_s: Array) -> float:
 
 
 def _cost(common: Calibrated, zoomed: Calibrated) -> float:
-    """Return how far apart the paths are, after the best rotation and translation of small size."""
-    centres = [
-        -np.einsum("kji,kj->ki", each.T_camera_world[:, :3, :3], each.T_camera_world[:, :3, 3])
-        for each in (common, zoomed)
-    ]
-    at, there = (each - each.mean(axis=0) for each in centres)
-    U, _, Vt = np.linalg.svd(at.T @ there)
-    turned = there @ (U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt).T
-    return float(np.sqrt(np.square(at - turned).sum(axis=1).mean()))
+    """Return how far apart the two paths are after alignment, root mean square in metres."""
+    at, there = (inverse(each.T_camera_world)[:, :3, 3] for each in (common, zoomed))
+    return rms_after_alignment(at, there - at, has_metres=common.has_metres)

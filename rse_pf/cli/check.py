@@ -41,6 +41,8 @@ __all__ = ["add_arguments", "run"]
 _MOST_LIVE = 3000
 """A device is looked at for so many frames unless --frames says another number."""
 _MAX_REPORT_BYTES = 16 << 20
+_OF_RECORDINGS = ("rgb.txt", "intrinsics.json", "metadata.yaml")
+"""Folders with one of these are recordings or bags, whatever report somebody left in them."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -71,8 +73,9 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
         raise UsageError(f"--frames {args.frames} is below 2", hint="leave it out to look at all frames")
     if args.write is not None and not args.write.absolute().parent.is_dir():
         raise UsageError(f"there is no folder {args.write.absolute().parent}", hint="create it")
-    results = Path(args.source) / "report.json"
-    if results.is_file() and (Path(args.source) / "trajectory.txt").is_file():
+    folder = Path(args.source)
+    results = folder / "report.json"
+    if results.is_file() and not any((folder / name).exists() for name in _OF_RECORDINGS):
         return _show_results(args, results)
     require("check")
     if args.out is not None:
@@ -103,7 +106,7 @@ def _show_results(args: argparse.Namespace, file: Path) -> int:
     if not isinstance(told, dict):
         raise UsageError(
             f"{args.source} was not checked while it was made, and its results have no images",
-            hint="check the recording itself, or make the map without --no-check",
+            hint="check the recording itself; only maps of cameras, recordings and bags are checked",
         )
     if args.write is not None or args.out is not None:
         raise UsageError("results of a map are shown only", hint="check the recording for --write and --out")

@@ -14,7 +14,14 @@ import numpy.typing as npt
 from rse_pf.errors import BadRequest, DegenerateGeometry
 from rse_pf.geometry import Array, Camera, exp_se3, inverse, skew
 
-__all__ = ["UNKNOWNS", "Calibrated", "DriveObservations", "adjust_with_calibration", "triangulated"]
+__all__ = [
+    "UNKNOWNS",
+    "Calibrated",
+    "DriveObservations",
+    "adjust_with_calibration",
+    "rms_after_alignment",
+    "triangulated",
+]
 
 Rows = npt.NDArray[np.int64]
 
@@ -117,7 +124,7 @@ class Calibrated:
     def bend_m(self, error: Array) -> float:
         """Return how far a calibration that is wrong by *error* ``(9,)`` bends the drive, after alignment."""
         moved = np.tensordot(error, self.bends_m, axes=1)
-        return _rms_aligned(inverse(self.T_camera_world)[:, :3, 3], moved, has_metres=self.has_metres)
+        return rms_after_alignment(inverse(self.T_camera_world)[:, :3, 3], moved, has_metres=self.has_metres)
 
 
 def triangulated(observed: DriveObservations, T_camera_world: Array, count: int) -> Array:
@@ -460,12 +467,15 @@ class _System:
         moved = np.einsum("kij,kjs->ski", slopes, drawn.reshape(self.k, self._c, _SAMPLES)[:, :3])
         positions = inverse(state.T)[:, :3, 3]
         metres = self._has_metres()
-        squares = [_rms_aligned(positions, each, has_metres=metres) ** 2 for each in moved]
+        squares = [rms_after_alignment(positions, each, has_metres=metres) ** 2 for each in moved]
         return float(np.sqrt(np.mean(squares)))
 
 
-def _rms_aligned(positions: Array, moved: Array, *, has_metres: bool) -> float:
-    """Return the root mean square of small motions after the best small motion of all, and scale if free."""
+def rms_after_alignment(positions: Array, moved: Array, *, has_metres: bool) -> float:
+    """Return the root mean square of ``(k, 3)`` small motions *moved* of ``(k, 3)`` *positions*, metres.
+
+    The best small motion of all of them is taken away before, and a scale where there are no metres.
+    """
     at = positions - positions.mean(axis=0)
     J = np.concatenate([np.tile(np.eye(3), (len(at), 1, 1)), -skew(at)], axis=2).reshape(-1, 6)
     if not has_metres:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import signal
 import subprocess
+import sys
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -17,7 +19,7 @@ from client_sdk import connect
 from client_sdk.bags import BagOptions, open_bag
 from rse_pf.local.control.platform import LocalPlatform
 
-__all__ = ["Line", "Program", "own_run", "poses", "tell_delay", "worst_mm"]
+__all__ = ["Line", "Program", "RosPrograms", "own_run", "poses", "tell_delay", "worst_mm"]
 
 
 class Line(TypedDict, total=False):
@@ -80,6 +82,44 @@ class Program:
         if self.process.stdout is not None and not self._reader.is_alive():
             self.process.stdout.close()
         return code
+
+
+class RosPrograms:
+    """Programs with the environment of one ROS; `end` ends all of them."""
+
+    shell = "ros1"
+    listener_file = "ros1_listener.py"
+
+    def __init__(self, python: str, topics: dict[str, str], env: dict[str, str]) -> None:
+        """Describe them: the Python that has this ROS, the topics of a bridge, and the environment."""
+        kept = {name: value for name, value in os.environ.items() if not name.startswith(("ROS", "RMW"))}
+        self.python, self._topics = python, topics
+        self._env = {**kept, "PYTHONPATH": str(Path(__file__).parents[2]), **env}
+        self._stack = contextlib.ExitStack()
+
+    def start(self, *words: str) -> Program:
+        program = Program(list(words), self._env)
+        self._stack.callback(program.end, signal.SIGTERM)
+        return program
+
+    def listener(self, *words: str) -> Program:
+        program = self.start(self.python, str(Path(__file__).with_name(self.listener_file)), *words)
+        program.until(lambda lines: any('"ready"' in line for line in lines))
+        return program
+
+    def bridge(self, url: str, token_file: Path, shell: str = "", **options: str) -> Program:
+        # rospy is not in the environment of the tests, but the bridge takes it from Debian; rclpy is not.
+        python = self.python if (shell or self.shell) == "ros2" else sys.executable
+        words = [f"--{name.replace('_', '-')}={value}" for name, value in {**self._topics, **options}.items()]
+        program = self.start(
+            python, "-m", "ros_bridge", shell or self.shell, "--url", url, "--token-file", str(token_file),
+            "--publish-odom=false", "--queue-frames=100", *words,
+        )  # fmt: skip
+        program.until(lambda lines: any(line.startswith("bridging") for line in lines))
+        return program
+
+    def end(self) -> None:
+        self._stack.close()
 
 
 async def own_run(bag: Path, platform: LocalPlatform) -> dict[int, np.ndarray[Any, Any]]:

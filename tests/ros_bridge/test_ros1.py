@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import json
-import os
 import shutil
 import signal
 import socket
 import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -20,7 +17,7 @@ from benchmarks.maps.bags import write_recording
 from client_sdk.bags.message_types import load_types
 from rse_pf.config import PlatformSettings
 from rse_pf.local.control.platform import LocalPlatform
-from tests.ros_bridge.programs import Line, Program, own_run, poses, tell_delay, worst_mm
+from tests.ros_bridge.programs import Line, Program, RosPrograms, own_run, poses, tell_delay, worst_mm
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
 
@@ -31,49 +28,22 @@ _TOPICS = {"colour": "/camera/image_raw", "depth": "/camera/aligned_depth", "inf
 _NEEDED = ("rospy", "geometry_msgs", "nav_msgs", "sensor_msgs", "tf2_msgs", "diagnostic_msgs")
 
 
-class Ros:
+class Ros(RosPrograms):
     """A master on a free port, and programs that know it."""
 
     def __init__(self, folder: Path) -> None:
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
             self._port = free.getsockname()[1]
-        self._env = {
-            **{name: value for name, value in os.environ.items() if not name.startswith("ROS")},
-            "ROS_MASTER_URI": f"http://127.0.0.1:{self._port}", "ROS_IP": "127.0.0.1",
-            "ROS_HOME": str(folder), "PYTHONPATH": str(Path(__file__).parents[2]),
-        }  # fmt: skip
-        self._stack = contextlib.ExitStack()
-
-    def start(self, *words: str) -> Program:
-        program = Program(list(words), self._env)
-        self._stack.callback(program.end, signal.SIGTERM)
-        return program
+        master = {"ROS_MASTER_URI": f"http://127.0.0.1:{self._port}", "ROS_IP": "127.0.0.1"}
+        super().__init__(_PYTHON, _TOPICS, {**master, "ROS_HOME": str(folder)})
 
     def master(self) -> Program:
         # roscore would start this program in a group of its own, and leave it behind when it is killed.
         return self.start("rosmaster", "--core", "-p", str(self._port))
 
-    def listener(self, colour: str = "") -> Program:
-        env_words = (_PYTHON, str(Path(__file__).with_name("ros1_listener.py")), colour)
-        program = self.start(*env_words)
-        program.until(lambda lines: any('"ready"' in line for line in lines))
-        return program
-
-    def bridge(self, url: str, token_file: Path, **options: str) -> Program:
-        words = [f"--{name.replace('_', '-')}={value}" for name, value in {**_TOPICS, **options}.items()]
-        program = self.start(
-            sys.executable, "-m", "ros_bridge", "ros1", "--url", url, "--token-file", str(token_file),
-            "--publish-odom=false", "--queue-frames=100", *words,
-        )  # fmt: skip
-        program.until(lambda lines: any(line.startswith("bridging") for line in lines))
-        return program
-
     def play(self, bag: Path, rate: float) -> Program:
         return self.start("rosbag", "play", "-q", "-d", "2", "-r", str(rate), str(bag))
-
-    def end(self) -> None:
-        self._stack.close()
 
 
 @pytest.fixture
@@ -147,7 +117,7 @@ async def _drive(ros: Ros, bag: Path, folder: Path) -> None:
 
         await asyncio.to_thread(ros.master)
         await asyncio.to_thread(bridge.until, lambda lines: any("registered again" in each for each in lines))
-        late = await asyncio.to_thread(ros.listener)
+        late = await asyncio.to_thread(ros.listener, "")
         player = ros.play(bag, 0.5)
         await asyncio.to_thread(late.until, poses(1))
         await asyncio.to_thread(player.end)

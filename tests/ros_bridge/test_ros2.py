@@ -3,11 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import math
-import os
-import signal
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -16,7 +12,7 @@ import pytest
 from benchmarks.maps.bags import write_recording
 from rse_pf.config import PlatformSettings
 from rse_pf.local.control.platform import LocalPlatform
-from tests.ros_bridge.programs import Program, own_run, poses, tell_delay, worst_mm
+from tests.ros_bridge.programs import Program, RosPrograms, own_run, poses, tell_delay, worst_mm
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
 
@@ -33,51 +29,27 @@ _CYCLONE = (
 """Cyclone DDS on this machine alone, as ROS_AUTOMATIC_DISCOVERY_RANGE makes Fast DDS."""
 _FRAMES = 60
 _DOMAIN = 86
-_TOPICS = {"colour": "/camera/image_raw", "depth": "/camera/aligned_depth", "info": "/camera/camera_info"}
+_COLOUR = "/camera/image_raw"
+_TOPICS = {"colour": _COLOUR, "depth": "/camera/aligned_depth", "info": "/camera/camera_info"}
 
 
-class Ros2:
+class Ros2(RosPrograms):
     """Programs of one domain of ROS 2 on this machine."""
 
+    shell = "ros2"
+    listener_file = "ros2_listener.py"
+
     def __init__(self, folder: Path) -> None:
-        self.python = str(_ROS2 / "bin" / "python")
-        self._env = {
-            **{name: value for name, value in os.environ.items() if not name.startswith(("ROS", "RMW"))},
+        env = {
             "ROS_DOMAIN_ID": str(_DOMAIN), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
             "FASTDDS_DEFAULT_PROFILES_FILE": str(_PROFILE), "CYCLONEDDS_URI": _CYCLONE,
-            "ROS_HOME": str(folder), "PYTHONPATH": str(_ROOT),
-            "PYTHONUNBUFFERED": "1",
+            "ROS_HOME": str(folder), "PYTHONUNBUFFERED": "1",
         }  # fmt: skip
-        self._stack = contextlib.ExitStack()
-
-    def start(self, *words: str) -> Program:
-        program = Program(list(words), self._env)
-        self._stack.callback(program.end, signal.SIGTERM)
-        return program
-
-    def listener(self, prefix: str = "", service: str = "") -> Program:
-        words = [prefix, _TOPICS["colour"], *([service] if service else [])]
-        program = self.start(self.python, str(Path(__file__).with_name("ros2_listener.py")), *words)
-        program.until(lambda lines: any('"ready"' in line for line in lines))
-        return program
-
-    def bridge(
-        self, url: str, token_file: Path, shell: str = "ros2", python: str = "", **options: str
-    ) -> Program:
-        words = [f"--{name.replace('_', '-')}={value}" for name, value in {**_TOPICS, **options}.items()]
-        program = self.start(
-            python or self.python, "-m", "ros_bridge", shell, "--url", url, "--token-file", str(token_file),
-            "--publish-odom=false", "--queue-frames=100", *words,
-        )  # fmt: skip
-        program.until(lambda lines: any(line.startswith("bridging") for line in lines))
-        return program
+        super().__init__(str(_ROS2 / "bin" / "python"), _TOPICS, env)
 
     def play(self, bag: Path, rate: float = 1.0) -> Program:
         words = ["--rate", str(rate), "--wait", *_TOPICS.values()]
         return self.start(self.python, str(_ROOT / "examples/robots/ros2_play_bag.py"), str(bag), *words)
-
-    def end(self) -> None:
-        self._stack.close()
 
 
 @pytest.fixture
@@ -102,17 +74,6 @@ def test_poses_equal_those_of_the_sdk_and_survive_a_killed_server(
     asyncio.run(_drive(ros2, bag, tmp_path))
 
 
-async def _all_poses(listener: Program) -> None:
-    """Wait for the pose of each image; images are best effort, so where the transport lost some, skip."""
-    try:
-        await asyncio.to_thread(listener.until, poses(_FRAMES), 30.0)
-    except AssertionError:
-        heard = len(listener.heard("pose"))
-        if heard < _FRAMES - 6:
-            raise
-        pytest.skip(f"DDS lost {_FRAMES - heard} of {_FRAMES} images or poses: poses cannot be equal")
-
-
 async def _drive(ros2: Ros2, bag: Path, folder: Path) -> None:
     token_file = folder / "token"
     async with LocalPlatform(PlatformSettings(), port=0, servers=2, state=folder / "platform") as platform:
@@ -121,13 +82,13 @@ async def _drive(ros2: Ros2, bag: Path, folder: Path) -> None:
         assert len(expected) == _FRAMES
 
         bridge = await asyncio.to_thread(ros2.bridge, platform.url, token_file, out=str(folder / "saved"))
-        listener = await asyncio.to_thread(ros2.listener)
+        listener = await asyncio.to_thread(ros2.listener, "", _COLOUR)
         player = ros2.play(bag)
         await asyncio.to_thread(listener.until, poses(_FRAMES // 2))
         pages = {each.name: await platform.backend_servers.status(each) for each in platform.servers}
         (busy,) = (name for name, page in pages.items() if page is not None and page["robots"])
         platform.kill(busy)
-        await _all_poses(listener)
+        await asyncio.to_thread(listener.until, poses(_FRAMES))
         await asyncio.to_thread(player.end)
         assert player.lines[-1].endswith("messages played\n")
 
@@ -138,7 +99,7 @@ async def _drive(ros2: Ros2, bag: Path, folder: Path) -> None:
         assert listener.heard("path")
         assert listener.heard("cloud")
         tell_delay(listener)
-        saved = await asyncio.to_thread(ros2.listener, "", "/rse_pf_bridge/save")
+        saved = await asyncio.to_thread(ros2.listener, "", _COLOUR, "/rse_pf_bridge/save")
         assert saved.heard("saved")[0]["ok"]
         assert (folder / "saved" / "trajectory.txt").exists()
         assert await asyncio.to_thread(bridge.end) == 0
@@ -159,10 +120,10 @@ async def _share(ros2: Ros2, bag: Path, folder: Path) -> None:
             token_file = folder / name
             token_file.write_text(platform.issue_token(name), encoding="ascii")
             await asyncio.to_thread(ros2.bridge, platform.url, token_file, namespace=name, map="hall")
-            listeners.append(await asyncio.to_thread(ros2.listener, f"/{name}"))
+            listeners.append(await asyncio.to_thread(ros2.listener, f"/{name}", _COLOUR))
         player = ros2.play(bag, 0.5)
-        for listener in listeners:  # images are sent best effort: a busy machine loses some
-            await asyncio.to_thread(listener.until, poses(_FRAMES - 6))
+        for listener in listeners:
+            await asyncio.to_thread(listener.until, poses(_FRAMES))
         await asyncio.to_thread(player.end)
         for name, listener in zip(names, listeners, strict=True):
             assert ("map", f"{name}/odom") in {
@@ -188,11 +149,11 @@ async def _drive_over_dds(ros2: Ros2, bag: Path, folder: Path) -> None:
         token_file.write_text(platform.issue_token("dds-2"), encoding="ascii")
         expected = await own_run(bag, platform)
         bridge = await asyncio.to_thread(
-            ros2.bridge, platform.url, token_file, "dds", dds_domain=str(_DOMAIN), python=sys.executable
+            ros2.bridge, platform.url, token_file, "dds", dds_domain=str(_DOMAIN)
         )
-        listener = await asyncio.to_thread(ros2.listener)
+        listener = await asyncio.to_thread(ros2.listener, "", _COLOUR)
         player = ros2.play(bag, 0.25)
-        await _all_poses(listener)
+        await asyncio.to_thread(listener.until, poses(_FRAMES))
         await asyncio.to_thread(player.end)
         assert worst_mm(listener.heard("pose"), expected) <= 1.0
         assert await asyncio.to_thread(bridge.end) == 0

@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import argparse
 import itertools
-import math
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -39,8 +38,6 @@ __all__ = ["add_arguments", "run"]
 _WANTED_VIEWS = 25
 _LIVE_IMAGES = 3000
 """A live calibration ends after so many images even if there are too few views."""
-_BLURRED = 60.0
-"""Variance of the Laplacian below which an image is likely blurred, or shows nothing."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -209,22 +206,23 @@ def _check(args: argparse.Namespace) -> int:
     """Look at some frames and say what they are; the exit code is 1 if most are blurred."""
     if args.frames < 2:
         raise UsageError(f"--frames {args.frames} is below 2", hint="60 is two seconds of a webcam")
-    stamps, blur, size = [], [], (0, 0)
+    from client_sdk.check.images import FrameStatistics
+
+    stamps, statistics, size = [], FrameStatistics(), (0, 0)
     lengths: Counter[str] = Counter()
     for stamp, rgb, length in itertools.islice(_frames(args.source), args.frames):
         stamps.append(stamp)
-        blur.append(_sharpness(_gray(rgb)))
+        statistics.add(stamp, rgb)
         lengths[length] += 1
         size = (rgb.shape[1], rgb.shape[0])
     if len(stamps) < 2:
         raise UsageError(f"{args.source} gives {len(stamps)} frames", hint="a check needs 2 or more")
-    unsharp = [number for number, value in enumerate(blur, 1) if value < _BLURRED]
+    unsharp = [int(row) + 1 for row in np.flatnonzero(statistics.blurred() | statistics.empty())]
     rate_hz = (len(stamps) - 1) / max(stamps[-1] - stamps[0], 1e-9)
     figures: dict[str, Any] = {
         "source": args.source, "width": size[0], "height": size[1], "frames": len(stamps),
         "rate_hz": round(rate_hz, 2), "with_depth": lengths["depth"],
         "with_stereo": lengths["a stereo pair"], "blurred": len(unsharp),
-        "sharpness_median": round(float(np.median(blur)), 1),
     }  # fmt: skip
     if args.json:
         show_json(figures)
@@ -274,11 +272,3 @@ def _gray(rgb: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
     """Return the luminance, ITU-R BT.601, as OpenCV does."""
     gray: npt.NDArray[np.uint8] = np.rint(rgb @ np.array([0.299, 0.587, 0.114])).astype(np.uint8)
     return gray
-
-
-def _sharpness(gray: npt.NDArray[np.uint8]) -> float:
-    """Return the variance of the Laplacian: low where there are no sharp edges."""
-    g = gray.astype(np.float32)
-    laplacian = g[1:-1, :-2] + g[1:-1, 2:] + g[:-2, 1:-1] + g[2:, 1:-1] - 4 * g[1:-1, 1:-1]
-    value = float(laplacian.var())
-    return value if math.isfinite(value) else 0.0

@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from client_sdk.check.drive_check import check_lines
 from client_sdk.check.findings import CannotTell, CheckReport, FaultKind, Finding, order
 from rse_pf.errors import UsageError
 
@@ -48,7 +49,9 @@ def test_of_one_kind_the_better_known_is_told() -> None:
 def test_a_report_says_what_is_wrong_and_what_to_do() -> None:
     report = CheckReport(findings=(finding(correction={"fx": 525.0}),), frames=9)
 
-    assert report.lines() == ("check: half of it is blurred; hold still",)
+    assert check_lines(report.to_dict()) == [
+        "check: half of it is blurred; it bends the path by about 10.0 cm; hold still"
+    ]
     (told,) = json.loads(json.dumps(report.to_dict()))["findings"]
     assert {
         "kind": "blur",
@@ -64,7 +67,9 @@ def test_a_report_without_findings_names_what_the_drive_cannot_tell() -> None:
     untold = CannotTell(FaultKind.FOCAL_LENGTH, "no turn about the vertical axis: within 6 %", 0.06)
     report = CheckReport(cannot_tell=(untold,), frames=30)
 
-    assert report.lines() == ("check: nothing wrong found in 30 frames; this drive cannot tell focal_length",)
+    assert check_lines(report.to_dict()) == [
+        "check: nothing wrong found in 30 frames; this drive cannot tell focal_length"
+    ]
     assert report.to_dict()["cannot_tell"][0]["within"] == 0.06
 
 

@@ -53,6 +53,12 @@ def test_every_second_frame_is_blurred(length_px: int) -> None:
     assert findings[FaultKind.BLUR].is_certain
 
 
+def test_frames_a_little_softer_than_their_neighbours_are_not_blurred() -> None:
+    frames = [blurred(each, 7 if row % 2 else 5) for row, each in enumerate(images())]
+
+    assert FaultKind.BLUR not in found(frames)
+
+
 def test_a_lens_out_of_focus_blurs_all_frames() -> None:
     frames = [blurred(blurred(each, 15).swapaxes(0, 1), 15).swapaxes(0, 1) for each in images()]
 
@@ -64,6 +70,15 @@ def test_a_plain_wall_is_not_blurred() -> None:
     wall = [np.clip(120 + 2 * rng.standard_normal((240, 320, 3)), 0, 255).astype(np.uint8) for _ in range(30)]
 
     assert found([*images()[:30], *wall]) == {}
+
+
+def test_frames_without_an_edge_are_empty_and_not_blurred() -> None:
+    statistics = FrameStatistics()
+    for row, image in enumerate([*images()[:12], np.full((240, 320, 3), 128, np.uint8)]):
+        statistics.add(row / 10.0, image)
+
+    assert statistics.empty().tolist() == [False] * 12 + [True]
+    assert not statistics.blurred().any()
 
 
 def test_dark_frames_are_counted() -> None:
