@@ -1,0 +1,59 @@
+"""Focal lengths of keyframes: two cameras, a lens that focuses, and what is only noise."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from client_sdk.check.findings import FaultKind
+from client_sdk.check.zooms import judge_zooms
+from rse_pf.geometry import Array
+from rse_pf.slam.self_calibration import UNKNOWNS, Calibrated
+
+VIEWS = 20
+
+
+def adjusted(zooms: Array, deviation: float) -> Calibrated:
+    """Return a drive along x with these zooms, each known with the same deviation."""
+    T = np.tile(np.eye(4), (VIEWS, 1, 1))
+    T[:, 0, 3] = -0.1 * np.arange(VIEWS)
+    n = len(UNKNOWNS)
+    return Calibrated(
+        values=np.zeros(n), covariance=np.zeros((n, n)), zooms=zooms,
+        zooms_covariance=deviation**2 * np.eye(VIEWS), T_camera_world=T, points_world=np.zeros((1, 3)),
+        bends_m=np.zeros((n, VIEWS, 3)), noise_m=0.0, cost=0.0, has_metres=True, pixel_factor=1.0,
+        depth_factor=1.0,
+    )  # fmt: skip
+
+
+HALVES = np.where(np.arange(VIEWS) % 2 == 0, 0.05, -0.05)
+RAMP = np.linspace(-0.04, 0.04, VIEWS)
+
+
+@pytest.mark.parametrize(
+    ("zooms", "kind", "value"),
+    [
+        (HALVES, FaultKind.TWO_CAMERAS, np.expm1(0.1)),
+        (RAMP, FaultKind.MOVING_FOCAL_LENGTH, np.expm1(0.08)),
+    ],
+)
+def test_a_focal_length_that_is_not_the_same_is_found_where_it_is_known(
+    zooms: Array, kind: FaultKind, value: float
+) -> None:
+    common, times_s = adjusted(np.zeros(VIEWS), 0.01), np.arange(VIEWS) / 2.0
+
+    found = judge_zooms(adjusted(zooms, 0.01), times_s, common)
+
+    assert found is not None
+    assert (found.kind, found.value) == (kind, pytest.approx(value, rel=0.02))
+    assert judge_zooms(adjusted(zooms, 0.2), times_s, common) is None
+
+
+def test_the_cost_is_the_distance_of_the_paths_after_alignment() -> None:
+    common, bent = adjusted(np.zeros(VIEWS), 0.01), adjusted(HALVES, 0.01)
+    bent.T_camera_world[:, 1, 3] += np.where(np.arange(VIEWS) % 2 == 0, 0.02, -0.02) + 0.3
+
+    found = judge_zooms(bent, np.arange(VIEWS) / 2.0, common)
+
+    assert found is not None
+    assert found.cost_m == pytest.approx(0.02, rel=0.02)
