@@ -100,7 +100,8 @@ def start_job_server(tmp_path: Path) -> Iterator[StartJobServer]:
         process.wait()
 
 
-def wait_until(is_so: Callable[[], bool], within_s: float = 20.0) -> None:
+def wait_until(is_so: Callable[[], bool], within_s: float = 50.0) -> None:
+    """Wait for what a job does: its process gets what others leave of the processors."""
     until = time.monotonic() + within_s
     while not is_so():
         assert time.monotonic() < until, "it did not happen in time"
