@@ -13,15 +13,13 @@ from pathlib import Path
 parser = argparse.ArgumentParser(description=__doc__)
 parser.add_argument("bag", type=Path, help="folder of a ROS 2 bag")
 parser.add_argument("--rate", type=float, default=1.0, help="times the speed of the bag (default: 1)")
-parser.add_argument("--wait", nargs="*", default=(), help="topics that must have a subscriber first")
-parser.add_argument("--wait-s", type=float, default=30.0, help="wait for them so long (default: 30)")
-parser.add_argument("--delay-s", type=float, default=2.0, help="then let all find each other (default: 2)")
+parser.add_argument("--wait", nargs="*", default=(), help="TOPIC or TOPIC=SUBSCRIBERS to wait for, 30 s")
+parser.add_argument("--delay-s", type=float, default=2.0, help="pause before and after (default: 2)")
 
 
-def main(args: argparse.Namespace) -> int:
+def main(args: argparse.Namespace) -> None:
     if not args.rate > 0:
-        print("--rate has to be above 0", file=sys.stderr)
-        return 2
+        parser.error("--rate has to be above 0")
     import rclpy  # here, so that --help needs no ROS
     from rclpy.qos import QoSProfile, ReliabilityPolicy
     from rclpy.signals import SignalHandlerOptions
@@ -38,11 +36,11 @@ def main(args: argparse.Namespace) -> int:
             best = ReliabilityPolicy.BEST_EFFORT if is_sensor else ReliabilityPolicy.RELIABLE
             message = getattr(importlib.import_module(f"{package}.msg"), name)
             publishers[topic] = node.create_publisher(message, topic, QoSProfile(depth=10, reliability=best))
-        until_s = time.monotonic() + args.wait_s
-        while silent := [topic for topic in args.wait if not publishers[topic].get_subscription_count()]:
+        until_s = time.monotonic() + 30.0
+        wanted = {topic: int(count or 1) for topic, _, count in (each.partition("=") for each in args.wait)}
+        while silent := [each for each, n in wanted.items() if publishers[each].get_subscription_count() < n]:
             if time.monotonic() > until_s:
-                print(f"nobody takes {', '.join(silent)}", file=sys.stderr)
-                return 1
+                sys.exit(f"nobody takes {', '.join(silent)}")
             time.sleep(0.05)
         began_s, first_ns, sent = time.monotonic() + args.delay_s, None, 0
         for connection, log_ns, data in bag.messages():
@@ -50,9 +48,12 @@ def main(args: argparse.Namespace) -> int:
             time.sleep(max(0.0, began_s + (log_ns - first_ns) / 1e9 / args.rate - time.monotonic()))
             publishers[connection.topic].publish(bytes(data))
             sent += 1
+        time.sleep(args.delay_s)  # what was published last leaves with the program else
     print(f"{sent} messages played")
-    return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main(parser.parse_args()))
+    try:
+        main(parser.parse_args())
+    except KeyboardInterrupt:
+        sys.exit(130)

@@ -56,7 +56,7 @@ def main():
     rclpy.init()
     node = rclpy.create_node("listener")
     prefix, colour = sys.argv[1], sys.argv[2]
-    node.create_subscription(PoseWithCovarianceStamped, f"{prefix}/rse_pf/pose", pose, 100)
+    poses = node.create_subscription(PoseWithCovarianceStamped, f"{prefix}/rse_pf/pose", pose, 100)
     node.create_subscription(
         Path, f"{prefix}/rse_pf/path", lambda each: say(kind="path", poses=len(each.poses)), 10
     )
@@ -75,6 +75,9 @@ def main():
         reply = client.call_async(Trigger.Request())
         rclpy.spin_until_future_complete(node, reply, timeout_sec=30.0)
         say(kind="saved", ok=reply.result().success, message=reply.result().message)
+    until = time.monotonic() + 40.0
+    while not poses.get_publisher_count() and time.monotonic() < until:  # else the first poses are missed
+        time.sleep(0.05)
     say(kind="ready")
     with contextlib.suppress(KeyboardInterrupt, ExternalShutdownException):
         rclpy.spin(node)

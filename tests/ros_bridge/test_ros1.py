@@ -124,9 +124,9 @@ async def _drive(ros: Ros, bag: Path, folder: Path) -> None:
         assert await asyncio.to_thread(bridge.end) == 0
 
 
-async def _played(ros: Ros, bag: Path, listener: Program, poses: int) -> list[Line]:
+async def _played(ros: Ros, bag: Path, listener: Program, count: int) -> list[Line]:
     player = ros.play(bag, 0.5)
-    await asyncio.to_thread(listener.until, poses(poses))
+    await asyncio.to_thread(listener.until, poses(count))
     await asyncio.to_thread(player.end)
     return listener.heard("pose")
 

@@ -47,9 +47,15 @@ class Ros2(RosPrograms):
         }  # fmt: skip
         super().__init__(str(_ROS2 / "bin" / "python"), _TOPICS, env)
 
-    def play(self, bag: Path, rate: float = 1.0) -> Program:
-        words = ["--rate", str(rate), "--wait", *_TOPICS.values()]
+    def play(self, bag: Path, rate: float = 1.0, robots: int = 1) -> Program:
+        """Play when each robot's bridge takes each topic, and its listener the colours."""
+        wanted = [f"{topic}={robots * (2 if topic == _COLOUR else 1)}" for topic in _TOPICS.values()]
+        words = ["--rate", str(rate), "--wait", *wanted]
         return self.start(self.python, str(_ROOT / "examples/robots/ros2_play_bag.py"), str(bag), *words)
+
+
+def _all_is_played(lines: list[str]) -> bool:
+    return bool(lines) and lines[-1].endswith("messages played\n")
 
 
 @pytest.fixture
@@ -89,8 +95,7 @@ async def _drive(ros2: Ros2, bag: Path, folder: Path) -> None:
         (busy,) = (name for name, page in pages.items() if page is not None and page["robots"])
         platform.kill(busy)
         await asyncio.to_thread(listener.until, poses(_FRAMES))
-        await asyncio.to_thread(player.end)
-        assert player.lines[-1].endswith("messages played\n")
+        await asyncio.to_thread(player.until, _all_is_played)
 
         heard = listener.heard("pose")
         assert worst_mm(heard, expected) <= 1.0
@@ -121,7 +126,7 @@ async def _share(ros2: Ros2, bag: Path, folder: Path) -> None:
             token_file.write_text(platform.issue_token(name), encoding="ascii")
             await asyncio.to_thread(ros2.bridge, platform.url, token_file, namespace=name, map="hall")
             listeners.append(await asyncio.to_thread(ros2.listener, f"/{name}", _COLOUR))
-        player = ros2.play(bag, 0.5)
+        player = ros2.play(bag, 0.5, robots=len(names))
         for listener in listeners:
             await asyncio.to_thread(listener.until, poses(_FRAMES))
         await asyncio.to_thread(player.end)
