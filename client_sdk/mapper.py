@@ -26,11 +26,17 @@ from client_sdk.mapping import MapOptions, PointMap, Trajectory, write_ply, writ
 from client_sdk.monocular.scale import MarkerScale, OdometryScale
 from client_sdk.slots import FeaturesFunction, LoopsFunction, MotionFunction, OptimiserFunction, Slots
 from client_sdk.tracking.monocular_tracker import MonocularOptions, MonocularTracker
-from client_sdk.tracking.segments import DriveRecords, SegmentRecord, keyframe_of, tracker_record
+from client_sdk.tracking.segments import (
+    DriveRecords,
+    SegmentRecord,
+    keyframe_of,
+    landmark_keyframes,
+    tracker_record,
+)
 from client_sdk.tracking.tracker import Tracker
 from rse_pf.errors import ConfigurationError, RsePfError, UsageError
 from rse_pf.geometry import Array, Camera
-from rse_pf.maps.format import MapVersion, encode_map
+from rse_pf.maps.format import UP, UP_FIELD, Keyframe, MapVersion, encode_map
 from rse_pf.pnp import DepthNoise, PnpOptions
 from rse_pf.slam.inertial import KeyframeImu, upright_turn
 
@@ -134,7 +140,7 @@ class Mapper:
             map_options: Density of the map of frames with depth.
             T_world_start: ``(4, 4)``, pose of the first camera; None means the identity, or, with an IMU, a
                 world whose z points up, in which a level camera looks along x.
-            keyframes_of: Name of the robot under which keyframes with depth are kept, about 50 kB each, for
+            keyframes_of: Name of the robot under which keyframes are kept, about 50 kB each, for
                 `encoded_map`; empty keeps none.
             adds_frames: Whether each frame with depth is added to the map; else the caller adds to `map`
                 what it wants.
@@ -341,18 +347,20 @@ class Mapper:
         `DataClient.update_map` shares it; `merge_maps` makes one map of several.
 
         Raises:
-            UsageError: No keyframe was kept: the frames have no depth, or *keyframes_of* is empty.
+            UsageError: No keyframe was kept: the scale is not known, or *keyframes_of* is empty.
         """
-        record = self._records.first
-        if not record.keyframes:
+        keyframes = self._kept_keyframes()
+        if not keyframes:
             raise UsageError(
-                "no keyframe was kept, so there is no map to share",
-                hint="make the mapper with keyframes_of=ROBOT, and give it frames with depth",
+                "no keyframe was kept in metres, so there is no map to share",
+                hint="make the mapper with keyframes_of=ROBOT, and give it frames with depth, or a scale",
             )
-        points, colours = record.cloud.points(min_readings=self._least_readings)
-        made_by = {"made_by": "mapper", "robot": self._keyframes_of}
-        keyframes = tuple(replace(keyframe, id=number) for number, keyframe in enumerate(record.keyframes))
-        version = MapVersion(keyframes=keyframes, points=points, colours=colours, provenance=made_by)
+        points, colours = self.map.points(min_readings=self._least_readings)
+        made_by: dict[str, Any] = {"made_by": "mapper", "robot": self._keyframes_of}
+        if self._is_upright:
+            made_by[UP_FIELD] = list(UP)
+        numbered = tuple(replace(keyframe, id=number) for number, keyframe in enumerate(keyframes))
+        version = MapVersion(keyframes=numbered, points=points, colours=colours, provenance=made_by)
         return encode_map(version)
 
     def save(self, folder: Path) -> dict[str, Any]:
@@ -399,6 +407,15 @@ class Mapper:
                 f"cannot write {folder}: {error.strerror}", hint="name another folder"
             ) from error
         return report
+
+    def _kept_keyframes(self) -> list[Keyframe]:
+        """Return the keyframes that others may use: those in metres."""
+        tracker = self._tracker
+        if not isinstance(tracker, MonocularTracker):
+            return self._records.first.keyframes
+        if not self._keyframes_of or self.camera is None or self.scale == _UP_TO_SCALE:
+            return []
+        return landmark_keyframes(tracker, self.camera, self._keyframes_of)
 
     @property
     def _least_readings(self) -> int:

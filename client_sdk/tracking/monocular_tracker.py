@@ -278,12 +278,13 @@ class MonocularTracker:
         """The number of keyframes of this segment."""
         return len(self._own.map.keyframes)
 
-    def keyframe(self, number: int) -> SeenKeyframe:
-        """Return a keyframe of this segment."""
-        own, keyframe = self._own, self._own.map.keyframes[number]
+    def keyframe(self, number: int, segment: int | None = None) -> SeenKeyframe:
+        """Return a keyframe of a segment; None for that of the newest pose."""
+        own = self._own if segment is None else self._segments[segment]
+        keyframe = own.map.keyframes[number]
         return SeenKeyframe(
             timestamp_s=next(placed.timestamp_s for placed in own.placed if placed.keyframe == number),
-            T_world_camera=self.keyframe_pose(number),
+            T_world_camera=self._T_world_start @ inverse(keyframe.T_camera_world),
             image=keyframe.features.image,
             kind=ORB if self._slots.features is None else self._slots.features.kind,
             depths=own.map.depths(number),
@@ -293,6 +294,11 @@ class MonocularTracker:
         """Return the ``(4, 4)`` pose of a keyframe of this segment in the world, as it is adjusted now."""
         pose: Array = self._T_world_start @ inverse(self._own.map.keyframes[number].T_camera_world)
         return pose
+
+    def keyframes_of(self, segment: int) -> Iterator[SeenKeyframe]:
+        """Yield the keyframes of a segment, oldest first."""
+        for number in range(len(self._segments[segment].map.keyframes) if segment in self._segments else 0):
+            yield self.keyframe(number, segment)
 
     @property
     def segments(self) -> tuple[int, ...]:

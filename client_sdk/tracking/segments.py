@@ -13,10 +13,17 @@ from client_sdk.frontend import Features, Frame, TrackedFrame
 from client_sdk.mapping import MapOptions, PointMap, Trajectory
 from client_sdk.tracking.monocular_tracker import MonocularTracker
 from client_sdk.tracking.tracker import Join
-from rse_pf.geometry import Array, rigid, transform
+from rse_pf.geometry import Array, Camera, rigid, transform
 from rse_pf.maps.format import Keyframe
 
-__all__ = ["DriveRecords", "SegmentRecord", "add_to_cloud", "keyframe_of", "tracker_record"]
+__all__ = [
+    "DriveRecords",
+    "SegmentRecord",
+    "add_to_cloud",
+    "keyframe_of",
+    "landmark_keyframes",
+    "tracker_record",
+]
 
 _CLOUD_SHARE = 0.05
 """Largest deviation of a stereo pair's depth in the cloud, as a share of the depth."""
@@ -127,6 +134,22 @@ def keyframe_of(tracked: TrackedFrame, pose: Array, features: Features, robot: s
         descriptors=features.descriptors, points_camera=features.points_camera.astype(np.float32),
         kind=features.kind,
     )  # fmt: skip
+
+
+def landmark_keyframes(tracker: MonocularTracker, camera: Camera, robot: str) -> list[Keyframe]:
+    """Return the keyframes of the first segment of a camera without depth, as they are corrected now.
+
+    Features without a landmark have no point.
+    """
+    return [
+        Keyframe(
+            id=0, robot=robot, timestamp_s=seen.timestamp_s, T_world_camera=seen.T_world_camera,
+            camera=camera, pixels=seen.image.pixels.astype(np.float32), descriptors=seen.image.descriptors,
+            points_camera=camera.back_project(seen.image.pixels, seen.depths).astype(np.float32),
+            kind=seen.kind,
+        )
+        for seen in tracker.keyframes_of(min(tracker.segments, default=0))
+    ]  # fmt: skip
 
 
 def _moved(T_into_segment: Array, pose: Array) -> Array:

@@ -7,6 +7,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -17,7 +18,7 @@ from rse_pf.live_map.events import MapStarted, StartKeyframe, StartLink, matrix_
 from rse_pf.live_map.graph import Graph, Segment
 from rse_pf.live_map.options import LiveMapOptions
 from rse_pf.live_map.smoothing import edges_of, link_information
-from rse_pf.maps.format import Edge, EdgeKind, Keyframe, MapVersion
+from rse_pf.maps.format import UP, UP_FIELD, Edge, EdgeKind, Keyframe, MapVersion
 from rse_pf.slam.inertial import agreed_gravity, upright_turn
 from rse_pf.slam.keyframe import Keyframe as SentKeyframe
 from rse_pf.slam.keyframe import decode_keyframe, encode_keyframe, make_features
@@ -123,7 +124,9 @@ def _version_of(graph: Graph, options: LiveMapOptions) -> MapVersion:
                     kind=kind,
                 )
             )  # fmt: skip
-    provenance = {"made_by": "live", "from": graph.source}
+    provenance: dict[str, Any] = {"made_by": "live", "from": graph.source}
+    if down is not None:
+        provenance[UP_FIELD] = list(UP)
     return MapVersion(keyframes=tuple(keyframes), edges=tuple(edges), provenance=provenance)
 
 

@@ -32,9 +32,24 @@ from rse_pf.errors import BadMessage, BadRequest, LimitExceeded, RsePfError, mes
 from rse_pf.geometry import Array, Camera, rigid
 from rse_pf.maps.descriptors import ORB, DescriptorKind, Descriptors, one_kind
 
-__all__ = ["Edge", "EdgeKind", "Keyframe", "MapLimits", "MapVersion", "decode_map", "encode_map"]
+__all__ = [
+    "UP",
+    "UP_FIELD",
+    "Edge",
+    "EdgeKind",
+    "Keyframe",
+    "MapLimits",
+    "MapVersion",
+    "decode_map",
+    "encode_map",
+]
 
 EdgeKind = Literal["odometry", "loop", "merge"]
+
+UP_FIELD = "up"
+"""Field of the provenance of a map whose gravity is known: the direction against it, in the world."""
+UP = (0.0, 0.0, 1.0)
+"""That of maps that were turned, so that their z points up."""
 
 _MAGIC = b"RSEMAP1\n"
 _MAX_BYTES = 1 << 30
@@ -148,6 +163,16 @@ class MapVersion:
     def kind(self) -> DescriptorKind:
         """Of the descriptors of all keyframes; ORB without any."""
         return self.keyframes[0].kind if self.keyframes else ORB
+
+    @property
+    def up(self) -> Array | None:
+        """The ``(3,)`` unit vector against gravity, in the world; None where gravity is not known."""
+        told = self.provenance.get(UP_FIELD)
+        if not isinstance(told, list) or len(told) != 3 or not all(type(each) is float for each in told):
+            return None
+        up = np.array(told)
+        length = float(np.linalg.norm(up))
+        return up / length if 0.99 <= length <= 1.01 else None
 
     def __post_init__(self) -> None:
         ids = {keyframe.id for keyframe in self.keyframes}

@@ -18,7 +18,7 @@ import numpy.typing as npt
 from rse_pf.budget import PROVENANCE, check_msgpack
 from rse_pf.errors import BadRequest, LimitExceeded
 from rse_pf.geometry import Array, inverse, median_pose
-from rse_pf.maps.format import Edge, MapVersion
+from rse_pf.maps.format import UP_FIELD, Edge, MapVersion
 from rse_pf.service import Report
 from rse_pf.slam.cloud_deform import deform_clouds
 from rse_pf.slam.consistency import LoopClosure, OdometryNoise
@@ -300,17 +300,23 @@ def _version(
         points=points,
         colours=colours,
         provenance=_provenance(
-            versions, [[int(atlas.of_map[row]), atlas.keyframes[row].id] for row in place]
+            versions,
+            [[int(atlas.of_map[row]), atlas.keyframes[row].id] for row in place],
+            versions[int(atlas.of_map[rows[0]])].up,
         ),
     )
 
 
-def _provenance(versions: Sequence[MapVersion], origins: list[list[int]]) -> dict[str, Any]:
-    """Return the provenance with those of *versions*, whose own parents are left out where it is too long."""
+def _provenance(versions: Sequence[MapVersion], origins: list[list[int]], up: Array | None) -> dict[str, Any]:
+    """Return the provenance with those of *versions*, whose own parents are left out where it is too long.
+
+    *up* is that of the map whose world is kept.
+    """
+    known: dict[str, Any] = {} if up is None else {UP_FIELD: up.tolist()}
     whole: list[Mapping[str, Any]] = [dict(version.provenance) for version in versions]
     short = [{name: each[name] for name in each if name != "parents"} for each in whole]
     for parents in (whole, short):
-        provenance = {"made_by": "merge", "from": origins, "parents": parents}
+        provenance = {"made_by": "merge", "from": origins, **known, "parents": parents}
         encoded = msgspec.msgpack.encode(provenance)
         try:
             check_msgpack(encoded, PROVENANCE)
@@ -318,7 +324,7 @@ def _provenance(versions: Sequence[MapVersion], origins: list[list[int]]) -> dic
             continue
         if len(encoded) <= PROVENANCE.wire_bytes:
             return provenance
-    return {"made_by": "merge", "from": origins}
+    return {"made_by": "merge", "from": origins, **known}
 
 
 def _reason_not_joined(

@@ -19,9 +19,10 @@ from urllib.parse import urlsplit
 
 from client_sdk.check.drive_check import DriveCheck
 from rse_pf.cli.maps.frame_table import FRAMES_FILE, FrameTable
+from rse_pf.cli.maps.map_store import add_keep_arguments, drive_store, keep_map, map_name
 from rse_pf.cli.sensors import add_check_argument, add_sensor_arguments
 from rse_pf.config import PlatformSettings
-from rse_pf.errors import CommandFailed, UsageError
+from rse_pf.errors import CommandFailed, RsePfError, UsageError
 from rse_pf.files import replace_file
 from rse_pf.terminal import show, show_progress
 
@@ -76,6 +77,7 @@ def add_drive_arguments(parser: argparse.ArgumentParser, out: Path) -> None:
     add("--frames", type=int, metavar="N", help="stop after so many frames")
     add_check_argument(parser)
     add("--out", type=Path, default=out, metavar="DIR", help="results (default: %(default)s)")
+    add_keep_arguments(parser)
     add(
         "--url", action="append",
         help="use the platform at this address, with --token-file; with several, the nearest of them",
@@ -134,6 +136,7 @@ def map_source(
     from rse_pf.experiments.plots.map_image import RobotPath, draw_map
 
     _make_folder(args.out)
+    kept_in = drive_store(args, settings)
     frames = FrameTable()
     check = DriveCheck(is_wanted=args.check, is_thinned=args.rate is not None)
     mapper = asyncio.run(_drive(args, settings, source, scale, frames, check))
@@ -143,8 +146,9 @@ def map_source(
         report = {**report, **about(mapper.trajectory)}
     if checked is not None:
         report["check"] = checked
-    if about is not None or checked is not None:
-        replace_file(args.out / "report.json", (json.dumps(report, indent=2) + "\n").encode())
+    kept, kept_line = _keep(args, mapper, kept_in)
+    report = {**report, **kept}
+    replace_file(args.out / "report.json", (json.dumps(report, indent=2) + "\n").encode())
     frames.write(args.out / FRAMES_FILE)
     points, colours = mapper.map.points()
     path = mapper.trajectory
@@ -162,6 +166,7 @@ def map_source(
         *frames.lines(),
         *check.lines(checked),
         f"results: {args.out}/map.ply, map.png, trajectory.txt, {FRAMES_FILE}, report.json",
+        kept_line,
     )
     if posed <= (1 - _MOST) * report["frames"]:
         raise CommandFailed(
@@ -170,11 +175,24 @@ def map_source(
     return 0
 
 
+def _keep(args: argparse.Namespace, mapper: Mapper, settings: PlatformSettings) -> tuple[dict[str, Any], str]:
+    """Keep the map, so that others can be found in it; return the fields of the report, and a line."""
+    try:
+        kept = keep_map(mapper.encoded_map(), map_name(args), settings, f"rse-pf map {args.action}")
+    except RsePfError as error:
+        why = "its scale is not known" if isinstance(error, UsageError) else f"{error.code}: {error.message}"
+        if mapper.keyframes == 0:
+            why = "it has no keyframe"
+        return {"map": None, "map_reason": why}, f"no map is kept: {why}"
+    return kept, f"map: {kept['map']} in {kept['store']}; see rse-pf map show {kept['map']}"
+
+
 def check_drive(args: argparse.Namespace) -> OdometryScale | MarkerScale | None:
     """Refuse options that contradict each other, and return the scale; raises UsageError."""
     from client_sdk.slots import load_features
 
     load_features(args.features)
+    map_name(args)
     if args.frames is not None and args.frames < 2:
         raise UsageError(f"--frames {args.frames} is below 2", hint="leave it out to use all frames")
     if args.enrolment is not None and (args.url is not None or args.token_file is not None):
@@ -228,7 +246,8 @@ async def _drive(
     with contextlib.suppress(NotImplementedError, ValueError, RuntimeError):  # not in the main thread
         asyncio.get_running_loop().add_signal_handler(signal.SIGINT, stop.set)
     async with _robot(args, settings) as robot:
-        mapper = robot.mapper(scale=scale, depth=source.has_depth, features=load_features(args.features))
+        mapper = robot.mapper(scale=scale, depth=source.has_depth, features=load_features(args.features),
+                              keyframes_of=_ROBOT)  # fmt: skip
         status = _Status(time.monotonic)
         while not stop.is_set() and (args.frames is None or mapper.frames < args.frames):
             frame = await asyncio.to_thread(next, source, None)

@@ -1,9 +1,9 @@
 """Work with the maps that robots share: show, merge and prune them, localise in them, roll them back.
 
-Works on the store itself (--store, by default data.store; rse-pf local keeps its own in STATE/objects).  A
-VERSION is head, or six or more digits of an id; show --all lists the ids.  rollback sets the head to an
-earlier version and deletes nothing; prune removes old versions.  Each action has its own help page:
-rse-pf map merge --help.
+Works on the store itself (--store; by default data.store, else that of the platform on this machine, where
+from-camera and from-bag keep their maps).  A VERSION is head, or six or more digits of an id; show --all
+lists the ids.  rollback sets the head to an earlier version and deletes nothing; prune removes old versions.
+Each action has its own help page: rse-pf map merge --help.
 
 examples:
   rse-pf map from-camera 0 --intrinsics intrinsics.json --out out-camera
@@ -24,7 +24,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 import functools
-import os
 import re
 import threading
 import time
@@ -37,17 +36,15 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 import numpy as np
 
-from rse_pf.audit.operator import record_map_change
-from rse_pf.aws.storage import open_data_store
 from rse_pf.cli.maps.bags import BAG_ACTIONS, BAG_FORMAT, add_bag_actions, export_bag, run_bags
 from rse_pf.cli.maps.from_camera import add_from_camera_arguments, run_from_camera
 from rse_pf.cli.maps.live import add_live_arguments, run_live, run_publish
+from rse_pf.cli.maps.map_store import open_maps, with_store
 from rse_pf.cli.maps.merge_output import commit_merge, merge_progress
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import NotFound, UsageError
 from rse_pf.files import replace_file
 from rse_pf.geometry import Camera, rotation_angle_deg, to_quaternion
-from rse_pf.local.state import state_folder
 from rse_pf.maps.descriptors import check_alike
 from rse_pf.maps.format import MapVersion
 from rse_pf.maps.registry import MapOrigin, MapRecord, MapRegistry, difference
@@ -90,7 +87,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the actions and their options."""
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
     common = argparse.ArgumentParser(add_help=False)
-    common.add_argument("--store", help="store of the maps: dir:PATH or s3:BUCKET (default: data.store)")
+    common.add_argument(
+        "--store",
+        help="store of the maps: dir:PATH or s3:BUCKET (default: data.store, or that of rse-pf local)",
+    )
     common.add_argument(
         "--tenant", default="default", help="tenant that owns the maps (default: %(default)s)"
     )
@@ -179,22 +179,10 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
         return run_from_camera(args, settings)
     if args.action in BAG_ACTIONS:
         return run_bags(args, settings)
-    chosen = settings if args.store is None else settings.replace(data={"store": args.store})
-    if chosen.data.store == "memory:":
-        folder = state_folder("default", os.environ) / "objects"
-        raise UsageError(
-            "no store is named, and one in memory belongs to another process",
-            hint=f"name --store dir:PATH; that of rse-pf local is dir:{folder}",
-        )
-
-    def record(action: str, name: str, version: MapRecord) -> None:
-        record_map_change(chosen, action, name, version=version.id, number=version.number)
-
-    _check_store(chosen.data.store)
+    chosen = with_store(args.store, settings)
     if args.action in ("live", "publish"):
         return (run_live if args.action == "live" else run_publish)(args, chosen)
-    max_bytes = 4 * chosen.data.max_object_bytes
-    maps = MapRegistry(open_data_store(chosen), args.tenant, max_bytes=max_bytes, on_change=record)
+    maps = open_maps(chosen, args.tenant)
     actions = {
         "list": _list,
         "show": _show,
@@ -207,16 +195,6 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
         "export": _export,
     }
     return actions[args.action](args, maps) or 0
-
-
-def _check_store(store: str) -> None:
-    """Refuse a folder that is not there: an empty list of maps would look like an answer."""
-    kind, _, path = store.partition(":")
-    if kind == "dir" and not Path(path).is_dir():
-        raise UsageError(
-            f"there is no folder {path[:200]}",
-            hint="check --store; rse-pf local keeps its maps in the folder objects of its state",
-        )
 
 
 def _check_folder(file: Path) -> None:

@@ -29,7 +29,7 @@ from rse_pf.experiments.child_process import (
     end_process,
     start_process,
 )
-from rse_pf.experiments.demo.live import fetch_live_map, show_live_map
+from rse_pf.experiments.demo.live import LIVE_NAME, fetch_live_map, show_live_map
 from rse_pf.experiments.demo.live_faults import Disturbance, LiveFault
 from rse_pf.experiments.demo.merge import MERGED_MAP, merge_on_platform, print_tenths, write_merged
 from rse_pf.experiments.demo.report import closing_lines, demo_page, is_lost, make_report
@@ -327,7 +327,10 @@ def _write_results(
         report["checks"] = checks
     if options.live:
         drives = read_live_drives(folder, [_name(number) for number in range(len(finished))])
-        report["live"] = live_figures(drives, read_live_map(folder))
+        live_map = read_live_map(folder)
+        report["live"] = live_figures(drives, live_map)
+        if live_map is not None:
+            report |= {"store": f"dir:{folder / 'platform' / 'objects'}", "map": LIVE_NAME}
     write_json(folder / "report.json", report)
     (folder / "report.md").write_text(demo_page(report), encoding="utf-8")
     paths = [

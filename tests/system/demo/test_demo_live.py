@@ -14,6 +14,7 @@ from typing import Any
 import pytest
 
 from rse_pf.backend.live_map.owner.lease import decode_lease, lease_name
+from rse_pf.cli.main import main
 from rse_pf.errors import NotFound
 from rse_pf.experiments.results.live_error import live_figures, read_live_drives, read_live_map
 from rse_pf.identity import DEFAULT_TENANT
@@ -90,3 +91,5 @@ def test_no_keyframe_is_lost_when_the_server_of_the_owner_is_killed(tmp_path: Pa
     for numbers in numbers_in_order(out, 2):
         assert numbers == list(range(len(numbers)))
     assert live["keyframes"] >= 16
+    assert main(["map", "export", report["map"], "--store", report["store"], "--format", "g2o",
+                 "--out", str(tmp_path / "demo.g2o")]) == 0  # fmt: skip

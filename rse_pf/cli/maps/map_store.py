@@ -1,0 +1,136 @@
+"""Find the store of the maps, and keep the map of a drive in it.
+
+Without a name the store is that of the settings, else that of the platform that runs on this machine, else
+the folder of ``rse-pf local``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import re
+import time
+from pathlib import Path
+from typing import Any
+
+from rse_pf.audit.operator import record_map_change
+from rse_pf.aws.storage import open_data_store
+from rse_pf.config import PlatformSettings
+from rse_pf.errors import ConfigurationError, NotFound, RsePfError, UsageError
+from rse_pf.local.processes import is_alive
+from rse_pf.local.state import platform_settings, read_state, state_folder
+from rse_pf.maps.registry import MapRecord, MapRegistry
+
+__all__ = ["add_keep_arguments", "drive_store", "keep_map", "map_name", "open_maps", "with_store"]
+
+_IN_MEMORY, _FOLDER = "memory:", "dir:"
+_OBJECTS = "objects"
+_MAP_NAME = re.compile(r"[a-z0-9][a-z0-9-]{0,63}")
+_NO_NAME = re.compile(r"[^a-z0-9]+")
+
+
+def with_store(named: str | None, settings: PlatformSettings) -> PlatformSettings:
+    """Return the settings with the store that is *named*, or that is found.
+
+    Raises:
+        UsageError: The folder that is named is not there, or none was named and none found.
+    """
+    chosen = settings if named is None else settings.replace(data={"store": named})
+    if chosen.data.store == _IN_MEMORY:
+        folder = None if named is not None else _objects_of_platform()
+        if folder is None or not folder.is_dir():
+            own = state_folder("default", os.environ) / _OBJECTS
+            raise UsageError(
+                "no store is named, and one in memory belongs to another process",
+                hint=f"name --store dir:PATH; that of rse-pf local is dir:{own}",
+            )
+        chosen = settings.replace(data={"store": f"{_FOLDER}{folder}"})
+    kind, _, path = chosen.data.store.partition(":")
+    # An empty list of maps would look like an answer.
+    if kind == "dir" and not Path(path).is_dir():
+        raise UsageError(
+            f"there is no folder {path[:200]}",
+            hint="check --store; rse-pf local keeps its maps in the folder objects of its state",
+        )
+    return chosen
+
+
+def open_maps(settings: PlatformSettings, tenant: str = "default") -> MapRegistry:
+    """Return the maps of a tenant in ``data.store``; changes are recorded in the platform's audit log."""
+
+    def record(action: str, name: str, version: MapRecord) -> None:
+        record_map_change(settings, action, name, version=version.id, number=version.number)
+
+    max_bytes = 4 * settings.data.max_object_bytes
+    return MapRegistry(open_data_store(settings), tenant, max_bytes=max_bytes, on_change=record)
+
+
+def add_keep_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare where the map of a drive is kept."""
+    parser.add_argument(
+        "--objects", type=Path, metavar="DIR",
+        help="folder of objects that keeps the map (default: that of data.store, or of rse-pf local)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--map", metavar="NAME", help="name of the map that is kept (default: the name of --out)"
+    )
+
+
+def map_name(args: argparse.Namespace) -> str:
+    """Return the name of the map of a drive; raises UsageError."""
+    if args.map is None:
+        return _NO_NAME.sub("-", args.out.absolute().name.lower()).strip("-")[:64].strip("-") or "drive"
+    if not _MAP_NAME.fullmatch(args.map):
+        raise UsageError(
+            f"{args.map[:80]!r} is no name of a map", hint="use 1 to 64 small letters, digits and hyphens"
+        )
+    return str(args.map)
+
+
+def drive_store(args: argparse.Namespace, settings: PlatformSettings) -> PlatformSettings:
+    """Return the settings with the store that keeps the map of a drive; its folder is made if need be."""
+    folder: Path | None = args.objects
+    if folder is None and settings.data.store != _IN_MEMORY:
+        return settings
+    folder = (folder or _objects_of_platform()).absolute()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UsageError(f"cannot make {folder}: {error.strerror}", hint="name another --objects") from error
+    return settings.replace(data={"store": f"{_FOLDER}{folder}"})
+
+
+def keep_map(data: bytes, name: str, settings: PlatformSettings, author: str) -> dict[str, Any]:
+    """Make *data* the next version of map *name*; return ``store`` and ``map`` as ``map export`` takes them.
+
+    Raises:
+        RsePfError: It was not kept.
+    """
+    maps = open_maps(settings)
+    try:
+        parent = maps.head(name).id
+    except NotFound:
+        parent = None
+    version = maps.commit(name, data, parent=parent, author=author, created_s=time.time(), note="a drive")
+    return {"store": settings.data.store, "map": name, "map_version": version.id}
+
+
+def _objects_of_platform() -> Path:
+    """Return the folder of objects of the one platform that runs here, or that of ``rse-pf local``."""
+    own = state_folder("default", os.environ)
+    running = []
+    for folder in sorted(own.parent.glob("*/")):
+        try:
+            state = read_state(folder)
+        except RsePfError:
+            continue
+        if state is not None and is_alive(state.control_plane):
+            running.append(folder)
+    folder = running[0] if len(running) == 1 else own
+    try:
+        known = platform_settings(folder)
+    except ConfigurationError:
+        known = None
+    if known is not None and known.data.store.startswith(_FOLDER):
+        return Path(known.data.store.removeprefix(_FOLDER))
+    return folder / _OBJECTS
