@@ -83,13 +83,9 @@ types: ## run mypy --strict
 	@$(SETUP) dev
 	@$(BIN)/mypy
 
-bench: ## run every benchmark that needs no argument; prints tables, writes JSON to out/bench
+bench: ## run every benchmark that needs no argument; writes JSON to out/bench
 	@$(SETUP) dev
-	@mkdir -p out/bench
-	@for each in $$(grep -rl --include='*.py' -- '"--out"' benchmarks | sort); do \
-	  name=$$(echo $${each%.py} | cut -d/ -f2- | tr / .); echo "== $$name"; \
-	  $(BIN)/python -m benchmarks.$$name --out out/bench/$$name.json; case $$? in 0) ;; \
-	  2) echo "left out: it needs the arguments above" ;; *) exit 1 ;; esac; done
+	@$(BIN)/python -m benchmarks all out/bench
 
 docs: ## write the generated pages, the source tree and the picture of the packages
 	@$(SETUP) dev

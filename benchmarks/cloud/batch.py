@@ -5,29 +5,29 @@ the scheduler killed; links and alignment at least 1.6 times as fast on two idle
 as a whole, drift apart, and have noise in pixels, depths, descriptors and clouds.  ``two_processes`` says
 what two independent processes without any engine reach on this machine: no engine can be faster than they.
 
-    python -m benchmarks.cloud.batch --recordings ../shared/data --copies 20 --candidates 2 --out batch.json
-    python -m benchmarks.cloud.batch --recordings ../shared/data --copies 4 --frames 60
+    python -m benchmarks cloud.batch --recordings ../shared/data --copies 20 --candidates 2 --out batch.json
+    python -m benchmarks cloud.batch --recordings ../shared/data --copies 4 --frames 60
 
 With 20 copies of 250 keyframes it takes an hour on two cores, with 4 copies of 60 about three minutes.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
-import platform
 import signal
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
+from benchmarks.frame.registry import Bar, Recordings, benchmark, command_of
+from benchmarks.frame.report import say
 from rse_pf.batch.cluster import DaskEngine, LocalCluster, new_cluster_key
 from rse_pf.batch.merge import BatchMerge, BatchMergeResult
 from rse_pf.batch.tasks import InProcessEngine
@@ -39,12 +39,24 @@ from rse_pf.one_thread import ONE_THREAD
 from rse_pf.slam.cloud_deform import deform_cloud
 from rse_pf.slam.links import Atlas, MergeOptions, measure_pairs
 
-__all__ = ["kitchen", "main", "noisy_copy"]
+__all__ = ["kitchen", "noisy_copy"]
 
 _STEP_M, _STEP_DEG = 0.002, 0.05
 """Drift of a copy from one keyframe to the next."""
 _PIXEL, _DEPTH_M, _CLOUD_M, _FLIPPED_BITS = 0.3, 0.004, 0.003, 0.02
 _PARALLEL = ("vectors", "pairs", "links", "agree", "tiles")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Options:
+    """The arguments."""
+
+    recordings: Recordings = Path("../shared/data")
+    copies: int = 4
+    frames: Annotated[int, "of the recording; each is a keyframe"] = 250
+    candidates: int = 6
+    workers: int = 2
+    folder: Annotated[Path | None, "where maps and parts are written (default: temporary)"] = None
 
 
 def kitchen(recordings: Path, frames: int) -> MapVersion:
@@ -84,39 +96,20 @@ def noisy_copy(version: MapVersion, number: int) -> MapVersion:
     )  # fmt: skip
 
 
-def main() -> None:
-    """Print the figures, and write them to ``--out``; the exit code is 1 if a bar is not met."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--recordings", type=Path, required=True)
-    parser.add_argument("--copies", type=int, default=4)
-    parser.add_argument("--frames", type=int, default=250, help="of the recording; each is a keyframe")
-    parser.add_argument("--candidates", type=int, default=6)
-    parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--folder", type=Path, help="where maps and parts are written (default: temporary)")
-    parser.add_argument("--out", type=Path)
-    parser.add_argument("--one", type=Path, help=argparse.SUPPRESS)
-    parser.add_argument("--pairs", type=Path, help=argparse.SUPPRESS)
-    args = parser.parse_args()
-    if args.one is not None:
-        _in_one_process(args.one, args.candidates)
-        return
-    if args.pairs is not None:
-        print(json.dumps({"seconds": _time_of_pairs(args.pairs)}))
-        return
-    if not args.recordings.is_dir():
-        sys.exit(
-            f"there is no folder {args.recordings}: the benchmark needs the recording 7scenes_redkitchen"
-        )
+@benchmark(
+    Bar("links_and_clouds_equal", equals=True),
+    Bar("apart_mm", at_most=0.1, unit="mm"),
+    Bar("apart_of_one_level_mm", at_most=0.1, unit="mm"),
+    Bar("not_joined", equals=0),
+    Bar("speed_up_links_and_icp", at_least=1.6, unit="times"),
+)
+def run_benchmark(args: Options) -> dict[str, Any]:
+    """Merge in one process, on workers, and with kills."""
     with tempfile.TemporaryDirectory(dir=args.folder) as folder:
-        report = _measure(args, Path(folder))
-    text = json.dumps(report, indent=2)
-    print(text)
-    if args.out is not None:
-        args.out.write_text(text + "\n", encoding="utf-8")
-    sys.exit(0 if report["bars"]["all"] else 1)
+        return _measure(args, Path(folder))
 
 
-def _measure(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
+def _measure(args: Options, folder: Path) -> dict[str, Any]:
     source = kitchen(args.recordings, args.frames)
     names = []
     store = DirectoryStore(folder / "one")
@@ -125,39 +118,44 @@ def _measure(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
         names.append(f"maps/{digest_of(data)}")
         store.put(names[-1], data)
     (folder / "names.json").write_text(json.dumps(names), encoding="utf-8")
-    _say(f"{args.copies} maps of {len(source.keyframes)} keyframes and {len(source.points)} points")
+    say(f"{args.copies} maps of {len(source.keyframes)} keyframes and {len(source.points)} points")
     report: dict[str, Any] = {
-        "machine": platform.platform(), "cores": os.cpu_count(), "load_average": os.getloadavg(),
         "copies": args.copies, "keyframes": args.copies * len(source.keyframes),
         "points": args.copies * len(source.points), "candidates": args.candidates,
         "two_processes": _two_processes(folder),
     }  # fmt: skip
-    subprocess.run(_again(args, "--one", folder), env=_environment(), check=True)
+    subprocess.run(
+        command_of(merge_in_one_process, str(folder), str(args.candidates)), env=_environment(), check=True
+    )
     one = json.loads((folder / "one.json").read_text(encoding="utf-8"))
-    _say(f"one process: {one['seconds']:.0f} s")
+    say(f"one process: {one['seconds']:.0f} s")
     two, quiet = _in_workers(args, folder, names, "two", kills=False)
-    _say(f"{args.workers} workers: {quiet['seconds']:.0f} s")
+    say(f"{args.workers} workers: {quiet['seconds']:.0f} s")
     killed, broken = _in_workers(args, folder, names, "killed", kills=True)
-    _say(f"with kills: {broken['seconds']:.0f} s, {broken['events']}")
+    say(f"with kills: {broken['seconds']:.0f} s, {broken['events']}")
     report |= {"one_process": one, "workers": quiet, "workers_killed": broken}
     speed_up = _seconds_of(one, *_PARALLEL) / _seconds_of(quiet, *_PARALLEL)
     apart_m = _apart_m(killed.merged.version, _merge(folder, "one"))
     single_m = _apart_m(_merge(folder, "one"), _merge(folder, "single"))
-    bars = {
-        "links_and_clouds_equal": one["digest"] == quiet["digest"] == broken["digest"],
-        "poses_within_0.1_mm_of_one_process": apart_m <= 1e-4,
-        "poses_within_0.1_mm_of_one_level": single_m <= 1e-4,
-        "all_joined": len(killed.merged.joined) == args.copies,
-        "links_and_icp_1.6_times_as_fast": speed_up >= 1.6,
-    }
     report |= {
         "links": len(two.links), "clouds_aligned": len(two.tiles),
         "speed_up_links_and_icp": round(speed_up, 3),
         "speed_up_whole": round(one["seconds"] / quiet["seconds"], 3),
         "apart_mm": round(1e3 * apart_m, 6), "apart_of_one_level_mm": round(1e3 * single_m, 6),
-        "bars": {**bars, "all": all(bars.values())},
+        "links_and_clouds_equal": one["digest"] == quiet["digest"] == broken["digest"],
+        "not_joined": args.copies - len(killed.merged.joined),
     }  # fmt: skip
     return report
+
+
+def merge_in_one_process(folder: str, candidates: str) -> None:
+    """Run `_in_one_process` in a process of its own."""
+    _in_one_process(Path(folder), int(candidates))
+
+
+def print_time_of_pairs(folder: str) -> None:
+    """Print `_time_of_pairs` of a process of its own."""
+    print(json.dumps({"seconds": _time_of_pairs(Path(folder))}))
 
 
 def _in_one_process(folder: Path, candidates: int) -> None:
@@ -177,7 +175,7 @@ def _in_one_process(folder: Path, candidates: int) -> None:
 
 
 def _in_workers(
-    args: argparse.Namespace, folder: Path, names: list[str], called: str, *, kills: bool
+    args: Options, folder: Path, names: list[str], called: str, *, kills: bool
 ) -> tuple[BatchMergeResult, dict[str, Any]]:
     """Merge on worker processes; kill a worker at a third of the links, and the scheduler at two thirds."""
     store, source = DirectoryStore(folder / called), DirectoryStore(folder / "one")
@@ -230,7 +228,7 @@ def _two_processes(folder: Path) -> dict[str, float]:
 
 
 def _times_of(folder: Path, count: int) -> list[float]:
-    command = [sys.executable, "-m", "benchmarks.cloud.batch", "--recordings", "-", "--pairs", str(folder)]
+    command = command_of(print_time_of_pairs, str(folder))
     processes = [
         subprocess.Popen(command, env=_environment(), stdout=subprocess.PIPE, text=True) for _ in range(count)
     ]
@@ -248,13 +246,6 @@ def _time_of_pairs(folder: Path, pairs: int = 600) -> float:
     began = time.monotonic()
     measure_pairs(atlas, chosen, MergeOptions())
     return time.monotonic() - began
-
-
-def _again(args: argparse.Namespace, option: str, folder: Path) -> list[str]:
-    return [
-        sys.executable, "-m", "benchmarks.cloud.batch", "--recordings", str(args.recordings),
-        "--candidates", str(args.candidates), option, str(folder),
-    ]  # fmt: skip
 
 
 def _environment() -> dict[str, str]:
@@ -300,11 +291,3 @@ def _noisy(keyframe: Keyframe, T_world_camera: Array, number: int, rng: np.rando
         pixels=(keyframe.pixels + rng.normal(size=(count, 2)) * _PIXEL).astype(np.float32),
         descriptors=keyframe.descriptors ^ flips, points_camera=points.astype(np.float32),
     )  # fmt: skip
-
-
-def _say(text: str) -> None:
-    print(text, file=sys.stderr, flush=True)
-
-
-if __name__ == "__main__":
-    main()

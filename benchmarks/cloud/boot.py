@@ -1,6 +1,6 @@
 """Measure the start of a bare Debian machine until /readyz: pip on the machine against the ready archives.
 
-    python -m benchmarks.cloud.boot [--runs 3]
+    python -m benchmarks cloud.boot [--runs 3]
 
 Needs root, debootstrap (once) and `make assets`.  S3 and the instance's metadata are emulated on this
 machine, so the download takes no time of a network; both ways fetch the same libraries with all services of
@@ -10,9 +10,6 @@ least 5x less time to /readyz.
 
 from __future__ import annotations
 
-import argparse
-import os
-import platform
 import re
 import shutil
 import statistics
@@ -21,6 +18,11 @@ import tempfile
 import time
 import zipfile
 from pathlib import Path
+from typing import Annotated, Any
+
+from benchmarks.frame.registry import Bar, benchmark
+from benchmarks.frame.report import say
+from benchmarks.frame.statistics import interleaved, spread
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(REPOSITORY / "tests"))
@@ -29,6 +31,7 @@ from system.boot.world import World, debian_root, missing  # noqa: E402
 
 from rse_pf.config import PlatformSettings  # noqa: E402
 from rse_pf.config.resource_names import READY_PATH  # noqa: E402
+from rse_pf.errors import ConfigurationError  # noqa: E402
 from stacks.assets import SERVERS, SUMS_FILE, staged, sums_digest, sums_text  # noqa: E402
 
 WAYS = ("pip", "archive")
@@ -49,34 +52,27 @@ def unpack(about):
 '''
 
 
-def main() -> int:
-    """Measure both ways alternately and print the medians; 1 when the bar is missed."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--runs", type=int, default=3, metavar="N", help="starts of each way")
-    args = parser.parse_args()
+@benchmark(Bar("times_as_fast", at_least=BAR, unit="times"))
+def run_benchmark(*, runs: Annotated[int, "starts of each way"] = 3) -> dict[str, Any]:
+    """Start both ways alternately."""
     build = REPOSITORY / "build"
     problem = missing() or ("" if (build / SERVERS).is_dir() else "no packages in build: run make assets")
     if problem:
-        sys.stderr.write(f"cannot measure: {problem}\n")
-        return 2
+        raise ConfigurationError(problem, hint="see the help of this benchmark")
     root = debian_root(build / "debian12")
-    print(f"{platform.platform()}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}, n = {args.runs}")
-    runs_of: dict[str, list[tuple[float, float, float]]] = {way: [] for way in WAYS}
-    for _ in range(args.runs):
-        for way in WAYS:
-            runs_of[way].append(measure(way, build, root))
-    ready = {}
-    for way, runs in runs_of.items():
-        installed_s, cpu_s, ready_s = (statistics.median(values) for values in zip(*runs, strict=True))
-        ready[way] = ready_s
-        worst_s = max(run_s for *_, run_s in runs)
-        print(
-            f"{way:8} installed {installed_s:6.1f} s ({cpu_s:.1f} s of CPU)   /readyz {ready_s:6.1f} s"
-            f"   worst {worst_s:.1f} s"
-        )
-    times = ready["pip"] / ready["archive"]
-    print(f"archive: {times:.1f}x less time to /readyz (bar {BAR:g}x)")
-    return 0 if times >= BAR else 1
+    taken: dict[str, list[tuple[float, float, float]]] = {way: [] for way in WAYS}
+    for _, way in interleaved(WAYS, runs):
+        taken[way].append(measure(way, build, root))
+        say({"way": way, "ready_s": taken[way][-1][-1]})
+    figures: dict[str, Any] = {
+        way: {
+            name: spread(values)
+            for name, values in zip(("installed_s", "cpu_s", "ready_s"), zip(*rows, strict=True), strict=True)
+        }
+        for way, rows in taken.items()
+    }
+    ready = {way: statistics.median(row[-1] for row in rows) for way, rows in taken.items()}
+    return {**figures, "times_as_fast": ready["pip"] / ready["archive"]}
 
 
 def measure(way: str, build: Path, root: Path) -> tuple[float, float, float]:
@@ -118,7 +114,3 @@ def use_pip(package: Path, build: Path) -> None:
     text = script.read_text(encoding="utf-8")
     script.write_text(text.replace('if __name__ == "__main__":', f'{PIP_UNPACK}if __name__ == "__main__":'))
     (package / SUMS_FILE).write_text(sums_text(package), encoding="utf-8")
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,7 +1,7 @@
 """Robots at a server that is too small, with and without the burst function.
 
-    python -m benchmarks.cloud.burst [--robots 50] [--seconds 30] [--rate 8] [--deadline 0.3]
-        [--emulated-cores 0.2] [--matches 200] [--budget N] [--out FILE]
+    python -m benchmarks cloud.burst [--robots 50] [--seconds 30] [--rate 8] [--deadline 0.3]
+        [--emulated-cores 0.2] [--matches 200] [--budget N]
 
 One server with a fifth of a core, and the function behind `lambda_pnp.local_front`, which plays firewall,
 load balancer and Lambda.  Each robot is a `client_sdk.Robot` without a solver of its own; real PnP (200
@@ -15,11 +15,9 @@ than the budget; every answer of it says ``lambda``.
 
 from __future__ import annotations
 
-import argparse
 import asyncio
 import json
 import os
-import platform
 import signal
 import subprocess
 import sys
@@ -28,11 +26,14 @@ import time
 from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
 import client_sdk
+from benchmarks.frame.registry import Bar, benchmark
+from benchmarks.frame.report import say
+from benchmarks.frame.statistics import spread
 from rse_pf.auth.tokens import SigningKey
 from rse_pf.config import PlatformSettings, SessionSettings
 from rse_pf.errors import RsePfError
@@ -44,6 +45,20 @@ BAR_PERCENT = 99.0
 PROBLEMS = 16
 LARGEST_M = 0.1
 START_S = 120.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Options:
+    """The arguments."""
+
+    robots: int = 50
+    seconds: float = 30.0
+    rate: Annotated[float, "frames of a robot in a second"] = 8.0
+    deadline: Annotated[float, "s"] = 0.3
+    emulated_cores: float = 0.2
+    matches: int = 200
+    codec: str = "zlib"
+    budget: Annotated[int, "commands of a robot in a day"] = 10_000
 
 
 @dataclass(slots=True)
@@ -67,18 +82,16 @@ class Outcome:
 
     def document(self) -> dict[str, Any]:
         """Return all of it as plain JSON values."""
-        trips = sorted(self.round_trips_ms) or [float("nan")]
         return {
             "frames": self.frames, "in_time_percent": round(self.percent, 2), "wrong": self.wrong,
             "answered_by": dict(self.sources), "servers_of_burst": dict(self.servers_of_burst),
             "failures": dict(self.failures), "commands_at_the_function": self.at_function,
             "most_commands_of_a_robot_there": self.most_of_a_robot,
-            **{f"p{share}_ms": round(trips[min(len(trips) - 1, len(trips) * share // 100)], 1)
-               for share in (50, 95, 99)},
+            "ms": spread(self.round_trips_ms),
         }  # fmt: skip
 
 
-def measure(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
+def measure(args: Options, folder: Path) -> dict[str, Any]:
     """Run without the function, with it, and with it while the server dies; return what came of each."""
     key = SigningKey.from_seed(os.urandom(32), "bench")
     (folder / "keys.json").write_text(key.key_set().to_json(), encoding="utf-8")
@@ -88,11 +101,11 @@ def measure(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
     ):  # fmt: skip
         outcome = _run(args, folder, key, has_burst=has_burst, dies=dies)
         figures[name] = outcome.document()
-        print(f"{name:12} {json.dumps(figures[name])}", flush=True)
+        say({"run": name, **figures[name]})
     return figures
 
 
-def _run(args: argparse.Namespace, folder: Path, key: SigningKey, *, has_burst: bool, dies: bool) -> Outcome:
+def _run(args: Options, folder: Path, key: SigningKey, *, has_burst: bool, dies: bool) -> Outcome:
     started: list[subprocess.Popen[bytes]] = []
     try:
         url = _start_front(args, folder, started) if has_burst else ""
@@ -107,13 +120,13 @@ def _run(args: argparse.Namespace, folder: Path, key: SigningKey, *, has_burst: 
     return robots
 
 
-def _write_settings(args: argparse.Namespace, folder: Path, url: str) -> None:
+def _write_settings(args: Options, folder: Path, url: str) -> None:
     settings = {"burst": {"url": url, "robot_commands_per_day": args.budget}}
     document = {"context": {"rse-pf": PlatformSettings.from_dict(settings).to_dict()}}
     (folder / "settings.json").write_text(json.dumps(document), encoding="utf-8")
 
 
-def _start_front(args: argparse.Namespace, folder: Path, started: list[subprocess.Popen[bytes]]) -> str:
+def _start_front(args: Options, folder: Path, started: list[subprocess.Popen[bytes]]) -> str:
     _write_settings(args, folder, "")
     with (folder / "front.log").open("wb") as log:
         process = subprocess.Popen(
@@ -130,7 +143,7 @@ def _start_front(args: argparse.Namespace, folder: Path, started: list[subproces
 
 
 def _start_server(
-    args: argparse.Namespace, folder: Path, started: list[subprocess.Popen[bytes]]
+    args: Options, folder: Path, started: list[subprocess.Popen[bytes]]
 ) -> tuple[subprocess.Popen[bytes], int]:
     announce = folder / "server.json"
     announce.unlink(missing_ok=True)
@@ -152,9 +165,7 @@ def _start_server(
     return process, int(json.loads(announce.read_text(encoding="utf-8"))["port"])
 
 
-async def _drive(
-    args: argparse.Namespace, key: SigningKey, url: str, dying: subprocess.Popen[bytes] | None
-) -> Outcome:
+async def _drive(args: Options, key: SigningKey, url: str, dying: subprocess.Popen[bytes] | None) -> Outcome:
     problems = [make_problem(seed=seed, n=args.matches) for seed in range(PROBLEMS)]
     settings, outcome = PlatformSettings().auth, Outcome()
     robots = [
@@ -184,7 +195,7 @@ async def _drive(
 
 
 async def _robot(
-    args: argparse.Namespace, robot: client_sdk.Robot, problems: list[Any], begins: float, frames: int,
+    args: Options, robot: client_sdk.Robot, problems: list[Any], begins: float, frames: int,
     outcome: Outcome,
 ) -> None:  # fmt: skip
     loop = asyncio.get_running_loop()
@@ -196,9 +207,7 @@ async def _robot(
     await asyncio.gather(*asked)
 
 
-async def _frame(
-    args: argparse.Namespace, robot: client_sdk.Robot, problem: Any, due: float, outcome: Outcome
-) -> None:
+async def _frame(args: Options, robot: client_sdk.Robot, problem: Any, due: float, outcome: Outcome) -> None:
     loop = asyncio.get_running_loop()
     outcome.frames += 1
     try:
@@ -219,44 +228,20 @@ async def _frame(
     outcome.wrong += away > LARGEST_M
 
 
-def _options() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--robots", type=int, default=50)
-    parser.add_argument("--seconds", type=float, default=30.0)
-    parser.add_argument("--rate", type=float, default=8.0, help="frames of a robot in a second")
-    parser.add_argument("--deadline", type=float, default=0.3, help="s")
-    parser.add_argument("--emulated-cores", type=float, default=0.2)
-    parser.add_argument("--matches", type=int, default=200)
-    parser.add_argument("--codec", default="zlib")
-    parser.add_argument("--budget", type=int, default=10_000, help="commands of a robot in a day")
-    parser.add_argument("--out", type=Path)
-    return parser.parse_args()
-
-
-def main() -> int:
-    """Measure, print, and return 1 if the row is not kept."""
-    args = _options()
+@benchmark(
+    Bar("with.in_time_percent", at_least=BAR_PERCENT, unit="%"),
+    Bar("with.wrong", equals=0),
+    Bar("server dies.wrong", equals=0),
+    Bar("answered_elsewhere", equals=0),
+    Bar("above_budget", equals=0),
+)
+def run_benchmark(args: Options) -> dict[str, Any]:
+    """Run without the function, with it, and while the server dies."""
     with tempfile.TemporaryDirectory() as folder:
         figures = measure(args, Path(folder))
-    document = {
-        "command": " ".join(sys.argv), "machine": platform.platform(), "cores": os.cpu_count(),
-        "load_average": os.getloadavg()[0], "runs": figures,
-    }  # fmt: skip
-    if args.out:
-        args.out.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
-    held = [
-        (run["in_time_percent"] >= BAR_PERCENT or name != "with")
-        and not run["wrong"]
-        and set(run["servers_of_burst"]) == {"lambda"}
-        and run["most_commands_of_a_robot_there"] <= args.budget
-        for name, run in figures.items()
-        if name != "without"
-    ]
-    print("kept" if all(held) else "not kept")
-    return 0 if all(held) else 1
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+    helped = [figures["with"], figures["server dies"]]
+    return {
+        **figures,
+        "answered_elsewhere": sum(set(run["servers_of_burst"]) != {"lambda"} for run in helped),
+        "above_budget": sum(max(0, run["most_commands_of_a_robot_there"] - args.budget) for run in helped),
+    }

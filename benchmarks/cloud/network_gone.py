@@ -1,7 +1,7 @@
 """The network of a hundred robots is gone for a while: when each has an answer, and what the firewall saw.
 
-    python -m benchmarks.cloud.network_gone [--client CLIENT] [--robots N] [--gone S,S] [--case CASE]
-        [--runs N] [--out FILE]
+    python -m benchmarks cloud.network_gone [--client CLIENT] [--robots N] [--gone S S] [--case CASE]
+        [--runs N]
 
 Three network namespaces, which are deleted at the end: robots, a router, and a server with a local platform
 behind a relay that plays the web firewall.  Two cases for each time: the link of the robots is down, or the
@@ -15,13 +15,10 @@ Defends: first answer p99 <= 2 s after the network is back, of pages <= 5 s; the
 
 from __future__ import annotations
 
-import argparse
 import asyncio
 import functools
 import json
-import math
 import os
-import platform
 import shutil
 import subprocess
 import sys
@@ -32,13 +29,16 @@ from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import ExitStack, asynccontextmanager, contextmanager
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 from urllib.parse import urlsplit
 
 import client_sdk
 from benchmarks.cloud.local_platform import LocalPlatform
 from benchmarks.cloud.outage import FrontDoor, most_within
 from benchmarks.cloud.played_firewall import PlayedFirewall, rules_of_settings
+from benchmarks.frame.registry import Bar, benchmark, command_of
+from benchmarks.frame.report import say
+from benchmarks.frame.statistics import spread
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import RsePfError
 
@@ -110,10 +110,10 @@ class Machines:
         subprocess.run(["ip", "netns", "exec", space, *words], check=True)
 
     @staticmethod
-    def python(space: str, *words: str) -> subprocess.Popen[str]:
-        """Start this module in a namespace, with pipes."""
+    def python(space: str, function: Callable[[str], None], word: str) -> subprocess.Popen[str]:
+        """Call *function* in a namespace, with pipes."""
         return subprocess.Popen(
-            ["ip", "netns", "exec", space, sys.executable, "-m", "benchmarks.cloud.network_gone", *words],
+            ["ip", "netns", "exec", space, *command_of(function, word)],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=TREE,
         )  # fmt: skip
 
@@ -136,6 +136,16 @@ def machines() -> Iterator[Machines]:
 
 
 # --- in the namespace of the server ------------------------------------------------------------------
+
+
+def start_serving(robots: str) -> None:
+    """Run `serve` in a process of its own."""
+    asyncio.run(serve(int(robots)))
+
+
+def start_driving(client: str) -> None:
+    """Run `drive` in a process of its own."""
+    asyncio.run(drive(client))
 
 
 async def serve(robots: int) -> None:
@@ -306,10 +316,10 @@ def measure(
     """Return a row for each case, time and run."""
     rows: list[dict[str, Any]] = []
     with machines() as made, ExitStack() as ends:
-        server = made.python(made.server, "--serve", "--robots", str(robots))
+        server = made.python(made.server, start_serving, str(robots))
         ends.callback(_end, server)
         told = _line(server)
-        fleet = made.python(made.robots, "--drive", "--client", client)
+        fleet = made.python(made.robots, start_driving, client)
         ends.callback(_end, fleet)
         _say(fleet, told.strip())
         assert _line(fleet).strip() == "ready"
@@ -319,7 +329,7 @@ def measure(
                     row = one(made, server, fleet, case, gone_s)
                     asked = {"client": client, "case": case, "gone_s": gone_s, "run": number + 1}
                     rows.append({**asked, "robots": robots, **row})
-                    print(json.dumps(rows[-1]), flush=True)
+                    say(rows[-1])
     return rows
 
 
@@ -339,11 +349,8 @@ def one(
     _say(server, repr(began))
     seen = json.loads(_line(server))
     after = found.pop("after_s")
-    # The nearest rank, so that p99 of a few pages is their last.
-    ranks = {share: math.ceil(share / 100 * len(after)) - 1 for share in (50, 99)}
-    figures = {f"p{share}_s": round(after[rank], 2) for share, rank in ranks.items()}
-    figures |= {"max_s": round(after[-1], 2), "answered": len(after)} if after else {}
-    return {**figures, **seen, **found, "load_average": round(os.getloadavg()[0], 2)}
+    figures = {"after_s": spread(after), "answered": len(after)}
+    return {**figures, **seen, **found}
 
 
 def _say(process: subprocess.Popen[str], line: str) -> None:
@@ -369,36 +376,22 @@ def _end(process: subprocess.Popen[str]) -> None:
         process.kill()
 
 
-def main() -> int:
-    """Run it and print the rows; the exit code is 1 if a bar is missed."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--client", choices=sorted(CLIENTS), default="python", help="default: python")
-    parser.add_argument("--robots", type=int, default=100)
-    parser.add_argument("--gone", default="5,30,120", metavar="S,S", help="seconds (default: 5,30,120)")
-    parser.add_argument("--runs", type=int, default=1)
-    parser.add_argument("--case", choices=CASES, help="only this one")
-    parser.add_argument("--out", type=Path)
-    parser.add_argument("--serve", action="store_true", help=argparse.SUPPRESS)
-    parser.add_argument("--drive", action="store_true", help=argparse.SUPPRESS)
-    args = parser.parse_args()
-    if args.serve or args.drive:
-        asyncio.run(serve(args.robots) if args.serve else drive(args.client))
-        return 0
-    gone = [float(each) for each in args.gone.split(",")]
-    cases = [args.case] if args.case else [*CASES]
-    rows = measure(client=args.client, robots=args.robots, gone=gone, runs=args.runs, cases=cases)
-    machine = f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}"
-    if args.out is not None:
-        args.out.write_text(json.dumps({"machine": machine, "rows": rows}, indent=1) + "\n", encoding="utf-8")
-    is_met = all(
-        row["answered"] == args.robots and row["p99_s"] <= BARS_S[args.client] and not row["blocked"]
-        for row in rows
-    )
-    print(f"{machine}; bar (p99 {BARS_S[args.client]:g} s, none blocked): {'met' if is_met else 'MISSED'}")
-    return 0 if is_met else 1
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())
+@benchmark(
+    Bar("p99_s.python", at_most=BARS_S["python"], unit="s"),
+    Bar("p99_s.node", at_most=BARS_S["node"], unit="s"),
+    Bar("p99_s.chromium", at_most=BARS_S["chromium"], unit="s"),
+    Bar("without_answer", equals=0),
+    Bar("rows.*.blocked", equals=0),
+)
+def run_benchmark(
+    *, client: Annotated[str, "", CLIENTS] = "python", robots: int = 100,
+    gone: Annotated[tuple[float, ...], "seconds"] = (5.0, 30.0, 120.0), runs: int = 1,
+    case: Annotated[str | None, "only this one", CASES] = None,
+) -> dict[str, Any]:  # fmt: skip
+    """Take the network away, in every case for every time."""
+    cases = [case] if case else [*CASES]
+    rows = measure(client=client, robots=robots, gone=list(gone), runs=runs, cases=cases)
+    return {
+        "rows": rows, "without_answer": sum(robots - row["answered"] for row in rows),
+        "p99_s": {client: max(row["after_s"]["p99"] or float("inf") for row in rows)},
+    }  # fmt: skip

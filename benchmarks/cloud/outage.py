@@ -1,6 +1,6 @@
 """Robots behind one address while the platform is away: who is connected again, and when.
 
-    python -m benchmarks.cloud.outage [--robots 40] [--outage 60] [--old-rule] [--out FILE]
+    python -m benchmarks cloud.outage [--robots 40] [--outage 60] [--old-rule]
 
 A local platform of two servers stands behind a relay that plays the load balancer and its web firewall: in
 the outage every connection is cut and each handshake is answered with 503, as an ALB without a healthy target
@@ -13,23 +13,22 @@ Defends: every robot has an answer within 30 s after the outage; the disabled ro
 
 from __future__ import annotations
 
-import argparse
 import asyncio
 import json
 import os
-import platform
 import tempfile
 import time
 from collections import Counter
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import client_sdk
 from benchmarks.cloud.local_platform import LocalPlatform
 from benchmarks.cloud.played_firewall import PlayedFirewall, PlayedRule, Reply, rules_of_template
+from benchmarks.frame.registry import Bar, benchmark
 from rse_pf.errors import Forbidden, RsePfError, Unauthorized
 
-__all__ = ["FrontDoor", "measure", "most_within"]
+__all__ = ["FrontDoor", "most_within"]
 
 BAR_S = 30.0
 WAIT_S = 300.0
@@ -219,35 +218,22 @@ def most_within(times: list[float], window_s: float) -> int:
     return max((sum(begin <= seconds < begin + window_s for seconds in times) for begin in times), default=0)
 
 
-def measure(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
-    """Run one outage and return what happened."""
-    rules = old_rules() if args.old_rule else template_rules()
-    with LocalPlatform("bench-outage", folder) as local:
-        return asyncio.run(drive(local, rules, robots=args.robots, outage_s=args.outage))
-
-
-def main() -> int:
-    """Run it and print the result; the exit code is 1 if the bar is missed."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--robots", type=int, default=40)
-    parser.add_argument("--outage", type=float, default=60.0, metavar="S")
-    parser.add_argument("--old-rule", action="store_true", help="play the rule of 0.1.0")
-    parser.add_argument("--out", type=Path)
-    args = parser.parse_args()
-    with tempfile.TemporaryDirectory(prefix="outage-") as folder:
-        figures = measure(args, Path(folder))
-    figures["machine"] = f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}"
-    print(json.dumps(figures, indent=1))
-    if args.out is not None:
-        args.out.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
-    after_s = figures["all_back_after_s"]
-    is_met = after_s is not None and after_s <= BAR_S and figures["answered"] == args.robots
-    is_ended = figures["disabled_robot_ended_as"] in ("unauthorized", "forbidden")
-    print(f"bar ({BAR_S:g} s, the disabled robot ends): {'met' if is_met and is_ended else 'MISSED'}")
-    return 0 if is_met and is_ended else 1
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())
+@benchmark(
+    Bar("all_back_after_s", at_most=BAR_S, unit="s"),
+    Bar("without_answer", equals=0),
+    Bar("disabled_robot_is_refused", equals=True),
+)
+def run_benchmark(
+    *, robots: int = 40, outage: Annotated[float, "seconds"] = 60.0,
+    old_rule: Annotated[bool, "play the rule of 0.1.0"] = False,
+) -> dict[str, Any]:  # fmt: skip
+    """Run one outage."""
+    rules = old_rules() if old_rule else template_rules()
+    with (
+        tempfile.TemporaryDirectory(prefix="outage-") as folder,
+        LocalPlatform("bench-outage", Path(folder)) as local,
+    ):
+        figures = asyncio.run(drive(local, rules, robots=robots, outage_s=outage))
+    figures["without_answer"] = robots - figures["answered"]
+    figures["disabled_robot_is_refused"] = figures["disabled_robot_ended_as"] in ("unauthorized", "forbidden")
+    return figures

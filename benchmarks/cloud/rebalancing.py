@@ -1,6 +1,6 @@
 """Three real servers with the agents of AWS: 60, 60 and 0 robots, on a CloudWatch that shows numbers late.
 
-    python -m benchmarks.cloud.rebalancing [--robots 120] [--fps 2] [--profile fast] [--watch-s 60]
+    python -m benchmarks cloud.rebalancing [--robots 120] [--fps 2] [--profile fast] [--watch-s 60]
 
 Two local servers get all robots; then a third one joins, and the control plane moves nobody.  Each server has
 the tasks of its agent (publish, rebalance) with the real control port, fake instance metadata, and one fake
@@ -12,17 +12,17 @@ Defends: within 20 % of even in 60 s, and no command lost.  That nothing moves i
 
 from __future__ import annotations
 
-import argparse
 import asyncio
-import json
 import tempfile
 import threading
 import time
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 from benchmarks.cloud.delayed_cloudwatch import DELAY_S, DelayedCloudWatch
+from benchmarks.frame.registry import Bar, benchmark
 from rse_pf.aws.fleet.agent import Agent, AgentConfig, AgentContext
 from rse_pf.aws.fleet.instance import Instance
 from rse_pf.aws.fleet.task import AgentState, Phase
@@ -35,10 +35,21 @@ from rse_pf.local.control.platform import LocalPlatform
 from rse_pf.local.state import control_token_file
 from rse_pf.object_store import MemoryStore
 
-__all__ = ["main"]
+__all__ = []
 
 WITHIN_S, MARGIN = 60.0, 0.2
 _STEP_S = 1.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Options:
+    """The arguments."""
+
+    robots: int = 120
+    fps: float = 2.0
+    profile: Literal["fast", "paper"] = "fast"
+    watch_s: Annotated[float, "time after all are even"] = 60.0
+    delay_s: Annotated[float, "until CloudWatch shows a number"] = DELAY_S
 
 
 class LocalInstance(Instance):
@@ -53,20 +64,18 @@ class LocalInstance(Instance):
         return self._name
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Run once; print one JSON document; return 1 if a bar is missed."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--robots", type=int, default=120)
-    parser.add_argument("--fps", type=float, default=2.0)
-    parser.add_argument("--profile", choices=("fast", "paper"), default="fast")
-    parser.add_argument("--watch-s", type=float, default=60.0, help="time after all are even")
-    parser.add_argument("--delay-s", type=float, default=DELAY_S, help="until CloudWatch shows a number")
-    result = asyncio.run(_measure(parser.parse_args(arguments)))
-    print(json.dumps(result, indent=2))
-    return int(not result["holds"])
+@benchmark(
+    Bar("even_after_s", at_most=WITHIN_S, unit="s"),
+    Bar("left_even_s", equals=0.0),
+    Bar("lost", equals=0),
+    Bar("failed", equals=0),
+)
+def run_benchmark(args: Options) -> dict[str, Any]:
+    """Run once."""
+    return asyncio.run(_measure(args))
 
 
-async def _measure(args: argparse.Namespace) -> dict[str, Any]:
+async def _measure(args: Options) -> dict[str, Any]:
     settings = PlatformSettings.from_dict(
         {"scaling": {"profile": args.profile}, "serving": {"workers": 1}, "local": {"warm_standby": False}}
     )
@@ -95,16 +104,14 @@ async def _measure(args: argparse.Namespace) -> dict[str, Any]:
                     agents.follow(platform)
                     course = await _watch(platform, began_s, args)
                 answers = await swarm.finish()
-    even_s = course["even_after_s"]
     counts = summarise(answers.commands)["commands"]
-    lost = counts["lost"] + counts["failed"]
     return {
         "robots": args.robots, "fps": args.fps, "profile": args.profile, "delay_s": args.delay_s,
         "before": before, **course, "lost": counts["lost"], "failed": counts["failed"],
         "twice": answers.duplicates, "commands": counts["sent"], "moves": answers.moves,
         "orders": agents.orders,
         "cloudwatch_reads": cloudwatch.reads,
-        "holds": even_s is not None and even_s <= WITHIN_S and not lost and course["left_even_s"] == 0.0,
+
     }  # fmt: skip
 
 
@@ -150,7 +157,7 @@ class Agents:
         self.orders.append({"event": event, **fields})
 
 
-async def _watch(platform: LocalPlatform, began_s: float, args: argparse.Namespace) -> dict[str, Any]:
+async def _watch(platform: LocalPlatform, began_s: float, args: Options) -> dict[str, Any]:
     """Return when all servers were even, and for how long they were not any more after that."""
     course, even_after_s, left_even_s = [], None, 0.0
     while True:
@@ -172,7 +179,3 @@ async def _watch(platform: LocalPlatform, began_s: float, args: argparse.Namespa
 
 async def _robots(platform: LocalPlatform) -> Mapping[str, int]:
     return {str(server["server"]): int(server["robots"]) for server in await platform.status()}
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

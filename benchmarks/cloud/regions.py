@@ -1,6 +1,6 @@
 """A robot with two regions: two local platforms behind links of 30 and 130 ms there and back.
 
-    python -m benchmarks.cloud.regions [--hold 60] [--flapping 300] [--runs 3] [--out FILE]
+    python -m benchmarks cloud.regions [--hold 60] [--flapping 300] [--runs 3]
 
 Each platform is a ``rse-pf local`` with one server, behind a relay in this process that delays each way.  A
 robot asks echo ten times a second, open loop, while
@@ -21,15 +21,13 @@ Defends: the nearer region within 2 s of connect; a change within 5 s; 0 command
 
 from __future__ import annotations
 
-import argparse
 import asyncio
-import json
 import os
-import platform
 import tempfile
 import time
 from collections import Counter
 from contextlib import AsyncExitStack
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -37,6 +35,7 @@ from typing import Any
 import client_sdk
 from benchmarks.cloud.delaying_proxy import DelayingProxy
 from benchmarks.cloud.local_platform import LocalPlatform
+from benchmarks.frame.registry import Bar, benchmark
 from rse_pf.config import SessionSettings
 from rse_pf.errors import RsePfError
 
@@ -45,10 +44,18 @@ __all__ = ["Asker", "measure"]
 NEAR_S, FAR_S, SLOW_S = 0.015, 0.065, 0.2
 ASK_EVERY_S = 0.1
 DEADLINE_S = 8.0
-CONNECT_BAR_S, CHANGE_BAR_S = 2.0, 5.0
 WAIT_S = 900.0
 BEFORE_S, AFTER_S = 2.0, 3.0
 """Quiet times before a fault and after a change, so that gaps are seen."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Options:
+    """The arguments."""
+
+    hold: float = 60.0
+    flapping: float = 300.0
+    runs: int = 3
 
 
 class Asker:
@@ -214,60 +221,33 @@ def _summarise(asker: Asker, figures: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-async def measure(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
+async def measure(args: Options, folder: Path) -> dict[str, Any]:
     """Run all parts and return what was found."""
     figures: dict[str, Any] = {"hold_s": args.hold}
     async with Site(folder, args.hold) as site:
         figures["connects"] = [await connects(site) for _ in range(args.runs)]
-        _print("connects", figures)
         figures["dies"] = [await loses_near(site, "dies") for _ in range(args.runs)]
-        _print("dies", figures)
         figures["falls silent"] = [await loses_near(site, "falls silent")]
-        _print("falls silent", figures)
         figures["gets slow"] = [await gets_slow(site)]
-        _print("gets slow", figures)
         figures["flaps"] = [await flaps(site, args.flapping)]
-        _print("flaps", figures)
     return figures
 
 
-def _print(part: str, figures: dict[str, Any]) -> None:
-    for figure in figures[part]:
-        print(f"{part:14} {json.dumps(figure)}", flush=True)
-
-
-def is_met(figures: dict[str, Any]) -> bool:
-    """Return whether the bars of the head of this file are met."""
-    lost = [figure for part in ("dies", "falls silent", "gets slow", "flaps") for figure in figures[part]]
-    changed = [
-        figure["longest_gap_s"] for part in ("dies", "falls silent", "gets slow") for figure in figures[part]
-    ]
-    return (
-        all(figure["near"] and figure["answered_s"] <= CONNECT_BAR_S for figure in figures["connects"])
-        and all(figure["answered"] == figure["sent"] and not figure["twice"] for figure in lost)
-        and max(changed) <= CHANGE_BAR_S
-        and not figures["flaps"][0]["changes"]
-    )
-
-
-def main() -> int:
-    """Run it and print the result; the exit code is 1 if the bar is missed."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--hold", type=float, default=60.0, metavar="S")
-    parser.add_argument("--flapping", type=float, default=300.0, metavar="S")
-    parser.add_argument("--runs", type=int, default=3)
-    parser.add_argument("--out", type=Path)
-    args = parser.parse_args()
+@benchmark(
+    Bar("connects.*.near", equals=True),
+    Bar("connects.*.answered_s", at_most=2.0, unit="s"),
+    *(
+        Bar(f"{part}.*.longest_gap_s", at_most=5.0, unit="s")
+        for part in ("dies", "falls silent", "gets slow")
+    ),
+    Bar("unanswered", equals=0),
+    Bar("twice", equals=0),
+    Bar("flaps.*.changes", equals=0),
+)
+def run_benchmark(args: Options) -> dict[str, Any]:
+    """Run all parts."""
     with tempfile.TemporaryDirectory(prefix="regions-") as folder:
         figures = asyncio.run(measure(args, Path(folder)))
-    figures["machine"] = f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}"
-    if args.out is not None:
-        args.out.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
-    print(f"bar: {'met' if is_met(figures) else 'MISSED'}")
-    return 0 if is_met(figures) else 1
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())
+    rows = [row for part in ("dies", "falls silent", "gets slow", "flaps") for row in figures[part]]
+    unanswered = sum(row["sent"] - row["answered"] for row in rows)
+    return {**figures, "unanswered": unanswered, "twice": sum(row["twice"] for row in rows)}

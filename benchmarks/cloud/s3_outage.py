@@ -1,6 +1,6 @@
 """S3 answers 503, then nothing: does any server end, and what do robots and the operator see of it?
 
-    python -m benchmarks.cloud.s3_outage [--servers 4] [--outage-s 60] [--data-path /data/readyz]
+    python -m benchmarks cloud.s3_outage [--servers 4] [--outage-s 60] [--data-path /data/readyz]
 
 Each server is a real rse-pf serve and rse-pf data, whose bucket is `PlayedS3` on this machine.  For the first
 half of the outage S3 answers 503, for the second half nothing.  Each server has a robot that asks for two
@@ -15,7 +15,6 @@ Defends: no server ends, all poses are answered, all refusals of data are typed,
 
 from __future__ import annotations
 
-import argparse
 import asyncio
 import contextlib
 import hashlib
@@ -37,6 +36,7 @@ from typing import Any
 import client_sdk
 from benchmarks.cloud.delayed_cloudwatch import DELAY_S
 from benchmarks.cloud.played_s3 import PlayedS3
+from benchmarks.frame.registry import Bar, benchmark
 from rse_pf.auth.tokens import SigningKey
 from rse_pf.aws.clients import make_client
 from rse_pf.aws.fleet.agent import Agent, AgentConfig, AgentContext
@@ -51,7 +51,7 @@ from rse_pf.scaling.health import CLOUD_INTERVAL_S, CLOUD_TIMEOUT_S, Health, clo
 from rse_pf.scaling.operator_alarms import STORE_PERIOD_S, operator_alarms
 from tests.alarm_states import AlarmRule, replay
 
-__all__ = ["Outage", "Report", "main", "measure"]
+__all__ = ["Outage", "Report", "measure"]
 
 ALARM_WITHIN_S = 60.0
 BUCKET = "maps"
@@ -121,23 +121,16 @@ class LocalInstance(Instance):
         return "i-here"
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Run once; print one JSON document; return 1 if a bar is missed."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--servers", type=int, default=4)
-    parser.add_argument("--outage-s", type=float, default=60.0)
-    parser.add_argument("--data-path", default="", metavar="PATH")
-    args = parser.parse_args(arguments)
-    chosen = Outage(servers=args.servers, outage_s=args.outage_s, data_path=args.data_path)
+@benchmark(Bar("holds", equals=True))
+def run_benchmark(*, servers: int = 4, outage_s: float = 60.0, data_path: str = "") -> dict[str, Any]:
+    """Run once."""
+    chosen = Outage(servers=servers, outage_s=outage_s, data_path=data_path)
     with tempfile.TemporaryDirectory() as folder:
         report = measure(chosen, Path(folder))
-    document = {
-        "servers": chosen.servers, "outage_s": chosen.outage_s, "ended": report.ended,
-        "poses": report.poses, "data_during": report.data_during, "data_after": report.data_after,
-        "alarm_after_s": report.alarm_after_s, "load": os.getloadavg()[0], "holds": report.holds,
+    return {
+        "ended": report.ended, "poses": report.poses, "data_during": report.data_during,
+        "data_after": report.data_after, "alarm_after_s": report.alarm_after_s, "holds": report.holds,
     }  # fmt: skip
-    print(json.dumps(document, indent=2))
-    return int(not report.holds)
 
 
 def measure(outage: Outage, folder: Path) -> Report:
@@ -376,7 +369,3 @@ def _read_pids(file: Path, processes: list[subprocess.Popen[bytes]], home: Path)
             raise RuntimeError(f"{file.name} is not ready:\n{logs}")
         time.sleep(0.05)  # polls, with a deadline
     return dict(json.loads(file.read_text()))
-
-
-if __name__ == "__main__":
-    sys.exit(main())

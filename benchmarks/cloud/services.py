@@ -1,6 +1,6 @@
 """New versions of a service while robots call it: how late are they, and is a command lost?
 
-    python -m benchmarks.cloud.services [--robots 20] [--rate 5] [--versions 3] [--seconds 10]
+    python -m benchmarks cloud.services [--robots 20] [--rate 5] [--versions 3] [--seconds 10]
 
 Two local servers with the agent's task of AWS each, on one bucket (a folder).  Robots call a stateful Python
 service and the built-in echo in turn; every ``--seconds`` a version is published and both agents look at
@@ -11,7 +11,6 @@ Defends: no command is lost or out of order while versions change, and echo does
 
 from __future__ import annotations
 
-import argparse
 import asyncio
 import json
 import random
@@ -19,9 +18,11 @@ import tempfile
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import client_sdk
+from benchmarks.frame.registry import Bar, benchmark
+from benchmarks.frame.statistics import spread
 from rse_pf.aws.fleet.agent import Agent
 from rse_pf.aws.fleet.instance import Instance
 from rse_pf.aws.fleet.task import AgentConfig, AgentContext
@@ -34,7 +35,7 @@ from rse_pf.services.custom.installed import install
 from rse_pf.services.custom.published_folder import PublishedFolder
 from rse_pf.services.custom.publishing import LIST_NAME, archive_name, publish
 
-__all__ = ["main"]
+__all__ = []
 
 _SOURCE = """
 from __future__ import annotations
@@ -64,6 +65,16 @@ class Service:
 _AT_ALL_S = 60.0
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Options:
+    """The arguments."""
+
+    robots: int = 20
+    rate: Annotated[float, "commands of a robot each second"] = 5.0
+    versions: int = 3
+    seconds: Annotated[float, "between two versions"] = 10.0
+
+
 @dataclass
 class Heard:
     """What the robots got: times in ms of (service, whether a version was changing), and what went wrong."""
@@ -79,21 +90,17 @@ class Heard:
         self.times_ms.setdefault((service, self.is_changing), []).append(ms)
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Run once; print one JSON document; return 1 if a command was lost or came out of order."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--robots", type=int, default=20)
-    parser.add_argument("--rate", type=float, default=5.0, help="commands of a robot each second")
-    parser.add_argument("--versions", type=int, default=3)
-    parser.add_argument("--seconds", type=float, default=10.0, help="between two versions")
-    args = parser.parse_args(arguments)
+@benchmark(
+    Bar("lost", equals=0),
+    Bar("out_of_order", equals=0),
+)
+def run_benchmark(args: Options) -> dict[str, Any]:
+    """Publish versions while robots call."""
     with tempfile.TemporaryDirectory(prefix="rse-pf-services-") as folder:
-        figures = asyncio.run(_run(args, Path(folder)))
-    print(json.dumps(figures, indent=1))
-    return int(figures["lost"] > 0 or figures["out_of_order"] > 0)
+        return asyncio.run(_run(args, Path(folder)))
 
 
-async def _run(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
+async def _run(args: Options, folder: Path) -> dict[str, Any]:
     bucket = DirectoryStore(folder / "artifacts")
     (folder / "artifacts").mkdir()
     (folder / "var").mkdir()
@@ -133,7 +140,7 @@ async def _run(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
         "robots": args.robots, "rate_per_s": args.rate, "versions": args.versions,
         "publish_to_every_robot_s": took, "lost": heard.lost, "out_of_order": heard.disordered,
         "ms": {
-            f"{service}{', while a version changes' if changing else ''}": _percentiles(times)
+            f"{service}{', while a version changes' if changing else ''}": spread(times)
             for (service, changing), times in sorted(heard.times_ms.items())
         },
     }  # fmt: skip
@@ -183,13 +190,3 @@ def _agent(folder: Path, bucket: DirectoryStore, port: int) -> Agent:
         ),
     )  # fmt: skip
     return Agent(context)
-
-
-def _percentiles(times: list[float]) -> dict[str, float]:
-    ordered = sorted(times)
-    at = {f"p{p}": ordered[min(len(ordered) - 1, len(ordered) * p // 100)] for p in (50, 95, 99)}
-    return {"n": len(ordered), **{name: round(value, 1) for name, value in at.items()}}
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

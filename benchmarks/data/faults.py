@@ -1,6 +1,6 @@
 """Uploads through the load balancer while robots request poses and the data server is killed repeatedly.
 
-    python -m benchmarks.data.faults [--uploads 200] [--kills 3] [--robots 20] [--seconds 15] [--out FILE]
+    python -m benchmarks data.faults [--uploads 200] [--kills 3] [--robots 20] [--seconds 15]
 
 One local platform (two servers, one data server) behind the load balancer; robots request 5 poses per
 second (200 matches, 30 % wrong, every frame kept).  First without uploads; then a process of four robots
@@ -15,12 +15,9 @@ digest; no partial object; p99 of poses unchanged while robots upload.
 
 from __future__ import annotations
 
-import argparse
 import asyncio
-import json
 import multiprocessing
 import os
-import platform
 import random
 import signal
 import tempfile
@@ -28,16 +25,17 @@ import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
 from benchmarks.data.windows import poses
+from benchmarks.frame.registry import Bar, benchmark
 from client_sdk.transfer.data_client import DataClient, DataOptions
 from rse_pf.config import PlatformSettings
-from rse_pf.errors import RsePfError
 from rse_pf.experiments.load.swarm import Swarm, SwarmOptions
 from rse_pf.local.control.control_plane import ControlOptions
 from rse_pf.local.control.platform import LocalPlatform
@@ -51,6 +49,18 @@ _LOWEST_PRIORITY = 19
 BACK_S, RATIO = 5.0, 1.1
 SETTLE_S = 2.0
 TIMEOUT_S = 120.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Options:
+    """The arguments."""
+
+    uploads: int = 200
+    size_kib: int = 1024
+    kills: int = 3
+    robots: int = 20
+    fps: float = 5.0
+    seconds: Annotated[float, "before, and of the paced uploads"] = 15.0
 
 
 def content(number: int, size: int) -> bytes:
@@ -135,13 +145,11 @@ class Uploads:
         self._pipe.close()
 
 
-async def kill_during_uploads(
-    cloud: LocalPlatform, uploads: Uploads, args: argparse.Namespace
-) -> list[float]:
+async def kill_during_uploads(cloud: LocalPlatform, uploads: Uploads, kills: int, count: int) -> list[float]:
     """Kill the data server at equal shares of the uploads; return when it was ready again (s)."""
     back: list[float] = []
-    for kill in range(args.kills):
-        share = (kill + 1) * args.uploads // (args.kills + 1)
+    for kill in range(kills):
+        share = (kill + 1) * count // (kills + 1)
         await uploads.until(lambda share=share: len(uploads.acknowledged) >= share)  # type: ignore[misc]
         before = cloud.data_servers.process.mark
         began = time.monotonic()
@@ -174,7 +182,7 @@ def judge(cloud: LocalPlatform, acknowledged: list[str], wanted: set[str]) -> di
     }  # fmt: skip
 
 
-async def run(args: argparse.Namespace) -> dict[str, Any]:
+async def run(args: Options) -> dict[str, Any]:
     """Return every figure of the table."""
     size, settings = args.size_kib * 1024, PlatformSettings()
     with tempfile.TemporaryDirectory() as folder:
@@ -199,7 +207,7 @@ async def run(args: argparse.Namespace) -> dict[str, Any]:
                 await asyncio.sleep(args.seconds)
                 times.append(time.monotonic() - began)
                 uploads.begin()
-                back_s = await kill_during_uploads(cloud, uploads, args)
+                back_s = await kill_during_uploads(cloud, uploads, args.kills, args.uploads)
                 await uploads.until(lambda: False)
                 uploads.close()
                 times.append(time.monotonic() - began)
@@ -214,50 +222,20 @@ async def run(args: argparse.Namespace) -> dict[str, Any]:
     rows = [poses(result.commands, *times[i : i + 2]) for i in range(3)]
     names = ("before", f"{args.uploads} uploads, {args.kills} kills", f"{count} paced uploads")
     return {
-        "poses": dict(zip(names, rows, strict=True)), "back_s": back_s, "objects": verdict,
+        "poses": dict(zip(names, rows, strict=True)), "back_s": back_s,
+        "p99_ratio": [row["p99_ms"] / rows[0]["p99_ms"] for row in rows[1:]], "objects": verdict,
         "upload_s": times[2] - times[1], "longest_upload_s": max(s for _, s in uploads.acknowledged),
         "mib_per_s": args.uploads * size / MIB / (times[2] - times[1]),
         "late_sends_ms": result.late_sends_ms_p99,
     }  # fmt: skip
 
 
-def main() -> None:
-    """Run, print the table, write the figures."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--uploads", type=int, default=200)
-    parser.add_argument("--size-kib", type=int, default=1024)
-    parser.add_argument("--kills", type=int, default=3)
-    parser.add_argument("--robots", type=int, default=20)
-    parser.add_argument("--fps", type=float, default=5.0)
-    parser.add_argument("--seconds", type=float, default=15.0, help="before, and of the paced uploads")
-    parser.add_argument("--out", type=Path)
-    args = parser.parse_args()
-    load = os.getloadavg()[0]
-    try:
-        verdict = asyncio.run(run(args))
-    except RsePfError as error:
-        raise SystemExit(error.report()) from error
-    verdict["load"] = [load, os.getloadavg()[0]]
-    print(f"{platform.node()}, {os.cpu_count()} cores, load {load:.1f} -> {verdict['load'][1]:.1f}")
-    print(
-        f"{args.robots} robots x {args.fps:g} fps; {UPLOADERS} robots upload objects of {args.size_kib} KiB"
-    )
-    first = next(iter(verdict["poses"].values()))["p99_ms"]
-    for name, row in verdict["poses"].items():
-        print(
-            f"{name:24} n={row['n']} unanswered={row['unanswered']} p50={row['p50_ms']:.1f} ms "
-            f"p99={row['p99_ms']:.1f} ms, {row['p99_ms'] / first:.2f} x before (bar {RATIO})"
-        )
-    back = ", ".join(f"{s:.2f}" for s in verdict["back_s"])
-    print(
-        f"service ready after {back} s (bar {BACK_S:g} s); longest upload {verdict['longest_upload_s']:.1f} s"
-    )
-    print(
-        f"{verdict['mib_per_s']:.1f} MiB/s with the kills; {verdict['objects']} (bar: 0 missing, 0 partial)"
-    )
-    if args.out is not None:
-        args.out.write_text(json.dumps(verdict, indent=1))
-
-
-if __name__ == "__main__":
-    main()
+@benchmark(
+    Bar("back_s.*", at_most=BACK_S, unit="s"),
+    Bar("p99_ratio.*", at_most=RATIO, unit="times before"),
+    Bar("objects.missing", equals=0),
+    Bar("objects.partial_objects", equals=0),
+)
+def run_benchmark(args: Options) -> dict[str, Any]:
+    """Measure poses beside uploads and kills."""
+    return asyncio.run(run(args))

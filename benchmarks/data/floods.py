@@ -1,6 +1,6 @@
 """One robot floods the data service with lists and tiny objects; another robot stores its pictures beside it.
 
-    python -m benchmarks.data.floods [--seconds 20] [--objects 100000] [--listers 12] [--out FILE]
+    python -m benchmarks data.floods [--seconds 20] [--objects 100000] [--listers 12]
 
 One data server (``rse-pf data``) on loopback, its store in a folder.  A robot stores 64 KiB five times a
 second: first alone, then beside a hostile robot of another tenant, which already has *objects* objects of
@@ -20,7 +20,6 @@ page of 1,000 of 100,000 objects takes at most 50 ms; the server grows by at mos
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import hashlib
 import http.client
@@ -28,10 +27,8 @@ import itertools
 import json
 import multiprocessing
 import os
-import platform
 import runpy
 import signal
-import statistics
 import subprocess
 import sys
 import tempfile
@@ -39,10 +36,13 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from multiprocessing.synchronize import Event
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
+from benchmarks.frame.registry import Bar, benchmark
+from benchmarks.frame.statistics import spread
 from rse_pf.auth.tokens import SigningKey
 from rse_pf.config import AuthSettings, PlatformSettings
 from rse_pf.identity import RobotId, object_name
@@ -55,6 +55,21 @@ VICTIM, HOSTILE = RobotId("acme", "robot-1"), RobotId("rival", "robot-1")
 _LOWEST_PRIORITY = 19
 _TIMEOUT_S = 60.0
 _PUT_EVERY_S = 0.2
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Options:
+    """The arguments."""
+
+    seconds: Annotated[float, "of each phase"] = 10.0
+    rounds: int = 6
+    objects: Annotated[int, "data.max_objects of the server"] = 100000
+    margin: Annotated[int, "objects that the hostile robot may add"] = 2000
+    attempts: Annotated[int, "new objects without a limit of rates"] = 4000
+    listers: int = 12
+    writers: int = 4
+    committers: int = 4
+    folder: Annotated[Path | None, "where the store is made (default: the system's)"] = None
 
 
 class Server:
@@ -264,17 +279,7 @@ def reach_the_count(folder: Path, key: SigningKey, attempts: int, max_objects: i
     }  # fmt: skip
 
 
-def row(times: list[float]) -> dict[str, float]:
-    """Return n and percentiles."""
-    ordered = sorted(times)
-    return {
-        "n": len(ordered), "p50_ms": statistics.median(ordered),
-        "p95_ms": ordered[int(0.95 * (len(ordered) - 1))], "p99_ms": ordered[int(0.99 * (len(ordered) - 1))],
-        "max_ms": ordered[-1],
-    }  # fmt: skip
-
-
-def run(args: argparse.Namespace) -> dict[str, Any]:
+def run(args: Options) -> dict[str, Any]:
     """Return every figure."""
     key = SigningKey.from_seed(os.urandom(32), "key-1")
     statuses: Counter[str] = Counter()
@@ -307,43 +312,25 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
             lister.close()
         count = reach_the_count(folder, key, args.attempts, args.objects)
         stored = store.usage(object_name(HOSTILE, "")).objects
-    return {
-        "quiet": row(quiet), "lists": row(beside), "maps": row(beside_maps), "pages": row(pages),
+    figures = {
+        "quiet": spread(quiet), "lists": spread(beside), "maps": spread(beside_maps), "pages": spread(pages),
         "statuses": {"lists": dict(sorted(statuses.items())), "maps": dict(sorted(map_statuses.items()))},
         "count": count, "stored": stored, "server_grown_mib": grown_mib,
+        "stored_above_limit": max(0, stored - args.objects),
     }  # fmt: skip
+    for name in ("lists", "maps"):
+        figures[f"{name}_p99_ratio"] = figures[name]["p99"] / figures["quiet"]["p99"]
+    return figures
 
 
-def main() -> None:
-    """Run, print the table, write the figures."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--seconds", type=float, default=10.0, help="of each phase")
-    parser.add_argument("--rounds", type=int, default=6)
-    parser.add_argument("--objects", type=int, default=100_000, help="data.max_objects of the server")
-    parser.add_argument("--margin", type=int, default=2000, help="objects that the hostile robot may add")
-    parser.add_argument("--attempts", type=int, default=4000, help="new objects without a limit of rates")
-    parser.add_argument("--listers", type=int, default=12)
-    parser.add_argument("--writers", type=int, default=4)
-    parser.add_argument("--committers", type=int, default=4)
-    parser.add_argument("--folder", type=Path, help="where the store is made (default: the system's)")
-    parser.add_argument("--out", type=Path)
-    args = parser.parse_args()
-    load = os.getloadavg()[0]
-    result = run(args)
-    result["load"] = [load, os.getloadavg()[0]]
-    print(f"{platform.node()}, {os.cpu_count()} cores, load {load:.1f} -> {result['load'][1]:.1f}")
-    for name in ("quiet", "lists", "maps", "pages"):
-        figures = " ".join(f"{what}={value:.1f}" for what, value in result[name].items() if what != "n")
-        print(f"{name:8} n={result[name]['n']} {figures}")
-    lists, maps = (result[name]["p99_ms"] / result["quiet"]["p99_ms"] for name in ("lists", "maps"))
-    print(f"PUT beside lists and writes: p99 {lists:.2f} x quiet (bar {RATIO}); pages: bar {PAGE_MS:g} ms")
-    print(f"PUT beside hostile maps: p99 {maps:.2f} x quiet (bar {MAPS_RATIO}, and {MAPS_MS:g} ms)")
-    print(f"answers to the hostile robots: {result['statuses']}")
-    print(f"stored {result['stored']} of at most {args.objects}; without a limit of rates: {result['count']}")
-    print(f"the server grew by {result['server_grown_mib']:.0f} MiB (bar {GROWTH_MIB:g})")
-    if args.out is not None:
-        args.out.write_text(json.dumps(result, indent=1))
-
-
-if __name__ == "__main__":
-    main()
+@benchmark(
+    Bar("lists_p99_ratio", at_most=RATIO, unit="times quiet"),
+    Bar("maps_p99_ratio", at_most=MAPS_RATIO, unit="times quiet"),
+    Bar("maps.p99", at_most=MAPS_MS, unit="ms"),
+    Bar("pages.p50", at_most=PAGE_MS, unit="ms"),
+    Bar("stored_above_limit", equals=0),
+    Bar("server_grown_mib", at_most=GROWTH_MIB, unit="MiB"),
+)
+def run_benchmark(args: Options) -> dict[str, Any]:
+    """Measure the phases in turns."""
+    return run(args)

@@ -1,7 +1,7 @@
 """A merge of many keyframes while robots request poses, and a crash of its server half-way.
 
-    python -m benchmarks.data.jobs [--robots 20] [--keyframes 50] [--seconds 20] [--recordings DIR]
-        [--out FILE]
+    python -m benchmarks data.jobs [--robots 20] [--keyframes 50] [--seconds 20] [--recordings DIR]
+
 
 Two local servers behind the balancer; robots request 5 poses per second (200 matches, 30 % wrong, every
 frame kept).  First without merges, then one merge after the other, then a merge's server is killed
@@ -14,27 +14,25 @@ result has the same digest as an undisturbed one.  Start it in the ordinary sche
 
 from __future__ import annotations
 
-import argparse
 import asyncio
 import itertools
-import json
 import os
-import platform
 import tempfile
 import time
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
 import client_sdk
 from benchmarks.data.windows import poses
+from benchmarks.frame.registry import Bar, benchmark
 from client_sdk.datasets import open_dataset
 from client_sdk.frontend import Frame, FrontEndOptions, extract
 from client_sdk.simulator import render_frames, true_trajectory
 from rse_pf.config import PlatformSettings
-from rse_pf.errors import RsePfError
 from rse_pf.experiments.load.swarm import Swarm, SwarmOptions
 from rse_pf.geometry import Array, inverse
 from rse_pf.identity import RobotId, object_name
@@ -49,6 +47,17 @@ HALF = 0.4
 """Share at which the server is killed: matching goes from 0.1 to 0.8."""
 SETTLE_S = 2.0
 FRAME_STEP = 5
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Options:
+    """The arguments."""
+
+    robots: int = 20
+    fps: float = 5.0
+    keyframes: int = 50
+    seconds: Annotated[float, "of each phase"] = 20.0
+    recordings: Annotated[Path | None, "folder of recordings; without it, the simulated world"] = None
 
 
 def frames_of(recordings: Path | None, count: int) -> Iterator[tuple[Frame, Array]]:
@@ -90,7 +99,7 @@ def two_maps(recordings: Path | None, count: int) -> list[bytes]:
 class Bench:
     """One run: a platform, robots that stream, and robots that merge."""
 
-    def __init__(self, args: argparse.Namespace, cloud: LocalPlatform, maps: list[bytes]) -> None:
+    def __init__(self, args: Options, cloud: LocalPlatform, maps: list[bytes]) -> None:
         self.args = args
         self.cloud = cloud
         self.maps = maps
@@ -153,7 +162,7 @@ class Bench:
             }  # fmt: skip
 
 
-async def run(args: argparse.Namespace) -> dict[str, Any]:
+async def run(args: Options) -> dict[str, Any]:
     """Return every figure of the table."""
     maps = two_maps(args.recordings, args.keyframes)
     settings = PlatformSettings.from_dict({"local": {"servers": 2}})
@@ -191,45 +200,11 @@ def _read_joins(reply: Any) -> Any:
     return None if reply is None else as_type(reply, MergeReply).joined
 
 
-def main() -> None:
-    """Run, print the table, write the figures."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--robots", type=int, default=20)
-    parser.add_argument("--fps", type=float, default=5.0)
-    parser.add_argument("--keyframes", type=int, default=50)
-    parser.add_argument("--seconds", type=float, default=20.0, help="of each phase")
-    parser.add_argument(
-        "--recordings", type=Path, help="folder of recordings; without it, the simulated world"
-    )
-    parser.add_argument("--out", type=Path)
-    args = parser.parse_args()
-    load = os.getloadavg()[0]
+@benchmark(
+    Bar("ratio", at_most=BAR, unit="times the p99"),
+    Bar("same_digest", equals=True),
+)
+def run_benchmark(args: Options) -> dict[str, Any]:
+    """Measure poses beside merges; a run in the idle class says nothing of the ratio."""
     is_idle_class = os.sched_getscheduler(0) == os.SCHED_IDLE
-    try:
-        figures = asyncio.run(run(args))
-    except RsePfError as error:
-        raise SystemExit(error.report()) from error
-    figures["is_idle_class"] = is_idle_class
-    if is_idle_class:
-        print("everything runs in SCHED_IDLE: jobs are behind nobody, and the ratio says nothing")
-    figures["load"] = [load, os.getloadavg()[0]]
-    print(f"{platform.node()}, {os.cpu_count()} cores, load {load:.1f} -> {figures['load'][1]:.1f}")
-    print(
-        f"{args.robots} robots x {args.fps:g} fps; {args.keyframes} keyframes, {figures['map_bytes']} bytes"
-    )
-    for name in ("before", "during"):
-        row = figures[name]
-        print(
-            f"{name:8} n={row['n']} unanswered={row['unanswered']} "
-            f"p50={row['p50_ms']:.1f} ms p99={row['p99_ms']:.1f} ms"
-        )
-    took = [round(s, 1) for s in figures["merges_s"]]
-    print(f"ratio of p99: {figures['ratio']:.2f} (bar {BAR})")
-    print(f"merges: {took} s, the one after them {figures['merge_alone_s']:.1f} s")
-    print(f"server killed half-way: {figures['death']}; same digest: {figures['same_digest']}")
-    if args.out is not None:
-        args.out.write_text(json.dumps(figures, indent=1))
-
-
-if __name__ == "__main__":
-    main()
+    return {"is_idle_class": is_idle_class, **asyncio.run(run(args))}

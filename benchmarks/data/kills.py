@@ -1,6 +1,6 @@
 """SIGKILL at each step of a PUT and of an upload in parts: what was acknowledged is there, and nothing else.
 
-    python -m benchmarks.data.kills [--kills 500] [--seed 1]
+    python -m benchmarks data.kills [--kills 500] [--seed 1]
 
 A data service, forked from this process, kills itself at one of the calls by which its threads change the
 store: before it, after it, or in the middle of a write.  The next one goes on in the same folder.  After each
@@ -11,7 +11,6 @@ Defends: every object that was acknowledged is there and whole, and no other byt
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import hashlib
 import http.client
@@ -19,7 +18,6 @@ import json
 import os
 import random
 import signal
-import sys
 import tempfile
 import threading
 import time
@@ -30,6 +28,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.data.requests import HERE, KEY, token_of
+from benchmarks.frame.registry import Bar, benchmark
 from rse_pf.config import PlatformSettings
 from rse_pf.data_server.routes import openapi_page
 from rse_pf.data_server.server import KeysFile, serve_data
@@ -126,21 +125,17 @@ def check(folder: Path, sent: set[str], acknowledged: set[str]) -> list[str]:
     return wrong + [f"{digest} was acknowledged and is lost" for digest in acknowledged - seen]
 
 
-def main() -> int:
-    """Kill, check, print."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--kills", type=int, default=500)
-    parser.add_argument("--seed", type=int, default=1)
-    options = parser.parse_args()
-    source, sent, acknowledged = random.Random(options.seed), set[str](), set[str]()
+@benchmark(Bar("wrong", equals=[]))
+def run_benchmark(*, kills: int = 500, seed: int = 1) -> dict[str, Any]:
+    """Kill, and check all objects."""
+    source, sent, acknowledged = random.Random(seed), set[str](), set[str]()
+    wrong: list[str] = []
     (HERE / "build").mkdir(exist_ok=True)
     with tempfile.TemporaryDirectory(dir=HERE / "build") as made:
         folder = Path(made)
         (folder / "keys.json").write_text(KEY.key_set().to_json())
         openapi_page()  # once, not in each service
-        for kill in range(options.kills):
+        for kill in range(kills):
             announcement = folder / "announce.json"
             announcement.unlink(missing_ok=True)
             child = os.fork()
@@ -159,16 +154,11 @@ def main() -> int:
                 for digest, is_acknowledged in send(port, f"robot-{kill % 7}", source):
                     (acknowledged if is_acknowledged else sent).add(digest)
             assert os.waitpid(child, 0)[1] == signal.SIGKILL, "the service ended in another way"
-            wrong = check(folder, sent, acknowledged) if kill % 10 == 9 or kill > options.kills - 3 else []
+            if kill % 10 == 9 or kill > kills - 3:
+                wrong = check(folder, sent, acknowledged)
             if wrong:
-                print("\n".join(wrong))
-                return 1
+                break
         places = Counter(line for line in (folder / "log").read_text().splitlines() if "killed" in line)
-    print(f"{options.kills} kills; {len(sent)} objects sent, {len(acknowledged)} acknowledged: all whole")
-    for place, count in sorted(places.items()):
-        print(f"{count:5} {place}")
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+    return {
+        "n": kills, "sent": len(sent), "acknowledged": len(acknowledged), "wrong": wrong, "places": places
+    }  # fmt: skip

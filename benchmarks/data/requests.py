@@ -1,6 +1,6 @@
 """CPU and latency of requests to one data server, and the rate of one stream, beside another checkout.
 
-    python -m benchmarks.data.requests [--base CHECKOUT] [--rounds 5] [--only small] [--out FILE]
+    python -m benchmarks data.requests [--base CHECKOUT] [--rounds 5] [--only small]
 
 One data server on a folder, with an audit log, asked over loopback by raw sockets.  With `--base` the rounds
 of this checkout and of the other one alternate; medians are given.
@@ -21,7 +21,6 @@ Defends: the bars of requests in docs/decisions/data_service.md.
 
 from __future__ import annotations
 
-import argparse
 import asyncio
 import hashlib
 import json
@@ -36,10 +35,10 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Annotated, Any
 
-import numpy as np
-
-from benchmarks.server.serving import machine
+from benchmarks.frame.registry import Bar, benchmark
+from benchmarks.frame.statistics import interleaved, percentile
 from rse_pf.auth.tokens import SigningKey
 from rse_pf.config import AuthSettings, PlatformSettings
 from rse_pf.local.balancer.envoy_config import Target
@@ -178,7 +177,7 @@ async def small(server: Server) -> dict[str, float]:
         )
         took_ms = [took for row in rows for took in row]
         figures[f"{name}_cpu_us"] = 1e6 * (server.cpu_s() - before) / len(took_ms)
-        figures[f"{name}_p50_ms"], figures[f"{name}_p99_ms"] = np.percentile(took_ms, [50, 99]).tolist()
+        figures[f"{name}_p50_ms"], figures[f"{name}_p99_ms"] = percentile(took_ms, [50, 99]).tolist()
     await asyncio.sleep(_SETTLE_S)
     before, began = server.cpu_s(), time.monotonic()
     await asyncio.sleep(IDLE_S)
@@ -305,7 +304,7 @@ async def greedy(server: Server) -> dict[str, float]:
             ]
             took, *_ = await asyncio.gather(open_loop(victim, wanted, every_s, first_s), *load)
             rows[is_loaded] += took
-        quiet, loaded = (float(np.percentile(rows[key], 99)) for key in (False, True))
+        quiet, loaded = (percentile(rows[key], 99) for key in (False, True))
         figures |= {f"greedy_{name}_quiet_p99_ms": quiet, f"greedy_{name}_p99_ms": loaded}
         for robot in (victim, *others):
             await robot.close()
@@ -332,35 +331,34 @@ def measure(checkout: Path, rows: list[str]) -> dict[str, float]:
     return figures
 
 
-def main() -> None:
-    """Read the command line, measure, print the medians."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--base", type=Path, help="another checkout, measured in turns with this one")
-    parser.add_argument("--rounds", type=int, default=5)
-    parser.add_argument("--only", choices=tuple(ROWS), action="append", help="measure this row only")
-    parser.add_argument("--out", type=Path, help="write the figures as JSON")
-    args = parser.parse_args()
-    checkouts = {"here": HERE, **({} if args.base is None else {"base": args.base.resolve()})}
+@benchmark(
+    *(Bar(f"medians.here.{name}", at_most=bar) for name, bar in BARS.items()),
+    Bar("greedy.*", at_most=GREEDY_RATIO, unit="times quiet"),
+    Bar("times_as_fast.*", at_least=STREAM_RATIO, unit="times the base"),
+)
+def run_benchmark(
+    *, base: Annotated[Path | None, "another checkout, measured in turns with this one"] = None,
+    rounds: int = 5, only: Annotated[tuple[str, ...], "measure these rows only", ROWS] = (),
+) -> dict[str, Any]:  # fmt: skip
+    """Measure the checkouts in turns."""
+    checkouts = {"here": HERE, **({} if base is None else {"base": base.resolve()})}
     made: dict[str, list[dict[str, float]]] = {name: [] for name in checkouts}
     (HERE / "build").mkdir(exist_ok=True)
-    for number in range(args.rounds):
-        for name in sorted(checkouts, reverse=number % 2 == 1):
-            made[name].append(measure(checkouts[name], args.only or list(ROWS)))
-    figures = {
+    for _, name in interleaved(list(checkouts), rounds):
+        made[name].append(measure(checkouts[name], list(only or ROWS)))
+    medians = {
         name: {key: statistics.median(row[key] for row in rows) for key in rows[0]}
         for name, rows in made.items()
     }
-    for key, value in figures["here"].items():
-        base = f"   base {figures['base'][key]:9.2f}" if "base" in figures else ""
-        bar = f"   bar {BARS[key]:g}" if key in BARS else ""
-        print(f"{key:28} {value:9.2f}{base}{bar}")
-    report = {"machine": machine(), "medians": figures, "rounds": made}
-    print(f"load {report['machine']['load_average']}, {args.rounds} rounds")
-    if args.out is not None:
-        args.out.write_text(json.dumps(report, indent=1))
-
-
-if __name__ == "__main__":
-    main()
+    here, base_median = medians["here"], medians.get("base")
+    ratios = {
+        f"greedy_{name}": here[f"greedy_{name}_p99_ms"] / here[f"greedy_{name}_quiet_p99_ms"]
+        for name in ("get", "put")
+        if f"greedy_{name}_p99_ms" in here
+    }
+    speed_ups = (
+        {key: value / base_median[key] for key, value in here.items() if "mb_per_s" in key}
+        if base_median
+        else {}
+    )
+    return {"medians": medians, "rounds": made, "greedy": ratios, "times_as_fast": speed_ups}

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
-
+from benchmarks.frame.statistics import percentile
 from rse_pf.experiments.results.records import CommandRecord
 
 
@@ -17,5 +16,5 @@ def poses(commands: list[CommandRecord], begin_s: float, end_s: float) -> dict[s
         for command in chosen
         if command.answered is not None and command.code == "ok"
     ]
-    p50, p99 = np.percentile(took, [50, 99]) if took else (float("nan"),) * 2
+    p50, p99 = percentile(took, [50, 99])
     return {"n": len(chosen), "unanswered": len(chosen) - len(took), "p50_ms": p50, "p99_ms": p99}

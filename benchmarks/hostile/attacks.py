@@ -1,9 +1,8 @@
 """Attacks of a hostile robot or client on a platform, each bounded in number and time.
 
-    python -m benchmarks.hostile.attacks NAME URL     one attack, its outcome as JSON; see robots.py
-
-Reads the tokens (one line of JSON), prints ``ready`` when its messages are prepared, and begins at the next
-line of input.
+`run_attack` is one attack in a process of its own, with its outcome as JSON; see robots.py.  It reads the
+tokens (one line of JSON), prints ``ready`` when its messages are prepared, and begins at the next line of
+input.
 
 `ATTACKS` names them.  The attacks send raw frames without any library of ours, and close every socket.
 """
@@ -359,9 +358,8 @@ async def _attack(name: str, target: AttackTarget) -> Outcome:
     return outcome
 
 
-def main() -> None:
-    """Get ready, wait, attack, tell."""
-    name, url = sys.argv[1:]
+def run_attack(name: str, url: str) -> None:
+    """Get ready, wait, attack, tell; in a process of its own."""
     target = AttackTarget(url, tuple(json.loads(sys.stdin.readline())))
     if name == "zip-bombs":
         bomb()
@@ -369,7 +367,3 @@ def main() -> None:
     sys.stdin.readline()
     made = asyncio.run(_attack(name, target))
     print(json.dumps({name: getattr(made, name) for name in made.__slots__}))
-
-
-if __name__ == "__main__":
-    main()

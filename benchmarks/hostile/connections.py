@@ -1,8 +1,8 @@
 """Silent connections to every port of a platform, and what connections that were used leave behind.
 
-    python -m benchmarks.hostile.connections silent [--count 5000] [--ports NAME ...]
-    python -m benchmarks.hostile.connections beside [--count 5000] [--pairs 5] [--ports NAME ...]
-    python -m benchmarks.hostile.connections leave [--times 500]
+    python -m benchmarks hostile.connections silent [--count 5000] [--ports NAME ...]
+    python -m benchmarks hostile.connections beside [--count 5000] [--pairs 5] [--ports NAME ...]
+    python -m benchmarks hostile.connections leave [--times 500]
 
 ``silent`` starts a platform with its page, a live map and a cluster of Dask, and opens connections that
 send nothing to one port after the other.  For each port it shows in how many seconds the server had closed
@@ -17,7 +17,6 @@ a cycle).
 
 from __future__ import annotations
 
-import argparse
 import asyncio
 import contextlib
 import http.client
@@ -26,20 +25,21 @@ import os
 import random
 import resource
 import socket
-import statistics
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 from urllib.parse import urlsplit
 
 from websockets.asyncio.client import connect as connect_socket
 
 import client_sdk
-from benchmarks.server.serving import machine
+from benchmarks.frame.registry import Bar, benchmark
+from benchmarks.frame.report import say
+from benchmarks.frame.statistics import median_ratio, percentile
 from rse_pf.batch.cluster import LocalCluster, new_cluster_key
 from rse_pf.cli.local_platform.page import new_address
 from rse_pf.fleet_page.server import ANNOUNCEMENT
@@ -209,18 +209,15 @@ def at_all_ports(
                 break
             time.sleep(0.2)
         if late:
-            print(f"not listening: {', '.join(sorted(late))}", flush=True)
+            say(f"not listening: {', '.join(sorted(late))}")
         attack = prepare(url, issue)
         # A map that is only watched gives its owner up, so that owner comes first.
         for port, owner in sorted(listening(pids).items(), key=lambda row: (row[1] != _OWNER, row[0])):
             if port not in listening(pids):
-                print(f"listens no longer: {port} {owner}", flush=True)
+                say(f"listens no longer: {port} {owner}")
             elif not only or owner in only:
                 row = {"port": port, "owner": owner, **attack(port, pids)}
-                print(
-                    json.dumps({k: round(v, 2) if isinstance(v, float) else v for k, v in row.items()}),
-                    flush=True,
-                )
+                say(row)
                 rows.append(row)
     return rows
 
@@ -278,7 +275,7 @@ async def compared(url: str, tokens: list[str], port: int, count: int, pairs: in
         if opener is not None:
             opener.kill()
             await opener.wait()
-        return sorted(took_ms)[int(0.99 * (len(took_ms) - 1))]
+        return float(percentile(took_ms, 99))
 
     async with contextlib.AsyncExitStack() as ends:
         fleet = [
@@ -293,11 +290,10 @@ async def compared(url: str, tokens: list[str], port: int, count: int, pairs: in
                 (with_ms if is_attacked else without_ms).append(await window(is_attacked))
         for task in driving:
             task.cancel()
-    ratios = [beside_ms / alone_ms for beside_ms, alone_ms in zip(with_ms, without_ms, strict=True)]
     return {
         "without_p99_ms": [round(p99_ms, 2) for p99_ms in without_ms],
         "with_p99_ms": [round(p99_ms, 2) for p99_ms in with_ms],
-        "ratio": statistics.median(ratios), "load": os.getloadavg()[0],
+        "ratio": median_ratio(with_ms, without_ms),
     }  # fmt: skip
 
 
@@ -318,7 +314,7 @@ time.sleep(600)
 _WATCH = """
 import asyncio, itertools, random, sys, client_sdk
 from benchmarks.hostile.one_tenant import keyframe
-async def main():
+async def watch():
     async with client_sdk.connect(sys.argv[1], token=sys.argv[2], random=random.Random(1)) as robot:
         updates = robot.subscribe("live/m")
         for number in itertools.count():  # a map that gets nothing has no owner
@@ -326,7 +322,7 @@ async def main():
             if number == 0:
                 print(await updates.next(), flush=True)
             await asyncio.sleep(2.0)
-asyncio.run(main())
+asyncio.run(watch())
 """
 
 
@@ -433,33 +429,27 @@ def leave_page(times: int) -> dict[str, Any]:
         return count_growth(int(json.loads(announced[0].read_text())["pid"]), times, run)
 
 
-def main() -> int:
-    """Run a part, and say whether it kept its bars."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("part", choices=("silent", "beside", "leave"))
-    parser.add_argument("--count", type=int, default=5000)
-    parser.add_argument("--pairs", type=int, default=5)
-    parser.add_argument("--times", type=int, default=500)
-    parser.add_argument("--ports", nargs="*", default=[], help="names of processes")
-    args = parser.parse_args()
-    print(f"{machine()}, load {os.getloadavg()[0]:.1f}")
-    if args.part == "leave":
-        kept = []
-        for who, found in (("worker", leave(args.times)), ("page", leave_page(args.times))):
-            print(json.dumps({"of": who, **found}), flush=True)
-            same = all(found["after"][what] <= found["before"][what] for what in ("descriptors", "threads"))
-            kept.append(same and found["kib_per_cycle"] <= 1.0)
-        return 0 if all(kept) else 1
-    if args.part == "beside":
-        return 0 if all(row["ratio"] <= 1.2 for row in beside(args.count, args.pairs, args.ports)) else 1
-    rows = silent(args.count, args.ports)
-    kept = [
-        r["closed_s"] <= 10 and not r["left"] and r["memory_mib"] <= 64 and r["robot_s"] <= 1 for r in rows
-    ]
-    return 0 if all(kept) else 1
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+@benchmark(
+    Bar("silent.*.closed_s", at_most=10, unit="s"),
+    Bar("silent.*.left", equals=0),
+    Bar("silent.*.memory_mib", at_most=64, unit="MiB"),
+    Bar("silent.*.robot_s", at_most=1, unit="s"),
+    Bar("beside.*.ratio", at_most=1.2, unit="times the p99"),
+    Bar("leave.*.descriptors_left", at_most=0),
+    Bar("leave.*.threads_left", at_most=0),
+    Bar("leave.*.kib_per_cycle", at_most=1.0, unit="KiB"),
+)
+def run_benchmark(
+    *, part: Literal["silent", "beside", "leave"], count: int = 5000, pairs: int = 5, times: int = 500,
+    ports: Annotated[tuple[str, ...], "names of processes"] = (),
+) -> dict[str, Any]:  # fmt: skip
+    """Run a part."""
+    if part == "beside":
+        return {"beside": beside(count, pairs, list(ports))}
+    if part == "silent":
+        return {"silent": silent(count, list(ports))}
+    rows = {"worker": leave(times), "page": leave_page(times)}
+    for row in rows.values():
+        for what in ("descriptors", "threads"):
+            row[f"{what}_left"] = row["after"][what] - row["before"][what]
+    return {"leave": rows}

@@ -1,6 +1,6 @@
 """Measure what a robot with impossible deadlines, and a tenant that wants every sandbox, take from others.
 
-    python -m benchmarks.hostile.deadlines [--seconds 120] [--only own,shared,sandboxes] [--out FILE]
+    python -m benchmarks hostile.deadlines [--seconds 120] [--only own shared sandboxes]
 
 A service of 0.3 s is asked by six robots of three tenants, once a second each.  Beside them, after a quiet
 window of a quarter of the time, a robot of a fourth tenant asks with deadlines of 60 ms as fast as it can:
@@ -16,16 +16,18 @@ from __future__ import annotations
 
 import asyncio
 import json
-import os
 import tempfile
 import time
 from collections import Counter
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from benchmarks.hostile.sandboxes import KEY, Row, Server, percentile, run_rows, serving
+from benchmarks.frame.registry import Bar, benchmark
+from benchmarks.frame.report import say
+from benchmarks.frame.statistics import spread
+from benchmarks.hostile.sandboxes import KEY, Row, Server, serving
 from client_sdk import connect
 from rse_pf.errors import RsePfError
 from rse_pf.services.custom.installed import install
@@ -45,6 +47,7 @@ def serve(request: Request) -> Reply:
     return Reply(number=request.number)
 """
 SERVICE, COMMON_PAYLOAD = "slow", {"number": 7}
+ROWS = ("own", "shared", "sandboxes")
 OTHERS = [(f"tenant-{i}", f"robot-{j}") for i in range(3) for j in range(2)]
 HOSTILE_DEADLINE_S, DEADLINE_S, PERIOD_S = 0.06, 5.0, 1.0
 PLACES, WANTED = 16, 64
@@ -64,7 +67,7 @@ class Seen:
         return {
             f"{prefix}_n": n, f"{prefix}_answered_percent": 100 * self.codes["ok"] / max(1, n),
             f"{prefix}_codes": dict(self.codes),
-            **{f"{prefix}_p{p}_ms": round(percentile(self.times_s, p), 1) for p in (50, 95, 99)},
+            f"{prefix}_ms": spread(1e3 * time_s for time_s in self.times_s),
         }  # fmt: skip
 
 
@@ -191,16 +194,17 @@ async def measure(only: list[str], seconds: float) -> list[Row]:
             "sandboxes": lambda: sandboxes(folder, min(seconds, 60.0)),
         }
         for name in only:
-            row = {**await works[name](), "load": round(os.getloadavg()[0], 1)}
-            print(json.dumps(row), flush=True)
+            row = await works[name]()
+            say(row)
             rows.append(row)
     return rows
 
 
-def main() -> None:
-    """Measure, and write the rows."""
-    run_rows(measure, only="own,shared,sandboxes", seconds=120.0, doc=__doc__)
-
-
-if __name__ == "__main__":
-    main()
+@benchmark(
+    *(Bar(f"rows.*.{who}_answered_percent", at_least=100.0, unit="%") for who in ("others", "quiet")),
+)
+def run_benchmark(
+    *, only: Annotated[tuple[str, ...], "rows", ROWS] = ROWS, seconds: float = 120.0
+) -> dict[str, Any]:
+    """Measure the rows."""
+    return {"rows": asyncio.run(measure(list(only), seconds))}

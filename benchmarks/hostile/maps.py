@@ -1,7 +1,7 @@
 """Poses of honest robots while others send hostile maps; and what limited processes cost an honest map.
 
-    python -m benchmarks.hostile.maps flood [--workers 1] [--robots 10] [--seconds 20] [--out FILE]
-    python -m benchmarks.hostile.maps honest --before DIR [--n 300] [--out FILE]
+    python -m benchmarks hostile.maps flood [--workers 1] [--robots 10] [--seconds 20]
+    python -m benchmarks hostile.maps honest --before DIR [--n 300]
 
 ``flood`` starts `rse-pf serve`.  Robots request 5 poses per second each; latency counts from the planned
 time.  After a quiet window, robots of their own identity each send every map of
@@ -16,13 +16,11 @@ Defends: others' p99 <= 1.5x of quiet and <= 100 ms, no 503, serving processes g
 
 from __future__ import annotations
 
-import argparse
 import asyncio
 import collections
 import contextlib
 import json
 import os
-import platform
 import random
 import re
 import runpy
@@ -31,16 +29,20 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
 import client_sdk
+from benchmarks.frame.registry import Bar, benchmark
+from benchmarks.frame.report import say
+from benchmarks.frame.statistics import spread
 from benchmarks.hostile.robots import summarise_window
 from rse_pf.auth.tokens import SigningKey
 from rse_pf.config import PlatformSettings
-from rse_pf.errors import RsePfError
+from rse_pf.errors import RsePfError, UsageError
 from rse_pf.experiments.load.swarm import Swarm, SwarmOptions
 from rse_pf.geometry import exp_se3
 from rse_pf.maps.format import Keyframe, encode_map
@@ -54,7 +56,6 @@ START_S, SETTLE_S, GRACE_S = 60.0, 3.0, 6.0
 ATTACKERS = 4
 P99_BAR, P99_BAR_MS, MEMORY_BAR_MIB = 1.5, 100.0, 64.0
 CLOUD_SIZES = (30_000, 60_000)
-QUANTILES = (50, 95, 99)
 
 
 _PUT = """
@@ -66,6 +67,22 @@ store, data = open_store(place), sys.stdin.buffer.read()
 for robot in robots:
     store.put(object_name(RobotId("default", robot), digest), data)
 """
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Options:
+    """The arguments."""
+
+    what: Literal["flood", "honest"]
+    workers: int = 1
+    robots: int = 10
+    seconds: Annotated[float, "length of the quiet windows"] = 20.0
+    n: Annotated[int, "commands of each kind with each server"] = 300
+    rate: Annotated[float, "hostile commands per second, at most"] = 10.0
+    only: Annotated[str, "regular expression of the names of hostile maps"] = ""
+    without_jobs: bool = False
+    tree: Annotated[Path, "sources of the server, or of the later one"] = ROOT
+    before: Annotated[Path | None, "sources of the other server"] = None
 
 
 class Server:
@@ -125,37 +142,22 @@ class Server:
         self._log.close()
 
 
-def main() -> None:
-    """Measure, print a table, write ``--out``."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("what", choices=("flood", "honest"))
-    parser.add_argument("--workers", type=int, default=1)
-    parser.add_argument("--robots", type=int, default=10)
-    parser.add_argument("--seconds", type=float, default=20.0, help="length of the quiet windows")
-    parser.add_argument("--n", type=int, default=300, help="commands of each kind with each server")
-    parser.add_argument("--rate", type=float, default=10.0, help="hostile commands per second, at most")
-    parser.add_argument("--only", default="", help="regular expression of the names of hostile maps")
-    parser.add_argument("--without-jobs", action="store_true")
-    parser.add_argument("--tree", type=Path, default=ROOT, help="sources of the server, or of the later one")
-    parser.add_argument("--before", type=Path, help="sources of the other server")
-    parser.add_argument("--out", type=Path, help="write the figures as JSON")
-    args = parser.parse_args()
-    report = {"machine": f"{platform.machine()}, {os.cpu_count()} cores", "load_before": os.getloadavg()}
+@benchmark(
+    Bar("attacks.*.p99_ratio", at_most=P99_BAR, unit="times quiet"),
+    Bar("attacks.*.p99_ms", at_most=P99_BAR_MS, unit="ms"),
+    Bar("attacks.*.grown_mib", at_most=MEMORY_BAR_MIB, unit="MiB"),
+    Bar("attacks.*.others_failed", equals={}),
+)
+def run_benchmark(args: Options) -> dict[str, Any]:
+    """Measure one of both."""
+    if args.what == "honest" and args.before is None:
+        raise UsageError("honest needs --before", hint="name the sources of the other server")
     with tempfile.TemporaryDirectory() as folder:
-        report |= asyncio.run(
-            (flood if args.what == "flood" else honest)(args, Path(folder))  # type: ignore[operator]
-        )
-    report["load_after"] = os.getloadavg()
-    if args.out:
-        args.out.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+        work = flood(args, Path(folder)) if args.what == "flood" else honest(args, Path(folder))
+        return asyncio.run(work)
 
 
-# --- hostile maps beside honest robots ------------------------------------------------------------------
-
-
-async def flood(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
+async def flood(args: Options, folder: Path) -> dict[str, Any]:
     """Measure quiet, attacked by commands, quiet, attacked by jobs."""
     server = Server(folder / "server", workers=args.workers, tree=args.tree.absolute())
     origin = time.monotonic()
@@ -186,7 +188,12 @@ async def flood(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
     finally:
         server.stop()
     others = {name: summarise_window(result.commands, *window) for name, window in windows.items()}
-    show_flood(rows, others)
+    for name, row in rows.items():
+        quiet, beside = others[f"quiet before {name}"], others[name]
+        row |= {
+            "p99_ratio": beside["p99_ms"] / quiet["p99_ms"], "p99_ms": beside["p99_ms"],
+            "others_failed": {code: n for code, n in beside["codes"].items() if code not in ("ok", "")},
+        }  # fmt: skip
     return {"attacks": rows, "others": others}
 
 
@@ -297,32 +304,10 @@ def _own_mib(pids: Iterable[int]) -> float:
     return total * os.sysconf("SC_PAGE_SIZE") / 2**20
 
 
-def show_flood(rows: dict[str, dict[str, Any]], others: dict[str, dict[str, Any]]) -> None:
-    """Print what became of the attacks and of the others."""
-    print("| attack | n | took s | slowest s | serving MiB | all MiB | others | goodput | p50 ms | p99 ms |")
-    print("|---|---|---|---|---|---|---|---|---|---|")
-    for name, row in rows.items():
-        quiet, beside = others[f"quiet before {name}"], others[name]
-        ratio = beside["p99_ms"] / quiet["p99_ms"]
-        print(
-            f"| {name} | {row['n']} | {row['took_s']:.1f} | {row['slowest_s']:.1f} | "
-            f"{row['grown_mib']:+.1f} | "
-            f"{row['all_grown_mib']:+.0f} | {beside['n']} | {100 * beside['goodput']:.2f} % | "
-            f"{quiet['p50_ms']:.1f} -> {beside['p50_ms']:.1f} | "
-            f"{quiet['p99_ms']:.1f} -> {beside['p99_ms']:.1f} ({ratio:.2f}x) |"
-        )
-        is_good = (
-            (ratio <= P99_BAR and beside["p99_ms"] <= P99_BAR_MS)
-            and row["grown_mib"] <= MEMORY_BAR_MIB
-            and set(beside["codes"]) <= {"ok", ""}
-        )
-        print(f"  {'ok' if is_good else 'MISSED'}; others: {beside['codes']}; attack: {row['codes']}")
-
-
 # --- the cost of a limited process ----------------------------------------------------------------------
 
 
-async def honest(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
+async def honest(args: Options, folder: Path) -> dict[str, Any]:
     """Ask two servers the same, in turns."""
     trees = {"after": args.tree.absolute(), "before": args.before.absolute()}
     servers = {name: Server(folder / name, workers=1, tree=tree) for name, tree in trees.items()}
@@ -344,20 +329,16 @@ async def honest(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
             for robot in robots.values():
                 await robot.close()
             report[kind] = {
-                name: {"first_ms": first[name], **_quantiles(values)} for name, values in took.items()
+                name: {"first_ms": first[name], **spread(values)} for name, values in took.items()
             }
             before, after = report[kind]["before"], report[kind]["after"]
-            ratios = {f"p{q}": after[f"p{q}"] / before[f"p{q}"] for q in QUANTILES}
+            ratios = {name: after[name] / before[name] for name in ("p50", "p95", "p99")}
             report[kind]["ratio"] = ratios
-            print(kind, json.dumps(report[kind]), flush=True)
+            say({"kind": kind, **report[kind]})
     finally:
         for server in servers.values():
             server.stop()
     return {"n": args.n, "honest": report}
-
-
-def _quantiles(values: list[float]) -> dict[str, float]:
-    return {f"p{q}": round(float(np.percentile(values, q)), 3) for q in QUANTILES}
 
 
 def _place(keyframes: int, *, service_options: dict[str, Any]) -> Callable[..., Any]:
@@ -388,7 +369,3 @@ HONEST: dict[str, tuple[str, Callable[..., Any]]] = {
     "localise, 200 keyframes": ("localise", _place(200, service_options={})),
     "icp, 3,000 points": ("icp", _icp),
 }
-
-
-if __name__ == "__main__":
-    main()

@@ -1,6 +1,6 @@
 """A robot with every scope of its tenant attacks, while a robot of another tenant drives, asks and stores.
 
-    python -m benchmarks.hostile.one_tenant [--pairs 10] [--seconds 60] [--only NAME] [--out FILE]
+    python -m benchmarks hostile.one_tenant [--pairs 10] [--seconds 60] [--only NAME]
 
 One local platform with two servers and a quota of 64 MiB for a tenant.  The measured robot asks for a pose
 (200 matches) ten times a second, sends a keyframe 2.5 times a second and stores 64 KiB once a second.  A pair
@@ -21,7 +21,6 @@ the owners that an attack with several maps may have (2 of a server).
 
 from __future__ import annotations
 
-import argparse
 import asyncio
 import contextlib
 import functools
@@ -31,7 +30,6 @@ import json
 import multiprocessing
 import os
 import secrets
-import statistics
 import tempfile
 import threading
 import time
@@ -39,12 +37,14 @@ from collections import Counter
 from collections.abc import Awaitable, Callable, Sequence
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from websockets.asyncio.client import connect as connect_websocket
 from websockets.exceptions import WebSocketException
 
+from benchmarks.frame.registry import Bar, benchmark
+from benchmarks.frame.statistics import median_ratio, percentile
 from benchmarks.hostile.robots import resident_mib
 from client_sdk import connect
 from client_sdk.robot import Robot
@@ -61,7 +61,7 @@ from rse_pf.services.pnp import make_request
 from rse_pf.slam.keyframe import Keyframe, encode_keyframe, make_features
 from rse_pf.wire.live_map import live_topic
 
-__all__ = ["ATTACKS", "main", "measure"]
+__all__ = ["ATTACKS", "measure"]
 
 HOME, RIVAL = "home", "rival"
 QUOTA_BYTES = 64 << 20
@@ -418,12 +418,16 @@ async def _pairs(
         windows.append(rows)
     store = DirectoryStore(_store_of(state))
     return {
-        "attack": name, "pairs": pairs, "load_average": round(os.getloadavg()[0], 2),
+        "attack": name, "pairs": pairs,
         "ratios": {
-            what: _median_ratio(measured, windows, name, what) for what in ("pose", "keyframe", "object")
+            what: median_ratio(
+                [_tail_ms(measured, [window[name]], what) for window in windows],
+                [_tail_ms(measured, [window[FAIR]], what) for window in windows],
+            )
+            for what in ("pose", "keyframe", "object")
         },
         "p99_ms": {
-            what: [_p99(measured, [window[kind] for window in windows], what) for kind in (FAIR, name)]
+            what: [_tail_ms(measured, [window[kind] for window in windows], what) for kind in (FAIR, name)]
             for what in ("pose", "keyframe", "object")
         },
         "n": dict(Counter(what for _, what, _, _ in measured.rows)),
@@ -445,53 +449,31 @@ def _store_of(state: Path) -> Path:
     return next(path.parent for path in state.rglob("accounts") if path.is_dir())
 
 
-def _p99(measured: Measured, spans: Sequence[tuple[float, float]], what: str) -> float:
+def _tail_ms(measured: Measured, spans: Sequence[tuple[float, float]], what: str) -> float:
     values = [
         ms
         for at, kind, ms, _ in measured.rows
         if kind == what and any(low <= at < high for low, high in spans)
     ]
-    return round(float(np.percentile(values, 99)), 2) if values else float("nan")
+    return percentile(values, 99)
 
 
-def _median_ratio(
-    measured: Measured, windows: Sequence[dict[str, tuple[float, float]]], name: str, what: str
-) -> float:
-    ratios = [
-        _p99(measured, [window[name]], what) / _p99(measured, [window[FAIR]], what) for window in windows
-    ]
-    return round(statistics.median(ratios), 3)
-
-
-def verdict(row: dict[str, Any]) -> list[str]:
-    """Return which bars a row misses."""
-    missed = [f"{what} {ratio} times" for what, ratio in row["ratios"].items() if not ratio <= RATIO]
-    missed += [f"refused: {row['refused']}"] if row["refused"] else []
-    if row["stored_mib"] > QUOTA_BYTES / 2**20 + GROWTH_MIB:
-        missed.append(f"stored {row['stored_mib']} MiB")
-    if row["memory_mib"] > GROWTH_MIB + OWNERS_MIB * (row["attack"] == "maps"):
-        missed.append(f"memory {row['memory_mib']:+} MiB")
-    return missed
-
-
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Measure and print the figures."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.hostile.one_tenant")
-    parser.add_argument("--pairs", type=int, default=10)
-    parser.add_argument("--seconds", type=float, default=60.0)
-    parser.add_argument("--only", choices=sorted(ATTACKS), action="append")
-    parser.add_argument("--out", type=Path)
-    chosen = parser.parse_args(arguments)
-    names = chosen.only or list(ATTACKS)
+@benchmark(
+    *(
+        Bar(f"*.ratios.{what}", at_most=RATIO, unit="times the p99")
+        for what in ("pose", "keyframe", "object")
+    ),
+    Bar("*.refused", equals={}),
+    Bar("*.stored_mib", at_most=QUOTA_BYTES / 2**20 + GROWTH_MIB, unit="MiB"),
+    Bar("*.memory_without_owners_mib", at_most=GROWTH_MIB, unit="MiB"),
+)
+def run_benchmark(
+    *, pairs: int = 10, seconds: float = 60.0, only: Annotated[tuple[str, ...], "attacks", ATTACKS] = ()
+) -> dict[str, Any]:
+    """Attack in every way."""
     with tempfile.TemporaryDirectory() as folder:
-        rows = asyncio.run(measure(names, chosen.pairs, chosen.seconds, Path(folder)))
-    text = json.dumps(rows, indent=1)
-    print(text)
-    if chosen.out is not None:
-        chosen.out.write_text(text + "\n", encoding="utf-8")
+        rows = asyncio.run(measure(list(only or ATTACKS), pairs, seconds, Path(folder)))
     for row in rows:
-        print(f"{row['attack']}: {'; '.join(verdict(row)) or 'ok'}")
-
-
-if __name__ == "__main__":
-    main()
+        owners_mib = OWNERS_MIB if row["attack"] == "maps" else 0.0
+        row["memory_without_owners_mib"] = row["memory_mib"] - owners_mib
+    return {row["attack"]: row for row in rows}

@@ -1,6 +1,6 @@
 """Round trips of robots that send real PnP problems through the load balancer while it is attacked.
 
-    python -m benchmarks.hostile.robots [--robots 20] [--seconds 8] [--only NAME] [--out FILE]
+    python -m benchmarks hostile.robots [--robots 20] [--seconds 8] [--only NAME]
 
 For each attack of benchmarks/hostile/attacks.py: a quiet window, the attack (at least as long), a pause.
 "Others" send 5 commands per second each, kept; latency counts from the planned time; goodput is the share
@@ -14,20 +14,18 @@ of quiet (1.5x beside one robot at 100 times its rate, goodput >= 99 %), 0 robot
 
 from __future__ import annotations
 
-import argparse
 import asyncio
 import json
 import os
-import sys
 import tempfile
 import time
 from asyncio.subprocess import Process
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-import numpy as np
-
+from benchmarks.frame.registry import Bar, benchmark, command_of
+from benchmarks.frame.statistics import percentile
 from benchmarks.hostile import attacks
 from benchmarks.hostile.attacks import ATTACKS
 from rse_pf.config import PlatformSettings
@@ -58,7 +56,7 @@ async def attacker(name: str, cloud: LocalPlatform) -> Process:
     """Start the process of one attack and wait until it is ready: it would have a machine of its own."""
     tokens = json.dumps([cloud.issue_token(f"hostile-{n}") for n in range(TOKENS)]).encode()
     process = await asyncio.create_subprocess_exec(
-        sys.executable, attacks.__file__, name, cloud.url,
+        *command_of(attacks.run_attack, name, cloud.url),
         stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE,
     )  # fmt: skip
     assert process.stdin is not None
@@ -90,10 +88,18 @@ def summarise_window(commands: Sequence[CommandRecord], begin: float, end: float
     return {
         "n": len(planned),
         "goodput": len(trips) / max(1, len(planned)),
-        "p50_ms": float(np.percentile(trips, 50)) if trips else float("nan"),
-        "p99_ms": float(np.percentile(trips, 99)) if trips else float("nan"),
+        "p50_ms": percentile(trips, 50),
+        "p99_ms": percentile(trips, 99),
         "codes": codes,
     }
+
+
+def is_refused(row: dict[str, Any]) -> bool:
+    """Return whether the attacker was refused or cut off, as its kind of attack must be."""
+    refused, tried = row["outcome"].get("refused", 0), row["outcome"].get("tried", 1)
+    if row["attack"] in ("empty-fragments", "ping-flood"):
+        return refused > 0
+    return row["attack"] == "rate-flood" or refused >= tried
 
 
 async def run(names: Sequence[str], robots: int, seconds: float, folder: Path) -> list[dict[str, Any]]:
@@ -126,7 +132,7 @@ async def run(names: Sequence[str], robots: int, seconds: float, folder: Path) -
                 began = now()
                 outcome, grown = await attack(ready, cloud)
                 await asyncio.sleep(max(0.0, began + seconds - now()))
-                row = {"attack": name, "outcome": outcome, "grown_mib": grown, "load": os.getloadavg()[0]}
+                row = {"attack": name, "outcome": outcome, "grown_mib": grown}
                 rows.append({**row, "quiet_s": quiet, "began_s": began, "ended_s": now()})
             result = await swarm.finish(GRACE_S)
     for row in rows:
@@ -137,58 +143,28 @@ async def run(names: Sequence[str], robots: int, seconds: float, folder: Path) -
     return rows
 
 
-def verdict(row: dict[str, Any]) -> str:
-    """Return ``ok``, or which bars were missed."""
-    outcome, others = row["outcome"], row["others"]
-    is_rate = row["attack"] == "rate-flood"
-    ratio = others["p99_ms"] / row["quiet"]["p99_ms"]
-    unrefused = not is_rate and outcome.get("refused", 0) < outcome.get("tried", 1)
-    if row["attack"] in ("empty-fragments", "ping-flood"):
-        unrefused = not outcome.get("refused")
-    missed = {
-        "p99": not ratio < (P99_BAR_OF_RATE if is_rate else P99_BAR),
-        "goodput": others["goodput"] < GOODPUT_BAR,
-        "dropped": row["dropped"] > 0,
-        "memory": row["grown_mib"] >= MEMORY_BAR_MIB,
-        "refused": unrefused,
-    }
-    return ", ".join(name for name, is_missed in missed.items() if is_missed) or "ok"
-
-
-def table(rows: Sequence[dict[str, Any]]) -> str:
-    """Return all rows as Markdown."""
-    lines = [
-        "| attack | attacker | n | goodput | p50 ms | p99 ms (quiet) | x | dropped | MiB | load | misses |",
-        "|---|---|---|---|---|---|---|---|---|---|---|",
-    ]
-    for row in rows:
-        outcome, quiet, others = row["outcome"], row["quiet"], row["others"]
-        text = f"{outcome.get('refused')} of {outcome.get('tried')} refused, {outcome.get('ends')}"
-        lines.append(
-            f"| {row['attack']} | {text}, slowest {outcome.get('slowest_s', 0):.2f} s | {others['n']} | "
-            f"{100 * others['goodput']:.2f} % | {others['p50_ms']:.1f} | {others['p99_ms']:.1f} "
-            f"({quiet['p99_ms']:.1f}) | {others['p99_ms'] / quiet['p99_ms']:.2f} | {row['dropped']} | "
-            f"{row['grown_mib']:+.1f} | {row['load']:.1f} | {verdict(row)} |"
+@benchmark(
+    *(
+        Bar(
+            f"{name}.p99_ratio",
+            at_most=P99_BAR_OF_RATE if name == "rate-flood" else P99_BAR,
+            unit="times quiet",
         )
-    return "\n".join(lines)
-
-
-def main() -> None:
-    """Read the command line, attack, print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--robots", type=int, default=20)
-    parser.add_argument("--seconds", type=float, default=8.0)
-    parser.add_argument("--only", choices=sorted(ATTACKS), action="append")
-    parser.add_argument("--out", type=Path)
-    asked = parser.parse_args()
+        for name in ATTACKS
+    ),
+    Bar("*.others.goodput", at_least=GOODPUT_BAR),
+    Bar("*.dropped", equals=0),
+    Bar("*.grown_mib", at_most=MEMORY_BAR_MIB, unit="MiB"),
+    Bar("*.is_refused", equals=True),
+)
+def run_benchmark(
+    *, robots: int = 20, seconds: float = 8.0, only: Annotated[tuple[str, ...], "attacks", ATTACKS] = ()
+) -> dict[str, Any]:
+    """Attack in every way."""
     with tempfile.TemporaryDirectory() as folder:
-        names = asked.only or list(ATTACKS)
-        rows = asyncio.run(run(names, asked.robots, asked.seconds, Path(folder)))
-    print(f"{asked.robots} robots x 5 fps through the balancer, 2 servers; windows of {asked.seconds:g} s")
-    print(table(rows))
-    if asked.out is not None:
-        asked.out.write_text(json.dumps(rows, indent=1), encoding="utf-8")
-
-
-if __name__ == "__main__":
-    main()
+        rows = asyncio.run(run(list(only or ATTACKS), robots, seconds, Path(folder)))
+    for row in rows:
+        row |= {
+            "p99_ratio": row["others"]["p99_ms"] / row["quiet"]["p99_ms"], "is_refused": is_refused(row)
+        }  # fmt: skip
+    return {row["attack"]: row for row in rows}

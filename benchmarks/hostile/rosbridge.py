@@ -1,6 +1,6 @@
 """What rosbridge costs beside the platform's own JSON, and what attacks on it cost the robots beside it.
 
-    python -m benchmarks.hostile.rosbridge [--rounds 10] [--seconds 5] [--out FILE]
+    python -m benchmarks hostile.rosbridge [--rounds 10] [--seconds 5]
 
 First part: one robot solves the same poses by turns over the sub-protocol JSON and over rosbridge; the
 figure is the ratio of the medians, which must be at most 1.3.  Second part: four robots solve ten poses a
@@ -11,7 +11,6 @@ server, with a code in `MUST`.
 
 from __future__ import annotations
 
-import argparse
 import asyncio
 import contextlib
 import json
@@ -23,13 +22,15 @@ import time
 from collections import Counter
 from collections.abc import Awaitable, Callable
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed, InvalidHandshake
 from websockets.typing import Subprotocol
 
-from benchmarks.server.serving import BenchServer, machine
+from benchmarks.frame.registry import Bar, benchmark, command_of
+from benchmarks.frame.statistics import percentile, spread
+from benchmarks.server.serving import BenchServer
 from rse_pf.pnp.problems import make_problem
 from rse_pf.services.pnp import make_request
 from rse_pf.wire import Command, make_codec
@@ -202,55 +203,44 @@ async def beside(server: BenchServer, rounds: int, seconds: float) -> dict[str, 
     ]
     tokens = [server.token(f"hostile-{number}") for number in range(rounds * len(ATTACKS))]
     process = await asyncio.create_subprocess_exec(
-        "nice", "-n", "19", sys.executable, "-m", "benchmarks.hostile.rosbridge", "--attack",
-        str(server.port), "--rounds", str(rounds), "--seconds", str(seconds),
+        "nice", "-n", "19", *command_of(run_attacks, str(server.port), str(rounds), str(seconds)),
         stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE,
     )  # fmt: skip
     output, _ = await process.communicate(json.dumps(tokens).encode())
     for task in robots:
         task.cancel()
     measured = json.loads(output)
-    quiet = sorted(ms for at, ms in times if any(a <= at < b for a, b, _ in measured["windows"]))
-    attacked = sorted(ms for at, ms in times if any(b <= at < c for _, b, c in measured["windows"]))
-    figures = {
-        name: {
-            "n": len(row),
-            **{f"p{p}_ms": round(row[int(p / 100 * (len(row) - 1))], 2) for p in (50, 99)},
-        }
-        for name, row in (("quiet", quiet), ("attacked", attacked))
-    }
-    ratio = figures["attacked"]["p99_ms"] / figures["quiet"]["p99_ms"]
-    return {**figures, "p99_ratio": round(ratio, 2), "ends": measured["ends"]}
+    quiet = [ms for at, ms in times if any(a <= at < b for a, b, _ in measured["windows"])]
+    attacked = [ms for at, ms in times if any(b <= at < c for _, b, c in measured["windows"])]
+    ratio = percentile(attacked, 99) / percentile(quiet, 99)
+    wrong = [end for end in measured["ends"] if end.split()[1] not in map(str, MUST[end.split()[0]])]
+    return {
+        "quiet_ms": spread(quiet), "attacked_ms": spread(attacked), "p99_ratio": ratio,
+        "ends": measured["ends"], "wrong_ends": wrong,
+    }  # fmt: skip
 
 
-def main() -> int:
-    """Measure and print both parts; return 0 if every attack ended as it must."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--rounds", type=int, default=10)
-    parser.add_argument("--seconds", type=float, default=5.0, help="length of a window")
-    parser.add_argument("--out", type=Path)
-    parser.add_argument("--attack", type=int, default=0, metavar="PORT", help=argparse.SUPPRESS)
-    args = parser.parse_args()
-    if args.attack:
-        tokens = json.load(sys.stdin)
-        print(json.dumps(asyncio.run(attack(args.attack, tokens, args.rounds, args.seconds))))
-        return 0
+@benchmark(
+    Bar("cost.*.ratio", at_most=1.3, unit="times JSON"),
+    Bar("beside.p99_ratio", at_most=1.2, unit="times quiet"),
+    Bar("beside.wrong_ends", equals=[]),
+)
+def run_benchmark(
+    *, rounds: int = 10, seconds: Annotated[float, "length of a window"] = 5.0
+) -> dict[str, Any]:
+    """Measure both parts."""
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     serving = {"rosbridge": True}
     with tempfile.TemporaryDirectory() as folder:
         unlimited = {"max_commands_per_s": 0.0}
         with BenchServer(Path(folder), workers=2, serving=serving, session=unlimited) as server:
-            paid = asyncio.run(cost(server, args.rounds))
+            paid = asyncio.run(cost(server, rounds))
         with BenchServer(Path(folder), workers=2, serving=serving) as server:
-            figures = asyncio.run(beside(server, args.rounds, args.seconds))
-    result = {"machine": machine(), "cost": paid, "beside": figures}
-    print(json.dumps(result, indent=1))
-    if args.out is not None:
-        args.out.parent.mkdir(parents=True, exist_ok=True)
-        args.out.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
-    wrong = [end for end in figures["ends"] if end.split()[1] not in map(str, MUST[end.split()[0]])]
-    return 1 if wrong else 0
+            figures = asyncio.run(beside(server, rounds, seconds))
+    return {"cost": paid, "beside": figures}
 
 
-if __name__ == "__main__":
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    sys.exit(main())
+def run_attacks(port: str, rounds: str, seconds: str) -> None:
+    """Attack from a process of its own, with the tokens of its input."""
+    tokens = json.load(sys.stdin)
+    print(json.dumps(asyncio.run(attack(int(port), tokens, int(rounds), float(seconds)))))

@@ -1,13 +1,12 @@
 """Measure what sandboxes cost, and what the crashes of one robot cost the others: the table of issue 5.
 
-    python -m benchmarks.hostile.sandboxes [--only cost,released,...] [--crash-seconds 60] [--out FILE]
+    python -m benchmarks hostile.sandboxes [--only cost released ...] [--crash-seconds 60]
 
 Real servers and robots on this machine, on shared cores.
 """
 
 from __future__ import annotations
 
-import argparse
 import asyncio
 import contextlib
 import itertools
@@ -21,10 +20,13 @@ import tempfile
 import time
 import urllib.error
 import urllib.request
-from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
+from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
+from benchmarks.frame.registry import benchmark
+from benchmarks.frame.report import say
+from benchmarks.frame.statistics import percentile
 from client_sdk import connect
 from rse_pf.auth.tokens import SigningKey
 from rse_pf.cli.main import main as rse_pf
@@ -74,6 +76,7 @@ settings = PlatformSettings.from_dict(order["settings"])
 sys.exit(serve(settings, keys=keys, server_id="bench", announce=Path(order["announce"])))
 """
 Row = dict[str, Any]
+ROWS = ("cost", "released", "poison", "state", "crashes")
 
 
 class Server:
@@ -164,12 +167,6 @@ def unique_mib(pid: int) -> float:
     return sum(int(line.split()[1]) for line in lines if line.startswith("Private_")) / 1024
 
 
-def percentile(times: list[float], percent: float) -> float:
-    """Return the nearest rank, in ms."""
-    ranked = sorted(times)
-    return 1e3 * ranked[min(len(ranked) - 1, int(len(ranked) * percent / 100))] if ranked else float("nan")
-
-
 @contextlib.asynccontextmanager
 async def serving(folder: Path, **services: Any) -> AsyncIterator[Server]:
     """Serve for the length of a block."""
@@ -203,8 +200,8 @@ async def cost(folder: Path, robots: int = 8, calls: int = 200) -> list[Row]:
                 memory = [unique_mib(pid) for pid in set(server.processes()) - before]
             following = await _median_ms(server, name, POINTS, calls)
             rows.append({
-                "row": f"cost, {language}", "first_answer_median_ms": percentile(first, 50),
-                "first_answer_worst_ms": percentile(first, 100), "direct_ms": direct,
+                "row": f"cost, {language}", "first_answer_median_ms": 1e3 * percentile(first, 50),
+                "first_answer_worst_ms": 1e3 * percentile(first, 100), "direct_ms": direct,
                 "following_median_ms": following, "echo_median_ms": echo,
                 "overhead_over_echo_and_direct_ms": following - echo - direct,
                 "overhead_with_network_ms": following - direct,
@@ -244,7 +241,7 @@ async def crashes(folder: Path, seconds: float, others: int = 20, count: int = 5
                     if crashing:
                         each.append(_crash_robot(server, end, count // turns + 1, part_s, victims))
                     await asyncio.gather(*each)
-            quiet, busy = percentile(times[False], 99), percentile(times[True], 99)
+            quiet, busy = 1e3 * percentile(times[False], 99), 1e3 * percentile(times[True], 99)
             codes = [code for code, _ in victims]
             rows.append({
                 "row": f"{len(victims)} crashes, circuit breaker {'off' if crash_limit else 'as by default'}",
@@ -438,48 +435,14 @@ async def measure(only: list[str], crash_s: float) -> list[Row]:
         }  # fmt: skip
         for name in only:
             for row in await works[name]():
-                print(json.dumps(row), flush=True)
+                say(row)
                 rows.append(row)
     return rows
 
 
-def run_rows(
-    measure: Callable[[list[str], float], Coroutine[Any, Any, list[Row]]],
-    *,
-    only: str,
-    seconds: float,
-    doc: str | None,
-    option: str = "--seconds",
-) -> None:
-    """Read the command line of a benchmark of rows, measure, and write the rows.
-
-    Args:
-        measure: Gets the names of the rows and the seconds of *option*.
-        only: All names, joined by commas.
-        seconds: Default of *option*.
-        doc: Help of the benchmark.
-        option: Name of the option that gives the seconds.
-    """
-    parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--only", default=only)
-    parser.add_argument(option, dest="seconds", type=float, default=seconds)
-    parser.add_argument("--out", type=Path)
-    args = parser.parse_args()
-    rows = asyncio.run(measure(args.only.split(","), args.seconds))
-    if args.out:
-        args.out.write_text(json.dumps(rows, indent=1) + "\n")
-
-
-def main() -> None:
-    """Measure, and write the rows."""
-    run_rows(
-        measure,
-        only="cost,released,poison,state,crashes",
-        option="--crash-seconds",
-        seconds=60.0,
-        doc=__doc__,
-    )
-
-
-if __name__ == "__main__":
-    main()
+@benchmark()
+def run_benchmark(
+    *, only: Annotated[tuple[str, ...], "rows", ROWS] = ROWS, crash_seconds: float = 60.0
+) -> dict[str, Any]:
+    """Measure the rows."""
+    return {"rows": asyncio.run(measure(list(only), crash_seconds))}

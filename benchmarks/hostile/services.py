@@ -1,6 +1,6 @@
 """Measure what hostile services take: memory, threads and inodes of the machine, and time of other robots.
 
-    python -m benchmarks.hostile.services [--only memory,cpu] [--seconds 60] [--out FILE]
+    python -m benchmarks hostile.services [--only memory cpu] [--seconds 60]
 
 One row per attack.  ``peak_mib`` is what the machine lost to the sandbox: its pages, shared ones in part,
 and the growth of shared memory and kernel memory meanwhile; the limit is that of `services.memory_bytes`.
@@ -14,9 +14,12 @@ import json
 import tempfile
 import time
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from benchmarks.hostile.sandboxes import Answers, Row, Server, percentile, pnp_robot, run_rows, serving
+from benchmarks.frame.registry import benchmark
+from benchmarks.frame.report import say
+from benchmarks.frame.statistics import percentile
+from benchmarks.hostile.sandboxes import Answers, Row, Server, pnp_robot, serving
 from rse_pf.errors import RsePfError
 from rse_pf.linux import cpu_seconds, proportional_bytes
 from rse_pf.services.custom.installed import install
@@ -215,11 +218,12 @@ async def cpu(folder: Path, seconds: float, others: int = 10, turns: int = 4) ->
                     if is_hostile:
                         spent = sum(map(cpu_seconds, sandbox_pids(server))) - before
                         used += spent / (time.perf_counter() - began_s)
-        quiet, beside = percentile(times[False], 99), percentile(times[True], 99)
+        quiet, beside = 1e3 * percentile(times[False], 99), 1e3 * percentile(times[True], 99)
         rows.append({
             "row": f"cpu, {attack}", "n_quiet": len(times[False]), "n_beside": len(times[True]),
-            "failed": len(failed), "p50_quiet_ms": percentile(times[False], 50),
-            "p50_beside_ms": percentile(times[True], 50), "p99_quiet_ms": quiet, "p99_beside_ms": beside,
+            "failed": len(failed), "p50_quiet_ms": 1e3 * percentile(times[False], 50),
+            "p50_beside_ms": 1e3 * percentile(times[True], 50),
+            "p99_quiet_ms": quiet, "p99_beside_ms": beside,
             "ratio": beside / quiet, "hostile_cores": used / turns,
         })  # fmt: skip
     return rows
@@ -232,6 +236,7 @@ async def _hostile(robot: Any, attack: str, call_s: float, end: float) -> None:
         await asyncio.sleep(0.5)  # the pace of the robot
 
 
+ROWS = ("memory", "cpu")
 LIMITS = {"memory_bytes": MEMORY_BYTES, "breaker_crashes": 100_000}
 
 
@@ -249,15 +254,14 @@ async def measure(only: list[str], seconds: float) -> list[Row]:
         works = {"memory": lambda: memory(folder), "cpu": lambda: cpu(folder, seconds)}
         for name in only:
             for row in await works[name]():
-                print(json.dumps(row), flush=True)
+                say(row)
                 rows.append(row)
     return rows
 
 
-def main() -> None:
-    """Measure, and write the rows."""
-    run_rows(measure, only="memory,cpu", seconds=60.0, doc=__doc__)
-
-
-if __name__ == "__main__":
-    main()
+@benchmark()
+def run_benchmark(
+    *, only: Annotated[tuple[str, ...], "rows", ROWS] = ROWS, seconds: float = 60.0
+) -> dict[str, Any]:
+    """Measure the rows."""
+    return {"rows": asyncio.run(measure(list(only), seconds))}

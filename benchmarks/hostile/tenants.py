@@ -1,6 +1,6 @@
 """Three tenants whose robots have one name: nothing of one may reach another, in interleaved commands.
 
-    python -m benchmarks.hostile.tenants [--commands 10000] [--out FILE]
+    python -m benchmarks hostile.tenants [--commands 10000]
 
 Every robot is called ``robot-1``.  Each sends frames of the same streams (the rival's with far higher
 sequence numbers), keeps and reads a secret in a stateful service, names its own and the others' stored
@@ -12,23 +12,19 @@ Defends (issue 14): nothing shared in 10,000 interleaved commands, no ``stale`` 
 
 from __future__ import annotations
 
-import argparse
 import asyncio
 import json
-import os
-import subprocess
-import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from benchmarks.frame.registry import Bar, benchmark
 from benchmarks.hostile.attacks import AttackTarget, Socket
-from rse_pf.auth.tokens import SigningKey
-from rse_pf.config import PlatformSettings
+from benchmarks.server.serving import BenchServer
 from rse_pf.identity import RobotId, object_name
 from rse_pf.object_store import DirectoryStore, digest_of
 from rse_pf.pnp.problems import make_problem
@@ -54,9 +50,8 @@ NAME = "robot-1"
 STREAMS = 4
 JOBS = 2
 """Long jobs of each tenant; each starts a process."""
-START_S, ANSWER_S, PING_S = 60.0, 60.0, 1.0
+ANSWER_S, PING_S = 60.0, 1.0
 FIRST_SEQ = {"acme": 0, "rival": 10**9, "third": 10**6}
-KEY = SigningKey.from_seed(b"t" * 32, "tenants")
 KEEPER = """
 import msgspec
 
@@ -240,61 +235,26 @@ def owners(store: Path, area: str) -> list[str]:
     return sorted(str(path.relative_to(store / area)) for path in (store / area).glob("*/*"))
 
 
-def main(arguments: Sequence[str]) -> int:
-    """Run the benchmark; the exit code is 1 if anything was shared."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
-    parser.add_argument("--commands", type=int, default=10_000)
-    parser.add_argument("--out", type=Path)
-    chosen = parser.parse_args(arguments)
+@benchmark(
+    Bar("shared", equals=[]),
+    Bar("stale", equals=0),
+    Bar("every_line_has_its_tenant", equals=True),
+    Bar("owners_are_right", equals=True),
+)
+def run_benchmark(*, commands: int = 10000) -> dict[str, Any]:
+    """Send the commands of all tenants, interleaved."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         prepare(folder)
-        settings = PlatformSettings.from_dict(settings_in(folder))
-        (folder / "settings.json").write_text(json.dumps({"context": {"rse-pf": settings_in(folder)}}))
-        (folder / "keys.json").write_text(KEY.key_set().to_json())
-        announce, log = folder / "announce.json", folder / "server.log"
-        with log.open("wb") as file:
-            server = subprocess.Popen(
-                [
-                    sys.executable, "-m", "rse_pf.cli.main", "serve", "--settings",
-                    str(folder / "settings.json"), "--keys", str(folder / "keys.json"), "--port", "0",
-                    "--control-port", "0", "--workers", "1", "--server-id", "t", "--announce", str(announce),
-                ],
-                stdout=subprocess.DEVNULL, stderr=file,
-            )  # fmt: skip
-        try:
-            end = time.monotonic() + START_S
-            while not announce.exists():
-                if server.poll() is not None or time.monotonic() > end:
-                    raise SystemExit(log.read_text())
-                time.sleep(0.05)  # polls, with a deadline
-            port = json.loads(announce.read_text())["port"]
-            tokens = {
-                tenant: KEY.issue(
-                    NAME, now=time.time(), token_id=tenant, settings=settings.auth, tenant=tenant
-                )
-                for tenant in TENANTS
-            }
-            began = time.monotonic()
-            outcome = asyncio.run(interleave(f"ws://127.0.0.1:{port}/ws", tokens, chosen.commands))
-            took_s = time.monotonic() - began
-        finally:
-            server.terminate()
-            server.wait()
-        lines = count_logged(log.read_text())
+        with BenchServer(folder, workers=1, **settings_in(folder)) as server:
+            tokens = {tenant: server.token(NAME, tenant=tenant) for tenant in TENANTS}
+            outcome = asyncio.run(interleave(f"ws://127.0.0.1:{server.port}/ws", tokens, commands))
+        lines = count_logged(server.log_file.read_text())
         areas = {area: owners(folder / "store", area) for area in ("states", "jobs", "objects")}
     expected = sorted(f"{tenant}/{NAME}" for tenant in TENANTS)
-    report = {
+    return {
         "commands": dict(outcome.commands), "codes": dict(outcome.codes), "shared": outcome.shared[:20],
-        "stale": outcome.stale, "log_lines": dict(lines), "owners": areas, "took_s": round(took_s, 1),
-        "load": os.getloadavg()[0],
+        "stale": outcome.stale, "log_lines": dict(lines), "owners": areas,
+        "every_line_has_its_tenant": lines == outcome.commands,
+        "owners_are_right": all(stored == expected for stored in areas.values()),
     }  # fmt: skip
-    sys.stdout.write(json.dumps(report, indent=1) + "\n")
-    if chosen.out:
-        chosen.out.write_text(json.dumps(report, indent=1))
-    is_right = lines == outcome.commands and all(stored == expected for stored in areas.values())
-    return 0 if not outcome.shared and not outcome.stale and is_right else 1
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))

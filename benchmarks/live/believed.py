@@ -3,20 +3,20 @@
 Three robots drive through parts of the red kitchen, and four through unrelated recordings; the steps of their
 odometry are scaled by the slip.
 
-    python -m benchmarks.live.believed --recordings ../shared/data --runs 3
+    python -m benchmarks live.believed --recordings ../shared/data --runs 3
 """
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
-import os
-from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from benchmarks.frame.registry import Recordings, benchmark
+from benchmarks.frame.report import say
 from benchmarks.live.one_process import DENSE, FOREIGN, KITCHEN_CUTS, play
 from benchmarks.maps.recordings import Run, drive, red_kitchen
 from client_sdk.datasets import open_dataset
@@ -24,7 +24,7 @@ from client_sdk.frontend import FrontEndOptions
 from rse_pf.geometry import inverse
 from rse_pf.live_map.live_map import LiveMap
 
-__all__ = ["main", "most_contradictions", "slipping"]
+__all__ = ["most_contradictions", "slipping"]
 
 
 def slipping(run: Run, slip: float) -> Run:
@@ -52,36 +52,32 @@ def most_contradictions(live_map: LiveMap) -> tuple[int, int, int]:
     )
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Print what the module's docstring says."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.live.believed")
-    parser.add_argument("--recordings", type=Path, default=Path("../shared/data"))
-    parser.add_argument("--runs", type=int, default=3)
-    chosen = parser.parse_args(arguments)
-    kitchen = red_kitchen(chosen.recordings)
+@benchmark()
+def run_benchmark(*, recordings: Recordings = Path("../shared/data"), runs: int = 3) -> dict[str, Any]:
+    """Play both sets of robots with every slip."""
+    kitchen = red_kitchen(recordings)
     sets = {"kitchen": {name: drive(kitchen, rows, name, DENSE) for name, rows in KITCHEN_CUTS.items()}}
     sets["foreign"] = {}
     for name in FOREIGN:
-        dataset = open_dataset(chosen.recordings / name)
+        dataset = open_dataset(recordings / name)
         options = FrontEndOptions.wide_baseline() if name.startswith("nyu") else DENSE
         sets["foreign"][name] = drive(dataset, range(min(len(dataset), 84)), name, options)
-    for what, runs in sets.items():
+    rows = []
+    for what, drives in sets.items():
         for slip in (1.0, 0.9, 1.1):
-            slipped = {name: slipping(run, slip) for name, run in runs.items()}
+            slipped = {name: slipping(run, slip) for name, run in drives.items()}
             most = disbelieved = smoothed = 0
-            for seed in range(chosen.runs):
-                at = np.random.default_rng(seed).integers(0, 60, len(runs))
-                starts = dict(zip(runs, (at - at.min()).tolist(), strict=True))
+            for seed in range(runs):
+                at = np.random.default_rng(seed).integers(0, 60, len(drives))
+                starts = dict(zip(drives, (at - at.min()).tolist(), strict=True))
                 contradictions = most_contradictions(play(slipped, starts).live_map)
                 most, disbelieved = max(most, contradictions[0]), disbelieved + contradictions[1]
                 smoothed = max(smoothed, contradictions[2])
-            print(
-                f"{what}, steps x{slip:g}, {chosen.runs} runs: at most {most} of 32 keyframes contradict, "
-                f"{disbelieved} segments disbelieved, {smoothed} of 2,000 of the budget used at the end; "
-                f"load {os.getloadavg()[0]:.1f}",
-                flush=True,
-            )
-
-
-if __name__ == "__main__":
-    main()
+            rows.append(
+                {
+                    "robots": what, "slip": slip, "n": runs, "contradicting_of_32_keyframes": most,
+                    "segments_disbelieved": disbelieved, "used_of_2000_of_the_budget": smoothed,
+                }
+            )  # fmt: skip
+            say(rows[-1])
+    return {"rows": rows}

@@ -1,7 +1,7 @@
 """Robots in two rendered rooms of equal furniture and textures: whom does a live map join, and when?
 
-    python -m benchmarks.live.equal_rooms prepare [--features DIR] [--seeds 20]
-    python -m benchmarks.live.equal_rooms run [--features DIR] [--seeds 20]
+    python -m benchmarks live.equal_rooms prepare [--features DIR] [--seeds 20]
+    python -m benchmarks live.equal_rooms run [--features DIR] [--seeds 20]
 
 ``prepare`` renders and tracks three robots for each seed (35 CPU seconds, 5 MB), and keeps their keyframes:
 one in each of two equal rooms with other rooms around them, and one that drives from the first through the
@@ -15,15 +15,16 @@ called ambiguous.
 
 from __future__ import annotations
 
-import argparse
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 
+from benchmarks.frame.registry import Bar, benchmark
+from benchmarks.frame.report import say
 from benchmarks.live.one_process import DENSE
 from benchmarks.maps.recordings import track
 from client_sdk.frontend import Frame, extract
@@ -41,7 +42,7 @@ from rse_pf.live_map.live_map import LiveMap
 from rse_pf.live_map.outcomes import Added, Joined, OptimiseWanted
 from rse_pf.slam.keyframe import Keyframe, encode_keyframe, make_features
 
-__all__ = ["Drive", "Met", "main", "meet", "prepare_drives"]
+__all__ = ["Drive", "Met", "meet", "prepare_drives"]
 
 ROOMS, EQUAL, APART_M = 5, (1, 3), 10.0
 STEP_M = 0.11
@@ -168,36 +169,32 @@ def _split(data: Array, sizes: Array) -> list[bytes]:
     return [data[end - size : end].tobytes() for end, size in zip(ends.tolist(), sizes.tolist(), strict=True)]
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Prepare the drives, or run and print what became of the robot in the second room."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.live.equal_rooms")
-    parser.add_argument("part", choices=("prepare", "run"))
-    parser.add_argument("--features", type=Path, default=Path("out-equal-rooms"))
-    parser.add_argument("--seeds", type=int, default=20)
-    parser.add_argument("--processes", type=int, default=2)
-    chosen = parser.parse_args(arguments)
-    if chosen.part == "prepare":
-        with get_context("spawn").Pool(chosen.processes) as pool:
-            pool.starmap(
-                prepare_drives, [(chosen.features, seed) for seed in range(chosen.seeds)], chunksize=1
-            )
-        return
+@benchmark(Bar("across.*.joined_wrongly", equals=0), Bar("stated.*.joined_wrongly_ever", equals=0))
+def run_benchmark(
+    *,
+    part: Literal["prepare", "run"],
+    features: Path = Path("out-equal-rooms"),
+    seeds: int = 20,
+    processes: int = 2,
+) -> dict[str, Any]:
+    """Prepare the drives, or tell what became of the robot in the second room."""
+    if part == "prepare":
+        with get_context("spawn").Pool(processes) as pool:
+            pool.starmap(prepare_drives, [(features, seed) for seed in range(seeds)], chunksize=1)
+        return {}
+    figures: dict[str, Any] = {"across": [], "stated": []}
     for names in (("a", "b"), ("a", "c", "b")):
         for stated_m in (0.0, STATED_M):
-            meetings = [
-                meet(prepare_drives(chosen.features, seed), names, stated_m) for seed in range(chosen.seeds)
-            ]
-            figures = {
-                "robots": "".join(names), "stated_m": stated_m, "seeds": len(meetings),
-                "joined_ever": sum(meeting.ever for meeting in meetings),
-                "joined_wrongly_ever": sum(meeting.wrong_ever for meeting in meetings),
-                "joined": sum(meeting.aligned for meeting in meetings),
-                "joined_wrongly": sum(meeting.wrong for meeting in meetings),
-                "ambiguous": sum("ambiguous" in meeting.reason for meeting in meetings),
-                "reasons": sorted({meeting.reason for meeting in meetings}),
+            met = [meet(prepare_drives(features, seed), names, stated_m) for seed in range(seeds)]
+            row = {
+                "robots": "".join(names), "stated_m": stated_m, "n": len(met),
+                "joined_ever": sum(meeting.ever for meeting in met),
+                "joined_wrongly_ever": sum(meeting.wrong_ever for meeting in met),
+                "joined": sum(meeting.aligned for meeting in met),
+                "joined_wrongly": sum(meeting.wrong for meeting in met),
+                "ambiguous": sum("ambiguous" in meeting.reason for meeting in met),
+                "reasons": sorted({meeting.reason for meeting in met}),
             }  # fmt: skip
-            print(json.dumps(figures))
-
-
-if __name__ == "__main__":
-    main()
+            say(row)
+            figures["stated" if stated_m else "across"].append(row)
+    return figures

@@ -4,8 +4,8 @@ Three honest robots drive through the red kitchen, and a fourth one through the 
 are changed before they are sent.  The errors of the honest robots are compared with those of the same map
 without the fourth robot, and with the map in which it tells the truth.
 
-    python -m benchmarks.live.hostile_rigs [--recordings ../shared/data] [--attack NAME ...]
-    python -m benchmarks.live.hostile_rigs --platform
+    python -m benchmarks live.hostile_rigs [--recordings ../shared/data] [--attack NAME ...]
+    python -m benchmarks live.hostile_rigs --platform
 
 ``--platform`` sends the same keyframes through a local platform with two servers, in the order and at the
 rate of the recording, and compares the maps that it publishes.  Without a recording the robots drive through
@@ -17,19 +17,20 @@ most 0.1 cm.
 
 from __future__ import annotations
 
-import argparse
 import asyncio
 import contextlib
-import os
 import struct
 import tempfile
 import time
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Annotated, Any
 
 import numpy as np
 
+from benchmarks.frame.registry import Bar, benchmark
+from benchmarks.frame.report import say
 from benchmarks.live.one_process import DENSE, KITCHEN_CUTS
 from benchmarks.maps.recordings import Run, drive, red_kitchen, truth_of
 from client_sdk import connect
@@ -412,53 +413,54 @@ def worse_cm(
     return errors_cm(drives, poses, keys) - worst, 100.0 * ate_m(now, before)
 
 
-def row_of(name: str, drives: Mapping[str, SentDrive], attacked: Outcome, others: Sequence[Outcome]) -> str:
-    """Return the line of a table."""
+def row_of(
+    name: str, drives: Mapping[str, SentDrive], attacked: Outcome, others: Sequence[Outcome]
+) -> dict[str, Any]:
+    """Return what an attack did; harm is how far honest poses moved, or became worse if it was accepted."""
     worse, moved = worse_cm(drives, attacked.poses, others)
-    again = "-"
+    row = {
+        "attack": name, "refused": attacked.refused, "accepted": attacked.accepted,
+        "has_joined": attacked.has_joined, "worse_cm": worse, "moved_cm": moved,
+        "harm_cm": worse if attacked.accepted else moved, "apart": list(attacked.apart),
+    }  # fmt: skip
     if attacked.after_forget:
         left, _ = worse_cm(drives, attacked.after_forget, others[:1])
-        again = f"{left:+.3f}, apart: {', '.join(attacked.apart_after_forget) or 'none'}"
-    is_harmless = (worse if attacked.accepted else moved) <= BAR_CM and not attacked.apart
-    return (
-        f"| {name} | {attacked.refused} refused, {attacked.accepted} accepted"
-        f"{', joined' if attacked.has_joined else ''} | {worse:+.3f} | {moved:.3f} | "
-        f"{', '.join(attacked.apart) or 'none'} | {again} | {'ok' if is_harmless else 'MISSED'} |"
-    )
+        row["after_forget"] = {"worse_cm": left, "apart": list(attacked.apart_after_forget)}
+    say(row)
+    return row
 
 
-def main() -> None:
-    """Play all attacks and print a row for each."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--recordings", type=Path, default=Path("../shared/data"))
-    parser.add_argument("--attack", action="append", choices=sorted(ATTACKS))
-    parser.add_argument("--seeds", type=int, default=3, help="generated halls, where there is no recording")
-    parser.add_argument("--platform", action="store_true")
-    given = parser.parse_args()
-    names = given.attack or list(ATTACKS)
-    print(f"load average {os.getloadavg()[0]:.1f}; bar {BAR_CM} cm")
-    print("| attack | its keyframes | honest ATE worse, cm | moved, cm | apart | after forget | |")
-    print("|---|---|---|---|---|---|---|")
-    if given.recordings.is_dir():
-        places = [kitchen_drives(given.recordings)]
+@benchmark(
+    Bar("rows.*.harm_cm", at_most=BAR_CM, unit="cm"),
+    Bar("rows.*.apart", equals=[]),
+)
+def run_benchmark(
+    *, recordings: Path = Path("../shared/data"),
+    attack: Annotated[tuple[str, ...], "attacks", ATTACKS] = (),
+    seeds: Annotated[int, "generated halls, where there is no recording"] = 3, platform: bool = False,
+) -> dict[str, Any]:  # fmt: skip
+    """Play all attacks."""
+    names = attack or tuple(ATTACKS)
+    if recordings.is_dir():
+        places = [kitchen_drives(recordings)]
     else:
-        places = [generated_drives(seed) for seed in range(given.seeds)]
-    if given.platform:
+        places = [generated_drives(seed) for seed in range(seeds)]
+    if platform:
         with tempfile.TemporaryDirectory() as folder:
-            asyncio.run(_all_on_platform(places[0], names, Path(folder)))
-        return
+            return {"rows": asyncio.run(_all_on_platform(places[0], names, Path(folder)))}
+    rows, honest = [], []
     for drives in places:
         others = [play(drives, None), play(drives, tell_truth)]
         keys = sorted(set(others[0].poses) & set(others[1].poses))
         without, truthful = (errors_cm(drives, each.poses, keys) for each in others)
-        print(f"without it {without:.2f} cm, beside the truth {truthful:.2f} cm")
-        for name in names:
-            print(row_of(name, drives, play(drives, ATTACKS[name]), others), flush=True)
+        honest.append({"without_it_cm": without, "beside_the_truth_cm": truthful})
+        rows += [row_of(name, drives, play(drives, ATTACKS[name]), others) for name in names]
+    return {"honest": honest, "rows": rows}
 
 
-async def _all_on_platform(drives: Mapping[str, SentDrive], names: Sequence[str], folder: Path) -> None:
+async def _all_on_platform(
+    drives: Mapping[str, SentDrive], names: Sequence[str], folder: Path
+) -> list[dict[str, Any]]:
     async with LocalPlatform(
         PlatformSettings(), servers=2, port=0, state=folder / "platform", data=True
     ) as platform:
@@ -467,11 +469,8 @@ async def _all_on_platform(drives: Mapping[str, SentDrive], names: Sequence[str]
             for name, attack in (("without", None), ("truthful", tell_truth))
         ]
         again = await play_on(platform, "again", drives, None)
-        print(row_of("again without it", drives, again, others), flush=True)
+        rows = [row_of("again without it", drives, again, others)]
         for number, name in enumerate(names):
             attacked = await play_on(platform, f"attack-{number}", drives, ATTACKS[name])
-            print(row_of(name, drives, attacked, others), flush=True)
-
-
-if __name__ == "__main__":
-    main()
+            rows.append(row_of(name, drives, attacked, others))
+        return rows

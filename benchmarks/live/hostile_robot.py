@@ -5,22 +5,24 @@ map without that robot has the same links between the others, so joins and error
 What an honest keyframe costs is compared with the map in which the fourth robot drives as far, and tells the
 truth.
 
-    python -m benchmarks.live.hostile_robot --seeds 20
-    python -m benchmarks.live.hostile_robot --forget 1000
+    python -m benchmarks live.hostile_robot --seeds 20
+    python -m benchmarks live.hostile_robot --forget 1000
 """
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
-import os
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
 
+from benchmarks.frame.registry import Bar, benchmark
+from benchmarks.frame.report import say
+from benchmarks.frame.statistics import percentile, spread
 from benchmarks.live.generated_drives import GeneratedDrive, GeneratedWorld, circle
 from rse_pf.experiments.results.trajectory_error import ate_m
 from rse_pf.geometry import Array, exp_se3
@@ -33,7 +35,7 @@ from rse_pf.live_map.events import (
 from rse_pf.live_map.live_map import LiveMap
 from rse_pf.slam.keyframe import encode_keyframe
 
-__all__ = ["ATTACKS", "HOSTILE", "Judged", "Played", "judge", "main", "play", "scenario", "without"]
+__all__ = ["ATTACKS", "HOSTILE", "Judged", "Played", "judge", "play", "scenario", "without"]
 
 HOSTILE = "x"
 ATTACKS = ("random-odometry", "mirrored-views", "lookalikes", "scaled-rotations")
@@ -166,9 +168,7 @@ def judge(attack: str, seed: int) -> Judged:
     attacked.live_map.apply(RobotForgotten(robot=HOSTILE))
     forget_s = time.process_time() - begin
     same = joins(attacked.live_map) == joins(clean.live_map)
-    p50, p99 = (
-        float(np.percentile(attacked.honest_ms, q) / np.percentile(behaved.honest_ms, q)) for q in (50, 99)
-    )
+    p50, p99 = (float(percentile(attacked.honest_ms, q) / percentile(behaved.honest_ms, q)) for q in (50, 99))
     return Judged(
         same_joins=same, ate_cm=error_cm(attacked, true[attacked.ids]),
         ate_without_cm=error_cm(clean, true[attacked.ids]), forget_s=forget_s, slower_p50=p50, slower_p99=p99,
@@ -187,29 +187,27 @@ def forget_s(keyframes: int) -> float:
     return time.process_time() - begin
 
 
-def main() -> None:
-    """Print what the module's docstring says."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seeds", type=int, default=20)
-    parser.add_argument("--forget", type=int, default=0, help="keyframes of a robot to forget instead")
-    given = parser.parse_args()
-    print(f"load average {os.getloadavg()[0]:.1f}")
-    if given.forget:
-        print(f"forget {given.forget} keyframes: {forget_s(given.forget):.2f} s of CPU (bar 5)")
-        return
+@benchmark(
+    Bar("forget_s", at_most=5.0, unit="s of CPU"),
+    Bar("attacks.*.other_joins", equals=0),
+    Bar("attacks.*.ate_differs_cm.max", at_most=0.1, unit="cm"),
+    Bar("attacks.*.honest_p99_ratio", at_most=2.0, unit="times"),
+)
+def run_benchmark(
+    *, seeds: int = 20, forget: Annotated[int, "keyframes of a robot to forget instead"] = 0
+) -> dict[str, Any]:
+    """Judge all attacks, or forget one large robot."""
+    if forget:
+        return {"keyframes": forget, "forget_s": forget_s(forget)}
+    figures = {}
     for attack in ATTACKS:
-        verdicts = [judge(attack, seed) for seed in range(given.seeds)]
-        worse = [abs(verdict.ate_cm - verdict.ate_without_cm) for verdict in verdicts]
-        print(
-            f"{attack}: n {len(verdicts)}, same joins {sum(verdict.same_joins for verdict in verdicts)}, "
-            f"ATE differs by {np.median(worse):.3f} cm, at most {max(worse):.3f} (bar 0.1); "
-            f"honest keyframes p50 x{np.median([verdict.slower_p50 for verdict in verdicts]):.2f}, "
-            f"p99 x{np.median([verdict.slower_p99 for verdict in verdicts]):.2f} (bar 2); "
-            f"forget at most {max(verdict.forget_s for verdict in verdicts):.2f} s; "
-            f"load {os.getloadavg()[0]:.1f}",
-            flush=True,
-        )
-
-
-if __name__ == "__main__":
-    main()
+        verdicts = [judge(attack, seed) for seed in range(seeds)]
+        figures[attack] = {
+            "n": len(verdicts), "other_joins": sum(not verdict.same_joins for verdict in verdicts),
+            "ate_differs_cm": spread(abs(verdict.ate_cm - verdict.ate_without_cm) for verdict in verdicts),
+            "honest_p50_ratio": float(np.median([verdict.slower_p50 for verdict in verdicts])),
+            "honest_p99_ratio": float(np.median([verdict.slower_p99 for verdict in verdicts])),
+            "forget_s": spread(verdict.forget_s for verdict in verdicts),
+        }  # fmt: skip
+        say({"attack": attack, **figures[attack]})
+    return {"attacks": figures}

@@ -1,7 +1,7 @@
 """Ten robots in one live map of ten rendered rooms, on two cores, and their poses without a live map.
 
-    python -m benchmarks.live.many prepare [--features DIR] [--robots 10] [--rooms 10] [--frames 200]
-    python -m benchmarks.live.many run [--features DIR] [--rounds 1] [--out DIR]
+    python -m benchmarks live.many prepare [--features DIR] [--robots 10] [--rooms 10] [--frames 200]
+    python -m benchmarks live.many run [--features DIR] [--rounds 1]
 
 ``prepare`` renders the drives and keeps the features of each frame (12 CPU minutes for ten rooms, 190 MB).
 Each robot drives 3.5 m beyond the start of the next one: with the least overlap robots met in their last
@@ -14,20 +14,21 @@ Defends: all robots in one map, correction p99 <= 1 s, and p99 of poses <= 1.3 t
 
 from __future__ import annotations
 
-import argparse
 import json
 import multiprocessing
 import os
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
 import rse_pf.experiments.demo.robot as demo_robot
 import rse_pf.experiments.demo.run as demo_run
+from benchmarks.frame.registry import Bar, benchmark
+from benchmarks.frame.statistics import percentile
 from client_sdk import frontend, mapping
 from client_sdk.frontend import Features, Frame, FrontEndOptions
 from client_sdk.mapping import Trajectory
@@ -36,7 +37,7 @@ from rse_pf.config import PlatformSettings
 from rse_pf.experiments.demo.run import DemoOptions, RobotSpec, run_demo
 from rse_pf.experiments.results.records import read_commands
 
-__all__ = ["main", "prepare", "run"]
+__all__ = ["prepare", "run"]
 
 SEED = 0
 RATE_HZ = 5.0
@@ -44,6 +45,20 @@ CORRECTION_P99_MS, POSES_RATIO = 1000.0, 1.3
 _FEATURES = "RSE_PF_BENCHMARK_FEATURES"
 _ABOUT = "about.json"
 _OPTIONS = FrontEndOptions().sent_with("zlib")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Options:
+    """The arguments."""
+
+    part: Literal["prepare", "run"]
+    features: Path = Path("out-live-features")
+    robots: int = 10
+    rooms: int = 10
+    frames: int = 200
+    processes: int = 2
+    rounds: int = 1
+    folder: Annotated[Path, "folder of the records"] = Path("out-live-many")
 
 
 def prepare(folder: Path, robots: int, rooms: int, frames: int, processes: int = 2) -> None:
@@ -68,7 +83,6 @@ def run(folder: Path, out: Path, rounds: int) -> dict[str, Any]:
     out.mkdir(parents=True, exist_ok=True)
     rows = []
     for turn in range(rounds):
-        load = os.getloadavg()[0]
         options = DemoOptions(
             robots=about["robots"], rate_hz=RATE_HZ, frames=about["frames"], seed=SEED, quiet=True,
             out=out / f"alone-{turn}",
@@ -81,8 +95,8 @@ def run(folder: Path, out: Path, rounds: int) -> dict[str, Any]:
         live = json.loads((options.out / "report.json").read_text(encoding="utf-8"))["live"]
         rows.append(
             {
-                "load_average": [round(load, 2), round(os.getloadavg()[0], 2)],
                 "joined": live["joined"],
+                "not_joined": about["robots"] - live["joined"],
                 "join_frame": live["join_frame"],
                 "aligned_percent": live["aligned_percent"],
                 "final_ate_cm": live["final_ate_cm"],
@@ -91,8 +105,12 @@ def run(folder: Path, out: Path, rounds: int) -> dict[str, Any]:
                 "lost_frames": live["lost_frames"],
                 "correction_ms": live["correction_ms"],
                 "keyframe_kept_ms": live["keyframe_kept_ms"],
-                "poses_p99_ms": {"alone": _p99(alone), "beside": _p99(beside), "n": len(beside)},
-                "poses_p99_ratio": round(_p99(beside) / _p99(alone), 3),
+                "poses_p99_ms": {
+                    "alone": percentile(alone, 99),
+                    "beside": percentile(beside, 99),
+                    "n": len(beside),
+                },
+                "poses_p99_ratio": round(percentile(beside, 99) / percentile(alone, 99), 3),
             }
         )
     return {**about, "rounds": rows}
@@ -161,44 +179,14 @@ def _poses_ms(out: Path) -> list[float]:
     return [command.round_trip_ms for command in commands if command.round_trip_ms is not None]
 
 
-def _p99(values: Sequence[float]) -> float:
-    return round(float(np.percentile(values, 99)), 2)
-
-
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Prepare the features, or run and print the figures and what they miss."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.live.many")
-    parser.add_argument("part", choices=("prepare", "run"))
-    parser.add_argument("--features", type=Path, default=Path("out-live-features"))
-    parser.add_argument("--robots", type=int, default=10)
-    parser.add_argument("--rooms", type=int, default=10)
-    parser.add_argument("--frames", type=int, default=200)
-    parser.add_argument("--processes", type=int, default=2)
-    parser.add_argument("--rounds", type=int, default=1)
-    parser.add_argument("--out", type=Path, default=Path("out-live-many"))
-    chosen = parser.parse_args(arguments)
+@benchmark(
+    Bar("rounds.*.not_joined", equals=0),
+    Bar("rounds.*.correction_ms.p99", at_most=CORRECTION_P99_MS, unit="ms"),
+    Bar("rounds.*.poses_p99_ratio", at_most=POSES_RATIO, unit="times"),
+)
+def run_benchmark(chosen: Options) -> dict[str, Any]:
+    """Prepare the features, or play the robots."""
     if chosen.part == "prepare":
         prepare(chosen.features, chosen.robots, chosen.rooms, chosen.frames, chosen.processes)
-        return
-    figures = run(chosen.features, chosen.out, chosen.rounds)
-    print(json.dumps(figures))
-    for row in figures["rounds"]:
-        missed = [
-            what
-            for what, held in (
-                ("all joined", row["joined"] == figures["robots"]),
-                ("correction p99", (row["correction_ms"]["p99"] or 1e9) <= CORRECTION_P99_MS),
-                ("poses beside it", row["poses_p99_ratio"] <= POSES_RATIO),
-            )
-            if not held
-        ]
-        print(
-            f"{row['joined']} of {figures['robots']} joined, correction p50 {row['correction_ms']['p50']}, "
-            f"p99 {row['correction_ms']['p99']} ms (n {row['correction_ms']['n']}), poses p99 "
-            f"{row['poses_p99_ms']['beside']} ms, {row['poses_p99_ratio']} times that alone, ATE "
-            f"{row['final_ate_cm']} cm, load {row['load_average']}: {', '.join(missed) or 'all met'}"
-        )
-
-
-if __name__ == "__main__":
-    main()
+        return {}
+    return run(chosen.features, chosen.folder, chosen.rounds)

@@ -1,6 +1,6 @@
 """Robots of a live map beside a slow reader, a sender of garbage, and another tenant with its own map.
 
-    python -m benchmarks.live.neighbours [--rounds 3] [--seconds 6] [--out FILE]
+    python -m benchmarks live.neighbours [--rounds 3] [--seconds 6]
 
 One local platform with two servers.  Three robots share a live map: each sends a keyframe of generated
 features 2.5 times a second and asks for a pose (200 matches) 10 times a second.  Quiet windows and windows
@@ -14,9 +14,7 @@ nothing of a foreign map.
 
 from __future__ import annotations
 
-import argparse
 import asyncio
-import json
 import multiprocessing
 import os
 import secrets
@@ -29,6 +27,8 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.frame.registry import Bar, benchmark
+from benchmarks.frame.statistics import spread
 from benchmarks.hostile.attacks import AttackTarget, frame
 from client_sdk import connect
 from client_sdk.robot import Robot
@@ -44,7 +44,9 @@ from rse_pf.wire import Hello, Subscribe, make_codec
 from rse_pf.wire.live_map import live_topic
 from rse_pf.wire.server_session import UPDATES
 
-__all__ = ["NEIGHBOURS", "main"]
+__all__ = [
+    "NEIGHBOURS",
+]
 
 RATIO = 1.2
 MAP = "lab"
@@ -180,7 +182,6 @@ async def _drive_beside(url: str, tokens: Sequence[str], seconds: float) -> int:
 async def measure(rounds: int, seconds: float, folder: Path) -> dict[str, Any]:
     """Return p99 in quiet windows and beside each neighbour."""
     settings = PlatformSettings()
-    load = os.getloadavg()[0]
     async with LocalPlatform(settings, servers=2, port=0, state=folder / "platform") as platform:
         key = ensure_key(platform.state, seed=secrets.token_bytes(32), key_id="unused")
 
@@ -230,7 +231,6 @@ async def measure(rounds: int, seconds: float, folder: Path) -> dict[str, Any]:
             raise RuntimeError(f"a robot ended early: {error!r}")
     figures = {name: _figures(drivers, spans) for name, spans in windows.items()}
     return {
-        "load_average": [round(load, 2), round(os.getloadavg()[0], 2)],
         "windows": figures,
         "ratios": {
             kind: {
@@ -248,9 +248,7 @@ async def measure(rounds: int, seconds: float, folder: Path) -> dict[str, Any]:
 def _figures(drivers: Sequence[Driver], spans: Sequence[tuple[float, float]]) -> dict[str, Any]:
     def within(rows: Sequence[tuple[float, float]]) -> dict[str, Any]:
         values = np.array([ms for at, ms in rows if any(low <= at < high for low, high in spans)])
-        failed = int(np.isnan(values).sum())
-        p50, p99 = np.nanpercentile(values, [50, 99])
-        return {"n": len(values), "failed": failed, "p50": round(float(p50), 2), "p99": round(float(p99), 2)}
+        return {"failed": int(np.isnan(values).sum()), **spread(values[~np.isnan(values)])}
 
     return {
         "poses_ms": within([row for driver in drivers for row in driver.poses]),
@@ -258,22 +256,13 @@ def _figures(drivers: Sequence[Driver], spans: Sequence[tuple[float, float]]) ->
     }
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Measure and print the figures."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.live.neighbours")
-    parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument("--seconds", type=float, default=6.0)
-    parser.add_argument("--out", type=Path)
-    chosen = parser.parse_args(arguments)
+@benchmark(
+    Bar("ratios.*.poses_ms", at_most=1.2, unit="times the p99"),
+    Bar("ratios.*.keyframes_ms", at_most=1.2, unit="times the p99"),
+    Bar("updates_of_a_foreign_map", equals=0),
+    Bar("foreign_robots_in_the_map", equals=0),
+)
+def run_benchmark(*, rounds: int = 3, seconds: float = 6.0) -> dict[str, Any]:
+    """Drive beside each neighbour."""
     with tempfile.TemporaryDirectory() as folder:
-        figures = asyncio.run(measure(chosen.rounds, chosen.seconds, Path(folder)))
-    text = json.dumps(figures, indent=1)
-    print(text)
-    if chosen.out is not None:
-        chosen.out.write_text(text + "\n", encoding="utf-8")
-    for kind, ratios in figures["ratios"].items():
-        print(f"{kind}: " + ", ".join(f"{what} {ratio} times" for what, ratio in ratios.items()))
-
-
-if __name__ == "__main__":
-    main()
+        return asyncio.run(measure(rounds, seconds, Path(folder)))

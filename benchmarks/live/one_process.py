@@ -3,23 +3,25 @@
 Recordings are tracked by the product's `Tracker`; poses are solved in this process, and corrections reach a
 robot two frames late.  Ground truth is used for errors only.
 
-    python -m benchmarks.live.one_process kitchen --recordings ../shared/data --runs 10
-    python -m benchmarks.live.one_process foreign --recordings ../shared/data --runs 20
-    python -m benchmarks.live.one_process wrong | twins | replay | growth
+    python -m benchmarks live.one_process kitchen --recordings ../shared/data --runs 10
+    python -m benchmarks live.one_process foreign --recordings ../shared/data --runs 20
+    python -m benchmarks live.one_process wrong | twins | replay | growth
 """
 
 from __future__ import annotations
 
-import argparse
-import os
 import resource
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Annotated, Any
 
 import numpy as np
 
+from benchmarks.frame.registry import Bar, benchmark
+from benchmarks.frame.report import say
+from benchmarks.frame.statistics import percentile, spread
 from benchmarks.live.generated_drives import (
     GeneratedDrive,
     GeneratedWorld,
@@ -48,10 +50,11 @@ from rse_pf.live_map.outcomes import (
 )
 from rse_pf.live_map.versions import encode_stored
 
-__all__ = ["Played", "main", "play"]
+__all__ = ["Played", "play"]
 
 DENSE = FrontEndOptions(is_spread=False, keyframe_m=0.1, keyframe_deg=6.0)
 LATE_FRAMES = 2
+PARTS = ("kitchen", "foreign", "wrong", "twins", "replay", "growth")
 KITCHEN_CUTS = {"a": range(84), "b": range(84, 168), "c": range(168, 250)}
 FOREIGN = ("redwood_living_room", "nyu_dining_room", "tum_fr1_xyz_start", "7scenes_redkitchen")
 
@@ -134,69 +137,6 @@ def _send(played: Played, name: str, run: Run, number: int, tick: int) -> list[t
     return alignments
 
 
-def kitchen(recordings: Path, runs: int) -> None:
-    """State the accuracy of one robot and of three in the red kitchen."""
-    dataset = red_kitchen(recordings)
-    whole = {"whole": drive(dataset, range(len(dataset)), "whole", DENSE)}
-    three = {name: drive(dataset, rows, name, DENSE) for name, rows in KITCHEN_CUTS.items()}
-    truth = {name: truth_of(dataset, run.stamps_s) for name, run in (whole | three).items()}
-    played = play(whole, {"whole": 0})
-    print(
-        f"one robot: final {played.final_cm(whole, truth):.2f} cm, online {played.online_cm(truth):.2f} cm, "
-        f"frame to frame {100.0 * ate_m(whole['whole'].T_world_camera, truth['whole']):.2f} cm"
-    )
-    final, online, last, share = [], [], [], []
-    for seed in range(runs):
-        at = np.random.default_rng(seed).integers(0, 60, 3)
-        starts = dict(zip(three, (at - at.min()).tolist(), strict=True))
-        played = play(three, starts)
-        joined = played.joined_at()
-        if len(joined) < 3:
-            print(f"seed {seed}: only {sorted(joined)} joined: not scored")
-            continue
-        final.append(played.final_cm(three, truth))
-        online.append(played.online_cm(truth))
-        last.append(max(joined.values()))
-        share.append(
-            sum(map(len, played.given.values())) / sum(len(run.stamps_s) for run in three.values())
-        )  # fmt: skip
-    print(
-        f"three robots, {len(final)} of {runs} runs: final mean {np.mean(final):.2f} max {max(final):.2f}, "
-        f"online mean {np.mean(online):.2f} max {max(online):.2f} cm, last join at own frame {max(last)}, "
-        f"given out aligned {100.0 * np.mean(share):.0f} % (least {100.0 * min(share):.0f} %)"
-    )
-
-
-def foreign(recordings: Path, runs: int) -> None:
-    """State how many robots of unrelated recordings join each other."""
-    drives: dict[str, Run] = {}
-    for name in FOREIGN:
-        dataset: Dataset = open_dataset(recordings / name)
-        wide = FrontEndOptions.wide_baseline() if name.startswith("nyu") else DENSE
-        drives[name] = drive(dataset, range(min(len(dataset), 84)), name, wide)
-    wrong = links = 0
-    for seed in range(runs):
-        rng = np.random.default_rng(seed)
-        starts = {name: int(rng.integers(0, 40)) for name in rng.permutation(list(drives)).tolist()}
-        played = play({name: drives[name] for name in starts}, starts)
-        wrong += sum(isinstance(outcome, Joined) for outcome in played.outcomes) - 1
-        links += played.live_map.links_open
-    keyframes = {name: len(run.version.keyframes) for name, run in drives.items()}
-    print(f"unrelated recordings {keyframes}, {runs} seeds: {wrong} wrong joins, {links} open links")
-
-
-def wrong_links(runs: int) -> None:
-    """State how many random wrong links are believed, and how long four planted ones are."""
-    waited = [_plant(seed) for seed in range(runs)]
-    print(
-        f"{runs} seeds: four planted links are removed after {np.median(waited):.0f} (most {max(waited)}) "
-        "keyframes with contrary links"
-    )
-    for inliers in (100, 20):
-        believed, sent = _random_links(runs, inliers)
-        print(f"{runs} seeds: {believed} of {sent} random wrong links of {inliers} inliers believed")
-
-
 def _random_links(runs: int, inliers: int) -> tuple[int, int]:
     """Return how many random wrong links are believed, and how many there were."""
     believed = sent = 0
@@ -236,95 +176,6 @@ def _plant(seed: int) -> int:
     return 99
 
 
-def twins(runs: int) -> None:
-    """State what becomes of robots in two rooms that look the same, which the map may know of."""
-    for told_m in (0.0, 4.0):
-        _twins(runs, told_m)
-        _one_building(runs, told_m)
-
-
-def _one_building(runs: int, told_m: float) -> None:
-    """State when two robots that drive the same way through unique rooms are joined."""
-    joined, at_m = 0, []
-    for seed in range(runs):
-        world = GeneratedWorld(seed=seed, links=2)
-        drives = [world.drive(name, straight(0.0, 9.0)) for name in ("a", "b")]
-        live_map = LiveMap()
-        live_map.apply(MapStarted(source="", keyframes=(), equal_rooms_m=told_m))
-        for event in world.play(drives):
-            for outcome in live_map.apply(event):
-                if isinstance(outcome, Joined) and outcome.robot == "b":
-                    joined += 1
-                    at_m.append(float(world.seen[-1][0, 3]))
-    print(
-        f"two robots on one way of 9 m, equal rooms of {told_m:g} m stated, {runs} seeds: {joined} joined, "
-        f"after {np.median(at_m):.1f} m (most {max(at_m):.1f})"
-    )  # fmt: skip
-
-
-def _twins(runs: int, told_m: float) -> None:
-    for what in ("one robot in each room", "and one that drives from one to the other"):
-        wrong = ambiguous = ever = 0
-        for seed in range(runs):
-            world = GeneratedWorld(seed=seed, twin_m=10.0, links=2)
-            drives = [world.drive("a", straight(0.0, 3.0)), world.drive("b", straight(10.0, 13.0))]
-            if what.startswith("and"):
-                drives.insert(1, world.drive("c", straight(0.0, 13.0)))
-            live_map = LiveMap()
-            live_map.apply(MapStarted(source="", keyframes=(), equal_rooms_m=told_m))
-            outcomes = [outcome for event in world.play(drives) for outcome in live_map.apply(event)]
-            ever += any(isinstance(outcome, Joined) and outcome.robot == "b" for outcome in outcomes)
-            aligned = {alignment.robot: alignment.aligned for alignment in live_map.alignments()}
-            wrong += aligned["b"]
-            ambiguous += any(isinstance(outcome, Ambiguous) and outcome.robot == "b" for outcome in outcomes)
-        print(
-            f"two equal rooms, {told_m:g} m stated, {what}, {runs} seeds: {ever} joined at some time, "
-            f"{wrong} at the end, {ambiguous} called ambiguous"
-        )
-
-
-def replay() -> None:
-    """State the time of a replay of 2,000 keyframes with measured links, and whether it is the same map."""
-    world = GeneratedWorld(seed=1)
-    drives = [world.drive(f"robot-{i}", circle(8.0, 0.8, 2.0 * i)[:400]) for i in range(5)]
-    log, live_map = _make(world, drives)
-    begin = time.process_time()
-    again = LiveMap()
-    for event in log:
-        again.apply(event)
-    from_empty = time.process_time() - begin
-    snapshot = live_map.snapshot()
-    begin = time.process_time()
-    restored = LiveMap.restore(snapshot)
-    from_snapshot = time.process_time() - begin
-    same = again.digest() == live_map.digest() == restored.digest()
-    print(
-        f"replay of {len(world.seen)} keyframes: {from_empty:.1f} s from empty, {from_snapshot:.2f} s from "
-        f"a snapshot of {len(snapshot) / 1e6:.1f} MB; {'equal' if same else 'NOT EQUAL'} to the byte"
-    )
-
-
-def growth(keyframes: int) -> None:
-    """State the cost of a keyframe in a map that grows, wide and revisiting."""
-    for what, way in (
-        ("wide", meander(50.0, keyframes // 500 + 2)),
-        ("revisiting", circle(3.0, keyframes / 150.0)),
-    ):
-        world = GeneratedWorld(seed=1)
-        drives = [world.drive("a", way[:keyframes])]
-        ms: list[float] = []
-        _, live_map = _make(world, drives, ms)
-        cost = np.array(ms[0::2]) + np.array(ms[1::2])
-        early, late = cost[len(cost) * 9 // 100 : len(cost) // 10], cost[len(cost) * 9 // 10 :]
-        ratios = [np.percentile(late, q) / np.percentile(early, q) for q in (50, 95)]
-        memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
-        print(
-            f"{what}, {len(world.seen)} keyframes, {live_map.keyframes} kept: p50 {np.median(late):.1f} ms, "
-            f"{ratios[0]:.2f} times that at a tenth of the map; p95 {np.percentile(late, 95):.1f} ms, "
-            f"{ratios[1]:.2f} times; {memory:.2f} GiB in all"
-        )
-
-
 def _make(
     world: GeneratedWorld, drives: Sequence[GeneratedDrive], ms: list[float] | None = None
 ) -> tuple[list[Event], LiveMap]:
@@ -343,25 +194,163 @@ def _make(
     return log, live_map
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Run one part and print its figures."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.live.one_process")
-    parser.add_argument("part", choices=("kitchen", "foreign", "wrong", "twins", "replay", "growth"))
-    parser.add_argument("--recordings", type=Path, default=Path("../shared/data"))
-    parser.add_argument("--runs", type=int, default=10)
-    parser.add_argument("--keyframes", type=int, default=10_000)
-    chosen = parser.parse_args(arguments)
-    parts: dict[str, Callable[[], None]] = {
-        "kitchen": lambda: kitchen(chosen.recordings, chosen.runs),
-        "foreign": lambda: foreign(chosen.recordings, chosen.runs),
-        "wrong": lambda: wrong_links(chosen.runs),
-        "twins": lambda: twins(chosen.runs),
-        "replay": replay,
-        "growth": lambda: growth(chosen.keyframes),
+@benchmark(
+    Bar("online_cm.mean", at_most=3.35, unit="cm"),
+    Bar("wrong_joins", equals=0),
+    Bar("equal_to_the_byte", equals=True),
+)
+def run_benchmark(
+    *, part: Annotated[str, "what is measured", PARTS],
+    recordings: Path = Path("../shared/data"), runs: int = 10, keyframes: int = 10_000,
+) -> dict[str, Any]:  # fmt: skip
+    """Run one part; times are CPU times."""
+    parts: dict[str, Callable[[], dict[str, Any]]] = {
+        "kitchen": lambda: kitchen(recordings, runs), "foreign": lambda: foreign(recordings, runs),
+        "wrong": lambda: wrong_links(runs), "twins": lambda: twins(runs), "replay": replay,
+        "growth": lambda: growth(keyframes),
+    }  # fmt: skip
+    return parts[part]()
+
+
+def kitchen(recordings: Path, runs: int) -> dict[str, Any]:
+    """Return the accuracy of one robot and of three in the red kitchen."""
+    dataset = red_kitchen(recordings)
+    whole = {"whole": drive(dataset, range(len(dataset)), "whole", DENSE)}
+    three = {name: drive(dataset, rows, name, DENSE) for name, rows in KITCHEN_CUTS.items()}
+    truth = {name: truth_of(dataset, run.stamps_s) for name, run in (whole | three).items()}
+    played = play(whole, {"whole": 0})
+    one = {
+        "final_cm": played.final_cm(whole, truth), "online_cm": played.online_cm(truth),
+        "frame_to_frame_cm": 100.0 * ate_m(whole["whole"].T_world_camera, truth["whole"]),
+    }  # fmt: skip
+    final, online, last, share = [], [], [], []
+    for seed in range(runs):
+        at = np.random.default_rng(seed).integers(0, 60, 3)
+        starts = dict(zip(three, (at - at.min()).tolist(), strict=True))
+        played = play(three, starts)
+        joined = played.joined_at()
+        if len(joined) < 3:
+            say(f"seed {seed}: only {sorted(joined)} joined: not scored")
+            continue
+        final.append(played.final_cm(three, truth))
+        online.append(played.online_cm(truth))
+        last.append(max(joined.values()))
+        given = sum(map(len, played.given.values()))
+        share.append(100.0 * given / sum(len(run.stamps_s) for run in three.values()))
+    return {
+        "one_robot": one, "n": runs, "scored": len(final), "final_cm": spread(final),
+        "online_cm": spread(online), "last_join_at_own_frame": max(last, default=None),
+        "given_out_aligned_percent": spread(share),
+    }  # fmt: skip
+
+
+def foreign(recordings: Path, runs: int) -> dict[str, Any]:
+    """Return how many robots of unrelated recordings join each other."""
+    drives: dict[str, Run] = {}
+    for name in FOREIGN:
+        dataset: Dataset = open_dataset(recordings / name)
+        wide = FrontEndOptions.wide_baseline() if name.startswith("nyu") else DENSE
+        drives[name] = drive(dataset, range(min(len(dataset), 84)), name, wide)
+    wrong = links = 0
+    for seed in range(runs):
+        rng = np.random.default_rng(seed)
+        starts = {name: int(rng.integers(0, 40)) for name in rng.permutation(list(drives)).tolist()}
+        played = play({name: drives[name] for name in starts}, starts)
+        wrong += sum(isinstance(outcome, Joined) for outcome in played.outcomes) - 1
+        links += played.live_map.links_open
+    keyframes = {name: len(run.version.keyframes) for name, run in drives.items()}
+    return {"n": runs, "keyframes": keyframes, "wrong_joins": wrong, "open_links": links}
+
+
+def wrong_links(runs: int) -> dict[str, Any]:
+    """Return how many random wrong links are believed, and how long four planted ones are."""
+    waited = spread(_plant(seed) for seed in range(runs))
+    believed = {
+        f"{inliers} inliers": dict(zip(("believed", "sent"), _random_links(runs, inliers), strict=True))
+        for inliers in (100, 20)
     }
-    print(f"load average {os.getloadavg()[0]:.1f}, {os.cpu_count()} CPUs, times are CPU times")
-    parts[chosen.part]()
+    return {"n": runs, "keyframes_until_four_are_removed": waited, "random_wrong_links": believed}
 
 
-if __name__ == "__main__":
-    main()
+def twins(runs: int) -> dict[str, Any]:
+    """Return what becomes of robots in two rooms that look the same, which the map may know of."""
+    return {
+        f"{told_m:g} m stated": {
+            "one robot in each room": _twins(runs, told_m, drives_across=False),
+            "one drives across": _twins(runs, told_m, drives_across=True),
+            "unique rooms": _one_building(runs, told_m),
+        }
+        for told_m in (0.0, 4.0)
+    }
+
+
+def _one_building(runs: int, told_m: float) -> dict[str, Any]:
+    """Return when two robots that drive the same way of 9 m through unique rooms are joined."""
+    at_m = []
+    for seed in range(runs):
+        world = GeneratedWorld(seed=seed, links=2)
+        drives = [world.drive(name, straight(0.0, 9.0)) for name in ("a", "b")]
+        live_map = LiveMap()
+        live_map.apply(MapStarted(source="", keyframes=(), equal_rooms_m=told_m))
+        for event in world.play(drives):
+            for outcome in live_map.apply(event):
+                if isinstance(outcome, Joined) and outcome.robot == "b":
+                    at_m.append(float(world.seen[-1][0, 3]))
+    return {"n": runs, "joined": len(at_m), "joined_after_m": spread(at_m)}
+
+
+def _twins(runs: int, told_m: float, *, drives_across: bool) -> dict[str, int]:
+    wrong = ambiguous = ever = 0
+    for seed in range(runs):
+        world = GeneratedWorld(seed=seed, twin_m=10.0, links=2)
+        drives = [world.drive("a", straight(0.0, 3.0)), world.drive("b", straight(10.0, 13.0))]
+        if drives_across:
+            drives.insert(1, world.drive("c", straight(0.0, 13.0)))
+        live_map = LiveMap()
+        live_map.apply(MapStarted(source="", keyframes=(), equal_rooms_m=told_m))
+        outcomes = [outcome for event in world.play(drives) for outcome in live_map.apply(event)]
+        ever += any(isinstance(outcome, Joined) and outcome.robot == "b" for outcome in outcomes)
+        aligned = {alignment.robot: alignment.aligned for alignment in live_map.alignments()}
+        wrong += aligned["b"]
+        ambiguous += any(isinstance(outcome, Ambiguous) and outcome.robot == "b" for outcome in outcomes)
+    return {"n": runs, "joined_ever": ever, "joined_at_the_end": wrong, "ambiguous": ambiguous}
+
+
+def replay() -> dict[str, Any]:
+    """Return the time of a replay of 2,000 keyframes with measured links, and whether it is the same map."""
+    world = GeneratedWorld(seed=1)
+    drives = [world.drive(f"robot-{i}", circle(8.0, 0.8, 2.0 * i)[:400]) for i in range(5)]
+    log, live_map = _make(world, drives)
+    begin = time.process_time()
+    again = LiveMap()
+    for event in log:
+        again.apply(event)
+    from_empty_s = time.process_time() - begin
+    snapshot = live_map.snapshot()
+    begin = time.process_time()
+    restored = LiveMap.restore(snapshot)
+    return {
+        "keyframes": len(world.seen), "from_empty_s": from_empty_s,
+        "from_snapshot_s": time.process_time() - begin, "snapshot_mb": len(snapshot) / 1e6,
+        "equal_to_the_byte": again.digest() == live_map.digest() == restored.digest(),
+    }  # fmt: skip
+
+
+def growth(keyframes: int) -> dict[str, Any]:
+    """Return the cost of a keyframe in a map that grows, wide and revisiting."""
+    rows = {}
+    for what, way in (
+        ("wide", meander(50.0, keyframes // 500 + 2)),
+        ("revisiting", circle(3.0, keyframes / 150.0)),
+    ):
+        world = GeneratedWorld(seed=1)
+        ms: list[float] = []
+        _, live_map = _make(world, [world.drive("a", way[:keyframes])], ms)
+        cost = np.array(ms[0::2]) + np.array(ms[1::2])
+        early, late = cost[len(cost) * 9 // 100 : len(cost) // 10], cost[len(cost) * 9 // 10 :]
+        rows[what] = {
+            "keyframes": len(world.seen), "kept": live_map.keyframes, "late_ms": spread(late),
+            "times_a_tenth": {f"p{q}": percentile(late, q) / percentile(early, q) for q in (50, 95)},
+            "peak_gib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20,
+        }  # fmt: skip
+    return rows

@@ -6,15 +6,11 @@ trained for the map; a measured pair <= 5 ms p50; of each fifth kitchen frame >=
 within 1 cm / 0.5 deg of the map's own poses and 3.5 cm / 2 deg of the truth; no foreign frame called ok; two
 equal places are ambiguous.  CPU times are of this process, with one thread for linear algebra.
 
-    OPENBLAS_NUM_THREADS=1 python -m benchmarks.live.places --recordings ../shared/data --out live_places.json
+    OPENBLAS_NUM_THREADS=1 python -m benchmarks live.places --recordings ../shared/data --out live_places.json
 """
 
 from __future__ import annotations
 
-import argparse
-import json
-import os
-import platform
 import time
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
@@ -26,6 +22,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from benchmarks.frame.registry import Bar, Recordings, benchmark
+from benchmarks.frame.statistics import spread
 from benchmarks.maps.recordings import RED_KITCHEN, Run, drive, frame_poses
 from client_sdk.datasets import open_dataset
 from client_sdk.frontend import Frame, FrontEndOptions, extract
@@ -42,7 +40,7 @@ from rse_pf.slam.localise import Localised, PlacedKeyframe, localise, spread_can
 from rse_pf.slam.map_merge import merge_versions
 from rse_pf.slam.places import PLACE_NUMBERS, PlaceIndex, place_vector
 
-__all__ = ["main"]
+__all__ = []
 
 SMALL = ("tum_fr1_xyz_start", "redwood_living_room", "nyu_dining_room")
 SPACING_M, SPACING_DEG = 0.1, 6.0
@@ -114,7 +112,7 @@ def code_row(views: Sequence[View], rows: Sequence[int]) -> dict[str, Any]:
     sizes = [view.size_bytes for view in views]
     return {
         "keyframe_bytes": {"mean": round(float(np.mean(sizes))), "max": max(sizes), "n": len(sizes)},
-        "pair_ms": _percentiles(took_ms), "links": links,
+        "pair_ms": spread(took_ms), "links": links,
     }  # fmt: skip
 
 
@@ -220,7 +218,7 @@ def relocalise_row(known: PlacedMap, views: Sequence[View], T_map_camera: Array)
             turned = localised.T_map_camera[:3, :3].T @ rotation @ T_truth[row][:3, :3]
             by_truth.append((float(np.linalg.norm(away)), rotation_angle_deg(turned)))
     return {
-        "verdicts": dict(verdicts), "keyframes": len(known.keyframes), "ms": _percentiles(took_ms),
+        "verdicts": dict(verdicts), "keyframes": len(known.keyframes), "ms": spread(took_ms),
         "map_ate_cm": round(100.0 * ate_m(T_map_camera, T_truth), 2),
         "by_map_m_deg": _medians(by_map), "by_truth_m_deg": _medians(by_truth),
     }  # fmt: skip
@@ -232,14 +230,13 @@ def verdicts_of(known: PlacedMap, views: Iterable[View]) -> dict[str, int]:
     return dict(given)
 
 
-def main() -> None:
+@benchmark(
+    Bar("code.keyframe_bytes.max", at_most=34_000, unit="bytes"),
+    Bar("code.pair_ms.p50", at_most=5.0, unit="ms of CPU"),
+)
+def run_benchmark(*, recordings: Recordings = Path("../shared/data")) -> dict[str, Any]:
     """Measure, print and write."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--recordings", type=Path, required=True, help="the folder of recordings")
-    parser.add_argument("--out", type=Path, required=True)
-    arguments = parser.parse_args()
-    load_before = os.getloadavg()[0]
-    sources = {name: _load_views(arguments.recordings, name) for name in (RED_KITCHEN, *SMALL)}
+    sources = {name: _load_views(recordings, name) for name in (RED_KITCHEN, *SMALL)}
     kitchen = sources[RED_KITCHEN]
     rendered = _render_views(7, range(0, ROUND, 2))
     foreign = [view for name in SMALL for view in sources[name]]
@@ -250,13 +247,12 @@ def main() -> None:
     pool = [kitchen[row] for row in dense] + [rendered[row] for row in dense_rendered]
     pool += [view for name in SMALL for view in sources[name]]
     queries = kitchen[::3] + rendered[::2] + [view for name in SMALL for view in sources[name]]
-    known, T_map_camera = kitchen_map(arguments.recordings, kitchen)
+    known, T_map_camera = kitchen_map(recordings, kitchen)
     halves = rendered[::2], rendered[1::2]
     house = PlacedMap.of(halves[0], [_true(view) for view in halves[0]])
     twins = [replace(view, T=ELSEWHERE @ _true(view)) for view in halves[1]]
     both = [*(view for place, view in enumerate(halves[0]) if place % 3), *twins]
-    report: dict[str, Any] = {
-        "machine": platform.platform(),
+    return {
         "code": code_row(kitchen, dense),
         "recall": recall_rows(pool, queries),
         "search": search_rows(pool),
@@ -265,11 +261,7 @@ def main() -> None:
         "foreign_to_rendered": verdicts_of(house, foreign),
         "own_of_rendered": verdicts_of(house, halves[1]),
         "two_equal_houses": verdicts_of(PlacedMap.of(both, [_true(v) for v in both]), halves[0][::3]),
-        "load": [load_before, os.getloadavg()[0]],
     }
-    text = json.dumps(report, indent=2)
-    print(text)
-    arguments.out.write_text(text + "\n", encoding="utf-8")
 
 
 def _load_views(recordings: Path, name: str) -> list[View]:
@@ -360,12 +352,7 @@ def _time(call: Any, inputs: Iterable[Any]) -> dict[str, float]:
         start = time.process_time()
         call(value)
         took_ms.append((time.process_time() - start) * 1e3)
-    return _percentiles(took_ms)
-
-
-def _percentiles(values: Sequence[float]) -> dict[str, float]:
-    p50, p95 = np.percentile(np.asarray(values), [50, 95]).round(2).tolist()
-    return {"p50": p50, "p95": p95, "n": len(values)}
+    return spread(took_ms)
 
 
 def _medians(values: Sequence[tuple[float, float]]) -> dict[str, list[float]]:
@@ -373,7 +360,3 @@ def _medians(values: Sequence[tuple[float, float]]) -> dict[str, list[float]]:
     return {
         "median": np.median(errors, axis=0).round(4).tolist(), "max": errors.max(axis=0).round(4).tolist()
     }  # fmt: skip
-
-
-if __name__ == "__main__":
-    main()

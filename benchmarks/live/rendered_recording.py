@@ -5,23 +5,23 @@ driving play this recording with ``--data`` instead.  The frames of robot 0 come
 so that `Dataset.share` gives each robot its own drive.  Depth is kept to 0.2 mm; the images are not
 compressed (1.5 MB a frame), so that reading them takes no time from the robots.
 
-    python -m benchmarks.live.rendered_recording FOLDER [--robots 3] [--frames 300] [--seed 0] [--processes 2]
+    python -m benchmarks live.rendered_recording FOLDER [--robots 3] [--frames 300] [--seed 0] [--processes 2]
 """
 
 from __future__ import annotations
 
-import argparse
 import multiprocessing
-from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from benchmarks.frame.registry import benchmark
 from client_sdk.mapping import Trajectory, write_trajectory
 from client_sdk.rigs.intrinsics import Intrinsics, write_intrinsics
 from client_sdk.simulator import RATE_HZ, SIMULATED_CAMERA, render_frames, true_trajectory
 
-__all__ = ["main", "write_recording"]
+__all__ = ["write_recording"]
 
 DEPTH_SCALE = 5000.0
 
@@ -63,17 +63,9 @@ def _write_robot(folder: Path, robot: int, robots: int, frames: int, seed: int) 
         cv2.imwrite(str(folder / "depth" / f"{name}.pgm"), depth)
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
+@benchmark()
+def run_benchmark(
+    *, folder: Path, robots: int = 3, frames: int = 300, seed: int = 0, processes: int = 2
+) -> dict[str, Any]:
     """Write one recording."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.live.rendered_recording")
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--robots", type=int, default=3)
-    parser.add_argument("--frames", type=int, default=300)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--processes", type=int, default=2)
-    chosen = parser.parse_args(arguments)
-    print(write_recording(chosen.folder, chosen.robots, chosen.frames, chosen.seed, chosen.processes))
-
-
-if __name__ == "__main__":
-    main()
+    return {"folder": write_recording(folder, robots, frames, seed, processes)}

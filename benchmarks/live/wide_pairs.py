@@ -6,7 +6,7 @@ of them is a run of its own.  A link is right within 5 cm and 5 degrees of the t
 5 degrees, and wrong beyond 30 cm or 10 degrees.  Then frames of one half of the kitchen's drive are sought
 among keyframes of the other half: of the nearest by their true poses, so that no place recognition is needed.
 
-    python -m benchmarks.live.wide_pairs --recordings ../shared/data [--features module:function]
+    python -m benchmarks live.wide_pairs --recordings ../shared/data [--features module:function]
 
 The function is a features function of `client_sdk.slots`; a keyframe has as many of its features as it can
 carry.  MH_01 has the depth of its rectified stereo pairs by block matching.
@@ -16,16 +16,17 @@ Defends: >= 15 % of the pairs 60 frames apart accepted and right with ORB, and n
 
 from __future__ import annotations
 
-import argparse
-import os
 import time
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Annotated, Any
 
 import numpy as np
 
+from benchmarks.frame.registry import Bar, Recordings, benchmark
+from benchmarks.frame.report import say
 from benchmarks.maps.recordings import red_kitchen, track, truth_of
 from benchmarks.maps.stereo import euroc_stereo
 from client_sdk.frontend import Frame, FrontEndOptions, describe, points_at
@@ -51,7 +52,6 @@ __all__ = [
     "Sight",
     "judge_pairs",
     "kitchen_sights",
-    "main",
     "mh01_sights",
     "relocalise",
     "sights_of",
@@ -99,10 +99,11 @@ class Judged:
             sum(metres > _WRONG_M or degrees > _WRONG_DEG for metres, degrees in links),
         )
 
-    def row(self, links: Sequence[tuple[float, float]]) -> str:
-        """Return the counts as text."""
+    def row(self, links: Sequence[tuple[float, float]]) -> dict[str, float]:
+        """Return the counts as figures."""
         right, off, wrong = self.count(links)
-        return f"{len(links)}, right {right} ({100.0 * right / self.pairs:.0f} %), off {off}, wrong {wrong}"
+        share = 100.0 * right / self.pairs
+        return {"links": len(links), "right": right, "right_percent": share, "off": off, "wrong": wrong}
 
 
 def kitchen_sights(recordings: Path, slot: FeaturesSlot | None = None) -> list[Sight]:
@@ -177,7 +178,7 @@ def judge_pairs(
     return judged
 
 
-def relocalise(known: Sequence[Sight], sought: Sequence[Sight], every: int = 5) -> str:
+def relocalise(known: Sequence[Sight], sought: Sequence[Sight], every: int = 5) -> dict[str, Any]:
     """Seek views among each *every*-th one of *known*; say how many are found, and how exactly."""
     placed = list(known[::every])
     verdicts: Counter[str] = Counter()
@@ -195,10 +196,10 @@ def relocalise(known: Sequence[Sight], sought: Sequence[Sight], every: int = 5) 
         verdicts[found.verdict] += 1
         if found.verdict == "ok" and found.T_map_camera is not None:
             errors.append(pose_difference(found.T_map_camera, sight.T_world_camera))
-    return (
-        f"{len(placed)} keyframes, {len(sought)} views: {dict(sorted(verdicts.items()))}; ok "
-        f"{Judged(pairs=len(sought)).row(errors)}"
-    )
+    return {
+        "keyframes": len(placed), "views": len(sought), "verdicts": dict(sorted(verdicts.items())),
+        "ok": Judged(pairs=len(sought)).row(errors),
+    }  # fmt: skip
 
 
 def _nearest(placed: Sequence[Sight], sight: Sight) -> list[int]:
@@ -231,31 +232,31 @@ def _measured(keyframe: int, other: int, link: RelativePose) -> LinksMeasured:
     return LinksMeasured(keyframe=keyframe, links=(measured,))
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Print a row for each recording and gap, and one of relocalisation."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.live.wide_pairs")
-    parser.add_argument("--recordings", type=Path, default=Path("../shared/data"))
-    parser.add_argument("--features", help="module:function of other features, as `rse-pf demo` takes it")
-    chosen = parser.parse_args(arguments)
-    function = load_features(chosen.features)
+@benchmark(
+    Bar("pairs.*.believed.wrong", equals=0),
+    Bar("pairs.kitchen, 60 of 10 Hz.believed.right_percent", at_least=15.0, unit="%"),
+)
+def run_benchmark(
+    *,
+    recordings: Recordings = Path("../shared/data"),
+    features: Annotated[str | None, "module:function of other features, as `rse-pf demo` takes it"] = None,
+) -> dict[str, Any]:
+    """Judge the pairs of each recording and gap, and relocalise."""
+    function = load_features(features)
     slot = None if function is None else FeaturesSlot(function)
-    sights = {
-        "kitchen": kitchen_sights(chosen.recordings, slot),
-        "MH_01": mh01_sights(chosen.recordings, slot),
-    }
+    sights = {"kitchen": kitchen_sights(recordings, slot), "MH_01": mh01_sights(recordings, slot)}
+    pairs = {}
     for name, (recording, gap, spacing) in _DRIVES.items():
         judged = judge_pairs(sights[recording], gap, spacing)
-        print(
-            f"{name}: {judged.pairs} pairs; links {judged.row(judged.alone)}; believed "
-            f"{judged.row(judged.believed)}; {judged.measure_ms / judged.pairs:.2f} ms of CPU a pair; "
-            f"load {os.getloadavg()[0]:.1f}",
-            flush=True,
-        )
+        pairs[name] = {
+            "n": judged.pairs, "alone": judged.row(judged.alone), "believed": judged.row(judged.believed),
+            "cpu_ms_a_pair": judged.measure_ms / judged.pairs,
+        }  # fmt: skip
+        say({"drive": name, **pairs[name]})
     kitchen = sights["kitchen"]
     half = len(kitchen) // 2
-    print(f"kitchen, second half sought in the first: {relocalise(kitchen[:half], kitchen[half:])}")
-    print(f"kitchen, first half sought in the second: {relocalise(kitchen[half:], kitchen[:half])}")
-
-
-if __name__ == "__main__":
-    main()
+    return {
+        "pairs": pairs,
+        "second_half_in_first": relocalise(kitchen[:half], kitchen[half:]),
+        "first_half_in_second": relocalise(kitchen[half:], kitchen[:half]),
+    }

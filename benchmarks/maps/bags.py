@@ -5,30 +5,28 @@ of the folder (ATE within 1 mm); 1 GB of raw images is read at 100 MB/s or more,
 A bag is read twice, and both readings count: the rate is its size by their time together.  Poses are solved
 in this process as the service does.  Each large bag is read in a process of its own, to measure its memory.
 
-    python -m benchmarks.maps.bags --recordings ../shared/data --out bags.json
-    python -m benchmarks.maps.bags --recordings ../shared/data --only-rate --kinds mcap
+    python -m benchmarks maps.bags --recordings ../shared/data --out bags.json
+    python -m benchmarks maps.bags --recordings ../shared/data --only-rate --kinds mcap
 """
 
 from __future__ import annotations
 
-import argparse
 import asyncio
 import json
-import os
-import platform
 import resource
 import struct
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import cv2
 import numpy as np
 
+from benchmarks.frame.registry import Bar, Recordings, benchmark, command_of
+from benchmarks.frame.report import say
 from client_sdk.answers import PoseAnswer
 from client_sdk.bags import BagKind, BagWriter, open_bag
 from client_sdk.bags.message_types import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, TF
@@ -40,7 +38,7 @@ from rse_pf.experiments.results.trajectory_error import absolute_error
 from rse_pf.geometry import Array, to_quaternion
 from rse_pf.pnp import PnpOptions, refine_with_depth, solve_pnp
 
-__all__ = ["answer_query", "main", "write_recording"]
+__all__ = ["answer_query", "write_recording"]
 
 _RECORDING = "7scenes_redkitchen"
 _KINDS: tuple[BagKind, ...] = ("ros1", "sqlite3", "mcap")
@@ -84,48 +82,47 @@ def write_recording(
             loops += 1
 
 
-def main() -> None:
-    """Print the figures of every kind, and write them to ``--out``."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--recordings", type=Path, required=True)
-    parser.add_argument("--kinds", nargs="+", choices=_KINDS, default=_KINDS)
-    parser.add_argument("--only-rate", action="store_true", help="leave out the maps")
-    parser.add_argument("--only-maps", action="store_true", help="leave out the large bags")
-    parser.add_argument("--folder", type=Path, help="where bags are written (default: a temporary folder)")
-    parser.add_argument("--out", type=Path)
-    parser.add_argument("--read", type=Path, help=argparse.SUPPRESS)
-    args = parser.parse_args()
-    if args.read is not None:
-        print(json.dumps(_read(args.read)))
-        return
-    report: dict[str, Any] = {
-        "machine": platform.platform(), "load_average": os.getloadavg(), "maps": [], "rates": []
-    }  # fmt: skip
-    source = args.recordings / _RECORDING
-    with tempfile.TemporaryDirectory(dir=args.folder) as folder:
-        if not args.only_rate:
-            dataset = open_dataset(source)
-            report["maps"].append(_show(_map("folder", dataset, 0.0, source)))
-        for kind in args.kinds:
+@benchmark(
+    Bar("ate_off_folder_mm.*", at_most=1.0, unit="mm"),
+    Bar("rates.*.mb_per_s", at_least=100, unit="MB/s"),
+    Bar("rates.*.peak_mb", at_most=300, unit="MB"),
+)
+def run_benchmark(
+    *, recordings: Recordings = Path("../shared/data"),
+    kinds: Annotated[tuple[str, ...], "kinds of bags", _KINDS] = _KINDS,
+    only_rate: Annotated[bool, "leave out the maps"] = False,
+    only_maps: Annotated[bool, "leave out the large bags"] = False,
+    folder: Annotated[Path | None, "where bags are written"] = None,
+) -> dict[str, Any]:  # fmt: skip
+    """Map and read bags of every kind."""
+    maps, rates = [], []
+    source = recordings / _RECORDING
+    with tempfile.TemporaryDirectory(dir=folder) as made:
+        if not only_rate:
+            maps.append(_show(_map("folder", open_dataset(source), 0.0, source)))
+        for kind in kinds:
             for is_raw in (True, False):
                 name = f"{kind}, {'raw' if is_raw else 'compressed'}"
-                path = Path(folder) / (f"b-{is_raw}" + (".bag" if kind == "ros1" else ""))
-                if not args.only_rate:
+                path = Path(made) / (f"b-{is_raw}" + (".bag" if kind == "ros1" else ""))
+                if not only_rate:
                     write_recording(source, path, kind, is_raw=is_raw)
                     with open_bag(path) as bag:
-                        report["maps"].append(_show(_map(name, bag, float(_START_S), source)))
+                        maps.append(_show(_map(name, bag, float(_START_S), source)))
                     _remove(path)
-                if is_raw and not args.only_maps:
+                if is_raw and not only_maps:
                     write_recording(source, path, kind, is_raw=True, at_least_bytes=_LARGE_BYTES)
-                    command = [sys.executable, __file__, "--recordings", str(args.recordings)]
                     done = subprocess.run(
-                        [*command, "--read", str(path)], check=True, capture_output=True, text=True
+                        command_of(print_reading, str(path)), check=True, capture_output=True, text=True
                     )
-                    report["rates"].append(_show({"bag": name, **json.loads(done.stdout)}))
+                    rates.append(_show({"bag": name, **json.loads(done.stdout)}))
                     _remove(path)
-    report["load_average_after"] = os.getloadavg()
-    if args.out is not None:
-        args.out.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
+    off_mm = [abs(row["ate_mm"] - maps[0]["ate_mm"]) for row in maps[1:]]
+    return {"maps": maps, "rates": rates, "ate_off_folder_mm": off_mm}
+
+
+def print_reading(path: str) -> None:
+    """Read a bag, in a process of its own, and print the figures."""
+    print(json.dumps(_read(Path(path))))
 
 
 def _read(path: Path) -> dict[str, Any]:
@@ -235,7 +232,7 @@ def _transform(w: BagWriter, stamp_ns: int, T: Array) -> Any:
 
 
 def _show(row: dict[str, Any]) -> dict[str, Any]:
-    print(", ".join(f"{name} {value}" for name, value in row.items()), flush=True)
+    say(row)
     return row
 
 
@@ -245,7 +242,3 @@ def _remove(path: Path) -> None:
             entry.rmdir()
         else:
             entry.unlink()
-
-
-if __name__ == "__main__":
-    main()

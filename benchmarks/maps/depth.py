@@ -5,22 +5,20 @@ fr1 and redwood no worse than without depth; no lost frame; every command of eve
 normalised error squared near 6; the native core <= 60 us for 200 matches.  CPU figures are of this thread,
 native and numpy in turn; the load average stands beside them: discard those of a busy machine.
 
-    python -m benchmarks.maps.depth --recordings ../shared/data --out depth.json
+    python -m benchmarks maps.depth --recordings ../shared/data --out depth.json
 """
 
 from __future__ import annotations
 
-import argparse
-import json
-import os
-import platform
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
+from benchmarks.frame.registry import Bar, benchmark
+from benchmarks.frame.statistics import spread
 from benchmarks.maps.recordings import judged_answer, truth_of
 from benchmarks.maps.services import joined_poses, robots_of
 from client_sdk.datasets import Dataset, open_dataset
@@ -35,7 +33,7 @@ from rse_pf.services.pnp import make_request
 from rse_pf.slam.map_merge import merge_versions
 from rse_pf.wire import CODECS, Command, make_codec
 
-__all__ = ["main"]
+__all__ = []
 
 _RECORDINGS = {
     "7scenes_redkitchen": FrontEndOptions(),
@@ -160,35 +158,36 @@ def cost_row(n: int) -> dict[str, Any]:
             refine(solution, views.points_reference, views.pixels, views.depths_m, views.camera)
             spent[name].append((time.thread_time_ns() - begin) / 1e3)
     return {
-        "n": n,
-        **{name: np.percentile(times, [50, 95, 99]).round(1).tolist() for name, times in spent.items()},
+        **{name: spread(times) for name, times in spent.items()},
     }
 
 
-def main() -> None:
-    """Measure and print; write JSON where asked."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--recordings", type=Path, help="folder of recordings; without it they are left out")
-    parser.add_argument("--n", type=int, default=1000)
-    parser.add_argument("--out", type=Path)
-    arguments = parser.parse_args()
-    report: dict[str, Any] = {"machine": platform.processor() or platform.machine(), "load": os.getloadavg()}
-    report["cost_us_p50_p95_p99"] = cost_row(max(500, arguments.n // 2))
-    report["consistency"] = consistency_row(arguments.n)
-    if arguments.recordings:
+@benchmark(
+    Bar("cost_us.default.p50", at_most=60.0, unit="us of CPU"),
+    Bar("7scenes_redkitchen.depth.ate_cm", at_most=3.4, unit="cm"),
+    Bar("red_kitchen_maps.with_loops_ate_cm", at_most=3.0, unit="cm"),
+    Bar("red_kitchen_maps.merged_in_three_ate_cm", at_most=3.3, unit="cm"),
+    Bar("*.depth.lost", equals=0),
+    Bar("*.depth.command_bytes_max", at_most=10_000, unit="bytes"),
+    Bar("worse_than_pnp_cm.*", at_most=0.0, unit="cm"),
+)
+def run_benchmark(
+    *,
+    recordings: Annotated[Path | None, "folder of recordings; without it they are left out"] = None,
+    n: int = 1000,
+) -> dict[str, Any]:
+    """Measure the refinement alone, and on recordings where there are some."""
+    figures: dict[str, Any] = {"cost_us": cost_row(max(500, n // 2)), "consistency": consistency_row(n)}
+    if recordings is not None:
         for name, options in _RECORDINGS.items():
-            dataset = open_dataset(arguments.recordings / name)
-            report[name] = {
+            dataset = open_dataset(recordings / name)
+            figures[name] = {
                 label: recording_row(dataset, options, with_depth=with_depth)
                 for label, with_depth in (("pnp", False), ("depth", True))
             }
-            report[name]["commands"] = command_rows(dataset)
-        report["red_kitchen_maps"] = map_rows(arguments.recordings)
-    text = json.dumps(report, indent=1)
-    print(text)
-    if arguments.out:
-        arguments.out.write_text(text + "\n", encoding="utf-8")
-
-
-if __name__ == "__main__":
-    main()
+            figures[name]["commands"] = command_rows(dataset)
+        figures["red_kitchen_maps"] = map_rows(recordings)
+        figures["worse_than_pnp_cm"] = {
+            name: figures[name]["depth"]["ate_cm"] - figures[name]["pnp"]["ate_cm"] for name in _RECORDINGS
+        }
+    return figures

@@ -2,7 +2,7 @@
 
 Needs a separate interpreter with g2o-python and numpy below 2 (with numpy 2 the wheel crashes):
 
-    python -m benchmarks.maps.g2o_reference < ORDER.json > ANSWER.json
+    VENV/bin/python g2o_reference.py < ORDER.json > ANSWER.json
 
 The order has ``g2o`` (text), ``robust`` (for each edge), ``cauchy`` (width of the kernel on robust edges, 0
 for none) and ``rounds``; the answer ``poses`` (4 x 4, one for each vertex, in their order), ``chi2`` of them
@@ -57,7 +57,7 @@ def optimizer_of(order: dict[str, Any]) -> tuple[Any, list[Any]]:
     return optimizer, vertices
 
 
-def main() -> None:
+def fit() -> None:
     """Read the order, fit, write the answer."""
     order = json.load(sys.stdin)
     optimizer, vertices = optimizer_of(order)
@@ -76,4 +76,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    fit()

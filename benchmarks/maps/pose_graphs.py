@@ -1,6 +1,6 @@
 """Our ``optimise`` beside g2o's own optimiser, on the sphere and on the graph of the kitchen's merge.
 
-    python -m benchmarks.maps.pose_graphs --g2o-python VENV/bin/python [--recordings DIR] [--out FILE]
+    python -m benchmarks maps.pose_graphs VENV/bin/python [--recordings DIR]
 
 *VENV* has ``g2o-python`` and ``numpy<2``; see `g2o_reference.py`, which runs there.  Both fit the same text
 with the same Cauchy kernel from the same start, ours once more from the chordal start; each is judged by our
@@ -12,18 +12,16 @@ Defends: chi2 not above g2o's by more than 0.1 %, trajectory error within 10 % o
 
 from __future__ import annotations
 
-import argparse
 import json
-import os
-import platform
 import subprocess
-import sys
 import time
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
+from benchmarks.frame.registry import Bar, benchmark
 from benchmarks.maps.services import robots_of
 from rse_pf.experiments.results.trajectory_error import ate_m
 from rse_pf.geometry import Array
@@ -35,6 +33,15 @@ from rse_pf.slam.pose_graph import PoseGraph, write_g2o
 
 REFERENCE = Path(__file__).with_name("g2o_reference.py")
 CAUCHY = 3.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Options:
+    """The arguments."""
+
+    g2o_python: Annotated[Path, "interpreter with g2o and numpy 1"]
+    recordings: Annotated[Path | None, "folder of recordings, for the kitchen's graph"] = None
+    rounds: Annotated[int, "of g2o"] = 60
 
 
 def kitchen_graph(recordings: Path) -> tuple[PoseGraph, Array]:
@@ -77,7 +84,7 @@ def reference(graph: PoseGraph, interpreter: Path, rounds: int, cauchy: float) -
     return np.array(answer["poses"]), float(answer["seconds"])
 
 
-def row(name: str, graph: PoseGraph, truth: Array, args: argparse.Namespace) -> dict[str, Any]:
+def row(name: str, graph: PoseGraph, truth: Array, args: Options) -> dict[str, Any]:
     """Fit *graph* by both, with and without a kernel."""
     figures: dict[str, Any] = {"graph": name, "poses": len(graph.ids), "edges": len(graph.a)}
     for kernel in (0.0, CAUCHY):
@@ -91,40 +98,22 @@ def row(name: str, graph: PoseGraph, truth: Array, args: argparse.Namespace) -> 
             "ate_cm": [100 * ate_m(poses, truth) for poses in (ours, theirs)],
             "seconds": [seconds, g2o_s],
         }
+    both = figures["squares"]
+    figures["chi2_over_g2o"] = both["chi2"][0] / both["chi2"][1]
+    figures["ate_over_g2o"] = both["ate_cm"][0] / both["ate_cm"][1]
     figures["chi2_start"], figures["chi2_truth"] = graph.chi2(), graph.chi2(truth)
     figures["ate_start_cm"] = 100 * ate_m(graph.T_world_pose, truth)
     return figures
 
 
-def main() -> None:
-    """Fit, print the table, write the figures."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--g2o-python", type=Path, required=True, help="interpreter with g2o and numpy 1")
-    parser.add_argument("--recordings", type=Path, help="folder of recordings, for the kitchen's graph")
-    parser.add_argument("--rounds", type=int, default=60, help="of g2o")
-    parser.add_argument("--out", type=Path)
-    args = parser.parse_args()
-    load = os.getloadavg()[0]
+@benchmark(
+    Bar("*.chi2_over_g2o", at_most=1.001),
+    Bar("*.ate_over_g2o", at_most=1.1),
+    Bar("*.squares.seconds.0", at_most=5.0, unit="s"),
+)
+def run_benchmark(args: Options) -> dict[str, Any]:
+    """Fit the graphs by both."""
     rows = [row("sphere", *make_sphere(7), args)]
     if args.recordings is not None:
         rows.append(row("red kitchen", *kitchen_graph(args.recordings), args))
-    print(f"{platform.node()}, {os.cpu_count()} cores, load {load:.1f} -> {os.getloadavg()[0]:.1f}")
-    for figures in rows:
-        print(
-            f"{figures['graph']}: {figures['poses']} poses, {figures['edges']} edges; chi2 at the start "
-            f"{figures['chi2_start']:.1f}, at the truth {figures['chi2_truth']:.1f}; "
-            f"trajectory off by {figures['ate_start_cm']:.1f} cm at the start"
-        )
-        for name in ("squares", "kernel"):
-            both = figures[name]
-            parts = [
-                f"{what} {both[what][0]:.{digits}f} (g2o {both[what][1]:.{digits}f})"
-                for what, digits in (("chi2", 2), ("cost", 2), ("ate_cm", 3), ("seconds", 2))
-            ]
-            print(f"  {name:8} " + ", ".join(parts))
-    if args.out is not None:
-        args.out.write_text(json.dumps({"load": load, "rows": rows}, indent=1))
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+    return {figures["graph"]: figures for figures in rows}

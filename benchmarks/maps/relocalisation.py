@@ -2,24 +2,22 @@
 
 The map's poses are the true ones, and keyframes have what fits into 36 kB.  A pose is right within 5 cm and
 5 deg of the truth, near within 15 cm and 10 deg, else wrong.  Place search is compared with trying all
-keyframes.  `benchmarks.live.wide_pairs` counts the links of views that lie apart.
+keyframes.  `live.wide_pairs` counts the links of views that lie apart.
 
-    python -m benchmarks.maps.relocalisation --data ../shared/data/7scenes_redkitchen --features xfeat:xfeat
+    python -m benchmarks maps.relocalisation ../shared/data/7scenes_redkitchen --features xfeat:xfeat
 """
 
 from __future__ import annotations
 
-import argparse
-import json
-import os
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
+from benchmarks.frame.registry import benchmark
 from benchmarks.maps.recordings import truth_of
 from client_sdk.datasets import open_dataset
 from client_sdk.frontend import FrontEndOptions, extract
@@ -36,7 +34,7 @@ from rse_pf.slam.relative_pose import (
     view_of_keyframe,
 )
 
-__all__ = ["main"]
+__all__ = []
 
 RIGHT_M, RIGHT_DEG = 0.05, 5.0
 NEAR_M, NEAR_DEG = 0.15, 10.0
@@ -48,25 +46,17 @@ SHOWS_INLIERS = 15
 """A keyframe with a right pose of so many inliers shows the place of a view."""
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run, print and save the result; return the exit code."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--data", type=Path, required=True, help="a recording with depth and truth")
-    parser.add_argument("--features", metavar="MODULE:FUNCTION", help="default: ORB alone")
-    parser.add_argument("--map-step", type=int, default=4, help="frames between two keyframes of a map")
-    parser.add_argument("--out", type=Path, help="write JSON")
-    args = parser.parse_args(arguments)
-    function = load_features(args.features)
-    slots = {"orb": None, **({} if function is None else {args.features: FeaturesSlot(function)})}
-    found: dict[str, Any] = {"data": args.data.name, "load": [os.getloadavg()[0]]}
-    for name, slot in slots.items():
-        views = keyframes_of(args.data, slot)
-        found[name] = relocalised(views, args.map_step)
-        print(json.dumps(found[name], indent=1), flush=True)
-    found["load"].append(os.getloadavg()[0])
-    if args.out:
-        args.out.write_text(json.dumps(found, indent=2) + "\n", encoding="utf-8")
-    return 0
+@benchmark()
+def run_benchmark(
+    *,
+    data: Annotated[Path, "a recording with depth and truth"],
+    features: Annotated[str | None, "default: ORB alone"] = None,
+    map_step: Annotated[int, "frames between two keyframes of a map"] = 4,
+) -> dict[str, Any]:
+    """Localise with every kind of features."""
+    function = load_features(features)
+    slots = {"orb": None, **({} if function is None else {features: FeaturesSlot(function)})}
+    return {name: relocalised(keyframes_of(data, slot), map_step) for name, slot in slots.items()}
 
 
 def keyframes_of(folder: Path, slot: FeaturesSlot | None) -> list[Keyframe]:
@@ -153,7 +143,3 @@ def _judged(T_found: Array, T_true: Array) -> str:
     if apart_m <= RIGHT_M and apart_deg <= RIGHT_DEG:
         return "right"
     return "near" if apart_m <= NEAR_M and apart_deg <= NEAR_DEG else "wrong"
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

@@ -1,6 +1,6 @@
 """A rendered rig with exact truth: a stereo pair of distorted lenses and an IMU with noise, tracked.
 
-    python -m benchmarks.maps.rendered_rigs [--seeds 20] [--first 0] [--lens pinhole fisheye]
+    python -m benchmarks maps.rendered_rigs [--seeds 20] [--first 0] [--lens pinhole fisheye]
 
 Each seed has a room, a motion, noise and biases of its own.  Both cameras are turned against each other and
 have distorted lenses, radial-tangential or Kannala-Brandt; their images are rectified by the rig's own
@@ -13,18 +13,19 @@ time is found within 3 ms, or the IMU is refused.
 
 from __future__ import annotations
 
-import argparse
 import asyncio
 import math
-import os
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
-from typing import Literal
+from dataclasses import asdict, dataclass, replace
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 
+from benchmarks.frame.registry import Bar, benchmark
+from benchmarks.frame.report import say
+from benchmarks.frame.statistics import spread
 from client_sdk.frontend import Frame, load_opencv
 from client_sdk.imu.samples import ImuSamples
 from client_sdk.mapper import Mapper
@@ -40,7 +41,7 @@ from rse_pf.experiments.compare.solvers import InProcessSolver
 from rse_pf.experiments.results.trajectory_error import ate_m
 from rse_pf.geometry import Array, Camera, exp_se3, inverse
 
-__all__ = ["Driven", "LensKind", "RenderedRig", "drive_rig", "main", "rendered_rig"]
+__all__ = ["Driven", "LensKind", "RenderedRig", "drive_rig", "rendered_rig"]
 
 LensKind = Literal["pinhole", "fisheye"]
 ATE_PERCENT, DEVIATIONS, OFFSET_S = 0.5, 3.0, 0.003
@@ -216,42 +217,27 @@ def _judged(
     )  # fmt: skip
 
 
-def main() -> None:
-    """Drive all seeds and print a line for each, and the worst of all."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--seeds", type=int, default=20)
-    parser.add_argument("--first", type=int, default=0, help="the first of the seeds")
-    parser.add_argument("--lens", nargs="+", choices=list(_DISTORTIONS), default=list(_DISTORTIONS))
-    parser.add_argument("--seconds", type=float, default=8.0)
-    parser.add_argument("--rate", type=float, default=10.0)
-    given = parser.parse_args()
+@benchmark(
+    Bar("*.percent.max", at_most=ATE_PERCENT, unit="% of the path"),
+    Bar("*.missed", equals=0, unit="seeds"),
+)
+def run_benchmark(
+    *, seeds: int = 20, first: Annotated[int, "the first of the seeds"] = 0,
+    lens: Annotated[tuple[str, ...], "kinds of lenses", _DISTORTIONS] = tuple(_DISTORTIONS),
+    seconds: float = 8.0, rate: float = 10.0,
+) -> dict[str, Any]:  # fmt: skip
+    """Drive all seeds with each kind of lenses."""
     load_opencv().setNumThreads(1)
-    print(
-        f"{_SIZE[0]}x{_SIZE[1]} px, {given.seconds:g} s at {given.rate:g} Hz; load {os.getloadavg()[0]:.1f}"
-    )
-    made: dict[str, list[Driven]] = {kind: [] for kind in given.lens}
-    for seed in range(given.first, given.first + given.seeds):
-        for kind in given.lens:
-            done = asyncio.run(drive_rig(kind, seed, given.seconds, given.rate))
-            made[kind].append(done)
-            apart = "-" if done.deviations is None else f"{done.deviations:.1f}"
-            offset = "-" if done.offset_error_s is None else f"{1e3 * done.offset_error_s:.1f}"
-            print(
-                f"{kind} {seed}: ATE {done.ate_cm:.2f} cm, {done.percent:.2f} % of {done.path_m:.1f} m, lost "
-                f"{done.lost}, IMU {done.imu}, biases {apart} deviations, offset off by {offset} ms, "
-                f"{done.took_s:.0f} s of CPU: {', '.join(done.missed) or 'ok'}",
-                flush=True,
-            )
-    for kind, runs in made.items():
-        worst = max(run.percent for run in runs)
-        print(
-            f"{kind}, n {len(runs)}: ATE median {np.median([run.percent for run in runs]):.3f} %, at most "
-            f"{worst:.3f} % (bar {ATE_PERCENT}); met by {sum(not run.missed for run in runs)}; "
-            f"load {os.getloadavg()[0]:.1f}"
-        )
-
-
-if __name__ == "__main__":
-    main()
+    made: dict[str, list[Driven]] = {kind: [] for kind in lens}
+    for seed in range(first, first + seeds):
+        for kind in lens:
+            made[kind].append(asyncio.run(drive_rig(kind, seed, seconds, rate)))
+            say({"lens": kind, "seed": seed, **asdict(made[kind][-1]), "missed": made[kind][-1].missed})
+    return {
+        kind: {
+            "percent": spread(run.percent for run in runs),
+            "missed": sum(bool(run.missed) for run in runs),
+            "runs": [{**asdict(run), "missed": run.missed} for run in runs],
+        }
+        for kind, runs in made.items()
+    }

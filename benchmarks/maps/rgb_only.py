@@ -17,26 +17,25 @@ the moment when the robot got it.  With --hold-out, drives that did not choose t
 too, without a bar: rendered worlds of four seeds, TUM fr1, other frames of the kitchen, and MH_01 at
 10 Hz.
 
-    python -m benchmarks.maps.rgb_only --recordings ../shared/data --out rgb_only.json
-    python -m benchmarks.maps.rgb_only --recordings ../shared/data --hold-out
+    python -m benchmarks maps.rgb_only --recordings ../shared/data --out rgb_only.json
+    python -m benchmarks maps.rgb_only --recordings ../shared/data --hold-out
 """
 
 from __future__ import annotations
 
-import argparse
 import asyncio
-import json
-import os
-import platform
 import tempfile
 import time
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
+from benchmarks.frame.registry import Bar, Recordings, benchmark
+from benchmarks.frame.report import say
+from benchmarks.frame.statistics import spread
 from benchmarks.maps.recordings import track
 from client_sdk.answers import PoseAnswer
 from client_sdk.datasets import Dataset, open_dataset
@@ -52,7 +51,7 @@ from rse_pf.pnp import PnpOptions, solve_pnp
 from rse_pf.services.pnp import make_request
 from rse_pf.wire import Command, make_codec
 
-__all__ = ["main"]
+__all__ = []
 
 _RECORDING = "7scenes_redkitchen"
 _MAX_ATE_CM, _MAX_LOST_PERCENT = 8.0, 5.0
@@ -244,9 +243,8 @@ def row_of(drive: Drive, *, with_scale: bool) -> dict[str, Any]:
         "landmarks": report["map_points"],
         "scale": mapper.scale,
         "path_m": truth.length_m,
-        "cpu_ms_p50_p95_max": [float(np.percentile(frame_ms, q)) for q in (50, 95, 100)],
+        "cpu_ms": spread(frame_ms),
         "command_bytes_max": {name: max(size, default=0) for name, size in sizes.items()},
-        "load_average": os.getloadavg()[0],
         "ate_cm": None,
         "live_ate_cm": None,
         "sim3_cm": None,
@@ -267,91 +265,50 @@ def row_of(drive: Drive, *, with_scale: bool) -> dict[str, Any]:
     return row
 
 
-def line_of(row: dict[str, Any]) -> str:
-    """Return the figures of a row in one line."""
-    cpu = " / ".join(f"{value:.0f}" for value in row["cpu_ms_p50_p95_max"])
-    scale = "-" if row["sim3_scale"] is None else f"{row['sim3_scale']:.3f}"
-    live = "" if row["live_metric_poses"] is None else f" of {row['live_metric_poses']} poses"
-    return (
-        f"{row['scale']}: ATE {_cm(row['ate_cm'])}, live ATE {_cm(row['live_ate_cm'])}{live}, Sim(3) "
-        f"{_cm(row['sim3_cm'])} at scale {scale}, {_cm(row['sim3_before_save_cm'])} before the last "
-        f"adjustment of {row['save_s']:.1f} s; {row['lost']} of {row['frames']} lost, "
-        f"{row['before_start']} before the start, {row['poses']} poses, {row['keyframes']} keyframes, "
-        f"{row['landmarks']} points; path {row['path_m']:.1f} m; CPU of a frame p50 / p95 / max {cpu} ms; "
-        f"largest command {row['command_bytes_max']} bytes; load {row['load_average']:.1f}"
-    )
-
-
-def _cm(value: float | None) -> str:
-    return "-" if value is None else f"{value:.2f} cm"
-
-
-def main() -> int:
-    """Print the rows, and return 1 if a bar is missed."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--recordings", type=Path, default=Path("../shared/data"))
-    parser.add_argument("--rates", type=float, nargs="+", default=[10.0], metavar="HZ")
-    parser.add_argument("--hold-out", action="store_true", help="also measure other drives, without a bar")
-    parser.add_argument("--out", type=Path)
-    args = parser.parse_args()
-    print(f"{platform.machine()}, {os.cpu_count()} cores, load average {os.getloadavg()[0]:.1f}, n = 1")
-    rows: dict[str, Any] = {}
+@benchmark(
+    Bar("metric.*.ate_cm", at_most=_MAX_ATE_CM, unit="cm"),
+    Bar("metric.*.lost_percent", at_most=_MAX_LOST_PERCENT, unit="%"),
+    Bar("kitchen.*.sim3_cm", at_most=_MAX_KITCHEN_CM, unit="cm"),
+    Bar("kitchen.*.lost", equals=0),
+    Bar("MH_01.sim3_cm", at_most=_MAX_EUROC_CM, unit="cm"),
+    Bar("MH_01.lost", equals=0),
+    Bar("KITTI 00.posed_percent", at_least=100 * _MIN_KITTI_POSED, unit="%"),
+    Bar("KITTI 00.sim3_percent_of_path", at_most=_MAX_KITTI_PERCENT, unit="%"),
+    Bar("cuts.*.segments_beyond", equals=0),
+    Bar("cuts.*.late_s", at_most=0.0, unit="s"),
+)
+def run_benchmark(
+    *,
+    recordings: Recordings = Path("../shared/data"),
+    rates: tuple[float, ...] = (10.0,),
+    hold_out: Annotated[bool, "also measure other drives, without a bar"] = False,
+) -> dict[str, Any]:
+    """Map the drives without their depth."""
+    figures: dict[str, Any] = {"metric": {}, "kitchen": {}, "cuts": {}, "held_out": {}}
 
     def measure(drive: Drive, *, with_scale: bool) -> dict[str, Any]:
         row = row_of(drive, with_scale=with_scale)
-        rows[f"{drive.name}, {'first metre of odometry' if with_scale else 'no scale'}"] = row
-        print(f"{drive.name}; {line_of(row)}", flush=True)
+        row["lost_percent"] = 100 * row["lost"] / row["frames"]
+        row["posed_percent"] = 100 * row["poses"] / row["frames"]
+        if row["sim3_cm"] is not None:
+            row["sim3_percent_of_path"] = row["sim3_cm"] / row["path_m"]
+        say({"drive": drive.name, "with_scale": with_scale, **row})
         return row
 
-    missed = []
-
-    def judge(name: str, *, is_good: bool) -> None:
-        print(f"  bar of {name}: {'met' if is_good else 'MISSED'}", flush=True)
-        if not is_good:
-            missed.append(name)
-
-    for rate_hz in args.rates:
-        dataset = open_dataset(args.recordings / _RECORDING).thinned(rate_hz)
-        name = f"kitchen, {rate_hz:g} Hz"
-        row = measure(load_drive(dataset, name), with_scale=True)
-        is_metric = row["ate_cm"] is not None and row["ate_cm"] <= _MAX_ATE_CM
-        judge(
-            f"{name}, with odometry",
-            is_good=is_metric and row["lost"] <= _MAX_LOST_PERCENT / 100 * row["frames"],
-        )
-        row = measure(load_drive(dataset, name), with_scale=False)
-        judge(name, is_good=_is_within(row, _MAX_KITCHEN_CM))
-    euroc = open_euroc(args.recordings / _EUROC, camera="left", imu=False)
-    row = measure(load_drive(euroc, "MH_01, 20 Hz"), with_scale=False)
-    judge("MH_01", is_good=_is_within(row, _MAX_EUROC_CM))
-    row = measure(load_drive(open_kitti(args.recordings / _KITTI), "KITTI 00"), with_scale=False)
-    is_posed = row["poses"] >= _MIN_KITTI_POSED * row["frames"]
-    is_right = row["sim3_cm"] is not None and row["sim3_cm"] <= _MAX_KITTI_PERCENT * row["path_m"]
-    judge("KITTI 00", is_good=is_posed and is_right)
-    for cut in cuts(args.recordings):
-        row = rows[cut.name] = cut_row(cut)
-        errors = " and ".join(f"{value:.2f}" for value in row["sim3_cm"])
-        scales = ", ".join(f"{value:.2f}" for value in row["join_scales"])
-        print(
-            f"{cut.name}: {row['segments']} segments, {row['joins']} joins (scale {scales or '-'}), "
-            f"{row['loops']} loops, {row['lost']} of {row['frames']} lost, first pose after "
-            f"{row['after_s']:.1f} s, Sim(3) {errors} cm",
-            flush=True,
-        )
-        judge(cut.name, is_good=row["segments"] == cut.segments and row["after_s"] <= cut.within_s)
-    if args.hold_out:
-        for drive in held_out_drives(args.recordings):
-            measure(drive, with_scale=True)
-    if args.out:
-        args.out.write_text(json.dumps(rows, indent=2) + "\n", encoding="utf-8")
-    return 1 if missed else 0
-
-
-def _is_within(row: dict[str, Any], most_cm: float) -> bool:
-    return row["lost"] == 0 and row["sim3_cm"] is not None and row["sim3_cm"] <= most_cm
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())
+    for rate_hz in rates:
+        dataset = open_dataset(recordings / _RECORDING).thinned(rate_hz)
+        for part, with_scale in (("metric", True), ("kitchen", False)):
+            drive = load_drive(dataset, f"kitchen, {rate_hz:g} Hz")
+            figures[part][f"{rate_hz:g} Hz"] = measure(drive, with_scale=with_scale)
+    euroc = open_euroc(recordings / _EUROC, camera="left", imu=False)
+    figures["MH_01"] = measure(load_drive(euroc, "MH_01, 20 Hz"), with_scale=False)
+    figures["KITTI 00"] = measure(load_drive(open_kitti(recordings / _KITTI), "KITTI 00"), with_scale=False)
+    for cut in cuts(recordings):
+        row = cut_row(cut)
+        row |= {"segments_beyond": row["segments"] - cut.segments, "late_s": row["after_s"] - cut.within_s}
+        figures["cuts"][cut.name] = row
+        say({"cut": cut.name, **row})
+    if hold_out:
+        for drive in held_out_drives(recordings):
+            figures["held_out"][drive.name] = measure(drive, with_scale=True)
+    return figures

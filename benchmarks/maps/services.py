@@ -5,25 +5,22 @@ wrong loops (10 %) move the ATE by less than a tenth; a 2,500-pose sphere in 5 s
 median 3 cm / 2 deg, none wrong; icp to 1 cm / 0.5 deg; 68 +- 5 % inside the wifi radius.
 Times are meaningful on an idle machine only.
 
-    python -m benchmarks.maps.services --recordings ../shared/data --out map_services.json
+    python -m benchmarks maps.services --recordings ../shared/data --out map_services.json
 """
 
 from __future__ import annotations
 
-import argparse
 import functools
-import json
 import math
-import os
-import platform
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
+from benchmarks.frame.registry import Bar, benchmark
 from benchmarks.maps.recordings import (
     Run,
     cloud_of,
@@ -315,24 +312,34 @@ def alignment_of_poses(T_estimate: Array, T_truth: Array) -> Array:
     return T
 
 
-def main() -> None:
-    """Measure what was asked for and print it."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0] if __doc__ else None)
-    parser.add_argument(
-        "--recordings", type=Path, help="folder of recordings; without it their rows are left out"
-    )
-    parser.add_argument("--out", type=Path, help="write the figures here as JSON")
-    arguments = parser.parse_args()
-    report: dict[str, Any] = {"machine": platform.processor() or platform.machine(), "load": os.getloadavg()}
-    report |= {"optimise": sphere_row(), "icp": icp_row(), "wifi": wifi_row()}
-    if arguments.recordings:
-        report |= {"merge": merge_rows(arguments.recordings), "localise": localise_row(arguments.recordings)}
-    report["load_after"] = os.getloadavg()
-    text = json.dumps(report, indent=2)
-    print(text)
-    if arguments.out:
-        arguments.out.write_text(text + "\n", encoding="utf-8")
-
-
-if __name__ == "__main__":
-    main()
+@benchmark(
+    Bar("optimise.seconds", at_most=5.0, unit="s"),
+    Bar("icp.right_percent", at_least=100.0, unit="%"),
+    Bar("icp.worse_called_ok", equals=0),
+    Bar("wifi.inside_percent", at_least=63.0, unit="%"),
+    Bar("wifi.inside_percent", at_most=73.0, unit="%"),
+    Bar("merge.ate_cm", at_most=4.5, unit="cm"),
+    Bar("merge.origins_cm.*", at_most=7.0, unit="cm"),
+    Bar("merge.origins_deg.*", at_most=2.5, unit="degrees"),
+    Bar("merge.cloud_median_mm", at_most=15.0, unit="mm"),
+    Bar("merge.cloud_under_5_cm_percent", at_least=85.0, unit="%"),
+    Bar("merge.moved_by_wrong_loops_percent.*", at_most=10.0, unit="%"),
+)
+def run_benchmark(
+    *, recordings: Annotated[Path | None, "folder of recordings; without it their rows are left out"] = None
+) -> dict[str, Any]:
+    """Measure the services, and the merge where there are recordings."""
+    icp = icp_row()
+    icp["right_percent"] = 100.0 * icp["right"] / icp["cases"]
+    figures: dict[str, Any] = {"optimise": sphere_row(), "icp": icp, "wifi": wifi_row()}
+    if recordings is not None:
+        merge = merge_rows(recordings)
+        merge["origins_cm"], merge["origins_deg"] = (
+            [factor * origin[place] for origin in merge["origins_m_deg"]]
+            for place, factor in ((0, 100), (1, 1))
+        )
+        merge["moved_by_wrong_loops_percent"] = [
+            100 * abs(error_cm / merge["ate_cm"] - 1) for error_cm in merge["ate_wrong_loops_cm"]
+        ]
+        figures |= {"merge": merge, "localise": localise_row(recordings)}
+    return figures

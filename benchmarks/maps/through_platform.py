@@ -5,23 +5,22 @@ Defends: three robots, merged ATE at most 4.5 cm, origins 7 cm / 2.5 deg, cloud 
 without.  Runs ``rse-pf demo --merge`` twice (balancer, two servers, data service, robots, the merge as a
 job), unless --folders names the folders of earlier runs.  The maps are judged by their files alone.
 
-    python -m benchmarks.maps.through_platform --recordings ../shared/data --out map_platform.json
+    python -m benchmarks maps.through_platform --recordings ../shared/data --out map_platform.json
 """
 
 from __future__ import annotations
 
-import argparse
 import json
-import os
 import subprocess
 import sys
 import tempfile
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import numpy.typing as npt
 
+from benchmarks.frame.registry import Bar, Recordings, benchmark
 from benchmarks.maps.recordings import cloud_of, red_kitchen, truth_of
 from benchmarks.maps.services import alignment_of_poses
 from client_sdk.datasets import Dataset
@@ -82,55 +81,33 @@ def judge(dataset: Dataset, folder: Path, every: int = 5) -> dict[str, Any]:
     }
 
 
-def rows_of(three: dict[str, Any], one: dict[str, Any]) -> list[tuple[str, str, str, bool]]:
-    """Return the issue's rows: what, bar, measured, met."""
-    worst_cm = max(origin["cm"] for origin in three["origins"])
-    worst_deg = max(origin["deg"] for origin in three["origins"])
-    cloud, ply = three["cloud"], three["merged_ply"]
-    rows = [
-        ("joined", "3 robots", str(len(three["joined"])), len(three["joined"]) == 3),
-        ("merged ATE", "4.5 cm", f"{three['ate_cm']:.2f} cm", three["ate_cm"] <= 4.5),
-        (
-            "origins",
-            "7 cm, 2.5 deg",
-            f"{worst_cm:.1f} cm, {worst_deg:.2f} deg",
-            worst_cm <= 7 and worst_deg <= 2.5,
-        ),
-    ]
-    for name, figures in (("cloud of the frames", cloud), ("merged.ply", ply)):
-        text = f"{figures['median_mm']:.1f} mm, {figures['under_5_cm_percent']:.0f} %"
-        met = figures["median_mm"] <= 15 and figures["under_5_cm_percent"] >= 85
-        rows.append((name, "15 mm median, 85 % under 5 cm", text, met))
-    text = f"{one['ate_cm']:.2f} cm, without {one['ate_before_cm']:.2f} cm"
-    met = one["ate_cm"] <= min(4.5, one["ate_before_cm"])
-    return [*rows, ("one robot, loops closed", "4.5 cm, not worse than without", text, met)]
-
-
-def main() -> int:
-    """Run or read, judge, and print the table; the exit code is 1 if a bar is missed."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0] if __doc__ else None)
-    parser.add_argument("--recordings", type=Path, required=True, help="the folder of recordings")
-    parser.add_argument("--folders", type=Path, nargs=2, metavar=("THREE", "ONE"), help="judge these demos")
-    parser.add_argument("--out", type=Path, help="write the figures here as JSON")
-    arguments = parser.parse_args()
-    dataset = red_kitchen(arguments.recordings)
-    before = os.getloadavg()
+@benchmark(
+    Bar("joined", equals=3),
+    Bar("three.ate_cm", at_most=4.5, unit="cm"),
+    Bar("three.origins.*.cm", at_most=7, unit="cm"),
+    Bar("three.origins.*.deg", at_most=2.5, unit="degrees"),
+    *(
+        bar
+        for cloud in ("cloud", "merged_ply")
+        for bar in (
+            Bar(f"three.{cloud}.median_mm", at_most=15, unit="mm"),
+            Bar(f"three.{cloud}.under_5_cm_percent", at_least=85, unit="%"),
+        )
+    ),
+    Bar("one.ate_cm", at_most=4.5, unit="cm"),
+    Bar("worse_with_loops_cm", at_most=0.0, unit="cm"),
+)
+def run_benchmark(
+    *, recordings: Recordings = Path("../shared/data"),
+    folders: Annotated[tuple[Path, ...], "judge these demos instead: of three robots, and of one"] = (),
+) -> dict[str, Any]:  # fmt: skip
+    """Run or read the demos, and judge their maps."""
+    dataset = red_kitchen(recordings)
     with tempfile.TemporaryDirectory() as temporary:
-        folders = arguments.folders or [Path(temporary) / "three", Path(temporary) / "one"]
-        if arguments.folders is None:
-            for robots, folder in zip((3, 1), folders, strict=True):
-                demo(arguments.recordings, robots, folder)
-        three, one = (judge(dataset, folder) for folder in folders)
-    rows = rows_of(three, one)
-    print("| what | bar | measured | |\n|---|---|---|---|")
-    for what, bar, measured, met in rows:
-        print(f"| {what} | {bar} | {measured} | {'met' if met else 'MISSED'} |")
-    print(f"load average before {before[0]:.1f}, after {os.getloadavg()[0]:.1f}")
-    if arguments.out:
-        figures = {"three": three, "one": one, "load": before, "load_after": os.getloadavg()}
-        arguments.out.write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
-    return 0 if all(row[3] for row in rows) else 1
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+        judged_folders = list(folders) or [Path(temporary) / "three", Path(temporary) / "one"]
+        if not folders:
+            for robots, folder in zip((3, 1), judged_folders, strict=True):
+                demo(recordings, robots, folder)
+        three, one = (judge(dataset, folder) for folder in judged_folders)
+    worse_cm = one["ate_cm"] - one["ate_before_cm"]
+    return {"three": three, "one": one, "joined": len(three["joined"]), "worse_with_loops_cm": worse_cm}

@@ -12,15 +12,11 @@ ATE is of all poses of the first segment, and of what was joined to it, after on
 is interpolated to the frames.  RPE is of the motion over 1 s.  The first second counts no frame as
 lost.  Everything is deterministic: n = 1, and load changes no figure.
 
-    python -m benchmarks.maps.tracking --recordings ../shared/data --out tracking.json
+    python -m benchmarks maps.tracking --recordings ../shared/data --out tracking.json
 """
 
 from __future__ import annotations
 
-import argparse
-import json
-import os
-import platform
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -28,6 +24,8 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.frame.registry import Bar, Recordings, benchmark
+from benchmarks.frame.report import say
 from benchmarks.maps.recordings import RED_KITCHEN, track
 from client_sdk.datasets import Dataset, open_dataset
 from client_sdk.frontend import Frame, TrackedFrame
@@ -39,7 +37,7 @@ from client_sdk.tracking.tracker import Join, Tracker
 from rse_pf.experiments.results.trajectory_error import ate_m, motion_errors
 from rse_pf.geometry import Array, inverse
 
-__all__ = ["main"]
+__all__ = []
 
 _TURNING = "tum_fr1_rpy_start"
 _FIRST_FRAMES = (0, 5, 11)
@@ -174,33 +172,20 @@ def rows(recordings: Path) -> Iterator[tuple[str, Drive, tuple[int, float] | Non
             yield name, drive_of(kitchen, rate_hz, is_mirrored=is_mirrored), bar
 
 
-def main() -> int:
-    """Print the rows, and return 1 if a bar is missed."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--recordings", type=Path, default=Path("../shared/data"))
-    parser.add_argument("--out", type=Path)
-    args = parser.parse_args()
-    print(f"{platform.machine()}, {os.cpu_count()} cores, load average {os.getloadavg()[0]:.1f}, n = 1")
+@benchmark(
+    Bar("rows.*.lost_above_bar", at_most=0, unit="frames"),
+    Bar("rows.*.ate_above_bar_cm", at_most=0.0, unit="cm"),
+)
+def run_benchmark(*, recordings: Recordings = Path("../shared/data")) -> dict[str, Any]:
+    """Track every drive; figures above a bar of `_TURNING_BARS` and `_KITCHEN_BARS` are positive."""
     figures: dict[str, Any] = {}
-    missed = []
-    for name, drive, bar in rows(args.recordings):
-        row = figures[name] = row_of(drive)
-        is_missed = bar is not None and (row["lost"] > bar[0] or row["ate_cm"] > bar[1])
-        if is_missed:
-            missed.append(name)
-        print(
-            f"{name}: {row['lost']} of {row['frames']} lost, ATE {row['ate_cm']:.2f} cm, RPE over 1 s "
-            f"{row['rpe_deg']:.2f} degrees (max {row['rpe_max_deg']:.2f}) and {row['rpe_cm']:.1f} cm, "
-            f"{row['keyframes']} keyframes, {row['segments']} segments, {row['joins']} joins"
-            f"{'  MISSED' if is_missed else ''}",
-            flush=True,
-        )
-    if args.out is not None:
-        args.out.write_text(json.dumps(figures, indent=1) + "\n")
-    return 1 if missed else 0
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())
+    for name, drive, bar in rows(recordings):
+        figures[name] = row = row_of(drive)
+        if bar is not None:
+            row |= {
+                "bar": bar,
+                "lost_above_bar": row["lost"] - bar[0],
+                "ate_above_bar_cm": row["ate_cm"] - bar[1],
+            }
+        say({"drive": name, **row})
+    return {"rows": figures}

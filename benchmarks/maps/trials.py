@@ -17,24 +17,23 @@ interpolated to the images, and the map is laid on it by the images before the i
 and NYU are too short to be cut: their lens is covered, and then the later images, or the ones before, are
 shown to and fro.  Poses are solved in this process as the service does; n = 1, and load changes no figure.
 
-    python -m benchmarks.maps.trials --recordings ../shared/data --out trials.json
+    python -m benchmarks maps.trials --recordings ../shared/data --out trials.json
 """
 
 from __future__ import annotations
 
-import argparse
 import copy
-import json
-import os
-import platform
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Annotated, Any
 
 import numpy as np
 import numpy.typing as npt
 
+from benchmarks.frame.registry import Bar, Recordings, benchmark
+from benchmarks.frame.report import say
 from benchmarks.maps.recordings import RED_KITCHEN, track
 from benchmarks.maps.tracking import hard_drive, poses_of
 from client_sdk.datasets import open_dataset
@@ -45,7 +44,7 @@ from client_sdk.simulator.world import make_world
 from client_sdk.tracking.tracker import Tracker
 from rse_pf.geometry import Array, Camera, inverse, pose_difference, transform
 
-__all__ = ["Depths", "Scene", "Shown", "Trial", "interruptions", "judge", "main", "share_seen"]
+__all__ = ["Depths", "Scene", "Shown", "Trial", "interruptions", "judge", "share_seen"]
 
 _COVERED_S, _CUT_S, _SHOWN_S, _RELOCALISE_S = 3.0, 5.0, 3.0, 1.0
 _WRONG_M, _WRONG_DEG = 0.2, 5.0
@@ -292,44 +291,39 @@ def scenes(recordings: Path) -> Iterator[tuple[str, Callable[[], Scene]]]:
         yield f"hard world {seed}", partial(_turning, recordings, seed, begin_s)
 
 
-def main() -> int:
-    """Print what came of the trials by scene and kind, and each that failed; return 1 if a bar is missed."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--recordings", type=Path, default=Path("../shared/data"))
-    parser.add_argument("--out", type=Path)
-    parser.add_argument("--only", default="", help="scenes whose name holds this")
-    args = parser.parse_args()
-    print(f"{platform.machine()}, {os.cpu_count()} cores, load average {os.getloadavg()[0]:.1f}, n = 1")
+@benchmark(
+    Bar("all.judged", at_least=_LEAST_JUDGED),
+    Bar("all.not_found", equals=0),
+    Bar("all.wrong_poses", equals=0),
+)
+def run_benchmark(
+    *,
+    recordings: Recordings = Path("../shared/data"),
+    only: Annotated[str, "scenes whose name holds this"] = "",
+) -> dict[str, Any]:
+    """Interrupt every scene at every moment, and count by scene and kind."""
     results: list[Trial] = []
-    for name, make in scenes(args.recordings):
-        if args.only not in name:
-            continue
-        came = list(trials(name, make()))
-        results += came
-        print(f"{name}: {_counted(came)}", flush=True)
-        for trial in came:
-            if trial.wrong or (trial.is_judged and not trial.is_found):
-                print(f"  {trial}", flush=True)
+    counts: dict[str, Any] = {}
+    for name, make in scenes(recordings):
+        if only in name:
+            came = list(trials(name, make()))
+            results += came
+            counts[name] = _counted(came)
+            say({"scene": name, **counts[name]})
     for kind in ("covered", "cut", "moved"):
-        print(f"{kind}: {_counted([trial for trial in results if trial.kind == kind])}")
-    print(f"all: {_counted(results)}")
-    if args.out is not None:
-        args.out.write_text(json.dumps([asdict(trial) for trial in results], indent=1) + "\n")
-    judged = [trial for trial in results if trial.is_judged]
-    is_met = len(judged) >= _LEAST_JUDGED and all(trial.is_found for trial in judged)
-    return 0 if is_met and not any(trial.wrong for trial in results) else 1
+        counts[kind] = _counted([trial for trial in results if trial.kind == kind])
+    failed = [trial for trial in results if trial.wrong or (trial.is_judged and not trial.is_found)]
+    return {"all": _counted(results), "counts": counts, "failed": [asdict(trial) for trial in failed]}
 
 
-def _counted(came: list[Trial]) -> str:
+def _counted(came: list[Trial]) -> dict[str, int]:
     judged = [trial for trial in came if trial.is_judged]
     found = sum(trial.is_found for trial in judged)
     wrong = [trial for trial in came if trial.wrong]
-    return (
-        f"{len(came)} tried, {len(judged)} judged, {found} found within 1 s, "
-        f"{sum(len(trial.wrong) for trial in wrong)} wrong poses in {len(wrong)}"
-    )
+    return {
+        "tried": len(came), "judged": len(judged), "not_found": len(judged) - found,
+        "wrong_poses": sum(len(trial.wrong) for trial in wrong), "trials_with_wrong_poses": len(wrong),
+    }  # fmt: skip
 
 
 def _recorded(
@@ -395,7 +389,3 @@ def _mean_pose(poses: Sequence[Array]) -> Array:
     U, _, Vt = np.linalg.svd(mean[:3, :3])
     mean[:3, :3] = U @ Vt
     return mean
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

@@ -1,8 +1,8 @@
 """ORB-SLAM3 beside our tracker on the same frames, with the same errors: several runs, losses included.
 
     python -m venv PEER && PEER/bin/pip install pyorbslam3==0.1.1 opencv-python-headless
-    python -m benchmarks.peers.vocabulary ../shared/data --out words.txt
-    python -m benchmarks.peers.orbslam3 --python PEER/bin/python --vocabulary words.txt --out comparison
+    python -m benchmarks peers.vocabulary ../shared/data --words words.txt
+    python -m benchmarks peers.orbslam3 PEER/bin/python words.txt --folder comparison
 
 The peer runs in its own environment and process (`orbslam3_process.py`), gets images and gives trajectory
 files; nothing of it is imported here.  It is paced by its own threads, or by the time stamps at --speed times
@@ -14,20 +14,20 @@ Defends nothing: both are reported, with every run.
 
 from __future__ import annotations
 
-import argparse
 import asyncio
 import json
-import os
 import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
+from benchmarks.frame.registry import Recordings, benchmark
+from benchmarks.frame.report import say
 from client_sdk.datasets import CameraChoice, associate_stamps
 from client_sdk.frontend import load_opencv
 from client_sdk.mapping import Trajectory, read_trajectory
@@ -44,7 +44,7 @@ from rse_pf.experiments.results.result_folder import environment, load_average, 
 from rse_pf.experiments.results.trajectory_error import accuracy
 from rse_pf.geometry import Array, inverse
 
-__all__ = ["main"]
+__all__ = []
 
 _NOT_COMPARABLE = """\
 - Time: neither side ran in real time. The CPU of the peer is that of all its threads (tracking, mapping, loop
@@ -78,6 +78,21 @@ _DEPTH_BASELINE_M, _TOO_FAR = 0.08, 40.0
 _FEATURES: dict[Sensor, int] = {"RGBD": 1000, "STEREO": 1200, "MONOCULAR": 1000}
 _FEATURES_OF_KITTI = 2000
 """As in ORB-SLAM3's examples for these recordings."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Options:
+    """The arguments."""
+
+    python: Annotated[Path, "of the environment of the peer"]
+    vocabulary: Path
+    recordings: Recordings = Path("../shared/data")
+    folder: Annotated[Path, "folder of the report"] = Path("comparison")
+    runs: int = 3
+    speed: Annotated[float, "times real time; 0 gives a frame when all threads rest (default)"] = 0.0
+    only: Annotated[str, "rows whose name and sensor contain this"] = ""
+    part: Annotated[Literal["both", "ours", "peer"], "who is measured now"] = "both"
+    more: Annotated[bool, "add runs of the peer to those that are there"] = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -163,7 +178,7 @@ def job_of(recordings: Path, drive: Drive, sensor: Sensor) -> Job:
     return Job(settings=settings, frames=frames, T_camera_peer=same)
 
 
-def run_peer(args: argparse.Namespace, drive: Drive, sensor: Sensor, job: Job) -> dict[str, Any]:
+def run_peer(args: Options, drive: Drive, sensor: Sensor, job: Job) -> dict[str, Any]:
     """Run the peer once in a process of its own; return its figures."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -183,7 +198,7 @@ def run_peer(args: argparse.Namespace, drive: Drive, sensor: Sensor, job: Job) -
             tail = (folder / "log.txt").read_text(errors="replace").splitlines()[-3:]
             return {"failed": f"exit code {done.returncode}: {' / '.join(tail)[:200]}"}
         figures: dict[str, Any] = json.loads((folder / "figures.json").read_text())
-        figures["load_average"] = os.getloadavg()[0]
+        figures["load_average"] = load_average()[0]
         for which in ("final", "online"):
             figures[which] = _scored(
                 read_trajectory(folder / f"{which}.txt"), drive, sensor, job.T_camera_peer
@@ -378,33 +393,15 @@ def _fixed(value: float | None) -> str:
     return "-" if value is None else f"{value:.2f}"
 
 
-def main() -> int:
-    """Run all rows and write the report."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--python", type=Path, required=True, help="of the environment of the peer")
-    parser.add_argument("--vocabulary", type=Path, required=True)
-    parser.add_argument("--recordings", type=Path, default=Path("../shared/data"))
-    parser.add_argument("--runs", type=int, default=3)
-    parser.add_argument(
-        "--speed",
-        type=float,
-        default=0.0,
-        help="times real time; 0 gives a frame when all threads rest (default)",
-    )
-    parser.add_argument("--only", default="", help="rows whose name and sensor contain this")
-    parser.add_argument(
-        "--part", choices=("both", "ours", "peer"), default="both", help="who is measured now"
-    )
-    parser.add_argument("--more", action="store_true", help="add runs of the peer to those that are there")
-    parser.add_argument("--out", type=Path, required=True, help="folder of the report")
-    args = parser.parse_args()
-    args.recordings, args.python = args.recordings.resolve(), args.python.absolute()
-    args.out.mkdir(parents=True, exist_ok=True)
+@benchmark()
+def run_benchmark(args: Options) -> dict[str, Any]:
+    """Run all rows, and write the report into the folder."""
+    recordings, python = args.recordings.resolve(), args.python.absolute()
+    args = replace(args, recordings=recordings, python=python)
+    args.folder.mkdir(parents=True, exist_ok=True)
     load_opencv().setNumThreads(1)
     sys.path.append(str(_EXAMPLES_FOLDER))
-    file = args.out / "comparison.json"
+    file = args.folder / "comparison.json"
     report: dict[str, Any] = json.loads(file.read_text()) if file.exists() else {"experiment": "comparison"}
     known = {(row["name"], row["sensor"]): row for row in report.get("rows", [])}
     if args.part != "peer" or "environment" not in report:
@@ -425,16 +422,16 @@ def main() -> int:
                     **known.get(key, {}),
                     **_measured(args, row, drive, own, known.get(key, {}).get("peer", [])),
                 }
-                print(json.dumps(known[key]), flush=True)
+                say(known[key])
             report["rows"] = list(known.values())
             report["load_average_after"] = load_average()
             write_json(file, report)
-            (args.out / "report.md").write_text(report_page(report), encoding="utf-8")
-    return 0
+            (args.folder / "report.md").write_text(report_page(report), encoding="utf-8")
+    return {"rows": report["rows"]}
 
 
 def _measured(
-    args: argparse.Namespace, row: Row, drive: Drive, own: Drive, earlier: Sequence[dict[str, Any]]
+    args: Options, row: Row, drive: Drive, own: Drive, earlier: Sequence[dict[str, Any]]
 ) -> dict[str, Any]:
     """Return what is measured now of a row, ours on *own*; with --more, after *earlier* runs of the peer."""
     before = earlier if args.more else ()
@@ -453,7 +450,7 @@ def _measured(
     return measured
 
 
-def _about_peer(args: argparse.Namespace) -> str:
+def _about_peer(args: Options) -> str:
     """Return the version of the peer and the size of its vocabulary."""
     version = ["-c", "from importlib.metadata import version; print(version('pyorbslam3'))"]
     told = subprocess.run([str(args.python), *version], capture_output=True, text=True, check=True).stdout
@@ -461,7 +458,3 @@ def _about_peer(args: argparse.Namespace) -> str:
     return (
         f"pyorbslam3 {told.strip()} with a vocabulary of {words} words, trained on images of these recordings"
     )
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

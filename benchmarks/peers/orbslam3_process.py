@@ -25,7 +25,7 @@ import pyorbslam3
 RESTS, LONGEST_REST_S = 3, 1.0
 
 
-def main(job_path):
+def run_job(job_path):
     """Run the job."""
     job = json.loads(Path(job_path).read_text())
     out = Path(job["out"])
@@ -107,4 +107,4 @@ def line_of(stamp_s, pose):
 
 
 if __name__ == "__main__":
-    main(sys.argv[1])
+    run_job(sys.argv[1])

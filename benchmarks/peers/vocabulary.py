@@ -4,7 +4,7 @@ ORB features of each image are clustered into a tree of 10 branches and 6 levels
 weighs the logarithm of images over images that show it.  Deterministic: the same images give the same file.
 The file belongs to the images, and is not committed.
 
-    python -m benchmarks.peers.vocabulary ../shared/data --every 5 --out words.txt
+    python -m benchmarks peers.vocabulary ../shared/data --every 5 --words words.txt
 
 Source:
     Galvez-Lopez and Tardos, "Bags of Binary Words for Fast Place Recognition in Image Sequences", T-RO 2012.
@@ -12,19 +12,19 @@ Source:
 
 from __future__ import annotations
 
-import argparse
-import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Annotated, Any
 
 import numpy as np
 import numpy.typing as npt
 
+from benchmarks.frame.registry import benchmark
 from client_sdk.frontend import describe
 from client_sdk.monocular.opencv import load_opencv, read_image
 
-__all__ = ["Node", "main", "text_of", "train"]
+__all__ = ["Node", "text_of", "train"]
 
 Bits = npt.NDArray[np.uint8]
 
@@ -109,17 +109,13 @@ def _images(folders: Sequence[Path], every: int) -> list[Path]:
     return paths[::every]
 
 
-def main() -> int:
+@benchmark()
+def run_benchmark(
+    *, folders: tuple[Path, ...], words: Annotated[Path, "the file to write"] = Path("words.txt"),
+    every: Annotated[int, "take each n-th image"] = 5,
+) -> dict[str, Any]:  # fmt: skip
     """Train on the images below the folders, and write the file."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("folders", type=Path, nargs="+", metavar="FOLDER")
-    parser.add_argument("--every", type=int, default=5, help="take each n-th image (default: 5)")
-    parser.add_argument("--out", type=Path, required=True)
-    args = parser.parse_args()
-    began = time.perf_counter()
-    paths = _images(args.folders, args.every)
+    paths = _images(folders, every)
     cv2 = load_opencv()
     described = []
     for path in paths:
@@ -128,12 +124,6 @@ def main() -> int:
         described.append(describe(image, _FEATURES, is_spread=True).descriptors)
     images = np.repeat(np.arange(len(described)), [len(each) for each in described])
     nodes = train(np.concatenate(described), images)
-    args.out.write_text(text_of(nodes), encoding="ascii")
-    words = sum(not node.children for node in nodes)
-    took_s = time.perf_counter() - began
-    print(f"{len(paths)} images, {len(images)} descriptors, {words} words in {took_s:.0f} s")
-    return 0
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())
+    words.write_text(text_of(nodes), encoding="ascii")
+    count = sum(not node.children for node in nodes)
+    return {"images": len(paths), "descriptors": len(images), "words": count}

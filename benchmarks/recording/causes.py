@@ -6,22 +6,21 @@ labels, and the answers are compared only when all are given.  Thresholds were c
 seeds below 100 and the first half of the red kitchen, and corrected once after seeds 1000 to 1130, which took
 its second half and fr1; report seeds from 2000 on.
 
-    python -m benchmarks.recording.causes --recordings ../shared/data --seed 2000 --rounds 1 --out causes.json
+    python -m benchmarks recording.causes --recordings ../shared/data --seed 2000 --rounds 1 --out causes.json
 """
 
 from __future__ import annotations
 
-import argparse
-import json
-import os
-import platform
 import time
 from collections import Counter
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
+from benchmarks.frame.registry import Bar, benchmark
+from benchmarks.frame.report import say
+from benchmarks.frame.statistics import spread
 from benchmarks.recording.planted_causes import (
     PLANTED,
     RecordedCase,
@@ -33,7 +32,7 @@ from benchmarks.recording.planted_causes import (
 )
 from rse_pf.recording.explain import Cause, PoseExplanation, explain
 
-__all__ = ["main"]
+__all__ = []
 
 _FIRST_OF_SECOND_HALF, _FIRST_REPORTED_SEED = 1000, 2000
 _SEVERITIES = (1, 2, 3)
@@ -111,12 +110,12 @@ def report_of(cases: list[tuple[Label, RecordedCase]], verbose: bool) -> dict[st
         if verbose:
             mark = "right" if given[0].cause is label[0] else "WRONG"
             what = f"{label[0].value} {label[1]} ({case.kind}; {case.origin}; off {case.error_m:.3f} m)"
-            print(f"{mark} {what}")
+
+            say(f"{mark} {what}")
             for explanation in given:
-                print(f"      {explanation.cause.value} {explanation.confidence:.2f}: {explanation.sentence}")
+                say(f"      {explanation.cause.value} {explanation.confidence:.2f}: {explanation.sentence}")
     planted = [label for label in total if label[0] is not Cause.NONE]
     return {
-        "machine": platform.processor() or platform.machine(), "load": os.getloadavg(),
         "planted": sum(total[label] for label in planted),
         "planted_right": sum(right[label] for label in planted),
         "healthy": total[(Cause.NONE, 0)], "healthy_right": right[(Cause.NONE, 0)],
@@ -124,32 +123,28 @@ def report_of(cases: list[tuple[Label, RecordedCase]], verbose: bool) -> dict[st
             cause.value: [f"{right[(cause, s)]}/{total[(cause, s)]}" for s in _SEVERITIES]
             for cause in PLANTED
         },
-        "explain_cpu_ms_p50_p95_max": np.percentile(spent_ms, [50, 95, 100]).round(1).tolist(),
+        "explain_cpu_ms": spread(spent_ms),
         "wrong": wrong,
     }  # fmt: skip
 
 
-def main() -> None:
-    """Measure and print; write JSON where asked."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--recordings", type=Path, help="folder of recordings; without it all is rendered")
-    parser.add_argument("--seed", type=int, default=_FIRST_REPORTED_SEED)
-    parser.add_argument(
-        "--rounds", type=int, default=1, help="how often the 30 planted cases, with other seeds"
-    )
-    parser.add_argument("--healthy", type=int, default=100)
-    parser.add_argument("--only", type=Cause, help="one cause, or none for healthy commands only")
-    parser.add_argument("--verbose", action="store_true", help="print every case")
-    parser.add_argument("--out", type=Path)
-    arguments = parser.parse_args()
-    cases = cases_of(
-        arguments.seed, arguments.rounds, arguments.healthy, arguments.recordings, arguments.only
-    )
-    text = json.dumps(report_of(cases, arguments.verbose), indent=1)
-    print(text)
-    if arguments.out:
-        arguments.out.write_text(text + "\n", encoding="utf-8")
-
-
-if __name__ == "__main__":
-    main()
+@benchmark(
+    Bar("planted_right_percent", at_least=100 * 26 / 30, unit="%"),
+    Bar("healthy_right_percent", at_least=95, unit="%"),
+    Bar("explain_cpu_ms.max", at_most=200, unit="ms"),
+)
+def run_benchmark(
+    *,
+    recordings: Annotated[Path | None, "folder of recordings; without it all is rendered"] = None,
+    seed: int = _FIRST_REPORTED_SEED,
+    rounds: Annotated[int, "how often the 30 planted cases, with other seeds"] = 1,
+    healthy: int = 100,
+    only: Annotated[Cause | None, "one cause, or none for healthy commands only"] = None,
+    verbose: Annotated[bool, "print every case"] = False,
+) -> dict[str, Any]:
+    """Explain the cases, and count."""
+    figures = report_of(cases_of(seed, rounds, healthy, recordings, only), verbose)
+    for kind in ("planted", "healthy"):
+        if figures[kind]:
+            figures[f"{kind}_right_percent"] = 100 * figures[f"{kind}_right"] / figures[kind]
+    return figures

@@ -1,6 +1,6 @@
 """What a recording costs: the same load on a platform that records and on one that does not, in turns.
 
-    python -m benchmarks.recording.cost [--seconds 60] [--rounds 3] [--robots 100] [--codec zlib] [--out FILE]
+    python -m benchmarks recording.cost [--seconds 60] [--rounds 3] [--robots 100] [--codec zlib]
 
 Two platforms of the same build run at the same time (`rse-pf local`, two servers of one worker each, Envoy);
 only one of them records.  Robots request 5 poses a second each (200 matches, 30 % wrong, every frame kept)
@@ -14,7 +14,6 @@ has <= 12 kB for each command with its payload; no message is dropped.
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import signal
@@ -27,10 +26,13 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
+from benchmarks.frame.registry import Bar, benchmark
+from benchmarks.frame.report import say
+from benchmarks.frame.statistics import interleaved, median_ratio
 from benchmarks.server.load import LoadPlan, RobotGroup, compile_generator, hello_file, pnp_file, run_load
-from benchmarks.server.serving import machine, tree
+from benchmarks.server.serving import tree
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import ConfigurationError
 from rse_pf.local.firewall import key_file, read_key
@@ -38,13 +40,23 @@ from rse_pf.local.state import PlatformState, read_state, state_folder
 
 FRAMES_PER_S = 5.0
 """The paper's rate (Sect. 6.2)."""
-BARS = {"workers": 1.05, "platform": 1.20, "p99": 1.1, "bytes": 12_000.0}
 SERVERS = 2
 SETTINGS: dict[str, dict[str, Any]] = {"local": {"start_timeout_s": 120.0}}
 """A machine that is busy starts slowly; nothing else differs from the defaults."""
 _START_S, _STOP_S = 180.0, 30.0
 _LAST_CHUNK_S = 1.5
 """After a window, the recorder has written what it got."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Options:
+    """The arguments."""
+
+    robots: int = 100
+    seconds: Annotated[float, "of each round"] = 60.0
+    rounds: Annotated[int, "pairs of rounds"] = 3
+    codec: Literal["zlib", "json", "bin"] = "zlib"
+    folder: Annotated[Path | None, "disk for recordings (default: that of temporary files)"] = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -133,7 +145,7 @@ def _wait_state(folder: Path, process: subprocess.Popen[bytes]) -> PlatformState
     raise ConfigurationError("a platform did not start", hint=" ".join(lines[-3:]))
 
 
-def one_round(site: RecordingSite, folder: Path, asked: argparse.Namespace, seconds: float) -> dict[str, Any]:
+def one_round(site: RecordingSite, folder: Path, asked: Options, seconds: float) -> dict[str, Any]:
     """Return what one window of load cost *site*."""
     marks: dict[str, tuple[float, float, float]] = {}
     bytes_before = site.recorded_bytes()
@@ -168,18 +180,17 @@ def summary(rounds: list[dict[str, Any]]) -> dict[str, Any]:
     pairs = list(zip(on, off, strict=True))
 
     def ratio(name: str) -> float:
-        return statistics.median(a[name] / b[name] for a, b in pairs)
+        return median_ratio([a[name] for a, _ in pairs], [b[name] for _, b in pairs])
 
     row = {
         "workers": ratio("workers_us"), "platform": ratio("platform_us"), "p99": ratio("p99_ms"),
         "bytes": statistics.median(window["bytes"] for window in on),
     }  # fmt: skip
-    return {**row, "holds": {name: row[name] <= bar for name, bar in BARS.items()}, "pairs": len(pairs)}
+    return {**row, "pairs": len(pairs)}
 
 
-def measure(asked: argparse.Namespace) -> dict[str, Any]:
+def measure(asked: Options) -> dict[str, Any]:
     """Run all rounds; return the report."""
-    report: dict[str, Any] = {"machine": machine(), "robots": asked.robots, "codec": asked.codec}
     rounds: list[dict[str, Any]] = []
     with tempfile.TemporaryDirectory(dir=asked.folder) as made, ExitStack() as stack:
         folder = Path(made)
@@ -188,50 +199,19 @@ def measure(asked: argparse.Namespace) -> dict[str, Any]:
         on = stack.enter_context(running(folder, "on", asked.robots, folder / "recordings"))
         for site in (off, on):
             one_round(site, folder, asked, 2.0)  # warms it up
-        for number in range(asked.rounds):
-            for site in (off, on) if number % 2 == 0 else (on, off):
-                rounds.append(one_round(site, folder, asked, asked.seconds))
-                print_round(rounds[-1])
-    return {**report, "rounds": rounds, **summary(rounds), "load_average_after": machine()["load_average"]}
+        for _, site in interleaved((off, on), asked.rounds):
+            rounds.append(one_round(site, folder, asked, asked.seconds))
+            say(rounds[-1])
+    return {"rounds": rounds, **summary(rounds)}
 
 
-def print_round(window: dict[str, Any]) -> None:
-    """Print one line for a round."""
-    print(
-        f"  {'recording' if window['is_recording'] else 'off':9} {window['commands']:6} commands, "
-        f"{window['not_ok']} not ok, p50 {window['p50_ms']:6.2f} p99 {window['p99_ms']:7.2f} ms; "
-        f"CPU a command: workers {window['workers_us']:6.1f}, platform {window['platform_us']:6.1f}, "
-        f"recorders {window['recorders_us']:.1f} us; "
-        f"{window['bytes'] / 1e3:.2f} kB recorded a command",
-        flush=True,
-    )
-
-
-def main() -> None:
-    """Read the command line, measure, print the figures."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--robots", type=int, default=100)
-    parser.add_argument("--seconds", type=float, default=60.0, help="of each round")
-    parser.add_argument("--rounds", type=int, default=3, help="pairs of rounds")
-    parser.add_argument("--codec", default="zlib", choices=("zlib", "json", "bin"))
-    parser.add_argument("--folder", type=Path, help="disk for recordings (default: that of temporary files)")
-    parser.add_argument("--out", type=Path, help="write the figures as JSON")
-    asked = parser.parse_args()
-    try:
-        compile_generator()
-        report = measure(asked)
-    except ConfigurationError as error:
-        print(f"skipped: {error.message} ({error.hint})")
-        return
-    for name, bar in BARS.items():
-        print(f"{name:9} {report[name]:9.3f} (bar {bar:g}): {'held' if report['holds'][name] else 'missed'}")
-    print(f"n = {report['pairs']} pairs; load average {report['machine']['load_average']} -> "
-          f"{report['load_average_after']}")  # fmt: skip
-    if asked.out is not None:
-        asked.out.write_text(json.dumps(report, indent=1), encoding="utf-8")
-
-
-if __name__ == "__main__":
-    main()
+@benchmark(
+    Bar("workers", at_most=1.05, unit="times the CPU"),
+    Bar("platform", at_most=1.20, unit="times the CPU"),
+    Bar("p99", at_most=1.1, unit="times"),
+    Bar("bytes", at_most=12_000.0, unit="a command"),
+)
+def run_benchmark(asked: Options) -> dict[str, Any]:
+    """Measure all rounds."""
+    compile_generator()
+    return measure(asked)

@@ -1,6 +1,6 @@
 """What the recorder of a server costs alone: the stream of a worker's pipe, read as its process reads it.
 
-    python -m benchmarks.recording.recorder [--commands 6000] [--runs 5] [--codec zlib]
+    python -m benchmarks recording.recorder [--commands 6000] [--runs 5] [--codec zlib]
 
 The stream is that of 100 robots whose `pnp` commands (200 matches, 30 % wrong) were answered.  ``told`` is
 what a worker with the native core hands over, ``untold`` what one without it does.  Both take turns; CPU time
@@ -12,13 +12,15 @@ Defends: what a worker tells saves the recorder half of its work, and the file i
 
 from __future__ import annotations
 
-import argparse
 import itertools
 import os
 import tempfile
 import time
 from pathlib import Path
+from typing import Annotated, Any, Literal
 
+from benchmarks.frame.registry import Bar, benchmark
+from benchmarks.frame.statistics import interleaved, spread
 from rse_pf.config import PlatformSettings, SessionSettings
 from rse_pf.identity import RobotId
 from rse_pf.pnp.problems import make_problem
@@ -90,32 +92,24 @@ def cost_us(data: bytes, commands: int, folder: Path) -> tuple[float, int]:
     return 1e6 * spent / commands, sum(path.stat().st_size for path in folder.iterdir())
 
 
-def main() -> None:
-    """Read the command line, measure, print the figures."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--commands", type=int, default=6000)
-    parser.add_argument("--runs", type=int, default=5, help="of each")
-    parser.add_argument("--codec", default="zlib", choices=("zlib", "json", "bin"))
-    asked = parser.parse_args()
-    streams = {
-        name: stream(asked.codec, asked.commands, is_told=name == "told") for name in ("untold", "told")
-    }
+@benchmark(Bar("ratio", at_most=0.5))
+def run_benchmark(
+    *,
+    commands: int = 6000,
+    runs: Annotated[int, "of each"] = 5,
+    codec: Literal["zlib", "json", "bin"] = "zlib",
+) -> dict[str, Any]:
+    """Measure both streams in turns."""
+    streams = {name: stream(codec, commands, is_told=name == "told") for name in ("untold", "told")}
     spent: dict[str, list[float]] = {name: [] for name in streams}
-    for _ in range(asked.runs):
-        for name, data in streams.items():
-            with tempfile.TemporaryDirectory() as folder:
-                us, size = cost_us(data, asked.commands, Path(folder))
-                spent[name].append(us)
-                print(f"{name:6} {us:6.1f} us of CPU a command, {size / asked.commands / 1e3:.2f} kB")
+    kilobytes = {}
+    for _, name in interleaved(list(streams), runs):
+        with tempfile.TemporaryDirectory() as folder:
+            us, size = cost_us(streams[name], commands, Path(folder))
+            spent[name].append(us)
+            kilobytes[name] = size / commands / 1e3
     least = {name: min(times_us) for name, times_us in spent.items()}
-    print(
-        f"least of {asked.runs}: untold {least['untold']:.1f}, told {least['told']:.1f} us, ratio "
-        f"{least['told'] / least['untold']:.2f}; n = {asked.commands} commands, {asked.codec}, load average "
-        f"{os.getloadavg()[0]:.1f}"
-    )
-
-
-if __name__ == "__main__":
-    main()
+    return {
+        "us": {name: spread(times_us) for name, times_us in spent.items()}, "least_us": least,
+        "kilobytes": kilobytes, "ratio": least["told"] / least["untold"],
+    }  # fmt: skip

@@ -1,6 +1,6 @@
 """Cost of the audit log for a handshake: servers with and without it, in turns.
 
-    python -m benchmarks.server.audit [--n 1500] [--only accepted|refused] [--out FILE]
+    python -m benchmarks server.audit [--n 1500] [--only accepted|refused]
 
 Three servers of one worker each: without a log, without a log again, with one.  In every round each gets
 one handshake, in random order; the second server without a log shows how far equal servers differ.  From
@@ -10,11 +10,9 @@ within what two equal servers differ by, or its 95 % interval (bootstrap over ro
 
 from __future__ import annotations
 
-import argparse
 import base64
 import json
 import os
-import platform
 import random
 import socket
 import subprocess
@@ -22,10 +20,12 @@ import sys
 import tempfile
 import time
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
+from benchmarks.frame.registry import Bar, benchmark
+from benchmarks.frame.statistics import percentile, spread
 from rse_pf.audit.verify import check_folder
 from rse_pf.auth.tokens import SigningKey
 from rse_pf.config import PlatformSettings
@@ -39,34 +39,27 @@ WARM_UP, RESAMPLES = 50, 1000
 START_S = 60.0
 
 
-def main() -> None:
-    """Measure, print the table with its verdict, write ``--out``."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--n", type=int, default=1500, help="handshakes of each kind with each server")
-    parser.add_argument("--only", choices=tuple(KINDS), help="this kind alone")
-    parser.add_argument("--out", type=Path, help="write the figures as JSON")
-    args = parser.parse_args()
-    report: dict[str, Any] = {
-        "machine": f"{platform.machine()}, {os.cpu_count()} cores", "n": args.n,
-        "load_before": os.getloadavg(), "kinds": {},
-    }  # fmt: skip
+@benchmark(
+    Bar("kinds.*.within_noise", equals=True),
+    Bar("chain_good", equals=True),
+)
+def run_benchmark(
+    *, n: Annotated[int, "handshakes of each kind with each server"] = 1500,
+    only: Annotated[str | None, "this kind alone", KINDS] = None,
+) -> dict[str, Any]:  # fmt: skip
+    """Measure both kinds in turns, and check the log."""
     with tempfile.TemporaryDirectory() as folder:
         servers = [Server(Path(folder) / name.replace(" ", "-"), name == "on") for name in SERVERS]
         try:
-            for kind in [args.only] if args.only else KINDS:
-                report["kinds"][kind] = judge(measure_ms(servers, kind, args.n))
+            kinds = {kind: judge(measure_ms(servers, kind, n)) for kind in ([only] if only else KINDS)}
         finally:
             for server in servers:
                 server.stop()
         verdicts = check_folder(Path(folder) / "on" / "audit")
-        report["entries"] = sum(verdict.entries for verdict in verdicts)
-        report["chain_good"] = not any(verdict.problem for verdict in verdicts)
-    report["load_after"] = os.getloadavg()
-    show(report)
-    if args.out:
-        args.out.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
+    return {
+        "kinds": kinds, "entries": sum(verdict.entries for verdict in verdicts),
+        "chain_good": not any(verdict.problem for verdict in verdicts),
+    }  # fmt: skip
 
 
 class Server:
@@ -142,16 +135,14 @@ def handshake_ms(port: int, token: str, expected: int) -> float:
 
 def judge(taken: np.ndarray) -> dict[str, Any]:
     """Return quantiles, what the log adds to each, and whether that is within the noise."""
-    figures: dict[str, Any] = {
-        name: np.percentile(taken[:, row], QUANTILES).round(3).tolist() for row, name in enumerate(SERVERS)
-    }
+    figures: dict[str, Any] = {name: spread(taken[:, row]) for row, name in enumerate(SERVERS)}
     rng, adds, noise = np.random.default_rng(11), [], []
     for _ in range(RESAMPLES):
-        off, again, on = np.percentile(taken[rng.integers(0, len(taken), len(taken))], QUANTILES, axis=0).T
+        off, again, on = percentile(taken[rng.integers(0, len(taken), len(taken))], QUANTILES, axis=0).T
         adds.append(on - (off + again) / 2)
         noise.append(again - off)
-    low, high = np.percentile(adds, (2.5, 97.5), axis=0)
-    apart = np.abs(np.percentile(noise, (2.5, 97.5), axis=0)).max(axis=0)
+    low, high = percentile(adds, (2.5, 97.5), axis=0)
+    apart = np.abs(percentile(noise, (2.5, 97.5), axis=0)).max(axis=0)
     figures["log_adds_ms"] = np.median(adds, axis=0).round(3).tolist()
     figures["log_adds_95_ms"] = [low.round(3).tolist(), high.round(3).tolist()]
     figures["equal_servers_differ_ms"] = apart.round(3).tolist()
@@ -159,23 +150,3 @@ def judge(taken: np.ndarray) -> dict[str, Any]:
     figures["within_noise_of_each"] = is_within.tolist()
     figures["within_noise"] = bool(is_within[0] and is_within[-1])
     return figures
-
-
-def show(report: dict[str, Any]) -> None:
-    """Print the table."""
-    print(f"{report['machine']}, n {report['n']} handshakes with each, p50 / p95 / p99 ms")
-    for kind, figures in report["kinds"].items():
-        for name in (*SERVERS, "log_adds_ms", "equal_servers_differ_ms"):
-            print(f"{kind:9} {name:24}", " / ".join(f"{value:.3f}" for value in figures[name]))
-        low, high = figures["log_adds_95_ms"]
-        print(
-            f"{kind:9} {'log adds, 95 %':24}",
-            " / ".join(f"{a:+.3f}..{b:+.3f}" for a, b in zip(low, high, strict=True)),
-        )
-        print(f"{kind:9} within noise: {'yes' if figures['within_noise'] else 'NO'}")
-    print(f"{report['entries']} entries, chain {'good' if report['chain_good'] else 'BROKEN'}")
-    print(f"load average {report['load_before'][0]:.2f} before, {report['load_after'][0]:.2f} after")
-
-
-if __name__ == "__main__":
-    main()

@@ -1,7 +1,7 @@
 """How many robots one server carries: at 5 frames a second each, and 10,000 of which few are active.
 
-    python -m benchmarks.server.capacity [--workers 1 2] [--codec bin] [--balancer] [--search-only]
-        [--out FILE]
+    python -m benchmarks server.capacity [--workers 1 2] [--codec bin] [--balancer] [--search-only]
+
 
 Real PnP (200 matches, 30 % wrong, every frame kept), open loop: send times are fixed before each step, and
 latency counts from the planned time.  A step carries its robots if every command of its window returned a
@@ -18,17 +18,17 @@ Defends: two workers on two cores carry >= 1,000 robots at 5 frames a second; 10
 
 from __future__ import annotations
 
-import argparse
 import asyncio
 import contextlib
-import json
 import tempfile
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
+from benchmarks.frame.registry import Bar, benchmark
+from benchmarks.frame.report import say
 from benchmarks.server.load import (
     LoadPlan,
     RobotGroup,
@@ -38,9 +38,8 @@ from benchmarks.server.load import (
     pnp_file,
     run_load,
 )
-from benchmarks.server.serving import BenchServer, cpu_of_tree_s, machine, private_bytes_of_tree
+from benchmarks.server.serving import BenchServer, cpu_of_tree_s, private_bytes_of_tree
 from rse_pf.config import PlatformSettings
-from rse_pf.errors import ConfigurationError
 from rse_pf.local.control.platform import LocalPlatform
 
 SETTINGS: dict[str, dict[str, Any]] = {
@@ -125,7 +124,7 @@ def search(try_robots: Callable[[int], CapacityStep], clock: Callable[[], float]
     def is_carried(robots: int) -> bool:
         for _ in range(2):
             steps.append(try_robots(robots))
-            print_step(steps[-1])
+            say(steps[-1])
             if steps[-1].is_carried or clock() > until:
                 break
         return steps[-1].is_carried
@@ -143,17 +142,6 @@ def search(try_robots: Callable[[int], CapacityStep], clock: Callable[[], float]
         else:
             failed = robots
     return steps
-
-
-def print_step(tested: CapacityStep) -> None:
-    """Print one line for a step."""
-    verdict = "carried" if tested.is_carried else f"not carried {tested.codes or ''}"
-    print(
-        f"  {tested.robots:6} robots: p50 {tested.p50_ms:7.2f} p99 {tested.p99_ms:7.2f} ms, {tested.ok} ok, "
-        f"{tested.failed} failed, {tested.lost} lost, {tested.unsent} unsent, "
-        f"late p99 {tested.late_p99_ms:.2f} ms, generator {tested.generator_cores:.2f} cores: {verdict}",
-        flush=True,
-    )
 
 
 def most_robots(workers: int, codec: str, seconds: float) -> dict[str, Any]:
@@ -232,61 +220,30 @@ def serving(workers: int) -> Iterator[tuple[BenchServer, Path]]:
         yield server, Path(folder)
 
 
-def print_connected(report: dict[str, Any]) -> None:
-    """Print what 10,000 robots need."""
-    active, idle = report["active"], report["idle"]
-    print(
-        f"{report['connected']} of {report['robots']} robots connected after {report['opening_s']:.1f} s, "
-        f"{report['kib_per_robot']:.1f} KiB each (bar {KIB_BAR:g}); server {report['server_cores']:.2f} "
-        f"cores, generator {report['generator_cores']:.2f}; closed {report['closed']}, "
-        f"failure codes {report['codes']}"
-    )
-    for about, group in (("active robots at 1 frame a second", active), ("other robots, pings", idle)):
-        latency = group["latency_ms"]
-        print(
-            f"{group['robots']} {about}: p50 {latency['p50']:.2f} p99 {latency['p99']:.2f} ms, {group['ok']} "
-            f"ok, {group['failed']} failed, {group['lost']} lost, {group['unsent']} unsent"
-        )
-
-
-def main() -> None:
-    """Read the command line, measure, print the figures."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--workers", type=int, nargs="+", default=[1, 2], help="workers of each search")
-    parser.add_argument("--codec", default="bin", choices=("zlib", "json", "bin"))
-    parser.add_argument("--balancer", action="store_true", help="through Envoy, with tokens")
-    parser.add_argument("--search-only", action="store_true", help="leave the 10,000 robots out")
-    parser.add_argument("--seconds", type=float, default=5.0, help="of each step")
-    parser.add_argument("--out", type=Path, help="write the figures as JSON")
-    asked = parser.parse_args()
-    settings = {"serving": SETTINGS["serving"]} if asked.balancer else SETTINGS
-    report: dict[str, Any] = {"machine": machine(), "settings": settings, "codec": asked.codec}
-    report |= {"balancer": asked.balancer, "seconds": asked.seconds, "searches": []}
-    try:
-        compile_generator()
-        print(f"{report['machine']}; settings {settings}; {asked.codec}, steps of {asked.seconds:g} s")
-        for workers in asked.workers:
-            print(f"{workers} workers{', through the balancer' if asked.balancer else ''}", flush=True)
-            if asked.balancer:
-                made = asyncio.run(most_robots_behind_balancer(workers, asked.codec, asked.seconds))
-            else:
-                made = most_robots(workers, asked.codec, asked.seconds)
-            report["searches"].append(made)
-            bar = f" (bar {ROBOTS_BAR})" if workers == 2 else ""
-            print(f"{workers} workers carry {made['robots']} robots at {FRAMES_PER_S:g} fps{bar}", flush=True)
-        if not asked.search_only:
-            report["connected"] = measure_connected(asked.codec, 2 * asked.seconds)
-            print_connected(report["connected"])
-    except ConfigurationError as error:
-        print(f"skipped: {error.message} ({error.hint})")
-        report["skipped"] = error.message
-    report["load_average_after"] = machine()["load_average"]
-    print(f"load average {report['machine']['load_average']} -> {report['load_average_after']}")
-    if asked.out is not None:
-        asked.out.write_text(json.dumps(report, indent=1), encoding="utf-8")
-
-
-if __name__ == "__main__":
-    main()
+@benchmark(
+    Bar("robots_carried.2", at_least=ROBOTS_BAR, unit="robots at 5 fps"),
+    Bar("connected.kib_per_robot", at_most=KIB_BAR, unit="KiB"),
+    Bar("connected.active.failed", equals=0),
+    Bar("connected.active.lost", equals=0),
+)
+def run_benchmark(
+    *,
+    workers: Annotated[tuple[int, ...], "workers of each search"] = (1, 2),
+    codec: Literal["zlib", "json", "bin"] = "bin",
+    balancer: Annotated[bool, "through Envoy, with tokens"] = False,
+    search_only: Annotated[bool, "leave the 10,000 robots out"] = False,
+    seconds: Annotated[float, "of each step"] = 5.0,
+) -> dict[str, Any]:
+    """Search, then connect the 10,000."""
+    compile_generator()
+    searches = []
+    for count in workers:
+        if balancer:
+            searches.append(asyncio.run(most_robots_behind_balancer(count, codec, seconds)))
+        else:
+            searches.append(most_robots(count, codec, seconds))
+    return {
+        "settings": {"serving": SETTINGS["serving"]} if balancer else SETTINGS, "searches": searches,
+        "robots_carried": {str(found["workers"]): found["robots"] for found in searches},
+        **({} if search_only else {"connected": measure_connected(codec, 2 * seconds)}),
+    }  # fmt: skip

@@ -1,6 +1,6 @@
 """CPU of one handshake on a server, accepted and refused, for all processes of the server.
 
-    python -m benchmarks.server.handshakes [--base TREE] [--n 1000] [--at-once 1] [--only WORDS] [--out FILE]
+    python -m benchmarks server.handshakes [--base TREE] [--n 1000] [--at-once 1] [--only WORDS]
 
 An accepted handshake is connect, upgrade, Hello, Welcome and close; a refused one ends with its HTTP answer.
 The rows differ in the token: none is required, signed by the platform, signed by an enrolled robot's key (a
@@ -12,14 +12,11 @@ Defends: <= 400 us accepted and refused (1,340 to 1,550 in version 0.1.0).
 
 from __future__ import annotations
 
-import argparse
 import itertools
 import json
 import os
-import platform
 import signal
 import socket
-import statistics
 import subprocess
 import sys
 import tempfile
@@ -28,8 +25,10 @@ import urllib.request
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+from benchmarks.frame.registry import Bar, benchmark
+from benchmarks.frame.statistics import spread
 from rse_pf.auth.roster import EnrolledRobot
 from rse_pf.auth.tokens import SigningKey
 from rse_pf.config import AuthSettings
@@ -279,7 +278,7 @@ def measure(servers: dict[str, dict[bool, Server]], n: int, at_once: int, only: 
                     make_batch(server, heads[first : first + at_once], status)
                 if number >= 0:
                     taken[tree].append((wait_settled(server) - before) / BATCH * 1e6)
-        figures[name] = {tree: figures_of(batches) for tree, batches in taken.items()}
+        figures[name] = {tree: spread(batches) for tree, batches in taken.items()}
     return figures
 
 
@@ -292,50 +291,24 @@ def wait_settled(server: Server) -> float:
     return now
 
 
-def figures_of(taken: list[float]) -> dict[str, float]:
-    """Return percentiles and mean of *taken*."""
-    cuts = statistics.quantiles(taken, n=100, method="inclusive")
-    named = {"p50": cuts[49], "p95": cuts[94], "p99": cuts[98], "mean": statistics.fmean(taken)}
-    return {name: round(value, 1) for name, value in named.items()}
-
-
-def main() -> None:
-    """Measure, print the table, write ``--out``."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--base", type=Path, help="another tree of the sources, measured in turns")
-    parser.add_argument("--n", type=int, default=1000, help="handshakes of each row")
-    parser.add_argument("--at-once", type=int, default=1, help="handshakes that robots begin together")
-    parser.add_argument("--only", default="", help="measure the rows with these words in their name")
-    parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--audit", action="store_true", help="record the handshakes in an audit log")
-    parser.add_argument("--out", type=Path, help="write the figures as JSON")
-    options = parser.parse_args()
-    load = os.getloadavg()
-    trees = {**({"base": options.base.resolve()} if options.base else {}), "this tree": None}
+@benchmark(Bar("*.this tree.p50", at_most=BAR_US, unit="us of CPU"))
+def run_benchmark(
+    *,
+    base: Annotated[Path | None, "another tree of the sources, measured in turns"] = None,
+    n: Annotated[int, "handshakes of each row"] = 1000,
+    at_once: Annotated[int, "handshakes that robots begin together"] = 1,
+    only: Annotated[str, "measure the rows with these words in their name"] = "",
+    workers: int = 2,
+    audit: Annotated[bool, "record the handshakes in an audit log"] = False,
+) -> dict[str, Any]:
+    """Measure all rows, with two trees in turns."""
+    trees = {**({"base": base.resolve()} if base else {}), "this tree": None}
     with ExitStack() as stack:
         servers = {
             name: {
-                tokens: stack.enter_context(
-                    serve_tree(tree, options.workers, tokens=tokens, audit=options.audit)
-                )
+                tokens: stack.enter_context(serve_tree(tree, workers, tokens=tokens, audit=audit))
                 for tokens in (False, True)
             }
             for name, tree in trees.items()
         }
-        figures = measure(servers, options.n, options.at_once, options.only)
-    print(f"machine {platform.machine()}, {os.cpu_count()} cores, {options.workers} workers")
-    print(f"command {' '.join(sys.argv)}, n {options.n}, batches of {BATCH}, {options.at_once} at once")
-    print(f"load average {load[0]:.2f} before, {os.getloadavg()[0]:.2f} after; bar {BAR_US} us")
-    print(f"{'CPU us of a handshake':34}{'':10}    p50    p95    p99   mean")
-    for name, trees_of in figures.items():
-        for tree, values in trees_of.items():
-            print(f"{name:34}{tree:10}" + "".join(f"{value:7.0f}" for value in values.values()))
-    if options.out:
-        report = {"n": options.n, "load": load, "at_once": options.at_once, "rows": figures}
-        options.out.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
-
-
-if __name__ == "__main__":
-    main()
+        return measure(servers, n, at_once, only)

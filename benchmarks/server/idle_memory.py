@@ -1,7 +1,7 @@
 """Measure the cost of an idle robot on a server: memory of all processes, kernel buffers, and idle CPU.
 
-    python -m benchmarks.server.idle_memory [--robots 10000] [--workers 2] [--tokens] [--base TREE]
-        [--out FILE]
+    python -m benchmarks server.idle_memory [--robots 10000] [--workers 2] [--tokens] [--base TREE]
+
 
 Robots are plain sockets of sixteen loopback addresses that said Hello.  The memory is the growth of the
 private pages of supervisor and workers; the TCP buffers of the kernel are reported beside it.  The CPU
@@ -11,17 +11,14 @@ Defends: <= 16 KiB per robot in all processes of the server.
 
 from __future__ import annotations
 
-import argparse
 import itertools
-import json
 import os
-import platform
 import resource
-import sys
 import time
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+from benchmarks.frame.registry import Bar, benchmark
 from benchmarks.server import handshakes
 from rse_pf.auth.tokens import SigningKey
 from rse_pf.config import AuthSettings
@@ -83,37 +80,23 @@ def measure(server: Any, robots: int, tokens: bool) -> dict[str, Any]:
         "idle_cpu_ms_per_s": round(idle_s / WATCH_S * 1e3, 2),
         "handshake_cpu_us": round((joined_s - cpu_before) / robots * 1e6),
         "spread": spread,
-        "load": os.getloadavg(),
     }
 
 
-def main() -> None:
-    """Measure each tree once, print, write ``--out``."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--robots", type=int, default=10_000, help="idle connections")
-    parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--tokens", action="store_true", help="each robot has a token of its own")
-    parser.add_argument("--base", type=Path, help="another tree of the sources, measured first")
-    parser.add_argument("--out", type=Path, help="write the figures as JSON")
-    options = parser.parse_args()
+@benchmark(Bar("this tree.kib_per_robot", at_most=BAR_KIB, unit="KiB"))
+def run_benchmark(
+    *,
+    robots: Annotated[int, "idle connections"] = 10000,
+    workers: int = 2,
+    tokens: Annotated[bool, "each robot has a token of its own"] = False,
+    base: Annotated[Path | None, "another tree of the sources, measured first"] = None,
+) -> dict[str, Any]:
+    """Connect the robots to each tree once."""
     hard = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
     resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
-    reports: dict[str, Any] = {}
-    print(f"machine {platform.machine()}, {os.cpu_count()} cores, command {' '.join(sys.argv)}")
-    for name, tree in (*((("base", options.base),) if options.base else ()), ("this tree", None)):
+    figures: dict[str, Any] = {}
+    for name, tree in (*((("base", base),) if base else ()), ("this tree", None)):
         idle = {"ping_interval_s": 600.0, "hello_timeout_s": 600.0}
-        with handshakes.serve_tree(
-            tree, options.workers, tokens=options.tokens, audit=False, **idle
-        ) as server:
-            reports[name] = measure(server, options.robots, options.tokens)
-        for figure, value in reports[name].items():
-            print(f"{name:10} {figure:22} {value}")
-    print(f"bar: {BAR_KIB:g} KiB per robot, kernel buffers not counted")
-    if options.out:
-        options.out.write_text(json.dumps(reports, indent=2) + "\n", encoding="utf-8")
-
-
-if __name__ == "__main__":
-    main()
+        with handshakes.serve_tree(tree, workers, tokens=tokens, audit=False, **idle) as server:
+            figures[name] = measure(server, robots, tokens)
+    return figures

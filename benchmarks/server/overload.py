@@ -1,7 +1,7 @@
 """Goodput of one small server at 0.9, 2 and 5 times its capacity.
 
-    python -m benchmarks.server.overload [--seconds 20] [--emulated-cores 0.25]
-        [--codec zlib] [--out FILE]
+    python -m benchmarks server.overload [--seconds 20] [--emulated-cores 0.25]
+        [--codec zlib]
 
 Real PnP (200 matches, 30 % wrong), open loop: Poisson send times fixed before the run, latency from the
 planned time, a deadline of 250 ms, every frame kept.  Phases 0.9, 2, 0.9, 5, 0.9 in one run, so that a slower
@@ -15,22 +15,21 @@ all busy or expired, with retry_after_ms; back to normal <= 2 s after the load; 
 
 from __future__ import annotations
 
-import argparse
 import asyncio
 import base64
-import json
 import os
-import platform
 import signal
 import socket
 import tempfile
 import time
 from collections import Counter
-from pathlib import Path
-from typing import Any
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
+from benchmarks.frame.registry import Bar, benchmark
+from benchmarks.frame.statistics import percentile
 from benchmarks.server.round_trip import start, status
 from rse_pf.pnp.problems import make_problem
 from rse_pf.services.pnp import make_request
@@ -43,6 +42,17 @@ DEADLINE_S = 0.25
 ANSWER_WINDOW_S = 0.5
 REFUSED_PAUSE_S = 0.1
 BINARY, TEXT, FIN, MASKED = 2, 1, 0x80, 0x80
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Options:
+    """The arguments."""
+
+    seconds: Annotated[float, "of each phase"] = 20.0
+    capacity_seconds: Annotated[float, "of the closed loop before"] = 6.0
+    emulated_cores: Annotated[float, "emulated cores of the server"] = 0.25
+    codec: Literal["zlib", "json", "bin"] = "zlib"
+    seed: int = 1
 
 
 def frame(payload: bytes, opcode: int) -> bytes:
@@ -247,11 +257,11 @@ def judge(generator: Generator, borders: Any, first: int) -> list[dict[str, Any]
                 "offered": int(inside.sum()),
                 "goodput_per_s": round(float((good & inside).sum() / (end - begin)), 1),
                 "wasted_percent": round(100 * float((ok & ~good).sum() / max(1, ok.sum())), 2),
-                "good_p50_ms": percentile(waits[ok], 50),
-                "good_p99_ms": percentile(waits[ok], 99),
-                "refused_p50_ms": percentile((answered - sent)[answered_refusals], 50),
-                "refused_p99_ms": percentile((answered - sent)[answered_refusals], 99),
-                "late_sends_p99_ms": percentile((sent - planned)[inside], 99),
+                "good_p50_ms": percentile_ms(waits[ok], 50),
+                "good_p99_ms": percentile_ms(waits[ok], 99),
+                "refused_p50_ms": percentile_ms((answered - sent)[answered_refusals], 50),
+                "refused_p99_ms": percentile_ms((answered - sent)[answered_refusals], 99),
+                "late_sends_p99_ms": percentile_ms((sent - planned)[inside], 99),
                 "outcomes": dict(Counter(outcome[inside].tolist())),
                 "busy_without_retry_after": int((inside & (outcome == "busy") & ~retry).sum()),
             }
@@ -268,12 +278,33 @@ def judge(generator: Generator, borders: Any, first: int) -> list[dict[str, Any]
     return rows
 
 
-def percentile(values: Any, percent: float) -> float | None:
-    """Return a percentile in ms, None of nothing."""
-    return round(1e3 * float(np.percentile(values, percent)), 2) if len(values) else None
+def percentile_ms(values: Any, percent: float) -> float | None:
+    """Return a percentile of seconds in ms, None of nothing."""
+    return round(1e3 * float(percentile(values, percent)), 2) if len(values) else None
 
 
-async def run(args: argparse.Namespace, identity: dict[str, int]) -> dict[str, Any]:
+def judged(report: dict[str, Any]) -> dict[str, float]:
+    """Return the figures that have a bar."""
+    rows = report["phases"]
+    normal = float(np.mean([row["goodput_per_s"] for row in rows if row["offered_x"] < 1]))
+    busy = [row for row in rows if row["offered_x"] > 1]
+    refused = Counter[str]()
+    for row in busy:
+        refused.update({code: n for code, n in row["outcomes"].items() if code != "ok"})
+    return {
+        "goodput_2x_percent": 100 * rows[1]["goodput_per_s"] / normal,
+        "goodput_5x_percent": 100 * rows[3]["goodput_per_s"] / normal,
+        "wasted_percent": max(row["wasted_percent"] for row in busy),
+        "refused_p99_ms": max(row["refused_p99_ms"] or 0.0 for row in busy),
+        "untyped_refusals": sum(n for code, n in refused.items() if code not in ("busy", "expired")),
+        "busy_without_retry_after": sum(row["busy_without_retry_after"] for row in rows),
+        "recovery_s": max(999.0 if rows[n]["recovery_s"] is None else rows[n]["recovery_s"] for n in (2, 4)),
+        "control_max_ms": max(report["control_max_ms"].values()),
+        "generator_cpu_percent": max(row["generator_cpu_percent"] for row in rows),
+    }  # fmt: skip
+
+
+async def run(args: Options, identity: dict[str, int]) -> dict[str, Any]:
     """Measure capacity, play all phases, return the report."""
     generator = Generator(args.codec)
     await generator.open(identity["port"])
@@ -308,84 +339,26 @@ async def run(args: argparse.Namespace, identity: dict[str, int]) -> dict[str, A
     }
 
 
-def verdict(report: dict[str, Any]) -> dict[str, Any]:
-    """Return each bar with what was measured and whether it holds."""
-    rows = report["phases"]
-    normal = float(np.mean([row["goodput_per_s"] for row in rows if row["offered_x"] < 1]))
-    busy = [row for row in rows if row["offered_x"] > 1]
-    refused = Counter[str]()
-    for row in busy:
-        refused.update({code: n for code, n in row["outcomes"].items() if code != "ok"})
-    recoveries = [999.0 if rows[n]["recovery_s"] is None else rows[n]["recovery_s"] for n in (2, 4)]
-    figures = {
-        "goodput_2x_percent": (100 * rows[1]["goodput_per_s"] / normal, ">=", 95),
-        "goodput_5x_percent": (100 * rows[3]["goodput_per_s"] / normal, ">=", 90),
-        "wasted_percent": (max(row["wasted_percent"] for row in busy), "<=", 5),
-        "refused_p99_ms": (max(row["refused_p99_ms"] or 0.0 for row in busy), "<=", 50),
-        "untyped_refusals": (sum(n for c, n in refused.items() if c not in ("busy", "expired")), "<=", 0),
-        "busy_without_retry_after": (sum(row["busy_without_retry_after"] for row in rows), "<=", 0),
-        "recovery_s": (max(recoveries), "<=", 2),
-        "control_max_ms": (max(report["control_max_ms"].values()), "<=", 250),
-        "generator_cpu_percent": (max(row["generator_cpu_percent"] for row in rows), "<=", 50),
-    }  # fmt: skip
-    return {
-        name: {
-            "figure": round(figure, 2),
-            "bar": f"{sign} {bar}",
-            "holds": figure >= bar if sign == ">=" else figure <= bar,
-        }
-        for name, (figure, sign, bar) in figures.items()
-    }
-
-
-def main() -> None:
-    """Measure, print, write ``--out``."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--seconds", type=float, default=20.0, help="of each phase")
-    parser.add_argument("--capacity-seconds", type=float, default=6.0, help="of the closed loop before")
-    parser.add_argument("--emulated-cores", type=float, default=0.25, help="emulated cores of the server")
-    parser.add_argument("--codec", default="zlib", choices=("zlib", "json", "bin"))
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--out", type=Path, help="write the figures as JSON")
-    args = parser.parse_args()
-    load = os.getloadavg()
+@benchmark(
+    Bar("judged.goodput_2x_percent", at_least=95, unit="%"),
+    Bar("judged.goodput_5x_percent", at_least=90, unit="%"),
+    Bar("judged.wasted_percent", at_most=5, unit="%"),
+    Bar("judged.refused_p99_ms", at_most=50, unit="ms"),
+    Bar("judged.untyped_refusals", equals=0),
+    Bar("judged.busy_without_retry_after", equals=0),
+    Bar("judged.recovery_s", at_most=2, unit="s"),
+    Bar("judged.control_max_ms", at_most=250, unit="ms"),
+    Bar("judged.generator_cpu_percent", at_most=50, unit="%"),
+)
+def run_benchmark(args: Options) -> dict[str, Any]:
+    """Play all phases on one small server."""
     with tempfile.TemporaryDirectory() as folder:
         process, identity = start(
-            folder,
-            workers=1,
-            emulated_cores=args.emulated_cores,
-            log_level="warning",
-        )
+            folder, workers=1, emulated_cores=args.emulated_cores, log_level="warning"
+        )  # fmt: skip
         try:
             report = asyncio.run(run(args, identity))
         finally:
             process.send_signal(signal.SIGINT)
             process.wait(10)
-    report |= {
-        "machine": f"{platform.machine()}, {os.cpu_count()} cores",
-        "settings": {
-            "emulated_cores": args.emulated_cores, "codec": args.codec,
-            "seed": args.seed,
-        },
-        "seconds": args.seconds, "load_before": load, "load_after": os.getloadavg(),
-        "verdict": verdict(report),
-    }  # fmt: skip
-    cores = f"{args.emulated_cores} emulated cores"
-    about = f"{cores}, {args.codec}, {args.seconds:g} s a phase"
-    print(f"{report['machine']}, {about}")
-    print(f"capacity {report['capacity_per_s']}/s; control port at most {report['control_max_ms']} ms")
-    for row in report["phases"]:
-        print(json.dumps(row))
-    for name, judged in report["verdict"].items():
-        print(
-            f"{name:28} {judged['figure']:>9} {judged['bar']:>8} {'holds' if judged['holds'] else 'MISSED'}"
-        )
-    print(f"load average {load[0]:.2f} before, {report['load_after'][0]:.2f} after")
-    if args.out:
-        args.out.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
-
-
-if __name__ == "__main__":
-    main()
+    return {**report, "judged": judged(report)}

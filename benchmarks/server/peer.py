@@ -1,6 +1,6 @@
 """Our server beside the paper's own design (nginx, Lua, OpenCV), in one run, with one load generator.
 
-    python -m benchmarks.server.peer --peer FOLDER [--rounds 7] [--seconds 3.5] [--out FILE]
+    python -m benchmarks server.peer FOLDER [--rounds 7] [--seconds 3.5]
 
 *FOLDER* holds the sources of the paper's design, and its README says which packages it needs; without them,
 one line says what is missing and nothing is measured.  Two workers each, 200 matches, 30 and 50 % of them
@@ -15,7 +15,6 @@ p99 of 100 robots at 30 % >= 8 times (JSON+zlib) and 12 times (binary) better, a
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import itertools
 import json
@@ -30,8 +29,9 @@ import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+from benchmarks.frame.registry import Bar, benchmark
 from benchmarks.server.load import (
     LoadPlan,
     RobotGroup,
@@ -41,7 +41,7 @@ from benchmarks.server.load import (
     run_load,
     write_messages,
 )
-from benchmarks.server.serving import UNLIMITED, BenchServer, cpu_of_tree_s, machine
+from benchmarks.server.serving import UNLIMITED, BenchServer, cpu_of_tree_s
 from rse_pf.errors import ConfigurationError
 from rse_pf.pnp.problems import make_problem
 
@@ -50,9 +50,6 @@ FRAMES_PER_S = 5.0
 """The paper's rate (Sect. 6.2)."""
 MANY = 100
 OUTLIERS = (0.3, 0.5)
-CPU_BARS = {(0.3, "zlib"): 10.0, (0.3, "bin"): 14.0, (0.5, "zlib"): 30.0, (0.5, "bin"): 40.0}
-P99_BARS = {"zlib": 8.0, "bin": 12.0}
-SPREAD_BAR = 4.0
 """Own p99 over own p50 of 100 robots at 30 %."""
 PEER, ZLIB, BINARY = "peer", "zlib", "bin"
 SYSTEMS = (PEER, ZLIB, BINARY)
@@ -235,49 +232,22 @@ def _medians(rounds: list[dict[str, Any]], system: str) -> dict[str, Any]:
     return row | {name: sum(window[name] for window in chosen) for name in ("ok", "failed", "lost", "unsent")}
 
 
-def bars(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return each bar with what was measured and whether it holds."""
-    verdicts = []
-
-    def bar(what: str, figure: float, limit: float, *, is_least: bool = True) -> None:
-        holds = figure >= limit if is_least else figure <= limit
-        sign = ">=" if is_least else "<="
-        verdicts.append({"what": what, "figure": figure, "bar": f"{sign} {limit:g}", "holds": holds})
-
-    for row in rows:
-        system, outliers, robots = row["system"], row["outliers"], row["robots"]
-        if system == PEER:
-            continue
-        about = f"{system}, {round(100 * outliers)} % wrong, {robots} robots"
-        bar(f"CPU ratio, {about}", row["cpu_ratio"], CPU_BARS[outliers, system])
-        if robots == MANY and outliers == OUTLIERS[0]:
-            bar(f"p99 ratio, {about}", row["p99_ratio"], P99_BARS[system])
-            bar(f"own p99 / p50, {about}", row["p99_ms"] / row["p50_ms"], SPREAD_BAR, is_least=False)
-        bar(f"failed and lost, {about}", row["failed"] + row["lost"] + row["unsent"], 0, is_least=False)
-    return verdicts
-
-
-def table(rows: list[dict[str, Any]]) -> str:
-    """Return the rows as Markdown."""
-    names = {PEER: "paper's design", ZLIB: "JSON+zlib", BINARY: "binary"}
-    lines = [
-        "| wrong | robots | server | CPU us | ratio | p50 ms | p99 ms | ratio | late, p99 ms | ok | not ok |",
-        "|---|---|---|---|---|---|---|---|---|---|---|",
-    ]
-    for row in rows:
-        late = "" if math.isnan(row["late_p99_ms"]) else f"{row['late_p99_ms']:.2f}"
-        lines.append(
-            f"| {round(100 * row['outliers'])} % | {row['robots']} | {names[row['system']]} | "
-            f"{row['cpu_us']:.0f} | {row['cpu_ratio']:.1f} | {row['p50_ms']:.2f} | {row['p99_ms']:.2f} | "
-            f"{row['p99_ratio']:.1f} | {late} | {row['ok']} | {row['failed'] + row['lost'] + row['unsent']} |"
-        )
-    return "\n".join(lines)
+def judged(rows: list[dict[str, Any]]) -> dict[str, dict[str, float]]:
+    """Return the figures of our rows that have a bar, by codec, share of wrong matches and robots."""
+    return {
+        f"{row['system']} {round(100 * row['outliers'])} % {row['robots']}": {
+            "cpu_ratio": row["cpu_ratio"], "p99_ratio": row["p99_ratio"],
+            "p99_over_p50": row["p99_ms"] / row["p50_ms"],
+            "without_pose": row["failed"] + row["lost"] + row["unsent"],
+        }
+        for row in rows
+        if row["system"] != PEER
+    }  # fmt: skip
 
 
 def run(sources: Path, rounds: int, seconds: float) -> dict[str, Any]:
     """Start both, measure, return the report; raises ConfigurationError where one does not start."""
     compile_generator()
-    before = machine()
     with tempfile.TemporaryDirectory() as made, contextlib.ExitStack() as stack:
         folder = Path(made)
         (folder / "ours").mkdir()
@@ -295,48 +265,36 @@ def run(sources: Path, rounds: int, seconds: float) -> dict[str, Any]:
             )  # fmt: skip
         for server in servers:
             measure(server, OUTLIERS[0], 1, 0.5, 0)  # warms it up
-        began = time.monotonic()
         windows = play(servers, rounds, seconds)
     rows = summarize(windows)
     return {
-        "machine": before, "load_average_after": machine()["load_average"], "workers": WORKERS,
-        "settings": UNLIMITED, "seconds": seconds, "took_s": round(time.monotonic() - began, 1),
-        "rows": rows, "bars": bars(rows), "rounds": windows,
+        "settings": UNLIMITED, "rows": rows, "judged": judged(rows), "rounds": windows,
     }  # fmt: skip
 
 
-def main() -> None:
-    """Read the command line, measure, print the table."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--peer", type=Path, metavar="FOLDER", help="sources of the paper's design")
-    parser.add_argument("--rounds", type=int, default=7)
-    parser.add_argument("--seconds", type=float, default=3.5, help="of each run")
-    parser.add_argument("--out", type=Path, help="write the figures as JSON")
-    asked = parser.parse_args()
-    reason, report = missing(asked.peer), {}
-    if not reason:
-        try:
-            report = run(asked.peer, asked.rounds, asked.seconds)
-        except ConfigurationError as error:
-            reason = f"{error.message} ({error.hint})"
-    if reason:
-        print(f"skipped: {reason}")
-        report = {"skipped": reason}
-    else:
-        print(
-            f"{report['machine']['cores']} cores, load {report['machine']['load_average'][0]} -> "
-            f"{report['load_average_after'][0]}; {asked.rounds} rounds of {asked.seconds:g} s a row, "
-            f"{WORKERS} workers each; {report['took_s']:g} s in all"
+@benchmark(
+    *(
+        Bar(f"judged.{codec} {percent} % {robots}.cpu_ratio", at_least=bar)
+        for codec, percent, bar in (
+            ("zlib", 30, 10.0),
+            ("bin", 30, 14.0),
+            ("zlib", 50, 30.0),
+            ("bin", 50, 40.0),
         )
-        print(table(report["rows"]))
-        for bar in report["bars"]:
-            verdict = "holds" if bar["holds"] else "MISSED"
-            print(f"{bar['what']:46} {bar['figure']:8.2f}  {bar['bar']:>6}  {verdict}")
-    if asked.out is not None:
-        asked.out.write_text(json.dumps(report, indent=1), encoding="utf-8")
-
-
-if __name__ == "__main__":
-    main()
+        for robots in (1, MANY)
+    ),
+    Bar("judged.zlib 30 % 100.p99_ratio", at_least=8.0),
+    Bar("judged.bin 30 % 100.p99_ratio", at_least=12.0),
+    Bar("judged.zlib 30 % 100.p99_over_p50", at_most=4.0),
+    Bar("judged.bin 30 % 100.p99_over_p50", at_most=4.0),
+    Bar("judged.*.without_pose", equals=0),
+)
+def run_benchmark(
+    *, peer: Annotated[Path, "sources of the paper's design"], rounds: int = 7,
+    seconds: Annotated[float, "of each run"] = 3.5,
+) -> dict[str, Any]:  # fmt: skip
+    """Measure both designs in turns."""
+    reason = missing(peer)
+    if reason:
+        raise ConfigurationError(reason, hint=f"see the README of {peer}")
+    return run(peer, rounds, seconds)

@@ -1,6 +1,6 @@
 """Round trip and CPU per command through a real server: 1 robot, and 100 robots at 5 frames per second.
 
-    python -m benchmarks.server.round_trip [--seconds 4] [--workers 2] [--out FILE]
+    python -m benchmarks server.round_trip [--seconds 4] [--workers 2]
 
 Echo and real PnP (200 matches, 30 % wrong), JSON+zlib and binary.  One robot asks as fast as it is
 answered; a hundred send at times that were fixed before the run, and their round trip counts from those.
@@ -9,11 +9,8 @@ CPU is that of all processes of the server.  The CPU of the robots, which share 
 
 from __future__ import annotations
 
-import argparse
 import asyncio
 import json
-import os
-import platform
 import signal
 import subprocess
 import sys
@@ -22,11 +19,13 @@ import time
 import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-import numpy as np
 import websockets
 
+from benchmarks.frame.registry import Bar, benchmark
+from benchmarks.frame.report import say
+from benchmarks.frame.statistics import spread
 from rse_pf.pnp.problems import make_problem
 from rse_pf.services.pnp import make_request
 from rse_pf.wire import SUBPROTOCOLS, Command, Hello, Result, make_codec
@@ -140,49 +139,30 @@ async def measure(
     plans = [Plan(begin, begin + seconds, every_s, i / robots) for i in range(robots)]
     failed = sum(await asyncio.gather(*(robot(url, codec, messages, times, plan) for plan in plans)))
     after, own = status(identity), time.process_time() - own
-    p50, p95, p99 = (round(1e3 * float(v), 3) for v in np.percentile(times, (50, 95, 99)))
     requests = after["requests"] - before["requests"]
     return {
-        "service": service, "codec": codec, "robots": robots, "n": len(times), "failed": failed,
-        "p50_ms": p50, "p95_ms": p95, "p99_ms": p99,
+        "service": service, "codec": codec, "robots": robots, "failed": failed,
+        "ms": spread(1e3 * time_s for time_s in times),
         "server_cpu_us": round((after["cpu_s"] - before["cpu_s"]) / requests * 1e6),
         "robots_cpu_percent": round(100 * own / seconds),
     }  # fmt: skip
 
 
-def main() -> None:
-    """Measure, print the table, write ``--out``."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--seconds", type=float, default=4.0, help="length of each row")
-    parser.add_argument("--workers", type=int, default=2, help="worker processes of the server")
-    parser.add_argument("--out", type=Path, help="write the figures as JSON")
-    options = parser.parse_args()
-    before, rows = os.getloadavg(), []
+@benchmark(Bar("rows.*.failed", equals=0))
+def run_benchmark(
+    *,
+    seconds: Annotated[float, "length of each row"] = 4.0,
+    workers: Annotated[int, "worker processes of the server"] = 2,
+) -> dict[str, Any]:
+    """Measure every row on one server."""
+    rows = []
     with tempfile.TemporaryDirectory() as folder:
-        process, identity = start(folder, workers=options.workers, log_level="info")
+        process, identity = start(folder, workers=workers, log_level="info")
         try:
             for service, codec, robots in ROWS:
-                rows.append(asyncio.run(measure(identity, service, codec, robots, options.seconds)))
+                rows.append(asyncio.run(measure(identity, service, codec, robots, seconds)))
+                say(rows[-1])
         finally:
             process.send_signal(signal.SIGINT)
             process.wait(20)
-    print(
-        f"{platform.machine()}, {os.cpu_count()} cores, {options.workers} workers, "
-        f"load {before[0]:.2f} before"
-    )
-    print("service codec robots      n failed    p50    p95    p99 ms  server us/command  robots' CPU %")
-    for row in rows:
-        print(
-            f"{row['service']:7} {row['codec']:5} {row['robots']:6} {row['n']:6} {row['failed']:6} "
-            f"{row['p50_ms']:6.2f} {row['p95_ms']:6.2f} {row['p99_ms']:6.2f} {row['server_cpu_us']:21} "
-            f"{row['robots_cpu_percent']:14}"
-        )
-    if options.out:
-        report = {"rows": rows, "load_before": before, "load_after": os.getloadavg()}
-        options.out.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
-
-
-if __name__ == "__main__":
-    main()
+    return {"rows": rows}

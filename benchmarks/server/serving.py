@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import os
-import platform
 import subprocess
 import sys
 import time
@@ -21,7 +20,7 @@ from rse_pf.config import PlatformSettings
 from rse_pf.errors import ConfigurationError
 from rse_pf.linux import raise_descriptor_limit
 
-__all__ = ["UNLIMITED", "BenchServer", "cpu_of_tree_s", "machine", "private_bytes_of_tree", "tree"]
+__all__ = ["UNLIMITED", "BenchServer", "cpu_of_tree_s", "private_bytes_of_tree", "tree"]
 
 UNLIMITED: dict[str, dict[str, Any]] = {
     "auth": {"required": False},
@@ -71,14 +70,6 @@ def private_bytes_of_tree(pid: int) -> int:
             continue
         kilobytes += sum(int(line.split()[1]) for line in lines if line.startswith("Private_"))
     return 1024 * kilobytes
-
-
-def machine() -> dict[str, Any]:
-    """Return what a table of figures must say about the machine, now."""
-    return {
-        "cores": os.cpu_count(), "architecture": platform.machine(), "python": platform.python_version(),
-        "load_average": [round(average, 2) for average in os.getloadavg()],
-    }  # fmt: skip
 
 
 class BenchServer:
@@ -143,9 +134,10 @@ class BenchServer:
         """Where the server's log is."""
         return self._folder / "server.log"
 
-    def token(self, robot: str) -> str:
+    def token(self, robot: str, tenant: str = "default") -> str:
         """Return a new token of *robot*."""
         self._issued += 1
+        identity = f"t-{self._issued}"
         return self._key.issue(
-            robot, now=time.time(), token_id=f"t-{self._issued}", settings=self.settings.auth
+            robot, now=time.time(), token_id=identity, settings=self.settings.auth, tenant=tenant
         )

@@ -1,6 +1,6 @@
 """p99 of robots beside hostile or heavy neighbours, as a ratio to quiet windows of the same run.
 
-    python -m benchmarks.server.tails [--only bombs] [--rounds 7] [--out FILE]
+    python -m benchmarks server.tails [--only bombs] [--rounds 7]
 
 Robots request 5 poses a second each (200 matches, 30 % wrong, every frame kept), from one run of the load
 generator; quiet and loaded windows alternate, so that a slower machine slows both.  Latency counts from the
@@ -23,13 +23,10 @@ Defends: those bars, and that every command of the robots is answered by a pose.
 
 from __future__ import annotations
 
-import argparse
 import asyncio
 import json
-import math
 import statistics
 import subprocess
-import sys
 import tempfile
 import time
 from collections import Counter
@@ -37,12 +34,15 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import numpy.typing as npt
 
-from benchmarks.data.faults import UPLOADERS, Uploads, kill_during_uploads
+from benchmarks.data.faults import Uploads, kill_during_uploads
+from benchmarks.frame.registry import Bar, benchmark, command_of
+from benchmarks.frame.report import say
+from benchmarks.frame.statistics import percentile
 from benchmarks.hostile import attacks
 from benchmarks.server.load import (
     LoadPlan,
@@ -54,7 +54,7 @@ from benchmarks.server.load import (
     read_samples,
     run_load,
 )
-from benchmarks.server.serving import BenchServer, machine, private_bytes_of_tree
+from benchmarks.server.serving import BenchServer, private_bytes_of_tree
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import ConfigurationError
 from rse_pf.local.control.control_plane import ControlOptions
@@ -67,7 +67,6 @@ SETTINGS: dict[str, dict[str, dict[str, Any]]] = {
     "bombs": {}, "rate": {}, "silent": {"serving": {"trusted_proxies": 0}}, "uploads": {},
 }  # fmt: skip
 """Settings of each row beside the defaults: without a proxy, limits for each address count."""
-BARS = {"bombs": 2.0, "rate": 1.5, "silent": 2.0, "uploads": 1.1}
 WORKERS = 2
 LONGEST_S = 600.0
 SETTLE_S, PAUSE_S = 1.0, 0.5
@@ -99,7 +98,7 @@ def summarise(samples: npt.NDArray[np.void], windows: Sequence[LoadWindow]) -> l
         planned = samples["planned_s"]
         chosen = samples[(planned >= window.begin_s) & (planned < window.end_s)]
         took_ms = 1e3 * chosen["latency_s"][chosen["outcome"] == 0]
-        p50, p99 = np.percentile(took_ms, [50, 99]) if len(took_ms) else (math.nan, math.nan)
+        p50, p99 = percentile(took_ms, [50, 99])
         rows.append(
             {
                 "is_loaded": window.is_loaded, "seconds": window.end_s - window.begin_s, "n": len(chosen),
@@ -111,7 +110,7 @@ def summarise(samples: npt.NDArray[np.void], windows: Sequence[LoadWindow]) -> l
 
 def summary(name: str, windows: list[dict[str, Any]], outcomes: list[dict[str, Any]]) -> dict[str, Any]:
     """Return one row of the table."""
-    row: dict[str, Any] = {"row": name, "bar": BARS[name], "outcomes": _add_up(outcomes), "windows": windows}
+    row: dict[str, Any] = {"row": name, "outcomes": _add_up(outcomes), "windows": windows}
     for kind, is_loaded in (("quiet", False), ("loaded", True)):
         chosen = [window for window in windows if window["is_loaded"] == is_loaded]
         row[kind] = {
@@ -121,7 +120,6 @@ def summary(name: str, windows: list[dict[str, Any]], outcomes: list[dict[str, A
             "p99_ms": statistics.median(window["p99_ms"] for window in chosen),
         }  # fmt: skip
     row["ratio"] = row["loaded"]["p99_ms"] / row["quiet"]["p99_ms"]
-    row["holds"] = row["ratio"] <= row["bar"] and not row["loaded"]["not_ok"]
     return row
 
 
@@ -193,7 +191,7 @@ def bombs(rounds: int) -> dict[str, Any]:
         def prepare(number: int) -> Neighbour:
             tokens = json.dumps([server.token(f"hostile-{number}-{row}") for row in range(BOMBERS)])
             process = subprocess.Popen(
-                [*_LOWEST_PRIORITY, sys.executable, attacks.__file__, "zip-bombs", url],
+                [*_LOWEST_PRIORITY, *command_of(attacks.run_attack, "zip-bombs", url)],
                 stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
             )  # fmt: skip
             assert process.stdin is not None
@@ -279,7 +277,6 @@ async def uploads(rounds: int) -> dict[str, Any]:
             control=ControlOptions(elastic=True),
         ) as cloud:  # fmt: skip
             plan = robots_of("calm", 20, folder, cloud.issue_token, cloud.port)
-            asked = argparse.Namespace(kills=1, uploads=UPLOADS)
             with LoadProcess(plan) as load:
                 await asyncio.to_thread(load.wait_begun)
                 for number in range(rounds):
@@ -290,7 +287,7 @@ async def uploads(rounds: int) -> dict[str, Any]:
                     await asyncio.sleep(UPLOAD_WINDOW_S)
                     middle = time.monotonic()
                     neighbour.begin()
-                    back_s = await kill_during_uploads(cloud, neighbour, asked)
+                    back_s = await kill_during_uploads(cloud, neighbour, 1, UPLOADS)
                     await neighbour.until(lambda: False)
                     await asyncio.sleep(max(0.0, middle + UPLOAD_WINDOW_S - time.monotonic()))
                     windows.append(LoadWindow(is_loaded=False, begin_s=began, end_s=middle))
@@ -312,44 +309,21 @@ ROWS: dict[str, Callable[[int], dict[str, Any]]] = {
 }
 
 
-def print_row(row: dict[str, Any]) -> None:
-    """Print one row."""
-    quiet, loaded = row["quiet"], row["loaded"]
-    print(
-        f"{row['row']:8} p99 {quiet['p99_ms']:.2f} -> {loaded['p99_ms']:.2f} ms, {row['ratio']:.2f} x (bar "
-        f"{row['bar']:g}); p50 {quiet['p50_ms']:.2f} -> {loaded['p50_ms']:.2f} ms; n {quiet['n']}, "
-        f"{loaded['n']} in {quiet['windows']} windows each; without a pose {quiet['not_ok']}, "
-        f"{loaded['not_ok']}: {'holds' if row['holds'] else 'MISSED'}"
-    )
-    print(f"         neighbours: {row['outcomes']}", flush=True)
-
-
-def main() -> None:
-    """Read the command line, measure, print the rows."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--only", choices=tuple(ROWS), action="append", help="measure this row only")
-    parser.add_argument("--rounds", type=int, default=7, help="of the short rows; the others have five")
-    parser.add_argument("--out", type=Path, help="write the figures as JSON")
-    asked = parser.parse_args()
-    report: dict[str, Any] = {"machine": machine(), "settings": SETTINGS, "rows": []}
-    began = time.monotonic()
-    try:
-        compile_generator()
-        print(f"{report['machine']}; settings {SETTINGS}; {CODEC}; {UPLOADERS} uploaders", flush=True)
-        for name in asked.only or ROWS:
-            report["rows"].append(ROWS[name](asked.rounds))
-            print_row(report["rows"][-1])
-    except ConfigurationError as error:
-        print(f"skipped: {error.message} ({error.hint})")
-        report["skipped"] = error.message
-    report |= {"load_average_after": machine()["load_average"], "took_s": round(time.monotonic() - began, 1)}
-    before, after = report["machine"]["load_average"], report["load_average_after"]
-    print(f"load average {before} -> {after}; {report['took_s']:g} s")
-    if asked.out is not None:
-        asked.out.write_text(json.dumps(report, indent=1), encoding="utf-8")
-
-
-if __name__ == "__main__":
-    main()
+@benchmark(
+    Bar("bombs.ratio", at_most=2.0),
+    Bar("rate.ratio", at_most=1.5),
+    Bar("silent.ratio", at_most=2.0),
+    Bar("uploads.ratio", at_most=1.1),
+    Bar("*.loaded.not_ok", equals=0),
+)
+def run_benchmark(
+    *, only: Annotated[tuple[str, ...], "measure these rows only", ROWS] = (),
+    rounds: Annotated[int, "of the short rows; the others have five"] = 7,
+) -> dict[str, Any]:  # fmt: skip
+    """Measure the rows."""
+    compile_generator()
+    figures = {}
+    for name in only or ROWS:
+        figures[name] = ROWS[name](rounds)
+        say({"row": name, "ratio": figures[name]["ratio"]})
+    return figures

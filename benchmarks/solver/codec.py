@@ -1,6 +1,6 @@
 """Measure the codecs, and the handler against the bare solver.
 
-    python -m benchmarks.solver.codec [--n 500] [--out FILE]
+    python -m benchmarks solver.codec [--n 500]
 
 For each codec and 200 and 300 matches: bytes, encode and decode (to float64 arrays), thread-CPU
 microseconds.  Then one request, bytes in to bytes out (decode, dispatch, encode), over one
@@ -10,18 +10,14 @@ which takes a tenth of the time that PoseLib takes.
 
 from __future__ import annotations
 
-import argparse
-import json
-import os
-import platform
 import time
 from collections.abc import Callable
-from importlib.metadata import version
-from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
+from benchmarks.frame.registry import Bar, benchmark
+from benchmarks.frame.statistics import spread
 from rse_pf.config import PlatformSettings
 from rse_pf.pnp import solve_pnp
 from rse_pf.pnp.problems import PnpProblem, make_problem
@@ -30,63 +26,31 @@ from rse_pf.services.builtin import builtin_services
 from rse_pf.services.pnp import PnpReply, PnpRequest, make_request, wire_types
 from rse_pf.wire import CODECS, Command, Result, as_type, make_codec
 
-__all__ = ["main", "measure"]
+__all__ = ["measure"]
 
 MATCHES = (200, 300)
-BARS = {"zlib": 2.2, "json": 2.2, "bin": 1.3}
 PROBLEMS = 32
-PERCENTILES = (50, 95, 99)
 
 
-def main() -> None:
-    """Measure, print the tables, write the report."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--n", type=int, default=500, help="samples of each figure")
-    parser.add_argument("--out", type=Path, help="write the figures as JSON")
-    args = parser.parse_args()
-    report = measure(args.n)
-    print(f"{report['machine']}, {report['versions']}, n {args.n}, load {report['load_before'][0]:.2f}")
-    print(f"{'codec':6}{'matches':>8}{'up B':>7}{'down B':>7}", *(f"{name:>22}" for name in STAGES))
-    for row in report["codecs"]:
-        shown = (" / ".join(f"{row[name][f'p{p}']:.0f}" for p in PERCENTILES) for name in STAGES)
-        print(
-            f"{row['codec']:6}{row['matches']:8}{row['command_bytes']:7}{row['result_bytes']:7}",
-            *(f"{cell:>22}" for cell in shown),
-        )
-    print(f"\n{'codec':6}{'matches':>8}{'solver us':>11}{'handler us':>11}{'ratio':>7}{'bar':>6}")
-    for row in report["handler"]:
-        print(
-            f"{row['codec']:6}{row['matches']:8}{row['solver']['p50']:11.0f}{row['handler']['p50']:11.0f}"
-            f"{row['ratio']:7.2f}{row['bar']:6.2f}  {'held' if row['ratio'] <= row['bar'] else 'BROKEN'}"
-        )
-    if args.out:
-        args.out.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
-
-
-STAGES = ("robot encodes", "server decodes", "server encodes", "robot decodes")
+@benchmark(
+    Bar("handler.*.ratio_of.zlib", at_most=2.2),
+    Bar("handler.*.ratio_of.json", at_most=2.2),
+    Bar("handler.*.ratio_of.bin", at_most=1.3),
+)
+def run_benchmark(*, n: Annotated[int, "samples of each figure"] = 500) -> dict[str, Any]:
+    """Measure the codecs and the handler."""
+    return measure(n)
 
 
 def measure(n: int) -> dict[str, Any]:
     """Return all figures of *n* samples each."""
-    load_before = os.getloadavg()
     registry = builtin_services(PlatformSettings())
     codecs, handler = [], []
     for matches in MATCHES:
         problems = [make_problem(seed=seed, n=matches) for seed in range(PROBLEMS)]
         codecs += [_codec_row(name, problems, registry, n) for name in CODECS]
         handler += _handler_rows(problems, registry, n)
-    return {
-        "machine": f"{platform.machine()} x {os.cpu_count()}, Python {platform.python_version()}",
-        "versions": ", ".join(f"{name} {version(name)}" for name in ("numpy", "msgspec", "poselib")),
-        "n": n,
-        "load_before": load_before,
-        "load_after": os.getloadavg(),
-        "unit": "thread-CPU us",
-        "codecs": codecs,
-        "handler": handler,
-    }
+    return {"unit": "thread-CPU us", "codecs": codecs, "handler": handler}
 
 
 def _codec_row(name: str, problems: list[PnpProblem], registry: Registry, n: int) -> dict[str, Any]:
@@ -107,7 +71,7 @@ def _codec_row(name: str, problems: list[PnpProblem], registry: Registry, n: int
         "matches": len(problems[0].pixels),
         "command_bytes": round(float(np.median([len(data) for data in sent]))),
         "result_bytes": round(float(np.median([len(data) for data in answered]))),
-        **{stage: _percentiles(times_us) for stage, times_us in zip(stages, times, strict=True)},
+        **{stage: spread(times_us) for stage, times_us in zip(stages, times, strict=True)},
     }
 
 
@@ -134,11 +98,10 @@ def _handler_rows(problems: list[PnpProblem], registry: Registry, n: int) -> lis
     return [
         {
             "codec": name,
+            "ratio_of": {name: float(np.median(times_us) / np.median(solved))},
             "matches": len(problems[0].pixels),
-            "solver": _percentiles(solved),
-            "handler": _percentiles(times_us),
-            "ratio": float(np.median(times_us) / np.median(solved)),
-            "bar": BARS[name],
+            "solver": spread(solved),
+            "handler": spread(times_us),
         }
         for name, times_us in zip(CODECS, handled, strict=True)
     ]
@@ -158,11 +121,3 @@ def _time_interleaved(calls: list[Callable[[int], Any]], n: int) -> list[list[fl
             call(i % PROBLEMS)
             times_us.append((time.thread_time_ns() - started) / 1e3)
     return [times_us[PROBLEMS:] for times_us in times]
-
-
-def _percentiles(times: list[float]) -> dict[str, float]:
-    return {f"p{p}": float(np.percentile(times, p)) for p in PERCENTILES}
-
-
-if __name__ == "__main__":
-    main()

@@ -4,23 +4,19 @@ Defends: at least 99.5 % right poses at 10-50 % wrong matches with both engines,
 70 %; thread CPU of `solve_pnp` at most 1.35 times the bare PoseLib call (200 matches, 30 %).
 The load average stands beside the figures: discard those of a busy machine.
 
-    python -m benchmarks.solver.engines --out solver.json
+    python -m benchmarks solver.engines --out solver.json
 """
 
 from __future__ import annotations
 
-import argparse
-import json
-import os
-import platform
 import time
 from collections.abc import Callable
-from importlib.metadata import version
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from benchmarks.frame.registry import Bar, benchmark
+from benchmarks.frame.statistics import spread
 from rse_pf.errors import RsePfError
 from rse_pf.geometry import pose_difference
 from rse_pf.pnp import PnpOptions, PnpSolution, available_engines, solve_pnp
@@ -31,7 +27,6 @@ OUTLIER_RATIOS = (0.1, 0.3, 0.5, 0.7)
 RIGHT_M, RIGHT_DEG = 0.1, 2.0
 MAX_PROBLEMS = 2000
 MIN_PAIRS = 500
-PACKAGES = {"poselib": "poselib", "opencv": "opencv-python-headless", "native": "rse-pf"}
 
 
 def cpu_us(work: Callable[[], Any]) -> tuple[float, Any]:
@@ -71,12 +66,11 @@ def measure_engines(problems: int) -> list[dict[str, Any]]:
                 times[engine].append(spent)
                 right[engine] += is_right(problem, solution)
         for engine, spent_us in times.items():
-            p50, p95, p99 = np.percentile(spent_us, [50, 95, 99]).round(1).tolist()
             rows.append(
                 {
-                    "engine": engine, "outlier_percent": round(100 * outlier_ratio), "n": problems,
+                    "engine": engine, "outlier_percent": round(100 * outlier_ratio),
                     "right_percent": 100.0 * right[engine] / problems,
-                    "cpu_us_p50": p50, "cpu_us_p95": p95, "cpu_us_p99": p99,
+                    "cpu_us": spread(spent_us),
                 }
             )  # fmt: skip
     return rows
@@ -121,46 +115,23 @@ def measure_overhead(pairs: int) -> dict[str, Any]:
     }
 
 
-def table(report: dict[str, Any]) -> str:
-    """Return *report* for a person."""
-    lines = [
-        f"{'engine':8s} {'wrong %':>7s} {'right %':>8s} {'p50 us':>8s} {'p95 us':>8s} {'p99 us':>8s}     n"
-    ]
-    for row in report["engines"]:
-        lines.append(
-            f"{row['engine']:8s} {row['outlier_percent']:7d} {row['right_percent']:8.2f} "
-            f"{row['cpu_us_p50']:8.0f} {row['cpu_us_p95']:8.0f} {row['cpu_us_p99']:8.0f} {row['n']:5d}"
-        )
-    overhead = report["overhead"]
-    lines.append(
-        f"solve_pnp {overhead['solve_pnp_us_p50']:.0f} us / bare call {overhead['bare_us_p50']:.0f} us = "
-        f"{overhead['ratio']:.3f}   ({overhead['pairs']} pairs, thread CPU, 200 matches, 30 % wrong)"
-    )
-    lines.append(f"load average {report['load_before']} before, {report['load_after']} after")
-    return "\n".join(lines)
-
-
-def main() -> None:
-    """Run, print the table, and write ``--out``."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--n", type=int, default=200, help=f"problems a cell, at most {MAX_PROBLEMS}")
-    parser.add_argument("--out", type=Path, help="write the figures as JSON")
-    arguments = parser.parse_args()
-    problems = max(1, min(arguments.n, MAX_PROBLEMS))
-    before = [round(load, 2) for load in os.getloadavg()]
-    report = {
-        "machine": f"{platform.machine()}, {os.cpu_count()} cores",
-        "python": platform.python_version(),
-        "versions": {engine: version(PACKAGES[engine]) for engine in available_engines()},
-        "engines": measure_engines(problems),
-        "overhead": measure_overhead(max(MIN_PAIRS, problems)),
-        "load_before": before,
-        "load_after": [round(load, 2) for load in os.getloadavg()],
-    }
-    print(table(report))
-    if arguments.out:
-        arguments.out.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
-
-
-if __name__ == "__main__":
-    main()
+@benchmark(
+    Bar("right_percent.poselib", at_least=99.5, unit="%"),
+    Bar("right_percent.opencv, up to 50 % wrong", at_least=99.5, unit="%"),
+    Bar("overhead.ratio", at_most=1.35),
+)
+def run_benchmark(*, n: int = 200) -> dict[str, Any]:
+    """Measure the engines and the overhead."""
+    problems = max(1, min(n, MAX_PROBLEMS))
+    rows = measure_engines(problems)
+    return {
+        "engines": rows, "overhead": measure_overhead(max(MIN_PAIRS, problems)),
+        "right_percent": {
+            name: min(
+                row["right_percent"]
+                for row in rows
+                if row["engine"] == name.partition(",")[0] and row["outlier_percent"] <= most
+            )
+            for name, most in (("poselib", 70), ("opencv, up to 50 % wrong", 50))
+        },
+    }  # fmt: skip

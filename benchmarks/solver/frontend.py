@@ -4,16 +4,12 @@ Defends: on the kitchen recording at most half the CPU of version 0.1.0, and eve
 matches.  All ways take turns on each frame; the load average stands beside the figures.
 
     git worktree add ../0.1.0 7523456
-    python -m benchmarks.solver.frontend ../shared/data/7scenes_redkitchen --before ../0.1.0 --n 500
+    python -m benchmarks solver.frontend ../shared/data/7scenes_redkitchen --before ../0.1.0 --n 500
 """
 
 from __future__ import annotations
 
-import argparse
 import importlib.util
-import json
-import os
-import platform
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -21,10 +17,12 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
+from benchmarks.frame.registry import Bar, benchmark
+from benchmarks.frame.statistics import spread
 from client_sdk import frontend
 from client_sdk.datasets import Dataset, open_dataset
 from client_sdk.native_match import FrontEndCore, open_front_end
@@ -130,62 +128,30 @@ def measure(dataset: Dataset, compared: list[Way], pairs: int, *, wide: bool) ->
     figures = [
         {
             "way": way.name,
-            "n": len(way.match_us),
-            "extract_us": percentiles(way.extract_us),
-            "match_us": percentiles(way.match_us),
-            "frame_us": percentiles(whole[way.name]),
+            "extract_us": spread(way.extract_us),
+            "match_us": spread(way.match_us),
+            "frame_us": spread(whole[way.name]),
             "share": float(np.median(whole[way.name]) / reference),
             "frames_with_other_bytes": way.other_bytes,
         }
         for way in compared
     ]
-    return [*figures, {"way": "ORB alone", "n": len(orb_us), "frame_us": percentiles(orb_us)}]
+    return [*figures, {"way": "ORB alone", "frame_us": spread(orb_us)}]
 
 
-def percentiles(spent_us: Any) -> dict[str, float]:
-    """Return p50, p95 and p99."""
-    return {f"p{percent}": float(np.percentile(spent_us, percent)) for percent in (50, 95, 99)}
-
-
-def table(report: dict[str, Any]) -> str:
-    """Return *report* for a person; microseconds."""
-
-    def cells(row: dict[str, Any], name: str) -> str:
-        return "".join(f"{value:8.0f}" for value in row[name].values()) if name in row else " " * 24
-
-    lines = [f"{'':17s}     n  extract p50 p95 p99         match p50 p95 p99           frame p50 p95 p99     share  other"]  # fmt: skip # noqa: E501  the head of a table
-    for row in report["ways"]:
-        end = f"{row['share']:9.3f}{row['frames_with_other_bytes']:6d}" if "share" in row else ""
-        columns = "".join(cells(row, name) for name in ("extract_us", "match_us", "frame_us"))
-        lines.append(f"{row['way']:17s}{row['n']:6d}{columns}{end}")
-    lines.append(
-        f"{report['machine']}; load average {report['load_before']} before, {report['load_after']} after"
-    )
-    return "\n".join(lines)
-
-
-def main() -> None:
-    """Run, print the table, and write ``--out``."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("recording", type=Path, help="folder of a recording")
-    parser.add_argument("--before", type=Path, help="a checkout of version 0.1.0, the reference")
-    parser.add_argument("--n", type=int, default=500, help="pairs of frames")
-    parser.add_argument("--wide", action="store_true", help="four times the features, as for wide baselines")
-    parser.add_argument("--out", type=Path, help="write the figures as JSON")
-    arguments = parser.parse_args()
-    report: dict[str, Any] = {
-        "machine": f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}",
-        "recording": arguments.recording.name,
-        "load_before": [round(load, 2) for load in os.getloadavg()],
-        "ways": measure(
-            open_dataset(arguments.recording), ways(arguments.before), arguments.n, wide=arguments.wide
-        ),
-    }
-    report["load_after"] = [round(load, 2) for load in os.getloadavg()]
-    print(table(report))
-    if arguments.out:
-        arguments.out.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
-
-
-if __name__ == "__main__":
-    main()
+@benchmark(
+    Bar("share", at_most=0.5, unit="of the CPU of 0.1.0"),
+    Bar("frames_with_other_bytes", equals=0),
+)
+def run_benchmark(
+    *,
+    recording: Annotated[Path, "folder of a recording"],
+    before: Annotated[Path | None, "a checkout of version 0.1.0, the reference"] = None,
+    n: Annotated[int, "pairs of frames"] = 500,
+    wide: Annotated[bool, "four times the features, as for wide baselines"] = False,
+) -> dict[str, Any]:
+    """Compare all ways on one recording."""
+    figures = measure(open_dataset(recording), ways(before), n, wide=wide)
+    ours = figures[-2]
+    compared = {} if before is None else {key: ours[key] for key in ("share", "frames_with_other_bytes")}
+    return {"recording": recording.name, "ways": figures, **compared}

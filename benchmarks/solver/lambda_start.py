@@ -2,21 +2,22 @@
 
 Each run is a fresh process; fetching the keys from S3 is left out: it takes time, but no CPU.  Runs with
 bytecode, as the package of the function has it, and runs that compile all sources take turns.
-``python -m benchmarks.solver.lambda_start --out FILE``; ``--folder build/lambda --python python3.13``
+``python -m benchmarks solver.lambda_start --out FILE``; ``--folder build/lambda --python python3.13``
 measures the package itself, and `--base TREE` another tree of the sources beside it.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
-import statistics
 import subprocess
 import sys
 import tempfile
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+from benchmarks.frame.registry import Bar, benchmark
+from benchmarks.frame.statistics import spread
 
 RUNS = 10
 BAR_S = 0.5
@@ -74,44 +75,24 @@ def start(python: str, folder: Path, bytecode: Path | None, sent: str) -> dict[s
     return row
 
 
-def main() -> None:
-    """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--folder", type=Path, default=Path.cwd(), help="the sources that are measured")
-    parser.add_argument("--base", type=Path, help="other sources, measured in turns")
-    parser.add_argument("--python", default=sys.executable)
-    parser.add_argument("--out", type=Path)
-    args = parser.parse_args()
-    sent, load = order(), os.getloadavg()
-    trees = {"": args.folder, **({"base, ": args.base} if args.base else {})}
+@benchmark(Bar("bytecode.all_s.p50", at_most=BAR_S, unit="s of CPU"))
+def run_benchmark(
+    *, folder: Annotated[Path, "the sources that are measured"] = Path(),
+    base: Annotated[Path | None, "other sources, measured in turns"] = None,
+    python: str = sys.executable,
+) -> dict[str, Any]:  # fmt: skip
+    """Start fresh processes in turns."""
+    sent = order()
+    trees = {"": folder.resolve(), **({"base, ": base} if base else {})}
     rows: dict[str, list[dict[str, Any]]] = {}
     with tempfile.TemporaryDirectory() as bytecode:
         for number in range(-1, RUNS):
             for name, tree in trees.items():
-                for kind, folder in (("bytecode", Path(bytecode)), ("compiling", None)):
-                    row = start(args.python, tree, folder, sent)
+                for kind, cache in (("bytecode", Path(bytecode)), ("compiling", None)):
+                    row = start(python, tree, cache, sent)
                     if number >= 0:  # the first run writes the bytecode
                         rows.setdefault(name + kind, []).append(row)
-    figures = {
-        kind: {
-            name: {
-                "p50": round(statistics.median(row[name] for row in taken), 3),
-                "max": round(max(row[name] for row in taken), 3),
-            }
-            for name in ("import_s", "first_s", "all_s")
-        }
+    return {
+        kind: {name: spread(row[name] for row in taken) for name in ("import_s", "first_s", "all_s")}
         for kind, taken in rows.items()
     }
-    for kind, figure in figures.items():
-        for name, value in figure.items():
-            print(
-                f"{kind:<16} {name:<9} p50 {value['p50']:.3f}  max {value['max']:.3f} s of processor time "
-                f"(n = {RUNS})"
-            )
-    print(f"bar: all_s with bytecode within {BAR_S} s; load average before: {load[0]:.2f}")
-    if args.out:
-        args.out.write_text(json.dumps({"runs": RUNS, "load_average": load, **figures}, indent=2) + "\n")
-
-
-if __name__ == "__main__":
-    main()

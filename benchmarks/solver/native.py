@@ -6,28 +6,26 @@ outlier ratio; median error within 2 % and p95 within 5 %; no pose that is wrong
 poses called ok; mean normalised error squared 6 +- 0.6; the same bytes with and without AVX2.
 The load average stands beside the figures: discard CPU figures of a busy machine.
 
-    python -m benchmarks.solver.native --n 10000 --out native.json
+    python -m benchmarks solver.native --n 10000 --out native.json
 """
 
 from __future__ import annotations
 
-import argparse
 import contextlib
-import json
-import os
-import platform
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
 
+from benchmarks.frame.registry import Bar, benchmark
+from benchmarks.frame.statistics import spread
 from rse_pf import native
-from rse_pf.errors import ConfigurationError, RsePfError
+from rse_pf.errors import RsePfError
 from rse_pf.geometry import Array, Camera, exp_se3, inverse, pose_difference, transform
 from rse_pf.pnp import PnpOptions, WeakLimits, engines, solve_pnp
 from rse_pf.pnp.problems import DEGENERATE, KINECT, make_degenerate, make_problem
@@ -209,10 +207,10 @@ def judgements(each: Case) -> tuple[tuple[str, str, Any], ...]:
     )
 
 
-def spread_mm(metres: list[float]) -> dict[str, float]:
-    """Return the median and the 95th percentile, in millimetres."""
-    p50, p95 = np.percentile(metres, [50, 95])
-    return {"p50": 1e3 * float(p50), "p95": 1e3 * float(p95)}
+def spread_mm(metres: list[float]) -> dict[str, Any]:
+    """Return the spread, in millimetres."""
+
+    return spread(1e3 * value for value in metres)
 
 
 @references()
@@ -257,7 +255,7 @@ def compare(cases: Iterator[Case]) -> dict[str, Any]:
         "all": dict(total),
         "error_mm": {name: spread_mm(values) for name, values in errors_m.items() if values},
         "apart_mm": spread_mm(apart_m) if apart_m else {},
-        "other_verdict_than_0.1.0": dict(verdicts.most_common()),
+        "other_verdict_than_old": dict(verdicts.most_common()),
         "other_bytes_without_avx2": lanes_differ,
         "other_verdict_than_python_on_the_same_pose": evidence_differs,
     }  # fmt: skip
@@ -277,50 +275,31 @@ def normalised_errors(problems: int, outlier_ratio: float) -> dict[str, float]:
     return {"n": problems, "outlier_ratio": outlier_ratio, "mean": float(np.mean(errors2))}
 
 
-def table(report: dict[str, Any]) -> str:
-    """Return *report* for a person."""
-    lines = ["matches wrong %  PoseLib us  native us  without AVX2  ratio     n"]
-    lines += [
-        f"{row['matches']:7d} {row['outlier_percent']:7d} {row['poselib_us_p50']:11.0f} "
-        f"{row['native_us_p50']:10.1f} {row['portable_us_p50']:13.1f} {row['ratio']:6.1f} {row['n']:5d}"
-        for row in report["cpu"]
-    ]
-    for name in ("problems", "degenerate", "recordings"):
-        if name in report:
-            lines.append(f"{name}:")
-            lines += [f"  {key}: {value}" for key, value in report[name].items()]
-    lines += [f"normalised error squared: {row}" for row in report["normalised_errors"]]
-    lines.append(f"load average {report['load_before']} before, {report['load_after']} after")
-    return "\n".join(lines)
-
-
-def main() -> None:
-    """Run, print the table, and write ``--out``."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--n", type=int, default=1000, help="problems of all kinds together")
-    parser.add_argument("--cpu-n", type=int, default=500, help="problems a row of the CPU table")
-    parser.add_argument("--out", type=Path, help="write the figures as JSON")
-    arguments = parser.parse_args()
-    try:
-        lanes = native.native_solver().lanes
-    except ConfigurationError as error:
-        raise SystemExit(error.report()) from None
-    report: dict[str, Any] = {
-        "machine": f"{platform.machine()}, {os.cpu_count()} cores, {lanes}",
-        "python": platform.python_version(),
-        "load_before": [round(load, 2) for load in os.getloadavg()],
-        "cpu": measure_cpu(arguments.cpu_n),
-        "problems": compare(map(case, range(arguments.n))),
-        "degenerate": compare(map(degenerate, range(max(14, arguments.n // 10)))),
-        "normalised_errors": [normalised_errors(1000, 0.0), normalised_errors(1000, 0.3)],
+@benchmark(
+    *(Bar(f"cpu_ratio.{percent} %", at_least=6.0) for percent in (30, 50, 70)),
+    Bar("problems.wrong_and_ok", equals=0),
+    Bar("degenerate.wrong_and_ok", equals=0),
+    Bar("*.other_bytes_without_avx2", equals=0),
+    Bar("normalised_errors.*.mean", at_least=5.4),
+    Bar("normalised_errors.*.mean", at_most=6.6),
+)
+def run_benchmark(
+    *,
+    n: Annotated[int, "problems of all kinds together"] = 1000,
+    cpu_n: Annotated[int, "problems a row of the CPU table"] = 500,
+) -> dict[str, Any]:
+    """Compare with PoseLib."""
+    lanes = native.native_solver().lanes
+    cpu = measure_cpu(cpu_n)
+    compared = {
+        "problems": compare(map(case, range(n))),
+        "degenerate": compare(map(degenerate, range(max(14, n // 10)))),
+        **({"recordings": compare(recorded_cases(RECORDINGS))} if RECORDINGS.is_dir() else {}),
     }
-    if RECORDINGS.is_dir():
-        report["recordings"] = compare(recorded_cases(RECORDINGS))
-    report["load_after"] = [round(load, 2) for load in os.getloadavg()]
-    print(table(report))
-    if arguments.out:
-        arguments.out.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
-
-
-if __name__ == "__main__":
-    main()
+    for row in compared.values():
+        row["wrong_and_ok"] = row["all"].get("native wrong and ok", 0)
+    return {
+        "lanes": lanes, "cpu": cpu, **compared,
+        "cpu_ratio": {f"{row['outlier_percent']} %": row["ratio"] for row in cpu if row["matches"] == 200},
+        "normalised_errors": [normalised_errors(1000, 0.0), normalised_errors(1000, 0.3)],
+    }  # fmt: skip

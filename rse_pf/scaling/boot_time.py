@@ -10,7 +10,7 @@ from rse_pf.scaling.cloud_delays import DESIGNS, Delay
 
 __all__ = ["BOOT_LIMIT_S", "BOOT_S", "STEPS", "ready_within_s", "retry_within_s"]
 
-_MEASURED = "python -m benchmarks.cloud.boot, on a loaded machine"
+_MEASURED = "python -m benchmarks cloud.boot, on a loaded machine"
 
 STEPS: tuple[Delay, ...] = (
     *DESIGNS["0.1.0"].launch[:2],

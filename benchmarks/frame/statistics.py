@@ -1,0 +1,42 @@
+"""Statistics of benchmarks: the one percentile, and pairs of runs that take turns."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any, TypeVar
+
+import numpy as np
+
+from rse_pf.experiments.results.summary import percentiles
+
+__all__ = ["interleaved", "median_ratio", "percentile", "spread"]
+
+Way = TypeVar("Way")
+
+
+def percentile(values: Any, percent: Any, axis: int | None = None) -> Any:
+    """Return the percentile of *values*, linear between two of them; NaN without any."""
+    if not len(values):
+        return np.full(np.shape(percent), np.nan)[()]
+    return np.percentile(values, percent, axis=axis)
+
+
+def spread(values: Iterable[float]) -> dict[str, float | int | None]:
+    """Return n, mean, p50, p95, p99 and max, to three digits; None without any value."""
+    return percentiles([float(value) for value in values])
+
+
+def interleaved(ways: Sequence[Way], rounds: int) -> Iterator[tuple[int, Way]]:
+    """Yield round and way, all ways in each round; every second round begins with the last way.
+
+    What else happens on the machine then disturbs all ways alike, and none is always first.
+    """
+    for number in range(rounds):
+        for way in reversed(ways) if number % 2 else ways:
+            yield number, way
+
+
+def median_ratio(values: Sequence[float], bases: Sequence[float]) -> float:
+    """Return the median of the ratios of the pairs of *values* and *bases*."""
+    return statistics.median(value / base for value, base in zip(values, bases, strict=True))
