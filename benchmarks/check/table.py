@@ -5,23 +5,22 @@ rendered drives, >= 85 % in recordings, with the value within 20 %; of 200 healt
 the check of 250 frames <= 10 s beside the tracker.  A fault counts as told if any finding is certain of it;
 one that no finding names is missed, whatever its deviation would be.  Poses are solved in this process.
 
-    python -m benchmarks.check.table --seeds 0 1 --out check.json
-    python -m benchmarks.check.table --seeds 20 21 --recordings ../shared/data --out check.json
+    python -m benchmarks check.table --seeds 0 1 --out check.json
+    python -m benchmarks check.table --seeds 20 21 --recordings ../shared/data --out check.json
 """
 
 from __future__ import annotations
 
-import argparse
-import json
-import os
 import time
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from benchmarks.check.drives import CheckedDrive, recorded_drive, rendered_drive
 from benchmarks.check.faults import FAULTS, Fault
+from benchmarks.frame.registry import Bar, benchmark
+from benchmarks.frame.report import say
 from benchmarks.maps.recordings import track
 from client_sdk.check.findings import CheckReport
 from client_sdk.check.motion import MotionReference
@@ -29,10 +28,11 @@ from client_sdk.check.observer import DriveObserver
 from client_sdk.frontend import Frame, FrontEndOptions
 from client_sdk.tracking.tracker import Tracker
 
-__all__ = ["main"]
+__all__ = ["table"]
 
 _PARTS = (("7scenes_redkitchen", 0, 125), ("7scenes_redkitchen", 125, 125), ("tum_fr1_rpy_start", 0, 150),
           ("tum_fr1_rpy_start", 150, 150))  # fmt: skip
+_RECORDINGS = {name for name, _, _ in _PARTS}
 _WITHIN = 0.2
 
 
@@ -85,41 +85,62 @@ def drives(seeds: Iterable[int], frames: int, recordings: Path | None) -> Iterat
         yield recorded_drive(recordings / name, first, count)
 
 
-def main() -> int:
-    """Run the table and write JSON; rows are written as they come."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--seeds", type=int, nargs="*", default=[0], help="of rendered drives (default: 0)")
-    parser.add_argument("--frames", type=int, default=120, help="of a rendered drive (default: 120)")
-    parser.add_argument("--recordings", type=Path, help="folder of recordings")
-    parser.add_argument("--only", nargs="*", help="names of faults, such as fx k1; none for healthy drives")
-    parser.add_argument("--out", type=Path, required=True, help="JSON file")
-    args = parser.parse_args()
+@benchmark(
+    Bar("rendered.first_share", at_least=0.95),
+    Bar("rendered.near_share", at_least=0.95),
+    Bar("recorded.first_share", at_least=0.85),
+    Bar("healthy.share_with_finding", at_most=0.02),
+    Bar("check_s.*", at_most=10.0, unit="s"),
+)
+def table(
+    seeds: Annotated[tuple[int, ...], "of rendered drives"] = (0,),
+    frames: Annotated[int, "of a rendered drive"] = 120,
+    recordings: Annotated[Path | None, "folder of recordings, whose parts are driven too"] = None,
+    only: Annotated[tuple[str, ...], "names of faults, such as fx k1 (default: all)"] = (),
+) -> dict[str, Any]:
+    """Run every drive healthy and with each fault; return shares, counts by fault, and all rows."""
+    chosen = [fault for fault in FAULTS if not only or fault.name.rpartition("-")[0] in only]
     rows: list[dict[str, Any]] = []
-    chosen = [f for f in FAULTS if args.only is None or f.name.rpartition("-")[0] in args.only]
-    for drive in drives(args.seeds, args.frames, args.recordings):
+    for drive in drives(seeds, frames, recordings):
         for fault in (None, *chosen):
-            row = row_of(drive, fault)
+            row = row_of(drive, fault) | {"is_recorded": drive.name in _RECORDINGS}
             rows.append(row)
-            args.out.write_text(json.dumps({"load": os.getloadavg(), "rows": rows}, indent=1) + "\n")
             said = ", ".join(f"{e['kind']} {e['value']:.3g}+-{e['deviation']:.2g}" for e in row["findings"])
-            print(
-                f"{drive.name} {'healthy' if fault is None else fault.name}: {said or 'nothing'}", flush=True
-            )
-    summary: dict[str, list[dict[str, Any]]] = defaultdict(list)
-    for row in rows:
-        if "fault" in row:
-            summary[row["fault"].rpartition("-")[0]].append(row)
-    for name, each in summary.items():
-        counts = {
-            key: sum(row[key] for row in each) for key in ("is_first", "is_told", "is_near", "is_declared")
-        }
-        print(f"{name:<14} n {len(each):3}  " + "  ".join(f"{key} {count}" for key, count in counts.items()))
+            say(f"{drive.name} {'healthy' if fault is None else fault.name}: {said or 'nothing'}")
+    planted = [row for row in rows if "fault" in row]
     healthy = [row for row in rows if "fault" not in row]
-    print(f"healthy: {sum(bool(row['findings']) for row in healthy)} of {len(healthy)} with a finding")
-    return 0
+    with_finding = sum(bool(row["findings"]) for row in healthy)
+    by_fault: dict[str, list[dict[str, Any]]] = defaultdict(list)
+    for row in planted:
+        by_fault[row["fault"].rpartition("-")[0]].append(row)
+    return {
+        **{
+            name: shares([row for row in planted if row["is_recorded"] is is_recorded])
+            for name, is_recorded in (("rendered", False), ("recorded", True))
+        },
+        "healthy": {
+            "n": len(healthy), "with_finding": with_finding,
+            "share_with_finding": with_finding / max(len(healthy), 1),
+        },
+        "check_s": {"worst_of_250_frames": max(row["check_s"] * 250 / row["frames"] for row in rows)},
+        "by_fault": {name: counts(each) for name, each in by_fault.items()},
+        "rows": rows,
+    }  # fmt: skip
 
 
-if __name__ == "__main__":
-    raise SystemExit(main())
+def counts(rows: Iterable[dict[str, Any]]) -> dict[str, int]:
+    """Return how many rows there are, and in how many the fault was first, told, near and declared."""
+    kept = list(rows)
+    keys = ("is_first", "is_told", "is_near", "is_declared")
+    return {"n": len(kept), **{key: sum(row[key] for row in kept) for key in keys}}
+
+
+def shares(rows: Iterable[dict[str, Any]]) -> dict[str, Any]:
+    """Return the counts of planted faults, with the shares that are judged; none without rows."""
+    each = counts(rows)
+    if not each["n"]:
+        return {}
+    return each | {
+        "first_share": each["is_first"] / each["n"],
+        "near_share": each["is_near"] / max(each["is_told"], 1),
+    }
