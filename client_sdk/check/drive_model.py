@@ -9,8 +9,9 @@ import numpy as np
 import numpy.typing as npt
 
 from client_sdk.check.keyframes import FLIPS, Keyframe, Tracks
-from client_sdk.frontend import load_opencv
+from rse_pf.errors import PnpError
 from rse_pf.geometry import Array, Camera, inverse, transform
+from rse_pf.pnp import PnpOptions, solve_pnp
 from rse_pf.slam.self_calibration import DriveObservations, triangulated
 
 __all__ = ["DepthReading", "DriveModel", "best_reading", "drive_model", "nearest_delay"]
@@ -18,7 +19,8 @@ __all__ = ["DepthReading", "DriveModel", "best_reading", "drive_model", "nearest
 Rows = npt.NDArray[np.int64]
 
 _LEAST_SEEN, _LEAST_KEYFRAMES = 20, 5
-_PNP_PX, _PNP_TRIALS = 8.0, 100
+_PNP = PnpOptions(inlier_px=8.0, max_iterations=100)
+"""Wide: intrinsics that are wrong have residuals of some pixels."""
 _PIXEL_PX = 0.7
 _LEAST_SHARE = 0.3
 _FAR_S = 0.07
@@ -223,14 +225,9 @@ def _chained(
 def _pose(camera: Camera, points: Array, pixels: Array) -> Array | None:
     if len(points) < _LEAST_SEEN:
         return None
-    cv2 = load_opencv()
-    cv2.setRNGSeed(0)
-    done, turn, shift, inliers = cv2.solvePnPRansac(
-        points, pixels, camera.matrix, None, iterationsCount=_PNP_TRIALS, reprojectionError=_PNP_PX,
-        flags=cv2.SOLVEPNP_EPNP,
-    )  # fmt: skip
-    if not done or inliers is None or len(inliers) < max(_LEAST_SEEN // 2, _LEAST_SHARE * len(points)):
+    try:
+        found = solve_pnp(points, pixels, camera, _PNP)
+    except PnpError:
         return None
-    T: Array = np.eye(4)
-    T[:3, :3], T[:3, 3] = cv2.Rodrigues(turn)[0], shift.ravel()
-    return T if np.isfinite(T).all() else None
+    enough = max(_LEAST_SEEN // 2, _LEAST_SHARE * len(points))
+    return found.T_camera_world if len(found.inliers) >= enough else None

@@ -348,8 +348,6 @@ class _System:
         c, m, split = self._c, self._m, self._c * self.k
         size = split + m
         self._H, self._g = np.zeros((size, size)), np.zeros(size)
-        E = np.zeros((size, self.l, 3))
-        W_c, W_v = J_c.transpose(0, 2, 1) @ J_p, J_v.transpose(0, 2, 1) @ J_p
         for row, own in enumerate(self._of_keyframe):
             at = slice(c * row, c * row + c)
             stacked, others = J_c[own].reshape(-1, c), J_v[own].reshape(-1, m)
@@ -360,27 +358,30 @@ class _System:
             self._H[split:, split:] += others.T @ others
             self._g[at] = stacked.T @ r
             self._g[split:] += others.T @ r
-            E[at, self.landmarks[own]] = W_c[own].transpose(1, 0, 2)
-        E[split:] = _summed(W_v, self.landmarks, self.l).transpose(1, 0, 2)
-        self._E = E.reshape(size, -1)
-        self._Hpp = _summed(J_p.transpose(0, 2, 1) @ J_p, self.landmarks, self.l)
-        self._gp = _summed((J_p.transpose(0, 2, 1) @ self._r[:, :, None])[:, :, 0], self.landmarks, self.l)
+        # (l, 3, size): a landmark's rows lie together, so that the product below is of one array with itself.
+        J_pt = J_p.transpose(0, 2, 1)
+        self._E = np.zeros((self.l, 3, size))
+        columns = c * self.keyframes[:, None, None] + np.arange(c)
+        self._E[self.landmarks[:, None, None], np.arange(3)[:, None], columns] = J_pt @ J_c
+        self._E[:, :, split:] = _summed(J_pt @ J_v, self.landmarks, self.l)
+        self._Hpp = _summed(J_pt @ J_p, self.landmarks, self.l)
+        self._gp = _summed((J_pt @ self._r[:, :, None])[:, :, 0], self.landmarks, self.l)
 
     def _reduced(self, damping: float) -> tuple[Array, Array, Array]:
-        """Return the reduced matrix with priors, ``E Hpp^-1``, and ``Hpp^-1``."""
+        """Return the reduced matrix with priors, its right side, and ``Hpp^-1``."""
         size = len(self._g)
         damped = self._Hpp * (1.0 + damping * np.eye(3)) + _POINT_INFORMATION * np.eye(3)
-        P: Array = np.linalg.inv(damped).astype(np.float64, copy=False)
-        E = self._E.reshape(size, self.l, 3)
-        Y = (E.transpose(1, 0, 2) @ P).transpose(1, 0, 2).reshape(size, -1)
-        S = self._H - Y @ self._E.T
+        root: Array = np.linalg.inv(np.linalg.cholesky(damped)).astype(np.float64, copy=False)
+        Z = (root @ self._E).reshape(-1, size)
+        S = self._H - Z.T @ Z
+        right = (root @ self._gp[:, :, None]).ravel() @ Z - self._g
         diagonal = np.arange(size)
         S[diagonal, diagonal] += damping * self._H[diagonal, diagonal] + self._prior()
         if self._c == 7:
             # The mean of the zooms is the common focal length's.
             zoom = 7 * np.arange(self.k) + 6
             S[np.ix_(zoom, zoom)] += _MEAN_INFORMATION / self.k
-        return S, Y, P
+        return S, right, root.transpose(0, 2, 1) @ root
 
     def _prior(self) -> Array:
         own = np.full((self.k, self._c), _POSE_INFORMATION)
@@ -389,13 +390,13 @@ class _System:
 
     def step(self, state: _State, damping: float) -> _State:
         """Return the state after one damped step."""
-        S, Y, P = self._reduced(damping)
+        S, right, P = self._reduced(damping)
         k, c = self.k, self._c
         now = np.zeros((k, c))
         now[:, 6:] = state.zooms[:, None]
         pull = self._prior() * np.concatenate([now.ravel(), state.values[self._free]])
-        d = np.linalg.solve(S, Y @ self._gp.ravel() - self._g - pull)
-        back = -(self._gp + (self._E.T @ d).reshape(-1, 3))
+        d = np.linalg.solve(S, right - pull)
+        back = -(self._gp + self._E @ d)
         own = d[: c * k].reshape(k, c)
         limit = min(1.0, _MOST_TURN_RAD / max(float(np.abs(own[:, 3:6]).max()), 1e-12))
         values = state.values.copy()
@@ -409,14 +410,14 @@ class _System:
 
     def result(self, state: _State) -> Calibrated:
         """Return the state with its deviations."""
-        S, Y, _ = self._reduced(0.0)
+        S, _, P = self._reduced(0.0)
         k, c, m, split = self.k, self._c, self._m, self._c * self.k
         whole: Array = np.linalg.inv(S).astype(np.float64, copy=False)
         rows = np.arange(split, split + m)
         if c == 7:
             rows = np.concatenate([rows, 7 * np.arange(k) + 6])
         own = whole[rows][:, rows]
-        growth = np.sqrt(self._inflation(whole[rows], Y, np.diag(own)))
+        growth = np.sqrt(self._inflation(whole[rows], P, np.diag(own)))
         own = own * growth[:, None] * growth[None]
         covariance: Array = np.zeros((len(UNKNOWNS), len(UNKNOWNS)))
         zooms_covariance: Array = np.zeros((k, k))
@@ -436,10 +437,10 @@ class _System:
             has_metres=self._has_metres(), pixel_factor=self.pixel_factor, depth_factor=self.depth_factor,
         )  # fmt: skip
 
-    def _inflation(self, rows: Array, Y: Array, variances: Array) -> Array:
+    def _inflation(self, rows: Array, P: Array, variances: Array) -> Array:
         """Return by how much variances grow where errors of one stretch of the drive go together."""
         k, split = self.k, self._c * self.k
-        of_points = (rows @ Y).reshape(len(rows), self.l, 3)
+        of_points = np.einsum("lar,lab->rlb", self._E @ rows.T, P)
         of_cameras = rows[:, :split].reshape(len(rows), k, self._c)
         pull_c, pull_v, pull_p = ((J.transpose(0, 2, 1) @ self._r[:, :, None])[:, :, 0] for J in self._J)
         moved = pull_v @ rows[:, split:].T
