@@ -25,6 +25,7 @@ from client_sdk.offloading.burst import Burst
 from client_sdk.offloading.burst_rules import check_burst_url
 from client_sdk.offloading.offload import CloudFirst
 from client_sdk.recording import make_recorder, sdk_version
+from client_sdk.robot_objects import RobotObjects
 from client_sdk.stats import Stats, StatsKeeper
 from client_sdk.updates import RobotSubscriptions, Updates
 from rse_pf.config import SessionSettings
@@ -141,6 +142,9 @@ class Robot:
             session=self._session, flush=self._connection.flush, keeper=self._keeper, clock=clock,
             offload=offload, local=self._local, burst=self._burst,
         )  # fmt: skip
+        self._objects = RobotObjects(
+            self._read_token, lambda: (self._connection.url, self._connection.dialler.ssl_context)
+        )
         self._open = False
 
     async def __aenter__(self) -> Robot:
@@ -191,6 +195,7 @@ class Robot:
                 self._take_answer(event)
         await self._connection.close()
         await self._asking.close()
+        self._objects.close()
         if self._local is not None:
             self._local.close()
         if self._recorder is not None:
@@ -360,6 +365,17 @@ class Robot:
             T_world_start=T_world_start, features=features, motion=motion, loops=loops,
             clock=self._clock,
         )  # fmt: skip
+
+    async def store_object(self, data: bytes) -> str:
+        """Store *data*, at most 256 KiB, as an object of this robot by the data service; return its digest.
+
+        `DataClient` stores larger ones, and repeats what fails.
+
+        Raises:
+            ConnectError: The platform has no data service, or it does not answer.
+            StoreFull, QuotaExceeded, LimitExceeded, Unauthorized, Forbidden: It refuses the object.
+        """
+        return await self._objects.store(data)
 
     def record_frame(self, frame: Frame, T_odom_camera: npt.NDArray[np.float64] | None = None) -> None:
         """Record a thumbnail of *frame*, if allowed, and its pose ``(4, 4)`` by odometry, if there is one.

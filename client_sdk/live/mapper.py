@@ -31,7 +31,9 @@ import numpy as np
 from client_sdk.answers import PoseAnswer
 from client_sdk.frontend import Features, Frame, FrontEndOptions, PoseQuery, TrackedFrame
 from client_sdk.live.alignments import Alignments, Correction, OtherRobot
+from client_sdk.live.attachments import Attached, Attachments
 from client_sdk.live.keyframe_chain import KeyframeChain
+from client_sdk.live.object_sender import StoreObject
 from client_sdk.live.options import LiveOptions
 from client_sdk.live.sender import REFUSALS, KeyframeSender, LiveCaller, Myself
 from client_sdk.live.waiting_keyframes import Base, WaitingKeyframe, WaitingKeyframes
@@ -113,6 +115,7 @@ class LiveMapper:
         features: FeaturesFunction | None = None,
         motion: MotionFunction | None = None,
         loops: LoopsFunction | None = None,
+        store: StoreObject | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         """Describe the robot's part of a live map; ``async with`` joins it.
@@ -134,6 +137,7 @@ class LiveMapper:
             motion: Expects the pose of the next frame; None for a constant velocity.
             loops: Describes an image, so that this robot finds its own places again; other robots are found
                 by the features.
+            store: Stores an object of this robot, for the cloud of the map; None: it gets no points.
             clock: Seconds, monotonic.
 
         Raises:
@@ -145,6 +149,7 @@ class LiveMapper:
         self._robot, self._clock = robot, clock
         self._waiting = WaitingKeyframes(None if spool is None else spool / name)
         self._sender: KeyframeSender
+        self._attachments = Attachments(store, self.options, clock, self._wait_idle)
         self._ask = ask
         self._mapper = Mapper(
             ask=self._ask_first, camera=camera, depth=depth,
@@ -209,7 +214,8 @@ class LiveMapper:
         if len(self._waiting):
             self._sender.note_added()
         self._is_open = True
-        self._tasks = [asyncio.create_task(self._sender.run()), asyncio.create_task(self._follow())]
+        works = self._sender.run(), self._follow(), self._attachments.run()
+        self._tasks = [asyncio.create_task(work) for work in works]
 
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -223,7 +229,7 @@ class LiveMapper:
             await self._wait_for_cloud()
             if self._robot.connected and not isinstance(error, asyncio.CancelledError):
                 with contextlib.suppress(asyncio.TimeoutError):
-                    await asyncio.wait_for(self._sender.wait_empty(), self.options.leave_s)
+                    await asyncio.wait_for(self._wait_sent(), self.options.leave_s)
                 with contextlib.suppress(RsePfError):
                     await self._robot.call("live-leave", {"map": self.name}, deadline_s=_RETRY_S, keep=True)
         finally:
@@ -417,6 +423,7 @@ class LiveMapper:
                 "keyframes_refused": self._sender.refused if self._is_open or self._is_over else 0,
                 "relocalisations": dict(self._verdicts),
                 "others": sorted(self._alignments.others),
+                **self._attachments.report(),
             },
         }
 
@@ -469,13 +476,14 @@ class LiveMapper:
 
     async def _keep(self, done: TrackedFrame, pose: Array, features: Features) -> None:
         """Make a keyframe of a tracked frame, and queue it for the map."""
-        data = await asyncio.to_thread(self._encode, done.frame, pose, features)
+        data, attached = await asyncio.to_thread(self._encode, done.frame, pose, features)
         self._last_keyframe, self._last_keyframe_s = pose, done.frame.timestamp_s
         await self._wait_for_cloud()
         self._adding = asyncio.ensure_future(
             asyncio.to_thread(add_to_cloud, self.map, done.frame, pose, features, True)
         )
-        await self._queue(data, pose)
+        if await self._queue(data, pose):
+            self._attachments.add(attached)
 
     async def _chained(self, tracker: MonocularTracker, done: TrackedFrame, pose: Array) -> TrackedFrame:
         """Return a frame of a camera without depth with its pose in the odometry; queue settled keyframes."""
@@ -488,24 +496,36 @@ class LiveMapper:
             await self._queue(data, T_odom_camera)
         return replace(done, T_world_camera=chain.pose(pose), scale="up to scale")
 
-    async def _queue(self, data: bytes, pose: Array) -> None:
-        """Queue a keyframe for the map."""
+    async def _queue(self, data: bytes, pose: Array) -> bool:
+        """Queue a keyframe for the map; return whether there was space for it."""
         waiting = self._waiting
         keyframe = WaitingKeyframe(waiting.next_index, self._segment, data)
         if not await asyncio.to_thread(waiting.add, keyframe):
             self._dropped += 1
-            return
+            return False
         self._made += 1
         self._sender.note_added()
         self._relocalise(keyframe, pose)
+        return True
+
+    async def _wait_idle(self) -> None:
+        """Wait until neither a pose is asked for nor a keyframe waits."""
+        await self._sender.wait_empty()
+        await self._sender.wait_quiet()
+
+    async def _wait_sent(self) -> None:
+        """Wait until the map has every keyframe, and the store what belongs to them."""
+        await self._sender.wait_empty()
+        await self._attachments.wait_empty()
 
     async def _wait_for_cloud(self) -> None:
         """Wait until the last keyframe is in the robot's own cloud."""
         if self._adding is not None:
             await self._adding
 
-    def _encode(self, frame: Frame, T_odom_camera: Array, features: Features) -> bytes:
-        """Return a keyframe of the first features that have depth: those of the finest levels."""
+    def _encode(self, frame: Frame, T_odom_camera: Array, features: Features) -> tuple[bytes, Attached]:
+        """Return a keyframe of the first features with depth, of the finest levels; and what is its."""
+        attached = self._attachments.make(frame, features)
         depths_m = features.points_camera[:, 2]
         rows = np.flatnonzero(np.isfinite(depths_m))[: self._most(features.kind)]
         keyframe = Keyframe(
@@ -515,8 +535,9 @@ class LiveMapper:
                 features.kind, 0.0 if frame.stereo is None else frame.camera.fx * frame.stereo.baseline_m,
             ),
             imu=self._mapper.keyframe_imu(T_odom_camera, self._last_keyframe_s, frame.timestamp_s),
+            points=attached.points_reference,
         )  # fmt: skip
-        return encode_keyframe(keyframe)
+        return encode_keyframe(keyframe), attached
 
     def _encode_settled(self, seen: SeenKeyframe, T_odom_camera: Array) -> bytes:
         """Return a keyframe without scale: its features with a landmark first, then those without."""

@@ -145,6 +145,10 @@ class KeyframeSender:
         """Wait until the map has every keyframe."""
         await self._empty.wait()
 
+    async def wait_quiet(self) -> None:
+        """Wait until no pose is asked for."""
+        await self._quiet.wait()
+
     async def introduce(self) -> Myself:
         """Ask how the map knows this robot, and number the waiting keyframes by it; raises RsePfError."""
         async with self._one_introduction:
@@ -233,7 +237,7 @@ class KeyframeSender:
 
     async def _wait_quiet(self) -> None:
         with contextlib.suppress(asyncio.TimeoutError):
-            await asyncio.wait_for(self._quiet.wait(), _MAX_QUIET_WAIT_S)
+            await asyncio.wait_for(self.wait_quiet(), _MAX_QUIET_WAIT_S)
 
 
 def keyframe_request(name: str, keyframe: WaitingKeyframe, base: Base) -> KeyframeRequest:

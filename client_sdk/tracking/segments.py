@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+import numpy.typing as npt
 
 from client_sdk.frontend import Features, Frame, TrackedFrame
 from client_sdk.mapping import MapOptions, PointMap, Trajectory
@@ -20,6 +21,7 @@ __all__ = [
     "DriveRecords",
     "SegmentRecord",
     "add_to_cloud",
+    "certain_rows",
     "keyframe_of",
     "landmark_keyframes",
     "tracker_record",
@@ -116,14 +118,19 @@ def add_to_cloud(
     if frame.stereo is None:
         cloud.add(frame, pose)
     elif features is not None and is_keyframe:
-        points = features.points_camera
-        with np.errstate(invalid="ignore"):
-            deviation_m = 2.0 * np.sqrt(frame.depth_noise.variance_m2(points[:, 2]))
-            rows = np.flatnonzero(deviation_m <= _CLOUD_SHARE * points[:, 2])
+        points, rows = features.points_camera, certain_rows(frame, features)
         columns, lines = np.rint(features.pixels[rows]).astype(np.int64).T
         size = np.array([frame.camera.width, frame.camera.height]) - 1
         colours = frame.rgb[np.clip(lines, 0, size[1]), np.clip(columns, 0, size[0])]
         cloud.add_points(transform(pose, points[rows]), colours)
+
+
+def certain_rows(frame: Frame, features: Features) -> npt.NDArray[np.int64]:
+    """Return the rows of the features of a stereo pair whose depth is known to 5 %."""
+    depths_m = features.points_camera[:, 2]
+    with np.errstate(invalid="ignore"):
+        deviation_m = 2.0 * np.sqrt(frame.depth_noise.variance_m2(depths_m))
+        return np.flatnonzero(deviation_m <= _CLOUD_SHARE * depths_m)
 
 
 def keyframe_of(tracked: TrackedFrame, pose: Array, features: Features, robot: str) -> Keyframe:

@@ -23,35 +23,26 @@ from typing import Any, BinaryIO
 from urllib.parse import urlsplit
 
 from client_sdk.enrolment import read_enrolment
-from client_sdk.token_text import strip_token
-from rse_pf.errors import (
-    BadRequest,
-    CommandFailed,
-    Conflict,
-    ConnectError,
-    NotFound,
-    RsePfError,
-    StoreError,
-    UsageError,
-    error_from_code,
+from client_sdk.network.data_requests import (
+    CONNECTIONS,
+    MAX_SINGLE_PUT_BYTES,
+    NO_UPSTREAM,
+    DataRequests,
+    Response,
+    error_of,
 )
+from rse_pf.errors import Conflict, ConnectError, NotFound, RsePfError, StoreError, UsageError
 
 __all__ = ["DataClient", "DataOptions", "OnBytes", "is_allowed"]
 
 OnBytes = Callable[[int, int], None]
 """Called after each part with the bytes transferred and the bytes in total."""
 
-_MAX_SINGLE_PUT_BYTES = 262_144
 _PIECE_BYTES = 1 << 20
 _PRESIGNED_TRIES = 3
 _REDIRECTED = 307
-_NO_UPSTREAM = b"no healthy upstream"
-"""The body of the load balancer's 503 while it knows no data server at all."""
 _NO_SERVICE_S = 5.0
 _RETRIED = {408, 429, 500, 502, 503, 504}
-_CONNECTIONS = {True: http.client.HTTPSConnection, False: http.client.HTTPConnection}
-
-Response = tuple[int, http.client.HTTPMessage, bytes]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -86,14 +77,11 @@ class DataClient:
         Raises:
             UsageError: *url* is not such an address.
         """
-        parts = urlsplit(url)
-        if parts.scheme not in ("http", "https", "ws", "wss") or not parts.hostname:
-            raise UsageError(f"{url!r} is not an address of a data service", hint="write https://HOST")
-        self._secure = parts.scheme in ("https", "wss")
-        self._host, self._port = parts.hostname, parts.port
         self._token = token
         self._options = options or DataOptions()
-        self._connection: http.client.HTTPConnection | None = None
+        self._requests = DataRequests(
+            url, timeout_s=self._options.timeout_s, ssl_context=self._options.ssl_context
+        )
         self._lock = threading.Lock()
 
     @classmethod
@@ -108,9 +96,7 @@ class DataClient:
 
     def close(self) -> None:
         """Close the connection; the next call opens another."""
-        connection, self._connection = self._connection, None
-        if connection is not None:
-            connection.close()
+        self._requests.close()
 
     def upload(self, source: bytes | Path, progress: OnBytes | None = None) -> str:
         """Store bytes or a file and return the digest, once the object is durable.
@@ -124,7 +110,7 @@ class DataClient:
         """
         with self._lock, _Source(source) as opened:
             size, digest = opened.size, opened.digest()
-            if size <= _MAX_SINGLE_PUT_BYTES:
+            if size <= MAX_SINGLE_PUT_BYTES:
                 self._request("PUT", f"/data/v1/objects/{digest}", opened.read(0, size))
                 _report(progress, size, size)
             else:
@@ -225,7 +211,7 @@ class DataClient:
         while True:
             state = self._json("PUT", path, begin)
             direct = state.get("direct")
-            if direct is None or not tries or not is_allowed(direct["url"], secure=self._secure):
+            if direct is None or not tries or not is_allowed(direct["url"], secure=self._requests.secure):
                 return state
             tries -= 1
             body = opened.pieces(progress)
@@ -243,7 +229,7 @@ class DataClient:
                 route.url = answer.get("Location", "") if status == _REDIRECTED else ""
                 if status != _REDIRECTED:
                     return status, answer, piece
-            if is_allowed(route.url, secure=self._secure):
+            if is_allowed(route.url, secure=self._requests.secure):
                 response = _ask_bucket("GET", route.url, headers, None, options.timeout_s)
                 if response is not None:
                     return response
@@ -296,25 +282,19 @@ class DataClient:
             error: RsePfError
             after_s = 0.0
             try:
-                status, answer, content = self._request_once(method, path, body, headers or {})
-            except (OSError, http.client.HTTPException) as broken:
-                self.close()
-                error = ConnectError(
-                    f"no answer from {self._host}: {broken or type(broken).__name__}",
-                    hint="call again to resume the transfer",
-                )
+                token = self._token() if callable(self._token) else self._token
+                status, answer, content = self._requests.request(method, path, body, headers or {}, token)
+            except ConnectError as broken:
+                error = broken
             else:
                 if status < 400 or status in also:
                     return status, answer, content
-                error = _error_of(status, content)
+                error = error_of(status, content)
                 if status not in _RETRIED:
                     raise error
-                if content == _NO_UPSTREAM:
+                if content == NO_UPSTREAM:
                     end = min(end, begin + _NO_SERVICE_S)
-                    error = ConnectError(
-                        f"the platform at {self._host} has no data service",
-                        hint="start rse-pf local without --no-data; in a cloud, set data.enabled",
-                    )
+                    error = self._requests.no_service()
                 retry_after = answer.get("Retry-After", "")
                 after_s = float(retry_after) if retry_after.isdecimal() else 0.0
             wait_s = max(after_s, pause * options.random.uniform(0.5, 1.0))
@@ -322,26 +302,6 @@ class DataClient:
                 raise error
             options.sleep(wait_s)
             pause = min(2 * pause, options.max_pause_s)
-
-    def _new_connection(self) -> http.client.HTTPConnection:
-        host, port, timeout_s = self._host, self._port, self._options.timeout_s
-        if self._secure and self._options.ssl_context is not None:
-            return http.client.HTTPSConnection(
-                host, port, timeout=timeout_s, context=self._options.ssl_context
-            )
-        made: http.client.HTTPConnection = _CONNECTIONS[self._secure](host, port, timeout=timeout_s)
-        return made
-
-    def _request_once(self, method: str, path: str, body: bytes | None, headers: dict[str, str]) -> Response:
-        if self._connection is None:
-            self._connection = self._new_connection()
-        token = strip_token(self._token() if callable(self._token) else self._token)
-        self._connection.request(method, path, body, {"Authorization": f"Bearer {token}", **headers})
-        answer = self._connection.getresponse()
-        content = answer.read()
-        if answer.will_close:
-            self.close()
-        return answer.status, answer.headers, content
 
 
 @dataclass(slots=True)
@@ -401,7 +361,7 @@ def _ask_bucket(
 ) -> Response | None:
     """Send exactly *headers*, never the token, to a presigned address; None unless the request succeeded."""
     parts = urlsplit(url)
-    connection = _CONNECTIONS[parts.scheme == "https"](parts.hostname or "", parts.port, timeout=timeout_s)
+    connection = CONNECTIONS[parts.scheme == "https"](parts.hostname or "", parts.port, timeout=timeout_s)
     try:
         connection.request(method, f"{parts.path}?{parts.query}", body, dict(headers))
         answer = connection.getresponse()
@@ -411,15 +371,6 @@ def _ask_bucket(
     finally:
         connection.close()
     return response if answer.status in ((200, 206, 416) if method == "GET" else (200, 201)) else None
-
-
-def _error_of(status: int, content: bytes) -> RsePfError:
-    try:
-        error = json.loads(content)
-        return error_from_code(str(error["code"]), str(error["message"]), hint=str(error.get("hint", "")))
-    except (ValueError, KeyError, TypeError):
-        kind = NotFound if status == 404 else BadRequest if status < 500 else CommandFailed
-        return kind(f"the data service answered {status}", hint="see the log of the data server")
 
 
 def _report(progress: OnBytes | None, done: int, size: int) -> None:

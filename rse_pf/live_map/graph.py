@@ -31,7 +31,8 @@ _MAX_WALK = 200.0
 """Steps of odometry beyond which two keyframes tell nothing about each other."""
 _MAX_VISITED = 250
 _MAX_REMOVED = 2000
-_SCALES = "scales"
+_SCALES, _OBJECTS = "scales", "objects"
+_MAX_GONE = 10_000
 _CARRIED = 0xFFFF
 """Contradictions of the newest 16 keyframes count in the robot's next segment, too."""
 
@@ -42,13 +43,17 @@ _FLOOR: Array = np.diag([0.02**2] * 3 + [math.radians(0.7) ** 2] * 3)
 
 @dataclass(slots=True, eq=False)
 class LiveKeyframe:
-    """The row of a keyframe; ``data`` are its bytes, None when it was culled or forgotten."""
+    """The row of a keyframe; ``data`` are its bytes, None when it was culled or forgotten.
+
+    ``objects`` are the digests of what the robot stored beside it, also of a culled one.
+    """
 
     robot: str
     segment: int
     number: int
     timestamp_s: float
     data: bytes | None
+    objects: tuple[str, ...] = ()
 
 
 @dataclass(slots=True, eq=False)
@@ -120,6 +125,7 @@ class Graph:
         removed: The newest links that were taken out, by number: who refuted them may be forgotten.
         smoothing: By robot, how many keyframes were smoothed because of it beyond what its own ones allow.
         lookalikes: Keyframes at places of which the map knows another one that looks the same.
+        gone_objects: Robot and digest of the newest objects whose robot was forgotten.
         cameras_v1: Cameras by id of a snapshot of version 1, whose parts hold features alone; else empty.
     """
 
@@ -141,6 +147,7 @@ class Graph:
         self.lookalikes: set[int] = set()
         self.source = ""
         self.equal_rooms_m = 0.0
+        self.gone_objects: list[tuple[str, str]] = []
         self.cameras_v1: list[CameraNumbers] = []
         self._links_of: dict[int, list[int]] = {}
         self._size = 0
@@ -332,7 +339,10 @@ class Graph:
         self.smoothing.pop(robot, None)
         for i in gone:
             self.drop_data(i)
+            self.gone_objects += [(robot, digest) for digest in self.keyframes[i].objects]
+            self.keyframes[i].objects = ()
             self._of_segment[i] = -1
+        self.gone_objects = self.gone_objects[-_MAX_GONE:]
         return gone
 
     def disbelieve(self, row: int) -> None:
@@ -470,6 +480,10 @@ class Graph:
         believed = {str(i): numbers for i, numbers in sorted(self._links_of.items()) if numbers}
         if self.has_scales:  # a map in metres has the bytes that it had before there were others
             extra = {**extra, _SCALES: self._encode_scales()}
+        objects = [(i, each.objects) for i, each in enumerate(self.keyframes) if each.objects]
+        if objects or self.gone_objects:
+            packed_objects = _PackedObjects(keyframes=objects, gone=self.gone_objects)
+            extra = {**extra, _OBJECTS: msgspec.msgpack.encode(packed_objects)}
         packed = _Packed(
             version=_VERSION,
             keyframes=[
@@ -562,6 +576,7 @@ class Graph:
         graph._links_of = {int(i): numbers for i, numbers in packed.links_of}
         extra = dict(packed.extra)
         graph._take_scales(extra.pop(_SCALES, b""))
+        graph._take_objects(extra.pop(_OBJECTS, b""))
         return graph, extra
 
     def _encode_scales(self) -> bytes:
@@ -592,6 +607,20 @@ class Graph:
             raise BadRequest(
                 f"the snapshot is damaged: {message_of(error)}", hint="take the older one"
             ) from error
+
+    def _take_objects(self, data: bytes) -> None:
+        """Take the objects of keyframes of a snapshot; raises BadRequest."""
+        if not data:
+            return
+        try:
+            packed = msgspec.msgpack.decode(data, type=_PackedObjects)
+            for i, objects in packed.keyframes:
+                self.keyframes[i].objects = objects
+        except (msgspec.MsgspecError, LookupError) as error:
+            raise BadRequest(
+                f"the snapshot is damaged: {message_of(error)}", hint="take the older one"
+            ) from error
+        self.gone_objects = packed.gone
 
 
 _PackedLink = tuple[int, int, int, bytes, bytes, int, int, bool, LinkState, int]
@@ -632,6 +661,13 @@ class _PackedScales(msgspec.Struct, kw_only=True):
 
     segments: list[tuple[int, float, float]]
     links: list[tuple[int, float, float]]
+
+
+class _PackedObjects(msgspec.Struct, kw_only=True):
+    """What objects of robots add to a snapshot: digests by id of the keyframe, and those to be deleted."""
+
+    keyframes: list[tuple[int, tuple[str, ...]]]
+    gone: list[tuple[str, str]]
 
 
 class _PackedV1(_Packed, kw_only=True):

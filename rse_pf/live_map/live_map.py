@@ -57,7 +57,7 @@ from rse_pf.live_map.outcomes import (
     Unaligned,
 )
 from rse_pf.live_map.smoothing import SmoothedWindows, odometry_step, smooth_all
-from rse_pf.live_map.versions import version_of, whole_graph
+from rse_pf.live_map.versions import PointSource, point_sources, version_of, whole_graph
 from rse_pf.maps.descriptors import DescriptorKind, check_alike
 from rse_pf.maps.format import MapVersion
 from rse_pf.slam.keyframe import Keyframe, check_sent, decode_keyframe
@@ -336,6 +336,20 @@ class LiveMap:
         """Return the keyframes and links that are connected with the map's frame, as a version."""
         return version_of(self._graph, self.options)
 
+    def point_sources(self, version: MapVersion) -> tuple[PointSource, ...]:
+        """Return where the points of the keyframes of *version* are, which this map has just made."""
+        return point_sources(self._graph, version)
+
+    def objects_of(self, keyframes: Collection[int]) -> list[tuple[str, str]]:
+        """Return robot and digest of the objects that were stored beside *keyframes*."""
+        rows = [self._graph.keyframes[i] for i in keyframes]
+        return [(row.robot, digest) for row in rows for digest in row.objects]
+
+    @property
+    def gone_objects(self) -> list[tuple[str, str]]:
+        """Robot and digest of the newest objects whose robot was forgotten, which nobody may read again."""
+        return list(self._graph.gone_objects)
+
     # --- events -------------------------------------------------------------------------------
 
     def _add(self, event: KeyframeAdded) -> list[Outcome]:
@@ -362,7 +376,7 @@ class LiveMap:
         i = graph.add(
             LiveKeyframe(
                 robot=event.robot, segment=event.segment, number=event.number,
-                timestamp_s=keyframe.timestamp_s, data=event.data,
+                timestamp_s=keyframe.timestamp_s, data=event.data, objects=_objects_of(keyframe),
             ),
             row, T_odom, T, way,
         )  # fmt: skip
@@ -636,6 +650,10 @@ class LiveMap:
             T_map_odom=segment.told, covariance=segment.covariance if aligned else None,
             scale=_scale_of(segment, is_told=True) if aligned else None,
         )  # fmt: skip
+
+
+def _objects_of(keyframe: Keyframe) -> tuple[str, ...]:
+    return tuple(each.digest for each in (keyframe.points, keyframe.image) if each is not None)
 
 
 def _scale_of(segment: Segment, is_told: bool = False) -> float | None:

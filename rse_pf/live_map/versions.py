@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
 
@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rse_pf.errors import BadMessage, BadRequest, InternalError, LimitExceeded
-from rse_pf.geometry import Array, inverse
+from rse_pf.geometry import Array, Camera, inverse
 from rse_pf.live_map.events import MapStarted, StartKeyframe, StartLink, matrix_bytes
 from rse_pf.live_map.graph import Graph, Segment
 from rse_pf.live_map.options import LiveMapOptions
@@ -22,9 +22,31 @@ from rse_pf.maps.format import UP, UP_FIELD, Edge, EdgeKind, Keyframe, MapVersio
 from rse_pf.slam.inertial import agreed_gravity, upright_turn
 from rse_pf.slam.keyframe import Keyframe as SentKeyframe
 from rse_pf.slam.keyframe import decode_keyframe, encode_keyframe, make_features
+from rse_pf.slam.keyframe_points import ObjectReference
 from rse_pf.slam.pose_graph import PoseGraph, is_positive_definite
 
-__all__ = ["encode_stored", "errors_of_maps", "started_from", "version_of", "whole_graph"]
+__all__ = [
+    "PointSource",
+    "encode_stored",
+    "errors_of_maps",
+    "point_sources",
+    "started_from",
+    "version_of",
+    "whole_graph",
+]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PointSource:
+    """The points of one keyframe of a version: an object of ``robot``, a `RobotId.folder`, and its pose.
+
+    ``T_world_camera`` is ``(4, 4)``, in the world of the version.
+    """
+
+    robot: str
+    reference: ObjectReference
+    camera: Camera
+    T_world_camera: Array
 
 
 @contextlib.contextmanager
@@ -128,6 +150,27 @@ def _version_of(graph: Graph, options: LiveMapOptions) -> MapVersion:
     if down is not None:
         provenance[UP_FIELD] = list(UP)
     return MapVersion(keyframes=tuple(keyframes), edges=tuple(edges), provenance=provenance)
+
+
+def point_sources(graph: Graph, version: MapVersion) -> tuple[PointSource, ...]:
+    """Return where the points of the keyframes of *version* are, which was just made of *graph*.
+
+    Points of a segment without metres, or that the map does not believe, are left out.
+    """
+    sources = []
+    for keyframe in version.keyframes:
+        row, segment = graph.keyframes[keyframe.id], graph.segment_of(keyframe.id)
+        if not row.objects or row.data is None or not segment.is_metric or segment.disbelieved:
+            continue
+        reference = decode_keyframe(row.data).points
+        if reference is not None:
+            sources.append(
+                PointSource(
+                    robot=row.robot, reference=reference, camera=keyframe.camera,
+                    T_world_camera=keyframe.T_world_camera,
+                )
+            )  # fmt: skip
+    return tuple(sources)
 
 
 def whole_graph(graph: Graph, options: LiveMapOptions) -> tuple[PoseGraph, list[int]]:

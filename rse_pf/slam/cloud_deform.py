@@ -11,7 +11,7 @@ from rse_pf.geometry import Array, inverse, transform
 from rse_pf.maps.format import Keyframe, MapVersion
 from rse_pf.slam.ply import Colours, Points
 
-__all__ = ["deform_cloud", "deform_clouds", "joined_cloud", "observers_of"]
+__all__ = ["deform_cloud", "deform_clouds", "joined_cloud", "observers_of", "voxels_of"]
 
 _VOXEL_M = 0.01
 _MIN_DEPTH_M, _MAX_DEPTH_M = 0.2, 6.0
@@ -91,11 +91,22 @@ def observers_of(points: Array, keyframes: Sequence[Keyframe]) -> npt.NDArray[np
     return observer
 
 
+def voxels_of(points: Array, voxel_m: float) -> npt.NDArray[np.int64]:
+    """Return the voxel of each of ``(n, 3)`` points as one number, ``(n,)``, in the order of its three.
+
+    Points that are farther apart than 2**21 voxels get these three numbers, ``(n, 3)``.
+    """
+    voxels = np.floor(points / voxel_m).astype(np.int64)
+    voxels -= voxels.min(axis=0, initial=0)
+    if voxels.max(initial=0) < 1 << 21:
+        keys: npt.NDArray[np.int64] = (voxels[:, 0] << 42) | (voxels[:, 1] << 21) | voxels[:, 2]
+        return keys
+    return voxels
+
+
 def _thin(points: Array, colours: Colours) -> tuple[Points, Colours]:
     """Return the mean of the points of each voxel, with the colour of the first."""
-    _, first, group = np.unique(
-        np.floor(points / _VOXEL_M).astype(np.int64), axis=0, return_index=True, return_inverse=True
-    )
+    _, first, group = np.unique(voxels_of(points, _VOXEL_M), axis=0, return_index=True, return_inverse=True)
     group = group.ravel()
     count = np.bincount(group)
     means = np.stack([np.bincount(group, weights=points[:, axis]) / count for axis in range(3)], axis=1)

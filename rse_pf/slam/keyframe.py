@@ -25,6 +25,8 @@ All numbers are little-endian::
     noise     kind 5, optional: deviation of a depth z in metres is base + growth * max(0, z - from)^2
               (3 float64); a Kinect's where it is left out
     IMU       kind 6, optional: gravity, and the motion since the last keyframe: `rse_pf.slam.inertial`
+    points    kind 7, optional: where its coloured points are: `rse_pf.slam.keyframe_points`
+    image     kind 8, optional: where its image is, as JPEG
 
 Blocks stand in the order of their kinds.
 """
@@ -43,6 +45,7 @@ from rse_pf.geometry import Array, Camera, rigid
 from rse_pf.maps.descriptors import ORB, DescriptorKind, Descriptors
 from rse_pf.pnp import DepthNoise
 from rse_pf.slam.inertial import KeyframeImu, decode_imu, encode_imu
+from rse_pf.slam.keyframe_points import ObjectReference, decode_reference, encode_reference
 
 __all__ = [
     "MAX_BLOCKS",
@@ -74,8 +77,8 @@ _GEOMETRY = struct.Struct("<BBH")
 _F_BASELINE = struct.Struct("<d")
 _UNIT = struct.Struct("<d")
 _CAMERA_KIND, _FEATURES_KIND, _GEOMETRY_KIND = 1, 2, 3
-_NOISE_KIND, _IMU_KIND = 5, 6
-_OPTIONAL = {_NOISE_KIND: "noise", _IMU_KIND: "IMU"}
+_NOISE_KIND, _IMU_KIND, _POINTS_KIND, _IMAGE_KIND = 5, 6, 7, 8
+_OPTIONAL = {_NOISE_KIND: "noise", _IMU_KIND: "IMU", _POINTS_KIND: "points", _IMAGE_KIND: "image"}
 _NAMES = {_CAMERA_KIND: "camera", _FEATURES_KIND: "features", _GEOMETRY_KIND: "geometry"}
 _NOISE = struct.Struct("<3d")
 _KINECT = DepthNoise()
@@ -138,7 +141,7 @@ class KeyframeFeatures:
 
 @dataclass(frozen=True, slots=True)
 class UnknownBlock:
-    """An optional block of a kind that this release does not know, 4 or above 6, kept as it came."""
+    """An optional block of a kind that this release does not know, 4 or above 8, kept as it came."""
 
     kind: int
     content: bytes
@@ -150,8 +153,9 @@ class Keyframe:
 
     ``timestamp_s`` is in seconds since 1970.  ``T_odom_camera`` ``(4, 4)``, metres (or the unit of its
     features' depths), maps the camera's frame to the odometry frame of the robot's segment; for a keyframe of
-    a version it is the pose in that map.  ``imu`` tells where down is, if the robot has an IMU; ``others``
-    are the blocks that this release does not know.
+    a version it is the pose in that map.  ``imu`` tells where down is, if the robot has an IMU; ``points``
+    and ``image`` are objects of the robot that tell more of what it shows; ``others`` are the blocks that
+    this release does not know.
     """
 
     timestamp_s: float
@@ -160,6 +164,8 @@ class Keyframe:
     features: KeyframeFeatures
     others: tuple[UnknownBlock, ...] = ()
     imu: KeyframeImu | None = None
+    points: ObjectReference | None = None
+    image: ObjectReference | None = None
 
 
 def most_features(kind: DescriptorKind) -> int:
@@ -297,8 +303,8 @@ def encode_keyframe(keyframe: Keyframe) -> bytes:
     fraction = _fraction_of(float(features.pixels.max(initial=0.0)))
     name = b"" if features.kind == ORB else features.kind.name.encode()
     units = np.rint(features.pixels.T.astype(np.float64) * 2.0**fraction).astype("<u2")
-    has_noise = features.noise != _KINECT
-    blocks = len(_NAMES) + has_noise + (keyframe.imu is not None) + len(keyframe.others)
+    optional = _optional_blocks(keyframe)
+    blocks = len(_NAMES) + len(optional)
     parts = [_HEAD.pack(
         _MAGIC, _VERSION, blocks, keyframe.timestamp_s,
         *keyframe.T_odom_camera[:3].ravel().tolist(),
@@ -313,15 +319,23 @@ def encode_keyframe(keyframe: Keyframe) -> bytes:
         (_GEOMETRY_KIND, *_geometry_of(features)),
     ):  # fmt: skip
         parts += [_BLOCK.pack(kind, _REQUIRED, sum(map(len, contents))), *contents]
-    optional = [(block.kind, block.content) for block in keyframe.others]
-    if has_noise:
-        noise = features.noise
-        optional.append((_NOISE_KIND, _NOISE.pack(noise.base_m, noise.growth_per_m, noise.from_m)))
-    if keyframe.imu is not None:
-        optional.append((_IMU_KIND, encode_imu(keyframe.imu)))
-    for kind, content in sorted(optional, key=lambda block: block[0]):
+    for kind, content in optional:
         parts += [_BLOCK.pack(kind, 0, len(content)), content]
     return b"".join(parts)
+
+
+def _optional_blocks(keyframe: Keyframe) -> list[tuple[int, bytes]]:
+    """Return kind and content of the blocks that may be missing, in their order."""
+    blocks = [(block.kind, block.content) for block in keyframe.others]
+    noise = keyframe.features.noise
+    if noise != _KINECT:
+        blocks.append((_NOISE_KIND, _NOISE.pack(noise.base_m, noise.growth_per_m, noise.from_m)))
+    if keyframe.imu is not None:
+        blocks.append((_IMU_KIND, encode_imu(keyframe.imu)))
+    for kind, reference in ((_POINTS_KIND, keyframe.points), (_IMAGE_KIND, keyframe.image)):
+        if reference is not None:
+            blocks.append((kind, encode_reference(reference)))
+    return sorted(blocks, key=lambda block: block[0])
 
 
 def _geometry_of(features: KeyframeFeatures) -> tuple[bytes, bytes]:
@@ -376,9 +390,13 @@ def decode_keyframe(data: bytes) -> Keyframe:
     if _IMU_KIND in known:
         begin, end = known[_IMU_KIND]
         imu = decode_imu(bytes(data[begin:end]))
+    points, image = (
+        decode_reference(bytes(data[slice(*known[kind])])) if kind in known else None
+        for kind in (_POINTS_KIND, _IMAGE_KIND)
+    )
     return Keyframe(
         timestamp_s=timestamp_s, T_odom_camera=T_odom_camera, camera=camera, features=features,
-        others=tuple(others), imu=imu,
+        others=tuple(others), imu=imu, points=points, image=image,
     )  # fmt: skip
 
 

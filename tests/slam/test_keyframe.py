@@ -132,7 +132,7 @@ def test_shapes_that_do_not_fit_are_refused() -> None:
 
 def test_optional_blocks_that_are_not_known_are_kept_byte_for_byte() -> None:
     made = replace(
-        keyframe(), others=(UnknownBlock(7, b"new"), UnknownBlock(7, b""), UnknownBlock(65_535, bytes(200)))
+        keyframe(), others=(UnknownBlock(10, b"new"), UnknownBlock(10, b""), UnknownBlock(65_535, bytes(200)))
     )
     data = encode_keyframe(made)
 
@@ -152,7 +152,7 @@ def noisy(*numbers: float) -> bytes:
 
 def test_the_noise_of_the_depths_is_kept_among_blocks_that_are_not_known() -> None:
     noise = DepthNoise(base_m=0.0024, growth_per_m=0.0038)
-    first = replace(keyframe(), others=(UnknownBlock(4, b"rig"), UnknownBlock(7, b"")))
+    first = replace(keyframe(), others=(UnknownBlock(4, b"rig"), UnknownBlock(10, b"")))
     first = replace(first, features=replace(first.features, noise=noise))
 
     assert_equal(decode_keyframe(encode_keyframe(first)), first)
@@ -180,9 +180,9 @@ def test_a_noise_that_no_camera_has_is_refused(numbers: tuple[float, ...]) -> No
 def test_a_required_block_that_is_not_known_is_refused_with_what_to_do() -> None:
     data = bytearray(encode_keyframe(keyframe()))
     data[3] += 1
-    data += struct.pack("<HHI", 9, 1, 3) + b"abc"
+    data += struct.pack("<HHI", 12, 1, 3) + b"abc"
 
-    with pytest.raises(BadRequest, match="it needs block 9, which this release does not know") as refused:
+    with pytest.raises(BadRequest, match="it needs block 12, which this release does not know") as refused:
         decode_keyframe(bytes(data))
 
     assert refused.value.hint == "update the server, or send the keyframe without this block"
@@ -322,7 +322,7 @@ def test_hostile_disparities_are_refused_with_a_hint(at: int, form: str, value: 
         (changed(12, "<d", 2.0), "no rigid motion"),
         (changed(HEAD, "<H", 0), "block 0 stands twice"),
         (changed(HEAD, "<H", 2), "block 2 stands twice"),
-        (changed(HEAD, "<H", 9), "block 9"),
+        (changed(HEAD, "<H", 12), "block 12"),
         (changed(HEAD + 2, "<H", 0), "block of the camera is not required"),
         (changed(HEAD + 2, "<H", 2), "unknown flags"),
         (changed(HEAD + 4, "<I", 2**32 - 1), "goes on beyond its end"),

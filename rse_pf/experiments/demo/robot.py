@@ -207,7 +207,7 @@ async def _run(spec: RobotSpec, pipe: ParentPipe) -> None:
                 shared = LiveMapper(
                     robot, LIVE_NAME, ask=ask, options=options.frontend_options,
                     live=LiveOptions().sent_with(options.codec), features=load_features(options.features),
-                    spool=spec.folder / "spool" if spec.has_offload else None,
+                    spool=spec.folder / "spool" if spec.has_offload else None, store=robot.store_object,
                 )  # fmt: skip
                 mapper = await stack.enter_async_context(shared)
             else:

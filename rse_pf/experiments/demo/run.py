@@ -45,7 +45,9 @@ from rse_pf.experiments.results.result_folder import (
     remove_keys,
     write_json,
 )
+from rse_pf.geometry import Array
 from rse_pf.local.control.platform import LocalPlatform
+from rse_pf.maps.format import MapVersion
 from rse_pf.terminal import show_page
 
 if TYPE_CHECKING:
@@ -331,6 +333,8 @@ def _write_results(
         report["live"] = live_figures(drives, live_map)
         if live_map is not None:
             report |= {"store": f"dir:{folder / 'platform' / 'objects'}", "map": LIVE_NAME}
+            if len(live_map.points):
+                _draw_live_map(folder, live_map)
     write_json(folder / "report.json", report)
     (folder / "report.md").write_text(demo_page(report), encoding="utf-8")
     paths = [
@@ -349,6 +353,16 @@ def _write_results(
         caption = f"{len(paths)} robots, {sum(robot.frames for robot in finished)} frames, one world"
         draw_map(folder / "map.png", points, colours, paths, caption)
     return report
+
+
+def _draw_live_map(folder: Path, version: MapVersion) -> None:
+    """Draw the cloud of a live map, and its robots' keyframes as their paths."""
+    by_robot: dict[str, list[Array]] = {}
+    for keyframe in version.keyframes:
+        by_robot.setdefault(keyframe.robot, []).append(keyframe.T_world_camera)
+    paths = [RobotPath(name=name, T_world_camera=np.array(poses)) for name, poses in by_robot.items()]
+    caption = f"{len(paths)} robots, {len(version.keyframes)} keyframes, {len(version.points):,} points"
+    draw_map(folder / "map.png", version.points, version.colours, paths, f"live map: {caption}")
 
 
 def _progress_bars(quiet: bool) -> Progress:

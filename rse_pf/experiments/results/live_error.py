@@ -118,6 +118,8 @@ def live_figures(drives: Sequence[LiveDrive], version: MapVersion | None) -> dic
         "corrections": sum(len(drive.corrections) for drive in drives),
         "keyframes": sum(len(drive.keyframes) for drive in drives),
         "keyframes_in_map": None if version is None else len(version.keyframes),
+        "points": None if version is None else len(version.points),
+        "points_bytes_by_robot": [drive.end.get("points", {}).get("bytes", 0) for drive in drives],
         "keyframe_kept_ms": _percentiles(
             [1e3 * (keyframe["kept"] - keyframe["sent"]) for drive in drives for keyframe in drive.keyframes]
         ),
@@ -208,7 +210,8 @@ def live_lines(live: Mapping[str, Any], robots: int) -> str:
     )
     times = f"corrections after {delay['p50']} ms (p50), {delay['p99']} ms (p99)"
     return (
-        f"{live['joined']} of {robots} in one live map of {live['keyframes']} keyframes; {errors}"
+        f"{live['joined']} of {robots} in one live map of {live['keyframes']} keyframes, "
+        f"{live.get('points') or 0:,} points; {errors}"
         f"{live['aligned_percent']} % of the poses aligned; {times if delay['n'] else 'no correction'}\n"
         + (_NO_METRES if live.get("without_metres") == robots else "")
     )
@@ -226,6 +229,7 @@ def live_table(live: Mapping[str, Any]) -> list[str]:
         ("keyframe sent to correction, p50 / p99 ms, n", f"{delay['p50']} / {delay['p99']}, {delay['n']}"),
         ("keyframe sent to kept, p50 / p99 ms", f"{acknowledged_ms['p50']} / {acknowledged_ms['p99']}"),
         ("keyframes / in the published map", f"{live['keyframes']} / {number(live['keyframes_in_map'])}"),
+        ("points in the published map", number(live.get("points"))),
         ("owners", ", ".join(live["owners"]) or "-"),
     ]
     return table(["live map", ""], rows)

@@ -24,6 +24,7 @@ from rse_pf.live_map.events import (
 )
 from rse_pf.live_map.feature_parts import SnapshotParts
 from rse_pf.live_map.outcomes import Added, Alignment, Corrected, Outcome
+from rse_pf.live_map.versions import PointSource
 from rse_pf.maps.format import Keyframe, MapVersion
 from rse_pf.slam.keyframe import Keyframe as SentKeyframe
 from rse_pf.slam.keyframe import UnknownBlock, encode_keyframe, make_features
@@ -126,6 +127,13 @@ class FakeMap:
             for row, (robot, _, timestamp_s) in enumerate(self._state["keyframes"])
         ]  # fmt: skip
         return MapVersion(keyframes=tuple(keyframes), edges=(), points=np.zeros((0, 3), np.float32))
+
+    def point_sources(self, version: MapVersion) -> tuple[PointSource, ...]:
+        return ()
+
+    @property
+    def gone_objects(self) -> list[tuple[str, str]]:
+        return []
 
     @property
     def keyframes(self) -> int:

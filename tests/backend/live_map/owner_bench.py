@@ -12,10 +12,11 @@ import msgspec
 
 from rse_pf.accounts import TenantAccount
 from rse_pf.backend.live_map.owner.context import OwnerContext
+from rse_pf.backend.live_map.owner.keyframe_objects import KeyframeObjects
 from rse_pf.backend.live_map.owner.lease import LeaseRecord, OwnerLease, decode_lease, lease_name, map_folder
 from rse_pf.backend.live_map.owner.live_owner import LiveOwner
 from rse_pf.backend.live_map.owner.log import LiveLog
-from rse_pf.backend.live_map.owner.state import MapState, take_over
+from rse_pf.backend.live_map.owner.state import MapKind, MapState, take_over
 from rse_pf.backend.live_map.owner.threads import Urgency
 from rse_pf.backend.log import JsonLog
 from rse_pf.config import PlatformSettings
@@ -117,15 +118,16 @@ class OwnerBench:
         self.log = LiveLog(
             bench.store, FOLDER, owner=name, epoch=record.epoch, base=record.base, keeps_all=bench.keeps_all
         )
-        self.state: MapState = take_over(self.log, FAKE_MAP, owner=name, epoch=record.epoch)
+        self.state: MapState = take_over(self.log, bench.kind, owner=name, epoch=record.epoch)
         assert self.lease.serve("127.0.0.1", 1, "c")
+        account = TenantAccount(
+            bench.store, TENANT, bench.settings.data, wall_clock=lambda: 1e9 + bench.clock()
+        )
         context = OwnerContext(
-            map_name=MAP, settings=bench.settings.live, kind=FAKE_MAP, threads=bench.threads,
+            map_name=MAP, settings=bench.settings.live, kind=bench.kind, threads=bench.threads,
             maps=MapRegistry(bench.store, TENANT), clock=bench.clock, wall_clock=lambda: 1000.0,
             sleep=bench.clock.sleep,
-            account=TenantAccount(
-                bench.store, TENANT, bench.settings.data, wall_clock=lambda: 1e9 + bench.clock()
-            ),
+            account=account, objects=KeyframeObjects(bench.store, account),
             log=bench.log, tell=self.told.append, on_beat=self.beats.append,
             on_use=self.used.append,
         )  # fmt: skip
@@ -159,8 +161,10 @@ class Bench:
         *,
         keeps_all: bool = False,
         data: dict[str, Any] | None = None,
+        kind: MapKind = FAKE_MAP,
         **live: Any,
     ) -> None:
+        self.kind = kind
         self.store: ObjectStore = store or MemoryStore()
         self.clock = HandClock()
         self.settings = PlatformSettings.from_dict({"live": live, "data": data or {}})
@@ -188,7 +192,7 @@ class Bench:
     def replayed(self) -> MapState:
         """Return the map that the entries of the log give, from the first one on."""
         log = LiveLog(self.store, FOLDER, owner="replay", epoch=10**6)
-        state = MapState(FAKE_MAP.empty(), 0)
+        state = MapState(self.kind.empty(), 0)
         from rse_pf.live_map.events import decode_events
 
         for entry in log.entries():

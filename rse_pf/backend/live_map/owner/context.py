@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from rse_pf.accounts import TenantAccount
+from rse_pf.backend.live_map.owner.keyframe_objects import KeyframeObjects
 from rse_pf.backend.live_map.owner.state import MapKind
 from rse_pf.backend.live_map.owner.threads import Sleep, Threads
 from rse_pf.backend.live_map.owner.whole_fit import WholeFit, fit_here
@@ -26,6 +27,7 @@ class OwnerContext:
         wall_clock: Unix seconds.
         sleep: Waits for seconds.
         account: Of the tenant, which is charged with what the map stores.
+        objects: What robots store beside their keyframes.
         tell: Gets each new payload.
         on_beat: Gets the number of each renewal of the lease.
         on_use: Gets whether the map is used: commands came, or none for a while.
@@ -41,6 +43,7 @@ class OwnerContext:
     wall_clock: Callable[[], float]
     sleep: Sleep
     account: TenantAccount
+    objects: KeyframeObjects
     log: JsonLog
     tell: Callable[[dict[str, Any]], None]
     on_beat: Callable[[int], None]

@@ -48,6 +48,7 @@ from rse_pf.live_map.outcomes import (
     Added,
     Ambiguous,
     Corrected,
+    Culled,
     Joined,
     LinkRemoved,
     OptimiseWanted,
@@ -147,7 +148,8 @@ class LiveOwner:
         alignments = await self._context.threads.compute(Urgency.APPLY, self._state.live_map.alignments)
         self._book.align(alignments, (), self._state.position)
         self._describe()
-        for work in (self._writer.run(), self._measuring.run(), self._keep_lease()):
+        begins = self._writer.run(), self._measuring.run(), self._keep_lease(), self._delete_gone_at_start()
+        for work in begins:
             self._start(work)
         try:
             return await asyncio.shield(self._ended)
@@ -293,7 +295,24 @@ class LiveOwner:
             )
         for folder in folders:
             await asyncio.shield(self._writer.submit(RobotForgotten(robot=folder)))
+        await self._delete_gone()
         return {"forgotten": len(folders), "version": self._state.position}
+
+    async def _delete_gone(self) -> None:
+        """Delete what forgotten robots stored beside their keyframes; raises StoreError."""
+        gone = await self._context.threads.compute(Urgency.ANSWER, lambda: self._state.live_map.gone_objects)
+        if gone:
+            await self._context.threads.background(functools.partial(self._context.objects.delete_gone, gone))
+
+    async def _cull(self, objects: list[tuple[str, str]]) -> None:
+        """Delete what robots stored beside keyframes that were culled; those that stay go with the robot."""
+        with contextlib.suppress(StoreError):
+            await self._context.threads.background(functools.partial(self._context.objects.cull, objects))
+
+    async def _delete_gone_at_start(self) -> None:
+        """Do what the owner before may not have done; it is done again with each version, too."""
+        with contextlib.suppress(StoreError):
+            await self._delete_gone()
 
     async def _start_from(self, request: LiveStart) -> dict[str, Any]:
         if self._state.changes or self._state.keyframes:
@@ -345,15 +364,19 @@ class LiveOwner:
         """Apply the events of an entry that is durable, answer who waits for them, and tell what is new."""
         events = [each.event for each in batch]
         compute = self._context.threads.compute
-        applied, told = await compute(Urgency.APPLY, functools.partial(self._apply, position, events))
+        applied, told, culled = await compute(Urgency.APPLY, functools.partial(self._apply, position, events))
         self._settle(batch, applied)
+        if culled:
+            self._start(self._cull(culled))
         for payload in told:
             self._tell(payload)
         if self._state.is_snapshot_due:
             self._start(self._write_snapshot(await self._snapshot()))
 
-    def _apply(self, position: int, events: list[Event]) -> tuple[Applied, list[dict[str, Any]]]:
-        """Apply an entry and note what to tell; in the thread of the map."""
+    def _apply(
+        self, position: int, events: list[Event]
+    ) -> tuple[Applied, list[dict[str, Any]], list[tuple[str, str]]]:
+        """Apply an entry; return what to tell, and the objects of culled keyframes; in the map's thread."""
         applied = self._state.apply(position, events)
         outcomes = [each for found in applied.outcomes for each in found]
         told: list[dict[str, Any]] = []
@@ -366,7 +389,8 @@ class LiveOwner:
             told += self._book.align(self._state.live_map.alignments(), outcomes, position)
         for event in keyframes:
             told += self._book.place(event)
-        return applied, told
+        culled = [i for each in outcomes if isinstance(each, Culled) for i in each.ids]
+        return applied, told, self._state.live_map.objects_of(culled) if culled else []
 
     def _settle(self, batch: list[Submitted], applied: Applied) -> None:
         for each, outcomes, defect in zip(batch, applied.outcomes, applied.defects, strict=True):

@@ -29,6 +29,7 @@ import msgspec
 from rse_pf.accounts import TenantAccount
 from rse_pf.aws.storage import open_data_store
 from rse_pf.backend.live_map.owner.context import OwnerContext
+from rse_pf.backend.live_map.owner.keyframe_objects import KeyframeObjects
 from rse_pf.backend.live_map.owner.lease import OwnerLease, lease_name, map_folder, renewal_s
 from rse_pf.backend.live_map.owner.link_security import (
     LinkClaims,
@@ -275,10 +276,11 @@ class _Process:
         maps = MapRegistry(
             self._store, self._order.tenant, max_bytes=4 * self._settings.data.max_object_bytes
         )
+        account = TenantAccount(self._store, self._order.tenant, self._settings.data)
         return OwnerContext(
             map_name=self._order.map_name, settings=self._settings.live, kind=self._kind,
             threads=self._threads, maps=maps, clock=time.monotonic, wall_clock=time.time,
-            sleep=asyncio.sleep, account=TenantAccount(self._store, self._order.tenant, self._settings.data),
+            sleep=asyncio.sleep, account=account, objects=KeyframeObjects(self._store, account),
             log=self._log, tell=tell, on_beat=on_beat, on_use=self._tell_use, fit=fit_apart,
         )  # fmt: skip
 

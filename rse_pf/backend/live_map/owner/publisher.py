@@ -18,7 +18,7 @@ from rse_pf.backend.live_map.owner.context import OwnerContext
 from rse_pf.backend.live_map.owner.state import MapState
 from rse_pf.backend.live_map.owner.threads import Urgency
 from rse_pf.errors import Busy, Conflict, NotFound, RsePfError, StoreError
-from rse_pf.live_map.versions import errors_of_maps
+from rse_pf.live_map.versions import PointSource, errors_of_maps
 from rse_pf.maps.format import MapVersion, encode_map
 from rse_pf.maps.registry import MapOrigin, MapRecord, MapRegistry
 from rse_pf.maps.removal import superseded
@@ -133,7 +133,7 @@ class Publisher:
 
     async def _publish(self, note: str, freed: int = 0) -> MapRecord:
         changes = self._state.changes
-        version = await self._threads.compute(Urgency.BACKGROUND, self._state.live_map.to_version)
+        version = await self._make_version()
         made_s = self._context.wall_clock()
         origin = MapOrigin(parent=None, author=self._author, created_s=made_s, note=note)
         charge = functools.partial(self._context.account.reserve, freed=freed)
@@ -151,6 +151,28 @@ class Publisher:
             if removed:
                 self._json_log.info("live-versions-removed", map=self._name, removed=removed)
         return record
+
+    async def _make_version(self) -> MapVersion:
+        """Return the map with its cloud; made anew if a robot is forgotten while its points are read."""
+        compute, live_map, objects = self._threads.compute, self._state.live_map, self._context.objects
+
+        def make() -> tuple[MapVersion, tuple[PointSource, ...], list[tuple[str, str]]]:
+            version = live_map.to_version()
+            return version, live_map.point_sources(version), live_map.gone_objects
+
+        while True:
+            version, sources, gone = await compute(Urgency.BACKGROUND, make)
+            await self._threads.background(functools.partial(objects.delete_gone, gone))
+            if not sources:
+                return version
+            cloud = await self._threads.background(functools.partial(objects.cloud, sources))
+            if await compute(Urgency.BACKGROUND, lambda: live_map.gone_objects) == gone:
+                break
+        self._json_log.info(
+            "live-cloud", map=self._name, points=len(cloud.points), keyframes=cloud.keyframes,
+            missing=cloud.missing,
+        )  # fmt: skip
+        return dataclasses.replace(version, points=cloud.points, colours=cloud.colours)
 
     def _remove_old_versions(self) -> int:
         """Remove the oldest versions that nobody asked for, ten at most; return how many.  Blocking.

@@ -1,0 +1,176 @@
+"""Points beside keyframes: which are chosen, when they are sent, and what happens where they cannot be."""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from client_sdk.answers import PoseAnswer
+from client_sdk.frontend import Frame, FrontEndOptions, PoseQuery, extract
+from client_sdk.live import LiveMapper, LiveOptions
+from client_sdk.live.keyframe_points import points_of
+from rse_pf.errors import ConnectError, Forbidden, UsageError
+from rse_pf.slam.keyframe import decode_keyframe
+from rse_pf.slam.keyframe_points import decode_points
+from tests.client_sdk.live.fake_live_map import FakeLiveRobot, solve
+from tests.client_sdk.live.test_live_mapper import QUICK, drive, run
+from tests.client_sdk.mapper.flat_world import CAMERA, DEPTHS_M, frame_at
+
+pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
+
+NO_FEATURES = extract(frame_at(0, depth=True), FrontEndOptions())
+
+
+class Objects:
+    """The objects of a robot, and why none can be stored."""
+
+    def __init__(self) -> None:
+        self.held: dict[str, bytes] = {}
+        self.error: Exception | None = None
+        self.tries = 0
+
+    async def store(self, data: bytes) -> str:
+        self.tries += 1
+        await asyncio.sleep(0)
+        if self.error is not None:
+            raise self.error
+        digest = hashlib.sha256(data).hexdigest()
+        self.held[digest] = data
+        return digest
+
+
+def mapper_of(robot: FakeLiveRobot, objects: Objects, live: LiveOptions = QUICK, ask=solve) -> LiveMapper:
+    return LiveMapper(robot, "lab", ask=ask, live=live, store=objects.store)
+
+
+def test_points_lie_on_surfaces_and_not_between_them_and_have_their_colours() -> None:
+    frame = frame_at(3, depth=True)
+    frame.depth_m[40:60, 100:120] = np.nan
+
+    data = points_of(frame, NO_FEATURES, 2_000)
+
+    assert data is not None
+    points, colours = decode_points(data, CAMERA)
+    assert 1_000 < len(points) <= 2_000
+    assert {round(float(z), 3) for z in points[:, 2]} == {round(depth, 3) for depth in DEPTHS_M}
+    u, v = np.rint(points[:, :2] / points[:, 2:] * 500.0 + [159.5, 119.5]).astype(int).T
+    assert not ((v >= 39) & (v <= 60) & (u >= 99) & (u <= 120)).any()
+    assert not np.isin(v, (79, 80, 159, 160)).any(), "beside an edge"
+    assert np.array_equal(colours, frame.rgb[v, u])
+
+
+def test_near_points_are_thinned_to_one_for_each_centimetre() -> None:
+    frame = frame_at(0, depth=True)
+    near = Frame(timestamp_s=0.0, rgb=frame.rgb, depth_m=np.full_like(frame.depth_m, 0.4), camera=CAMERA)
+
+    data = points_of(near, NO_FEATURES, 12_000)
+
+    assert data is not None
+    points, _ = decode_points(data, CAMERA)
+    width_m, height_m = 0.4 * 320 / 500, 0.4 * 240 / 500
+    assert len(points) <= (width_m / 0.01 + 2) * (height_m / 0.01 + 2)
+
+
+def test_a_frame_without_depth_has_no_points() -> None:
+    assert points_of(frame_at(0, depth=False), NO_FEATURES, 2_000) is None
+
+
+def test_each_keyframe_refers_to_points_that_the_robot_stores() -> None:
+    async def work(robot: FakeLiveRobot) -> None:
+        objects = Objects()
+        async with mapper_of(robot, objects, replace(QUICK, points_bytes_per_s=1e9, leave_s=5.0)) as mapper:
+            await drive(mapper, range(9))
+
+        keyframes = [decode_keyframe(request.keyframe) for request in robot.kept]
+        references = [each.points for each in keyframes if each.points is not None]
+        assert len(references) == len(keyframes) == 3
+        assert {each.digest: each.size for each in references} == {
+            digest: len(data) for digest, data in objects.held.items()
+        }
+        assert mapper.report()["live"]["points"]["sent"] == 3
+
+    run(work)
+
+
+def test_points_wait_while_a_pose_is_asked_for() -> None:
+    async def work(robot: FakeLiveRobot) -> None:
+        objects, is_asked, may_answer = Objects(), asyncio.Event(), asyncio.Event()
+        may_answer.set()
+
+        async def ask(query: PoseQuery) -> PoseAnswer:
+            is_asked.set()
+            await may_answer.wait()
+            return await solve(query)
+
+        live = replace(QUICK, points_bytes_per_s=1e9, leave_s=5.0)
+        async with mapper_of(robot, objects, live, ask) as mapper:
+            await drive(mapper, range(2))
+            await robot.until(lambda: len(objects.held) == 1)
+            robot.before_answer = lambda service: None
+            may_answer.clear()
+            is_asked.clear()
+            tracking = asyncio.ensure_future(mapper.track(frame_at(2, depth=True)))
+            await is_asked.wait()
+            mapper._attachments._points.add(b"more")  # type: ignore[union-attr]
+            for _ in range(200):
+                await asyncio.sleep(0)
+            assert len(objects.held) == 1
+            may_answer.set()
+            await tracking
+            await robot.until(lambda: len(objects.held) == 2)
+
+    run(work)
+
+
+def test_keyframes_that_follow_fast_have_fewer_points_within_the_share_of_the_link() -> None:
+    async def work(robot: FakeLiveRobot) -> None:
+        objects = Objects()
+        live = replace(QUICK, points_bytes_per_s=5_000.0)
+        mapper = LiveMapper(
+            robot, "lab", ask=solve, live=live, store=objects.store, clock=lambda: 0.0
+        )  # no time passes
+        async with mapper:
+            await drive(mapper, range(13))
+            await robot.until(lambda: mapper.keyframes_waiting == 0)
+            sizes = [decode_keyframe(request.keyframe).points for request in robot.kept]
+            assert len(sizes) == 4
+            assert sum(each.size for each in sizes if each is not None) < 2 * 5_000 + 4 * 2_000
+
+    run(work)
+
+
+@pytest.mark.parametrize("error", [Forbidden("no scope data:write"), ConnectError("no data service")])
+def test_a_robot_that_cannot_store_points_maps_and_leaves_as_before(error: Exception) -> None:
+    async def work(robot: FakeLiveRobot) -> None:
+        objects = Objects()
+        objects.error = error
+        live = replace(QUICK, points_bytes_per_s=1e9, leave_s=0.2)
+        async with mapper_of(robot, objects, live) as mapper:
+            done = await drive(mapper, range(9))
+        assert all(each.T_world_camera is not None for each in done)
+        assert len(robot.kept) == 3
+        assert mapper.report()["live"]["points"]["sent"] == 0
+        assert mapper.report()["live"]["points"]["trouble"]
+
+    run(work)
+
+
+def test_no_points_are_made_where_none_are_wanted() -> None:
+    async def work(robot: FakeLiveRobot) -> None:
+        objects = Objects()
+        async with mapper_of(robot, objects, replace(QUICK, points=0)) as mapper:
+            await drive(mapper, range(5))
+            await robot.until(lambda: mapper.keyframes_waiting == 0)
+        assert not objects.tries
+        assert all(decode_keyframe(request.keyframe).points is None for request in robot.kept)
+
+    run(work)
+
+
+def test_more_points_than_an_object_holds_are_refused() -> None:
+    with pytest.raises(UsageError, match="points = 20000 is above 16000"):
+        LiveOptions(points=20_000)
