@@ -59,7 +59,7 @@ def main(arguments: list[str] | None = None) -> int:
     args, others = parser.parse_known_args(arguments)
     unknown = [word for word in others if ":=" not in word]
     if unknown:
-        parser.error(f"unrecognized arguments: {' '.join(unknown)}")
+        parser.error(f"unknown option: {' '.join(unknown)}")
     given = {name: value for name, value in vars(args).items() if name != "shell"}
     try:
         if args.shell == "where":

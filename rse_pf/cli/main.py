@@ -66,6 +66,14 @@ _CHOICE = re.compile(r"invalid choice: '(?P<word>[^']*)' \(choose from (?P<known
 class Parser(argparse.ArgumentParser):
     """Raises UsageError instead of printing a page and leaving."""
 
+    typed: Sequence[str] = ()
+    """The words that are parsed."""
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """Keep the words, for the explanation of an error."""
+        self.typed = sys.argv[1:] if args is None else args
+        return super().parse_known_args(args, namespace)
+
     def error(self, message: str) -> NoReturn:
         """Raise what is wrong, with the option or word that was perhaps meant."""
         choice = _CHOICE.search(message)
@@ -75,18 +83,30 @@ class Parser(argparse.ArgumentParser):
                 f"{self.prog}: {choice['word']!r} is not one of {', '.join(known)}",
                 hint=did_you_mean(choice["word"], known, f"see {self.prog} --help"),
             )
+        known = [word for action in self._actions for word in action.option_strings]
         unknown = re.search(r"unrecognized arguments: ([^\s=]*)", message)
         option = unknown[1] if unknown else ""
+        if "arguments are required" in message:  # perhaps only for an option that does not exist
+            options = (word.partition("=")[0] for word in self.typed if word.startswith("--"))
+            ours = {word for parser in (self, *self._actions_of()) for word in parser._option_string_actions}
+            option = next((word for word in options if word.strip("-") and word not in ours), "")
         if option and not option.startswith("-"):
             raise UsageError(
                 f"{self.prog}: {message}",
                 hint=f"leave it out, or put it before the options; see {self.prog} --help",
             )
-        known = [word for action in self._actions for word in action.option_strings]
         raise UsageError(
-            f"{self.prog}: {message}",
+            f"{self.prog}: unknown option {option}" if option else f"{self.prog}: {message}",
             hint=did_you_mean(option, known, f"see {self.prog} --help"),
         )
+
+    def _actions_of(self) -> list[argparse.ArgumentParser]:
+        return [
+            each
+            for action in self._actions
+            if isinstance(action, argparse._SubParsersAction)
+            for each in action.choices.values()
+        ]
 
 
 def main(argv: Sequence[str] | None = None) -> int:

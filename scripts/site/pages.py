@@ -11,8 +11,11 @@ import importlib
 import os
 import re
 from collections.abc import Iterator
+from dataclasses import is_dataclass
 from pathlib import Path
 from typing import Any
+
+import msgspec
 
 __all__ = ["SDK", "cli_page", "generated", "inside", "metrics_page", "moved", "sdk_page", "sources"]
 
@@ -140,7 +143,14 @@ def sdk_page() -> str:
 
 
 def _directive(path: str) -> str:
-    return f"::: {path}\n    options:\n      heading_level: 3\n"
+    """Return what makes mkdocstrings describe *path*, and the fields that its docstring does not list."""
+    lines = [f"::: {path}", "    options:", "      heading_level: 3"]
+    module, _, name = path.rpartition(".")
+    described = getattr(importlib.import_module(module), name)
+    has_fields = is_dataclass(described) or issubclass(type(described), type(msgspec.Struct))
+    if has_fields and "Attributes:" not in (described.__doc__ or ""):
+        lines.append("      show_if_no_docstring: true")
+    return "\n".join(lines) + "\n"
 
 
 def _public_names(module: str) -> list[str]:

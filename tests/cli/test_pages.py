@@ -116,7 +116,7 @@ def test_every_command_in_a_sentence_exists(repository: Path, name: str) -> None
 
 
 def test_a_wrong_command_is_seen(repository: Path) -> None:
-    assert "unrecognized" in complaint(repository, "rse-pf map list --shop dir:objects")
+    assert "unknown option" in complaint(repository, "rse-pf map list --shop dir:objects")
     assert complaint(repository, "rse-pf mop list") == "no verb"
     assert complaint(repository, "make fuss") == "no target"
     assert half_a_complaint("rse-pf audit verify --tail") == "--tail"
