@@ -1,4 +1,4 @@
-"""Export maps for other programs: PLY and PCD clouds, TUM trajectories, g2o pose graphs.
+"""Export maps for other programs as one file: PLY and PCD clouds, TUM trajectories, g2o pose graphs.
 
 Units are metres and binary data is little-endian; quaternions of TUM and g2o end with w; g2o gets the upper
 triangle of an information matrix.
@@ -28,10 +28,14 @@ def export_map(version: MapVersion, kind: str, robot: str | None = None) -> byte
         robot: ``tum`` only: this robot's keyframes; None for all.
 
     Raises:
-        UsageError: There is no such format, or no such robot in the map.
+        UsageError: There is no such format, no such robot in the map, or the map has no points for a cloud.
     """
     if kind not in FORMATS:
         raise UsageError(f"{kind!r} is not a format of maps", hint=f"use one of {', '.join(FORMATS)}")
+    if kind in _CLOUDS and not len(version.points):
+        raise UsageError(
+            f"this map has no points, so there is no {kind} of it", hint="export it as tum or g2o"
+        )
     return FORMATS[kind](version, robot)
 
 
@@ -79,3 +83,4 @@ FORMATS: dict[str, Callable[[MapVersion, str | None], bytes]] = {
     "ply": _ply, "pcd": _pcd, "tum": _tum, "g2o": _g2o,
 }  # fmt: skip
 """The formats of `export_map` by name."""
+_CLOUDS = ("ply", "pcd")

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
+import numpy.typing as npt
 
 from rse_pf.errors import PnpError
 from rse_pf.geometry import Array, Camera, adjoint, inverse, transform
@@ -27,6 +28,7 @@ __all__ = [
     "RelativePoseOptions",
     "View",
     "match_points",
+    "match_rows",
     "measure_inverse_link",
     "measure_link",
     "measure_pose",
@@ -151,6 +153,8 @@ class RelativePose:
 
 
 _DEFAULT = RelativePoseOptions()
+_ANY_CAMERA = Camera(fx=1.0, fy=1.0, cx=0.5, cy=0.5, width=1, height=1)
+"""No matcher looks at the camera."""
 
 
 def reference_of(keyframe: Keyframe) -> Reference:
@@ -309,6 +313,23 @@ def match_points(
     rows, columns = rows[leftmost], columns[leftmost]
     points, depths_m = reference.points_camera[rows], view_depths_m[columns]
     return points.round(4), view.pixels[columns].round(2), depths_m.round(3)
+
+
+def match_rows(
+    reference: Descriptors, view: Descriptors, options: RelativePoseOptions = _DEFAULT
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    """Return the rows of *reference* and of *view* that match, as `match_points` finds them.
+
+    Raises:
+        As `match_points`.
+    """
+    n, m = len(reference), len(view)
+    # The matcher only carries points and pixels along: here they are the numbers of their rows.
+    numbered = Reference(points_camera=np.column_stack([np.arange(n), np.zeros(n), np.ones(n)]),
+                         descriptors=reference)  # fmt: skip
+    seen = View(camera=_ANY_CAMERA, pixels=np.column_stack([np.arange(m), np.zeros(m)]), descriptors=view)
+    points, pixels, _ = match_points(numbered, seen, options)
+    return points[:, 0].astype(np.int64), pixels[:, 0].astype(np.int64)
 
 
 @lru_cache(maxsize=16)

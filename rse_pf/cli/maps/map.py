@@ -17,6 +17,7 @@ examples:
   rse-pf map live list --store dir:objects
   rse-pf map prune kitchen --keep 10 --store dir:objects
   rse-pf map export kitchen --format ply --out kitchen.ply --store dir:objects
+  rse-pf map export kitchen --format occupancy --out kitchen-plan --store dir:objects
 """
 
 from __future__ import annotations
@@ -36,20 +37,19 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 import numpy as np
 
-from rse_pf.cli.maps.bags import BAG_ACTIONS, BAG_FORMAT, add_bag_actions, export_bag, run_bags
+from rse_pf.cli.maps.bags import BAG_ACTIONS, add_bag_actions, run_bags
+from rse_pf.cli.maps.export import add_export_arguments, run_export
 from rse_pf.cli.maps.from_camera import add_from_camera_arguments, run_from_camera
 from rse_pf.cli.maps.live import add_live_arguments, run_live, run_publish
 from rse_pf.cli.maps.map_store import open_maps, with_store
 from rse_pf.cli.maps.merge_output import commit_merge, merge_progress
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import NotFound, UsageError
-from rse_pf.files import replace_file
 from rse_pf.geometry import Camera, rotation_angle_deg, to_quaternion
 from rse_pf.maps.descriptors import check_alike
 from rse_pf.maps.format import MapVersion
 from rse_pf.maps.registry import MapOrigin, MapRecord, MapRegistry, difference
 from rse_pf.maps.removal import freed_bytes, superseded
-from rse_pf.slam.map_export import FORMATS, export_map
 from rse_pf.terminal import at_work, counted, show, show_json
 
 if TYPE_CHECKING:
@@ -76,7 +76,7 @@ _ACTIONS = {
     "prune": ("remove all but the newest versions", "prune kitchen --keep 10"),
     "export": (
         "write a version in the format of another program",
-        "export kitchen --format ply --out kitchen.ply",
+        "export kitchen --format colmap --out kitchen-colmap",
     ),
     "publish": ("publish a live map as the next version of its map", "publish warehouse"),
 }
@@ -126,9 +126,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     made["prune"].add_argument(
         "--keep", type=int, required=True, metavar="N", help="how many of the newest stay, besides the head"
     )
-    made["export"].add_argument("--format", choices=(*FORMATS, BAG_FORMAT), required=True, help="the format")
-    made["export"].add_argument("--out", type=Path, required=True, metavar="FILE", help="the file to write")
-    made["export"].add_argument("--robot", help="tum: only the keyframes of this robot")
+    add_export_arguments(made["export"])
     add_from_camera_arguments(
         actions.add_parser(
             "from-camera", help="make a map from a camera, a video or images",
@@ -192,7 +190,7 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
         "diff": _diff,
         "rollback": _rollback,
         "prune": _prune,
-        "export": _export,
+        "export": run_export,
     }
     return actions[args.action](args, maps) or 0
 
@@ -361,18 +359,6 @@ def _prune(args: argparse.Namespace, maps: MapRegistry) -> None:
         *map(_record_line, removed),
         f"{counted(len(removed), 'version')} of {args.name} removed, {freed} bytes freed",
     )
-
-
-def _export(args: argparse.Namespace, maps: MapRegistry) -> None:
-    _check_folder(args.out)
-    version = maps.load(args.name, args.version)
-    if args.format == BAG_FORMAT:
-        size = export_bag(args.out, version)
-    else:
-        data = export_map(version, args.format, args.robot)
-        replace_file(args.out, data)
-        size = len(data)
-    _print(args, {"file": str(args.out), "bytes": size}, f"{args.out}: {size} bytes")
 
 
 def _draw(args: argparse.Namespace, maps: MapRegistry, record: MapRecord) -> None:
