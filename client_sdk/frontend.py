@@ -6,23 +6,22 @@ What a frame is matched with is decided in `client_sdk.tracking`.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cache
-from operator import attrgetter
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
 
 from client_sdk.imu.samples import ImuSamples
-from client_sdk.monocular.opencv import load_opencv
-from client_sdk.native_match import FrontEndCore, front_end_core
 from client_sdk.slots import FeaturesSlot
 from client_sdk.stereo.depth import noise_of, stereo_points
 from client_sdk.stereo.view import StereoView
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Array, Camera, body_poses
+from rse_pf.images import load_opencv
 from rse_pf.maps.descriptors import ORB, DescriptorKind, Descriptors
+from rse_pf.native_front_end import front_end_core
 from rse_pf.pnp import DepthNoise
+from rse_pf.slam.orb import DescribedPixels, describe_orb, spread_rows
 
 __all__ = [
     "Correspondences",
@@ -33,26 +32,16 @@ __all__ = [
     "PoseQuery",
     "TrackedFrame",
     "describe",
-    "describe_at",
     "extract",
     "load_opencv",
     "match",
     "points_at",
     "round_for_wire",
-    "spread_rows",
 ]
 
 # So many matches fit into a command of 10 kB.  Each takes 14 to 15 bytes with zlib in recordings, and 18 if
 # all digits are random; 24 with MessagePack; 40 with plain JSON, 43 at most.
 _MATCHES_OF_CODEC = {"zlib": 530, "bin": 400, "json": 220}
-
-# ORB's pyramid.
-_SCALE, _LEVELS = 1.2, 8
-_SCALES: Array = np.power(_SCALE, np.arange(_LEVELS, dtype=np.float64))
-_FAST, _FAST_SPREAD = 10, 7
-_PATCH_PX = 31.0
-_SOUGHT, _CELL_PX = 3, 40
-"""So many times the features are sought, and spread over cells of this size."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -240,19 +229,6 @@ def extract(frame: Frame, options: FrontEndOptions, slot: FeaturesSlot | None = 
     )  # fmt: skip
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class DescribedPixels:
-    """Keypoints of one image as `Features` has them, without depth."""
-
-    pixels: Array
-    descriptors: Descriptors
-    turns: Array
-    sizes: Array
-    kind: DescriptorKind = ORB
-    is_oriented: bool = True
-    is_scaled: bool = True
-
-
 def describe(
     rgb: npt.NDArray[np.uint8], count: int, *, is_spread: bool = True, slot: FeaturesSlot | None = None
 ) -> DescribedPixels:
@@ -268,37 +244,10 @@ def describe(
     Raises:
         MissingExtra: OpenCV is not installed.
         UsageError: The features function failed, or returned no features.
-
-    Source:
-        Rublee et al., ICCV 2011; scale 1.2, 8 levels, FAST threshold 7, and 10 where features are not spread.
     """
     if slot is not None:
         return _described_by(slot, rgb, count, is_spread=is_spread)
-    cv2 = load_opencv()
-    gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
-    orb = _orb(cv2, _SOUGHT * count, _FAST_SPREAD) if is_spread else _orb(cv2, count, _FAST)
-    keypoints = orb.detect(gray, None)
-    if not keypoints:
-        none = np.empty((0, 2))
-        return DescribedPixels(
-            pixels=none, descriptors=np.empty((0, 32), dtype=np.uint8), turns=none, sizes=np.empty(0)
-        )
-    n = len(keypoints)
-    responses = np.fromiter(map(attrgetter("response"), keypoints), np.float64, n)
-    rows = spread_rows(cv2.KeyPoint_convert(keypoints), responses, gray.shape, count)
-    chosen = [keypoints[row] for row in rows] if is_spread else list(keypoints)
-    core = front_end_core()
-    descriptors = _described(cv2, gray, chosen, core) if core is not None and _describes_alike(core) else None
-    if descriptors is None:
-        chosen, descriptors = orb.compute(gray, chosen)
-    angles = np.radians(np.fromiter(map(attrgetter("angle"), chosen), np.float64, len(chosen)))
-    octaves = np.fromiter(map(attrgetter("octave"), chosen), np.int64, len(chosen))
-    return DescribedPixels(
-        pixels=cv2.KeyPoint_convert(chosen).astype(np.float64),
-        descriptors=descriptors,
-        turns=np.stack([np.cos(angles), np.sin(angles)], axis=1),
-        sizes=_SCALES[octaves],
-    )
+    return describe_orb(rgb, count, is_spread=is_spread)
 
 
 def _described_by(
@@ -314,86 +263,6 @@ def _described_by(
         pixels=found.pixels[rows], descriptors=found.descriptors[rows], turns=found.turns[rows],
         sizes=found.sizes[rows], kind=slot.kind, is_oriented=slot.is_oriented, is_scaled=slot.is_scaled,
     )  # fmt: skip
-
-
-def describe_at(
-    rgb: npt.NDArray[np.uint8], pixels: Array, turns: Array, sizes: Array
-) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.uint8]]:
-    """Return the ORB descriptors that an image has at given pixels, whether it has features there or not.
-
-    Args:
-        rgb: ``(h, w, 3)``.
-        pixels: ``(n, 2)``.
-        turns: ``(n, 2)``, cosine and sine of the orientations.
-        sizes: ``(n,)``, as `Features` has them; the nearest level of the pyramid is taken.
-
-    Returns:
-        The rows that could be described, none of which is near the edge, and ``(k, 32)`` descriptors.
-
-    Raises:
-        MissingExtra: OpenCV is not installed.
-    """
-    cv2 = load_opencv()
-    levels = np.clip(np.rint(np.log(sizes) / np.log(_SCALE)), 0, _LEVELS - 1).astype(int)
-    angles_deg = np.degrees(np.arctan2(turns[:, 1], turns[:, 0])) % 360.0
-    keypoints = [
-        cv2.KeyPoint(
-            float(u), float(v), float(_PATCH_PX * _SCALES[level]), float(angle), 1.0, int(level), row
-        )
-        for row, ((u, v), angle, level) in enumerate(zip(pixels, angles_deg, levels, strict=True))
-    ]
-    if keypoints:
-        gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
-        keypoints, descriptors = _orb(cv2, len(keypoints), _FAST).compute(gray, keypoints)
-    if not keypoints:
-        return np.empty(0, dtype=np.int64), np.empty((0, 32), dtype=np.uint8)
-    return np.fromiter(map(attrgetter("class_id"), keypoints), np.int64, len(keypoints)), descriptors
-
-
-def spread_rows(pixels: Array, responses: Array, size: tuple[int, int], count: int) -> list[int]:
-    """Return the rows of the strongest keypoints of each cell of the image, *count* in all, ascending.
-
-    Args:
-        pixels: ``(n, 2)``.
-        responses: ``(n,)``, how strong a keypoint is.
-        size: Height and width of the image.
-        count: Rows of the first, then the second strongest of all cells, and so on.
-    """
-    across = -(-size[1] // _CELL_PX)
-    cells = (pixels[:, 1] // _CELL_PX * across + pixels[:, 0] // _CELL_PX).astype(np.int64)
-    order = np.lexsort((-responses, cells))
-    starts = np.flatnonzero(np.concatenate(([True], np.diff(cells[order]) != 0)))
-    rank = np.arange(len(order)) - np.repeat(starts, np.diff(np.append(starts, len(order))))
-    best = order[np.lexsort((-responses[order], rank))][:count]
-    rows: list[int] = np.sort(best).tolist()
-    return rows
-
-
-def _orb(cv2: Any, count: int, threshold: int) -> Any:
-    return cv2.ORB_create(nfeatures=count, scaleFactor=_SCALE, nlevels=_LEVELS, fastThreshold=threshold)
-
-
-def _described(
-    cv2: Any, gray: npt.NDArray[np.uint8], keypoints: list[Any], core: FrontEndCore
-) -> npt.NDArray[np.uint8] | None:
-    """Return the descriptors of keypoints by the native core; None where it cannot describe them."""
-    n = len(keypoints)
-    angles_deg = np.fromiter(map(attrgetter("angle"), keypoints), np.float32, n)
-    octaves = np.fromiter(map(attrgetter("octave"), keypoints), np.int32, n)
-    return core.describe(
-        gray, cv2.KeyPoint_convert(keypoints), angles_deg, octaves, scale=_SCALE, levels=_LEVELS
-    )
-
-
-@cache
-def _describes_alike(core: FrontEndCore) -> bool:
-    """Say whether the core describes a picture as the installed OpenCV does, which may be another version."""
-    cv2 = load_opencv()
-    blocks = np.random.default_rng(1).integers(0, 256, (60, 80))
-    gray = np.kron(blocks, np.ones((5, 5))).astype(np.uint8)
-    keypoints, descriptors = _orb(cv2, 500, _FAST).detectAndCompute(gray, None)
-    ours = _described(cv2, gray, keypoints, core)
-    return ours is not None and bool(np.array_equal(ours, descriptors))
 
 
 def match(reference: Features, frame: Features, options: FrontEndOptions) -> Correspondences:

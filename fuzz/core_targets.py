@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from client_sdk.native_match import FrontEndCore, open_front_end
 from fuzz.checks import expect
 from fuzz.meter import Meter
 from rse_pf.errors import ProtocolError
 from rse_pf.geometry import Array, Camera
 from rse_pf.native import address_of, find_library, load_part
+from rse_pf.native_front_end import FrontEndCore, open_front_end
 from rse_pf.native_tracker import TrackCore, open_tracker
 from rse_pf.pnp import PnpSolution
 from rse_pf.pnp.native_depth import DepthCore, RefinedPose, open_depth

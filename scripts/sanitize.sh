@@ -45,7 +45,7 @@ echo "sanitize: Python tests"
 "$python" -m pytest -q -p no:cacheprovider --timeout 900 -m "not slow and not system" \
   tests/pnp/test_degenerate.py tests/pnp/test_engines.py tests/pnp/test_solver.py \
   tests/pnp/test_depth_refinement.py tests/wire/test_native_codec.py tests/wire/test_codec.py tests/wire/test_golden.py \
-  tests/client_sdk/test_native_match.py tests/pnp/test_native_depth.py tests/slam/test_tracking.py \
+  tests/test_native_front_end.py tests/pnp/test_native_depth.py tests/slam/test_tracking.py \
   tests/hostile/test_geometry.py
 for target in codec geometry native match depth describe track; do
   echo "sanitize: fuzz $target for $seconds s"

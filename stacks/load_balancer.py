@@ -9,7 +9,7 @@ from aws_cdk import aws_s3 as s3
 from constructs import Construct
 
 from rse_pf.config import PlatformSettings
-from rse_pf.config.front_door import BALANCER_IDLE_TIMEOUT_S
+from rse_pf.config.front_door import BALANCER_IDLE_TIMEOUT_S, DATA_PATH, LOCALISE_PATH
 from rse_pf.config.resource_names import READY_PATH
 from rse_pf.scaling.health import CLOUD_INTERVAL_S, CLOUD_TIMEOUT_S, HEALTHY_CHECKS, cloud_checks
 from stacks.data_stack import BALANCER_LOGS
@@ -55,7 +55,10 @@ class LoadBalancer(Construct):
         if settings.data.enabled:
             self.targets["data"] = self._targets("Data", vpc, settings.data.port, settings)
             listener.add_target_groups(
-                "DataRule", priority=10, conditions=[elbv2.ListenerCondition.path_patterns(["/data/*"])],
+                "DataRule", priority=10,
+                conditions=[
+                    elbv2.ListenerCondition.path_patterns([f"{DATA_PATH}*", f"{LOCALISE_PATH}*"])
+                ],
                 target_groups=[self.targets["data"]],
             )  # fmt: skip
             # Each request would cost a request to the bucket; health checks do not pass through the listener.

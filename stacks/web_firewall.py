@@ -118,14 +118,19 @@ def _burst_token_rule(prefix: str, place: int) -> wafv2.CfnWebACL.RuleProperty:
 
 
 def _scope(rule: RateRule) -> wafv2.CfnWebACL.StatementProperty:
-    if rule.path:
-        return _path_begins_with(rule.path)
-    others = [_path_begins_with(path) for path in rule.but]
-    either = wafv2.CfnWebACL.StatementProperty(
-        or_statement=wafv2.CfnWebACL.OrStatementProperty(statements=others)
-    )
+    if rule.paths:
+        return _path_begins_with_one_of(rule.paths)
     return wafv2.CfnWebACL.StatementProperty(
-        not_statement=wafv2.CfnWebACL.NotStatementProperty(statement=either)
+        not_statement=wafv2.CfnWebACL.NotStatementProperty(statement=_path_begins_with_one_of(rule.but))
+    )
+
+
+def _path_begins_with_one_of(paths: tuple[str, ...]) -> wafv2.CfnWebACL.StatementProperty:
+    statements = [_path_begins_with(path) for path in paths]
+    if len(statements) == 1:  # an or of one statement is invalid
+        return statements[0]
+    return wafv2.CfnWebACL.StatementProperty(
+        or_statement=wafv2.CfnWebACL.OrStatementProperty(statements=statements)
     )
 
 

@@ -12,7 +12,7 @@ from typing import Any
 from rse_pf.auth.tokens import SigningKey
 from rse_pf.config import PlatformSettings
 from rse_pf.data_server import DataServer
-from rse_pf.data_server.map_describer import max_map_bytes
+from rse_pf.data_server.robot_processes import max_map_bytes
 from rse_pf.identity import RobotId
 from rse_pf.maps.describe import MapSummary, describe_map
 from rse_pf.object_store import ObjectStore
@@ -35,8 +35,8 @@ class Answer:
 class Service:
     """The application with its own store and clock."""
 
-    def __init__(self, settings: PlatformSettings, store: ObjectStore) -> None:
-        self.settings, self.store = settings, store
+    def __init__(self, settings: PlatformSettings, store: ObjectStore, localiser: Any = None) -> None:
+        self.settings, self.store, self.localiser = settings, store, localiser
         self.now = 0.0
         self.wall = NOW
         self.lines: list[dict[str, Any]] = []
@@ -46,7 +46,7 @@ class Service:
         self.app = DataServer(
             self.settings, self.store, keys=KEY.key_set, log=self.lines.append,
             clock=lambda: self.now, wall_clock=lambda: self.wall, describe=self.describe,
-            pause=self.pause,
+            pause=self.pause, localiser=self.localiser,
         )  # fmt: skip
 
     async def pause(self, seconds: float) -> None:

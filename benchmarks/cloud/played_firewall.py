@@ -132,10 +132,8 @@ def rules_of_settings(settings: PlatformSettings) -> list[PlayedRule]:
 
 
 def _scope(rule: RateRule) -> dict[str, Any]:
-    if rule.path:
-        return _begins(rule.path)
-    either = {"OrStatement": {"Statements": [_begins(path) for path in rule.but]}}
-    return {"NotStatement": {"Statement": either}}
+    either = {"OrStatement": {"Statements": [_begins(path) for path in rule.paths or rule.but]}}
+    return either if rule.paths else {"NotStatement": {"Statement": either}}
 
 
 def _begins(path: str) -> dict[str, Any]:

@@ -167,11 +167,11 @@ def flood(port: int, token: str, crowd: Crowd, begun: Event, stop: Event, result
                 client.close()
         client.close()
 
-    _run_threads(work, listers + writers, begun)
+    run_threads(work, listers + writers, begun)
     results.put(dict(statuses))
 
 
-def _run_threads(work: Callable[[int], None], count: int, begun: Event) -> None:
+def run_threads(work: Callable[[int], None], count: int, begun: Event) -> None:
     """Run *work* of each number below *count* in a thread, set *begun*, and wait for them."""
     threads = [threading.Thread(target=work, args=(row,)) for row in range(count)]
     for thread in threads:
@@ -200,7 +200,7 @@ def flood_of_maps(port: int, tokens: list[str], begun: Event, stop: Event, resul
             statuses[f"commit {status}"] += 1
         client.close()
 
-    _run_threads(work, len(tokens), begun)
+    run_threads(work, len(tokens), begun)
     results.put(dict(statuses))
 
 

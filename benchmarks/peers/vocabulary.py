@@ -22,7 +22,7 @@ import numpy.typing as npt
 
 from benchmarks.frame.registry import benchmark
 from client_sdk.frontend import describe
-from client_sdk.monocular.opencv import load_opencv, read_image
+from rse_pf.images import load_opencv, read_image
 
 __all__ = ["Node", "text_of", "train"]
 

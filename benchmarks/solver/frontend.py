@@ -25,10 +25,10 @@ from benchmarks.frame.registry import Bar, benchmark
 from benchmarks.frame.statistics import spread
 from client_sdk import frontend
 from client_sdk.datasets import Dataset, open_dataset
-from client_sdk.native_match import FrontEndCore, open_front_end
 from rse_pf import native
 from rse_pf.errors import ConfigurationError
 from rse_pf.geometry import Array
+from rse_pf.native_front_end import FrontEndCore, open_front_end
 
 ARRAYS = ("points_world", "pixels")
 

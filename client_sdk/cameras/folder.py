@@ -16,8 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from client_sdk.cameras.source import RawFrame, colour_of
-from client_sdk.monocular.opencv import MAX_IMAGE_PIXELS, load_opencv, read_image
 from rse_pf.errors import UsageError
+from rse_pf.images import MAX_IMAGE_PIXELS, load_opencv, read_image
 
 __all__ = ["image_files", "is_image", "open_folder", "read_raw_image"]
 

@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from client_sdk.cameras.source import RawFrame, colour_of
-from client_sdk.monocular.opencv import MAX_IMAGE_PIXELS, load_opencv
 from rse_pf.errors import UsageError
+from rse_pf.images import MAX_IMAGE_PIXELS, load_opencv
 
 __all__ = ["is_video_file", "open_video"]
 

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from client_sdk.monocular.opencv import MAX_IMAGE_PIXELS, load_opencv, read_image
 from rse_pf.errors import UsageError
+from rse_pf.images import MAX_IMAGE_PIXELS, load_opencv, read_image
 
 __all__ = ["read_colour", "read_image_file"]
 

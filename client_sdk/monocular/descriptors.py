@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from client_sdk.monocular.opencv import load_opencv
+from rse_pf.images import load_opencv
 from rse_pf.maps.descriptors import ORB, Descriptors
 from rse_pf.native_matcher import MatchCore, match_core
 from rse_pf.slam.descriptors import best_matches, distances_of_pairs

@@ -11,9 +11,9 @@ import numpy as np
 import numpy.typing as npt
 
 from client_sdk.monocular.bundle import Bundle, adjust
-from client_sdk.monocular.opencv import load_opencv
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Array, Camera, inverse
+from rse_pf.images import load_opencv
 from rse_pf.slam.triangulation import parallax_deg, triangulate
 
 __all__ = ["MarkerScale", "OdometryScale"]

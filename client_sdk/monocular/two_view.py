@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from client_sdk.monocular.opencv import load_opencv
 from rse_pf.geometry import Array, Camera, inverse
+from rse_pf.images import load_opencv
 from rse_pf.slam.triangulation import parallax_deg, triangulate
 
 __all__ = ["TwoViewStart", "start_from_two_views"]

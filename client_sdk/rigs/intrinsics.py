@@ -24,10 +24,10 @@ import numpy as np
 
 from client_sdk.frontend import load_opencv
 from client_sdk.image_map import ImageMap
-from client_sdk.monocular.opencv import MAX_IMAGE_PIXELS
 from rse_pf.errors import InvalidCamera, UsageError
 from rse_pf.files import read_regular_file
 from rse_pf.geometry import Array, Camera
+from rse_pf.images import MAX_IMAGE_PIXELS
 
 __all__ = [
     "Intrinsics", "LensModel", "Undistortion", "intrinsics_of", "lens_maps", "read_intrinsics", "read_json",

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from client_sdk.monocular.opencv import load_opencv
 from client_sdk.stereo.view import StereoView
 from rse_pf.geometry import Array, Camera
+from rse_pf.images import load_opencv
 from rse_pf.pnp import DepthNoise
 from rse_pf.slam.stereo import StereoOptions, disparities, stereo_noise
 

@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from client_sdk.frontend import Frame, describe_at
+from client_sdk.frontend import Frame
 from client_sdk.tracking.keyframe_map import Landmarks, expect
 from rse_pf.geometry import Array, inverse, transform
 from rse_pf.slam.descriptors import distances_of_pairs
+from rse_pf.slam.orb import describe_at
 
 __all__ = ["share_alike"]
 

@@ -20,7 +20,9 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO
-from urllib.parse import urlsplit
+from urllib.parse import quote, urlencode, urlsplit
+
+import msgspec
 
 from client_sdk.enrolment import read_enrolment
 from client_sdk.network.data_requests import (
@@ -31,7 +33,9 @@ from client_sdk.network.data_requests import (
     Response,
     error_of,
 )
+from rse_pf.config.front_door import LOCALISE_PATH
 from rse_pf.errors import Conflict, ConnectError, NotFound, RsePfError, StoreError, UsageError
+from rse_pf.maps.photos import Lens, MapOutline, PhotoLocation
 
 __all__ = ["DataClient", "DataOptions", "OnBytes", "is_allowed"]
 
@@ -185,6 +189,31 @@ class DataClient:
         except NotFound:
             parent = None
         return self.commit_map(name, data, parent=parent, note=note)
+
+    def localise(self, name: str, photo: bytes, lens: Lens) -> PhotoLocation:
+        """Return where a photo was taken in the head of a map.
+
+        Args:
+            name: Of the map.
+            photo: A JPEG or PNG, as its file has it.
+            lens: Intrinsics of the camera that took it.
+
+        Raises:
+            NotFound: There is no such map of this tenant.
+            BadRequest, LimitExceeded, InvalidCamera: The photo or its intrinsics cannot be used.
+            Forbidden: The token has not the scope ``maps:localise/MAP``.
+        """
+        query: dict[str, Any] = msgspec.to_builtins(lens)
+        query |= {"distortion": ",".join(map(repr, lens.distortion))} if lens.distortion else {}
+        with self._lock:
+            path = f"{LOCALISE_PATH}{quote(name, safe='')}?{urlencode(query)}"
+            return msgspec.json.decode(self._request("POST", path, photo)[2], type=PhotoLocation)
+
+    def map_outline(self, name: str) -> MapOutline:
+        """Return the head of a map as it is seen from above; raises as `localise`."""
+        with self._lock:
+            path = f"{LOCALISE_PATH}{quote(name, safe='')}"
+            return msgspec.json.decode(self._request("GET", path)[2], type=MapOutline)
 
     def _upload_parts(self, opened: _Source, digest: str, progress: OnBytes | None) -> None:
         path, size = f"/data/v1/uploads/{digest}", opened.size

@@ -47,7 +47,7 @@ QUOTAS = ("data_bytes",)
 _SCOPE = re.compile(
     r"services:(?:\*|[A-Za-z0-9][A-Za-z0-9._-]{0,63})"
     r"|data:(?:\*|read|write)"
-    r"|maps:(?:\*|read|write|live|watch)(?:/[a-z0-9][a-z0-9-]{0,63})?"
+    r"|maps:(?:\*|read|write|live|watch|localise)(?:/[a-z0-9][a-z0-9-]{0,63})?"
     r"|topics:(?:\*|read|write)"
 )
 _X = re.compile(r"[A-Za-z0-9_-]{43}")
@@ -286,7 +286,8 @@ def check_scopes(scopes: tuple[str, ...]) -> tuple[str, ...]:
             raise UsageError(
                 f"{scope[:80]!r} is not a scope",
                 hint="write services:NAME, data:read, data:write, maps:read, maps:write, maps:live, "
-                "maps:live/MAP, maps:watch/MAP, topics:read or topics:write; * stands for all of an area",
+                "maps:live/MAP, maps:watch/MAP, maps:localise/MAP, topics:read or topics:write; "
+                "* stands for all of an area",
             )
     if len(scopes) > _MAX_SCOPES:
         raise UsageError(f"{len(scopes)} scopes are above {_MAX_SCOPES}", hint="use services:* and the like")

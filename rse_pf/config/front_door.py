@@ -21,6 +21,7 @@ __all__ = [
     "DATA_PATH",
     "DIALS_PER_MINUTE",
     "DIAL_BURST",
+    "LOCALISE_PATH",
     "MAX_HANDSHAKE_BYTES",
     "RETRY_AFTER_S",
     "STATUS",
@@ -43,7 +44,8 @@ DIALS_PER_MINUTE = 10.0
 DATA_REQUESTS_PER_MINUTE = 600
 """Data requests of one robot, averaged over the robots of a site; ``data.max_requests_per_s`` bounds each
 alone."""
-DATA_PATH = "/data/"
+DATA_PATH, LOCALISE_PATH = "/data/", "/localise/"
+"""What the data servers answer."""
 BURST_PATH = "/burst"
 """At the robots' address, where the serverless PnP answers."""
 BEARER_PATTERN = r"^[Bb]earer +[A-Za-z0-9_-]+\.[A-Za-z0-9_-]+\.[A-Za-z0-9_-]{86}$"
@@ -64,13 +66,13 @@ _LEAST = 10
 class RateRule:
     """At most ``limit`` requests within ``window_s`` seconds, of one address or ``of_all``.
 
-    It counts paths that begin with ``path``, or with ``but`` all that begin with none of these.
+    It counts paths that begin with one of ``paths``, or with ``but`` all that begin with none of these.
     """
 
     name: str
     limit: int
     window_s: int = _MINUTE_S
-    path: str = ""
+    paths: tuple[str, ...] = ()
     but: tuple[str, ...] = ()
     of_all: bool = False
 
@@ -85,19 +87,19 @@ def rate_rules(settings: PlatformSettings) -> tuple[RateRule, ...]:
     dials = robots * (DIAL_BURST + DIALS_PER_MINUTE)
     requests = robots * DATA_REQUESTS_PER_MINUTE
     return (
-        RateRule(name="dials", limit=_limit(dials), but=(DATA_PATH, BURST_PATH)),
-        RateRule(name="data", limit=_limit(requests), path=DATA_PATH),
+        RateRule(name="dials", limit=_limit(dials), but=(DATA_PATH, LOCALISE_PATH, BURST_PATH)),
+        RateRule(name="data", limit=_limit(requests), paths=(DATA_PATH, LOCALISE_PATH)),
         RateRule(
             name="burst",
             limit=_limit(_ADDRESS_SHARE * burst.commands_per_5_minutes),
             window_s=_FIVE_MINUTES_S,
-            path=BURST_PATH,
+            paths=(BURST_PATH,),
         ),
         RateRule(
             name="burst-of-all",
             limit=burst.commands_per_5_minutes,
             window_s=_FIVE_MINUTES_S,
-            path=BURST_PATH,
+            paths=(BURST_PATH,),
             of_all=True,
         ),
     )

@@ -23,7 +23,7 @@ from rse_pf.auth.roster import scopes_allow
 from rse_pf.auth.tokens import Claims, KeySet, token_problem, verify_token
 from rse_pf.config import PlatformSettings
 from rse_pf.data_server.cross_origin import is_preflight, preflight_reply, shared_reply
-from rse_pf.data_server.handlers import Handler, Handlers
+from rse_pf.data_server.handlers import Handler, Handlers, MapWork
 from rse_pf.data_server.http import (
     HttpReply,
     HttpRequest,
@@ -34,6 +34,7 @@ from rse_pf.data_server.http import (
     failure_reply,
 )
 from rse_pf.data_server.map_describer import MapDescriber
+from rse_pf.data_server.photo_localiser import PhotoLocaliser
 from rse_pf.data_server.request_limits import RequestLimits
 from rse_pf.data_server.routes import ROUTES, Route
 from rse_pf.errors import (
@@ -74,6 +75,7 @@ class DataServer:
         wall_clock: Callable[[], float] = time.time,
         audit: AuditLog | None = None,
         describe: Callable[[RobotId, str], MapSummary] | None = None,
+        localiser: PhotoLocaliser | None = None,
         pause: Callable[[float], Awaitable[None]] = asyncio.sleep,
     ) -> None:
         """Make the application; nothing is read or started yet.
@@ -88,6 +90,7 @@ class DataServer:
             audit: Records refused tokens and changes of maps; None records nothing.
             describe: Returns what the map in an object that a robot sent holds; None starts a process with
                 limits for it.
+            localiser: Localises photos; None starts processes with limits for it.
             pause: Waits for so many seconds before a robot above its rate gets its refusal.
         """
         self._audit = audit
@@ -105,8 +108,11 @@ class DataServer:
             describer = MapDescriber(settings, store, clock)
             describe = describer.describe
             self._closing.callback(describer.close)
+        if localiser is None:
+            localiser = PhotoLocaliser(settings, store, clock)
+        self._closing.callback(localiser.close)
         self.handlers = Handlers(
-            store, settings.data, describe=describe, clock=clock,
+            store, settings.data, MapWork(describe, localiser), clock=clock,
             wall_clock=wall_clock, audit=audit,
         )  # fmt: skip
         self._routes: dict[str, list[tuple[re.Pattern[str], Route, Handler]]] = {}

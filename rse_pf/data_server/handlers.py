@@ -10,7 +10,8 @@ import contextlib
 import functools
 import re
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Mapping
+from dataclasses import dataclass
 from typing import Any, TypeVar
 
 import msgspec
@@ -20,6 +21,7 @@ from rse_pf.auth.tokens import Claims
 from rse_pf.config import DataSettings
 from rse_pf.data_server.fair_threads import FairThreads, check_wanted
 from rse_pf.data_server.http import HttpReply, HttpRequest, failure_reply, json_reply, requested_range
+from rse_pf.data_server.photo_localiser import PhotoLocaliser
 from rse_pf.data_server.routes import (
     BYTES,
     Commit,
@@ -41,11 +43,12 @@ from rse_pf.errors import BadRequest, Conflict, NotFound
 from rse_pf.identity import RobotId
 from rse_pf.maps.charges import charge_name
 from rse_pf.maps.describe import MapSummary
+from rse_pf.maps.photos import Lens
 from rse_pf.maps.registry import MapContent, MapOrigin, MapRecord, MapRegistry
 from rse_pf.maps.removal import freed_bytes, superseded
 from rse_pf.object_store import CachedStore, ObjectStore, PresigningStore, read_range
 
-__all__ = ["Handler", "Handlers"]
+__all__ = ["Handler", "Handlers", "MapWork"]
 
 _T = TypeVar("_T")
 # Gets a request, the claims of its token, and the parameters of its path.
@@ -62,7 +65,16 @@ _BEGINNING = re.compile(r"[0-9a-f]{0,64}")
 _MAP_THREADS = 1
 """They wait for the process that reads maps, so that slow maps delay only other maps."""
 _PROBE = "ready/probe"
+_LENS = frozenset(Lens.__struct_fields__)
 _COUNT = re.compile(r"[0-9]{1,6}")
+
+
+@dataclass(frozen=True, slots=True)
+class MapWork:
+    """What reads maps: *describe* returns what the map in an object that a robot sent holds."""
+
+    describe: Callable[[RobotId, str], MapSummary]
+    localiser: PhotoLocaliser
 
 
 class Handlers:
@@ -72,21 +84,23 @@ class Handlers:
         self,
         store: ObjectStore,
         settings: DataSettings,
+        map_work: MapWork,
         *,
-        describe: Callable[[RobotId, str], MapSummary],
         clock: Callable[[], float] = time.monotonic,
         wall_clock: Callable[[], float] = time.time,
         audit: AuditLog | None = None,
     ) -> None:
-        """Make the handlers; *describe* returns what the map in an object that a robot sent holds."""
+        """Make the handlers; *map_work* is done in threads of its own, and closed elsewhere."""
         self._store = store
         self._cached = store if isinstance(store, CachedStore) else None
         self._audit = audit
         self._settings = settings
         self._wall_clock = wall_clock
-        self._describe = describe
+        self._describe = map_work.describe
         self.threads = FairThreads()
+        self._localiser = map_work.localiser
         self._map_threads = FairThreads(_MAP_THREADS)
+        self._photo_threads = FairThreads(map_work.localiser.count)
         self.objects = Objects(store, settings, clock, wall_clock)
         self._document = openapi_page().encode()
 
@@ -94,6 +108,7 @@ class Handlers:
         """End the threads when their work is done."""
         self.threads.close()
         self._map_threads.close()
+        self._photo_threads.close()
 
     async def healthz(self, request: HttpRequest, claims: Claims, path: dict[str, str]) -> HttpReply:
         """Return 200."""
@@ -297,6 +312,22 @@ class Handlers:
         record = await self.threads.run(claims.robot, work)
         return _version(200, record)
 
+    async def localise(self, request: HttpRequest, claims: Claims, path: dict[str, str]) -> HttpReply:
+        """Localise a photo."""
+        lens = _lens(request.query)
+        photo = await request.body(self._settings.part_bytes, hint="make the photo smaller")
+        return json_reply(
+            200,
+            await self._photo_threads.run(
+                claims.robot, self._localiser.localise, claims.robot, path["name"], photo, lens
+            ),
+        )
+
+    async def outline(self, request: HttpRequest, claims: Claims, path: dict[str, str]) -> HttpReply:
+        """Return a map from above."""
+        robot, draw = claims.robot, self._localiser.outline
+        return json_reply(200, await self._photo_threads.run(robot, draw, robot, path["name"]))
+
     def _maps(self, claims: Claims) -> MapRegistry:
         def record_change(action: str, name: str, record: MapRecord) -> None:
             if self._audit is not None:
@@ -379,6 +410,18 @@ def _upload(status: int, state: Upload) -> HttpReply:
 
 def _version(status: int, record: MapRecord) -> HttpReply:
     return json_reply(status, MapVersionInfo(id=record.id, record=record))
+
+
+def _lens(query: Mapping[str, str]) -> Lens:
+    """Return the lens that a query describes; raises BadRequest."""
+    values: dict[str, Any] = {name: text for name, text in query.items() if name in _LENS}
+    values["distortion"] = [each for each in values.get("distortion", "").split(",") if each]
+    try:
+        return msgspec.convert(values, Lens, strict=False)
+    except msgspec.ValidationError as error:
+        raise BadRequest(
+            f"the query is not a lens: {error}", hint="write ?fx=525&fy=525&cx=319.5&cy=239.5, pixels"
+        ) from error
 
 
 async def _json_body(request: HttpRequest, kind: type[_T]) -> _T:

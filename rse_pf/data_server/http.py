@@ -29,6 +29,7 @@ from rse_pf.errors import (
     Forbidden,
     InvalidCamera,
     LimitExceeded,
+    MissingExtra,
     NotFound,
     QuotaExceeded,
     RsePfError,
@@ -56,6 +57,7 @@ Receive = Callable[[], Awaitable[Mapping[str, Any]]]
 Send = Callable[[Mapping[str, Any]], Awaitable[None]]
 _MIN_BODY_BYTES_PER_S, _BODY_GRACE_S = 1024, 5.0
 """A body that has been slower than the first after the second is refused."""
+_IN_PARTS = "send the object in parts: PUT an upload"
 _DRAIN_S = 0.1
 _DISCARD_BYTES, _DISCARD_S = 8 << 20, 2.0
 
@@ -76,7 +78,7 @@ _STATUS: dict[type[RsePfError], int] = {
     MethodNotAllowed: 405, TooManyRequests: 429,
     Unauthorized: 401, Forbidden: 403, NotFound: 404, Expired: 408, Conflict: 409, LimitExceeded: 413,
     QuotaExceeded: 413, Crashed: 413, BadRequest: 400, InvalidCamera: 400, Busy: 503, WorkerLost: 503,
-    Archived: 409, StoreFull: 507, StoreError: 503,
+    Archived: 409, StoreFull: 507, StoreError: 503, MissingExtra: 501,
 }  # fmt: skip
 _FRAMES = {"content-length", "transfer-encoding"}
 """A request with none of these headers has no body."""
@@ -129,8 +131,8 @@ class HttpRequest:
             raise BadRequest(f"{name}: {text[:40]!r} is not a number of bytes", hint="send decimal digits")
         return int(text)
 
-    async def body(self, max_bytes: int) -> bytes:
-        """Return the whole body.
+    async def body(self, max_bytes: int, *, hint: str = _IN_PARTS) -> bytes:
+        """Return the whole body; *hint* says what to do if it is too long.
 
         Raises:
             LimitExceeded: It is longer than *max_bytes*.
@@ -139,12 +141,12 @@ class HttpRequest:
         """
         announced = self.header_number("content-length")
         if announced is not None and announced > max_bytes:
-            raise _too_long(announced, max_bytes)
+            raise _too_long(announced, max_bytes, hint)
         pieces = []
         async for piece in self._pieces():
             pieces.append(piece)
             if self.received_bytes > max_bytes:
-                raise _too_long(self.received_bytes, max_bytes)
+                raise _too_long(self.received_bytes, max_bytes, hint)
         if self._whole is not None:
             return self._whole
         return pieces[0] if len(pieces) == 1 else b"".join(pieces)
@@ -259,10 +261,8 @@ async def _within(seconds: float, work: Awaitable[_T]) -> _T:
     return await asyncio.wait_for(work, seconds)
 
 
-def _too_long(got: int, max_bytes: int) -> LimitExceeded:
-    return LimitExceeded(
-        f"got {got} bytes, the limit is {max_bytes}", hint="send the object in parts: PUT an upload"
-    )
+def _too_long(got: int, max_bytes: int, hint: str) -> LimitExceeded:
+    return LimitExceeded(f"got {got} bytes, the limit is {max_bytes}", hint=hint)
 
 
 def _too_slow(subject: str) -> Expired:

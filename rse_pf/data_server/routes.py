@@ -15,7 +15,9 @@ from typing import Any
 
 import msgspec
 
+from rse_pf.config.front_door import LOCALISE_PATH
 from rse_pf.data_server.http import HttpFailure
+from rse_pf.maps.photos import MapOutline, PhotoLocation
 from rse_pf.maps.registry import MapRecord
 
 __all__ = [
@@ -164,7 +166,7 @@ class Route:
         return re.compile(re.sub(r"\\{(\w+)\\}", r"(?P<\1>[^/]*)", re.escape(self.path)))
 
 
-_LIST_COST, _COMMIT_COST = 5.0, 20.0
+_LIST_COST, _PHOTO_COST, _COMMIT_COST = 5.0, 10.0, 20.0
 _WHOLE_NUMBER = {"type": "integer", "minimum": 0}
 _RANGE = Field(name="Range", place="header", doc="one range of bytes, as bytes=START-END")
 _OFFSET = Field(
@@ -186,10 +188,33 @@ _LIMIT = Field(
     schema={"type": "integer", "minimum": 1, "maximum": 1000},
 )
 
+_PIXELS = {"type": "number"}
+_LENS = (
+    *(
+        Field(name=name, place="query", doc=f"{name} of the camera, px", required=True, schema=_PIXELS)
+        for name in ("fx", "fy", "cx", "cy")
+    ),
+    *(
+        Field(
+            name=name, place="query", doc=f"{name} that fx fy cx cy are for, px (default: the photo's)",
+            schema={"type": "integer", "minimum": 1},
+        )
+        for name in ("width", "height")
+    ),
+    Field(name="distortion", place="query", doc="k1,k2,p1,p2[,k3], or k1,k2,k3,k4 of a fisheye"),
+    Field(
+        name="model", place="query", doc="of the lens",
+        schema={"type": "string", "enum": ["radial-tangential", "fisheye"]},
+    ),
+)  # fmt: skip
+
 _BAD, _NOT_FOUND, _CONFLICT = {400: HttpFailure}, {404: HttpFailure}, {409: HttpFailure}
 _STORING = {408: HttpFailure, 413: HttpFailure, 503: HttpFailure, 507: HttpFailure}
+_WORKING = {408: HttpFailure, 413: HttpFailure, 503: HttpFailure}
 _OBJECT, _UPLOAD = "/data/v1/objects/{digest}", "/data/v1/uploads/{digest}"
 _MAP, _VERSION = "/data/v1/maps/{name}/versions", "/data/v1/maps/{name}/versions/{version}"
+
+_LOCALISE = LOCALISE_PATH + "{name}"
 
 ROUTES: tuple[Route, ...] = (
     Route(
@@ -286,6 +311,16 @@ ROUTES: tuple[Route, ...] = (
         doc="Move the head to another version, as a rollback does",
         replies={200: MapVersionInfo, **_BAD, **_NOT_FOUND, **_CONFLICT, **_STORING},
     ),
+    Route(
+        operation="localise", method="POST", path=_LOCALISE, scope="maps:localise", body=bytes,
+        cost=_PHOTO_COST, fields=_LENS, doc="Return where a photo, JPEG or PNG, was taken in a map",
+        replies={200: PhotoLocation, 501: HttpFailure, **_BAD, **_NOT_FOUND, **_WORKING},
+    ),
+    Route(
+        operation="outline", method="GET", path=_LOCALISE, scope="maps:localise", cost=_PHOTO_COST,
+        doc="Return a map as it is seen from above",
+        replies={200: MapOutline, 501: HttpFailure, **_BAD, **_NOT_FOUND, **_WORKING},
+    ),
 )  # fmt: skip
 """All routes; the handler of each is the method named *operation*."""
 
@@ -302,7 +337,8 @@ _DESCRIPTIONS = {
     404: "Does not exist, or belongs to another robot", 408: "The body was too slow",
     409: "Changed by another request", 413: "Larger than a limit or the quota",
     416: "The range is outside of the object",
-    429: "More requests than one robot may send; see Retry-After", 503: "Unavailable; retry later",
+    429: "More requests than one robot may send; see Retry-After",
+    501: "The server lacks a package that this needs", 503: "Unavailable; retry later",
     507: "The disk is full; nothing was stored",
 }  # fmt: skip
 

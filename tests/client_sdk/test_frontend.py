@@ -13,7 +13,6 @@ from client_sdk.frontend import (
     Frame,
     FrontEndOptions,
     describe,
-    describe_at,
     extract,
     match,
     round_for_wire,
@@ -23,6 +22,7 @@ from rse_pf.geometry import Array, Camera, transform
 from rse_pf.pnp import PnpOptions
 from rse_pf.services.pnp import make_request
 from rse_pf.slam.descriptors import distances_of_pairs
+from rse_pf.slam.orb import describe_at
 from rse_pf.wire import Command, make_codec
 
 cv2 = pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")

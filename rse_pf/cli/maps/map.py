@@ -12,6 +12,7 @@ examples:
   rse-pf map show kitchen --store dir:objects --png kitchen.png
   rse-pf map merge robot-1 robot-2 robot-3 --into kitchen --store dir:objects
   rse-pf map localise kitchen recordings/kitchen:0-40 --store dir:objects
+  rse-pf map localise kitchen photo.jpg --enrolment phone.enrolment --intrinsics intrinsics.json
   rse-pf map view kitchen --out kitchen.png --store dir:objects
   rse-pf map diff kitchen 3f9bd1 head --store dir:objects
   rse-pf map live list --store dir:objects
@@ -25,12 +26,9 @@ from __future__ import annotations
 import argparse
 import contextlib
 import functools
-import re
 import threading
 import time
 from collections import Counter
-from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -41,27 +39,22 @@ from rse_pf.cli.maps.bags import BAG_ACTIONS, add_bag_actions, run_bags
 from rse_pf.cli.maps.export import add_export_arguments, run_export
 from rse_pf.cli.maps.from_camera import add_from_camera_arguments, run_from_camera
 from rse_pf.cli.maps.live import add_live_arguments, run_live, run_publish
+from rse_pf.cli.maps.localise import add_localise_arguments, is_remote, localise_frames, localise_photos
 from rse_pf.cli.maps.map_store import open_maps, with_store
 from rse_pf.cli.maps.merge_output import commit_merge, merge_progress
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import NotFound, UsageError
-from rse_pf.geometry import Camera, rotation_angle_deg, to_quaternion
-from rse_pf.maps.descriptors import check_alike
-from rse_pf.maps.format import MapVersion
 from rse_pf.maps.registry import MapOrigin, MapRecord, MapRegistry, difference
 from rse_pf.maps.removal import freed_bytes, superseded
 from rse_pf.terminal import at_work, counted, show, show_json
 
 if TYPE_CHECKING:
-    from client_sdk.slots import FeaturesSlot
-    from rse_pf.services.mapping.localise import LocaliseReply
-    from rse_pf.slam.relative_pose import View
+    pass
 
 __all__ = ["add_arguments", "run"]
 
 _SHORT = 12
 _MAX_VALUE = 80
-_FRAME_RANGE = re.compile(r"(?P<folder>.+):(?P<first>\d+)(-(?P<last>\d+))?")
 _ACTIONS = {
     "list": ("list the maps", "list"),
     "show": ("show the contents and the origin of a version", "show kitchen --png kitchen.png"),
@@ -145,7 +138,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         ),
         common,
     )  # fmt: skip
-    merge, localise = made["merge"], made["localise"]
+    merge = made["merge"]
     merge.add_argument(
         "names",
         nargs="+",
@@ -154,21 +147,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     merge.add_argument("--into", required=True, metavar="NAME", help="the map that gets a new version")
     merge.add_argument("--note", default="", help="note of the new version")
-    localise.add_argument(
-        "frames",
-        nargs="+",
-        metavar="FRAME",
-        help="an image, a recording, RECORDING:ROW or RECORDING:FIRST-LAST",
-    )
-    localise.add_argument("--every", type=int, default=1, metavar="N", help="only every n-th frame")
-    localise.add_argument(
-        "--camera",
-        metavar="FX,FY,CX,CY",
-        help="camera of images, pixels (default: the camera of the map with the same image size)",
-    )
-    localise.add_argument(
-        "--features", metavar="MODULE:FUNCTION", help="with which the map was made (default: ORB)"
-    )
+    add_localise_arguments(made["localise"])
 
 
 def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
@@ -177,6 +156,8 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
         return run_from_camera(args, settings)
     if args.action in BAG_ACTIONS:
         return run_bags(args, settings)
+    if args.action == "localise" and is_remote(args):
+        return localise_photos(args)
     chosen = with_store(args.store, settings)
     if args.action in ("live", "publish"):
         return (run_live if args.action == "live" else run_publish)(args, chosen)
@@ -186,7 +167,7 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
         "show": _show,
         "view": _view,
         "merge": _merge,
-        "localise": _localise,
+        "localise": localise_frames,
         "diff": _diff,
         "rollback": _rollback,
         "prune": _prune,
@@ -297,33 +278,6 @@ def _merge(args: argparse.Namespace, maps: MapRegistry) -> int:
     )  # fmt: skip
 
 
-def _localise(args: argparse.Namespace, maps: MapRegistry) -> int:
-    """Estimate the pose of each frame and print a line for it; the exit code is 1 if none has a pose."""
-    from rse_pf.services.mapping.localise import locate
-    from rse_pf.services.mapping.place import open_map
-
-    if args.every < 1:
-        raise UsageError(f"--every {args.every} is below 1", hint="1 takes every frame")
-    from client_sdk.slots import FeaturesSlot, load_features
-
-    features = load_features(args.features)
-    slot = None if features is None else FeaturesSlot(features)
-    name, version = _version_of(args.name)
-    data = maps.data(name, version)
-    with at_work(f"reading {args.name}"):
-        version_map, index = open_map(data)
-    frames = [each for word in args.frames for each in _frames(word, args.every)]
-    found: list[dict[str, Any]] = []
-    for each in frames:
-        location = locate(index, _view_of(each, version_map, args.camera, slot))
-        found.append(_location_document(each.label, location))
-        if not args.json:
-            show(_location_line(found[-1]))
-    good = sum(each["verdict"] == "ok" for each in found)
-    _print(args, found, f"{good} of {len(found)} found")
-    return 0 if good else 1
-
-
 def _diff(args: argparse.Namespace, maps: MapRegistry) -> None:
     found = difference(maps.load(args.name, args.before), maps.load(args.name, args.after))
     _print(
@@ -389,111 +343,6 @@ def _version_of(word: str) -> tuple[str, str]:
     """Return name and version of ``MAP`` or ``MAP@VERSION``."""
     name, _, version = word.partition("@")
     return name, version or "head"
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _NamedFrame:
-    """A frame to localise: a row of a recording, or (row None) an image."""
-
-    label: str
-    path: Path
-    row: int | None
-
-
-def _frames(word: str, every: int) -> Iterator[_NamedFrame]:
-    path = Path(word)
-    if path.is_file():
-        yield _NamedFrame(label=word, path=path, row=None)
-        return
-    first, last = 0, -1
-    match = None if path.is_dir() else _FRAME_RANGE.fullmatch(word)
-    if match is not None:
-        path = Path(match["folder"])
-        first = int(match["first"])
-        last = int(match["last"] or first)
-    if not path.exists():
-        raise UsageError(
-            f"there is no image or recording {word}",
-            hint="name an image, a recording, or RECORDING:FIRST-LAST",
-        )
-    from client_sdk.datasets import open_dataset
-
-    count = len(open_dataset(path))
-    if match is not None and not first <= last < count:
-        raise UsageError(
-            f"{path} has the frames 0 to {count - 1}, not {word.rpartition(':')[2]}",
-            hint="count frames from 0",
-        )
-    for row in range(first, count if last < 0 else last + 1, every):
-        yield _NamedFrame(label=f"{path.name}:{row}", path=path, row=row)
-
-
-def _view_of(named: _NamedFrame, version: MapVersion, camera: str | None, slot: FeaturesSlot | None) -> View:
-    from client_sdk.datasets import open_dataset, read_colour
-    from client_sdk.frontend import Frame, FrontEndOptions, extract
-    from rse_pf.slam.relative_pose import View
-
-    if named.row is not None:
-        recording = open_dataset(named.path)
-        frame = recording.read(recording.rows[named.row])
-    else:
-        rgb = read_colour(named.path)
-        height, width = rgb.shape[:2]
-        lens = (
-            _parse_lens(camera, width, height)
-            if camera
-            else _lens_of_map(version, width, height, named.label)
-        )
-        nothing = np.zeros((height, width), dtype=np.float32)
-        frame = Frame(timestamp_s=0.0, rgb=rgb, depth_m=nothing, camera=lens)
-    features = extract(frame, FrontEndOptions(), slot)
-    check_alike(version.kind, features.kind, "the map")
-    return View(camera=frame.camera, pixels=features.pixels, descriptors=features.descriptors)
-
-
-def _parse_lens(numbers: str, width: int, height: int) -> Camera:
-    try:
-        fx, fy, cx, cy = (float(number) for number in numbers.split(","))
-    except ValueError as error:
-        raise UsageError(
-            f"--camera {numbers} is not four numbers", hint="write fx,fy,cx,cy in pixels"
-        ) from error
-    return Camera(fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height)
-
-
-def _lens_of_map(version: MapVersion, width: int, height: int, label: str) -> Camera:
-    """Return the camera of a keyframe with the same image size, which likely took the image."""
-    for keyframe in version.keyframes:
-        if (keyframe.camera.width, keyframe.camera.height) == (width, height):
-            return keyframe.camera
-    raise UsageError(
-        f"{label} is {width}x{height} px, and no camera of the map has that size",
-        hint="name it: --camera fx,fy,cx,cy",
-    )
-
-
-def _location_document(label: str, location: LocaliseReply) -> dict[str, Any]:
-    T = location.T_map_camera
-    return {
-        "frame": label, "verdict": location.verdict, "reason": location.reason, "inliers": location.inliers,
-        "rmse_px": round(location.rmse_px, 3), "keyframes": location.keyframes,
-        "position_m": None if T is None else [round(float(x), 4) + 0.0 for x in T[:3, 3]],
-        "quaternion_xyzw": None if T is None else [round(float(x), 6) for x in to_quaternion(T[:3, :3])],
-        "turned_deg": None if T is None else round(rotation_angle_deg(T[:3, :3]), 2),
-    }  # fmt: skip
-
-
-def _location_line(found: dict[str, Any]) -> str:
-    start = f"{found['frame']:<24} {found['verdict']:<4}"
-    if found["position_m"] is None:
-        return f"{start}  {found['reason']}, {found['inliers']} inliers"
-    x, y, z = found["position_m"]
-    reason = f" ({found['reason']})" if found["reason"] else ""
-    keyframes = ", ".join(str(keyframe) for keyframe in found["keyframes"])
-    return (
-        f"{start}  x {x:7.3f}  y {y:7.3f}  z {z:7.3f} m, turned {found['turned_deg']:6.2f} deg; "
-        f"{found['inliers']} inliers, {found['rmse_px']:.2f} px, keyframes {keyframes}{reason}"
-    )
 
 
 def _record_line(record: MapRecord) -> str:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from rse_pf.config import PlatformSettings
-from rse_pf.config.front_door import BODY_TIMEOUT_S, MAX_HANDSHAKE_BYTES
+from rse_pf.config.front_door import BODY_TIMEOUT_S, DATA_PATH, LOCALISE_PATH, MAX_HANDSHAKE_BYTES
 from rse_pf.config.resource_names import HEALTH_PATH, READY_PATH, ROSBRIDGE_PATH
 from rse_pf.local.lan.connect_page import connect_page, page_headers
 from rse_pf.local.lan.listener import CERTIFICATE_NAME, LanListener, secret_file
@@ -25,7 +25,6 @@ CLUSTER = "backend-servers"
 ADMIN_SOCKET = "admin.sock"
 """In the balancer's folder.  The admin page can end the balancer, so it is not on a port."""
 DATA_CLUSTER = "data-servers"
-_DATA_PATH = "/data/"
 _DATA_READY = "/data/readyz"
 _TYPES = "type.googleapis.com/envoy"
 _LOOPBACK = "127.0.0.1"
@@ -253,7 +252,7 @@ def _virtual_host(settings: PlatformSettings, lan: LanListener | None) -> dict[s
             {"match": {"path": HEALTH_PATH}, "route": {**route, "timeout": timeout}},
             # Each would ask the store; the balancer's own checks do not pass the listener.
             {"match": {"path": _DATA_READY}, "direct_response": {"status": 404}},
-            {"match": {"prefix": _DATA_PATH}, "route": data_route},
+            *({"match": {"prefix": path}, "route": data_route} for path in (DATA_PATH, LOCALISE_PATH)),
             *(() if lan is None else (_page(settings),)),
         ],
     }

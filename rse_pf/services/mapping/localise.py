@@ -77,6 +77,7 @@ class LocaliseRequest(msgspec.Struct, frozen=True, kw_only=True):
 class LocaliseReply(msgspec.Struct, frozen=True, kw_only=True):
     """A pose ``T_map_camera`` (16 numbers, row-major) with its evidence.
 
+    ``covariance`` (36 numbers, row-major) is of the twist (metres, radians) on the left of the pose.
     ``inliers`` counts the matches of the best keyframe, and *rmse_px* is over them.
 
     ``verdict``: ok; weak, with a *reason*; or lost, with a reason and without a pose.
@@ -89,6 +90,7 @@ class LocaliseReply(msgspec.Struct, frozen=True, kw_only=True):
     rmse_px: float = 0.0
     keyframes: list[int] = []
     """Ids of the keyframes that support the pose, best first."""
+    covariance: Array | None = None
 
 
 def locate(
@@ -99,7 +101,7 @@ def locate(
     Place recognition gives candidates of each place that looks alike, and `rse_pf.slam.localise` decides.
 
     Returns:
-        The reply of the service, with ``T_map_camera`` as ``(4, 4)``.
+        The reply of the service, with ``T_map_camera`` as ``(4, 4)`` and ``covariance`` as ``(6, 6)``.
 
     Raises:
         MissingExtra: faiss or the solver is not installed.
@@ -129,6 +131,7 @@ def locate(
         inliers=located.inliers,
         rmse_px=located.rmse_px,
         keyframes=list(located.keyframes),
+        covariance=located.covariance,
     )
 
 
@@ -142,5 +145,8 @@ def register(registry: Registry) -> None:
         view = view_of(request.camera, request.pixels, request.descriptors, request.features, index)
         check_comparisons(index, view, (request.options or LocaliseOptions()).candidates)
         found = locate(index, view, request.options, within=request.within)
-        pose = None if found.T_map_camera is None else found.T_map_camera.ravel()
-        return msgspec.structs.replace(found, T_map_camera=pose)
+        if found.T_map_camera is None or found.covariance is None:
+            return found
+        return msgspec.structs.replace(
+            found, T_map_camera=found.T_map_camera.ravel(), covariance=found.covariance.ravel()
+        )

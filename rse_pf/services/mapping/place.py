@@ -32,6 +32,7 @@ __all__ = [
     "PlaceRequest",
     "Within",
     "check_comparisons",
+    "index_map",
     "map_limits",
     "open_map",
     "register",
@@ -132,9 +133,8 @@ def map_limits(keyframes: int = MAX_KEYFRAMES) -> MapLimits:
     return MapLimits(keyframes=keyframes, features=MAX_FEATURES)
 
 
-@functools.lru_cache(maxsize=_CACHED_MAPS)
-def open_map(data: bytes) -> tuple[MapVersion, MapIndex]:
-    """Return the map of *data* and its index; the last results are cached.
+def index_map(data: bytes) -> tuple[MapVersion, MapIndex]:
+    """Return the map of *data* and its index.
 
     Raises:
         BadRequest: The bytes are not a map.
@@ -146,6 +146,10 @@ def open_map(data: bytes) -> tuple[MapVersion, MapIndex]:
             f"a map of 0 keyframes is not within 1..{MAX_KEYFRAMES}", hint="send a map with keyframes"
         )
     return version, MapIndex(version.keyframes)
+
+
+open_map = functools.lru_cache(maxsize=_CACHED_MAPS)(index_map)
+"""The same; the last results are cached."""
 
 
 def view_of(

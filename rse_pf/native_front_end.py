@@ -1,4 +1,4 @@
-"""The robot's front end in the native core: ORB descriptors, points at keypoints, and matches.
+"""The visual front end in the native core: ORB descriptors, points at keypoints, and matches.
 
 The library is the one that `rse_pf.native` finds; without it, or with an older one, the front end does the
 same work in numpy and OpenCV, with the same numbers.

@@ -15,10 +15,11 @@ import pytest
 from client_sdk import frontend
 from client_sdk.datasets import open_dataset
 from client_sdk.frontend import Features, Frame, FrontEndOptions, extract, match
-from client_sdk.native_match import FrontEndCore, front_end_core, open_front_end
 from rse_pf import native
 from rse_pf.errors import ConfigurationError
 from rse_pf.geometry import Array, Camera
+from rse_pf.native_front_end import FrontEndCore, front_end_core, open_front_end
+from rse_pf.slam import orb
 
 cv2 = pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
 
@@ -36,7 +37,8 @@ def core(request: pytest.FixtureRequest) -> FrontEndCore:
 
 
 def use(monkeypatch: pytest.MonkeyPatch, core: FrontEndCore | None) -> None:
-    monkeypatch.setattr(frontend, "front_end_core", lambda: core)
+    for module in (frontend, orb):
+        monkeypatch.setattr(module, "front_end_core", lambda: core)
 
 
 def made_features(pixels: Array, descriptors: npt.NDArray[np.uint8], points_camera: Array) -> Features:

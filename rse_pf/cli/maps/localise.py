@@ -1,0 +1,296 @@
+"""Localise images in a map: here, with the map of a store, or at a platform by HTTP."""
+
+from __future__ import annotations
+
+import argparse
+import re
+import ssl
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from rse_pf.errors import UsageError
+from rse_pf.files import read_regular_file
+from rse_pf.geometry import Camera, rotation_angle_deg, to_quaternion
+from rse_pf.maps.descriptors import check_alike
+from rse_pf.maps.format import MapVersion
+from rse_pf.maps.photos import Lens, PhotoLocation
+from rse_pf.maps.registry import MapRegistry
+from rse_pf.terminal import at_work, show, show_json
+
+if TYPE_CHECKING:
+    from client_sdk.slots import FeaturesSlot
+    from client_sdk.transfer.data_client import DataClient
+    from rse_pf.services.mapping.localise import LocaliseReply
+    from rse_pf.slam.relative_pose import View
+
+__all__ = ["add_localise_arguments", "is_remote", "localise_frames", "localise_photos"]
+
+_FRAME_RANGE = re.compile(r"(?P<folder>.+):(?P<first>\d+)(-(?P<last>\d+))?")
+_MAX_PHOTO_BYTES = 1 << 26
+"""The platform says what it takes; this only keeps a wrong file out of memory."""
+
+
+def add_localise_arguments(localise: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    localise.add_argument(
+        "frames",
+        nargs="+",
+        metavar="FRAME",
+        help="an image, a recording, RECORDING:ROW or RECORDING:FIRST-LAST",
+    )
+    localise.add_argument("--every", type=int, default=1, metavar="N", help="only every n-th frame")
+    localise.add_argument(
+        "--camera",
+        metavar="FX,FY,CX,CY",
+        help="camera of images, pixels (default: the camera of the map with the same image size)",
+    )
+    localise.add_argument(
+        "--features", metavar="MODULE:FUNCTION", help="with which the map was made (default: ORB)"
+    )
+    localise.add_argument(
+        "--url", help="localise at the platform of this address, http(s): or ws(s):, with --token-file"
+    )
+    localise.add_argument(
+        "--token-file", type=Path, metavar="FILE", help="with --url: file that holds the token"
+    )
+    localise.add_argument(
+        "--authority", type=Path, metavar="FILE", help="with --url: certificate to trust, authority.crt"
+    )
+    localise.add_argument(
+        "--enrolment", type=Path, metavar="FILE", help="localise at the platform of this enrolment"
+    )
+    localise.add_argument(
+        "--intrinsics", type=Path, metavar="FILE", help="at a platform: of the camera, with its distortion"
+    )
+
+
+def is_remote(args: argparse.Namespace) -> bool:
+    """Return whether a platform localises, and not this process."""
+    return args.url is not None or args.enrolment is not None
+
+
+def localise_frames(args: argparse.Namespace, maps: MapRegistry) -> int:
+    """Estimate the pose of each frame and print a line for it; the exit code is 1 if none has a pose."""
+    from rse_pf.services.mapping.localise import locate
+    from rse_pf.services.mapping.place import open_map
+
+    if args.intrinsics is not None or args.token_file is not None or args.authority is not None:
+        raise UsageError(
+            "--intrinsics, --token-file and --authority are for a platform", hint="add --url, or use --camera"
+        )
+    if args.every < 1:
+        raise UsageError(f"--every {args.every} is below 1", hint="1 takes every frame")
+    from client_sdk.slots import FeaturesSlot, load_features
+
+    features = load_features(args.features)
+    slot = None if features is None else FeaturesSlot(features)
+    name, _, version = args.name.partition("@")
+    data = maps.data(name, version or "head")
+    with at_work(f"reading {args.name}"):
+        version_map, index = open_map(data)
+    frames = [each for word in args.frames for each in _frames(word, args.every)]
+    found: list[dict[str, Any]] = []
+    for each in frames:
+        location = locate(index, _view_of(each, version_map, args.camera, slot))
+        found.append(_location_document(each.label, location))
+        if not args.json:
+            show(_location_line(found[-1]))
+    return _finish(args, found)
+
+
+def localise_photos(args: argparse.Namespace) -> int:
+    """Let a platform localise each photo and print a line for it; the exit code is 1 if none is found."""
+    if args.store is not None or args.features is not None or args.every != 1:
+        raise UsageError(
+            "--store, --features and --every are for a map of a store", hint="leave them out, or leave --url"
+        )
+    lens = _lens_of(args)
+    photos = [(word, _photo(Path(word))) for word in args.frames]
+    client = _client(args)
+    found: list[dict[str, Any]] = []
+    try:
+        for label, photo in photos:
+            location = client.localise(args.name, photo, lens)
+            found.append(_location_document(label, location))
+            found[-1] |= {
+                name: getattr(location, name)
+                for name in ("version", "position_sigma_m", "turn_sigma_deg", "T_map_camera", "covariance")
+            }
+            if not args.json:
+                show(_location_line(found[-1]))
+    finally:
+        client.close()
+    return _finish(args, found)
+
+
+def _lens_of(args: argparse.Namespace) -> Lens:
+    if (args.intrinsics is None) == (args.camera is None):
+        raise UsageError(
+            "a platform needs --intrinsics FILE, or --camera FX,FY,CX,CY, and not both",
+            hint="make a file: rse-pf camera calibrate SOURCE --board 9x6 --square-mm 25",
+        )
+    if args.camera is not None:
+        fx, fy, cx, cy = _four_numbers(args.camera)
+        return Lens(fx=fx, fy=fy, cx=cx, cy=cy)
+    from client_sdk.rigs.intrinsics import read_intrinsics
+
+    read = read_intrinsics(args.intrinsics)
+    camera = read.camera
+    return Lens(
+        fx=camera.fx, fy=camera.fy, cx=camera.cx, cy=camera.cy, width=camera.width, height=camera.height,
+        distortion=read.distortion, model=read.model,
+    )  # fmt: skip
+
+
+def _photo(path: Path) -> bytes:
+    try:
+        return read_regular_file(path, _MAX_PHOTO_BYTES)
+    except OSError as error:
+        raise UsageError(f"cannot read {path}: {error.strerror}", hint="name a JPEG or PNG file") from error
+    except ValueError as error:
+        raise UsageError(f"{path} is no photo", hint="name a JPEG or PNG file") from error
+
+
+def _client(args: argparse.Namespace) -> DataClient:
+    from client_sdk.transfer.data_client import DataClient, DataOptions
+
+    if args.enrolment is not None:
+        if args.url is not None or args.token_file is not None or args.authority is not None:
+            raise UsageError("--enrolment names address and key", hint="leave out --url and its options")
+        return DataClient.enrolled(args.enrolment)
+    if args.token_file is None:
+        raise UsageError("--url needs --token-file", hint="get a token: rse-pf token issue NAME > FILE")
+    try:
+        token = args.token_file.read_text(encoding="ascii").strip()
+    except (OSError, ValueError) as error:
+        raise UsageError(f"cannot read the token in {args.token_file}", hint="rse-pf token") from error
+    trusted = None
+    if args.authority is not None:
+        try:
+            trusted = ssl.create_default_context(cafile=str(args.authority))
+        except OSError as error:
+            raise UsageError(f"{args.authority} is no certificate", hint="name authority.crt") from error
+    return DataClient(args.url, token, DataOptions(ssl_context=trusted))
+
+
+def _finish(args: argparse.Namespace, found: list[dict[str, Any]]) -> int:
+    good = sum(each["verdict"] == "ok" for each in found)
+    if args.json:
+        show_json(found, indent=2, sort_keys=True)
+    else:
+        show(f"{good} of {len(found)} found")
+    return 0 if good else 1
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _NamedFrame:
+    """A frame to localise: a row of a recording, or (row None) an image."""
+
+    label: str
+    path: Path
+    row: int | None
+
+
+def _frames(word: str, every: int) -> Iterator[_NamedFrame]:
+    path = Path(word)
+    if path.is_file():
+        yield _NamedFrame(label=word, path=path, row=None)
+        return
+    first, last = 0, -1
+    match = None if path.is_dir() else _FRAME_RANGE.fullmatch(word)
+    if match is not None:
+        path = Path(match["folder"])
+        first = int(match["first"])
+        last = int(match["last"] or first)
+    if not path.exists():
+        raise UsageError(
+            f"there is no image or recording {word}",
+            hint="name an image, a recording, or RECORDING:FIRST-LAST",
+        )
+    from client_sdk.datasets import open_dataset
+
+    count = len(open_dataset(path))
+    if match is not None and not first <= last < count:
+        raise UsageError(
+            f"{path} has the frames 0 to {count - 1}, not {word.rpartition(':')[2]}",
+            hint="count frames from 0",
+        )
+    for row in range(first, count if last < 0 else last + 1, every):
+        yield _NamedFrame(label=f"{path.name}:{row}", path=path, row=row)
+
+
+def _view_of(named: _NamedFrame, version: MapVersion, camera: str | None, slot: FeaturesSlot | None) -> View:
+    from client_sdk.datasets import open_dataset, read_colour
+    from client_sdk.frontend import Frame, FrontEndOptions, extract
+    from rse_pf.slam.relative_pose import View
+
+    if named.row is not None:
+        recording = open_dataset(named.path)
+        frame = recording.read(recording.rows[named.row])
+    else:
+        rgb = read_colour(named.path)
+        height, width = rgb.shape[:2]
+        lens = (
+            _parse_lens(camera, width, height)
+            if camera
+            else _lens_of_map(version, width, height, named.label)
+        )
+        nothing = np.zeros((height, width), dtype=np.float32)
+        frame = Frame(timestamp_s=0.0, rgb=rgb, depth_m=nothing, camera=lens)
+    features = extract(frame, FrontEndOptions(), slot)
+    check_alike(version.kind, features.kind, "the map")
+    return View(camera=frame.camera, pixels=features.pixels, descriptors=features.descriptors)
+
+
+def _parse_lens(numbers: str, width: int, height: int) -> Camera:
+    fx, fy, cx, cy = _four_numbers(numbers)
+    return Camera(fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height)
+
+
+def _four_numbers(numbers: str) -> tuple[float, float, float, float]:
+    try:
+        fx, fy, cx, cy = (float(number) for number in numbers.split(","))
+    except ValueError as error:
+        raise UsageError(
+            f"--camera {numbers} is not four numbers", hint="write fx,fy,cx,cy in pixels"
+        ) from error
+    return fx, fy, cx, cy
+
+
+def _lens_of_map(version: MapVersion, width: int, height: int, label: str) -> Camera:
+    """Return the camera of a keyframe with the same image size, which likely took the image."""
+    for keyframe in version.keyframes:
+        if (keyframe.camera.width, keyframe.camera.height) == (width, height):
+            return keyframe.camera
+    raise UsageError(
+        f"{label} is {width}x{height} px, and no camera of the map has that size",
+        hint="name it: --camera fx,fy,cx,cy",
+    )
+
+
+def _location_document(label: str, location: LocaliseReply | PhotoLocation) -> dict[str, Any]:
+    T = None if location.T_map_camera is None else np.array(location.T_map_camera)
+    return {
+        "frame": label, "verdict": location.verdict, "reason": location.reason, "inliers": location.inliers,
+        "rmse_px": round(location.rmse_px, 3), "keyframes": location.keyframes,
+        "position_m": None if T is None else [round(float(x), 4) + 0.0 for x in T[:3, 3]],
+        "quaternion_xyzw": None if T is None else [round(float(x), 6) for x in to_quaternion(T[:3, :3])],
+        "turned_deg": None if T is None else round(rotation_angle_deg(T[:3, :3]), 2),
+    }  # fmt: skip
+
+
+def _location_line(found: dict[str, Any]) -> str:
+    start = f"{found['frame']:<24} {found['verdict']:<4}"
+    if found["position_m"] is None:
+        return f"{start}  {found['reason']}, {found['inliers']} inliers"
+    x, y, z = found["position_m"]
+    reason = f" ({found['reason']})" if found["reason"] else ""
+    keyframes = ", ".join(str(keyframe) for keyframe in found["keyframes"])
+    return (
+        f"{start}  x {x:7.3f}  y {y:7.3f}  z {z:7.3f} m, turned {found['turned_deg']:6.2f} deg; "
+        f"{found['inliers']} inliers, {found['rmse_px']:.2f} px, keyframes {keyframes}{reason}"
+    )

@@ -1,0 +1,156 @@
+"""Find where photos were taken in maps, in processes that have limits and may be killed.
+
+A process reads maps itself and keeps the last ones, so that the data server never holds a map nor decodes an
+image.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from collections import OrderedDict
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+
+from rse_pf.config import PlatformSettings
+from rse_pf.data_server.robot_processes import RobotProcesses, max_map_bytes, private_store, shared_store
+from rse_pf.errors import MissingExtra
+from rse_pf.identity import RobotId
+from rse_pf.limited_process import Handler, LimitedProcesses
+from rse_pf.maps.photos import Lens, MapOutline, PhotoLocation
+from rse_pf.maps.registry import MapRegistry
+from rse_pf.object_store import ObjectStore
+
+if TYPE_CHECKING:
+    from rse_pf.maps.format import MapVersion
+    from rse_pf.services.mapping.place import MapIndex
+
+__all__ = ["PhotoLocaliser", "make_handler"]
+
+_TARGET = f"{__name__}:make_handler"
+_CACHED_MAPS = 4
+
+
+class _Request(msgspec.Struct, frozen=True, kw_only=True):
+    """A *photo* to localise in a map, or None for the outline of the map.
+
+    *version* and *data* are those of the map where the process cannot read the store itself.
+    """
+
+    tenant: str
+    name: str
+    photo: bytes | None = None
+    lens: Lens | None = None
+    version: str = ""
+    data: bytes = b""
+
+
+class PhotoLocaliser:
+    """The processes of one data server that localise photos; the first request starts them."""
+
+    def __init__(
+        self,
+        settings: PlatformSettings,
+        store: ObjectStore,
+        clock: Callable[[], float],
+        processes: LimitedProcesses | None = None,
+    ) -> None:
+        """Remember what is needed; nothing is started.
+
+        Args:
+            settings: Groups data, serving and services.
+            store: Is read here only if ``data.store`` is in the memory of this process.
+            clock: Monotonic seconds.
+            processes: What localises; None means ``serving.compute_processes`` with the limits of
+                ``serving``.
+        """
+        self.count = settings.serving.compute_processes
+        self._store = private_store(settings, store)
+        self._processes = RobotProcesses(_TARGET, settings, clock, count=self.count, processes=processes)
+
+    def localise(self, robot: RobotId, name: str, photo: bytes, lens: Lens) -> PhotoLocation:
+        """Return where *photo*, which *robot* sent, was taken in the head of the map *name*; blocks.
+
+        Raises:
+            NotFound: The robot's tenant has no such map.
+            BadRequest, LimitExceeded, InvalidCamera: As `localise_photo` says.
+            MissingExtra: The server lacks what localises.
+            Crashed, Busy, Expired, WorkerLost: As `RobotProcesses.call` says.
+        """
+        reply = self._call(robot, _Request(tenant=robot.tenant, name=name, photo=photo, lens=lens))
+        return msgspec.msgpack.decode(reply, type=PhotoLocation)
+
+    def outline(self, robot: RobotId, name: str) -> MapOutline:
+        """Return the head of the map *name* as it is seen from above; blocks, and raises as `localise`."""
+        reply = self._call(robot, _Request(tenant=robot.tenant, name=name))
+        return msgspec.msgpack.decode(reply, type=MapOutline)
+
+    def close(self) -> None:
+        """End the processes; a call that is under way raises WorkerLost."""
+        self._processes.close()
+
+    def _call(self, robot: RobotId, request: _Request) -> bytes:
+        if self._store is not None:
+            maps = MapRegistry(self._store, robot.tenant)
+            version = maps.head(request.name).id
+            request = msgspec.structs.replace(request, version=version, data=maps.data(request.name, version))
+        return self._processes.call(robot, msgspec.msgpack.encode(request))
+
+
+def make_handler(configuration: str) -> Handler:
+    """Import what localises and return what answers in the process; *configuration* has the settings."""
+    from rse_pf.images import load_opencv
+    from rse_pf.services.mapping.photo import localise_photo, location_of, outline_of
+    from rse_pf.slam.descriptors import load_faiss
+
+    settings = PlatformSettings.from_dict(json.loads(configuration))
+    for load in (load_faiss, load_opencv):
+        with contextlib.suppress(MissingExtra):  # the answer to each request says so
+            load()
+    maps = _Maps(settings)
+
+    def answer(data: bytes) -> bytes:
+        request = msgspec.msgpack.decode(data, type=_Request)
+        version, map_version, index = maps.find(request)
+        reply: Any
+        if request.photo is None or request.lens is None:
+            reply = outline_of(map_version, version)
+        else:
+            reply = location_of(localise_photo(request.photo, request.lens, index), version)
+        return msgspec.msgpack.encode(reply)
+
+    return answer
+
+
+class _Maps:
+    """The maps that a process has read last."""
+
+    def __init__(self, settings: PlatformSettings) -> None:
+        self._store = shared_store(settings)
+        self._max_bytes = max_map_bytes(settings)
+        self._known: OrderedDict[tuple[str, str, str], tuple[MapVersion, MapIndex]] = OrderedDict()
+
+    def find(self, request: _Request) -> tuple[str, MapVersion, MapIndex]:
+        """Return the version, the map and its index that *request* names.
+
+        Raises:
+            NotFound: There is no such map of this tenant.
+            LimitExceeded: It holds no keyframe, or more than are computed with.
+        """
+        from rse_pf.services.mapping.place import index_map
+
+        maps, version = None, request.version
+        if self._store is not None:
+            maps = MapRegistry(self._store, request.tenant, max_bytes=self._max_bytes)
+            version = maps.head(request.name).id
+        key = (request.tenant, request.name, version)
+        found = self._known.pop(key, None)
+        if found is None:
+            data = request.data if maps is None else maps.data(request.name, version)
+            if len(self._known) == _CACHED_MAPS:
+                self._known.popitem(last=False)
+            found = index_map(data)
+        self._known[key] = found
+        return version, *found

@@ -1,0 +1,97 @@
+"""Processes with limits that work on what robots sent.
+
+A robot whose bytes ended two of them is refused for a while.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+
+from rse_pf.aws.storage import open_data_store
+from rse_pf.config import PlatformSettings
+from rse_pf.crash_record import CrashRecord
+from rse_pf.errors import Crashed
+from rse_pf.identity import RobotId
+from rse_pf.limited_process import LimitedProcesses, ProcessLimits
+from rse_pf.object_store import ObjectStore
+
+__all__ = ["RobotProcesses", "max_map_bytes", "private_store", "shared_store"]
+
+_PRIVATE_STORE = "memory:"
+"""The ``data.store`` that other processes cannot read."""
+_MAX_INFLATED = 4
+"""Times ``data.max_object_bytes``."""
+_WALL_S_PER_CPU_S = 3.0
+"""The processes have a low priority: on a busy machine poses go first."""
+
+
+def max_map_bytes(settings: PlatformSettings) -> int:
+    """Return the largest size of an inflated map."""
+    return _MAX_INFLATED * settings.data.max_object_bytes
+
+
+class RobotProcesses:
+    """The processes of one data server for one kind of work; the first call starts them."""
+
+    def __init__(
+        self,
+        target: str,
+        settings: PlatformSettings,
+        clock: Callable[[], float],
+        *,
+        count: int = 1,
+        processes: LimitedProcesses | None = None,
+    ) -> None:
+        """Remember what is needed; nothing is started.
+
+        Args:
+            target: ``module:function``, which takes the settings in JSON and returns the handler.
+            settings: Groups data, serving and services.
+            clock: Monotonic seconds.
+            count: Calls that are worked on at the same time.
+            processes: What answers; None means processes with the limits of ``serving``.
+        """
+        self._clock = clock
+        self._crashes = CrashRecord()
+        self._timeout_s = _WALL_S_PER_CPU_S * settings.serving.max_compute_s
+        self._processes = processes or LimitedProcesses(
+            target,
+            ProcessLimits(
+                memory_bytes=settings.serving.max_compute_memory_bytes, cpu_s=settings.serving.max_compute_s
+            ),
+            configuration=json.dumps(settings.to_dict()),
+            count=count,
+        )
+
+    def call(self, robot: RobotId, request: bytes) -> bytes:
+        """Return the handler's reply to what *robot* asked; blocks.
+
+        Raises:
+            Crashed: The request ended the process that worked on it.
+            Busy: Earlier requests of this robot ended processes, or none was free in time.
+            Expired, WorkerLost: It was not answered, for another reason than its bytes.
+            RsePfError: What the handler raised.
+        """
+        refusal = self._crashes.refusal(robot, self._clock())
+        if refusal is not None:
+            raise refusal
+        try:
+            return self._processes.call(request, self._timeout_s)
+        except Crashed:
+            self._crashes.note_crash(robot, self._clock())
+            raise
+
+    def close(self) -> None:
+        """End the processes; a call that is under way raises WorkerLost."""
+        self._processes.close()
+
+
+def private_store(settings: PlatformSettings, store: ObjectStore) -> ObjectStore | None:
+    """Return *store* if only this process can read it, else None."""
+    return store if settings.data.store == _PRIVATE_STORE else None
+
+
+def shared_store(settings: PlatformSettings) -> ObjectStore | None:
+    """Return the store as a process of its own reads it, None if only the data server can."""
+    return None if settings.data.store == _PRIVATE_STORE else open_data_store(settings)

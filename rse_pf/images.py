@@ -1,0 +1,163 @@
+"""Load OpenCV, and read images with it that may come from a stranger.
+
+An image in memory is judged by its head before anything of it is decoded.  Nothing here looks at what an
+image shows.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from rse_pf.errors import BadRequest, LimitExceeded, MissingExtra
+
+__all__ = ["MAX_IMAGE_PIXELS", "MAX_PHOTO_PIXELS", "decode_photo", "load_opencv", "photo_size", "read_image"]
+
+MAX_IMAGE_PIXELS = 1 << 25
+"""Of one image: a frame of 8K video has fewer, and decoding it takes some 200 MB."""
+MAX_PHOTO_PIXELS = 1 << 24
+"""Of an image that is sent to a server: 16 megapixels."""
+_LIMIT = "OPENCV_IO_MAX_IMAGE_PIXELS"
+"""OpenCV reads it when it is loaded, and compares it with the size in an image's header."""
+_JPEG, _PNG = b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"
+_MAX_SEGMENTS = 1000
+"""Before the size of a JPEG, or the pixels of a PNG."""
+_MAX_SCANS = 64
+"""Each scan of a progressive JPEG goes over the whole image, however few bytes it has; cameras write ten."""
+_FRAMES, _NO_FRAMES = range(0xC0, 0xD0), (0xC4, 0xC8, 0xCC)
+_DECODED_FRAMES = (0xC0, 0xC1, 0xC2)
+"""Baseline, extended and progressive Huffman coding."""
+_SCAN, _END_OF_JPEG = b"\xff\xda", b"\xff\xd9"
+_HINT = "send a JPEG or PNG file as a camera writes it"
+
+
+def load_opencv() -> Any:
+    """Return the module ``cv2``, which decodes no image above `MAX_IMAGE_PIXELS`; raises MissingExtra.
+
+    The limit does not hold in a program that imported ``cv2`` by itself before, nor where the environment
+    sets another one.
+    """
+    os.environ.setdefault(_LIMIT, str(MAX_IMAGE_PIXELS))
+    try:
+        import cv2
+    except ImportError as error:
+        raise MissingExtra("opencv-python-headless", "vision") from error
+    return cv2
+
+
+def read_image(path: Path, flags: int) -> npt.NDArray[Any] | None:
+    """Return the image of a file as OpenCV decodes it with *flags*; None if it is no image, or too large.
+
+    Raises:
+        MissingExtra: OpenCV is not installed.
+    """
+    cv2 = load_opencv()
+    if not path.is_file():  # OpenCV would print a warning, or wait for what a pipe brings
+        return None
+    try:
+        image: npt.NDArray[Any] | None = cv2.imread(str(path), flags)
+    except cv2.error:
+        return None
+    return image
+
+
+def photo_size(data: bytes) -> tuple[int, int]:
+    """Return width and height that the head of a JPEG or PNG states, px; nothing is decoded.
+
+    Raises:
+        BadRequest: It is neither, has no whole head or end, or is of a kind that no camera writes.
+        LimitExceeded: It has more than `MAX_PHOTO_PIXELS`, or too many parts.
+
+    Source:
+        ITU-T T.81, Annex B; W3C PNG, Sect. 5 and 11.2.2.
+    """
+    if data.startswith(_JPEG):
+        width, height = _jpeg_size(data)
+    elif data.startswith(_PNG):
+        width, height = _png_size(data)
+    else:
+        raise BadRequest("the image is neither JPEG nor PNG", hint=_HINT)
+    if not width or not height:
+        raise BadRequest(f"an image of {width}x{height} px shows nothing", hint=_HINT)
+    if width * height > MAX_PHOTO_PIXELS:
+        raise LimitExceeded(
+            f"an image of {width}x{height} px is above {MAX_PHOTO_PIXELS} pixels",
+            hint="make it smaller, and scale fx fy cx cy with it",
+        )
+    return width, height
+
+
+def decode_photo(data: bytes) -> npt.NDArray[np.uint8]:
+    """Return the ``(h, w, 3)`` image of a JPEG or PNG, red first, as its pixels are stored.
+
+    An orientation in its EXIF data does not turn it, so that intrinsics of the camera fit.
+
+    Raises:
+        BadRequest, LimitExceeded: As `photo_size` says, or it is damaged.
+        MissingExtra: OpenCV is not installed.
+    """
+    width, height = photo_size(data)
+    cv2 = load_opencv()
+    flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+    try:
+        image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags)
+    except cv2.error:
+        image = None
+    if image is None or image.shape != (height, width, 3):
+        raise BadRequest("the image is damaged", hint=_HINT)
+    rgb: npt.NDArray[np.uint8] = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+    return rgb
+
+
+def _jpeg_size(data: bytes) -> tuple[int, int]:
+    if data.count(_SCAN) > _MAX_SCANS:
+        raise LimitExceeded(f"the image has more than {_MAX_SCANS} scans", hint=_HINT)
+    if data.rfind(_END_OF_JPEG) < data.rfind(_SCAN):
+        raise BadRequest("the image has no end", hint=_HINT)
+    for kind, body in _jpeg_segments(data):
+        if kind in _FRAMES and kind not in _NO_FRAMES:
+            if kind not in _DECODED_FRAMES or len(body) < 6 or body[0] != 8 or body[5] not in (1, 3):
+                raise BadRequest("the image is no JPEG of 8 bits in grey or colour", hint=_HINT)
+            return int.from_bytes(body[3:5], "big"), int.from_bytes(body[1:3], "big")
+        if kind == _SCAN[1]:
+            break
+    raise BadRequest("the image does not state its size", hint=_HINT)
+
+
+def _jpeg_segments(data: bytes) -> Iterator[tuple[int, bytes]]:
+    """Yield marker and content of the first segments, as far as they are whole."""
+    at = 2
+    for _ in range(_MAX_SEGMENTS):
+        while data[at : at + 2] == b"\xff\xff":
+            at += 1
+        length = int.from_bytes(data[at + 2 : at + 4], "big")
+        if data[at : at + 1] != b"\xff" or length < 2 or at + 2 + length > len(data):
+            return
+        yield data[at + 1], data[at + 4 : at + 2 + length]
+        at += 2 + length
+
+
+def _png_size(data: bytes) -> tuple[int, int]:
+    at, size = len(_PNG), (0, 0)
+    for number in range(_MAX_SEGMENTS):
+        length, name = int.from_bytes(data[at : at + 4], "big"), data[at + 4 : at + 8]
+        if len(name) < 4 or at + 12 + length > len(data) or (number == 0) != (name == b"IHDR"):
+            break
+        if name == b"IHDR":
+            if length != 13:
+                break
+            size = (
+                int.from_bytes(data[at + 8 : at + 12], "big"),
+                int.from_bytes(data[at + 12 : at + 16], "big"),
+            )
+        elif name == b"acTL":
+            raise BadRequest("the image is animated", hint=_HINT)
+        elif name == b"IDAT":
+            return size
+        at += 12 + length
+    raise BadRequest("the image does not state its size, or has no pixels", hint=_HINT)

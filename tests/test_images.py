@@ -1,0 +1,74 @@
+"""Images of strangers: judged by their heads, and refused with one line before they take anything."""
+
+from __future__ import annotations
+
+import struct
+from typing import Any
+
+import numpy as np
+import pytest
+
+cv2 = pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
+from hostile.hostile_images import HARMLESS, hostile_images, photo  # noqa: E402
+
+from rse_pf import images  # noqa: E402
+from rse_pf.errors import BadRequest, LimitExceeded  # noqa: E402
+from rse_pf.images import MAX_PHOTO_PIXELS, decode_photo, photo_size  # noqa: E402
+
+IMAGES = hostile_images()
+
+
+@pytest.mark.parametrize("kind", [".jpg", ".png"])
+@pytest.mark.parametrize("size", [(640, 480), (480, 640), (8, 8)])
+def test_a_photo_has_the_size_that_its_head_states(kind: str, size: tuple[int, int]) -> None:
+    data = photo(*size, kind)
+
+    assert photo_size(data) == size
+    assert decode_photo(data).shape == (size[1], size[0], 3)
+
+
+def test_the_first_channel_is_red_and_grey_images_have_three() -> None:
+    red = np.zeros((16, 16, 3), np.uint8)
+    red[:, :, 2] = 255
+
+    assert decode_photo(bytes(cv2.imencode(".png", red)[1]))[0, 0].tolist() == [255, 0, 0]
+    grey = bytes(cv2.imencode(".jpg", np.full((16, 16), 99, np.uint8))[1])
+    assert decode_photo(grey)[3, 3].tolist() == [99, 99, 99]
+
+
+def test_an_orientation_does_not_turn_the_pixels() -> None:
+    data = photo(64, 48)
+    tags = b"Exif\0\0MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0\x06\0\0\0\0\0\0"
+    turned = data[:2] + b"\xff\xe1" + struct.pack(">H", len(tags) + 2) + tags + data[2:]
+
+    assert cv2.imdecode(np.frombuffer(turned, np.uint8), cv2.IMREAD_COLOR).shape == (64, 48, 3)
+    np.testing.assert_array_equal(decode_photo(turned), decode_photo(data))
+
+
+def test_there_are_sixty_kinds_of_hostile_images() -> None:
+    assert len(IMAGES) >= 60
+
+
+@pytest.mark.parametrize("name", IMAGES)
+def test_a_hostile_image_is_refused_in_one_line_or_harmless(name: str) -> None:
+    if name.startswith(HARMLESS):
+        height, width, _ = decode_photo(IMAGES[name]).shape
+        assert height * width <= MAX_PHOTO_PIXELS
+        return
+    with pytest.raises((BadRequest, LimitExceeded)) as refused:
+        decode_photo(IMAGES[name])
+    assert "\n" not in refused.value.message
+    assert refused.value.hint
+
+
+@pytest.mark.parametrize(
+    "name", ["jpeg of 65535x65535", "jpeg of ten thousand scans", "jpeg of 65 scans", "png of 65536x257"]
+)
+def test_a_bomb_is_refused_before_anything_is_decoded(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    def load() -> Any:
+        raise AssertionError("nothing may be decoded")
+
+    monkeypatch.setattr(images, "load_opencv", load)
+
+    with pytest.raises(LimitExceeded):
+        decode_photo(IMAGES[name])
