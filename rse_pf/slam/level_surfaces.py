@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import numpy.typing as npt
 
@@ -14,7 +16,8 @@ _MAX_POINTS = 500_000
 _LEAST_POINTS, _LEAST_VOXELS = 12, 20
 _FLAT = 0.02
 """A voxel is flat if its points spread at most this share of their variance along its surface across it."""
-_NARROWER_DEG = (30.0, 15.0, 5.0)
+_LEVEL_DEG, _ALIKE_DEG = 30.0, 5.0
+_MOST_TRIED = 500
 
 
 def up_of_surfaces(points: npt.NDArray[np.float32], up: Array) -> Array | None:
@@ -22,7 +25,7 @@ def up_of_surfaces(points: npt.NDArray[np.float32], up: Array) -> Array | None:
 
     Args:
         points: ``(n, 3)`` metres.
-        up: ``(3,)``, about where up is: surfaces within 30 degrees of it are level.
+        up: ``(3,)``, about where up is: the direction within 30 degrees of it that most surfaces share is it.
     """
     chosen = points[:: max(1, len(points) // _MAX_POINTS)].astype(np.float64)
     _, voxel, count = np.unique(
@@ -40,12 +43,17 @@ def up_of_surfaces(points: npt.NDArray[np.float32], up: Array) -> Array | None:
             spread[:, i, j] = np.bincount(voxel, apart[:, i] * apart[:, j], total) / count
     lengths, axes = np.linalg.eigh(spread[count >= _LEAST_POINTS])
     normals = axes[lengths[:, 0] <= _FLAT * lengths[:, 1], :, 0]
-    found = up
-    for most_deg in _NARROWER_DEG:
-        along = normals @ found
-        near = np.abs(along) >= np.cos(np.radians(most_deg))
-        if np.count_nonzero(near) < _LEAST_VOXELS:
+    normals = normals * np.sign(normals @ up)[:, None]
+    normals = normals[normals @ up >= math.cos(math.radians(_LEVEL_DEG))]
+    if not len(normals):
+        return None
+    least = math.cos(math.radians(_ALIKE_DEG))
+    tried = normals[:: max(1, len(normals) // _MOST_TRIED)]
+    found: Array = tried[int(np.argmax(np.count_nonzero(tried @ normals.T >= least, axis=1)))]
+    for _ in range(2):
+        alike = normals[normals @ found >= least]
+        if len(alike) < _LEAST_VOXELS:
             return None
-        found = (normals[near] * np.sign(along[near])[:, None]).mean(axis=0)
+        found = alike.mean(axis=0)
         found = found / np.linalg.norm(found)
     return found

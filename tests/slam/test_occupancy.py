@@ -11,6 +11,7 @@ from slam.exact_maps import CAMERA, shares_right, world_map
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Array, exp_se3, transform
 from rse_pf.maps.format import Keyframe, MapVersion
+from rse_pf.slam.level_surfaces import up_of_surfaces
 from rse_pf.slam.occupancy import (
     FREE,
     OCCUPIED,
@@ -92,6 +93,21 @@ def test_without_gravity_up_is_found_across_the_floors_that_are_seen() -> None:
     assert np.degrees(np.arccos(up[2])) < 0.3
 
 
+def test_ramps_and_walls_do_not_tilt_what_is_level() -> None:
+    a, b = (each.ravel() for each in np.meshgrid(np.arange(0, 3, 0.02), np.arange(0, 3, 0.02)))
+    floor = np.column_stack([a, b, 0 * a])
+    ramp = np.column_stack([a - 4, b, np.tan(np.radians(20.0)) * a])[b < 1.5]
+    wall = np.column_stack([0 * a + 3, a, b])
+    points = np.concatenate([floor, ramp, wall]).astype(np.float32)
+    rough = np.array([np.sin(np.radians(8.0)), 0.0, np.cos(np.radians(8.0))])
+
+    up = up_of_surfaces(points, rough)
+
+    assert up is not None
+    assert np.degrees(np.arccos(up[2])) < 0.1
+    assert up_of_surfaces(wall.astype(np.float32), rough) is None
+
+
 def test_floor_is_free_obstacles_are_occupied_and_the_rest_is_unknown() -> None:
     grid = occupancy_grid(room(), UP)
 
@@ -104,11 +120,11 @@ def test_floor_is_free_obstacles_are_occupied_and_the_rest_is_unknown() -> None:
 
 def test_a_look_frees_what_it_passes_at_the_height_of_the_robot_alone() -> None:
     grid = occupancy_grid(room(looks=np.array([[0.0, 0.0, 3.0]])), UP)
-    above = occupancy_grid(room(looks=np.array([[0.0, -1.4, 1.4]])), UP)
+    above = occupancy_grid(room(looks=np.array([[0.0, -1.4, 2.2]])), UP)
 
     assert at(grid, 2.8, 2.0) == FREE
     assert at(grid, 3.52, 2.0) == OCCUPIED
-    assert at(above, 2.2, 2.0) == UNKNOWN
+    assert at(above, 2.4, 2.0) == UNKNOWN
 
 
 def test_a_map_that_knows_gravity_is_turned_and_the_file_says_how() -> None:

@@ -12,20 +12,22 @@ from pathlib import Path
 from typing import Any
 
 from rse_pf.cli.maps.bags import BAG_FORMAT, export_bag
+from rse_pf.cli.maps.keyframe_images import IMAGES_FOLDER
 from rse_pf.errors import UsageError
-from rse_pf.files import replace_file
+from rse_pf.files import read_regular_file, replace_file
 from rse_pf.maps.format import MapVersion
 from rse_pf.maps.registry import MapRegistry
-from rse_pf.slam.colmap import colmap_files
+from rse_pf.slam.colmap import colmap_files, image_name
 from rse_pf.slam.map_export import FORMATS, export_map
 from rse_pf.slam.nerfstudio import nerfstudio_files
 from rse_pf.slam.occupancy import GridOptions, occupancy_files, occupancy_grid
-from rse_pf.terminal import at_work, show, show_json, show_progress
+from rse_pf.terminal import at_work, counted, show, show_json, show_progress
 
 __all__ = ["add_export_arguments", "run_export"]
 
 _GRID = ("resolution", "robot_height", "step", "floor", "up")
-_NO_IMAGES = "a map holds no images: put the image of each keyframe there under its name"
+_NO_IMAGES = "a map holds no images: name those of map from-camera --keep-images by --images"
+_MAX_IMAGE_BYTES = 64 << 20
 
 
 def add_export_arguments(parser: argparse.ArgumentParser) -> None:
@@ -35,6 +37,10 @@ def add_export_arguments(parser: argparse.ArgumentParser) -> None:
     add(
         "--out", type=Path, required=True, metavar="PATH",
         help="the file to write, or the folder of colmap, nerfstudio and occupancy",
+    )  # fmt: skip
+    add(
+        "--images", type=Path, metavar="DIR",
+        help="colmap, nerfstudio: folder of the images, as map from-camera --keep-images writes it",
     )  # fmt: skip
     add("--robot", help="tum: only the keyframes of this robot")
     add(
@@ -74,6 +80,8 @@ def run_export(args: argparse.Namespace, maps: MapRegistry) -> None:
             raise UsageError(f"{args.out} is a file", hint=f"{args.format} is a folder of files: name one")
         files, notes = _FOLDERS[args.format](args, maps.load(args.name, args.version))
         args.out.mkdir(exist_ok=True)
+        if any(name.startswith(f"{IMAGES_FOLDER}/") for name in files):
+            (args.out / IMAGES_FOLDER).mkdir(exist_ok=True)
         written = {args.out / name: data for name, data in files.items()}
     else:
         if args.out.is_dir():
@@ -96,11 +104,19 @@ def _say(args: argparse.Namespace, written: list[tuple[Path, int]], notes: list[
         value = {"file": str(args.out), "bytes": size, **names, **({"notes": notes} if notes else {})}
         show_json(value, indent=2, sort_keys=True)
         return
-    show(*(f"{file}: {count} bytes" for file, count in written), *(f"note: {note}" for note in notes))
+    images = [count for file, count in written if file.parent.name == IMAGES_FOLDER]
+    lines = [f"{file}: {count} bytes" for file, count in written if file.parent.name != IMAGES_FOLDER]
+    if images:
+        lines.append(f"{args.out / IMAGES_FOLDER}: {counted(len(images), 'image')}, {sum(images)} bytes")
+    show(*lines, *(f"note: {note}" for note in notes))
 
 
 def _check_options(args: argparse.Namespace) -> None:
     """Refuse options that belong to another format."""
+    if args.images is not None and args.format not in ("colmap", "nerfstudio"):
+        raise UsageError(
+            f"--images is for colmap and nerfstudio, not {args.format}", hint="leave --images out"
+        )
     given = [("--robot", args.robot, "tum")]
     given += [(f"--{name.replace('_', '-')}", getattr(args, name), "occupancy") for name in _GRID]
     for option, value, kind in given:
@@ -111,18 +127,38 @@ def _check_options(args: argparse.Namespace) -> None:
 _Files = tuple[dict[str, bytes], list[str]]
 
 
+def _with_images(args: argparse.Namespace, version: MapVersion, files: dict[str, bytes]) -> _Files:
+    """Return the files with the images of keyframes, as far as they are known."""
+    if args.images is None:
+        return files, [_NO_IMAGES]
+    if not args.images.is_dir():
+        raise UsageError(f"there is no folder {args.images}", hint="map from-camera --keep-images makes one")
+    images = {}
+    for name in map(image_name, version.keyframes):
+        file = args.images / name
+        if file.is_file():
+            try:
+                images[f"{IMAGES_FOLDER}/{name}"] = read_regular_file(file, _MAX_IMAGE_BYTES)
+            except OSError as error:
+                raise UsageError(f"cannot read {file}: {error}", hint="leave --images out") from error
+    missing = len(version.keyframes) - len(images)
+    notes = [f"{args.images} has no image of {counted(missing, 'keyframe')}"] if missing else []
+    return {**files, **images}, notes
+
+
 def _colmap(args: argparse.Namespace, version: MapVersion) -> _Files:
     def report(done: float) -> None:
         show_progress(f"{100 * done:3.0f} %  matching keyframes", is_over=done >= 1.0)
 
-    return colmap_files(version, report), [f"{args.out}: images.txt names images; {_NO_IMAGES}"]
+    files = colmap_files(version, report)
+    return _with_images(args, version, files)
 
 
 def _nerfstudio(args: argparse.Namespace, version: MapVersion) -> _Files:
-    notes = [f"{args.out / 'images'}: {_NO_IMAGES}"]
+    files, notes = _with_images(args, version, nerfstudio_files(version))
     if version.up is None:
         notes.append("this map does not say where up is: its axes are kept")
-    return nerfstudio_files(version), notes
+    return files, notes
 
 
 def _occupancy(args: argparse.Namespace, version: MapVersion) -> _Files:

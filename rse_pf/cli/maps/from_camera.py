@@ -19,17 +19,20 @@ from urllib.parse import urlsplit
 
 from client_sdk.check.drive_check import DriveCheck
 from rse_pf.cli.maps.frame_table import FRAMES_FILE, FrameTable
+from rse_pf.cli.maps.keyframe_images import IMAGES_FOLDER, KeyframeImages
 from rse_pf.cli.maps.map_store import add_keep_arguments, drive_store, keep_map, map_name
 from rse_pf.cli.sensors import add_check_argument, add_sensor_arguments
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import CommandFailed, RsePfError, UsageError
 from rse_pf.files import replace_file
+from rse_pf.maps.format import decode_map
 from rse_pf.terminal import show, show_progress
 
 if TYPE_CHECKING:
     from client_sdk import MarkerScale, OdometryScale, Robot, TrackedFrame
     from client_sdk.cameras import FrameSource
     from client_sdk.check.motion import MotionReference
+    from client_sdk.frontend import Frame
     from client_sdk.mapper import Mapper
     from client_sdk.mapping import Trajectory
 
@@ -78,6 +81,10 @@ def add_drive_arguments(parser: argparse.ArgumentParser, out: Path) -> None:
     add_check_argument(parser)
     add("--out", type=Path, default=out, metavar="DIR", help="results (default: %(default)s)")
     add_keep_arguments(parser)
+    add(
+        "--keep-images", action="store_true",
+        help="write the images of keyframes into DIR/images, for map export --images",
+    )  # fmt: skip
     add(
         "--url", action="append",
         help="use the platform at this address, with --token-file; with several, the nearest of them",
@@ -138,15 +145,22 @@ def map_source(
     _make_folder(args.out)
     kept_in = drive_store(args, settings)
     frames = FrameTable()
+    images = KeyframeImages(args.out) if args.keep_images else None
     check = DriveCheck(is_wanted=args.check, is_thinned=args.rate is not None)
-    mapper = asyncio.run(_drive(args, settings, source, scale, frames, check))
+
+    def watch(frame: Frame, tracked: TrackedFrame) -> None:
+        check.add(frame, tracked)
+        if images is not None:
+            images.add(tracked)
+
+    mapper = asyncio.run(_drive(args, settings, source, scale, frames, watch))
     report = mapper.save(args.out)
     checked = check.finish(reference)
     if about is not None:
         report = {**report, **about(mapper.trajectory)}
     if checked is not None:
         report["check"] = checked
-    kept, kept_line = _keep(args, mapper, kept_in)
+    kept, kept_line = _keep(args, mapper, kept_in, images)
     report = {**report, **kept}
     replace_file(args.out / "report.json", (json.dumps(report, indent=2) + "\n").encode())
     frames.write(args.out / FRAMES_FILE)
@@ -175,16 +189,26 @@ def map_source(
     return 0
 
 
-def _keep(args: argparse.Namespace, mapper: Mapper, settings: PlatformSettings) -> tuple[dict[str, Any], str]:
+def _keep(
+    args: argparse.Namespace, mapper: Mapper, settings: PlatformSettings, images: KeyframeImages | None
+) -> tuple[dict[str, Any], str]:
     """Keep the map, so that others can be found in it; return the fields of the report, and a line."""
+    data, kept = None, {}
     try:
-        kept = keep_map(mapper.encoded_map(), map_name(args), settings, f"rse-pf map {args.action}")
+        data = mapper.encoded_map()
+        kept = keep_map(data, map_name(args), settings, f"rse-pf map {args.action}")
     except RsePfError as error:
         why = "its scale is not known" if isinstance(error, UsageError) else f"{error.code}: {error.message}"
         if mapper.keyframes == 0:
             why = "it has no keyframe"
-        return {"map": None, "map_reason": why}, f"no map is kept: {why}"
-    return kept, f"map: {kept['map']} in {kept['store']}; see rse-pf map show {kept['map']}"
+        kept, line = {"map": None, "map_reason": why}, f"no map is kept: {why}"
+    else:
+        line = f"map: {kept['map']} in {kept['store']}; see rse-pf map show {kept['map']}"
+    if images is not None:
+        count = images.finish(None if data is None else decode_map(data))
+        kept["images"] = count
+        line += f"; {count} images in {args.out / IMAGES_FOLDER}"
+    return kept, line
 
 
 def check_drive(args: argparse.Namespace) -> OdometryScale | MarkerScale | None:
@@ -237,9 +261,9 @@ async def _drive(
     source: FrameSource,
     scale: Any,
     frames: FrameTable,
-    check: DriveCheck,
+    watch: Callable[[Frame, TrackedFrame], None],
 ) -> Mapper:
-    """Track all frames; Ctrl-C ends the drive, and what was mapped is kept."""
+    """Track all frames, each of which *watch* gets; Ctrl-C ends the drive, and what was mapped is kept."""
     from client_sdk.slots import load_features
 
     stop = asyncio.Event()
@@ -255,7 +279,7 @@ async def _drive(
                 break
             tracked = await mapper.track(frame)
             frames.add(tracked)
-            await asyncio.to_thread(check.add, frame, tracked)
+            await asyncio.to_thread(watch, frame, tracked)
             status.show(mapper, tracked)
         status.end()
     if not mapper.frames:

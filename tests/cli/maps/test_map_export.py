@@ -109,6 +109,8 @@ def test_the_grid_takes_its_options(folder: Path, capsys: pytest.CaptureFixture[
         ("void", "colmap", [], "a map without keyframes"),
         ("void", "nerfstudio", [], "a map without keyframes"),
         ("hall", "colmap", ["--robot", "x"], "--robot is for tum"),
+        ("hall", "tum", ["--images", "x"], "--images is for colmap and nerfstudio"),
+        ("hall", "colmap", ["--images", "x"], "there is no folder x"),
         ("hall", "ply", ["--resolution", "1"], "--resolution is for occupancy"),
         ("hall", "occupancy", ["--up", "1,2"], "is not three numbers"),
         ("hall", "occupancy", ["--up", "0,0,0"], "is no direction"),

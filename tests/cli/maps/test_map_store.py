@@ -84,6 +84,44 @@ def test_the_map_of_a_video_in_metres_can_be_localised_in(
     np.testing.assert_allclose(found["position_m"], [4 * 5 * STEP_M, 0.0, 0.0], atol=0.05)
 
 
+def test_images_of_keyframes_are_kept_if_asked_for_and_exported_with_the_map(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["map", "from-bag", "drive.bag", "--keep-images", *PLATFORM]) == 0
+    kept = sorted(Path("out-bag/images").iterdir())
+    assert report_of("out-bag")["images"] == len(kept) >= 2
+    capsys.readouterr()
+
+    words = ["--format", "nerfstudio", "--images", "out-bag/images", "--out", "nerf"]
+    assert main(["map", "export", "out-bag", *words]) == 0
+
+    frames = json.loads(Path("nerf/transforms.json").read_text())["frames"]
+    assert len(frames) == len(kept)
+    for frame in frames:
+        image = cv2.imread(str(Path("nerf") / frame["file_path"]))[:, :, ::-1]
+        row = round(frame["transform_matrix"][0][3] / STEP_M)
+        difference = np.abs(image.astype(int) - frame_at(row, depth=False).rgb).mean()
+        assert difference < 5
+    kept[0].unlink()
+    assert main(["map", "export", "out-bag", *words[:-1], "colmap"]) == 0
+    assert "out-bag/images has no image of 1 keyframe" in capsys.readouterr().out
+    assert main(["map", "from-bag", "drive.bag", "--out", "bare", *PLATFORM]) == 0
+    assert not Path("bare/images").exists()
+
+
+def test_images_of_a_video_are_those_of_its_keyframes(video_folder: Path) -> None:
+    poses = np.tile(np.eye(4), (60, 1, 1))
+    poses[:, 0, 3] = STEP_M * np.arange(60) * 5
+    write_trajectory(Path("odometry.txt"), Trajectory(np.arange(60) / 10, poses))
+    words = ["v.avi", "--intrinsics", "i.json", "--scale", "odometry:odometry.txt", *PLATFORM]
+
+    assert main(["map", "from-camera", *words, "--keep-images"]) == 0
+
+    record = MapRegistry(DirectoryStore(Path(report_of("out-camera")["store"][4:]))).head("out-camera")
+    names = {file.name for file in Path("out-camera/images").iterdir()}
+    assert names == {f"camera-{number:06d}.jpg" for number in range(record.keyframes)}
+
+
 def test_a_map_up_to_scale_is_not_kept_and_the_report_says_why(
     video_folder: Path, state_home: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

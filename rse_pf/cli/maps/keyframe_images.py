@@ -1,0 +1,60 @@
+"""The images of the keyframes of a drive, as JPEG files under the names that exported maps give them.
+
+They lie in the folder of results alone: neither the map nor the platform gets them.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from client_sdk.frontend import TrackedFrame, load_opencv
+from rse_pf.errors import UsageError
+from rse_pf.files import replace_file
+from rse_pf.maps.format import MapVersion
+from rse_pf.slam.colmap import image_name
+
+__all__ = ["IMAGES_FOLDER", "KeyframeImages"]
+
+IMAGES_FOLDER = "images"
+_QUALITY = 95
+
+
+class KeyframeImages:
+    """The images of one drive."""
+
+    def __init__(self, out: Path) -> None:
+        """Keep none yet; they go into the folder ``images`` of *out*."""
+        self._folder = out / IMAGES_FOLDER
+        self._files: dict[float, Path] = {}
+
+    def add(self, tracked: TrackedFrame) -> None:
+        """Keep an image if its frame is a keyframe, or may become one.
+
+        Raises:
+            UsageError: It cannot be written.
+        """
+        if not (tracked.keyframe or tracked.status in ("first", "starting")):
+            return
+        frame, cv2 = tracked.frame, load_opencv()
+        good, data = cv2.imencode(
+            ".jpg", np.ascontiguousarray(frame.rgb[:, :, ::-1]), [cv2.IMWRITE_JPEG_QUALITY, _QUALITY]
+        )
+        file = self._folder / f"frame-{len(self._files)}.jpg"
+        try:
+            self._folder.mkdir(exist_ok=True)
+            replace_file(file, data.tobytes() if good else b"")
+        except OSError as error:
+            raise UsageError(f"cannot write {file}: {error.strerror}", hint="name another --out") from error
+        self._files[frame.timestamp_s] = file
+
+    def finish(self, version: MapVersion | None) -> int:
+        """Name the images of the keyframes of *version* and remove the others; return how many stay."""
+        named = {} if version is None else {each.timestamp_s: image_name(each) for each in version.keyframes}
+        for timestamp_s, file in self._files.items():
+            if timestamp_s in named:
+                file.replace(self._folder / named[timestamp_s])
+            else:
+                file.unlink()
+        return len(named.keys() & self._files.keys())
