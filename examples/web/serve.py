@@ -1,4 +1,4 @@
-"""Serve the page of this folder, and the client that it uses, to browsers.
+"""Serve the pages of this folder, and the client that they use, to browsers.
 
 For this machine alone: python examples/web/serve.py
 
@@ -20,6 +20,8 @@ EXAMPLES = HERE.parent
 FILES = {
     "/": (HERE / "index.html", "text/html; charset=utf-8"),
     "/camera_pose.js": (HERE / "camera_pose.js", "text/javascript"),
+    "/place": (HERE / "place.html", "text/html; charset=utf-8"),
+    "/place.js": (HERE / "place.js", "text/javascript"),
     "/rse-pf.js": (EXAMPLES.parent / "client_web" / "rse-pf.js", "text/javascript"),
     "/cover.png": (EXAMPLES / "robots" / "object_recognition_service" / "objects" / "cover.png", "image/png"),
 }
