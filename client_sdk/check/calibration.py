@@ -9,16 +9,18 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from typing import TypedDict
 
 import numpy as np
 
+from client_sdk.check.competition import Explanation, Measured, explain
 from client_sdk.check.drive_model import DepthReading, DriveModel, best_reading, drive_model, nearest_delay
 from client_sdk.check.findings import CannotTell, FaultKind, Finding
 from client_sdk.check.keyframes import FLIPS, KeyframeStore, Tracks, tracks_of
 from client_sdk.check.zooms import judge_zooms
 from rse_pf.errors import DegenerateGeometry
 from rse_pf.geometry import Array, Camera, inverse, log_so3
-from rse_pf.slam.self_calibration import UNKNOWNS, Calibrated, adjust_with_calibration
+from rse_pf.slam.self_calibration import UNKNOWNS, Calibrated, adjust_with_calibration, deviations_of_parts
 
 __all__ = ["CalibrationJudgement", "judge_calibration"]
 
@@ -26,16 +28,30 @@ _FX, _FY, _CX, _CY, _K1, _OFFSET, _DELAY = range(7)
 _COLOUR = ("fx", "fy", "cx", "cy", "k1", "readout")
 _LEAST_KEYFRAMES = 6
 _INFLATION = 1.5
-_FLOOR = np.array([0.005, 0.005, 2.0, 2.0, 0.006, 0.006, 0.003])
+_FLOOR = np.array([0.005, 0.005, 2.0, 2.0, 0.006, 0.006, 0.003, 0.01, 0.002])
 """Deviations that remain of any drive, from what the adjustment does not know: other terms of the lens,
 registration, and errors of depth.  They grow with the residuals of depth."""
 _USUAL_DEPTH_FACTOR = 0.7
-_LEAST = np.array([0.02, 0.02, 6.0, 6.0, 0.03, 0.015, 0.02])
+_USUAL = np.array([0.005, 0.005, 2.0, 2.0, 0.01, 0.007, 0.005, 0.03, 0.007])
+_WIDEST = np.array([0.15, 0.15, 40.0, 40.0, 0.15, 0.15, 0.3, 0.03, 0.007])
+"""Deviations of the errors of a good calibration, and of faults.  A rolling shutter and errors of depth that
+grow with depth are no faults."""
+_LEAST = np.array([0.02, 0.02, 6.0, 6.0, 0.045, 0.015, 0.02])
 """Smaller errors are those of a good calibration."""
-_TOLD = np.array([0.06, 0.06, 25.0, 25.0, 0.15, 0.06, 0.1])
+_TOLD = np.array([0.06, 0.06, 20.0, 20.0, 0.15, 0.06, 0.1])
 """A drive that could hide more than this of an unknown cannot tell it."""
 _LEAST_COST_M, _COST_OF_NOISE = 0.004, 1.2
 _FEW_DEG = 12.0
+_OF_FEW_PARTS = 1.5
+"""Deviations that come from two to four parts are too small as often as not."""
+_MAINLY, _ALIKE = 0.7, 0.8
+_ROWS = {
+    FaultKind.FOCAL_LENGTH: (_FX, _FY), FaultKind.PRINCIPAL_POINT: (_CX, _CY),
+    FaultKind.DISTORTION: (_K1,), FaultKind.DEPTH_OFFSET: (_OFFSET,), FaultKind.DEPTH_DELAY: (_DELAY,),
+}  # fmt: skip
+_OF_COLOUR = (FaultKind.FOCAL_LENGTH, FaultKind.PRINCIPAL_POINT, FaultKind.DISTORTION)
+_UNITS = ("%", "%", "px", "px", "", "cm", "s")
+_TIMES = (100.0, 100.0, 1.0, 1.0, 1.0, 100.0, 1.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -44,12 +60,13 @@ class CalibrationJudgement:
 
     ``noise_m`` is how well the drive tells its path.  ``stamps_s`` ``(k,)`` and ``T_world_camera``
     ``(k, 4, 4)`` are the keyframes that were adjusted with the calibration, for whoever compares motions;
-    empty where there were too few.
+    empty where there were too few.  ``metres_deviation``, relative, is how well the calibration tells metres.
     """
 
     findings: tuple[Finding, ...] = ()
     cannot_tell: tuple[CannotTell, ...] = ()
     noise_m: float = 0.0
+    metres_deviation: float = 0.0
     stamps_s: Array = field(default_factory=lambda: np.empty(0))
     T_world_camera: Array = field(default_factory=lambda: np.empty((0, 4, 4)))
 
@@ -72,19 +89,76 @@ def judge_calibration(store: KeyframeStore) -> CalibrationJudgement:
     except DegenerateGeometry:
         return _untold("views that do not determine their poses", has_depth=has_depth)
     times_s = np.array([keyframes[row].timestamp_s for row in model.rows])
-    zoom = judge_zooms(zoomed, times_s, found, _depth_error_factor(zoomed))
-    found = found if zoom is None else zoomed
-    deviations = _whole_deviations(found)
-    kinds = _of_colour(found, deviations, model) if zoom is None else [zoom]
-    if store.has_depth:
-        kinds += list(_of_depth(found, deviations, reading))
+    zoom = judge_zooms(zoomed, times_s, found)
+    findings = [] if zoom.finding is None else [zoom.finding]
+    found = zoomed if findings else found
+    parts = np.zeros(len(UNKNOWNS)) if findings else deviations_of_parts(model.observed, found, free)
+    causes = _causes(reading, has_depth=store.has_depth, is_one_camera=not findings)
+    measured = _measured(found, parts, reading, causes)
+    explanation = explain(measured)
+    told = [each for each in explanation.causes if not explanation.rivals[each]]
+    doubted: list[FaultKind] = []
+    if zoom.hint:
+        # What only one focal length for all views explains may be one that moves.
+        moving = explain(_measured(zoomed, parts, reading, causes)).causes
+        doubted = [each for each in told if each not in moving]
+        told = [each for each in told if each in moving]
+    findings += _findings(measured, explanation.causes, told, found, model, reading)
+    drive = _Drive(measured, explanation, found, model, parts)
     return CalibrationJudgement(
-        findings=tuple(kinds),
-        cannot_tell=tuple(_cannot_tell(found, deviations, model, reading, has_depth=store.has_depth)),
+        findings=tuple(findings),
+        cannot_tell=(
+            *zoom.cannot_tell,
+            *_doubts(doubted, zoom.hint),
+            *_cannot_tell(
+                drive, reading, told={*doubted, *(each.kind for each in findings)}, has_depth=store.has_depth
+            ),
+        ),
         noise_m=found.noise_m,
         stamps_s=times_s,
-        T_world_camera=inverse(found.T_camera_world),
+        **_path(found, measured, explanation),
     )
+
+
+class _Path(TypedDict):
+    T_world_camera: Array
+    metres_deviation: float
+
+
+def _path(found: Calibrated, measured: Measured, explanation: Explanation) -> _Path:
+    """Return the keyframes with the calibration that causes explain, and how well that tells their metres."""
+    values, covariance = measured.under(explanation.causes)
+    T_world_camera = inverse(found.T_camera_world)
+    T_world_camera[:, :3, 3] += np.tensordot(values - measured.values, found.bends_m, axes=1)
+    at = T_world_camera[:, :3, 3] - T_world_camera[:, :3, 3].mean(axis=0)
+    slopes = np.tensordot(found.bends_m, at, axes=2) / max(float((at**2).sum()), 1e-12)
+    variance = float(slopes @ covariance @ slopes)
+    return _Path(T_world_camera=T_world_camera, metres_deviation=math.sqrt(max(variance, 0.0)))
+
+
+def _causes(
+    reading: DepthReading, *, has_depth: bool, is_one_camera: bool
+) -> dict[FaultKind, tuple[int, ...]]:
+    """Return which faults may explain a drive, and the rows of their unknowns."""
+    kinds = list(_OF_COLOUR) if is_one_camera else []
+    kinds += [FaultKind.DEPTH_OFFSET, FaultKind.DEPTH_DELAY] if has_depth and not reading.flip else []
+    return {kind: _ROWS[kind] for kind in kinds}
+
+
+def _measured(
+    found: Calibrated, parts: Array, reading: DepthReading, causes: dict[FaultKind, tuple[int, ...]]
+) -> Measured:
+    """Return what an adjustment says of the calibration, with what it does not know of its own errors."""
+    values = found.values.copy()
+    values[_DELAY] += reading.delay_s
+    unknown = np.hypot(_depth_error_factor(found) * _FLOOR, _OF_FEW_PARTS * parts)
+    usual = _USUAL.copy()
+    if FaultKind.FOCAL_LENGTH not in causes:
+        usual[: _K1 + 1] = _WIDEST[: _K1 + 1]
+    return Measured(
+        values=values, covariance=_INFLATION**2 * found.covariance + np.diag(unknown**2), usual=usual,
+        widest=_WIDEST, causes=causes,
+    )  # fmt: skip
 
 
 def _adjusted(
@@ -107,75 +181,87 @@ def _adjusted(
     return model, found, reading
 
 
-def _whole_deviations(found: Calibrated) -> Array:
-    """Return ``(7,)`` deviations with what the adjustment does not know."""
-    own: Array = found.deviations[: len(_FLOOR)]
-    return np.hypot(_INFLATION * own, _depth_error_factor(found) * _FLOOR)
-
-
 def _depth_error_factor(found: Calibrated) -> float:
     """Return how much larger the errors of depth are than the noise of a Kinect, 1 at least."""
     return max(1.0, found.depth_factor / _USUAL_DEPTH_FACTOR)
 
 
-def _matters(found: Calibrated, rows: list[int], errors: Array) -> float | None:
-    """Return the cost of errors of some unknowns, None where it is lost in the noise of the drive."""
-    wrong = np.zeros(len(UNKNOWNS))
-    wrong[rows] = errors
-    cost_m = found.bend_m(wrong)
-    return cost_m if cost_m > max(_LEAST_COST_M, _COST_OF_NOISE * found.noise_m) else None
+def _findings(
+    measured: Measured, causes: tuple[FaultKind, ...], told: list[FaultKind], found: Calibrated,
+    model: DriveModel, reading: DepthReading,
+) -> list[Finding]:  # fmt: skip
+    """Return the findings of causes that are told from others."""
+    values, covariance = measured.under(causes)
+    errors = _Errors(values, np.sqrt(np.diag(covariance)), found, model.observed.camera)
+    judges = {
+        FaultKind.FOCAL_LENGTH: _focal, FaultKind.PRINCIPAL_POINT: _principal,
+        FaultKind.DISTORTION: _distortion, FaultKind.DEPTH_OFFSET: _offset, FaultKind.DEPTH_DELAY: _delay,
+    }  # fmt: skip
+    findings = [judges[kind](errors) for kind in told]
+    if reading.flip:
+        findings.append(_flipped(reading))
+    return [finding for finding in findings if finding is not None]
 
 
-def _certain(found: Calibrated, deviations: Array, rows: list[int]) -> list[int]:
-    values = np.abs(found.values[rows])
-    return [
-        row
-        for row, value in zip(rows, values, strict=True)
-        if value > max(3.0 * deviations[row], _LEAST[row])
-    ]
+@dataclass(frozen=True, slots=True)
+class _Errors:
+    """``(9,)`` values of the unknowns that causes explain, their deviations, and the drive they are of."""
+
+    values: Array
+    deviations: Array
+    found: Calibrated
+    camera: Camera
+
+    def certain(self, kind: FaultKind) -> tuple[list[int], float]:
+        """Return the rows of a fault that are certain, with its cost; none where it does not matter."""
+        rows = [
+            row for row in _ROWS[kind] if abs(self.values[row]) > max(3.0 * self.deviations[row], _LEAST[row])
+        ]
+        wrong = np.zeros(len(UNKNOWNS))
+        wrong[rows] = self.values[rows]
+        cost_m = self.found.bend_m(wrong)
+        matters = cost_m > max(_LEAST_COST_M, _COST_OF_NOISE * self.found.noise_m)
+        return (rows if matters or kind is FaultKind.DEPTH_DELAY else []), cost_m
+
+    def worst(self, rows: list[int]) -> int:
+        return max(rows, key=lambda row: abs(self.values[row]) / self.deviations[row])
 
 
-def _of_colour(found: Calibrated, deviations: Array, model: DriveModel) -> list[Finding]:
-    camera = model.observed.camera
-    judged = (judge(found, deviations, camera) for judge in (_focal, _principal, _distortion))
-    return [finding for finding in judged if finding is not None]
-
-
-def _focal(found: Calibrated, deviations: Array, camera: Camera) -> Finding | None:
-    rows = _certain(found, deviations, [_FX, _FY])
-    cost_m = _matters(found, rows, found.values[rows]) if rows else None
-    if cost_m is None:
+def _focal(errors: _Errors) -> Finding | None:
+    rows, cost_m = errors.certain(FaultKind.FOCAL_LENGTH)
+    if not rows:
         return None
-    worst = max(rows, key=lambda row: abs(found.values[row]) / deviations[row])
+    values, deviations, camera = errors.values, errors.deviations, errors.camera
+    worst = errors.worst(rows)
     names = {row: UNKNOWNS[row] for row in rows}
-    errors = {row: math.exp(-found.values[row]) - 1.0 for row in rows}
-    right = {names[row]: getattr(camera, names[row]) * math.exp(found.values[row]) for row in rows}
+    relative = {row: math.exp(-values[row]) - 1.0 for row in rows}
+    right = {names[row]: getattr(camera, names[row]) * math.exp(values[row]) for row in rows}
     told = " and ".join(
-        f"{names[row]} is {abs(errors[row]):.1%} too {_size(errors[row])} (+- {deviations[row]:.1%})"
+        f"{names[row]} is {abs(relative[row]):.1%} too {_size(relative[row])} (+- {deviations[row]:.1%})"
         for row in rows
     )
     return Finding(
-        kind=FaultKind.FOCAL_LENGTH, value=errors[worst], deviation=float(deviations[worst]), unit="relative",
+        kind=FaultKind.FOCAL_LENGTH, value=relative[worst], deviation=float(deviations[worst]),
+        unit="relative",
         cost_m=cost_m, sentence=f"the focal length {told}",
         fix="set " + ", ".join(f"{name} = {value:.1f}" for name, value in right.items()),
         correction=right,
     )  # fmt: skip
 
 
-def _principal(found: Calibrated, deviations: Array, camera: Camera) -> Finding | None:
-    rows = _certain(found, deviations, [_CX, _CY])
-    cost_m = _matters(found, rows, found.values[rows]) if rows else None
-    if cost_m is None:
+def _principal(errors: _Errors) -> Finding | None:
+    rows, cost_m = errors.certain(FaultKind.PRINCIPAL_POINT)
+    if not rows:
         return None
-    worst = max(rows, key=lambda row: abs(found.values[row]) / deviations[row])
-    right = {UNKNOWNS[row]: getattr(camera, UNKNOWNS[row]) + found.values[row] for row in rows}
+    values, deviations, camera = errors.values, errors.deviations, errors.camera
+    worst = errors.worst(rows)
+    right = {UNKNOWNS[row]: getattr(camera, UNKNOWNS[row]) + values[row] for row in rows}
     told = " and ".join(
-        f"{UNKNOWNS[row]} is {abs(found.values[row]):.1f} px too {_size(-found.values[row])} "
-        f"(+- {deviations[row]:.1f})"
+        f"{UNKNOWNS[row]} is {abs(values[row]):.1f} px too {_size(-values[row])} (+- {deviations[row]:.1f})"
         for row in rows
     )
     return Finding(
-        kind=FaultKind.PRINCIPAL_POINT, value=-float(found.values[worst]),
+        kind=FaultKind.PRINCIPAL_POINT, value=-float(values[worst]),
         deviation=float(deviations[worst]), unit="px", cost_m=cost_m,
         sentence=f"the principal point {told}",
         fix="set " + ", ".join(f"{name} = {value:.1f}" for name, value in right.items()),
@@ -183,12 +269,12 @@ def _principal(found: Calibrated, deviations: Array, camera: Camera) -> Finding 
     )  # fmt: skip
 
 
-def _distortion(found: Calibrated, deviations: Array, camera: Camera) -> Finding | None:
-    rows = _certain(found, deviations, [_K1])
-    cost_m = _matters(found, rows, found.values[rows]) if rows else None
-    if cost_m is None:
+def _distortion(errors: _Errors) -> Finding | None:
+    rows, cost_m = errors.certain(FaultKind.DISTORTION)
+    if not rows:
         return None
-    k1 = float(found.values[_K1])
+    values, deviations, camera = errors.values, errors.deviations, errors.camera
+    k1 = float(values[_K1])
     corner_px = abs(k1) * math.hypot(camera.width / 2 / camera.fx, camera.height / 2 / camera.fy) ** 3
     corner_px *= 0.5 * (camera.fx + camera.fy)
     return Finding(
@@ -202,41 +288,41 @@ def _distortion(found: Calibrated, deviations: Array, camera: Camera) -> Finding
     )  # fmt: skip
 
 
-def _of_depth(found: Calibrated, deviations: Array, reading: DepthReading) -> Iterator[Finding]:
-    if reading.flip:
-        how = FLIPS[reading.flip]
-        yield Finding(
-            kind=FaultKind.MIRRORED, value=1.0, deviation=0.0, unit="", cost_m=None,
-            sentence=f"depth fits the colour images only with {how}",
-            fix="turn either the depth or the colour images in the driver of the camera",
-        )  # fmt: skip
-        return
-    if _certain(found, deviations, [_OFFSET]):
-        cost_m = _matters(found, [_OFFSET], found.values[[_OFFSET]])
-        offset_m = float(found.values[_OFFSET])
-        if cost_m is not None:
-            yield Finding(
-                kind=FaultKind.DEPTH_OFFSET, value=offset_m, deviation=float(deviations[_OFFSET]), unit="m",
-                cost_m=cost_m, fix=f"subtract {offset_m:+.3f} m from every depth before it is used",
-                sentence=(
-                    f"depths are {100 * abs(offset_m):.1f} cm too {_size(offset_m)} "
-                    f"(+- {100 * deviations[_OFFSET]:.1f})"
-                ),
-            )  # fmt: skip
-    delay_s = reading.delay_s + float(found.values[_DELAY])
-    if abs(delay_s) > max(3.0 * deviations[_DELAY], _LEAST[_DELAY]):
-        wrong = np.zeros(len(UNKNOWNS))
-        wrong[_DELAY] = delay_s
-        which, other = ("depth", "colour") if delay_s > 0 else ("colour", "depth")
-        yield Finding(
-            kind=FaultKind.DEPTH_DELAY, value=delay_s, deviation=float(deviations[_DELAY]), unit="s",
-            cost_m=found.bend_m(wrong),
-            sentence=(
-                f"{which} is {1e3 * abs(delay_s):.0f} ms late (+- {1e3 * deviations[_DELAY]:.0f}) "
-                f"beside {other}"
-            ),
-            fix=f"pair each colour image with the depth image {1e3 * delay_s:+.0f} ms from it",
-        )  # fmt: skip
+def _flipped(reading: DepthReading) -> Finding:
+    return Finding(
+        kind=FaultKind.MIRRORED, value=1.0, deviation=0.0, unit="", cost_m=None,
+        sentence=f"depth fits the colour images only with {FLIPS[reading.flip]}",
+        fix="turn either the depth or the colour images in the driver of the camera",
+    )  # fmt: skip
+
+
+def _offset(errors: _Errors) -> Finding | None:
+    rows, cost_m = errors.certain(FaultKind.DEPTH_OFFSET)
+    if not rows:
+        return None
+    offset_m, deviation_m = float(errors.values[_OFFSET]), float(errors.deviations[_OFFSET])
+    return Finding(
+        kind=FaultKind.DEPTH_OFFSET, value=offset_m, deviation=deviation_m, unit="m",
+        cost_m=cost_m, fix=f"subtract {offset_m:+.3f} m from every depth before it is used",
+        sentence=(
+            f"depths are {100 * abs(offset_m):.1f} cm too {_size(offset_m)} (+- {100 * deviation_m:.1f})"
+        ),
+    )  # fmt: skip
+
+
+def _delay(errors: _Errors) -> Finding | None:
+    rows, cost_m = errors.certain(FaultKind.DEPTH_DELAY)
+    if not rows:
+        return None
+    delay_s, deviation_s = float(errors.values[_DELAY]), float(errors.deviations[_DELAY])
+    which, other = ("depth", "colour") if delay_s > 0 else ("colour", "depth")
+    return Finding(
+        kind=FaultKind.DEPTH_DELAY, value=delay_s, deviation=deviation_s, unit="s", cost_m=cost_m,
+        sentence=(
+            f"{which} is {1e3 * abs(delay_s):.0f} ms late (+- {1e3 * deviation_s:.0f}) beside {other}"
+        ),
+        fix=f"pair each colour image with the depth image {1e3 * delay_s:+.0f} ms from it",
+    )  # fmt: skip
 
 
 def _size(error: float) -> str:
@@ -245,35 +331,72 @@ def _size(error: float) -> str:
 
 # --- what a drive cannot tell ---
 
-_KINDS = (
-    (FaultKind.FOCAL_LENGTH, (_FX, _FY), "relative"), (FaultKind.PRINCIPAL_POINT, (_CX, _CY), "px"),
-    (FaultKind.DISTORTION, (_K1,), "relative"), (FaultKind.DEPTH_OFFSET, (_OFFSET,), "m"),
-    (FaultKind.DEPTH_DELAY, (_DELAY,), "s"),
-)  # fmt: skip
-_COLOUR_KINDS = 3
+
+@dataclass(frozen=True, slots=True)
+class _Drive:
+    """What a drive shows: for reasons of what it does not."""
+
+    measured: Measured
+    explanation: Explanation
+    found: Calibrated
+    model: DriveModel
+    parts: Array
+
+
+def _kinds(*, has_depth: bool) -> tuple[FaultKind, ...]:
+    return tuple(_ROWS) if has_depth else _OF_COLOUR
 
 
 def _untold(shown: str, *, has_depth: bool) -> CalibrationJudgement:
-    kinds = _KINDS if has_depth else _KINDS[:_COLOUR_KINDS]
     return CalibrationJudgement(
-        cannot_tell=tuple(CannotTell(kind, f"the drive has {shown}") for kind, _, _ in kinds)
+        cannot_tell=tuple(CannotTell(kind, f"the drive has {shown}") for kind in _kinds(has_depth=has_depth))
     )
 
 
 def _cannot_tell(
-    found: Calibrated, deviations: Array, model: DriveModel, reading: DepthReading, *, has_depth: bool
+    drive: _Drive, reading: DepthReading, *, told: set[FaultKind], has_depth: bool
 ) -> Iterator[CannotTell]:
     if reading.flip:
         yield CannotTell(FaultKind.DEPTH_DELAY, "depth images that lie wrong on colour were not tried late")
-    for kind, rows, _ in _KINDS if has_depth else _KINDS[:_COLOUR_KINDS]:
-        row = max(rows, key=lambda each: deviations[each] / _TOLD[each])
+    rivals = {**drive.explanation.rivals}
+    for kind in _kinds(has_depth=has_depth):
+        if kind in told or kind not in drive.measured.causes:
+            continue
+        _, covariance = drive.measured.under([*drive.explanation.causes, kind])
+        deviations = np.sqrt(np.diag(covariance))
+        row = max(_ROWS[kind], key=lambda each: deviations[each] / _TOLD[each])
         within = 3.0 * float(deviations[row])
-        if within > _TOLD[row] and not (row == _DELAY and reading.flip):
-            yield CannotTell(kind, f"{_reason(row, found, model)}: {_bound(row, within)}", within)
+        of = next((cause for cause, others in rivals.items() if others and kind in (cause, *others)), None)
+        if of is not None:
+            yield CannotTell(kind, _either(drive, of, row), within)
+        elif within > _TOLD[row]:
+            yield CannotTell(kind, f"{_reason(row, within / 3.0, drive)}: {_bound(row, within)}", within)
 
 
-def _reason(row: int, found: Calibrated, model: DriveModel) -> str:
+def _doubts(kinds: list[FaultKind], hint: float) -> Iterator[CannotTell]:
+    """Yield what cannot be told from a focal length that moves by *hint*, relative."""
+    moving = FaultKind.MOVING_FOCAL_LENGTH
+    for kind in kinds:
+        yield CannotTell(kind, f"this drive looks alike with {moving.value} (by {hint:+.1%})")
+        yield CannotTell(moving, f"this drive looks alike with {kind.value}")
+
+
+def _either(drive: _Drive, cause: FaultKind, row: int) -> str:
+    """Return that some causes explain a drive alike, and by how much."""
+    alike = (cause, *drive.explanation.rivals[cause])
+    before = [each for each in drive.explanation.causes if each is not cause]
+    told = []
+    for kind in alike:
+        values, _ = drive.measured.under([*before, kind])
+        worst = max(_ROWS[kind], key=lambda each: abs(values[each]) / _LEAST[each])
+        value = _TIMES[worst] * float(values[worst])
+        told.append(f"{kind.value} ({UNKNOWNS[worst]} by {value:+.3g} {_UNITS[worst]}".rstrip() + ")")
+    return f"this drive looks alike with {' and with '.join(told)}"
+
+
+def _reason(row: int, deviation: float, drive: _Drive) -> str:
     """Return which motion, or which sight, this drive lacks, with its figure."""
+    found, model = drive.found, drive.model
     yaw, pitch, roll = _turns_deg(found)
     if row in (_FX, _CX, _FY, _CY):
         about, turned = ("vertical", yaw) if row in (_FX, _CX) else ("horizontal", pitch)
@@ -281,6 +404,8 @@ def _reason(row: int, found: Calibrated, model: DriveModel) -> str:
             return f"the camera turns by {turned:.0f} degrees only about its {about} axis"
         if row in (_CX, _CY) and roll < _FEW_DEG:
             return f"the camera turns by {roll:.0f} degrees only about its optical axis"
+    if _OF_FEW_PARTS * drive.parts[row] > _MAINLY * deviation:
+        return "parts of the drive, adjusted by themselves, disagree by more than they know"
     if row == _OFFSET:
         depths = model.observed.depths_m[np.isfinite(model.observed.depths_m)]
         if not len(depths):
@@ -290,7 +415,22 @@ def _reason(row: int, found: Calibrated, model: DriveModel) -> str:
     if row == _DELAY:
         rate = float(np.median(np.abs(model.observed.rates_m_s)))
         return f"depths at a pixel change by {100 * rate:.0f} cm/s only"
-    return f"{len(found.points_world)} landmarks in {len(model.rows)} views are too few"
+    correlation = _correlations(found.covariance, row)
+    other = int(np.argmax(np.abs(correlation)))
+    if abs(correlation[other]) > _ALIKE:
+        return (
+            f"{UNKNOWNS[row]} looks like {UNKNOWNS[other]} in these views "
+            f"(correlation {correlation[other]:+.2f})"
+        )
+    return f"{len(found.points_world)} landmarks in {len(model.rows)} views do not tell more"
+
+
+def _correlations(covariance: Array, row: int) -> Array:
+    """Return ``(n,)`` correlations of one unknown with the others, 0 with itself."""
+    deviations = np.sqrt(np.maximum(np.diag(covariance), 1e-30))
+    correlations: Array = covariance[row] / (deviations * deviations[row])
+    correlations[row] = 0.0
+    return correlations
 
 
 def _bound(row: int, within: float) -> str:

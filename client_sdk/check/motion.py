@@ -29,6 +29,8 @@ __all__ = ["CameraMotion", "MotionReference", "check_imu", "check_motion", "noth
 _LEAST_STEP_S, _LONGEST_STEP_S = 0.45, 1.0
 _MOST_PAIRS, _FEWEST_PAIRS, _BLOCKS = 600, 20, 10
 _MOST_DELAY_S, _DELAY_STEP_S, _DELAY_FLOOR_S, _LEAST_DELAY_S, _VAGUE_S = 0.5, 0.02, 0.003, 0.01, 0.04
+_OF_INTERVAL = 0.1
+"""How the camera moves between its frames is not known: a delay is not known better than this share."""
 _EXPLAINED = 0.5
 """Motions that fit leave less of their mean square than this share."""
 _BETTER, _ALIKE, _DEVIATIONS = 0.5, 1.2, 3.0
@@ -103,6 +105,7 @@ class CameraMotion:
         metres: Where metres come from that can be wrong; ``none`` up to scale.
         adjusted: ``(k,)`` stamps and ``(k, 4, 4)`` poses of keyframes, adjusted with the calibration: metres
             are compared by them, since a wrong lens bends the others.
+        metres_deviation: How well the calibration of *adjusted* tells metres, relative.
     """
 
     stamps_s: Array
@@ -110,6 +113,7 @@ class CameraMotion:
     segments: Array | None = None
     metres: Literal["depth", "stereo", "none"] = "depth"
     adjusted: tuple[Array, Array] | None = None
+    metres_deviation: float = 0.0
 
 
 def check_motion(motion: CameraMotion, reference: MotionReference) -> tuple[list[Finding], list[CannotTell]]:
@@ -130,16 +134,20 @@ def check_motion(motion: CameraMotion, reference: MotionReference) -> tuple[list
     if fits[best].left > _EXPLAINED:
         reason = f"the camera does not move as {reference.name} says, at any delay within 0.5 s"
         return [], [CannotTell(FaultKind.STAMP_DELAY, reason), CannotTell(FaultKind.DEPTH_SCALE, reason)]
-    findings, untold = _delay(fits, seen, reference)
+    findings, untold = _delay(fits, seen, reference, float(np.median(np.diff(stamps_s))))
     axes, vague = _axes(fits[best], reference)
     findings += axes
     untold += vague
     if motion.metres != "none" and not any(each.kind is FaultKind.MIRRORED for each in axes):
-        moved_s, poses = stamps_s, T_world_camera
+        moved_s, poses, doubt = stamps_s, T_world_camera, 0.0
         if motion.adjusted is not None and len(motion.adjusted[0]) >= _FEWEST_ADJUSTED:
-            (moved_s, poses), segments = motion.adjusted, None
+            (moved_s, poses), segments, doubt = motion.adjusted, None, motion.metres_deviation
         by_metres = CameraMotion(
-            stamps_s=moved_s - _DELAYS_S[best], T_world_camera=poses, segments=segments, metres=motion.metres
+            stamps_s=moved_s - _DELAYS_S[best],
+            T_world_camera=poses,
+            segments=segments,
+            metres=motion.metres,
+            metres_deviation=doubt,
         )
         scale, vague = _scale(by_metres, reference, fits[best].rotation)
         findings += scale
@@ -266,7 +274,7 @@ def _ratio(one: Array, other: Array) -> float:
 
 
 def _delay(
-    fits: list[_Fit], seen: Array, reference: MotionReference
+    fits: list[_Fit], seen: Array, reference: MotionReference, interval_s: float
 ) -> tuple[list[Finding], list[CannotTell]]:
     """Return by how much the stamps of images are late."""
     squares = np.array([fit.best for fit in fits])
@@ -274,7 +282,7 @@ def _delay(
     total = squares.sum(axis=1)
     without = [total - squares[:, blocks == block].sum(axis=1) for block in range(_BLOCKS)]
     delay_s, deviation_s = _jackknife(_lowest(total), np.array([_lowest(each) for each in without]))
-    deviation_s = math.hypot(deviation_s, _DELAY_FLOOR_S)
+    deviation_s = math.hypot(deviation_s, _DELAY_FLOOR_S, _OF_INTERVAL * interval_s)
     if deviation_s > _VAGUE_S:
         reason = f"neither speed nor turn changes enough beside {reference.name}: delay within "
         within_s = _DEVIATIONS * deviation_s
@@ -386,7 +394,7 @@ def _scale(
     scale, deviation = _jackknife(_solved(A, B, rotation, arm_m, kept)[0], without)
     if not 1e-3 < scale < 1e3:
         return [], [CannotTell(FaultKind.DEPTH_SCALE, f"paths of camera and {reference.name} do not fit")]
-    deviation = math.hypot(deviation, reference.scale_deviation * scale)
+    deviation = math.hypot(deviation, reference.scale_deviation * scale, motion.metres_deviation * scale)
     value = scale - 1.0
     if abs(value) < max(_LEAST_SCALE, _DEVIATIONS * deviation):
         vague = _DEVIATIONS * deviation

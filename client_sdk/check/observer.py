@@ -117,6 +117,7 @@ class DriveObserver:
             motion = CameraMotion(
                 stamps_s=stamps_s, T_world_camera=poses, segments=segments, metres=self._metres(),
                 adjusted=(calibration.stamps_s, calibration.T_world_camera),
+                metres_deviation=calibration.metres_deviation,
             )  # fmt: skip
             by_reference, untold = check_motion(motion, self.reference)
             findings = [*findings, *by_reference]

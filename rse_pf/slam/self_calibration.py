@@ -6,7 +6,7 @@ complement.  What a value means for a user, and which matches are believed, is d
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -19,6 +19,7 @@ __all__ = [
     "Calibrated",
     "DriveObservations",
     "adjust_with_calibration",
+    "deviations_of_parts",
     "rms_after_alignment",
     "triangulated",
 ]
@@ -39,6 +40,7 @@ _NEAR_M = 0.02
 _BEHIND = 1e3
 _BLOCKS, _CELLS = 6, 6
 _MAD = 1.4826
+_MOST_PARTS, _LEAST_OF_PART = 4, 6
 _MOST_TURN_RAD, _MEAN_INFORMATION = 0.5, 1e8
 _SAMPLES = 8
 _POSE_INFORMATION, _POINT_INFORMATION = 1.0, 1e-3
@@ -208,6 +210,61 @@ def adjust_with_calibration(
             "the keyframes of this drive do not determine their poses",
             hint="move more, and past more texture",
         ) from error
+
+
+def deviations_of_parts(observed: DriveObservations, found: Calibrated, free: tuple[str, ...]) -> Array:
+    """Return ``(9,)`` deviations of the calibration from how far parts of a drive disagree about it.
+
+    Parts that are adjusted by themselves disagree by more than their own deviations where the model lacks
+    something, such as errors of depth that change with the scene.  0 where there are too few keyframes.
+
+    Args:
+        observed: As it was adjusted.
+        found: The result for the whole drive.
+        free: As it was adjusted.
+
+    Source:
+        DerSimonian and Laird, Controlled Clinical Trials 1986, Sect. 2: the variance between studies.
+    """
+    k = len(found.T_camera_world)
+    count = min(_MOST_PARTS, k // _LEAST_OF_PART)
+    values, variances = [], []
+    for part in range(count if count > 1 else 0):
+        rows = np.arange(k * part // count, k * (part + 1) // count)
+        try:
+            own = adjust_with_calibration(*_part_of(observed, found, rows), free, values=found.values)
+        except DegenerateGeometry:
+            continue
+        values.append(own.values)
+        variances.append(np.diag(own.covariance))
+    total: Array = np.zeros(len(UNKNOWNS))
+    if len(values) < 2:
+        return total
+    at = [UNKNOWNS.index(name) for name in free]
+    x, w = np.array(values)[:, at], 1.0 / np.maximum(np.array(variances)[:, at], 1e-18)
+    mean = (w * x).sum(axis=0) / w.sum(axis=0)
+    excess = (w * (x - mean) ** 2).sum(axis=0) - (len(x) - 1)
+    between = np.maximum(excess, 0.0) / (w.sum(axis=0) - (w**2).sum(axis=0) / w.sum(axis=0))
+    total[at] = np.sqrt(between / len(x))
+    return total
+
+
+def _part_of(
+    observed: DriveObservations, found: Calibrated, rows: Rows
+) -> tuple[DriveObservations, Array, Array]:
+    """Return what some keyframes see of the landmarks that two of them share, with where these are."""
+    numbers = np.full(len(found.T_camera_world), -1)
+    numbers[rows] = np.arange(len(rows))
+    kept = numbers[observed.keyframes] >= 0
+    kept &= np.bincount(observed.landmarks[kept], minlength=len(found.points_world))[observed.landmarks] > 1
+    seen, landmarks = np.unique(observed.landmarks[kept], return_inverse=True)
+    own = replace(
+        observed, keyframes=numbers[observed.keyframes[kept]], landmarks=landmarks,
+        pixels=observed.pixels[kept], pixels_px=observed.pixels_px[kept], depths_m=observed.depths_m[kept],
+        depths_dev_m=observed.depths_dev_m[kept], rates_m_s=observed.rates_m_s[kept],
+        twists_s=observed.twists_s[rows],
+    )  # fmt: skip
+    return own, found.T_camera_world[rows], found.points_world[seen]
 
 
 @dataclass(frozen=True, slots=True)
