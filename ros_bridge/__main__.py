@@ -35,6 +35,8 @@ _HELP = {
     "path_poses": "most poses of a path",
     "dds_domain": "with dds: ROS_DOMAIN_ID of the robots",
     "out": "folder that the service save writes to",
+    "publish_as": "name of the map that the service publish makes of a map of its own",
+    "localise_in": "name of the map in which the service localise looks",
 }
 
 

@@ -10,7 +10,7 @@ import contextlib
 import json
 import time
 from collections import Counter
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
@@ -22,12 +22,14 @@ from client_sdk.bags.message_maker import MessageMaker
 from client_sdk.frontend import Frame, TrackedFrame
 from client_sdk.live import LiveMapper
 from client_sdk.mapper import Mapper
-from client_sdk.robot import Robot, connect
+from client_sdk.robot import Robot
+from ros_bridge.access import connect_robot
 from ros_bridge.incoming import NO_MESSAGE, IncomingFrames, PairedImages, Role
+from ros_bridge.map_services import MapServices, as_json
 from ros_bridge.options import BridgeOptions
 from ros_bridge.outgoing import Message, OutgoingMessages
 from rse_pf.errors import RsePfError, UsageError
-from rse_pf.geometry import Array
+from rse_pf.geometry import Array, Camera
 from rse_pf.terminal import show
 
 __all__ = ["Bridge", "CallReply", "Publish", "connected_bridge"]
@@ -72,7 +74,7 @@ class Bridge:
             options: What is bridged.
             publish: Gets each message.
             is_ros1: Whether messages are in the format of ROS 1, or in CDR.
-            robot: For services of ROS that call services of the platform; None refuses them.
+            robot: For services of ROS that call the platform; None refuses them.
             clock: Seconds, monotonic; for pauses between clouds, paths and diagnostics.
         """
         maker = MessageMaker(is_ros1=is_ros1)
@@ -89,6 +91,23 @@ class Bridge:
         self._stamp_ns = 0
         self._reason = ""
         self._cloud: asyncio.Task[None] | None = None
+        self._maps = None if robot is None else MapServices(robot, mapper, options)
+        self._seen: Camera | None = None
+
+    def close(self) -> None:
+        """End what the services of maps have opened."""
+        if self._maps is not None:
+            self._maps.close()
+
+    @property
+    def triggers(self) -> dict[str, Callable[[], Coroutine[Any, Any, CallReply]]]:
+        """The services of ROS without a request (``std_srvs/Trigger``), by name."""
+        return {
+            "save": self.save,
+            "publish": lambda: self._of_maps(MapServices.publish),
+            "relocalise": lambda: self._of_maps(MapServices.relocalise),
+            "localise": lambda: self._of_maps(lambda maps: maps.localise(self._seen)),
+        }
 
     def receive(self, role: Role, data: bytes | memoryview) -> None:
         """Take the bytes of a message of a topic; quick, never waits, raises nothing."""
@@ -133,9 +152,18 @@ class Bridge:
             return CallReply(ok=False, code="bad-request", message=f"the payload is no JSON: {error}")
         try:
             answer = await self._robot.call(service, request, deadline_s=_CALL_S, keep=True)
-            return CallReply(ok=True, reply=json.dumps(answer.reply, default=_plain))
+            return CallReply(ok=True, reply=as_json(answer.reply))
         except RsePfError as error:
             return CallReply(ok=False, code=error.code, message=error.message)
+
+    async def _of_maps(self, ask: Callable[[MapServices], Awaitable[Any]]) -> CallReply:
+        if self._maps is None:
+            return CallReply(ok=False, code="disconnected", message="this bridge has no connection")
+        try:
+            return CallReply(ok=True, reply=as_json(await ask(self._maps)))
+        except RsePfError as error:
+            said = error.message + (f" ({error.hint})" if error.hint else "")
+            return CallReply(ok=False, code=error.code, message=said)
 
     async def _take(self) -> None:
         """Track each frame that comes."""
@@ -149,7 +177,7 @@ class Bridge:
         frame = await asyncio.to_thread(self._incoming.decode, images)
         if frame is None:
             return
-        started = time.perf_counter()
+        started, self._seen = time.perf_counter(), frame.camera
         try:
             tracked = await self._track(frame)
         except UsageError as error:
@@ -252,63 +280,13 @@ async def connected_bridge(
         UsageError: There is no address, or no token that can be read.
         RsePfError: The platform refuses the robot.
     """
-    async with _connect(options) as robot:
-        if not options.map:
-            mapper = robot.mapper(depth=options.partner == "depth")
-            yield Bridge(mapper, options, publish, is_ros1=is_ros1, robot=robot)
-            return
-        async with robot.live_map(options.map, depth=True) as live:
-            yield Bridge(live, options, publish, is_ros1=is_ros1, robot=robot)
-
-
-def _connect(options: BridgeOptions) -> Robot:
-    if options.enrolment:
-        return connect(enrolment=options.enrolment, on_change=_log_change)
-    if not (options.url and options.token_file):
-        raise UsageError(
-            "the bridge needs a platform: url and token_file, or enrolment",
-            hint="rse-pf local prints the address; rse-pf token issue ROBOT issues a token",
-        )
-    file = Path(options.token_file)
-    _read_token(file)  # a file that cannot be read is told at once, not after several attempts
-
-    async def token() -> str:
-        return _read_token(file)
-
-    return connect(options.url, token=token, on_change=_log_change)
-
-
-def _read_token(file: Path) -> str:
-    """Return the token in a file; an error names the file and the cause, and nothing of what is in it."""
-    try:
-        token = file.read_text(encoding="ascii").strip()
-        cause = "" if token else "it is empty"
-    except OSError as error:
-        token, cause = "", error.strerror or type(error).__name__
-    except UnicodeDecodeError:
-        token, cause = "", "it holds other characters than ASCII"
-    if cause:
-        raise UsageError(
-            f"cannot read the token in {file.absolute()}: {cause}",
-            hint="give the whole path of a file that rse-pf token issue ROBOT wrote",
-        )
-    return token
-
-
-def _log_change(what: str, why: str) -> None:
-    """Say when the connection is lost and why, and when it is back."""
-    if what == "link-lost":
-        show(f"connection lost: {why}")
-    elif what == "link-back":
-        show(f"connected again, to {why}")
-
-
-def _plain(value: Any) -> Any:
-    """Return an array as a list; bytes as text in base64."""
-    if hasattr(value, "tolist"):
-        return value.tolist()
-    if isinstance(value, bytes):
-        import base64
-
-        return base64.b64encode(value).decode()
-    raise TypeError(type(value).__name__)
+    async with connect_robot(options) as robot, contextlib.AsyncExitStack() as stack:
+        mapper: Mapper | LiveMapper
+        if options.map:
+            mapper = await stack.enter_async_context(robot.live_map(options.map, depth=True))
+        else:
+            name = (options.namespace.strip("/") or "robot") if options.publish_as else ""
+            mapper = robot.mapper(depth=options.partner == "depth", keyframes_of=name)
+        bridge = Bridge(mapper, options, publish, is_ros1=is_ros1, robot=robot)
+        stack.callback(bridge.close)
+        yield bridge

@@ -45,6 +45,8 @@ class BridgeOptions:
         cloud_every_s: Time between two clouds.
         path_poses: A path has so many poses at most; from there on, each second one is left out.
         out: Folder that the service ``save`` writes to; empty: it is refused.
+        publish_as: Name of the map that the service ``publish`` makes of a map of its own; empty: refused.
+        localise_in: Name of the map in which the service ``localise`` looks; empty: it is refused.
         dds_domain: ``ROS_DOMAIN_ID`` of the robots, where no ROS is used.
 
     Raises:
@@ -73,6 +75,8 @@ class BridgeOptions:
     cloud_every_s: float = 2.0
     path_poses: int = 2000
     out: str = ""
+    publish_as: str = ""
+    localise_in: str = ""
     dds_domain: int = 0
 
     def __post_init__(self) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import functools
 import hashlib
 import importlib
 import importlib.util
@@ -15,7 +16,7 @@ import sys
 import threading
 import time
 import xmlrpc.client
-from collections.abc import Callable
+from collections.abc import Callable, Coroutine
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -107,7 +108,7 @@ class _Node:
         return type(f"Raw{name}", (self._rospy.AnyMsg,), {"__slots__": ["_buff"], **parts})
 
     def _offer(self, bridge: Bridge, loop: asyncio.AbstractEventLoop) -> None:
-        """Offer ``~call`` and ``~save``."""
+        """Offer ``~call``, and the triggers of a bridge."""
 
         def wait(work: Any) -> CallReply:
             reply: CallReply = asyncio.run_coroutine_threadsafe(work, loop).result(_CALL_S)
@@ -117,7 +118,7 @@ class _Node:
             self._rospy, "rse_pf_bridge/Call", CALL_REQUEST, CALL_REPLY, ["string", "string"],
             ["bool", "string", "string", "string"],
         )  # fmt: skip
-        save = _service_class(
+        trigger = _service_class(
             self._rospy, "std_srvs/Trigger", "", "bool success\nstring message", [], ["bool", "string"]
         )
 
@@ -125,12 +126,13 @@ class _Node:
             reply = wait(bridge.call(*request.values))
             return call._response_class([reply.ok, reply.reply, reply.code, reply.message])
 
-        def saved(_: Any) -> Any:
-            reply = wait(bridge.save())
-            return save._response_class([reply.ok, reply.reply or f"{reply.code}: {reply.message}"])
+        def triggered(ask: Callable[[], Coroutine[Any, Any, CallReply]], _: Any) -> Any:
+            reply = wait(ask())
+            return trigger._response_class([reply.ok, reply.reply or f"{reply.code}: {reply.message}"])
 
         self._rospy.Service("~call", call, called)
-        self._rospy.Service("~save", save, saved)
+        for name, ask in bridge.triggers.items():
+            self._rospy.Service(f"~{name}", trigger, functools.partial(triggered, ask))
 
 
 class _Master:

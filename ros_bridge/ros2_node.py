@@ -6,6 +6,7 @@ import asyncio
 import functools
 import importlib
 import threading
+from collections.abc import Callable, Coroutine
 from typing import Any
 
 from ros_bridge.bridge import Bridge, CallReply, connected_bridge
@@ -39,7 +40,7 @@ def run_ros2_node(arguments: list[str], options: dict[str, Any]) -> int:
     signals = importlib.import_module("rclpy.signals").SignalHandlerOptions.NO  # asyncio has them
     rclpy.init(args=["rse-pf-ros", *arguments], signal_handler_options=signals)
     node = rclpy.create_node(
-        "rse_pf_bridge", allow_undeclared_parameters=True,
+        "rse_pf_bridge", namespace=str(options.get("namespace", "")), allow_undeclared_parameters=True,
         automatically_declare_parameters_from_overrides=True,
     )  # fmt: skip
     try:
@@ -90,15 +91,16 @@ def publishers_of(node: Any, options: BridgeOptions) -> dict[str, Any]:
 
 
 def _offer(node: Any, bridge: Bridge, loop: asyncio.AbstractEventLoop) -> None:
-    """Offer ``~/save``; a service with a payload needs an interface that a workspace builds."""
+    """Offer the triggers of a bridge; a service with a payload needs an interface that a workspace builds."""
     trigger = importlib.import_module("std_srvs.srv").Trigger
 
-    def saved(_: Any, answer: Any) -> Any:
-        reply: CallReply = asyncio.run_coroutine_threadsafe(bridge.save(), loop).result(_CALL_S)
+    def answered(ask: Callable[[], Coroutine[Any, Any, CallReply]], _: Any, answer: Any) -> Any:
+        reply = asyncio.run_coroutine_threadsafe(ask(), loop).result(_CALL_S)
         answer.success, answer.message = reply.ok, reply.reply or f"{reply.code}: {reply.message}"
         return answer
 
-    node.create_service(trigger, "~/save", saved)
+    for name, ask in bridge.triggers.items():
+        node.create_service(trigger, f"~/{name}", functools.partial(answered, ask))
 
 
 def _class_of(kind: str) -> Any:

@@ -357,6 +357,15 @@ class LiveMapper:
         return len(self._waiting)
 
     @property
+    def features(self) -> Features | None:
+        """The features of the last frame that has a pose, as those of `Mapper.features`."""
+        return self._mapper.features
+
+    def relocalise(self) -> None:
+        """Ask for the place in the map with the next keyframe, without the usual pause."""
+        self._relocalised_at, self._asked_in_vain = float("-inf"), 0
+
+    @property
     def map(self) -> PointMap:
         """The robot's own cloud of its keyframes, in its odometry frame; the newest may be missing.
 
@@ -466,7 +475,7 @@ class LiveMapper:
         self._segment += 1
         self._sender.current_segment = self._segment
         self._last_keyframe = self._last_keyframe_s = None
-        self._relocalised_at, self._asked_in_vain = float("-inf"), 0
+        self.relocalise()
 
     def _is_keyframe(self, pose: Array) -> bool:
         if self._last_keyframe is None:

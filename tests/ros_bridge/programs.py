@@ -32,6 +32,8 @@ class Line(TypedDict, total=False):
     child: str
     position: list[float]
     values: dict[str, str]
+    ok: bool
+    message: str
 
 
 class Program:

@@ -52,7 +52,7 @@ def diagnostics(message):
 
 
 def main():
-    """Listen until killed; with a second argument, call that service for each line of standard input."""
+    """Listen until killed; call the services that further arguments name."""
     rclpy.init()
     node = rclpy.create_node("listener")
     prefix, colour = sys.argv[1], sys.argv[2]
@@ -69,12 +69,13 @@ def main():
         Image, colour, lambda each: say(kind="image", stamp=nanoseconds(each), at=time.time()),
         qos_profile_sensor_data,
     )  # fmt: skip
-    if len(sys.argv) > 3:
-        client = node.create_client(Trigger, sys.argv[3])
+    for service in sys.argv[3:]:
+        client = node.create_client(Trigger, service)
         client.wait_for_service(30.0)
         reply = client.call_async(Trigger.Request())
         rclpy.spin_until_future_complete(node, reply, timeout_sec=30.0)
-        say(kind="saved", ok=reply.result().success, message=reply.result().message)
+        name = service.rpartition("/")[2]
+        say(kind=name, ok=reply.result().success, message=reply.result().message)
     until = time.monotonic() + 40.0
     while not poses.get_publisher_count() and time.monotonic() < until:  # else the first poses are missed
         time.sleep(0.05)

@@ -123,6 +123,8 @@ def test_without_a_folder_or_a_connection_services_say_so() -> None:
     async def ask(bridge: Bridge, heard: Heard) -> None:
         assert (await bridge.save()).code == "usage"
         assert (await bridge.call("pnp", "{}")).code == "disconnected"
+        for name in ("publish", "relocalise", "localise"):
+            assert (await bridge.triggers[name]()).code == "disconnected"
 
     asyncio.run(bridged([0], ask))
 

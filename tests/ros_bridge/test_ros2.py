@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import math
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from benchmarks.maps.bags import write_recording
@@ -82,12 +84,16 @@ def test_poses_equal_those_of_the_sdk_and_survive_a_killed_server(
 
 async def _drive(ros2: Ros2, bag: Path, folder: Path) -> None:
     token_file = folder / "token"
-    async with LocalPlatform(PlatformSettings(), port=0, servers=2, state=folder / "platform") as platform:
+    settings, state = PlatformSettings(), folder / "platform"
+    async with LocalPlatform(settings, port=0, servers=2, state=state, data=True) as platform:
         token_file.write_text(platform.issue_token("ros-2"), encoding="ascii")
         expected = await own_run(bag, platform)
         assert len(expected) == _FRAMES
 
-        bridge = await asyncio.to_thread(ros2.bridge, platform.url, token_file, out=str(folder / "saved"))
+        bridge = await asyncio.to_thread(
+            ros2.bridge, platform.url, token_file, out=str(folder / "saved"), publish_as="kitchen",
+            localise_in="kitchen",
+        )  # fmt: skip
         listener = await asyncio.to_thread(ros2.listener, "", _COLOUR)
         player = ros2.play(bag)
         await asyncio.to_thread(listener.until, poses(_FRAMES // 2))
@@ -104,8 +110,15 @@ async def _drive(ros2: Ros2, bag: Path, folder: Path) -> None:
         assert listener.heard("path")
         assert listener.heard("cloud")
         tell_delay(listener)
-        saved = await asyncio.to_thread(ros2.listener, "", _COLOUR, "/rse_pf_bridge/save")
-        assert saved.heard("saved")[0]["ok"]
+        services = [f"/rse_pf_bridge/{name}" for name in ("save", "publish", "localise", "relocalise")]
+        asked = await asyncio.to_thread(ros2.listener, "", _COLOUR, *services)
+        assert asked.heard("save")[0]["ok"]
+        assert asked.heard("publish")[0]["ok"], asked.heard("publish")
+        place = json.loads(asked.heard("localise")[0]["message"])
+        assert place["verdict"] == "ok", place
+        last = max(heard, key=lambda line: line["stamp"])["position"]
+        assert math.dist(np.reshape(place["T_map_camera"], (4, 4))[:3, 3], last) < 0.05
+        assert "set the parameter map" in asked.heard("relocalise")[0]["message"]
         assert (folder / "saved" / "trajectory.txt").exists()
         assert await asyncio.to_thread(bridge.end) == 0
         assert bridge.lines[-1] == f"{_FRAMES} frames, 0 lost\n"
@@ -129,6 +142,14 @@ async def _share(ros2: Ros2, bag: Path, folder: Path) -> None:
         player = ros2.play(bag, 0.5, robots=len(names))
         for listener in listeners:
             await asyncio.to_thread(listener.until, poses(_FRAMES))
+        asked = await asyncio.to_thread(
+            ros2.listener,
+            "/robot1",
+            _COLOUR,
+            *(f"/robot1/rse_pf_bridge/{name}" for name in ("relocalise", "publish")),
+        )
+        assert json.loads(asked.heard("relocalise")[0]["message"])["aligned"]
+        assert asked.heard("publish")[0]["ok"], asked.heard("publish")
         await asyncio.to_thread(player.end)
         for name, listener in zip(names, listeners, strict=True):
             assert ("map", f"{name}/odom") in {
