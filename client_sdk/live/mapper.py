@@ -544,7 +544,7 @@ class LiveMapper:
                 features.kind, 0.0 if frame.stereo is None else frame.camera.fx * frame.stereo.baseline_m,
             ),
             imu=self._mapper.keyframe_imu(T_odom_camera, self._last_keyframe_s, frame.timestamp_s),
-            points=attached.points_reference,
+            points=attached.points_reference, image=attached.image_reference,
         )  # fmt: skip
         return encode_keyframe(keyframe), attached
 
@@ -618,6 +618,7 @@ class LiveMapper:
     def _note_introduction(self, myself: Myself, base: Base) -> None:
         """Take how the map knows this robot."""
         self._is_known = True
+        self._attachments.may_have_images = myself.images
         if myself.robot:
             for correction in self._alignments.know_myself(myself.robot, base.segment):
                 self._announce(correction)

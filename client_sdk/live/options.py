@@ -26,6 +26,8 @@ class LiveOptions:
         points: At most so many coloured points of a keyframe are sent for the cloud of the map, fewer where
             keyframes follow each other fast; 0 sends none.
         points_bytes_per_s: Share of the link that points may take.
+        images: Whether the image of a keyframe is sent, too, where the operator allows it (``live.images``).
+        images_bytes_per_s: Share of the link that images may take; a keyframe beyond it has none.
         segment_after: A new segment begins after so many frames that show enough and no place that the robot
             knows; a covered lens does not count.
         relocalise_s: While a segment is not aligned, the robot asks for its place so often at most; after six
@@ -40,6 +42,8 @@ class LiveOptions:
     features: int = 870
     points: int = 12_500
     points_bytes_per_s: float = 36_000.0
+    images: bool = True
+    images_bytes_per_s: float = 100_000.0
     segment_after: int = 5
     relocalise_s: float = 0.5
     bytes_per_s: float = 262_144.0
@@ -50,6 +54,7 @@ class LiveOptions:
         numbers = (
             self.keyframe_m, self.keyframe_deg, self.features, self.segment_after, self.relocalise_s,
             self.bytes_per_s, self.deadline_s, self.points_bytes_per_s,
+            self.images_bytes_per_s,
         )  # fmt: skip
         if min(numbers) <= 0 or min(self.leave_s, self.points) < 0:
             raise UsageError("a number of LiveOptions is not above 0", hint="leave it out for the default")

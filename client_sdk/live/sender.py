@@ -60,6 +60,8 @@ class Myself:
     segment: int
     keyframes: int
     """Of the whole map."""
+    images: bool = False
+    """Whether the platform allows images of keyframes."""
 
 
 async def ask_map(robot: LiveCaller, name: str, deadline_s: float) -> Myself:
@@ -76,8 +78,9 @@ async def ask_map(robot: LiveCaller, name: str, deadline_s: float) -> Myself:
             number=int(you["number"]),
             segment=int(you["segment"]),
             keyframes=int(reply["keyframes"]),
+            images=bool(reply.get("images", False)),
         )
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise BadMessage(
             "the reply of live-show does not say how the map knows this robot", hint="update the server"
         ) from error

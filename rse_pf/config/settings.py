@@ -207,6 +207,7 @@ class LiveSettings:
     publish_pause_s: float = setting(10.0, unit="s", doc="shortest time between two versions of a live map; a version that is asked for earlier comes then", source="a robot that left again and again wrote 959 MB in 45 s", low=0)
     keep_versions: int = setting(20, unit="versions", doc="newest versions of a live map that stay, of those that nobody asked for; older ones are removed, and those above a quarter of the tenant's quota; 0 keeps all", low=0)
     idle_s: float = setting(60.0, unit="s", doc="the owner of a map that nobody uses for this long publishes it and ends", low=1)
+    images: bool = setting(False, doc="robots store the image of each keyframe of a live map, about 60 kB each, for exports of its versions")
     keep_log: bool = setting(False, doc="keep all entries of a live map's log, which experiments replay; else those before the older snapshot are deleted")
 
 

@@ -57,7 +57,13 @@ from rse_pf.live_map.outcomes import (
     Unaligned,
 )
 from rse_pf.live_map.smoothing import SmoothedWindows, odometry_step, smooth_all
-from rse_pf.live_map.versions import PointSource, point_sources, version_of, whole_graph
+from rse_pf.live_map.versions import (
+    PointSource,
+    image_references,
+    point_sources,
+    version_of,
+    whole_graph,
+)
 from rse_pf.maps.descriptors import DescriptorKind, check_alike
 from rse_pf.maps.format import MapVersion
 from rse_pf.slam.keyframe import Keyframe, check_sent, decode_keyframe
@@ -339,6 +345,10 @@ class LiveMap:
     def point_sources(self, version: MapVersion) -> tuple[PointSource, ...]:
         """Return where the points of the keyframes of *version* are, which this map has just made."""
         return point_sources(self._graph, version)
+
+    def image_references(self, version: MapVersion) -> dict[str, dict[str, dict[str, str]]]:
+        """Return ``images`` of the provenance of *version*: digests by robot's folder and id of keyframe."""
+        return image_references(self._graph, version)
 
     def objects_of(self, keyframes: Collection[int]) -> list[tuple[str, str]]:
         """Return robot and digest of the objects that were stored beside *keyframes*."""

@@ -29,11 +29,15 @@ __all__ = [
     "PointSource",
     "encode_stored",
     "errors_of_maps",
+    "image_references",
     "point_sources",
     "started_from",
     "version_of",
     "whole_graph",
 ]
+
+_MAX_IMAGES = 8_000
+"""75 bytes each: a provenance has 1 MiB."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -171,6 +175,20 @@ def point_sources(graph: Graph, version: MapVersion) -> tuple[PointSource, ...]:
                 )
             )  # fmt: skip
     return tuple(sources)
+
+
+def image_references(graph: Graph, version: MapVersion) -> dict[str, dict[str, dict[str, str]]]:
+    """Return ``images`` of the provenance of *version*: digests by robot's folder and id of the keyframe.
+
+    They are those of the newest 8,000 keyframes; nothing without an image.
+    """
+    images: dict[str, dict[str, str]] = {}
+    for keyframe in version.keyframes[-_MAX_IMAGES:]:
+        row = graph.keyframes[keyframe.id]
+        image = decode_keyframe(row.data).image if row.objects and row.data is not None else None
+        if image is not None:
+            images.setdefault(row.robot, {})[str(keyframe.id)] = image.digest
+    return {"images": images} if images else {}
 
 
 def whole_graph(graph: Graph, options: LiveMapOptions) -> tuple[PoseGraph, list[int]]:

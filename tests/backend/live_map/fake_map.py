@@ -131,6 +131,9 @@ class FakeMap:
     def point_sources(self, version: MapVersion) -> tuple[PointSource, ...]:
         return ()
 
+    def image_references(self, version: MapVersion) -> dict[str, Any]:
+        return {}
+
     @property
     def gone_objects(self) -> list[tuple[str, str]]:
         return []

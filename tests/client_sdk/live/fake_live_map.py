@@ -56,6 +56,7 @@ class FakeLiveRobot:
         self.asked: list[str] = []
         self.relocalised: dict[str, Any] = {"verdict": "none", "reason": "nothing alike"}
         self.foreign_keyframes = 0
+        self.has_images = False
         self.changed = asyncio.Event()
         self._updates: asyncio.Queue[tuple[str, Any]] = asyncio.Queue()
 
@@ -116,7 +117,11 @@ class FakeLiveRobot:
             "number": len(self.kept),
             "segment": max((each.segment for each in self.kept), default=-1) + 1,
         }
-        return {"keyframes": len(self.kept) + self.foreign_keyframes, "you": you}
+        return {
+            "keyframes": len(self.kept) + self.foreign_keyframes,
+            "images": self.has_images,
+            "you": you,
+        }
 
     def _keyframe(self, request: Any) -> Any:
         keyframe = as_type(msgspec.to_builtins(request, builtin_types=(bytes,)), KeyframeRequest)

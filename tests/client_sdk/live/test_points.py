@@ -174,3 +174,42 @@ def test_no_points_are_made_where_none_are_wanted() -> None:
 def test_more_points_than_an_object_holds_are_refused() -> None:
     with pytest.raises(UsageError, match="points = 20000 is above 16000"):
         LiveOptions(points=20_000)
+
+
+@pytest.mark.parametrize(("is_allowed", "is_wanted"), [(True, True), (True, False), (False, True)])
+def test_an_image_is_stored_where_operator_and_robot_want_it(is_allowed: bool, is_wanted: bool) -> None:
+    cv2 = pytest.importorskip("cv2")
+
+    async def work(robot: FakeLiveRobot) -> None:
+        objects = Objects()
+        robot.has_images, robot.foreign_keyframes = is_allowed, 1
+        live = replace(QUICK, images=is_wanted, images_bytes_per_s=1e9, points=0, leave_s=5.0)
+        async with mapper_of(robot, objects, live) as mapper:
+            await drive(mapper, range(5))
+
+        images = [decode_keyframe(request.keyframe).image for request in robot.kept]
+        assert len(images) == 2
+        if not (is_allowed and is_wanted):
+            assert images == [None, None]
+            assert not objects.tries
+            return
+        first = cv2.imdecode(np.frombuffer(objects.held[images[0].digest], np.uint8), cv2.IMREAD_COLOR)
+        assert np.abs(first[:, :, ::-1].astype(int) - frame_at(0, depth=True).rgb).mean() < 8.0
+        assert {each.digest for each in images} == set(objects.held)
+
+    run(work)
+
+
+def test_keyframes_whose_images_do_not_fit_the_share_of_the_link_have_none() -> None:
+    async def work(robot: FakeLiveRobot) -> None:
+        objects = Objects()
+        robot.has_images, robot.foreign_keyframes = True, 1
+        live = replace(QUICK, images_bytes_per_s=1_000.0, points=0)
+        mapper = LiveMapper(robot, "lab", ask=solve, live=live, store=objects.store, clock=lambda: 0.0)
+        async with mapper:
+            await drive(mapper, range(9))
+            await robot.until(lambda: mapper.keyframes_waiting == 0)
+            images = [decode_keyframe(request.keyframe).image for request in robot.kept]
+            assert [each is not None for each in images] == [True, False, False]
+
+    run(work)

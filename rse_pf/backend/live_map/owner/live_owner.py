@@ -356,6 +356,7 @@ class LiveOwner:
             told_state=self._name_state(),
             name_of=self._name_of,
             is_present=self._present.__contains__,
+            has_images=self._context.settings.images,
         )
 
     # --- the log ------------------------------------------------------------------------------------

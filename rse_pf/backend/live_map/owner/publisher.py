@@ -158,6 +158,9 @@ class Publisher:
 
         def make() -> tuple[MapVersion, tuple[PointSource, ...], list[tuple[str, str]]]:
             version = live_map.to_version()
+            if self._context.settings.images:
+                provenance = {**version.provenance, **live_map.image_references(version)}
+                version = dataclasses.replace(version, provenance=provenance)
             return version, live_map.point_sources(version), live_map.gone_objects
 
         while True:

@@ -52,6 +52,7 @@ def show_reply(
     told_state: str,
     name_of: Callable[[str], str],
     is_present: Callable[[str], bool],
+    has_images: bool,
 ) -> dict[str, Any]:
     """Return the reply of ``live-show``: the state of a map, and how *robot* numbers its keyframes.
 
@@ -62,6 +63,7 @@ def show_reply(
         told_state: As robots are told.
         name_of: Returns the name under which a `RobotId.folder` is shown.
         is_present: Returns whether that robot drives.
+        has_images: Whether robots may store the images of their keyframes.
     """
     rows = [
         {
@@ -84,6 +86,7 @@ def show_reply(
         "links": state.live_map.links_believed,
         "state": told_state,
         "digest": state.digest(),
+        "images": has_images,
         "you": {
             "robot": name_of(robot.folder),
             "number": state.live_map.next_number(robot.folder),

@@ -59,12 +59,14 @@ def objects(store: MemoryStore) -> KeyframeObjects:
     return KeyframeObjects(store, Account())  # type: ignore[arg-type]
 
 
-def keyframe_request(number: int, reference: ObjectReference | None) -> bytes:
+def keyframe_request(
+    number: int, reference: ObjectReference | None, image: ObjectReference | None = None
+) -> bytes:
     noise = np.random.default_rng(number)
     seen = noise.uniform(10, 400, (50, 2)), np.full(50, 2.0), noise.integers(0, 255, (50, 32), dtype=np.uint8)
     made = Keyframe(
         timestamp_s=float(number), T_odom_camera=exp_se3([0.2 * number, 0, 0, 0, 0, 0]), camera=CAMERA,
-        features=make_features(*seen), points=reference,
+        features=make_features(*seen), points=reference, image=image,
     )  # fmt: skip
     return msgspec.msgpack.encode(
         KeyframeRequest(map=MAP, segment=0, number=number, keyframe=encode_keyframe(made))
@@ -172,6 +174,33 @@ def test_a_forgotten_robots_points_are_in_no_later_version_and_not_in_the_store(
         assert np.allclose(maps.load(MAP, "head").points[:, 2], 3.0)
         assert not list(store.list(f"objects/{ONE.folder}/"))
         assert store.get(object_name(OTHER, theirs.digest))
+
+    bench.run(test)
+
+
+@pytest.mark.parametrize("is_allowed", [True, False])
+def test_a_version_names_images_where_the_operator_allows_them_and_forget_deletes_them(
+    is_allowed: bool,
+) -> None:
+    store = MemoryStore()
+    bench = Bench(store, kind=LIVE_MAP, publish_pause_s=0.0, images=is_allowed)
+    mine, theirs = stored(store, ONE, b"my image"), stored(store, OTHER, b"their image")
+
+    async def test() -> None:
+        owner, maps = await bench.own("a"), MapRegistry(store, "default")
+        await owner.owner.answer(ONE, "live-keyframe", keyframe_request(0, None, mine))
+        await owner.owner.answer(OTHER, "live-keyframe", keyframe_request(0, None, theirs))
+        await settle()
+        await owner.ask("live-publish")
+        assert (await owner.ask("live-show"))["images"] is is_allowed
+        named = {"images": {ONE.folder: {"0": mine.digest}}} if is_allowed else {}
+        assert maps.load(MAP, "head").provenance == {"made_by": "live", "from": "", **named}
+
+        await owner.ask("live-forget", {"robot": "one"})
+
+        assert not list(store.list(f"objects/{ONE.folder}/"))
+        await owner.ask("live-publish")
+        assert ONE.folder not in maps.load(MAP, "head").provenance.get("images", {})
 
     bench.run(test)
 
