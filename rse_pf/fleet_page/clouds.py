@@ -134,9 +134,10 @@ def spread_order(count: int) -> npt.NDArray[np.int64]:
 def packer(configuration: str) -> Handler:
     """Return what packs an encoded map: a length, JSON, and blocks of points.
 
-    The JSON holds ``points``, ``block`` and ``robots`` (name to the positions of its keyframes, metres).  A
-    block has ``block`` points, the last one the rest: positions as ``<u2``, then colours as bytes.  A
-    position is ``low + number * step``, by axis.  Points stand in `spread_order`.
+    The JSON holds ``points``, ``block``, ``robots`` (name to the positions of its keyframes, metres) and
+    ``fit`` (two corners of a box that holds nearly all points, none without points).  A block has ``block``
+    points, the last one the rest: positions as ``<u2``, then colours as bytes.  A position is
+    ``low + number * step``, by axis.  Points stand in `spread_order`.
     """
     import numpy as np
 
@@ -156,7 +157,10 @@ def packer(configuration: str) -> Handler:
             place = [round(float(value), 4) for value in keyframe.T_world_camera[:3, 3]]
             robots.setdefault(printable(keyframe.robot), []).append(place)
         down = np.array([keyframe.T_world_camera[:3, 1] for keyframe in version.keyframes]).reshape(-1, 3)
+        # A few points far away, such as those of a mirror, must not make the rest small.
+        shares = np.percentile(points, (1, 99), axis=0) if len(points) else np.empty((0, 3))
         header = {
+            "fit": shares.round(4).tolist(),
             "points": len(points), "all_points": len(version.points), "block": BLOCK_POINTS,
             "low": low.tolist(), "step": step.tolist(), "robots": robots,
             "up": (-down.mean(axis=0)).tolist() if len(down) else [0.0, -1.0, 0.0],

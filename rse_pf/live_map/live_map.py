@@ -60,6 +60,7 @@ from rse_pf.live_map.smoothing import SmoothedWindows, odometry_step, smooth_all
 from rse_pf.live_map.versions import (
     PointSource,
     image_references,
+    paths_of,
     point_sources,
     version_of,
     whole_graph,
@@ -349,6 +350,10 @@ class LiveMap:
     def image_references(self, version: MapVersion) -> dict[str, dict[str, dict[str, str]]]:
         """Return ``images`` of the provenance of *version*: digests by robot's folder and id of keyframe."""
         return image_references(self._graph, version)
+
+    def paths(self, most: int) -> list[tuple[str, int, Array]]:
+        """Return robot, segment and ``(n, 3)`` positions of the keyframes in the map, of *most* of them."""
+        return paths_of(self._graph, most)
 
     def objects_of(self, keyframes: Collection[int]) -> list[tuple[str, str]]:
         """Return robot and digest of the objects that were stored beside *keyframes*."""

@@ -30,6 +30,7 @@ __all__ = [
     "encode_stored",
     "errors_of_maps",
     "image_references",
+    "paths_of",
     "point_sources",
     "started_from",
     "version_of",
@@ -175,6 +176,24 @@ def point_sources(graph: Graph, version: MapVersion) -> tuple[PointSource, ...]:
                 )
             )  # fmt: skip
     return tuple(sources)
+
+
+def paths_of(graph: Graph, most: int) -> list[tuple[str, int, Array]]:
+    """Return robot, segment and ``(n, 3)`` positions of the keyframes in the map's frame, metres.
+
+    They are those of robots' segments that are connected with it, an even choice of *most* keyframes or a
+    few more: the first and the last of each segment are there.
+    """
+    segments = [each for each in _aligned_segments(graph) if not each.version]
+    each_one = -(-sum(len(segment.keyframes) for segment in segments) // most) or 1
+    return [
+        (
+            segment.robot,
+            segment.segment,
+            graph.T[[*segment.keyframes[:-1:each_one], segment.keyframes[-1]], :3, 3].copy(),
+        )
+        for segment in segments
+    ]
 
 
 def image_references(graph: Graph, version: MapVersion) -> dict[str, dict[str, dict[str, str]]]:

@@ -36,6 +36,7 @@ __all__ = [
     "LiveRelocalise",
     "LiveRelocaliseV1",
     "LiveRequest",
+    "LiveShow",
     "LiveStart",
     "MapCause",
     "MapUpdate",
@@ -57,9 +58,15 @@ class _Value(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class LiveMapRequest(_Value, frozen=True, kw_only=True):
-    """``live-leave``, ``live-show``, ``live-publish`` and ``live-stop``: the name of a map of the tenant."""
+    """``live-leave``, ``live-publish`` and ``live-stop``: the name of a map of the tenant."""
 
     map: _MapName
+
+
+class LiveShow(LiveMapRequest, frozen=True, kw_only=True):
+    """``live-show``; with ``paths``, where the keyframes of all robots lie in the map, too."""
+
+    paths: bool = False
 
 
 class KeyframeRequest(_Value, frozen=True, kw_only=True):
@@ -151,7 +158,7 @@ LIVE_REQUESTS: dict[str, type[LiveRequest]] = {
     KEYFRAME: KeyframeRequest,
     RELOCALISE: LiveRelocalise,
     LEAVE: LiveMapRequest,
-    SHOW: LiveMapRequest,
+    SHOW: LiveShow,
     PUBLISH: LiveMapRequest,
     STOP: LiveMapRequest,
     FORGET: LiveForget,

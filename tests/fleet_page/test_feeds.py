@@ -14,8 +14,14 @@ from rse_pf.auth.roster import check_scopes, scopes_allow
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import UsageError
 from rse_pf.fleet_page import clouds
-from rse_pf.fleet_page.feeds.live_feed import SCOPES, RobotPaths, plain
-from rse_pf.fleet_page.feeds.platform_feed import fleet_document, group_of, moved_robots
+from rse_pf.fleet_page.feeds.live_feed import SCOPES, RobotPaths, histories, plain
+from rse_pf.fleet_page.feeds.platform_feed import (
+    LocalFeed,
+    fleet_document,
+    group_of,
+    moved_robots,
+)
+from rse_pf.fleet_page.hub import Hub
 from rse_pf.geometry import Camera
 from rse_pf.limited_process import LimitedProcesses
 from rse_pf.local.control.operations import Operations
@@ -83,6 +89,40 @@ def test_the_path_of_a_robot_lies_in_its_odometry_frame_so_that_corrections_move
     assert told is not None
     np.testing.assert_allclose(told["points"], [[0.0, -2.0, 0.0]], atol=1e-3)
     assert paths.take({**pose, "segment": 1}) is None
+
+
+def test_the_history_of_a_robot_has_all_its_segments_and_its_name_is_escaped() -> None:
+    shown = [
+        {"robot": "a\x1b", "segment": 0, "points": [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]},
+        {"robot": "b", "segment": 0, "points": [[5.0, 0.0, 0.0]]},
+        {"robot": "a\x1b", "segment": 1, "points": [[2.0, 0.0, 0.0]]},
+    ]
+
+    told = histories(shown)
+
+    assert set(told) == {r"a\x1b", "b"}
+    assert told[r"a\x1b"]["parts"] == [[[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]], [[2.0, 0.0, 0.0]]]
+    assert told[r"a\x1b"]["robot"] == r"a\x1b"
+
+
+def test_answer_times_are_known_after_two_readings_that_nobody_asked_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock, counts, hub = iter((10.0, 11.0, 16.0)), iter((100, 500, 2500)), Hub()
+    feed = LocalFeed(hub, tmp_path, clock=lambda: next(clock))
+
+    async def ask(target: str) -> tuple[list[str], list[bytes | None]]:
+        row = 'rse_pf_duration_seconds_bucket{service="pnp",le="0.01"}'
+        return ["server-1"], [f"{row} {next(counts)}\n".encode()]
+
+    monkeypatch.setattr(feed, "_ask_servers", ask)
+    told = []
+    for _ in range(3):
+        asyncio.run(feed._read_metrics())
+        told.append((feed._percentiles["count"], feed._percentiles["covered_s"]))
+
+    assert hub.pages == 0
+    assert told == [(0, 0.0), (400, 1.0), (2400, 6.0)]
 
 
 def test_values_of_a_live_map_become_plain_and_escaped() -> None:

@@ -195,7 +195,7 @@ def _read(args: argparse.Namespace, settings: PlatformSettings) -> dict[str, Any
     state = restore(log, LIVE_MAP)
     return show_reply(
         RobotId(args.tenant, "operator"), state, lease, told_state="idle", name_of=shown_name,
-        is_present=lambda folder: False, has_images=settings.live.images,
+        is_present=lambda folder: False,
     )  # fmt: skip
 
 

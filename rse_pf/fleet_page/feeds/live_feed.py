@@ -21,7 +21,7 @@ from rse_pf.local.firewall import read_key
 from rse_pf.local.state import PlatformState, platform_settings, read_state
 from rse_pf.terminal import printable
 
-__all__ = ["LIVE", "SCOPES", "LiveFeed", "RobotPaths", "plain"]
+__all__ = ["LIVE", "SCOPES", "LiveFeed", "RobotPaths", "histories", "plain"]
 
 LIVE = "live/"
 _ROBOT = "fleet-page"
@@ -32,6 +32,7 @@ _LOOK_S = 0.5
 _LIST_EVERY_S = 3.0
 _MAX_MAPS = 8
 _MAX_PATH = 2000
+_HISTORY_EVERY_S = 3.0
 
 
 class LiveFeed:
@@ -82,6 +83,26 @@ class LiveFeed:
             await asyncio.sleep(_LOOK_S)
 
     async def _follow(self, robot: Any, name: str) -> None:
+        reading = asyncio.ensure_future(self._follow_history(robot, name))
+        try:
+            await self._follow_updates(robot, name)
+        finally:
+            reading.cancel()
+
+    async def _follow_history(self, robot: Any, name: str) -> None:
+        """Tell where all robots have been, also before anybody looked, from the keyframes of the map."""
+        version = -1
+        while True:
+            if self._hub.watches(LIVE + name):
+                with contextlib.suppress(RsePfError):
+                    shown = (await robot.call("live-show", {"map": name, "paths": True}, keep=True)).reply
+                    if shown.get("version") != version:
+                        version = shown.get("version")
+                        for key, value in histories(shown.get("paths", ())).items():
+                            self._hub.put(LIVE + name, f"history/{key}", value)
+            await asyncio.sleep(_HISTORY_EVERY_S)
+
+    async def _follow_updates(self, robot: Any, name: str) -> None:
         paths = RobotPaths()
         async for key, value in robot.subscribe(LIVE + name):
             message = plain(value)
@@ -134,6 +155,16 @@ class RobotPaths:
         if before is not None and path is not None and before[0] == segment == path["segment"]:
             stretch = scale / before[1]
             path["points"] = [[stretch * each for each in point] for point in path["points"]]
+
+
+def histories(paths: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
+    """Return ``parts`` by robot, every text escaped: positions (metres, in the map), segment by segment."""
+    found: dict[str, dict[str, Any]] = {}
+    for path in paths:
+        robot = printable(str(path.get("robot", "")))
+        told = found.setdefault(robot, {"kind": "history", "robot": robot, "parts": []})
+        told["parts"].append(plain(path.get("points", [])))
+    return found
 
 
 def plain(value: Any) -> Any:

@@ -1,6 +1,7 @@
 """What the page knows of one local platform: read from its operator's port, its servers and its logs.
 
-The control plane is asked for one stream and nothing else; servers are asked only while somebody looks.
+The control plane is asked for one stream and nothing else; servers are asked for their histograms, and for
+their robots only while somebody looks.
 Whatever does not answer is shown as silent, and asked again.
 """
 
@@ -13,7 +14,7 @@ import math
 import os
 import time
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +39,8 @@ __all__ = ["LocalFeed", "fleet_document", "group_of", "moved_robots"]
 
 _ROBOTS_EVERY_S = 1.0
 _METRICS_EVERY_S = 5.0
+_FIRST_METRICS_S = 1.0
+"""Between the first two readings, of which a percentile is the difference."""
 _LOGS_EVERY_S = 0.3
 _AUDIT_EVERY_S = 0.5
 _AGAIN_S = 0.5
@@ -60,10 +63,11 @@ _SCALING = frozenset(
 class LocalFeed:
     """Feeds a `Hub` with what one platform does."""
 
-    def __init__(self, hub: Hub, folder: Path) -> None:
-        """Read nothing yet; *folder* is that of the platform's state."""
+    def __init__(self, hub: Hub, folder: Path, clock: Callable[[], float] = time.monotonic) -> None:
+        """Read nothing yet; *folder* is that of the platform's state, *clock* is monotonic, in seconds."""
         self._hub = hub
         self._folder = folder
+        self._clock = clock
         self._settings = PlatformSettings()
         self._log = CommandLog(folder)
         self._audit = AuditRows(folder)
@@ -169,16 +173,20 @@ class LocalFeed:
         self._hub.put("robots", "now", rows)
 
     async def _follow_metrics(self) -> None:
+        """Read the histograms of all servers, also while nobody looks: a page begins with the last minute."""
         while True:
-            if self._hub.watches("fleet"):
-                with contextlib.suppress(*_UNREADABLE):
-                    names, replies = await self._ask_servers("/metrics")
-                    now_s = time.monotonic()
-                    for name, page in zip(names, replies, strict=True):
-                        if page:
-                            self._minute.add(name, buckets_of(page.decode("utf-8", "replace")), now_s=now_s)
-                    self._percentiles = self._minute.document(now_s=now_s, servers=names)
-            await asyncio.sleep(_METRICS_EVERY_S)
+            with contextlib.suppress(*_UNREADABLE):
+                await self._read_metrics()
+            is_first = not self._percentiles.get("covered_s")
+            await asyncio.sleep(_FIRST_METRICS_S if is_first else _METRICS_EVERY_S)
+
+    async def _read_metrics(self) -> None:
+        names, replies = await self._ask_servers("/metrics")
+        now_s = self._clock()
+        for name, page in zip(names, replies, strict=True):
+            if page:
+                self._minute.add(name, buckets_of(page.decode("utf-8", "replace")), now_s=now_s)
+        self._percentiles = self._minute.document(now_s=now_s, servers=names)
 
     async def _ask_servers(self, target: str) -> tuple[list[str], list[bytes | None]]:
         state = await asyncio.to_thread(read_state, self._folder)

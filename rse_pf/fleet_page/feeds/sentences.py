@@ -53,7 +53,9 @@ def event_sentence(event: Mapping[str, Any]) -> str:
     if text is not None:
         return text.format_map(_Missing(values))
     details = [
-        f"{name} {value}" for name, value in values.items() if name not in ("event", "time_s", "number")
+        f"{name} {value}"
+        for name, value in values.items()
+        if value and name not in ("event", "time_s", "number")
     ]
     return f"{kind.replace('-', ' ')}: {', '.join(details)}" if details else kind.replace("-", " ")
 
@@ -156,10 +158,14 @@ _EVENTS = {
     "data-server-down": "data server {name} ended ({code})",
     "data-server-failed": "data server {name} does not start: {error}",
     "data-server-silent": "data server {name} does not answer and is killed",
+    "data-server-start": "data server {name} starts",
     "data-server-up": "data server {name} is ready",
     "drain-over": "{server} has left after {seconds} s",
     "drain-start": "{server} drains ({reason}); its robots move",
     "grow": "{servers} more: {reason}",
+    "control-plane-silent": "the control plane does not answer",
+    "metrics-port-taken": "port {port} is taken: the metrics have another one",
+    "not-written": "something could not be written: {reason}",
     "over": "the control plane has ended",
     "platform-gone": "the platform has ended",
     "platform-ready": "the platform is ready after {seconds} s",

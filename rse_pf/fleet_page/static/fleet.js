@@ -81,7 +81,8 @@ export function fleetView(root) {
     const p = told.percentiles ?? {};
     setText(boxes.monitor.small, p.count
       ? `last ${Math.round(p.covered_s)} s: p50 ${p.p50_ms}, p95 ${p.p95_ms}, p99 ${p.p99_ms} ms of ${p.count} commands`
-      : told.cloud ? "no answer times were published" : "no command in the last minute");
+      : told.cloud ? "no answer times were published"
+        : p.covered_s ? `no command in the last ${p.covered_s < 59 ? `${Math.round(p.covered_s)} s` : "minute"}` : "answer times are being read");
     setText(boxes.modifier.big, `${told.min_servers ?? "–"} to ${told.max_servers ?? "–"}`);
     setText(boxes.modifier.small, `servers; busy above ${number(told.busy_percent)} % CPU, judged each ${number(told.period_s)} s${told.last_action ? `; last: ${told.last_action}` : ""}`);
     const said = told.waiting.map((text) => `${text[0].toUpperCase()}${text.slice(1)}.`);

@@ -4,6 +4,7 @@ import { byId, clock, element, setText } from "./dom.js";
 import { ask, get } from "./session.js";
 
 const PREPARE_MS = 300; // after the first view has been filled
+const GROW_MS = 5000; // between two looks for a new version of a live map
 const STATE_MS = 1500; // so long after the stream began, what is told is the state, not news
 
 export function mapView(root, changeMap) {
@@ -34,6 +35,17 @@ export function mapView(root, changeMap) {
   let entries = [];
   let openedAt = 0;
   let due = false;
+  let newest = ""; // version of the live map whose cloud is shown
+  setInterval(() => { grow().catch((error) => setText(note, error.message)); }, GROW_MS);
+
+  const newestOf = (map) => known.maps.find((each) => each.map === map)?.versions[0]?.id ?? "";
+
+  // A live map that was published again is shown with its new cloud.
+  async function grow() {
+    if (!visible || document.hidden || !chosen.startsWith("live:")) return;
+    await readMaps();
+    if (chosen.startsWith("live:") && newestOf(chosen.slice(5)) !== newest) await load(true);
+  }
 
   async function shown() {
     visible = true;
@@ -69,7 +81,7 @@ export function mapView(root, changeMap) {
   function fill() {
     const options = [["", "Choose a map"], ...known.live.map((name) => [`live:${name}`, `${name} (live)`])];
     for (const { map, versions } of known.maps) {
-      for (const version of versions.slice(0, 20)) options.push([`version:${map}:${version.id}`, `${map}, version ${version.number}`]);
+      for (const version of versions.slice(0, 20)) options.push([`version:${map}:${version.id}`, `${map}, version ${version.number}${version.points ? "" : ", no points"}`]);
     }
     const told = JSON.stringify(options);
     if (choice.dataset.told === told) return;
@@ -93,11 +105,11 @@ export function mapView(root, changeMap) {
     await load().catch((error) => setText(note, error.message));
   }
 
-  async function load() {
+  async function load(isGrown = false) {
     empty.hidden = chosen !== "";
     if (!scene || !chosen) return;
     isLoaded = true;
-    scene.clear();
+    if (!isGrown) scene.clear();
     const [kind, map, version] = chosen.split(":");
     const has = known.maps.find((each) => each.map === map);
     if (kind === "live" && !has) { setText(note, "The cloud comes with the first version: rse-pf map publish."); return; }
@@ -110,6 +122,7 @@ export function mapView(root, changeMap) {
     let sample = null;
     const told = await readCloud(answer, () => chosen === wanted, (head) => {
       scene.begin(head, kind === "version");
+      if (kind === "live") scene.update(state);
       sample = scene.drawn(Math.min(head.points, head.block)).then(() => {
         performance.mark("map-sample");
         if (note.dataset.points !== "all") setText(note, `a sample in ${seconds()} s, loading`);
@@ -125,6 +138,12 @@ export function mapView(root, changeMap) {
     if (chosen !== wanted) return;
     performance.mark("map-whole");
     note.dataset.points = "all";
+    newest = newestOf(map);
+    if (!told.points) {
+      const count = Object.values(told.robots).reduce((sum, path) => sum + path.length, 0);
+      setText(note, `This version has no points: ${count} keyframes of ${Object.keys(told.robots).length} robots.`);
+      return;
+    }
     const all = told.all_points > told.points ? ` of ${told.all_points.toLocaleString("en")}` : "";
     setText(note, `${told.points.toLocaleString("en")}${all} points in ${seconds()} s`);
   }
@@ -163,6 +182,9 @@ export function mapView(root, changeMap) {
       const spread = value.covariance ? `± ${(100 * Math.sqrt(Math.max(value.covariance[0], value.covariance[6], value.covariance[11]))).toFixed(1)}\u00a0cm` : "";
       return row(value.robot, value.aligned ? `in the map ${spread}` : `outside: ${value.reason || "not joined yet"}`);
     });
+    for (const [, value] of state) {
+      if (value.kind === "history" && !state.has(`alignment/${value.robot}`)) rows.push(row(value.robot, "has left"));
+    }
     robots.replaceChildren(...rows);
   }
 

@@ -2,7 +2,7 @@
 
 import { Cloud } from "./cloud.js";
 import {
-  BufferGeometry, Color, ColorManagement, GridHelper, Group, Line, LineBasicMaterial, LinearSRGBColorSpace, Matrix4, Mesh, MeshBasicMaterial,
+  Box3, BufferGeometry, Color, ColorManagement, GridHelper, Group, Line, LineBasicMaterial, LinearSRGBColorSpace, Matrix4, Mesh, MeshBasicMaterial,
   PerspectiveCamera, Points, PointsMaterial, Scene, SphereGeometry, Spherical, Vector3, WebGLRenderer,
 } from "./vendor/three.module.js";
 
@@ -14,6 +14,8 @@ const FILLING_POINTS = 200_000; // at least, in a frame while nothing moves
 const SLOW_MS = 70; // a frame takes so long: the next one draws fewer points
 const FAST_MS = 40;
 const CLOUD_LAYER = 1;
+const HOME = [0.95, 0.6]; // angles of the first view, from above and around
+const MARGIN = 0.88; // names stand beside robots
 ColorManagement.enabled = false; // nothing is lit: the colours of cameras are shown as they are
 
 export class MapScene {
@@ -32,6 +34,8 @@ export class MapScene {
     this.target = new Vector3();
     this.orbit = new Spherical(8, 1.0, 0.6);
     this.radius = 4;
+    this.cloudReach = [];
+    this.robotReach = [];
     this.dirty = true;
     this.frames = 0;
     this.shown = null;
@@ -68,7 +72,8 @@ export class MapScene {
     this.world.add(this.moving);
     this.places.clear();
     this.labels.replaceChildren();
-    this.hasCloud = false;
+    this.hasCloud = this.touched = false;
+    [this.cloudReach, this.robotReach] = [[], []];
     this.dropCloud();
     this.dirty = true;
   }
@@ -81,12 +86,33 @@ export class MapScene {
     this.world.add(this.shown.points);
     this.turnUp(new Vector3(...told.up));
     if (withPaths) Object.entries(told.robots).forEach(([name, path]) => this.path(this.world, name, path));
-    const low = new Vector3(...told.low);
-    const size = new Vector3(...told.step).multiplyScalar(65535);
-    this.centre = low.clone().addScaledVector(size, 0.5).applyMatrix4(this.world.matrix);
-    this.radius = Math.max(size.length() / 2, 0.5);
+    this.cloudReach = cornersOf(told.fit);
+    if (withPaths) this.cloudReach.push(...Object.values(told.robots).flat().map((each) => new Vector3(...each)));
     this.hasCloud = told.points > 0;
-    this.home();
+    this.fit(this.robotReach);
+    if (!this.touched) this.home();
+  }
+
+  // Take what must be seen: the cloud, the paths and the robots.
+  fit(robotReach) {
+    this.robotReach = robotReach;
+    const all = [...this.cloudReach, ...robotReach].map((each) => each.clone().applyMatrix4(this.world.matrix));
+    if (!all.length) return;
+    const box = new Box3().setFromPoints(all);
+    this.centre = box.getCenter(new Vector3());
+    this.seen = all.map((each) => each.sub(this.centre));
+    this.radius = Math.max(box.getSize(new Vector3()).length() / 2, 0.5);
+  }
+
+  // Return from how far away all of it is in the picture, in the direction of home.
+  distance() {
+    const back = new Vector3().setFromSpherical(new Spherical(1, ...HOME));
+    const right = new Vector3(0, 1, 0).cross(back).normalize();
+    const up = back.clone().cross(right);
+    const high = Math.tan((this.camera.fov * Math.PI) / 360) * MARGIN;
+    const aspect = (this.canvas.clientWidth || 1) / (this.canvas.clientHeight || 1);
+    const needed = (this.seen ?? []).map((each) => each.dot(back) + Math.max(Math.abs(each.dot(right)) / (high * aspect), Math.abs(each.dot(up)) / high));
+    return Math.max(0.8, ...needed);
   }
 
   more(bytes, count) {
@@ -138,6 +164,14 @@ export class MapScene {
     this.moving.clear();
     const reach = [];
     for (const [, value] of state) {
+      if (value.kind !== "history") continue;
+      const parts = value.parts.filter((each) => each.length).map((part) => part.map((each) => new Vector3(...each)));
+      this.colour(value.robot);
+      for (const points of parts) this.moving.add(...this.drive(points, this.colour(value.robot)));
+      if (parts.length) this.place(value.robot, parts[parts.length - 1].at(-1));
+      reach.push(...parts.flat());
+    }
+    for (const [, value] of state) {
       if (value.kind !== "alignment" || !value.aligned || !value.T_map_odom) continue;
       const T = new Matrix4().set(...value.T_map_odom);
       const path = state.get(`path/${value.robot}`);
@@ -151,12 +185,10 @@ export class MapScene {
       this.moving.add(this.robot(at, this.colour(value.robot), value.covariance));
       reach.push(at, ...points);
     }
-    if (!this.hasCloud && reach.length) {
-      if (!this.isTurned) { this.turnUp(new Vector3(0, -1, 0)); this.isTurned = true; }
-      const centre = reach.reduce((sum, each) => sum.add(each), new Vector3()).divideScalar(reach.length);
-      this.radius = Math.max(0.8, ...reach.map((each) => each.distanceTo(centre)));
-      this.centre = centre.applyMatrix4(this.world.matrix);
-      this.moving.add(this.grid(centre, reach));
+    if (reach.length) {
+      if (!this.hasCloud && !this.isTurned) { this.turnUp(new Vector3(0, -1, 0)); this.isTurned = true; }
+      this.fit(reach);
+      if (!this.hasCloud) this.moving.add(this.grid(this.centre.clone().applyMatrix4(this.world.matrix.clone().invert()), reach));
       if (!this.touched) this.home();
     }
     this.dirty = true;
@@ -193,7 +225,7 @@ export class MapScene {
 
   home() {
     this.target.copy(this.centre ?? new Vector3());
-    this.orbit.set(this.radius * 1.55, 0.95, 0.6);
+    this.orbit.set(this.distance(), ...HOME);
     this.touched = false;
     this.dirty = true;
   }
@@ -304,4 +336,11 @@ function contextOf(canvas) {
   const wanted = { alpha: true, depth: true, stencil: false, powerPreference: "low-power", preserveDrawingBuffer: true };
   return canvas.getContext("webgl2", { ...wanted, antialias: true, failIfMajorPerformanceCaveat: true })
     ?? canvas.getContext("webgl2", { ...wanted, antialias: false });
+}
+
+// Return the eight corners of a box, none of no box.
+function cornersOf(fit) {
+  if (!fit?.length) return [];
+  const [low, high] = fit;
+  return [0, 1, 2, 3, 4, 5, 6, 7].map((bits) => new Vector3(...[0, 1, 2].map((axis) => (bits >> axis & 1 ? high : low)[axis])));
 }

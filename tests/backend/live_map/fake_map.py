@@ -134,6 +134,9 @@ class FakeMap:
     def image_references(self, version: MapVersion) -> dict[str, Any]:
         return {}
 
+    def paths(self, most: int) -> list[tuple[str, int, Any]]:
+        return []
+
     @property
     def gone_objects(self) -> list[tuple[str, str]]:
         return []

@@ -27,7 +27,7 @@ from rse_pf.backend.live_map.owner.log import (
     Submitted,
 )
 from rse_pf.backend.live_map.owner.publisher import AUTOMATIC_NOTES, Publisher, version_to_start_from
-from rse_pf.backend.live_map.owner.replies import relocalise_reply, show_reply, version_reply
+from rse_pf.backend.live_map.owner.replies import paths_reply, relocalise_reply, show_reply, version_reply
 from rse_pf.backend.live_map.owner.state import Applied, MapState, Measuring, UpdateBook
 from rse_pf.backend.live_map.owner.threads import FIRST_RETRY_S, Urgency, next_retry_s
 from rse_pf.config import LiveSettings
@@ -59,13 +59,13 @@ from rse_pf.wire.live_map import (
     LEAVE,
     LIVE_REQUESTS,
     PUBLISH,
-    SHOW,
     STOP,
     KeyframeRequest,
     LiveForget,
     LiveMapRequest,
     LiveRelocalise,
     LiveRequest,
+    LiveShow,
     LiveStart,
 )
 
@@ -195,6 +195,9 @@ class LiveOwner:
                 return await self._forget(request)
             case LiveStart() as request:
                 return await self._start_from(request)
+            case LiveShow() as request:
+                show = functools.partial(self._show, robot, request.paths)
+                return await self._context.threads.compute(Urgency.ANSWER, show)
             case LiveMapRequest():
                 return await self._reply_about(robot, operation)
 
@@ -202,9 +205,6 @@ class LiveOwner:
         """Answer an operation whose request names the map alone."""
         if operation == LEAVE:
             return await self._leave(robot)
-        if operation == SHOW:
-            show = functools.partial(self._show, robot)
-            return await self._context.threads.compute(Urgency.ANSWER, show)
         if operation == PUBLISH:
             record = await self._publisher.publish(f"published by {robot}")
             return version_reply(self._context.map_name, record)
@@ -347,17 +347,18 @@ class LiveOwner:
             )
         return {} if record is None else version_reply(self._context.map_name, record)
 
-    def _show(self, robot: RobotId) -> dict[str, Any]:
+    def _show(self, robot: RobotId, with_paths: bool) -> dict[str, Any]:
         """Return the reply of ``live-show`` for *robot*; called in the thread of the map."""
-        return show_reply(
+        shown = show_reply(
             robot,
             self._state,
             self._lease.record,
             told_state=self._name_state(),
             name_of=self._name_of,
             is_present=self._present.__contains__,
-            has_images=self._context.settings.images,
         )
+        paths = {"paths": paths_reply(self._state, self._name_of)} if with_paths else {}
+        return {**shown, "images": self._context.settings.images, **paths}
 
     # --- the log ------------------------------------------------------------------------------------
 

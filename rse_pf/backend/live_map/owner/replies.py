@@ -11,7 +11,10 @@ from rse_pf.identity import RobotId
 from rse_pf.live_map.events import matrix_bytes
 from rse_pf.maps.registry import MapRecord
 
-__all__ = ["relocalise_reply", "show_missing", "show_reply", "version_reply"]
+__all__ = ["paths_reply", "relocalise_reply", "show_missing", "show_reply", "version_reply"]
+
+_MAX_PATH_POINTS = 4_000
+"""About 100 kB of JSON, of 256 that a message may have."""
 
 
 def relocalise_reply(found: Any, version: int) -> dict[str, Any]:
@@ -52,7 +55,6 @@ def show_reply(
     told_state: str,
     name_of: Callable[[str], str],
     is_present: Callable[[str], bool],
-    has_images: bool,
 ) -> dict[str, Any]:
     """Return the reply of ``live-show``: the state of a map, and how *robot* numbers its keyframes.
 
@@ -63,7 +65,6 @@ def show_reply(
         told_state: As robots are told.
         name_of: Returns the name under which a `RobotId.folder` is shown.
         is_present: Returns whether that robot drives.
-        has_images: Whether robots may store the images of their keyframes.
     """
     rows = [
         {
@@ -86,13 +87,20 @@ def show_reply(
         "links": state.live_map.links_believed,
         "state": told_state,
         "digest": state.digest(),
-        "images": has_images,
         "you": {
             "robot": name_of(robot.folder),
             "number": state.live_map.next_number(robot.folder),
             "segment": state.live_map.next_segment(robot.folder),
         },
     }
+
+
+def paths_reply(state: MapState, name_of: Callable[[str], str]) -> list[dict[str, Any]]:
+    """Return robot, segment and points (metres, in the map) of each segment in the map."""
+    return [
+        {"robot": name_of(robot), "segment": segment, "points": points.round(3).tolist()}
+        for robot, segment, points in state.live_map.paths(_MAX_PATH_POINTS)
+    ]
 
 
 def version_reply(map_name: str, record: MapRecord) -> dict[str, Any]:

@@ -241,3 +241,23 @@ def test_a_snapshot_knows_whose_objects_are_to_be_deleted() -> None:
     assert [robot for robot, _ in restored.gone_objects] == [ONE.folder]
     assert restored.objects_of([1]) == live_map.objects_of([1]) != []
     assert restored.digest() == live_map.digest()
+
+
+def test_live_show_has_whole_paths_in_the_map_where_they_are_asked_for() -> None:
+    bench = Bench(kind=LIVE_MAP)
+
+    async def test() -> None:
+        owner = await bench.own("a")
+        for number in range(5):
+            await owner.owner.answer(ONE, "live-keyframe", keyframe_request(number, None))
+        await settle()
+        shown = await owner.ask("live-show", {"paths": True})
+        assert "paths" not in await owner.ask("live-show")
+        assert [(each["robot"], each["segment"]) for each in shown["paths"]] == [("one", 0)]
+        assert np.allclose(shown["paths"][0]["points"], [[0.2 * n, 0, 0] for n in range(5)], atol=1e-3)
+        first_and_last = owner.state.live_map.paths(2)[0][2][:, 0]
+        assert first_and_last[0] == 0.0
+        assert abs(first_and_last[-1] - 0.8) < 1e-9
+        assert len(first_and_last) == 3
+
+    bench.run(test)
