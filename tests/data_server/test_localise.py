@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ from client_sdk.frontend import Frame, FrontEndOptions, extract  # noqa: E402
 from client_sdk.simulator import make_world, render_along, true_trajectory  # noqa: E402
 from rse_pf.data_server.photo_localiser import make_handler  # noqa: E402
 from rse_pf.geometry import Array, pose_difference  # noqa: E402
-from rse_pf.maps.format import Keyframe, MapVersion, encode_map  # noqa: E402
+from rse_pf.maps.format import Keyframe, MapVersion, decode_map, encode_map  # noqa: E402
 from rse_pf.maps.registry import MapRegistry  # noqa: E402
 from rse_pf.object_store import DirectoryStore, MemoryStore  # noqa: E402
 
@@ -231,9 +232,20 @@ def test_a_new_head_is_used_at_once(drive: Drive, tmp_path: Path) -> None:
     handler = make_handler(json.dumps(settings.to_dict()))
     asked = msgspec.msgpack.encode({"tenant": "default", "name": "m"})
 
-    assert msgspec.msgpack.decode(handler(asked))["version"] == first.id
-    second = maps.commit("m", drive.map, parent=first.id, author="t", created_s=1.0)
-    assert msgspec.msgpack.decode(handler(asked))["version"] == second.id
+    before = msgspec.msgpack.decode(handler(asked))
+    assert before["version"] == first.id
+    map_version = decode_map(drive.map)
+    T_new_world = np.eye(4)
+    T_new_world[:3, 3] = [1.0, 2.0, 3.0]
+    moved = tuple(
+        replace(each, T_world_camera=T_new_world @ each.T_world_camera) for each in map_version.keyframes
+    )
+    encoded = encode_map(replace(map_version, keyframes=moved))
+    second = maps.commit("m", encoded, parent=first.id, author="t", created_s=1.0)
+    after = msgspec.msgpack.decode(handler(asked))
+    assert after["version"] == second.id
+    by = np.array(after["keyframes"]) - np.array(before["keyframes"])
+    np.testing.assert_allclose(by, [np.array(after["top_view"]) @ T_new_world[:3, 3]] * len(by), atol=1e-3)
 
 
 def test_a_store_in_memory_is_read_by_the_data_server(drive: Drive) -> None:
