@@ -104,6 +104,7 @@ class BlockingRobot(Closing):
     call = _blocking(Robot.call)
     mapper = _blocking_mapper(Robot.mapper)
     live_map = _blocking_live_map(Robot.live_map)
+    store_object = _blocking(Robot.store_object)
 
     def subscribe(self, topic: str) -> BlockingUpdates:
         """Ask for the updates of *topic*; iterate over what is returned.  See `Robot.subscribe`."""

@@ -45,7 +45,7 @@ def test_has_the_public_methods_of_the_robot():
     assert public(client_sdk.BlockingRobot) == public(client_sdk.Robot) - for_loops_only
 
 
-@pytest.mark.parametrize("method", ["call", "solve_pnp", "close"])
+@pytest.mark.parametrize("method", ["call", "solve_pnp", "store_object", "close"])
 def test_takes_the_same_arguments_as_the_robot(method):
     ours, theirs = (getattr(kind, method) for kind in (client_sdk.BlockingRobot, client_sdk.Robot))
 
