@@ -223,6 +223,18 @@ class _Errors:
         matters = cost_m > max(_LEAST_COST_M, _COST_OF_NOISE * self.found.noise_m)
         return (rows if matters or kind is FaultKind.DEPTH_DELAY else []), cost_m
 
+    def with_the_other(self, rows: list[int]) -> list[int]:
+        """Return both focal lengths where one is certain and the other is wrong alike by a deviation.
+
+        One of two corrected alone bends a map more: 7.4 cm instead of 6.5 where both were 6 % too small.
+        """
+        first = self.values[rows[0]]
+        return [
+            row
+            for row in _ROWS[FaultKind.FOCAL_LENGTH]
+            if row in rows or self.values[row] * np.sign(first) > self.deviations[row]
+        ]
+
     def worst(self, rows: list[int]) -> int:
         return max(rows, key=lambda row: abs(self.values[row]) / self.deviations[row])
 
@@ -235,7 +247,10 @@ def _focal(errors: _Errors) -> Finding | None:
     worst = errors.worst(rows)
     names = {row: UNKNOWNS[row] for row in rows}
     relative = {row: math.exp(-values[row]) - 1.0 for row in rows}
-    right = {names[row]: getattr(camera, names[row]) * math.exp(values[row]) for row in rows}
+    right = {
+        UNKNOWNS[row]: getattr(camera, UNKNOWNS[row]) * math.exp(values[row])
+        for row in errors.with_the_other(rows)
+    }
     told = " and ".join(
         f"{names[row]} is {abs(relative[row]):.1%} too {_size(relative[row])} (+- {deviations[row]:.1%})"
         for row in rows

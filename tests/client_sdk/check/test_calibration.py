@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from unittest.mock import Mock
+
 import numpy as np
 import pytest
 from made_drives import Made, make_store
 
-from client_sdk.check.calibration import CalibrationJudgement, judge_calibration
+from client_sdk.check.calibration import CalibrationJudgement, _Errors, judge_calibration
 from client_sdk.check.drive_model import DepthReading, drive_model
 from client_sdk.check.findings import FaultKind, Finding, order
 from client_sdk.check.keyframes import KeyframeStore, tracks_of
@@ -69,6 +71,22 @@ def test_a_focal_length_comes_with_the_number_to_set() -> None:
 
     assert finding.correction["fx"] == pytest.approx(525.0 / 1.05, abs=6.0)
     assert "fx = " in finding.fix
+
+
+@pytest.mark.parametrize(
+    ("fy", "deviation", "rows"),
+    [(0.05, 0.03, [0, 1]), (0.02, 0.03, [0]), (-0.05, 0.03, [0])],
+    ids=["wrong alike", "not known", "wrong the other way"],
+)
+def test_both_focal_lengths_are_corrected_where_both_are_wrong_alike(
+    fy: float, deviation: float, rows: list[int]
+) -> None:
+    """One of them alone bends the map more; only fx is certain here."""
+    values, deviations = np.zeros(9), np.full(9, 0.01)
+    values[:2], deviations[:2] = (0.06, fy), (0.01, deviation)
+    errors = _Errors(values, deviations, found=Mock(), camera=Mock())
+
+    assert errors.with_the_other([0]) == rows
 
 
 def test_a_drive_that_does_not_turn_cannot_tell_the_focal_length_and_says_so() -> None:
