@@ -98,25 +98,11 @@ def test_results_that_were_not_checked_name_the_recording(
 def test_a_rendered_recording_with_a_wrong_depth_scale_is_corrected(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    cv2 = pytest.importorskip("cv2")
-    import numpy as np
-
-    from client_sdk.mapping import write_trajectory
+    pytest.importorskip("cv2")
     from client_sdk.simulator import render_frames, true_trajectory
+    from tests.tum_recording import write_tum
 
-    (tmp_path / "rgb").mkdir()
-    (tmp_path / "depth").mkdir()
-    names = {"rgb": "", "depth": ""}
-    for row, frame in enumerate(render_frames(0, 1, 40, 3)):
-        images = {"rgb": frame.rgb[:, :, ::-1], "depth": np.uint16(np.rint(1000 * frame.depth_m))}
-        for kind, image in images.items():
-            cv2.imwrite(str(tmp_path / kind / f"{row:03}.png"), image)
-            names[kind] += f"{frame.timestamp_s:.4f} {kind}/{row:03}.png\n"
-    for kind, lines in names.items():
-        (tmp_path / f"{kind}.txt").write_text(lines)
-    write_trajectory(tmp_path / "groundtruth.txt", true_trajectory(0, 1, 40, 3))
-    camera = {"fx": 525, "fy": 525, "cx": 319.5, "cy": 239.5, "width": 640, "height": 480}
-    (tmp_path / "intrinsics.json").write_text(json.dumps({**camera, "depth_scale": 1100}))
+    write_tum(tmp_path, render_frames(0, 1, 40, 3), true_trajectory(0, 1, 40, 3), depth_scale=1100)
 
     code = main(
         ["check", str(tmp_path), "--out", str(tmp_path / "out"), "--write", str(tmp_path / "better.json")]

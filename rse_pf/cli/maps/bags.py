@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rse_pf.cli.extras import require
-from rse_pf.cli.maps.from_camera import add_drive_arguments, check_drive, map_source
+from rse_pf.cli.maps.from_camera import add_drive_arguments, check_drive, errors_of, map_source
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import UsageError
 from rse_pf.terminal import at_work, counted, show
@@ -131,7 +131,7 @@ def _from_bag(args: argparse.Namespace, settings: PlatformSettings) -> int:
                     if topic is not None
                 },
                 "notes": list(bag.notes),
-                **_errors(path, bag.truth, bag.truth_kind),
+                **errors_of(path, bag.truth, bag.truth_kind),
             }
 
         reference = MotionReference.of_truth(bag.truth, bag.truth_kind, is_camera=False)
@@ -202,12 +202,6 @@ def _options(args: argparse.Namespace) -> BagOptions:
         pair_within_s=args.pair_within,
         use_depth=not args.no_depth,
     )
-
-
-def _errors(path: Trajectory, truth: Trajectory | None, kind: str) -> dict[str, Any]:
-    from rse_pf.experiments.results.trajectory_error import trajectory_figures
-
-    return {"truth": kind, **trajectory_figures(path, truth)}
 
 
 def _kind(out: Path, named: BagKind | None) -> BagKind:

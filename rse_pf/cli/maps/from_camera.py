@@ -12,7 +12,7 @@ import contextlib
 import json
 import signal
 import time
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
@@ -32,11 +32,16 @@ if TYPE_CHECKING:
     from client_sdk import MarkerScale, OdometryScale, Robot, TrackedFrame
     from client_sdk.cameras import FrameSource
     from client_sdk.check.motion import MotionReference
+    from client_sdk.datasets import Dataset
     from client_sdk.frontend import Frame
     from client_sdk.mapper import Mapper
     from client_sdk.mapping import Trajectory
+    from rse_pf.geometry import Array
 
-__all__ = ["add_drive_arguments", "add_from_camera_arguments", "check_drive", "map_source", "run_from_camera"]
+__all__ = [
+    "add_drive_arguments", "add_from_camera_arguments", "check_drive", "errors_of", "map_source",
+    "run_from_camera",
+]  # fmt: skip
 
 _ROBOT = "camera"
 _MOST = 0.5
@@ -97,6 +102,17 @@ def run_from_camera(args: argparse.Namespace, settings: PlatformSettings) -> int
     """Track the camera and write the results; the exit code is 1 if most frames have no pose."""
     scale = check_drive(args)
     from client_sdk.cameras import open_camera
+    from client_sdk.check.motion import MotionReference
+
+    recording = _recording(args)
+    reference = None
+    if recording is not None and args.check:
+        reference = MotionReference.of_truth(recording.truth, recording.truth_kind)
+
+    def about(path: Trajectory) -> dict[str, Any]:
+        if recording is None or recording.truth is None:
+            return {}
+        return errors_of(path, recording.truth, recording.truth_kind, recording.T_body_camera)
 
     with open_camera(
         args.source,
@@ -106,20 +122,25 @@ def run_from_camera(args: argparse.Namespace, settings: PlatformSettings) -> int
         camera=args.camera,
         imu=args.imu,
     ) as source:
-        return map_source(args, settings, source, scale, reference=_reference(args))
+        return map_source(args, settings, source, scale, about, reference)
 
 
-def _reference(args: argparse.Namespace) -> MotionReference | None:
-    """Return the true poses of a recording, for the check alone."""
+def _recording(args: argparse.Namespace) -> Dataset | None:
+    """Return the recording that the source is, for its true poses; None if it is a camera or a video."""
     from client_sdk.cameras.open_camera import is_recording
-    from client_sdk.check.motion import MotionReference
     from client_sdk.datasets import open_dataset
 
     path = Path(args.source)
-    if not args.check or not is_recording(path):
-        return None
-    recording = open_dataset(path, camera=args.camera, imu=args.imu)
-    return MotionReference.of_truth(recording.truth, recording.truth_kind)
+    return open_dataset(path, camera=args.camera, imu=args.imu) if is_recording(path) else None
+
+
+def errors_of(
+    path: Trajectory, truth: Trajectory | None, kind: str, T_body_camera: Array | None = None
+) -> dict[str, Any]:
+    """Return the errors of a path against what *kind* names, for a report; of the body where one is given."""
+    from rse_pf.experiments.results.trajectory_error import trajectory_figures
+
+    return {"truth": kind, **trajectory_figures(path, truth, T_body_camera)}
 
 
 def map_source(
@@ -158,6 +179,8 @@ def map_source(
     checked = check.finish(reference)
     if about is not None:
         report = {**report, **about(mapper.trajectory)}
+    if report["unit"] != "m" and report.get("ate_cm") is not None:
+        report |= dict.fromkeys(("path_m", "ate_cm", "rpe_cm"))  # a path without scale has no centimetres
     if checked is not None:
         report["check"] = checked
     kept, kept_line = _keep(args, mapper, kept_in, images)
@@ -177,6 +200,7 @@ def map_source(
         f"{report['frames']} frames, {report['lost_frames']} lost, {report['keyframes']} keyframes, "
         f"{report['map_points']} points; path {report['path']:.2f} {unit}; scale: {mapper.scale}"
         + ("" if trip is None else f"; round trip p50 {trip} ms"),
+        *error_lines(report),
         *frames.lines(),
         *check.lines(checked),
         f"results: {args.out}/map.ply, map.png, trajectory.txt, {FRAMES_FILE}, report.json",
@@ -187,6 +211,15 @@ def map_source(
             f"{report['frames'] - posed} of {report['frames']} frames have no pose", hint=_advice(mapper)
         )
     return 0
+
+
+def error_lines(report: Mapping[str, Any]) -> list[str]:
+    """Return the line that tells the error of a path; none without a truth, or without a scale."""
+    if report.get("ate_cm") is None:
+        return []
+    return [
+        f"error beside the {report['truth']}: ATE {report['ate_cm']:.2f} cm, RPE {report['rpe_cm']:.2f} cm"
+    ]
 
 
 def _keep(

@@ -7,7 +7,7 @@ Pure functions: they change neither trajectory and read no files.
 from __future__ import annotations
 
 import contextlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -240,10 +240,13 @@ def relative_error(
     )
 
 
-def trajectory_figures(estimate: Trajectory, truth: Trajectory | None) -> dict[str, float | None]:
+def trajectory_figures(
+    estimate: Trajectory, truth: Trajectory | None, T_body_camera: Array | None = None
+) -> dict[str, float | None]:
     """Return ``path_m``, ``ate_cm``, ``rpe_cm`` and ``rpe_deg``, rounded for a report.
 
-    The errors are None without a truth, or where fewer than three poses match it in time.
+    The errors are None without a truth, or where fewer than three poses match it in time.  With
+    *T_body_camera* ``(4, 4)`` they are those of the body.
     """
     figures: dict[str, float | None] = {
         "path_m": round(estimate.length_m, 3),
@@ -252,6 +255,11 @@ def trajectory_figures(estimate: Trajectory, truth: Trajectory | None) -> dict[s
         "rpe_deg": None,
     }
     if truth is not None:
+        if T_body_camera is not None:
+            estimate, truth = (
+                replace(each, T_world_camera=body_poses(each.T_world_camera, T_body_camera))
+                for each in (estimate, truth)
+            )
         with contextlib.suppress(UsageError):
             relative = relative_error(estimate, truth)
             figures["ate_cm"] = round(100 * absolute_error(estimate, truth).rmse_m, 4)

@@ -26,6 +26,7 @@ from rse_pf.pnp import refine_with_depth, solve_pnp
 from tests.client_sdk.mapper.flat_world import CAMERA, STEP_M, frame_at
 
 cv2 = pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
+from tests.tum_recording import write_tum  # noqa: E402
 
 
 class SolvingRobot:
@@ -99,6 +100,26 @@ def test_a_video_becomes_a_map_in_metres_by_odometry(
     assert len(read_ply(Path("out-camera/map.ply"))[0]) > 300
     assert Path("out-camera/map.png").stat().st_size > 1000
     assert "9 frames, 0 lost" in out
+
+
+@pytest.mark.parametrize("off_m", [0.0, 0.05])
+def test_a_recording_with_true_poses_tells_the_error_of_the_path(
+    folder: Path, capsys: pytest.CaptureFixture[str], off_m: float
+) -> None:
+    poses = np.tile(np.eye(4), (9, 1, 1))
+    poses[:, 0, 3] = STEP_M * np.arange(9)
+    poses[::2, 2, 3] = off_m
+    frames = [frame_at(row, depth=True) for row in range(9)]
+    write_tum(folder / "drive", frames, Trajectory(np.array([f.timestamp_s for f in frames]), poses))
+
+    code = main(["map", "from-camera", "drive", *PLATFORM])
+
+    out = capsys.readouterr().out
+    report = json.loads(Path("out-camera/report.json").read_text())
+    assert code == 0, out
+    assert report["truth"] == "ground truth"
+    assert report["ate_cm"] == pytest.approx(100 * off_m / 2, abs=0.3)
+    assert f"error beside the ground truth: ATE {report['ate_cm']:.2f} cm" in out
 
 
 def test_several_addresses_are_given_to_the_robot_which_takes_the_nearest(
