@@ -132,9 +132,10 @@ def _moved(zooms: Array, times_s: Array, common: Calibrated, zoomed: Calibrated)
     if _DEVIATIONS * deviation <= _TOLD:
         return ZoomJudgement(hint=hint)
     low, high = float(rates.min()) * span_s, float(rates.max()) * span_s
+    errors = "of depth or of the lens" if common.has_metres else "of the lens or its distortion"
     reason = (
         f"parts of the drive say that the focal length changes by {low:+.0%} to {high:+.0%}, as by errors "
-        f"of depth or of the lens: a change within {_DEVIATIONS * deviation:.0%}"
+        f"{errors}: a change within {_DEVIATIONS * deviation:.0%}"
     )
     return ZoomJudgement(
         hint=hint,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -76,3 +78,15 @@ def test_the_cost_is_the_distance_of_the_paths_after_alignment() -> None:
 
     assert found is not None
     assert found.cost_m == pytest.approx(0.018, rel=0.02)  # the rest is a turn
+
+
+def test_a_drive_without_depth_does_not_blame_depth() -> None:
+    common, times_s = adjusted(np.zeros(VIEWS), 0.01), np.arange(VIEWS) / 2.0
+    reasons = [
+        judge_zooms(adjusted(WANDERING, 0.001), times_s, replace(common, has_metres=has))
+        .cannot_tell[0]
+        .reason
+        for has in (True, False)
+    ]
+
+    assert ["of depth" in reason for reason in reasons] == [True, False]
