@@ -648,11 +648,19 @@ def _make_folder(folder: str) -> list[str]:
         except FileNotFoundError:
             break  # a remover took its parent meanwhile: the caller tries again
         except FileExistsError as error:
-            if os.path.lexists(made) and not os.path.isdir(made):
+            if _is_no_folder(made):
                 raise StoreError(
                     f"{os.path.basename(made)!r} is an object, not a folder", hint="choose another name"
                 ) from error
     return [os.path.dirname(made) or "." for made in reversed(missing)]
+
+
+def _is_no_folder(path: str) -> bool:
+    """Return whether something else than a folder is at *path*; False if a remover took it meanwhile."""
+    try:
+        return not stat.S_ISDIR(os.stat(path).st_mode)
+    except FileNotFoundError:
+        return os.path.islink(path)
 
 
 @contextlib.contextmanager

@@ -32,6 +32,7 @@ from rse_pf.object_store import (
     ObjectStore,
     RangedStore,
     Usage,
+    _is_no_folder,
     check_name,
     digest_of,
     open_store,
@@ -569,3 +570,21 @@ def test_a_digest_is_a_name() -> None:
 
     assert digest == "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
     assert check_name(digest) == digest
+
+
+@pytest.mark.parametrize(
+    ("kind", "expected"), [("nothing", False), ("folder", False), ("file", True), ("dangling link", True)]
+)
+def test_only_what_is_there_and_no_folder_is_called_an_object(
+    tmp_path: Path, kind: str, expected: bool
+) -> None:
+    """A folder that a remover took between two looks is made again."""
+    path = tmp_path / "a"
+    if kind == "folder":
+        path.mkdir()
+    elif kind == "file":
+        path.write_bytes(b"")
+    elif kind == "dangling link":
+        path.symlink_to(tmp_path / "gone")
+
+    assert _is_no_folder(str(path)) is expected
