@@ -222,9 +222,6 @@ def deviations_of_parts(observed: DriveObservations, found: Calibrated, free: tu
         observed: As it was adjusted.
         found: The result for the whole drive.
         free: As it was adjusted.
-
-    Source:
-        DerSimonian and Laird, Controlled Clinical Trials 1986, Sect. 2: the variance between studies.
     """
     k = len(found.T_camera_world)
     count = min(_MOST_PARTS, k // _LEAST_OF_PART)
@@ -241,12 +238,22 @@ def deviations_of_parts(observed: DriveObservations, found: Calibrated, free: tu
     if len(values) < 2:
         return total
     at = [UNKNOWNS.index(name) for name in free]
-    x, w = np.array(values)[:, at], 1.0 / np.maximum(np.array(variances)[:, at], 1e-18)
-    mean = (w * x).sum(axis=0) / w.sum(axis=0)
-    excess = (w * (x - mean) ** 2).sum(axis=0) - (len(x) - 1)
-    between = np.maximum(excess, 0.0) / (w.sum(axis=0) - (w**2).sum(axis=0) / w.sum(axis=0))
-    total[at] = np.sqrt(between / len(x))
+    total[at] = disagreement(np.array(values)[:, at], np.array(variances)[:, at])
     return total
+
+
+def disagreement(values: Array, variances: Array) -> Array:
+    """Return by what parts disagree beyond their ``(p, n)`` variances: the ``(n,)`` deviation of the mean.
+
+    Source:
+        DerSimonian and Laird, Controlled Clinical Trials 1986, Sect. 2: the variance between studies.
+    """
+    w = 1.0 / np.maximum(variances, 1e-18)
+    mean = (w * values).sum(axis=0) / w.sum(axis=0)
+    excess = (w * (values - mean) ** 2).sum(axis=0) - (len(values) - 1)
+    between = np.maximum(excess, 0.0) / (w.sum(axis=0) - (w**2).sum(axis=0) / w.sum(axis=0))
+    deviations: Array = np.sqrt(between / len(values))
+    return deviations
 
 
 def _part_of(

@@ -21,40 +21,35 @@ Size = Annotated[int, msgspec.Meta(gt=0)]
 Text = Annotated[str, msgspec.Meta(min_length=1)]
 
 
-class FrameSchema(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
+class IntrinsicsSchema(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
+    """What the file says for all frames, or a frame for itself."""
+
+    fl_x: Positive | msgspec.UnsetType = msgspec.UNSET
+    fl_y: Positive | msgspec.UnsetType = msgspec.UNSET
+    cx: Positive | msgspec.UnsetType = msgspec.UNSET
+    cy: Positive | msgspec.UnsetType = msgspec.UNSET
+    w: Size | msgspec.UnsetType = msgspec.UNSET
+    h: Size | msgspec.UnsetType = msgspec.UNSET
+    k1: float | msgspec.UnsetType = msgspec.UNSET
+    k2: float | msgspec.UnsetType = msgspec.UNSET
+    p1: float | msgspec.UnsetType = msgspec.UNSET
+    p2: float | msgspec.UnsetType = msgspec.UNSET
+
+
+class FrameSchema(IntrinsicsSchema, forbid_unknown_fields=True, kw_only=True):
     """A frame, as nerfstudio's page "Data conventions" documents it; it may have intrinsics of its own."""
 
     file_path: Text
     transform_matrix: Annotated[list[Row], msgspec.Meta(min_length=4, max_length=4)]
     depth_file_path: Text | msgspec.UnsetType = msgspec.UNSET
     mask_path: Text | msgspec.UnsetType = msgspec.UNSET
-    fl_x: Positive | msgspec.UnsetType = msgspec.UNSET
-    fl_y: Positive | msgspec.UnsetType = msgspec.UNSET
-    cx: Positive | msgspec.UnsetType = msgspec.UNSET
-    cy: Positive | msgspec.UnsetType = msgspec.UNSET
-    w: Size | msgspec.UnsetType = msgspec.UNSET
-    h: Size | msgspec.UnsetType = msgspec.UNSET
-    k1: float | msgspec.UnsetType = msgspec.UNSET
-    k2: float | msgspec.UnsetType = msgspec.UNSET
-    p1: float | msgspec.UnsetType = msgspec.UNSET
-    p2: float | msgspec.UnsetType = msgspec.UNSET
 
 
-class TransformsSchema(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
+class TransformsSchema(IntrinsicsSchema, forbid_unknown_fields=True, kw_only=True):
     """The file: intrinsics here, if all frames share them, or in each frame."""
 
     camera_model: Literal["OPENCV", "OPENCV_FISHEYE"]
     frames: Annotated[list[FrameSchema], msgspec.Meta(min_length=1)]
-    fl_x: Positive | msgspec.UnsetType = msgspec.UNSET
-    fl_y: Positive | msgspec.UnsetType = msgspec.UNSET
-    cx: Positive | msgspec.UnsetType = msgspec.UNSET
-    cy: Positive | msgspec.UnsetType = msgspec.UNSET
-    w: Size | msgspec.UnsetType = msgspec.UNSET
-    h: Size | msgspec.UnsetType = msgspec.UNSET
-    k1: float | msgspec.UnsetType = msgspec.UNSET
-    k2: float | msgspec.UnsetType = msgspec.UNSET
-    p1: float | msgspec.UnsetType = msgspec.UNSET
-    p2: float | msgspec.UnsetType = msgspec.UNSET
     applied_transform: Annotated[list[Row], msgspec.Meta(min_length=3, max_length=3)] | msgspec.UnsetType = (
         msgspec.UNSET
     )

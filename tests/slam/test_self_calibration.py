@@ -14,6 +14,7 @@ from rse_pf.slam.self_calibration import (
     Calibrated,
     DriveObservations,
     adjust_with_calibration,
+    disagreement,
     triangulated,
 )
 
@@ -166,3 +167,13 @@ def test_what_does_not_fit_is_refused_in_one_line() -> None:
         adjust_with_calibration(observed, T, np.zeros((POINTS, 3)), ("zoom",))
     with pytest.raises(BadRequest, match="different numbers of rows"):
         replace(observed, pixels=observed.pixels[:3])
+
+
+def test_parts_that_disagree_by_more_than_they_know_add_a_deviation() -> None:
+    """By hand: equal weights, squares about the mean of 2, one degree of freedom, between 0.02 - 0.01."""
+    values = np.array([[0.0, 0.0, 0.0], [0.2, 0.1, 0.2]])
+    variances = np.array([[0.01, 0.01, 1.0], [0.01, 0.01, 1.0]])
+
+    told = disagreement(values, variances)
+
+    np.testing.assert_allclose(told, [np.sqrt(0.01 / 2), 0.0, 0.0], atol=1e-12)

@@ -200,7 +200,7 @@ def map_source(
         f"{report['frames']} frames, {report['lost_frames']} lost, {report['keyframes']} keyframes, "
         f"{report['map_points']} points; path {report['path']:.2f} {unit}; scale: {mapper.scale}"
         + ("" if trip is None else f"; round trip p50 {trip} ms"),
-        *error_lines(report),
+        *accuracy_lines(report),
         *frames.lines(),
         *check.lines(checked),
         f"results: {args.out}/map.ply, map.png, trajectory.txt, {FRAMES_FILE}, report.json",
@@ -213,7 +213,7 @@ def map_source(
     return 0
 
 
-def error_lines(report: Mapping[str, Any]) -> list[str]:
+def accuracy_lines(report: Mapping[str, Any]) -> list[str]:
     """Return the line that tells the error of a path; none without a truth, or without a scale."""
     if report.get("ate_cm") is None:
         return []

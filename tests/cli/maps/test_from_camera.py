@@ -122,6 +122,24 @@ def test_a_recording_with_true_poses_tells_the_error_of_the_path(
     assert f"error beside the ground truth: ATE {report['ate_cm']:.2f} cm" in out
 
 
+def test_a_path_without_scale_has_no_error_in_centimetres(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    poses = np.tile(np.eye(4), (9, 1, 1))
+    poses[:, 0, 3] = STEP_M * np.arange(9)
+    frames = [frame_at(row, depth=True) for row in range(9)]
+    write_tum(folder / "drive", frames, Trajectory(np.array([f.timestamp_s for f in frames]), poses))
+
+    code = main(["map", "from-camera", "drive", "--no-depth", *PLATFORM])
+
+    out = capsys.readouterr().out
+    report = json.loads(Path("out-camera/report.json").read_text())
+    assert code == 0, out
+    assert report["unit"] != "m"
+    assert [report[name] for name in ("path_m", "ate_cm", "rpe_cm")] == [None, None, None]
+    assert "error beside" not in out
+
+
 def test_several_addresses_are_given_to_the_robot_which_takes_the_nearest(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -6,6 +6,7 @@ import asyncio
 import subprocess
 import sys
 from collections.abc import Awaitable, Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -365,6 +366,23 @@ def test_a_lost_robot_begins_a_segment_and_asks_where_it_is() -> None:
             robot.tell("alignment/me", alignment("me", None, segment=1, reason="too few links"))
             robot.tell("alignment/me", alignment("me", T_MAP_ODOM, segment=1))
             await robot.until(lambda: mapper.aligned_by == "map")  # what the map found wins
+
+    run(work)
+
+
+def test_a_robot_that_is_told_to_relocalise_asks_with_its_next_keyframe() -> None:
+    async def work(robot: FakeLiveRobot) -> None:
+        robot.foreign_keyframes = 50
+        patient = replace(QUICK, relocalise_s=3600.0, keyframe_m=0.01)
+        async with LiveMapper(robot, "lab", ask=solve, live=patient) as mapper:
+            await drive(mapper, range(2))
+            await robot.until(lambda: "live-relocalise" in robot.asked)
+            await drive(mapper, range(2, 4))
+            await robot.until(lambda: len(robot.kept) == 4)
+            assert robot.asked.count("live-relocalise") == 1
+            mapper.relocalise()
+            await drive(mapper, range(4, 5))
+            await robot.until(lambda: robot.asked.count("live-relocalise") == 2)
 
     run(work)
 
