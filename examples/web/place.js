@@ -63,7 +63,8 @@ async function ask(method, body) {
   const address = `${form.url.value}/localise/${encodeURIComponent(form.map.value)}${body ? `?${lens}` : ""}`;
   const reply = await fetch(address, { method, body, headers: { Authorization: `Bearer ${form.token.value}` } });
   if (reply.ok) return reply.json();
-  const { message, hint } = await reply.json();
+  // Not every proxy on the way answers errors in JSON.
+  const { message, hint } = await reply.json().catch(() => ({ message: `the platform answers ${reply.status}` }));
   if (!body || !PASSING.includes(reply.status)) throw new Error(hint ? `${message} (${hint})` : message);
   said.textContent = message;
   return null;

@@ -26,7 +26,9 @@ __all__ = ["Cloud", "KeyframeObjects"]
 
 _MAX_SOURCES = 4_000
 _MAX_POINTS = 3_000_000
-"""Before they are thinned: about 400 MB of the owner's memory."""
+"""Before they are thinned: about 400 MB of the owner's memory.  Of many keyframes each gives fewer."""
+_MAX_KEPT_BYTES = 128 << 20
+"""Of objects that are kept for the next version; what is beyond is read again."""
 _FARTHEST_M = 100.0
 """Points farther from their camera are left out: such a camera sees no metres."""
 _TIMES = 2
@@ -51,6 +53,7 @@ class KeyframeObjects:
         """Read nothing yet; *account* is told what is deleted."""
         self._store, self._account = store, account
         self._read: dict[str, bytes] = {}
+        self._read_bytes = 0
         self._culled: deque[tuple[str, str]] = deque()
         self._deleted: Counter[tuple[str, str]] = Counter()
 
@@ -63,16 +66,17 @@ class KeyframeObjects:
             StoreError: The store fails.
         """
         chosen = _even_share(sources)
-        known, self._read = self._read, {}
+        known, self._read, self._read_bytes = self._read, {}, 0
+        most = max(1, _MAX_POINTS // max(1, len(chosen)))
         clouds: list[Array] = []
         colours: list[Colours] = []
         for source in chosen:
             found = self._points(source, known)
             if found is not None:
-                clouds.append(transform(source.T_world_camera, found[0]).astype(np.float32))
-                colours.append(found[1])
-        each = -(-sum(map(len, clouds)) // _MAX_POINTS) or 1
-        points, joined = joined_cloud([cloud[::each] for cloud in clouds], [part[::each] for part in colours])
+                each = -(-len(found[0]) // most) or 1
+                clouds.append(transform(source.T_world_camera, found[0][::each]).astype(np.float32))
+                colours.append(found[1][::each])
+        points, joined = joined_cloud(clouds, colours)
         return Cloud(points=points, colours=joined, keyframes=len(clouds), missing=len(chosen) - len(clouds))
 
     def delete(self, objects: Iterable[tuple[str, str]]) -> None:
@@ -116,7 +120,9 @@ class KeyframeObjects:
                 return None
             if digest_of(data) != digest:
                 return None
-        self._read[name] = data
+        if self._read_bytes + len(data) <= _MAX_KEPT_BYTES:
+            self._read[name] = data
+            self._read_bytes += len(data)
         try:
             points, colours = decode_points(data, source.camera)
         except BadRequest:

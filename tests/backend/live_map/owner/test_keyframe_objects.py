@@ -17,6 +17,7 @@ from rse_pf.identity import RobotId, object_name
 from rse_pf.live_map.versions import PointSource
 from rse_pf.maps.registry import MapRegistry
 from rse_pf.object_store import MemoryStore
+from rse_pf.slam.cloud_deform import joined_cloud
 from rse_pf.slam.keyframe import Keyframe, encode_keyframe, make_features
 from rse_pf.slam.keyframe_points import ObjectReference, encode_points
 from rse_pf.wire.live_map import KeyframeRequest
@@ -134,6 +135,30 @@ def test_each_robot_has_its_share_of_a_map_with_many_keyframes(monkeypatch: pyte
 
     assert found.keyframes == 10
     assert {round(float(z)) for z in found.points[:, 2]} == {1, 3}
+
+
+def test_many_keyframes_of_many_points_take_no_more_memory_than_a_few(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """4,000 of the largest objects would be 640 MB of bytes and 1 GB of points."""
+    module = "rse_pf.backend.live_map.owner.keyframe_objects"
+    store = MemoryStore()
+    references = [stored(store, ONE, some_points(1.0 + 0.1 * number)) for number in range(10)]
+    monkeypatch.setattr(f"{module}._MAX_POINTS", 5 * 12 * 16)
+    monkeypatch.setattr(f"{module}._MAX_KEPT_BYTES", 3 * max(each.size for each in references))
+    keeper, joined = objects(store), []
+
+    def join(clouds: list[np.ndarray], colours: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+        joined.append(sum(map(len, clouds)))
+        return joined_cloud(clouds, colours)
+
+    monkeypatch.setattr(f"{module}.joined_cloud", join)
+    found = [keeper.cloud([source(ONE, each) for each in references]) for _ in range(2)]
+
+    assert [each.keyframes for each in found] == [10, 10]
+    assert joined == [5 * 12 * 16] * 2
+    assert sum(map(len, keeper._read.values())) <= 3 * max(each.size for each in references)
+    assert len(keeper._read) == 3
 
 
 def test_a_culled_keyframe_loses_its_objects_a_little_later() -> None:
