@@ -85,7 +85,8 @@ function draw({ keyframes, points, top_view: axes }, found) {
   const low = [0, 1].map((axis) => Math.min(...shown.map((place) => place[axis])));
   const high = [0, 1].map((axis) => Math.max(...shown.map((place) => place[axis])));
   const scale = (canvas.width - 2 * MARGIN_PX) / Math.max(high[0] - low[0], high[1] - low[1], 1);
-  const pixel = ([x, y]) => [MARGIN_PX + (x - low[0]) * scale, canvas.height - MARGIN_PX - (y - low[1]) * scale];
+  const middle = [0, 1].map((axis) => (low[axis] + high[axis]) / 2);
+  const pixel = ([x, y]) => [canvas.width / 2 + (x - middle[0]) * scale, canvas.height / 2 - (y - middle[1]) * scale];
   drawing.clearRect(0, 0, canvas.width, canvas.height);
   drawing.fillStyle = "#9ab";
   for (const place of points) drawing.fillRect(...pixel(place), 2, 2);
