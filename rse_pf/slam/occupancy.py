@@ -21,13 +21,13 @@ from rse_pf.errors import UsageError
 from rse_pf.geometry import Array, transform
 from rse_pf.maps.format import MapVersion
 from rse_pf.slam.inertial import upright_turn
-from rse_pf.slam.level_surfaces import up_of_surfaces
+from rse_pf.slam.level_surfaces import up_of_floor, up_of_surfaces
 
 __all__ = ["FREE", "OCCUPIED", "UNKNOWN", "GridOptions", "OccupancyGrid", "occupancy_files", "occupancy_grid"]
 
 OCCUPIED, UNKNOWN, FREE = 0, 205, 254
 """Values of cells, as grey levels of the image."""
-UpSource = Literal["the map", "--up", "the level surfaces", "the cameras"]
+UpSource = Literal["the map", "--up", "the floor", "the level surfaces", "the cameras"]
 
 _MAX_CELLS = 1 << 24
 _AROUND_M = 30.0
@@ -51,8 +51,8 @@ class GridOptions:
         robot_height_m: Points higher above the floor are no obstacle.
         step_m: Points lower above the floor are floor.
         floor_m: Height of the floor in the world whose z points up; None: the lowest large surface.
-        up: ``(3,)`` in the world of the map; None: as the map says, else across its level surfaces, which
-            are told from walls by how the cameras stand.
+        up: ``(3,)`` in the world of the map; None: as the map says, else across its floor, else across its
+            level surfaces, which are told from walls by how the cameras stand.
     """
 
     resolution_m: float = 0.05
@@ -181,7 +181,12 @@ def _up_of(version: MapVersion, options: GridOptions) -> tuple[Array, UpSource]:
             "this map does not say where up is, and its cameras do not agree", hint="name it: --up 0,0,1"
         )
     level = up_of_surfaces(version.points, mean / length)
-    return (mean / length, "the cameras") if level is None else (level, "the level surfaces")
+    rough: tuple[Array, UpSource] = (mean / length, "the cameras")
+    if level is not None:
+        rough = level, "the level surfaces"
+    places = np.array([keyframe.T_world_camera[:3, 3] for keyframe in version.keyframes])
+    floor = up_of_floor(version.points, rough[0], places)
+    return rough if floor is None else (floor, "the floor")
 
 
 def _check_size(extent_m: Array, options: GridOptions) -> None:

@@ -11,7 +11,7 @@ from slam.exact_maps import CAMERA, shares_right, world_map
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Array, exp_se3, transform
 from rse_pf.maps.format import Keyframe, MapVersion
-from rse_pf.slam.level_surfaces import up_of_surfaces
+from rse_pf.slam.level_surfaces import up_of_floor, up_of_surfaces
 from rse_pf.slam.occupancy import (
     FREE,
     OCCUPIED,
@@ -89,8 +89,8 @@ def test_without_gravity_up_is_found_across_the_floors_that_are_seen() -> None:
     grid = occupancy_grid(moved)
 
     up = grid.T_grid_world[:3, :3] @ tilted[:3, :3] @ [0.0, 0.0, 1.0]
-    assert grid.up_by == "the level surfaces"
-    assert np.degrees(np.arccos(up[2])) < 0.3
+    assert grid.up_by == "the floor"
+    assert np.degrees(np.arccos(up[2])) < 0.15
 
 
 def test_ramps_and_walls_do_not_tilt_what_is_level() -> None:
@@ -106,6 +106,39 @@ def test_ramps_and_walls_do_not_tilt_what_is_level() -> None:
     assert up is not None
     assert np.degrees(np.arccos(up[2])) < 0.1
     assert up_of_surfaces(wall.astype(np.float32), rough) is None
+
+
+def long_floor(tilt_deg: float, *, width_m: float = 4.0, step_m: float = 0.0) -> tuple[Array, Array]:
+    """Return a floor of 14 m with furniture of 0.4 to 0.8 m on a third of it, tilted; and camera places."""
+    rng = np.random.default_rng(6)
+    points = np.column_stack([rng.uniform(0, 14, 60_000), rng.uniform(0, width_m, 60_000), np.zeros(60_000)])
+    points[:, 2] = np.where(points[:, 0] > 7.0, step_m, 0.0) + 0.008 * rng.standard_normal(60_000)
+    stands = (np.floor(points[:, 0] / 0.7).astype(int) % 3 == 0) & (points[:, 1] > 1.0)
+    points[stands, 2] += rng.uniform(0.4, 0.8, stands.sum())
+    places = np.column_stack([np.linspace(1, 13, 20), np.full(20, width_m / 2), np.full(20, 1.2)])
+    turn = exp_se3(np.array([0, 0, 0, 0.0, np.radians(tilt_deg), 0.0]))
+    return transform(turn, points), transform(turn, places)
+
+
+@pytest.mark.parametrize("tilt_deg", [-3.0, 0.0, 1.6])
+def test_a_long_floor_tells_up_better_than_its_parts(tilt_deg: float) -> None:
+    points, places = long_floor(tilt_deg)
+
+    up = up_of_floor(points.astype(np.float32), np.array([0.0, 0.0, 1.0]), places)
+
+    assert up is not None
+    wanted = exp_se3(np.array([0, 0, 0, 0.0, np.radians(tilt_deg), 0.0]))[:3, 2]
+    assert np.degrees(np.arccos(min(1.0, float(up @ wanted)))) < 0.1
+
+
+@pytest.mark.parametrize(
+    "floor", [long_floor(8.0), long_floor(0.0, width_m=0.7), long_floor(0.0, step_m=0.9)],
+    ids=["a ramp", "a corridor of 0.7 m", "two storeys"],
+)  # fmt: skip
+def test_a_floor_that_tells_no_up_is_not_asked(floor: tuple[Array, Array]) -> None:
+    points, places = floor
+
+    assert up_of_floor(points.astype(np.float32), np.array([0.0, 0.0, 1.0]), places) is None
 
 
 def test_floor_is_free_obstacles_are_occupied_and_the_rest_is_unknown() -> None:

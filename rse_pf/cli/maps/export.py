@@ -63,7 +63,7 @@ def add_export_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add(
         "--up", metavar="X,Y,Z",
-        help="occupancy: up in the world of the map (default: by an IMU, else across level surfaces)",
+        help="occupancy: up in the world of the map (default: by an IMU, else across the floor)",
     )  # fmt: skip
 
 

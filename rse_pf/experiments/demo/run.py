@@ -360,7 +360,7 @@ def _draw_live_map(folder: Path, version: MapVersion) -> None:
     by_robot: dict[str, list[Array]] = {}
     for keyframe in version.keyframes:
         by_robot.setdefault(keyframe.robot, []).append(keyframe.T_world_camera)
-    paths = [RobotPath(name=name, T_world_camera=np.array(poses)) for name, poses in by_robot.items()]
+    paths = [RobotPath(name=name, T_world_camera=np.array(poses)) for name, poses in sorted(by_robot.items())]
     caption = f"{len(paths)} robots, {len(version.keyframes)} keyframes, {len(version.points):,} points"
     draw_map(folder / "map.png", version.points, version.colours, paths, f"live map: {caption}")
 
