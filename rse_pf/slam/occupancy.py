@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rse_pf.errors import UsageError
-from rse_pf.geometry import Array, transform
+from rse_pf.geometry import Array, to_quaternion, transform
 from rse_pf.maps.format import MapVersion
 from rse_pf.slam.inertial import upright_turn
 from rse_pf.slam.level_surfaces import up_of_floor, up_of_surfaces
@@ -155,6 +155,8 @@ def occupancy_files(grid: OccupancyGrid) -> dict[str, bytes]:
         f"# The floor is at z = {grid.floor_m:.3f} m; up is by {grid.up_by}.",
         "# T_grid_world, from the world of the map to that of this grid:",
         *(f"#   [{row}]" for row in rows),
+        "# The same for ROS 2, with the frame `map` of the bridge below the frame `plan` of this grid:",
+        f"#   {_as_static_transform(grid.T_grid_world)}",
         "image: map.pgm",
         "mode: trinary",
         f"resolution: {grid.resolution_m:.6g}",
@@ -164,6 +166,15 @@ def occupancy_files(grid: OccupancyGrid) -> dict[str, bytes]:
         "free_thresh: 0.196",
     ]
     return {"map.pgm": image, "map.yaml": ("\n".join(lines) + "\n").encode("ascii")}
+
+
+def _as_static_transform(T_grid_world: Array) -> str:
+    x, y, z = T_grid_world[:3, 3]
+    qx, qy, qz, qw = to_quaternion(T_grid_world[:3, :3])
+    return (
+        f"ros2 run tf2_ros static_transform_publisher --x {x:.6f} --y {y:.6f} --z {z:.6f} "
+        f"--qx {qx:.9f} --qy {qy:.9f} --qz {qz:.9f} --qw {qw:.9f} --frame-id plan --child-frame-id map"
+    )
 
 
 def _up_of(version: MapVersion, options: GridOptions) -> tuple[Array, UpSource]:
