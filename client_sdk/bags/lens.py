@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,10 +11,12 @@ import numpy as np
 from client_sdk.frontend import load_opencv
 from client_sdk.image_map import ImageMap
 from client_sdk.rigs.intrinsics import Intrinsics
+from client_sdk.rigs.rig import Rig
+from client_sdk.rigs.rig_file import read_calibration
 from rse_pf.errors import InvalidCamera, UsageError
 from rse_pf.geometry import Array, Camera
 
-__all__ = ["Lens", "Rectifier", "lens_of", "numbers_of"]
+__all__ = ["Lens", "Rectifier", "lens_of", "lens_or_rig", "numbers_of"]
 
 _BROWN = {"plumb_bob", "rational_polynomial", "rational_polynomial_thin_prism", "brown_conrady"}
 _FISHEYE = {"equidistant", "kannala_brandt4", "fisheye"}
@@ -36,6 +39,16 @@ class Lens:
             distortion=intrinsics.distortion,
             is_fisheye=intrinsics.model == "fisheye",
         )
+
+
+def lens_or_rig(file: Path) -> tuple[Lens | None, Rig | None]:
+    """Return what a file of intrinsics, or of a rig, holds: ``lens`` and ``rig`` of `BagOptions`.
+
+    Raises:
+        UsageError: The file is neither.
+    """
+    own = read_calibration(file)
+    return (Lens.of(own), None) if isinstance(own, Intrinsics) else (None, own)
 
 
 def lens_of(message: Any, topic: str, *, is_rectified: bool) -> Lens:

@@ -81,13 +81,10 @@ def open_camera(
             hint="read it with rse-pf map from-bag (extra bags)",
         )
     if is_recording(path):
-        dataset = open_dataset(path, camera=camera, imu=imu)
+        if intrinsics is not None and not isinstance(intrinsics, Path | str):
+            raise UsageError(f"{path} is a recording", hint="name a file of intrinsics, or leave it out")
+        dataset = open_dataset(path, camera=camera, imu=imu, intrinsics=intrinsics)
         dataset.check()
-        if isinstance(own, Rig) or (own is not None and own.camera != dataset.camera):
-            raise UsageError(
-                f"{path} has intrinsics of its own, and they differ",
-                hint="leave --intrinsics out for recordings",
-            )
         dataset = dataset if rate_hz is None else dataset.thinned(rate_hz)
         return source_of_frames(
             word, dataset, dataset.camera,

@@ -336,7 +336,10 @@ def _delay(errors: _Errors) -> Finding | None:
         sentence=(
             f"{which} is {1e3 * abs(delay_s):.0f} ms late (+- {1e3 * deviation_s:.0f}) beside {other}"
         ),
-        fix=f"pair each colour image with the depth image {1e3 * delay_s:+.0f} ms from it",
+        fix=(
+            f"pair each colour image with the depth image whose stamp is {1e3 * abs(delay_s):.0f} ms "
+            f"{'later' if delay_s > 0 else 'earlier'}"
+        ),
     )  # fmt: skip
 
 

@@ -13,6 +13,7 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -21,7 +22,8 @@ import numpy.typing as npt
 from client_sdk.check.findings import CannotTell, FaultKind, Finding
 from client_sdk.imu.checks import RateCheck, check_rates, trouble_of_samples
 from client_sdk.imu.history import ImuHistory
-from client_sdk.mapping import Trajectory
+from client_sdk.mapping import Trajectory, read_trajectory
+from rse_pf.errors import UsageError
 from rse_pf.geometry import Array, inverse, log_se3, rotation_angle_deg
 
 __all__ = ["CameraMotion", "MotionReference", "check_imu", "check_motion", "nothing_to_compare"]
@@ -68,6 +70,24 @@ class MotionReference:
             return None
         name = "the truth" if kind == "ground truth" else "the reference poses"
         return cls(path=path, name=name, is_camera=is_camera)
+
+    @classmethod
+    def beside(cls, source: Path | str) -> MotionReference | None:
+        """Return ``odometry.txt`` (TUM format) in the folder of a recording; None where there is none.
+
+        Raises:
+            UsageError: The file is broken, or holds fewer than two poses.
+        """
+        file = Path(source) / "odometry.txt"
+        return cls.of_file(file) if file.is_file() else None
+
+    @classmethod
+    def of_file(cls, file: Path) -> MotionReference:
+        """Return a path in TUM format, of what the camera is mounted on; raises as `beside`."""
+        path = read_trajectory(file)
+        if len(path) < 2:
+            raise UsageError(f"{file} holds {len(path)} poses", hint="a motion needs 2 or more")
+        return cls(path=path, is_camera=False)
 
 
 def nothing_to_compare(*, has_depth: bool) -> list[CannotTell]:

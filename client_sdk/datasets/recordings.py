@@ -14,7 +14,7 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from client_sdk.bags import Bag, BagOptions, is_bag, open_bag
+from client_sdk.bags import Bag, BagOptions, is_bag, lens_or_rig, open_bag
 from client_sdk.bags.index import pair_stamps
 from client_sdk.datasets import nyu
 from client_sdk.datasets.dataset import Dataset
@@ -51,6 +51,7 @@ def open_dataset(
     scene: str | None = None,
     camera: CameraChoice | None = None,
     imu: bool | None = None,
+    intrinsics: Path | str | None = None,
 ) -> Dataset:
     """Detect the format of *path* and return its frames; images are read later.
 
@@ -63,20 +64,29 @@ def open_dataset(
         scene: Of the labelled file.
         camera: ``stereo`` for both cameras of a rig, ``left`` for one; None for both where there are two.
         imu: Whether frames carry samples of the IMU; None for yes where there is one.
+        intrinsics: File of the camera, in the place of ``intrinsics.json`` of a folder in TUM layout (it
+            names ``depth_scale`` then) or of what a bag says.
 
     Raises:
-        UsageError: The path is none of these, a part is missing or broken, or it has no such camera or IMU.
+        UsageError: The path is none of these, has a calibration of its own format beside *intrinsics*, a
+            part is missing or broken, or it has no such camera or IMU.
         MissingExtra: OpenCV, h5py or rosbags is needed and not installed.
     """
     path = Path(path)
+    if intrinsics is not None and not (_is_bag(path) or (path / "rgb.txt").is_file()):
+        raise UsageError(
+            f"{path} has a calibration of its own format", hint="leave out --intrinsics, or change that file"
+        )
     if scene is None and is_euroc(path):
         return open_euroc(path, camera=camera, imu=imu)
     if scene is None and is_kitti(path):
         return open_kitti(path, camera=camera, imu=imu)
     if scene is None and _is_bag(path):
         use_stereo = None if camera is None else camera == "stereo"
-        return dataset_of_bag(open_bag(path, BagOptions(use_stereo=use_stereo, use_imu=imu)))
-    dataset = _open_single(path, scene)
+        lens, rig = (None, None) if intrinsics is None else lens_or_rig(Path(intrinsics))
+        options = BagOptions(use_stereo=use_stereo, use_imu=imu, lens=lens, rig=rig)
+        return dataset_of_bag(open_bag(path, options))
+    dataset = _open_single(path, scene, None if intrinsics is None else Path(intrinsics))
     if camera == "stereo":
         raise UsageError(f"{path} has one camera", hint="leave out --camera stereo")
     if imu:
@@ -88,7 +98,7 @@ def _is_bag(path: Path) -> bool:
     return is_bag(path) and not (path / "rgb.txt").is_file()
 
 
-def _open_single(path: Path, scene: str | None) -> Dataset:
+def _open_single(path: Path, scene: str | None, intrinsics: Path | None) -> Dataset:
     if path.is_file():
         if path.suffix != ".mat":
             raise UsageError(f"{path} is not a recording", hint="name a folder, a ROS bag or the .mat file")
@@ -102,7 +112,7 @@ def _open_single(path: Path, scene: str | None) -> Dataset:
         raise UsageError(f"{path} has no scenes", hint="name scenes for the labelled .mat file only")
     if not (path / "rgb.txt").exists() and any(path.glob("d-*.pgm")):
         return _open_raw(path)
-    return _open_tum(path)
+    return _open_tum(path, intrinsics or path / "intrinsics.json")
 
 
 def dataset_of_bag(bag: Bag) -> Dataset:
@@ -135,7 +145,7 @@ def associate_stamps(
 # --- TUM layout --------------------------------------------------------------------------------
 
 
-def _open_tum(folder: Path) -> Dataset:
+def _open_tum(folder: Path, of_camera: Path) -> Dataset:
     colours, depths = _read_list(folder, "rgb.txt"), _read_list(folder, "depth.txt")
     pairs = associate_stamps(
         [stamp for stamp, _ in colours], [stamp for stamp, _ in depths], _MAX_STAMP_DIFFERENCE_S
@@ -150,7 +160,7 @@ def _open_tum(folder: Path) -> Dataset:
             f"no colour image of {folder} has a depth image within {_MAX_STAMP_DIFFERENCE_S:g} s",
             hint="check that rgb.txt and depth.txt use the same clock",
         )
-    intrinsics, notes = _intrinsics(folder)
+    intrinsics, notes = _intrinsics(folder, of_camera)
     camera, undistort = intrinsics.camera, Undistortion(intrinsics)
 
     def read(row: int) -> Frame:
@@ -210,11 +220,10 @@ def _read_list(folder: Path, name: str) -> list[tuple[float, str]]:
     return sorted(entries)
 
 
-def _intrinsics(folder: Path) -> tuple[Intrinsics, tuple[str, ...]]:
-    """Return the intrinsics, and notes on what was assumed without intrinsics.json."""
-    path = folder / "intrinsics.json"
-    if path.exists():
-        return read_intrinsics(path, with_depth_scale=True), ()
+def _intrinsics(folder: Path, file: Path) -> tuple[Intrinsics, tuple[str, ...]]:
+    """Return the intrinsics of a file, and notes on what was assumed where the folder has none."""
+    if file.exists() or file.parent != folder:
+        return read_intrinsics(file, with_depth_scale=True), ()
     name = next(key for key in _FREIBURG if key in folder.resolve().name)
     fx, fy, cx, cy, distortion = _FREIBURG[name]
     camera = Camera(fx=fx, fy=fy, cx=cx, cy=cy, width=640, height=480)

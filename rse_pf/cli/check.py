@@ -49,10 +49,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add = parser.add_argument
     add("source", metavar="SOURCE", help="a recording, bag, folder, video, device, or results of a map")
-    add("--intrinsics", type=Path, metavar="FILE", help="of the camera, if the source has none of its own")
+    add("--intrinsics", type=Path, metavar="FILE", help="of the camera, instead of the file in the source")
     add(
         "--odometry", type=Path, metavar="FILE",
-        help="compare the motion with this path (TUM format; default: the truth of the source)",
+        help="compare the motion with this path (TUM format; default: truth or odometry.txt of the source)",
     )  # fmt: skip
     add_sensor_arguments(parser)
     add("--no-depth", action="store_true", help="use the colours only")
@@ -108,8 +108,10 @@ def _show_results(args: argparse.Namespace, file: Path) -> int:
             f"{args.source} was not checked while it was made, and its results have no images",
             hint="check the recording itself; only maps of cameras, recordings and bags are checked",
         )
-    if args.write is not None or args.out is not None:
-        raise UsageError("results of a map are shown only", hint="check the recording for --write and --out")
+    unused = ("write", "out", "odometry", "intrinsics", "frames")
+    given = next((name for name in unused if getattr(args, name) is not None), None)
+    if given is not None:
+        raise UsageError(f"results of a map are shown only: no --{given}", hint="check the recording itself")
     if args.json:
         show_json(told, indent=2)
     else:
@@ -128,37 +130,34 @@ def _checked(args: argparse.Namespace, settings: PlatformSettings) -> tuple[Chec
 
     path = Path(args.source)
     if not (path.exists() and (is_recording(path) or is_bag(path) or (path / "rgb.txt").is_file())):
-        reference = None if args.odometry is None else _odometry(args.odometry)
+        reference = _reference(args, None)
         with open_camera(
             args.source, intrinsics=args.intrinsics, depth=not args.no_depth, camera=args.camera, imu=args.imu
         ) as source:
             most = args.frames or (_MOST_LIVE if str(args.source).isdigit() else None)
             report = _watched(source, settings, reference, None, has_depth=source.has_depth, most=most)
             return report, _base(args, Intrinsics(camera=source.camera))
-    dataset = open_dataset(path, camera=args.camera, imu=args.imu)
+    dataset = open_dataset(path, camera=args.camera, imu=args.imu, intrinsics=args.intrinsics)
     show(*(f"note: {note}" for note in dataset.notes), error=True)
     fault: PairFault | None = None
     if dataset.has_stereo:
         from client_sdk.rigs.checks import fault_of_pairs, spread_pairs
 
         fault = fault_of_pairs(spread_pairs(dataset.rows, dataset.read))
-    if args.odometry is not None:
-        reference = _odometry(args.odometry)
-    else:
-        reference = MotionReference.of_truth(dataset.truth, dataset.truth_kind, is_camera=not is_bag(path))
+    truth = MotionReference.of_truth(dataset.truth, dataset.truth_kind, is_camera=not is_bag(path))
+    reference = _reference(args, truth)
     has_depth = dataset.has_depth and not args.no_depth
     report = _watched(iter(dataset), settings, reference, fault, has_depth=has_depth, most=args.frames)
     return report, _base(args, Intrinsics(camera=dataset.camera))
 
 
-def _odometry(path: Path) -> MotionReference:
+def _reference(args: argparse.Namespace, truth: MotionReference | None) -> MotionReference | None:
+    """Return what the user names, else the truth, else the odometry in the folder."""
     from client_sdk.check.motion import MotionReference
-    from client_sdk.mapping import read_trajectory
 
-    read = read_trajectory(path)
-    if len(read) < 2:
-        raise UsageError(f"{path} holds {len(read)} poses", hint="a motion needs 2 or more")
-    return MotionReference(path=read, is_camera=False)
+    if args.odometry is not None:
+        return MotionReference.of_file(args.odometry)
+    return truth or MotionReference.beside(args.source)
 
 
 def _watched(

@@ -95,6 +95,16 @@ def test_results_that_were_not_checked_name_the_recording(
     assert "check the recording itself" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("option", ["--odometry", "--intrinsics", "--write", "--out"])
+def test_results_of_a_map_take_no_other_option(
+    option: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "report.json").write_text(json.dumps({"check": {"findings": [], "frames": 9}}))
+
+    assert main(["check", str(tmp_path), option, str(tmp_path / "x")]) == 2
+    assert f"no {option}" in capsys.readouterr().err
+
+
 def test_a_rendered_recording_with_a_wrong_depth_scale_is_corrected(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -114,3 +124,17 @@ def test_a_rendered_recording_with_a_wrong_depth_scale_is_corrected(
     assert report["findings"][0]["value"] == pytest.approx(0.1, abs=0.02)
     assert json.loads((tmp_path / "better.json").read_text())["depth_scale"] == pytest.approx(1000, rel=0.02)
     assert "depth scale is set" in capsys.readouterr().out
+
+
+def test_odometry_beside_the_images_knows_metres(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("cv2")
+    from client_sdk.simulator import render_frames, true_trajectory
+    from tests.tum_recording import write_tum
+
+    write_tum(tmp_path, render_frames(0, 1, 40, 3), true_trajectory(0, 1, 40, 3), depth_scale=1100)
+    (tmp_path / "groundtruth.txt").rename(tmp_path / "odometry.txt")
+    code = main(["check", str(tmp_path)])
+    assert (code, "depth scale is set" in capsys.readouterr().out) == (1, True)
+    (tmp_path / "odometry.txt").write_text("0 0 0 0 0 0 0 1\n")
+    assert main(["check", str(tmp_path)]) == 2
+    assert "holds 1 poses" in capsys.readouterr().err

@@ -183,11 +183,9 @@ def export_bag(file: Path, version: MapVersion) -> int:
 
 
 def _options(args: argparse.Namespace) -> BagOptions:
-    from client_sdk.bags import BagOptions, Lens
-    from client_sdk.rigs.intrinsics import Intrinsics
-    from client_sdk.rigs.rig_file import read_calibration
+    from client_sdk.bags import BagOptions, lens_or_rig
 
-    own = None if args.intrinsics is None else read_calibration(args.intrinsics)
+    lens, rig = (None, None) if args.intrinsics is None else lens_or_rig(args.intrinsics)
     return BagOptions(
         colour=args.colour,
         depth=args.depth,
@@ -196,8 +194,8 @@ def _options(args: argparse.Namespace) -> BagOptions:
         right=args.right,
         imu=args.imu,
         use_imu=False if args.no_imu else None,
-        lens=Lens.of(own) if isinstance(own, Intrinsics) else None,
-        rig=None if isinstance(own, Intrinsics) else own,
+        lens=lens,
+        rig=rig,
         depth_scale=args.depth_scale,
         pair_within_s=args.pair_within,
         use_depth=not args.no_depth,

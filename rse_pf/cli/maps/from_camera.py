@@ -106,8 +106,14 @@ def run_from_camera(args: argparse.Namespace, settings: PlatformSettings) -> int
 
     recording = _recording(args)
     reference = None
+    if args.check:
+        try:
+            reference = MotionReference.beside(args.source)
+        except UsageError as error:
+            show(f"note: {error}: it is not compared with the motion", error=True)
     if recording is not None and args.check:
-        reference = MotionReference.of_truth(recording.truth, recording.truth_kind)
+        truth = MotionReference.of_truth(recording.truth, recording.truth_kind)
+        reference = truth or reference
 
     def about(path: Trajectory) -> dict[str, Any]:
         if recording is None or recording.truth is None:
@@ -131,7 +137,9 @@ def _recording(args: argparse.Namespace) -> Dataset | None:
     from client_sdk.datasets import open_dataset
 
     path = Path(args.source)
-    return open_dataset(path, camera=args.camera, imu=args.imu) if is_recording(path) else None
+    if not is_recording(path):
+        return None
+    return open_dataset(path, camera=args.camera, imu=args.imu, intrinsics=args.intrinsics)
 
 
 def errors_of(

@@ -270,6 +270,29 @@ def test_an_image_of_another_size_than_the_camera_is_refused(
     assert "intrinsics.json" in told.value.hint
 
 
+def test_intrinsics_that_are_named_count_before_those_of_the_folder(tmp_path: Path):
+    folder = write_tum(tmp_path / "x", [0.0])
+    own = json.loads((folder / "intrinsics.json").read_text())
+    named = tmp_path / "named.json"
+    named.write_text(json.dumps({**own, "fx": own["fx"] + 7, "depth_scale": 2 * own["depth_scale"]}))
+
+    before, after = open_dataset(folder), open_dataset(folder, intrinsics=named)
+
+    assert after.camera.fx == before.camera.fx + 7
+    assert np.array_equal(2 * next(iter(after)).depth_m, next(iter(before)).depth_m)
+
+
+def test_named_intrinsics_of_a_folder_with_depth_say_its_scale(tmp_path: Path):
+    folder = write_tum(tmp_path / "x", [0.0])
+    own = json.loads((folder / "intrinsics.json").read_text())
+    del own["depth_scale"]
+    (tmp_path / "named.json").write_text(json.dumps(own))
+    with pytest.raises(UsageError, match="depth_scale"):
+        open_dataset(folder, intrinsics=tmp_path / "named.json")
+    with pytest.raises(UsageError, match="there is no"):
+        open_dataset(folder, intrinsics=tmp_path / "none.json")
+
+
 def test_assumed_intrinsics_are_told(tmp_path: Path):
     (note,) = open_dataset(write_tum(tmp_path / "mine", [0.0], intrinsics=False)).notes
     assert "has no intrinsics.json, so a Kinect's are assumed: fx 525 fy 525" in note
