@@ -16,7 +16,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from rse_pf.backend.sandbox.ipc import encode_message
+from rse_pf.ipc import encode_message
 from rse_pf.live_map.versions import encode_stored
 from rse_pf.maps.format import Edge, MapVersion, decode_map, encode_map
 from rse_pf.pnp.problems import DEGENERATE, KINECT, make_degenerate, make_problem, make_two_views

@@ -14,7 +14,8 @@ from pathlib import Path
 
 __all__ = [
     "PR_CAPBSET_DROP", "PR_SET_CHILD_SUBREAPER", "PR_SET_DUMPABLE", "PR_SET_NO_NEW_PRIVS", "PR_SET_SECCOMP",
-    "cpu_seconds", "die_with_parent", "page_table_bytes", "prctl", "proportional_bytes",
+    "be_killed_first", "cpu_seconds", "die_with_parent", "limit_memory", "page_table_bytes", "prctl",
+    "proportional_bytes",
     "raise_descriptor_limit", "resident_bytes", "run_as_batch", "run_when_idle", "set_process_name",
 ]  # fmt: skip
 
@@ -48,6 +49,21 @@ def raise_descriptor_limit() -> None:
     _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     with contextlib.suppress(OSError, ValueError):
         resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
+
+
+def be_killed_first() -> None:
+    """Have Linux end this process before others when the memory of the machine is short."""
+    with contextlib.suppress(OSError):
+        Path("/proc/self/oom_score_adj").write_text("1000", encoding="ascii")
+
+
+def limit_memory(memory_bytes: int, *, beyond_now: bool = False) -> None:
+    """Limit what this process may allocate (*beyond_now*: beside what it has), and forbid core files."""
+    if beyond_now:
+        pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[5])
+        memory_bytes += pages * os.sysconf("SC_PAGE_SIZE")
+    resource.setrlimit(resource.RLIMIT_DATA, (memory_bytes, memory_bytes))
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 
 
 def cpu_seconds(pid: int) -> float:

@@ -12,7 +12,7 @@ import pytest
 from fuzz.damage import run_damaged
 from fuzz.meter import BARS, Meter
 from fuzz.targets import TARGETS
-from rse_pf.backend.sandbox import ipc
+from rse_pf import ipc
 from rse_pf.maps import format as map_format
 
 pytest.importorskip("faiss", reason="needs the extra 'maps'")

@@ -16,7 +16,7 @@ WAYS = ("The way of a frame", "The way of a keyframe", "The way of a setting", "
 LIVE_MAPS_BESIDE = frozenset({
     "children.py", "garbage.py", "subscriptions.py", "owner/context.py", "owner/keyframe_objects.py",
     "owner/lease.py", "owner/link_security.py", "owner/process.py", "owner/publisher.py", "owner/replies.py",
-    "owner/start.py", "owner/threads.py", "owner/whole_fit.py",
+    "owner/threads.py", "owner/whole_fit.py",
 })  # fmt: skip
 """Files of live maps that no keyframe passes: processes, leases, keys, versions, other replies; and the one
 file that a correction passes besides, as the page says."""

@@ -18,6 +18,7 @@ ORDER = (
     "native_buffers", "native_matcher", "native_front_end", "native_tracker", "native_stereo", "images",
     "token_bucket", "config",
     "silent_connections", "control_http", "http_head", "http_connections", "page_cache", "budget", "wire",
+    "ipc", "child",
     "scaling",
     "object_store", "lease", "identity", "crash_record", "maps", "accounts", "auth", "enrolment", "audit",
     "service",

@@ -1,4 +1,4 @@
-"""One idea has one place: queues of commands, leases, servers and clients of control ports."""
+"""One idea has one place: queues of commands, leases, control ports, and who starts processes."""
 
 from __future__ import annotations
 
@@ -110,3 +110,66 @@ def test_a_second_server_client_or_lease_is_caught() -> None:
     assert with_own_http({"x.py": server}, "start_server") == {"x.py"}
     assert with_own_http({"x.py": server.replace("start_server", "open_connection")}, "open_connection")
     assert with_own_lease({"x.py": lease}) == {"x.py"}
+
+
+CHILDREN = {"rse_pf/child/start.py"}
+"""Starts the processes that work for another one."""
+FORKS = {
+    "rse_pf/backend/supervisor/worker_handle.py": "workers share what the supervisor has imported",
+    "rse_pf/limited_process.py": "",
+    "rse_pf/backend/sandbox/zygote.py": "",
+    "rse_pf/backend/sandbox/isolation.py": "a child tries a means of isolation, and is gone",
+}
+SERVERS = {
+    "rse_pf/local/processes.py": "servers have a log, and may outlive the control plane that started them",
+    "rse_pf/local/faults/network_emulator.py": "the emulator is beside what it disturbs",
+    "rse_pf/cli/local_platform/page.py": "the fleet page is a server beside the platform",
+    "rse_pf/experiments/child_process.py": "robots of experiments",
+    "rse_pf/experiments/paper/control_plane_fault.py": "a platform that is killed",
+}
+PROGRAMS = {
+    "rse_pf/aws/fleet/journal.py": "journalctl",
+    "rse_pf/aws/lifecycle/cdk_tools.py": "cdk",
+    "rse_pf/services/custom/dependencies.py": "pip",
+    "rse_pf/cli/services/debugging.py": "a debugger",
+    "rse_pf/cli/services/building.py": "a compiler",
+    "rse_pf/cli/doctor.py": "versions of programs",
+    "rse_pf/cli/cloud/doctor.py": "versions of programs",
+    "rse_pf/experiments/compare/evo_figures.py": "evo",
+    "rse_pf/experiments/results/result_folder.py": "git",
+    "rse_pf/experiments/results/log_replay.py": "",
+    "rse_pf/local/faults/faults.py": "a helper that holds the rights for a fault",
+}
+"""Programs of others, which run to their end."""
+BESIDE = {
+    "rse_pf/backend/sandbox/zygote_client.py", "rse_pf/recording/recorder_process.py",
+    "rse_pf/batch/cluster.py",
+}  # fmt: skip
+STARTS = {
+    "subprocess.Popen", "subprocess.run", "subprocess.call", "subprocess.check_output", "os.fork",
+    "os.forkpty", "os.posix_spawn", "os.posix_spawnp", "os.system", "os.popen", "multiprocessing.Process",
+    "multiprocessing.Pool", "multiprocessing.get_context", "asyncio.create_subprocess_exec",
+    "asyncio.create_subprocess_shell", "ProcessPoolExecutor", "futures.ProcessPoolExecutor",
+}  # fmt: skip
+
+
+def starters(tree: Mapping[str, str]) -> set[str]:
+    """Return the modules of *tree* that start a process."""
+    return {
+        path
+        for path, text in tree.items()
+        for node in ast.walk(ast.parse(text))
+        if isinstance(node, ast.Call) and ast.unparse(node.func) in STARTS
+    }
+
+
+def test_child_processes_are_started_in_one_place(repository: Path) -> None:
+    known = CHILDREN | FORKS.keys() | SERVERS.keys() | PROGRAMS.keys() | BESIDE
+
+    assert starters(product(repository)) == known
+
+
+def test_another_start_of_a_process_is_caught() -> None:
+    for start in ("subprocess.Popen([sys.executable])", "os.fork()", "multiprocessing.get_context('spawn')"):
+        assert starters({"x.py": f"child = {start}"}) == {"x.py"}
+    assert starters({"x.py": "child = start_child(plan)"}) == set()

@@ -1,4 +1,4 @@
-"""The process of one job: the worker starts it with `JobProcess`, it runs one command and ends.
+"""The process of one job: the worker starts it with `spawner`, it runs one command and ends.
 
 Over one socket it receives an order, sends progress and then one answer.  It runs at the lowest priority,
 within its memory limit, and does not outlive its worker.  It reads its inputs and stores its reply itself, so
@@ -8,12 +8,8 @@ that the worker can serve robots meanwhile.
 from __future__ import annotations
 
 import contextlib
-import os
-import resource
 import select
 import socket
-import subprocess
-import sys
 import time
 import traceback
 from collections.abc import Callable
@@ -26,7 +22,7 @@ from rse_pf.accounts import Accounts
 from rse_pf.aws.storage import open_data_store
 from rse_pf.backend.object_refs import named_in, resolve
 from rse_pf.backend.robot_store import is_shared, store_within_quota
-from rse_pf.backend.sandbox.ipc import encode_message, receive
+from rse_pf.child.start import Child, ChildPlan, start_child
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import (
     BadMessage,
@@ -38,14 +34,13 @@ from rse_pf.errors import (
     message_of,
 )
 from rse_pf.identity import RobotId
-from rse_pf.linux import die_with_parent, run_when_idle
-from rse_pf.one_thread import ONE_THREAD
+from rse_pf.ipc import encode_message, receive
 from rse_pf.service import dispatch, failure_of
 from rse_pf.services.loading import load_services
 from rse_pf.wire import Command, Failure, Result
 from rse_pf.wire.arrays import binary_encode_hook
 
-__all__ = ["JobProcess", "JobRequest", "inline_bytes", "main", "retry_store", "spawner", "store_reply"]
+__all__ = ["JobRequest", "inline_bytes", "retry_store", "run", "spawner", "store_reply"]
 
 _REPORT_INTERVAL_S = 0.5
 _STORE_TRIES = 3
@@ -65,35 +60,20 @@ class JobRequest:
     """Of the command that asked for it first."""
 
 
-class JobProcess:
-    """A started process and the socket to it.
-
-    It uses one thread for linear algebra, so that the same inputs give the same result.
-    """
-
-    def __init__(self, order: dict[str, Any]) -> None:
-        self.connection, theirs = socket.socketpair()
-        with theirs:
-            self._process = subprocess.Popen(
-                [sys.executable, "-m", "rse_pf.backend.jobs.process", str(theirs.fileno())],
-                pass_fds=(theirs.fileno(),), stdin=subprocess.DEVNULL, env={**os.environ, **ONE_THREAD},
-            )  # fmt: skip
-        self.pid = self._process.pid
-        run_when_idle(self.pid)
-        with contextlib.suppress(OSError):  # it has ended, which the next read shows
-            self.connection.sendall(encode_message(order))
-
-    def kill(self) -> int:
-        """Kill it unless it has ended, reap it and return the exit code; negative for a signal."""
-        self._process.kill()
-        self.connection.close()
-        return self._process.wait()
-
-
-def spawner(services: str, settings: PlatformSettings) -> Callable[[JobRequest], JobProcess]:
+def spawner(services: str, settings: PlatformSettings) -> Callable[[JobRequest], Child]:
     """Return a function that starts the process of a job; *services* is ``module:function``."""
-    order = {"worker": os.getpid(), "services": services, "settings": settings.to_dict()}
-    return lambda request: JobProcess({**order, "request": request})
+    plan = ChildPlan(
+        target=f"{__name__}:run", name="rse-pf job", policy="idle", is_killed_first=True,
+        memory_bytes=settings.serving.max_job_memory_bytes,
+    )  # fmt: skip
+    order = {"services": services, "settings": settings.to_dict()}
+
+    def start(request: JobRequest) -> Child:
+        child = start_child(plan)
+        child.say({**order, "request": request})
+        return child
+
+    return start
 
 
 def inline_bytes(settings: PlatformSettings) -> int:
@@ -109,16 +89,13 @@ def retry_store(act: Callable[[], T]) -> T:
     return act()
 
 
-def main(arguments: list[str]) -> None:
-    """Run the one job that the worker orders over the socket with this number."""
-    with socket.socket(fileno=int(arguments[0])) as worker:
+def run(worker: socket.socket) -> None:
+    """Run the one job that the *worker* orders."""
+    with worker:
         order = receive(worker)
-        if order is None or not die_with_parent(order["worker"]):
+        if order is None:
             return
-        _lower_priority()
         settings, request = PlatformSettings.from_dict(order["settings"]), _request(order["request"])
-        resource.setrlimit(resource.RLIMIT_DATA, (settings.serving.max_job_memory_bytes,) * 2)
-        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
         answer = _work(request, settings, order["services"], _Reporter(worker, time.monotonic))
         with contextlib.suppress(OSError):  # the worker may have gone
             worker.sendall(encode_message(store_reply(answer, request, settings)))
@@ -216,14 +193,3 @@ def _encode_answer(answer: Result | Failure) -> list[Any]:
     except (BadMessage, TypeError, ValueError, OverflowError) as error:
         return ["failed", "internal", f"the reply cannot be encoded: {message_of(error)[:150]}", ""]
     return ["done", answer.compute_ms, reply]
-
-
-def _lower_priority() -> None:
-    """Run only when the processors are idle; be killed first when memory is short."""
-    run_when_idle(0)
-    with contextlib.suppress(OSError), open("/proc/self/oom_score_adj", "w", encoding="ascii") as file:
-        file.write("1000")
-
-
-if __name__ == "__main__":
-    main(sys.argv[1:])

@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import os
 import select
-import signal
 import socket
 import threading
 from collections.abc import Callable
@@ -18,11 +17,11 @@ from typing import Any, Literal
 
 from rse_pf.accounts import Accounts
 from rse_pf.backend.jobs.lease import MAX_TRIES, JobLease, JobRecord, record_name, renewal_s, verdict_on
-from rse_pf.backend.jobs.process import JobProcess, JobRequest, inline_bytes, retry_store
+from rse_pf.backend.jobs.process import JobRequest, inline_bytes, retry_store
 from rse_pf.backend.jobs.queue import JobQueue
 from rse_pf.backend.jobs.slots import JobSlots
 from rse_pf.backend.robot_store import store_within_quota
-from rse_pf.backend.sandbox.ipc import FrameReader, encode_message
+from rse_pf.child.start import Child, how_ended
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import (
     Cancelled,
@@ -37,6 +36,7 @@ from rse_pf.errors import (
     error_from_code,
 )
 from rse_pf.identity import object_name
+from rse_pf.ipc import FrameReader
 from rse_pf.lease import ObjectRecords
 from rse_pf.linux import cpu_seconds
 from rse_pf.object_store import ObjectStore, digest_of
@@ -59,7 +59,7 @@ class JobContext:
     slots: JobSlots
     settings: PlatformSettings
     server_id: str
-    start: Callable[[JobRequest], JobProcess]
+    start: Callable[[JobRequest], Child]
     clock: Callable[[], float]
     services: frozenset[str] = frozenset()
     """Names of the long services, of which robots may ask."""
@@ -290,7 +290,7 @@ class _JobRun:
             error_from_code(str(self._end[1]), str(self._end[2]), hint=str(self._end[3]))
         )
 
-    def _supervise(self, process: JobProcess) -> Literal["over", "lost", "given-up", "cancelled", "late"]:
+    def _supervise(self, process: Child) -> Literal["over", "lost", "given-up", "cancelled", "late"]:
         """Read from the process and renew the lease until the run ends."""
         serving, clock, signals = self._context.settings.serving, self._context.clock, self._signals
         began = renewed = clock()
@@ -300,8 +300,7 @@ class _JobRun:
             if signals.giving_up:
                 return "given-up"
             if self._is_cancelled and killed_s == float("inf"):
-                with contextlib.suppress(OSError):  # it has ended, which the next read shows
-                    process.connection.sendall(encode_message(["cancel"]))
+                process.say(["cancel"])
                 killed_s = now + _KILL_AFTER_S
             if now >= killed_s:
                 return "cancelled"
@@ -329,7 +328,7 @@ class _JobRun:
         except StoreError:
             return False
 
-    def _read(self, process: JobProcess) -> None:
+    def _read(self, process: Child) -> None:
         try:
             data = process.connection.recv(_READ_BYTES, socket.MSG_DONTWAIT)
         except BlockingIOError:
@@ -385,7 +384,6 @@ def _cancelled_error() -> RsePfError:
 
 
 def _crash_error(code: int) -> RsePfError:
-    how = f"exit code {code}"
-    if code < 0:
-        how = signal.Signals(-code).name if -code in set(signal.Signals) else f"signal {-code}"
-    return Crashed(f"the job's process ended: {how}", hint="the server's log has what it printed last")
+    return Crashed(
+        f"the job's process ended: {how_ended(code)}", hint="the server's log has what it printed last"
+    )

@@ -14,9 +14,12 @@ from collections import Counter, defaultdict
 from collections.abc import Callable
 from typing import Any, Literal
 
-from rse_pf.backend.live_map.owner.process import OwnerOrder, OwnerProcess
-from rse_pf.backend.sandbox.ipc import FrameReader
+import msgspec
+
+from rse_pf.backend.live_map.owner.process import OwnerOrder
 from rse_pf.backend.scheduling.fair_share import CLAIM_S, FairShare
+from rse_pf.child.start import Child
+from rse_pf.ipc import FrameReader
 from rse_pf.linux import cpu_seconds
 
 __all__ = ["OwnerChild", "OwnerChildren"]
@@ -29,7 +32,7 @@ _NEXT_SPARE_S = 3.0
 class OwnerChild:
     """One owner process, in the event loop of its worker."""
 
-    def __init__(self, process: OwnerProcess, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, process: Child, clock: Callable[[], float] = time.monotonic) -> None:
         """Read what the process says; *clock* returns seconds."""
         self.tenant = ""
         """Whose map it claims or serves."""
@@ -78,13 +81,13 @@ class OwnerChild:
         """Let it claim a map; return whether it serves it now."""
         if not await asyncio.shield(self._ready):
             return False
-        self._process.claim(order)
+        self._process.say(msgspec.structs.asdict(order))
         return await asyncio.shield(self._outcome) == "serving"
 
     def release(self) -> None:
         """Let it release its map, and end."""
         self.is_leaving = True
-        self._process.release()
+        self._process.say({"do": "release"})
 
     def kill(self) -> None:
         """End it at once, as it is not needed."""
@@ -131,7 +134,7 @@ class OwnerChildren:
     """The owner processes of one worker: those in use, and one that waits for a map."""
 
     def __init__(
-        self, spawn: Callable[[bool], OwnerProcess], *, max_owners: int, keeps_spare: bool,
+        self, spawn: Callable[[bool], Child], *, max_owners: int, keeps_spare: bool,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:  # fmt: skip
         """Start none yet.

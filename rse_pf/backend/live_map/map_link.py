@@ -35,11 +35,10 @@ from rse_pf.backend.live_map.owner.link_security import (
     internal_key,
     make_token,
 )
-from rse_pf.backend.live_map.owner.process import MAP_KIND, OwnerOrder, OwnerProcess
+from rse_pf.backend.live_map.owner.process import MAP_KIND, OwnerOrder, start_owner
 from rse_pf.backend.live_map.owner.replies import show_missing
 from rse_pf.backend.live_map.owner.server import MAX_LINK_BYTES
 from rse_pf.backend.log import JsonLog
-from rse_pf.backend.sandbox.ipc import FrameReader, encode_message
 from rse_pf.config import LiveSettings, PlatformSettings
 from rse_pf.errors import (
     BadRequest,
@@ -52,6 +51,7 @@ from rse_pf.errors import (
     error_from_code,
 )
 from rse_pf.identity import RobotId
+from rse_pf.ipc import FrameReader, encode_message
 from rse_pf.lease import Lease, ObjectRecords, Versioned
 from rse_pf.object_store import ObjectStore
 from rse_pf.wire.live_map import SHOW, KeyframeRequest, LiveRequest, LiveStart
@@ -539,7 +539,7 @@ class OwnerLinks:
         self._key: bytes | None = None
         self._threads = ThreadPoolExecutor(_THREADS, thread_name_prefix="live-link")
         self._children = OwnerChildren(
-            lambda calmly: OwnerProcess(settings, kind, calmly=calmly),
+            lambda calmly: start_owner(settings, kind, calmly=calmly),
             max_owners=settings.live.max_owners,
             keeps_spare=settings.live.warm_standby,
         )

@@ -16,8 +16,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from rse_pf.backend.ports import Log
+from rse_pf.backend.sandbox.channel import IpcChannel
 from rse_pf.backend.sandbox.circuit_breaker import Block
-from rse_pf.backend.sandbox.ipc import IpcChannel, encode_message
 from rse_pf.backend.sandbox.policy import (
     Action,
     AnswerCall,
@@ -39,6 +39,7 @@ from rse_pf.backend.scheduling.scheduler import QueuedCommand
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import BadMessage, NotFound, RsePfError, StoreError
 from rse_pf.identity import RobotId, state_name
+from rse_pf.ipc import encode_message
 from rse_pf.object_store import ObjectStore, is_name
 from rse_pf.service import failure_of
 from rse_pf.services.custom.installed import InstalledService

@@ -24,12 +24,12 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from rse_pf.backend.sandbox.circuit_breaker import CircuitBreaker
-from rse_pf.backend.sandbox.ipc import encode_message
 from rse_pf.backend.scheduling.fair_share import FairShare
 from rse_pf.backend.scheduling.scheduler import QueuedCommand
 from rse_pf.config import ServiceSettings
 from rse_pf.errors import Busy, Conflict, Expired, Poison, RsePfError, StoreError, WorkerLost
 from rse_pf.identity import RobotId
+from rse_pf.ipc import encode_message
 from rse_pf.service import Kind
 
 __all__ = [

@@ -18,10 +18,10 @@ from rse_pf.backend.jobs.queue import JobQueue, interleave
 from rse_pf.backend.jobs.runner import JobContext, JobOutcome, JobSignals, run_job
 from rse_pf.backend.jobs.slots import JobSlots, make_pipe
 from rse_pf.backend.log import JsonLog
-from rse_pf.backend.sandbox.ipc import encode_message
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import StoreError
 from rse_pf.identity import RobotId
+from rse_pf.ipc import encode_message
 from rse_pf.lease import ObjectRecords
 from rse_pf.object_store import MemoryStore
 from tests.backend.jobs.test_runner import FakeProcess

@@ -21,10 +21,10 @@ from rse_pf.backend.jobs.queue import JobQueue
 from rse_pf.backend.jobs.runner import JobContext
 from rse_pf.backend.jobs.slots import JobSlots, make_pipe
 from rse_pf.backend.log import JsonLog
-from rse_pf.backend.sandbox.ipc import encode_message
 from rse_pf.backend.scheduling.scheduler import QueuedCommand
 from rse_pf.config import PlatformSettings
 from rse_pf.identity import RobotId
+from rse_pf.ipc import encode_message
 from rse_pf.object_store import MemoryStore
 from rse_pf.wire import Command, Failure, Result
 from tests.fakes import FakeLoop
@@ -41,11 +41,14 @@ class FakeProcess:
         self.request = request
         self.connection, self._theirs = socket.socketpair()
 
-    def say(self, *message: Any) -> None:
+    def say(self, message: list[str]) -> None:
+        self.connection.sendall(encode_message(message))
+
+    def tell(self, *message: Any) -> None:
         self._theirs.sendall(encode_message(list(message)))
 
     def done(self, value: int = 1) -> None:
-        self.say("done", 5.0, msgspec.msgpack.encode({"value": value}))
+        self.tell("done", 5.0, msgspec.msgpack.encode({"value": value}))
 
     def kill(self) -> int:
         self._theirs.close()
@@ -207,7 +210,7 @@ def test_progress_is_sent_at_once_then_at_most_twice_a_second_and_never_repeated
     assert bench.progress == [(1, 0.0, "waits for its turn")]
     process = bench.process()
     for step in range(5):
-        process.say("progress", step / 10, f"step {step}")
+        process.tell("progress", step / 10, f"step {step}")
     others = itertools.count(2)
 
     def a_new_command_is_told_step_4() -> bool:
@@ -248,7 +251,7 @@ def test_cancelling_the_last_command_ends_the_job_and_a_request_meanwhile_gets_a
     bench.jobs.withdraw(owner, 1)
     ask(bench, owner, 2)
 
-    process.say("failed", "cancelled", "the robot took the command back", "")
+    process.tell("failed", "cancelled", "the robot took the command back", "")
     bench.run_until(lambda: 1 in bench.answers)
     bench.process().done()
     bench.run_until(lambda: 2 in bench.answers)

@@ -7,14 +7,20 @@ import time
 
 import pytest
 
-from rse_pf.backend.jobs.process import JobProcess
+from rse_pf.backend.jobs.process import JobRequest, spawner
+from rse_pf.config import PlatformSettings
+from rse_pf.identity import RobotId
 
 pytestmark = pytest.mark.system
+REQUEST = JobRequest(
+    service="long", payload={}, robot=RobotId("default", "robot-1"), key="ab" * 32, quota_bytes=1e6
+)
 
 
 def test_a_job_process_has_the_lowest_priority_before_it_runs_any_code() -> None:
+    start = spawner("no.module:services", PlatformSettings())
     began = time.monotonic()
-    job = JobProcess({"worker": 0})  # it is not this process's child of 0, so it does nothing and ends
+    job = start(REQUEST)
     policy, took_s = os.sched_getscheduler(job.pid), time.monotonic() - began
     job.kill()
 

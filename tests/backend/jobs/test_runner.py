@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import socket
 import threading
@@ -15,10 +16,10 @@ from rse_pf.backend.jobs.lease import JobLease, JobRecord, record_name
 from rse_pf.backend.jobs.process import JobRequest
 from rse_pf.backend.jobs.runner import JobContext, JobOutcome, JobSignals, run_job
 from rse_pf.backend.jobs.slots import JobSlots, make_pipe
-from rse_pf.backend.sandbox.ipc import encode_message
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import Conflict, StoreError
 from rse_pf.identity import RobotId, object_name
+from rse_pf.ipc import encode_message
 from rse_pf.lease import ObjectRecords
 from rse_pf.object_store import MemoryStore, digest_of
 
@@ -51,6 +52,10 @@ class FakeProcess:
             self.theirs.sendall(encode_message(message))
         if ends:
             self.theirs.close()
+
+    def say(self, message: list[str]) -> None:
+        with contextlib.suppress(OSError):
+            self.connection.sendall(encode_message(message))
 
     def kill(self) -> int:
         self.killed.set()

@@ -5,12 +5,12 @@ from __future__ import annotations
 import asyncio
 import socket
 from collections.abc import Awaitable, Callable
+from typing import Any
 
 import pytest
 
 from rse_pf.backend.live_map.children import OwnerChild, OwnerChildren
-from rse_pf.backend.live_map.owner.process import OwnerOrder
-from rse_pf.backend.sandbox.ipc import encode_message
+from rse_pf.ipc import encode_message
 
 
 class PlayedProcess:
@@ -22,9 +22,8 @@ class PlayedProcess:
         self.connection, self.theirs = socket.socketpair()
         self.theirs.sendall(encode_message(["ready"]))
 
-    def claim(self, order: OwnerOrder) -> None: ...
-
-    def release(self) -> None:
+    def say(self, order: dict[str, Any]) -> None:
+        assert order == {"do": "release"}
         self.theirs.close()
 
     def kill(self) -> int:

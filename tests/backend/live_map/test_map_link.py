@@ -16,10 +16,10 @@ from rse_pf.backend.live_map.owner.lease import LeaseRecord, OwnerLease, decode_
 from rse_pf.backend.live_map.owner.link_security import server_context
 from rse_pf.backend.live_map.owner.process import OwnerOrder
 from rse_pf.backend.log import JsonLog
-from rse_pf.backend.sandbox.ipc import encode_message
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import Busy, NotFound
 from rse_pf.identity import RobotId
+from rse_pf.ipc import encode_message
 from rse_pf.lease import ObjectRecords
 from rse_pf.object_store import MemoryStore
 from rse_pf.wire.live_map import KeyframeRequest, LiveMapRequest, LiveStart
@@ -39,11 +39,14 @@ class PlayedProcess:
         self.claims = 0
         self._store = store
 
-    def say(self, *message: Any) -> None:
+    def tell(self, *message: Any) -> None:
         self._theirs.sendall(encode_message(list(message)))
 
-    def claim(self, order: OwnerOrder) -> None:
+    def say(self, message: dict[str, Any]) -> None:
+        if "do" in message:
+            return
         self.claims += 1
+        order = OwnerOrder(**message)
         lease = OwnerLease(
             ObjectRecords(self._store),
             LEASE,
@@ -52,11 +55,9 @@ class PlayedProcess:
             clock=time.monotonic,
         )
         if lease.claim(order.known) and lease.serve("127.0.0.1", 1, "c"):
-            self.say("serving", lease.record.epoch)
+            self.tell("serving", lease.record.epoch)
         else:
-            self.say("lost")
-
-    def release(self) -> None: ...
+            self.tell("lost")
 
     def kill(self) -> int:
         self.connection.close()
@@ -124,7 +125,7 @@ def test_a_process_is_started_as_soon_as_a_map_that_nobody_has_begun_is_watched(
     async def test(worker: Worker) -> None:
         worker.link.set_watched(True)
         await until(lambda: worker.started)
-        worker.started[0].say("ready")
+        worker.started[0].tell("ready")
         spare = worker.children.prepare()
         assert isinstance(spare, OwnerChild)
         await until(lambda: spare.is_ready)
@@ -177,7 +178,7 @@ def test_an_owner_whose_port_is_closed_is_replaced_at_once_by_those_who_were_con
         began_s = time.monotonic()
         sent = asyncio.ensure_future(worker.link.request(ROBOT, "live-keyframe", FIRST, 5.0))
         await until(lambda: worker.started)
-        worker.started[0].say("ready")
+        worker.started[0].tell("ready")
         await until(lambda: (found := worker.lease()) is not None and found.epoch == 2)
         assert time.monotonic() - began_s < PlatformSettings().live.lease_s
         sent.cancel()
@@ -220,7 +221,7 @@ def test_an_owner_whose_port_was_never_reached_keeps_its_lease() -> None:
         owner_on_a_closed_port(worker)
         sent = asyncio.ensure_future(worker.link.request(ROBOT, "live-keyframe", FIRST, 0.3))
         await until(lambda: worker.started)
-        worker.started[0].say("ready")
+        worker.started[0].tell("ready")
         await asyncio.wait({sent})
         assert isinstance(sent.exception(), Busy)
         assert decode_lease(LEASE, worker.store.get(LEASE)).epoch == 1
@@ -242,7 +243,7 @@ def test_who_may_only_watch_starts_no_process_and_is_told_that_the_map_is_idle()
 
         worker.link.set_watched(True, may_start=True)
         await until(lambda: worker.started)
-        worker.started[0].say("ready")
+        worker.started[0].tell("ready")
         await until(lambda: (found := worker.lease()) is not None and found.state == "serving")
         assert worker.told[-1]["state"] == "moving"
 

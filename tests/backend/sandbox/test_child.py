@@ -16,7 +16,7 @@ import pytest
 
 from rse_pf.backend.sandbox import isolation
 from rse_pf.backend.sandbox.child import readable_paths
-from rse_pf.backend.sandbox.ipc import encode_message, receive
+from rse_pf.ipc import encode_message, receive
 from rse_pf.services.custom.installed import read_service
 from rse_pf.services.custom.native import INCLUDE_FOLDER
 

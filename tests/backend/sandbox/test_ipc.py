@@ -9,8 +9,9 @@ from typing import Any
 
 import pytest
 
-from rse_pf.backend.sandbox.ipc import FrameReader, IpcChannel, encode_message, encode_reply, receive
+from rse_pf.backend.sandbox.channel import IpcChannel
 from rse_pf.errors import BadMessage, LimitExceeded
+from rse_pf.ipc import FrameReader, encode_message, encode_reply, receive
 from tests.fakes import FakeLoop
 
 MESSAGES: list[Any] = [["ready"], [True, {"count": 1}, b"\x00\x01", 1.5], []]

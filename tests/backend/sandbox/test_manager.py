@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from rse_pf.backend.sandbox.dry_run import DryRun, dry_run
-from rse_pf.backend.sandbox.ipc import encode_message
 from rse_pf.config import PlatformSettings
+from rse_pf.ipc import encode_message
 from rse_pf.services.custom.installed import read_service
 
 SOURCE = """

@@ -6,7 +6,6 @@ import math
 from typing import Any
 
 from rse_pf.backend.sandbox.circuit_breaker import OPEN_S, POISON_CRASHES, CircuitBreaker
-from rse_pf.backend.sandbox.ipc import encode_message
 from rse_pf.backend.sandbox.policy import (
     START_TIMEOUT_S,
     Action,
@@ -27,6 +26,7 @@ from rse_pf.backend.scheduling.scheduler import QueuedCommand
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import BadRequest, Conflict, RsePfError, StoreError
 from rse_pf.identity import RobotId
+from rse_pf.ipc import encode_message
 from rse_pf.wire import Command
 
 GRACE_S, FACTOR = 5.0, 2.0

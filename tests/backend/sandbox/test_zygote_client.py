@@ -13,10 +13,10 @@ from typing import Any
 
 import pytest
 
-from rse_pf.backend.sandbox.ipc import receive
 from rse_pf.backend.sandbox.zygote_client import ZygoteClient
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import ConfigurationError
+from rse_pf.ipc import receive
 
 pytestmark = pytest.mark.system
 SETTINGS = PlatformSettings.from_dict({"services": {"accept_weak_isolation": True}})

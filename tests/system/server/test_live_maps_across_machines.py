@@ -33,9 +33,9 @@ from rse_pf.backend.live_map.owner.link_security import (
     internal_key,
     make_token,
 )
-from rse_pf.backend.sandbox.ipc import FrameReader, encode_message
 from rse_pf.config import PlatformSettings
 from rse_pf.config.settings import LIVE_PORTS
+from rse_pf.ipc import FrameReader, encode_message
 from rse_pf.object_store import DirectoryStore
 
 pytestmark = [pytest.mark.slow, pytest.mark.system]

@@ -1,8 +1,7 @@
-"""The process of an owner: a worker starts it with `OwnerProcess`, it claims one map, serves it and ends.
+"""The process of an owner: a worker starts it with `start_owner`, it claims one map, serves it and ends.
 
 It is started before it is known whether it is needed, and says ``ready`` when all is imported; ordered to
-claim a map, it says ``serving`` or ``lost``.  It runs within its memory limit, does not outlive its worker,
-and ignores the signals of a terminal: they are for the server.
+claim a map, it says ``serving`` or ``lost``.
 """
 
 from __future__ import annotations
@@ -12,12 +11,9 @@ import contextlib
 import importlib
 import ipaddress
 import os
-import resource
 import secrets
-import signal
 import socket
 import ssl
-import subprocess
 import sys
 import time
 import traceback
@@ -44,17 +40,16 @@ from rse_pf.backend.live_map.owner.state import MapKind, MapState, take_over
 from rse_pf.backend.live_map.owner.threads import OwnerThreads, Urgency
 from rse_pf.backend.live_map.owner.whole_fit import fit_apart
 from rse_pf.backend.log import JsonLog
-from rse_pf.backend.sandbox.ipc import FrameReader, encode_message, receive
+from rse_pf.child.start import Child, ChildPlan, start_child
 from rse_pf.config import PlatformSettings
 from rse_pf.config.placement import live_ports
 from rse_pf.errors import StoreError
+from rse_pf.ipc import FrameReader, encode_message, receive
 from rse_pf.lease import ObjectRecords, Versioned
-from rse_pf.linux import die_with_parent, set_process_name
 from rse_pf.maps.registry import MapRegistry
 from rse_pf.object_store import ObjectStore
-from rse_pf.one_thread import ONE_THREAD
 
-__all__ = ["MAP_KIND", "OwnerOrder", "OwnerProcess", "advertised_address", "main"]
+__all__ = ["MAP_KIND", "OwnerOrder", "advertised_address", "run", "start_owner"]
 
 MAP_KIND = "rse_pf.backend.live_map.owner.state:LIVE_MAP"
 """Where the `MapKind` of real maps is, as ``module:name``."""
@@ -77,39 +72,19 @@ class OwnerOrder(msgspec.Struct, frozen=True, kw_only=True):
     known: Versioned | None
 
 
-class OwnerProcess:
-    """A started process and the socket to it; only for the main thread of a process, with which it ends."""
+def start_owner(settings: PlatformSettings, kind: str = MAP_KIND, *, calmly: bool = False) -> Child:
+    """Start the process of an owner, *calmly* if nobody waits for it yet.
 
-    def __init__(self, settings: PlatformSettings, kind: str = MAP_KIND, *, calmly: bool = False) -> None:
-        """Start it; *calmly* if nobody waits for it yet."""
-        self.connection, theirs = socket.socketpair()
-        with theirs:
-            self._process = subprocess.Popen(
-                [sys.executable, "-m", "rse_pf.backend.live_map.owner.start", str(theirs.fileno()),
-                 str(_CALM_NICE if calmly else 0)],
-                pass_fds=(theirs.fileno(),), stdin=subprocess.DEVNULL, env={**os.environ, **ONE_THREAD},
-            )  # fmt: skip
-        self.pid = self._process.pid
-        self.say({"worker": os.getpid(), "settings": settings.to_dict(), "kind": kind})
-
-    def claim(self, order: OwnerOrder) -> None:
-        """Let it claim a map."""
-        self.say(msgspec.structs.asdict(order))
-
-    def release(self) -> None:
-        """Let it release its map, and end."""
-        self.say({"do": "release"})
-
-    def say(self, message: dict[str, Any]) -> None:
-        """Send an order; it is lost if the process has ended, which the next read shows."""
-        with contextlib.suppress(OSError):
-            self.connection.sendall(encode_message(message))
-
-    def kill(self) -> int:
-        """Kill it unless it has ended, reap it and return the exit code; negative for a signal."""
-        self._process.kill()
-        self.connection.close()
-        return self._process.wait()
+    Only for the main thread of a process, with which it ends.
+    """
+    child = start_child(
+        ChildPlan(
+            target=f"{__name__}:run", name="rse-pf live map", memory_bytes=settings.live.max_memory_bytes,
+            import_nice=_CALM_NICE if calmly else 0,
+        )
+    )  # fmt: skip
+    child.say({"settings": settings.to_dict(), "kind": kind})
+    return child
 
 
 def advertised_address(host: str) -> str:
@@ -129,18 +104,12 @@ def advertised_address(host: str) -> str:
         return str(probe.getsockname()[0])
 
 
-def main(arguments: list[str]) -> None:
-    """Claim and serve the map that the worker orders over the socket with this number."""
-    worker = socket.socket(fileno=int(arguments[0]))
+def run(worker: socket.socket) -> None:
+    """Claim and serve the map that the *worker* orders."""
     order = receive(worker)
-    if order is None or not die_with_parent(order["worker"]):
+    if order is None:
         return
     settings = PlatformSettings.from_dict(order["settings"])
-    resource.setrlimit(resource.RLIMIT_DATA, (settings.live.max_memory_bytes,) * 2)
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, signal.SIG_IGN)
-    set_process_name("rse-pf live map")
     sys.setswitchinterval(_SWITCH_S)
     module, _, name = order["kind"].partition(":")
     kind: MapKind = getattr(importlib.import_module(module), name)

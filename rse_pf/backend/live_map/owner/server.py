@@ -14,9 +14,9 @@ from collections.abc import Callable
 from typing import Any
 
 from rse_pf.backend.live_map.owner.live_owner import LiveOwner, MapMoves
-from rse_pf.backend.sandbox.ipc import FrameReader, encode_message
 from rse_pf.errors import InternalError, RsePfError
 from rse_pf.identity import RobotId
+from rse_pf.ipc import FrameReader, encode_message
 from rse_pf.silent_connections import BACKLOG, FIRST_REQUEST_S, TlsListener
 
 __all__ = ["MAX_LINK_BYTES", "OwnerServer", "listen"]

@@ -23,7 +23,7 @@ from rse_pf.backend.live_map.children import OwnerChild
 from rse_pf.backend.live_map.map_link import OwnerLinks
 from rse_pf.backend.live_map.owner.lease import decode_lease, lease_name, map_folder
 from rse_pf.backend.live_map.owner.log import LiveLog
-from rse_pf.backend.live_map.owner.process import OwnerOrder, OwnerProcess
+from rse_pf.backend.live_map.owner.process import OwnerOrder, start_owner
 from rse_pf.backend.live_map.owner.state import MapState
 from rse_pf.backend.log import JsonLog
 from rse_pf.config import PlatformSettings
@@ -239,7 +239,7 @@ def test_a_process_listens_only_once_it_has_a_map(tmp_path: Path) -> None:
 
     async def test() -> None:
         settings = PlatformSettings.from_dict({"data": {"store": f"dir:{tmp_path}"}})
-        child = OwnerChild(OwnerProcess(settings, KIND))
+        child = OwnerChild(start_owner(settings, KIND))
         try:
             await child.wait_ready(PATIENT_S)
             assert child.is_ready

@@ -1,86 +1,25 @@
-"""Messages between a worker and its child processes, and what a sandbox prints.
+"""The channel between a worker and one sandbox: messages, and what the sandbox prints.
 
-A message on a stream socket is its length and its MessagePack body; sandboxes and job processes both use
-this format.  Neither a slow nor a hostile sandbox can block the event loop or fill the worker's memory:
-the size of a message, its values and levels, and the number and length of printed lines have limits.
+Neither a slow nor a hostile sandbox can block the event loop or fill the worker's memory: the size of a
+message, its values and levels, and the number and length of printed lines have limits.
 """
 
 from __future__ import annotations
 
 import os
 import socket
-import struct
 from asyncio import AbstractEventLoop
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
-import msgspec
-
-from rse_pf.budget import SERVICE_REPLY, check_msgpack
-from rse_pf.errors import BadMessage, LimitExceeded, RsePfError
+from rse_pf.errors import RsePfError
+from rse_pf.ipc import FrameReader
 from rse_pf.services.custom.output import OutputLines
-from rse_pf.wire.arrays import binary_encode_hook, extension_hook
 
-__all__ = ["FrameReader", "IpcChannel", "encode_message", "encode_reply", "receive"]
+__all__ = ["IpcChannel"]
 
-_HEADER = struct.Struct("<I")
 _READ_BYTES = 1 << 18
 _NO_MESSAGE = object()
-
-
-def encode_message(message: Any) -> bytes:
-    """Return *message* with its length before it."""
-    body = msgspec.msgpack.encode(message, enc_hook=binary_encode_hook)
-    return _HEADER.pack(len(body)) + body
-
-
-def encode_reply(message: Any) -> bytes:
-    """Return *message* of a sandbox with its length before it.
-
-    Raises:
-        LimitExceeded: The worker would refuse it for its values or levels.
-    """
-    data = encode_message(message)
-    check_msgpack(data[_HEADER.size :], SERVICE_REPLY)
-    return data
-
-
-def receive(connection: socket.socket) -> Any:
-    """Return the next message on a blocking socket, None at its end."""
-    header = connection.recv(_HEADER.size, socket.MSG_WAITALL)
-    if len(header) < _HEADER.size:
-        return None
-    (length,) = _HEADER.unpack(header)
-    body = connection.recv(length, socket.MSG_WAITALL)
-    return _decode(body) if len(body) == length else None
-
-
-class FrameReader:
-    """Splits the bytes of a stream into messages of at most *max_bytes*."""
-
-    def __init__(self, max_bytes: int) -> None:
-        self._max_bytes = max_bytes
-        self._received = bytearray()
-
-    def feed(self, data: bytes) -> Iterator[Any]:
-        """Yield every message that *data* completes.
-
-        Raises:
-            LimitExceeded: A message is longer than the limit, or holds too many values or levels.
-            BadMessage: A body is not MessagePack.
-        """
-        self._received += data
-        while len(self._received) >= _HEADER.size:
-            (length,) = _HEADER.unpack_from(self._received)
-            if length > self._max_bytes:
-                raise LimitExceeded(f"a message of {length} bytes is longer than {self._max_bytes}")
-            end = _HEADER.size + length
-            if len(self._received) < end:
-                return
-            body = bytes(self._received[_HEADER.size : end])
-            del self._received[:end]
-            check_msgpack(body, SERVICE_REPLY)
-            yield _decode(body)
 
 
 class IpcChannel:
@@ -201,12 +140,3 @@ class IpcChannel:
             return
         for line in self._lines.feed(text, self._loop.time()):
             self._on_line(line)
-
-
-def _decode(body: bytes) -> Any:
-    try:
-        return msgspec.msgpack.decode(body, ext_hook=extension_hook)
-    except RsePfError:
-        raise
-    except (msgspec.DecodeError, TypeError, ValueError, LookupError, RecursionError) as error:
-        raise BadMessage(f"not MessagePack: {error}") from error
