@@ -7,37 +7,9 @@ import importlib.resources
 import sys
 from dataclasses import fields
 
-from ros_bridge.options import BridgeOptions
+from ros_bridge.options import HELP, BridgeOptions
 from rse_pf.errors import RsePfError
 from rse_pf.terminal import show, show_error
-
-_HELP = {
-    "url": "address of the platform: ws://HOST:PORT/ws",
-    "token_file": "file that holds the robot's token",
-    "enrolment": "file of rse-pf robot enrol --out, instead of both",
-    "namespace": "name of this robot, before its topics and frames",
-    "map": "live map that it shares with other robots (default: a map of its own)",
-    "colour": "topic of the colours",
-    "depth": "topic of depth registered to them; empty: none",
-    "info": "topic of the camera_info of the colours",
-    "right": "topic of the right images of a stereo pair, instead of depth; empty: none",
-    "right_info": "topic of the camera_info of the right images",
-    "imu": "topic of an IMU; needs rig",
-    "rig": "file of the rig, rig.json; empty: by both camera_info",
-    "depth_scale": "units of a 16-bit depth image in a metre",
-    "pair_within_s": "colour and depth belong together up to this difference of time",
-    "queue_frames": "so many frames wait while another is tracked",
-    "map_frame": "name of the frame of the map",
-    "odom_frame": "name of the odometry frame",
-    "camera_frame": "name of the camera's frame (default: as in the images)",
-    "publish_odom": "whether to publish the transform from odometry frame to camera",
-    "cloud_every_s": "time between two clouds",
-    "path_poses": "most poses of a path",
-    "dds_domain": "with dds: ROS_DOMAIN_ID of the robots",
-    "out": "folder that the service save writes to",
-    "publish_as": "name of the map that the service publish makes of a map of its own",
-    "localise_in": "name of the map in which the service localise looks",
-}
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -56,10 +28,13 @@ def main(arguments: list[str] | None = None) -> int:
     for each in fields(BridgeOptions):
         parser.add_argument(
             f"--{each.name.replace('_', '-')}", dest=each.name, default=argparse.SUPPRESS, metavar="VALUE",
-            help=f"{_HELP[each.name]}{'' if each.default in ('', None) else f' (default: {each.default})'}",
+            help=f"{HELP[each.name]}{'' if each.default in ('', None) else f' (default: {each.default})'}",
         )  # fmt: skip
-    args, others = parser.parse_known_args(arguments)
-    unknown = [word for word in others if ":=" not in word]
+    words = sys.argv[1:] if arguments is None else arguments
+    mark = words.index("--ros-args") if "--ros-args" in words else len(words)
+    args, others = parser.parse_known_args(words[:mark])
+    of_ros = words[mark:] if args.shell == "ros2" else []
+    unknown = [word for word in [*others, *words[mark + len(of_ros) :]] if ":=" not in word]
     if unknown:
         parser.error(f"unknown option: {' '.join(unknown)}")
     given = {name: value for name, value in vars(args).items() if name != "shell"}
@@ -74,13 +49,15 @@ def main(arguments: list[str] | None = None) -> int:
         if args.shell == "ros2":
             from ros_bridge.ros2_node import run_ros2_node
 
-            return run_ros2_node(others, given)
+            return run_ros2_node([*others, *of_ros], given)
         from ros_bridge.dds import run_dds
 
         return run_dds(given)
     except RsePfError as error:
         show_error(error)
         return 1
+    except KeyboardInterrupt:  # Ctrl-C before the bridge runs; then it ends by itself, with 0
+        return 130
 
 
 if __name__ == "__main__":

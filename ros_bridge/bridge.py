@@ -93,6 +93,7 @@ class Bridge:
         self._cloud: asyncio.Task[None] | None = None
         self._maps = None if robot is None else MapServices(robot, mapper, options)
         self._seen: Camera | None = None
+        self._tells_imu = bool(options.imu) and options.publish_odom
 
     def close(self) -> None:
         """End what the services of maps have opened."""
@@ -195,6 +196,7 @@ class Bridge:
             tracked, images.stamp_ns, images.camera_frame, T_map_odom=T_map_odom, alignment=alignment
         ):
             self._publish(message)
+        self._tell_imu(images)
         now = self._clock()
         if now >= self._due["path"]:
             self._due["path"] = now + _PATH_EVERY_S
@@ -203,6 +205,14 @@ class Bridge:
         if now >= self._due["cloud"] and (self._cloud is None or self._cloud.done()):
             self._due["cloud"] = now + self._options.cloud_every_s
             self._cloud = asyncio.create_task(self._publish_cloud(images.stamp_ns))
+
+    def _tell_imu(self, images: PairedImages) -> None:
+        """Publish once where the IMU is; its frame is named by its samples."""
+        rig = self._incoming.rig
+        T = rig.T_camera_imu
+        if self._tells_imu and rig.imu_frame and T is not None:
+            self._tells_imu = False
+            self._publish(self._outgoing.imu_place(images.stamp_ns, images.camera_frame, rig.imu_frame, T))
 
     async def _track(self, frame: Frame) -> TrackedFrame:
         return await self._mapper.track(frame)

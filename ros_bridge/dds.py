@@ -22,7 +22,7 @@ from client_sdk.bags.message_maker import MessageMaker
 from ros_bridge.bridge import connected_bridge
 from ros_bridge.options import BridgeOptions
 from ros_bridge.outgoing import Message, advertised
-from ros_bridge.shell import end_by_signal, run_until, taken
+from ros_bridge.shell import end_by_signal, queue_of, run_until, taken
 from rse_pf.errors import MissingExtra
 
 __all__ = ["DdsTopics", "run_dds"]
@@ -188,9 +188,8 @@ async def _run(options: BridgeOptions) -> int:
     try:
         async with connected_bridge(options, publish, is_ros1=False) as bridge:
             for role, topic, kind in taken(options):
-                topics.subscribe(
-                    topic, kind, functools.partial(bridge.receive, role), depth=options.queue_frames
-                )
+                receive = functools.partial(bridge.receive, role)
+                topics.subscribe(topic, kind, receive, depth=queue_of(role, options))
             await run_until(bridge, options, ended)
     finally:
         topics.close()

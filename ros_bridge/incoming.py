@@ -64,12 +64,15 @@ class PairedImages:
 
 
 class IncomingFrames:
-    """Pairs the images of two topics; any thread may `add`, another may `take` and `decode`."""
+    """Pairs the images of two topics; any thread may `add`, another may `take` and `decode`.
+
+    ``rig`` is what is known of a pair and of an IMU.
+    """
 
     def __init__(self, maker: MessageMaker, options: BridgeOptions) -> None:
         self.left_out: Counter[str] = Counter()
         self.received: Counter[str] = Counter({"colour": 0, "depth": 0, "info": 0})
-        self._rig = RigTopics(options)
+        self.rig = RigTopics(options)
         self.trouble = NO_MESSAGE
         self._maker, self._options = maker, options
         self._bound_ns = round(1e9 * options.pair_within_s)
@@ -95,8 +98,9 @@ class IncomingFrames:
                     self._learn_camera(role, message)
                     return False
                 if role == "imu":
-                    self._rig.add_imu(message, _stamp_ns(message))
-                    return False
+                    waited = self._waits_for_imu()
+                    self.rig.add_imu(message, _stamp_ns(message))
+                    return waited and not self._waits_for_imu()
                 self._check(role, message)
             except (BrokenMessage, RsePfError, *_FAULTS) as error:
                 self.left_out["broken"] += 1
@@ -120,9 +124,9 @@ class IncomingFrames:
             return len(self._ready) > before
 
     def take(self) -> PairedImages | None:
-        """Return the oldest frame that is ready, None if there is none."""
+        """Return the oldest frame that is ready, None if there is none, or if the IMU is behind it."""
         with self._lock:
-            return self._ready.popleft() if self._ready else None
+            return self._ready.popleft() if self._ready and not self._waits_for_imu() else None
 
     def decode(self, images: PairedImages) -> Frame | None:
         """Return a frame without distortion; None, and a count, if its images make no sense."""
@@ -138,10 +142,10 @@ class IncomingFrames:
                     f"{wanted.width}x{wanted.height} px"
                 )
             with self._lock:
-                samples = self._rig.imu_until(images.stamp_ns)
+                samples = self.rig.imu_until(images.stamp_ns)
             made = Frame(
                 timestamp_s=images.stamp_ns / 1e9, rgb=rgb, depth_m=no_depth(wanted), camera=wanted,
-                imu=samples, T_body_camera=self._rig.T_body_camera,
+                imu=samples, T_body_camera=self.rig.T_body_camera,
             )  # fmt: skip
             if self._partner == "right":
                 return self._pair_of(made, images.partner)
@@ -157,9 +161,13 @@ class IncomingFrames:
                 self.trouble = str(error)
             return None
 
+    def _waits_for_imu(self) -> bool:
+        """Return whether the only frame that is ready waits for the sample after it."""
+        return len(self._ready) == 1 and self.rig.is_imu_due(self._ready[0].stamp_ns)
+
     def _pair_of(self, left: Frame, right: Any) -> Frame:
         """Return the rectified pair of a frame as it came, and the message of its right image."""
-        rectification = self._rig.rectification
+        rectification = self.rig.rectification
         if rectification is None:
             raise BrokenMessage(f"no camera_info came on {self._options.right_info}")
         gray = load_opencv().cvtColor(decode_colour(right), load_opencv().COLOR_RGB2GRAY)
@@ -191,7 +199,7 @@ class IncomingFrames:
 
     def _learn_camera(self, role: Role, message: Any) -> None:
         """Take the camera of the first good message; later ones of the same camera cost nothing."""
-        self._rig.learn(role, message)
+        self.rig.learn(role, message)
         if self._camera is None and role == "info":
             is_rectified = "rect" in self._options.colour.rsplit("/", 1)[-1]
             lens = lens_of(message, self._options.info, is_rectified=is_rectified)

@@ -10,10 +10,38 @@ from typing import Any, Literal
 
 from rse_pf.errors import UsageError
 
-__all__ = ["BridgeOptions"]
+__all__ = ["HELP", "BridgeOptions"]
 
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*)*")
 _TRUE, _FALSE = ("true", "1", "yes"), ("false", "0", "no")
+HELP = {
+    "url": "address of the platform: ws://HOST:PORT/ws",
+    "token_file": "file that holds the robot's token",
+    "enrolment": "file of rse-pf robot enrol --out, instead of both",
+    "namespace": "name of this robot, before its topics and frames",
+    "map": "live map that it shares with other robots (default: a map of its own)",
+    "colour": "topic of the colours",
+    "depth": "topic of depth registered to them; empty: none",
+    "info": "topic of the camera_info of the colours",
+    "right": "topic of the right images of a stereo pair, instead of depth; empty: none",
+    "right_info": "topic of the camera_info of the right images",
+    "imu": "topic of an IMU; needs rig",
+    "rig": "file of the rig, rig.json; empty: by both camera_info",
+    "depth_scale": "units of a 16-bit depth image in a metre",
+    "pair_within_s": "colour and depth belong together up to this difference of time",
+    "queue_frames": "so many frames wait while another is tracked",
+    "map_frame": "name of the frame of the map",
+    "odom_frame": "name of the odometry frame",
+    "camera_frame": "name of the camera's frame (default: as in the images)",
+    "publish_odom": "whether to publish the transform from odometry frame to camera",
+    "cloud_every_s": "time between two clouds",
+    "path_poses": "most poses of a path",
+    "dds_domain": "with dds: ROS_DOMAIN_ID of the robots",
+    "out": "folder that the service save writes to",
+    "publish_as": "name of the map that the service publish makes of a map of its own",
+    "localise_in": "name of the map in which the service localise looks",
+}
+"""What each option is, for a command line and for the description of a parameter."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

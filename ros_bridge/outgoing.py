@@ -14,7 +14,14 @@ import numpy as np
 import numpy.typing as npt
 
 from client_sdk.bags.message_maker import MessageMaker
-from client_sdk.bags.message_types import DIAGNOSTICS, PATH, POINT_CLOUD, POSE_WITH_COVARIANCE, TF
+from client_sdk.bags.message_types import (
+    DIAGNOSTICS,
+    ODOMETRY,
+    PATH,
+    POINT_CLOUD,
+    POSE_WITH_COVARIANCE,
+    TF,
+)
 from client_sdk.frontend import TrackedFrame
 from ros_bridge.options import BridgeOptions
 from rse_pf.geometry import Array
@@ -68,10 +75,12 @@ def advertised(options: BridgeOptions) -> list[tuple[str, str, bool]]:
     """Return the topics that a bridge publishes: names, types, and whether late subscribers get the last."""
     topics = (
         ("rse_pf/pose", POSE_WITH_COVARIANCE, False),
+        ("rse_pf/odometry", ODOMETRY, False),
         ("rse_pf/path", PATH, False),
         ("rse_pf/cloud", POINT_CLOUD, True),
         ("/tf", TF, False),
         ("/diagnostics", DIAGNOSTICS, False),
+        *((("/tf_static", TF, True),) if options.imu and options.publish_odom else ()),
     )
     return [(options.named(topic), kind, latched) for topic, kind, latched in topics]
 
@@ -81,7 +90,7 @@ class OutgoingMessages:
 
     def __init__(self, maker: MessageMaker, options: BridgeOptions) -> None:
         self._maker, self._options = maker, options
-        self._path: list[tuple[int, Any]] = []
+        self._path: list[tuple[int, Array, Any]] = []
         self._every = 1
         self._counted = 0
 
@@ -94,7 +103,7 @@ class OutgoingMessages:
         T_map_odom: Array | None,
         alignment: Array | None = None,
     ) -> list[Message]:
-        """Return pose and transforms of a frame; a lost one gives nothing.
+        """Return pose, odometry and transforms of a frame; a lost one gives nothing.
 
         Args:
             tracked: The result of the mapper.
@@ -107,10 +116,13 @@ class OutgoingMessages:
         if T_odom_camera is None:
             return []
         options, odom = self._options, self._options.own_odom_frame
-        covariance = _UNKNOWN
+        if tracked.T_new_old is not None:
+            self._move_path(tracked.T_new_old)
+        covariance, own = _UNKNOWN, _UNKNOWN
         is_in_map = T_map_odom is not None
         pose = T_map_odom @ T_odom_camera if T_map_odom is not None else T_odom_camera
         if tracked.covariance is not None:
+            own = ros_covariance(tracked.covariance, T_odom_camera)
             covariance = ros_covariance(tracked.covariance, pose)
             if is_in_map and alignment is not None:
                 covariance = with_alignment(covariance, pose, alignment)
@@ -121,7 +133,11 @@ class OutgoingMessages:
         if options.publish_odom:
             moved.append(self._maker.transform(stamp_ns, odom, camera_frame, T_odom_camera))
         made = self._maker.pose_with_covariance(stamp_ns, frame, pose, covariance)
-        messages = [self._message("rse_pf/pose", POSE_WITH_COVARIANCE, made)]
+        odometry = self._maker.odometry(stamp_ns, (odom, camera_frame), T_odom_camera, own)
+        messages = [
+            self._message("rse_pf/pose", POSE_WITH_COVARIANCE, made),
+            self._message("rse_pf/odometry", ODOMETRY, odometry),
+        ]
         if moved:
             messages.append(self._message("/tf", TF, self._maker.transforms(moved)))
         self._extend_path(stamp_ns, T_odom_camera)
@@ -132,8 +148,13 @@ class OutgoingMessages:
         if not self._path:
             return []
         frame = self._options.own_odom_frame
-        made = self._maker.path_of(self._path[-1][0], frame, [pose for _, pose in self._path])
+        made = self._maker.path_of(self._path[-1][0], frame, [pose for _, _, pose in self._path])
         return [self._message("rse_pf/path", PATH, made)]
+
+    def imu_place(self, stamp_ns: int, camera_frame: str, imu_frame: str, T_camera_imu: Array) -> Message:
+        """Return where the IMU is on the camera: ``(4, 4)``, metres."""
+        moved = self._maker.transform(stamp_ns, camera_frame, imu_frame, T_camera_imu)
+        return self._message("/tf_static", TF, self._maker.transforms([moved]))
 
     def cloud(
         self, stamp_ns: int, points: npt.NDArray[np.float32], colours: npt.NDArray[np.uint8]
@@ -160,7 +181,13 @@ class OutgoingMessages:
         if self._counted % self._every:
             return
         frame = self._options.own_odom_frame
-        self._path.append((stamp_ns, self._maker.pose(stamp_ns, frame, T_odom_camera)))
+        self._path.append((stamp_ns, T_odom_camera, self._maker.pose(stamp_ns, frame, T_odom_camera)))
         if len(self._path) > self._options.path_poses:
             self._path = self._path[::2]
             self._every *= 2
+
+    def _move_path(self, T_new_old: Array) -> None:
+        """Express the path in the odometry frame as it is now."""
+        frame = self._options.own_odom_frame
+        moved = ((stamp_ns, T_new_old @ T) for stamp_ns, T, _ in self._path)
+        self._path = [(stamp_ns, T, self._maker.pose(stamp_ns, frame, T)) for stamp_ns, T in moved]

@@ -26,7 +26,7 @@ from ros_bridge.bridge import Bridge, CallReply, connected_bridge
 from ros_bridge.incoming import Role
 from ros_bridge.options import BridgeOptions
 from ros_bridge.outgoing import Message, advertised
-from ros_bridge.shell import end_by_signal, run_until, taken
+from ros_bridge.shell import end_by_signal, queue_of, run_until, taken
 from rse_pf.errors import CommandFailed, UsageError
 from rse_pf.terminal import show
 
@@ -91,7 +91,7 @@ class _Node:
     def _subscribe(self, bridge: Bridge) -> None:
         for role, topic, kind in taken(self._options):
             self._rospy.Subscriber(
-                topic, self._raw(kind), _receiver(bridge, role), queue_size=self._options.queue_frames,
+                topic, self._raw(kind), _receiver(bridge, role), queue_size=queue_of(role, self._options),
                 buff_size=1 << 24, tcp_nodelay=True,
             )  # fmt: skip
 

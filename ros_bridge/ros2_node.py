@@ -7,12 +7,13 @@ import functools
 import importlib
 import threading
 from collections.abc import Callable, Coroutine
+from dataclasses import fields
 from typing import Any
 
 from ros_bridge.bridge import Bridge, CallReply, connected_bridge
-from ros_bridge.options import BridgeOptions
+from ros_bridge.options import HELP, BridgeOptions
 from ros_bridge.outgoing import Message, advertised
-from ros_bridge.shell import end_by_signal, run_until, taken
+from ros_bridge.shell import end_by_signal, queue_of, run_until, taken
 from rse_pf.errors import UsageError
 from rse_pf.terminal import show
 
@@ -38,20 +39,38 @@ def run_ros2_node(arguments: list[str], options: dict[str, Any]) -> int:
             hint="source the setup.bash of your ROS 2, and use its Python, 3.10 or newer",
         ) from error
     signals = importlib.import_module("rclpy.signals").SignalHandlerOptions.NO  # asyncio has them
-    rclpy.init(args=["rse-pf-ros", *arguments], signal_handler_options=signals)
-    node = rclpy.create_node(
-        "rse_pf_bridge", namespace=str(options.get("namespace", "")), allow_undeclared_parameters=True,
-        automatically_declare_parameters_from_overrides=True,
-    )  # fmt: skip
+    try:
+        rclpy.init(args=["rse-pf-ros", *arguments], signal_handler_options=signals)
+        node = rclpy.create_node(
+            "rse_pf_bridge", namespace=str(options.get("namespace", "")),
+            automatically_declare_parameters_from_overrides=True,
+        )  # fmt: skip
+    except (RuntimeError, importlib.import_module("rclpy.exceptions").NameValidationException) as error:
+        rclpy.try_shutdown()
+        raise UsageError(
+            f"ROS 2 refuses its arguments: {str(error).splitlines()[0]}",
+            hint="--ros-args -p NAME:=VALUE sets a parameter, --params-file FILE all of them",
+        ) from error
     try:
         own = {name: parameter.value for name, parameter in node.get_parameters_by_prefix("").items()}
         own = {name: value for name, value in own.items() if name not in _OF_ROS and "." not in name}
         namespace = str(node.get_namespace()).strip("/")
         bridge_options = BridgeOptions.of({"namespace": namespace, **own, **options})
+        _declare(node, bridge_options)
         return asyncio.run(_run(rclpy, node, bridge_options))
     finally:
         node.destroy_node()
         rclpy.try_shutdown()
+
+
+def _declare(node: Any, options: BridgeOptions) -> None:
+    """Declare each option as a parameter with the value that is used; none can be set while the node runs."""
+    descriptor = importlib.import_module("rcl_interfaces.msg").ParameterDescriptor
+    for each in fields(options):
+        if node.has_parameter(each.name):
+            node.undeclare_parameter(each.name)
+        described = descriptor(description=HELP[each.name], read_only=True)
+        node.declare_parameter(each.name, getattr(options, each.name), described, ignore_override=True)
 
 
 async def _run(rclpy: Any, node: Any, options: BridgeOptions) -> int:
@@ -66,7 +85,7 @@ async def _run(rclpy: Any, node: Any, options: BridgeOptions) -> int:
     async with connected_bridge(options, publish, is_ros1=False) as bridge:
         for role, topic, kind in taken(options):
             receive = functools.partial(bridge.receive, role)
-            quality = _quality(depth=options.queue_frames, sensor=True)
+            quality = _quality(depth=queue_of(role, options), sensor=True)
             node.create_subscription(_class_of(kind), topic, receive, quality, raw=True)
         _offer(node, bridge, asyncio.get_running_loop())
         executor = rclpy.executors.SingleThreadedExecutor()

@@ -11,9 +11,10 @@ from ros_bridge.incoming import Role, kind_of
 from ros_bridge.options import BridgeOptions
 from rse_pf.terminal import show
 
-__all__ = ["end_by_signal", "run_until", "taken"]
+__all__ = ["end_by_signal", "queue_of", "run_until", "taken"]
 
 _ROLES: tuple[Role, ...] = ("info", "right_info", "imu", "right", "depth", "colour")
+_IMU_SAMPLES = 1000
 
 
 def taken(options: BridgeOptions) -> list[tuple[Role, str, str]]:
@@ -21,6 +22,11 @@ def taken(options: BridgeOptions) -> list[tuple[Role, str, str]]:
     left_out = {"depth", "right"} - {options.partner}
     topics = ((role, str(getattr(options, role))) for role in _ROLES if role not in left_out)
     return [(role, options.named(topic), kind_of(role, topic)) for role, topic in topics if topic]
+
+
+def queue_of(role: Role, options: BridgeOptions) -> int:
+    """Return how many messages of a topic wait: of an IMU, those of half a second at 2 kHz."""
+    return _IMU_SAMPLES if role == "imu" else options.queue_frames
 
 
 def end_by_signal() -> asyncio.Event:

@@ -41,7 +41,7 @@ from rse_pf.experiments.compare.solvers import InProcessSolver
 from rse_pf.experiments.results.trajectory_error import ate_m
 from rse_pf.geometry import Array, Camera, exp_se3, inverse
 
-__all__ = ["Driven", "LensKind", "RenderedRig", "drive_rig", "rendered_rig"]
+__all__ = ["Driven", "LensKind", "RenderedRig", "drive_rig", "render_raw", "rendered_rig"]
 
 LensKind = Literal["pinhole", "fisheye"]
 ATE_PERCENT, DEVIATIONS, OFFSET_S = 0.5, 3.0, 0.003
@@ -158,6 +158,18 @@ def render(
 ) -> Iterator[Frame]:
     """Yield the rectified pairs of a body on ``(n, 4, 4)`` poses."""
     cv2 = load_opencv()
+    for row, (left, right) in enumerate(render_raw(rig, world, T_world_body, seed)):
+        yield Frame(
+            timestamp_s=float(stamps_s[row]), rgb=rectification.left(left), camera=rectification.camera,
+            depth_m=np.zeros(left.shape[:2], dtype=np.float32),
+            stereo=rectification.right(cv2.cvtColor(right, cv2.COLOR_RGB2GRAY)),
+        )  # fmt: skip
+
+
+def render_raw(
+    rig: RenderedRig, world: World, T_world_body: Array, seed: int
+) -> Iterator[tuple[npt.NDArray[np.uint8], npt.NDArray[np.uint8]]]:
+    """Yield the colours ``(h, w, 3)`` of the left and the right lens, as they are."""
     painters = [_LensPainter(world, each.lens) for each in (rig.left, rig.right)]
     for row, T in enumerate(T_world_body):
         rng = np.random.default_rng([seed, 73, row])
@@ -165,11 +177,7 @@ def render(
             painter.draw(T @ each.T_body_camera, rng)
             for painter, each in zip(painters, (rig.left, rig.right), strict=True)
         )
-        yield Frame(
-            timestamp_s=float(stamps_s[row]), rgb=rectification.left(left), camera=rectification.camera,
-            depth_m=np.zeros(left.shape[:2], dtype=np.float32),
-            stereo=rectification.right(cv2.cvtColor(right, cv2.COLOR_RGB2GRAY)),
-        )  # fmt: skip
+        yield left, right
 
 
 async def drive_rig(kind: LensKind, seed: int, seconds: float, rate_hz: float) -> Driven:

@@ -15,6 +15,7 @@ from client_sdk.bags.bag_file import BrokenMessage
 from client_sdk.bags.message_types import (
     DIAGNOSTICS,
     IMU,
+    ODOMETRY,
     PATH,
     POINT_CLOUD,
     POSE,
@@ -95,12 +96,27 @@ class MessageMaker:
             T: ``(4, 4)``.
             covariance: ``(6, 6)`` as ROS defines it: position, then rotation about the axes of *frame*.
         """
-        pose = self.make(
-            "geometry_msgs/msg/PoseWithCovariance",
-            pose=self._pose(T),
-            covariance=np.ascontiguousarray(covariance, dtype=np.float64).ravel(),
+        made = self._with_covariance("Pose", "pose", self._pose(T), covariance)
+        return self.make(POSE_WITH_COVARIANCE, header=self.header(stamp_ns, frame), pose=made)
+
+    def odometry(self, stamp_ns: int, frames: tuple[str, str], T: Array, covariance: Array) -> Any:
+        """Return an ``Odometry`` whose velocity is unknown: 0 with a covariance of 1e6.
+
+        Args:
+            stamp_ns: Time stamp.
+            frames: The frame that the pose is in, and the frame that is there.
+            T: ``(4, 4)``.
+            covariance: ``(6, 6)`` as for `pose_with_covariance`.
+        """
+        still = {name: self._numbers("Vector3", np.zeros(3), "xyz") for name in ("linear", "angular")}
+        twist = self.make("geometry_msgs/msg/Twist", **still)
+        return self.make(
+            ODOMETRY,
+            header=self.header(stamp_ns, frames[0]),
+            child_frame_id=frames[1],
+            pose=self._with_covariance("Pose", "pose", self._pose(T), covariance),
+            twist=self._with_covariance("Twist", "twist", twist, np.diag(np.full(6, 1e6))),
         )
-        return self.make(POSE_WITH_COVARIANCE, header=self.header(stamp_ns, frame), pose=pose)
 
     def path_of(self, stamp_ns: int, frame: str, poses: list[Any]) -> Any:
         """Return a ``Path`` of messages of `pose`."""
@@ -186,6 +202,10 @@ class MessageMaker:
             level=level, name=name, message=text, hardware_id="", values=pairs,
         )  # fmt: skip
         return self.make(DIAGNOSTICS, header=self.header(stamp_ns, ""), status=[status])
+
+    def _with_covariance(self, kind: str, name: str, value: Any, covariance: Array) -> Any:
+        numbers = np.ascontiguousarray(covariance, dtype=np.float64).ravel()
+        return self.make(f"geometry_msgs/msg/{kind}WithCovariance", **{name: value, "covariance": numbers})
 
     def _pose(self, T: Array) -> Any:
         return self.make(

@@ -49,3 +49,32 @@ def test_the_format_of_maps_names_its_objects(repository: Path) -> None:
 
     assert "`pose` is `T_world_camera`" in page
     assert "`step`\nis `T_a_b`" in page
+
+
+def test_pages_say_truly_what_make_installs(repository: Path) -> None:
+    """Where make has installed what elsewhere some extras install, its lock has their packages."""
+    toml = pytest.importorskip("tomllib", reason="Python 3.10 reads no TOML")
+    text = (repository / "pyproject.toml").read_text(encoding="utf-8")
+    extras = toml.loads(text)["project"]["optional-dependencies"]
+
+    def packages(names: set[str]) -> set[str]:
+        wanted = [line for name in names for line in extras[name]]
+        own = {name for line in wanted for name in re.findall(r"rse-pf\[([\w,]+)\]", line)}
+        found = {re.split(r"[\[><=; ]", line)[0] for line in wanted} - {"rse-pf"}
+        return found | (packages({each for name in own for each in name.split(",")}) if own else set())
+
+    locks = {"demo": "demo", "setup": "dev"}
+    claim = re.compile(
+        r"((?:`make \w+`(?: and )?)+) ha(?:s|ve) (?:installed|made)[^.;]*;[^.;]*?"
+        r"install the extras? ((?:`\w+`(?:, | and )?)+)"
+    )
+    seen = {}
+    for page in (repository / "docs").rglob("*.md"):
+        for made, named in claim.findall(" ".join(page.read_text(encoding="utf-8").split())):
+            for target in re.findall(r"make (\w+)", made):
+                lock = (repository / f"locks/{locks[target]}.txt").read_text(encoding="utf-8")
+                installed = set(re.findall(r"^([\w-]+)==", lock, re.MULTILINE))
+                seen[page.name] = packages(set(re.findall(r"`(\w+)`", named))) - installed
+
+    assert {"bags.md", "cameras.md", "ros.md"} <= seen.keys()
+    assert {name: missing for name, missing in seen.items() if missing} == {}

@@ -124,15 +124,19 @@ class RosPrograms:
         self._stack.close()
 
 
-async def own_run(bag: Path, platform: LocalPlatform) -> dict[int, np.ndarray[Any, Any]]:
-    """Return the positions that the SDK alone finds in a bag, by time stamps in milliseconds."""
-    with open_bag(bag, BagOptions()) as opened:
+async def own_run(
+    bag: Path, platform: LocalPlatform, options: BagOptions | None = None
+) -> dict[int, np.ndarray[Any, Any]]:
+    """Return the positions that the SDK alone gives for a bag, as they come, by stamps in milliseconds."""
+    found = {}
+    with open_bag(bag, options or BagOptions()) as opened:
         async with connect(platform.url, token=platform.issue_token("sdk")) as robot:
             mapper = robot.mapper()
             for frame in opened:
-                await mapper.track(frame)
-    path = mapper.trajectory
-    return {round(1e9 * s / 1e6): p for s, p in zip(path.timestamps_s, path.positions, strict=True)}
+                pose = (await mapper.track(frame)).T_world_camera
+                if pose is not None:
+                    found[round(1e3 * frame.timestamp_s)] = pose[:3, 3]
+    return found
 
 
 def poses(number: int) -> Callable[[list[str]], bool]:

@@ -11,9 +11,9 @@ import time
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped
-from nav_msgs.msg import Path
+from nav_msgs.msg import Odometry, Path
 from rclpy.executors import ExternalShutdownException
-from rclpy.qos import qos_profile_sensor_data
+from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
 from sensor_msgs.msg import Image, PointCloud2
 from std_srvs.srv import Trigger
 from tf2_msgs.msg import TFMessage
@@ -36,6 +36,16 @@ def pose(message):
         kind="pose", stamp=nanoseconds(message), at=time.time(), frame=message.header.frame_id,
         position=[place.x, place.y, place.z], variance=message.pose.covariance[0],
     )  # fmt: skip
+
+
+def odometry(message):
+    """Write odometry."""
+    say(
+        kind="odometry",
+        stamp=nanoseconds(message),
+        frame=message.header.frame_id,
+        child=message.child_frame_id,
+    )
 
 
 def moved(message):
@@ -63,7 +73,10 @@ def main():
     node.create_subscription(
         PointCloud2, f"{prefix}/rse_pf/cloud", lambda each: say(kind="cloud", points=each.width), 10
     )
+    node.create_subscription(Odometry, f"{prefix}/rse_pf/odometry", odometry, 100)
     node.create_subscription(TFMessage, "/tf", moved, 100)
+    kept = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    node.create_subscription(TFMessage, "/tf_static", moved, kept)
     node.create_subscription(DiagnosticArray, "/diagnostics", diagnostics, 10)
     node.create_subscription(
         Image, colour, lambda each: say(kind="image", stamp=nanoseconds(each), at=time.time()),

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from client_sdk.bags.message_maker import MessageMaker
-from client_sdk.bags.message_types import PATH, POINT_CLOUD, POSE_WITH_COVARIANCE, TF
+from client_sdk.bags.message_types import ODOMETRY, PATH, POINT_CLOUD, POSE_WITH_COVARIANCE, TF
 from client_sdk.frontend import Frame, TrackedFrame
 from ros_bridge import BridgeOptions, OutgoingMessages
 from ros_bridge.outgoing import ros_covariance, with_alignment
@@ -93,8 +93,9 @@ def test_a_pose_has_the_stamp_of_its_images_and_is_in_the_map() -> None:
     )
 
     pose = maker.decode(POSE_WITH_COVARIANCE, messages[0].data)
-    moved = maker.decode(TF, messages[1].data)
-    assert [each.topic for each in messages] == ["/robot1/rse_pf/pose", "/tf"]
+    moved = maker.decode(TF, messages[2].data)
+    topics = ["/robot1/rse_pf/pose", "/robot1/rse_pf/odometry", "/tf"]
+    assert [each.topic for each in messages] == topics
     assert (pose.header.stamp.sec, pose.header.stamp.nanosec) == divmod(STAMP_NS, 1_000_000_000)
     assert pose.header.frame_id == "map"
     assert np.allclose(
@@ -107,11 +108,39 @@ def test_a_pose_has_the_stamp_of_its_images_and_is_in_the_map() -> None:
     assert moved.transforms[0].transform.translation.x == pytest.approx(ALIGNMENT[0, 3])
 
 
+def test_odometry_is_in_the_odometry_frame_and_claims_no_velocity() -> None:
+    maker, outgoing = made(BridgeOptions(namespace="robot1"))
+    seen = tracked(covariance=random_covariance(0, 0.01))
+    messages = outgoing.of_frame(seen, STAMP_NS, "eye", T_map_odom=ALIGNMENT, alignment=np.eye(6))
+
+    odometry = maker.decode(ODOMETRY, messages[1].data)
+    assert (odometry.header.frame_id, odometry.child_frame_id) == ("robot1/odom", "eye")
+    place = odometry.pose.pose.position
+    assert np.allclose([place.x, place.y, place.z], POSE[:3, 3])
+    in_map = maker.decode(POSE_WITH_COVARIANCE, messages[0].data)
+    assert odometry.pose.covariance[0] < in_map.pose.covariance[0]  # no doubt of the alignment is in it
+    assert odometry.twist.covariance.reshape(6, 6).diagonal().tolist() == [1e6] * 6
+
+
+def test_a_path_is_turned_with_its_world() -> None:
+    maker, outgoing = made()
+    outgoing.of_frame(tracked(), 1, "eye", T_map_odom=None)
+    upright = exp_se3(np.array([0.0, 0.0, 0.0, 0.3, -0.2, 0.1]))
+    turned = replace(tracked(), T_world_camera=upright @ POSE, T_new_old=upright)
+    outgoing.of_frame(turned, 2, "eye", T_map_odom=None)
+
+    first, second = maker.decode(PATH, outgoing.path()[0].data).poses
+    assert np.allclose(
+        [first.pose.position.x, first.pose.position.y, first.pose.position.z], (upright @ POSE)[:3, 3]
+    )
+    assert first.pose.orientation.w == pytest.approx(second.pose.orientation.w)
+
+
 def test_before_the_map_is_known_a_pose_is_in_the_odometry_frame() -> None:
     maker, outgoing = made(BridgeOptions(publish_odom=False))
     messages = outgoing.of_frame(tracked(), STAMP_NS, "eye", T_map_odom=None)
 
-    assert [each.kind for each in messages] == [POSE_WITH_COVARIANCE]
+    assert [each.kind for each in messages] == [POSE_WITH_COVARIANCE, ODOMETRY]
     pose = maker.decode(POSE_WITH_COVARIANCE, messages[0].data)
     assert pose.header.frame_id == "odom"
     assert pose.pose.covariance[0] == 1e6  # nobody believes a covariance that is not known

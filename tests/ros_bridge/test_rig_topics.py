@@ -141,6 +141,27 @@ def test_a_file_of_a_rig_rectifies_the_pair_and_places_the_imu(tmp_path: Path) -
     assert second.imu.timestamps_s[-2] < second.timestamp_s <= second.imu.timestamps_s[-1]
 
 
+def test_a_frame_waits_for_the_sample_after_it_but_not_for_a_silent_imu(tmp_path: Path) -> None:
+    path, _ = rig_file(tmp_path)
+    robot = Robot(rig=str(path), imu="/imu")
+    robot.infos(-FX * BASELINE_M)
+    robot.imu(stamp_of(0) - 5_000_000)
+    assert robot.pair(0) is None
+
+    robot.imu(stamp_of(0) + 5_000_000)
+    images = robot.frames.take()
+    assert images is not None
+    frame = robot.frames.decode(images)
+    assert frame is not None, robot.frames.trouble
+    assert frame.imu is not None
+    assert frame.imu.timestamps_s[-1] > frame.timestamp_s
+
+    assert robot.pair(1) is None  # a sample may still come
+    assert robot.pair(2) is not None  # the next frame is here: it will not
+    assert robot.pair(3) is not None
+    assert robot.frames.take() is not None  # 0.3 s after the last sample: the IMU is silent
+
+
 def test_a_sample_that_is_not_finite_is_counted_and_left_out(tmp_path: Path) -> None:
     path, _ = rig_file(tmp_path)
     robot = Robot(rig=str(path), imu="/imu")
