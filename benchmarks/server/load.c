@@ -12,6 +12,9 @@
    Answers are matched by their `id`: message k of a payload file has the id k.  An answer without id belongs
    to the oldest unanswered message of its connection.
 
+   With --obey 1 a robot that is told `retry_after_ms` sends nothing until then; what it leaves out counts as
+   unsent, so as offered.
+
    It connects to 127.0.0.0/8 only, ends at a deadline whatever happens, and does not check poses. */
 #define _GNU_SOURCE
 #include <arpa/inet.h>
@@ -54,6 +57,7 @@ static const char USAGE[] =
     "  --reply none|json|zlib|msgpack|peer   how answers are read\n"
     "  --seconds 5 --warm-up 0.5 --drain 4 --opening 60   the window, before it, after it, to connect\n"
     "  --at-once 64 --reopen 0   connections that open at the same time; pause before a closed one reopens\n"
+    "  --obey 0   1: wait as long as a failure says\n"
     "  --seed 1 --samples FILE\n";
 
 typedef enum { OPEN_LOOP, EARLY_LOOP, CLOSED_LOOP, IDLE, SILENT } Mode;
@@ -99,7 +103,7 @@ typedef struct {
   bool says_hello, waits_for_room, is_settled;
   uint8_t *partial;
   size_t partial_size, partial_capacity;
-  double reopen_s;
+  double reopen_s, silent_until_s;
 } Robot;
 
 typedef struct {
@@ -119,6 +123,7 @@ static struct {
   int sources, first_source, at_once;
   double seconds, warm_up_s, drain_s, opening_s, reopen_s;
   unsigned seed;
+  bool obeys;
   ReplyKind reply;
   FILE *samples;
 } option;
@@ -349,7 +354,7 @@ static void flush(Robot *robot) {
 
 static void send_next(Robot *robot, double planned_s) {
   Group *group = robot->group;
-  if (robot->state != READY || robot->queued == MAX_QUEUED) {
+  if (robot->state != READY || robot->queued == MAX_QUEUED || now_s() < robot->silent_until_s) {
     note(group, UNSENT, planned_s, NAN, NAN);
     return;
   }
@@ -491,6 +496,25 @@ static Answer read_msgpack(const uint8_t *data, size_t size, long *id) {
   return answer;
 }
 
+/* The pause that a failure asks for, in seconds; 0 where it names none. */
+static double retry_after_s(const uint8_t *data, size_t size) {
+  static uint8_t text[8192];
+  if (option.reply == REPLY_MSGPACK) {
+    const uint8_t *at = after(data, size, "\xae" "retry_after_ms\xcb", 16);
+    if (!at || at + 8 > data + size) return 0;
+    uint64_t bits = 0;
+    for (int i = 0; i < 8; i++) bits = bits << 8 | at[i];
+    double ms;
+    memcpy(&ms, &bits, sizeof ms);
+    return 1e-3 * ms;
+  }
+  size_t length = option.reply == REPLY_ZLIB ? inflated(data, size, text, sizeof text - 1) : 0;
+  if (option.reply == REPLY_JSON) memcpy(text, data, length = size < sizeof text ? size : sizeof text - 1);
+  text[length] = 0;
+  const uint8_t *at = after(text, length, "\"retry_after_ms\":", 17);
+  return at ? 1e-3 * strtod((const char *)at, NULL) : 0;
+}
+
 static Answer read_answer(const uint8_t *data, size_t size, long *id) {
   static uint8_t text[8192];
   switch (option.reply) {
@@ -511,6 +535,7 @@ static void take_answer(Robot *robot, const uint8_t *data, size_t size, double a
   long id = -1;
   Answer answer = read_answer(data, size, &id);
   if (answer == NO_ANSWER) return;
+  if (answer == ANSWER_FAILED && option.obeys) robot->silent_until_s = at_s + retry_after_s(data, size);
   Group *group = robot->group;
   double *planned = group->frame_count ? planned_of(robot) : NULL;
   if (id < 0 && robot->unanswered) {
@@ -847,6 +872,7 @@ static void read_options(int argc, char **argv) {
     else if (!strcmp(name, "--opening")) option.opening_s = atof(value);
     else if (!strcmp(name, "--at-once")) option.at_once = atoi(value);
     else if (!strcmp(name, "--reopen")) option.reopen_s = atof(value);
+    else if (!strcmp(name, "--obey")) option.obeys = atoi(value) != 0;
     else if (!strcmp(name, "--seed")) option.seed = (unsigned)strtoul(value, NULL, 10);
     else if (!strcmp(name, "--samples")) {
       if (!(option.samples = fopen(value, "wb"))) fail("cannot write %s", value);

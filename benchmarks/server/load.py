@@ -97,7 +97,7 @@ def ping_file(folder: Path, codec_name: str) -> Path:
 
 
 def pnp_file(folder: Path, codec_name: str, outlier_ratio: float, **fields: Any) -> Path:
-    """Write `PROBLEMS` commands of 200 matches, every frame kept; return their file.
+    """Write `PROBLEMS` commands of 200 matches, every frame kept unless *fields* say else; return their file.
 
     *fields* are those of a command, such as ``deadline_ms``.
     """
@@ -105,7 +105,7 @@ def pnp_file(folder: Path, codec_name: str, outlier_ratio: float, **fields: Any)
     for seed in range(PROBLEMS):
         p = make_problem(seed=seed, outlier_ratio=outlier_ratio)
         request = make_request(p.points_world, p.pixels, p.camera, binary=codec_name == "bin")
-        commands.append(Command(id=seed, service="pnp", payload=request, keep=True, **fields))
+        commands.append(Command(id=seed, service="pnp", payload=request, **{"keep": True, **fields}))
     file = folder / f"pnp-{round(100 * outlier_ratio)}.{codec_name}"
     return _encode(file, codec_name, commands)
 
@@ -155,6 +155,8 @@ class LoadPlan:
     reopen_s: float = 0.0
     seed: int = 1
     samples: Path | None = None
+    obeys: bool = False
+    """Whether robots wait as long as a failure says; what they leave out is unsent."""
 
     def command(self, program: Path) -> list[str]:
         """Return the command line."""
@@ -163,7 +165,7 @@ class LoadPlan:
             "warm-up": self.warm_up_s, "drain": self.drain_s, "opening": self.opening_s,
             "sources": self.sources, "first-source": self.first_source, "at-once": self.at_once,
             "reopen": self.reopen_s, "seed": self.seed, "hello": self.hello, "tokens": self.tokens,
-            "samples": self.samples, "subprotocol": SUBPROTOCOLS.get(self.codec),
+            "samples": self.samples, "obey": int(self.obeys), "subprotocol": SUBPROTOCOLS.get(self.codec),
         }  # fmt: skip
         made = [str(program)]
         for name, value in values.items():

@@ -39,6 +39,7 @@ IDS = 8
 FAILS, IS_SILENT, FAILS_WITHOUT_ID = 1, 2, 3
 """What the server does with the commands of these ids; it answers all others, and all with this payload:"""
 ALL = "answer all"
+LATER = "refuse all for a while"
 READY_S = 10.0
 STALL_S = 0.15
 
@@ -107,7 +108,11 @@ class ScriptedServer:
             if message.payload == "stall" and not self.outcomes["stalled"]:
                 self.outcomes["stalled"] += 1
                 await asyncio.sleep(STALL_S)  # the defect that the test looks for
-            if message.payload == ALL:
+            if message.payload == LATER:
+                wait_ms = 1e3 * READY_S
+                text = "the server is behind with its work"
+                await say(Failure(id=message.id, code="busy", message=text, retry_after_ms=wait_ms))
+            elif message.payload == ALL:
                 await say(Result(id=message.id))
             elif message.id == IS_SILENT:
                 self.outcomes["lost"] += 1
@@ -176,6 +181,20 @@ def test_counts_what_the_server_did_in_each_codec(server: ScriptedServer, tmp_pa
     assert {name: int(np.sum(rows["outcome"] == n)) for n, name in enumerate(OUTCOMES)} == counted | {
         "unsent": 0
     }
+
+
+@pytest.mark.parametrize("codec", ["zlib", "json", "bin"])
+def test_robots_that_obey_are_silent_as_long_as_a_failure_says(
+    server: ScriptedServer, tmp_path: Path, codec: str
+) -> None:
+    group = open_loop(commands(tmp_path, codec, ids=64, payload=LATER))
+
+    ignoring = run_load(plan(server, tmp_path, codec, group)).groups[0]
+    obeying = run_load(plan(server, tmp_path, codec, group, obeys=True)).groups[0]
+
+    assert (ignoring.failed, ignoring.unsent) == (40, 0)
+    assert obeying.failed < 10
+    assert obeying.failed + obeying.unsent == 40
 
 
 def test_latency_counts_from_the_planned_time(server: ScriptedServer, tmp_path: Path) -> None:
