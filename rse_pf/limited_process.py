@@ -22,7 +22,6 @@ import gc
 import importlib
 import json
 import os
-import queue
 import resource
 import signal
 import socket
@@ -32,10 +31,12 @@ import sys
 import threading
 import time
 import traceback
+from collections import deque
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NoReturn, Protocol
 
 from rse_pf.errors import (
     Busy,
@@ -49,7 +50,15 @@ from rse_pf.errors import (
 from rse_pf.linux import die_with_parent, run_as_batch, set_process_name
 from rse_pf.one_thread import ONE_THREAD
 
-__all__ = ["DEFAULT_NICENESS", "Handler", "LimitedProcesses", "Overran", "ProcessLimits", "main"]
+__all__ = [
+    "DEFAULT_NICENESS",
+    "CallWatch",
+    "Handler",
+    "LimitedProcesses",
+    "Overran",
+    "ProcessLimits",
+    "main",
+]
 
 Handler = Callable[[bytes], bytes]
 """What answers a call; raises MemoryError, or an `RsePfError` that the caller is to see."""
@@ -60,6 +69,8 @@ _MAX_ORDER_BYTES = 1 << 17
 _ORDER_TIMEOUT_S = 10.0
 """A template that does not fork or kill a process within this is replaced."""
 _BUSY_RETRY_MS = 1000.0
+_NEAR = 4
+"""Kinds of work that a process is remembered for."""
 _OUT_OF_MEMORY = 77
 """Exit code of a process whose handler raised MemoryError."""
 _OUT_OF_TIME = signal.SIGPROF
@@ -90,6 +101,16 @@ class ProcessLimits:
     """A process that replies with more has failed."""
 
 
+class CallWatch(Protocol):
+    """Sees in which process a call is worked on, and what it uses."""
+
+    def working(self, pid: int) -> AbstractContextManager[None]:
+        """Return what lasts as long as the process *pid* works; it has not been reaped before the end."""
+
+    def used(self, cpu_s: float) -> None:
+        """Get the CPU seconds that the call took, once for each process that worked on it."""
+
+
 class LimitedProcesses:
     """Up to *count* processes that answer calls; nothing is started before the first call."""
 
@@ -118,9 +139,7 @@ class LimitedProcesses:
         self._cpu_s = limits.cpu_s
         self._max_reply_bytes = limits.max_reply_bytes
         self._template = _Template(self._order, niceness)
-        self._free: queue.LifoQueue[_Slot] = queue.LifoQueue()
-        for _ in range(count):
-            self._free.put(_Slot())
+        self._free = _FreeSlots(count)
 
     def __enter__(self) -> LimitedProcesses:
         return self
@@ -128,11 +147,18 @@ class LimitedProcesses:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def call(self, data: bytes, timeout_s: float) -> bytes:
+    def call(self, data: bytes, timeout_s: float, *, near: str = "", watch: CallWatch | None = None) -> bytes:
         """Return the handler's reply to *data*; blocks for at most *timeout_s* seconds, and some ms.
 
         A call whose process ends, although it had answered other calls before, is repeated once in a new
         process: what others left there may have been the cause.
+
+        Args:
+            data: What the handler gets.
+            timeout_s: Bounds the wait for a process and the work.
+            near: A free process that answered a call with the same text lately is preferred: it may have
+                cached what this call needs.
+            watch: Is told of the work.
 
         Raises:
             Crashed: *data* ended the process: a limit, or a signal; the message says which.
@@ -143,10 +169,8 @@ class LimitedProcesses:
             RsePfError: What the handler raised.
         """
         until = time.monotonic() + timeout_s
-        try:
-            slot = self._free.get(timeout=max(0.0, timeout_s))
-        except queue.Empty:
-            raise _busy_error("no process was free in time") from None
+        watch = watch or _Unwatched()
+        slot = self._free.take(near, until)
         try:
             while True:
                 process = slot.process
@@ -154,8 +178,11 @@ class LimitedProcesses:
                 if process is None or is_new:
                     slot.forget()
                     process = slot.process = self._template.fork(until)
+                slot.note(near)
+                before_s = process.cpu_s
                 try:
-                    return _exchange(process, data, until, self._max_reply_bytes)
+                    with watch.working(process.pid):
+                        return _exchange(process, data, until, self._max_reply_bytes)
                 except TimeoutError:
                     _, cpu_s = self._end(slot, process)
                     raise Overran(timeout_s, cpu_s) from None
@@ -163,8 +190,10 @@ class LimitedProcesses:
                     how, _ = self._end(slot, process)
                     if is_new or how == _name_of(_OUT_OF_TIME):
                         raise self._crash(ended.reason or how) from None
+                finally:
+                    watch.used(process.cpu_s - before_s)
         finally:
-            self._free.put(slot)
+            self._free.give(slot)
 
     def pids(self) -> list[int]:
         """Return the ids of the template, if it runs, and of its processes."""
@@ -173,9 +202,7 @@ class LimitedProcesses:
     def close(self) -> None:
         """End the template and all processes; a call that is under way raises WorkerLost."""
         self._template.close()
-        with contextlib.suppress(queue.Empty):
-            while True:
-                self._free.get_nowait().forget()
+        self._free.forget_all()
 
     def _end(self, slot: _Slot, process: _Process) -> tuple[str, float]:
         """Kill *process* unless it has ended; return how it ended, and the CPU seconds of its last call."""
@@ -206,11 +233,57 @@ class _Slot:
 
     def __init__(self) -> None:
         self.process: _Process | None = None
+        self.near: deque[str] = deque(maxlen=_NEAR)
+
+    def note(self, near: str) -> None:
+        """Remember that the process worked near this."""
+        if near in self.near:
+            self.near.remove(near)
+        self.near.append(near)
 
     def forget(self) -> None:
+        self.near.clear()
         if self.process is not None:
             self.process.connection.close()
             self.process = None
+
+
+class _FreeSlots:
+    """The places where no call is worked on."""
+
+    def __init__(self, count: int) -> None:
+        self._slots = [_Slot() for _ in range(count)]
+        self._changed = threading.Condition()
+
+    def take(self, near: str, until: float) -> _Slot:
+        """Return the one that was near last, else the one that was near to least; raises Busy at *until*."""
+        with self._changed:
+            if not self._changed.wait_for(lambda: self._slots, max(0.0, until - time.monotonic())):
+                raise _busy_error("no process was free in time")
+            fitting = [row for row, slot in enumerate(self._slots) if near in slot.near]
+            fewest = min(range(len(self._slots)), key=lambda row: len(self._slots[row].near))
+            return self._slots.pop(fitting[-1] if fitting else fewest)
+
+    def give(self, slot: _Slot) -> None:
+        with self._changed:
+            self._slots.append(slot)
+            self._changed.notify()
+
+    def forget_all(self) -> None:
+        with self._changed:
+            for slot in self._slots:
+                slot.forget()
+            self._slots.clear()
+
+
+class _Unwatched:
+    """A watch that sees nothing."""
+
+    def working(self, pid: int) -> AbstractContextManager[None]:
+        return contextlib.nullcontext()
+
+    def used(self, cpu_s: float) -> None:
+        pass
 
 
 class _ProcessEnded(Exception):
@@ -275,7 +348,9 @@ class _Template:
             reply = self._ask({"do": "end", "pid": process.pid})
         code = int(reply["code"])
         how = f"exit code {code}" if code >= 0 else _name_of(-code)
-        return how, max(0.0, float(reply["cpu_s"]) - process.cpu_s)
+        cpu_s = max(0.0, float(reply["cpu_s"]) - process.cpu_s)
+        process.cpu_s += cpu_s
+        return how, cpu_s
 
     def close(self) -> None:
         with self._lock:

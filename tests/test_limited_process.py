@@ -6,7 +6,7 @@ import os
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 
 import pytest
@@ -161,6 +161,60 @@ def test_one_process_answers_one_call_after_the_other(processes: LimitedProcesse
 
     assert len(pids) == 1
     assert int(size) == 5 << 20
+
+
+def test_a_call_gets_the_process_that_had_one_like_it(handler: str):
+    with made_of(handler, count=2) as made:
+        first = int(made.call(b"pid", LONG_S))
+        with beside(lambda: made.call(b"sleep", 2.0), Overran):
+            while not is_working(first):
+                threading.Event().wait(0.005)
+            of_rooms = made.call(b"pid", LONG_S, near="rooms")
+        of_kitchen = made.call(b"pid", LONG_S, near="kitchen")
+        assert of_kitchen != of_rooms
+        for _ in range(3):
+            assert made.call(b"pid", LONG_S, near="rooms") == of_rooms
+            assert made.call(b"pid", LONG_S, near="kitchen") == of_kitchen
+
+
+class Watch:
+    """Notes which processes worked on a call, and what they used."""
+
+    def __init__(self) -> None:
+        self.pids: list[int] = []
+        self.cpu_s: list[float] = []
+        self.is_working = False
+
+    @contextmanager
+    def working(self, pid: int) -> Iterator[None]:
+        assert not self.is_working
+        self.pids.append(pid)
+        self.is_working = True
+        try:
+            yield
+        finally:
+            self.is_working = False
+
+    def used(self, cpu_s: float) -> None:
+        self.cpu_s.append(cpu_s)
+
+
+@pytest.mark.parametrize(
+    ("data", "error", "times"), [(b"burn 0.1", None, 1), (b"refuse", BadRequest, 1), (b"loop", Crashed, 1),
+                                 (b"signal 9", Crashed, 2)],
+)  # fmt: skip
+def test_a_watch_sees_the_processes_and_their_cpu_time(
+    processes: LimitedProcesses, data: bytes, error: type[RsePfError] | None, times: int
+):
+    processes.call(b"", LONG_S)
+    watch = Watch()
+
+    with nullcontext() if error is None else pytest.raises(error):
+        processes.call(data, LONG_S, watch=watch)
+
+    assert len(watch.pids) == len(watch.cpu_s) == times
+    expected = {b"burn 0.1": 0.1, b"loop": 0.3}.get(data, 0.0)
+    assert 0.9 * expected <= sum(watch.cpu_s) < expected + 0.1
 
 
 def test_a_process_has_its_limits_and_none_of_the_sockets_of_its_owner(processes: LimitedProcesses):

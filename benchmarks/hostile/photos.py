@@ -1,12 +1,12 @@
 """Robots flood the data service with photos and hostile images; how long do others wait?
 
-    python -m benchmarks hostile.photos [--seconds 10] [--rounds 6] [--attackers 4]
+    python -m benchmarks hostile.photos [--seconds 10] [--rounds 6] [--attackers 4] [--identities 1]
 
 One data server (``rse-pf data``) on loopback.  A robot of another tenant stores 64 KiB five times a second,
-and then localises a photo twice a second, each first alone and then beside *attackers* robots.  Every second
-one of these sends photos that can be localised, the others all images of `tests/hostile/hostile_images.py`,
-as fast as the service answers.  The phases alternate.  The hostile robots run at the lowest priority: in the
-field their work costs a server nothing.
+and then localises a photo twice a second, each first alone and then beside *attackers* connections of
+*identities* robots.  Every second connection sends photos that can be localised, the others all images of
+`tests/hostile/hostile_images.py`, as fast as the service answers.  The phases alternate.  The hostile robots
+run at the lowest priority: in the field their work costs a server nothing.
 
 Defends: the p99 of PUT and of photos beside the flood is at most 1.2 times that of the quiet phases; no
 hostile image is localised, and none ends a process.
@@ -20,6 +20,7 @@ import os
 import tempfile
 import time
 from collections import Counter
+from collections.abc import Callable, Sequence
 from multiprocessing.synchronize import Event
 from pathlib import Path
 from typing import Annotated, Any
@@ -59,7 +60,12 @@ _LOWEST_PRIORITY = 19
     Bar("processes_ended", equals=0),
 )
 def run_benchmark(
-    *, seconds: Annotated[float, "of each phase"] = 10.0, rounds: int = 6, attackers: int = 4
+    *,
+    seconds: Annotated[float, "of each phase"] = 10.0,
+    rounds: int = 6,
+    attackers: Annotated[int, "connections of the flood"] = 4,
+    identities: Annotated[int, "robots that the flood comes from"] = 4,
+    only: Annotated[str, "put or photo; '' for both"] = "",
 ) -> dict[str, Any]:
     """Measure the phases in turns."""
     key, statuses = SigningKey.from_seed(os.urandom(32), "key-1"), Counter[str]()
@@ -78,20 +84,24 @@ def run_benchmark(
             store_pictures(victim, 2.0)
             localise_photos(victim, photos[1].jpeg, 2.0)
             tokens = [
-                token_of(key, RobotId(HOSTILE.tenant, f"phone-{number}")) for number in range(attackers)
+                token_of(key, RobotId(HOSTILE.tenant, f"phone-{number % identities}"))
+                for number in range(attackers)
             ]
             flood = server.port, tokens, str(Path(made) / "photo.jpg")
             for _ in range(rounds):
-                took["put"] += store_pictures(victim, seconds)
-                with hostile(flood_of_photos, flood, statuses):
-                    took["put_beside"] += store_pictures(victim, seconds)
-                took["photo"] += localise_photos(victim, photos[1].jpeg, seconds)
-                with hostile(flood_of_photos, flood, statuses):
-                    took["photo_beside"] += localise_photos(victim, photos[1].jpeg, seconds)
+                if only in ("", "put"):
+                    took["put"] += store_pictures(victim, seconds)
+                    with hostile(flood_of_photos, flood, statuses):
+                        took["put_beside"] += store_pictures(victim, seconds)
+                if only in ("", "photo"):
+                    took["photo"] += localise_photos(victim, photos[1].jpeg, seconds)
+                    with hostile(flood_of_photos, flood, statuses):
+                        took["photo_beside"] += localise_photos(victim, photos[1].jpeg, seconds)
             victim.close()
             log = (Path(made) / "log").read_text()
-    figures: dict[str, Any] = {name: spread(times) for name, times in took.items()}
-    for name in ("put", "photo"):
+    figures: dict[str, Any] = {name: spread(times) for name, times in took.items() if times}
+    figures["photos_beside_ms"] = list(map(round, took["photo_beside"]))
+    for name in ("put", "photo") if not only else (only,):
         figures[f"{name}_p99_ratio"] = figures[f"{name}_beside"]["p99"] / figures[name]["p99"]
     found = sum(count for what, count in statuses.items() if what.startswith("image 200 ok"))
     return figures | {
@@ -117,19 +127,25 @@ def localise_photos(client: Client, photo: bytes, seconds: float) -> list[float]
 def flood_of_photos(
     port: int, tokens: list[str], photo: str, begun: Event, stop: Event, results: Any
 ) -> None:
-    """Send photos, and every second robot hostile images, until *stop*."""
+    """Send photos, and over every second connection hostile images, until *stop*."""
+    os.nice(_LOWEST_PRIORITY)
+    results.put(dict(send_photos(port, tokens, Path(photo).read_bytes(), stop.is_set, begun)))
+
+
+def send_photos(
+    port: int, tokens: Sequence[str], photo: bytes, is_over: Callable[[], bool], begun: Event
+) -> Counter[str]:
+    """Send *photo*, and over every second connection hostile images; return the statuses."""
     from tests.hostile.hostile_images import hostile_images
 
-    os.nice(_LOWEST_PRIORITY)
-    statuses, known = Counter[str](), Path(photo).read_bytes()
-    images = list(hostile_images().values())
+    statuses, images = Counter[str](), list(hostile_images().values())
 
     def work(row: int) -> None:
         client = Client(port, tokens[row])
         for number in itertools.count(row):
-            if stop.is_set():
+            if is_over():
                 break
-            image = known if row % 2 == 0 else images[number % len(images)]
+            image = photo if row % 2 == 0 else images[number % len(images)]
             try:
                 status, content = client.ask("POST", PATH, image)
             except (OSError, http.client.HTTPException):
@@ -141,4 +157,4 @@ def flood_of_photos(
         client.close()
 
     run_threads(work, len(tokens), begun)
-    results.put(dict(statuses))
+    return statuses

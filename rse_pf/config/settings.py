@@ -162,7 +162,7 @@ class DataSettings:
     quota_bytes: int = setting(10737418240, unit="bytes", doc="total size of the objects of one robot", low=1024)
     tenant_quota_bytes: int = setting(107374182400, unit="bytes", doc="total size of what one tenant stores: objects, maps with all their versions, live maps, states of services and jobs that wait", low=1024)
     max_objects: int = setting(100000, unit="objects", doc="objects, unfinished uploads and map versions of one robot", source="file systems run out of inodes", low=1)
-    max_requests_per_s: float = setting(50.0, unit="requests/s", doc="requests of one robot; a list counts as 5, a photo to localise as 10, a commit of a map as 20; more are refused with 429", low=0.1)
+    max_requests_per_s: float = setting(50.0, unit="requests/s", doc="requests of one robot; a list counts as 5, a photo to localise as 10 or one for each 5 ms of its CPU time, a commit of a map as 20; more are refused with 429", low=0.1)
     part_bytes: int = setting(4194304, unit="bytes", doc="body of one request; larger objects are sent in parts", low=1024)
     max_uploads: int = setting(32, doc="request bodies received at the same time; more are refused with 503 and Retry-After", low=1)
     background_bytes_per_s: int = setting(262144, unit="bytes/s", doc="rate at which a robot uploads keyframes in the background", low=1024)

@@ -22,6 +22,7 @@ from rse_pf.auth.origins import AllowedOrigins
 from rse_pf.auth.roster import scopes_allow
 from rse_pf.auth.tokens import Claims, KeySet, token_problem, verify_token
 from rse_pf.config import PlatformSettings
+from rse_pf.data_server import map_describer, photo_localiser
 from rse_pf.data_server.cross_origin import is_preflight, preflight_reply, shared_reply
 from rse_pf.data_server.handlers import Handler, Handlers, MapWork
 from rse_pf.data_server.http import (
@@ -35,8 +36,10 @@ from rse_pf.data_server.http import (
 )
 from rse_pf.data_server.map_describer import MapDescriber
 from rse_pf.data_server.photo_localiser import PhotoLocaliser
+from rse_pf.data_server.photo_turns import PhotoTurns
 from rse_pf.data_server.request_limits import RequestLimits
-from rse_pf.data_server.routes import ROUTES, Route
+from rse_pf.data_server.robot_processes import RobotProcesses
+from rse_pf.data_server.routes import PHOTO_COST, ROUTES, Route
 from rse_pf.errors import (
     BadRequest,
     Busy,
@@ -105,14 +108,16 @@ class DataServer:
         self._origins = AllowedOrigins(settings.serving.allowed_origins)
         self._closing = contextlib.ExitStack()
         if describe is None:
-            describer = MapDescriber(settings, store, clock)
+            describer = MapDescriber(RobotProcesses(map_describer.TARGET, settings, store, clock))
             describe = describer.describe
             self._closing.callback(describer.close)
         if localiser is None:
-            localiser = PhotoLocaliser(settings, store, clock)
+            count = max(photo_localiser.LEAST_PROCESSES, settings.serving.compute_processes)
+            processes = RobotProcesses(photo_localiser.TARGET, settings, store, clock, count=count)
+            localiser = PhotoLocaliser(processes, PhotoTurns(clock))
         self._closing.callback(localiser.close)
         self.handlers = Handlers(
-            store, settings.data, MapWork(describe, localiser), clock=clock,
+            store, settings.data, MapWork(describe, localiser, self._charge_photo), clock=clock,
             wall_clock=wall_clock, audit=audit,
         )  # fmt: skip
         self._routes: dict[str, list[tuple[re.Pattern[str], Route, Handler]]] = {}
@@ -239,6 +244,9 @@ class DataServer:
         if not scopes_allow(claims.scopes, scope, name):
             raise Forbidden(f"this token does not have the scope {scope}", hint="issue another token")
         return claims
+
+    def _charge_photo(self, robot: RobotId, cpu_s: float) -> None:
+        self._limits.charge_cpu(robot, cpu_s, PHOTO_COST, self._clock())
 
     def close(self) -> None:
         """End what the application started, when its work is done."""

@@ -2,8 +2,8 @@
 
 Of the robots that wait, the one whose tenant uses the fewest threads goes first, then the one that uses the
 fewest itself, then the one that was served least recently.  A robot never has more than `_PER_ROBOT` threads
-and a tenant never all of them.  Work that is no longer wanted is not started; work that runs ends at its next
-call of `check_wanted`.
+and a tenant never all of them, if there are several.  Work that is no longer wanted is not started; work that
+runs ends at its next call of `check_wanted`.
 """
 
 from __future__ import annotations
@@ -66,6 +66,7 @@ class FairThreads:
 
     def __init__(self, threads: int = _THREADS) -> None:
         self._most = threads
+        self._per_tenant = min(_PER_TENANT, max(1, threads - 1))
         self._threads: list[threading.Thread] = []
         self._started: queue.SimpleQueue[_Task | None] = queue.SimpleQueue()
         self._free = threads
@@ -119,7 +120,7 @@ class FairThreads:
 
     def _next(self) -> RobotId | None:
         """Return the robot whose turn it is; `_waiting` has the one first that was served least recently."""
-        best, fewest = None, (_PER_TENANT, 0)
+        best, fewest = None, (self._per_tenant, 0)
         for robot in self._waiting:
             used = self._tenants[robot.tenant], self._robots[robot]
             if used < fewest and used[1] < _PER_ROBOT:

@@ -71,10 +71,15 @@ _COUNT = re.compile(r"[0-9]{1,6}")
 
 @dataclass(frozen=True, slots=True)
 class MapWork:
-    """What reads maps: *describe* returns what the map in an object that a robot sent holds."""
+    """What reads maps.
+
+    *describe* returns what the map in an object that a robot sent holds; *charge* counts the CPU seconds of a
+    robot's photo.
+    """
 
     describe: Callable[[RobotId, str], MapSummary]
     localiser: PhotoLocaliser
+    charge: Callable[[RobotId, float], None]
 
 
 class Handlers:
@@ -99,6 +104,7 @@ class Handlers:
         self._describe = map_work.describe
         self.threads = FairThreads()
         self._localiser = map_work.localiser
+        self._charge_cpu = map_work.charge
         self._map_threads = FairThreads(_MAP_THREADS)
         self._photo_threads = FairThreads(map_work.localiser.count)
         self.objects = Objects(store, settings, clock, wall_clock)
@@ -316,17 +322,20 @@ class Handlers:
         """Localise a photo."""
         lens = _lens(request.query)
         photo = await request.body(self._settings.part_bytes, hint="make the photo smaller")
-        return json_reply(
-            200,
-            await self._photo_threads.run(
-                claims.robot, self._localiser.localise, claims.robot, path["name"], photo, lens
-            ),
-        )
+        return await self._of_map(claims.robot, self._localiser.localise, path["name"], photo, lens)
 
     async def outline(self, request: HttpRequest, claims: Claims, path: dict[str, str]) -> HttpReply:
         """Return a map from above."""
-        robot, draw = claims.robot, self._localiser.outline
-        return json_reply(200, await self._photo_threads.run(robot, draw, robot, path["name"]))
+        return await self._of_map(claims.robot, self._localiser.outline, path["name"])
+
+    async def _of_map(self, robot: RobotId, work: Callable[..., Any], *arguments: Any) -> HttpReply:
+        loop = asyncio.get_running_loop()
+
+        def charge(cpu_s: float) -> None:
+            with contextlib.suppress(RuntimeError):  # the loop was closed
+                loop.call_soon_threadsafe(self._charge_cpu, robot, cpu_s)
+
+        return json_reply(200, await self._photo_threads.run(robot, work, robot, *arguments, charge))
 
     def _maps(self, claims: Claims) -> MapRegistry:
         def record_change(action: str, name: str, record: MapRecord) -> None:

@@ -6,42 +6,25 @@ The process reads the object itself, so that the data server never holds a map.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 
 import msgspec
 
 from rse_pf.config import PlatformSettings
-from rse_pf.data_server.robot_processes import RobotProcesses, max_map_bytes, private_store, shared_store
+from rse_pf.data_server.robot_processes import RobotProcesses, max_map_bytes, shared_store
 from rse_pf.identity import RobotId
-from rse_pf.limited_process import Handler, LimitedProcesses
+from rse_pf.limited_process import Handler
 from rse_pf.maps.describe import MapSummary, describe_map
-from rse_pf.object_store import ObjectStore
 
-__all__ = ["MapDescriber", "make_handler"]
+__all__ = ["TARGET", "MapDescriber", "make_handler"]
 
-_TARGET = f"{__name__}:make_handler"
+TARGET = f"{__name__}:make_handler"
 
 
 class MapDescriber:
-    """The process of one data server that reads maps; the first map starts it."""
+    """Reads maps in *processes*, which have the target `TARGET`."""
 
-    def __init__(
-        self,
-        settings: PlatformSettings,
-        store: ObjectStore,
-        clock: Callable[[], float],
-        processes: LimitedProcesses | None = None,
-    ) -> None:
-        """Remember what is needed; nothing is started.
-
-        Args:
-            settings: Groups data, serving and services.
-            store: Is read here only if ``data.store`` is in the memory of this process.
-            clock: Monotonic seconds.
-            processes: What reads maps; None means a process with the limits of ``serving``.
-        """
-        self._store = private_store(settings, store)
-        self._processes = RobotProcesses(_TARGET, settings, clock, processes=processes)
+    def __init__(self, processes: RobotProcesses) -> None:
+        self._processes = processes
 
     def describe(self, robot: RobotId, name: str) -> MapSummary:
         """Return what the map in the object *name*, which *robot* sent, holds; blocks.
@@ -50,7 +33,8 @@ class MapDescriber:
             BadRequest, LimitExceeded: It is no map, or larger than maps may be.
             Crashed, Busy, Expired, WorkerLost: As `RobotProcesses.call` says.
         """
-        data = None if self._store is None else self._store.get(name)
+        store = self._processes.private_store
+        data = None if store is None else store.get(name)
         reply = self._processes.call(robot, msgspec.msgpack.encode([name, data]))
         return msgspec.msgpack.decode(reply, type=MapSummary)
 

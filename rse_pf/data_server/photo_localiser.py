@@ -8,28 +8,30 @@ from __future__ import annotations
 
 import contextlib
 import json
-from collections import OrderedDict
+from collections import Counter, OrderedDict
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import msgspec
 
 from rse_pf.config import PlatformSettings
-from rse_pf.data_server.robot_processes import RobotProcesses, max_map_bytes, private_store, shared_store
+from rse_pf.data_server.photo_turns import PhotoTurns
+from rse_pf.data_server.robot_processes import RobotProcesses, max_map_bytes, shared_store
 from rse_pf.errors import MissingExtra
 from rse_pf.identity import RobotId
-from rse_pf.limited_process import Handler, LimitedProcesses
+from rse_pf.limited_process import Handler
 from rse_pf.maps.photos import Lens, MapOutline, PhotoLocation
 from rse_pf.maps.registry import MapRegistry
-from rse_pf.object_store import ObjectStore
 
 if TYPE_CHECKING:
     from rse_pf.maps.format import MapVersion
     from rse_pf.services.mapping.place import MapIndex
 
-__all__ = ["PhotoLocaliser", "make_handler"]
+__all__ = ["LEAST_PROCESSES", "TARGET", "PhotoLocaliser", "make_handler"]
 
-_TARGET = f"{__name__}:make_handler"
+TARGET = f"{__name__}:make_handler"
+LEAST_PROCESSES = 3
+"""A robot has one of them at most and a tenant all but one, so that others find one that is free."""
 _CACHED_MAPS = 4
 
 
@@ -48,30 +50,19 @@ class _Request(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class PhotoLocaliser:
-    """The processes of one data server that localise photos; the first request starts them."""
+    """Localises photos in *processes*, which have the target `TARGET`, by the turns of their robots."""
 
-    def __init__(
-        self,
-        settings: PlatformSettings,
-        store: ObjectStore,
-        clock: Callable[[], float],
-        processes: LimitedProcesses | None = None,
-    ) -> None:
-        """Remember what is needed; nothing is started.
+    def __init__(self, processes: RobotProcesses, turns: PhotoTurns) -> None:
+        self.count = processes.count
+        self._processes = processes
+        self._turns = turns
 
-        Args:
-            settings: Groups data, serving and services.
-            store: Is read here only if ``data.store`` is in the memory of this process.
-            clock: Monotonic seconds.
-            processes: What localises; None means ``serving.compute_processes`` with the limits of
-                ``serving``.
-        """
-        self.count = settings.serving.compute_processes
-        self._store = private_store(settings, store)
-        self._processes = RobotProcesses(_TARGET, settings, clock, count=self.count, processes=processes)
-
-    def localise(self, robot: RobotId, name: str, photo: bytes, lens: Lens) -> PhotoLocation:
+    def localise(
+        self, robot: RobotId, name: str, photo: bytes, lens: Lens, charge: Callable[[float], None]
+    ) -> PhotoLocation:
         """Return where *photo*, which *robot* sent, was taken in the head of the map *name*; blocks.
+
+        *charge* gets the CPU seconds that it took, also if it fails.
 
         Raises:
             NotFound: The robot's tenant has no such map.
@@ -79,24 +70,30 @@ class PhotoLocaliser:
             MissingExtra: The server lacks what localises.
             Crashed, Busy, Expired, WorkerLost: As `RobotProcesses.call` says.
         """
-        reply = self._call(robot, _Request(tenant=robot.tenant, name=name, photo=photo, lens=lens))
+        reply = self._call(robot, _Request(tenant=robot.tenant, name=name, photo=photo, lens=lens), charge)
         return msgspec.msgpack.decode(reply, type=PhotoLocation)
 
-    def outline(self, robot: RobotId, name: str) -> MapOutline:
+    def outline(self, robot: RobotId, name: str, charge: Callable[[float], None]) -> MapOutline:
         """Return the head of the map *name* as it is seen from above; blocks, and raises as `localise`."""
-        reply = self._call(robot, _Request(tenant=robot.tenant, name=name))
+        reply = self._call(robot, _Request(tenant=robot.tenant, name=name), charge)
         return msgspec.msgpack.decode(reply, type=MapOutline)
 
     def close(self) -> None:
         """End the processes; a call that is under way raises WorkerLost."""
         self._processes.close()
 
-    def _call(self, robot: RobotId, request: _Request) -> bytes:
-        if self._store is not None:
-            maps = MapRegistry(self._store, robot.tenant)
+    def _call(self, robot: RobotId, request: _Request, charge: Callable[[float], None]) -> bytes:
+        store = self._processes.private_store
+        if store is not None:
+            maps = MapRegistry(store, robot.tenant)
             version = maps.head(request.name).id
             request = msgspec.structs.replace(request, version=version, data=maps.data(request.name, version))
-        return self._processes.call(robot, msgspec.msgpack.encode(request))
+        call = self._turns.call_of(robot)
+        try:
+            near = f"{request.tenant}/{request.name}"
+            return self._processes.call(robot, msgspec.msgpack.encode(request), near=near, watch=call)
+        finally:
+            charge(call.cpu_s)
 
 
 def make_handler(configuration: str) -> Handler:
@@ -125,7 +122,7 @@ def make_handler(configuration: str) -> Handler:
 
 
 class _Maps:
-    """The maps that a process has read last."""
+    """The maps that a process has read last, of as many tenants as there are."""
 
     def __init__(self, settings: PlatformSettings) -> None:
         self._store = shared_store(settings)
@@ -150,7 +147,12 @@ class _Maps:
         if found is None:
             data = request.data if maps is None else maps.data(request.name, version)
             if len(self._known) == _CACHED_MAPS:
-                self._known.popitem(last=False)
+                del self._known[self._superfluous()]
             found = index_map(data)
         self._known[key] = found
         return version, *found
+
+    def _superfluous(self) -> tuple[str, str, str]:
+        """Return the map that was used least recently of the tenant that has most."""
+        counts = Counter(tenant for tenant, _, _ in self._known)
+        return max(self._known, key=lambda key: counts[key[0]])  # the first of equals is the oldest

@@ -28,6 +28,9 @@ _RETRY_AFTER_MS = 1000.0
 _REFUSED_BYTES, _REFUSED_COST = 64 << 10, 32.0
 """So many bytes of a refused body count as one request more, and one refusal as this many more at most."""
 
+CPU_S_PER_REQUEST = 0.005
+"""A request whose work took more CPU time than its cost in requests counts by its CPU time."""
+
 
 @dataclass(slots=True)
 class _Robot:
@@ -94,6 +97,20 @@ class RequestLimits:
             now: Monotonic seconds.
         """
         self._state_of(robot, now).bucket.spend(min(body_bytes / _REFUSED_BYTES, _REFUSED_COST), now)
+
+    def charge_cpu(self, robot: RobotId, cpu_s: float, paid: float, now: float) -> None:
+        """Count the CPU time of a request's work, beyond what it counted for when it began.
+
+        One request counts for no more than what may come at once: the first one of a map reads that map.
+
+        Args:
+            robot: Who sent it.
+            cpu_s: CPU seconds.
+            paid: The cost with which it began.
+            now: Monotonic seconds.
+        """
+        bucket = self._state_of(robot, now).bucket
+        bucket.spend(max(0.0, min(cpu_s / CPU_S_PER_REQUEST, bucket.burst) - paid), now)
 
     def end(self, robot: RobotId, *, has_body: bool) -> None:
         """Give back what `begin` took, except for the rate."""

@@ -13,10 +13,10 @@ from rse_pf.config import PlatformSettings
 from rse_pf.crash_record import CrashRecord
 from rse_pf.errors import Crashed
 from rse_pf.identity import RobotId
-from rse_pf.limited_process import LimitedProcesses, ProcessLimits
+from rse_pf.limited_process import CallWatch, LimitedProcesses, ProcessLimits
 from rse_pf.object_store import ObjectStore
 
-__all__ = ["RobotProcesses", "max_map_bytes", "private_store", "shared_store"]
+__all__ = ["RobotProcesses", "max_map_bytes", "shared_store"]
 
 _PRIVATE_STORE = "memory:"
 """The ``data.store`` that other processes cannot read."""
@@ -32,12 +32,18 @@ def max_map_bytes(settings: PlatformSettings) -> int:
 
 
 class RobotProcesses:
-    """The processes of one data server for one kind of work; the first call starts them."""
+    """The processes of one data server for one kind of work; the first call starts them.
+
+    Attributes:
+        count: Calls that are worked on at the same time.
+        private_store: The store if only the data server can read it, else None.
+    """
 
     def __init__(
         self,
         target: str,
         settings: PlatformSettings,
+        store: ObjectStore,
         clock: Callable[[], float],
         *,
         count: int = 1,
@@ -48,10 +54,13 @@ class RobotProcesses:
         Args:
             target: ``module:function``, which takes the settings in JSON and returns the handler.
             settings: Groups data, serving and services.
+            store: Of the data server; the processes read it themselves unless it is in its memory.
             clock: Monotonic seconds.
             count: Calls that are worked on at the same time.
             processes: What answers; None means processes with the limits of ``serving``.
         """
+        self.count = count
+        self.private_store = store if settings.data.store == _PRIVATE_STORE else None
         self._clock = clock
         self._crashes = CrashRecord()
         self._timeout_s = _WALL_S_PER_CPU_S * settings.serving.max_compute_s
@@ -64,8 +73,12 @@ class RobotProcesses:
             count=count,
         )
 
-    def call(self, robot: RobotId, request: bytes) -> bytes:
+    def call(
+        self, robot: RobotId, request: bytes, *, near: str = "", watch: CallWatch | None = None
+    ) -> bytes:
         """Return the handler's reply to what *robot* asked; blocks.
+
+        *near* and *watch* are those of `LimitedProcesses.call`.
 
         Raises:
             Crashed: The request ended the process that worked on it.
@@ -77,7 +90,7 @@ class RobotProcesses:
         if refusal is not None:
             raise refusal
         try:
-            return self._processes.call(request, self._timeout_s)
+            return self._processes.call(request, self._timeout_s, near=near, watch=watch)
         except Crashed:
             self._crashes.note_crash(robot, self._clock())
             raise
@@ -85,11 +98,6 @@ class RobotProcesses:
     def close(self) -> None:
         """End the processes; a call that is under way raises WorkerLost."""
         self._processes.close()
-
-
-def private_store(settings: PlatformSettings, store: ObjectStore) -> ObjectStore | None:
-    """Return *store* if only this process can read it, else None."""
-    return store if settings.data.store == _PRIVATE_STORE else None
 
 
 def shared_store(settings: PlatformSettings) -> ObjectStore | None:

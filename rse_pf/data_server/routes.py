@@ -166,7 +166,8 @@ class Route:
         return re.compile(re.sub(r"\\{(\w+)\\}", r"(?P<\1>[^/]*)", re.escape(self.path)))
 
 
-_LIST_COST, _PHOTO_COST, _COMMIT_COST = 5.0, 10.0, 20.0
+PHOTO_COST = 10.0
+_LIST_COST, _COMMIT_COST = 5.0, 20.0
 _WHOLE_NUMBER = {"type": "integer", "minimum": 0}
 _RANGE = Field(name="Range", place="header", doc="one range of bytes, as bytes=START-END")
 _OFFSET = Field(
@@ -313,11 +314,11 @@ ROUTES: tuple[Route, ...] = (
     ),
     Route(
         operation="localise", method="POST", path=_LOCALISE, scope="maps:localise", body=bytes,
-        cost=_PHOTO_COST, fields=_LENS, doc="Return where a photo, JPEG or PNG, was taken in a map",
+        cost=PHOTO_COST, fields=_LENS, doc="Return where a photo, JPEG or PNG, was taken in a map",
         replies={200: PhotoLocation, 501: HttpFailure, **_BAD, **_NOT_FOUND, **_WORKING},
     ),
     Route(
-        operation="outline", method="GET", path=_LOCALISE, scope="maps:localise", cost=_PHOTO_COST,
+        operation="outline", method="GET", path=_LOCALISE, scope="maps:localise", cost=PHOTO_COST,
         doc="Return a map as it is seen from above",
         replies={200: MapOutline, 501: HttpFailure, **_BAD, **_NOT_FOUND, **_WORKING},
     ),

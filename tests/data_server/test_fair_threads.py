@@ -64,6 +64,22 @@ def test_a_robot_and_a_tenant_never_have_all_threads(threads: FairThreads) -> No
     asyncio.run(flood())
 
 
+def test_a_tenant_never_has_all_of_a_few_threads() -> None:
+    gate, few = Gate(), FairThreads(3)
+
+    async def flood() -> None:
+        robots = [RobotId("acme", f"robot-{number}") for number in range(6)]
+        flood = [asyncio.ensure_future(few.run(robot, gate.work)) for robot in robots]
+        await gate.wait_entered(2)
+        assert await asyncio.wait_for(few.run(OTHER, int, "5"), TIMEOUT_S) == 5
+        assert not gate.entered.acquire(blocking=False)
+        gate.open.set()
+        await asyncio.wait_for(asyncio.gather(*flood), TIMEOUT_S)
+
+    asyncio.run(flood())
+    few.close()
+
+
 def test_a_robot_is_served_beside_the_flood_of_another(threads: FairThreads) -> None:
     gate = Gate()
 

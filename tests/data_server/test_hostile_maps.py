@@ -10,7 +10,8 @@ import pytest
 from fake_data_service import Service, small_settings
 from hostile.hostile_maps import DECODABLE, hostile_maps
 
-from rse_pf.data_server.map_describer import MapDescriber
+from rse_pf.data_server.map_describer import TARGET, MapDescriber
+from rse_pf.data_server.robot_processes import RobotProcesses
 from rse_pf.identity import RobotId
 from rse_pf.maps.describe import MapSummary
 from rse_pf.maps.format import MapVersion, encode_map
@@ -48,7 +49,7 @@ def service(tmp_path: Path) -> Iterator[MapService]:
         store=store, part_bytes=MIB, max_object_bytes=1 << 28, quota_bytes=1 << 30, max_requests_per_s=1000
     )
     made = MapService(settings, DirectoryStore(tmp_path))
-    made.describer = MapDescriber(settings, made.store, lambda: made.now)
+    made.describer = MapDescriber(RobotProcesses(TARGET, settings, made.store, lambda: made.now))
     yield made
     made.describer.close()
 

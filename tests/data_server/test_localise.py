@@ -248,6 +248,36 @@ def test_a_new_head_is_used_at_once(drive: Drive, tmp_path: Path) -> None:
     np.testing.assert_allclose(by, [np.array(after["top_view"]) @ T_new_world[:3, 3]] * len(by), atol=1e-3)
 
 
+def test_the_maps_of_one_tenant_do_not_displace_those_of_another(
+    drive: Drive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read: list[int] = []
+
+    def index_map(data: bytes) -> tuple[MapVersion, None]:
+        read.append(len(data))
+        return decode_map(drive.map), None
+
+    monkeypatch.setattr("rse_pf.services.mapping.place.index_map", index_map)
+    store = DirectoryStore(tmp_path)
+    settings = small_settings(store=f"dir:{tmp_path}")
+    for tenant, count in (("default", 1), ("rival", 5)):
+        for number in range(count):
+            maps = MapRegistry(store, tenant)
+            maps.commit(f"m{number}", drive.map, parent=None, author="t", created_s=0.0)
+    handler = make_handler(json.dumps(settings.to_dict()))
+
+    def ask(tenant: str, name: str) -> int:
+        before = len(read)
+        handler(msgspec.msgpack.encode({"tenant": tenant, "name": name}))
+        return len(read) - before
+
+    assert ask("default", "m0") == 1
+    assert [ask("rival", f"m{number}") for number in range(5)] == [1] * 5
+    assert ask("default", "m0") == 0
+    assert ask("rival", "m4") == 0
+    assert ask("rival", "m0") == 1
+
+
 def test_a_store_in_memory_is_read_by_the_data_server(drive: Drive) -> None:
     store = MemoryStore()
     MapRegistry(store, "default").commit("rooms", drive.map, parent=None, author="t", created_s=0.0)

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from fake_data_service import small_settings
 
 from rse_pf.config import PlatformSettings
 from rse_pf.crash_record import BLOCK_S
-from rse_pf.data_server.map_describer import MapDescriber
+from rse_pf.data_server.map_describer import TARGET, MapDescriber
+from rse_pf.data_server.robot_processes import RobotProcesses
 from rse_pf.errors import Busy, Crashed, RsePfError
 from rse_pf.identity import RobotId
 from rse_pf.maps.describe import MapSummary
@@ -38,7 +40,7 @@ def clock() -> Clock:
 def describer(tmp_path: Path, clock: Clock) -> Iterator[MapDescriber]:
     """One for a store in a folder, which the process reads itself."""
     settings = small_settings(store=f"dir:{tmp_path}", max_object_bytes=1 << 20)
-    made = MapDescriber(settings, MemoryStore(), clock)
+    made = MapDescriber(RobotProcesses(TARGET, settings, MemoryStore(), clock))
     yield made
     made.close()
 
@@ -55,7 +57,7 @@ def test_a_store_in_memory_is_read_by_the_data_server(clock: Clock) -> None:
     store = MemoryStore()
     store.put("map", MAP)
     store.put("none", b"x")
-    made = MapDescriber(small_settings(), store, clock)
+    made = MapDescriber(RobotProcesses(TARGET, small_settings(), store, clock))
     try:
         assert made.describe(ROBOT, "map") == EMPTY
         with pytest.raises(RsePfError):
@@ -70,7 +72,7 @@ class Killed:
     def __init__(self) -> None:
         self.calls = 0
 
-    def call(self, data: bytes, timeout_s: float) -> bytes:
+    def call(self, data: bytes, timeout_s: float, **_: Any) -> bytes:
         self.calls += 1
         raise Crashed("the process ended: signal SIGKILL")
 
@@ -81,8 +83,8 @@ class Killed:
 def test_a_robot_whose_maps_ended_two_processes_is_refused_for_a_while(clock: Clock) -> None:
     store, processes = MemoryStore(), Killed()
     store.put("map", MAP)
-    settings = PlatformSettings()
-    made = MapDescriber(settings, store, clock, processes=processes)
+    asked: Any = processes
+    made = MapDescriber(RobotProcesses(TARGET, PlatformSettings(), store, clock, processes=asked))
 
     for _ in range(2):
         with pytest.raises(Crashed):

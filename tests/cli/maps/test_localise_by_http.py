@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from fake_data_service import HttpServer, Service, small_settings
@@ -31,13 +32,13 @@ class Localiser:
     def __init__(self) -> None:
         self.asked: list[tuple[str, bytes, Lens]] = []
 
-    def localise(self, robot: RobotId, name: str, photo: bytes, lens: Lens) -> PhotoLocation:
+    def localise(self, robot: RobotId, name: str, photo: bytes, lens: Lens, charge: Any) -> PhotoLocation:
         self.asked.append((name, photo, lens))
         if name != "kitchen":
             raise NotFound(f"there is no map {name!r}", hint="see rse-pf map list")
         return OK if photo.startswith(b"k") else PhotoLocation(version="ab", verdict="lost", reason="no-pose")
 
-    def outline(self, robot: RobotId, name: str) -> MapOutline:
+    def outline(self, robot: RobotId, name: str, charge: Any) -> MapOutline:
         raise NotFound("none")
 
     def close(self) -> None:
