@@ -61,6 +61,7 @@ POSE_HZ, KEYFRAME_HZ = 10.0, 2.5
 NEIGHBOURS = ("slow-reader", "garbage", "tenant", "photos")
 HOME, RIVAL = "home", "rival"
 _WARM_S = 8.0
+_LOWEST_PRIORITY = 19
 _SILENT, _GARBAGE, _CONNECTIONS = 10, 5, 4
 _CAMERA = {"fx": 525.0, "fy": 525.0, "cx": 319.5, "cy": 239.5, "width": 640, "height": 480}
 
@@ -139,7 +140,7 @@ async def _neighbour(kind: str, url: str, tokens: Sequence[str], seconds: float)
         counts = await asyncio.gather(*(_send_garbage(url, token, seconds) for token in tokens))
         return sum(counts)
     if kind == "photos":
-        return await asyncio.to_thread(_flood_with_photos, url, tokens[0], seconds)
+        return await asyncio.to_thread(_flood_with_photos, url, tokens[0], Path(tokens[1]), seconds)
     return await _drive_beside(url, tokens, seconds)
 
 
@@ -176,19 +177,23 @@ async def _send_garbage(url: str, token: str, seconds: float) -> int:
     return sent
 
 
-def _flood_with_photos(url: str, token: str, seconds: float) -> int:
-    """Return how many photos were localised; the first order commits their map."""
+def _flood_with_photos(url: str, token: str, photo: Path, seconds: float) -> int:
+    """Return how many photos were localised."""
+    os.nice(_LOWEST_PRIORITY)  # in the field it costs a server nothing
+    until, begun = time.monotonic() + seconds, multiprocessing.Event()
+    address, tokens = urlsplit(url), [token] * _CONNECTIONS
+    sent = send_photos(
+        address.port or 80, tokens, photo.read_bytes(), lambda: time.monotonic() > until, begun
+    )
+    return sent["photo 200 ok"]
+
+
+def _commit_rooms(url: str, token: str, folder: Path) -> None:
+    """Commit the map of the photos, and write a photo of it."""
     keyframes, photos = world_of(0)
-    address = f"http://{urlsplit(url).netloc}"
-    with contextlib.closing(DataClient(address, token)) as client:
+    with contextlib.closing(DataClient(f"http://{urlsplit(url).netloc}", token)) as client:
         client.update_map("rooms", encode_map(MapVersion(keyframes=tuple(keyframes))))
-    os.nice(19)  # in the field it costs a server nothing
-    until = time.monotonic() + seconds
-    port = urlsplit(address).port or 80
-    tokens = [token] * _CONNECTIONS
-    begun = multiprocessing.Event()
-    statuses = send_photos(port, tokens, photos[1].jpeg, lambda: time.monotonic() > until, begun)
-    return statuses["photo 200 ok"]
+    (folder / "photo.jpg").write_bytes(photos[1].jpeg)
 
 
 async def _drive_beside(url: str, tokens: Sequence[str], seconds: float) -> int:
@@ -206,7 +211,10 @@ async def _drive_beside(url: str, tokens: Sequence[str], seconds: float) -> int:
 async def measure(rounds: int, seconds: float, kinds: Sequence[str], folder: Path) -> dict[str, Any]:
     """Return p99 in quiet windows and beside each neighbour of *kinds*."""
     settings = PlatformSettings()
-    async with LocalPlatform(settings, servers=2, port=0, state=folder / "platform") as platform:
+    has_data = "photos" in kinds
+    async with LocalPlatform(
+        settings, servers=2, port=0, state=folder / "platform", data=has_data
+    ) as platform:
         key = ensure_key(platform.state, seed=secrets.token_bytes(32), key_id="unused")
 
         def token(robot: str, tenant: str) -> str:
@@ -218,8 +226,10 @@ async def measure(rounds: int, seconds: float, kinds: Sequence[str], folder: Pat
             "slow-reader": [token(f"{HOME}-slow-{row}", HOME) for row in range(_SILENT)],
             "garbage": [token(f"{HOME}-garbage-{row}", HOME) for row in range(_GARBAGE)],
             "tenant": [token(f"{RIVAL}-{row}", RIVAL) for row in range(2)],
-            "photos": [token(f"{RIVAL}-phone", RIVAL)],
+            "photos": [token(f"{RIVAL}-phone", RIVAL), str(folder / "photo.jpg")],
         }
+        if has_data:
+            await asyncio.to_thread(_commit_rooms, platform.url, tokens["photos"][0], folder)
         context = multiprocessing.get_context("spawn")
         pipes = {}
         for kind in kinds:

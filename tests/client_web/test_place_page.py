@@ -1,4 +1,7 @@
-"""The page that localises its camera, in Chromium: the camera is a film of the drive that made the map."""
+"""The page that localises its camera, in Chromium and behind the load balancer of a platform.
+
+The camera is a film of the drive that made the map.
+"""
 
 from __future__ import annotations
 
@@ -15,36 +18,36 @@ from urllib.parse import urlsplit
 import numpy as np
 import pytest
 
+from tests.examples.conftest import ExamplePlatform, Program
+from tests.examples.conftest import platform as platform
+
 cv2 = pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
 pytest.importorskip("faiss", reason="pip install 'rse-pf[maps]'")
 from client_sdk.frontend import FrontEndOptions, extract  # noqa: E402
 from client_sdk.simulator import make_world, render_along, true_trajectory  # noqa: E402
-from rse_pf.auth.tokens import SigningKey  # noqa: E402
+from client_sdk.transfer.data_client import DataClient  # noqa: E402
+from rse_pf.cli.main import main  # noqa: E402
 from rse_pf.config import PlatformSettings  # noqa: E402
+from rse_pf.geometry import Array  # noqa: E402
+from rse_pf.local.firewall import ensure_key  # noqa: E402
 from rse_pf.maps.format import Keyframe, MapVersion, encode_map  # noqa: E402
-from rse_pf.maps.registry import MapRegistry  # noqa: E402
-from rse_pf.object_store import DirectoryStore  # noqa: E402
-from tests.examples.conftest import Program  # noqa: E402
 
-pytestmark = [pytest.mark.slow, pytest.mark.system, pytest.mark.timeout(180)]
+pytestmark = [pytest.mark.slow, pytest.mark.system, pytest.mark.timeout(300)]
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 FRAMES, HOLD, SEED = 6, 10, 5
-KEY = SigningKey.from_seed(b"w" * 32, "key-1")
-_WORDS = [sys.executable, "-m", "rse_pf.cli.main", "data"]
+HAS_DATA = True
+with socket.create_server(("127.0.0.1", 0)) as _free:
+    PORT = _free.getsockname()[1]
+ALLOWED_ORIGINS = f"http://localhost:{PORT}"
 
 
-def free_port() -> int:
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        return int(free.getsockname()[1])
-
-
-@pytest.fixture
-def places(tmp_path: Path) -> np.ndarray:
-    """The true places of the film's frames; the map and the film are in the folder."""
+@pytest.fixture(scope="module")
+def places(platform: ExamplePlatform) -> Array:
+    """The true places of the film's frames; the map is committed, and film and photos are in the folder."""
     truth = true_trajectory(0, 1, FRAMES, SEED)
     keyframes = []
-    with (tmp_path / "film.mjpeg").open("wb") as film:
+    with (platform.folder / "film.mjpeg").open("wb") as film:
         for row, frame in enumerate(render_along(truth, make_world(SEED), (SEED, 0))):
             found = extract(frame, FrontEndOptions())
             keyframes.append(
@@ -55,61 +58,65 @@ def places(tmp_path: Path) -> np.ndarray:
                 )
             )  # fmt: skip
             jpeg = cv2.imencode(".jpg", frame.rgb[:, :, ::-1], (cv2.IMWRITE_JPEG_QUALITY, 95))[1].tobytes()
+            (platform.folder / f"photo-{row}.jpg").write_bytes(jpeg)
             film.write(jpeg * HOLD)
-    MapRegistry(DirectoryStore(tmp_path / "store")).commit(
-        "rooms", encode_map(MapVersion(keyframes=tuple(keyframes))), parent=None, author="t", created_s=0.0
-    )
+    client = DataClient.enrolled(platform.folder / "robot-1.enrolment")
+    client.update_map("rooms", encode_map(MapVersion(keyframes=tuple(keyframes))))
+    client.close()
     return truth.T_world_camera[:, :3, 3]
 
 
+@pytest.fixture(scope="module")
+def token(platform: ExamplePlatform) -> str:
+    """A token for photos of the map, and nothing else."""
+    key = ensure_key(platform.cloud.state, seed=b"w" * 32, key_id="unused")
+    settings, scopes = PlatformSettings().auth, ("maps:localise/rooms",)
+    return key.issue("phone", now=time.time(), token_id="t", settings=settings, scopes=scopes)
+
+
 @pytest.fixture
-def ports(tmp_path: Path, places: np.ndarray) -> Iterator[tuple[int, int]]:
-    """The ports of a data service with the map, and of the page."""
-    page_port = free_port()
-    settings = PlatformSettings().replace(
-        data={"store": f"dir:{tmp_path / 'store'}", "port": 0},
-        serving={"allowed_origins": f"http://localhost:{page_port}"},
-    )
-    (tmp_path / "keys.json").write_text(KEY.key_set().to_json())
-    (tmp_path / "settings.json").write_text(json.dumps({"context": {"rse-pf": settings.to_dict()}}))
-    files = {"settings": "settings.json", "keys": "keys.json"}
-    words = [*_WORDS, *(f"--{option}={tmp_path / name}" for option, name in files.items())]
-    served = [sys.executable, str(REPOSITORY / "examples" / "web" / "serve.py"), "--port", str(page_port)]
-    programs = [
-        Program(subprocess.Popen(each, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True))
-        for each in (words, served)
-    ]
-    try:
-        ready = json.loads(programs[0].until('"ready"'))
-        programs[1].until("http")
-        yield ready["port"], page_port
-    finally:
-        for program in programs:
-            program.end()
+def page() -> Iterator[str]:
+    """The page, served as its text says."""
+    words = [sys.executable, str(REPOSITORY / "examples" / "web" / "serve.py"), "--port", str(PORT)]
+    program = Program(subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True))
+    program.until("http")
+    yield f"http://localhost:{PORT}/place"
+    program.end()
+
+
+def test_photos_are_localised_through_the_load_balancer(
+    platform: ExamplePlatform, places: Array, token: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (platform.folder / "phone.token").write_text(token)
+    photos = [str(platform.folder / f"photo-{row}.jpg") for row in range(FRAMES)]
+    told = ["--url", f"http://127.0.0.1:{platform.cloud.port}", "--camera", "525,525,319.5,239.5", "--json"]
+    words = ["map", "localise", "rooms", *photos, *told]
+
+    assert main([*words, "--token-file", str(platform.folder / "phone.token")]) == 0
+
+    found = json.loads(capsys.readouterr().out)
+    assert [each["verdict"] for each in found] == ["ok"] * FRAMES
+    localised = np.array([each["T_map_camera"] for each in found])[:, :3, 3]
+    assert np.linalg.norm(localised - places, axis=1).max() < 0.05
 
 
 def test_the_page_shows_its_place_and_asks_no_other_host(
-    ports: tuple[int, int], places: np.ndarray, tmp_path: Path
+    platform: ExamplePlatform, places: Array, token: str, page: str
 ) -> None:
     sync_api = pytest.importorskip("playwright.sync_api", reason="no playwright: make browser installs it")
     chromium = next(filter(None, map(shutil.which, ("chromium-headless-shell", "chromium"))), None)
     if chromium is None:
         pytest.skip("no Chromium: sudo apt-get install chromium-headless-shell")
-    data_port, page_port = ports
-    token = KEY.issue(
-        "phone", now=time.time(), token_id="t", settings=PlatformSettings().auth,
-        scopes=("maps:localise/rooms",),
-    )  # fmt: skip
     asked: set[str] = set()
     wrong: list[str] = []
     with sync_api.sync_playwright() as playwright:
         fake = ["--use-fake-ui-for-media-stream", "--use-fake-device-for-media-stream"]
-        film = f"--use-file-for-fake-video-capture={tmp_path / 'film.mjpeg'}"
+        film = f"--use-file-for-fake-video-capture={platform.folder / 'film.mjpeg'}"
         browser = playwright.chromium.launch(executable_path=chromium, args=["--no-sandbox", *fake, film])
         window = browser.new_page()
         window.on("pageerror", lambda error: wrong.append(str(error)))
         window.on("request", lambda request: asked.add(urlsplit(request.url).netloc))
-        window.goto(f"http://localhost:{page_port}/place#map=rooms&url=http://127.0.0.1:{data_port}")
+        window.goto(f"{page}#map=rooms&url=http://127.0.0.1:{platform.cloud.port}")
         window.fill("#token", token)
         window.click("button")
         window.wait_for_function("document.querySelector('output').dataset.drawn", timeout=60_000)
@@ -127,4 +134,4 @@ def test_the_page_shows_its_place_and_asks_no_other_host(
     place = np.array(found["T_map_camera"])[:3, 3]
     assert np.linalg.norm(places - place, axis=1).min() < 0.05
     np.testing.assert_allclose(red, [0xDD, 0x33, 0x33], atol=2)  # the canvas rounds
-    assert asked == {f"localhost:{page_port}", f"127.0.0.1:{data_port}"}
+    assert asked == {f"localhost:{PORT}", f"127.0.0.1:{platform.cloud.port}"}
