@@ -36,13 +36,17 @@ from rse_pf.object_store import (
 )
 
 if TYPE_CHECKING:  # importing numpy takes a third of a data server's start, and only maps need it
-    from rse_pf.maps.format import MapVersion
+    from rse_pf.maps.format import Keyframe, MapVersion
 
 __all__ = ["MapContent", "MapDiff", "MapOrigin", "MapRecord", "MapRegistry", "difference"]
 
 _NAME = re.compile(r"[a-z0-9][a-z0-9-]{0,63}")
 _ID = re.compile(r"[0-9a-f]{64}")
+_ROBOT = re.compile(r"[A-Za-z0-9][A-Za-z0-9._=-]*")
 _MIN_ID = 6
+_JPEG, _MAX_IMAGE_BYTES = b"\xff\xd8\xff", 64 << 20
+IMAGES_FIELD = "images"
+"""Field of the provenance of a live map: digests of images, by robot's folder and id of the keyframe."""
 _MAX_MAPS, _MAX_VERSIONS = 10_000, 10_000
 """Of one tenant, and of one map: all of them are read when somebody asks for a list."""
 _PIECE_BYTES = 1 << 20
@@ -316,6 +320,31 @@ class MapRegistry:
         from rse_pf.maps.format import decode_map
 
         return decode_map(self.data(name, version), self._max_bytes)
+
+    def images(self, version: MapVersion) -> Iterator[tuple[Keyframe, bytes]]:
+        """Yield keyframes of *version* with the images that its provenance names, of robots of the tenant.
+
+        A robot may have written what is named: an object that is no JPEG, or has another digest, is left out,
+        as one that is gone.
+        """
+        named = version.provenance.get(IMAGES_FIELD)
+        keyframes = {str(keyframe.id): keyframe for keyframe in version.keyframes}
+        for folder, digests in named.items() if isinstance(named, dict) else ():
+            tenant, _, robot = str(folder).partition("/")
+            if tenant != name_segment(self._tenant) or not _ROBOT.fullmatch(robot):
+                continue
+            for number, digest in digests.items() if isinstance(digests, dict) else ():
+                if number in keyframes and _ID.fullmatch(str(digest)):
+                    data = self._object(f"objects/{folder}/{digest}")
+                    if hashlib.sha256(data).hexdigest() == digest and data.startswith(_JPEG):
+                        yield keyframes[number], data
+
+    def _object(self, name: str) -> bytes:
+        """Return the object *name*, empty if there is none or it is too large for an image."""
+        with contextlib.suppress(NotFound):
+            if self._store.head(name).size <= _MAX_IMAGE_BYTES:
+                return self._store.get(name)
+        return b""
 
     def move_head(self, name: str, version: str, *, expected: str) -> MapRecord:
         """Move the head to an existing *version*, as a rollback does.

@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 import math
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
 
 from rse_pf.geometry import Array
+from rse_pf.maps.format import MapVersion
 
-__all__ = ["up_of_floor", "up_of_surfaces"]
+__all__ = ["UpSource", "up_of_floor", "up_of_map", "up_of_surfaces"]
+
+UpSource = Literal["the map", "--up", "the floor", "the level surfaces", "the cameras"]
+_LEAST_UP = 0.5
+"""Length of the mean of the cameras' unit vectors, below which they do not agree on where up is."""
 
 _VOXEL_M = 0.15
 _MAX_POINTS = 500_000
@@ -22,6 +28,29 @@ _CELL_M, _LEAST_OF_CELL, _LEAST_CELLS = 0.25, 10, 40
 _FLOOR_M = (0.4, 0.4, 0.2, 0.2, 0.1, 0.1, 0.05, 0.05, 0.05)
 """Heights beside the plane from which a cell does not count, from one fit to the next."""
 _LEAST_SHARE, _LEAST_WIDTH_M, _MOST_OFF_DEG = 0.5, 1.0, 5.0
+
+
+def up_of_map(version: MapVersion) -> tuple[Array, UpSource] | None:
+    """Return the unit vector of where up is in a map that has keyframes, and what tells it.
+
+    It is what the map says, else the normal of its floor, else that of its level surfaces, else the mean of
+    what is up in its cameras; None if these do not agree.
+    """
+    told = version.up
+    if told is not None:
+        return told, "the map"
+    # y of a camera points down in its image.
+    mean = -np.mean([keyframe.T_world_camera[:3, 1] for keyframe in version.keyframes], axis=0)
+    length = float(np.linalg.norm(mean))
+    if length < _LEAST_UP:
+        return None
+    level = up_of_surfaces(version.points, mean / length)
+    rough: tuple[Array, UpSource] = (mean / length, "the cameras")
+    if level is not None:
+        rough = level, "the level surfaces"
+    places = np.array([keyframe.T_world_camera[:3, 3] for keyframe in version.keyframes])
+    floor = up_of_floor(version.points, rough[0], places)
+    return rough if floor is None else (floor, "the floor")
 
 
 def up_of_surfaces(points: npt.NDArray[np.float32], up: Array) -> Array | None:

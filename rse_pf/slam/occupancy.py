@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -21,13 +20,12 @@ from rse_pf.errors import UsageError
 from rse_pf.geometry import Array, to_quaternion, transform
 from rse_pf.maps.format import MapVersion
 from rse_pf.slam.inertial import upright_turn
-from rse_pf.slam.level_surfaces import up_of_floor, up_of_surfaces
+from rse_pf.slam.level_surfaces import UpSource, up_of_map
 
 __all__ = ["FREE", "OCCUPIED", "UNKNOWN", "GridOptions", "OccupancyGrid", "occupancy_files", "occupancy_grid"]
 
 OCCUPIED, UNKNOWN, FREE = 0, 205, 254
 """Values of cells, as grey levels of the image."""
-UpSource = Literal["the map", "--up", "the floor", "the level surfaces", "the cameras"]
 
 _MAX_CELLS = 1 << 24
 _AROUND_M = 30.0
@@ -36,8 +34,6 @@ _MAX_RAY_M = 10.0
 _MAX_RAYS = 400_000
 _RAYS_AT_ONCE = 20_000
 _LEAST_POINTS = 2
-_LEAST_UP = 0.5
-"""Length of the mean of the cameras' up, below which they tell no direction."""
 _BIN_M, _AREA_M = 0.05, 0.1
 _FLOOR_SHARE = 0.3
 
@@ -181,23 +177,12 @@ def _up_of(version: MapVersion, options: GridOptions) -> tuple[Array, UpSource]:
     if options.up is not None:
         up = np.array(options.up)
         return up / np.linalg.norm(up), "--up"
-    told = version.up
-    if told is not None:
-        return told, "the map"
-    # y of a camera points down in its image.
-    mean = -np.mean([keyframe.T_world_camera[:3, 1] for keyframe in version.keyframes], axis=0)
-    length = float(np.linalg.norm(mean))
-    if length < _LEAST_UP:
+    found = up_of_map(version)
+    if found is None:
         raise UsageError(
             "this map does not say where up is, and its cameras do not agree", hint="name it: --up 0,0,1"
         )
-    level = up_of_surfaces(version.points, mean / length)
-    rough: tuple[Array, UpSource] = (mean / length, "the cameras")
-    if level is not None:
-        rough = level, "the level surfaces"
-    places = np.array([keyframe.T_world_camera[:3, 3] for keyframe in version.keyframes])
-    floor = up_of_floor(version.points, rough[0], places)
-    return rough if floor is None else (floor, "the floor")
+    return found
 
 
 def _check_size(extent_m: Array, options: GridOptions) -> None:

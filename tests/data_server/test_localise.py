@@ -21,10 +21,11 @@ from hostile.hostile_images import HARMLESS, hostile_images, photo  # noqa: E402
 from client_sdk.frontend import Frame, FrontEndOptions, extract  # noqa: E402
 from client_sdk.simulator import make_world, render_along, true_trajectory  # noqa: E402
 from rse_pf.data_server.photo_localiser import make_handler  # noqa: E402
-from rse_pf.geometry import Array, pose_difference  # noqa: E402
+from rse_pf.geometry import Array, exp_se3, pose_difference  # noqa: E402
 from rse_pf.maps.format import Keyframe, MapVersion, decode_map, encode_map  # noqa: E402
 from rse_pf.maps.registry import MapRegistry  # noqa: E402
 from rse_pf.object_store import DirectoryStore, MemoryStore  # noqa: E402
+from rse_pf.services.mapping.photo import outline_of  # noqa: E402
 
 pytestmark = pytest.mark.timeout(120)
 
@@ -222,6 +223,23 @@ def test_an_outline_shows_the_map_from_above(service: PhotoService, drive: Drive
     places = drive.poses[::2, :3, 3] @ axes.T
     np.testing.assert_allclose(np.array(answer.json["keyframes"]), places, atol=1e-3)
     assert 1000 < len(answer.json["points"]) <= 4000
+
+
+def test_up_of_an_outline_is_that_of_the_floor_though_all_cameras_look_down(drive: Drive) -> None:
+    keyframes = decode_map(drive.map).keyframes
+    x, z = (each.ravel() for each in np.meshgrid(np.arange(-6, 6, 0.03), np.arange(-6, 6, 0.03)))
+    # y of a camera points down; these are tilted by 20 degrees alike.
+    tilt = exp_se3([0.0, 0.0, 0.0, -np.radians(20.0), 0.0, 0.0])
+    poses = [exp_se3([0.3 * row, 0.0, 0.0, 0.0, 0.4 * row, 0.0]) @ tilt for row in range(len(keyframes))]
+    floor = np.column_stack([x, np.full(len(x), 1.2), z]).astype(np.float32)
+    version = MapVersion(
+        keyframes=tuple(replace(each, T_world_camera=T) for each, T in zip(keyframes, poses, strict=True)),
+        points=floor, colours=np.zeros((len(floor), 3), np.uint8),
+    )  # fmt: skip
+
+    axes = np.array(outline_of(version, "ab").top_view)
+
+    np.testing.assert_allclose(np.cross(axes[0], axes[1]), [0.0, -1.0, 0.0], atol=1e-3)
 
 
 def test_a_new_head_is_used_at_once(drive: Drive, tmp_path: Path) -> None:

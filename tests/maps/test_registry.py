@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import hashlib
 import os
 import signal
 import subprocess
@@ -174,3 +176,32 @@ def test_a_kill_at_any_step_leaves_the_old_or_the_new_head_complete(tmp_path: Pa
     assert seen[-1][1] == 2
     numbers = [number for _, number in seen]
     assert numbers == sorted(numbers)
+
+
+def test_images_of_keyframes_are_those_of_robots_of_the_tenant_and_nothing_else() -> None:
+    store = MemoryStore()
+    jpeg, text = b"\xff\xd8\xffimage", b"no image"
+    digests = {data: hashlib.sha256(data).hexdigest() for data in (jpeg, text)}
+    for folder in ("default/robot-1", "default/robot-1=abc", "rival/robot-1"):
+        for data, digest in digests.items():
+            store.put(f"objects/{folder}/{digest}", data)
+    forged = hashlib.sha256(b"other").hexdigest()
+    store.put(f"objects/default/robot-1/{forged}", jpeg)
+    good, of_text = digests[jpeg], digests[text]
+    named = {
+        "default/robot-1": {"0": good, "10": of_text, "20": forged, "30": "f" * 64, "99": good, "x": 5},
+        "default/robot-1=abc": {"10": good},
+        "rival/robot-1": {"20": good}, "default/../rival/robot-1": {"20": good}, "default": {"20": good},
+        "default/": {"20": good}, "default/robot-2": good, "/robot-1": {"20": good},
+    }  # fmt: skip
+
+    def images(of: object) -> list[int]:
+        version = dataclasses.replace(make_map(), provenance={"images": of})
+        found = list(MapRegistry(store).images(version))
+        assert {data for _, data in found} <= {jpeg}
+        return [keyframe.id for keyframe, _ in found]
+
+    assert images(named) == [0, 10]
+    for strange in (None, [], "x", 5, {"default/robot-1": None}, {"default/robot-1": {"0": [good]}}):
+        assert images(strange) == []
+    assert list(MapRegistry(store).images(make_map())) == []

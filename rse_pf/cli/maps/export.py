@@ -26,7 +26,10 @@ from rse_pf.terminal import at_work, counted, show, show_json, show_progress
 __all__ = ["add_export_arguments", "run_export"]
 
 _GRID = ("resolution", "robot_height", "step", "floor", "up")
-_NO_IMAGES = "a map holds no images: name those of map from-camera --keep-images by --images"
+_NO_IMAGES = (
+    "this map names no images that are stored: set live.images for live maps, or name those of "
+    "map from-camera --keep-images by --images"
+)
 _MAX_IMAGE_BYTES = 64 << 20
 
 
@@ -40,7 +43,8 @@ def add_export_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     add(
         "--images", type=Path, metavar="DIR",
-        help="colmap, nerfstudio: folder of the images, as map from-camera --keep-images writes it",
+        help="colmap, nerfstudio: folder of the images, as map from-camera --keep-images writes it "
+        "(default: those that robots stored for a live map)",
     )  # fmt: skip
     add("--robot", help="tum: only the keyframes of this robot")
     add(
@@ -78,7 +82,7 @@ def run_export(args: argparse.Namespace, maps: MapRegistry) -> None:
     if args.format in _FOLDERS:
         if args.out.exists() and not args.out.is_dir():
             raise UsageError(f"{args.out} is a file", hint=f"{args.format} is a folder of files: name one")
-        files, notes = _FOLDERS[args.format](args, maps.load(args.name, args.version))
+        files, notes = _FOLDERS[args.format](args, maps, maps.load(args.name, args.version))
         args.out.mkdir(exist_ok=True)
         if any(name.startswith(f"{IMAGES_FOLDER}/") for name in files):
             (args.out / IMAGES_FOLDER).mkdir(exist_ok=True)
@@ -127,10 +131,13 @@ def _check_options(args: argparse.Namespace) -> None:
 _Files = tuple[dict[str, bytes], list[str]]
 
 
-def _with_images(args: argparse.Namespace, version: MapVersion, files: dict[str, bytes]) -> _Files:
+def _with_images(
+    args: argparse.Namespace, maps: MapRegistry, version: MapVersion, files: dict[str, bytes]
+) -> _Files:
     """Return the files with the images of keyframes, as far as they are known."""
     if args.images is None:
-        return files, [_NO_IMAGES]
+        stored = {f"{IMAGES_FOLDER}/{image_name(each)}": data for each, data in maps.images(version)}
+        return {**files, **stored}, _missing("the store", version, stored) if stored else [_NO_IMAGES]
     if not args.images.is_dir():
         raise UsageError(f"there is no folder {args.images}", hint="map from-camera --keep-images makes one")
     images = {}
@@ -141,27 +148,30 @@ def _with_images(args: argparse.Namespace, version: MapVersion, files: dict[str,
                 images[f"{IMAGES_FOLDER}/{name}"] = read_regular_file(file, _MAX_IMAGE_BYTES)
             except OSError as error:
                 raise UsageError(f"cannot read {file}: {error}", hint="leave --images out") from error
+    return {**files, **images}, _missing(str(args.images), version, images)
+
+
+def _missing(where: str, version: MapVersion, images: dict[str, bytes]) -> list[str]:
     missing = len(version.keyframes) - len(images)
-    notes = [f"{args.images} has no image of {counted(missing, 'keyframe')}"] if missing else []
-    return {**files, **images}, notes
+    return [f"{where} has no image of {counted(missing, 'keyframe')}"] if missing else []
 
 
-def _colmap(args: argparse.Namespace, version: MapVersion) -> _Files:
+def _colmap(args: argparse.Namespace, maps: MapRegistry, version: MapVersion) -> _Files:
     def report(done: float) -> None:
         show_progress(f"{100 * done:3.0f} %  matching keyframes", is_over=done >= 1.0)
 
     files = colmap_files(version, report)
-    return _with_images(args, version, files)
+    return _with_images(args, maps, version, files)
 
 
-def _nerfstudio(args: argparse.Namespace, version: MapVersion) -> _Files:
-    files, notes = _with_images(args, version, nerfstudio_files(version))
+def _nerfstudio(args: argparse.Namespace, maps: MapRegistry, version: MapVersion) -> _Files:
+    files, notes = _with_images(args, maps, version, nerfstudio_files(version))
     if version.up is None:
         notes.append("this map does not say where up is: its axes are kept")
     return files, notes
 
 
-def _occupancy(args: argparse.Namespace, version: MapVersion) -> _Files:
+def _occupancy(args: argparse.Namespace, maps: MapRegistry, version: MapVersion) -> _Files:
     with at_work("looking for free space"):
         grid = occupancy_grid(version, _grid_options(args))
     notes = []
@@ -185,7 +195,7 @@ def _grid_options(args: argparse.Namespace) -> GridOptions:
     return GridOptions(**{name: value for name, value in named.items() if value is not None})
 
 
-_FOLDERS: dict[str, Callable[[argparse.Namespace, MapVersion], _Files]] = {
+_FOLDERS: dict[str, Callable[[argparse.Namespace, MapRegistry, MapVersion], _Files]] = {
     "colmap": _colmap, "nerfstudio": _nerfstudio, "occupancy": _occupancy,
 }  # fmt: skip
 """The formats that are folders of files, by name."""

@@ -19,6 +19,7 @@ from rse_pf.maps.format import MapVersion
 from rse_pf.maps.photos import Lens, MapOutline, PhotoLocation
 from rse_pf.services.mapping.localise import LocaliseOptions, LocaliseReply, locate
 from rse_pf.services.mapping.place import MapIndex, check_comparisons
+from rse_pf.slam.level_surfaces import up_of_map
 from rse_pf.slam.orb import describe_orb
 from rse_pf.slam.relative_pose import View
 
@@ -88,10 +89,11 @@ def location_of(found: LocaliseReply, version: str) -> PhotoLocation:
 def outline_of(map_version: MapVersion, version: str) -> MapOutline:
     """Return a map, which has keyframes, as it is seen from above.
 
-    Where its gravity is not known, up is the mean of what is up in its cameras.
+    Up is that of its floor plan: what the map says, or what its floor and its cameras tell.
     """
     poses = np.array([keyframe.T_world_camera for keyframe in map_version.keyframes])
-    axes = _top_view(-poses[:, :3, 1].sum(axis=0) if map_version.up is None else map_version.up)
+    up = up_of_map(map_version)
+    axes = _top_view(np.array([0.0, 0.0, 1.0]) if up is None else up[0])
     points = np.asarray(map_version.points, dtype=np.float64).reshape(-1, 3)
     return MapOutline(
         version=version,
@@ -123,9 +125,7 @@ def _sigma(covariance: Array) -> float:
 
 
 def _top_view(up: Array) -> Array:
-    """Return the ``(2, 3)`` axes of a plane that is seen from above."""
-    length = float(np.linalg.norm(up))
-    up = up / length if length > 1e-6 else np.array([0.0, 0.0, 1.0])
+    """Return the ``(2, 3)`` axes of a plane that is seen from above, of the unit vector *up*."""
     right = np.eye(3)[int(np.argmin(np.abs(up)))]
     right = right - (right @ up) * up
     right /= np.linalg.norm(right)

@@ -18,6 +18,7 @@ from rse_pf.maps.describe import MapSummary
 from rse_pf.maps.format import MapVersion, encode_map
 from rse_pf.maps.registry import MapContent, MapOrigin, MapRegistry
 from rse_pf.object_store import DirectoryStore, digest_of
+from rse_pf.slam.colmap import image_name
 
 FORMATS = ("colmap", "nerfstudio", "occupancy", "ply", "pcd", "tum", "g2o")
 WRITTEN = {
@@ -65,6 +66,28 @@ def test_a_format_of_several_files_is_a_folder(
     for name in WRITTEN[kind]:
         assert f"out/{name}: {Path('out', name).stat().st_size} bytes" in said
     assert said.count("note: ") == 2 * (1 + (kind == "nerfstudio"))
+
+
+@pytest.mark.parametrize("kind", ["colmap", "nerfstudio"])
+def test_the_images_that_robots_stored_for_a_live_map_are_taken_along(
+    folder: Path, kind: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    store, version = DirectoryStore(folder / "store"), hall()
+    image = b"\xff\xd8\xff" + b"an image"
+    digest = digest_of(image)
+    store.put(f"objects/default/robot-1/{digest}", image)
+    first = version.keyframes[0].id
+    named = {"made_by": "live", "images": {"default/robot-1": {str(first): digest}}}
+    live = encode_map(replace(version, provenance=named))
+    MapRegistry(store).commit("live", live, parent=None, author="me", created_s=0.0)
+
+    assert export("live", kind, "out") == 0, capsys.readouterr().err
+
+    (written,) = Path("out", "images").iterdir()
+    assert written.read_bytes() == image
+    assert written.name == image_name(version.keyframes[0])
+    missing = len(version.keyframes) - 1
+    assert f"note: the store has no image of {missing} keyframe" in capsys.readouterr().out
 
 
 def test_json_names_the_files_and_what_the_user_should_know(
