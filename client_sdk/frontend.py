@@ -338,6 +338,8 @@ class TrackedFrame:
     poses that were returned before have changed: read the trajectory again.  Where the world itself was
     turned since the last frame, such as upright, ``T_new_old`` ``(4, 4)`` is its motion: what was returned
     before is ``T_new_old @ T_world_camera`` now.
+    ``features`` are those of the image as they were found, None where nobody found any; their points are NaN
+    where depth is not used.
 
     In a live map, ``T_map_camera`` is the pose in the map, None until ``segment``, the present odometry
     frame, is aligned; ``corrected`` says that its alignment has changed since the last frame.
@@ -358,6 +360,7 @@ class TrackedFrame:
     T_new_old: Array | None = None
     T_map_camera: Array | None = None
     segment: int = 0
+    features: Features | None = None
 
     @property
     def T_world_body(self) -> Array | None:

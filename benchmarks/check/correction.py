@@ -17,7 +17,7 @@ import numpy as np
 
 from benchmarks.check.drives import CheckedDrive
 from benchmarks.check.faults import FAULTS
-from benchmarks.check.table import checked, drives
+from benchmarks.check.table import can_have, checked, drives
 from benchmarks.frame.registry import Bar, benchmark
 from benchmarks.frame.report import say
 from benchmarks.maps.recordings import track
@@ -49,7 +49,7 @@ def correction(
     ]
     for drive in drives(seeds, frames, recordings):
         healthy_cm, _ = _error(drive, drive.frames)
-        for fault in chosen:
+        for fault in (each for each in chosen if can_have(drive, each)):
             bent = list(fault.plant(drive.frames))
             reference = None if drive.odometry is None else MotionReference(path=drive.odometry)
             report, _ = checked(bent, reference)

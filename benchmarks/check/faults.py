@@ -32,8 +32,8 @@ Plant = Callable[[Iterable[Frame]], Iterator[Frame]]
 class Fault:
     """One fault at one of three severities.
 
-    ``value`` is what a finding should say, None where only its kind counts; ``needs`` is empty, ``depth`` or
-    ``odometry``.
+    ``value`` is what a finding should say, None where only its kind counts; ``needs`` is empty, ``depth``,
+    ``odometry`` or ``stereo``.
     """
 
     name: str
@@ -228,6 +228,24 @@ def _mirrored(*, colour: bool, depth: bool) -> Plant:
     return _each(change)
 
 
+def _baseline(share: float) -> Plant:
+    def change(frame: Frame) -> Frame:
+        assert frame.stereo is not None
+        return replace(
+            frame, stereo=replace(frame.stereo, baseline_m=(1.0 + share) * frame.stereo.baseline_m)
+        )
+
+    return _each(change)
+
+
+def _swapped(frame: Frame) -> Frame:
+    """Return a frame whose left image is the right one of its pair, and the other way round."""
+    assert frame.stereo is not None
+    left = np.repeat(frame.stereo.gray[:, :, None], 3, axis=2)
+    right = np.ascontiguousarray(frame.rgb[:, :, 1])
+    return replace(frame, rgb=left, stereo=replace(frame.stereo, gray=right))
+
+
 def _listed() -> Iterator[Fault]:
     def three(
         kind: FaultKind, name: str, faults: list[tuple[float | None, Plant]], needs: str = ""
@@ -271,6 +289,8 @@ def _listed() -> Iterator[Fault]:
     yield from three(kinds.DARK, "dark", [(v, _dark(v)) for v in (0.1, 0.25, 0.5)])
     yield from three(kinds.JITTER, "jitter", [(None, _jittered(v)) for v in (0.25, 0.35, 0.45)])
     yield from three(kinds.MOVING_FOCAL_LENGTH, "focus", [(v, _moving_focal(v)) for v in (0.03, 0.06, 0.12)])
+    yield from three(kinds.BASELINE, "baseline", [(v, _baseline(v)) for v in (0.03, -0.06, 0.1)], "stereo")
+    yield from three(kinds.SWAPPED_CAMERAS, "swapped", [(None, _each(_swapped))], "stereo")
 
 
 FAULTS: tuple[Fault, ...] = tuple(_listed())

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import time
 from collections import defaultdict
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -22,23 +22,30 @@ from benchmarks.check.faults import FAULTS, Fault
 from benchmarks.frame.registry import Bar, benchmark
 from benchmarks.frame.report import say
 from benchmarks.maps.recordings import track
-from client_sdk.check.findings import CheckReport
+from client_sdk.check.findings import CheckReport, FaultKind
 from client_sdk.check.motion import MotionReference
 from client_sdk.check.observer import DriveObserver
 from client_sdk.frontend import Frame, FrontEndOptions
+from client_sdk.rigs.checks import fault_of_pairs, spread_pairs
 from client_sdk.tracking.tracker import Tracker
 
 __all__ = ["table"]
 
 _PARTS = (("7scenes_redkitchen", 0, 125), ("7scenes_redkitchen", 125, 125), ("tum_fr1_rpy_start", 0, 150),
-          ("tum_fr1_rpy_start", 150, 150))  # fmt: skip
+          ("tum_fr1_rpy_start", 150, 150), ("euroc_mh01_start", 60, 100), ("euroc_mh01_start", 220, 100),
+          ("kitti_06_start", 0, 51))  # fmt: skip
 _RECORDINGS = {name for name, _, _ in _PARTS}
 _WITHIN = 0.2
+_OF_ONE_IMAGE = {FaultKind.DISTORTION, FaultKind.DEPTH_SCALE, FaultKind.MIRRORED, FaultKind.TWO_CAMERAS,
+                 FaultKind.MOVING_FOCAL_LENGTH}  # fmt: skip
+"""These are planted into the colour or the depth image, and not into the right one of a pair."""
 
 
-def checked(frames: Iterable[Frame], reference: MotionReference | None) -> tuple[CheckReport, float]:
+def checked(frames: Sequence[Frame], reference: MotionReference | None) -> tuple[CheckReport, float]:
     """Track frames, and return the report with the seconds that the check took beside that."""
     observer, tracker, took_s = DriveObserver(reference), Tracker(FrontEndOptions()), 0.0
+    if _has_stereo(frames):
+        observer.add_pairs(fault_of_pairs(spread_pairs(range(len(frames)), frames.__getitem__)))
     for frame in frames:
         result = track(tracker, frame)
         began_s = time.process_time()
@@ -47,6 +54,17 @@ def checked(frames: Iterable[Frame], reference: MotionReference | None) -> tuple
     began_s = time.process_time()
     report = observer.finish()
     return report, took_s + time.process_time() - began_s
+
+
+def _has_stereo(frames: Sequence[Frame]) -> bool:
+    return any(frame.stereo is not None for frame in frames)
+
+
+def can_have(drive: CheckedDrive, fault: Fault) -> bool:
+    """Say whether a drive has the sensors that a fault is of."""
+    if not _has_stereo(drive.frames):
+        return fault.needs != "stereo"
+    return fault.needs != "depth" and fault.kind not in _OF_ONE_IMAGE
 
 
 def row_of(drive: CheckedDrive, fault: Fault | None) -> dict[str, Any]:
@@ -102,7 +120,7 @@ def table(
     chosen = [fault for fault in FAULTS if not only or fault.name.rpartition("-")[0] in only]
     rows: list[dict[str, Any]] = []
     for drive in drives(seeds, frames, recordings):
-        for fault in (None, *chosen):
+        for fault in (None, *(each for each in chosen if can_have(drive, each))):
             row = row_of(drive, fault) | {"is_recorded": drive.name in _RECORDINGS}
             rows.append(row)
             said = ", ".join(f"{e['kind']} {e['value']:.3g}+-{e['deviation']:.2g}" for e in row["findings"])

@@ -7,15 +7,16 @@ matches by an epipolar line, for which no calibration is needed.
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
 
-from client_sdk.frontend import DescribedPixels, Frame, describe, load_opencv
+from client_sdk.frontend import DescribedPixels, Features, Frame, describe, load_opencv
 from client_sdk.monocular.descriptors import match_all
 from client_sdk.stereo.depth import stereo_points
 from rse_pf.geometry import Array, Camera, inverse, log_se3
+from rse_pf.maps.descriptors import ORB
 from rse_pf.pnp import DepthNoise
 
 __all__ = ["FLIPS", "Keyframe", "KeyframeStore", "Tracks", "tracks_of"]
@@ -24,7 +25,7 @@ Rows = npt.NDArray[np.int64]
 
 FLIPS = ("as it is", "left and right swapped", "top and bottom swapped", "turned by half a turn")
 """How the depth image may lie on the colour image."""
-_FEATURES = 500
+_FEATURES, _MOST_FEATURES = 500, 1200
 _CANDIDATE_S = 0.19
 _MOVED_SHARE = 0.025
 """Of the width of the image; a frame whose features moved less adds nothing."""
@@ -75,15 +76,18 @@ class KeyframeStore:
         self._tried_s = -np.inf
         self._moved_share = _MOVED_SHARE
 
-    def add(self, frame: Frame, T_world_camera: Array | None) -> None:
-        """Look at one frame, and at the pose that was tracked for it."""
+    def add(self, frame: Frame, T_world_camera: Array | None, found: Features | None = None) -> None:
+        """Look at one frame, at the pose that was tracked for it, and at the features that were found.
+
+        ORB features are found here where *found* is None or of another kind, such as vectors without sizes.
+        """
         self._move(frame.timestamp_s, T_world_camera)
         self._surround(frame)
         self.frames += 1
         if 0.0 <= frame.timestamp_s - self._tried_s < _CANDIDATE_S:
             return
         self._tried_s = frame.timestamp_s
-        described = describe(frame.rgb, _FEATURES)
+        described = _described(frame, found)
         if len(described.pixels) < _FEW or not self._is_new(described, frame.camera.width):
             return
         self.keyframes.append(self._made(frame, described, T_world_camera))
@@ -115,7 +119,7 @@ class KeyframeStore:
         while frame.timestamp_s - self._depths[0][0] > _AROUND_S:
             self._depths.popleft()
 
-    def _is_new(self, described: DescribedPixels, width: int) -> bool:
+    def _is_new(self, described: DescribedPixels | Features, width: int) -> bool:
         if not self.keyframes:
             return True
         last = self.keyframes[-1]
@@ -125,7 +129,9 @@ class KeyframeStore:
         moved = np.linalg.norm(last.pixels[one] - described.pixels[other], axis=1)
         return float(np.median(moved)) > self._moved_share * width
 
-    def _made(self, frame: Frame, described: DescribedPixels, T_world_camera: Array | None) -> Keyframe:
+    def _made(
+        self, frame: Frame, described: DescribedPixels | Features, T_world_camera: Array | None
+    ) -> Keyframe:
         pixels = described.pixels
         keyframe = Keyframe(
             row=self.frames - 1, timestamp_s=frame.timestamp_s, camera=frame.camera, pixels=pixels,
@@ -135,7 +141,11 @@ class KeyframeStore:
         )  # fmt: skip
         if frame.stereo is not None:
             self.has_stereo = True
-            points = stereo_points(frame.rgb, frame.stereo, frame.camera, pixels)
+            points = (
+                described.points_camera
+                if isinstance(described, Features) and np.isfinite(described.points_camera).any()
+                else stereo_points(frame.rgb, frame.stereo, frame.camera, pixels)
+            )
             keyframe.depths_m[0] = points[:, 2]
         elif frame.depth_m.any():
             self.has_depth = True
@@ -148,6 +158,20 @@ class KeyframeStore:
                 (stamp_s - frame.timestamp_s, depths_at(depth_m, pixels)) for stamp_s, depth_m in self._depths
             ]
         return keyframe
+
+
+def _described(frame: Frame, found: Features | None) -> DescribedPixels | Features:
+    """Return the ORB features of a frame: those that were found, the finest where they are many."""
+    if found is None or found.kind != ORB or not (found.is_oriented and found.is_scaled):
+        return describe(frame.rgb, _FEATURES)
+    if len(found.pixels) <= _MOST_FEATURES:
+        return found
+    # The finest: they are the same ones in the next image, which each second one would not be.
+    rows = np.sort(np.argsort(found.sizes, kind="stable")[:_MOST_FEATURES])
+    return replace(
+        found, pixels=found.pixels[rows], descriptors=found.descriptors[rows], turns=found.turns[rows],
+        sizes=found.sizes[rows], points_camera=found.points_camera[rows],
+    )  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

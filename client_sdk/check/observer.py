@@ -56,7 +56,8 @@ class DriveObserver:
             MissingExtra: OpenCV is not installed.
         """
         self._images.add(frame.timestamp_s, frame.rgb)
-        self._store.add(frame, None if tracked is None else tracked.T_world_camera)
+        found = None if tracked is None else tracked.features
+        self._store.add(frame, None if tracked is None else tracked.T_world_camera, found)
         self._has_stereo |= frame.stereo is not None
         self._has_depth |= frame.stereo is None and bool(frame.depth_m[::16, ::16].any())
         if frame.imu is not None and len(frame.imu):

@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from client_sdk.frontend import (
     Correspondences,
+    Features,
     Frame,
     PoseQuery,
     TrackedFrame,
@@ -251,6 +252,7 @@ class MonocularTracker:
         self._similar: _Similarity | None = None
         self._loop_from = 0
         self._frame: Frame  # set by `prepare`
+        self._raw: Features
         self._open = OneQuery()
 
     @property
@@ -317,7 +319,8 @@ class MonocularTracker:
         self.frames += 1
         self._frame = frame
         wider = max(1.0, frame.camera.width / _FEATURES_OF_PX)
-        return self._open.begin(self._track(_extract(frame, self._feature_count(wider), self._slots)))
+        self._raw = _found(frame, self._feature_count(wider), self._slots)
+        return self._open.begin(self._track(_looked_up(frame, self._raw, self._slots)))
 
     def accept(
         self, query: PoseQuery, T_camera_world: Array | None, inliers: int = 0, *, is_weak: bool = False
@@ -837,13 +840,14 @@ class MonocularTracker:
         return TrackedFrame(
             frame=self._frame, T_world_camera=self._T_world_start @ inverse(T), keyframe=keyframe,
             inliers=posed.inliers, matches=posed.matches, segment=self._segment, scale="up to scale",
+            features=self._raw,
             reason="in a segment that is not joined to the first one yet" if is_apart else "",
         )  # fmt: skip
 
     def _without_pose(self, status: Literal["lost", "starting"], reason: str) -> TrackedFrame:
         return TrackedFrame(
             frame=self._frame, T_world_camera=None, keyframe=False, inliers=0, matches=0, status=status,
-            reason=reason, segment=self._segment, scale="up to scale",
+            reason=reason, segment=self._segment, scale="up to scale", features=self._raw,
         )  # fmt: skip
 
 
@@ -868,15 +872,24 @@ def _agree(one: _Similarity, two: _Similarity, centre: Array, depth: float) -> b
     return apart <= _AGREE_DEPTH * depth and apart_deg <= _AGREE_DEG and ratio <= _AGREE_SCALE
 
 
-def _extract(frame: Frame, count: int, slots: Slots) -> ViewFeatures:
-    """Return features that are spread over the image."""
+def _found(frame: Frame, count: int, slots: Slots) -> Features:
+    """Return features that are spread over the image, without points."""
     described = describe(frame.rgb, count, slot=slots.features)
-    last = np.array([frame.camera.width - 1, frame.camera.height - 1])
-    columns, rows = np.clip(np.rint(described.pixels).astype(np.int64), 0, last).T
-    image = ImageFeatures(
+    return Features(
         pixels=described.pixels, descriptors=described.descriptors, turns=described.turns,
-        sizes=described.sizes, distinct=distinct_distances(described.descriptors, described.pixels),
+        sizes=described.sizes, points_camera=np.full((len(described.pixels), 3), np.nan), kind=described.kind,
         is_oriented=described.is_oriented, is_scaled=described.is_scaled,
     )  # fmt: skip
-    place = place_of(described.descriptors, frame.rgb, slots.loops)
+
+
+def _looked_up(frame: Frame, found: Features, slots: Slots) -> ViewFeatures:
+    """Return features with their colours and the place that they show."""
+    last = np.array([frame.camera.width - 1, frame.camera.height - 1])
+    columns, rows = np.clip(np.rint(found.pixels).astype(np.int64), 0, last).T
+    image = ImageFeatures(
+        pixels=found.pixels, descriptors=found.descriptors, turns=found.turns, sizes=found.sizes,
+        distinct=distinct_distances(found.descriptors, found.pixels),
+        is_oriented=found.is_oriented, is_scaled=found.is_scaled,
+    )  # fmt: skip
+    place = place_of(found.descriptors, frame.rgb, slots.loops)
     return ViewFeatures(image=image, colours=frame.rgb[rows, columns], place=place)

@@ -698,7 +698,7 @@ class Tracker:
         is_apart = self._segment != min(self._segments)
         return TrackedFrame(
             frame=self._frame, T_world_camera=self._T_last, keyframe=keyframe, inliers=posed.inliers,
-            matches=posed.matches, segment=self.segment,
+            matches=posed.matches, segment=self.segment, features=self._raw,
             reason="in a segment that is not joined to the first one yet" if is_apart else "",
         )  # fmt: skip
 
@@ -708,7 +708,7 @@ class Tracker:
         self._last, self._rate = None, np.zeros(3)
         return TrackedFrame(
             frame=self._frame, T_world_camera=None, keyframe=False, inliers=0, matches=matches,
-            segment=self.segment,
+            segment=self.segment, features=self._raw,
         )  # fmt: skip
 
 

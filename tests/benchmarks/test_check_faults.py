@@ -25,6 +25,7 @@ def changed(frames: list[Frame], kind: FaultKind, severity: int) -> list[Frame]:
 def test_each_fault_has_a_name_of_its_own_and_three_severities() -> None:
     assert len({fault.name for fault in FAULTS}) == len(FAULTS)
     severities = Counter(fault.name.rpartition("-")[0] for fault in FAULTS)
+    assert severities.pop("swapped") == 1
     assert set(severities.values()) == {3}
     assert len(severities) >= 12
 
