@@ -24,7 +24,9 @@ class Made:
 
     ``focal`` and ``principal_px`` are added to the true camera; ``zoom_after`` is the factor of the second
     half, or of every second stretch of so many views; ``depth_noise`` is that of a Kinect times so much;
-    ``turn`` and ``roll`` scale how the camera turns.
+    ``turn`` and ``roll`` scale how the camera turns; ``moves_m`` is how far it moves, ``speed`` how fast.
+    The room is ``size`` times the usual one, or its far wall alone; ``depth_share`` of the features have a
+    depth.
     """
 
     seed: int = 0
@@ -42,12 +44,18 @@ class Made:
     roll: float = 0.3
     has_depth: bool = True
     noise_px: float = 0.4
+    moves_m: tuple[float, float, float] = (0.6, 0.6, 0.6)
+    speed: float = 1.0
+    size: float = 1.0
+    is_wall: bool = False
+    points: int = 1500
+    depth_share: float = 1.0
 
 
 def make_store(made: Made) -> KeyframeStore:
     """Return the keyframes that an observer would keep of a drive."""
     rng = np.random.default_rng([made.seed, 33])
-    points = _walls(rng, 1500)
+    points = _walls(rng, made)
     looks = rng.integers(0, 256, (len(points), 32), dtype=np.uint8)
     phases = rng.uniform(0.0, 2.0 * np.pi, 6)
     store = KeyframeStore()
@@ -63,17 +71,21 @@ def make_store(made: Made) -> KeyframeStore:
 
 def pose_at(made: Made, phases: Array, time_s: float) -> Array:
     """Return ``T_world_camera`` of a hand that moves and turns about the middle of the room."""
-    waves = np.sin(np.array([0.9, 0.7, 0.8, 0.6, 0.75, 0.5]) * time_s + phases)
-    T: Array = exp_se3(np.concatenate([np.zeros(3), waves[3:] * (made.turn, made.turn, made.roll)]))
-    T[:3, 3] = 0.6 * waves[:3]
+    waves = np.sin(np.array([0.9, 0.7, 0.8, 0.6, 0.75, 0.5]) * made.speed * time_s + phases)
+    turned = waves[3:] * (made.turn, made.turn, made.roll)
+    T: Array = exp_se3(np.concatenate([np.zeros(3), turned]))
+    T[:3, 3] = np.array(made.moves_m) * waves[:3]
     return T
 
 
-def _walls(rng: np.random.Generator, count: int) -> Array:
-    points = rng.uniform(-1.0, 1.0, (count, 3)) * ROOM_M
+def _walls(rng: np.random.Generator, made: Made) -> Array:
+    count, room_m = made.points, made.size * ROOM_M
+    points = rng.uniform(-1.0, 1.0, (count, 3)) * room_m
     axis = rng.integers(0, 3, count)
     rows = np.arange(count)
-    points[rows, axis] = np.sign(points[rows, axis]) * ROOM_M[axis]
+    points[rows, axis] = np.sign(points[rows, axis]) * room_m[axis]
+    if made.is_wall:
+        points[:, 2] = room_m[2]
     return points
 
 
@@ -86,14 +98,17 @@ def _seen_at(made: Made, camera: Camera, T_world_camera: Array, pixels: Array) -
     """Return the true depths at pixels: those of the walls of the room."""
     rays = camera.back_project(pixels, np.ones(len(pixels))) @ T_world_camera[:3, :3].T
     with np.errstate(divide="ignore"):
-        reach = (np.sign(rays) * ROOM_M - T_world_camera[:3, 3]) / rays
-    depths: Array = reach.min(axis=1)
+        reach = (np.sign(rays) * made.size * ROOM_M - T_world_camera[:3, 3]) / rays
+    depths: Array = reach[:, 2] if made.is_wall else reach.min(axis=1)
     return depths
 
 
 def _measured(made: Made, rng: np.random.Generator, depths: Array) -> Array:
     noise = made.depth_noise * np.sqrt(DepthNoise().variance_m2(depths))
-    return depths + made.offset_m + noise * rng.standard_normal(len(depths))
+    measured: Array = depths + made.offset_m + noise * rng.standard_normal(len(depths))
+    if made.depth_share < 1.0:
+        measured[rng.uniform(size=len(depths)) >= made.depth_share] = np.nan
+    return measured
 
 
 def _keyframe(

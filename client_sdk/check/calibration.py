@@ -45,6 +45,7 @@ _FEW_DEG = 12.0
 _OF_FEW_PARTS = 1.5
 """Deviations that come from two to four parts are too small as often as not."""
 _MAINLY, _ALIKE = 0.7, 0.8
+_HARDLY, _LITTLE, _NOISY, _FEW_DEPTHS = 0.01, 0.06, 2.0, 0.2
 _ROWS = {
     FaultKind.FOCAL_LENGTH: (_FX, _FY), FaultKind.PRINCIPAL_POINT: (_CX, _CY),
     FaultKind.DISTORTION: (_K1,), FaultKind.DEPTH_OFFSET: (_OFFSET,), FaultKind.DEPTH_DELAY: (_DELAY,),
@@ -82,7 +83,7 @@ def judge_calibration(store: KeyframeStore) -> CalibrationJudgement:
     try:
         model, found, reading = _adjusted(store, tracks, reading, free)
         if model is None or found is None:
-            return _untold("too few views that show the same", has_depth=has_depth)
+            return _untold(_unconnected(store, reading), has_depth=has_depth)
         zoomed = adjust_with_calibration(
             model.observed, found.T_camera_world, found.points_world, free, zooms=True, values=found.values,
         )  # fmt: skip
@@ -371,6 +372,21 @@ def _untold(shown: str, *, has_depth: bool) -> CalibrationJudgement:
     )
 
 
+def _unconnected(store: KeyframeStore, reading: DepthReading) -> str:
+    """Return why the keyframes of a drive do not connect."""
+    keyframes = store.keyframes
+    if store.has_depth or store.has_stereo:
+        read = np.concatenate([each.depths_m[reading.flip] for each in keyframes])
+        share = float(np.isfinite(read).mean())
+        if share < _FEW_DEPTHS:
+            return f"a depth at {share:.0%} of its features only"
+    else:
+        posed = sum(each.T_world_camera is not None for each in keyframes)
+        if posed < _LEAST_KEYFRAMES:
+            return f"a pose in {posed} of {len(keyframes)} views only"
+    return "too few views that share enough features"
+
+
 def _cannot_tell(
     drive: _Drive, reading: DepthReading, *, told: set[FaultKind], has_depth: bool
 ) -> Iterator[CannotTell]:
@@ -416,31 +432,45 @@ def _reason(row: int, deviation: float, drive: _Drive) -> str:
     """Return which motion, or which sight, this drive lacks, with its figure."""
     found, model = drive.found, drive.model
     yaw, pitch, roll = _turns_deg(found)
+    moved = _moved_share(found)
+    if moved < _HARDLY and max(yaw, pitch, roll) < _FEW_DEG:
+        return "the camera neither moves nor turns"
+    if found.depth_factor > _NOISY:
+        return f"depths scatter by {found.depth_factor:.1f} times what those of a Kinect do"
     if row in (_FX, _CX, _FY, _CY):
         about, turned = ("vertical", yaw) if row in (_FX, _CX) else ("horizontal", pitch)
         if turned < _FEW_DEG:
             return f"the camera turns by {turned:.0f} degrees only about its {about} axis"
         if row in (_CX, _CY) and roll < _FEW_DEG:
             return f"the camera turns by {roll:.0f} degrees only about its optical axis"
+    if moved < (_LITTLE if row == _OFFSET else _HARDLY):
+        return f"the camera moves by {moved:.1%} of the depth of what it sees only"
     if _OF_FEW_PARTS * drive.parts[row] > _MAINLY * deviation:
         return "parts of the drive, adjusted by themselves, disagree by more than they know"
-    if row == _OFFSET:
-        depths = model.observed.depths_m[np.isfinite(model.observed.depths_m)]
-        if not len(depths):
-            return "no feature has a depth"
-        low, high = np.percentile(depths, [5, 95])
-        return f"depths lie between {low:.1f} and {high:.1f} m"
     if row == _DELAY:
         rate = float(np.median(np.abs(model.observed.rates_m_s)))
         return f"depths at a pixel change by {100 * rate:.0f} cm/s only"
     correlation = _correlations(found.covariance, row)
     other = int(np.argmax(np.abs(correlation)))
+    # Errors that grow with depth look like an offset where all depths are alike.
+    if row == _OFFSET and (UNKNOWNS[other] == "curve" or abs(correlation[other]) <= _ALIKE):
+        depths = model.observed.depths_m[np.isfinite(model.observed.depths_m)]
+        low, high = np.percentile(depths, [5, 95])
+        return f"depths lie between {low:.1f} and {high:.1f} m"
     if abs(correlation[other]) > _ALIKE:
         return (
             f"{UNKNOWNS[row]} looks like {UNKNOWNS[other]} in these views "
             f"(correlation {correlation[other]:+.2f})"
         )
     return f"{len(found.points_world)} landmarks in {len(model.rows)} views do not tell more"
+
+
+def _moved_share(found: Calibrated) -> float:
+    """Return how far the camera moves, root mean square, beside the median distance of what it sees."""
+    at = inverse(found.T_camera_world)[:, :3, 3]
+    middle = at.mean(axis=0)
+    reach = float(np.sqrt(np.square(at - middle).sum(axis=1).mean()))
+    return reach / max(float(np.median(np.linalg.norm(found.points_world - middle, axis=1))), 1e-9)
 
 
 def _correlations(covariance: Array, row: int) -> Array:

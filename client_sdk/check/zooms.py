@@ -23,7 +23,7 @@ _DEVIATIONS, _CLEAR, _HINT = 3.0, 6.0, 1.5
 _UNEVEN = 0.2
 """Jumps of two cameras are of one size, but for this share of it."""
 _FLOOR, _INFLATION = 0.005, 1.5
-_PARTS = 5
+_PARTS, _MAINLY = 5, 2.0
 _QUANTILE, _OF_NORMAL = 0.3, 0.385
 """Of the absolute steps of a normal distribution; up to half of the steps may be jumps."""
 _TOLD = 0.08
@@ -133,10 +133,13 @@ def _moved(zooms: Array, times_s: Array, common: Calibrated, zoomed: Calibrated)
         return ZoomJudgement(hint=hint)
     low, high = float(rates.min()) * span_s, float(rates.max()) * span_s
     errors = "of depth or of the lens" if common.has_metres else "of the lens or its distortion"
-    reason = (
-        f"parts of the drive say that the focal length changes by {low:+.0%} to {high:+.0%}, as by errors "
-        f"{errors}: a change within {_DEVIATIONS * deviation:.0%}"
-    )
+    reason = f"{len(zooms)} views do not tell more"
+    if between > _MAINLY * own:
+        reason = (
+            f"parts of the drive say that the focal length changes by {low:+.0%} to {high:+.0%}, as by "
+            f"errors {errors}"
+        )
+    reason += f": a change within {_DEVIATIONS * deviation:.0%}"
     return ZoomJudgement(
         hint=hint,
         cannot_tell=(CannotTell(FaultKind.MOVING_FOCAL_LENGTH, reason, _DEVIATIONS * deviation),),
