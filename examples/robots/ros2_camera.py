@@ -37,8 +37,8 @@ def main(args: argparse.Namespace) -> None:
     while not (colours.get_subscription_count() and infos.get_subscription_count()):
         time.sleep(0.1)
     time.sleep(1.0)  # the bridge finds the depth, too
-    for frame in render_frames(0, 1, args.frames, seed=0):
-        next_s = time.monotonic() + 1.0 / args.rate
+    for number, frame in enumerate(render_frames(0, 1, args.frames, seed=0), 1):
+        next_s = time.monotonic() + (1.0 / args.rate if number < args.frames else 4.0)  # for late poses
         now, camera = node.get_clock().now().to_msg(), frame.camera
         info = CameraInfo(width=camera.width, height=camera.height, distortion_model="plumb_bob")
         info.k, info.p = camera.matrix.ravel(), np.eye(3, 4).ravel()
