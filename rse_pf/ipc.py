@@ -10,6 +10,7 @@ import socket
 import struct
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from typing import Any
 
 import msgspec
@@ -62,15 +63,16 @@ def receive_bytes(connection: socket.socket, size: int, until: float | None = No
     Raises:
         TimeoutError: The monotonic time *until*, s, has passed.
     """
-    if until is None:
-        return connection.recv(size, socket.MSG_WAITALL)
     received = bytearray()
-    while len(received) < size:
-        connection.settimeout(max(1e-6, until - time.monotonic()))
-        piece = connection.recv(min(size - len(received), _PIECE_BYTES))
-        if not piece:
-            break
-        received += piece
+    with suppress(ConnectionResetError):  # it ended and left bytes unread
+        if until is None:
+            return connection.recv(size, socket.MSG_WAITALL)
+        while len(received) < size:
+            connection.settimeout(max(1e-6, until - time.monotonic()))
+            piece = connection.recv(min(size - len(received), _PIECE_BYTES))
+            if not piece:
+                break
+            received += piece
     return bytes(received)
 
 

@@ -10,10 +10,9 @@ import contextlib
 import logging
 import os
 import queue
-import selectors
 import subprocess
-import sys
-from collections.abc import Callable, Iterator, Sequence
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import CancelledError
 from dataclasses import dataclass
 from typing import Any
@@ -22,8 +21,10 @@ import msgspec
 
 from rse_pf.batch.node import NodeOrder, compute, security_of
 from rse_pf.batch.parts import Part, encode_part, is_done
+from rse_pf.child.start import Child, ChildPlan, start_child
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import Crashed, Disconnected, MissingExtra, error_from_code
+from rse_pf.ipc import receive
 from rse_pf.object_store import ObjectStore
 from rse_pf.one_thread import ONE_THREAD
 from rse_pf.terminal import counted
@@ -34,7 +35,6 @@ __all__ = [
     "LocalCluster",
     "new_cluster_key",
     "start_worker",
-    "stop_process",
 ]
 
 PART_TRIES = 3
@@ -96,11 +96,11 @@ class LocalCluster:
         self._key = key
         self._count = workers
         self._environment = {
-            **ONE_THREAD, **_DASK, "DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": str(part_tries - 1)
+            **_DASK, "DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": str(part_tries - 1)
         }  # fmt: skip
         self._host, self._port = host, port
-        self._scheduler: subprocess.Popen[bytes] | None = None
-        self._workers: list[subprocess.Popen[bytes]] = []
+        self._scheduler: Child | None = None
+        self._workers: list[Child] = []
         self._starts = 0
 
     @property
@@ -116,7 +116,7 @@ class LocalCluster:
     @property
     def is_lost(self) -> bool:
         """Whether the scheduler has ended."""
-        return self._scheduler is None or self._scheduler.poll() is not None
+        return self._scheduler is None or self._scheduler.exit_code() is not None
 
     def start(self) -> None:
         """Start scheduler and workers; raises Crashed if the scheduler does not come up."""
@@ -124,7 +124,7 @@ class LocalCluster:
         self._scheduler = self._spawn(
             "scheduler", NodeOrder(**self._order(), host=self._host, port=self._port)
         )
-        self.address = _first_line(self._scheduler, _START_TIMEOUT_S)
+        self.address = _address(self._scheduler, _START_TIMEOUT_S)
         self._workers = [self._start_worker() for _ in range(self._count)]
 
     def replace_dead_workers(self) -> int:
@@ -133,7 +133,7 @@ class LocalCluster:
         Raises:
             Crashed: Too many have ended.
         """
-        dead = [row for row, each in enumerate(self._workers) if each.poll() is not None]
+        dead = [row for row, each in enumerate(self._workers) if each.exit_code() is not None]
         for row in dead:
             self._starts += 1
             if self._starts > _MAX_WORKER_STARTS:
@@ -141,45 +141,38 @@ class LocalCluster:
                     f"{_MAX_WORKER_STARTS} workers ended",
                     hint="look at the memory of this machine; use fewer",
                 )
-            stop_process(self._workers[row])
+            self._workers[row].kill()
             self._workers[row] = self._start_worker()
         return len(dead)
 
     def stop(self) -> None:
         """Kill all processes and wait for them."""
         for each in [*self._workers, *([self._scheduler] if self._scheduler is not None else [])]:
-            stop_process(each)
+            each.kill()
         self._workers, self._scheduler = [], None
 
     def _order(self) -> dict[str, Any]:
-        return {"certificate": self._key.certificate, "key": self._key.key, "parent": os.getpid()}
+        return {"certificate": self._key.certificate, "key": self._key.key}
 
-    def _start_worker(self) -> subprocess.Popen[bytes]:
+    def _start_worker(self) -> Child:
         return self._spawn("worker", NodeOrder(**self._order(), address=self.address))
 
-    def _spawn(self, role: str, order: NodeOrder) -> subprocess.Popen[bytes]:
+    def _spawn(self, role: str, order: NodeOrder) -> Child:
         return _spawn(role, order, self._environment)
 
 
-def start_worker(
-    certificate: str, key: str, address: str, *, ports: str, parent: int
-) -> subprocess.Popen[bytes]:
-    """Start a worker of the scheduler at *address*, on one of *ports*; it ends with the process *parent*."""
-    order = NodeOrder(certificate=certificate, key=key, address=address, ports=ports, parent=parent)
-    return _spawn("worker", order, {**ONE_THREAD, **_DASK})
+def start_worker(certificate: str, key: str, address: str, *, ports: str) -> Child:
+    """Start a worker of the scheduler at *address*, on one of *ports*; it ends with this process."""
+    return _spawn("worker", NodeOrder(certificate=certificate, key=key, address=address, ports=ports), _DASK)
 
 
-def _spawn(role: str, order: NodeOrder, environment: dict[str, str]) -> subprocess.Popen[bytes]:
-    process = subprocess.Popen(
-        [sys.executable, "-m", "rse_pf.batch.node", role], stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE if role == "scheduler" else subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL, env={**os.environ, **environment},
-    )  # fmt: skip
-    assert process.stdin is not None
-    with contextlib.suppress(OSError):  # it has ended, which its exit code shows
-        process.stdin.write(msgspec.json.encode(order) + b"\n")
-        process.stdin.close()
-    return process
+def _spawn(role: str, order: NodeOrder, environment: Mapping[str, str]) -> Child:
+    plan = ChildPlan(target=f"rse_pf.batch.node:run_{role}", name=f"batch-{role}")
+    child = start_child(
+        plan, environment={**os.environ, **ONE_THREAD, **environment}, output=subprocess.DEVNULL
+    )
+    child.say(msgspec.to_builtins(order))
+    return child
 
 
 class DaskEngine:
@@ -330,24 +323,14 @@ class _SchedulerLost(Exception):
     """The scheduler does not answer any more."""
 
 
-def _first_line(process: subprocess.Popen[bytes], timeout_s: float) -> str:
-    """Return the first line that *process* prints; raises Crashed."""
-    assert process.stdout is not None
-    with selectors.DefaultSelector() as selector:
-        selector.register(process.stdout, selectors.EVENT_READ)
-        line = process.stdout.readline().decode() if selector.select(timeout_s) else ""
-    if not line:
+def _address(scheduler: Child, timeout_s: float) -> str:
+    """Return the address that *scheduler* tells; raises Crashed."""
+    try:
+        address: str | None = receive(scheduler.connection, time.monotonic() + timeout_s)
+    except TimeoutError:
+        address = None
+    if address is None:
         raise Crashed(
             "the scheduler of the batch did not start", hint="is its port free, and is its host ours?"
         )
-    return line.strip()
-
-
-def stop_process(process: subprocess.Popen[bytes]) -> None:
-    """Kill a process of a cluster, and wait for its end."""
-    process.kill()
-    process.wait()
-    for stream in (process.stdin, process.stdout):
-        if stream is not None:
-            with contextlib.suppress(OSError):
-                stream.close()
+    return address

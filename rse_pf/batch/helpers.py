@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import importlib.util
-import os
-import subprocess
 import time
 from collections import Counter
 from collections.abc import Callable
 
-from rse_pf.batch.cluster import start_worker, stop_process
+from rse_pf.batch.cluster import start_worker
 from rse_pf.batch.invitation import EXPIRES_S, Invited, invitations
+from rse_pf.child.start import Child
 from rse_pf.object_store import ObjectStore
 
 __all__ = ["BatchHelpers"]
@@ -32,7 +31,7 @@ class BatchHelpers:
         self._ports = ports
         self._store = store
         self._count = count
-        self._workers: list[subprocess.Popen[bytes]] = []
+        self._workers: list[Child] = []
         self._batch = ""
         self._is_able = importlib.util.find_spec("distributed") is not None
 
@@ -52,7 +51,7 @@ class BatchHelpers:
             self.close()
         if not found:
             return
-        had, self._workers = self._workers, [each for each in self._workers if each.poll() is None]
+        had, self._workers = self._workers, [each for each in self._workers if each.exit_code() is None]
         if had and not self._workers:
             self._ended[self._batch] += 1
             if self._ended[self._batch] >= _MOST_ENDS:
@@ -62,9 +61,7 @@ class BatchHelpers:
         invited = found[self._batch]
         while len(self._workers) < self._count:
             self._workers.append(
-                start_worker(
-                    invited.certificate, invited.key, invited.address, ports=self._ports, parent=os.getpid()
-                )
+                start_worker(invited.certificate, invited.key, invited.address, ports=self._ports)
             )
 
     def _current(self) -> dict[str, Invited]:
@@ -87,5 +84,5 @@ class BatchHelpers:
     def close(self) -> None:
         """End the workers; their parts go to others."""
         for each in self._workers:
-            stop_process(each)
+            each.kill()
         self._workers, self._batch = [], ""

@@ -1,9 +1,7 @@
 """One process of a cluster of Dask: a scheduler, or a worker that computes one part at a time.
 
-    python -m rse_pf.batch.node scheduler|worker  < ORDER
-
-The order is JSON on the standard input, because it has the key of the cluster.  A scheduler prints its
-address as one line.  Both speak TLS only, and only with those who have the cluster's key: what Dask sends is
+The order comes through the socket of the child, because it has the key of the cluster; a scheduler answers
+with its address.  Both speak TLS only, and only with those who have the cluster's key: what Dask sends is
 pickled, so that anybody who may connect may run any code.  Each listens at one port, on one address.  A
 robot's bytes are never among it: a part names objects of the store, and its result is an object of the store.
 """
@@ -12,8 +10,10 @@ from __future__ import annotations
 
 import asyncio
 import functools
+import socket
 import sys
 import tempfile
+from collections.abc import Awaitable, Callable
 from typing import Any
 
 import msgspec
@@ -24,11 +24,11 @@ from rse_pf.batch.parts import decode_part
 from rse_pf.batch.tasks import compute_part
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import RsePfError, message_of
-from rse_pf.linux import die_with_parent, set_process_name
+from rse_pf.ipc import encode_message, receive
 from rse_pf.object_store import ObjectStore
 from rse_pf.terminal import show
 
-__all__ = ["NodeOrder", "compute", "main", "security_of"]
+__all__ = ["NodeOrder", "compute", "run_scheduler", "run_worker", "security_of"]
 
 _DEATH_TIMEOUT_S = 20.0
 """A worker that finds no scheduler ends after this."""
@@ -44,8 +44,6 @@ class NodeOrder(msgspec.Struct, frozen=True, kw_only=True):
     address: str = ""
     ports: str = ""
     """Of a worker, such as ``8791:8889``; empty takes a free one."""
-    parent: int = 0
-    """The process with which it ends; 0 is none."""
 
 
 def security_of(certificate: str, key: str) -> Any:
@@ -77,22 +75,32 @@ def compute(settings: bytes, part: bytes) -> list[str]:
     return []
 
 
-def main(arguments: list[str]) -> int:
-    """Run until the other side is gone or a signal comes."""
-    order = msgspec.json.decode(sys.stdin.buffer.readline(), type=NodeOrder)
-    if order.parent and not die_with_parent(order.parent):
-        return 1
-    set_process_name(f"batch-{arguments[0]}"[:15])
-    act = _scheduler if arguments[0] == "scheduler" else _worker
+def run_scheduler(parent: socket.socket) -> None:
+    """Schedule until the parent is gone."""
+    _run(parent, functools.partial(_scheduler, parent))
+
+
+def run_worker(parent: socket.socket) -> None:
+    """Compute parts until the parent or the scheduler is gone."""
+    _run(parent, _worker)
+
+
+def _run(parent: socket.socket, act: Callable[[NodeOrder], Awaitable[None]]) -> None:
+    order = receive(parent)
+    if order is None:
+        return
+
+    async def run() -> None:
+        await act(msgspec.convert(order, NodeOrder))
+
     try:
-        asyncio.run(act(order))
+        asyncio.run(run())
     except (OSError, asyncio.TimeoutError) as error:
-        show(f"{arguments[0]}: {message_of(error)[:200]}", error=True)
-        return 1
-    return 0
+        show(message_of(error)[:200], error=True)
+        sys.exit(1)
 
 
-async def _scheduler(order: NodeOrder) -> None:
+async def _scheduler(parent: socket.socket, order: NodeOrder) -> None:
     from distributed import Scheduler
 
     security = security_of(order.certificate, order.key)
@@ -100,7 +108,7 @@ async def _scheduler(order: NodeOrder) -> None:
     async with without_pages(Scheduler)(
         host=order.host, port=order.port, protocol="tls", security=security, dashboard=False
     ) as scheduler:
-        show(scheduler.address)
+        parent.sendall(encode_message(scheduler.address))
         await scheduler.finished()
 
 
@@ -123,7 +131,3 @@ async def _worker(order: NodeOrder) -> None:
 @functools.lru_cache(maxsize=1)
 def _store_of(settings: bytes) -> ObjectStore:
     return open_data_store(PlatformSettings.from_dict(msgspec.json.decode(settings)))
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))

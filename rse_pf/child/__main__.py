@@ -34,10 +34,10 @@ def main(arguments: list[str]) -> None:
         return
     for number in _SIGNALS:
         signal.signal(number, signal.SIG_IGN)
-    set_process_name(plan["name"])
     if plan["is_killed_first"]:
         be_killed_first()
     run = _imported(plan["target"], plan["import_nice"])
+    set_process_name(plan["name"])  # who sees the name, sees a child that can begin
     if plan["memory_bytes"] is not None:
         limit_memory(plan["memory_bytes"])
     run(socket.socket(fileno=int(arguments[0])))

@@ -14,12 +14,12 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
+from rse_pf.child.limited import Handler
 from rse_pf.config import PlatformSettings
 from rse_pf.data_server.photo_turns import PhotoTurns
 from rse_pf.data_server.robot_processes import RobotProcesses, max_map_bytes, shared_store
 from rse_pf.errors import MissingExtra
 from rse_pf.identity import RobotId
-from rse_pf.limited_process import Handler
 from rse_pf.maps.photos import Lens, MapOutline, PhotoLocation
 from rse_pf.maps.registry import MapRegistry
 

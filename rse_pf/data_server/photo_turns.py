@@ -86,7 +86,7 @@ class PhotoTurns:
         self._is_due = False
 
     def call_of(self, robot: RobotId) -> _Call:
-        """Return what watches a call of *robot* (`rse_pf.limited_process.CallWatch`)."""
+        """Return what watches a call of *robot* (`rse_pf.child.limited.CallWatch`)."""
         return _Call(self, robot)
 
     def begin(self, call: _Call) -> None:

@@ -9,11 +9,11 @@ import json
 from collections.abc import Callable
 
 from rse_pf.aws.storage import open_data_store
+from rse_pf.child.limited import CallWatch, LimitedProcesses, ProcessLimits
 from rse_pf.config import PlatformSettings
 from rse_pf.crash_record import CrashRecord
 from rse_pf.errors import Crashed
 from rse_pf.identity import RobotId
-from rse_pf.limited_process import CallWatch, LimitedProcesses, ProcessLimits
 from rse_pf.object_store import ObjectStore
 
 __all__ = ["RobotProcesses", "max_map_bytes", "shared_store"]

@@ -16,9 +16,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rse_pf.aws.storage import open_data_store
+from rse_pf.child.limited import Handler, LimitedProcesses, ProcessLimits
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import NotFound, RsePfError
-from rse_pf.limited_process import Handler, LimitedProcesses, ProcessLimits
 from rse_pf.local.servers.backend_servers import local_placement
 from rse_pf.local.state import platform_settings
 from rse_pf.maps.registry import MapRegistry

@@ -1,6 +1,6 @@
 """Say what a map holds without keeping it: bytes in, counts out.
 
-A stranger's map is described in a process with limits only (`rse_pf.limited_process`).
+A stranger's map is described in a process with limits only (`rse_pf.child.limited`).
 """
 
 from __future__ import annotations

@@ -10,11 +10,8 @@ import json
 import os
 import secrets
 import selectors
-import signal
 import socket
 import struct
-import subprocess
-import sys
 import time
 from collections.abc import Sequence
 from contextlib import suppress
@@ -23,9 +20,10 @@ from typing import Any
 
 import msgspec
 
+from rse_pf.child.start import Child, ChildPlan, start_child
 from rse_pf.config import SessionSettings
 from rse_pf.identity import RobotId
-from rse_pf.linux import run_as_batch, set_process_name
+from rse_pf.ipc import receive
 from rse_pf.recording.file_format import (
     EVENT_SCHEMA,
     EVENTS_TOPIC,
@@ -56,7 +54,7 @@ from rse_pf.recording.writer import RecordingWriter
 from rse_pf.wire import make_codec
 
 __all__ = [
-    "MessageRecorder", "PipeRecorder", "RecordedConnection", "RecorderPlan", "run_recorder", "start_recorder",
+    "MessageRecorder", "PipeRecorder", "RecordedConnection", "RecorderPlan", "run", "start_recorder",
 ]  # fmt: skip
 
 _READ_BYTES = 1 << 15
@@ -65,7 +63,9 @@ _GATHER_S = 0.1
 """To be woken and to find cold caches costs more than what a few messages do."""
 _FLUSH_S = 0.2
 _MOST_FDS = 4
-_NICE = 5
+_CHILD = ChildPlan(
+    target=f"{__name__}:run", name="rse-pf recorder", policy="batch", nice=5, outlives_parent=True
+)
 _TOLD = frozenset({PLAIN, POSE})
 _HEX_BYTES = 8
 
@@ -77,7 +77,7 @@ class RecorderPlan(msgspec.Struct, frozen=True, kw_only=True):
         started_ns: When the server's first recorder was started, Unix time.
         from_workers: Socket from which it takes its ends of the workers' pipes, until no worker is left.
         restarts: How many recorders of this server ended before.
-        key: File of the key of the pseudonyms, "" for the one that stands on standard input.
+        key: File of the key of the pseudonyms, "" for the one that it is told with the plan.
     """
 
     folder: str
@@ -233,29 +233,24 @@ class PipeRecorder:
                 self._recorder.take(connection, direction, entry.time_ns, entry.data)
 
 
-def start_recorder(plan: RecorderPlan, key: bytes) -> subprocess.Popen[bytes]:
+def start_recorder(plan: RecorderPlan, key: bytes) -> Child:
     """Return the process of a new recorder with the key of its pseudonyms; raises OSError.
 
     Its log lines go where those of this process go.
     """
-    process = subprocess.Popen(
-        [sys.executable, "-m", __name__, msgspec.json.encode(plan).decode()],
-        stdin=subprocess.PIPE,
-        pass_fds=(plan.from_workers,),
-    )
-    assert process.stdin is not None
-    with suppress(OSError), process.stdin:  # it may have ended already
-        process.stdin.write(key)
-    return process
+    child = start_child(_CHILD, descriptors=(plan.from_workers,))
+    child.say([msgspec.to_builtins(plan), key])
+    child.connection.close()  # workers are forked from this process, and would have it
+    return child
 
 
-def run_recorder(plan: RecorderPlan) -> None:
+def run(server: socket.socket) -> None:
     """Record until no worker is left."""
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, signal.SIG_IGN)
-    set_process_name("rse-pf recorder")
-    with suppress(OSError):
-        run_as_batch(os.getpid(), _NICE)
+    with server:
+        order = receive(server)
+    if order is None:
+        return
+    plan, key = msgspec.convert(order[0], RecorderPlan), order[1]
     session = SessionSettings(**plan.session)
     with suppress(OSError):  # the writer says why it cannot write
         Path(plan.folder).mkdir(parents=True, exist_ok=True)
@@ -263,7 +258,7 @@ def run_recorder(plan: RecorderPlan) -> None:
         Path(plan.folder), plan.server, started_ns=plan.started_ns,
         max_bytes=plan.max_bytes, metadata={**plan.metadata, "version": plan.version},
     )  # fmt: skip
-    recorder = MessageRecorder(writer, Pseudonyms(_key(plan.key)), session, plan.server)
+    recorder = MessageRecorder(writer, Pseudonyms(_key(plan.key, key)), session, plan.server)
     recorder.event(time.time_ns(), "recording-started", restarts=plan.restarts)
     with (
         selectors.DefaultSelector() as selector,
@@ -338,16 +333,11 @@ def _log(server: str, problem: str, dropped: int) -> None:
         os.write(2, json.dumps(line).encode() + b"\n")
 
 
-def _key(file: str) -> bytes:
-    """Return the key of the pseudonyms of this recording."""
+def _key(file: str, told: bytes) -> bytes:
+    """Return the key of the pseudonyms of this recording: that of *file*, or the one that was *told*."""
     if file:
         with suppress(OSError):
             key = Path(file).read_bytes()
             if len(key) >= KEY_BYTES:
                 return key
-    key = sys.stdin.buffer.read(KEY_BYTES)
-    return key if len(key) == KEY_BYTES else secrets.token_bytes(KEY_BYTES)
-
-
-if __name__ == "__main__":
-    run_recorder(msgspec.json.decode(sys.argv[1], type=RecorderPlan))
+    return told

@@ -42,19 +42,16 @@ def test_nobody_helps_while_jobs_run() -> None:
 class FakeWorker:
     """A process that runs until it ends."""
 
-    pid, stdin, stdout = 1, None, None
+    pid = 1
 
     def __init__(self) -> None:
         self.code: int | None = None
 
-    def poll(self) -> int | None:
+    def exit_code(self) -> int | None:
         return self.code
 
     def kill(self) -> None:
         self.code = -9
-
-    def wait(self) -> int | None:
-        return self.code
 
 
 class Machine:

@@ -13,10 +13,10 @@ from typing import Any
 import pytest
 from fake_data_service import Service, small_settings
 
+from rse_pf.child.limited import LimitedProcesses, Overran, ProcessLimits
 from rse_pf.data_server.photo_turns import PhotoTurns, RecentUse
 from rse_pf.errors import BadRequest
 from rse_pf.identity import RobotId
-from rse_pf.limited_process import LimitedProcesses, Overran, ProcessLimits
 from rse_pf.maps.photos import Lens, PhotoLocation
 from rse_pf.object_store import MemoryStore
 

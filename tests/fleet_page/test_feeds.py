@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from rse_pf.auth.roster import check_scopes, scopes_allow
+from rse_pf.child.limited import LimitedProcesses
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import UsageError
 from rse_pf.fleet_page import clouds
@@ -23,7 +24,6 @@ from rse_pf.fleet_page.feeds.platform_feed import (
 )
 from rse_pf.fleet_page.hub import Hub
 from rse_pf.geometry import Camera
-from rse_pf.limited_process import LimitedProcesses
 from rse_pf.local.control.operations import Operations
 from rse_pf.maps.format import Keyframe, MapVersion, encode_map
 from rse_pf.maps.registry import MapRegistry

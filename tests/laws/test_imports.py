@@ -13,7 +13,7 @@ from collections.abc import Iterator, Mapping
 import pytest
 
 ORDER = (
-    "rse_pf", "errors", "event_loop", "terminal", "linux", "one_thread", "limited_process",
+    "rse_pf", "errors", "event_loop", "terminal", "linux", "one_thread",
     "files", "disk_reserve", "geometry", "native",
     "native_buffers", "native_matcher", "native_front_end", "native_tracker", "native_stereo", "images",
     "token_bucket", "config",

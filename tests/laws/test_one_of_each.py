@@ -116,8 +116,8 @@ CHILDREN = {"rse_pf/child/start.py"}
 """Starts the processes that work for another one."""
 FORKS = {
     "rse_pf/backend/supervisor/worker_handle.py": "workers share what the supervisor has imported",
-    "rse_pf/limited_process.py": "",
-    "rse_pf/backend/sandbox/zygote.py": "",
+    "rse_pf/child/limited.py": "the fork server of killable computations",
+    "rse_pf/backend/sandbox/zygote.py": "the fork server of sandboxes",
     "rse_pf/backend/sandbox/isolation.py": "a child tries a means of isolation, and is gone",
 }
 SERVERS = {
@@ -137,14 +137,9 @@ PROGRAMS = {
     "rse_pf/cli/cloud/doctor.py": "versions of programs",
     "rse_pf/experiments/compare/evo_figures.py": "evo",
     "rse_pf/experiments/results/result_folder.py": "git",
-    "rse_pf/experiments/results/log_replay.py": "",
     "rse_pf/local/faults/faults.py": "a helper that holds the rights for a fault",
 }
 """Programs of others, which run to their end."""
-BESIDE = {
-    "rse_pf/backend/sandbox/zygote_client.py", "rse_pf/recording/recorder_process.py",
-    "rse_pf/batch/cluster.py",
-}  # fmt: skip
 STARTS = {
     "subprocess.Popen", "subprocess.run", "subprocess.call", "subprocess.check_output", "os.fork",
     "os.forkpty", "os.posix_spawn", "os.posix_spawnp", "os.system", "os.popen", "multiprocessing.Process",
@@ -164,7 +159,7 @@ def starters(tree: Mapping[str, str]) -> set[str]:
 
 
 def test_child_processes_are_started_in_one_place(repository: Path) -> None:
-    known = CHILDREN | FORKS.keys() | SERVERS.keys() | PROGRAMS.keys() | BESIDE
+    known = CHILDREN | FORKS.keys() | SERVERS.keys() | PROGRAMS.keys()
 
     assert starters(product(repository)) == known
 

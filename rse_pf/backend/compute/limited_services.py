@@ -11,10 +11,10 @@ import traceback
 from rse_pf.backend.compute.process import TARGET, configuration_of, decode_reply, encode_request
 from rse_pf.backend.ports import WorkerContext
 from rse_pf.backend.scheduling.scheduler import QueuedCommand
+from rse_pf.child.limited import LimitedProcesses, Overran, ProcessLimits
 from rse_pf.config import PlatformSettings
 from rse_pf.crash_record import CrashRecord
 from rse_pf.errors import Busy, Crashed, Expired, InternalError, RsePfError
-from rse_pf.limited_process import LimitedProcesses, Overran, ProcessLimits
 from rse_pf.linux import cpu_seconds
 from rse_pf.service import failure_of
 from rse_pf.wire import Command, Failure, Result

@@ -16,10 +16,10 @@ import msgspec
 from rse_pf.aws.storage import open_data_store
 from rse_pf.backend.object_refs import resolve
 from rse_pf.backend.robot_store import is_shared
+from rse_pf.child.limited import Handler
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import BadRequest, InternalError, LimitExceeded, MissingExtra, RsePfError, message_of
 from rse_pf.identity import RobotId
-from rse_pf.limited_process import Handler
 from rse_pf.object_store import ObjectStore
 from rse_pf.service import Registry, dispatch, failure_of
 from rse_pf.services.loading import load_services

@@ -1,4 +1,4 @@
-"""The process that forks sandboxes: `python -m rse_pf.backend.sandbox.zygote FD`, started by a worker.
+"""The fork server of sandboxes, started by a worker.
 
 It imports once what services need, so that a fork starts without imports.  It starts no thread and no event
 loop, runs no service itself, and ends with its worker, together with every sandbox.
@@ -7,17 +7,11 @@ loop, runs no service itself, and ends with its worker, together with every sand
 from __future__ import annotations
 
 import contextlib
-import gc
 import importlib
-import json
 import os
-import select
-import signal
 import socket
-import sys
-import time
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,14 +19,13 @@ from rse_pf.backend.sandbox import isolation
 from rse_pf.backend.sandbox.cgroup import Cgroups, own_hierarchies
 from rse_pf.backend.sandbox.child import SandboxPlan, readable_paths, run_sandbox
 from rse_pf.backend.sandbox.watcher import MemoryWatcher
+from rse_pf.child.fork_server import ForkPlan, read_packet, serve_forks
 from rse_pf.errors import ConfigurationError, MissingExtra
-from rse_pf.linux import PR_SET_CHILD_SUBREAPER, die_with_parent, prctl
 from rse_pf.services.custom.installed import InstalledService
 from rse_pf.services.custom.verified_copy import PrivateFolder, VerifiedCopy
 
-__all__ = ["main"]
+__all__ = ["run"]
 
-_MAX_MESSAGE = 1 << 20
 _GO = b"g"
 _SLOTS = 500
 """User ids of one zygote; the next zygote's begin after them."""
@@ -41,26 +34,15 @@ _FIRST_UID = 1_000_000
 _MAX_THREADS = 64
 
 
-def main(arguments: list[str]) -> None:
+def run(worker: socket.socket) -> None:
     """Fork sandboxes until the worker is gone."""
-    worker = socket.socket(fileno=int(arguments[0]))
-    config = json.loads(worker.recv(_MAX_MESSAGE) or b"null")
-    if config is not None and die_with_parent(config["worker"]):
-        _Zygote(worker, config).run()
-
-
-@dataclass(frozen=True, slots=True)
-class _Child:
-    """A sandbox: its number, the slot of its user id, and a descriptor of its process."""
-
-    number: int
-    slot: int
-    handle: int
+    config, _ = read_packet(worker)
+    if config is not None:
+        _Zygote(config).run(worker)
 
 
 class _Zygote:
-    def __init__(self, worker: socket.socket, config: dict[str, Any]) -> None:
-        self._worker = worker
+    def __init__(self, config: dict[str, Any]) -> None:
         services = {
             fields["name"]: InstalledService(
                 **{
@@ -98,33 +80,14 @@ class _Zygote:
         self._cgroups.prepare()
         has_cgroup = "memory" in self._cgroups.controllers
         self._watcher = None if has_cgroup else MemoryWatcher(total_bytes)
-        self._look_s = 0.0
-        """When the watcher looks next."""
-        self._children: dict[int, _Child] = {}
-        """By pid."""
-        self._reasons: dict[int, str] = {}
-        """Why sandboxes were killed that are still ending, by pid."""
-        self._poll = select.poll()
+        self._slots: dict[int, int] = {}
+        """Which user id each sandbox has, by number."""
+        self._starts: dict[int, int] = {}
+        """Pipes by which sandboxes are told that their pid is known, by number."""
 
-    def run(self) -> None:
-        prctl(PR_SET_CHILD_SUBREAPER, 1)
-        signal.signal(signal.SIGCHLD, signal.SIG_DFL)  # descriptors of processes report their end
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, signal.SIG_IGN)
-        gc.collect()
-        gc.freeze()
-        self._report(event="ready", missing=list(self._plan.missing), cgroup=list(self._cgroups.controllers))
-        self._poll.register(self._worker, select.POLLIN)
-        while True:
-            ready = {fd for fd, _ in self._poll.poll(self._wait_ms())}
-            self._reap()
-            self._watch()
-            if self._worker.fileno() in ready and not self._follow_order():
-                break
-        for pid in self._children:
-            os.kill(pid, signal.SIGKILL)
-        while self._children:
-            self._reap(wait=True)
+    def run(self, worker: socket.socket) -> None:
+        plan = ForkPlan(fork=self._fork, begin=self._begin, free=self._free, watcher=self._watcher)
+        serve_forks(worker, plan, missing=list(self._plan.missing), cgroup=list(self._cgroups.controllers))
         self._cgroups.close()
         self._private.remove()
         os._exit(0)
@@ -154,47 +117,12 @@ class _Zygote:
         edited = {name: error for name, error in problems.items() if error is not None}
         return replace(self._plan, refused={**self._refused, **edited})
 
-    def _wait_ms(self) -> float | None:
-        """Return how long there is nothing to do without an event; None is forever."""
-        if self._watcher is None or not self._children:
-            return None
-        return max(0.0, self._look_s - time.monotonic()) * 1e3
-
-    def _watch(self) -> None:
-        """End the sandboxes that use too much memory in all."""
-        if self._watcher is None or not self._children or time.monotonic() < self._look_s:
-            return
-        for pid, reason in self._watcher.find_excess(list(self._children)).items():
-            self._reasons[pid] = reason
-            os.kill(pid, signal.SIGKILL)
-        self._look_s = time.monotonic() + self._watcher.interval_s
-
-    def _follow_order(self) -> bool:
-        try:
-            message, fds, _, _ = socket.recv_fds(self._worker, _MAX_MESSAGE, 2)
-        except OSError:
-            return False
-        if not message:
-            return False
-        order = json.loads(message)
-        if order["do"] == "create":
-            self._create(order["id"], *fds)
-        else:
-            for pid, child in self._children.items():
-                if child.number == order["id"]:
-                    os.kill(pid, signal.SIGKILL)
-        for fd in fds:
-            os.close(fd)
-        return True
-
-    def _create(self, number: int, channel: int, output: int) -> None:
-        """Fork twice: the first child enters the namespaces, the second is the first process inside them.
-
-        Its cgroup comes last: moving a process takes about 10 ms, in which it isolates itself.
-        """
-        used = {child.slot for child in self._children.values()}
-        slot = next(n for n in range(_SLOTS) if n not in used)
-        uid = None if self._first_uid is None else self._first_uid + slot
+    def _fork(self, number: int, descriptors: list[int]) -> int:
+        """Fork twice: the first child enters the namespaces, the second is the first process inside them."""
+        channel, output = descriptors
+        used = set(self._slots.values())
+        self._slots[number] = next(n for n in range(_SLOTS) if n not in used)
+        uid = None if self._first_uid is None else self._first_uid + self._slots[number]
         pid_read, pid_write = os.pipe()
         go_read, go_write = os.pipe()
         plan = self._plan_of_now()
@@ -208,17 +136,22 @@ class _Zygote:
         pid = int(os.read(pid_read, 32) or b"0")
         os.close(pid_read)
         if pid:
-            handle = os.pidfd_open(pid)
-            self._children[pid] = _Child(number, slot, handle)
-            self._poll.register(handle, select.POLLIN)
-            self._report(handle, event="created", id=number)
-            os.write(go_write, _GO)
-            if not self._cgroups.add(number, pid):
-                self._reasons[pid] = "it could not enter its cgroup"
-                os.kill(pid, signal.SIGKILL)
+            self._starts[number] = go_write
         else:
-            self._report(event="gone", id=number, how="it could not enter its namespaces")
-        os.close(go_write)
+            os.close(go_write)
+            del self._slots[number]
+        return pid
+
+    def _begin(self, number: int, pid: int) -> str:
+        """Let a sandbox isolate itself; moving it into its cgroup takes about 10 ms of that time."""
+        go = self._starts.pop(number)
+        os.write(go, _GO)
+        os.close(go)
+        return "" if self._cgroups.add(number, pid) else "it could not enter its cgroup"
+
+    def _free(self, number: int) -> str:
+        del self._slots[number]
+        return self._cgroups.remove(number) or ""
 
     def _fork_inside(
         self, plan: SandboxPlan, channel: int, output: int, uid: int | None, pid_write: int, go_read: int
@@ -241,24 +174,6 @@ class _Zygote:
         finally:
             os._exit(0)
 
-    def _reap(self, *, wait: bool = False) -> None:
-        while self._children:
-            try:
-                pid, status = os.waitpid(-1, 0 if wait else os.WNOHANG)
-            except ChildProcessError:
-                return
-            if pid == 0:
-                return
-            if pid in self._children:
-                child = self._children.pop(pid)
-                self._poll.unregister(child.handle)
-                os.close(child.handle)
-                code = os.waitstatus_to_exitcode(status)
-                how = f"exit code {code}" if code >= 0 else f"signal {signal.Signals(-code).name}"
-                how = self._reasons.pop(pid, how)
-                how = self._cgroups.remove(child.number) or how
-                self._report(event="gone", id=child.number, how=how)
-
     def _missing_isolation(
         self, readable: list[Path], copies: Mapping[Path, Path], scratch_bytes: int
     ) -> list[str]:
@@ -277,11 +192,6 @@ class _Zygote:
             ]
         )
 
-    def _report(self, handle: int | None = None, **message: Any) -> None:
-        data = json.dumps(message).encode()
-        with contextlib.suppress(OSError):  # the worker is gone, which the next poll shows
-            socket.send_fds(self._worker, [data], [] if handle is None else [handle])
-
 
 def _warm_up(languages: set[str]) -> None:
     """Import what every sandbox would import otherwise."""
@@ -294,7 +204,3 @@ def _warm_up(languages: set[str]) -> None:
 
         with contextlib.suppress(MissingExtra):  # reported when a robot calls the service
             warm_up()
-
-
-if __name__ == "__main__":
-    main(sys.argv[1:])

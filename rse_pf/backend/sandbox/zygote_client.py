@@ -6,18 +6,17 @@ Only the first start blocks; orders to a zygote that is restarted wait in its ch
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import signal
 import socket
-import subprocess
-import sys
 import tempfile
 from asyncio import AbstractEventLoop
 from collections.abc import Callable, Sequence
 from typing import Protocol
 
 from rse_pf.backend.ports import Log
+from rse_pf.child.fork_server import read_packet, send_order, start_fork_server
+from rse_pf.child.start import ChildPlan
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import ConfigurationError
 from rse_pf.services.custom.installed import InstalledService
@@ -26,7 +25,6 @@ __all__ = ["ZygoteClient", "ZygoteListener"]
 
 SCRATCH_BYTES = 1 << 24
 """Scratch folder of one sandbox, in its memory; it holds at most one file per 4,096 bytes of this."""
-_MAX_MESSAGE = 1 << 16
 _END_S = 0.5
 """Time that a zygote has to end its sandboxes before it is killed."""
 
@@ -86,9 +84,8 @@ class ZygoteClient:
 
     def create(self, number: int, channel: socket.socket, output: int) -> bool:
         """Order sandbox *number* with its descriptors; return False if too many orders wait."""
-        order = json.dumps({"do": "create", "id": number}).encode()
         try:
-            socket.send_fds(self._channel, [order], [channel.fileno(), output])
+            send_order(self._process, "create", number, channel.fileno(), output)
         except OSError:
             return False
         return True
@@ -96,7 +93,7 @@ class ZygoteClient:
     def end(self, number: int) -> None:
         """Have sandbox *number* killed; one that is gone already is no error."""
         with contextlib.suppress(OSError):
-            self._channel.send(json.dumps({"do": "end", "id": number}).encode())
+            send_order(self._process, "end", number)
 
     def pause(self, number: int) -> None:
         """Stop every thread of sandbox *number* until `resume`; it may still be starting."""
@@ -119,7 +116,7 @@ class ZygoteClient:
         self._loop.remove_reader(self._channel.fileno())
         self._channel.close()
         self._forget_all()
-        self._loop.run_in_executor(None, self._reap)
+        self._loop.run_in_executor(None, self._process.end, _END_S)
 
     def _signal(self, number: int, which: signal.Signals) -> None:
         """Send a signal; a descriptor never means another process, as a reused process id could."""
@@ -128,10 +125,9 @@ class ZygoteClient:
                 signal.pidfd_send_signal(self._handles[number], which)
 
     def _launch(self) -> None:
-        self._channel, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         limits = self._settings.services
         config = {
-            "worker": os.getpid(), "temporary": tempfile.gettempdir(),
+            "temporary": tempfile.gettempdir(),
             "services": [
                 {
                     "name": s.name, "language": s.language, "entry": s.entry, "kind": s.kind,
@@ -151,22 +147,18 @@ class ZygoteClient:
             "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "PYTHONDONTWRITEBYTECODE": "1",
             "MALLOC_ARENA_MAX": "2", "PYTHONSAFEPATH": "1",
         }  # fmt: skip
-        with theirs:
-            self._process = subprocess.Popen(
-                [sys.executable, "-m", "rse_pf.backend.sandbox.zygote", str(theirs.fileno())],
-                pass_fds=(theirs.fileno(),), stdin=subprocess.DEVNULL, env=variables,
-            )  # fmt: skip
-        with contextlib.suppress(OSError):  # it has ended, which the next read shows
-            self._channel.send(json.dumps(config).encode())
+        plan = ChildPlan(target="rse_pf.backend.sandbox.zygote:run", name="rse-pf zygote")
+        self._process = start_fork_server(plan, config, environment=variables)
+        self._channel = self._process.connection
 
     def _wait_until_ready(self) -> tuple[str, ...]:
         self._channel.settimeout(self._settings.local.start_timeout_s)
         try:
-            report = json.loads(self._channel.recv(_MAX_MESSAGE) or b"{}")
-        except OSError:
-            report = {}
-        missing = tuple(report.get("missing", ()))
-        if report.get("event") != "ready":
+            report, _ = read_packet(self._channel)
+        except TimeoutError:
+            report = None
+        missing = () if report is None else tuple(report["missing"])
+        if report is None:
             self._stop()
             raise ConfigurationError("the zygote of sandboxes did not start", hint="see the server's log")
         if missing and not self._settings.services.accept_weak_isolation:
@@ -187,12 +179,10 @@ class ZygoteClient:
     def _read_reports(self) -> None:
         while True:
             try:
-                message, handles, _, _ = socket.recv_fds(self._channel, _MAX_MESSAGE, 1)
+                report, handles = read_packet(self._channel)
             except BlockingIOError:
                 return
-            except OSError:
-                message, handles = b"", []
-            if not message:
+            if report is None:
                 self._loop.remove_reader(self._channel.fileno())
                 self._stop()
                 self._log.error("zygote-lost")
@@ -202,7 +192,6 @@ class ZygoteClient:
                 self._listen()
                 self._listener.on_lost()
                 return
-            report = json.loads(message)
             if report["event"] == "ready":
                 self._log.info("sandbox-limits", cgroup=", ".join(report["cgroup"]))
                 self.missing = tuple(report["missing"])
@@ -232,15 +221,8 @@ class ZygoteClient:
 
     def _stop(self) -> None:
         """End the zygote: it ends its sandboxes and removes their cgroups when the channel is closed."""
-        self._channel.close()
-        self._reap()
+        self._process.end(_END_S)
         self._forget_all()
-
-    def _reap(self) -> None:
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            self._process.wait(_END_S)
-        self._process.kill()
-        self._process.wait()
 
     def _forget_all(self) -> None:
         for number in list(self._handles):

@@ -9,7 +9,6 @@ import json
 import os
 import secrets
 import socket
-import subprocess
 import threading
 import time
 from collections import deque
@@ -21,6 +20,7 @@ from pathlib import Path
 
 import msgspec
 
+from rse_pf.child.start import Child
 from rse_pf.config import PlatformSettings
 from rse_pf.recording.recorder_process import RecorderPlan, start_recorder
 from rse_pf.recording.redact import KEY_BYTES
@@ -55,7 +55,7 @@ class ServerRecording:
         server: str,
         key: Path | None = None,
         *,
-        start: Callable[[RecorderPlan, bytes], subprocess.Popen[bytes]] = start_recorder,
+        start: Callable[[RecorderPlan, bytes], Child] = start_recorder,
         restart_s: float = 0.5,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
@@ -78,7 +78,7 @@ class ServerRecording:
         self._random_key = secrets.token_bytes(KEY_BYTES)
         self._from_workers: socket.socket | None = None
         self._to_recorder: socket.socket | None = None
-        self._process: subprocess.Popen[bytes] | None = None
+        self._process: Child | None = None
         self._watching: threading.Thread | None = None
         self._is_over = threading.Event()
 
@@ -127,7 +127,7 @@ class ServerRecording:
         if self._from_workers is not None:
             self._from_workers.close()
 
-    def _watch(self, plan: RecorderPlan, process: subprocess.Popen[bytes]) -> None:
+    def _watch(self, plan: RecorderPlan, process: Child) -> None:
         """Start the recorder again until the workers or this server end; *process* is the first one."""
         ends: deque[float] = deque()
         while process.wait() != 0 and not self._is_over.is_set():  # with 0 the workers are gone

@@ -6,30 +6,28 @@ the poses may differ, and with them the digest.
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
+import socket
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import msgspec
 
 from rse_pf.backend.live_map.owner.lease import map_folder
 from rse_pf.backend.live_map.owner.log import LiveLog, MapSnapshot
 from rse_pf.backend.live_map.owner.state import LIVE_MAP, MapState
+from rse_pf.child.start import ChildPlan, how_ended, start_child
 from rse_pf.errors import RsePfError, UsageError
 from rse_pf.identity import DEFAULT_TENANT, shown_name
+from rse_pf.ipc import encode_message, receive
 from rse_pf.live_map.events import KeyframeAdded, decode_events
 from rse_pf.object_store import DirectoryStore
-from rse_pf.one_thread import ONE_THREAD
-from rse_pf.terminal import show, show_json
 
-__all__ = ["LoggedMap", "main", "read_log"]
+__all__ = ["LoggedMap", "read_log", "run"]
 
 _MAP_NAME = "demo"
-_DAMAGED = 3
-"""Exit code of a process whose last line of output says why the log cannot be replayed."""
+_END_S = 5.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -53,26 +51,23 @@ class _WholeLog(LiveLog):
 
 def read_log(objects: Path, position: int) -> LoggedMap:
     """Replay the log of the map of the demo in *objects* up to *position*; raises UsageError."""
-    command = [sys.executable, "-m", "rse_pf.experiments.results.log_replay", str(objects), str(position)]
-    done = subprocess.run(
-        command, env={**os.environ, **ONE_THREAD}, stdout=subprocess.PIPE, check=False
-    )  # fmt: skip
-    if done.returncode == 0:
-        return msgspec.json.decode(done.stdout, type=LoggedMap)
-    cause = done.stdout.decode().strip() if done.returncode == _DAMAGED else f"exit code {done.returncode}"
-    raise UsageError(f"cannot replay the log in {objects}: {cause}", hint="run it again")
+    child = start_child(ChildPlan(target=f"{__name__}:run", name="rse-pf replay"))
+    child.say([str(objects), position])
+    answer = receive(child.connection)
+    code = child.end(_END_S)
+    if isinstance(answer, dict):
+        return msgspec.convert(answer, LoggedMap)
+    raise UsageError(f"cannot replay the log in {objects}: {answer or how_ended(code)}", hint="run it again")
 
 
-def main() -> int:
-    """Replay the log that the arguments name, and print what it holds as JSON."""
-    objects, position = Path(sys.argv[1]), int(sys.argv[2])
+def run(parent: socket.socket) -> None:
+    """Replay the log that the *parent* names, and answer with what it holds, or why it cannot be replayed."""
+    objects, position = receive(parent)
     try:
-        logged = _replay(objects, position)
+        answer: Any = asdict(_replay(Path(objects), position))
     except RsePfError as error:
-        show(error.message)
-        return _DAMAGED
-    show_json(asdict(logged))
-    return 0
+        answer = error.message
+    parent.sendall(encode_message(answer))
 
 
 def _replay(objects: Path, position: int) -> LoggedMap:
@@ -95,7 +90,3 @@ def _replay(objects: Path, position: int) -> LoggedMap:
     return LoggedMap(
         keyframes=tuple(keyframes), epochs=len(epochs), digest=state.digest(), position=log.position
     )
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -15,9 +15,9 @@ from typing import Any, TypeVar
 
 import msgspec
 
+from rse_pf.child.limited import Handler, LimitedProcesses, Overran, ProcessLimits
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import BadMessage, BadRequest, Crashed, InternalError, LimitExceeded
-from rse_pf.limited_process import Handler, LimitedProcesses, Overran, ProcessLimits
 from rse_pf.recording.reader import recording_files
 from rse_pf.recording.replay import run
 from rse_pf.recording.replay.case import CASE_SUFFIX, MAX_CASE_BYTES

@@ -11,10 +11,10 @@ from backend.gateway.worker_parts import WorkerParts, worker_parts
 
 from rse_pf.backend.compute.limited_services import LimitedServices
 from rse_pf.backend.scheduling.scheduler import QueuedCommand
+from rse_pf.child.limited import Overran
 from rse_pf.crash_record import BLOCK_S
 from rse_pf.errors import Busy, Crashed, WorkerLost
 from rse_pf.identity import RobotId
-from rse_pf.limited_process import Overran
 from rse_pf.wire import Command, Failure, Result
 
 ALICE, BOB = RobotId("default", "alice"), RobotId("default", "bob")

@@ -25,9 +25,9 @@ from rse_pf.backend.object_refs import ObjectRefs
 from rse_pf.backend.ports import Clocks, WorkerContext
 from rse_pf.backend.rosbridge.topics import RosbridgeTopics
 from rse_pf.backend.scheduling.command_queue import CommandQueue
+from rse_pf.child.limited import LimitedProcesses
 from rse_pf.config import PlatformSettings
 from rse_pf.identity import RobotId
-from rse_pf.limited_process import LimitedProcesses
 from rse_pf.object_store import MemoryStore
 from rse_pf.service import Registry
 from rse_pf.services import echo

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import json
 import os
 import select
 import socket
-import subprocess
-import sys
 import tempfile
 from collections.abc import Iterator
 from typing import Any
 
 import pytest
+
+from rse_pf.child.fork_server import read_packet, send_order, start_fork_server
+from rse_pf.child.start import ChildPlan
 
 pytestmark = pytest.mark.system
 WAIT_S = 20.0
@@ -27,35 +27,25 @@ class Zygote:
     """A zygote whose worker is this test."""
 
     def __init__(self, **config: int) -> None:
-        self._channel, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        plan = ChildPlan(target="rse_pf.backend.sandbox.zygote:run", name="zygote")
+        self._process = start_fork_server(plan, {**CONFIG, **config})
+        self._channel = self._process.connection
         self._channel.settimeout(WAIT_S)
-        with theirs:
-            self._process = subprocess.Popen(
-                [sys.executable, "-m", "rse_pf.backend.sandbox.zygote", str(theirs.fileno())],
-                pass_fds=(theirs.fileno(),),
-            )
-        self._channel.send(json.dumps({**CONFIG, **config, "worker": os.getpid()}).encode())
 
     def report(self) -> tuple[dict[str, Any], list[int]]:
         """Return the next report and the descriptors that came with it."""
-        data, handles, _, _ = socket.recv_fds(self._channel, 1 << 16, 4)
-        return json.loads(data), handles
+        return read_packet(self._channel)
 
     def create(self, number: int) -> socket.socket:
         """Order sandbox *number* and return the worker's end of its channel."""
         ours, theirs = socket.socketpair()
         with theirs, open(os.devnull, "w") as output:
-            order = json.dumps({"do": "create", "id": number}).encode()
-            socket.send_fds(self._channel, [order], [theirs.fileno(), output.fileno()])
+            send_order(self._process, "create", number, theirs.fileno(), output.fileno())
         return ours
 
     def close(self) -> None:
         """Let the zygote end by itself, as it does when its worker is gone."""
-        self._channel.close()
-        try:
-            self._process.wait(WAIT_S)
-        finally:
-            self._process.kill()
+        self._process.end(WAIT_S)
 
 
 @pytest.fixture
@@ -73,7 +63,7 @@ def test_a_sandbox_is_reported_with_a_descriptor_that_shows_its_end(started: Zyg
 
     channel.close()
 
-    assert report == {"event": "created", "id": 5}
+    assert report == {"event": "created", "id": 5, "pid": report["pid"]}
     assert select.select([handle], [], [], WAIT_S)[0] == [handle]
     gone, _ = started.report()
     assert gone["event"] == "gone"

@@ -158,6 +158,22 @@ def zygote_of(worker: int) -> int:
     raise AssertionError("no zygote")
 
 
+def test_a_zygote_has_no_variable_and_no_socket_of_its_worker(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "of the worker")
+
+    async def test(zygote: ZygoteClient, reports: Reports, log: Log) -> None:
+        folder = Path("/proc", str(zygote_of(os.getpid())))
+        held = [os.readlink(each) for each in (folder / "fd").iterdir() if int(each.name) > 2]
+
+        assert b"of the worker" not in (folder / "environ").read_bytes()
+        assert sum(name.startswith("socket") for name in held) == 1
+
+    with socket.socket() as listener:
+        listener.listen()
+        listener.set_inheritable(True)
+        run(test)
+
+
 def test_a_zygote_that_does_not_start_is_a_typed_error(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sys.executable", "/bin/false")
 

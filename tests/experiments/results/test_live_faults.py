@@ -151,15 +151,14 @@ def test_a_log_with_a_gap_is_told(tmp_path: Path) -> None:
         read_log(objects, 6)
 
 
-@pytest.mark.parametrize(("code", "cause"), [(3, "1 thread"), (9, "exit code 9")])
 def test_a_log_is_replayed_with_one_thread_as_owners_compute(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: int, cause: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     python = tmp_path / "python"
-    python.write_text(f'#!/bin/sh\necho "$OPENBLAS_NUM_THREADS thread"\nexit {code}\n', encoding="ascii")
+    python.write_text('#!/bin/sh\nexit "$OPENBLAS_NUM_THREADS"\n', encoding="ascii")
     python.chmod(0o755)
     monkeypatch.setenv("OPENBLAS_NUM_THREADS", "2")
     monkeypatch.setattr(sys, "executable", str(python))
 
-    with pytest.raises(UsageError, match=f"cannot replay the log in .*: {cause}\\n"):
+    with pytest.raises(UsageError, match=r"cannot replay the log in .*: exit code 1\n"):
         read_log(tmp_path, 6)

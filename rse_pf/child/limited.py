@@ -17,27 +17,23 @@ sandbox: code that took over the process may do what its user may do.
 from __future__ import annotations
 
 import contextlib
-import functools
-import gc
 import importlib
 import json
 import os
-import resource
 import signal
 import socket
 import struct
-import subprocess
-import sys
 import threading
 import time
 import traceback
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, NoReturn, Protocol
 
+from rse_pf.child.fork_server import ForkPlan, read_packet, send_order, serve_forks, start_fork_server
+from rse_pf.child.start import Child, ChildPlan, how_ended
 from rse_pf.errors import (
     Busy,
     Crashed,
@@ -47,8 +43,8 @@ from rse_pf.errors import (
     WorkerLost,
     error_from_code,
 )
-from rse_pf.linux import die_with_parent, run_as_batch, set_process_name
-from rse_pf.one_thread import ONE_THREAD
+from rse_pf.ipc import receive_bytes
+from rse_pf.linux import be_killed_first, die_with_parent, limit_memory
 
 __all__ = [
     "DEFAULT_NICENESS",
@@ -57,7 +53,7 @@ __all__ = [
     "LimitedProcesses",
     "Overran",
     "ProcessLimits",
-    "main",
+    "run",
 ]
 
 Handler = Callable[[bytes], bytes]
@@ -65,7 +61,6 @@ Handler = Callable[[bytes], bytes]
 
 DEFAULT_NICENESS = 5
 _MAX_REPLY_BYTES = 1 << 20
-_MAX_ORDER_BYTES = 1 << 17
 _ORDER_TIMEOUT_S = 10.0
 """A template that does not fork or kill a process within this is replaced."""
 _BUSY_RETRY_MS = 1000.0
@@ -73,8 +68,8 @@ _NEAR = 4
 """Kinds of work that a process is remembered for."""
 _OUT_OF_MEMORY = 77
 """Exit code of a process whose handler raised MemoryError."""
-_OUT_OF_TIME = signal.SIGPROF
-"""Ends a process that used up its CPU time, which it arms before each call."""
+_NO_MEMORY, _NO_TIME = how_ended(_OUT_OF_MEMORY), how_ended(-signal.SIGPROF)
+"""How a process ends by its limits; it arms the signal before each call."""
 _LENGTH = struct.Struct("<Q")
 _REPLY = struct.Struct("<BQd")
 """Kind and length of what follows, and the CPU seconds of the process so far."""
@@ -132,13 +127,13 @@ class LimitedProcesses:
             count: Processes that work at the same time; further calls wait for one of them.
             niceness: Of the processes, above that of this process.
         """
-        self._order = json.dumps(
-            {"target": target, "configuration": configuration, "limits": [limits.memory_bytes, limits.cpu_s]}
-        ).encode()
+        order = {
+            "target": target, "configuration": configuration, "limits": [limits.memory_bytes, limits.cpu_s]
+        }  # fmt: skip
         self._memory_bytes = limits.memory_bytes
         self._cpu_s = limits.cpu_s
         self._max_reply_bytes = limits.max_reply_bytes
-        self._template = _Template(self._order, niceness)
+        self._template = _Template(order, niceness)
         self._free = _FreeSlots(count)
 
     def __enter__(self) -> LimitedProcesses:
@@ -188,7 +183,7 @@ class LimitedProcesses:
                     raise Overran(timeout_s, cpu_s) from None
                 except _ProcessEnded as ended:
                     how, _ = self._end(slot, process)
-                    if is_new or how == _name_of(_OUT_OF_TIME):
+                    if is_new or how == _NO_TIME:
                         raise self._crash(ended.reason or how) from None
                 finally:
                     watch.used(process.cpu_s - before_s)
@@ -210,20 +205,20 @@ class LimitedProcesses:
         return self._template.end(process)
 
     def _crash(self, how: str) -> Crashed:
-        if how == f"exit code {_OUT_OF_MEMORY}":
+        if how == _NO_MEMORY:
             how = f"it needs more than {self._memory_bytes / 1e6:.0f} MB of memory"
-        elif how == _name_of(_OUT_OF_TIME):
+        elif how == _NO_TIME:
             how = f"it needs more than {self._cpu_s:g} s of CPU time"
         return Crashed(f"the process that worked on this ended: {how}", hint="send less at once")
 
 
 class _Process:
-    """One forked process; *generation* numbers its template."""
+    """One forked process."""
 
-    def __init__(self, pid: int, connection: socket.socket, generation: int) -> None:
+    def __init__(self, number: int, pid: int, connection: socket.socket) -> None:
+        self.number = number
         self.pid = pid
         self.connection = connection
-        self.generation = generation
         self.cpu_s = 0.0
         """CPU seconds at the end of the last call."""
 
@@ -295,62 +290,72 @@ class _ProcessEnded(Exception):
 
 
 class _Template:
-    """The template process as its owner sees it: started by the first fork, replaced when it ended."""
+    """The fork server as its owner sees it: started by the first fork, replaced when it ended."""
 
-    def __init__(self, order: bytes, niceness: int) -> None:
+    def __init__(self, order: dict[str, Any], niceness: int) -> None:
         self._order = order
-        self._niceness = niceness
+        self._plan = ChildPlan(
+            target=f"{__name__}:run", name="rse-pf limited", policy="batch", nice=niceness,
+            outlives_parent=True,
+        )  # fmt: skip
         self._lock = threading.Lock()
-        self._process: subprocess.Popen[bytes] | None = None
-        self._channel: socket.socket | None = None
+        self._server: Child | None = None
         self._is_ready = False
         self._is_closed = False
-        self._generation = 0
-        self._forked: set[int] = set()
+        self._number = 0
+        """Of the last fork, of all fork servers."""
+        self._forked: dict[int, int] = {}
+        """The pids of the forks of this server, by number."""
+        self._ends: dict[int, tuple[str, float]] = {}
+        """How forks ended, and their CPU seconds, by number."""
 
     def has(self, process: _Process) -> bool:
-        """Return whether *process* was forked from the template that runs now."""
-        return process.generation == self._generation and process.pid in self._forked
+        """Return whether *process* was forked by the server that runs now."""
+        return process.number in self._forked
 
     def pids(self) -> list[int]:
-        return ([self._process.pid] if self._process is not None else []) + sorted(self._forked)
+        return ([self._server.pid] if self._server is not None else []) + sorted(self._forked.values())
 
     def fork(self, until: float) -> _Process:
         """Return a new process.
 
         Raises:
-            Busy: The template was not ready in time; it goes on starting.
+            Busy: The fork server was not ready in time; it goes on starting.
             WorkerLost: It cannot start, or was closed.
         """
         with self._hold_lock(until):
             if self._is_closed:
                 raise WorkerLost("the processes were closed", hint="try again elsewhere")
             try:
-                if self._process is None:
-                    self._start()
-                self._wait_until_ready(until)
+                server = self._server = self._server or start_fork_server(self._plan, self._order)
+                self._wait_until_ready(server, until)
                 ours, theirs = socket.socketpair()
             except OSError as error:
                 raise WorkerLost(f"no process can be started: {error.strerror}", hint="try again") from error
             with theirs, contextlib.ExitStack() as undo:
                 undo.enter_context(ours)
-                pid = int(self._ask({"do": "fork"}, theirs)["pid"])
+                self._number += 1
+                number = self._number
+                self._ask(server, "create", number, theirs.fileno())
+                while number not in self._forked:
+                    self._take_report(server)
                 undo.pop_all()
-            self._forked.add(pid)
-            return _Process(pid, ours, self._generation)
+            return _Process(number, self._forked[number], ours)
 
     def end(self, process: _Process) -> tuple[str, float]:
         """Kill *process* unless it has ended; return how it ended, and the CPU seconds of its last call."""
+        number = process.number
         with self._lock:
-            if self._is_closed or not self.has(process):
+            if self._server is None or not self.has(process):
                 raise WorkerLost("the process ended with its template", hint="try again")
-            self._forked.discard(process.pid)
-            reply = self._ask({"do": "end", "pid": process.pid})
-        code = int(reply["code"])
-        how = f"exit code {code}" if code >= 0 else _name_of(-code)
-        cpu_s = max(0.0, float(reply["cpu_s"]) - process.cpu_s)
-        process.cpu_s += cpu_s
-        return how, cpu_s
+            self._ask(self._server, "end", number)
+            while number not in self._ends:
+                self._take_report(self._server)
+            del self._forked[number]
+            how, cpu_s = self._ends.pop(number)
+        used_s = max(0.0, cpu_s - process.cpu_s)
+        process.cpu_s += used_s
+        return how, used_s
 
     def close(self) -> None:
         with self._lock:
@@ -358,7 +363,7 @@ class _Template:
             self._stop()
 
     @contextlib.contextmanager
-    def _hold_lock(self, until: float) -> Any:
+    def _hold_lock(self, until: float) -> Iterator[None]:
         if not self._lock.acquire(timeout=max(0.0, until - time.monotonic())):
             raise _busy_error("no process was free in time")
         try:
@@ -366,67 +371,59 @@ class _Template:
         finally:
             self._lock.release()
 
-    def _start(self) -> None:
-        self._channel, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        with theirs:
-            self._process = subprocess.Popen(
-                [sys.executable, "-m", "rse_pf.limited_process", str(theirs.fileno())],
-                pass_fds=(theirs.fileno(),), stdin=subprocess.DEVNULL, stdout=2,
-                env={**os.environ, **ONE_THREAD},
-            )  # fmt: skip
-        self._generation += 1
-        run_as_batch(self._process.pid, os.getpriority(os.PRIO_PROCESS, 0) + self._niceness)
-        with contextlib.suppress(OSError):  # it has ended, which the next read shows
-            self._channel.send(self._order)
-
-    def _wait_until_ready(self, until: float) -> None:
+    def _wait_until_ready(self, server: Child, until: float) -> None:
         if self._is_ready:
             return
-        assert self._channel is not None
-        self._channel.settimeout(max(1e-3, until - time.monotonic()))
+        server.connection.settimeout(max(1e-3, until - time.monotonic()))
         try:
-            message = self._channel.recv(_MAX_ORDER_BYTES)
+            report, _ = read_packet(server.connection)
         except TimeoutError:
             raise _busy_error("the process was not started in time") from None
-        except OSError:
-            message = b""
-        if not message:
+        if report is None:
             self._stop()
             raise WorkerLost(
                 "the process cannot be started", hint="tell the operator; the server's log has it"
             )
+        server.connection.settimeout(_ORDER_TIMEOUT_S)
         self._is_ready = True
 
-    def _ask(self, order: dict[str, Any], passed: socket.socket | None = None) -> dict[str, Any]:
-        assert self._channel is not None
-        self._channel.settimeout(_ORDER_TIMEOUT_S)
-        fds = [] if passed is None else [passed.fileno()]
+    def _ask(self, server: Child, do: str, number: int, *descriptors: int) -> None:
         try:
-            socket.send_fds(self._channel, [json.dumps(order).encode()], fds)
-            reply: dict[str, Any] = json.loads(self._channel.recv(_MAX_ORDER_BYTES))
-        except (OSError, ValueError):
-            self._stop()
-            raise WorkerLost("the template of the processes ended", hint="try again") from None
-        return reply
+            send_order(server, do, number, *descriptors)
+        except OSError:
+            self._lose()
+
+    def _take_report(self, server: Child) -> None:
+        """Take one report; raises WorkerLost if the fork server has ended or does not answer."""
+        try:
+            report, handles = read_packet(server.connection)
+        except TimeoutError:
+            report, handles = None, []
+        for handle in handles:
+            os.close(handle)
+        if report is None:
+            self._lose()
+        elif report["event"] == "created":
+            self._forked[report["id"]] = report["pid"]
+        else:
+            self._ends[report["id"]] = report["how"], report["cpu_s"]
+
+    def _lose(self) -> NoReturn:
+        self._stop()
+        raise WorkerLost("the template of the processes ended", hint="try again")
 
     def _stop(self) -> None:
-        """End the template, and with it every process, which dies with its parent."""
-        if self._process is not None and self._channel is not None:
-            self._channel.close()
-            self._process.kill()
-            self._process.wait()
-        self._process = self._channel = None
+        """End the fork server, and with it every process, which dies with its parent."""
+        if self._server is not None:
+            self._server.kill()
+        self._server = None
         self._is_ready = False
-        self._generation += 1
         self._forked.clear()
+        self._ends.clear()
 
 
 def _busy_error(why: str) -> Busy:
     return Busy(why, hint="try again later, or allow more time", retry_after_ms=_BUSY_RETRY_MS)
-
-
-def _name_of(signal_number: int) -> str:
-    return f"signal {signal.Signals(signal_number).name}"
 
 
 def _exchange(process: _Process, data: bytes, until: float, max_reply_bytes: int) -> bytes:
@@ -453,14 +450,10 @@ def _exchange(process: _Process, data: bytes, until: float, max_reply_bytes: int
 
 
 def _receive(connection: socket.socket, size: int, until: float) -> bytes:
-    received = bytearray()
-    while len(received) < size:
-        connection.settimeout(_left_s(until))
-        piece = connection.recv(min(size - len(received), 1 << 18))
-        if not piece:
-            raise _ProcessEnded
-        received += piece
-    return bytes(received)
+    received = receive_bytes(connection, size, until)
+    if len(received) < size:
+        raise _ProcessEnded
+    return received
 
 
 def _left_s(until: float) -> float:
@@ -470,53 +463,25 @@ def _left_s(until: float) -> float:
     return left_s
 
 
-# --- the template process -------------------------------------------------------------------------------
+# --- the fork server ------------------------------------------------------------------------------------
 
 
-def main(arguments: list[str]) -> None:
-    """Fork and kill processes as the owner of the socket with this number orders, until it is gone."""
-    owner = socket.socket(fileno=int(arguments[0]))
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, signal.SIG_IGN)
-    set_process_name("rse-pf limited")
-    order = json.loads(owner.recv(_MAX_ORDER_BYTES) or b"null")
+def run(owner: socket.socket) -> None:
+    """Fork processes as the *owner* orders, until it is gone."""
+    order, _ = read_packet(owner)
     if order is None:
         return
+    memory_bytes, cpu_s = order["limits"]
     module, _, function = order["target"].partition(":")
     handler: Handler = getattr(importlib.import_module(module), function)(order["configuration"])
-    gc.collect()
-    gc.freeze()
-    work = functools.partial(_work, owner, handler, *order["limits"])
-    owner.send(b'"ready"')
-    while _obey(owner, work):
-        pass
 
+    def fork(number: int, descriptors: list[int]) -> int:
+        pid = os.fork()
+        if pid == 0:
+            _work(owner, handler, memory_bytes, cpu_s, socket.socket(fileno=descriptors[0]))
+        return pid
 
-def _obey(owner: socket.socket, work: Callable[[socket.socket], NoReturn]) -> bool:
-    """Follow one order; return False when the owner is gone."""
-    try:
-        message, fds, _, _ = socket.recv_fds(owner, _MAX_ORDER_BYTES, 1)
-    except OSError:
-        return False
-    if not message:
-        return False
-    order = json.loads(message)
-    if order["do"] == "fork":
-        with socket.socket(fileno=fds[0]) as connection:
-            pid = os.fork()
-            if pid == 0:
-                work(connection)
-        reply: dict[str, float] = {"pid": pid}
-    else:
-        with contextlib.suppress(ProcessLookupError):
-            os.kill(order["pid"], signal.SIGKILL)  # not reaped yet, so nobody else has this id
-        _, status, used = os.wait4(order["pid"], 0)
-        reply = {"code": os.waitstatus_to_exitcode(status), "cpu_s": used.ru_utime + used.ru_stime}
-    try:
-        owner.send(json.dumps(reply).encode())
-    except OSError:
-        return False
-    return True
+    serve_forks(owner, ForkPlan(fork=fork, keeps_ended=True))
 
 
 def _work(
@@ -527,7 +492,8 @@ def _work(
         template = os.getppid()
         owner.close()
         if die_with_parent(template):
-            _limit(memory_bytes)
+            limit_memory(memory_bytes, beyond_now=True)
+            be_killed_first()
             while _answer(connection, handler, cpu_s):
                 pass
         os._exit(0)
@@ -535,16 +501,6 @@ def _work(
         os._exit(_OUT_OF_MEMORY)
     finally:
         os._exit(1)
-
-
-def _limit(memory_bytes: int) -> None:
-    """Allow this process *memory_bytes* more than it has, no core file, and let it be killed first."""
-    pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[5])
-    limit = pages * os.sysconf("SC_PAGE_SIZE") + memory_bytes
-    resource.setrlimit(resource.RLIMIT_DATA, (limit, limit))
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    with contextlib.suppress(OSError):
-        Path("/proc/self/oom_score_adj").write_text("1000", encoding="ascii")
 
 
 def _answer(connection: socket.socket, handler: Handler, cpu_s: float) -> bool:
@@ -574,7 +530,3 @@ def _answer(connection: socket.socket, handler: Handler, cpu_s: float) -> bool:
     except OSError:
         return False
     return True
-
-
-if __name__ == "__main__":
-    main(sys.argv[1:])

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
+from rse_pf.child.limited import LimitedProcesses, Overran, ProcessLimits
 from rse_pf.errors import BadRequest, Busy, Crashed, Expired, InternalError, RsePfError, WorkerLost
-from rse_pf.limited_process import LimitedProcesses, Overran, ProcessLimits
 
 _HANDLER = '''
 import os, resource, signal, socket, time
