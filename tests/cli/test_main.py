@@ -59,6 +59,7 @@ def _alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         ("serve --settings none.json", "cannot read none.json", "--settings"),
         ("serve --settings empty", "empty is not JSON", "correct the file"),
         ("local strat", "'strat' is not one of start, stop", "did you mean start?"),
+        ("local --xyzzy", "unknown option --xyzzy", "rse-pf local --help"),
         ("local --name ../x", "'../x' is no name for a platform", "1 to 32"),
         ("local --servers 0", "local.servers = 0 is below 1", "raise --servers"),
         ("local --port -1", "local.port = -1 is below 0", "raise --port"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import zlib
@@ -12,10 +13,13 @@ import numpy as np
 import pytest
 from recording.replay.made import Made, jpeg
 
+from rse_pf.cli import replay as replay_command
 from rse_pf.cli.main import main
 from rse_pf.pnp.problems import make_degenerate, make_problem
 from rse_pf.recording.mcap_file import McapFile
 from rse_pf.recording.replay import limited
+from rse_pf.recording.replay.report import CauseFound
+from rse_pf.recording.replay.run import Overview
 from rse_pf.wire import Result
 
 
@@ -204,3 +208,22 @@ def test_a_case_that_is_too_large_is_not_opened(tmp_path: Path, capsys: pytest.C
 
     assert main(["replay", str(path)]) == 1
     assert "above 8388608" in capsys.readouterr().err
+
+
+def test_of_good_poses_text_and_json_blame_no_calibration_and_name_who_judges_it(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    blamed = CauseFound(cause="depth_scale", confidence=0.9, sentence="the scale", evidence={})
+    overview = Overview(
+        files=1, cut=(), version="1", side="robot", commands=2, robots=1, seconds=1.0, left_out=0,
+        causes={"a:1": (blamed,), "a:2": (blamed,)}, explained=2,
+    )  # fmt: skip
+
+    replay_command._show_overview(overview, argparse.Namespace(file=tmp_path))
+    told = replay_command._overview_json(overview)
+
+    out = capsys.readouterr().out
+    assert "nothing went wrong" not in out
+    assert "rse-pf check" in out
+    assert told["causes_count"] == {"none": 2}
+    assert told["findings"] == [{"id": "a:1", "causes": []}, {"id": "a:2", "causes": []}]

@@ -125,9 +125,12 @@ class RosPrograms:
 
 
 async def own_run(
-    bag: Path, platform: LocalPlatform, options: BagOptions | None = None
+    bag: Path, platform: LocalPlatform, options: BagOptions | None = None, out: Path | None = None
 ) -> dict[int, np.ndarray[Any, Any]]:
-    """Return the positions that the SDK alone gives for a bag, as they come, by stamps in milliseconds."""
+    """Return the positions that the SDK alone gives for a bag, as they come, by stamps in milliseconds.
+
+    Its map is written into the folder *out*, as `rse-pf map from-bag` does.
+    """
     found = {}
     with open_bag(bag, options or BagOptions()) as opened:
         async with connect(platform.url, token=platform.issue_token("sdk")) as robot:
@@ -136,6 +139,8 @@ async def own_run(
                 pose = (await mapper.track(frame)).T_world_camera
                 if pose is not None:
                     found[round(1e3 * frame.timestamp_s)] = pose[:3, 3]
+            if out is not None:
+                mapper.save(out)
     return found
 
 

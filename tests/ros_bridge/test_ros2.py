@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from benchmarks.maps.bags import write_recording
+from client_sdk.mapping import read_trajectory
 from rse_pf.config import PlatformSettings
 from rse_pf.local.control.platform import LocalPlatform
 from tests.ros_bridge.programs import own_run, poses, tell_delay, worst_mm
@@ -39,7 +40,7 @@ async def _drive(ros2: Ros2, bag: Path, folder: Path) -> None:
     settings, state = PlatformSettings(), folder / "platform"
     async with LocalPlatform(settings, port=0, servers=2, state=state, data=True) as platform:
         token_file.write_text(platform.issue_token("ros-2"), encoding="ascii")
-        expected = await own_run(bag, platform)
+        expected = await own_run(bag, platform, out=folder / "own")
         assert len(expected) == _FRAMES
 
         bridge = await asyncio.to_thread(
@@ -71,7 +72,12 @@ async def _drive(ros2: Ros2, bag: Path, folder: Path) -> None:
         last = max(heard, key=lambda line: line["stamp"])["position"]
         assert math.dist(np.reshape(place["T_map_camera"], (4, 4))[:3, 3], last) < 0.05
         assert "set the parameter map" in asked.heard("relocalise")[0]["message"]
-        assert (folder / "saved" / "trajectory.txt").exists()
+        own, saved = (
+            json.loads((folder / name / "report.json").read_text(encoding="utf-8"))
+            for name in ("own", "saved")
+        )
+        assert saved["map_points"] == pytest.approx(own["map_points"], rel=0.01)
+        assert len(read_trajectory(folder / "saved" / "trajectory.txt")) == _FRAMES
         assert await asyncio.to_thread(bridge.end) == 0
         assert bridge.lines[-1] == f"{_FRAMES} frames, 0 lost\n"
 
