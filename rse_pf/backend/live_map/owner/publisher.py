@@ -17,9 +17,18 @@ from collections.abc import Callable, Sequence
 from rse_pf.backend.live_map.owner.context import OwnerContext
 from rse_pf.backend.live_map.owner.state import MapState
 from rse_pf.backend.live_map.owner.threads import Urgency
-from rse_pf.errors import Busy, Conflict, NotFound, RsePfError, StoreError
+from rse_pf.errors import (
+    BadMessage,
+    BadRequest,
+    Busy,
+    Conflict,
+    LimitExceeded,
+    NotFound,
+    RsePfError,
+    StoreError,
+)
 from rse_pf.live_map.versions import PointSource, errors_of_maps
-from rse_pf.maps.format import MapVersion, encode_map
+from rse_pf.maps.format import UP_FIELD, MapVersion, encode_map
 from rse_pf.maps.registry import MapOrigin, MapRecord, MapRegistry
 from rse_pf.maps.removal import superseded
 from rse_pf.object_store import digest_of
@@ -56,6 +65,7 @@ class Publisher:
         """
         self._state, self._context, self._author = state, context, _AUTHOR + server
         self._maps, self._threads = context.maps, context.threads
+        self._up_of: tuple[str, list[float] | None] = "", None
         self._clock, self._json_log, self._name = context.clock, context.log, context.map_name
         self._pause_s = context.settings.publish_pause_s
         self._lock = asyncio.Lock()
@@ -134,6 +144,7 @@ class Publisher:
     async def _publish(self, note: str, freed: int = 0) -> MapRecord:
         changes = self._state.changes
         version = await self._make_version()
+        version = await self._threads.background(functools.partial(self._with_up, version))
         made_s = self._context.wall_clock()
         origin = MapOrigin(parent=None, author=self._author, created_s=made_s, note=note)
         charge = functools.partial(self._context.account.reserve, freed=freed)
@@ -176,6 +187,23 @@ class Publisher:
             missing=cloud.missing,
         )  # fmt: skip
         return dataclasses.replace(version, points=cloud.points, colours=cloud.colours)
+
+    def _with_up(self, version: MapVersion) -> MapVersion:
+        """Return *version* with up of the one that it started from, whose axes it keeps.  Blocking.
+
+        Raises:
+            StoreError: The store fails.
+        """
+        source = str(version.provenance.get("from", ""))
+        if self._up_of[0] != source:
+            up = None
+            with contextlib.suppress(NotFound, BadRequest, BadMessage, LimitExceeded):  # it was removed
+                name, _, number = source.partition("@")
+                up = self._maps.load(name, number).up
+            self._up_of = source, None if up is None else up.tolist()
+        if self._up_of[1] is None:
+            return version
+        return dataclasses.replace(version, provenance={**version.provenance, UP_FIELD: self._up_of[1]})
 
     def _remove_old_versions(self) -> int:
         """Remove the oldest versions that nobody asked for, ten at most; return how many.  Blocking.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import zlib
 
@@ -15,6 +16,7 @@ from rse_pf.errors import NotFound
 from rse_pf.geometry import Camera, exp_se3, transform
 from rse_pf.identity import RobotId, object_name
 from rse_pf.live_map.versions import PointSource
+from rse_pf.maps.format import UP_FIELD, encode_map
 from rse_pf.maps.registry import MapRegistry
 from rse_pf.object_store import MemoryStore
 from rse_pf.slam.cloud_deform import joined_cloud
@@ -228,6 +230,32 @@ def test_a_version_names_images_where_the_operator_allows_them_and_forget_delete
         assert ONE.folder not in maps.load(MAP, "head").provenance.get("images", {})
 
     bench.run(test)
+
+
+@pytest.mark.parametrize("up", [[0.0, 0.6, 0.8], None, "up"])
+def test_a_map_keeps_up_of_the_version_that_it_started_from(up: object) -> None:
+    store = MemoryStore()
+    maps, source = MapRegistry(store, "default"), Bench(MemoryStore(), kind=LIVE_MAP, publish_pause_s=0.0)
+
+    async def drive(bench: Bench, start: bool) -> None:
+        owner = await bench.own("a")
+        if start:
+            await owner.ask("live-start", {"from": "origin"})
+        await owner.owner.answer(ONE, "live-keyframe", keyframe_request(0, None))
+        await settle()
+        await owner.ask("live-publish")
+
+    source.run(lambda: drive(source, False))
+    first = MapRegistry(source.store, "default").load(MAP, "head")
+    assert first.up is None
+    origin = encode_map(dataclasses.replace(first, provenance={UP_FIELD: up}))
+    maps.commit("origin", origin, parent=None, author="t", created_s=0.0)
+    bench = Bench(store, kind=LIVE_MAP, publish_pause_s=0.0)
+
+    bench.run(lambda: drive(bench, True))
+
+    found = maps.load(MAP, "head").up
+    assert found is None if not isinstance(up, list) else np.allclose(found, up)
 
 
 def test_the_next_owner_deletes_what_the_last_one_could_not() -> None:
