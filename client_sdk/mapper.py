@@ -145,7 +145,8 @@ class Mapper:
             adds_frames: Whether each frame with depth is added to the map; else the caller adds to `map`
                 what it wants.
             recorder: Gets each frame before it is tracked, and the points of each map that is saved.
-            holds_world: Whether poses that were returned are never turned, when gravity becomes known better.
+            holds_world: Whether poses that were returned are never turned, when gravity becomes known better,
+                nor moved by an adjustment of stereo pairs.
             features: Finds the features of an image; None for ORB.
             motion: Expects the pose of the next frame; None for a constant velocity.
             loops: Describes an image, so that places are recognised; None takes its features.
@@ -163,6 +164,7 @@ class Mapper:
         self._scale: OdometryScale | MarkerScale | ImuScale | None = scale
         self._inertial: Inertial | None = None
         self._began_s = float("-inf")
+        self._holds_poses, self._disparity_deviation_px = holds_world, float("nan")
         self._is_upright, self._holds_world = False, holds_world or T_world_start is not None
         self._map_options = map_options or MapOptions()
         self._T_world_start = T_world_start
@@ -320,6 +322,10 @@ class Mapper:
         trips = np.array(self._round_trips_ms)
         starting = self._tracker.starting_frames if isinstance(self._tracker, MonocularTracker) else 0
         trajectory, apart = self.trajectory, self._apart()
+        offset: dict[str, float] = {}
+        if isinstance(self._tracker, Tracker) and np.isfinite(self._disparity_deviation_px):
+            offset["disparity_offset_px"] = round(self._tracker.disparity_offset_px, 3)
+            offset["disparity_offset_deviation_px"] = round(self._disparity_deviation_px, 3)
         return {
             "frames": self.frames,
             "lost_frames": self.lost_frames,
@@ -328,6 +334,7 @@ class Mapper:
             "segments_apart": len(apart),
             "frames_apart": sum(len(record.poses) for record, _ in apart),
             "scale": self.scale,
+            **offset,
             **({} if self._inertial is None else {"imu": self.imu}),
             **({} if self.T_body_camera is None else {"T_body_camera": self.T_body_camera.tolist()}),
             "unit": "unit of the map" if self.scale == _UP_TO_SCALE else "m",
@@ -372,7 +379,8 @@ class Mapper:
         ``trajectory-2.txt`` and so on.
 
         A map with depth has the points that were read at least twice; the report counts those.  Without depth
-        all keyframes are adjusted together before, which takes seconds.
+        and with stereo pairs all keyframes are adjusted together before, which takes seconds.  Pairs move
+        only if their disparities are clearly too small or too large: by the report's ``disparity_offset_px``.
 
         Raises:
             UsageError: The folder cannot be written.
@@ -381,9 +389,12 @@ class Mapper:
             self._tracker.adjust()
             for segment in self._metric:
                 self._make_metric(self._tracker, segment)
-        elif self._tracker is not None and self._inertial is not None:
-            self._align(self._tracker)
-            self._make_upright(self._tracker)
+        elif self._tracker is not None:
+            if self._depth_by == "stereo" and not self._holds_poses:
+                self._adjust_pairs(self._tracker)
+            if self._inertial is not None:
+                self._align(self._tracker)
+                self._make_upright(self._tracker)
         report = self.report()
         points, colours = self.map.points(min_readings=self._least_readings)
         report["map_points"] = len(points)
@@ -463,6 +474,13 @@ class Mapper:
         if self._T_world_start is None:
             gravity = self._inertial.first_gravity()
             self._T_world_start = upright(_LEVEL_GRAVITY if gravity is None else gravity)
+
+    def _adjust_pairs(self, tracker: Tracker) -> None:
+        """Adjust the keyframes of stereo pairs together, with what their disparities lack."""
+        adjusted = tracker.adjust_pairs()
+        self._records.correct(adjusted)
+        if tracker.segment in adjusted:
+            self._disparity_deviation_px = adjusted[tracker.segment].deviation_px
 
     def _align(self, tracker: Tracker) -> None:
         """Find gravity and biases of a drive in metres."""

@@ -11,7 +11,7 @@ from rse_pf.images import load_opencv
 from rse_pf.pnp import DepthNoise
 from rse_pf.slam.stereo import StereoOptions, disparities, stereo_noise
 
-__all__ = ["noise_of", "stereo_points"]
+__all__ = ["noise_of", "stereo_points", "with_offset"]
 
 _NEAREST_M, _FARTHEST_M = 0.3, 900.0
 _MOST_SHARE, _MOST_PX = 0.2, 512
@@ -46,3 +46,18 @@ def stereo_points(rgb: npt.NDArray[np.uint8], stereo: StereoView, camera: Camera
 def noise_of(stereo: StereoView, camera: Camera) -> DepthNoise:
     """Return the noise of a pair's depths where its pictures are clear."""
     return stereo_noise(camera.fx * stereo.baseline_m, _DISPARITY_PX)
+
+
+def with_offset(points_camera: Array, f_baseline: float, offset_px: float) -> Array:
+    """Return ``(n, 3)`` points along their rays, as disparities that are *offset_px* larger have them.
+
+    A point that has none, or whose disparity would not be above 0, is NaN.
+
+    Args:
+        points_camera: ``(n, 3)``, of the left camera's frame.
+        f_baseline: Focal length in pixels times the baseline in metres.
+        offset_px: Pixels.
+    """
+    stretch = 1.0 + points_camera[:, 2:] * (offset_px / f_baseline)
+    moved: Array = points_camera / np.where(stretch > 0.0, stretch, np.nan)
+    return moved

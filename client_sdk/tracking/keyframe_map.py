@@ -6,11 +6,12 @@ fused by their noise.  Nothing is matched here, and no keyframe is ever moved bu
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
 
+from client_sdk.stereo.depth import with_offset
 from client_sdk.tracking.place import Place
 from rse_pf.geometry import Array, Camera, inverse, transform
 from rse_pf.maps.descriptors import Descriptors
@@ -46,7 +47,8 @@ class View:
     """One image: its features, and their ``(n, 3)`` points in the camera's frame, NaN without depth.
 
     ``sways`` ``(n, 3)`` is how far the points move for each second that the camera's readout takes longer.
-    ``is_stereo`` says that the depths are those of disparities, whose noise has no floor.
+    ``is_stereo`` says that the depths are those of disparities, whose noise has no floor.  ``timestamp_s`` is
+    that of the frame.
     """
 
     features: ImageFeatures
@@ -55,6 +57,7 @@ class View:
     camera: Camera
     place: Place
     is_stereo: bool = False
+    timestamp_s: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -157,6 +160,10 @@ class KeyframeMap:
     def view(self, keyframe: int) -> View:
         """Return the image of a keyframe."""
         return self._keyframes[keyframe].view
+
+    def seen_in(self, keyframe: int) -> Rows:
+        """Return the landmark of each feature of a keyframe, or NO_LANDMARK."""
+        return self._keyframes[keyframe].landmarks
 
     def add_keyframe(
         self, view: View, T_world_camera: Array, landmarks: Rows, noise: DepthNoise, pixel_px: float
@@ -273,6 +280,37 @@ class KeyframeMap:
         self._sways[:count] = self._sways[:count] @ rotation.T
         self._rays[:count] = self._rays[:count] @ rotation.T
         self._turns[:count] = self._turns[:count] @ rotation.T
+
+    def correct(self, T_world_camera: Array, f_baseline: float, offset_px: float) -> None:
+        """Take corrected poses, and disparities that are *offset_px* larger.
+
+        Each landmark follows the last keyframe that sees it.
+
+        Args:
+            T_world_camera: ``(k, 4, 4)``, of all keyframes.
+            f_baseline: Focal length in pixels times the baseline in metres.
+            offset_px: Pixels.
+        """
+        of = np.zeros(self._count, dtype=np.int64)
+        for number, record in enumerate(self._keyframes):
+            of[record.own] = number
+        count, before, after = self._count, self._poses[of, :3], T_world_camera[of, :3]
+        seen = np.einsum("nji,nj->ni", before[:, :, :3], self._points[:count] - before[:, :, 3])
+        moved = with_offset(seen, f_baseline, offset_px)
+        seen = np.where(np.isfinite(moved), moved, seen)
+        rotation = after[:, :, :3] @ before[:, :, :3].transpose(0, 2, 1)
+        self._rays[:count] = np.einsum("nij,nj->ni", after[:, :, :3], seen)
+        self._points[:count] = self._rays[:count] + after[:, :, 3]
+        self._spreads[:count] = rotation @ self._spreads[:count] @ rotation.transpose(0, 2, 1)
+        self._turns[:count] = np.einsum("nij,nj->ni", rotation, self._turns[:count])
+        self._sways[:count] = np.einsum("nij,nj->ni", rotation, self._sways[:count])
+        self._poses = T_world_camera.copy()
+        self._keyframes = [
+            replace(record, view=replace(
+                record.view, points_camera=with_offset(record.view.points_camera, f_baseline, offset_px)
+            ))
+            for record in self._keyframes
+        ]  # fmt: skip
 
     def take(self, other: KeyframeMap) -> int:
         """Add all of another map in the same frame; return the number that its first landmark has here."""

@@ -5,6 +5,7 @@ A tracker without depth keeps its segments itself, since each keyframe corrects 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -12,9 +13,11 @@ import numpy.typing as npt
 
 from client_sdk.frontend import Features, Frame, TrackedFrame
 from client_sdk.mapping import MapOptions, PointMap, Trajectory
+from client_sdk.stereo.depth import with_offset
 from client_sdk.tracking.monocular_tracker import MonocularTracker
+from client_sdk.tracking.stereo_adjustment import StereoAdjustment
 from client_sdk.tracking.tracker import Join
-from rse_pf.geometry import Array, Camera, rigid, transform
+from rse_pf.geometry import Array, Camera, inverse, rigid, transform
 from rse_pf.maps.format import Keyframe
 
 __all__ = [
@@ -31,14 +34,28 @@ _CLOUD_SHARE = 0.05
 """Largest deviation of a stereo pair's depth in the cloud, as a share of the depth."""
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _SeenPoints:
+    """What a stereo keyframe adds to a cloud: its pose, ``(n, 3)`` points and colours."""
+
+    timestamp_s: float
+    T_world_camera: Array
+    points_camera: npt.NDArray[np.float32]
+    colours: npt.NDArray[np.uint8]
+
+
 @dataclass(slots=True, kw_only=True, eq=False)
 class SegmentRecord:
-    """One segment: stamps in seconds, ``(4, 4)`` poses in its own frame, its cloud and its keyframes."""
+    """One segment: stamps in seconds, ``(4, 4)`` poses in its own frame, its cloud and its keyframes.
+
+    Of stereo pairs the points of the cloud are kept, so that it follows the keyframes.
+    """
 
     cloud: PointMap
     stamps_s: list[float] = field(default_factory=list)
     poses: list[Array] = field(default_factory=list)
     keyframes: list[Keyframe] = field(default_factory=list)
+    seen: list[_SeenPoints] = field(default_factory=list)
 
     def take(self, other: SegmentRecord, T_own_other: Array) -> None:
         """Add all of another segment."""
@@ -49,6 +66,44 @@ class SegmentRecord:
             replace(keyframe, T_world_camera=_moved(T_own_other, keyframe.T_world_camera))
             for keyframe in other.keyframes
         ]
+        self.seen += [
+            replace(seen, T_world_camera=_moved(T_own_other, seen.T_world_camera)) for seen in other.seen
+        ]
+
+    def corrected(self, found: StereoAdjustment) -> SegmentRecord:
+        """Return the segment as an adjustment of its keyframes has it; a cloud that others made stays."""
+
+        def moved(stamp_s: float, pose: Array) -> Array:
+            T = found.moved(np.array([stamp_s]), pose[None])[0]
+            return _moved(T @ inverse(pose), pose)
+
+        def shown(points_camera: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+            points = with_offset(points_camera.astype(np.float64), found.f_baseline, found.offset_px)
+            return points.astype(np.float32)
+
+        corrected = SegmentRecord(
+            cloud=PointMap(self.cloud.options) if self.seen else self.cloud, stamps_s=self.stamps_s,
+            poses=[moved(*each) for each in zip(self.stamps_s, self.poses, strict=True)],
+            keyframes=[
+                replace(
+                    each, T_world_camera=moved(each.timestamp_s, each.T_world_camera),
+                    points_camera=shown(each.points_camera),
+                )
+                for each in self.keyframes
+            ],
+            seen=[
+                replace(
+                    each, T_world_camera=moved(each.timestamp_s, each.T_world_camera),
+                    points_camera=shown(each.points_camera),
+                )
+                for each in self.seen
+            ],
+        )  # fmt: skip
+        for each in corrected.seen:
+            is_known = np.isfinite(each.points_camera[:, 2])
+            points = transform(each.T_world_camera, each.points_camera[is_known].astype(np.float64))
+            corrected.cloud.add_points(points, each.colours[is_known])
+        return corrected
 
     def trajectory(self) -> Trajectory:
         """Return the poses in the order of time."""
@@ -82,7 +137,18 @@ class DriveRecords:
 
     def add_to_cloud(self, tracked: TrackedFrame, pose: Array, features: Features | None) -> None:
         """Add what a frame shows to the cloud of its segment, see the function."""
-        add_to_cloud(self._segments[tracked.segment].cloud, tracked.frame, pose, features, tracked.keyframe)
+        record = self._segments[tracked.segment]
+        add_to_cloud(record.cloud, tracked.frame, pose, features, tracked.keyframe)
+        if tracked.frame.stereo is not None and features is not None and tracked.keyframe:
+            points, colours = _pair_points(tracked.frame, features)
+            stamp_s = tracked.frame.timestamp_s
+            record.seen.append(_SeenPoints(stamp_s, pose, points.astype(np.float32), colours))
+
+    def correct(self, adjusted: Mapping[int, StereoAdjustment]) -> None:
+        """Move segments as an adjustment of their keyframes has them."""
+        for number, found in adjusted.items():
+            if number in self._segments:
+                self._segments[number] = self._segments[number].corrected(found)
 
     def join(self, join: Join) -> None:
         """Move all of a segment into the one that it lies in."""
@@ -118,11 +184,17 @@ def add_to_cloud(
     if frame.stereo is None:
         cloud.add(frame, pose)
     elif features is not None and is_keyframe:
-        points, rows = features.points_camera, certain_rows(frame, features)
-        columns, lines = np.rint(features.pixels[rows]).astype(np.int64).T
-        size = np.array([frame.camera.width, frame.camera.height]) - 1
-        colours = frame.rgb[np.clip(lines, 0, size[1]), np.clip(columns, 0, size[0])]
-        cloud.add_points(transform(pose, points[rows]), colours)
+        points, colours = _pair_points(frame, features)
+        cloud.add_points(transform(pose, points), colours)
+
+
+def _pair_points(frame: Frame, features: Features) -> tuple[Array, npt.NDArray[np.uint8]]:
+    """Return the ``(n, 3)`` points of a pair whose depth is known to 5 %, and their colours."""
+    rows = certain_rows(frame, features)
+    columns, lines = np.rint(features.pixels[rows]).astype(np.int64).T
+    size = np.array([frame.camera.width, frame.camera.height]) - 1
+    colours = frame.rgb[np.clip(lines, 0, size[1]), np.clip(columns, 0, size[0])]
+    return features.points_camera[rows], colours
 
 
 def certain_rows(frame: Frame, features: Features) -> npt.NDArray[np.int64]:

@@ -24,12 +24,14 @@ from client_sdk.frontend import (
 )
 from client_sdk.monocular.descriptors import match_all
 from client_sdk.slots import Slots
+from client_sdk.stereo.depth import with_offset
 from client_sdk.tracking.keyframe_map import NO_LANDMARK, KeyframeMap, Landmarks, View, between, expect
 from client_sdk.tracking.looks import share_alike
 from client_sdk.tracking.noise import NoiseEstimate
 from client_sdk.tracking.place import place_of
 from client_sdk.tracking.queries import Answer, OneQuery, Steps
 from client_sdk.tracking.shutter import ReadoutEstimate, sways, turn_rate, without_shutter
+from client_sdk.tracking.stereo_adjustment import StereoAdjustment, adjust_stereo
 from rse_pf.geometry import Array, inverse, pose_difference, rigid, transform
 from rse_pf.maps.descriptors import Descriptors
 from rse_pf.pnp import DepthNoise
@@ -143,7 +145,8 @@ class Tracker:
 
     ``frames`` counts the frames prepared so far, ``lost_frames`` those of them without an accepted pose, and
     ``unrecognised`` those since the last pose that show enough and no known place; a covered lens is none.
-    ``joins`` are the joins so far, in their order; ``noise`` and ``readout`` are estimates of the camera's.
+    ``joins`` are the joins so far, in their order; ``noise`` and ``readout`` are estimates of the camera's,
+    and ``disparity_offset_px`` what the disparities of a stereo pair lack, which `adjust_pairs` finds.
     """
 
     def __init__(
@@ -160,11 +163,12 @@ class Tracker:
         self.unrecognised = 0
         self.joins: list[Join] = []
         self.noise = NoiseEstimate()
+        self.disparity_offset_px = 0.0
         self.readout = ReadoutEstimate()
         self._T_world_start = np.eye(4) if T_world_start is None else T_world_start
         self._segments: dict[int, KeyframeMap] = {}
         self._segment = -1
-        self._begun = 0
+        self._begun = self._adjusted = 0
         self._last: _Posed | None = None
         self._T_last: Array = self._T_world_start
         self._last_s, self._more_s = 0.0, 0.0
@@ -219,6 +223,34 @@ class Tracker:
         if self._slots.motion is not None:
             self._slots.motion.clear()
 
+    def adjust_pairs(self) -> dict[int, StereoAdjustment]:
+        """Adjust all keyframes of each segment of a stereo drive together, such as at its end.
+
+        It takes seconds.  Returned is by segment how poses change that were returned before, nothing if no
+        frame came since the last time; the next frame is recognised.
+
+        Raises:
+            UsageError: A query is open.
+        """
+        self._open.refuse_open()
+        stereo = self._frame.stereo if self._segments else None
+        if stereo is None or self._adjusted == self.frames:
+            return {}
+        self._adjusted = self.frames
+        adjusted = {}
+        for number, known in self._segments.items():
+            found = adjust_stereo(known, self._frame.camera.fx * stereo.baseline_m)
+            if found is not None:
+                adjusted[number] = found
+        own = adjusted.get(self._segment)
+        if own is not None:
+            self.disparity_offset_px += own.offset_px
+            self._T_last = _rotation_made(own.moved(np.array([self._last_s]), self._T_last[None])[0])
+        self._last, self._place, self._first = None, None, None
+        if self._slots.motion is not None:
+            self._slots.motion.clear()
+        return adjusted
+
     def prepare(self, frame: Frame) -> PoseQuery | TrackedFrame:
         """Take the next frame; return a query, or the result for the frame if none is needed.
 
@@ -231,6 +263,10 @@ class Tracker:
         self._open.refuse_open()
         self.frames += 1
         self._frame, self._raw = frame, extract(frame, self.options, self._slots.features)
+        if self.disparity_offset_px and frame.stereo is not None:
+            f_baseline = frame.camera.fx * frame.stereo.baseline_m
+            points_camera = with_offset(self._raw.points_camera, f_baseline, self.disparity_offset_px)
+            self._raw = replace(self._raw, points_camera=points_camera)
         self._features = self._raw
         self.noise.model = frame.depth_noise
         return self._open.begin(self._track(self._turned(self._view(), self._raw, self._rate)))
@@ -577,7 +613,7 @@ class Tracker:
             features=image, points_camera=features.points_camera, sways=np.zeros_like(features.points_camera),
             camera=self._frame.camera,
             place=place_of(features.descriptors, self._frame.rgb, self._slots.loops),
-            is_stereo=self._frame.stereo is not None,
+            is_stereo=self._frame.stereo is not None, timestamp_s=self._frame.timestamp_s,
         )  # fmt: skip
 
     def _interval_s(self) -> float:

@@ -62,6 +62,7 @@ class DriveObservations:
         rates_m_s: ``(n,)``, how the depth at the pixel changes with time; 0 where that is not known.
         twists_s: ``(k, 6)``, how the pose of each keyframe changes in a second, as a twist on its left; 0
             where that is not known.
+        curve_dev_per_m: Deviation of the unknown ``curve`` before the drive is seen.
     """
 
     camera: Camera
@@ -73,6 +74,7 @@ class DriveObservations:
     depths_dev_m: Array
     rates_m_s: Array
     twists_s: Array
+    curve_dev_per_m: float = float(PRIOR[-1])
 
     def __post_init__(self) -> None:
         n = len(self.keyframes)
@@ -295,6 +297,7 @@ class _System:
         zooms: bool,
     ) -> None:
         self._free = np.flatnonzero([name in free for name in UNKNOWNS])
+        self._priors = np.append(PRIOR[:-1], observed.curve_dev_per_m)
         self._c, self._m = 7 if zooms else 6, len(self._free)
         order = np.argsort(observed.landmarks, kind="stable")
         self.k, self.l = keyframes, landmarks
@@ -363,7 +366,7 @@ class _System:
         squares = np.stack([whitened[:, :2].sum(axis=1), whitened[:, 2]])
         each = _CAUCHY**2 * np.log1p(squares / _CAUCHY**2)
         each[0] = np.where(seen[:, 2] > _NEAR_M, each[0], _BEHIND)
-        priors = ((state.values / PRIOR) ** 2).sum() + ((state.zooms / _ZOOM_PRIOR) ** 2).sum()
+        priors = ((state.values / self._priors) ** 2).sum() + ((state.zooms / _ZOOM_PRIOR) ** 2).sum()
         return float(each.sum() + priors)
 
     def linearise(self, state: _State) -> None:
@@ -450,7 +453,7 @@ class _System:
     def _prior(self) -> Array:
         own = np.full((self.k, self._c), _POSE_INFORMATION)
         own[:, 6:] = 1.0 / _ZOOM_PRIOR**2
-        return np.concatenate([own.ravel(), 1.0 / PRIOR[self._free] ** 2])
+        return np.concatenate([own.ravel(), 1.0 / self._priors[self._free] ** 2])
 
     def step(self, state: _State, damping: float) -> _State:
         """Return the state after one damped step."""

@@ -1,0 +1,105 @@
+"""All keyframes of a stereo drive adjusted together with what its disparities lack."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from client_sdk.stereo.depth import with_offset
+from client_sdk.tracking.keyframe_map import NO_LANDMARK, KeyframeMap, View
+from client_sdk.tracking.place import Place
+from client_sdk.tracking.stereo_adjustment import adjust_stereo
+from rse_pf.geometry import Array, Camera, exp_se3, inverse, transform
+from rse_pf.slam.stereo import stereo_noise
+from rse_pf.slam.tracking import ImageFeatures
+
+pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
+
+CAMERA = Camera(fx=500.0, fy=500.0, cx=320.0, cy=240.0, width=640, height=480)
+F_BASELINE, OFFSET_PX, SCALE = 60.0, 0.3, 1.02
+
+
+def drive(offset_px: float, keyframes: int = 8) -> tuple[KeyframeMap, Array, Array]:
+    """Return a map whose path is 2 % too long, the true ``T_world_camera``, and the true landmarks."""
+    rng = np.random.default_rng(4)
+    points = CAMERA.back_project(rng.uniform([60, 60], [580, 420], (300, 2)), rng.uniform(4.0, 20.0, 300))
+    steps = np.arange(keyframes)[:, None] * np.array([0.15, 0.02, 0.25, 0.004, -0.006, 0.002])
+    truth = exp_se3(steps)
+    known = KeyframeMap(100)
+    landmarks = np.full(len(points), NO_LANDMARK)
+    for number, T in enumerate(truth):
+        seen = transform(inverse(T), points)
+        pixels = CAMERA.project(seen) + rng.normal(0.0, 0.3, (len(points), 2))
+        disparities = F_BASELINE / seen[:, 2] - offset_px + rng.normal(0.0, 0.05, len(points))
+        features = ImageFeatures(
+            pixels=pixels, descriptors=np.zeros((len(points), 32), dtype=np.uint8),
+            turns=np.tile([1.0, 0.0], (len(points), 1)), sizes=np.ones(len(points)),
+            distinct=np.zeros(len(points), dtype=np.int32),
+        )  # fmt: skip
+        view = View(
+            features=features, points_camera=CAMERA.back_project(pixels, F_BASELINE / disparities),
+            sways=np.zeros((len(points), 3)), camera=CAMERA, place=Place(lambda: np.ones(4, np.float32)),
+            is_stereo=True, timestamp_s=0.5 * number,
+        )  # fmt: skip
+        tracked = T.copy()
+        tracked[:3, 3] *= SCALE
+        landmarks = known.add_keyframe(view, tracked, landmarks, stereo_noise(F_BASELINE, 0.1), 1.0)
+    return known, truth, points
+
+
+@pytest.mark.parametrize("offset_px", [OFFSET_PX, -OFFSET_PX])
+def test_the_offset_of_disparities_and_the_metres_are_found(offset_px: float) -> None:
+    known, truth, points = drive(offset_px)
+
+    found = adjust_stereo(known, F_BASELINE)
+
+    assert found is not None
+    assert found.offset_px == pytest.approx(offset_px, abs=4.0 * found.deviation_px + 0.01)
+    assert found.deviation_px < 0.05
+    poses = np.array([known.pose(row) for row in range(len(known))])
+    assert np.abs(poses[:, :3, 3] - truth[:, :3, 3]).max() < 0.01  # 4 cm before
+    landmarks = known.landmarks_of(list(range(len(known)))).points
+    assert np.median(np.linalg.norm(landmarks - points, axis=1) / points[:, 2]) < 0.03
+    measured = known.view(3).points_camera[:, 2]
+    expected = transform(inverse(truth[3]), points)[:, 2]
+    assert abs(np.median(F_BASELINE / measured - F_BASELINE / expected)) < 0.06  # 0.3 before
+
+
+def test_poses_between_keyframes_move_with_them() -> None:
+    known, _truth, _ = drive(OFFSET_PX)
+    found = adjust_stereo(known, F_BASELINE)
+    between = exp_se3(3.5 * np.array([0.15, 0.02, 0.25, 0.004, -0.006, 0.002]))
+    tracked = between.copy()
+    tracked[:3, 3] *= SCALE
+
+    assert found is not None
+    moved = found.moved(np.array([1.75]), tracked[None])[0]
+
+    np.testing.assert_allclose(moved[:3, 3], between[:3, 3], atol=0.01)
+
+
+def test_a_good_calibration_moves_nothing() -> None:
+    known, _, _ = drive(0.0)
+    before = known.pose(3).copy()
+
+    assert adjust_stereo(known, F_BASELINE) is None
+    np.testing.assert_array_equal(known.pose(3), before)
+
+
+def test_few_keyframes_stay_where_they_are() -> None:
+    known, _, _ = drive(OFFSET_PX, keyframes=4)
+    before = known.pose(3).copy()
+
+    assert adjust_stereo(known, F_BASELINE) is None
+    np.testing.assert_array_equal(known.pose(3), before)
+
+
+def test_an_offset_moves_points_along_their_rays() -> None:
+    points = np.array([[1.0, 2.0, 10.0], [0.0, 1.0, 100.0], [np.nan] * 3])
+
+    nearer, farther = with_offset(points, F_BASELINE, 0.5), with_offset(points, F_BASELINE, -0.6)
+
+    np.testing.assert_allclose(nearer[0], points[0] * (6.0 / 6.5))
+    np.testing.assert_allclose(farther[0], points[0] * (6.0 / 5.4))
+    assert np.isnan(farther[1:]).all()
+    assert np.isnan(nearer[2]).all()
