@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from itertools import groupby, pairwise
 
@@ -21,12 +21,20 @@ from rse_pf.live_map.agreement import (
     weight_of,
     with_metres,
 )
+from rse_pf.live_map.events import MeasuredLink
 from rse_pf.live_map.graph import Graph, Segment
 from rse_pf.live_map.options import LiveMapOptions
 from rse_pf.live_map.outcomes import Ambiguous, LinkBelieved, LinkRemoved, Outcome
 from rse_pf.live_map.smoothing import SmoothedWindows, odometry_step, smooth_around
 
-__all__ = ["Changes", "disbelieve_contradicting", "judge_again", "judge_links", "smooth_changes"]
+__all__ = [
+    "Changes",
+    "disbelieve_contradicting",
+    "has_other_metres",
+    "judge_again",
+    "judge_links",
+    "smooth_changes",
+]
 
 _DOUBTFUL = 30.0
 """Squared misfit of a link, six degrees of freedom: one true link in 25,000 has more."""
@@ -34,7 +42,8 @@ _JUDGED_AFTER_JOIN = 48
 _FIXED = 1e9
 """Weight of links that are never removed."""
 _CONTRADICTIONS = 16
-"""Of the last 32 keyframes of a robot; honest robots, also with 10 % of wheel slip, stay far below."""
+"""Of the last 32 keyframes of a robot, those with other metres twice; honest robots, also with 10 % of wheel
+slip, stay far below."""
 
 
 @dataclass(slots=True)
@@ -91,24 +100,49 @@ def judge_again(graph: Graph, options: LiveMapOptions) -> Iterator[Changes]:
                 yield changes
 
 
-def disbelieve_contradicting(graph: Graph, keyframe: int, changes: Changes) -> bool:
+def has_other_metres(
+    graph: Graph, keyframe: int, links: Iterable[MeasuredLink], options: LiveMapOptions
+) -> bool:
+    """Return whether the metres of *keyframe* are not those of all other robots that it is compared with.
+
+    These must be two or more, and differ from it alike: of two robots nobody knows which one is wrong.
+    """
+    own, signs = graph.keyframes[keyframe].robot, dict[tuple[str, bool], set[float]]()
+    for link in links:
+        other = graph.segment_of(link.other)
+        is_strong = options.strong.weight_of(link.inliers, link.matches) == 1.0
+        if other.is_metric and graph.keyframes[link.other].robot != own and is_strong:
+            seen = signs.setdefault((graph.keyframes[link.other].robot, other.version), set())
+            seen.add(math.copysign(1.0, link.off_scale) if link.off_scale else 0.0)
+    return len(signs) > 1 and len(set().union(*signs.values())) == 1 and {0.0} not in signs.values()
+
+
+def disbelieve_contradicting(
+    graph: Graph, keyframe: int, changes: Changes, *, has_other_metres: bool = False
+) -> bool:
     """Note whether all links of *keyframe* contradict the map; say if its segment is disbelieved from now on.
 
     Links of an honest robot contradict its odometry for a few keyframes, until they are believed, or prove
     that two places look alike; places that are known to do so count for nothing here.
     """
     segment = graph.segments[int(graph.of_segment[keyframe])]
-    if not changes.verdicts or segment.disbelieved or segment.version:
+    if not (changes.verdicts or has_other_metres) or segment.disbelieved or segment.version:
         return False
-    is_contrary = changes.verdicts == {"contrary"} and not any(
-        isinstance(each, LinkBelieved) for each in changes.outcomes
+    is_contrary = has_other_metres or (
+        changes.verdicts == {"contrary"}
+        and not any(isinstance(each, LinkBelieved) for each in changes.outcomes)
     )
-    segment.contradictions = ((segment.contradictions << 1) | is_contrary) & 0xFFFFFFFF
+    # What two robots measure tells more than what the map predicts.
+    noted = 2 if has_other_metres else 1
+    bits = (1 << noted) - 1 if is_contrary else 0
+    segment.contradictions = ((segment.contradictions << noted) | bits) & 0xFFFFFFFF
     count = segment.contradictions.bit_count()
     if count < _CONTRADICTIONS or not is_contrary:
         return False
     graph.disbelieve(int(graph.of_segment[keyframe]))
     segment.reason = f"contradicting: {count} of the last 32 keyframes contradict their own odometry"
+    if has_other_metres:
+        segment.reason = "contradicting: its metres are not those of two other robots"
     changes.outcomes.append(Ambiguous(robot=segment.robot, segment=segment.segment, reason=segment.reason))
     return True
 

@@ -20,6 +20,7 @@ from rse_pf.geometry import Array, inverse, scaled
 from rse_pf.live_map.beliefs import (
     Changes,
     disbelieve_contradicting,
+    has_other_metres,
     judge_again,
     judge_links,
     smooth_changes,
@@ -424,7 +425,9 @@ class LiveMap:
             for link, each, variances in zip(kept, information, variances_of(information), strict=True)
         ]  # fmt: skip
         changes = judge_links(graph, k, numbers, self.options)
-        again = self._judge_again() if disbelieve_contradicting(graph, k, changes) else []
+        is_off = has_other_metres(graph, k, kept, self.options)
+        is_gone = disbelieve_contradicting(graph, k, changes, has_other_metres=is_off)
+        again = self._judge_again() if is_gone else []
         mine = graph.keyframes[k]
         window = self._smooth(changes, mine.robot)
         graph.drop_oldest_open(self.options.open_links)

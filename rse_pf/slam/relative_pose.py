@@ -6,7 +6,7 @@ Which views to compare, and which links to believe, is decided elsewhere.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -104,13 +104,15 @@ class MeasuredPose:
     """``T_view_reference`` by PnP and depth, and the matches it was found among.
 
     ``points_reference`` ``(k, 3)`` are metres, in the frame of the reference; ``pixels`` ``(k, 2)`` and
-    ``depths_view`` ``(k,)``, 0 where there is none, are those of the view.
+    ``depths_view`` ``(k,)``, 0 where there is none, are those of the view.  ``depth_ratio`` is how long a
+    metre of the view is in those of the reference, by the pose that pixels alone give.
     """
 
     solution: PnpSolution
     points_reference: Array
     pixels: Array
     depths_view: Array
+    depth_ratio: MeasuredScale | None = None
 
     @property
     def matches(self) -> int:
@@ -142,7 +144,8 @@ class RelativePose:
 
     The information is the inverse covariance of the twist (metres, radians) in
     ``log(inverse(T_a_b) @ T_a_b_true)``.  ``scale``, where the keyframes have different units, is that of the
-    unit of *b* in the unit of *a*.
+    unit of *b* in the unit of *a*; ``depth_ratio`` how long a metre of one is in those of the other, where
+    both claim metres.
     """
 
     T_a_b: Array
@@ -150,6 +153,7 @@ class RelativePose:
     inliers: int
     matches: int
     scale: MeasuredScale | None = None
+    depth_ratio: MeasuredScale | None = None
 
 
 _DEFAULT = RelativePoseOptions()
@@ -211,6 +215,7 @@ def measure_link(
         inliers=measured.inliers,
         matches=measured.matches,
         scale=scale,
+        depth_ratio=measured.depth_ratio,
     )
 
 
@@ -277,9 +282,11 @@ def measure_pose(
         solution = solve_pnp(points, pixels, view.camera, _pnp_options(options.inlier_px))
     except PnpError:
         return "no-pose"
-    if view.depths_m is not None and view.is_metric and points[:, 2].min() >= _NEAREST_M:
-        solution = refine_with_depth(solution, points, pixels, depths_m, view.camera, view.noise)
-    return MeasuredPose(solution=solution, points_reference=points, pixels=pixels, depths_view=depths_m)
+    measured = MeasuredPose(solution=solution, points_reference=points, pixels=pixels, depths_view=depths_m)
+    if view.depths_m is None or not view.is_metric or points[:, 2].min() < _NEAREST_M:
+        return measured
+    refined = refine_with_depth(solution, points, pixels, depths_m, view.camera, view.noise)
+    return replace(measured, solution=refined, depth_ratio=scale_between(measured, options))
 
 
 def match_points(

@@ -5,12 +5,13 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from client_sdk.answers import PoseAnswer
-from client_sdk.frontend import Frame, FrontEndOptions, PoseQuery, extract, points_at
+from client_sdk.frontend import Frame, FrontEndOptions, PoseQuery, extract, load_opencv, points_at
 from client_sdk.mapper import Mapper
 from client_sdk.simulator import SIMULATED_CAMERA, make_world, render_pairs, true_trajectory
 from client_sdk.stereo.depth import noise_of, stereo_points
@@ -20,6 +21,7 @@ from rse_pf.config import PlatformSettings
 from rse_pf.experiments.compare.solvers import InProcessSolver
 from rse_pf.experiments.results.trajectory_error import accuracy
 from rse_pf.geometry import Camera, inverse, transform
+from rse_pf.maps.format import decode_map
 from rse_pf.pnp import DepthNoise
 
 pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
@@ -166,3 +168,59 @@ def test_a_robot_without_answers_loses_its_place_and_no_more(pairs: Sequence[Fra
         return [(await mapper.track(frame)).lost for frame in pairs[:3]]
 
     assert asyncio.run(track()) == [False, True, True]
+
+
+LACKING_PX = 0.3
+
+
+@pytest.fixture(scope="module")
+def lacking(pairs: Sequence[Frame]) -> list[Frame]:
+    """The same frames, with disparities that are 0.3 px too small."""
+    cv2, made = load_opencv(), []
+    moved = np.array([[1.0, 0.0, LACKING_PX], [0.0, 1.0, 0.0]])
+    for frame in pairs:
+        assert frame.stereo is not None
+        size = (frame.camera.width, frame.camera.height)
+        gray = cv2.warpAffine(frame.stereo.gray, moved, size, flags=cv2.INTER_CUBIC)
+        made.append(replace(frame, stereo=StereoView(gray, BASELINE_M)))
+    return made
+
+
+def test_a_saved_drive_is_corrected_by_what_its_disparities_lack(
+    lacking: Sequence[Frame], tmp_path: Path
+) -> None:
+    mapper = drive(lacking, keyframes_of="drone")
+    before, cloud = accuracy(mapper.trajectory, TRUTH), mapper.map.points()[0]
+
+    report = mapper.save(tmp_path)
+
+    after = accuracy(mapper.trajectory, TRUTH)
+    assert before.ate_m > 0.01
+    assert after.ate_m < 0.4 * before.ate_m
+    assert report["disparity_offset_px"] == pytest.approx(LACKING_PX, abs=0.15)
+    made = decode_map(mapper.encoded_map())
+    for keyframe in made.keyframes:
+        row = int(np.argmin(np.abs(mapper.trajectory.timestamps_s - keyframe.timestamp_s)))
+        np.testing.assert_allclose(keyframe.T_world_camera, mapper.trajectory.T_world_camera[row], atol=1e-5)
+    moved = mapper.map.points()[0]
+    assert len(moved) == pytest.approx(len(cloud), rel=0.05)
+    far = [float(np.median(np.linalg.norm(points, axis=1))) for points in (moved, cloud)]
+    assert far[0] < 0.99 * far[1]
+    asyncio.run(mapper.track(replace(lacking[-1], timestamp_s=lacking[-1].timestamp_s + 0.1)))
+    assert mapper.lost_frames == 0
+    np.testing.assert_allclose(
+        mapper.trajectory.positions[-1], mapper.trajectory.positions[-2], atol=0.01
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("holds_world", [False, True])
+def test_a_good_calibration_and_a_live_map_keep_their_poses(
+    holds_world: bool, pairs: Sequence[Frame], lacking: Sequence[Frame], tmp_path: Path
+) -> None:
+    mapper = drive(lacking if holds_world else pairs, holds_world=holds_world)
+    before = mapper.trajectory.T_world_camera.copy()
+
+    report = mapper.save(tmp_path)
+
+    assert "disparity_offset_px" not in report
+    np.testing.assert_array_equal(mapper.trajectory.T_world_camera, before)

@@ -1,0 +1,87 @@
+"""A robot whose metres are not those of two others: its links tell it, and it is disbelieved."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from benchmarks.live.hostile_rigs import generated_drives
+from rse_pf.live_map.beliefs import Changes, disbelieve_contradicting, has_other_metres
+from rse_pf.live_map.events import MeasuredLink, matrix_bytes
+from rse_pf.live_map.graph import Graph, LiveKeyframe
+from rse_pf.live_map.measure import measure_links
+from rse_pf.live_map.options import LiveMapOptions
+from rse_pf.slam.keyframe import decode_keyframe, make_features
+
+OPTIONS = LiveMapOptions()
+
+
+def graph_of(*robots: str) -> Graph:
+    """Return a graph with one keyframe of each robot, without links."""
+    graph = Graph()
+    for robot in robots:
+        row = graph.segment_row(robot, 0)
+        keyframe = LiveKeyframe(robot=robot, segment=0, number=0, timestamp_s=0.0, data=None)
+        graph.add(keyframe, row, np.eye(4), np.eye(4), 0.0)
+    return graph
+
+
+def link(other: int, off_scale: float, inliers: int = 100) -> MeasuredLink:
+    return MeasuredLink(
+        other=other, T_keyframe_other=matrix_bytes(np.eye(4)), information=matrix_bytes(np.eye(6)),
+        inliers=inliers, matches=inliers, off_scale=off_scale,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("links", "is_other"),
+    [
+        ([link(1, 0.1), link(2, 0.08)], True),
+        ([link(1, -0.1), link(2, -0.3)], True),
+        ([link(1, 0.1)], False),  # of two robots nobody knows which one is wrong
+        ([link(1, 0.1), link(2, 0.0)], False),
+        ([link(1, 0.1), link(2, -0.1)], False),
+        ([link(1, 0.1), link(2, 0.1), link(3, 0.0)], False),
+        ([link(1, 0.1), link(2, 0.1, inliers=16)], False),
+        ([link(0, 0.1), link(1, 0.1)], False),
+        ([], False),
+    ],
+)
+def test_metres_are_others_where_two_robots_say_so(links: list[MeasuredLink], is_other: bool) -> None:
+    graph = graph_of("x", "a", "b", "c")
+
+    assert has_other_metres(graph, 0, links, OPTIONS) is is_other
+
+
+def test_robots_without_metres_say_nothing_of_them() -> None:
+    graph = graph_of("x", "a", "b")
+    graph.segments[1].is_metric = False
+
+    assert not has_other_metres(graph, 0, [link(1, 0.1), link(2, 0.1)], OPTIONS)
+
+
+def test_after_eight_keyframes_with_other_metres_a_robot_is_disbelieved() -> None:
+    graph = graph_of("x", "a", "b")
+
+    gone = [disbelieve_contradicting(graph, 0, Changes(), has_other_metres=True) for _ in range(8)]
+
+    assert gone == [False] * 7 + [True]
+    assert graph.segments[0].disbelieved
+    assert graph.segments[0].reason == "contradicting: its metres are not those of two other robots"
+    assert not graph.segments[1].disbelieved
+
+
+@pytest.mark.parametrize(("factor", "least"), [(1.0, 0.0), (1.1, 0.06), (1 / 1.1, 0.06), (1.5, 0.3)])
+def test_depths_of_both_keyframes_tell_the_ratio_of_their_metres(factor: float, least: float) -> None:
+    drive = generated_drives(seed=1, keyframes=6)["a"]
+    one, other = (decode_keyframe(data) for data in drive.keyframes[2:4])
+    seen = other.features
+    false = make_features(seen.pixels, factor * seen.depths_m, seen.descriptors, seen.noise, seen.kind, 0.0)
+
+    (measured,) = measure_links((0, one.features, one.camera), [(1, false, other.camera)]).links
+
+    # A metre of the second one is shorter if it reads too many.
+    assert -measured.off_scale * math.copysign(1.0, math.log(factor)) >= least
+    assert abs(measured.off_scale) <= 1.3 * abs(math.log(factor))
