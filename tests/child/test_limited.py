@@ -326,6 +326,21 @@ def test_several_threads_share_the_processes(handler: str):
     assert answers == [b"done"] * 50
 
 
+def test_a_process_that_ended_keeps_its_pid_until_its_place_is_needed(handler: str):
+    with made_of(handler, count=2) as processes:
+        ended = int(processes.call(b"pid", LONG_S, near="a"))
+        other = int(processes.call(b"pid", LONG_S, near="b"))
+        os.kill(ended, 9)
+        assert has_ended(ended)
+        with pytest.raises(Crashed):  # the template kills and forks meanwhile
+            processes.call(b"signal 9", LONG_S, near="b")
+
+        assert ended != other
+        assert state_of(ended) == "Z"
+        assert processes.call(b"", LONG_S, near="a") == b"done"
+        assert state_of(ended) == ""
+
+
 def test_without_a_free_process_in_time_a_call_is_busy(processes: LimitedProcesses):
     processes.call(b"", LONG_S)
     refused: list[RsePfError] = []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import select
 import signal
 import time
 from collections.abc import Iterator
@@ -12,6 +13,7 @@ from typing import Any
 
 import pytest
 
+from rse_pf.child.fork_server import read_packet, send_order, start_fork_server
 from rse_pf.child.start import Child, ChildPlan, how_ended, start_child
 from rse_pf.ipc import receive
 
@@ -80,6 +82,40 @@ def test_a_child_that_does_not_end_is_killed_and_reaped() -> None:
 
         assert how_ended(code) == "signal SIGKILL"
         assert not Path(f"/proc/{started.pid}").exists()
+
+
+def test_a_child_ends_with_the_process_that_started_it() -> None:
+    with child("nest") as started:
+        pid = receive(started.connection, time.monotonic() + WITHIN_S)
+        handle = os.pidfd_open(pid)
+        started.kill()
+
+        assert select.select([handle], [], [], WITHIN_S)[0] == [handle]
+        os.close(handle)
+
+
+def test_a_fork_that_must_not_begin_is_killed_with_the_reason_and_others_on_order() -> None:
+    server = start_fork_server(ChildPlan(target="tests.child.told_children:fork", name="forks"), None)
+    server.connection.settimeout(WITHIN_S)
+
+    def report() -> dict[str, Any]:
+        told, handles = read_packet(server.connection)
+        for handle in handles:
+            os.close(handle)
+        return {"event": told["event"], "id": told.get("id"), "how": told.get("how")}
+
+    try:
+        assert report()["event"] == "ready"
+        send_order(server, "create", 2)
+        assert [report(), report()] == [
+            {"event": "created", "id": 2, "how": None}, {"event": "gone", "id": 2, "how": "not today"}
+        ]  # fmt: skip
+        send_order(server, "create", 1)
+        assert report()["event"] == "created"
+        send_order(server, "end", 1)
+        assert report() == {"event": "gone", "id": 1, "how": "signal SIGKILL"}
+    finally:
+        assert server.end(WITHIN_S) == 0
 
 
 def test_a_message_to_a_child_that_has_ended_is_lost() -> None:

@@ -8,6 +8,8 @@ import signal
 import socket
 from pathlib import Path
 
+from rse_pf.child.fork_server import ForkPlan, read_packet, serve_forks
+from rse_pf.child.start import ChildPlan, start_child
 from rse_pf.ipc import encode_message, receive
 
 
@@ -32,3 +34,24 @@ def stay(parent: socket.socket) -> None:
     parent.sendall(encode_message("here"))
     while True:
         signal.pause()
+
+
+def nest(parent: socket.socket) -> None:
+    """Start a child that stays, tell its pid, and wait."""
+    started = start_child(ChildPlan(target="tests.child.told_children:stay", name="a grandchild"))
+    receive(started.connection)
+    parent.sendall(encode_message(started.pid))
+    receive(parent)
+
+
+def fork(parent: socket.socket) -> None:
+    """Fork processes that stay; the second one is not to begin."""
+    read_packet(parent)
+
+    def start(number: int, descriptors: list[int]) -> int:
+        pid = os.fork()
+        if pid == 0:
+            signal.pause()
+        return pid
+
+    serve_forks(parent, ForkPlan(fork=start, begin=lambda number, pid: "not today" if number == 2 else ""))
