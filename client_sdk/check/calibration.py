@@ -40,7 +40,7 @@ _LEAST = np.array([0.02, 0.02, 6.0, 6.0, 0.045, 0.015, 0.02])
 """Smaller errors are those of a good calibration."""
 _TOLD = np.array([0.06, 0.06, 20.0, 20.0, 0.15, 0.06, 0.1])
 """A drive that could hide more than this of an unknown cannot tell it."""
-_LEAST_COST_M, _COST_OF_NOISE = 0.004, 1.2
+_LEAST_COST_M, _COST_OF_NOISE = 0.002, 1.2
 _FEW_DEG = 12.0
 _OF_FEW_PARTS = 1.5
 """Deviations that come from two to four parts are too small as often as not."""
@@ -128,7 +128,10 @@ class _Path(TypedDict):
 
 def _path(found: Calibrated, measured: Measured, explanation: Explanation) -> _Path:
     """Return the keyframes with the calibration that causes explain, and how well that tells their metres."""
-    values, covariance = measured.under(explanation.causes)
+    values, _ = measured.under(explanation.causes)
+    # Depths that are too large by an offset look like a scale: metres are doubted by what it may be.
+    offset = [FaultKind.DEPTH_OFFSET] if FaultKind.DEPTH_OFFSET in measured.causes else []
+    _, covariance = measured.under([*explanation.causes, *offset])
     T_world_camera = inverse(found.T_camera_world)
     T_world_camera[:, :3, 3] += np.tensordot(values - measured.values, found.bends_m, axes=1)
     at = T_world_camera[:, :3, 3] - T_world_camera[:, :3, 3].mean(axis=0)
@@ -152,13 +155,12 @@ def _measured(
     """Return what an adjustment says of the calibration, with what it does not know of its own errors."""
     values = found.values.copy()
     values[_DELAY] += reading.delay_s
-    unknown = np.hypot(_depth_error_factor(found) * _FLOOR, _OF_FEW_PARTS * parts)
     usual = _USUAL.copy()
     if FaultKind.FOCAL_LENGTH not in causes:
         usual[: _K1 + 1] = _WIDEST[: _K1 + 1]
     return Measured(
-        values=values, covariance=_INFLATION**2 * found.covariance + np.diag(unknown**2), usual=usual,
-        widest=_WIDEST, causes=causes,
+        values=values, covariance=_INFLATION**2 * found.covariance + np.diag((_OF_FEW_PARTS * parts) ** 2),
+        unknown=_depth_error_factor(found) * _FLOOR, usual=usual, widest=_WIDEST, causes=causes,
     )  # fmt: skip
 
 

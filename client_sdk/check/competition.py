@@ -28,14 +28,17 @@ class Measured:
 
     Attributes:
         values: ``(n,)``.
-        covariance: ``(n, n)``.
-        usual: ``(n,)`` standard deviations of the errors of a good calibration.
+        covariance: ``(n, n)``, of what the drive shows.
+        unknown: ``(n,)`` deviations that remain of any drive, since the model lacks something.
+        usual: ``(n,)`` standard deviations of the errors of a good calibration.  They are not told from what
+            the model lacks, and so do not come on top of it when a cause is judged.
         widest: ``(n,)`` standard deviations of errors that are faults.
         causes: Kinds of faults, and the rows of the errors that are each one's.
     """
 
     values: Array
     covariance: Array
+    unknown: Array
     usual: Array
     widest: Array
     causes: Mapping[FaultKind, tuple[int, ...]]
@@ -43,14 +46,17 @@ class Measured:
     def under(self, causes: Iterable[FaultKind]) -> tuple[Array, Array]:
         """Return ``(n,)`` values and their ``(n, n)`` covariance where these causes may have any value."""
         prior = np.diag(self._prior(causes))
-        gain = np.linalg.solve(self.covariance + prior, prior).T
+        gain = np.linalg.solve(self.covariance + np.diag(self.unknown**2) + prior, prior).T
         values: Array = gain @ self.values
         covariance: Array = prior - gain @ prior
         return values, covariance
 
     def left(self, causes: Iterable[FaultKind]) -> float:
         """Return the sum of squares that these causes leave."""
-        whole = self.covariance + np.diag(self._prior(causes))
+        rows = [row for name in causes for row in self.causes[name]]
+        spread = np.square(np.maximum(self.usual, self.unknown))
+        spread[rows] = np.square(np.hypot(self.widest, self.unknown))[rows]
+        whole = self.covariance + np.diag(spread)
         return float(self.values @ np.linalg.solve(whole, self.values))
 
     def _prior(self, causes: Iterable[FaultKind]) -> Array:

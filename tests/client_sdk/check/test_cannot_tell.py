@@ -73,3 +73,11 @@ def test_a_drive_that_was_not_tracked_cannot_tell_its_lens_and_says_so() -> None
     told = {each.kind: each.reason for each in judge_calibration(store).cannot_tell}
 
     assert "a pose in 4 of 30 views only" in told[FOCAL]
+
+
+def test_a_drive_that_cannot_tell_an_offset_of_depths_doubts_its_metres() -> None:
+    flat = Made(seed=83, is_wall=True, turn=0.03, moves_m=(0.6, 0.6, 0.0))
+
+    deviations = [judge_calibration(make_store(made)).metres_deviation for made in (flat, Made(seed=83))]
+
+    assert deviations[0] > 0.02 > deviations[1]

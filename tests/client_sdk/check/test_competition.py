@@ -12,17 +12,25 @@ from rse_pf.geometry import Array
 FOCAL, OFFSET = FaultKind.FOCAL_LENGTH, FaultKind.DEPTH_OFFSET
 
 
-def measured(values: tuple[float, float], correlation: float, deviation: float = 0.02) -> Measured:
+def measured(
+    values: tuple[float, float], correlation: float, deviation: float = 0.02, unknown: float = 0.0
+) -> Measured:
     """Return a relative focal length and an offset, metres, known equally well."""
     covariance: Array = deviation**2 * np.array([[1.0, correlation], [correlation, 1.0]])
     return Measured(
-        values=np.array(values), covariance=covariance, usual=np.full(2, 0.005), widest=np.full(2, 0.15),
-        causes={FOCAL: (0,), OFFSET: (1,)},
+        values=np.array(values), covariance=covariance, unknown=np.full(2, unknown), usual=np.full(2, 0.005),
+        widest=np.full(2, 0.15), causes={FOCAL: (0,), OFFSET: (1,)},
     )  # fmt: skip
 
 
 def test_a_healthy_calibration_needs_no_cause() -> None:
     assert explain(measured((0.03, -0.02), 0.0)).causes == ()
+
+
+def test_what_the_model_lacks_is_not_doubted_twice() -> None:
+    """It is an error of a good calibration, too: on top of that it would hide faults of five deviations."""
+    assert explain(measured((0.02, 0.0), 0.0, deviation=0.001, unknown=0.005)).causes == (FOCAL,)
+    assert explain(measured((0.02, 0.0), 0.0, deviation=0.001, unknown=0.008)).causes == ()
 
 
 def test_a_cause_that_explains_all_is_named_alone_although_another_is_tied_to_it() -> None:

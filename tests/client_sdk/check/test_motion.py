@@ -147,3 +147,16 @@ def test_axes_of_an_imu_that_are_turned_are_found() -> None:
     (finding,), _ = check_imu(imu_history(), stamps(18.0), turned)
 
     assert finding.kind is FaultKind.SWAPPED_AXES
+
+
+def test_what_a_pair_cannot_tell_of_its_metres_is_its_baseline() -> None:
+    near, known_s = tracked(stamps()).copy(), np.arange(0.0, 23.0, 0.05)
+    path = drive().T_world_camera(known_s).copy()
+    near[:, :3, 3] *= 0.02
+    path[:, :3, 3] *= 0.02
+    motion = CameraMotion(stamps_s=stamps(), T_world_camera=near, metres="stereo")
+
+    _, untold = check_motion(motion, MotionReference(path=Trajectory(known_s, path)))
+
+    assert FaultKind.BASELINE in {each.kind for each in untold}
+    assert FaultKind.DEPTH_SCALE not in {each.kind for each in untold}
