@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 
 from client_sdk.check.findings import FaultKind, Finding
-from client_sdk.check.motion import CameraMotion, MotionReference, check_imu, check_motion, nothing_to_compare
+from client_sdk.check.motion import (
+    CameraMotion,
+    MotionReference,
+    _explains,
+    check_imu,
+    check_motion,
+    nothing_to_compare,
+)
 from client_sdk.imu.history import ImuHistory
 from client_sdk.imu.samples import ImuModel
 from client_sdk.mapping import Trajectory
@@ -160,3 +167,17 @@ def test_what_a_pair_cannot_tell_of_its_metres_is_its_baseline() -> None:
 
     assert FaultKind.BASELINE in {each.kind for each in untold}
     assert FaultKind.DEPTH_SCALE not in {each.kind for each in untold}
+
+
+@pytest.mark.parametrize(
+    ("in_parts", "share_left", "is_told"),
+    [(10, 0.8, True), (2, 0.8, False), (10, 0.4, True), (9, 0.3, True)],
+)
+def test_a_delay_that_explains_little_does_so_in_most_parts_of_the_drive(
+    in_parts: int, share_left: float, is_told: bool
+) -> None:
+    without = np.ones(200)
+    with_delay = without.copy()
+    with_delay[: 20 * in_parts] = share_left
+
+    assert _explains(with_delay, without) is is_told
