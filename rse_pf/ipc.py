@@ -1,7 +1,8 @@
 """Messages between processes of the platform, on stream sockets.
 
 A message is its length and its MessagePack body.  Child processes and their parents use this format, and
-servers that pass commands of live maps on.
+servers that pass commands of live maps on.  What needs numpy is imported with the first message: a data
+server starts processes, and starts without it.
 """
 
 from __future__ import annotations
@@ -15,9 +16,7 @@ from typing import Any
 
 import msgspec
 
-from rse_pf.budget import SERVICE_REPLY, check_msgpack
 from rse_pf.errors import BadMessage, LimitExceeded, RsePfError
-from rse_pf.wire.arrays import binary_encode_hook, extension_hook
 
 __all__ = ["FrameReader", "encode_message", "encode_reply", "receive", "receive_bytes"]
 
@@ -27,6 +26,8 @@ _PIECE_BYTES = 1 << 18
 
 def encode_message(message: Any) -> bytes:
     """Return *message* with its length before it."""
+    from rse_pf.wire.arrays import binary_encode_hook
+
     body = msgspec.msgpack.encode(message, enc_hook=binary_encode_hook)
     return _HEADER.pack(len(body)) + body
 
@@ -37,6 +38,8 @@ def encode_reply(message: Any) -> bytes:
     Raises:
         LimitExceeded: The worker would refuse it for its values or levels.
     """
+    from rse_pf.budget import SERVICE_REPLY, check_msgpack
+
     data = encode_message(message)
     check_msgpack(data[_HEADER.size :], SERVICE_REPLY)
     return data
@@ -90,6 +93,8 @@ class FrameReader:
             LimitExceeded: A message is longer than the limit, or holds too many values or levels.
             BadMessage: A body is not MessagePack.
         """
+        from rse_pf.budget import SERVICE_REPLY, check_msgpack
+
         self._received += data
         while len(self._received) >= _HEADER.size:
             (length,) = _HEADER.unpack_from(self._received)
@@ -105,6 +110,8 @@ class FrameReader:
 
 
 def _decode(body: bytes) -> Any:
+    from rse_pf.wire.arrays import extension_hook
+
     try:
         return msgspec.msgpack.decode(body, ext_hook=extension_hook)
     except RsePfError:

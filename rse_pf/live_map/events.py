@@ -62,7 +62,7 @@ class MeasuredLink(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True
     ``scale`` is the logarithm, with its variance, of how long the unit of the other keyframe is in that of
     this one; none between two in metres.  Lengths are metres if one of the two is, else in the unit of this
     one.  ``off_scale`` is the logarithm of how long a metre of the other keyframe is in those of this one,
-    where both claim metres and these clearly differ; else 0.
+    where both claim metres and these clearly differ; else none.
     """
 
     other: int
@@ -71,7 +71,7 @@ class MeasuredLink(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True
     inliers: int
     matches: int
     scale: tuple[float, float] | None = None
-    off_scale: float = 0.0
+    off_scale: float | None = None
 
 
 class LinksMeasured(msgspec.Struct, frozen=True, kw_only=True, tag="links"):

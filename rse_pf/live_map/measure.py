@@ -130,11 +130,11 @@ def sought_per_unit(features: KeyframeFeatures) -> float:
     return 1.0 if features.is_metric or not len(depths) else _MEDIAN_DEPTH / float(np.median(depths))
 
 
-def _off_scale(measured: RelativePose) -> float:
-    """Return the logarithm of the ratio of two metres that clearly differ, else 0."""
+def _off_scale(measured: RelativePose) -> float | None:
+    """Return the logarithm of the ratio of two metres that clearly differ, else None."""
     ratio = measured.depth_ratio
     if ratio is None or abs(ratio.log_ratio) < max(_OFF, _OFF_DEVIATIONS * math.sqrt(ratio.variance)):
-        return 0.0
+        return None
     return round(ratio.log_ratio, 4)
 
 
