@@ -15,6 +15,12 @@ from emulated_aws import is_localstack
 from hypothesis import settings
 from localstack.lacking import LACKING
 
+from rse_pf.one_thread import ONE_THREAD
+
+# Before numpy is imported.  BLAS' threads wait for each other where tests share the processors: a test of 6 s
+# took more than 120.
+os.environ.update(ONE_THREAD)
+
 settings.register_profile("rse-pf", deadline=None)  # a crowded machine is no defect
 settings.load_profile("rse-pf")
 
