@@ -25,7 +25,7 @@ def tell(parent: socket.socket) -> None:
             "core": resource.getrlimit(resource.RLIMIT_CORE)[1],
             "oom": Path("/proc/self/oom_score_adj").read_text().strip(),
             "sockets": sum(name.startswith("socket") for name in held if name),
-            "secret": os.environ.get("SECRET", ""),
+            "word": os.environ.get("A_WORD", ""),
         }))  # fmt: skip
 
 
