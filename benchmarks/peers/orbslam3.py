@@ -52,7 +52,8 @@ _NOT_COMPARABLE = """\
   frames the peer had the time that its threads wanted, which a robot does not give.
 - Corrections: the peer adjusts its map in the background and closes loops, so that the poses as returned and
   at the end differ; as returned they may also be of several maps, each in a frame of its own. Ours adjusts
-  nothing with depth, and all keyframes once at the end without; as returned, its first segment counts.
+  nothing with depth, and all keyframes once at the end without depth, and of stereo pairs (which was built
+  later: KITTI 06 is of commit bd6ad034); as returned, its first segment counts.
 - Place: the peer needs its map, its vocabulary and all threads on the robot; ours sends 4 to 7 kB a frame.
 - The vocabulary was trained on images of these very recordings, which favours the peer; it has far fewer
   words than the one that ORB-SLAM3 comes with, which does not.
