@@ -12,7 +12,7 @@ import pytest
 from fuzz.damage import run_damaged
 from fuzz.meter import BARS, Meter
 from fuzz.targets import TARGETS
-from rse_pf import ipc
+from rse_pf import budget
 from rse_pf.maps import format as map_format
 
 pytest.importorskip("faiss", reason="needs the extra 'maps'")
@@ -47,7 +47,7 @@ def test_a_worker_that_does_not_count_is_found(monkeypatch: pytest.MonkeyPatch) 
     lists = b"\x00\xdd\x00\x00\x50\x00" + b"\x90" * 0x5000
 
     assert refusals("snapshots", lists) == {"too-large": 1}
-    monkeypatch.setattr(ipc, "check_msgpack", lambda data, budget: True)
+    monkeypatch.setattr(budget, "check_msgpack", lambda data, budget: True)
     assert refusals("snapshots", lists) == {}
 
 
