@@ -15,13 +15,14 @@ from client_sdk.frontend import Features, Frame, TrackedFrame
 from client_sdk.mapping import MapOptions, PointMap, Trajectory
 from client_sdk.stereo.depth import with_offset
 from client_sdk.tracking.monocular_tracker import MonocularTracker
-from client_sdk.tracking.stereo_adjustment import StereoAdjustment
+from client_sdk.tracking.stereo_adjustment import MOST_KEYFRAMES, StereoAdjustment
 from client_sdk.tracking.tracker import Join
 from rse_pf.geometry import Array, Camera, inverse, rigid, transform
 from rse_pf.maps.format import Keyframe
 
 __all__ = [
     "DriveRecords",
+    "SeenPoints",
     "SegmentRecord",
     "add_to_cloud",
     "certain_rows",
@@ -35,7 +36,7 @@ _CLOUD_SHARE = 0.05
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _SeenPoints:
+class SeenPoints:
     """What a stereo keyframe adds to a cloud: its pose, ``(n, 3)`` points and colours."""
 
     timestamp_s: float
@@ -48,14 +49,15 @@ class _SeenPoints:
 class SegmentRecord:
     """One segment: stamps in seconds, ``(4, 4)`` poses in its own frame, its cloud and its keyframes.
 
-    Of stereo pairs the points of the cloud are kept, so that it follows the keyframes.
+    ``seen`` are the points that stereo keyframes added to the cloud, so that it follows these; None once they
+    are too many to be adjusted.
     """
 
     cloud: PointMap
     stamps_s: list[float] = field(default_factory=list)
     poses: list[Array] = field(default_factory=list)
     keyframes: list[Keyframe] = field(default_factory=list)
-    seen: list[_SeenPoints] = field(default_factory=list)
+    seen: list[SeenPoints] | None = field(default_factory=list)
 
     def take(self, other: SegmentRecord, T_own_other: Array) -> None:
         """Add all of another segment."""
@@ -66,9 +68,15 @@ class SegmentRecord:
             replace(keyframe, T_world_camera=_moved(T_own_other, keyframe.T_world_camera))
             for keyframe in other.keyframes
         ]
-        self.seen += [
-            replace(seen, T_world_camera=_moved(T_own_other, seen.T_world_camera)) for seen in other.seen
-        ]
+        self.note(
+            None if other.seen is None else
+            [replace(seen, T_world_camera=_moved(T_own_other, seen.T_world_camera)) for seen in other.seen]
+        )  # fmt: skip
+
+    def note(self, seen: list[SeenPoints] | None) -> None:
+        """Remember what stereo keyframes added to the cloud, None for too many."""
+        kept = None if self.seen is None or seen is None else self.seen + seen
+        self.seen = None if kept is None or len(kept) > MOST_KEYFRAMES else kept
 
     def corrected(self, found: StereoAdjustment) -> SegmentRecord:
         """Return the segment as an adjustment of its keyframes has it; a cloud that others made stays."""
@@ -91,7 +99,7 @@ class SegmentRecord:
                 )
                 for each in self.keyframes
             ],
-            seen=[
+            seen=None if self.seen is None else [
                 replace(
                     each, T_world_camera=moved(each.timestamp_s, each.T_world_camera),
                     points_camera=shown(each.points_camera),
@@ -99,7 +107,7 @@ class SegmentRecord:
                 for each in self.seen
             ],
         )  # fmt: skip
-        for each in corrected.seen:
+        for each in corrected.seen or ():
             is_known = np.isfinite(each.points_camera[:, 2])
             points = transform(each.T_world_camera, each.points_camera[is_known].astype(np.float64))
             corrected.cloud.add_points(points, each.colours[is_known])
@@ -142,7 +150,7 @@ class DriveRecords:
         if tracked.frame.stereo is not None and features is not None and tracked.keyframe:
             points, colours = _pair_points(tracked.frame, features)
             stamp_s = tracked.frame.timestamp_s
-            record.seen.append(_SeenPoints(stamp_s, pose, points.astype(np.float32), colours))
+            record.note([SeenPoints(stamp_s, pose, points.astype(np.float32), colours)])
 
     def correct(self, adjusted: Mapping[int, StereoAdjustment]) -> None:
         """Move segments as an adjustment of their keyframes has them."""

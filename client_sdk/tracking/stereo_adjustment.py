@@ -23,12 +23,12 @@ from rse_pf.slam.self_calibration import (
     triangulated,
 )
 
-__all__ = ["StereoAdjustment", "adjust_stereo"]
+__all__ = ["MOST_KEYFRAMES", "StereoAdjustment", "adjust_stereo"]
 
 Rows = npt.NDArray[np.int64]
 
 _DISPARITY_PX, _PRIOR_PX = 0.1, 0.5
-_LEAST_KEYFRAMES, _MOST_KEYFRAMES = 5, 150
+_LEAST_KEYFRAMES, MOST_KEYFRAMES = 5, 150
 _LEAST_LANDMARKS, _MOST_LANDMARKS = 50, 2500
 _ROUNDS = 2
 _LEAST_PX, _LEAST_DEVIATIONS = 0.1, 4.0
@@ -70,7 +70,7 @@ def adjust_stereo(known: KeyframeMap, f_baseline: float) -> StereoAdjustment | N
         known: The map.
         f_baseline: Focal length in pixels times the baseline in metres.
     """
-    if not _LEAST_KEYFRAMES <= len(known) <= _MOST_KEYFRAMES:
+    if not _LEAST_KEYFRAMES <= len(known) <= MOST_KEYFRAMES:
         return None
     numbers, observed = _observed(known)
     if len(numbers) < _LEAST_LANDMARKS:
