@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import math
 
+import msgspec
 import numpy as np
 import pytest
 
+from benchmarks.live.generated_drives import GeneratedWorld, circle
 from benchmarks.live.hostile_rigs import generated_drives
 from rse_pf.live_map.beliefs import Changes, disbelieve_contradicting, has_other_metres
-from rse_pf.live_map.events import MeasuredLink, matrix_bytes
+from rse_pf.live_map.events import KeyframeAdded, LinksMeasured, MeasuredLink, matrix_bytes
 from rse_pf.live_map.graph import Graph, LiveKeyframe
+from rse_pf.live_map.live_map import LiveMap
 from rse_pf.live_map.measure import measure_links
 from rse_pf.live_map.options import LiveMapOptions
+from rse_pf.live_map.outcomes import Outcome, Unaligned
 from rse_pf.slam.keyframe import decode_keyframe, make_features
 
 OPTIONS = LiveMapOptions()
@@ -86,3 +90,23 @@ def test_depths_of_both_keyframes_tell_the_ratio_of_their_metres(factor: float, 
     off_scale = measured.off_scale or 0.0
     assert -off_scale * math.copysign(1.0, math.log(factor)) >= least
     assert abs(off_scale) <= 1.3 * abs(math.log(factor))
+
+
+@pytest.mark.parametrize(("off_scale", "gone"), [(0.1, {"x"}), (None, set())])
+def test_a_map_lets_go_a_robot_whose_links_say_that_its_metres_are_others(
+    off_scale: float | None, gone: set[str]
+) -> None:
+    world, live = GeneratedWorld(seed=1), LiveMap()
+    drives = [world.drive(name, circle(0.5, 1.2, phase=row)) for row, name in enumerate(("a", "b", "x"))]
+    outcomes: list[Outcome] = []
+    robots: list[str] = []
+    for event in world.play(drives):
+        if isinstance(event, KeyframeAdded):
+            robots.append(event.robot)
+        if isinstance(event, LinksMeasured) and robots[event.keyframe] == "x":
+            links = tuple(msgspec.structs.replace(each, off_scale=off_scale) for each in event.links)
+            event = msgspec.structs.replace(event, links=links)
+        outcomes += live.apply(event)
+
+    said = [each for each in outcomes if isinstance(each, Unaligned) and "metres" in each.reason]
+    assert {each.robot for each in said} == gone
