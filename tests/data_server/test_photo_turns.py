@@ -13,7 +13,8 @@ from typing import Any
 import pytest
 from fake_data_service import Service, small_settings
 
-from rse_pf.child.limited import LimitedProcesses, Overran, ProcessLimits
+from rse_pf.child.limited import CallWatch, LimitedProcesses, Overran, ProcessLimits
+from rse_pf.data_server.photo_localiser import PhotoLocaliser
 from rse_pf.data_server.photo_turns import PhotoTurns, RecentUse
 from rse_pf.errors import BadRequest
 from rse_pf.identity import RobotId
@@ -248,3 +249,23 @@ def test_photos_that_take_little_count_as_ten_requests() -> None:
     localiser.cpu_s = 0.03
 
     assert [service.photo().status for _ in range(21)] == [200] * 20 + [429]
+
+
+class _BrokenProcesses:
+    """Processes of which each takes 0.3 s of CPU time, and fails."""
+
+    count, private_store = 1, None
+
+    def call(self, robot: RobotId, data: bytes, *, near: str, watch: CallWatch) -> bytes:
+        watch.used(0.3)
+        raise BadRequest("no image")
+
+
+def test_a_photo_that_fails_is_charged_for_what_it_took(server: Server) -> None:
+    localiser = PhotoLocaliser(_BrokenProcesses(), server.turns)  # type: ignore[arg-type]
+    charged: list[float] = []
+
+    with pytest.raises(BadRequest):
+        localiser.outline(ROBOT, "hall", charged.append)
+
+    assert charged == [0.3]
