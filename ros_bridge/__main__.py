@@ -6,15 +6,24 @@ import argparse
 import importlib.resources
 import sys
 from dataclasses import fields
+from typing import NoReturn
 
 from ros_bridge.options import HELP, BridgeOptions
-from rse_pf.errors import RsePfError
+from rse_pf.errors import RsePfError, UsageError
 from rse_pf.terminal import show, show_error
+
+
+class _Parser(argparse.ArgumentParser):
+    """Says what is wrong in one line with a hint, instead of a page."""
+
+    def error(self, message: str) -> NoReturn:
+        show_error(UsageError(f"{self.prog}: {message}", hint=f"see {self.prog} --help"))
+        raise SystemExit(2)
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the bridge that the command line names; return the exit code."""
-    parser = argparse.ArgumentParser(
+    parser = _Parser(
         prog="rse-pf-ros",
         description="Bridge a robot of ROS to the platform: images in; poses, paths, transforms, clouds out.",
         epilog="example:\n  rse-pf-ros ros1 --url ws://127.0.0.1:8700/ws --token-file robot.token",

@@ -53,6 +53,28 @@ def test_what_cannot_start_is_said_in_one_line(words: list[str], capsys: pytest.
     assert "hint" in said
 
 
+@pytest.mark.parametrize(
+    ("words", "what"),
+    [
+        (["ros2", "--colourr", "x"], "--colourr"),
+        (["ros2", "--colour"], "--colour"),
+        (["ros3"], "ros3"),
+        ([], "shell"),
+    ],
+)
+def test_a_wrong_command_line_is_one_line_with_a_hint(
+    words: list[str], what: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(words)
+
+    said = capsys.readouterr().err.splitlines()
+    assert ended.value.code == 2
+    assert len(said) == 2
+    assert what in said[0]
+    assert said[1] == "  hint: see rse-pf-ros --help"
+
+
 def test_the_folder_of_the_packages_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["where"]) == 0
     assert capsys.readouterr().out.strip().endswith("ros_bridge/packages")
