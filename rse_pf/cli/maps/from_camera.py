@@ -208,6 +208,7 @@ def map_source(
         f"{report['frames']} frames, {report['lost_frames']} lost, {report['keyframes']} keyframes, "
         f"{report['map_points']} points; path {report['path']:.2f} {unit}; scale: {mapper.scale}"
         + ("" if trip is None else f"; round trip p50 {trip} ms"),
+        *offset_lines(report),
         *accuracy_lines(report),
         *frames.lines(),
         *check.lines(checked),
@@ -219,6 +220,17 @@ def map_source(
             f"{report['frames'] - posed} of {report['frames']} frames have no pose", hint=_advice(mapper)
         )
     return 0
+
+
+def offset_lines(report: Mapping[str, Any]) -> list[str]:
+    """Return the line that tells how a stereo drive was moved when it was saved; none if it was not."""
+    offset_px, deviation_px = (report.get(f"disparity_offset{each}_px") for each in ("", "_deviation"))
+    if not offset_px:
+        return []
+    return [
+        f"the calibration lacks {offset_px:.2f} +- {deviation_px:.2f} px of disparity: saving corrected "
+        "path, keyframes and cloud; check speaks of the drive before that"
+    ]
 
 
 def accuracy_lines(report: Mapping[str, Any]) -> list[str]:

@@ -86,10 +86,11 @@ def draw_map(
 
 
 class _Observer:
-    """A pinhole camera that looks down on the scene from the side of its robots."""
+    """A pinhole camera that looks down on the scene from the side of its robots, whose paths it shows."""
 
     def __init__(self, points: Array, robots: list[RobotPath], up: Array) -> None:
-        low, high = (np.percentile(points, q, axis=0) if len(points) else np.zeros(3) for q in (2, 98))
+        places = np.concatenate([np.zeros((0, 3)), *(robot.T_world_camera[:, :3, 3] for robot in robots)])
+        low, high = _bounds(points, places, (2, 98))
         self.centre = (low + high) / 2
         forward = self._side(points, robots, up)
         slope = math.radians(40)
@@ -100,12 +101,9 @@ class _Observer:
         self.axis_y *= -1 if self.axis_y @ up > 0 else 1
         self.distance = max(1.0, float(np.linalg.norm(high - low)))
         self.scale, self.shift = 1.0, np.zeros(2)
-        shown = np.concatenate(
-            [points[:: max(1, len(points) // 20_000)]]
-            + [robot.T_world_camera[:, :3, 3] for robot in robots for _ in range(20)]
-        )
-        if len(shown):
-            low_px, high_px = np.percentile(self._flat(shown), (0.5, 99.5), axis=0)
+        if len(points) + len(places):
+            some = points[:: max(1, len(points) // 20_000)]
+            low_px, high_px = _bounds(self._flat(some), self._flat(places), (0.5, 99.5))
             available = np.array([_WIDTH - 2 * _MARGIN, _HEIGHT - 2 * _CAPTION - _MARGIN])
             self.scale = float((available / np.maximum(high_px - low_px, 1e-9)).min())
             self.shift = np.array([_WIDTH / 2, _HEIGHT / 2]) - self.scale * (high_px + low_px) / 2
@@ -142,6 +140,15 @@ class _Observer:
         flat = np.column_stack([moved @ self.axis_x, moved @ self.axis_y])
         flat *= (_FOCAL * self.scale / np.maximum(self.depth(points), 0.1))[:, None]
         return flat
+
+
+def _bounds(points: Array, places: Array, percentiles: tuple[float, float]) -> tuple[Array, Array]:
+    """Return the least and the greatest of each axis: of points by percentiles, of places of all."""
+    if len(points):
+        places = np.concatenate([places, np.percentile(points, percentiles, axis=0)])
+    if not len(places):
+        places = np.zeros((1, points.shape[1]))
+    return places.min(axis=0), places.max(axis=0)
 
 
 def _splat(view: _Observer, points: Array, colours: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:

@@ -150,6 +150,15 @@ def test_several_addresses_are_given_to_the_robot_which_takes_the_nearest(
     assert Path("addresses").read_text() == "ws://q/ws ws://p/ws"
 
 
+def test_a_stereo_drive_that_was_moved_when_it_was_saved_says_so() -> None:
+    (line,) = from_camera.offset_lines(
+        {"disparity_offset_px": -0.193, "disparity_offset_deviation_px": 0.027}
+    )
+
+    assert "lacks -0.19 +- 0.03 px" in line
+    assert from_camera.offset_lines({"disparity_offset_px": 0.0}) == from_camera.offset_lines({}) == []
+
+
 def test_without_a_scale_the_command_says_so(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     code = main(["map", "from-camera", "v.avi", "--intrinsics", "i.json", "--frames", "7", *PLATFORM])
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rse_pf.experiments.plots.map_image import _BACKGROUND, COLOURS, RobotPath, draw_map
+from rse_pf.experiments.plots.map_image import _BACKGROUND, COLOURS, RobotPath, _Observer, draw_map
 
 image = pytest.importorskip("PIL.Image")
 
@@ -48,6 +48,19 @@ def test_draws_the_path_of_the_robot(tmp_path):
     points = plane(y=1.0)
     picture = draw(tmp_path, points, np.full((len(points), 3), 128, dtype=np.uint8))
     assert count(picture[64:836], COLOURS[0]) > 300
+
+
+def test_a_path_that_begins_far_from_all_points_is_shown_whole(tmp_path):
+    poses = np.tile(np.eye(4), (50, 1, 1))
+    poses[:, 0, 3] = np.linspace(12.0, 0.0, 50)
+    points = plane(y=1.0, n=40_000)
+    robot = RobotPath(name="robot-1", T_world_camera=poses)
+    view = _Observer(points.astype(float), [robot], np.array([0.0, -1.0, 0.0]))
+
+    x, y = view.project(poses[:, :3, 3]).T
+
+    assert (x.min() > 0, x.max() < 1600) == (True, True)
+    assert (y.min() > 0, y.max() < 900) == (True, True)
 
 
 def test_an_empty_map_is_an_empty_image(tmp_path):
