@@ -29,6 +29,8 @@ from rse_pf.wire.messages import (
     Ping,
     Pong,
     Progress,
+    Rate,
+    Refused,
     Renew,
     Renewed,
     Result,
@@ -336,6 +338,8 @@ class ClientSession:
                 return [Notice(message)]
             case Failure() if message.id in self.subscriptions:
                 return [*self.subscriptions.refuse(connection, message)]
+            case Refused() | Rate():
+                return []  # of capabilities that `open_connection` does not name
             case Update():
                 return [*self.subscriptions.update(connection, message)]
             case Progress():

@@ -69,6 +69,20 @@ def opened(codec: str = "json") -> ServerSession:
     return server
 
 
+@pytest.mark.parametrize(
+    ("capabilities", "heard"),
+    [((), (False, False)), (("refusals",), (True, False)), (("rate", "move"), (False, True))],
+)
+def test_a_robot_is_sent_only_what_its_hello_names(
+    capabilities: tuple[str, ...], heard: tuple[bool, bool]
+) -> None:
+    server = session()
+
+    say(server, Hello(capabilities=capabilities))
+
+    assert (server.hears_refusals, server.hears_rate) == heard
+
+
 @pytest.mark.parametrize("codec", CODECS)
 def test_hello_is_answered_with_who_serves_and_what_it_accepts(codec: str) -> None:
     server = session(codec)
