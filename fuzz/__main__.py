@@ -21,7 +21,7 @@ from fuzz.meter import BARS, Meter
 _INPUTS_PER_SEED = 500
 _TARGETS = (
     "codec", "frames", "stream", "geometry", "maps", "keyframes", "snapshots", "graph", "cloud",
-    "native", "match", "depth", "describe", "track", "stereo", "live",
+    "native", "answer", "match", "depth", "describe", "track", "stereo", "live",
 )  # fmt: skip
 """Not read from `fuzz.targets`, which atheris has to import by itself."""
 

@@ -19,6 +19,7 @@ import numpy as np
 from rse_pf.ipc import encode_message
 from rse_pf.live_map.versions import encode_stored
 from rse_pf.maps.format import Edge, MapVersion, decode_map, encode_map
+from rse_pf.pnp import PnpOptions
 from rse_pf.pnp.problems import DEGENERATE, KINECT, make_degenerate, make_problem, make_two_views
 from rse_pf.services.pnp import make_request
 from rse_pf.services.synthetic_maps import make_room, make_sphere, make_world
@@ -58,6 +59,21 @@ def _messages() -> list[bytes]:
         bytes([kind]) + make_codec(name).encode(message)
         for kind, name in ((0, "bin"), (1, "json"), (2, "zlib"), (3, "json"))
         for message in said
+    ]
+
+
+def _answerable() -> list[bytes]:
+    """Return `pnp` commands of all encodings: plain ones with a good, a weak or no pose, and others."""
+    problems = [
+        make_problem(seed=n, n=n, outlier_ratio=share) for n, share in ((40, 0.3), (24, 0.0), (70, 0.75))
+    ]
+    problems += [make_degenerate(kind, seed=2, n=24) for kind in ("mirrored", "noise", "same-pixel")]
+    asked = [make_request(each.points_world, each.pixels, KINECT) for each in problems]
+    asked.append(msgspec.structs.replace(asked[0], options=PnpOptions(inlier_px=2.0)))
+    return [
+        bytes([kind]) + make_codec(name).encode(Command(id=number, service="pnp", payload=each, trace="t"))
+        for kind, name in ((0, "bin"), (1, "json"), (2, "zlib"), (3, "json"))
+        for number, each in enumerate(asked)
     ]
 
 
@@ -279,7 +295,8 @@ def _live_keyframes() -> list[bytes]:
 _MADE = {
     "codec": _messages, "frames": _frames, "stream": _streams, "geometry": _problems, "maps": _maps,
     "keyframes": _keyframes, "snapshots": _sandbox_messages, "graph": _graphs, "cloud": _clouds,
-    "native": _messages, "match": _views, "depth": _depths, "describe": _pictures, "track": _tracks,
+    "native": _messages, "answer": _answerable,
+    "match": _views, "depth": _depths, "describe": _pictures, "track": _tracks,
     "stereo": _pairs,
     "live": _live_keyframes,
 }  # fmt: skip

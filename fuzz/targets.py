@@ -222,5 +222,5 @@ TARGETS: dict[str, Target] = {
     "cloud": map_targets.cloud, "native": native_targets.native, "match": core_targets.match,
     "depth": core_targets.depth, "describe": core_targets.describe,
     "track": core_targets.track, "stereo": stereo_targets.stereo,
-    "live": live_targets.live,
+    "live": live_targets.live, "answer": native_targets.answer,
 }  # fmt: skip

@@ -32,6 +32,10 @@ from rse_pf.errors import (
 from rse_pf.geometry import Array, Camera
 
 __all__ = [
+    "POSE_AT",
+    "REASONS",
+    "RESULT",
+    "RESULT_BYTES",
     "Evidence",
     "NativeOptions",
     "NativeSolver",
@@ -42,6 +46,8 @@ __all__ = [
     "native_solver",
     "open_found",
     "open_solver",
+    "packed_request",
+    "solver_error",
 ]
 
 Part = TypeVar("Part")
@@ -54,9 +60,9 @@ _HEAD = struct.Struct("=IIqQQ")
 _BODY = struct.Struct("=ddddiiddiiQdddd")
 _TAIL = struct.Struct("=qQ")
 # rse_pf_pnp_result: status, reason, five counts, four measures | pose | covariance.
-_RESULT = struct.Struct("=iiqqqqqdddd")
-_POSE_AT, _COVARIANCE_AT = _RESULT.size, _RESULT.size + 16 * 8
-_RESULT_BYTES = _COVARIANCE_AT + 36 * 8
+RESULT = struct.Struct("=iiqqqqqdddd")
+POSE_AT, _COVARIANCE_AT = RESULT.size, RESULT.size + 16 * 8
+RESULT_BYTES = _COVARIANCE_AT + 36 * 8
 # One call packs what the three above describe; the camera and the options are packed already.
 _REQUEST = struct.Struct(f"=IIqQQ{_BODY.size}sqQ")
 _FIRST_ROWS = 1024
@@ -64,7 +70,7 @@ _COLLINEAR = 0.02
 # Of the 36 numbers of a covariance, those of the upper triangle.
 _UPPER = np.flatnonzero(np.triu(np.ones((6, 6))))
 
-_REASONS = (
+REASONS = (
     "", "few-inliers", "low-inlier-ratio", "nearly-collinear", "clustered", "poorly-constrained", "ambiguous",
 )  # fmt: skip
 
@@ -106,11 +112,11 @@ class _Buffers(threading.local):
 
     def __init__(self) -> None:
         request = np.zeros(_HEAD.size + _BODY.size + _TAIL.size, dtype=np.uint8)
-        result = np.zeros(_RESULT_BYTES, dtype=np.uint8)
+        result = np.zeros(RESULT_BYTES, dtype=np.uint8)
         self.request = memoryview(request)  # type: ignore[arg-type]
         self.result = memoryview(result)  # type: ignore[arg-type]
         self.request_at, self.result_at = address_of(request), address_of(result)
-        self.pose = result[_POSE_AT:_COVARIANCE_AT].view(np.float64).reshape(4, 4)
+        self.pose = result[POSE_AT:_COVARIANCE_AT].view(np.float64).reshape(4, 4)
         self.covariance = result[_COVARIANCE_AT:].view(np.float64).reshape(6, 6)
         self.flat_pose, self.flat_covariance = self.pose.reshape(16), self.covariance.reshape(36)
         self.inliers = np.empty(_FIRST_ROWS, dtype=np.int64)
@@ -131,6 +137,12 @@ def _pack(camera: Camera, options: NativeOptions) -> bytes:
         options.weak_inliers, options.weak_inlier_ratio, options.weak_translation_m,
         options.weak_rotation_rad,
     )  # fmt: skip
+
+
+def packed_request(camera: Camera, options: NativeOptions) -> bytes:
+    """Return an rse_pf_pnp_request that says how to solve, without rows."""
+    flags = _PORTABLE if options.portable else 0
+    return _REQUEST.pack(_ABI, flags, 0, 0, 0, _pack(camera, options), 0, 0)
 
 
 class NativeSolver:
@@ -177,14 +189,14 @@ class NativeSolver:
         del arrays
         status, reason, count, _, _, trials = values[:6]
         if status:
-            raise _error(values, n, options)
+            raise solver_error(values, n, options)
         buffers = self._buffers
         return Evidence(
             T_camera_world=buffers.pose.copy(),
             inliers=inliers[:count],
             rmse_px=values[7],
             covariance=buffers.covariance.copy(),
-            reason=_REASONS[reason],
+            reason=REASONS[reason],
             trials=trials,
         )
 
@@ -226,15 +238,15 @@ class NativeSolver:
             address_of(pixels), _pack(camera, options), 0, 0,
         )  # fmt: skip
         self._call(buffers.request_at, buffers.inliers_at, buffers.result_at)
-        values = _RESULT.unpack_from(buffers.result)
+        values = RESULT.unpack_from(buffers.result)
         if values[0]:
-            raise _error(values, n, options)
+            raise solver_error(values, n, options)
         return (
             buffers.flat_pose.copy(),
             buffers.inliers[: values[2]].astype(np.uint32),
             values[7],
             buffers.flat_covariance.take(_UPPER).astype(np.float32),
-            _REASONS[values[1]],
+            REASONS[values[1]],
         )
 
     def propose(
@@ -271,11 +283,11 @@ class NativeSolver:
         flag_at = 0 if cancelled is None else ctypes.addressof(cancelled)
         _TAIL.pack_into(buffers.request, _HEAD.size + _BODY.size, deadline_ns, flag_at)
         self._call(buffers.request_at, inliers_at, buffers.result_at)
-        return _RESULT.unpack_from(buffers.result)
+        return RESULT.unpack_from(buffers.result)
 
 
-def _error(values: tuple[Any, ...], n: int, options: NativeOptions) -> RsePfError:
-    """Return the error of a result; the sentences are those of `rse_pf.pnp.solver`."""
+def solver_error(values: tuple[Any, ...], n: int, options: NativeOptions) -> RsePfError:
+    """Return the error of what `RESULT` unpacks; the sentences are those of `rse_pf.pnp.solver`."""
     status, _, count, independent, other, _, _, rmse_px, other_rmse_px, thinness, radius_px = values
     everywhere = "match points all over the image, or skip this frame"
     match status:

@@ -34,6 +34,7 @@ class CallBuffers(threading.local):
         self.numbers = np.empty(numbers_room, dtype=np.float64)
         self.call = memoryview(call)  # type: ignore[arg-type]
         self.text_view = memoryview(self.text)  # type: ignore[arg-type]
+        self.number_bytes = memoryview(self.numbers).cast("B")  # type: ignore[arg-type]
         self.call_at, self.text_at = address_of(call), address_of(self.text)
         self.lend(self.text)
 

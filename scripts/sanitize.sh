@@ -47,7 +47,7 @@ echo "sanitize: Python tests"
   tests/pnp/test_depth_refinement.py tests/wire/test_native_codec.py tests/wire/test_codec.py tests/wire/test_golden.py \
   tests/test_native_front_end.py tests/pnp/test_native_depth.py tests/slam/test_tracking.py \
   tests/hostile/test_geometry.py
-for target in codec geometry native match depth describe track; do
+for target in codec geometry native answer match depth describe track; do
   echo "sanitize: fuzz $target for $seconds s"
   "$python" -m fuzz "$target" --engine hypothesis --seconds "$seconds"
 done

@@ -1,4 +1,5 @@
-/* The C ABI of the codecs' hot path: guards, inflating, and reading a `pnp` command into arrays.
+/* The C ABI of the codecs' hot path: guards, inflating, reading a `pnp` command into arrays, and from these
+ * arrays to the bytes of its reply.
  *
  * Every byte comes from a stranger.  Nothing is read outside of `data` and nothing is written outside of the
  * buffers of the call.  What is not plainly a `pnp` command is RSE_PF_CODEC_NOT_MINE and left to the decoder
@@ -8,11 +9,13 @@
 
 #include <stdint.h>
 
+#include "rse_pf_native.h"
+
 #ifdef __cplusplus
 extern "C" {
 #endif
 
-#define RSE_PF_CODEC_ABI 3
+#define RSE_PF_CODEC_ABI 4
 
 /* Bytes behind `text_room` and `deflated` that a call may write to. */
 #define RSE_PF_CODEC_SLACK 64
@@ -90,6 +93,21 @@ int32_t rse_pf_codec_read(const uint8_t *data, int64_t bytes, const rse_pf_codec
 /* Return the size of the zlib stream of `text`, which is written to `deflated`; 0 if `room` may be too small.
  * 2 * bytes + 256 is enough. */
 int64_t rse_pf_codec_deflate(const uint8_t *text, int64_t bytes, uint8_t *deflated, int64_t room);
+
+typedef struct rse_pf_codec_answer {
+    int64_t *inliers; /* room for inliers_room of them */
+    int64_t inliers_room;
+    uint8_t *reply;
+    int64_t reply_room;
+    rse_pf_pnp_result result;
+} rse_pf_codec_answer;
+
+/* Solve what a call has read and return the size of the reply, which is written to `reply` as JSON or MessagePack.
+ *
+ * `request` says all but the rows, which `numbers` holds: 3 * rows of points and 2 * rows of pixels.  0: there is
+ * no pose, as the status of `result` says, or (with RSE_PF_PNP_SOLVED) it has to be asked for elsewhere. */
+int64_t rse_pf_codec_solve(const rse_pf_pnp_request *request, const double *numbers, int64_t rows, int32_t encoding,
+                           rse_pf_codec_answer *answer);
 
 #ifdef __cplusplus
 }

@@ -7,6 +7,7 @@
 #include "codec_guards.hpp"
 #include "codec_inflate.hpp"
 #include "codec_pnp.hpp"
+#include "codec_reply.hpp"
 
 #define RSE_PF_CODEC_VISIBLE __attribute__((visibility("default")))
 
@@ -42,6 +43,12 @@ int32_t read_msgpack(const uint8_t* data, int64_t bytes, const rse_pf_codec_budg
     return is_short ? RSE_PF_CODEC_UNKNOWN : check_msgpack(data, bytes, budget);
 }
 
+template <class Reply>
+int64_t write_reply(const rse_pf_codec_answer& answer) {
+    Reply reply(answer.reply);
+    return reply.write(answer.result, answer.inliers) ? reply.end() - answer.reply : 0;
+}
+
 }  // namespace
 
 extern "C" {
@@ -70,6 +77,23 @@ RSE_PF_CODEC_VISIBLE int32_t rse_pf_codec_read(const uint8_t* data, int64_t byte
     call->limit = inflater.limit();
     if (status != RSE_PF_CODEC_READ) return status;
     return read_json(call->text, call->text_bytes, *budget, *call);
+}
+
+RSE_PF_CODEC_VISIBLE int64_t rse_pf_codec_solve(const rse_pf_pnp_request* request, const double* numbers, int64_t rows,
+                                                int32_t encoding, rse_pf_codec_answer* answer) {
+    answer->result.status = RSE_PF_PNP_SOLVED;
+    const bool is_json = encoding != RSE_PF_CODEC_MSGPACK;
+    const bool fits = rows >= 4 && rows <= kMaxInliers && rows <= answer->inliers_room &&
+                      reply_bytes(rows, is_json) <= answer->reply_room &&
+                      reinterpret_cast<uintptr_t>(numbers) % alignof(double) == 0;
+    if (!fits) return 0;
+    rse_pf_pnp_request whole = *request;
+    whole.rows = rows;
+    whole.points_world = numbers;
+    whole.pixels = numbers + 3 * rows;
+    rse_pf_pnp_solve(&whole, answer->inliers, &answer->result);
+    if (answer->result.status != RSE_PF_PNP_SOLVED) return 0;
+    return is_json ? write_reply<JsonReply>(*answer) : write_reply<MsgpackReply>(*answer);
 }
 
 RSE_PF_CODEC_VISIBLE int64_t rse_pf_codec_deflate(const uint8_t* text, int64_t bytes, uint8_t* deflated, int64_t room) {

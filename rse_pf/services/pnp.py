@@ -12,13 +12,15 @@ import numpy.typing as npt
 from rse_pf.config import PnpSettings
 from rse_pf.errors import LimitExceeded, TooFewCorrespondences
 from rse_pf.geometry import Camera
-from rse_pf.native import native_solver
+from rse_pf.native import native_solver, open_found
 from rse_pf.pnp import DepthNoise, PnpOptions, PnpSolution, refine_with_depth, solve_pnp, usable_engine
 from rse_pf.pnp.engines import native_options
+from rse_pf.pnp.native_reply import open_reply_solver
 from rse_pf.pnp.options import WeakLimits
 from rse_pf.service import Registry
 from rse_pf.wire.arrays import Array, reshaped
 from rse_pf.wire.native_codec import PnpTypes
+from rse_pf.wire.plain_pnp import EncodedReply, PlainPnp
 
 __all__ = ["PnpReply", "PnpRequest", "make_request", "register", "wire_types"]
 
@@ -123,10 +125,11 @@ def make_request(
     )
 
 
-def wire_types(registry: Registry) -> PnpTypes | None:
+def wire_types(registry: Registry, *, stays_plain: bool = False) -> PnpTypes | None:
     """Return what the codecs of a server decode a `pnp` command to, None if *registry* offers another one.
 
-    What runs in another process is sent there as the robot sent it.
+    What runs in another process is sent there as the robot sent it.  With *stays_plain* it is decoded to what
+    `Service.plain` answers.
     """
     own = any(
         each.name == "pnp"
@@ -135,7 +138,7 @@ def wire_types(registry: Registry) -> PnpTypes | None:
         and not each.limited
         for each in registry
     )
-    return PnpTypes(PnpRequest, Camera, PnpOptions, PnpReply) if own else None
+    return PnpTypes(PnpRequest, Camera, PnpOptions, PnpReply, stays_plain) if own else None
 
 
 def register(registry: Registry, settings: PnpSettings) -> None:
@@ -189,3 +192,14 @@ def register(registry: Registry, settings: PnpSettings) -> None:
                 request.depth_noise or DepthNoise(),
             )  # fmt: skip
         return PnpReply.of(solution)
+
+    if solver is not None:
+        replies = open_found(open_reply_solver)
+
+        def answer_plain(read: PlainPnp) -> EncodedReply | PnpReply:
+            """Answer as `pnp`, without a Python object for each part of the request and the reply."""
+            is_common = read.options is None and not read.depths and 8 <= read.pixels <= 2 * most
+            reply = replies.answer(read, plain) if replies is not None and is_common else None
+            return reply or pnp(read.request())
+
+        registry.answer_plain("pnp", answer_plain)

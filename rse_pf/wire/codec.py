@@ -28,6 +28,7 @@ from rse_pf.errors import BadMessage, LimitExceeded, RsePfError, UnsupportedProt
 from rse_pf.wire import arrays
 from rse_pf.wire.messages import Command, FromRobot, FromServer, Message, Result
 from rse_pf.wire.native_codec import NativeCodec, NativeReader, PnpTypes, native_codec
+from rse_pf.wire.plain_pnp import EncodedReply, PlainPnp
 
 __all__ = ["CODECS", "SUBPROTOCOLS", "Codec", "as_type", "codec_for", "deflated", "make_codec", "stored"]
 
@@ -114,6 +115,8 @@ def as_type(value: Any, kind: type[T]) -> T:
     Raises:
         BadMessage: It does not fit.
     """
+    if type(value) is PlainPnp:
+        value = value.request()
     try:
         return msgspec.convert(value, kind, dec_hook=arrays.decode_hook)
     except RsePfError:
@@ -231,9 +234,9 @@ class _JsonCodec:
         return message
 
     def _is_pose(self, message: Message) -> bool:
-        return (
-            self._pnp is not None and isinstance(message, Result) and type(message.reply) is self._pnp.reply
-        )
+        if self._pnp is None or not isinstance(message, Result):
+            return False
+        return type(message.reply) is EncodedReply or type(message.reply) is self._pnp.reply
 
     def _read(self, text: bytes | bytearray) -> FromRobot:
         if self._reader is None or not self._reader.check(text):

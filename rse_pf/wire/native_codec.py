@@ -21,10 +21,11 @@ from rse_pf.errors import RsePfError
 from rse_pf.native import load_part, open_found
 from rse_pf.native_buffers import SLACK, CallBuffers
 from rse_pf.wire.messages import Command
+from rse_pf.wire.plain_pnp import PlainPnp
 
-__all__ = ["NativeCodec", "NativeReader", "PnpTypes", "native_codec", "open_codec"]
+__all__ = ["CODEC_ABI", "NativeCodec", "NativeReader", "PnpTypes", "native_codec", "open_codec"]
 
-_ABI = 3
+CODEC_ABI = 4
 _NAMES = "rse_pf_codec_check", "rse_pf_codec_read", "rse_pf_codec_deflate"
 _READ, _NOT_MINE, _NEEDS_ROOM, _UNKNOWN = 0, 1, 11, 12
 _ENCODINGS = {"json": 0, "zlib": 1, "bin": 2}
@@ -56,12 +57,16 @@ _MSGPACK_REFUSALS: dict[int, Refusal] = {
 
 
 class PnpTypes(NamedTuple):
-    """The types of the service `pnp`, which stands above this package."""
+    """The types of the service `pnp`, which stands above this package.
+
+    With ``stays_plain`` a payload is a `PlainPnp`, for a caller that knows it; otherwise it is the request.
+    """
 
     request: Callable[..., Any]
     camera: type[Any]
     options: type[Any]
     reply: type[Any]
+    stays_plain: bool = False
 
 
 class NativeCodec:
@@ -161,7 +166,7 @@ class NativeReader:
             status, text = self._with_more_room(data)
         sizes = _FOUND_WITH_HEAD.unpack_from(buffers.call, _FOUND_AT)
         if status == _READ and self._types is not None:
-            command = _command(buffers, sizes, text, self._types)
+            command = _command(buffers, sizes, text, self._types, is_text=self._is_json)
             if command is not None:
                 return command
         elif status == _UNKNOWN:
@@ -204,7 +209,12 @@ def _functions(library: ctypes.CDLL) -> _Calls:
 
 
 def _command(
-    buffers: CallBuffers, numbers_found: tuple[Any, ...], text: bytes | memoryview, types: PnpTypes
+    buffers: CallBuffers,
+    numbers_found: tuple[Any, ...],
+    text: bytes | memoryview,
+    types: PnpTypes,
+    *,
+    is_text: bool,
 ) -> Command | None:
     """Return the command that a call has read; None if the camera or the options have invalid values."""
     (
@@ -215,20 +225,12 @@ def _command(
         camera, options = _head(types, head)
     except (RsePfError, msgspec.ValidationError):
         return None
-    pixels += points
-    numbers = buffers.numbers[: pixels + depths].copy()
-    points_world, pixel_rows = numbers[:points], numbers[points:pixels]
-    if depths:
-        payload = types.request(
-            camera=camera, points_world=points_world, pixels=pixel_rows, options=options,
-            depths_m=numbers[pixels:],
-        )  # fmt: skip
-    else:
-        payload = types.request(camera=camera, points_world=points_world, pixels=pixel_rows, options=options)
+    numbers = buffers.number_bytes[: 8 * (points + pixels + depths)].tobytes()
+    payload: Any = PlainPnp(numbers, points, pixels, depths, camera, options, is_text, types.request)
     return Command(
         id=identity,
         service="pnp",
-        payload=payload,
+        payload=payload if types.stays_plain else payload.request(),
         stream=str(text[stream_at : stream_at + stream_bytes], "ascii") if stream_bytes else "",
         seq=seq,
         keep=bool(fields & _HAS_KEEP),
@@ -255,7 +257,7 @@ def _head(types: PnpTypes, head: bytes) -> tuple[Any, Any]:
 
 def open_codec(path: Path) -> NativeCodec:
     """Load the codecs' part of the library at *path*; raises ConfigurationError as `load_part` says."""
-    load_part(path, "codec", _ABI, *_NAMES)
+    load_part(path, "codec", CODEC_ABI, *_NAMES)
     return NativeCodec(path)
 
 

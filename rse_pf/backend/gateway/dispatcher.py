@@ -82,7 +82,8 @@ class Dispatcher:
         self._token_watch = token_watch
         self._names = frozenset(service.name for service in answers.registry)
         self._codecs: dict[str, Codec] = {
-            name: make_codec(name, settings.session, pnp=wire_types(answers.registry)) for name in CODECS
+            name: make_codec(name, settings.session, pnp=wire_types(answers.registry, stays_plain=True))
+            for name in CODECS
         }
         serving = settings.serving
         self._awaited: SilentConnections[RobotConnection] = SilentConnections(

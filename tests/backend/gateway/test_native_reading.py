@@ -13,6 +13,7 @@ from rse_pf.service import Registry
 from rse_pf.services import pnp
 from rse_pf.wire import CODECS, Command, Result
 from rse_pf.wire.native_codec import NativeReader, native_codec
+from rse_pf.wire.plain_pnp import PlainPnp
 
 pytestmark = pytest.mark.skipif(native_codec() is None, reason="the native core is not built: make -C native")
 
@@ -39,7 +40,7 @@ def test_a_worker_reads_a_pnp_command_natively(codec: str, monkeypatch: pytest.M
         worker.say(connection, Command(id=5, service="pnp", payload=request, stream="camera"))
 
         assert isinstance(read[-1], Command)
-        assert isinstance(read[-1].payload, pnp.PnpRequest)
+        assert isinstance(read[-1].payload, PlainPnp)
         answer = wire.sent[-1]
         assert isinstance(answer, Result), answer
         assert answer.id == 5
