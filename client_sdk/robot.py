@@ -33,6 +33,7 @@ from rse_pf.errors import Disconnected, RsePfError, UsageError, error_from_code
 from rse_pf.wire import CODECS, Failure, as_type, make_codec
 from rse_pf.wire.client_session import Answered, ClientSession
 from rse_pf.wire.client_subscriptions import SubscriptionEnded, Updated
+from rse_pf.wire.rate_limit import REASONS
 
 if TYPE_CHECKING:
     import numpy as np
@@ -460,6 +461,8 @@ class Robot:
             unanswered=session.unanswered,
             resent=session.resent,
             dropped_answers=session.dropped_answers,
+            held_back={reason: session.held_back[reason] for reason in REASONS},
+            told_rate_per_s=session.told_rate_per_s,
             duplicates=keeper.duplicates,
             reconnects=connection.reconnects,
             moves=connection.moves,

@@ -297,7 +297,7 @@ class Busy(CommandFailed, code="busy"):
     """The server sheds load; retry after ``retry_after_ms``.
 
     Cause: More commands arrive than the servers can answer within their deadlines.
-    Check: Run rse-pf local status: it shows the CPU time and the queue of each server.
+    Check: Run rse-pf local status for CPU time and queues; held_back in robot.stats says what waited.
     Fix: Wait retry_after_ms before the next command, lower the frame rate, or add servers.
     """
 

@@ -32,7 +32,7 @@ from rse_pf.errors import BadMessage, BadRequest, LimitExceeded, RsePfError, Uns
 from rse_pf.geometry import Array
 from rse_pf.recording import file_format
 from rse_pf.recording.summary import ChunkPlan, Wanted, plan_of, robot_of
-from rse_pf.wire import CODECS, Codec, Command, Failure, Result, make_codec
+from rse_pf.wire import CODECS, Codec, Command, Failure, Refused, Result, make_codec
 
 __all__ = [
     "CASE_NAME", "Odometry", "RecordedCommand", "WireRecording", "open_recording", "recording_files",
@@ -272,6 +272,24 @@ class WireRecording:
             yield self._with_sights(
                 replace(asked, answered_ns=message.time_ns, reply_bytes=message.data), sights
             )
+        elif channel.direction == "down" and kind == "refused":
+            for number, data in self._failures(channel.codec, message.data):
+                refused = waiting.pop(f"{channel.connection}:{number}", None)
+                if refused is not None:
+                    yield self._with_sights(
+                        replace(refused, answered_ns=message.time_ns, reply_bytes=data), sights
+                    )
+
+    def _failures(self, codec: str, data: bytes) -> list[tuple[int | None, bytes]]:
+        """Return the id of each command that one message ends, and its own failure as a message."""
+        wire = _codec(codec, self._session)
+        try:
+            message = wire.decode_from_server(data)
+        except RsePfError:
+            self.left_out += 1
+            return []
+        failures = message.failures() if isinstance(message, Refused) else []
+        return [(failure.id, wire.encode(failure)) for failure in failures]
 
     def _envelope(self, codec: str, data: bytes) -> tuple[str, int | None, str]:
         """Return the type, the id and the service of a message, "" for one that cannot be read."""

@@ -8,7 +8,9 @@ The caller passes the time as ``now``: seconds of the robot's monotonic clock.
 
 from __future__ import annotations
 
+import itertools
 import math
+from collections import Counter
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -38,9 +40,9 @@ from rse_pf.wire.messages import (
     Welcome,
 )
 from rse_pf.wire.preencoded import encode_command
-from rse_pf.wire.rate_limit import Backlog, RateLimiter, is_long_outage, send_order
+from rse_pf.wire.rate_limit import MAX_PAUSE_S, Backlog, RateLimiter, Reason, is_long_outage, send_order
 from rse_pf.wire.renewal_timer import RenewalTimer
-from rse_pf.wire.server_session import PROGRESS, UPDATES
+from rse_pf.wire.server_session import PROGRESS, RATE, REFUSALS, UPDATES
 
 __all__ = [
     "Answered",
@@ -55,7 +57,7 @@ __all__ = [
     "Welcomed",
 ]
 
-_CAPABILITIES = ("move", PROGRESS, UPDATES)
+_CAPABILITIES = ("move", PROGRESS, UPDATES, REFUSALS, RATE)
 _MAX_TRIES_AFTER_LOSS, _RETRY_BURST = 2, 5.0
 _PINGS_PER_STALL_TIMEOUT = 3.0
 _MAX_DEADLINE_MS = 3.6e6
@@ -146,6 +148,7 @@ class _Pending:
     not_before: float = 0.0
     losses: int = 0
     cancelled: bool = False
+    was_held: bool = False
     has_default_deadline: bool = False
     is_long: bool = False
 
@@ -176,7 +179,13 @@ class ConnectionState:
 
 
 class ClientSession:
-    """All commands of one robot, and the connections that carry them."""
+    """All commands of one robot, and the connections that carry them.
+
+    Attributes:
+        held_back: How many commands were not sent at once although there was a connection, each counted by
+            the first reason.
+        told_rate_per_s: The last rate that a server told, commands a second; None if none did.
+    """
 
     def __init__(self, *, codec: Codec, settings: SessionSettings, sdk: str, first_id: int = 1) -> None:
         self.codec = codec
@@ -184,11 +193,14 @@ class ClientSession:
         self.current: ConnectionState | None = None
         self.resent = 0
         self.dropped_answers = 0
+        self.held_back: Counter[Reason] = Counter()
+        self.told_rate_per_s: float | None = None
         self._sdk = sdk
         self._next_id = first_id
         self._pending: dict[int, _Pending] = {}
         self._sequence: dict[str, int] = {}
         self._delivered: dict[str, int] = {}
+        self._stream_not_before: dict[str, float] = {}
         self._retry_tokens = _RETRY_BURST
         self.subscriptions = ClientSubscriptions()
 
@@ -243,7 +255,7 @@ class ClientSession:
         self._pending[command.id] = pending
         self._retry_tokens = min(_RETRY_BURST, self._retry_tokens + RETRY_SHARE)
         if self.current is not None and self._may_send(
-            command, self.current, self._capacity(self.current, now)
+            pending, self.current, self._capacity(self.current, now), now
         ):
             self._write(pending, self.current, now, data)
         return command.id
@@ -338,14 +350,19 @@ class ClientSession:
                 return [Notice(message)]
             case Failure() if message.id in self.subscriptions:
                 return [*self.subscriptions.refuse(connection, message)]
-            case Refused() | Rate():
-                return []  # of capabilities that `open_connection` does not name
+            case Rate():
+                if connection.rate_limiter.obey(message, now):
+                    self.told_rate_per_s = message.commands_per_s
+                return self._flush(now)
+            case Refused():
+                ended = [self._answer(connection, failure, now) for failure in message.failures()]
+                return [*itertools.chain.from_iterable(ended), *self._flush(now)]
             case Update():
                 return [*self.subscriptions.update(connection, message)]
             case Progress():
                 return self._progress(connection, message)
             case _:
-                return self._answer(connection, message, now)
+                return self._answer(connection, message, now) + self._flush(now)
 
     def renew(self, connection: ConnectionState, token: str) -> None:
         """Send a fresh *token* on *connection*; the server then extends the connection."""
@@ -414,12 +431,16 @@ class ClientSession:
 
     def next_due(self, now: float) -> float:
         """Return the time at which `due` and `check` must be called again."""
-        times = [now + self.settings.stall_timeout_s / _PINGS_PER_STALL_TIMEOUT]
-        times += [pending.deadline for pending in self._pending.values()]
-        times += [p.not_before for p in self._pending.values() if p.connection is None and p.not_before > now]
-        if self.current is not None and not self.current.rate_limiter.available(now):
-            times.append(self.current.rate_limiter.next_s(now))
-        return max(now, min(times))
+        first = now + self.settings.stall_timeout_s / _PINGS_PER_STALL_TIMEOUT
+        next_s = now if self.current is None else self.current.rate_limiter.next_s(now)
+        for pending in self._pending.values():
+            first = min(first, pending.deadline)
+            if pending.connection is None:
+                if self.current is not None and self._is_replaced(pending.command):
+                    return now
+                may_be_sent = max(next_s, self._not_before(pending))
+                first = min(first, may_be_sent if may_be_sent > now else first)
+        return max(now, first)
 
     def _flush(self, now: float) -> list[Event]:
         """Send the waiting commands, oldest first, as far as the server's limits allow."""
@@ -435,23 +456,45 @@ class ClientSession:
         else:
             waiting.sort(key=lambda item: send_order(item[0], item[1].command.stream))
         for identity, pending in waiting:
-            if now < pending.not_before:
-                continue
             command = pending.command
-            if command.stream and not command.keep and command.seq < self._sequence[command.stream]:
+            if self._is_replaced(command):
                 events += self._end(identity, _failure(command, "stale", "a newer frame took its place"))
-            elif self._may_send(command, connection, capacity):
+            elif self._may_send(pending, connection, capacity, now):
                 capacity -= 1
                 self._write(pending, connection, now)
                 if pending.cancelled:
                     self._cancel_on_server(pending)
         return events
 
-    def _may_send(self, command: Command, connection: ConnectionState, capacity: int) -> bool:
-        if capacity <= 0 or not command.stream or connection.backlog is None:
-            return capacity > 0
-        in_flight = sum(_is_frame(sent) and sent.connection is connection for sent in self._pending.values())
-        return in_flight < connection.backlog.max_in_flight
+    def _is_replaced(self, command: Command) -> bool:
+        """Return whether a newer frame of its stream makes this one void."""
+        return bool(command.stream) and not command.keep and command.seq < self._sequence[command.stream]
+
+    def _not_before(self, pending: _Pending) -> float:
+        """Return the time until which a busy answer holds back this command or its stream."""
+        return max(pending.not_before, self._stream_not_before.get(pending.command.stream, 0.0))
+
+    def _may_send(self, pending: _Pending, connection: ConnectionState, capacity: int, now: float) -> bool:
+        """Return whether this command may be sent now; count it if it is held back."""
+        reason = self._reason_to_wait(pending, connection, capacity, now)
+        if reason is not None and not pending.was_held:
+            pending.was_held = True
+            self.held_back[reason] += 1
+        return reason is None
+
+    def _reason_to_wait(
+        self, pending: _Pending, connection: ConnectionState, capacity: int, now: float
+    ) -> Reason | None:
+        if now < self._not_before(pending):
+            return "busy"
+        if connection.rate_limiter.waits_for_told_rate(now):
+            return "server-rate"
+        if capacity > 0 and pending.command.stream and connection.backlog is not None:
+            sent = sum(
+                _is_frame(other) and other.connection is connection for other in self._pending.values()
+            )
+            capacity = connection.backlog.max_in_flight - sent
+        return None if capacity > 0 else "own-limit"
 
     def _capacity(self, connection: ConnectionState, now: float) -> int:
         """Return how many commands may be sent now without exceeding the server's limits."""
@@ -482,7 +525,7 @@ class ClientSession:
         self.resent += pending.sent_at is not None
         pending.connection = connection
         pending.sent_at = now
-        connection.rate_limiter.spend(now)
+        connection.rate_limiter.spend(now, is_command=True)
         connection.outgoing.append(
             encode_command(self.codec, _with_deadline(pending.command, pending.deadline - now))
             if data is None
@@ -498,16 +541,15 @@ class ClientSession:
         if connection.backlog is not None:
             connection.backlog.note_answer(answer.queue_ms if isinstance(answer, Result) else math.inf)
         if isinstance(answer, Failure):
-            ended = [] if self._retry(pending, answer, now) else self._end(pending.command.id, answer)
-            return ended + self._flush(now)
+            return [] if self._retry(pending, answer, now) else self._end(pending.command.id, answer)
         command = pending.command
         if now >= pending.deadline:
             late = _failure(command, "expired", f"its answer came after {now - pending.submitted:.3f} s")
-            return self._end(command.id, late) + self._flush(now)
+            return self._end(command.id, late)
         last = self._delivered.get(command.stream, 0)
         if command.stream and not command.keep and command.seq < last:
             stale = _failure(command, "stale", "a newer answer came first")
-            return self._end(command.id, stale) + self._flush(now)
+            return self._end(command.id, stale)
         if not pending.cancelled:
             self._delivered[command.stream] = max(last, command.seq)
         up_s = None
@@ -516,17 +558,20 @@ class ClientSession:
             up_s, down_s = connection.clock_offset.split_s(
                 pending.sent_at, answer.received_s, answer.sent_s, now
             )
-        return self._end(command.id, answer, up_s, down_s) + self._flush(now)
+        return self._end(command.id, answer, up_s, down_s)
 
     def _retry(self, pending: _Pending, failure: Failure, now: float) -> bool:
         """Schedule a retry if another server or a later time may help; return whether one is scheduled."""
+        pause_s = max(0.0, failure.retry_after_ms or 0.0) / 1e3
+        if failure.code == "busy" and pause_s > 0.0 and pending.command.stream:
+            self._stream_not_before[pending.command.stream] = now + min(MAX_PAUSE_S, pause_s)
         if pending.cancelled:
             return False
         if failure.code == "worker-lost" and pending.losses < _MAX_TRIES_AFTER_LOSS:
             pending.losses += 1
             pending.connection = None
             return True
-        after = now + max(0.0, failure.retry_after_ms or 0.0) / 1e3
+        after = now + pause_s
         if failure.code != "busy" or not after < pending.deadline or self._retry_tokens < 1.0:
             return False
         self._retry_tokens -= 1.0

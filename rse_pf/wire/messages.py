@@ -169,6 +169,20 @@ class Refused(_Message, frozen=True, kw_only=True, tag="refused"):
     retry_after_ms: float | None = None
     server: str = ""
 
+    def failures(self) -> list[Failure]:
+        """Return what it stands for: a failure of each of its commands, once."""
+        return [
+            Failure(
+                id=identity,
+                code=self.code,
+                message=self.message,
+                hint=self.hint,
+                retry_after_ms=self.retry_after_ms,
+                server=self.server,
+            )
+            for identity in dict.fromkeys(self.ids)
+        ]
+
 
 class Rate(_Message, frozen=True, kw_only=True, tag="rate"):
     """Server tells how many commands a second the robot may send for ``for_ms``; a new one replaces it.

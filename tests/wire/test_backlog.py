@@ -105,6 +105,7 @@ def test_a_loaded_server_receives_one_frame_at_a_time_again(told):
     answer(session, connection, under_way[0], 1.2, **told)
     assert commands(connection) == []
     answer(session, connection, under_way[1], 1.3, **told)
+    session.due(1.361)  # after the pause that a busy answer asks for
 
     assert len(commands(connection)) == 1
 

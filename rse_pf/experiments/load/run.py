@@ -33,7 +33,7 @@ from rse_pf.experiments.results.summary import percent_answered, percentiles, su
 from rse_pf.local.control.platform import LocalPlatform
 from rse_pf.terminal import show, show_page
 
-__all__ = ["FAST_MS", "TargetPlatform", "report_of", "run_swarm"]
+__all__ = ["FAST_MS", "TargetPlatform", "report_of", "run_swarm", "table_of"]
 
 FAST_MS = 150.0
 """Limit for "answered in time": below the paper's mean round trip of 156.36 ms."""
@@ -72,7 +72,7 @@ def run_swarm(
     write_commands(folder / COMMANDS, result.commands)
     report = report_of(options, seconds, result, before)
     write_json(folder / "report.json", report)
-    show_page(_table(report, folder))
+    show_page(table_of(report, folder))
     commands = report["commands"]
     return 1 if commands["lost"] or result.duplicates or result.wrong_poses or not commands["answered"] else 0
 
@@ -96,6 +96,8 @@ def report_of(
         "reconnects": result.reconnects,
         "resent": result.resent,
         "moves": result.moves,
+        "held_back": result.held_back,
+        "told_a_rate": result.told_a_rate,
         "generator": {
             "cpu_s": result.cpu_s,
             "wall_s": result.wall_s,
@@ -191,7 +193,8 @@ def _frame_rates(commands: list[CommandRecord], fps: float) -> list[float]:
     return [answered[robot] / (max(times) - min(times) + 1.0 / fps) for robot, times in planned.items()]
 
 
-def _table(report: Mapping[str, Any], folder: Path) -> str:
+def table_of(report: Mapping[str, Any], folder: Path) -> str:
+    """Return the report that is saved in *folder* as the lines that a terminal shows."""
     commands, trip, own = report["commands"], report["round_trip_ms"], report["generator"]
     failures = ", ".join(f"{code} {count}" for code, count in report["failures_by_code"].items()) or "none"
     rows = [
@@ -202,10 +205,17 @@ def _table(report: Mapping[str, Any], folder: Path) -> str:
         ("frames per second", f"{report['fps_per_robot']['mean'] or 0.0:.2f} per robot"),
         ("wrong poses", f"{report['wrong_poses']}"),
         ("reconnects", f"{report['reconnects']} ({report['resent']} resent), {report['moves']} migrations"),
+        ("held back", _held_back(report["held_back"], report["told_a_rate"])),
         ("load generator", f"{own['cpu_percent']:.0f} % of a core, late p99 {_ms(own['late_sends_ms_p99'])}"),
         ("records", str(folder)),
     ]  # fmt: skip
     return "\n".join(f"{name:<18} {value}" for name, value in rows)
+
+
+def _held_back(counts: Mapping[str, int], told_a_rate: int) -> str:
+    """Return how many commands the robots held back, and why."""
+    told = f"{counts.get('server-rate', 0)} by a server's rate (told to {told_a_rate} robots)"
+    return f"{told}, {counts.get('busy', 0)} after busy, {counts.get('own-limit', 0)} by their own limit"
 
 
 def _ms(value: float | None) -> str:

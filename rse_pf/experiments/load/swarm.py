@@ -12,7 +12,7 @@ import time
 from array import array
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 from types import TracebackType
 from typing import Any
@@ -43,6 +43,7 @@ from rse_pf.experiments.load.swarm_process import (
 )
 from rse_pf.experiments.results.records import CommandRecord
 from rse_pf.local.faults.network_emulator import LinkProcess, profile_named
+from rse_pf.wire.rate_limit import REASONS
 
 __all__ = ["Swarm", "SwarmOptions", "SwarmResult", "records_of"]
 
@@ -57,9 +58,10 @@ Event = Mapping[str, Any]
 class SwarmResult:
     """The commands of all robots, and the cost of generating them.
 
-    ``cpu_s`` is the CPU time of all processes of the generator during ``wall_s``; ``duplicates`` counts
-    answers that were delivered twice; ``late_sends_ms_p99`` is the delay of the generator itself between
-    the planned and the real send time.
+    ``held_back`` counts the commands that were not sent at once, as `client_sdk.Stats` does, and
+    ``told_a_rate`` the robots that a server told a rate.  ``cpu_s`` is the CPU time of all processes of the
+    generator during ``wall_s``; ``duplicates`` counts answers that were delivered twice;
+    ``late_sends_ms_p99`` is the delay of the generator itself between the planned and the real send time.
     """
 
     commands: list[CommandRecord]
@@ -72,6 +74,8 @@ class SwarmResult:
     duplicates: int
     link: str | None
     late_sends_ms_p99: float
+    held_back: dict[str, int] = field(default_factory=dict)
+    told_a_rate: int = 0
 
 
 @dataclass(slots=True, eq=False)
@@ -199,6 +203,8 @@ class Swarm:
             - len({(command.robot, command.id) for command in commands}),
             link=self.options.link,
             late_sends_ms_p99=round(float(np.percentile(late_ms, 99)), 3) if late_ms else 0.0,
+            held_back={reason: totals[reason] for reason in REASONS},
+            told_a_rate=totals["told_a_rate"],
         )
 
     async def _launch(self) -> None:

@@ -139,7 +139,9 @@ class SwarmEvent:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SwarmEnded:
-    """From the process: its robots have ended; ``counts`` has the counts of `SwarmResult` by their names."""
+    """From the process: its robots have ended; ``counts`` has the counts of `SwarmResult` by their names, and
+    those of ``held_back`` by the reasons.
+    """
 
     cpu_s: float
     counts: Counter[str]
@@ -340,7 +342,10 @@ class _Process:
         for robot in self._robots.values():
             if robot.client is not None:
                 names = ("reconnects", "resent", "moves", "duplicates")
-                counts.update({name: getattr(robot.client.stats, name) for name in names})
+                stats = robot.client.stats
+                counts.update({name: getattr(stats, name) for name in names})
+                counts.update(stats.held_back)
+                counts["told_a_rate"] += stats.told_rate_per_s is not None
         return SwarmEnded(cpu_s=cpu_s, counts=counts)
 
 

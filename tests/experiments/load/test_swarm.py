@@ -10,7 +10,7 @@ import pytest
 
 from rse_pf.config import SessionSettings
 from rse_pf.errors import UsageError
-from rse_pf.experiments.load.run import report_of
+from rse_pf.experiments.load.run import report_of, table_of
 from rse_pf.experiments.load.swarm import SwarmOptions, SwarmResult, records_of
 from rse_pf.experiments.load.swarm_process import (
     ResultRows,
@@ -122,7 +122,8 @@ def test_the_round_trip_counts_from_the_planned_time() -> None:
 def result(commands: list[CommandRecord]) -> SwarmResult:
     return SwarmResult(
         commands=commands, cpu_s=2.0, wall_s=10.0, wrong_poses=0, reconnects=0, resent=0, moves=0,
-        duplicates=0,        link=None, late_sends_ms_p99=0.5,
+        duplicates=0, link=None, late_sends_ms_p99=0.5,
+        held_back={"server-rate": 7, "busy": 2, "own-limit": 0}, told_a_rate=3,
     )  # fmt: skip
 
 
@@ -131,6 +132,8 @@ def test_the_report_counts_what_was_answered_in_time(tmp_path: Any) -> None:
     assert report["commands"]["sent"] == 3
     assert report["commands"]["lost"] == 1
     assert report["failures_by_code"] == {"expired": 1}
+    assert report["held_back"] == {"server-rate": 7, "busy": 2, "own-limit": 0}
+    assert "7 by a server's rate (told to 3 robots), 2 after busy, 0 by" in table_of(report, tmp_path)
     assert report["answered_in_time_percent"] == pytest.approx(33.333)
     assert report["generator"]["cpu_percent"] == 20.0
     assert report["fps_per_robot"]["mean"] == pytest.approx(1 / 0.6, rel=1e-3)

@@ -16,7 +16,7 @@ from rse_pf.errors import BadRequest, LimitExceeded, RsePfError, UnsupportedProt
 from rse_pf.recording import file_format, reader
 from rse_pf.recording.reader import open_recording
 from rse_pf.recording.summary import Wanted
-from rse_pf.wire import Command, Result
+from rse_pf.wire import Command, Failure, Refused, Result
 
 
 def test_commands_come_with_their_answers_in_the_order_in_which_they_were_answered(tmp_path: Path) -> None:
@@ -35,6 +35,22 @@ def test_commands_come_with_their_answers_in_the_order_in_which_they_were_answer
     assert commands[2].reply is None
     assert commands[2].round_trip_ms is None
     assert commands[0].about["side"] == "server"
+
+
+@pytest.mark.parametrize("codec", ["bin", "zlib"])
+def test_a_message_that_ends_many_commands_is_a_failure_of_each(tmp_path: Path, codec: str) -> None:
+    made = Made(tmp_path / "a")
+    first = made.send(1, codec=codec, is_answered=False)
+    refused = Refused(ids=[0, 1, 7], code="busy", message="too many", retry_after_ms=20.0)
+    second = made.send(2, codec=codec, answer=refused)
+
+    commands = list(open_recording(made.close()).commands())
+
+    assert [each.id for each in commands] == [first, second]
+    assert [each.reply for each in commands] == [
+        Failure(id=number, code="busy", message="too many", retry_after_ms=20.0) for number in (0, 1)
+    ]
+    assert commands[0].answered_ns == commands[1].answered_ns
 
 
 def test_an_answer_in_the_next_file_is_found(tmp_path: Path) -> None:
