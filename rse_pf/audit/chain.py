@@ -35,6 +35,7 @@ __all__ = [
     "Value",
     "line_of",
     "next_entry",
+    "next_line",
     "parse_head",
 ]
 
@@ -44,7 +45,8 @@ CONTINUED, GAP, HEADS, HEADS_LOST = "log.continued", "log.gap", "log.heads", "lo
 """Actions of the log itself: a new file of the chain, lost entries, heads of chains, a lost file of heads."""
 
 _MAX_CHARACTERS, _MAX_DETAILS, _MAX_NUMBER = 200, 64, 2**53
-_TOKEN = re.compile(r"eyJ[\w-]{5,}\.[\w.-]+")
+_JWT_BEGINS = "eyJ"
+_TOKEN = re.compile(_JWT_BEGINS + r"[\w-]{5,}\.[\w.-]+")
 # Canonical JSON: keys in order, no spaces, UTF-8.
 _encode = msgspec.json.Encoder(order="sorted").encode
 _HEAD = re.compile(r"(\d{1,15}):([0-9a-f]{64})")
@@ -99,23 +101,26 @@ class Entry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
 def next_entry(head: Head, note: Note) -> Entry:
     """Return *note* as the entry after *head*; long strings are cut, what looks like a token is masked."""
-    details = list(note.detail.items())[:_MAX_DETAILS]
-    unsealed = Entry(
-        seq=head.seq + 1,
-        time=round(float(note.time), 3),
-        actor=_mask(note.actor),
-        action=_mask(note.action),
-        subject=_mask(note.subject),
-        detail={_mask(key): _plain(value) for key, value in details},
-        previous=head.hash,
-        hash="",
-    )
-    return msgspec.structs.replace(unsealed, hash=_hash_of(unsealed))
+    return msgspec.json.decode(next_line(head, note)[1], type=Entry)
+
+
+def next_line(head: Head, note: Note) -> tuple[Head, bytes]:
+    """Return the head after *note*, and the line of its entry; see `next_entry`."""
+    detail = note.detail
+    if len(detail) > _MAX_DETAILS:
+        detail = dict(list(detail.items())[:_MAX_DETAILS])
+    detail = {_mask(key): _plain(value) for key, value in detail.items()}
+    before = _encode(_BeforeHash(_mask(note.action), _mask(note.actor), detail))
+    time = round(float(note.time), 3)
+    behind = _encode(_BehindHash(head.hash, head.seq + 1, _mask(note.subject), time))
+    digest = _digest(before, behind)
+    return Head(head.seq + 1, digest), _line(before, digest, behind)
 
 
 def line_of(entry: Entry) -> bytes:
     """Return *entry* as canonical JSON with a newline."""
-    return _encode(msgspec.structs.asdict(entry)) + b"\n"
+    before, behind = _parts(entry)
+    return _line(before, entry.hash, behind)
 
 
 def parse_head(text: str) -> Head | None:
@@ -139,7 +144,7 @@ class Chain:
             is_canonical = line_of(entry) == line
         except (msgspec.DecodeError, UnicodeDecodeError, ValueError, RecursionError):
             return f"{number} is not readable: the line was changed"
-        if not is_canonical or entry.hash != _hash_of(entry):
+        if not is_canonical or entry.hash != _digest(*_parts(entry)):
             return f"{number} was changed: its hash does not match its content"
         if self.head is not None and (entry.seq, entry.previous) != (self.head.seq + 1, self.head.hash):
             return f"{number} is missing or was changed: entry {entry.seq} is in its place"
@@ -173,11 +178,39 @@ def _plain(value: Value) -> Value:
 
 
 def _mask(text: str) -> str:
+    if len(text) <= _MAX_CHARACTERS and text.isascii() and _JWT_BEGINS not in text:
+        return text
     printable = text[: 4 * _MAX_CHARACTERS].encode("utf-8", "replace").decode()
     return _TOKEN.sub("(a token)", printable)[:_MAX_CHARACTERS]
 
 
-def _hash_of(entry: Entry) -> str:
-    fields = msgspec.structs.asdict(entry)
-    del fields["hash"]
-    return hashlib.sha256(_encode(fields)).hexdigest()
+class _BeforeHash(msgspec.Struct, frozen=True):
+    """The members of an entry that stand before its hash in canonical JSON."""
+
+    action: str
+    actor: str
+    detail: Mapping[str, Value]
+
+
+class _BehindHash(msgspec.Struct, frozen=True):
+    """The members that stand behind it."""
+
+    previous: str
+    seq: int
+    subject: str
+    time: float
+
+
+def _parts(entry: Entry) -> tuple[bytes, bytes]:
+    before = _BeforeHash(entry.action, entry.actor, entry.detail)
+    behind = _BehindHash(entry.previous, entry.seq, entry.subject, entry.time)
+    return _encode(before), _encode(behind)
+
+
+def _digest(before: bytes, behind: bytes) -> str:
+    """Return the hash of an entry: of its canonical JSON without this hash."""
+    return hashlib.sha256(b"%b,%b" % (before[:-1], behind[1:])).hexdigest()
+
+
+def _line(before: bytes, digest: str, behind: bytes) -> bytes:
+    return b'%b,"hash":%b,%b\n' % (before[:-1], _encode(digest), behind[1:])

@@ -39,8 +39,7 @@ from rse_pf.audit.chain import (
     Head,
     Note,
     Value,
-    line_of,
-    next_entry,
+    next_line,
 )
 from rse_pf.audit.heads import HeadsFile
 from rse_pf.disk_reserve import allocated_bytes, is_full, preallocate
@@ -305,9 +304,8 @@ class AuditLog:
     def _write(self, notes: list[Note]) -> None:
         head, lines = self.head, []
         for note in notes:
-            entry = next_entry(head, note)
-            head = entry.head
-            lines.append(line_of(entry))
+            head, line = next_line(head, note)
+            lines.append(line)
         data = b"".join(lines)
         if self._is_short and len(data) > self._reserved - self._size:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))  # what is left stays for shorter ones
@@ -377,10 +375,10 @@ class AuditLog:
     def _record_continued(self, reason: str) -> None:
         self._first = self.head.seq + 1
         note = self._own_note(CONTINUED, {"reason": reason, "head": str(self.head)})
-        entry = next_entry(self.head, note)
-        os.write(self._fd, line_of(entry))
+        self.head, line = next_line(self.head, note)
+        os.write(self._fd, line)
         os.fsync(self._fd)
-        self.head, self._size = entry.head, self._size + len(line_of(entry))
+        self._size += len(line)
 
     def _rotate(self) -> None:
         """Go on in a new file; on failure the chain stays in the present one."""

@@ -12,11 +12,12 @@ a worker would serve nobody.  What this profile leaves open is read here in a fe
 from __future__ import annotations
 
 import base64
+import binascii
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import msgspec
 
@@ -62,10 +63,10 @@ _EXTENSIONS = ("crit", "b64")
 _MAX_TOKEN_BYTES = 4096
 _MAX_REMEMBERED = 8192
 """Tokens of a key set whose signature is not verified again; about 1 kB each."""
+_TO_URL, _FROM_URL = bytes.maketrans(b"+/", b"-_"), bytes.maketrans(b"-_", b"+/")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Claims:
+class Claims(msgspec.Struct, frozen=True, kw_only=True):
     """The claims of a verified token, the only source of a robot's identity."""
 
     robot: RobotId
@@ -81,8 +82,7 @@ class Claims:
         return dict(self.quotas).get(name)
 
 
-@dataclass(frozen=True, slots=True)
-class _SignedClaims:
+class _SignedClaims(NamedTuple):
     """What a token with a valid signature, issuer and audience says; nothing of it was judged by the time."""
 
     claims: Claims
@@ -202,6 +202,10 @@ class KeySet:
         self._revoked = {(token.tenant, token.robot, token.id) for token in denied.tokens}
         self._disabled = {(robot.tenant, robot.robot) for robot in denied.disabled}
         self._not_before = {(limit.tenant, limit.robot): limit.at_s for limit in denied.not_before}
+        self._robot_keys: dict[str, Ed25519PublicKey] = {}
+        """Keys of enrolled robots that have signed a token."""
+        self._enrolled: dict[str, tuple[RobotId, tuple[tuple[str, float], ...]]] = {}
+        """Identity and quotas of enrolled robots that had a valid token, by key id."""
         self._signed: dict[bytes, _SignedClaims] = {}
         self._digests: dict[RobotId, bytes] = {}
 
@@ -237,11 +241,24 @@ class KeySet:
             return None
         if not key_id.startswith(ROBOT_KEY):
             return self._keys.get(key_id)
-        robot = self._robots.get(key_id)
-        if robot is None:
-            return None
-        key: Ed25519PublicKey = _ed25519().Ed25519PublicKey.from_public_bytes(_unb64(robot.x))
+        robot, key = self._robots.get(key_id), self._robot_keys.get(key_id)
+        if key is None and robot is not None:
+            key = _ed25519().Ed25519PublicKey.from_public_bytes(_unb64(robot.x))
+            self._robot_keys[key_id] = key
         return key
+
+    def as_enrolled(self, claims: Claims, enrolled: EnrolledRobot) -> Claims:
+        """Return *claims* with what the roster says of the robot *enrolled*; a token says nothing of it."""
+        known = self._enrolled.get(claims.key_id)
+        if known is None:
+            known = self._enrolled[claims.key_id] = (enrolled.id, tuple(enrolled.quotas.items()))
+        robot, quotas = known
+        if (claims.robot, claims.scopes, claims.quotas) == (robot, enrolled.scopes, quotas):
+            return claims
+        return Claims(
+            robot=robot, token_id=claims.token_id, issued_s=claims.issued_s, expires_s=claims.expires_s,
+            key_id=claims.key_id, scopes=enrolled.scopes, quotas=quotas,
+        )  # fmt: skip
 
     def knows(self, key_id: str) -> bool:
         """Return whether `get` would find the key, without the cost of creating it."""
@@ -318,7 +335,7 @@ def claims_problem(claims: Claims, keys: KeySet) -> str:
 def renewed_claims(claims: Claims, keys: KeySet) -> Claims:
     """Return *claims*, which `claims_problem` allows, with the scopes and quotas of the present roster."""
     enrolled = keys.robot_of(claims.key_id)
-    return claims if enrolled is None else _as_enrolled(claims, enrolled)
+    return claims if enrolled is None else keys.as_enrolled(claims, enrolled)
 
 
 def unverified_parts(token: str) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -364,7 +381,7 @@ def _check(token: str, keys: KeySet, now: float, settings: AuthSettings) -> Clai
         if enrolled is not None:
             if not is_proven:
                 raise _TokenRefused("wrong-robot")
-            verified = _as_enrolled(verified, enrolled)
+            verified = keys.as_enrolled(verified, enrolled)
         denied = keys.denies(verified)
         if denied:
             raise _TokenRefused(denied)
@@ -421,13 +438,13 @@ def _signed_claims(token: str, keys: KeySet, settings: AuthSettings) -> _SignedC
 def _is_for_us(claims: dict[str, Any], settings: AuthSettings) -> bool:
     """Return whether nothing is missing, and this platform is the audience."""
     audience = claims.get("aud")
-    if isinstance(audience, str):
-        audience = [audience]
+    if audience != settings.audience:
+        if not isinstance(audience, list) or settings.audience not in audience:
+            return False
+        if not all(isinstance(name, str) for name in audience):
+            return False
     return (
-        all(claims.get(name) is not None for name in _REQUIRED)
-        and isinstance(audience, list)
-        and all(isinstance(name, str) for name in audience)
-        and settings.audience in audience
+        None not in map(claims.get, _REQUIRED)
         and claims["iss"] == ISSUER
         and isinstance(claims["sub"], str)
         and isinstance(claims["jti"], str)
@@ -435,14 +452,12 @@ def _is_for_us(claims: dict[str, Any], settings: AuthSettings) -> bool:
 
 
 def _claims_in(claims: dict[str, Any], key_id: str) -> _SignedClaims:
-    issued, expires, starts = (claims.get(name) for name in ("iat", "exp", "nbf"))
+    issued, expires, starts = claims["iat"], claims["exp"], claims.get("nbf")
     for stamp in (issued, expires, 0 if starts is None else starts):
         if isinstance(stamp, bool) or not isinstance(stamp, (int, float)) or not 0 <= stamp < 1e11:
             raise _TokenRefused("bad-time")
-    assert isinstance(issued, (int, float))
-    assert isinstance(expires, (int, float))
     robot, token_id = claims["sub"], claims["jti"]
-    if not all(0 < len(word) <= 64 for word in (robot, token_id)):
+    if not (0 < len(robot) <= 64 and 0 < len(token_id) <= 64):
         raise _TokenRefused("bad-subject")
     verified = Claims(
         robot=RobotId(str(claims.get("tenant", DEFAULT_TENANT)), robot),
@@ -465,22 +480,18 @@ def _check_times(signed: _SignedClaims, now: float, settings: AuthSettings) -> N
         raise _TokenRefused("not-yet-valid")
 
 
-def _as_enrolled(claims: Claims, enrolled: EnrolledRobot) -> Claims:
-    """Return *claims* with what the roster says of the robot; a token says nothing of it."""
-    quotas = tuple(enrolled.quotas.items())
-    robot = RobotId(enrolled.tenant, enrolled.robot, claims.key_id.removeprefix(ROBOT_KEY))
-    return replace(claims, robot=robot, scopes=enrolled.scopes, quotas=quotas)
-
-
 def _decode_parts(token: str) -> list[bytes]:
     """Return header, claims and signature; unused bits are 0, so that a token has one encoding only."""
-    parts = token.split(".")
+    parts = token.encode().split(b".")
+    if len(parts) != 3:
+        raise _TokenRefused("malformed")
     try:
-        decoded = [_unb64(part) for part in parts]
+        decoded = [binascii.a2b_base64(part.translate(_FROM_URL) + b"=" * (-len(part) % 4)) for part in parts]
     except ValueError as error:
         raise _TokenRefused("malformed") from error
-    if len(parts) != 3 or any(_b64(data) != part for data, part in zip(decoded, parts, strict=True)):
-        raise _TokenRefused("malformed")
+    for data, part in zip(decoded, parts, strict=True):  # what was decoded may hold letters of no alphabet
+        if binascii.b2a_base64(data, newline=False).translate(_TO_URL).rstrip(b"=") != part:
+            raise _TokenRefused("malformed")
     return decoded
 
 

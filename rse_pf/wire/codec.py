@@ -42,6 +42,7 @@ SUBPROTOCOLS = {
 """Short name to WebSocket sub-protocol, in the server's order of preference."""
 
 CODECS = tuple(SUBPROTOCOLS)
+_CODEC_NAMES = {protocol: name for name, protocol in SUBPROTOCOLS.items()}
 
 # A robot's uplink is slower than its processor: at level 1 a command is 6 % longer.
 _LEVEL = 6
@@ -127,8 +128,10 @@ def as_type(value: Any, kind: type[T]) -> T:
 
 def codec_for(offered: list[str]) -> str | None:
     """Return the codec name of the first offered sub-protocol that is supported, else None."""
-    names = {protocol: name for name, protocol in SUBPROTOCOLS.items()}
-    return next((names[protocol] for protocol in offered if protocol in names), None)
+    for protocol in offered:
+        if protocol in _CODEC_NAMES:
+            return _CODEC_NAMES[protocol]
+    return None
 
 
 def stored(text: bytes) -> bytes:

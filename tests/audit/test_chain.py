@@ -16,8 +16,10 @@ from rse_pf.audit.chain import (
     Head,
     Note,
     RefusalLimiter,
+    Value,
     line_of,
     next_entry,
+    next_line,
     parse_head,
 )
 
@@ -158,3 +160,20 @@ def test_a_flood_of_refusals_is_counted_and_not_written():
     assert written == 10 + 2 * 5 - 1
     assert refusals.summary() == {"bad-signature": 5000 - written}
     assert refusals.summary() == {}
+
+
+@pytest.mark.parametrize(
+    "detail", [{}, {"z": 1, "a": "ü\n", "previous": "x", "hash": None}, {f"d{n}": n / 7 for n in range(70)}]
+)
+def test_the_line_of_a_note_is_that_of_its_entry_and_continues_the_chain(
+    detail: dict[str, Value],
+) -> None:
+    note = Note(time=1.23456, actor="a", action="b", subject='"previous":"', detail=detail)
+
+    head, line = next_line(GENESIS, note)
+
+    entry = next_entry(GENESIS, note)
+    assert (head, line) == (entry.head, line_of(entry))
+    canonical = json.dumps(json.loads(line), sort_keys=True, separators=(",", ":"), ensure_ascii=False)
+    assert line == canonical.encode() + b"\n"
+    assert Chain().add(line) == entry

@@ -152,7 +152,7 @@ class Dispatcher:
         if source is None or not isinstance(session, RosbridgeSession):
             return
         now = clocks.monotonic()
-        accepted = self._token_watch.judge(token, connection.robot, source)
+        accepted = self._token_watch.judge(token, source)
         if accepted is None or self.rates.banned_s(accepted.robot, now) > 0:
             for send in session.token_refusal():
                 connection.write(send.data)

@@ -15,6 +15,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from http import HTTPStatus
 
+import msgspec
+
 from rse_pf.auth.origins import ORIGIN_HINT, AllowedOrigins, carried_token
 from rse_pf.auth.tokens import (
     Claims,
@@ -38,6 +40,7 @@ HEALTH = "health"
 """Result of a request for the health page."""
 
 _RETRY_AFTER_S = 2
+_HEALTH_PATH = HEALTH_PATH.encode()
 _NO_KEYS = "no-keys"
 _JSON = {"Content-Type": "application/json"}
 _HEAD = re.compile(
@@ -84,11 +87,13 @@ class Rejected:
 class RequestHead:
     """The head of an HTTP request that was checked line by line.  A header that is repeated is one list."""
 
-    __slots__ = ("_headers", "path")
+    __slots__ = ("_headers", "path", "websocket_key")
 
     def __init__(self, path: bytes, headers: dict[bytes, bytes]) -> None:
         self.path = path
         self._headers = headers
+        self.websocket_key = self._read_key()
+        """The key of a valid request for an upgrade to WebSocket, empty if this is none."""
 
     @classmethod
     def parse(cls, data: bytes) -> RequestHead | None:
@@ -97,19 +102,21 @@ class RequestHead:
         Source:
             RFC 9112, 3 and 5; RFC 6455, 4.2.1.
         """
-        lines = data.split(b"\r\n")
         request_line = _HEAD.fullmatch(data)
-        if request_line is None or len(lines) - 1 > _MAX_HEADERS:
+        if request_line is None:
+            return None
+        lines = request_line[2].split(b"\r\n")
+        if len(lines) - 1 > _MAX_HEADERS:
             return None
         headers: dict[bytes, bytes] = {}
         for line in lines[1:]:
             name, _, value = line.partition(b":")
-            name, value = name.lower(), value.strip(b" \t")
+            name = name.lower()
             if name in headers:
                 if name in _SINGLE:
                     return None
-                value = headers[name] + b"," + value
-            headers[name] = value
+                value = headers[name] + b"," + value.strip(b" \t")
+            headers[name] = value.strip(b" \t")
         length = headers.get(b"content-length", b"0")
         if b"transfer-encoding" in headers or not length or length.strip(b"0"):
             return None
@@ -122,16 +129,16 @@ class RequestHead:
 
     def words(self, name: bytes) -> list[str]:
         """Return the entries of the list *name*."""
-        return [word.strip() for word in self.text(name).split(",")]
+        text = self.text(name)
+        return [word.strip() for word in text.split(",")] if "," in text else [text]
 
-    @property
-    def websocket_key(self) -> bytes:
-        """The key of a valid request for an upgrade to WebSocket, empty if this is none."""
+    def _read_key(self) -> bytes:
         headers = self._headers
         key = headers.get(b"sec-websocket-key", b"")
+        options = headers.get(b"connection", b"").lower()
         is_upgrade = (
             headers.get(b"upgrade", b"").lower() == b"websocket"
-            and "upgrade" in self.text(b"connection").lower().replace(" ", "").replace("\t", "").split(",")
+            and (options == b"upgrade" or b"upgrade" in options.translate(None, b" \t").split(b","))
             and headers.get(b"sec-websocket-version") in _VERSIONS
             and _WEBSOCKET_KEY.fullmatch(key)
         )
@@ -179,8 +186,7 @@ def _http_answer(status: int, result: str, body: bytes, headers: Mapping[str, st
     return Rejected(status=status, body=body, result=result, headers=headers, answer=answer)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class HandshakeRequest:
+class HandshakeRequest(msgspec.Struct, frozen=True, kw_only=True):
     """What a handshake is judged by; a header that is absent is empty."""
 
     path: bytes
@@ -250,12 +256,11 @@ class HandshakePolicy:
             now_s: Unix seconds.
         """
         path, authorization, offered = request.path, request.authorization, request.offered
-        unnamed = RobotId(DEFAULT_TENANT, anonymous)
         if self._conformance_echo:
-            return Accepted(robot=unnamed, codec="", subprotocol="")
-        if path == HEALTH_PATH.encode():
+            return Accepted(robot=RobotId(DEFAULT_TENANT, anonymous), codec="", subprotocol="")
+        if path == _HEALTH_PATH:
             return self._healthy
-        asked = path.split(b"?")[0]
+        asked = path.partition(b"?")[0]
         if asked not in (self._path, self._rosbridge):
             return self._not_found
         if not self._origins.allows(request.origin, request.host):
@@ -263,19 +268,28 @@ class HandshakePolicy:
         if is_full:
             return self._full
         codec = ROSBRIDGE if asked == self._rosbridge else codec_for(offered)
+        name = codec or ""
+        if self.keys is None:
+            accepted = Accepted(
+                robot=RobotId(DEFAULT_TENANT, anonymous), codec=name, subprotocol=SUBPROTOCOLS.get(name, "")
+            )
+            return self._no_subprotocol if codec is None else accepted
         token = carried_token(authorization, offered)
-        accepted = Accepted(robot=unnamed, codec=codec or "", subprotocol=SUBPROTOCOLS.get(codec or "", ""))
-        if self.keys is not None:
-            if codec == ROSBRIDGE and not authorization and not token:
-                return replace(accepted, awaits_token=True)
-            verdict = self.with_token(accepted, token, now_s)
-            if isinstance(verdict, Rejected):
-                return verdict
-            accepted = verdict
-        return self._no_subprotocol if codec is None else accepted
+        if codec == ROSBRIDGE and not authorization and not token:
+            unnamed = RobotId(DEFAULT_TENANT, anonymous)
+            return Accepted(robot=unnamed, codec=name, subprotocol="", awaits_token=True)
+        verdict = self.with_token(token, now_s, codec=name)
+        return self._no_subprotocol if codec is None and isinstance(verdict, Accepted) else verdict
 
-    def with_token(self, accepted: Accepted, token: str, now_s: float) -> Accepted | Rejected:
-        """Return *accepted* with the robot that *token* names, or the rejection; *now_s* is Unix time."""
+    def with_token(self, token: str, now_s: float, *, codec: str, source: str = "") -> Accepted | Rejected:
+        """Return the robot that *token* names as accepted, or the rejection.
+
+        Args:
+            token: Of a robot that speaks *codec*.
+            now_s: Unix seconds.
+            codec: "" if it offered none that this server speaks.
+            source: The address that it came from.
+        """
         if self.keys is None:
             return replace(self._no_token, reason=_NO_KEYS)
         try:
@@ -284,13 +298,10 @@ class HandshakePolicy:
             proven = proven_refusal(error)
             refused = None if proven is None else _proven_rejection(proven, now_s)
             return replace(refused or self._no_token, reason=token_problem(error))
-        return replace(
-            accepted,
-            robot=claims.robot,
-            expires_s=self.ends_s(claims, now_s),
-            claims=claims,
-            awaits_token=False,
-        )
+        return Accepted(
+            robot=claims.robot, codec=codec, subprotocol=SUBPROTOCOLS.get(codec, ""),
+            expires_s=self.ends_s(claims, now_s), claims=claims, source=source,
+        )  # fmt: skip
 
     def ends_s(self, claims: Claims, now_s: float) -> float:
         """Return when a connection with *claims* ends, in Unix seconds; an expired token has its leeway."""

@@ -16,7 +16,6 @@ from rse_pf.backend.gateway.connection import RobotConnection
 from rse_pf.backend.gateway.handshake import Accepted, HandshakePolicy
 from rse_pf.backend.ports import WorkerContext
 from rse_pf.backend.rosbridge.codec import CODEC as ROSBRIDGE
-from rse_pf.identity import RobotId
 from rse_pf.wire.server_session import CLOSE_REPLACED, CLOSE_REVOKED, CLOSE_TOKEN_OVER
 
 __all__ = ["TokenWatch"]
@@ -103,11 +102,10 @@ class TokenWatch:
         self._context.log.info("replaced", robot=connection.robot)
         connection.close(CLOSE_REPLACED, "replaced")
 
-    def judge(self, token: str, unnamed: RobotId, source: str) -> Accepted | None:
+    def judge(self, token: str, source: str) -> Accepted | None:
         """Judge and record the token that a rosbridge client from *source* showed after its handshake."""
         metrics, now_s = self._context.metrics, self._context.clocks.wall()
-        waiting = Accepted(robot=unnamed, codec=ROSBRIDGE, subprotocol="", source=source)
-        verdict = self._handshake.with_token(waiting, token, now_s)
+        verdict = self._handshake.with_token(token, now_s, codec=ROSBRIDGE, source=source)
         self._recorder.record_verdict(verdict, source, token)
         if isinstance(verdict, Accepted):
             metrics.handshakes["ok"] += 1

@@ -35,7 +35,7 @@ from rse_pf.config.front_door import MAX_HANDSHAKE_BYTES
 from rse_pf.errors import MissingExtra
 from rse_pf.silent_connections import PendingHandshakes
 
-__all__ = ["PendingSocket", "RobotSockets", "listener_type", "protocol_options", "protocol_type"]
+__all__ = ["PendingSocket", "RobotSockets", "listener_type", "protocol_type"]
 
 _MAX_CLOSE_REASON_BYTES = 123
 _UPGRADE = (
@@ -68,6 +68,21 @@ class _NoLogger:
     def log(self, *args: Any) -> None: ...
 
     debug = info = warning = error = exception = log
+
+
+class _RobotSocket(socket.socket):
+    """An accepted socket, without the questions to the kernel that libraries ask for their log lines."""
+
+    family = socket.AF_INET  # IPv6 has the same options
+    type = socket.SOCK_STREAM
+
+    def getsockopt(self, *_: int) -> int:  # type: ignore[override]
+        return 0
+
+    def getsockname(self) -> None:
+        return None
+
+    getpeername = getsockname
 
 
 class PendingSocket:
@@ -141,6 +156,7 @@ class RobotSockets:
         self._context = dispatcher.context
         self._handshake = handshake
         serving = self._context.settings.serving
+        self._write_buffer_bytes = serving.write_buffer_bytes
         self._max_robots = max_robots
         self._sources = SourceRates(serving)
         per_source = 0 if serving.trusted_proxies else serving.max_unauthenticated_per_source
@@ -150,15 +166,14 @@ class RobotSockets:
         self._new_name = new_name
         self._recorder = recorder
         picows, self._transport = _libraries()
-        self._picows = picows
         clock = self._context.clocks.monotonic
         self._steps = DeferredWork(self._context.loop, clock=clock, bound_s=_HANDSHAKES_S)
         self._long_reads = DeferredWork(
             self._context.loop, clock=clock, bound_s=_HANDSHAKES_S, max_steps=_MAX_LONG_READS
         )
-        self._protocol = protocol_type(picows)
+        max_bytes = self._context.settings.session.max_message_bytes
+        self._protocol = protocol_type(picows, max_bytes, self._long_reads)
         self._listener = listener_type(picows, self._context.loop, serving)
-        self._protocol_options = protocol_options(picows, self._context.settings.session.max_message_bytes)
 
     @property
     def is_behind(self) -> bool:
@@ -175,7 +190,7 @@ class RobotSockets:
             peer: Address of the other end of the TCP connection.
         """
         family = socket.AF_INET6 if ":" in peer else socket.AF_INET
-        accepted = socket.socket(family, socket.SOCK_STREAM, 0, fileno=fd)
+        accepted = _RobotSocket(family, socket.SOCK_STREAM, 0, fd)
         accepted.setblocking(False)
         self._steps.add(self._read_first, PendingSocket(accepted, peer, on_end, number))
 
@@ -235,71 +250,56 @@ class RobotSockets:
         if not data:
             pending.close()
         elif end < 0:
-            self._refuse(pending, self._handshake.too_long)
+            self._refuse(pending, self._handshake.too_long, pending.peer)
         else:
             self._judge(pending, RequestHead.parse(pending.seen[:end]), pending.seen[end + 4 :])
         return True
 
     def _judge(self, pending: PendingSocket, head: RequestHead | None, rest: bytes) -> None:
         """Answer a handshake; *rest* was read behind its head.  No exception passes: the worker serves on."""
+        if head is None:
+            self._refuse(pending, self._handshake.no_request, pending.peer)
+            return
+        source, token = pending.peer, ""
         try:
-            verdict: Accepted | Rejected = self._handshake.no_request
-            if head is not None:
-                verdict = self._verdict(pending, head)
+            source = self._sources.source(pending.peer, head.text(b"x-forwarded-for"))
+            authorization, offered = head.text(b"authorization"), head.words(b"sec-websocket-protocol")
+            token = carried_token(authorization, offered)
+            verdict = self._verdict(head, authorization, offered, source)
+            self._recorder.record_verdict(verdict, source, token)
         except Exception as error:  # noqa: BLE001  the worker serves on
             self._context.log.error("defect", at="handshake", traceback=repr(error))
-            verdict, head = self._handshake.defect, None
-        if isinstance(verdict, Accepted) and head is not None:
+            verdict = self._handshake.defect
+        if isinstance(verdict, Accepted):
             self._context.metrics.handshakes["no-token-yet" if verdict.awaits_token else "ok"] += 1
-            self._serve(pending, verdict, (_UPGRADE % head.websocket_key, rest))
-        elif isinstance(verdict, Rejected):
-            self._refuse(pending, verdict, head)
+            self._serve(pending, verdict, _UPGRADE % head.websocket_key, rest)
+        else:
+            self._refuse(pending, verdict, source, token)
 
-    def _refuse(self, pending: PendingSocket, verdict: Rejected, head: RequestHead | None = None) -> None:
+    def _refuse(self, pending: PendingSocket, verdict: Rejected, source: str, token: str = "") -> None:
         self._context.metrics.handshakes[verdict.result] += 1
         if verdict.result != HEALTH:
-            about = {"source": pending.peer}
-            if head is not None:
-                token = carried_token(head.text(b"authorization"), head.words(b"sec-websocket-protocol"))
-                about = {"source": self._source(pending, head), **claimed_by(token)}
+            about = {"source": source, **claimed_by(token)}
             self._context.log.info("refused", result=verdict.result, reason=verdict.reason, **about)
         pending.close(verdict.answer)
 
-    def _serve(self, pending: PendingSocket, verdict: Accepted, request: tuple[bytes, bytes]) -> None:
-        serving, kinds = self._context.settings.serving, self._picows
+    def _serve(self, pending: PendingSocket, verdict: Accepted, upgrade: bytes, rest: bytes) -> None:
         listener = self._listener(self._dispatcher, verdict, pending.number)
-        answer = kinds.WSUpgradeResponseWithListener(_Upgrade(verdict.subprotocol), listener)
         accepted = pending.accepted
         try:
             # Otherwise the kernel buffers megabytes for a slow reader, unnoticed.
-            accepted.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, serving.write_buffer_bytes)
-            protocol = self._protocol(
-                pending.on_end,
-                request,
-                self._read_later(listener),
-                ws_listener_factory=lambda _: answer,
-                **self._protocol_options,
-            )
+            accepted.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, self._write_buffer_bytes)
+            protocol = self._protocol(listener, verdict.subprotocol, upgrade, rest, pending.on_end)
             self._transport(self._context.loop, accepted, protocol)
         except OSError:
             pending.close()
 
-    def _read_later(self, listener: Any) -> Callable[[], None]:
-        def read_later() -> None:
-            listener.hold()
-            self._long_reads.add(listener.read_on)
-
-        return read_later
-
-    def _source(self, pending: PendingSocket, head: RequestHead) -> str:
-        return self._sources.source(pending.peer, head.text(b"x-forwarded-for"))
-
-    def _verdict(self, pending: PendingSocket, head: RequestHead) -> Accepted | Rejected:
+    def _verdict(
+        self, head: RequestHead, authorization: str, offered: list[str], source: str
+    ) -> Accepted | Rejected:
         now = self._context.clocks.monotonic()
-        source = self._source(pending, head)
         if self._sources.wait_s(source, now) > 0:
             return replace(self._handshake.too_fast, reason="address-rate")
-        authorization, offered = head.text(b"authorization"), head.words(b"sec-websocket-protocol")
         verdict = self._handshake.judge(
             HandshakeRequest(
                 path=head.path,
@@ -314,12 +314,11 @@ class RobotSockets:
         )
         if isinstance(verdict, Accepted):
             if self._dispatcher.rates.banned_s(verdict.robot, now) > 0:
-                verdict = replace(self._handshake.too_fast, reason="robot-cut-off")
-            elif not head.websocket_key:
-                verdict = self._handshake.no_request
-            elif verdict.awaits_token:
-                verdict = replace(verdict, source=source)
-        self._recorder.record_verdict(verdict, source, carried_token(authorization, offered))
+                return replace(self._handshake.too_fast, reason="robot-cut-off")
+            if not head.websocket_key:
+                return self._handshake.no_request
+            if verdict.awaits_token:
+                return replace(verdict, source=source)
         return verdict
 
 
@@ -333,48 +332,34 @@ def _libraries() -> tuple[Any, Any]:
     return picows, SelectorSocketTransport
 
 
-def protocol_options(picows: Any, max_frame_bytes: int) -> dict[str, Any]:
-    """Return the options of picows' protocol for a robot's socket, without the listener's factory.
+def protocol_type(picows: Any, max_frame_bytes: int, long_reads: DeferredWork) -> Any:
+    """Return the subclass of picows' protocol that one robot's socket uses.
 
-    picows itself sends no pings and answers none: `RobotConnection` does.
+    picows itself sends no pings and answers none: `RobotConnection` does.  *long_reads* reads on where a
+    message is longer than one read.
     """
-    return {
-        "host_port": None,
-        "ws_path": None,
-        "is_client_side": False,
-        "logger": _NoLogger(),
-        "disconnect_on_exception": True,
-        "websocket_handshake_timeout": None,
-        "enable_auto_ping": False,
-        "auto_ping_idle_timeout": 20.0,
-        "auto_ping_reply_timeout": 20.0,
-        "auto_ping_strategy": picows.WSAutoPingStrategy.PING_WHEN_IDLE,
-        "enable_auto_pong": False,
-        "max_frame_size": max_frame_bytes,
-        "extra_headers": None,
-        "read_buffer_init_size": _READ_BUFFER_BYTES,
-    }
-
-
-def protocol_type(picows: Any) -> Any:
-    """Return the subclass of picows' protocol that one robot's socket uses."""
     base = picows.WSProtocol
     get_buffer, buffer_updated, connection_lost = base.get_buffer, base.buffer_updated, base.connection_lost
-    connection_made = base.connection_made
+    connection_made, begin, answer_with = (
+        base.connection_made, base.__init__, picows.WSUpgradeResponseWithListener,
+    )  # fmt: skip
+    auto_ping = (False, 20.0, 20.0, picows.WSAutoPingStrategy.PING_WHEN_IDLE)
+    disconnect_on_exception, auto_pong, handshake_timeout, extra_headers = True, False, None, None
+    options = (
+        _NoLogger(), disconnect_on_exception, handshake_timeout, *auto_ping, auto_pong, max_frame_bytes,
+        extra_headers, _READ_BUFFER_BYTES,
+    )  # fmt: skip
 
     class Protocol(base):  # type: ignore[misc, valid-type]
         """Passes nothing behind the first CLOSE to picows, and calls *on_end* when the socket is gone."""
 
         def __init__(
-            self,
-            on_end: Callable[[], None],
-            request: tuple[bytes, bytes],
-            read_later: Callable[[], None],
-            **options: Any,
+            self, listener: Any, subprotocol: str, upgrade: bytes, rest: bytes, on_end: Callable[[], None]
         ) -> None:
-            super().__init__(**options)
-            self._request = request
-            self._read_later = read_later
+            answer = answer_with(_Upgrade(subprotocol), listener)
+            begin(self, None, None, False, lambda _: answer, *options)
+            self._request = (upgrade, rest)
+            self._listener = listener
             self._is_made = False
             self._on_end = on_end
             self._border = CloseBorder(upgraded=True)
@@ -408,7 +393,8 @@ def protocol_type(picows: Any) -> Any:
                 buffer_updated(self, size)
             if is_full and self._is_made:
                 # The transport would read on up to 256 KiB, and then the next socket, in the same round.
-                self._read_later()
+                self._listener.hold()
+                long_reads.add(self._listener.read_on)
 
         def connection_lost(self, error: Exception | None) -> None:
             try:

@@ -13,6 +13,7 @@ import socket
 import time
 from collections import deque
 from collections.abc import Callable
+from typing import Any
 
 from rse_pf.backend.gateway.rate_limits import HANDSHAKE_BURST
 from rse_pf.config import ServingSettings
@@ -31,6 +32,8 @@ _MAX_READY = 1024
 """Sockets that have begun to send and wait for their turn; above that no more are accepted."""
 _LISTEN_BACKLOG = 4096
 """Connections that wait for accept; the kernel cuts it to net.core.somaxconn."""
+
+_PEEK = socket.MSG_PEEK | socket.MSG_DONTWAIT
 
 Accepted = tuple[socket.socket, int, str]
 """A socket, which one of the server it is, and the address of the other end."""
@@ -59,6 +62,8 @@ class RobotAcceptor:
             on_refused: Gets the reason when the system accepts no more.
         """
         self._listener = listener
+        self._accept: Callable[[], tuple[int, Any]] = listener._accept  # type: ignore[attr-defined]
+        """`socket.accept` without the questions about family and kind of the socket."""
         self._serving = serving
         self._silent_s = silent_s
         self._pass_on = pass_on
@@ -112,7 +117,7 @@ class RobotAcceptor:
             if len(self._ready) >= _MAX_READY:
                 break
             try:
-                connection, address = self._listener.accept()
+                fd, address = self._accept()
             except BlockingIOError:
                 return
             except OSError as error:  # out of descriptors, or the robot is gone already
@@ -120,7 +125,8 @@ class RobotAcceptor:
                 self._pause_accepting(_REFUSED_PAUSE_S)
                 return
             self._accepted += 1
-            self._take((connection, self._accepted, str(address[0])))
+            connection = socket.socket(socket.AF_INET, socket.SOCK_STREAM, 0, fd)
+            self._take((connection, self._accepted, address[0]))
         self._pause_accepting(_ACCEPT_PAUSE_S)
 
     def _pause_accepting(self, pause_s: float) -> None:
@@ -136,10 +142,8 @@ class RobotAcceptor:
     def _take(self, accepted: Accepted) -> None:
         assert self._silent is not None
         connection, _, address = accepted
-        connection.setblocking(False)
         if self._has_begun(accepted):
-            self._ready.append(accepted)
-            self._serve_ready()
+            self._serve_ready(accepted)
             return
         if connection.fileno() < 0:
             return  # it has ended
@@ -151,8 +155,8 @@ class RobotAcceptor:
         assert self._silent is not None
         self._loop.remove_reader(accepted[0].fileno())
         self._silent.leave(accepted)
-        self._ready.append(accepted)
-        self._serve_ready()
+        if self._has_begun(accepted):
+            self._serve_ready(accepted)
 
     def _drop(self, accepted: Accepted) -> None:
         self._loop.remove_reader(accepted[0].fileno())
@@ -161,7 +165,7 @@ class RobotAcceptor:
     def _has_begun(self, accepted: Accepted) -> bool:
         """Return whether bytes have come; a socket that has ended is closed."""
         try:
-            if accepted[0].recv(1, socket.MSG_PEEK):
+            if accepted[0].recv(1, _PEEK):
                 return True
         except BlockingIOError:
             return False
@@ -172,20 +176,27 @@ class RobotAcceptor:
 
     # --- sockets that have begun to send -----------------------------------------------------------
 
-    def _serve_ready(self) -> None:
-        if self._rate_pause is None:
-            self._pass_on_some()
+    def _serve_ready(self, accepted: Accepted) -> None:
+        """Pass on *accepted*, which has begun to send, or let it wait for the rate."""
+        if self._rate_pause is not None or not self._has_turn(accepted):
+            self._ready.append(accepted)
+
+    def _has_turn(self, accepted: Accepted) -> bool:
+        """Pass on *accepted* if the rate allows it, else plan when it does."""
+        wait_s = self._rate.take(time.monotonic()) if self._rate.rate > 0 else 0.0
+        if wait_s > 0:
+            self.pauses += 1
+            self._rate_pause = self._loop.call_later(max(wait_s, _MIN_PAUSE_S), self._pass_on_some)
+            return False
+        self._pass_on(accepted[0].fileno(), accepted[1], accepted[2])
+        accepted[0].close()
+        return True
 
     def _pass_on_some(self) -> None:
         """Pass on what the rate allows, in the order in which they began to send."""
         self._rate_pause = None
         while self._ready:
-            accepted = self._ready[0]
-            if self._has_begun(accepted):
-                wait_s = self._rate.take(time.monotonic()) if self._rate.rate > 0 else 0.0
-                if wait_s > 0:
-                    self.pauses += 1
-                    self._rate_pause = self._loop.call_later(max(wait_s, _MIN_PAUSE_S), self._pass_on_some)
-                    return
-                self._pass_on(accepted[0].fileno(), accepted[1], accepted[2])
-            self._ready.popleft()[0].close()
+            # One may have ended while it waited.
+            if self._has_begun(self._ready[0]) and not self._has_turn(self._ready[0]):
+                return
+            self._ready.popleft()

@@ -27,15 +27,14 @@ class SessionRegistry:
 
     def handle(self, worker: WorkerProcess, message: dict[str, Any]) -> None:
         """Handle what a worker reports of one socket: ``arrived``, ``stays`` or ``left``."""
-        robot = RobotId(*message["robot"])
-        number = int(str(message["number"]))
+        robot, number, event = RobotId(*message["robot"]), message["number"], message["event"]
         sockets = self._sockets.setdefault(robot, {})
-        if message["event"] == "arrived":
+        if event == "arrived":
             sockets[number] = worker
-        elif message["event"] == "left":
+        elif event == "left":
             sockets.pop(number, None)
         for older in sorted(sockets)[:-1]:
-            if message["event"] == "arrived" or older == number:
+            if event == "arrived" or older == number:
                 sockets[older].order(ReplaceOrder(older))
         if not sockets:
             del self._sockets[robot]

@@ -290,7 +290,9 @@ class _Supervisor:
 
     def _pass_on(self, fd: int, number: int, peer: str) -> None:
         """Send an accepted socket to the worker with the fewest."""
-        for worker in sorted(self._workers, key=_load_of):
+        if min(self._workers, key=_load_of).give(fd, number, peer):
+            return
+        for worker in sorted(self._workers, key=_load_of)[1:]:  # that one is behind
             if worker.give(fd, number, peer):
                 return
         self._refused_full += 1

@@ -11,7 +11,6 @@ import asyncio
 import base64
 import contextlib
 import gc
-import json
 import os
 import secrets
 import signal
@@ -22,6 +21,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
+
+import msgspec
 
 from rse_pf.auth.tokens import KeySet
 from rse_pf.auth.trust_store import key_set_from_snapshot
@@ -497,7 +498,7 @@ class _Worker:
         return f"anonymous-{(self._named - 1) * self._workers + self._index + 1}"
 
     def _say(self, **message: Any) -> None:
-        self._writer.write(json.dumps(message).encode() + b"\n")
+        self._writer.write(msgspec.json.encode(message) + b"\n")
 
     def _keep(self, work: Any) -> None:
         task = self._loop.create_task(work)

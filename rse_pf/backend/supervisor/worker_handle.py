@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import asyncio
 import gc
-import json
 import os
 import signal
 import socket
@@ -18,6 +17,8 @@ import sys
 import traceback
 from collections.abc import Callable, Sequence
 from typing import Any, NoReturn
+
+import msgspec
 
 from rse_pf.backend.supervisor.orders import (
     BlocksOrder,
@@ -188,7 +189,7 @@ class WorkerProcess:
     async def _listen(self, reader: asyncio.StreamReader, ready: asyncio.Event) -> None:
         try:
             while line := await reader.readline():
-                self._on_message(json.loads(line), ready)
+                self._on_message(msgspec.json.decode(line), ready)
         except OSError:
             pass  # a killed worker resets its channel: the same end as below
         self.gone.set()

@@ -9,19 +9,15 @@ from types import SimpleNamespace
 from fakes import FakeLoop
 from picows import picows
 
-from rse_pf.backend.gateway.websocket import listener_type, protocol_options, protocol_type
+from rse_pf.backend.gateway.websocket import listener_type, protocol_type
+from rse_pf.backend.scheduling.deferred_work import DeferredWork
 from rse_pf.config import ServingSettings
 
 
 def test_the_protocol_takes_the_options_that_we_give_it():
     async def make() -> object:
-        return protocol_type(picows)(
-            lambda: None,
-            (b"", b""),
-            lambda: None,
-            ws_listener_factory=lambda request: None,
-            **protocol_options(picows, 1000),
-        )
+        reads = DeferredWork(FakeLoop(), clock=lambda: 0.0, bound_s=1.0)
+        return protocol_type(picows, 1000, reads)(picows.WSListener(), "", b"", b"", lambda: None)
 
     protocol = asyncio.run(make())
 
