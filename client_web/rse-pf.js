@@ -19,6 +19,9 @@ const MAX_PUT_BYTES = 1 << 18;
 const MAX_PART_BYTES = 1 << 20;
 const MAX_BAD_MESSAGES = 10;
 const MAX_RETRIES = 5;
+const MAX_REFUSED_IDS = 64;
+// For so long it believes one word of a server about its rate.
+const MAX_PAUSE_S = 60;
 // A client that uses a little less than its limits is not refused when a network bunches messages.
 const SHARE = 0.9;
 // A first connect and the calls wait for the end of a refusal that is so near.
@@ -52,6 +55,9 @@ const later = (call, ...words) => queueMicrotask(() => call(...words));
 const CONNECT = "connect";
 const UNSUPPORTED = "unsupported";
 const USAGE = "usage";
+// The sentences that are used twice.
+const NO_ANSWER = "no answer";
+const TOO_LARGE = "a message is too large";
 
 /** An error with a stable code of docs/protocol.md, section 5. */
 export class RsePfError extends Error {
@@ -63,9 +69,9 @@ export class RsePfError extends Error {
 
 const wrong = (...words) => new RsePfError(...words);
 const told = (failure) => wrong(failure.code, failure.message, failure.hint, failure);
-const unreadable = (message) => wrong("protocol", message, "is it an RSE-PF server?");
-const cancelled = () => wrong("cancelled", "the robot took the command back");
-const unauthorized = (message = "the token is missing, wrong, expired or revoked", hint = "use a fresh token") =>
+const unreadable = (message) => wrong("protocol", message, "no RSE-PF server?");
+const cancelled = () => wrong("cancelled", "taken back");
+const unauthorized = (message = "no valid token", hint = "use a fresh token") =>
   wrong("unauthorized", message, hint);
 
 // --- codecs (section 1) ----------------------------------------------------------------------------------
@@ -81,7 +87,7 @@ const through = async ({ writable, readable }, bytes, limit) => {
       joined.set(whole);
       joined.set(step.value, whole.length);
       whole = joined;
-      if (whole.length > limit) throw unreadable("a message is too large");
+      if (whole.length > limit) throw unreadable(TOO_LARGE);
     }
   };
   // A stream that refuses what is written gives its reader nothing, not even an error.
@@ -129,30 +135,13 @@ const rounded = (values, scale) => from(values, (value) => round(value * scale) 
 
 const sha256 = async (bytes) => {
   if (!crypto.subtle) {
-    throw wrong(UNSUPPORTED, "this page may not compute sha256", "serve it by https or localhost");
+    throw wrong(UNSUPPORTED, "no sha256 on this page", "use https or localhost");
   }
   const found = bytesOf(await crypto.subtle.digest("SHA-256", bytes));
   return from(found, (byte) => byte.toString(16).padStart(2, "0")).join("");
 };
 
 // --- a connection ----------------------------------------------------------------------------------------
-
-/** Return how many messages may be sent on *link* (section 4, "Rate"), and note when one more may. */
-const allowance = (link, time) => {
-  // What does not leave the machine yet can still be replaced by a newer frame.
-  if (link._socket.bufferedAmount > MAX_BUFFERED_BYTES) {
-    link._nextAt = time + 0.02;
-    return 0;
-  }
-  const { max_commands_per_s: limit, command_burst: burst } = link._limits;
-  if (!limit) return Infinity;
-  const rate = limit * link._share;
-  const fresh = max(0, time - link._filledAt);
-  link._left = min(max(1, burst * link._share), link._left + fresh * rate);
-  link._filledAt += fresh;
-  link._nextAt = link._filledAt + (1 - link._left) / rate;
-  return link._left | 0;
-};
 
 /** Return whether the claims of a token say that it has expired; one that cannot be read has not. */
 const isExpired = (token) => {
@@ -166,21 +155,21 @@ const isExpired = (token) => {
 const trimmed = (token) => `${token || ""}`.trim();
 const bearer = (token) => (token ? { Authorization: "Bearer " + token } : {});
 
-const BROKEN = ["protocol", "this client breaks the protocol"];
+const BROKEN = ["protocol", "a defect of this client"];
 /** Close codes after which a robot connects again much later (section 6): code and sentence of its error. */
 const REFUSALS = {
   1002: BROKEN,
   1007: BROKEN,
   1008: BROKEN,
-  1009: ["too-large", "a message has too many bytes or pieces"],
+  1009: ["too-large", TOO_LARGE],
   4400: BROKEN,
-  4406: [UNSUPPORTED, "the server speaks another version", "update rse-pf.js"],
-  4409: ["conflict", "another connection replaced this one", "give every robot its own token"],
+  4406: [UNSUPPORTED, "another protocol version", "update rse-pf.js"],
+  4409: ["conflict", "another one replaced it", "one token for each robot"],
 };
 
 /** Node's words for an attempt that reached nobody; a browser tells no more than whether it is online. */
 const NOWHERE = /^E(NET|HOST|AI_|NOTF|TIMED)|^Timeout/;
-const isOnline = () => globalThis.navigator?.onLine;
+const isOnline = () => navigator.onLine;
 
 /** Mark an error as the refusal of a server: the robot connects again in 20 to 40 s, or once its tokens are valid. */
 const refused = (failed, validInS = Infinity) => {
@@ -200,14 +189,16 @@ export const connect = async (url, options = {}) => {
   } = options;
   const { encode, decode } = codecs[codec] || {};
   if (!encode) throw wrong(USAGE, `no codec named ${codec}`, `choose ${Object.keys(codecs)}`);
-  if (!WebSocket) throw wrong(UNSUPPORTED, "no WebSocket here", "use Node 22 or newer");
+  if (!WebSocket) throw wrong(UNSUPPORTED, "no WebSocket", "use Node 22 or newer");
   const stallS = stallTimeoutMs / 1e3;
   const links = new Set();
   const pending = new Map();
   const subscriptions = new Map();
-  const sequences = { __proto__: null };
-  const delivered = { __proto__: null };
-  const counts = { sent: 0, answered: 0, resent: 0, reconnects: 0, moves: 0, bytesUp: 0, bytesDown: 0 };
+  const lanes = { __proto__: null };
+  const counts = {
+    sent: 0, answered: 0, resent: 0, reconnects: 0, moves: 0, bytesUp: 0, bytesDown: 0, heldByRate: 0, heldByBusy: 0,
+    heldByLimit: 0,
+  };
   let { token } = options;
   let current = null;
   let lastId = 0;
@@ -245,7 +236,7 @@ export const connect = async (url, options = {}) => {
     const protocol = "rse-pf.v1." + codec;
     const time = now();
     const link = {
-      _token: used, _limits: {}, _share: share, _left: Infinity, _filledAt: time, _heardAt: time, _checkedAt: time,
+      _token: used, _limits: {}, _left: Infinity, _filledAt: time, _heardAt: time, _checkedAt: time,
       _pingedAt: -Infinity, _renewAt: Infinity, _bad: 0,
     };
     let socket;
@@ -258,7 +249,7 @@ export const connect = async (url, options = {}) => {
       );
     } catch (failed) {
       // Its message may contain the token.
-      throw refused(wrong(USAGE, "no WebSocket for this address and token: " + failed.name, "wss: from https pages"));
+      throw refused(wrong(USAGE, "no WebSocket: " + failed.name, "wss: from https pages"));
     }
     link._socket = socket;
     links.add(link);
@@ -272,8 +263,8 @@ export const connect = async (url, options = {}) => {
       });
       socket.onopen = () =>
         socket.protocol === protocol
-          ? say(link, "hello", { sdk, capabilities: ["progress", "updates"] })
-          : lose(link, refused(unreadable("the server does not speak " + protocol)));
+          ? say(link, "hello", { sdk, capabilities: ["progress", "updates", "refusals", "rate"] })
+          : lose(link, refused(unreadable("it does not speak " + protocol)));
       socket.onmessage = (event) => hear(link, event.data);
       // Node 22 has no close event for a handshake that failed; elsewhere it follows.
       socket.onerror = () => {
@@ -295,7 +286,7 @@ export const connect = async (url, options = {}) => {
       notBefore = now() + 5;
     }
     const refusalOfCode = REFUSALS[code];
-    let failed = wrong(...(refusalOfCode || [CONNECT, "the connection ended: " + code, "is it up, the token valid, the origin allowed?"]));
+    let failed = wrong(...(refusalOfCode || [CONNECT, "closed with " + code, "is it up, the token valid, the origin allowed?"]));
     // An attempt that was given up may still replace the connection that came after it.
     const isOwn = code === 4409 && (current?._moveUntil || now() < lateUntil);
     if (refusalOfCode && (link === current || !current) && !isOwn) refused(failed);
@@ -354,7 +345,7 @@ export const connect = async (url, options = {}) => {
       const wasOnline = isOnline();
       // Not so long if the clock of this machine is set, which may make tokens valid, or if there is another token
       // or a network.
-      while (now() < until && !error && trouble === before && isOnline() === wasOnline && Math.abs(clockOffset() - offset) < CLOCK_SET_S) {
+      while (now() < until && !error && trouble === before && isOnline() === wasOnline && (clockOffset() - offset) ** 2 < CLOCK_SET_S ** 2) {
         await pause(0.1);
       }
       if (error) break;
@@ -454,7 +445,7 @@ export const connect = async (url, options = {}) => {
     const write = (data) => {
       const size = sizeOf(data);
       if (command && (size > link._limits.max_message_bytes || text.length > MAX_INFLATED_BYTES)) {
-        settle(command, wrong("too-large", `a command of ${size} bytes is above the limit`, "upload it, and name its digest"));
+        settle(command, wrong("too-large", `${size} bytes are too many`, "upload it, name its digest"));
       } else if (links.has(link)) {
         counts.bytesUp += size;
         link._socket.send(data);
@@ -509,17 +500,50 @@ export const connect = async (url, options = {}) => {
         if (isHere && subscription) later(subscription._onUpdate, message.key || "", message.payload ?? null, message.seq);
       },
       progress() {
-        if (isOfLink) progress(each, message);
+        if (!isOfLink) return;
+        const { _isLong: wasLong, _onProgress: onProgress } = each;
+        each._isLong = true;
+        if (each._isCancelled) {
+          if (!wasLong) withdraw(each);
+        } else {
+          if (each._isDefault) each._until = Infinity;
+          if (onProgress) later(onProgress, min(1, max(0, message.done)), message.what || "");
+        }
       },
       failure() {
-        if (id == null) notice(link, message, time);
-        else if (subscription && isHere) {
+        const failed = told(message);
+        if (id == null) {
+          // It is about a message or the session, not about one command.
+          if (message.code === "busy") {
+            link._left = 0;
+            link._filledAt = time + (message.retry_after_ms || 0) / 1e3;
+          }
+          renewal(failed);
+          if (!link._welcome) lose(link, message.code === UNSUPPORTED ? refused(failed) : failed);
+        } else if (subscription && isHere) {
           subscriptions.delete(id);
-          later(subscription._onEnd, told(message));
-        } else if (isOfLink && !again(each, message, time)) settle(each, told(message));
+          later(subscription._onEnd, failed);
+        } else if (isOfLink && !again(each, message, time)) settle(each, failed);
+      },
+      refused() {
+        from(new Set(message.ids)).slice(0, MAX_REFUSED_IDS).forEach((id) => receive(link, { ...message, type: "failure", id }));
+      },
+      rate() {
+        const { commands_per_s: perS, for_ms: forMs } = message;
+        if (!(perS > 0 && forMs >= 0)) return;
+        counts.toldRatePerS = perS;
+        link._toldPause = 1 / perS;
+        link._toldUntil = time + min(MAX_PAUSE_S, forMs / 1e3);
       },
       result() {
-        if (each) answer(each, message, time);
+        if (!each) return;
+        const { _lane: lane, _seq: seq } = each;
+        if (time >= each._until) settle(each, expired(each, time));
+        else if (!isReplaced(each, lane._delivered)) {
+          if (!each._isCancelled) lane._delivered = max(seq, lane._delivered);
+          const { reply = null, object = "", server = "", queue_ms: queueMs = 0, compute_ms: computeMs = 0 } = message;
+          settle(each, null, { id, reply, object, server, queueMs, computeMs, roundTripMs: (time - each._from) * 1e3 });
+        }
       },
     }[type];
     if (!take) throw type;
@@ -527,48 +551,16 @@ export const connect = async (url, options = {}) => {
     flush();
   };
 
-  const answer = (each, message, time) => {
-    const { _stream: stream, _seq: seq } = each;
-    if (time >= each._until) settle(each, expired(each, time));
-    else if (!isReplaced(each, delivered)) {
-      if (!each._isCancelled) delivered[stream] = max(seq, delivered[stream] || 0);
-      const { reply = null, object = "", server = "", queue_ms: queueMs = 0, compute_ms: computeMs = 0 } = message;
-      settle(each, null, { id: each._id, reply, object, server, queueMs, computeMs, roundTripMs: (time - each._from) * 1e3 });
-    }
-  };
-
-  /** A failure of a message or of the session, not of one command. */
-  const notice = (link, message, time) => {
-    const failed = told(message);
-    if (message.code === "busy") {
-      link._left = 0;
-      link._filledAt = time + (message.retry_after_ms || 0) / 1e3;
-    }
-    renewal(failed);
-    if (!link._welcome) lose(link, message.code === UNSUPPORTED ? refused(failed) : failed);
-  };
-
   /** Send again where another server or a later time may help (section 5); return whether that happens. */
   const again = (each, { code, retry_after_ms: afterMs }, time) => {
     const after = time + (afterMs || 0) / 1e3;
     const isLost = code === "worker-lost" && each._losses++ < 2;
-    const isBusy = code === "busy" && after < each._until && retries >= 1;
-    if (each._isCancelled || !(isLost || isBusy)) return false;
+    const isBusy = code === "busy";
+    if (isBusy && after > time) each._lane._busyUntil = min(after, time + MAX_PAUSE_S);
+    if (each._isCancelled || !(isLost || (isBusy && after < each._until && retries >= 1))) return false;
     if (isBusy) retries--;
-    each._notBefore = after;
     each._link = null;
     return true;
-  };
-
-  const progress = (each, message) => {
-    const { _isLong: wasLong, _onProgress: onProgress } = each;
-    each._isLong = true;
-    if (each._isCancelled) {
-      if (!wasLong) withdraw(each);
-    } else {
-      if (each._isDefault) each._until = Infinity;
-      if (onProgress) later(onProgress, min(1, max(0, message.done)), message.what || "");
-    }
   };
 
   const cancel = (each) => {
@@ -593,10 +585,10 @@ export const connect = async (url, options = {}) => {
     if (each._isLong && each._link) say(each._link, "cancel", { id: each._id });
   };
 
-  /** End a command if it comes before the one of its stream in *newest*; return whether it does. */
+  /** End a command if it comes before number *newest* of its stream; return whether it does. */
   const isReplaced = (each, newest) => {
-    const isOlder = !each._keep && each._seq < newest[each._stream];
-    if (isOlder) settle(each, wrong("stale", "a newer frame took its place"));
+    const isOlder = !each._keep && each._seq < newest;
+    if (isOlder) settle(each, wrong("stale", "a newer one came"));
     return isOlder;
   };
 
@@ -621,18 +613,38 @@ export const connect = async (url, options = {}) => {
     link._renewAt = now() + 0.8 * seconds;
   };
 
+  /** Return how many commands may be sent (section 4, "Rate" and "Overload"), or minus the seconds until one may. */
+  const allowance = (time) => {
+    const { _toldUntil: toldUntil, _limits: limits } = current;
+    // What does not leave the machine yet can still be replaced by a newer frame.
+    if (current._socket.bufferedAmount > MAX_BUFFERED_BYTES) return -0.02;
+    const wait = min(toldUntil, current._commandAt + current._toldPause) - time;
+    if (wait > 0) return -wait;
+    const told = toldUntil > time ? 1 : Infinity;
+    const rate = limits.max_commands_per_s * share;
+    if (!rate) return told;
+    const fresh = max(0, time - current._filledAt);
+    const left = (current._left = min(max(1, limits.command_burst * share), current._left + fresh * rate));
+    current._filledAt += fresh;
+    return left < 1 ? time - current._filledAt - (1 - left) / rate : min(told, left | 0);
+  };
+
   // --- time ----------------------------------------------------------------------------------------------
 
   /** Send the waiting commands, oldest first, as far as the server's limits allow. */
   const flush = () => {
     const time = now();
     if (current) {
-      let room = min(allowance(current, time), max(1, current._limits.max_in_flight) - sentOn(current).length);
+      let room = min(allowance(time), max(1, current._limits.max_in_flight) - sentOn(current).length);
       pending.forEach((each) => {
-        if (each._link || time < each._notBefore || isReplaced(each, sequences) || room-- <= 0) return;
+        if (each._link || isReplaced(each, each._lane._sent)) return;
+        const why = time < each._lane._busyUntil ? "Busy"
+          : room-- > 0 ? 0
+          : time < current._toldUntil ? "Rate" : "Limit";
+        if (why) return (each._isHeld ||= ++counts["heldBy" + why]);
         if (each._at) counts.resent++;
         each._link = current;
-        each._at = time;
+        current._commandAt = each._at = time;
         const left = max(0, min(MAX_DEADLINE_MS, (each._until - time) * 1e3));
         send(current, `${each._head},"deadline_ms":${left},"payload":${each._payload}}`, each);
         if (each._isCancelled) withdraw(each);
@@ -666,7 +678,7 @@ export const connect = async (url, options = {}) => {
     const first = min(...sentOn(link).map((each) => (each._isLong ? Infinity : each._at)));
     const isSilent = time - max(link._heardAt, first) >= stallS;
     if (isSilent || time - (link._unansweredAt ?? time) >= PONG_S) {
-      return lose(link, wrong(CONNECT, "the server does not answer"));
+      return lose(link, wrong(CONNECT, NO_ANSWER));
     }
     if (time - link._pingedAt >= (first < time ? min(PING_S, stallS / 3) : PING_S)) {
       link._unansweredAt ??= time;
@@ -683,10 +695,12 @@ export const connect = async (url, options = {}) => {
   /** Set the timer for what is due next. */
   const schedule = () => {
     const time = now();
-    const readyAt = current && allowance(current, time) < 1 ? current._nextAt : Infinity;
+    const room = current ? allowance(time) : 1;
+    const readyAt = room < 1 ? time - room : Infinity;
     let due = time + stallS / 3;
     pending.forEach((each) => {
-      due = min(due, each._until, each._link ? Infinity : each._notBefore > time ? each._notBefore : readyAt);
+      const at = each._lane._busyUntil;
+      due = min(due, each._until, each._link ? Infinity : at > time ? at : readyAt);
     });
     if (error || due >= timerAt) return;
     clearTimeout(timer);
@@ -707,7 +721,7 @@ export const connect = async (url, options = {}) => {
       const { status, name } = response;
       const failed = status
         ? told({ code: "store", message: "HTTP " + status, ...(await response.json().catch(nothing)) })
-        : wrong(CONNECT, "no data service: " + name, "is this page's origin in serving.allowed_origins?");
+        : wrong(CONNECT, "no data service: " + name, "see serving.allowed_origins");
       if (tries > 4 || (status && !/408|429|50[0234]/.test(status))) throw failed;
       await pause(random() * 0.2 * 2 ** tries);
     }
@@ -736,23 +750,26 @@ export const connect = async (url, options = {}) => {
       new Promise((resolve, reject) => {
         const { deadlineMs, stream = "", keep: isKept = false, trace = "", onProgress, signal } = options;
         if (error || refusal || signal?.aborted) throw error || refusal || cancelled();
-        if (deadlineMs != null && !(deadlineMs > 0 && deadlineMs <= MAX_DEADLINE_MS)) {
-          throw wrong(USAGE, `deadlineMs = ${deadlineMs} is not within 0..${MAX_DEADLINE_MS}`);
+        if (!((deadlineMs ?? 1) > 0) || deadlineMs > MAX_DEADLINE_MS) {
+          throw wrong(USAGE, `deadlineMs is within 0..${MAX_DEADLINE_MS}, not ${deadlineMs}`);
         }
         const time = now();
         const id = ++lastId;
-        const seq = (sequences[stream] || 0) + 1;
+        // A command without a stream has one of its own.
+        const fresh = { _sent: 0, _delivered: 0 };
+        const lane = stream ? (lanes[stream] ||= fresh) : fresh;
+        const seq = lane._sent + 1;
         const each = {
-          _id: id, _stream: stream, _seq: seq, _keep: isKept || !stream, _onProgress: onProgress, _signal: signal,
+          _id: id, _lane: lane, _seq: seq, _keep: isKept, _onProgress: onProgress, _signal: signal,
           // As text, so that the caller may use the arrays again.
           _head: textOf({ type: "command", id, service, stream, seq, keep: isKept, trace }).slice(0, -1),
           _payload: textOf(payload),
           _from: time, _until: time + (deadlineMs ? deadlineMs / 1e3 : onProgress ? Infinity : ANSWER_S),
-          _isDefault: !deadlineMs, _at: 0, _notBefore: 0, _losses: 0,
+          _isDefault: !deadlineMs, _at: 0, _losses: 0,
           _end: ending(resolve, reject), _cancel: () => cancel(each),
         };
         signal?.addEventListener("abort", each._cancel);
-        sequences[stream] = seq;
+        lane._sent = seq;
         retries = min(MAX_RETRIES, retries + 0.1);
         counts.sent++;
         pending.set(id, each);
@@ -787,7 +804,7 @@ export const connect = async (url, options = {}) => {
         renewal(cancelled());
         trouble = {};
         if (!current) return resolve();
-        renewal = ending(resolve, reject, ANSWER_S * 1e3, () => reject(wrong("expired", "no answer to renew")));
+        renewal = ending(resolve, reject, ANSWER_S * 1e3, () => reject(wrong("expired", NO_ANSWER)));
         say(current, "renew", { token: fresh });
       }),
 
@@ -818,11 +835,11 @@ export const connect = async (url, options = {}) => {
 
     download: async (digest, { signal } = {}) => {
       const bytes = bytesOf(await (await http("GET", "objects/" + digest, null, signal)).arrayBuffer());
-      if ((await sha256(bytes)) !== digest) throw wrong("store", "the bytes do not match the digest", "try again");
+      if ((await sha256(bytes)) !== digest) throw wrong("store", "the digest does not match", "try again");
       return bytes;
     },
 
-    close: () => end(wrong("disconnected", "the robot closed its connection")),
+    close: () => end(wrong("disconnected", "closed")),
   };
 
   await keep();
