@@ -19,6 +19,7 @@ from rse_pf.errors import ProtocolError
 from rse_pf.geometry import Array, Camera
 from rse_pf.native import address_of, find_library, load_part
 from rse_pf.native_front_end import FrontEndCore, open_front_end
+from rse_pf.native_matcher import MATCH_ABI
 from rse_pf.native_tracker import TrackCore, open_tracker
 from rse_pf.pnp import PnpSolution
 from rse_pf.pnp.native_depth import DepthCore, RefinedPose, open_depth
@@ -239,7 +240,10 @@ def _refine_hostile_sizes(inliers: Anything, points: Array) -> None:
 
 
 def describe(data: bytes, meter: Meter) -> None:
-    """Check that any picture and keypoints give descriptors or None, and that nothing else is written."""
+    """Check that any picture and keypoints give descriptors or None, and that nothing else is written.
+
+    So does a picture give keypoints, which lie within it.
+    """
     cores = _front_ends()
     if len(data) < _HEAD or not cores:
         return
@@ -270,6 +274,42 @@ def describe(data: bytes, meter: Meter) -> None:
     expect(found is None or bool(((octaves >= 0) & (octaves < levels)).all()), "an octave without a level")
     expect(found is None or bool(np.isfinite(pixels).all()), "a keypoint at a place that is no number")
     _describe_directly(gray, pixels, angles_deg, octaves, scale, levels)
+    detected = cores[0].detect(gray, n, scale=scale, levels=levels, threshold=kind)
+    if detected is not None:
+        is_inside = (detected.pixels >= 0) & (detected.pixels < np.maximum(width, height))
+        expect(bool(is_inside.all()), "a keypoint outside of the picture")
+        expect(bool(np.isfinite(detected.responses + detected.angles_deg).all()), "no number")
+        expect(bool(((detected.octaves >= 0) & (detected.octaves < levels)).all()), "an unknown level")
+    _detect_directly(gray, n, scale, levels, kind)
+
+
+def _detect_directly(gray: Anything, n: int, scale: float, levels: int, threshold: int) -> None:
+    call, (height, width), gray = _functions()["rse_pf_detect"], gray.shape, np.array(gray)
+    with np.errstate(over="ignore", invalid="ignore"):
+        scales = np.float32(scale) ** np.arange(max(levels, 1), dtype=np.float32)
+    wanted = np.full(max(levels, 1), n, dtype=np.int64)
+    work = Room(8 * (width * height // 2 + 8 * width + height + 64))
+    out = [Room(each * n) for each in (8, 4, 4, 4)]
+
+    def called(width: int, height: int, levels: int, threshold: int, room: int) -> int:
+        request = np.zeros(8, dtype=np.int64)
+        request[:5] = address_of(gray), width, height, address_of(scales), address_of(wanted)
+        request[5:6].view(np.int32)[:] = levels, threshold
+        request[6:] = room, work.at
+        answer: int = call(address_of(request), *(each.at for each in out))
+        return answer
+
+    expect(called(width, height, levels, threshold, n) <= n, "more keypoints than there is room")
+    for size in HOSTILE_SIZES:
+        for sides in ((size, 50), (50, size)):
+            expect(called(*sides, 8, 7, n) == -1, f"sides {sides} are not refused")
+        expect(called(width, height, 8, 7, size) == -1, f"room for {size} is not refused")
+    for bad in (-1, 0, 33, 2**31 - 1):
+        expect(called(width, height, bad, 7, n) == -1, f"{bad} levels are not refused")
+    for bad in (-1, 256, 2**31 - 1):
+        expect(called(width, height, 8, bad, n) == -1, f"a threshold of {bad} is not refused")
+    for each in (work, *out):
+        each.check()
 
 
 def _describe_directly(
@@ -502,8 +542,8 @@ def _functions() -> dict[str, Any]:
     """Return the functions of the C ABI; `open_front_end` and `open_depth` set the types of their own."""
     path = find_library()
     assert path is not None
-    names = ("rse_pf_match", "rse_pf_points_at", "rse_pf_describe")
-    found = dict(zip(names, load_part(path, "match", 2, *names), strict=True))
+    names = ("rse_pf_match", "rse_pf_points_at", "rse_pf_describe", "rse_pf_detect")
+    found = dict(zip(names, load_part(path, "match", MATCH_ABI, *names), strict=True))
     pointer, size, number = ctypes.c_void_p, ctypes.c_int64, ctypes.c_double
     found["rse_pf_match"].argtypes = (
         pointer, pointer, size, *[pointer] * 3, size, number, size, ctypes.c_uint32, *[pointer] * 4
@@ -513,6 +553,7 @@ def _functions() -> dict[str, Any]:
     found["rse_pf_describe"].argtypes = (
         pointer, size, size, pointer, ctypes.c_int32, *[pointer] * 4, size, pointer, pointer
     )  # fmt: skip
+    found["rse_pf_detect"].argtypes, found["rse_pf_detect"].restype = (pointer,) * 5, size
     (refine,) = load_part(path, "depth", 1, "rse_pf_depth_refine")
     refine.argtypes, refine.restype = (pointer,) * 3, None
     names = ("rse_pf_distinct", "rse_pf_match_near", "rse_pf_fit_pose")

@@ -20,7 +20,7 @@ from rse_pf.native import address_of, aligned, load_part, open_found
 
 __all__ = ["MATCH_ABI", "Lanes", "MatchCore", "Workspace", "match_core", "open_matcher"]
 
-MATCH_ABI = 2
+MATCH_ABI = 3
 """Of the library's part ``match``."""
 _FLAGS = {"portable": 1, "avx2": 2, "avx512": 0}
 _BYTES = 32

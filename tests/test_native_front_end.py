@@ -195,6 +195,87 @@ def test_descriptors_are_those_of_opencv_to_the_last_bit(height, width):
     assert count > 50
 
 
+def detected_by_opencv(gray: npt.NDArray[np.uint8], count: int, threshold: int) -> list[Array]:
+    found = cv2.ORB_create(nfeatures=count, scaleFactor=1.2, nlevels=8, fastThreshold=threshold).detect(gray)
+    return [
+        np.array([each.pt for each in found], np.float32).reshape(-1, 2),
+        np.array([each.response for each in found], np.float32),
+        np.array([each.angle for each in found], np.float32),
+        np.array([each.octave for each in found], np.int32),
+    ]
+
+
+@needs_library
+@pytest.mark.parametrize(
+    ("height", "width"), [(480, 752), (479, 637), (240, 320), (301, 200), (90, 1000), (101, 110), (62, 62)]
+)
+@pytest.mark.parametrize(("count", "threshold"), [(3000, 7), (1000, 10), (60, 20), (9000, 0), (500, 255)])
+def test_keypoints_are_those_of_opencv_to_the_last_bit_and_in_its_order(height, width, count, threshold):
+    core, asked, answered = describes(), 0, 0
+    for seed in range(4):
+        gray = picture(seed, height, width)
+
+        found = core.detect(gray, count, scale=1.2, levels=8, threshold=threshold)
+
+        asked += 1
+        if found is None:  # too many equals, whose order is another one
+            continue
+        answered += 1
+        for ours, expected in zip(found, detected_by_opencv(gray, count, threshold), strict=True):
+            assert_same_bytes(ours, expected)
+    assert answered >= asked - 1
+
+
+@needs_library
+def test_a_picture_without_corners_and_one_of_one_pattern_are_those_of_opencv_or_left_to_it():
+    core = describes()
+    tiles = np.tile(np.kron([[0, 255], [255, 0]], np.ones((9, 9))), (20, 30)).astype(np.uint8)
+    for gray, count in [(np.full((300, 400), 90, np.uint8), 500), (tiles, 50), (tiles, 5000)]:
+        found = core.detect(gray, count, scale=1.2, levels=8, threshold=7)
+        expected = detected_by_opencv(gray, count, 7)
+        assert found is None or [each.tobytes() for each in found] == [each.tobytes() for each in expected]
+        assert found is not None or len(expected[1]) > 2 * count
+
+
+@needs_library
+def test_what_no_detector_can_do_is_refused():
+    core, gray = describes(), picture(1, 240, 320)
+
+    def detected(image=gray, count=100, scale=1.2, levels=8, threshold=7):
+        return core.detect(image, count, scale=scale, levels=levels, threshold=threshold)
+
+    assert detected() is not None
+    assert len(detected(count=0).pixels) == 0
+    for bad in (
+        {"image": gray.astype(np.float32)}, {"image": gray[0]}, {"image": np.zeros((1, 9), np.uint8)},
+        {"count": -1}, {"count": 2**40}, {"scale": 0.5}, {"scale": np.nan}, {"scale": 1e5}, {"levels": 0},
+        {"levels": 33}, {"threshold": -1}, {"threshold": 256},
+    ):  # fmt: skip
+        assert detected(**bad) is None, bad
+
+
+@needs_library
+def test_a_core_that_detects_otherwise_than_opencv_is_not_asked(monkeypatch):
+    core, gray = describes(), picture(2, 240, 320)
+    rgb = np.repeat(gray[..., None], 3, axis=2)
+    use(monkeypatch, None)
+    expected = orb.describe_orb(rgb, 300)
+    use(monkeypatch, core)
+    right, asked = core.detect, []
+
+    def wrong(*arguments, **options):
+        asked.append(arguments)
+        found = right(*arguments, **options)
+        return found._replace(angles_deg=np.nextafter(found.angles_deg, np.float32(0)))
+
+    monkeypatch.setattr(core, "detect", wrong)
+    found = orb.describe_orb(rgb, 300)
+
+    assert len(asked) == 1  # for the comparison, and never again
+    assert_same_bytes(found.turns, expected.turns)
+    assert_same_bytes(found.descriptors, expected.descriptors)
+
+
 @needs_library
 def test_keypoints_that_opencv_would_not_find_are_not_described():
     core, gray = describes(), picture(1, 240, 320)

@@ -11,7 +11,7 @@
 extern "C" {
 #endif
 
-#define RSE_PF_MATCH_ABI 2
+#define RSE_PF_MATCH_ABI 3
 
 /* Use no AVX2 and AVX-512, or no AVX-512, for tests: the bytes of the result are the same. */
 #define RSE_PF_MATCH_PORTABLE 1u
@@ -46,6 +46,28 @@ int64_t rse_pf_match(const uint8_t *reference, const double *points_camera, int6
                      const uint8_t *frame, const double *pixels, const double *frame_points, int64_t frame_rows,
                      double ratio, int64_t max_matches, uint32_t flags, uint64_t *workspace, double *points_world,
                      double *matched, double *depths_m);
+
+/* Numbers of 8 bytes that rse_pf_detect works in. */
+#define RSE_PF_DETECT_WORKSPACE(width, height) (((width) * (height)) / 2 + 8 * (width) + (height) + 64)
+
+/* An image of height x width, row-major; the scale of each level, 1 and more, and how many keypoints it gives;
+ * FAST's threshold; for how many keypoints there is room. */
+typedef struct rse_pf_detect_request {
+    const uint8_t *gray;
+    int64_t width, height;
+    const float *scales;
+    const int64_t *wanted;
+    int32_t levels, threshold;
+    int64_t room;
+    uint64_t *workspace;
+} rse_pf_detect_request;
+
+/* Write ORB's keypoints in OpenCV's order, bit by bit its own, and return their number; -1 if a size does not fit, if
+ * there is no room, or if the processor lacks AVX2.
+ *
+ * pixels: rows x 2, of the whole image; the Harris measure, the orientation and the octave (level) of each. */
+int64_t rse_pf_detect(const rse_pf_detect_request *request, float *pixels, float *responses, float *angles_deg,
+                      int32_t *octaves);
 
 /* Numbers of 8 bytes that rse_pf_describe works in. */
 #define RSE_PF_DESCRIBE_WORKSPACE(width, height) ((3 * (width) * (height)) / 8 + 7 * (width) + 64)

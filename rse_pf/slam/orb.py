@@ -16,9 +16,11 @@ import numpy.typing as npt
 from rse_pf.geometry import Array
 from rse_pf.images import load_opencv
 from rse_pf.maps.descriptors import ORB, DescriptorKind, Descriptors
-from rse_pf.native_front_end import FrontEndCore, front_end_core
+from rse_pf.native_front_end import FrontEndCore, Keypoints, front_end_core
 
 __all__ = ["DescribedPixels", "describe_at", "describe_orb", "spread_rows"]
+
+_Floats = npt.NDArray[np.floating[Any]]
 
 # ORB's pyramid.
 _SCALE, _LEVELS = 1.2, 8
@@ -59,28 +61,17 @@ def describe_orb(rgb: npt.NDArray[np.uint8], count: int, *, is_spread: bool = Tr
     """
     cv2 = load_opencv()
     gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
-    orb = _orb(cv2, _SOUGHT * count, _FAST_SPREAD) if is_spread else _orb(cv2, count, _FAST)
-    keypoints = orb.detect(gray, None)
-    if not keypoints:
-        none = np.empty((0, 2))
-        return DescribedPixels(
-            pixels=none, descriptors=np.empty((0, 32), dtype=np.uint8), turns=none, sizes=np.empty(0)
-        )
-    n = len(keypoints)
-    responses = np.fromiter(map(attrgetter("response"), keypoints), np.float64, n)
-    rows = spread_rows(cv2.KeyPoint_convert(keypoints), responses, gray.shape, count)
-    chosen = [keypoints[row] for row in rows] if is_spread else list(keypoints)
-    core = front_end_core()
-    descriptors = _described(cv2, gray, chosen, core) if core is not None and _describes_alike(core) else None
-    if descriptors is None:
-        chosen, descriptors = orb.compute(gray, chosen)
-    angles = np.radians(np.fromiter(map(attrgetter("angle"), chosen), np.float64, len(chosen)))
-    octaves = np.fromiter(map(attrgetter("octave"), chosen), np.int64, len(chosen))
+    sought, threshold = (_SOUGHT * count, _FAST_SPREAD) if is_spread else (count, _FAST)
+    found = _detected(cv2, gray, sought, threshold)
+    if is_spread and len(found.pixels):
+        found = found.only(spread_rows(found.pixels, found.responses, gray.shape, count))
+    found, descriptors = _described(cv2, gray, found)
+    angles = np.radians(found.angles_deg.astype(np.float64))
     return DescribedPixels(
-        pixels=cv2.KeyPoint_convert(chosen).astype(np.float64),
+        pixels=found.pixels.astype(np.float64),
         descriptors=descriptors,
         turns=np.stack([np.cos(angles), np.sin(angles)], axis=1),
-        sizes=_SCALES[octaves],
+        sizes=_SCALES[found.octaves],
     )
 
 
@@ -104,21 +95,17 @@ def describe_at(
     cv2 = load_opencv()
     levels = np.clip(np.rint(np.log(sizes) / np.log(_SCALE)), 0, _LEVELS - 1).astype(int)
     angles_deg = np.degrees(np.arctan2(turns[:, 1], turns[:, 0])) % 360.0
-    keypoints = [
-        cv2.KeyPoint(
-            float(u), float(v), float(_PATCH_PX * _SCALES[level]), float(angle), 1.0, int(level), row
-        )
-        for row, ((u, v), angle, level) in enumerate(zip(pixels, angles_deg, levels, strict=True))
-    ]
-    if keypoints:
-        gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
-        keypoints, descriptors = _orb(cv2, len(keypoints), _FAST).compute(gray, keypoints)
+    none = np.empty(0, dtype=np.int64), np.empty((0, 32), dtype=np.uint8)
+    if not len(pixels):
+        return none
+    gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
+    keypoints, descriptors = _computed(cv2, gray, pixels, angles_deg, levels)
     if not keypoints:
-        return np.empty(0, dtype=np.int64), np.empty((0, 32), dtype=np.uint8)
+        return none
     return np.fromiter(map(attrgetter("class_id"), keypoints), np.int64, len(keypoints)), descriptors
 
 
-def spread_rows(pixels: Array, responses: Array, size: tuple[int, int], count: int) -> list[int]:
+def spread_rows(pixels: _Floats, responses: _Floats, size: tuple[int, int], count: int) -> list[int]:
     """Return the rows of the strongest keypoints of each cell of the image, *count* in all, ascending.
 
     Args:
@@ -141,24 +128,69 @@ def _orb(cv2: Any, count: int, threshold: int) -> Any:
     return cv2.ORB_create(nfeatures=count, scaleFactor=_SCALE, nlevels=_LEVELS, fastThreshold=threshold)
 
 
-def _described(
-    cv2: Any, gray: npt.NDArray[np.uint8], keypoints: list[Any], core: FrontEndCore
-) -> npt.NDArray[np.uint8] | None:
-    """Return the descriptors of keypoints by the native core; None where it cannot describe them."""
+def _detected(cv2: Any, gray: npt.NDArray[np.uint8], count: int, threshold: int) -> Keypoints:
+    core = front_end_core()
+    found = None
+    if core is not None and _is_alike(core)[0]:
+        found = core.detect(gray, count, scale=_SCALE, levels=_LEVELS, threshold=threshold)
+    return _detected_by_opencv(cv2, gray, count, threshold) if found is None else found
+
+
+def _detected_by_opencv(cv2: Any, gray: npt.NDArray[np.uint8], count: int, threshold: int) -> Keypoints:
+    keypoints = _orb(cv2, count, threshold).detect(gray, None)
     n = len(keypoints)
-    angles_deg = np.fromiter(map(attrgetter("angle"), keypoints), np.float32, n)
-    octaves = np.fromiter(map(attrgetter("octave"), keypoints), np.int32, n)
-    return core.describe(
-        gray, cv2.KeyPoint_convert(keypoints), angles_deg, octaves, scale=_SCALE, levels=_LEVELS
+    return Keypoints(
+        cv2.KeyPoint_convert(keypoints) if n else np.empty((0, 2), dtype=np.float32),
+        np.fromiter(map(attrgetter("response"), keypoints), np.float32, n),
+        np.fromiter(map(attrgetter("angle"), keypoints), np.float32, n),
+        np.fromiter(map(attrgetter("octave"), keypoints), np.int32, n),
     )
 
 
+def _described(
+    cv2: Any, gray: npt.NDArray[np.uint8], found: Keypoints
+) -> tuple[Keypoints, npt.NDArray[np.uint8]]:
+    """Return the keypoints that can be described, and their descriptors."""
+    core = front_end_core()
+    descriptors = None
+    if core is not None and _is_alike(core)[1]:
+        descriptors = core.describe(
+            gray, found.pixels, found.angles_deg, found.octaves, scale=_SCALE, levels=_LEVELS
+        )
+    if descriptors is not None:
+        return found, descriptors
+    if not len(found.pixels):
+        return found, np.empty((0, 32), dtype=np.uint8)
+    keypoints, descriptors = _computed(cv2, gray, found.pixels, found.angles_deg, found.octaves)
+    return found.only(list(map(attrgetter("class_id"), keypoints))), descriptors
+
+
+def _computed(
+    cv2: Any, gray: npt.NDArray[np.uint8], pixels: npt.NDArray[Any], angles_deg: npt.NDArray[Any],
+    octaves: npt.NDArray[Any],
+) -> tuple[Any, npt.NDArray[np.uint8]]:  # fmt: skip
+    """Return OpenCV's keypoints that it can describe, the class of each of which is its row."""
+    keypoints = [
+        cv2.KeyPoint(
+            float(u), float(v), float(_PATCH_PX * _SCALES[octave]), float(angle), 1.0, int(octave), row
+        )
+        for row, ((u, v), angle, octave) in enumerate(zip(pixels, angles_deg, octaves, strict=True))
+    ]
+    computed: tuple[Any, npt.NDArray[np.uint8]] = _orb(cv2, len(keypoints), _FAST).compute(gray, keypoints)
+    return computed
+
+
 @cache
-def _describes_alike(core: FrontEndCore) -> bool:
-    """Say whether the core describes a picture as the installed OpenCV does, which may be another version."""
+def _is_alike(core: FrontEndCore) -> tuple[bool, bool]:
+    """Say whether the core detects and describes as the installed OpenCV, which may be another version."""
     cv2 = load_opencv()
     blocks = np.random.default_rng(1).integers(0, 256, (60, 80))
     gray = np.kron(blocks, np.ones((5, 5))).astype(np.uint8)
-    keypoints, descriptors = _orb(cv2, 500, _FAST).detectAndCompute(gray, None)
-    ours = _described(cv2, gray, keypoints, core)
-    return ours is not None and bool(np.array_equal(ours, descriptors))
+    expected = _detected_by_opencv(cv2, gray, 500, _FAST)
+    found = core.detect(gray, 500, scale=_SCALE, levels=_LEVELS, threshold=_FAST)
+    is_found = found is not None and all(map(np.array_equal, found, expected))
+    _, descriptors = _computed(cv2, gray, expected.pixels, expected.angles_deg, expected.octaves)
+    ours = core.describe(
+        gray, expected.pixels, expected.angles_deg, expected.octaves, scale=_SCALE, levels=_LEVELS
+    )
+    return is_found, ours is not None and bool(np.array_equal(ours, descriptors))
