@@ -25,6 +25,10 @@ struct Stats {
     std::uint64_t callback_exceptions = 0;  ///< exceptions of callbacks, which end there
     std::uint64_t bytes_in = 0, bytes_out = 0;
     std::map<std::string, std::uint64_t> failures_by_code{};
+    /// Commands that were not sent at once although there was a connection: by the rate that a server told, after a busy
+    /// answer (to this command, or another one of the stream), or by what the Welcome allows.
+    std::map<std::string, std::uint64_t> held_back{{"server-rate", 0}, {"busy", 0}, {"own-limit", 0}};
+    std::optional<double> told_rate_per_s{};  ///< the last rate that a server told, commands a second
     std::size_t unanswered = 0;
     std::string last_error{};
 };
@@ -182,6 +186,15 @@ class Session {
         const ServerMessage message = read_message(data);
         const auto type = message.type;
         if (type == "result" || type == "failure") return answered(link, message, now);
+        if (type == "refused") {
+            refused(link, message, now);
+            return {};
+        }
+        if (type == "rate") {
+            if (link->rate.obey(message.commands_per_s, message.for_ms, now)) stats.told_rate_per_s = message.commands_per_s;
+            flush(now);
+            return {};
+        }
         if (type == "pong") {
             link->ping_sent.reset();
             if (message.sent_s >= link->opened && message.sent_s <= now) {
@@ -305,7 +318,7 @@ class Session {
         std::uint64_t seq = 0;
         double submitted = 0, deadline = 0, sent_at = 0, not_before = 0;
         std::shared_ptr<Link> link{};
-        bool was_sent = false, cancelled = false, is_long = false, was_lost = false;
+        bool was_sent = false, cancelled = false, is_long = false, was_lost = false, was_held = false;
     };
     struct Subscription {
         std::string topic;
@@ -343,17 +356,26 @@ class Session {
                 continue;
             }
             if (!current_) continue;
-            if (now < pending.not_before) {
-                next_retry_ = std::min(next_retry_, pending.not_before);
-                continue;
+            const auto busy = busy_until_.find(options.stream);
+            const double held = busy == busy_until_.end() ? pending.not_before : std::max(pending.not_before, busy->second);
+            if (now < held) {
+                hold(pending, "busy", held);
+            } else if (now < current_->rate.held_until()) {
+                hold(pending, "server-rate", current_->rate.held_until());
+            } else if (current_->in_flight >= std::max<std::size_t>(1, current_->limits.max_in_flight)) {
+                hold(pending, "own-limit", never);
+            } else if (!current_->rate.allows(now)) {
+                hold(pending, "own-limit", current_->rate.next_s(now));
+            } else {
+                write(found, now);
             }
-            if (current_->in_flight >= std::max<std::size_t>(1, current_->limits.max_in_flight)) continue;
-            if (!current_->rate.allows(now)) {
-                next_retry_ = std::min(next_retry_, current_->rate.next_s(now));
-                continue;
-            }
-            write(found, now);
         }
+    }
+
+    /// Let a command wait for an answer, or until *until_s*; count it once.
+    void hold(Pending& pending, const char* why, double until_s) {
+        next_retry_ = std::min(next_retry_, until_s);
+        if (!std::exchange(pending.was_held, true)) ++stats.held_back[why];
     }
 
     void write(PendingMap::iterator found, double now) {
@@ -363,7 +385,7 @@ class Session {
         pending.link = current_;
         pending.sent_at = now;
         ++current_->in_flight;
-        current_->rate.spend(now);
+        current_->rate.spend_command(now);
         current_->outgoing.push_back(encode(pending, now));
         if (pending.cancelled) cancel_on_server(pending);
     }
@@ -448,6 +470,16 @@ class Session {
         return {};
     }
 
+    /// Take one message for a failure of each of its commands.
+    void refused(const std::shared_ptr<Link>& link, const ServerMessage& message, double now) {
+        ServerMessage failure = message;
+        failure.type = "failure";
+        for (const std::uint64_t id : std::set<std::uint64_t>(message.ids.begin(), message.ids.end())) {
+            failure.id = id;
+            answered(link, failure, now);
+        }
+    }
+
     static Answer answer_of(const Link& link, const Pending& pending, const ServerMessage& message, double now) {
         Answer answer;
         answer.id = *message.id;
@@ -468,12 +500,15 @@ class Session {
     /// Let the command wait if a later time or another process may help.
     bool retries(PendingMap::iterator found, const ServerMessage& failure, double now) {
         Pending& pending = found->second;
+        const double pause = std::max(0.0, failure.retry_after_ms.value_or(0)) / 1e3;
+        const auto& stream = pending.command.options.stream;
+        if (failure.code == "busy" && pause > 0 && !stream.empty()) busy_until_[stream] = now + std::min(max_pause_s, pause);
         if (pending.cancelled) return false;
         if (failure.code == "worker-lost" && !std::exchange(pending.was_lost, true)) {
             detach(found->first, pending);
             return true;
         }
-        const double after = now + std::max(0.0, failure.retry_after_ms.value_or(0)) / 1e3;
+        const double after = now + pause;
         if (failure.code != "busy" || !(after < pending.deadline) || retries_ < 1) return false;
         retries_ -= 1;
         detach(found->first, pending);
@@ -508,6 +543,7 @@ class Session {
     std::set<std::uint64_t> waiting_;
     std::map<std::uint64_t, Subscription> subscriptions_;
     std::unordered_map<std::string, std::uint64_t> sequence_, delivered_;
+    std::unordered_map<std::string, double> busy_until_;  // of a stream
     double retries_ = max_retries, next_deadline_ = never, next_retry_ = never;
 };
 
