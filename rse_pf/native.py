@@ -13,7 +13,7 @@ from collections.abc import Callable
 from functools import cache, lru_cache
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import msgspec
 import numpy as np
@@ -52,9 +52,10 @@ __all__ = [
 
 Part = TypeVar("Part")
 
-_ABI = 1
+_ABI = 2
 _FILE = "librse_pf_native.so"
-_PORTABLE, _PROPOSE = 1, 2
+_PROPOSE = 2
+_LANES = {"avx512": 0, "avx2": 4, "portable": 1}
 # rse_pf_pnp_request: abi, flags, rows, points, pixels | camera | options | deadline, cancelled.
 _HEAD = struct.Struct("=IIqQQ")
 _BODY = struct.Struct("=ddddiiddiiQdddd")
@@ -78,7 +79,7 @@ REASONS = (
 class NativeOptions(msgspec.Struct, frozen=True, kw_only=True):
     """How the library solves, and where a pose stops being ok.
 
-    ``portable`` forbids AVX2, which changes no byte of the result; the other fields are those of
+    ``lanes`` are the widest instructions allowed, which changes no byte; the other fields are those of
     `rse_pf.pnp.PnpOptions` and, with ``weak_`` before them, of `rse_pf.pnp.WeakLimits`.
     """
 
@@ -90,7 +91,7 @@ class NativeOptions(msgspec.Struct, frozen=True, kw_only=True):
     weak_inlier_ratio: float
     weak_translation_m: float
     weak_rotation_rad: float
-    portable: bool = False
+    lanes: Literal["avx512", "avx2", "portable"] = "avx512"
 
 
 class Evidence(msgspec.Struct, frozen=True, kw_only=True, eq=False):
@@ -141,7 +142,7 @@ def _pack(camera: Camera, options: NativeOptions) -> bytes:
 
 def packed_request(camera: Camera, options: NativeOptions) -> bytes:
     """Return an rse_pf_pnp_request that says how to solve, without rows."""
-    flags = _PORTABLE if options.portable else 0
+    flags = _LANES[options.lanes]
     return _REQUEST.pack(_ABI, flags, 0, 0, 0, _pack(camera, options), 0, 0)
 
 
@@ -152,7 +153,7 @@ class NativeSolver:
         self._call = call
         self._buffers = _Buffers()
         self.lanes = lanes
-        """``avx2`` or ``portable``: the instructions that this processor gets."""
+        """``avx512``, ``avx2`` or ``portable``: the instructions that this processor gets."""
 
     def solve(
         self,
@@ -234,7 +235,7 @@ class NativeSolver:
         if n > len(buffers.inliers):
             buffers.lend(n)
         _REQUEST.pack_into(
-            buffers.request, 0, _ABI, _PORTABLE if options.portable else 0, n, address_of(points_world),
+            buffers.request, 0, _ABI, _LANES[options.lanes], n, address_of(points_world),
             address_of(pixels), _pack(camera, options), 0, 0,
         )  # fmt: skip
         self._call(buffers.request_at, buffers.inliers_at, buffers.result_at)
@@ -270,7 +271,7 @@ class NativeSolver:
                 hint="send one pixel for each point",
             )
         request = self._buffers.request
-        flags |= _PORTABLE if options.portable else 0
+        flags |= _LANES[options.lanes]
         _HEAD.pack_into(request, 0, _ABI, flags, len(pixels), address_of(points_world), address_of(pixels))
         request[_HEAD.size : _HEAD.size + _BODY.size] = _pack(camera, options)
         return points_world, pixels

@@ -151,7 +151,7 @@ def cpu_us(work: Callable[[], Any]) -> tuple[float, Any]:
 def measure_cpu(problems: int) -> list[dict[str, Any]]:
     """Return CPU of the bare PoseLib call and of the native solver with its evidence, taking turns."""
     solver, limits = native.native_solver(), engines.native_options(OPTIONS, LIMITS)
-    narrow, bare = msgspec.structs.replace(limits, portable=True), old_engine()
+    narrow, bare = msgspec.structs.replace(limits, lanes="portable"), old_engine()
     rows = []
     for n, percent in ((200, 10), (200, 30), (200, 50), (200, 70), (100, 70), (500, 30), (2000, 70)):
         times: dict[str, list[float]] = {"poselib": [], "native": [], "portable": []}
@@ -197,7 +197,7 @@ def same_bytes(one: native.Evidence | None, other: native.Evidence | None) -> bo
 def judgements(each: Case) -> tuple[tuple[str, str, Any], ...]:
     """Return the outcomes of PoseLib, of the library, of it without AVX2, and with the Python evidence."""
     solver, limits = native.native_solver(), engines.native_options(OPTIONS, LIMITS)
-    narrow = msgspec.structs.replace(limits, portable=True)
+    narrow = msgspec.structs.replace(limits, lanes="portable")
     points, pixels, camera = each.points_world, each.pixels, each.camera
     return (
         outcome(lambda: solve_pnp(points, pixels, camera, OPTIONS, default_engine=OLD)),

@@ -11,11 +11,12 @@
 extern "C" {
 #endif
 
-#define RSE_PF_NATIVE_ABI 1
+#define RSE_PF_NATIVE_ABI 2
 
 /* Flags of a request. */
-#define RSE_PF_PNP_PORTABLE 1u /* Use no AVX2, for tests: the bytes of the result are the same. */
+#define RSE_PF_PNP_PORTABLE 1u /* Use no AVX, for tests: the bytes of the result are the same. */
 #define RSE_PF_PNP_PROPOSE 2u  /* Return the pose only, without inliers and evidence. */
+#define RSE_PF_PNP_AVX2 4u     /* Use no AVX-512, for tests as well. */
 
 /* What became of a request; all but the first leave no pose. */
 enum rse_pf_pnp_status {
@@ -76,7 +77,7 @@ typedef struct rse_pf_pnp_result {
 /* Return RSE_PF_NATIVE_ABI of the library, to compare with the header's. */
 uint32_t rse_pf_native_abi(void);
 
-/* Return "avx2" or "portable": the instructions that this processor gets. */
+/* Return "avx512", "avx2" or "portable": the instructions that this processor gets. */
 const char *rse_pf_native_lanes(void);
 
 /* Estimate the camera pose.  inliers has room for as many numbers as the request has rows (it may be null

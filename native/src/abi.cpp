@@ -97,12 +97,18 @@ int32_t checked(const rse_pf_pnp_request& request, const int64_t* inliers) {
     return RSE_PF_PNP_SOLVED;
 }
 
-bool has_avx2() {
+enum class Lanes { portable, avx2, avx512 };
+
+// Return the widest instructions of the processor that a request allows.
+Lanes lanes_for(uint32_t flags) {
 #if defined(__x86_64__)
-    return rse_pf::processor().avx2;
+    if ((flags & RSE_PF_PNP_PORTABLE) != 0) return Lanes::portable;
+    if (rse_pf::processor().avx512 && (flags & RSE_PF_PNP_AVX2) == 0) return Lanes::avx512;
+    if (rse_pf::processor().avx2) return Lanes::avx2;
 #else
-    return false;
+    (void)flags;
 #endif
+    return Lanes::portable;
 }
 
 }  // namespace
@@ -112,7 +118,8 @@ extern "C" {
 __attribute__((visibility("default"))) uint32_t rse_pf_native_abi(void) { return RSE_PF_NATIVE_ABI; }
 
 __attribute__((visibility("default"))) const char* rse_pf_native_lanes(void) {
-    return has_avx2() ? "avx2" : "portable";
+    const Lanes widest = lanes_for(0);
+    return widest == Lanes::avx512 ? "avx512" : widest == Lanes::avx2 ? "avx2" : "portable";
 }
 
 __attribute__((visibility("default"))) void rse_pf_pnp_solve(const rse_pf_pnp_request* request, int64_t* inliers,
@@ -126,10 +133,9 @@ __attribute__((visibility("default"))) void rse_pf_pnp_solve(const rse_pf_pnp_re
     }
     const rse_pf::Task task = {request, &memory.workspace, inliers, result};
 #if defined(__x86_64__)
-    if (has_avx2() && (request->flags & RSE_PF_PNP_PORTABLE) == 0) {
-        rse_pf::avx2::solve(task);
-        return;
-    }
+    const Lanes lanes = lanes_for(request->flags);
+    if (lanes == Lanes::avx512) return rse_pf::avx512::solve(task);
+    if (lanes == Lanes::avx2) return rse_pf::avx2::solve(task);
 #endif
     rse_pf::portable::solve(task);
 }

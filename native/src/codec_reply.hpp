@@ -43,6 +43,19 @@ inline void upper_triangle(const double (&covariance)[36], float (&triangle)[kTr
     }
 }
 
+// Write the number of a row and return what is behind it.
+inline uint8_t* write_row(int64_t row, uint8_t* at) {
+    uint8_t digits[8];
+    int first = 8;
+    do {
+        digits[--first] = static_cast<uint8_t>('0' + row % 10);
+        row /= 10;
+    } while (row != 0);
+    const int count = 8 - first;
+    for (int i = 0; i < count; ++i) at[i] = digits[first + i];
+    return at + count;
+}
+
 class MsgpackReply {
 public:
     explicit MsgpackReply(uint8_t* at) : at_(at) {}
@@ -120,7 +133,7 @@ public:
         for (const double number : result.T_camera_world) put(number);
         ends_list("],\"inliers\":[");
         for (int64_t i = 0; i < result.count; ++i) {
-            at_ = write_digits(static_cast<uint64_t>(inliers[i]), at_);
+            at_ = write_row(inliers[i], at_);
             *at_++ = ',';
         }
         ends_list("],\"rmse_px\":");

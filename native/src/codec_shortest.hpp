@@ -10,8 +10,8 @@
 
 namespace rse_pf_codec {
 
-// Bytes that a number takes at most: a sign, 17 digits, a point, and an exponent or five zeros.
-constexpr int64_t kMaxNumberBytes = 32;
+// Bytes that writing a number may touch.
+constexpr int64_t kMaxNumberBytes = 48;
 
 // A number as digits * 10^exponent.
 struct Shortest {
@@ -59,70 +59,98 @@ inline Shortest shortest(uint64_t bits) {
     return {s + (middle > half || (middle == half && (s & 1) != 0)), k};
 }
 
-// Write the digits of `value`, without leading zeros, and return what is behind them.
-inline uint8_t* write_digits(uint64_t value, uint8_t* at) {
-    uint8_t digits[20];
-    int first = 20;
-    do {
-        digits[--first] = static_cast<uint8_t>('0' + value % 10);
-        value /= 10;
-    } while (value != 0);
-    std::memcpy(at, digits + first, static_cast<size_t>(20 - first));
-    return at + (20 - first);
+// Return the eight digits of a number below 10^8, each a byte of its own and the first one lowest.
+inline uint64_t eight_digits(uint64_t value) {
+    // Two numbers of four digits, then four of two, then eight of one.
+    const uint64_t fours = value / 10000 | (value % 10000) << 32;
+    const uint64_t hundreds = (fours * 10486 >> 20) & 0x0000007F0000007Fu;
+    const uint64_t twos = hundreds | (fours - 100 * hundreds) << 16;
+    const uint64_t tens = (twos * 103 >> 10) & 0x000F000F000F000Fu;
+    return tens | (twos - 10 * tens) << 8;
 }
 
-// Write a finite double: from 0.00001 to below 1e16 with a point and without an exponent.
+// The digits of a number below 10^17 that is not 0, as text, without the zeros at both ends.
+struct Digits {
+    static constexpr int32_t kAll = 17;
+    uint8_t text[48];  // whoever copies them may copy more
+    int32_t first, count;
+
+    explicit Digits(uint64_t value) {
+        constexpr uint64_t kText = 0x3030303030303030u;
+        const uint64_t top = value / 10000000000000000u, rest = value % 10000000000000000u;
+        const uint64_t middle = eight_digits(rest / 100000000), low = eight_digits(rest % 100000000);
+        text[0] = static_cast<uint8_t>('0' + top);
+        put(1, middle | kText);
+        put(9, low | kText);
+        first = top != 0 ? 0 : middle != 0 ? 1 + __builtin_ctzll(middle) / 8 : 9 + __builtin_ctzll(low) / 8;
+        const int32_t last =
+            low != 0 ? 16 - __builtin_clzll(low) / 8 : middle != 0 ? 8 - __builtin_clzll(middle) / 8 : 0;
+        count = last - first + 1;
+    }
+    const uint8_t* begin() const { return text + first; }
+
+private:
+    void put(int at, uint64_t digits) {
+#if __BYTE_ORDER__ == __ORDER_BIG_ENDIAN__
+        digits = __builtin_bswap64(digits);
+#endif
+        std::memcpy(text + at, &digits, 8);
+    }
+};
+
+// Write a number below 10^17 without leading zeros and return what is behind it.
+inline uint8_t* write_whole(uint64_t value, uint8_t* at) {
+    if (value < 10) {
+        *at = static_cast<uint8_t>('0' + value);
+        return at + 1;
+    }
+    const Digits digits(value);
+    const int32_t count = Digits::kAll - digits.first;
+    std::memcpy(at, digits.begin(), 17);
+    return at + count;
+}
+
+// Write a finite double: from 0.00001 to below 1e16 with a point and without an exponent.  Up to 48 bytes are
+// touched, whatever the number needs.
 inline uint8_t* write_double(double value, uint8_t* at) {
     uint64_t bits;
     std::memcpy(&bits, &value, 8);
-    if (bits >> 63 != 0) *at++ = '-';
+    *at = '-';
+    at += bits >> 63;
     bits &= ~(uint64_t{1} << 63);
     if (bits == 0) {
         std::memcpy(at, "0.0", 3);
         return at + 3;
     }
-    Shortest number = shortest(bits);
-    while (number.digits % 10 == 0) {
-        number.digits /= 10;
-        ++number.exponent;
-    }
-    uint8_t digits[20];
-    const auto count = static_cast<int32_t>(write_digits(number.digits, digits) - digits);
+    const Shortest number = shortest(bits);
+    const Digits digits(number.digits);
+    const uint8_t* const text = digits.begin();
+    const int32_t count = digits.count;
     // Digits before the point.
-    const int32_t point = count + number.exponent;
-    const auto put = [&](const uint8_t* from, int32_t size) {
-        std::memcpy(at, from, static_cast<size_t>(size));
-        at += size;
-    };
-    const auto put_zeros = [&](int32_t size) {
-        for (int32_t i = 0; i < size; ++i) *at++ = '0';
-    };
+    const int32_t point = Digits::kAll - digits.first + number.exponent;
     if (point > 16 || point < -4) {
-        *at++ = digits[0];
-        if (count > 1) {
-            *at++ = '.';
-            put(digits + 1, count - 1);
-        }
+        *at++ = text[0];
+        *at = '.';
+        std::memcpy(at + 1, text + 1, 16);
+        if (count > 1) at += count;
         *at++ = 'e';
         if (point < 1) *at++ = '-';
-        return write_digits(static_cast<uint64_t>(point < 1 ? 1 - point : point - 1), at);
+        return write_whole(static_cast<uint64_t>(point < 1 ? 1 - point : point - 1), at);
     }
     if (point <= 0) {
-        std::memcpy(at, "0.", 2);
-        at += 2;
-        put_zeros(-point);
-        put(digits, count);
-    } else if (point >= count) {
-        put(digits, count);
-        put_zeros(point - count);
-        std::memcpy(at, ".0", 2);
-        at += 2;
-    } else {
-        put(digits, point);
-        *at++ = '.';
-        put(digits + point, count - point);
+        std::memcpy(at, "0.0000", 6);
+        std::memcpy(at + 2 - point, text, 17);
+        return at + 2 - point + count;
     }
-    return at;
+    std::memcpy(at, text, 17);
+    if (point < count) {
+        at[point] = '.';
+        std::memcpy(at + point + 1, text + point, 16);
+        return at + count + 1;
+    }
+    for (int32_t i = count; i < point; ++i) at[i] = '0';
+    std::memcpy(at + point, ".0", 2);
+    return at + point + 2;
 }
 
 }  // namespace rse_pf_codec

@@ -1,6 +1,6 @@
 // Eight numbers at a time, with the same bytes on every processor.
 //
-// A vector of eight is one AVX register of floats, or a pair of narrower vectors; what is computed in a lane
+// A vector of eight is one register, or a pair of narrower vectors; what is computed in a lane
 // never depends on that, because every operation is a single IEEE operation (the build forbids contraction)
 // and sums over lanes have one fixed order.  This header is compiled once for each set of instructions, inside
 // the namespace RSE_PF_ISA, and uses no templates of the standard library, so no function compiled for AVX2
@@ -19,13 +19,17 @@ typedef float Float4 __attribute__((vector_size(16)));
 typedef float Float8 __attribute__((vector_size(32)));
 typedef double Double2 __attribute__((vector_size(16)));
 typedef double Double4 __attribute__((vector_size(32)));
+typedef double Double8 __attribute__((vector_size(64)));
 
 template <class V>
 struct Pair {
     V low, high;
 };
 
-#ifdef __AVX2__
+#ifdef __AVX512F__
+typedef Float8 Floats;
+typedef Double8 Doubles;
+#elif defined(__AVX2__)
 typedef Float8 Floats;
 typedef Pair<Double4> Doubles;
 #else
@@ -55,6 +59,7 @@ RSE_PF_INLINE Float4 where_less(Float4 a, Float4 b, Float4 yes, Float4 no) { ret
 RSE_PF_INLINE Float8 where_less(Float8 a, Float8 b, Float8 yes, Float8 no) { return a < b ? yes : no; }
 RSE_PF_INLINE Double2 where_less(Double2 a, Double2 b, Double2 yes, Double2 no) { return a < b ? yes : no; }
 RSE_PF_INLINE Double4 where_less(Double4 a, Double4 b, Double4 yes, Double4 no) { return a < b ? yes : no; }
+RSE_PF_INLINE Double8 where_less(Double8 a, Double8 b, Double8 yes, Double8 no) { return a < b ? yes : no; }
 template <class V>
 RSE_PF_INLINE Pair<V> where_less(const Pair<V>& a, const Pair<V>& b, const Pair<V>& yes, const Pair<V>& no) {
     return {where_less(a.low, b.low, yes.low, no.low), where_less(a.high, b.high, yes.high, no.high)};
@@ -90,6 +95,9 @@ RSE_PF_INLINE void fill(Float8& lanes, float value) {
 }
 RSE_PF_INLINE void fill(Double2& lanes, double value) { lanes = Double2{value, value}; }
 RSE_PF_INLINE void fill(Double4& lanes, double value) { lanes = Double4{value, value, value, value}; }
+RSE_PF_INLINE void fill(Double8& lanes, double value) {
+    lanes = Double8{value, value, value, value, value, value, value, value};
+}
 template <class V, class T>
 RSE_PF_INLINE void fill(Pair<V>& lanes, T value) {
     fill(lanes.low, value);

@@ -6,6 +6,7 @@ namespace rse_pf {
 
 struct Processor {
     bool avx2, fma;
+    bool avx512;           // AVX-512 F, DQ and VL
     bool avx512_popcount;  // AVX-512 F and VPOPCNTDQ
 };
 

@@ -19,7 +19,7 @@ struct Workspace {
     double *along, *aside;               // scratch of the width of a cloud of points
 };
 
-// What the caller of both solvers has prepared; the centre was taken from all points.
+// What the caller of the solvers has prepared; the centre was taken from all points.
 struct Task {
     const rse_pf_pnp_request* request;
     Workspace* workspace;
@@ -32,6 +32,9 @@ void solve(const Task& task);
 }
 #if defined(__x86_64__)
 namespace avx2 {
+void solve(const Task& task);
+}
+namespace avx512 {
 void solve(const Task& task);
 }
 #endif
