@@ -28,7 +28,8 @@ from rse_pf.aws.fleet.instance import Instance
 from rse_pf.aws.fleet.task import AgentState, Phase
 from rse_pf.aws.fleet.tasks import rebalancing, server_metrics
 from rse_pf.config import PlatformSettings
-from rse_pf.experiments.load.swarm import Swarm, SwarmOptions
+from rse_pf.experiments.load.scenario import LoadScenario
+from rse_pf.experiments.load.swarm import Swarm
 from rse_pf.experiments.results.summary import summarise
 from rse_pf.local.control.control_plane import ControlOptions
 from rse_pf.local.control.platform import LocalPlatform
@@ -88,7 +89,7 @@ async def _measure(args: Options) -> dict[str, Any]:
         )  # fmt: skip
         async with platform:
             swarm = Swarm(
-                SwarmOptions(robots=args.robots, fps=args.fps), url=platform.url,
+                LoadScenario(robots=args.robots, fps=args.fps), url=platform.url,
                 token_of=platform.issue_token, session=settings.session,
             )  # fmt: skip
             async with swarm:

@@ -36,7 +36,8 @@ from benchmarks.data.windows import poses
 from benchmarks.frame.registry import Bar, benchmark
 from client_sdk.transfer.data_client import DataClient, DataOptions
 from rse_pf.config import PlatformSettings
-from rse_pf.experiments.load.swarm import Swarm, SwarmOptions
+from rse_pf.experiments.load.scenario import LoadScenario
+from rse_pf.experiments.load.swarm import Swarm
 from rse_pf.local.control.control_plane import ControlOptions
 from rse_pf.local.control.platform import LocalPlatform
 from rse_pf.object_store import DirectoryStore, digest_of
@@ -191,7 +192,7 @@ async def run(args: Options) -> dict[str, Any]:
         )
         async with cloud:
             began = time.monotonic()
-            options = SwarmOptions(robots=args.robots, fps=args.fps, join_every_s=0.02)
+            options = LoadScenario(robots=args.robots, fps=args.fps, join_every_s=0.02)
             swarm = Swarm(
                 options, url=cloud.url, token_of=cloud.issue_token, session=settings.session, origin=began
             )

@@ -33,7 +33,8 @@ from client_sdk.datasets import open_dataset
 from client_sdk.frontend import Frame, FrontEndOptions, extract
 from client_sdk.simulator import render_frames, true_trajectory
 from rse_pf.config import PlatformSettings
-from rse_pf.experiments.load.swarm import Swarm, SwarmOptions
+from rse_pf.experiments.load.scenario import LoadScenario
+from rse_pf.experiments.load.swarm import Swarm
 from rse_pf.geometry import Array, inverse
 from rse_pf.identity import RobotId, object_name
 from rse_pf.local.control.platform import LocalPlatform
@@ -170,7 +171,7 @@ async def run(args: Options) -> dict[str, Any]:
         async with LocalPlatform(settings, state=Path(folder), port=0, servers=2) as cloud:
             bench = Bench(args, cloud, maps)
             origin = time.monotonic()
-            options = SwarmOptions(robots=args.robots, fps=args.fps, join_every_s=0.02)
+            options = LoadScenario(robots=args.robots, fps=args.fps, join_every_s=0.02)
             swarm = Swarm(
                 options, url=cloud.url, token_of=cloud.issue_token, session=settings.session, origin=origin
             )

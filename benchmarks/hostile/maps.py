@@ -43,7 +43,8 @@ from benchmarks.hostile.robots import summarise_window
 from rse_pf.auth.tokens import SigningKey
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import RsePfError, UsageError
-from rse_pf.experiments.load.swarm import Swarm, SwarmOptions
+from rse_pf.experiments.load.scenario import LoadScenario
+from rse_pf.experiments.load.swarm import Swarm
 from rse_pf.geometry import exp_se3
 from rse_pf.maps.format import Keyframe, encode_map
 from rse_pf.object_store import digest_of
@@ -161,7 +162,7 @@ async def flood(args: Options, folder: Path) -> dict[str, Any]:
     """Measure quiet, attacked by commands, quiet, attacked by jobs."""
     server = Server(folder / "server", workers=args.workers, tree=args.tree.absolute())
     origin = time.monotonic()
-    options = SwarmOptions(robots=args.robots, fps=5.0, seed=7)
+    options = LoadScenario(robots=args.robots, fps=5.0, seed=7)
     windows: dict[str, tuple[float, float]] = {}
     rows: dict[str, dict[str, Any]] = {}
 

@@ -29,7 +29,8 @@ from benchmarks.frame.statistics import percentile
 from benchmarks.hostile import attacks
 from benchmarks.hostile.attacks import ATTACKS
 from rse_pf.config import PlatformSettings
-from rse_pf.experiments.load.swarm import Swarm, SwarmOptions
+from rse_pf.experiments.load.scenario import LoadScenario
+from rse_pf.experiments.load.swarm import Swarm
 from rse_pf.experiments.results.records import CommandRecord
 from rse_pf.local.control.platform import LocalPlatform
 
@@ -117,7 +118,7 @@ async def run(names: Sequence[str], robots: int, seconds: float, folder: Path) -
         return time.monotonic() - origin
 
     async with LocalPlatform(settings, state=folder / "platform", port=0, name="hostile") as cloud:
-        options = SwarmOptions(robots=robots, fps=5.0, seed=7)
+        options = LoadScenario(robots=robots, fps=5.0, seed=7)
         async with Swarm(
             options, url=cloud.url, token_of=cloud.issue_token, session=settings.session, on_event=heard,
             origin=origin,

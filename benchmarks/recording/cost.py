@@ -24,17 +24,18 @@ import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from benchmarks.frame.registry import Bar, benchmark
 from benchmarks.frame.report import say
 from benchmarks.frame.statistics import interleaved, median_ratio
-from benchmarks.server.load import LoadPlan, RobotGroup, compile_generator, hello_file, pnp_file, run_load
+from benchmarks.server.load import compile_generator, plan_of, run_load
 from benchmarks.server.serving import tree
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import ConfigurationError
+from rse_pf.experiments.load.scenario import LoadScenario
 from rse_pf.local.firewall import key_file, read_key
 from rse_pf.local.state import PlatformState, read_state, state_folder
 
@@ -149,14 +150,8 @@ def one_round(site: RecordingSite, folder: Path, asked: Options, seconds: float)
     """Return what one window of load cost *site*."""
     marks: dict[str, tuple[float, float, float]] = {}
     bytes_before = site.recorded_bytes()
-    group = RobotGroup(
-        name="robots", robots=asked.robots, mode="open", rate=FRAMES_PER_S,
-        payload=pnp_file(folder, asked.codec, 0.3),
-    )  # fmt: skip
-    plan = LoadPlan(
-        port=site.state.port, codec=asked.codec, hello=hello_file(folder, asked.codec), groups=(group,),
-        seconds=seconds, warm_up_s=0.5, drain_s=2.0, tokens=site.tokens, sources=8,
-    )  # fmt: skip
+    scenario = LoadScenario(robots=asked.robots, fps=FRAMES_PER_S, seconds=seconds, codec=asked.codec)
+    plan = replace(plan_of(scenario, folder, site.state.port), drain_s=2.0, tokens=site.tokens, sources=8)
     report = run_load(plan, lambda mark: marks.__setitem__(mark, site.cpu_s()))
     time.sleep(_LAST_CHUNK_S if site.recordings else 0.0)
     load = report.groups[0]

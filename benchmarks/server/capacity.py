@@ -23,7 +23,7 @@ import contextlib
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -33,13 +33,15 @@ from benchmarks.server.load import (
     LoadPlan,
     RobotGroup,
     compile_generator,
+    group_of,
     hello_file,
     ping_file,
-    pnp_file,
+    plan_of,
     run_load,
 )
 from benchmarks.server.serving import BenchServer, cpu_of_tree_s, private_bytes_of_tree
 from rse_pf.config import PlatformSettings
+from rse_pf.experiments.load.scenario import LoadScenario
 from rse_pf.local.control.platform import LocalPlatform
 
 SETTINGS: dict[str, dict[str, Any]] = {
@@ -98,16 +100,12 @@ class CapacityStep:
 
 def step(site: ServingSite, folder: Path, codec: str, robots: int, seconds: float) -> CapacityStep:
     """Connect *robots*, let them send, return what came of it."""
-    group = RobotGroup(
-        name="robots", robots=robots, mode="open", rate=FRAMES_PER_S, payload=pnp_file(folder, codec, 0.3)
-    )
-    report = run_load(
-        LoadPlan(
-            port=site.port, path=site.path, codec=codec, hello=hello_file(folder, codec), groups=(group,),
-            seconds=seconds, warm_up_s=WARM_UP_S, drain_s=DRAIN_S, sources=SOURCES, tokens=site.tokens,
-            opening_s=30.0, seed=robots,
-        )
+    scenario = LoadScenario(robots=robots, fps=FRAMES_PER_S, seconds=seconds, codec=codec)
+    plan = replace(
+        plan_of(scenario, folder, site.port), path=site.path, tokens=site.tokens, sources=SOURCES,
+        warm_up_s=WARM_UP_S, drain_s=DRAIN_S, opening_s=30.0, seed=robots,
     )  # fmt: skip
+    report = run_load(plan)
     load = report.groups[0]
     return CapacityStep(
         robots=robots, ok=load.ok, failed=load.failed, lost=load.lost, unsent=load.unsent,
@@ -182,9 +180,7 @@ def measure_connected(codec: str, seconds: float) -> dict[str, Any]:
                 name="idle", robots=CONNECTED - ACTIVE, mode="early", rate=1 / PING_EVERY_S,
                 payload=ping_file(folder, codec),
             ),
-            RobotGroup(
-                name="active", robots=ACTIVE, mode="open", rate=1.0, payload=pnp_file(folder, codec, 0.3)
-            ),
+            group_of(LoadScenario(robots=ACTIVE, fps=1.0, codec=codec), folder, "active"),
         )  # fmt: skip
         site = ServingSite(port=server.port, path="/ws", workers=2)
         step(site, folder, codec, 20, 1.0)  # warms it up

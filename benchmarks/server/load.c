@@ -57,6 +57,7 @@ static const char USAGE[] =
     "  --reply none|json|zlib|msgpack|peer   how answers are read\n"
     "  --seconds 5 --warm-up 0.5 --drain 4 --opening 60   the window, before it, after it, to connect\n"
     "  --at-once 64 --reopen 0   connections that open at the same time; pause before a closed one reopens\n"
+    "  --join-every 0   pause between two robots that connect\n"
     "  --obey 0   1: wait as long as a failure says\n"
     "  --seed 1 --samples FILE\n";
 
@@ -121,7 +122,7 @@ static struct {
   struct sockaddr_in address;
   const char *path, *subprotocol;
   int sources, first_source, at_once;
-  double seconds, warm_up_s, drain_s, opening_s, reopen_s;
+  double seconds, warm_up_s, drain_s, opening_s, reopen_s, join_every_s;
   unsigned seed;
   bool obeys;
   ReplyKind reply;
@@ -825,7 +826,7 @@ static void prepare_groups(void) {
       robot->next_frame = group->frame_count ? 7 * k % group->frame_count : 0;
       group->order[k] = k;
       group->phase_s[k] = group->rate > 0 ? uniform(&random) / group->rate : 0;
-      wait_to_open(robot, 0);
+      wait_to_open(robot, begin_s + option.join_every_s * (group->first + k));
     }
     phases = group->phase_s;
     qsort(group->order, n, sizeof *group->order, by_phase);
@@ -872,6 +873,7 @@ static void read_options(int argc, char **argv) {
     else if (!strcmp(name, "--opening")) option.opening_s = atof(value);
     else if (!strcmp(name, "--at-once")) option.at_once = atoi(value);
     else if (!strcmp(name, "--reopen")) option.reopen_s = atof(value);
+    else if (!strcmp(name, "--join-every")) option.join_every_s = atof(value);
     else if (!strcmp(name, "--obey")) option.obeys = atoi(value) != 0;
     else if (!strcmp(name, "--seed")) option.seed = (unsigned)strtoul(value, NULL, 10);
     else if (!strcmp(name, "--samples")) {

@@ -24,14 +24,17 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
+from rse_pf.config import SessionSettings
 from rse_pf.errors import ConfigurationError
-from rse_pf.pnp.problems import make_problem
-from rse_pf.services.pnp import make_request
+from rse_pf.experiments.load.payloads import make_payloads
+from rse_pf.experiments.load.scenario import LoadScenario
 from rse_pf.wire import SUBPROTOCOLS, Command, Hello, Message, Ping, make_codec
+from rse_pf.wire.preencoded import encode_command
 
 __all__ = [
     "OUTCOMES", "SAMPLE", "GroupReport", "LoadPlan", "LoadProcess", "LoadReport", "Percentiles", "RobotGroup",
-    "compile_generator", "hello_file", "ping_file", "pnp_file", "read_samples", "run_load", "write_messages",
+    "command_file", "compile_generator", "group_of", "hello_file", "ping_file", "plan_of", "read_samples",
+    "run_load", "write_messages",
 ]  # fmt: skip
 
 Mode = Literal["open", "early", "closed", "idle", "silent"]
@@ -39,9 +42,6 @@ Mode = Literal["open", "early", "closed", "idle", "silent"]
 SOURCE = Path(__file__).with_name("load.c")
 FLAGS = ("-O2", "-std=c11", "-Wall", "-Wextra", "-Werror")
 LIBRARIES = ("-lz", "-lm")
-PROBLEMS = 64
-"""Different problems of a payload file: enough that no cache answers."""
-
 SAMPLE = np.dtype(
     [("planned_s", "<f8"), ("latency_s", "<f4"), ("late_s", "<f4"), ("group", "<u4"), ("outcome", "<u4")]
 )
@@ -50,7 +50,7 @@ OUTCOMES = ("ok", "failed", "lost", "unsent")
 """What *outcome* of `SAMPLE` counts."""
 
 _BUILD = Path(__file__).resolve().parents[2] / "build" / "benchmarks"
-_COMPILE_S, _MARGIN_S = 60.0, 20.0
+_COMPILE_S, _MARGIN_S, _OPENING_S = 60.0, 20.0, 60.0
 _REPLIES = {"zlib": "zlib", "json": "json", "bin": "msgpack", "peer": "peer"}
 
 
@@ -96,18 +96,18 @@ def ping_file(folder: Path, codec_name: str) -> Path:
     return _encode(folder / f"ping.{codec_name}", codec_name, [Ping(sent_s=1.0)])
 
 
-def pnp_file(folder: Path, codec_name: str, outlier_ratio: float, **fields: Any) -> Path:
-    """Write `PROBLEMS` commands of 200 matches, every frame kept unless *fields* say else; return their file.
-
-    *fields* are those of a command, such as ``deadline_ms``.
-    """
-    commands: list[Command] = []
-    for seed in range(PROBLEMS):
-        p = make_problem(seed=seed, outlier_ratio=outlier_ratio)
-        request = make_request(p.points_world, p.pixels, p.camera, binary=codec_name == "bin")
-        commands.append(Command(id=seed, service="pnp", payload=request, **{"keep": True, **fields}))
-    file = folder / f"pnp-{round(100 * outlier_ratio)}.{codec_name}"
-    return _encode(file, codec_name, commands)
+def command_file(folder: Path, scenario: LoadScenario) -> Path:
+    """Write the commands of a robot of *scenario*, as the SDK sends them; return their file."""
+    codec, session = make_codec(scenario.codec), SessionSettings()
+    commands = [
+        Command(
+            id=number, service=scenario.service, payload=made.payload, stream="pose", keep=scenario.keep,
+            deadline_ms=1e3 * scenario.deadline_s,
+        )
+        for number, made in enumerate(make_payloads(scenario, session))
+    ]  # fmt: skip
+    file = folder / f"{scenario.service}-{round(100 * scenario.outliers)}.{scenario.codec}"
+    return write_messages(file, (encode_command(codec, command) for command in commands))
 
 
 def _encode(file: Path, codec_name: str, messages: Sequence[Message]) -> Path:
@@ -148,11 +148,12 @@ class LoadPlan:
     seconds: float = 4.0
     warm_up_s: float = 0.5
     drain_s: float = 4.0
-    opening_s: float = 60.0
+    opening_s: float = _OPENING_S
     sources: int = 1
     first_source: int = 1
     at_once: int = 64
     reopen_s: float = 0.0
+    join_every_s: float = 0.0
     seed: int = 1
     samples: Path | None = None
     obeys: bool = False
@@ -164,8 +165,9 @@ class LoadPlan:
             "port": self.port, "path": self.path, "reply": _REPLIES[self.codec], "seconds": self.seconds,
             "warm-up": self.warm_up_s, "drain": self.drain_s, "opening": self.opening_s,
             "sources": self.sources, "first-source": self.first_source, "at-once": self.at_once,
-            "reopen": self.reopen_s, "seed": self.seed, "hello": self.hello, "tokens": self.tokens,
-            "samples": self.samples, "obey": int(self.obeys), "subprotocol": SUBPROTOCOLS.get(self.codec),
+            "reopen": self.reopen_s, "join-every": self.join_every_s, "seed": self.seed,
+            "hello": self.hello, "tokens": self.tokens, "samples": self.samples, "obey": int(self.obeys),
+            "subprotocol": SUBPROTOCOLS.get(self.codec),
         }  # fmt: skip
         made = [str(program)]
         for name, value in values.items():
@@ -173,6 +175,32 @@ class LoadPlan:
         for group in self.groups:
             made += ["--group", group.option()]
         return made
+
+
+def group_of(scenario: LoadScenario, folder: Path, name: str = "robots") -> RobotGroup:
+    """Return the robots of *scenario*; their commands are written to *folder*.
+
+    Raises:
+        ConfigurationError: It has a link, which this generator does not emulate.
+    """
+    if scenario.link is not None:
+        raise ConfigurationError(
+            f"the load generator in C emulates no link ({scenario.link})", hint="drive it by rse-pf swarm"
+        )
+    return RobotGroup(
+        name=name, robots=scenario.robots, mode="early" if scenario.join_every_s else "open",
+        rate=scenario.fps, payload=command_file(folder, scenario),
+    )  # fmt: skip
+
+
+def plan_of(scenario: LoadScenario, folder: Path, port: int) -> LoadPlan:
+    """Return the plan that drives *scenario* against *port*; raises ConfigurationError as `group_of`."""
+    return LoadPlan(
+        port=port, groups=(group_of(scenario, folder),), codec=scenario.codec,
+        hello=hello_file(folder, scenario.codec), seconds=scenario.seconds, seed=scenario.seed,
+        drain_s=scenario.deadline_s, join_every_s=scenario.join_every_s,
+        opening_s=_OPENING_S + scenario.robots * scenario.join_every_s,
+    )  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)

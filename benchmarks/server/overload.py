@@ -37,13 +37,14 @@ from benchmarks.server.load import (
     LoadPlan,
     LoadProcess,
     RobotGroup,
+    command_file,
     compile_generator,
     hello_file,
     ping_file,
-    pnp_file,
     read_samples,
     run_load,
 )
+from rse_pf.experiments.load.scenario import LoadScenario
 
 Frames = Literal["kept", "newest"]
 MULTIPLES = (1.0, 1.2, 1.5, 2.0, 3.0)
@@ -92,10 +93,8 @@ def step(
         plan: Which frames are answered, whether robots obey, and for how many seconds the others join.
     """
     frames, obeys, seconds = plan
-    fields: dict[str, Any] = {"deadline_ms": 1e3 * DEADLINE_S}
-    if frames == "newest":
-        fields |= {"keep": False, "stream": "camera"}
-    payload = pnp_file(folder, codec, 0.3, **fields)
+    commands = LoadScenario(codec=codec, deadline_s=DEADLINE_S, keep=frames == "kept")
+    payload = command_file(folder, commands)
     hello, files = hello_file(folder, codec), [folder / "staying.samples", folder / "joining.samples"]
 
     def made(name: str, count: int) -> RobotGroup:

@@ -35,14 +35,15 @@ from benchmarks.frame.registry import Bar, benchmark
 from benchmarks.server.load import (
     LoadPlan,
     RobotGroup,
+    command_file,
     compile_generator,
     hello_file,
-    pnp_file,
     run_load,
     write_messages,
 )
 from benchmarks.server.serving import UNLIMITED, BenchServer, cpu_of_tree_s
 from rse_pf.errors import ConfigurationError
+from rse_pf.experiments.load.scenario import LoadScenario
 from rse_pf.pnp.problems import make_problem
 
 WORKERS = 2
@@ -96,7 +97,7 @@ def _free_port() -> int:
 
 
 def peer_file(folder: Path, outlier_ratio: float) -> Path:
-    """Write the same problems as `pnp_file` in the words of the paper's design; return their file."""
+    """Write the same problems as `command_file` in the words of the paper's design; return their file."""
     messages = []
     for seed in range(PROBLEMS):
         p = make_problem(seed=seed, outlier_ratio=outlier_ratio)
@@ -256,7 +257,10 @@ def run(sources: Path, rounds: int, seconds: float) -> dict[str, Any]:
         payloads = {outliers: peer_file(folder, outliers) for outliers in OUTLIERS}
         servers = [MeasuredServer(codec=PEER, port=port, pid=pid, path="/pnp", hello=None, payloads=payloads)]
         for codec in (ZLIB, BINARY):
-            payloads = {outliers: pnp_file(folder, codec, outliers) for outliers in OUTLIERS}
+            payloads = {
+                outliers: command_file(folder, LoadScenario(codec=codec, outliers=outliers))
+                for outliers in OUTLIERS
+            }
             servers.append(
                 MeasuredServer(
                     codec=codec, port=ours.port, pid=ours.pid, path="/ws", payloads=payloads,

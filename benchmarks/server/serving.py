@@ -49,14 +49,14 @@ def tree(pid: int) -> list[int]:
 
 
 def cpu_of_tree_s(pid: int) -> float:
-    """Return the user and system CPU seconds of *pid* and its living descendants."""
+    """Return the user and system CPU seconds of *pid* and its descendants, also of those that have ended."""
     ticks = 0
     for child in tree(pid):
         try:
             fields = Path(f"/proc/{child}/stat").read_text().rpartition(")")[2].split()
         except OSError:
             continue
-        ticks += int(fields[11]) + int(fields[12])
+        ticks += sum(map(int, fields[11:15]))  # its own, and of children that ended and were waited for
     return ticks / os.sysconf("SC_CLK_TCK")
 
 
@@ -76,14 +76,18 @@ class BenchServer:
     """``with BenchServer(folder, workers=2) as server``: a server of its own, ended with the block.
 
     *groups* are settings beside the defaults, such as ``session={"max_in_flight": 4}``; `UNLIMITED` is a set
-    of them.  With ``auth.required``, `token` returns tokens that the server accepts.
+    of them.  *python* is the interpreter whose installation serves, if not this one.  With ``auth.required``,
+    `token` returns tokens that the server accepts.
     """
 
-    def __init__(self, folder: Path, *, workers: int, **groups: dict[str, Any]) -> None:
+    def __init__(
+        self, folder: Path, *, workers: int, python: str | Path = sys.executable, **groups: dict[str, Any]
+    ) -> None:
         self.settings = PlatformSettings.from_dict(groups)
         self.workers = workers
         self.port = self.control_port = self.pid = 0
         self._folder = folder
+        self._python = python
         self._groups = groups
         self._key = SigningKey.from_seed(os.urandom(_KEY_BYTES), "bench-1")
         self._issued = 0
@@ -95,7 +99,7 @@ class BenchServer:
         announce.unlink(missing_ok=True)
         (self._folder / "settings.json").write_text(json.dumps(document), encoding="utf-8")
         command: list[str | Path] = [
-            sys.executable, "-m", "rse_pf.cli.main", "serve", "--settings", self._folder / "settings.json",
+            self._python, "-m", "rse_pf.cli.main", "serve", "--settings", self._folder / "settings.json",
             "--port", "0", "--control-port", "0", "--workers", str(self.workers), "--announce", announce,
         ]  # fmt: skip
         if self.settings.auth.required:

@@ -32,7 +32,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -49,14 +49,14 @@ from benchmarks.server.load import (
     LoadProcess,
     RobotGroup,
     compile_generator,
-    hello_file,
-    pnp_file,
+    plan_of,
     read_samples,
     run_load,
 )
 from benchmarks.server.serving import BenchServer, private_bytes_of_tree
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import ConfigurationError
+from rse_pf.experiments.load.scenario import LoadScenario
 from rse_pf.local.control.control_plane import ControlOptions
 from rse_pf.local.control.platform import LocalPlatform
 
@@ -139,14 +139,12 @@ def _add_up(outcomes: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 def robots_of(name: str, count: int, folder: Path, token_of: Callable[[str], str], port: int) -> LoadPlan:
     """Return the plan of the robots that are measured."""
-    group = RobotGroup(
-        name="robots", robots=count, mode="open", rate=FRAMES_PER_S, payload=pnp_file(folder, CODEC, 0.3)
-    )
+    scenario = LoadScenario(robots=count, fps=FRAMES_PER_S, seconds=LONGEST_S, codec=CODEC)
     tokens = folder / f"{name}.tokens"
     tokens.write_text("\n".join(token_of(f"{name}-{number}") for number in range(count)))
-    return LoadPlan(
-        port=port, codec=CODEC, hello=hello_file(folder, CODEC), tokens=tokens, groups=(group,),
-        seconds=LONGEST_S, warm_up_s=SETTLE_S, drain_s=1.0, samples=folder / f"{name}.samples", sources=4,
+    return replace(
+        plan_of(scenario, folder, port), tokens=tokens, sources=4, warm_up_s=SETTLE_S, drain_s=1.0,
+        samples=folder / f"{name}.samples",
     )  # fmt: skip
 
 
@@ -234,18 +232,14 @@ def generator(plan: LoadPlan) -> dict[str, Any]:
 def rate(rounds: int) -> dict[str, Any]:
     """Measure 99 robots beside one at 100 times their rate."""
     with one_server("rate") as (server, folder):
-        group = RobotGroup(
-            name="fast", robots=1, mode="open", rate=RATE_FACTOR * FRAMES_PER_S,
-            payload=pnp_file(folder, CODEC, 0.3),
-        )  # fmt: skip
+        fast = LoadScenario(robots=1, fps=RATE_FACTOR * FRAMES_PER_S, seconds=RATE_WINDOW_S, codec=CODEC)
 
         def prepare(number: int) -> Neighbour:
             tokens = folder / "fast.tokens"
             tokens.write_text(server.token(f"fast-{number}"))
-            plan = LoadPlan(
-                port=server.port, codec=CODEC, hello=hello_file(folder, CODEC), tokens=tokens,
-                groups=(group,), seconds=RATE_WINDOW_S, warm_up_s=0.0, drain_s=0.1, reopen_s=RATE_REOPEN_S,
-                first_source=NEIGHBOURS_FIRST_SOURCE,
+            plan = replace(
+                plan_of(fast, folder, server.port), tokens=tokens, warm_up_s=0.0, drain_s=0.1,
+                reopen_s=RATE_REOPEN_S, first_source=NEIGHBOURS_FIRST_SOURCE,
             )  # fmt: skip
             return lambda: generator(plan)
 

@@ -1,21 +1,23 @@
 """Load a platform with many robots that send real PnP problems, and measure their round trips.
 
 Send times are fixed before the run and latency counts from them, so that stalls are part of it. Without
---name or --url a platform is started for the run; Ctrl-C ends everything that was started.
+--name or --url a platform is started for the run; Ctrl-C ends everything that was started. Options count
+before --scenario.
 
 examples:
   rse-pf swarm --robots 20 --seconds 10
   rse-pf swarm --robots 100 --fps 5 --link paper --out out-swarm
   rse-pf swarm --name default --robots 50
+  rse-pf swarm --scenario out-swarm/scenario.json --codec bin --out again
 """
 
 from __future__ import annotations
 
 import argparse
-import math
 import os
 import secrets
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
@@ -29,42 +31,32 @@ if TYPE_CHECKING:
 
 __all__ = ["add_arguments", "run"]
 
-_MAX_S = 86400.0
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add = parser.add_argument
-    add("--robots", type=int, default=10, help="number of robots (default: 10)")
     add(
-        "--fps", type=float, default=5.0, help="frames per second of each robot (default: 5, as in the paper)"
+        "--scenario",
+        type=Path,
+        metavar="FILE",
+        help="what robots do, such as scenario.json of an earlier run",
     )
-    add(
-        "--join-every",
-        type=float,
-        default=0.0,
-        metavar="S",
-        help="time between two robots that join (default: 0)",
-    )
-    add(
-        "--seconds",
-        type=float,
-        default=20.0,
-        metavar="S",
-        help="duration after all have joined (default: 20)",
-    )
-    add("--matches", type=int, default=200, help="matches per frame (default: 200)")
-    add("--codec", default="zlib", help="zlib (default, as in the paper), json or bin")
-    add("--service", default="pnp", help="pnp (default) or echo")
+    add("--robots", type=int, help="number of robots (default: 10)")
+    add("--fps", type=float, help="frames per second of each robot (default: 5, as in the paper)")
+    add("--join-every", type=float, metavar="S", help="time between two robots that join (default: 0)")
+    add("--seconds", type=float, metavar="S", help="duration after all have joined (default: 20)")
+    add("--matches", type=int, help="matches per frame (default: 200)")
+    add("--codec", help="zlib (default, as in the paper), json or bin")
+    add("--service", help="pnp (default) or echo")
     add("--link", metavar="PROFILE", help="emulate a network: none, paper, wifi-bad or lte")
-    add("--deadline", type=float, default=5.0, metavar="S", help="deadline of each command (default: 5)")
+    add("--deadline", type=float, metavar="S", help="deadline of each command (default: 5)")
     add(
         "--latest-only",
         action="store_true",
         help="let the platform skip a frame when a newer one has arrived",
     )
-    add("--processes", type=int, default=1, help="processes of the generator (default: 1)")
-    add("--seed", type=int, default=0, help="seed of problems, jitter and link cuts (default: 0)")
+    add("--processes", type=int, help="processes of the generator (default: 1)")
+    add("--seed", type=int, help="seed of problems, jitter and link cuts (default: 0)")
     add("--servers", type=int, help="servers of the platform that is started (default: local.servers)")
     add("--name", help="use the platform that rse-pf local runs under this name")
     add("--url", help="use the platform at this address, with --token-from")
@@ -77,26 +69,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     """Check the options and run the swarm."""
     from rse_pf.experiments.load.run import run_swarm
-    from rse_pf.experiments.load.swarm import SwarmOptions
+    from rse_pf.experiments.load.scenario import LoadScenario, read_scenario
     from rse_pf.recording.writer import with_recordings
 
-    if not (math.isfinite(args.seconds) and 0 < args.seconds <= _MAX_S):
-        raise UsageError(
-            f"--seconds {args.seconds:g} is not within 0..{_MAX_S:g}", hint="20 is enough for percentiles"
-        )
-    options = SwarmOptions(
-        robots=args.robots,
-        fps=args.fps,
-        codec=args.codec,
-        matches=args.matches,
-        seed=args.seed,
-        join_every_s=args.join_every,
-        deadline_s=args.deadline,
-        keep=not args.latest_only,
-        service=args.service,
-        processes=args.processes,
-        link=args.link,
-    )
+    given = {
+        "robots": args.robots, "fps": args.fps, "seconds": args.seconds, "codec": args.codec,
+        "matches": args.matches, "seed": args.seed, "join_every_s": args.join_every,
+        "deadline_s": args.deadline, "keep": False if args.latest_only else None, "service": args.service,
+        "processes": args.processes, "link": args.link,
+    }  # fmt: skip
+    scenario = LoadScenario() if args.scenario is None else read_scenario(args.scenario)
+    scenario = replace(scenario, **{name: value for name, value in given.items() if value is not None})
     platform = _platform(args, settings)
     if platform is None:
         require("swarm")
@@ -113,14 +96,7 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
         )
     if platform is None:
         settings = with_recordings(settings, args.record)
-    return run_swarm(
-        options,
-        settings,
-        seconds=args.seconds,
-        out=args.out,
-        platform=platform,
-        quiet=args.quiet,
-    )
+    return run_swarm(scenario, settings, out=args.out, platform=platform, quiet=args.quiet)
 
 
 def _platform(args: argparse.Namespace, settings: PlatformSettings) -> TargetPlatform | None:

@@ -26,11 +26,16 @@ from benchmarks.server.load import (
     RobotGroup,
     compile_generator,
     hello_file,
+    plan_of,
     read_samples,
     run_load,
     write_messages,
 )
+from rse_pf.config import SessionSettings
 from rse_pf.errors import ConfigurationError
+from rse_pf.experiments.load.payloads import make_payloads
+from rse_pf.experiments.load.scenario import LoadScenario, read_scenario, write_scenario
+from rse_pf.experiments.load.swarm import Swarm, SwarmResult
 from rse_pf.wire import SUBPROTOCOLS, Command, Failure, Hello, Limits, Result, Welcome, make_codec
 
 pytestmark = pytest.mark.system
@@ -52,6 +57,8 @@ class ScriptedServer:
         self.outcomes: Counter[str] = Counter()
         self.sources: set[str] = set()
         self.tokens: set[str] = set()
+        self.echoes = False
+        self.commands: list[Command] = []
         self._loop = asyncio.new_event_loop()
         self._ready = threading.Event()
         self._stop = asyncio.Event()
@@ -99,12 +106,17 @@ class ScriptedServer:
         async for data in connection:
             message = codec.decode_from_robot(data.encode() if isinstance(data, str) else data)
             if isinstance(message, Hello):
-                limits = Limits(max_message_bytes=1, max_in_flight=1)
+                limits = Limits(max_message_bytes=1 << 20, max_in_flight=64)
                 await say(Welcome(server="s", session="x", robot="r", protocol=1, limits=limits, clock_s=0.0))
                 if connection.request is not None and connection.request.path == "/closes":
                     await connection.close(4429)
                 continue
-            assert isinstance(message, Command)
+            if not isinstance(message, Command):
+                continue  # a ping of the SDK, which does not miss the answer so soon
+            self.commands.append(message)
+            if self.echoes:
+                await say(Result(id=message.id, reply=message.payload))
+                continue
             if message.payload == "stall" and not self.outcomes["stalled"]:
                 self.outcomes["stalled"] += 1
                 await asyncio.sleep(STALL_S)  # the defect that the test looks for
@@ -259,6 +271,52 @@ def test_a_load_process_ends_when_it_is_asked(server: ScriptedServer, tmp_path: 
 
     assert isinstance(report, LoadReport)
     assert marks == ["begin", "end"]
+
+
+@pytest.mark.parametrize("codec", ["zlib", "json", "bin"])
+def test_one_scenario_file_drives_both_generators(server: ScriptedServer, tmp_path: Path, codec: str) -> None:
+    asked = LoadScenario(
+        robots=2, fps=20.0, seconds=0.5, codec=codec, service="echo", matches=5, seed=3, deadline_s=2.0,
+        keep=False, join_every_s=0.05,
+    )  # fmt: skip
+    scenario = read_scenario(write_scenario(tmp_path / "scenario.json", asked))
+    known = [made.echo for made in make_payloads(scenario, SessionSettings())]
+    server.echoes = True
+
+    report = run_load(plan_of(scenario, tmp_path, server.port))
+    by_c, server.commands = server.commands, []
+    result = asyncio.run(drive(scenario, f"ws://127.0.0.1:{server.port}/ws"))
+
+    assert scenario == asked
+    assert (report.groups[0].ok, report.groups[0].is_clean) == (20, True)
+    assert {command.code for command in result.commands} == {"ok"}
+    assert result.wrong_poses == 0
+    for sent in (by_c, server.commands):
+        assert len(sent) >= 20
+        assert {(each.service, each.stream, each.keep) for each in sent} == {("echo", "pose", False)}
+        assert all(each.payload["value"] in known for each in sent)
+        assert all(0.0 < (each.deadline_ms or 0.0) <= 2000.0 for each in sent)
+
+
+async def drive(scenario: LoadScenario, url: str) -> SwarmResult:
+    """Drive *scenario* by the SDK until as many commands are answered as in its time."""
+    swarm = Swarm(scenario, url=url, token_of=lambda robot: robot, session=SessionSettings())
+    async with swarm:
+        await swarm.start()
+        await swarm.wait_joined(READY_S)
+        await swarm.wait_answered(int(scenario.robots * scenario.fps * scenario.seconds), READY_S)
+        return await swarm.finish(scenario.deadline_s)
+
+
+def test_robots_join_one_after_another(server: ScriptedServer, tmp_path: Path) -> None:
+    scenario = LoadScenario(robots=3, fps=20.0, seconds=0.1, service="echo", join_every_s=0.1)
+
+    assert run_load(plan_of(scenario, tmp_path, server.port)).opening_s >= 0.2
+
+
+def test_refuses_a_scenario_with_a_link(tmp_path: Path) -> None:
+    with pytest.raises(ConfigurationError, match="emulates no link"):
+        plan_of(LoadScenario(link="paper"), tmp_path, 1)
 
 
 def test_ends_although_the_server_never_accepts(tmp_path: Path) -> None:

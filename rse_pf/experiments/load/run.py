@@ -1,7 +1,7 @@
 """One run of ``rse-pf swarm``: run the robots for a time, show progress, write the records and a report.
 
-Writes ``commands.csv``, ``events.jsonl`` and ``report.json``; the report is computed from the commands and
-the figures of the load generator.  The folder of results holds no key.
+Writes ``commands.csv``, ``events.jsonl``, ``report.json``, and ``scenario.json``, which repeats the run; the
+report is computed from the commands and the figures of the load generator.  The folder holds no key.
 """
 
 from __future__ import annotations
@@ -20,7 +20,8 @@ import numpy as np
 
 from client_sdk import connect
 from rse_pf.config import PlatformSettings
-from rse_pf.experiments.load.swarm import Swarm, SwarmOptions, SwarmResult
+from rse_pf.experiments.load.scenario import LoadScenario, write_scenario
+from rse_pf.experiments.load.swarm import Swarm, SwarmResult
 from rse_pf.experiments.load.swarm_process import ResultRows
 from rse_pf.experiments.results.records import COMMANDS, EVENTS, CommandRecord, EventLog, write_commands
 from rse_pf.experiments.results.result_folder import (
@@ -35,6 +36,7 @@ from rse_pf.terminal import show, show_page
 
 __all__ = ["FAST_MS", "TargetPlatform", "report_of", "run_swarm", "table_of"]
 
+SCENARIO = "scenario.json"
 FAST_MS = 150.0
 """Limit for "answered in time": below the paper's mean round trip of 156.36 ms."""
 
@@ -51,35 +53,33 @@ class TargetPlatform:
 
 
 def run_swarm(
-    options: SwarmOptions,
+    scenario: LoadScenario,
     settings: PlatformSettings,
     *,
-    seconds: float,
     out: Path,
     platform: TargetPlatform | None = None,
     quiet: bool = False,
 ) -> int:
-    """Run the swarm for *seconds* on *platform*; None starts one for the run.
+    """Run *scenario* on *platform*; None starts one for the run.
 
     Returns 0 if every command was answered or failed, once, and all poses were right.
     """
     if platform is not None:
         asyncio.run(_check(platform, settings))
-    folder = fresh_folder(out, ["report.json", COMMANDS, EVENTS])
+    folder = fresh_folder(out, [SCENARIO, "report.json", COMMANDS, EVENTS])
+    write_scenario(folder / SCENARIO, scenario)
     before = environment(settings)
     with (folder / EVENTS).open("w", encoding="utf-8") as file:
-        result = asyncio.run(_run(options, settings, seconds, platform, EventLog(file), quiet))
+        result = asyncio.run(_run(scenario, settings, platform, EventLog(file), quiet))
     write_commands(folder / COMMANDS, result.commands)
-    report = report_of(options, seconds, result, before)
+    report = report_of(scenario, result, before)
     write_json(folder / "report.json", report)
     show_page(table_of(report, folder))
     commands = report["commands"]
     return 1 if commands["lost"] or result.duplicates or result.wrong_poses or not commands["answered"] else 0
 
 
-def report_of(
-    options: SwarmOptions, seconds: float, result: SwarmResult, before: Mapping[str, Any]
-) -> dict[str, Any]:
+def report_of(scenario: LoadScenario, result: SwarmResult, before: Mapping[str, Any]) -> dict[str, Any]:
     """Return the report of a run.
 
     The frame rate of a robot is its answers over the time between its first and last planned command.
@@ -90,7 +90,7 @@ def report_of(
         "answered_percent": percent_answered(result.commands) or 0.0,
         "answered_in_time_percent": percent_answered(result.commands, FAST_MS) or 0.0,
         "in_time_ms": FAST_MS,
-        "fps_per_robot": percentiles(_frame_rates(result.commands, options.fps)),
+        "fps_per_robot": percentiles(_frame_rates(result.commands, scenario.fps)),
         "wrong_poses": result.wrong_poses,
         "twice": result.duplicates,
         "reconnects": result.reconnects,
@@ -106,15 +106,14 @@ def report_of(
             "late_sends_ms_p99": result.late_sends_ms_p99,
             "load_average_after": load_average(),
         },
-        "asked": {**asdict(options), "seconds": seconds},
+        "asked": asdict(scenario),
         "environment": dict(before),
     }
 
 
 async def _run(
-    options: SwarmOptions,
+    scenario: LoadScenario,
     settings: PlatformSettings,
-    seconds: float,
     platform: TargetPlatform | None,
     events: EventLog,
     quiet: bool,
@@ -135,11 +134,11 @@ async def _run(
                 )
             )
             platform = TargetPlatform(local.url, local.issue_token)
-        who = "1 robot sends" if options.robots == 1 else f"{options.robots} robots send"
-        _say(quiet, f"{who} {options.fps:g} commands per second each to {platform.url}")
+        who = "1 robot sends" if scenario.robots == 1 else f"{scenario.robots} robots send"
+        _say(quiet, f"{who} {scenario.fps:g} commands per second each to {platform.url}")
         swarm = await stack.enter_async_context(
             Swarm(
-                options,
+                scenario,
                 url=platform.url,
                 token_of=platform.token_of,
                 session=settings.session,
@@ -150,9 +149,9 @@ async def _run(
         screen = asyncio.create_task(_show(swarm, quiet))
         stack.callback(screen.cancel)
         await swarm.start()
-        await swarm.wait_joined(options.robots * options.join_every_s + _JOIN_S)
-        await asyncio.sleep(seconds)
-        return await swarm.finish(options.deadline_s)
+        await swarm.wait_joined(scenario.robots * scenario.join_every_s + _JOIN_S)
+        await asyncio.sleep(scenario.seconds)
+        return await swarm.finish(scenario.deadline_s)
 
 
 async def _check(platform: TargetPlatform, settings: PlatformSettings) -> None:

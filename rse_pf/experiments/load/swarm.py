@@ -30,6 +30,7 @@ from rse_pf.experiments.child_process import (
     end_process,
     start_process,
 )
+from rse_pf.experiments.load.scenario import LoadScenario
 from rse_pf.experiments.load.swarm_process import (
     FinishSwarm,
     ResultRows,
@@ -37,7 +38,6 @@ from rse_pf.experiments.load.swarm_process import (
     StartSwarm,
     SwarmEnded,
     SwarmEvent,
-    SwarmOptions,
     SwarmSpec,
     run_swarm_process,
 )
@@ -45,7 +45,7 @@ from rse_pf.experiments.results.records import CommandRecord
 from rse_pf.local.faults.network_emulator import LinkProcess, profile_named
 from rse_pf.wire.rate_limit import REASONS
 
-__all__ = ["Swarm", "SwarmOptions", "SwarmResult", "records_of"]
+__all__ = ["Swarm", "SwarmResult", "records_of"]
 
 _READY_TIMEOUT_S = 60.0
 _END_TIMEOUT_S = 30.0
@@ -94,7 +94,7 @@ class Swarm:
 
     def __init__(
         self,
-        options: SwarmOptions,
+        scenario: LoadScenario,
         *,
         url: str,
         token_of: Callable[[str], str],
@@ -105,14 +105,14 @@ class Swarm:
         """Describe the robots; nothing is started.
 
         Args:
-            options: Number of robots and what they do.
+            scenario: Number of robots and what they do.
             url: Address of the platform; an emulated link leads there.
             token_of: Returns a token for a robot; called in this process whenever a robot connects.
             session: Limits and timeouts of the robots.
             on_event: Called with each join, lost link and migration; ``time`` as in the records.
             origin: The `time.monotonic` that is 0 in all records; None means the start.
         """
-        self.options = options
+        self.scenario = scenario
         self.joined: set[str] = set()
         self.left: set[str] = set()
         self.rows: list[ResultRows] = []
@@ -123,7 +123,7 @@ class Swarm:
         self._on_event = on_event
         self._origin_s = origin
         self._start_s = 0.0
-        self._staying = list(range(options.robots))
+        self._staying = list(range(scenario.robots))
         self._children: list[_Child] = []
         self._changed = asyncio.Event()
         self._problem: CommandFailed | None = None
@@ -160,7 +160,7 @@ class Swarm:
 
     async def wait_joined(self, timeout_s: float) -> None:
         """Wait until every robot is connected and sends; raises CommandFailed after *timeout_s*."""
-        wanted = self.options.robots
+        wanted = self.scenario.robots
         await self._until(lambda: len(self.joined) >= wanted, timeout_s, "join")
 
     async def wait_answered(self, count: int, timeout_s: float) -> None:
@@ -175,8 +175,8 @@ class Swarm:
         self._staying = [number for number in self._staying if number not in leaving]
         for child in self._children:
             child.pipe.send(RobotsLeave(tuple(sorted(leaving & set(child.numbers)))))
-        names = {f"{self.options.robot_prefix}-{number + 1}" for number in leaving}
-        await self._until(lambda: names <= self.left, self.options.deadline_s + _END_TIMEOUT_S, "leave")
+        names = {f"robot-{number + 1}" for number in leaving}
+        await self._until(lambda: names <= self.left, self.scenario.deadline_s + _END_TIMEOUT_S, "leave")
 
     async def finish(self, grace_s: float = 5.0) -> SwarmResult:
         """Stop sending, wait up to *grace_s* for answers, end the processes; open commands count as lost."""
@@ -188,7 +188,7 @@ class Swarm:
         wall_s = time.monotonic() - self._start_s
         ended = [child.ended for child in self._children if child.ended is not None]
         totals = sum((end.counts for end in ended), Counter[str]())
-        commands = [command for rows in self.rows for command in records_of(rows, self.options.robot_prefix)]
+        commands = [command for rows in self.rows for command in records_of(rows)]
         late_ms = [1e3 * (command.sent - command.planned) for command in commands]
         return SwarmResult(
             commands=commands,
@@ -201,7 +201,7 @@ class Swarm:
             duplicates=totals["duplicates"]
             + len(commands)
             - len({(command.robot, command.id) for command in commands}),
-            link=self.options.link,
+            link=self.scenario.link,
             late_sends_ms_p99=round(float(np.percentile(late_ms, 99)), 3) if late_ms else 0.0,
             held_back={reason: totals[reason] for reason in REASONS},
             told_a_rate=totals["told_a_rate"],
@@ -209,17 +209,17 @@ class Swarm:
 
     async def _launch(self) -> None:
         url = self._url
-        if self.options.link is not None:
-            profile, parts = profile_named(self.options.link), urlsplit(url)
+        if self.scenario.link is not None:
+            profile, parts = profile_named(self.scenario.link), urlsplit(url)
             port = parts.port or (443 if parts.scheme == "wss" else 80)
-            link = LinkProcess(profile, parts.hostname or "", port, seed=self.options.seed)
+            link = LinkProcess(profile, parts.hostname or "", port, seed=self.scenario.seed)
             self.link = await link.__aenter__()
             url = parts._replace(netloc=f"127.0.0.1:{self.link.port}").geturl()
-        count = min(self.options.processes, self.options.robots)
+        count = min(self.scenario.processes, self.scenario.robots)
         loop = asyncio.get_running_loop()
         for share in range(count):
-            numbers = tuple(range(share, self.options.robots, count))
-            spec = SwarmSpec(numbers=numbers, url=url, session=self._session, options=self.options)
+            numbers = tuple(range(share, self.scenario.robots, count))
+            spec = SwarmSpec(numbers=numbers, url=url, session=self._session, scenario=self.scenario)
             process, pipe = await asyncio.to_thread(start_process, run_swarm_process, spec, "swarm")
             child = _Child(process, pipe, numbers)
             self._children.append(child)
@@ -264,7 +264,7 @@ class Swarm:
             if left_s <= 0:
                 raise CommandFailed(
                     f"the robots did not {what} within {timeout_s:g} s ({len(self.joined)} of "
-                    f"{self.options.robots} had joined)",
+                    f"{self.scenario.robots} had joined)",
                     hint="check that the platform runs and accepts their tokens",
                 )
             self._changed.clear()
@@ -286,14 +286,14 @@ class Swarm:
             await link.__aexit__(None, None, None)
 
 
-def records_of(rows: ResultRows, prefix: str) -> Iterator[CommandRecord]:
-    """Return the records of *rows* of robots with *prefix*; a command without a code was never answered."""
+def records_of(rows: ResultRows) -> Iterator[CommandRecord]:
+    """Return the records of *rows*; a command without a code was never answered."""
     for place, (server, code) in enumerate(zip(rows.servers, rows.codes, strict=True)):
         row: array[float] = rows.numbers[place * ResultRows.WIDTH : (place + 1) * ResultRows.WIDTH]
         number, identity, planned, sent, answered, size, up_ms, queue_ms, compute_ms, down_ms = row
         yield CommandRecord(
             id=int(identity),
-            robot=f"{prefix}-{int(number) + 1}",
+            robot=f"robot-{int(number) + 1}",
             planned=round(planned, 6),
             sent=round(sent, 6),
             answered=_round_or_none(answered, 6),

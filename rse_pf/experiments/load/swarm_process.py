@@ -19,93 +19,40 @@ from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 from typing import Any
 
-import numpy as np
-
 from rse_pf.config import SessionSettings
-from rse_pf.errors import RsePfError, UsageError
+from rse_pf.errors import RsePfError
 from rse_pf.experiments.child_process import ChildFailed, ChildReady, IssuedToken, TokenRequest
-from rse_pf.geometry import Array
-from rse_pf.local.faults.network_emulator import profile_named
-from rse_pf.wire import CODECS, Result, make_codec
+from rse_pf.experiments.load.payloads import SolvedPayload, is_right, make_payloads
+from rse_pf.experiments.load.scenario import LoadScenario
+from rse_pf.wire import Result
 from rse_pf.wire.client_session import Answered
-from rse_pf.wire.preencoded import PreencodedCommand, preencode
 
 __all__ = [
     "FinishSwarm",
     "ResultRows",
     "RobotsLeave",
-    "SolvedPayload",
     "StartSwarm",
     "SwarmEnded",
     "SwarmEvent",
-    "SwarmOptions",
     "SwarmSpec",
-    "is_right",
-    "make_payloads",
     "plan_s",
     "run_swarm_process",
 ]  # fmt: skip
 
-SERVICES = ("pnp", "echo")
-"""Services that the robots can call, because their true answers are known."""
-
-_MAX_ROBOTS, _MAX_PROCESSES, _MAX_FPS, _MAX_MATCHES = 5000, 16, 200.0, 5000
 _NO_PARTS = (math.nan,) * 4
-_POOL = 64
 _ROWS = 256
 _FLUSH_EVERY_S = 0.5
 _PHASE = (math.sqrt(5.0) - 1.0) / 2.0
-_POSE_M, _POSE_RAD = 0.05, math.radians(1.0)
-"""A pose with a larger error is wrong; with 200 matches the error is one or two centimetres."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SwarmOptions:
-    """Number of robots and what they do; raises UsageError for a value out of range.
-
-    Robot k connects ``k * join_every_s`` after the start.  ``keep`` asks the platform to answer every
-    frame, not only the newest.  ``link`` is the name of a profile of `rse_pf.local.faults.network_emulator`.
-    """
-
-    robots: int
-    fps: float = 5.0
-    codec: str = "zlib"
-    matches: int = 200
-    outliers: float = 0.3
-    seed: int = 0
-    join_every_s: float = 0.0
-    deadline_s: float = 5.0
-    keep: bool = True
-    service: str = "pnp"
-    processes: int = 1
-    link: str | None = None
-    robot_prefix: str = "robot"
-
-    def __post_init__(self) -> None:
-        """Check every field."""
-        _within("robots", self.robots, 1, _MAX_ROBOTS)
-        _within("fps", self.fps, 0.01, _MAX_FPS)
-        _within("matches", self.matches, 4, _MAX_MATCHES)
-        _within("outliers", self.outliers, 0.0, 0.9)
-        _within("seed", self.seed, 0, 2**31)
-        _within("join_every_s", self.join_every_s, 0.0, 3600.0)
-        _within("deadline_s", self.deadline_s, 0.01, 3600.0)
-        _within("processes", self.processes, 1, _MAX_PROCESSES)
-        for name, value, known in (("codec", self.codec, CODECS), ("service", self.service, SERVICES)):
-            if value not in known:
-                raise UsageError(f"no {name} named {value!r}", hint=f"choose one of {', '.join(known)}")
-        if self.link is not None:
-            profile_named(self.link)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SwarmSpec:
-    """What one process does: the robots *numbers* of all robots of *options*."""
+    """What one process does: the robots *numbers* of all robots of *scenario*."""
 
     numbers: tuple[int, ...]
     url: str
     session: SessionSettings
-    options: SwarmOptions
+    scenario: LoadScenario
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,52 +112,10 @@ class ResultRows:
         return len(self.codes)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SolvedPayload:
-    """An encoded payload and the true answer: a pose, or the numbers of an echo."""
-
-    payload: PreencodedCommand
-    T_camera_world: Array | None = None
-    echo: list[float] | None = None
-
-
-def make_payloads(options: SwarmOptions, session: SessionSettings) -> list[SolvedPayload]:
-    """Return a pool of seeded problems with known answers, encoded for the codec of *options*."""
-    from rse_pf.pnp.problems import make_problem
-    from rse_pf.services.pnp import make_request
-
-    codec = make_codec(options.codec, session)
-    if options.service == "echo":
-        numbers = np.random.default_rng(options.seed).integers(0, 1000, (_POOL, max(1, options.matches)))
-        return [SolvedPayload(payload=preencode(codec, {"value": row}), echo=row) for row in numbers.tolist()]
-    pool = []
-    for number in range(_POOL):
-        problem = make_problem(seed=options.seed + number, n=options.matches, outlier_ratio=options.outliers)
-        request = make_request(
-            problem.points_world, problem.pixels, problem.camera, binary=options.codec == "bin"
-        )
-        pool.append(SolvedPayload(payload=preencode(codec, request), T_camera_world=problem.T_camera_world))
-    return pool
-
-
-def is_right(problem: SolvedPayload, reply: Any) -> bool:
-    """Return whether a reply agrees with the truth: 5 cm and 1 degree for a pose."""
-    try:
-        if problem.T_camera_world is None:
-            return bool(reply["value"] == problem.echo)
-        T = np.asarray(reply["T_camera_world"], dtype=np.float64).reshape(4, 4)
-    except (KeyError, TypeError, ValueError):
-        return False
-    truth = problem.T_camera_world
-    centres = T[:3, :3].T @ T[:3, 3] - truth[:3, :3].T @ truth[:3, 3]
-    cosine = (float(np.vdot(T[:3, :3], truth[:3, :3])) - 1.0) / 2.0
-    return float(centres @ centres) <= _POSE_M**2 and cosine >= math.cos(_POSE_RAD)
-
-
-def plan_s(options: SwarmOptions, number: int, start_s: float, frame: int) -> float:
+def plan_s(scenario: LoadScenario, number: int, start_s: float, frame: int) -> float:
     """Return when robot *number* sends *frame*: fixed before the run, spread evenly over the robots."""
     phase = (number * _PHASE) % 1.0
-    return start_s + number * options.join_every_s + (frame + phase) / options.fps
+    return start_s + number * scenario.join_every_s + (frame + phase) / scenario.fps
 
 
 def run_swarm_process(spec: SwarmSpec, pipe: Connection) -> None:
@@ -251,7 +156,7 @@ class _Process:
 
     async def run(self) -> None:
         """Encode the payloads, follow the orders of the parent, and report the end."""
-        self.pool = await asyncio.to_thread(make_payloads, self.spec.options, self.spec.session)
+        self.pool = await asyncio.to_thread(make_payloads, self.spec.scenario, self.spec.session)
         gc.collect()
         gc.freeze()
         loop = asyncio.get_running_loop()
@@ -354,7 +259,7 @@ class _Robot:
 
     def __init__(self, process: _Process, number: int) -> None:
         self.client: Any = None
-        self.name = f"{process.spec.options.robot_prefix}-{number + 1}"
+        self.name = f"robot-{number + 1}"
         self._process = process
         self._number = number
         self._waiting: dict[int, tuple[float, float]] = {}
@@ -368,12 +273,12 @@ class _Robot:
         """Connect at the time of this robot, retry until that works, and begin to send."""
         from client_sdk import connect
 
-        process, spec, options = self._process, self._process.spec, self._process.spec.options
-        await asyncio.sleep(max(0.0, start_s + self._number * options.join_every_s - time.monotonic()))
-        jitter = random.Random(f"{options.seed}/{self.name}")
+        process, spec, scenario = self._process, self._process.spec, self._process.spec.scenario
+        await asyncio.sleep(max(0.0, start_s + self._number * scenario.join_every_s - time.monotonic()))
+        jitter = random.Random(f"{scenario.seed}/{self.name}")
         while not self._stopping:
             self.client = connect(
-                spec.url, token=self._token, codec=options.codec, settings=spec.session,
+                spec.url, token=self._token, codec=scenario.codec, settings=spec.session,
                 on_change=self._take_change, random=jitter,
             )  # fmt: skip
             try:
@@ -382,8 +287,8 @@ class _Robot:
             except RsePfError as error:
                 process.report("join-failed", robot=self.name, code=error.code, why=error.message)
                 await asyncio.sleep(spec.session.reconnect_max_s)
-        first = plan_s(options, self._number, start_s, 0)
-        missed = max(0, math.ceil((time.monotonic() - first) * options.fps))
+        first = plan_s(scenario, self._number, start_s, 0)
+        missed = max(0, math.ceil((time.monotonic() - first) * scenario.fps))
         if self._stopping:
             await self.close()
         else:
@@ -405,7 +310,7 @@ class _Robot:
 
     async def leave(self) -> None:
         """Stop, then disconnect."""
-        await self.stop(self._process.spec.options.deadline_s)
+        await self.stop(self._process.spec.scenario.deadline_s)
         await self.close()
         self._process.report("robot-left", robot=self.name)
 
@@ -415,20 +320,21 @@ class _Robot:
             await self.client.close()
 
     def _plan(self, start_s: float, frame: int) -> None:
-        planned = plan_s(self._process.spec.options, self._number, start_s, frame)
+        planned = plan_s(self._process.spec.scenario, self._number, start_s, frame)
         loop = asyncio.get_running_loop()
         self._next = loop.call_at(planned, self._send, start_s, frame, planned)
 
     def _send(self, start_s: float, frame: int, planned: float) -> None:
         self._plan(start_s, frame + 1)
-        process, options = self._process, self._process.spec.options
+        process, scenario = self._process, self._process.spec.scenario
         problem = process.pool[(frame + 7 * self._number) % len(process.pool)]
         identity = next(self._ids)
         sent = time.monotonic()
         try:
             self.client.post(
-                options.service, problem.payload, functools.partial(self._take_answer, identity, problem),
-                deadline_s=max(0.0, options.deadline_s - (sent - planned)), stream="pose", keep=options.keep,
+                scenario.service, problem.payload, functools.partial(self._take_answer, identity, problem),
+                deadline_s=max(0.0, scenario.deadline_s - (sent - planned)), stream="pose",
+                keep=scenario.keep,
             )  # fmt: skip
         except RsePfError as error:
             self._write(identity, (planned, sent, sent), "", error.code)
@@ -471,11 +377,3 @@ class _Robot:
     def _take_change(self, what: str, why: str) -> None:
         details = {"reason": why} if what == "link-lost" else {"server": why}
         self._process.report(what, robot=self.name, **details)
-
-
-def _within(name: str, value: float, low: float, high: float) -> None:
-    if not low <= value <= high:
-        raise UsageError(
-            f"{name} = {value:g} is not within {low:g}..{high:g}",
-            hint=f"give a value from {low:g} to {high:g}",
-        )

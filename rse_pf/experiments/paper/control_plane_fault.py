@@ -19,7 +19,8 @@ from typing import Any
 
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import CommandFailed
-from rse_pf.experiments.load.swarm import Swarm, SwarmOptions
+from rse_pf.experiments.load.scenario import LoadScenario
+from rse_pf.experiments.load.swarm import Swarm
 from rse_pf.experiments.paper.harness import generator_event, policy_parameters
 from rse_pf.experiments.results.records import (
     COMMANDS,
@@ -49,7 +50,7 @@ async def run_control_plane_fault(
     folder: Path,
     settings: PlatformSettings,
     parameters: Mapping[str, Any],
-    robots: SwarmOptions,
+    robots: LoadScenario,
     down_s: float,
 ) -> None:
     """Run a platform, kill its control plane for *down_s* under load, start it again; write the records.

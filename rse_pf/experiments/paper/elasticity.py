@@ -18,7 +18,7 @@ from typing import Any
 
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import CommandFailed
-from rse_pf.experiments.load.swarm import SwarmOptions
+from rse_pf.experiments.load.scenario import LoadScenario
 from rse_pf.experiments.paper.harness import Harness, generator_of
 from rse_pf.experiments.plots.figures import draw_elasticity, require_matplotlib
 from rse_pf.experiments.results.bars import Bars
@@ -170,7 +170,7 @@ async def _measure(options: ElasticityOptions, settings: PlatformSettings, folde
             status = (await harness.platform.status())[0]
             return float(status["cpu_s"]), int(status["requests"])
 
-        swarm_options = SwarmOptions(robots=robots, fps=options.fps, codec=options.codec, seed=options.seed)
+        swarm_options = LoadScenario(robots=robots, fps=options.fps, codec=options.codec, seed=options.seed)
         async with harness.swarm(swarm_options) as swarm:
             idle, began = await cpu(), harness.now()
             await harness.run_for(_CALIBRATION_IDLE_S)
@@ -206,7 +206,7 @@ async def _run(options: ElasticityOptions, settings: PlatformSettings, folder: P
     }
     quiet_s = max(_MIN_QUIET_S, 3 * period_s)
     async with Harness(folder, settings, parameters, compress=speed, rebalance=rebalance) as harness:
-        swarm_options = SwarmOptions(
+        swarm_options = LoadScenario(
             robots=options.robots,
             fps=options.fps,
             codec=options.codec,

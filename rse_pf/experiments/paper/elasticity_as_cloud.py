@@ -17,7 +17,7 @@ from typing import Any
 
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import CommandFailed
-from rse_pf.experiments.load.swarm import SwarmOptions
+from rse_pf.experiments.load.scenario import LoadScenario
 from rse_pf.experiments.paper.elasticity import ElasticityOptions, emulated_cores
 from rse_pf.experiments.paper.harness import Harness, generator_of
 from rse_pf.experiments.results.markdown import about_run, failures, number, page, table, three
@@ -157,7 +157,7 @@ async def _run(
     async with Harness(
         folder, settings, parameters, compress=speed, rebalance=design.rebalances, delays=design.delays
     ) as harness:
-        asked = SwarmOptions(robots=robots, fps=options.fps, codec=options.codec, seed=options.seed)
+        asked = LoadScenario(robots=robots, fps=options.fps, codec=options.codec, seed=options.seed)
         async with harness.swarm(asked) as swarm:
             await harness.run_for(max(period_s, settings.scaling.warm_up_s / speed))
             await harness.run_for(_until_phase(time.monotonic(), period_s, phase))

@@ -18,7 +18,8 @@ from typing import Any
 
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import CommandFailed, UsageError
-from rse_pf.experiments.load.swarm import Swarm, SwarmOptions, SwarmResult
+from rse_pf.experiments.load.scenario import LoadScenario
+from rse_pf.experiments.load.swarm import Swarm, SwarmResult
 from rse_pf.experiments.results.records import (
     COMMANDS,
     EVENTS,
@@ -128,7 +129,7 @@ class Harness:
         """Record an event that happens now."""
         self._record(self.now(), action, details)
 
-    def swarm(self, options: SwarmOptions) -> Swarm:
+    def swarm(self, options: LoadScenario) -> Swarm:
         """Return the robots of this run; start them with ``async with``."""
         return Swarm(
             options,

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from rse_pf.config import PlatformSettings
-from rse_pf.experiments.load.swarm import SwarmOptions
+from rse_pf.experiments.load.scenario import LoadScenario
 from rse_pf.experiments.paper.harness import Harness, generator_of
 from rse_pf.experiments.plots.figures import draw_latency, require_matplotlib
 from rse_pf.experiments.results.bars import Bars
@@ -90,7 +90,7 @@ async def _run(options: LatencyOptions, settings: PlatformSettings, folder: Path
         "link": options.link,
         "link_round_trip_ms": 1000.0 * profile_named(options.link).round_trip_s if options.link else 0.0,
     }
-    robots = SwarmOptions(
+    robots = LoadScenario(
         robots=options.robots,
         fps=options.fps,
         codec=options.codec,

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from rse_pf.config import PlatformSettings
-from rse_pf.experiments.load.swarm import SwarmOptions
+from rse_pf.experiments.load.scenario import LoadScenario
 from rse_pf.experiments.paper.control_plane_fault import run_control_plane_fault
 from rse_pf.experiments.paper.elasticity import crashes, slowest_replacement_s
 from rse_pf.experiments.paper.fault_scenarios import SCENARIOS
@@ -122,7 +122,7 @@ async def _run(
         "deadline_s": session.answer_timeout_s,
         "seed": seed,
     }
-    robots = SwarmOptions(
+    robots = LoadScenario(
         robots=options.robots,
         fps=options.fps,
         codec=options.codec,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,15 +11,11 @@ import pytest
 
 from rse_pf.config import SessionSettings
 from rse_pf.errors import UsageError
+from rse_pf.experiments.load.payloads import SolvedPayload, is_right, make_payloads
 from rse_pf.experiments.load.run import report_of, table_of
-from rse_pf.experiments.load.swarm import SwarmOptions, SwarmResult, records_of
-from rse_pf.experiments.load.swarm_process import (
-    ResultRows,
-    SolvedPayload,
-    is_right,
-    make_payloads,
-    plan_s,
-)
+from rse_pf.experiments.load.scenario import LoadScenario, read_scenario, write_scenario
+from rse_pf.experiments.load.swarm import SwarmResult, records_of
+from rse_pf.experiments.load.swarm_process import ResultRows, plan_s
 from rse_pf.experiments.results.records import CommandRecord
 from rse_pf.geometry import exp_se3
 from rse_pf.pnp import solve_pnp
@@ -27,8 +24,8 @@ from rse_pf.wire import Command, as_type, make_codec
 from rse_pf.wire.preencoded import encode_command
 
 
-def options(**changes: Any) -> SwarmOptions:
-    return SwarmOptions(**{"robots": 2, **changes})
+def options(**changes: Any) -> LoadScenario:
+    return LoadScenario(**{"robots": 2, **changes})
 
 
 def payloads(**changes: Any) -> list[SolvedPayload]:
@@ -45,7 +42,7 @@ def payloads(**changes: Any) -> list[SolvedPayload]:
 )  # fmt: skip
 def test_options_out_of_range_are_refused_with_a_hint(name: str, value: Any) -> None:
     with pytest.raises(UsageError) as told:
-        SwarmOptions(**{"robots": 2, name: value})
+        LoadScenario(**{"robots": 2, name: value})
     assert told.value.hint
 
 
@@ -111,7 +108,7 @@ def rows() -> ResultRows:
 
 
 def test_the_round_trip_counts_from_the_planned_time() -> None:
-    answered, failed, lost = records_of(rows(), "robot")
+    answered, failed, lost = records_of(rows())
     assert answered.robot == "robot-5"
     assert (answered.planned, answered.sent, answered.round_trip_ms) == (1.0, 1.01, pytest.approx(130.0))
     assert (answered.up_ms, answered.queue_ms, answered.compute_ms, answered.down_ms) == (1.5, 0.25, 2.0, 3.0)
@@ -128,7 +125,7 @@ def result(commands: list[CommandRecord]) -> SwarmResult:
 
 
 def test_the_report_counts_what_was_answered_in_time(tmp_path: Any) -> None:
-    report = report_of(SwarmOptions(robots=1), 1.0, result(list(records_of(rows(), "robot"))), {})
+    report = report_of(LoadScenario(robots=1), result(list(records_of(rows()))), {})
     assert report["commands"]["sent"] == 3
     assert report["commands"]["lost"] == 1
     assert report["failures_by_code"] == {"expired": 1}
@@ -137,3 +134,29 @@ def test_the_report_counts_what_was_answered_in_time(tmp_path: Any) -> None:
     assert report["answered_in_time_percent"] == pytest.approx(33.333)
     assert report["generator"]["cpu_percent"] == 20.0
     assert report["fps_per_robot"]["mean"] == pytest.approx(1 / 0.6, rel=1e-3)
+
+
+def test_a_scenario_is_read_as_it_was_written(tmp_path: Path) -> None:
+    asked = LoadScenario(robots=3, fps=2.5, link="paper", keep=False, service="echo", seconds=1.5)
+    assert read_scenario(write_scenario(tmp_path / "made", asked)) == asked
+
+
+def test_what_a_scenario_leaves_out_has_its_default(tmp_path: Path) -> None:
+    (tmp_path / "made").write_text('{"robots": 7}')
+    assert read_scenario(tmp_path / "made") == LoadScenario(robots=7)
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("", "is no scenario"), ("[1]", "is no scenario"), ("[" * 9999, "is no scenario"),
+        ('{"robots": 1.5}', "robots"), ('{"keep": 1}', "keep"), ('{"robots": 0}', "robots = 0"),
+        ('{"url": "ws://x"}', "has no 'url'"), ('{"fps": NaN}', "is no scenario"), ("\xff", "is no scenario"),
+    ],
+)  # fmt: skip
+def test_a_file_that_is_no_scenario_is_refused_in_one_line(tmp_path: Path, text: str, says: str) -> None:
+    (tmp_path / "made").write_bytes(text.encode("latin-1"))
+    with pytest.raises(UsageError, match=says) as told:
+        read_scenario(tmp_path / "made")
+    assert told.value.hint
+    assert "\n" not in told.value.message

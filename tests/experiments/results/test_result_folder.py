@@ -13,7 +13,7 @@ from rse_pf.config import PlatformSettings
 from rse_pf.errors import UsageError
 from rse_pf.experiments.demo.run import DemoOptions, run_demo
 from rse_pf.experiments.load.run import run_swarm
-from rse_pf.experiments.load.swarm import SwarmOptions
+from rse_pf.experiments.load.scenario import LoadScenario
 from rse_pf.experiments.results.result_folder import RUN_FILES, commit_of, finish_report, fresh_folder
 
 
@@ -88,7 +88,7 @@ def start_demo(out: Path) -> None:
 
 
 def start_swarm(out: Path) -> None:
-    run_swarm(SwarmOptions(robots=1), PlatformSettings(), seconds=1.0, out=out)
+    run_swarm(LoadScenario(robots=1, seconds=1.0), PlatformSettings(), out=out)
 
 
 @pytest.mark.parametrize(

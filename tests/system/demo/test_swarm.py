@@ -20,7 +20,8 @@ import pytest
 
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import CommandFailed
-from rse_pf.experiments.load.swarm import Swarm, SwarmOptions
+from rse_pf.experiments.load.scenario import LoadScenario
+from rse_pf.experiments.load.swarm import Swarm
 from rse_pf.experiments.results.summary import summarise
 from rse_pf.local.control.platform import LocalPlatform
 from rse_pf.local.processes import wait_ended
@@ -34,7 +35,7 @@ def run(work: Coroutine[Any, Any, None]) -> None:
     asyncio.run(asyncio.wait_for(work, 90))
 
 
-def swarm_of(cloud: LocalPlatform, options: SwarmOptions, **more: Any) -> Swarm:
+def swarm_of(cloud: LocalPlatform, options: LoadScenario, **more: Any) -> Swarm:
     return Swarm(options, url=cloud.url, token_of=cloud.issue_token, session=SETTINGS.session, **more)
 
 
@@ -58,7 +59,7 @@ def test_robots_of_two_processes_get_right_poses_and_leave(tmp_path: Path) -> No
     async def work() -> None:
         heard: list[Any] = []
         async with LocalPlatform(SETTINGS, servers=1, port=0, state=tmp_path / "a") as cloud:
-            options = SwarmOptions(robots=6, processes=2, join_every_s=0.05)
+            options = LoadScenario(robots=6, processes=2, join_every_s=0.05)
             async with swarm_of(cloud, options, on_event=heard.append) as swarm:
                 await swarm.start()
                 await swarm.wait_joined(20)
@@ -90,7 +91,7 @@ def test_robots_whose_tokens_are_refused_are_reported_and_no_process_is_left(tmp
     async def work() -> None:
         heard: list[Any] = []
         async with LocalPlatform(SETTINGS, servers=1, port=0, state=tmp_path / "a") as cloud, Swarm(
-            SwarmOptions(robots=2), url=cloud.url, token_of=lambda robot: "no-token",
+            LoadScenario(robots=2), url=cloud.url, token_of=lambda robot: "no-token",
             session=SETTINGS.session, on_event=heard.append,
         ) as swarm:  # fmt: skip
             await swarm.start()
@@ -106,7 +107,7 @@ def test_the_median_through_the_papers_link_is_little_more_than_its_delay(tmp_pa
     async def work() -> None:
         async with (
             LocalPlatform(SETTINGS, servers=1, port=0, state=tmp_path / "a") as cloud,
-            swarm_of(cloud, SwarmOptions(robots=3, link="paper")) as swarm,
+            swarm_of(cloud, LoadScenario(robots=3, link="paper")) as swarm,
         ):
             await swarm.start()
             await swarm.wait_joined(20)
@@ -132,7 +133,7 @@ def test_all_robots_reconnect_soon_after_the_load_balancer_was_killed_and_restar
 
         async with LocalPlatform(SETTINGS, servers=2, port=free_port(), state=tmp_path / "a") as cloud:
             origin = time.monotonic()
-            async with swarm_of(cloud, SwarmOptions(robots=robots), on_event=listen, origin=origin) as swarm:
+            async with swarm_of(cloud, LoadScenario(robots=robots), on_event=listen, origin=origin) as swarm:
                 await swarm.start()
                 await swarm.wait_joined(30)
                 before = cloud.load_balancer.process.mark

@@ -11,7 +11,8 @@ from urllib.parse import urlsplit
 import pytest
 
 from rse_pf.config import PlatformSettings
-from rse_pf.experiments.load.swarm import Swarm, SwarmOptions
+from rse_pf.experiments.load.scenario import LoadScenario
+from rse_pf.experiments.load.swarm import Swarm
 from rse_pf.local.control.platform import LocalPlatform
 from rse_pf.local.faults.network_emulator import PROFILES, LinkProcess
 
@@ -57,7 +58,7 @@ def test_both_sides_notice_a_cut_and_the_first_answers_come_soon_after_it(tmp_pa
                 url = parts._replace(netloc=f"127.0.0.1:{link.port}").geturl()
                 origin = time.monotonic()
                 async with Swarm(
-                    SwarmOptions(robots=ROBOTS, deadline_s=DEADLINE_S),
+                    LoadScenario(robots=ROBOTS, deadline_s=DEADLINE_S),
                     url=url, token_of=cloud.issue_token, session=SETTINGS.session, on_event=listener,
                     origin=origin,
                 ) as swarm:  # fmt: skip
