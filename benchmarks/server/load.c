@@ -12,8 +12,9 @@
    Answers are matched by their `id`: message k of a payload file has the id k.  An answer without id belongs
    to the oldest unanswered message of its connection.
 
-   With --obey 1 a robot that is told `retry_after_ms` sends nothing until then; what it leaves out counts as
-   unsent, so as offered.
+   With --obey 1 a robot that is told `retry_after_ms` sends nothing until then, and keeps to the rate that it
+   is told by leaving messages out, never waiting with one; what it leaves out counts as unsent, so as offered.
+   Its hello file names the capabilities.  Each id of a `refused` message counts as failed.
 
    It connects to 127.0.0.0/8 only, ends at a deadline whatever happens, and does not check poses. */
 #define _GNU_SOURCE
@@ -44,6 +45,7 @@ enum {
   MAX_QUEUED = 8,             /* frames that one connection has not taken yet; more are not sent */
   MAX_MESSAGE = 1 << 20,      /* longest message of a server */
   MAX_CODES = 64,
+  MAX_REFUSED = 64,           /* commands that one message ends */
   HEAD_BYTES = 160,           /* type and id of an answer stand within its first bytes */
   EVENTS = 1024,
 };
@@ -58,14 +60,14 @@ static const char USAGE[] =
     "  --seconds 5 --warm-up 0.5 --drain 4 --opening 60   the window, before it, after it, to connect\n"
     "  --at-once 64 --reopen 0   connections that open at the same time; pause before a closed one reopens\n"
     "  --join-every 0   pause between two robots that connect\n"
-    "  --obey 0   1: wait as long as a failure says\n"
+    "  --obey 0   1: wait as long as a failure says, and keep to a told rate\n"
     "  --seed 1 --samples FILE\n";
 
 typedef enum { OPEN_LOOP, EARLY_LOOP, CLOSED_LOOP, IDLE, SILENT } Mode;
 typedef enum { REPLY_NONE, REPLY_JSON, REPLY_ZLIB, REPLY_MSGPACK, REPLY_PEER } ReplyKind;
 typedef enum { ABSENT, CONNECTING, UPGRADING, WELCOMING, READY } State;
 typedef enum { OK, FAILED, LOST, UNSENT } Outcome;
-typedef enum { ANSWER_OK, ANSWER_FAILED, NO_ANSWER } Answer;
+typedef enum { ANSWER_OK, ANSWER_FAILED, MANY_FAILED, TOLD_RATE, NO_ANSWER } Answer;
 
 typedef struct {
   uint8_t *bytes;
@@ -105,6 +107,8 @@ typedef struct {
   uint8_t *partial;
   size_t partial_size, partial_capacity;
   double reopen_s, silent_until_s;
+  double told_per_s, told_until_s; /* the rate that it keeps to */
+  double may_send, counted_s;      /* messages that this rate allowed and that were not sent, up to this time */
 } Robot;
 
 typedef struct {
@@ -317,6 +321,7 @@ static void end(Robot *robot, const char *why) {
   robot->queued = 0;
   robot->offset = robot->partial_size = 0;
   robot->waits_for_room = robot->says_hello = false;
+  robot->told_until_s = 0;
   if (option.reopen_s > 0)
     wait_to_open(robot, now_s() + option.reopen_s);
   else
@@ -353,9 +358,22 @@ static void flush(Robot *robot) {
   watch(robot, robot->queued > 0 || robot->says_hello);
 }
 
+/* Return whether the rate that the robot was told allows a message.  Up to two are saved, since at a rate below
+   its own a robot would otherwise send every second message where nine of ten are allowed. */
+static bool rate_allows(Robot *robot, double now) {
+  if (now >= robot->told_until_s) return true;
+  robot->may_send = fmin(2, robot->may_send + robot->told_per_s * (now - robot->counted_s));
+  robot->counted_s = now;
+  if (robot->may_send < 1) return false;
+  robot->may_send--;
+  return true;
+}
+
 static void send_next(Robot *robot, double planned_s) {
   Group *group = robot->group;
-  if (robot->state != READY || robot->queued == MAX_QUEUED || now_s() < robot->silent_until_s) {
+  double now = now_s();
+  if (robot->state != READY || robot->queued == MAX_QUEUED || now < robot->silent_until_s ||
+      !rate_allows(robot, now)) {
     note(group, UNSENT, planned_s, NAN, NAN);
     return;
   }
@@ -457,7 +475,23 @@ static Answer kind_of(const uint8_t *type, size_t size) {
   if (size == 6 && !memcmp(type, "result", 6)) return ANSWER_OK;
   if (size == 4 && !memcmp(type, "pong", 4)) return ANSWER_OK;
   if (size == 7 && !memcmp(type, "failure", 7)) return ANSWER_FAILED;
+  if (size == 7 && !memcmp(type, "refused", 7)) return MANY_FAILED;
+  if (size == 4 && !memcmp(type, "rate", 4)) return TOLD_RATE;
   return NO_ANSWER;
+}
+
+/* Count the code of a failure, in text or in MessagePack. */
+static void count_code(const uint8_t *data, size_t size) {
+  const uint8_t *over = data + size, *at;
+  if (option.reply == REPLY_MSGPACK) {
+    at = after(data, size, "\xa4" "code", 5);
+    if (at && at < over && (*at & 0xe0) == 0xa0 && at + 1 + (*at & 31) <= over)
+      count(codes, (const char *)at + 1, *at & 31);
+    return;
+  }
+  at = after(data, size, "\"code\":\"", 8);
+  const uint8_t *quote = at ? memchr(at, '"', (size_t)(over - at)) : NULL;
+  if (quote) count(codes, (const char *)at, (size_t)(quote - at));
 }
 
 /* Read type and id of a JSON message; *id stays -1 where it has none. */
@@ -471,9 +505,7 @@ static Answer read_json(const uint8_t *data, size_t size, bool is_peer, long *id
   at = after(data, size, "\"type\":\"", 8);
   const uint8_t *quote = at ? memchr(at, '"', (size_t)(over - at)) : NULL;
   Answer answer = quote ? kind_of(at, (size_t)(quote - at)) : NO_ANSWER;
-  if (answer == ANSWER_FAILED && (at = after(data, size, "\"code\":\"", 8)) &&
-      (quote = memchr(at, '"', (size_t)(over - at))))
-    count(codes, (const char *)at, (size_t)(quote - at));
+  if (answer == ANSWER_FAILED) count_code(data, size);
   return answer;
 }
 
@@ -491,29 +523,56 @@ static Answer read_msgpack(const uint8_t *data, size_t size, long *id) {
   at = after(data, size, "\xa4type", 5);
   if (!at || at >= over || (*at & 0xe0) != 0xa0 || at + 1 + (*at & 31) > over) return NO_ANSWER;
   Answer answer = kind_of(at + 1, *at & 31);
-  if (answer == ANSWER_FAILED && (at = after(data, size, "\xa4" "code", 5)) && at < over &&
-      (*at & 0xe0) == 0xa0 && at + 1 + (*at & 31) <= over)
-    count(codes, (const char *)at + 1, *at & 31);
+  if (answer == ANSWER_FAILED) count_code(data, size);
   return answer;
 }
 
-/* The pause that a failure asks for, in seconds; 0 where it names none. */
-static double retry_after_s(const uint8_t *data, size_t size) {
+/* The whole of a rare message as text, or in MessagePack as it is; its size in *size. */
+static const uint8_t *whole(const uint8_t *data, size_t *size) {
   static uint8_t text[8192];
-  if (option.reply == REPLY_MSGPACK) {
-    const uint8_t *at = after(data, size, "\xae" "retry_after_ms\xcb", 16);
-    if (!at || at + 8 > data + size) return 0;
-    uint64_t bits = 0;
-    for (int i = 0; i < 8; i++) bits = bits << 8 | at[i];
-    double ms;
-    memcpy(&ms, &bits, sizeof ms);
-    return 1e-3 * ms;
+  if (option.reply == REPLY_MSGPACK) return data;
+  size_t length = option.reply == REPLY_ZLIB ? inflated(data, *size, text, sizeof text - 1) : 0;
+  if (option.reply == REPLY_JSON) memcpy(text, data, length = *size < sizeof text ? *size : sizeof text - 1);
+  text[*size = length] = 0;
+  return text;
+}
+
+/* A number of a `whole` message by its name, of less than 32 letters; 0 where it has none. */
+static double number_of(const uint8_t *text, size_t size, const char *name) {
+  char mark[40];
+  bool is_text = option.reply != REPLY_MSGPACK;
+  int length = is_text ? snprintf(mark, sizeof mark, "\"%s\":", name)
+                       : snprintf(mark, sizeof mark, "%c%s\xcb", (int)(0xa0 | strlen(name)), name);
+  const uint8_t *at = after(text, size, mark, (size_t)length);
+  if (is_text) return at ? strtod((const char *)at, NULL) : 0;
+  if (!at || at + 8 > text + size) return 0;
+  uint64_t bits = 0;
+  for (int i = 0; i < 8; i++) bits = bits << 8 | at[i];
+  double value;
+  memcpy(&value, &bits, sizeof value);
+  return value;
+}
+
+/* The ids of a `whole` message that ends many commands; returns how many. */
+static int ids_of(const uint8_t *text, size_t size, long ids[MAX_REFUSED]) {
+  const uint8_t *over = text + size, *at;
+  int n = 0;
+  if (option.reply != REPLY_MSGPACK) {
+    at = after(text, size, "\"ids\":[", 7);
+    for (char *next; at && n < MAX_REFUSED && *at >= '0' && *at <= '9'; at = (const uint8_t *)next + (*next == ','))
+      ids[n++] = strtol((const char *)at, &next, 10);
+    return n;
   }
-  size_t length = option.reply == REPLY_ZLIB ? inflated(data, size, text, sizeof text - 1) : 0;
-  if (option.reply == REPLY_JSON) memcpy(text, data, length = size < sizeof text ? size : sizeof text - 1);
-  text[length] = 0;
-  const uint8_t *at = after(text, length, "\"retry_after_ms\":", 17);
-  return at ? 1e-3 * strtod((const char *)at, NULL) : 0;
+  at = after(text, size, "\xa3ids", 4);
+  if (!at || at >= over) return 0;
+  int most = (*at & 0xf0) == 0x90 ? *at & 15 : *at == 0xdc && at + 2 < over ? at[1] << 8 | at[2] : 0;
+  for (at += *at == 0xdc ? 3 : 1; n < most && n < MAX_REFUSED && at < over; n++) {
+    int bytes = *at == 0xcc ? 1 : *at == 0xcd ? 2 : 0;
+    if ((*at >= 0x80 && !bytes) || at + bytes >= over) break;
+    ids[n] = !bytes ? *at : bytes == 1 ? at[1] : at[1] << 8 | at[2];
+    at += 1 + bytes;
+  }
+  return n;
 }
 
 static Answer read_answer(const uint8_t *data, size_t size, long *id) {
@@ -532,11 +591,19 @@ static Answer read_answer(const uint8_t *data, size_t size, long *id) {
   }
 }
 
-static void take_answer(Robot *robot, const uint8_t *data, size_t size, double at_s) {
-  long id = -1;
-  Answer answer = read_answer(data, size, &id);
-  if (answer == NO_ANSWER) return;
-  if (answer == ANSWER_FAILED && option.obeys) robot->silent_until_s = at_s + retry_after_s(data, size);
+/* Keep to the rate that the server tells, from the last message on. */
+static void obey(Robot *robot, double per_s, double for_s, double at_s) {
+  if (!(per_s > 0 && for_s >= 0)) return;
+  if (at_s >= robot->told_until_s) {
+    robot->may_send = 0;
+    robot->counted_s = at_s;
+  }
+  robot->told_per_s = per_s;
+  robot->told_until_s = at_s + fmin(60, for_s);
+}
+
+/* Take the end of message *id*, or of the oldest one where it is -1. */
+static void take_end(Robot *robot, long id, Outcome outcome, double at_s) {
   Group *group = robot->group;
   double *planned = group->frame_count ? planned_of(robot) : NULL;
   if (id < 0 && robot->unanswered) {
@@ -547,11 +614,40 @@ static void take_answer(Robot *robot, const uint8_t *data, size_t size, double a
     unmatched++;
     return;
   }
-  note(group, answer == ANSWER_OK ? OK : FAILED, planned[id], at_s - planned[id], NAN);
+  note(group, outcome, planned[id], at_s - planned[id], NAN);
   if (in_window(at_s)) group->answered_in_window++;
   planned[id] = 0;
   robot->unanswered--;
   if (group->mode == CLOSED_LOOP && at_s < last_s && !stop_asked) send_next(robot, now_s());
+}
+
+static void take_many(Robot *robot, const uint8_t *data, size_t size, double at_s) {
+  long ids[MAX_REFUSED];
+  const uint8_t *text = whole(data, &size);
+  int n = ids_of(text, size, ids);
+  for (int i = 0; i < n; i++) {
+    count_code(text, size);
+    take_end(robot, ids[i], FAILED, at_s);
+  }
+}
+
+static void take_answer(Robot *robot, const uint8_t *data, size_t size, double at_s) {
+  long id = -1;
+  Answer answer = read_answer(data, size, &id);
+  if (answer == NO_ANSWER) return;
+  if (option.obeys && answer != ANSWER_OK) {
+    size_t length = size;
+    const uint8_t *text = whole(data, &length);
+    if (answer == TOLD_RATE) {
+      obey(robot, number_of(text, length, "commands_per_s"), 1e-3 * number_of(text, length, "for_ms"), at_s);
+    } else {
+      robot->silent_until_s = at_s + 1e-3 * number_of(text, length, "retry_after_ms");
+    }
+  }
+  if (answer == MANY_FAILED)
+    take_many(robot, data, size, at_s);
+  else if (answer != TOLD_RATE)
+    take_end(robot, id, answer == ANSWER_OK ? OK : FAILED, at_s);
 }
 
 static void take_frame(Robot *robot, int opcode, const uint8_t *data, size_t size, double at_s) {

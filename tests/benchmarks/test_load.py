@@ -36,7 +36,19 @@ from rse_pf.errors import ConfigurationError
 from rse_pf.experiments.load.payloads import make_payloads
 from rse_pf.experiments.load.scenario import LoadScenario, read_scenario, write_scenario
 from rse_pf.experiments.load.swarm import Swarm, SwarmResult
-from rse_pf.wire import SUBPROTOCOLS, Command, Failure, Hello, Limits, Result, Welcome, make_codec
+from rse_pf.wire import (
+    SUBPROTOCOLS,
+    Command,
+    Failure,
+    FromServer,
+    Hello,
+    Limits,
+    Rate,
+    Refused,
+    Result,
+    Welcome,
+    make_codec,
+)
 
 pytestmark = pytest.mark.system
 
@@ -45,6 +57,8 @@ FAILS, IS_SILENT, FAILS_WITHOUT_ID = 1, 2, 3
 """What the server does with the commands of these ids; it answers all others, and all with this payload:"""
 ALL = "answer all"
 LATER = "refuse all for a while"
+TOGETHER, AT_ONCE = "refuse many at once", 10
+PACED, PACED_PER_S = "answer all, and tell a rate", 20.0
 READY_S = 10.0
 STALL_S = 0.15
 
@@ -59,6 +73,7 @@ class ScriptedServer:
         self.tokens: set[str] = set()
         self.echoes = False
         self.commands: list[Command] = []
+        self.capabilities: set[str] = set()
         self._loop = asyncio.new_event_loop()
         self._ready = threading.Event()
         self._stop = asyncio.Event()
@@ -99,14 +114,18 @@ class ScriptedServer:
         codec = make_codec({name: short for short, name in SUBPROTOCOLS.items()}[str(connection.subprotocol)])
         self.sources.add(connection.remote_address[0])
 
-        async def say(message: Welcome | Result | Failure) -> None:
+        refused: list[int] = []
+
+        async def say(message: FromServer) -> None:
             data = codec.encode(message)
             await connection.send(data.decode() if codec.is_text else data)
 
+        capabilities: set[str] = set()
         async for data in connection:
             message = codec.decode_from_robot(data.encode() if isinstance(data, str) else data)
             if isinstance(message, Hello):
                 limits = Limits(max_message_bytes=1 << 20, max_in_flight=64)
+                capabilities = set(message.capabilities)
                 await say(Welcome(server="s", session="x", robot="r", protocol=1, limits=limits, clock_s=0.0))
                 if connection.request is not None and connection.request.path == "/closes":
                     await connection.close(4429)
@@ -124,6 +143,15 @@ class ScriptedServer:
                 wait_ms = 1e3 * READY_S
                 text = "the server is behind with its work"
                 await say(Failure(id=message.id, code="busy", message=text, retry_after_ms=wait_ms))
+            elif message.payload == TOGETHER:
+                refused.append(message.id)
+                if len(refused) == AT_ONCE:
+                    await say(Refused(ids=refused, code="busy", message="later", retry_after_ms=1.0))
+                    refused.clear()
+            elif message.payload == PACED:
+                self.capabilities |= capabilities
+                await say(Rate(commands_per_s=PACED_PER_S, for_ms=1e4))
+                await say(Result(id=message.id))
             elif message.payload == ALL:
                 await say(Result(id=message.id))
             elif message.id == IS_SILENT:
@@ -166,8 +194,8 @@ def commands(folder: Path, codec_name: str, ids: int = IDS, payload: str = "") -
 
 def plan(server: ScriptedServer, folder: Path, codec: str, *groups: RobotGroup, **more: object) -> LoadPlan:
     return LoadPlan(
-        port=server.port, groups=groups, codec=codec, hello=hello_file(folder, codec),
-        **{"warm_up_s": 0.0, "seconds": 0.2, "drain_s": 0.2, **more},  # type: ignore[arg-type]
+        port=server.port, groups=groups, codec=codec,
+        **{"hello": hello_file(folder, codec), "warm_up_s": 0.0, "seconds": 0.2, "drain_s": 0.2, **more},  # type: ignore[arg-type]
     )  # fmt: skip
 
 
@@ -207,6 +235,36 @@ def test_robots_that_obey_are_silent_as_long_as_a_failure_says(
     assert (ignoring.failed, ignoring.unsent) == (40, 0)
     assert obeying.failed < 10
     assert obeying.failed + obeying.unsent == 40
+
+
+@pytest.mark.parametrize("codec", ["zlib", "json", "bin"])
+def test_each_command_that_a_message_ends_counts_as_failed(
+    server: ScriptedServer, tmp_path: Path, codec: str
+) -> None:
+    group = open_loop(commands(tmp_path, codec, ids=300, payload=TOGETHER), robots=40)  # ids of three digits
+
+    report = run_load(plan(server, tmp_path, codec, group))
+
+    assert report.groups[0].failed == 800
+    assert report.codes == {"busy": 800}
+    assert report.unmatched == 0
+
+
+@pytest.mark.parametrize("codec", ["zlib", "json", "bin"])
+def test_robots_that_obey_keep_to_a_told_rate(server: ScriptedServer, tmp_path: Path, codec: str) -> None:
+    group = open_loop(commands(tmp_path, codec, ids=64, payload=PACED))
+
+    ignoring = run_load(plan(server, tmp_path, codec, group, seconds=0.5)).groups[0]
+    assert not server.capabilities
+    hello = hello_file(tmp_path, codec, obeys=True)
+    obeying = run_load(plan(server, tmp_path, codec, group, seconds=0.5, obeys=True, hello=hello)).groups[0]
+
+    assert (ignoring.ok, ignoring.unsent) == (100, 0)
+    assert server.capabilities == {"refusals", "rate"}
+    assert obeying.ok + obeying.unsent == 100
+    assert 12 <= obeying.ok <= 2 * (2 + 0.5 * PACED_PER_S), (
+        "of two robots, and one or two before they are told"
+    )
 
 
 def test_latency_counts_from_the_planned_time(server: ScriptedServer, tmp_path: Path) -> None:
