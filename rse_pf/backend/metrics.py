@@ -59,6 +59,8 @@ GAUGE_HELP = {
     "recording_dropped": "messages that were not recorded because the recorder was too slow or has ended",
     "ready": "whether the server accepts robots: 1, or 0 while it starts or drains",
     "accept_pauses": "pauses because sockets began to send faster than max_accepts_per_s",
+    "worker_crashes": "workers that native code ended, and that were replaced, since the start",
+    "native_off": "whether workers that begin do without the native core, after crashes: 1 or 0",
     "control_refused": "requests to the control port that were refused for lack of its token",
 }
 """What each gauge means; a new gauge needs a line here."""

@@ -11,9 +11,10 @@ from typing import Any, Protocol
 from rse_pf.backend.log import JsonLog
 from rse_pf.backend.metrics import Metrics
 from rse_pf.config import PlatformSettings
+from rse_pf.identity import RobotId
 from rse_pf.recording.tap import RecordingTap
 
-__all__ = ["Clocks", "Log", "SlowReader", "Wire", "WorkerContext"]
+__all__ = ["Clocks", "CrashMarks", "Log", "SlowReader", "Wire", "WorkerContext"]
 
 
 class Wire(Protocol):
@@ -45,6 +46,19 @@ class Wire(Protocol):
 
     def close(self, code: int, reason: str) -> None:
         """Write a close frame and end the connection."""
+
+
+class CrashMarks(Protocol):
+    """Where a worker notes for whom it computes; `rse_pf.backend.supervisor.crash_report` reads it."""
+
+    of_loop: memoryview
+    """The connection for which the thread of the event loop works, in its only element; 0 for none."""
+
+    def enter(self, number: int, robot: RobotId) -> None:
+        """Note the robot of the new connection *number*."""
+
+    def compute_for(self, number: int) -> None:
+        """Note that this thread works for the connection *number* from now on, 0 for none."""
 
 
 class SlowReader(Protocol):
@@ -102,6 +116,7 @@ class WorkerContext:
         log: The log of the worker.
         metrics: The counters of the worker.
         tap: Takes the messages of all connections for a recording; None where nothing is recorded.
+        crash: Knows for whom this process computes, if it crashes; None in tests.
         new_session_id: Makes the id of a session, which goes into its welcome.
     """
 
@@ -112,4 +127,5 @@ class WorkerContext:
     log: JsonLog
     metrics: Metrics = field(default_factory=Metrics)
     tap: RecordingTap | None = None
+    crash: CrashMarks | None = None
     new_session_id: Callable[[], str] = make_session_id

@@ -36,9 +36,10 @@ sys.exit(serve(PlatformSettings.from_dict(o["settings"]), keys=o["keys"] and Key
 """
 
 _SERVICES = """
-import time
+import ctypes, time
 from typing import Any
 import msgspec
+from rse_pf import native
 from rse_pf.service import Registry
 from rse_pf.services import echo
 
@@ -64,6 +65,15 @@ def make(settings):
         while time.thread_time() < end:
             pass
         return Done(filling="x" * request.fill)
+
+    @registry.service("crash")
+    def crash(request: Work) -> Done:
+        ctypes.string_at(0)
+        return Done()
+
+    @registry.service("core")
+    def core(request: Work) -> Done:
+        return Done(filling=str(native.find_library()))
 
     return registry
 """

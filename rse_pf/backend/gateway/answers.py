@@ -63,6 +63,7 @@ class Answers:
         self._context = context
         self._services = services
         self._monotonic = context.clocks.monotonic
+        self._crash = context.crash
         self._logs_frequent = context.log.writes("debug")
 
     def offer(self, services: frozenset[str]) -> None:
@@ -74,6 +75,8 @@ class Answers:
 
         It may run in the event loop or in a thread, because it changes nothing that they share.
         """
+        if self._crash is not None:
+            self._crash.compute_for(queued.owner.number)
         command = queued.command
         if command.service in self.with_objects:
             return self._compute_with_objects(queued)

@@ -78,10 +78,10 @@ class RobotRates:
             return CUT_OFF
         return max(_MIN_RETRY_MS, wait_s * 1e3)
 
-    def ban(self, robot: RobotId, now: float) -> None:
-        """Refuse the handshakes of *robot*, cut off at *now* (s), for ``session.rate_ban_s``."""
+    def ban(self, robot: RobotId, now: float, seconds: float | None = None) -> None:
+        """Refuse the handshakes of *robot*, cut off at *now* (s), for *seconds* or ``session.rate_ban_s``."""
         known = self._robots.get(robot) or self._add(robot, now)
-        known.banned_until = now + self._limits.rate_ban_s
+        known.banned_until = now + (self._limits.rate_ban_s if seconds is None else seconds)
 
     def banned_s(self, robot: RobotId, now: float) -> float:
         """Return for how many seconds more *robot* is banned, 0 if it is not."""

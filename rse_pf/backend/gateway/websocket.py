@@ -29,6 +29,7 @@ from rse_pf.backend.gateway.handshake import (
     RequestHead,
 )
 from rse_pf.backend.gateway.rate_limits import SourceRates
+from rse_pf.backend.ports import CrashMarks
 from rse_pf.backend.scheduling.deferred_work import DeferredWork
 from rse_pf.config import ServingSettings
 from rse_pf.config.front_door import MAX_HANDSHAKE_BYTES
@@ -173,7 +174,7 @@ class RobotSockets:
         )
         max_bytes = self._context.settings.session.max_message_bytes
         self._protocol = protocol_type(picows, max_bytes, self._long_reads)
-        self._listener = listener_type(picows, self._context.loop, serving)
+        self._listener = listener_type(picows, self._context.loop, serving, self._context.crash)
 
     @property
     def is_behind(self) -> bool:
@@ -405,8 +406,11 @@ def protocol_type(picows: Any, max_frame_bytes: int, long_reads: DeferredWork) -
     return Protocol
 
 
-def listener_type(picows: Any, loop: asyncio.AbstractEventLoop, serving: ServingSettings) -> Any:
+def listener_type(
+    picows: Any, loop: asyncio.AbstractEventLoop, serving: ServingSettings, crash: CrashMarks | None = None
+) -> Any:
     """Return the subclass of picows' listener that passes frames between a socket and the dispatcher."""
+    works_for = memoryview(bytearray(8)).cast("Q") if crash is None else crash.of_loop
     text, binary = int(picows.WSMsgType.TEXT), int(picows.WSMsgType.BINARY)
 
     class Listener(picows.WSListener):  # type: ignore[misc]
@@ -428,13 +432,17 @@ def listener_type(picows: Any, loop: asyncio.AbstractEventLoop, serving: Serving
             self._transport = transport
             high = serving.write_buffer_bytes
             transport.underlying_transport.set_write_buffer_limits(high=high, low=high // 4)
+            if crash is not None and self._accepted.claims is not None:
+                crash.enter(self._number, self._accepted.robot)
             self._connection = self._dispatcher.connect(self, self._accepted, self._number)
 
         def on_ws_frame(self, transport: Any, frame: Any) -> None:
             if self._connection is not None:
                 rsv = bool(frame.rsv1 or frame.rsv2 or frame.rsv3)
                 payload = frame.get_payload_as_bytes()
+                works_for[0] = self._number
                 self._connection.receive_frame(frame.msg_type, bool(frame.fin), rsv, payload)
+                works_for[0] = 0
 
         def on_ws_disconnected(self, transport: Any) -> None:
             for timer in (self._cut, self._pause, self._linger):

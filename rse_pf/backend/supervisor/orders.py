@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import msgspec
 
+from rse_pf.identity import RobotId
+
 __all__ = [
-    "BlocksOrder", "DrainOrder", "LeaveOrder", "MigrateOrder", "RecordOrder", "ReloadServicesOrder",
-    "ReplaceOrder", "ReportOrder",
-    "RobotsOrder", "TakeRecordedOrder", "TrustOrder", "UnblockOrder", "WorkerOrder", "decode_order",
-    "encode_order",
+    "BanOrder", "BeginOrder", "BlocksOrder", "DrainOrder", "LeaveOrder", "MigrateOrder", "RecordOrder",
+    "ReloadServicesOrder", "ReplaceOrder", "ReportOrder", "RobotsOrder", "TakeRecordedOrder", "TrustOrder",
+    "UnblockOrder", "WorkerOrder", "decode_order", "encode_order",
 ]  # fmt: skip
 
 
@@ -88,6 +89,27 @@ class ReloadServicesOrder(msgspec.Struct, tag="reload-services", tag_field="do",
     """Load the services folder anew; what cannot be loaded changes nothing, and the log says why."""
 
 
+class BanOrder(msgspec.Struct, tag="ban", tag_field="do", frozen=True):
+    """Disconnect *robot*, and refuse it for *seconds*."""
+
+    robot: RobotId
+    seconds: float
+
+
+class BeginOrder(msgspec.Struct, tag="begin", tag_field="do", frozen=True):
+    """Take the place of worker *index*, which has crashed; the first order of a process that waits for one.
+
+    ``snapshot`` is the text of a `TrustStore`, "" for the keys of the server's start; the robots ``banned``
+    are refused for *seconds*.
+    """
+
+    index: int
+    is_native: bool
+    snapshot: str
+    banned: list[RobotId]
+    seconds: float
+
+
 class LeaveOrder(msgspec.Struct, tag="leave", tag_field="do", frozen=True):
     """Wait at most *held_s* for commands that are held, close every socket, and end."""
 
@@ -96,6 +118,8 @@ class LeaveOrder(msgspec.Struct, tag="leave", tag_field="do", frozen=True):
 
 WorkerOrder = (
     ReportOrder
+    | BanOrder
+    | BeginOrder
     | DrainOrder
     | MigrateOrder
     | TrustOrder

@@ -25,6 +25,19 @@ class SessionRegistry:
         """Return the number of robots that are connected."""
         return len(self._sockets)
 
+    def robot_of(self, number: int) -> RobotId | None:
+        """Return whose connection *number* is, None if that is not known."""
+        return next((robot for robot, sockets in self._sockets.items() if number in sockets), None)
+
+    def forget(self, worker: WorkerProcess) -> None:
+        """Forget the connections of *worker*, which has ended."""
+        for robot, sockets in list(self._sockets.items()):
+            left = {number: other for number, other in sockets.items() if other is not worker}
+            if left:
+                self._sockets[robot] = left
+            else:
+                del self._sockets[robot]
+
     def handle(self, worker: WorkerProcess, message: dict[str, Any]) -> None:
         """Handle what a worker reports of one socket: ``arrived``, ``stays`` or ``left``."""
         robot, number, event = RobotId(*message["robot"]), message["number"], message["event"]

@@ -1,8 +1,9 @@
 """One backend server: listener, worker processes, control port and drain; the body of `rse-pf serve`.
 
 The supervisor accepts each robot and passes the socket, when it has begun to send, to the worker with the
-fewest robots.  It consumes no byte of a robot and restarts no worker: the server ends with its first worker
-that is lost, and the scale modifier replaces it.  A drain loses no command.
+fewest robots.  It consumes no byte of a robot.  A worker that native code ended is replaced
+(`crash_recovery`); otherwise the server ends with its first worker that is lost, and the scale modifier
+replaces it.  A drain loses no command.
 """
 
 from __future__ import annotations
@@ -17,7 +18,6 @@ from collections.abc import Awaitable, Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
-from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +31,7 @@ from rse_pf.backend.log import JsonLog
 from rse_pf.backend.metrics import merge, merge_isolation, render, tenant_cpu_s
 from rse_pf.backend.rosbridge.peers import peer_channels
 from rse_pf.backend.supervisor.accepting import RobotAcceptor
+from rse_pf.backend.supervisor.crash_recovery import CrashRecovery, spare_plans
 from rse_pf.backend.supervisor.listener import bound_socket, check_authentication
 from rse_pf.backend.supervisor.orders import (
     BlocksOrder,
@@ -138,7 +139,8 @@ def serve(
             for index in range(count)
         ]  # fmt: skip
         with bound_socket(settings.serving.host, settings.serving.port) as listener:
-            workers = fork_workers(plans, listener=listener)
+            processes = fork_workers([*plans, *spare_plans(plans)], listener=listener)
+            workers, spares = processes[:count], processes[count:]
             recording.hand_over()
             try:
                 with ServerAudit(audit, server_id) as records:
@@ -146,13 +148,13 @@ def serve(
                         server_id=server_id, digest=digest, announce=announce, control_token=control_token
                     )
                     supervisor = _Supervisor(
-                        settings, identity, _Processes(workers=workers, others=recording.pids),
+                        settings, identity, _Processes(workers=workers, spares=spares, others=recording.pids),
                         trust=trust, listener=listener, records=records,
                     )  # fmt: skip
                     return run_in_loop(supervisor.run())
             finally:
-                for worker in workers:
-                    worker.kill()
+                for process in processes:
+                    process.kill()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -167,9 +169,10 @@ class _Identity:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Processes:
-    """The processes of a server beside the supervisor: workers, and the ids of the others."""
+    """The processes of a server beside the supervisor: workers, those that wait for a crash, other ids."""
 
     workers: list[WorkerProcess]
+    spares: list[WorkerProcess]
     others: list[int]
 
     def pids(self) -> list[int]:
@@ -215,6 +218,12 @@ class _Supervisor:
         self._log = JsonLog(level=settings.serving.log_level, server=identity.server_id, wall_clock=time.time)
         records.complain_to(lambda problem: self._log.error("audit", reason=problem))
         self._workers = processes.workers
+        self._registry = SessionRegistry()
+        self._on_robot = records.message_handler(self._registry.handle)
+        self._crashes = CrashRecovery(
+            self._workers, processes.spares, registry=self._registry, trust=self._trust, log=self._log,
+            records=records,
+        )  # fmt: skip
 
     async def run(self) -> int:
         loop = asyncio.get_running_loop()
@@ -250,9 +259,8 @@ class _Supervisor:
         return control
 
     async def _start(self, loop: asyncio.AbstractEventLoop) -> None:
-        on_robot = self._records.message_handler(SessionRegistry().handle)
         readiness = [
-            loop.create_task(worker.connect(on_lost=self._on_lost, on_robot=on_robot))
+            loop.create_task(worker.connect(on_lost=self._on_lost, on_robot=self._on_robot))
             for worker in self._workers
         ]
         everything = asyncio.gather(*readiness)
@@ -300,7 +308,12 @@ class _Supervisor:
     # --- the end -------------------------------------------------------------------------------
 
     def _on_lost(self, worker: WorkerProcess) -> None:
-        if self._state != "leaving":
+        heir = self._crashes.replace(worker, time.monotonic()) if self._state == "ready" else None
+        if heir is not None:
+            self._keep(heir.connect(on_lost=self._on_lost, on_robot=self._on_robot))
+            if self._announce is not None:
+                replace_json(self._announce, self._identity())
+        elif self._state != "leaving":
             self._log.error("worker-lost", pid=worker.pid, exit_code=worker.exit_code())
             self._finish(_EXIT_LOST)
 
@@ -409,6 +422,8 @@ class _Supervisor:
                 "ready": float(self._state == "ready"),
                 "accept_pauses": float(self._acceptor.pauses),
                 "control_refused": float(self._control_refused),
+                "worker_crashes": float(self._crashes.count),
+                "native_off": float(self._crashes.is_native_off),
             }
         )
         return ControlReply(body=render(merged), content_type="text/plain; version=0.0.4; charset=utf-8")
@@ -577,7 +592,9 @@ class _Supervisor:
 
     def _cpu_s(self, gauges: Mapping[str, float]) -> float:
         """Return the CPU seconds of the server and of its limited processes, which the workers report."""
-        return round(sum(map(cpu_seconds, self._processes.pids())) + gauges.get("compute_cpu_s", 0.0), 3)
+        running_s = sum(map(cpu_seconds, self._processes.pids())) + gauges.get("compute_cpu_s", 0.0)
+        return round(running_s + self._crashes.cpu_s, 3)
 
 
-_load_of = attrgetter("load")
+def _load_of(worker: WorkerProcess) -> tuple[bool, int]:
+    return not worker.is_ready, worker.load

@@ -18,12 +18,13 @@ import socket
 import struct
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
 import msgspec
 
+from rse_pf import native
 from rse_pf.auth.tokens import KeySet
 from rse_pf.auth.trust_store import key_set_from_snapshot
 from rse_pf.aws.storage import open_data_store
@@ -54,7 +55,10 @@ from rse_pf.backend.sandbox.circuit_breaker import Block
 from rse_pf.backend.sandbox.manager import SandboxHost, SandboxManager
 from rse_pf.backend.sandbox.reloading import Answer, OnReady, ReloadingSandboxes
 from rse_pf.backend.scheduling.command_queue import CommandQueue
+from rse_pf.backend.supervisor.crash_report import CrashReport
 from rse_pf.backend.supervisor.orders import (
+    BanOrder,
+    BeginOrder,
     BlocksOrder,
     DrainOrder,
     LeaveOrder,
@@ -75,17 +79,22 @@ from rse_pf.backend.supervisor.robot_rows import MAX_ROBOT_ROWS, robot_rows
 from rse_pf.config import PlatformSettings, ServiceSettings
 from rse_pf.errors import ConfigurationError, RsePfError, message_of
 from rse_pf.event_loop import event_loop_maker
+from rse_pf.identity import RobotId
+from rse_pf.ipc import receive_bytes
 from rse_pf.linux import die_with_parent, set_process_name
 from rse_pf.object_store import ObjectStore
 from rse_pf.recording.tap import RecordingTap, hand_pipe
 from rse_pf.service import Registry
 from rse_pf.services.custom.installed import InstalledService, installed_services, published_services
 from rse_pf.services.loading import load_services
+from rse_pf.wire.server_session import CLOSE_RATE
 
-__all__ = ["HANDOVER", "WorkerPlan", "repeat_for", "run_worker"]
+__all__ = ["BEGIN_LENGTH", "HANDOVER", "WorkerPlan", "repeat_for", "run_worker"]
 
 HANDOVER = struct.Struct("!Q46s")
 """A socket's number and the address of its peer, which travel with its descriptor."""
+BEGIN_LENGTH = struct.Struct("!I")
+"""Stands before the `BeginOrder` of a process that waits."""
 _DESCRIPTOR = struct.Struct("@i")
 _ANCILLARY_BYTES = socket.CMSG_SPACE(_DESCRIPTOR.size)
 _T = TypeVar("_T")
@@ -115,8 +124,14 @@ class WorkerPlan:
     supervisor: int
     conformance_echo: bool = False
     audit: bool = False
+    crash: CrashReport = field(default_factory=CrashReport)
+    """What is left when native code ends it."""
+    is_spare: bool = False
+    """Whether it waits for a `BeginOrder`, which gives it the index of a worker that crashed."""
     peers: PeerChannels = (-1, ())
     """This worker's way to the others, for topics of rosbridge clients."""
+    all_peers: tuple[PeerChannels, ...] = ()
+    """Those of all workers, for one that takes the place of another."""
     recording: int | None = None
     """Socket on which the recorder takes the ends of pipes; None where nothing is recorded."""
 
@@ -135,9 +150,36 @@ def run_worker(plan: WorkerPlan, data: socket.socket, control: socket.socket) ->
     if not die_with_parent(plan.supervisor):
         return
     set_process_name("rse-pf worker")
+    begin = _wait_to_begin(control) if plan.is_spare else None
+    if plan.is_spare and begin is None:
+        return
+    plan.crash.begin()
+    if begin is not None:
+        plan = _plan_of(plan, begin)
     loop = event_loop_maker()()
     asyncio.set_event_loop(loop)
-    loop.run_until_complete(_Worker(plan, data, control, loop).run())
+    worker = _Worker(plan, data, control, loop)
+    if begin is not None:
+        for robot in begin.banned:
+            worker.ban(robot, begin.seconds)
+    loop.run_until_complete(worker.run())
+
+
+def _wait_to_begin(control: socket.socket) -> BeginOrder | None:
+    """Return the order of a process that waits; None when its supervisor is gone."""
+    head = receive_bytes(control, BEGIN_LENGTH.size)
+    size = BEGIN_LENGTH.unpack(head)[0] if len(head) == BEGIN_LENGTH.size else 0
+    line = receive_bytes(control, size)
+    order = decode_order(line) if size and len(line) == size else None
+    return order if isinstance(order, BeginOrder) else None
+
+
+def _plan_of(plan: WorkerPlan, order: BeginOrder) -> WorkerPlan:
+    """Return the plan of a process that takes the place of a worker."""
+    if not order.is_native:
+        native.switch_off()
+    keys = key_set_from_snapshot(order.snapshot) if order.snapshot and plan.keys is not None else plan.keys
+    return replace(plan, index=order.index, peers=plan.all_peers[order.index], keys=keys)
 
 
 class _Worker:
@@ -167,6 +209,7 @@ class _Worker:
             loop=loop,
             log=self._log,
             tap=self._tap(plan.recording),
+            crash=plan.crash,
         )
         connections = set[RobotConnection]()
         store = open_data_store(settings) if is_shared(settings) else None
@@ -391,6 +434,8 @@ class _Worker:
                 self._keep(self._tell_when_empty())
             case MigrateOrder():
                 self._migration.begin(order.delays_s, order.within_ms)
+            case BanOrder():
+                self.ban(order.robot, order.seconds)
             case TrustOrder():
                 self._token_watch.trust(key_set_from_snapshot(order.snapshot))
             case ReplaceOrder():
@@ -410,6 +455,12 @@ class _Worker:
                 self._keep(self._reload_services())
             case TakeRecordedOrder(number, recording, max_bytes):
                 self._tell_rows(number, 1, [self._take_recorded(recording, max_bytes)])
+
+    def ban(self, robot: RobotId, seconds: float) -> None:
+        """Disconnect *robot*, and refuse it for *seconds*."""
+        self._dispatcher.rates.ban(robot, time.monotonic(), seconds)
+        for connection in [each for each in self._dispatcher.connections if each.robot == robot]:
+            connection.close(CLOSE_RATE, "crashes")
 
     def _record(self, order: RecordOrder) -> bool:
         """Begin or end a recording; return whether its service is an installed one."""

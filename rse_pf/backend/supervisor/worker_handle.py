@@ -21,6 +21,7 @@ from typing import Any, NoReturn
 import msgspec
 
 from rse_pf.backend.supervisor.orders import (
+    BeginOrder,
     BlocksOrder,
     RecordOrder,
     ReportOrder,
@@ -30,7 +31,7 @@ from rse_pf.backend.supervisor.orders import (
     WorkerOrder,
     encode_order,
 )
-from rse_pf.backend.supervisor.worker import HANDOVER, WorkerPlan, run_worker
+from rse_pf.backend.supervisor.worker import BEGIN_LENGTH, HANDOVER, WorkerPlan, run_worker
 from rse_pf.config import PlatformSettings
 from rse_pf.event_loop import event_loop_maker
 from rse_pf.services.loading import load_services
@@ -88,6 +89,10 @@ class WorkerProcess:
     def __init__(self, plan: WorkerPlan, *, unshared: Sequence[socket.socket]) -> None:
         """Fork.  The child closes *unshared*: the sockets of its parent that it must not hold."""
         self.load = 0
+        self.is_ready = False
+        self.cpu_s = 0.0
+        """CPU time that it took, known when it has ended."""
+        self.crash = plan.crash
         self.report: dict[str, Any] | None = None
         self.empty = asyncio.Event()
         self.gone = asyncio.Event()
@@ -113,12 +118,22 @@ class WorkerProcess:
         """
         if self._exit_code is None:
             try:
-                pid, status = os.waitpid(self.pid, how)
+                pid, status, used = os.wait4(self.pid, how)
+                self.cpu_s = used.ru_utime + used.ru_stime
             except ChildProcessError:
                 pid, status = self.pid, 0  # somebody else reaped it
             if pid:
                 self._exit_code = os.waitstatus_to_exitcode(status)
         return self._exit_code
+
+    def begin(self, order: BeginOrder) -> bool:
+        """Let a process that waits take the place of a worker; return whether it lives, then `connect`."""
+        data = encode_order(order)
+        try:
+            self._control.sendall(BEGIN_LENGTH.pack(len(data)) + data)
+        except OSError:
+            return False
+        return True
 
     async def connect(
         self,
@@ -133,6 +148,7 @@ class WorkerProcess:
         ready = asyncio.Event()
         self._reading = loop.create_task(self._listen(reader, ready))
         await ready.wait()
+        self.is_ready = True
         loop.add_reader(self._data.fileno(), self._count_ended)
 
     def give(self, fd: int, number: int, peer: str) -> bool:
@@ -180,6 +196,7 @@ class WorkerProcess:
         if self.exit_code() is None:
             os.kill(self.pid, signal.SIGKILL)
             self.exit_code(0)
+        self.crash.close()
         self._data.close()
         if self._writer is not None:
             self._writer.close()

@@ -1,0 +1,111 @@
+"""Replace a worker that native code ended, shut out a robot whose bytes do that, and do without the core.
+
+The processes that take over were forked with the workers, before any loop and thread, and wait.  A server has
+a few of them; when they are used up, or a worker ends in another way, the server ends with its worker.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import replace
+
+from rse_pf.auth.trust_store import TrustStore
+from rse_pf.backend.gateway.audit_recorder import ServerAudit
+from rse_pf.backend.ports import Log
+from rse_pf.backend.supervisor.crash_report import CRASH_SIGNALS, CrashReport
+from rse_pf.backend.supervisor.orders import BanOrder, BeginOrder
+from rse_pf.backend.supervisor.session_registry import SessionRegistry
+from rse_pf.backend.supervisor.worker import WorkerPlan
+from rse_pf.backend.supervisor.worker_handle import WorkerProcess
+from rse_pf.crash_record import BLOCK_S, WINDOW_S, CrashRecord
+from rse_pf.identity import RobotId
+
+__all__ = ["CrashRecovery", "spare_plans"]
+
+_MOST_CRASHES = 3
+"""Within `WINDOW_S`, by any robots: then the Python twin computes in each worker that begins."""
+_SPARES = 5
+"""Processes that wait for a crash: three until the twin computes, and two of workers that began before."""
+
+
+def spare_plans(plans: Sequence[WorkerPlan]) -> list[WorkerPlan]:
+    """Return the plans of the processes that wait beside the workers of *plans*."""
+    all_peers = tuple(plan.peers for plan in plans)
+    spare = replace(plans[0], index=-1, is_spare=True, all_peers=all_peers)
+    return [replace(spare, crash=CrashReport()) for _ in range(_SPARES)]
+
+
+class CrashRecovery:
+    """The crashes of one server, and the processes that wait for them."""
+
+    def __init__(
+        self,
+        workers: list[WorkerProcess],
+        spares: list[WorkerProcess],
+        *,
+        registry: SessionRegistry,
+        trust: TrustStore | None,
+        log: Log,
+        records: ServerAudit,
+    ) -> None:
+        """Replace nothing yet.
+
+        Args:
+            workers: Of the server; one that crashed is replaced in this list.
+            spares: Processes that wait.
+            registry: Knows the robots of connections, and forgets those of a worker that ended.
+            trust: Has the keys that a worker begins with; None for those of the server's start.
+            log: Of the server.
+            records: Its audit log.
+        """
+        self._workers, self._spares = workers, spares
+        self._registry, self._trust, self._log, self._records = registry, trust, log, records
+        self._crashes = CrashRecord()
+        self._times: deque[float] = deque(maxlen=_MOST_CRASHES)
+        self._banned: dict[RobotId, float] = {}
+        self.cpu_s = 0.0
+        """CPU seconds of workers that were replaced."""
+        self.count = 0
+        """Crashes since the start."""
+        self.is_native_off = False
+        """Whether workers that begin do not use the native core."""
+
+    def replace(self, worker: WorkerProcess, now: float) -> WorkerProcess | None:
+        """Return the process that takes the place of *worker*, which ended at *now* (s), or None."""
+        code = worker.exit_code(0)
+        if code is None or -code not in CRASH_SIGNALS or not self._spares:
+            return None
+        crash = worker.crash.read()
+        robot = crash.robot or self._registry.robot_of(crash.number)
+        self._registry.forget(worker)
+        self.count += 1
+        self.cpu_s += worker.cpu_s
+        about = {} if robot is None else {"robot": str(robot)}
+        self._log.error("worker-crashed", pid=worker.pid, signal=-code, at=crash.place, **about)
+        self._records.note("server.worker-crashed", pid=worker.pid, signal=-code, **about)
+        index = self._workers.index(worker)
+        worker.kill()
+        if robot is not None and self._crashes.note_crash(robot, now):
+            self._shut_out(robot, now)
+        self._times.append(now)
+        if len(self._times) == _MOST_CRASHES and now - self._times[0] <= WINDOW_S and not self.is_native_off:
+            self.is_native_off = True
+            self._log.error("native-core-off", hint="send the log lines worker-crashed to the developers")
+            self._records.note("server.native-core-off", crashes=_MOST_CRASHES)
+        banned = [robot for robot, until_s in self._banned.items() if until_s > now]
+        snapshot = "" if self._trust is None else self._trust.snapshot
+        order = BeginOrder(index, not self.is_native_off, snapshot, banned, BLOCK_S)
+        while self._spares:
+            spare = self._workers[index] = self._spares.pop()
+            if spare.begin(order):
+                return spare
+        return None
+
+    def _shut_out(self, robot: RobotId, now: float) -> None:
+        self._banned = {each: until_s for each, until_s in self._banned.items() if until_s > now}
+        self._banned[robot] = now + BLOCK_S
+        self._log.warning("cut-off", robot=robot, reason="crashes")
+        self._records.note("server.robot-shut-out", robot=str(robot), seconds=BLOCK_S)
+        for worker in self._workers:
+            worker.order(BanOrder(robot, BLOCK_S))

@@ -1,0 +1,174 @@
+"""What follows the crash of a worker: who takes its place, who is shut out, when the core is not used."""
+
+from __future__ import annotations
+
+import signal
+from dataclasses import dataclass, field
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from rse_pf.backend.supervisor.crash_recovery import CrashRecovery
+from rse_pf.backend.supervisor.crash_report import Crash
+from rse_pf.backend.supervisor.orders import BanOrder
+from rse_pf.backend.supervisor.session_registry import SessionRegistry
+from rse_pf.crash_record import BLOCK_S, WINDOW_S
+from rse_pf.identity import RobotId
+
+ONE, TWO, THREE = (RobotId("acme", name) for name in ("one", "two", "three"))
+
+
+@dataclass(eq=False)
+class Worker:
+    """A worker process that is none."""
+
+    pid: int
+    code: int = -signal.SIGSEGV
+    seen: Crash = field(default_factory=lambda: Crash(0, None, ""))
+    lives: bool = True
+    orders: list[Any] = field(default_factory=list)
+    killed: bool = False
+    cpu_s: float = 2.0
+
+    @property
+    def crash(self) -> SimpleNamespace:
+        return SimpleNamespace(read=lambda: self.seen)
+
+    def exit_code(self, how: int) -> int:
+        assert how == 0, "it waits for the end"
+        return self.code
+
+    def order(self, order: Any) -> None:
+        self.orders.append(order)
+
+    def begin(self, order: Any) -> bool:
+        self.orders.append(order)
+        return self.lives
+
+    def kill(self) -> None:
+        self.killed = True
+
+
+class Server:
+    """A server of two workers and *spares* processes that wait."""
+
+    def __init__(self, spares: int = 9) -> None:
+        self.now = 1000.0
+        self.workers = [Worker(1), Worker(2)]
+        self.spares = [Worker(100 + number) for number in range(spares)]
+        self.registry = SessionRegistry()
+        self.said: list[tuple[str, dict[str, Any]]] = []
+        self.noted: list[tuple[str, dict[str, Any]]] = []
+
+        def say(event: str, **about: Any) -> None:
+            self.said.append((event, about))
+
+        def note(action: str, **about: Any) -> None:
+            self.noted.append((action, about))
+
+        self.recovery = CrashRecovery(
+            self.workers, self.spares, registry=self.registry, trust=None,  # type: ignore[arg-type]
+            log=SimpleNamespace(info=say, warning=say, error=say), records=SimpleNamespace(note=note),
+        )  # fmt: skip
+
+    def crash(self, robot: RobotId | None = None, worker: int = 0) -> Worker | None:
+        ended = self.workers[worker]
+        ended.seen = Crash(7, robot, "f.py:1 f")
+        return self.recovery.replace(ended, self.now)  # type: ignore[arg-type,return-value]
+
+    def actions(self) -> list[str]:
+        return [action for action, _ in self.noted]
+
+
+def test_a_process_that_waits_takes_the_place_of_a_worker_that_crashed() -> None:
+    server = Server()
+    ended = server.workers[1]
+
+    heir = server.crash(ONE, worker=1)
+
+    assert heir is server.workers[1]
+    assert heir is not ended
+    assert ended.killed
+    assert server.recovery.cpu_s == ended.cpu_s
+    assert (heir.orders[0].index, heir.orders[0].is_native, heir.orders[0].banned) == (1, True, [])
+    assert server.noted == [("server.worker-crashed", {"pid": 2, "signal": 11, "robot": "acme/one"})]
+    assert server.said[0][1]["at"] == "f.py:1 f"
+
+
+@pytest.mark.parametrize("code", [1, 0, -signal.SIGKILL, -signal.SIGTERM])
+def test_a_worker_that_ended_otherwise_is_not_replaced(code: int) -> None:
+    server = Server()
+    server.workers[0].code = code
+
+    assert server.crash(ONE) is None
+    assert not server.noted
+
+
+def test_processes_that_wait_and_have_ended_are_passed_over_until_none_is_left() -> None:
+    server = Server(spares=3)
+    server.spares[-1].lives = False
+
+    first, second = server.crash(), server.crash()
+
+    assert [worker.pid for worker in (first, second) if worker is not None] == [101, 100]
+    assert server.crash() is None
+
+
+def test_two_crashes_by_one_robot_shut_it_out_everywhere_for_a_while() -> None:
+    server = Server()
+    other = server.workers[1]
+    server.crash(ONE)
+    assert not other.orders
+
+    heir = server.crash(ONE)
+
+    assert other.orders == [BanOrder(ONE, BLOCK_S)]
+    assert heir is not None
+    assert heir.orders[0].banned == [ONE]
+    assert ("server.robot-shut-out", {"robot": "acme/one", "seconds": BLOCK_S}) in server.noted
+    assert ("cut-off", {"robot": ONE, "reason": "crashes"}) in server.said
+    server.now += BLOCK_S
+    late = server.crash(TWO)
+    assert late is not None
+    assert late.orders[0].banned == []
+
+
+def test_two_crashes_by_two_robots_shut_nobody_out() -> None:
+    server = Server()
+    server.crash(ONE)
+    server.crash(TWO)
+    server.crash(None)
+
+    assert "server.robot-shut-out" not in server.actions()
+
+
+@pytest.mark.parametrize(("apart_s", "is_off"), [(WINDOW_S / 2, True), (WINDOW_S / 2 + 1, False)])
+def test_three_crashes_by_any_robots_within_the_window_end_the_use_of_the_core(
+    apart_s: float, is_off: bool
+) -> None:
+    server = Server()
+    heirs = []
+    for robot in (ONE, TWO, THREE):
+        heirs.append(server.crash(robot))
+        server.now += apart_s
+
+    assert [heir.orders[0].is_native for heir in heirs if heir is not None] == [True, True, not is_off]
+    assert server.recovery.is_native_off is is_off
+    assert ("server.native-core-off" in server.actions()) is is_off
+    assert server.recovery.count == 3
+    following = server.crash(None)
+    assert following is not None
+    assert following.orders[0].is_native is not is_off
+
+
+def test_a_robot_that_the_report_does_not_name_is_found_by_its_connection() -> None:
+    server = Server()
+    worker = server.workers[0]
+    server.registry.handle(worker, {"event": "arrived", "robot": list(ONE), "number": 7})  # type: ignore[arg-type]
+
+    server.crash(None)
+
+    assert server.noted[0][1]["robot"] == "acme/one"
+    assert server.registry.robot_of(7) is None
+    assert len(server.registry) == 0

@@ -1,0 +1,80 @@
+"""Native code that ends a worker: another one takes its place, and whose bytes do that is shut out."""
+
+from __future__ import annotations
+
+import asyncio
+import signal
+import time
+
+import pytest
+import websockets
+
+from rse_pf.wire import Command, Result
+
+pytestmark = pytest.mark.system
+
+PROMPT_S = 5.0
+
+
+async def answered(server) -> None:
+    """Connect until another robot is answered; a socket that the ended worker had taken is lost with it."""
+    until_s = time.monotonic() + PROMPT_S
+    while True:
+        try:
+            async with server.robot(token=server.token("witness")) as other:
+                assert isinstance(await other.ask(1, "echo"), Result)
+                return
+        except (websockets.InvalidMessage, websockets.ConnectionClosed, OSError):
+            assert time.monotonic() < until_s, "no robot is answered"
+
+
+async def crash(server, robot: str) -> float:
+    """Have *robot* end its worker; return the seconds until another robot is answered."""
+    async with server.robot(token=server.token(robot)) as sender:
+        await sender.send(Command(id=1, service="crash"))
+        await asyncio.wait_for(sender.socket.wait_closed(), PROMPT_S)
+        ended_s = time.monotonic()
+    await answered(server)
+    return time.monotonic() - ended_s
+
+
+def test_a_robot_that_crashes_twice_is_shut_out_and_after_three_crashes_the_core_is_off(start_server):
+    server = start_server(keys=True, serving={"workers": 1})
+
+    async def run():
+        away_s = [await crash(server, "culprit"), await crash(server, "culprit")]
+        with pytest.raises(websockets.InvalidStatus) as refused:
+            await crash(server, "culprit")
+        away_s.append(await crash(server, "third"))
+        async with server.robot(token=server.token("witness")) as other:
+            return away_s, refused.value.response.status_code, await other.ask(1, "core")
+
+    away_s, status, core = asyncio.run(run())
+
+    print(f"seconds until a robot is answered after a crash: {away_s}")
+    assert max(away_s) < PROMPT_S
+    assert status == 429
+    assert core.reply["filling"] == "None"
+    server.wait_for_log("native-core-off")
+    crashes = [line for line in server.lines if line["event"] == "worker-crashed"]
+    assert [line["robot"] for line in crashes] == ["culprit", "culprit", "third"]
+    assert all("string_at" in line["at"] and line["signal"] == signal.SIGSEGV for line in crashes)
+    cut_off = server.wait_for_log("cut-off")
+    assert (cut_off["robot"], cut_off["reason"]) == ("culprit", "crashes")
+    metrics = server.http("/metrics")[2].decode()
+    assert "rse_pf_worker_crashes 3" in metrics
+    assert "rse_pf_native_off 1" in metrics
+
+
+def test_the_other_worker_serves_on_during_a_crash_and_disconnects_who_is_shut_out(start_server):
+    server = start_server(keys=True, serving={"workers": 2})
+
+    async def run():
+        async with server.robot(token=server.token("staying")) as staying:
+            async with server.robot(token=server.token("culprit")) as sender:
+                await sender.send(Command(id=1, service="crash"))
+                await asyncio.wait_for(sender.socket.wait_closed(), PROMPT_S)
+            return await staying.ask(1, "echo")
+
+    assert isinstance(asyncio.run(run()), Result)
+    assert server.process.poll() is None
