@@ -27,8 +27,7 @@ from typing import Annotated, Any
 from benchmarks.frame.registry import Bar, benchmark
 from benchmarks.frame.report import say
 from benchmarks.frame.statistics import spread
-from benchmarks.hostile.sandboxes import KEY, Row, Server, serving
-from client_sdk import connect
+from benchmarks.hostile.sandboxes import Row, Server, serving
 from rse_pf.errors import RsePfError
 from rse_pf.services.custom.installed import install
 
@@ -71,14 +70,6 @@ class Seen:
         }  # fmt: skip
 
 
-def robot_of(server: Server, tenant: str, name: str) -> Any:
-    """Return a robot that is not yet connected."""
-    token = KEY.issue(
-        name, now=time.time(), token_id=f"{tenant}-{name}", settings=server.settings.auth, tenant=tenant
-    )
-    return connect(server.url, token=token, codec="bin")
-
-
 async def ask(robot: Any, payload: Row, deadline_s: float, planned: float, seen: Seen) -> str:
     """Call the service once; return "ok" or the error code."""
     try:
@@ -96,7 +87,7 @@ async def other(
 ) -> None:
     """Ask once a second, before and during the attack."""
     tenant, name = OTHERS[index]
-    async with robot_of(server, tenant, name) as robot:
+    async with server.robot(name, tenant) as robot:
         planned = time.perf_counter() + PERIOD_S * index / len(OTHERS)
         while planned < end_s:
             await asyncio.sleep(max(0.0, planned - time.perf_counter()))
@@ -114,7 +105,7 @@ async def deadlines(folder: Path, seconds: float, *, row: str, payload_of: Calla
             asyncio.ensure_future(other(server, i, quiet, beside, attack_s, end_s))
             for i in range(len(OTHERS))
         ]
-        async with robot_of(server, "hostile", "robot-0") as robot:
+        async with server.robot("robot-0", "hostile") as robot:
             await asyncio.sleep(attack_s - time.perf_counter())  # the others alone, to compare with
             number = 1000
             while time.perf_counter() < end_s:
@@ -140,7 +131,7 @@ async def sandboxes(folder: Path, seconds: float) -> Row:
         end_s = time.perf_counter() + seconds
 
         async def hog(index: int) -> None:
-            async with robot_of(server, "hostile", f"robot-{index}") as robot:
+            async with server.robot(f"robot-{index}", "hostile") as robot:
                 while time.perf_counter() < end_s:
                     now = time.perf_counter()
                     if await ask(robot, {"number": index}, DEADLINE_S, now, hostile) != "ok":
@@ -148,7 +139,7 @@ async def sandboxes(folder: Path, seconds: float) -> Row:
 
         async def guest(index: int) -> None:
             tenant, name = OTHERS[index]
-            async with robot_of(server, tenant, name) as robot:
+            async with server.robot(name, tenant) as robot:
                 began = time.perf_counter()
                 while await ask(robot, COMMON_PAYLOAD, DEADLINE_S, began, Seen()) != "ok":
                     await asyncio.sleep(_BUSY_PAUSE_S)

@@ -14,8 +14,6 @@ import json
 import os
 import signal
 import statistics
-import subprocess
-import sys
 import tempfile
 import time
 import urllib.error
@@ -27,11 +25,12 @@ from typing import Annotated, Any, NamedTuple
 from benchmarks.frame.registry import benchmark
 from benchmarks.frame.report import say
 from benchmarks.frame.statistics import percentile
+from benchmarks.server.serving import BenchServer
 from client_sdk import connect
-from rse_pf.auth.tokens import SigningKey
 from rse_pf.cli.main import main as rse_pf
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import RsePfError
+from rse_pf.identity import DEFAULT_TENANT
 from rse_pf.pnp.problems import make_problem
 from rse_pf.services.custom.installed import install, read_service
 from rse_pf.services.custom.runtime import open_runtime
@@ -39,7 +38,6 @@ from rse_pf.services.pnp import make_request
 
 LANGUAGES = ("python", "cpp", "lua")
 POINTS = {"points": [float(i % 7) for i in range(300)]}
-KEY = SigningKey.from_seed(b"b" * 32, "bench")
 HARD = """
 import os
 import msgspec
@@ -64,17 +62,6 @@ class Service:
         self.count += 1
         return Reply(count=self.count)
 """
-SERVE = """
-import json, sys
-from pathlib import Path
-from rse_pf.auth.tokens import KeySet
-from rse_pf.backend.supervisor import serve
-from rse_pf.config import PlatformSettings
-order = json.loads(sys.argv[1])
-keys = KeySet.from_json(order["keys"])
-settings = PlatformSettings.from_dict(order["settings"])
-sys.exit(serve(settings, keys=keys, server_id="bench", announce=Path(order["announce"])))
-"""
 Row = dict[str, Any]
 ROWS = ("cost", "released", "poison", "state", "crashes")
 
@@ -82,34 +69,13 @@ ROWS = ("cost", "released", "poison", "state", "crashes")
 class Server:
     """One backend server in processes of its own, without a load balancer."""
 
-    def __init__(self, folder: Path, **services: Any) -> None:
-        announce = folder / "announce.json"
-        announce.unlink(missing_ok=True)
-        chosen = {"folder": str(folder / "services"), "accept_weak_isolation": True, **services}
-        settings = {
-            "serving": {"port": 0, "control_port": 0, "workers": 1},
-            "session": {"max_commands_per_s": 0.0},  # calls follow one another at once
-            "services": chosen,
-            "data": {"store": f"dir:{folder / 'store'}"},
-        }
-        self.settings = PlatformSettings.from_dict(settings)
-        order = {"settings": settings, "keys": KEY.key_set().to_json(), "announce": str(announce)}
-        with (folder / "server.log").open("ab") as log:
-            self.process = subprocess.Popen(
-                [sys.executable, "-c", SERVE, json.dumps(order)], stdout=log, stderr=log
-            )
-        end = time.monotonic() + 30
-        while not announce.exists():
-            if time.monotonic() > end or self.process.poll() is not None:
-                raise SystemExit(f"the server did not start: {(folder / 'server.log').read_text()[-2000:]}")
-            time.sleep(0.02)  # looks again, with a deadline
-        self._identity = json.loads(announce.read_text())
-        self.url = f"ws://127.0.0.1:{self._identity['port']}/ws"
+    def __init__(self, server: BenchServer) -> None:
+        self._server = server
+        self._url = f"ws://127.0.0.1:{server.port}/ws"
 
-    def robot(self, name: str) -> Any:
+    def robot(self, name: str, tenant: str = DEFAULT_TENANT) -> Any:
         """Return a robot that is not yet connected."""
-        token = KEY.issue(name, now=time.time(), token_id=name, settings=self.settings.auth)
-        return connect(self.url, token=token, codec="bin")
+        return connect(self._url, token=self._server.token(name, tenant), codec="bin")
 
     def ready(self) -> Row:
         """Return the answer of /readyz."""
@@ -117,7 +83,7 @@ class Server:
 
     def control(self, path: str) -> Row:
         """Return what the control port answers."""
-        url = f"http://127.0.0.1:{self._identity['control_port']}{path}"
+        url = f"http://127.0.0.1:{self._server.control_port}{path}"
         try:
             with urllib.request.urlopen(url, timeout=5) as answer:
                 return dict(json.loads(answer.read()))
@@ -127,7 +93,7 @@ class Server:
 
     def processes(self) -> dict[int, str]:
         """Return the pids below the server, and what each is called."""
-        return dict(_below(self.process.pid))
+        return dict(_below(self._server.pid))
 
     def descriptors(self) -> int:
         """Return how many descriptors all of them hold."""
@@ -136,15 +102,6 @@ class Server:
             with contextlib.suppress(OSError):
                 count += len(os.listdir(f"/proc/{pid}/fd"))
         return count
-
-    def end(self) -> None:
-        """Stop it and wait."""
-        self.process.terminate()
-        try:
-            self.process.wait(15)
-        except subprocess.TimeoutExpired:
-            self.process.kill()
-            self.process.wait()
 
 
 def _below(pid: int) -> Iterator[tuple[int, str]]:
@@ -170,11 +127,11 @@ def unique_mib(pid: int) -> float:
 @contextlib.asynccontextmanager
 async def serving(folder: Path, **services: Any) -> AsyncIterator[Server]:
     """Serve for the length of a block."""
-    server = Server(folder, **services)
-    try:
-        yield server
-    finally:
-        server.end()
+    chosen = {"folder": str(folder / "services"), "accept_weak_isolation": True, **services}
+    session = {"max_commands_per_s": 0.0}  # calls follow one another at once
+    store = {"store": f"dir:{folder / 'store'}"}
+    with BenchServer(folder, workers=1, session=session, services=chosen, data=store) as server:
+        yield Server(server)
 
 
 async def cost(folder: Path, robots: int = 8, calls: int = 200) -> list[Row]:
