@@ -103,7 +103,8 @@ class Admission:
             )
             return RefusedCommand(queued, busy, "robot-queue")
         if backlog.delay_s > max_wait_s(allowed_s, backlog.max_delay_s):
-            busy = Busy(BEHIND, hint=BEHIND_HINT, retry_after_ms=retry_after_ms(backlog.delay_s))
+            retry_ms = retry_after_ms(max(backlog.delay_s, backlog.pause_s))
+            busy = Busy(BEHIND, hint=BEHIND_HINT, retry_after_ms=retry_ms)
             return RefusedCommand(queued, busy, "behind")
         return None
 

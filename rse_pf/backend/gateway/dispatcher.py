@@ -224,11 +224,16 @@ class Dispatcher:
             return True
         if connection.allowed_s is None or not self._scheduler.is_behind:
             return False
-        retry_ms = self._scheduler.retry_unread_ms(connection.robot, connection.allowed_s)
+        retry_ms = 1e3 * (connection.paused_s + self._scheduler.pause_s - now)
+        is_early = retry_ms > 0.0
+        if not is_early:
+            retry_ms = self._scheduler.retry_unread_ms(connection.robot, connection.allowed_s)
         envelope = peek(codec, data) if retry_ms else None
         if envelope is None or self._queue_of(envelope.service) is not self.stateless:
             return False
-        self.stateless.refuse_unread(connection, envelope, retry_ms, len(data))
+        if not is_early:
+            connection.paused_s = now
+        self.stateless.refuse_unread(connection, envelope, retry_ms, len(data), is_early=is_early)
         return True
 
     def refuse_long(self, connection: RobotConnection, session: ServerSession, data: bytes) -> bool:
@@ -261,6 +266,8 @@ class Dispatcher:
         if refusal is not None:
             if queue is not None and refusal.reason == "behind":
                 queue.note_refused(now)
+                if queue is self.stateless:
+                    connection.paused_s = now
             self._answers.send_refusal(refusal, now)
         elif queue is not None:
             queue.submit(queued, now)

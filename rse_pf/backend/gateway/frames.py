@@ -194,8 +194,11 @@ class CloseBorder:
             if n <= payload_left and not self._is_close:
                 self._left = payload_left - n
                 return n
-        elif self.is_upgraded and not self._head and _is_one_data_frame(data, n):
-            return n
+        elif self.is_upgraded and not self._head and n >= 6 and not data[0] & 8:
+            # One whole masked data frame of less than 64 KiB, as most pieces are.
+            size = data[1] - 128
+            if n == (8 + (data[2] << 8) + data[3] if size == 126 else 6 + size if size < 126 else 0):
+                return n
         data = data[:n]
         start = 0 if self.is_upgraded else self._end_of_request(data)
         return n if start < 0 else self._walk(data, start)
@@ -249,13 +252,3 @@ def _payload_length(head: bytes | memoryview) -> int:
     if size == 126:
         return int.from_bytes(head[2:4], "big")
     return int.from_bytes(head[2:10], "big") if size == 127 else size
-
-
-def _is_one_data_frame(data: memoryview, n: int) -> bool:
-    """Return whether the first *n* bytes are one whole masked data frame of less than 64 KiB."""
-    if n < 6 or data[0] & 8:
-        return False
-    size = data[1] - 128
-    if size < 126:
-        return n == 6 + size
-    return size == 126 and n == 8 + (data[2] << 8) + data[3]

@@ -27,6 +27,12 @@ from rse_pf.wire.envelope import Envelope
 
 __all__ = ["StatelessQueue"]
 
+_INLINE_S = 0.001
+"""Commands are computed in the event loop for so long in one of its rounds, so that sockets are read again: a
+longer round would hide the queue in the kernel, where its length cannot be seen."""
+_LEAST_S = 1e-6
+"""What a command counts as that took no time by the clock."""
+
 
 class StatelessQueue(CommandQueue):
     """Commands of stateless services that wait or run."""
@@ -61,7 +67,8 @@ class StatelessQueue(CommandQueue):
             lambda answer: loop.call_soon_threadsafe(self._on_computed, answer),
         )
         self._waits = LongestRecently()
-        self._ran_inline = False
+        self._inline_s = 0.0
+        """Time that commands took in the event loop in this round of it; see `_INLINE_S`."""
         self._throttle_timer: TimerHandle | None = None
         self._sweep_timer: TimerHandle | None = None
         self._batched: list[tuple[RobotConnection, Envelope, float, int]] = []
@@ -121,7 +128,7 @@ class StatelessQueue(CommandQueue):
         service = queued.command.service
         claims = queued.owner.claims
         if (
-            self._ran_inline
+            self._inline_s >= _INLINE_S
             or service not in self._cheap
             or queued.size_bytes > INLINE_BYTES
             or self._throttle.is_on
@@ -132,15 +139,20 @@ class StatelessQueue(CommandQueue):
         if not self.scheduler.start_unqueued(queued, now):
             return False
         self._waits.note(now - queued.received_s, now)
-        self._begin_inline()
         answer = self._answers.compute(queued)
-        now = self._monotonic()
-        self.scheduler.finish_unqueued(queued, now)
-        self._answers.send(answer, now)
+        self.scheduler.finish_unqueued(queued, ended := self._monotonic())
+        self._note_inline(ended - now)
+        self._answers.send(answer, ended)
         return True
 
     def refuse_unread(
-        self, connection: RobotConnection, envelope: Envelope, retry_ms: float, size_bytes: int
+        self,
+        connection: RobotConnection,
+        envelope: Envelope,
+        retry_ms: float,
+        size_bytes: int,
+        *,
+        is_early: bool = False,
     ) -> None:
         """Refuse a message that is not decoded, because the server is behind.
 
@@ -149,8 +161,9 @@ class StatelessQueue(CommandQueue):
             envelope: What could be read of the message.
             retry_ms: When the robot may try again, see `Scheduler.retry_unread_ms`.
             size_bytes: Length of the message.
+            is_early: Whether the robot was told to wait longer.
         """
-        self.scheduler.note_refused(self._monotonic())
+        self.scheduler.note_refused(self._monotonic(), is_early=is_early)
         if self._throttle_timer is None:
             self._answers.send_unread_refusal(connection, envelope, TOO_LATE, retry_ms, size_bytes)
         else:
@@ -160,15 +173,16 @@ class StatelessQueue(CommandQueue):
 
     # --- from the queue to an answer -----------------------------------------------------------
 
-    def _begin_inline(self) -> None:
-        """Keep every other command from running in this round of the event loop."""
-        self._ran_inline = True
-        self._loop.call_soon(self._next_round)
+    def _note_inline(self, spent_s: float) -> None:
+        """Note that a command took *spent_s* of this round of the event loop."""
+        if not self._inline_s:
+            self._loop.call_soon(self._next_round)
+        self._inline_s += spent_s or _LEAST_S
 
     def _start(self) -> None:
         """Start the commands whose turn it is, as many as threads and the throttle allow."""
         scheduler = self.scheduler
-        while not self._ran_inline and scheduler.waiting and scheduler.running < SOLVER_THREADS:
+        while self._inline_s < _INLINE_S and scheduler.waiting and scheduler.running < SOLVER_THREADS:
             now = self._monotonic()
             wait_s = self._throttle.wait_s(now)
             if wait_s > 0:
@@ -185,27 +199,24 @@ class StatelessQueue(CommandQueue):
             self._sweep_timer = self._loop.call_later(QUEUE_TARGET_S / 2, self._sweep)
 
     def _run(self, queued: QueuedCommand) -> None:
-        """Compute the answer to *queued*; in the event loop only one in each of its rounds.
-
-        Otherwise a slow round would hide the queue in the kernel, where its length cannot be seen.
-        """
+        """Compute the answer to *queued*, in the event loop or in a solver thread."""
         command = queued.command
         answers = self._answers
         service = self._registry.get(command.service)
         may_refer = command.service in answers.with_objects
         asks_store = may_refer and answers.objects.has_references(command, service)
         if not asks_store and self.scheduler.runs_inline(cheap=service.cheap, size_bytes=queued.size_bytes):
-            self._begin_inline()
-            self._finish(answers.compute(queued))
+            answer = answers.compute(queued)
+            self._finish(answer, ended := self._monotonic())
+            self._note_inline(ended - queued.started_s)
         else:
             self._threads.run(queued)
 
     def _on_computed(self, answer: EncodedAnswer) -> None:
-        self._finish(answer)
+        self._finish(answer, self._monotonic())
         self._start()
 
-    def _finish(self, answer: EncodedAnswer) -> None:
-        now = self._monotonic()
+    def _finish(self, answer: EncodedAnswer, now: float) -> None:
         self.scheduler.done(answer.queued, now)
         self._answers.send(answer, now)
 
@@ -216,7 +227,7 @@ class StatelessQueue(CommandQueue):
     # --- timers --------------------------------------------------------------------------------
 
     def _next_round(self) -> None:
-        self._ran_inline = False
+        self._inline_s = 0.0
         if self.scheduler.waiting:
             self._start()
 

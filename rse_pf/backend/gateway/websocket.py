@@ -362,6 +362,7 @@ def protocol_type(picows: Any, max_frame_bytes: int, long_reads: DeferredWork) -
             self._request = (upgrade, rest)
             self._listener = listener
             self._is_made = False
+            self._read_bytes = 0
             self._on_end = on_end
             self._border = CloseBorder(upgraded=True)
             self._buffer = memoryview(b"")
@@ -388,14 +389,16 @@ def protocol_type(picows: Any, max_frame_bytes: int, long_reads: DeferredWork) -
         def buffer_updated(self, n: int) -> None:
             if self.transport is not None and self.transport.is_close_frame_sent:
                 return
-            is_full = n == len(self._buffer)
+            read_bytes = self._read_bytes + n if n == len(self._buffer) else 0
             size = self._border.bytes_to_close(self._buffer, n)
             if size:
                 buffer_updated(self, size)
-            if is_full and self._is_made:
+            if read_bytes >= _MAX_READ_BYTES and self._is_made:
                 # The transport would read on up to 256 KiB, and then the next socket, in the same round.
+                read_bytes = 0
                 self._listener.hold()
                 long_reads.add(self._listener.read_on)
+            self._read_bytes = read_bytes
 
         def connection_lost(self, error: Exception | None) -> None:
             try:

@@ -60,6 +60,11 @@ _RESERVE_S = 1.5
 """Enough for compute and network of any command: one that has more time may wait for all but this."""
 _MAX_REFUSED_SHARE = 0.1
 """A server that refuses a smaller share of its commands is no longer behind."""
+_MANY_REFUSED, _LONGER, _SHORTER = 0.15, 1.5, 1.1
+"""Robots are told to pause for longer, by these factors in each interval, while more than this share of
+commands is refused, and for shorter at `_MAX_REFUSED_SHARE`: hardly more return than can be served."""
+_MAX_PAUSE_S = 1.0
+"""So that robots are back a second after an overload."""
 QUEUE_TARGET_S, QUEUE_INTERVAL_S = 0.05, 0.1
 """A server whose robots wait longer than the target for a whole interval is behind.
 
@@ -93,12 +98,14 @@ class QueueBacklog(NamedTuple):
         delay_s: The time until the command's turn.
         turn_s: The time that each turn takes; 0 where it is not measured and nothing waits.
         max_delay_s: How long a command with little time may wait now; see `Scheduler.max_delay_s`.
+        pause_s: Robots that are refused because of the delay pause for so long at least.
     """
 
     waiting: int = 0
     delay_s: float = 0.0
     turn_s: float = 0.0
     max_delay_s: float = math.inf
+    pause_s: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,7 +137,9 @@ class Scheduler:
         self._turns = Turns()
         self._late_since: float | None = None
         self._judged_s = 0.0
-        self._started = self._refused = 0
+        self._started = self._refused = self._early = 0
+        self._pause_s = QUEUE_INTERVAL_S
+        self._sweep_from_s = math.inf
         self._service_s = 0.0
         self._short_share = 0.0
         self._last_start = -math.inf
@@ -153,7 +162,9 @@ class Scheduler:
         if robot is not None and _replaceable(robot.waiting, queued) is not None:
             return QueueBacklog()
         waiting = 0 if robot is None else len(robot.waiting)
-        return QueueBacklog(waiting, self._delay_s(queued.robot, robot), self.turn_s, self.max_delay_s)
+        return QueueBacklog(
+            waiting, self._delay_s(queued.robot, robot), self.turn_s, self.max_delay_s, self.pause_s
+        )
 
     def retry_unread_ms(self, robot_id: RobotId, allowed_s: float) -> float:
         """Return when a robot may try again whose next command, not decoded yet, would wait too long.
@@ -173,7 +184,12 @@ class Scheduler:
             return 0.0
         if robot is not None and any(map(_is_replaceable, robot.waiting)):
             return 0.0
-        return retry_after_ms(delay_s)
+        return retry_after_ms(max(delay_s, self.pause_s))
+
+    @property
+    def pause_s(self) -> float:
+        """How long a robot is told to pause that is refused because the server is behind; else 0."""
+        return self._pause_s if self.is_behind else 0.0
 
     def submit(self, queued: QueuedCommand) -> list[RefusedCommand]:
         """Queue *queued*, which was admitted, for its turn; return the frame of its stream that ends
@@ -181,6 +197,7 @@ class Scheduler:
         robot = self._robots.get(queued.robot)
         if robot is None:
             robot = self._robots[queued.robot] = _Robot()
+        self._sweep_from_s = min(self._sweep_from_s, _soonest_late_s(queued))
         older = _replaceable(robot.waiting, queued)
         if older is not None:
             if queued.command.seq < older.command.seq:
@@ -193,9 +210,15 @@ class Scheduler:
             self._turns.append(queued.robot)
         return []
 
-    def note_refused(self, now: float) -> None:
-        """Count a command that was not queued because it would have waited too long."""
-        self._refused += 1
+    def note_refused(self, now: float, *, is_early: bool = False) -> None:
+        """Count a command that was not queued because it would have waited too long.
+
+        With *is_early* its robot was told to wait longer: that says nothing about the pauses of the others.
+        """
+        if is_early:
+            self._early += 1
+        else:
+            self._refused += 1
         if self.is_behind:
             self._judge(now)
 
@@ -264,6 +287,9 @@ class Scheduler:
         if self._turns:
             first = self._robots[self._turns.first]
             self._note_turn_wait(_turn_wait(first, first.waiting[0], now), now)
+        if now < self._sweep_from_s:
+            return refusals
+        self._sweep_from_s = math.inf
         for robot_id, robot in list(self._robots.items()):
             still_waiting: deque[QueuedCommand] = deque()
             for queued in robot.waiting:
@@ -274,6 +300,7 @@ class Scheduler:
                     refusals.append(self._refuse_late(robot, queued, now))
                 else:
                     still_waiting.append(queued)
+                    self._sweep_from_s = min(self._sweep_from_s, _soonest_late_s(queued, now))
             self._replace_waiting(robot_id, robot, still_waiting)
         return refusals
 
@@ -331,7 +358,7 @@ class Scheduler:
         self._refused += 1
         if queued.deadline_s <= now:
             return RefusedCommand(queued, expired_error(queued, now), "expired")
-        retry_ms = retry_after_ms(_turn_wait(robot, queued, now))
+        retry_ms = retry_after_ms(max(_turn_wait(robot, queued, now), self.pause_s))
         return RefusedCommand(queued, Busy(BEHIND, hint=BEHIND_HINT, retry_after_ms=retry_ms), "behind")
 
     def _note_turn_wait(self, wait_s: float, now: float) -> None:
@@ -344,7 +371,7 @@ class Scheduler:
             self._late_since = now
         elif now - self._late_since >= QUEUE_INTERVAL_S:
             self.is_behind, self._late_since = True, None
-            self._judged_s, self._started, self._refused = now, 0, 0
+            self._judged_s, self._started, self._refused, self._early = now, 0, 0, 0
 
     def _judge(self, now: float) -> None:
         """Leave *behind* after an interval that refused hardly any.
@@ -352,17 +379,23 @@ class Scheduler:
         The waits say nothing then: admission keeps them short however much is offered.
         """
         if now - self._judged_s >= QUEUE_INTERVAL_S:
-            self.is_behind = self._refused > _MAX_REFUSED_SHARE * (self._refused + self._started)
-            self._judged_s, self._started, self._refused = now, 0, 0
+            judged = self._refused + self._started
+            refused = self._refused + self._early
+            self.is_behind = refused > _MAX_REFUSED_SHARE * (judged + self._early)
+            if self._refused > _MANY_REFUSED * judged:
+                self._pause_s = min(_MAX_PAUSE_S, _LONGER * self._pause_s)
+            elif self._refused <= _MAX_REFUSED_SHARE * judged:
+                self._pause_s = max(QUEUE_INTERVAL_S, self._pause_s / _SHORTER)
+            self._judged_s, self._started, self._refused, self._early = now, 0, 0, 0
 
     def _note_service(self, spent_s: float) -> None:
         self._short_share += _SMOOTHING * ((spent_s <= _SHORT_COMPUTE_S) - self._short_share)
         self._service_s = _smooth(self._service_s, spent_s) if self._service_s else spent_s
 
     def _measure_turn(self, waited_s: float, now: float) -> None:
-        """Average the time between two starts while robots wait."""
+        """Average the time between two starts while robots wait; what is before its arrival is no turn."""
         if waited_s > _IMMEDIATE_S and self._last_start > -math.inf:
-            self.turn_s = _smooth(self.turn_s, now - self._last_start)
+            self.turn_s = _smooth(self.turn_s, min(now - self._last_start, waited_s))
         self._last_start = now
 
     def _replace_waiting(self, robot_id: RobotId, robot: _Robot, still_waiting: deque[QueuedCommand]) -> None:
@@ -373,6 +406,16 @@ class Scheduler:
         if not still_waiting and robot.running is None:
             self._turns.remove(robot_id)
             del self._robots[robot_id]
+
+
+def _soonest_late_s(queued: QueuedCommand, now: float = -math.inf) -> float:
+    """Return when a waiting command may be given up at the earliest; later than *now* if it was looked at.
+
+    `Scheduler._is_hopeless` lets it wait for so long at least.
+    """
+    allowed_s = queued.deadline_s - queued.received_s
+    waits_s = min(allowed_s / 2, max(_MAX_TARGETS_WAITED * QUEUE_TARGET_S, _spare_s(allowed_s)))
+    return max(queued.received_s + waits_s, now + QUEUE_TARGET_S / 2)
 
 
 def retry_after_ms(delay_s: float) -> float:

@@ -10,7 +10,7 @@ import msgspec
 import pytest
 from backend.gateway.worker_parts import BINARY, UNIX_S, WorkerParts, worker_parts
 from backend.scheduling.admitted import fall_behind, queued
-from fakes import FakeWire
+from fakes import FakeLoop, FakeWire
 
 from rse_pf.backend.scheduling.command_queue import CommandQueue, QueueReport, unmeasured_backlog
 from rse_pf.backend.scheduling.scheduler import QueueBacklog, QueuedCommand
@@ -51,12 +51,28 @@ def register(registry: Registry) -> None:
 
 @pytest.fixture
 def worker() -> Iterator[WorkerParts]:
-    with worker_parts(register=register) as parts:
+    loops: list[FakeLoop] = []
+
+    def register_all(registry: Registry) -> None:
+        register(registry)
+
+        @registry.service("half", cheap=True)
+        def half(request: Odd) -> Odd:
+            loops[0].now += 0.0006
+            return request
+
+    with worker_parts(register=register_all) as parts:
+        loops.append(parts.loop)
         yield parts
 
 
 def echo(number: int, **command: Any) -> Command:
     return Command(id=number, service="echo", payload={"value": 1}, **command)
+
+
+def half(number: int, **command: Any) -> Command:
+    """Return a command that takes 0.6 ms."""
+    return Command(id=number, service="half", payload={"value": 1}, **command)
 
 
 def results(wire: FakeWire) -> list[Result]:
@@ -191,6 +207,13 @@ def overload(worker: WorkerParts, *, waiting: int = 1) -> None:
         worker.scheduler.submit(queued(f"other-{number}", at=worker.loop.now))
 
 
+def compute_waiting(worker: WorkerParts) -> None:
+    """Empty the queue."""
+    now = worker.loop.now
+    while (started := worker.scheduler.start(now)[0]) is not None:
+        worker.scheduler.done(started, now)
+
+
 def test_a_server_that_is_behind_refuses_without_decoding(worker: WorkerParts):
     connection, wire = worker.join()
     worker.say(connection, echo(7, deadline_ms=250.0))
@@ -205,6 +228,40 @@ def test_a_server_that_is_behind_refuses_without_decoding(worker: WorkerParts):
     assert connection.session.in_flight == 0
     assert worker.metrics.shed["unread"] == 1
     assert worker.metrics.requests["echo", "busy"] == 1
+
+
+def test_a_robot_that_was_told_to_pause_is_refused_until_then_although_there_is_room(worker: WorkerParts):
+    connection, wire = worker.join()
+    worker.say(connection, echo(7, deadline_ms=250.0))
+    overload(worker)
+    worker.say(connection, echo(8, deadline_ms=250.0))
+    compute_waiting(worker)
+    told_s, pause_s = worker.loop.now, worker.scheduler.pause_s
+
+    worker.loop.now += 0.9 * pause_s
+    worker.say(connection, echo(9, deadline_ms=250.0))
+    assert refused(wire) == [8, 9]
+    assert wire.sent[-1].retry_after_ms == pytest.approx(100.0 * pause_s, rel=0.01)
+
+    worker.loop.now = told_s + 1.01 * worker.scheduler.pause_s
+    worker.say(connection, echo(10, deadline_ms=250.0))
+    worker.loop.run_until(lambda: bool(results(wire)[1:]))
+    assert refused(wire) == [8, 9]
+    assert results(wire)[-1].id == 10
+
+
+def test_a_pause_ends_when_the_server_is_no_longer_behind(worker: WorkerParts):
+    connection, wire = worker.join()
+    worker.say(connection, echo(7, deadline_ms=250.0))
+    overload(worker)
+    worker.say(connection, echo(8, deadline_ms=250.0))
+    worker.scheduler.is_behind = False
+    compute_waiting(worker)
+
+    worker.say(connection, echo(9, deadline_ms=250.0))
+
+    assert refused(wire) == [8]
+    assert results(wire)[-1].id == 9
 
 
 def test_the_first_command_of_a_robot_is_decoded_whatever_waits(worker: WorkerParts):
@@ -229,23 +286,27 @@ def test_hellos_pings_and_unknown_services_are_decoded_even_behind(worker: Worke
     assert worker.metrics.shed["unread"] == 0
 
 
-def test_one_command_runs_in_each_round_of_the_loop_so_that_the_queue_is_seen(worker: WorkerParts):
-    robots = [worker.join(name) for name in ("a", "b", "c")]
-    worker.loop.advance()
+def test_a_round_of_the_loop_computes_for_a_millisecond_so_that_the_queue_is_seen(worker: WorkerParts):
+    first, _ = worker.join("first")
+    for number in range(20):  # until the service is known to be short
+        worker.say(first, half(number))
+        worker.loop.advance()
+    robots = [worker.join(name) for name in "abcdef"]
 
     for connection, _ in robots:
-        worker.say(connection, echo(1))
+        worker.say(connection, half(1))
 
-    assert [len(results(wire)) for _, wire in robots] == [1, 0, 0]
-    assert worker.dispatcher.held == 2
+    assert [len(results(wire)) for _, wire in robots] == [1, 1, 0, 0, 0, 0]
+    assert worker.dispatcher.held == 4
+    worker.loop.turn()
+    assert [len(results(wire)) for _, wire in robots] == [1, 1, 1, 1, 0, 0]
     worker.loop.run_until(lambda: worker.dispatcher.held == 0)
-    assert [len(results(wire)) for _, wire in robots] == [1, 1, 1]
+    assert [len(results(wire)) for _, wire in robots] == [1] * 6
 
 
 def test_the_longest_recent_wait_is_reported(worker: WorkerParts):
-    (first, _), (second, _) = worker.join("a"), worker.join("b")
-    worker.say(first, echo(1))
-    worker.say(second, echo(1))
+    for name in "abc":
+        worker.say(worker.join(name)[0], half(1))
     worker.loop.now += 0.3
     worker.loop.turn()
 
@@ -413,7 +474,8 @@ def test_every_kind_of_command_passes_the_same_admission(
 def test_a_connection_that_ends_drops_its_waiting_commands(worker: WorkerParts):
     connection, wire = worker.join()
     other, _ = worker.join("other")
-    worker.say(other, echo(1))
+    worker.say(other, half(1))
+    worker.say(other, half(2))
     worker.say(connection, echo(2))
 
     connection.on_socket_end()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import heapq
 import random
 from collections import Counter, deque
 
@@ -243,6 +244,79 @@ def simulate(
         else:
             late += 1
     return good, late, refused
+
+
+def drive(load: float, *, obeys: bool, seconds: float = 12.0, robots: int = 40) -> tuple[float, float, float]:
+    """Let robots send at *load* times the capacity for two thirds of the time, then at half of it.
+
+    Returns what was offered and served a second in the last 4 s of the overload, in shares of the capacity,
+    and the time (s) from its end to the last refusal.
+    """
+    scheduler, chance = AdmittedScheduler(), random.Random(7)
+    ends_s = 2 * seconds / 3
+    period_s = robots / (load * CAPACITY)
+    due = [(chance.uniform(0.0, period_s), number) for number in range(robots)]
+    heapq.heapify(due)
+    told_s = [-1.0] * robots
+    now, swept, offered, served, last_refusal_s = 0.0, 0.0, 0, 0, ends_s
+
+    def arrive(until: float) -> None:
+        nonlocal offered, last_refusal_s
+        while due and due[0][0] <= until:
+            at, number = heapq.heappop(due)
+            own_s = period_s if at < ends_s else 2 * robots / CAPACITY
+            is_measured = ends_s - 4.0 <= at < ends_s
+            offered += is_measured
+            next_s = at + own_s * chance.uniform(0.5, 1.5)
+            if at < told_s[number] + scheduler.pause_s:
+                scheduler.note_refused(at, is_early=True)
+                gone = True
+            else:
+                retry_ms = scheduler.refuse_unread(f"r{number}", DEADLINE_S, at)
+                refusals = (
+                    [] if retry_ms else scheduler.submit(queued(f"r{number}", at=at, within=DEADLINE_S), at)
+                )
+                gone = bool(retry_ms or refusals)
+                if gone:
+                    told_s[number] = at
+                    if obeys:
+                        waits_s = 1e-3 * (retry_ms or refusals[0].error.retry_after_ms)
+                        next_s = max(next_s, at + waits_s)
+            if gone:
+                last_refusal_s = max(last_refusal_s, at)
+            heapq.heappush(due, (next_s, number))
+
+    while now < seconds:
+        arrive(now)
+        if now - swept >= SWEEP_S:
+            swept = now
+            scheduler.sweep(now)
+        started, _ = scheduler.start(now)
+        if started is None:
+            now = max(now + 1e-4, due[0][0])
+            continue
+        now += WORK_S * chance.uniform(0.7, 1.3)
+        arrive(now)
+        scheduler.done(started, now)
+        served += ends_s - 4.0 <= now < ends_s and now <= started.deadline_s
+    return offered / (4.0 * CAPACITY), served / (4.0 * CAPACITY), last_refusal_s - ends_s
+
+
+@pytest.mark.parametrize(("load", "most"), [(1.5, 1.25), (2.0, 1.25), (3.0, 1.6)])
+def test_robots_that_obey_offer_little_more_than_can_be_served(load: float, most: float):
+    offered, served, recovery_s = drive(load, obeys=True)
+
+    assert offered <= most
+    assert served >= 0.95
+    assert recovery_s <= 1.0
+
+
+@pytest.mark.parametrize("load", [1.2, 2.0, 3.0])
+def test_robots_that_ignore_pauses_take_nothing_and_the_server_recovers(load: float):
+    _, served, recovery_s = drive(load, obeys=False)
+
+    assert served >= 0.95
+    assert recovery_s <= 1.0
 
 
 def poisson(rate: float, robots: int, seed: int) -> list[tuple[float, str]]:
