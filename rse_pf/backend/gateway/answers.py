@@ -7,6 +7,8 @@ Neither a payload nor a token reaches the log.
 from __future__ import annotations
 
 import traceback
+from collections.abc import Sequence
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -22,6 +24,7 @@ from rse_pf.recording.tap import RecordingTap
 from rse_pf.service import Registry, dispatch, failure_of, unknown_service
 from rse_pf.wire import Command, Failure, Result
 from rse_pf.wire.envelope import Envelope, encode_refusal
+from rse_pf.wire.messages import MAX_REFUSED_IDS, Refused
 
 __all__ = ["Answers", "EncodedAnswer"]
 
@@ -176,33 +179,48 @@ class Answers:
         self._context.metrics.shed[refusal.reason] += 1
         self.send(self._encode_failure(refusal.queued, refusal.error), now)
 
-    def send_unread_refusal(
+    def send_unread_refusals(
         self,
         connection: RobotConnection,
-        envelope: Envelope | None,
+        unread: Sequence[tuple[Envelope | None, int]],
         refusal: UnreadRefusal,
         retry_after_ms: float,
-        size_bytes: int,
     ) -> None:
-        """Answer a message that is not decoded; *envelope* tells which command it is, if that is known."""
-        context, session = self._context, connection.session
+        """Answer messages that are not decoded: in one message, if the robot knows such messages.
+
+        Args:
+            connection: Of the robot.
+            unread: Which command each message is, if that is known, and its length.
+            refusal: Why they are refused.
+            retry_after_ms: When the robot may try again.
+        """
+        session = connection.session
         assert session is not None
-        context.metrics.shed[refusal.reason] += 1
-        failure = Failure(
-            id=None if envelope is None else envelope.id, code=Busy.code, message=refusal.message,
-            hint=refusal.hint, retry_after_ms=retry_after_ms, server=context.server_id,
-        )  # fmt: skip
-        data = encode_refusal(session.codec, failure)
-        connection.write(data)
-        if envelope is None:
-            return
+        fields: dict[str, Any] = {
+            "code": Busy.code, "message": refusal.message, "hint": refusal.hint,
+            "retry_after_ms": retry_after_ms, "server": self._context.server_id,
+        }  # fmt: skip
+        self._context.metrics.shed[refusal.reason] += len(unread)
+        ids = [envelope.id for envelope, _ in unread if envelope is not None]
+        if len(ids) > 1 and len(ids) == len(unread) and session.hears_refusals:
+            for first in range(0, len(ids), MAX_REFUSED_IDS):
+                together = Refused(ids=ids[first : first + MAX_REFUSED_IDS], **fields)
+                connection.write(encode_refusal(session.codec, together))
+        else:
+            for envelope, _ in unread:
+                failure = Failure(id=None if envelope is None else envelope.id, **fields)
+                connection.write(encode_refusal(session.codec, failure))
+        for envelope, size_bytes in unread:
+            if envelope is not None:
+                self._note_unread(connection, envelope, size_bytes)
+
+    def _note_unread(self, connection: RobotConnection, envelope: Envelope, size_bytes: int) -> None:
         service = self.label(envelope.service)
-        context.metrics.count_answer(service, Busy.code, 0.0)
-        if context.log.writes("debug"):
-            context.log.debug(
+        self._context.metrics.count_answer(service, Busy.code, 0.0)
+        if self._logs_frequent:
+            self._context.log.debug(
                 "command", robot=connection.robot, service=service, id=envelope.id,
                 trace="", code=Busy.code, queue_ms=0.0, compute_ms=0.0, bytes_in=size_bytes,
-                bytes_out=len(data),
             )  # fmt: skip
 
     def note_undecoded(self, connection: RobotConnection, failure: Failure, size_bytes: int) -> None:

@@ -98,7 +98,7 @@ class RobotConnection:
     __slots__ = (
         "_assembler", "_context", "_deferred", "_handler", "_wire", "allowed_s", "claims", "commands",
         "is_connected", "last_heard_s", "last_result", "moving_until_s", "number", "opened_s",
-        "paused_s", "pinged_s", "recorded", "robot", "session", "tap",
+        "paused_s", "pinged_s", "rated_until_s", "recorded", "robot", "session", "tap",
     )  # fmt: skip
 
     def __init__(
@@ -131,6 +131,8 @@ class RobotConnection:
         """Time that the last command had, from its arrival to its deadline."""
         self.paused_s = float("-inf")
         """When the robot was told to pause, because the server is behind."""
+        self.rated_until_s = float("-inf")
+        """Until when the robot keeps to the rate that it was told."""
         self.commands = 0
         """How many of its commands were answered; ``last_result`` is ``ok`` or the code of the last one."""
         self.last_result = ""

@@ -26,12 +26,14 @@ from rse_pf.backend.rosbridge.codec import RosbridgeCodec
 from rse_pf.backend.rosbridge.session import RosbridgeSession
 from rse_pf.backend.rosbridge.topics import RosbridgeTopics
 from rse_pf.backend.scheduling.command_queue import CommandQueue
+from rse_pf.backend.scheduling.robot_shares import TOLD_S
 from rse_pf.backend.scheduling.scheduler import QueueBacklog, QueuedCommand, RefusedCommand
 from rse_pf.errors import NotFound, UnknownService
 from rse_pf.services.pnp import wire_types
 from rse_pf.silent_connections import SilentConnections
 from rse_pf.wire import CODECS, Codec, Command, Failure, make_codec
 from rse_pf.wire.envelope import peek
+from rse_pf.wire.messages import Rate
 from rse_pf.wire.server_session import CLOSE_GOING_AWAY, CLOSE_RATE, CLOSE_TOKEN_OVER, ServerSession
 
 __all__ = ["Dispatcher"]
@@ -220,10 +222,11 @@ class Dispatcher:
             connection.close(CLOSE_RATE, "rate")
             return True
         if retry_ms:
-            answers.send_unread_refusal(connection, peek(codec, data), TOO_FAST, retry_ms, len(data))
+            answers.send_unread_refusals(connection, [(peek(codec, data), len(data))], TOO_FAST, retry_ms)
             return True
         if connection.allowed_s is None or not self._scheduler.is_behind:
             return False
+        self._scheduler.shares.sent.add(connection.robot)
         retry_ms = 1e3 * (connection.paused_s + self._scheduler.pause_s - now)
         is_early = retry_ms > 0.0
         if not is_early:
@@ -232,17 +235,26 @@ class Dispatcher:
         if envelope is None or self._queue_of(envelope.service) is not self.stateless:
             return False
         if not is_early:
-            connection.paused_s = now
+            self._pause(connection, now)
         self.stateless.refuse_unread(connection, envelope, retry_ms, len(data), is_early=is_early)
         return True
+
+    def _pause(self, connection: RobotConnection, now: float) -> None:
+        """Note that a robot is told to pause, and tell it its share of what the server can do."""
+        connection.paused_s = now
+        session, share_per_s = connection.session, self._scheduler.shares.per_s
+        if share_per_s and session is not None and session.hears_rate and now >= connection.rated_until_s:
+            connection.rated_until_s = now + TOLD_S
+            rate = Rate(commands_per_s=share_per_s, for_ms=1e3 * TOLD_S)
+            connection.write(session.codec.encode(rate))
 
     def refuse_long(self, connection: RobotConnection, session: ServerSession, data: bytes) -> bool:
         """Refuse a message that is too long for the event loop; False if the decoder thread may take it."""
         may_wait = self.admission.may_wait(len(data), self.decoder.unread_bytes, session.suspicion)
         if not may_wait:
             envelope = peek(session.codec, data)
-            self._answers.send_unread_refusal(
-                connection, envelope, DECODER_FULL, _DECODER_RETRY_MS, len(data)
+            self._answers.send_unread_refusals(
+                connection, [(envelope, len(data))], DECODER_FULL, _DECODER_RETRY_MS
             )
         return not may_wait
 
@@ -267,7 +279,7 @@ class Dispatcher:
             if queue is not None and refusal.reason == "behind":
                 queue.note_refused(now)
                 if queue is self.stateless:
-                    connection.paused_s = now
+                    self._pause(connection, now)
             self._answers.send_refusal(refusal, now)
         elif queue is not None:
             queue.submit(queued, now)

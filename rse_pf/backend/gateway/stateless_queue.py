@@ -71,7 +71,8 @@ class StatelessQueue(CommandQueue):
         """Time that commands took in the event loop in this round of it; see `_INLINE_S`."""
         self._throttle_timer: TimerHandle | None = None
         self._sweep_timer: TimerHandle | None = None
-        self._batched: list[tuple[RobotConnection, Envelope, float, int]] = []
+        self._batched: dict[RobotConnection, list[tuple[Envelope, int]]] = {}
+        self._retry_ms: dict[RobotConnection, float] = {}
 
     @property
     def held(self) -> int:
@@ -164,12 +165,14 @@ class StatelessQueue(CommandQueue):
             is_early: Whether the robot was told to wait longer.
         """
         self.scheduler.note_refused(self._monotonic(), is_early=is_early)
-        if self._throttle_timer is None:
-            self._answers.send_unread_refusal(connection, envelope, TOO_LATE, retry_ms, size_bytes)
-        else:
-            if not self._batched:
-                self._loop.call_later(BATCH_S, self._send_batch)
-            self._batched.append((connection, envelope, retry_ms, size_bytes))
+        session = connection.session
+        if self._throttle_timer is None and (session is None or not session.hears_refusals):
+            self._answers.send_unread_refusals(connection, [(envelope, size_bytes)], TOO_LATE, retry_ms)
+            return
+        if not self._batched:
+            self._loop.call_later(BATCH_S, self._send_batch)
+        self._batched.setdefault(connection, []).append((envelope, size_bytes))
+        self._retry_ms[connection] = retry_ms
 
     # --- from the queue to an answer -----------------------------------------------------------
 
@@ -236,9 +239,11 @@ class StatelessQueue(CommandQueue):
         self._start()
 
     def _send_batch(self) -> None:
-        batched, self._batched = self._batched, []
-        for connection, envelope, retry_ms, size_bytes in batched:
-            self._answers.send_unread_refusal(connection, envelope, TOO_LATE, retry_ms, size_bytes)
+        batched, self._batched = self._batched, {}
+        retry_ms, self._retry_ms = self._retry_ms, {}
+        for connection, unread in batched.items():
+            if connection.is_connected:
+                self._answers.send_unread_refusals(connection, unread, TOO_LATE, retry_ms[connection])
 
     def _sweep(self) -> None:
         self._sweep_timer = None

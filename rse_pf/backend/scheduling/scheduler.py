@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 
 import msgspec
 
+from rse_pf.backend.scheduling.robot_shares import RobotShares
 from rse_pf.backend.scheduling.turns import Turns
 from rse_pf.errors import Busy, Expired, RsePfError, Stale
 from rse_pf.identity import RobotId
@@ -133,6 +134,7 @@ class Scheduler:
         self.is_behind = False
         self.turn_s = 0.0
         """Average time between two starts while robots wait: threads and CPU throttle included."""
+        self.shares = RobotShares()
         self._robots: dict[RobotId, _Robot] = {}
         self._turns = Turns()
         self._late_since: float | None = None
@@ -371,6 +373,7 @@ class Scheduler:
             self._late_since = now
         elif now - self._late_since >= QUEUE_INTERVAL_S:
             self.is_behind, self._late_since = True, None
+            self.shares.begin(now)
             self._judged_s, self._started, self._refused, self._early = now, 0, 0, 0
 
     def _judge(self, now: float) -> None:
@@ -382,10 +385,13 @@ class Scheduler:
             judged = self._refused + self._started
             refused = self._refused + self._early
             self.is_behind = refused > _MAX_REFUSED_SHARE * (judged + self._early)
-            if self._refused > _MANY_REFUSED * judged:
+            many = self._refused > _MANY_REFUSED * judged
+            few = self._refused <= _MAX_REFUSED_SHARE * judged
+            if many:
                 self._pause_s = min(_MAX_PAUSE_S, _LONGER * self._pause_s)
-            elif self._refused <= _MAX_REFUSED_SHARE * judged:
+            elif few:
                 self._pause_s = max(QUEUE_INTERVAL_S, self._pause_s / _SHORTER)
+            self.shares.judge(now, self._started, less=many, more=few)
             self._judged_s, self._started, self._refused, self._early = now, 0, 0, 0
 
     def _note_service(self, spent_s: float) -> None:

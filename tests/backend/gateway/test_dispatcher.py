@@ -18,7 +18,9 @@ from rse_pf.config import PlatformSettings
 from rse_pf.identity import RobotId, object_name
 from rse_pf.object_store import MemoryStore, digest_of
 from rse_pf.service import Registry
-from rse_pf.wire import Cancel, Command, Failure, Move, Ping, Pong, Result, Welcome
+from rse_pf.wire import Cancel, Command, Failure, Hello, Move, Ping, Pong, Result, Welcome
+from rse_pf.wire.messages import MAX_REFUSED_IDS, Rate, Refused
+from rse_pf.wire.server_session import RATE, REFUSALS
 
 SETTINGS = PlatformSettings()
 
@@ -248,6 +250,63 @@ def test_a_robot_that_was_told_to_pause_is_refused_until_then_although_there_is_
     worker.loop.run_until(lambda: bool(results(wire)[1:]))
     assert refused(wire) == [8, 9]
     assert results(wire)[-1].id == 10
+
+
+@pytest.fixture
+def starved() -> Iterator[WorkerParts]:
+    """A worker without CPU time for any command, which is behind after the first one of a robot."""
+    settings = PlatformSettings.from_dict({"session": {"max_commands_per_s": 0.0}})
+    with worker_parts(settings=settings, emulated_cores=0.25) as parts:
+        other, _ = parts.join("other")
+        parts.say(other, echo(1))
+        parts.loop.advance()
+        parts.cpu_s = 10.0
+        yield parts
+
+
+def fall_behind_for_good(worker: WorkerParts) -> None:
+    overload(worker, waiting=0)
+    worker.say(worker.join("waits")[0], echo(1))
+    worker.scheduler.submit(queued("another", at=worker.loop.now))
+
+
+def test_a_robot_that_knows_such_messages_is_told_its_share_once_and_many_ends_in_one(starved: WorkerParts):
+    connection, wire = starved.join(hello=False)
+    starved.say(connection, Hello(capabilities=[RATE, REFUSALS]))
+    connection.allowed_s = 0.25
+    fall_behind_for_good(starved)
+    starved.scheduler.shares.per_s = 2.5
+
+    for number in range(MAX_REFUSED_IDS + 3):
+        starved.say(connection, echo(number, deadline_ms=250.0))
+    starved.loop.advance(0.01)
+
+    told = wire.sent[1:]
+    assert [type(message) for message in told] == [Rate, Refused, Refused]
+    assert told[0] == Rate(commands_per_s=2.5, for_ms=2000.0)
+    assert [*told[1].ids, *told[2].ids] == list(range(MAX_REFUSED_IDS + 3))
+    assert told[1].code == "busy"
+    assert told[1].retry_after_ms > 0
+    assert starved.metrics.requests["echo", "busy"] == MAX_REFUSED_IDS + 3
+
+    starved.loop.now += 2.0
+    starved.say(connection, echo(100, deadline_ms=250.0))
+    starved.loop.advance(0.01)
+    assert [type(message) for message in wire.sent[4:]] == [Rate, Failure]
+
+
+def test_a_robot_that_left_gets_none_of_the_refusals_that_waited(starved: WorkerParts):
+    connection, wire = starved.join(hello=False)
+    starved.say(connection, Hello(capabilities=[REFUSALS]))
+    connection.allowed_s = 0.25
+    fall_behind_for_good(starved)
+    starved.say(connection, echo(8, deadline_ms=250.0))
+    assert len(wire.sent) == 1, "it waits for others"
+
+    connection.on_socket_end()
+    starved.loop.advance(0.01)
+
+    assert len(wire.sent) == 1
 
 
 def test_a_pause_ends_when_the_server_is_no_longer_behind(worker: WorkerParts):

@@ -9,6 +9,7 @@ from collections import Counter, deque
 import pytest
 from backend.scheduling.admitted import AdmittedScheduler, fall_behind, measure_turns, queued
 
+from rse_pf.backend.scheduling.robot_shares import TOLD_S
 from rse_pf.backend.scheduling.scheduler import INLINE_BYTES, QueuedCommand, Scheduler
 from rse_pf.identity import RobotId
 
@@ -246,7 +247,9 @@ def simulate(
     return good, late, refused
 
 
-def drive(load: float, *, obeys: bool, seconds: float = 12.0, robots: int = 40) -> tuple[float, float, float]:
+def drive(
+    load: float, *, obeys: bool = False, hears_rate: bool = False, seconds: float = 12.0, robots: int = 40
+) -> tuple[float, float, float]:
     """Let robots send at *load* times the capacity for two thirds of the time, then at half of it.
 
     Returns what was offered and served a second in the last 4 s of the overload, in shares of the capacity,
@@ -257,7 +260,7 @@ def drive(load: float, *, obeys: bool, seconds: float = 12.0, robots: int = 40) 
     period_s = robots / (load * CAPACITY)
     due = [(chance.uniform(0.0, period_s), number) for number in range(robots)]
     heapq.heapify(due)
-    told_s = [-1.0] * robots
+    told_s, rated_until_s, gaps_s = [-1.0] * robots, [-1.0] * robots, [0.0] * robots
     now, swept, offered, served, last_refusal_s = 0.0, 0.0, 0, 0, ends_s
 
     def arrive(until: float) -> None:
@@ -268,6 +271,10 @@ def drive(load: float, *, obeys: bool, seconds: float = 12.0, robots: int = 40) 
             is_measured = ends_s - 4.0 <= at < ends_s
             offered += is_measured
             next_s = at + own_s * chance.uniform(0.5, 1.5)
+            if at < rated_until_s[number]:
+                next_s = max(next_s, at + gaps_s[number])
+            if scheduler.is_behind:
+                scheduler.shares.sent.add(RobotId("default", f"r{number}"))
             if at < told_s[number] + scheduler.pause_s:
                 scheduler.note_refused(at, is_early=True)
                 gone = True
@@ -279,6 +286,9 @@ def drive(load: float, *, obeys: bool, seconds: float = 12.0, robots: int = 40) 
                 gone = bool(retry_ms or refusals)
                 if gone:
                     told_s[number] = at
+                    share_per_s = scheduler.shares.per_s
+                    if hears_rate and share_per_s and at >= rated_until_s[number]:
+                        rated_until_s[number], gaps_s[number] = at + TOLD_S, 1 / share_per_s
                     if obeys:
                         waits_s = 1e-3 * (retry_ms or refusals[0].error.retry_after_ms)
                         next_s = max(next_s, at + waits_s)
@@ -308,6 +318,15 @@ def test_robots_that_obey_offer_little_more_than_can_be_served(load: float, most
 
     assert offered <= most
     assert served >= 0.95
+    assert recovery_s <= 1.0
+
+
+@pytest.mark.parametrize(("load", "least"), [(1.5, 0.95), (2.0, 0.95), (3.0, 0.9)])
+def test_robots_that_keep_to_their_share_offer_what_can_be_served(load: float, least: float):
+    offered, served, recovery_s = drive(load, obeys=True, hears_rate=True)
+
+    assert offered <= 1.2
+    assert served >= least
     assert recovery_s <= 1.0
 
 

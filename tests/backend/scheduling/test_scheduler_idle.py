@@ -13,7 +13,8 @@ from rse_pf.backend.scheduling.scheduler import Scheduler
 
 def state(scheduler: Scheduler) -> dict[str, Any]:
     """Return what a scheduler knows, but for when its next sweep has something to look at."""
-    return {name: value for name, value in vars(scheduler).items() if name != "_sweep_from_s"}
+    known = {name: value for name, value in vars(scheduler).items() if name != "_sweep_from_s"}
+    return {**known, "shares": vars(scheduler.shares)}
 
 
 def compute(scheduler: Scheduler, wait_s: float, spent_s: float, now: float, *, alone: bool) -> None:

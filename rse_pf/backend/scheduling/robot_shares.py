@@ -1,0 +1,59 @@
+"""How many commands a second each robot may send, so that all of them together offer what can be served.
+
+Counts and times go in, a rate comes out; the scheduler feeds it while the server is behind.
+"""
+
+from __future__ import annotations
+
+import math
+
+from rse_pf.identity import RobotId
+
+__all__ = ["TOLD_S", "RobotShares"]
+
+TOLD_S = 2.0
+"""A robot keeps to the rate that it was told for so long."""
+_WINDOW_S = 0.5
+"""Robots and commands are counted for so long; a robot that sends more rarely needs no share."""
+_LESS, _MORE = 0.9, 1.05
+"""Factors of the share in each interval in which many, or hardly any, commands were refused."""
+_LEAST, _MOST = 0.2, 4.0
+"""Bounds of the product of these factors: robots that send less than their share leave room for others."""
+
+
+class RobotShares:
+    """The equal share of each robot in what a server serves."""
+
+    def __init__(self) -> None:
+        self.per_s = 0.0
+        """Commands a second of each robot; 0 while it is not known."""
+        self.sent: set[RobotId] = set()
+        """The robots that sent a command since the last window ended."""
+        self._since_s = -math.inf
+        self._started = 0
+        self._factor = 1.0
+
+    def begin(self, now: float) -> None:
+        """Count from *now* (s): the server fell behind."""
+        self.sent.clear()
+        self._since_s, self._started = now, 0
+
+    def judge(self, now: float, started: int, *, less: bool, more: bool) -> None:
+        """Note what an interval that ends at *now* (s) brought.
+
+        Args:
+            now: Its end.
+            started: Commands that were served.
+            less: Whether so many were refused that robots should send less.
+            more: Whether hardly any was refused.
+        """
+        self._started += started
+        if less:
+            self._factor = max(_LEAST, _LESS * self._factor)
+        elif more:
+            self._factor = min(_MOST, _MORE * self._factor)
+        elapsed_s = now - self._since_s
+        if elapsed_s >= _WINDOW_S:
+            if self._started and self.sent:
+                self.per_s = self._factor * self._started / elapsed_s / len(self.sent)
+            self.begin(now)
