@@ -6,6 +6,7 @@ Counts and times go in, a rate comes out; the scheduler feeds it while the serve
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, field
 
 from rse_pf.identity import RobotId
 
@@ -21,17 +22,20 @@ _LEAST, _MOST = 0.2, 4.0
 """Bounds of the product of these factors: robots that send less than their share leave room for others."""
 
 
+@dataclass
 class RobotShares:
-    """The equal share of each robot in what a server serves."""
+    """The equal share of each robot in what a server serves.
 
-    def __init__(self) -> None:
-        self.per_s = 0.0
-        """Commands a second of each robot; 0 while it is not known."""
-        self.sent: set[RobotId] = set()
-        """The robots that sent a command since the last window ended."""
-        self._since_s = -math.inf
-        self._started = 0
-        self._factor = 1.0
+    Attributes:
+        per_s: Commands a second of each robot; 0 while it is not known.
+        sent: The robots that sent a command since the last window ended.
+    """
+
+    per_s: float = 0.0
+    sent: set[RobotId] = field(default_factory=set)
+    _since_s: float = -math.inf
+    _started: int = 0
+    _factor: float = 1.0
 
     def begin(self, now: float) -> None:
         """Count from *now* (s): the server fell behind."""

@@ -13,8 +13,7 @@ from rse_pf.backend.scheduling.scheduler import Scheduler
 
 def state(scheduler: Scheduler) -> dict[str, Any]:
     """Return what a scheduler knows, but for when its next sweep has something to look at."""
-    known = {name: value for name, value in vars(scheduler).items() if name != "_sweep_from_s"}
-    return {**known, "shares": vars(scheduler.shares)}
+    return {name: value for name, value in vars(scheduler).items() if name != "_sweep_from_s"}
 
 
 def compute(scheduler: Scheduler, wait_s: float, spent_s: float, now: float, *, alone: bool) -> None:
