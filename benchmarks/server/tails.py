@@ -12,11 +12,13 @@ row         beside the robots                                                   
 bombs       20 robots; 1,000 messages of 255 KB that would inflate to 256 MiB            2
 rate        99 robots; one robot at 100 times their rate, back when it is cut off        1.5
 silent      100 robots; 1,000 TCP connections that say nothing, 50 from each address     2
+returns     500 robots; 1,000 others connect with new tokens, 150 at a time              2
 uploads     20 robots; objects of 1 MiB to the data service, which is killed meanwhile   1.1
 ==========  ===========================================================================  ======
 
-The first three rows meet one server of two workers directly, the last one the whole platform through the load
-balancer.  The neighbours run at the lowest priority: in the field their work costs a server nothing.
+The thousand must be connected again within 5 s.  All rows but the last meet one server of two workers
+directly, the last one the whole platform through the load balancer.  The neighbours run at the lowest
+priority: in the field their work costs a server nothing.
 
 Defends: those bars, and that every command of the robots is answered by a pose.
 """
@@ -49,6 +51,7 @@ from benchmarks.server.load import (
     LoadProcess,
     RobotGroup,
     compile_generator,
+    hello_file,
     plan_of,
     read_samples,
     run_load,
@@ -64,7 +67,8 @@ CODEC = "bin"
 FRAMES_PER_S = 5.0
 """The paper's rate (Sect. 6.2)."""
 SETTINGS: dict[str, dict[str, dict[str, Any]]] = {
-    "bombs": {}, "rate": {}, "silent": {"serving": {"trusted_proxies": 0}}, "uploads": {},
+    "bombs": {}, "rate": {}, "silent": {"serving": {"trusted_proxies": 0}}, "returns": {},
+    "uploads": {},
 }  # fmt: skip
 """Settings of each row beside the defaults: without a proxy, limits for each address count."""
 WORKERS = 2
@@ -74,6 +78,9 @@ NEIGHBOURS_FIRST_SOURCE = 100
 BOMBERS, BOMB_WINDOW_S, BOMB_ROUNDS = 100, 6.0, 5
 RATE_WINDOW_S, RATE_FACTOR, RATE_REOPEN_S = 4.0, 100.0, 0.1
 SILENT_WINDOW_S, SILENT, SILENT_SOURCES = 5.0, 1000, 20
+RETURN_WINDOW_S, DRIVING, RETURNING, BACK_S = 6.0, 500, 1000, 5.0
+RETURNING_AT_ONCE = 150
+"""A server cuts sockets above serving.max_unauthenticated, 200, that have not sent yet."""
 UPLOAD_WINDOW_S, UPLOADS, UPLOAD_ROUNDS, MIB = 5.0, 24, 5, 1 << 20
 _LOWEST_PRIORITY = ("nice", "-n", "19")
 _ATTACK_S = 60.0
@@ -260,6 +267,29 @@ def silent(rounds: int) -> dict[str, Any]:
         return summary("silent", *figures)
 
 
+def returns(rounds: int) -> dict[str, Any]:
+    """Measure 500 robots beside 1,000 that come back at once."""
+    with one_server("returns") as (server, folder):
+        group = RobotGroup(name="returning", robots=RETURNING, mode="idle")
+        tokens = folder / "returning.tokens"
+        neighbours = LoadPlan(
+            port=server.port, groups=(group,), codec=CODEC, hello=hello_file(folder, CODEC), tokens=tokens,
+            seconds=0.5, warm_up_s=0.0, drain_s=0.0, sources=SILENT_SOURCES, opening_s=RETURN_WINDOW_S,
+            first_source=NEIGHBOURS_FIRST_SOURCE, at_once=RETURNING_AT_ONCE, reopen_s=0.1,
+        )  # fmt: skip
+
+        def come_back() -> dict[str, Any]:
+            report = run_load(neighbours, prefix=_LOWEST_PRIORITY)
+            return {"missing": RETURNING - report.connected, "back_s": report.opening_s}
+
+        def prepare(number: int) -> Neighbour:
+            tokens.write_text("\n".join(server.token(f"returning-{row}") for row in range(RETURNING)))
+            return come_back
+
+        plan = robots_of("driving", DRIVING, folder, server.token, server.port)
+        return summary("returns", *alternate(plan, rounds, RETURN_WINDOW_S, prepare))
+
+
 async def uploads(rounds: int) -> dict[str, Any]:
     """Measure 20 robots beside uploads to a data service that is killed."""
     windows: list[LoadWindow] = []
@@ -299,6 +329,7 @@ ROWS: dict[str, Callable[[int], dict[str, Any]]] = {
     "bombs": bombs,
     "rate": rate,
     "silent": silent,
+    "returns": returns,
     "uploads": lambda rounds: asyncio.run(uploads(min(rounds, UPLOAD_ROUNDS))),
 }
 
@@ -307,6 +338,9 @@ ROWS: dict[str, Callable[[int], dict[str, Any]]] = {
     Bar("bombs.ratio", at_most=2.0),
     Bar("rate.ratio", at_most=1.5),
     Bar("silent.ratio", at_most=2.0),
+    Bar("returns.ratio", at_most=2.0),
+    Bar("returns.outcomes.back_s", at_most=BACK_S, unit="s"),
+    Bar("returns.outcomes.missing", equals=0),
     Bar("uploads.ratio", at_most=1.1),
     Bar("*.loaded.not_ok", equals=0),
 )
