@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from itertools import groupby, pairwise
@@ -21,7 +22,7 @@ from rse_pf.live_map.agreement import (
     weight_of,
     with_metres,
 )
-from rse_pf.live_map.events import MeasuredLink
+from rse_pf.live_map.events import MeasuredLink, matrix_of
 from rse_pf.live_map.graph import Graph, Segment
 from rse_pf.live_map.options import LiveMapOptions
 from rse_pf.live_map.outcomes import Ambiguous, LinkBelieved, LinkRemoved, Outcome
@@ -30,6 +31,7 @@ from rse_pf.live_map.smoothing import SmoothedWindows, odometry_step, smooth_aro
 __all__ = [
     "Changes",
     "disbelieve_contradicting",
+    "has_jumped",
     "has_other_metres",
     "judge_again",
     "judge_links",
@@ -39,6 +41,7 @@ __all__ = [
 _DOUBTFUL = 30.0
 """Squared misfit of a link, six degrees of freedom: one true link in 25,000 has more."""
 _JUDGED_AFTER_JOIN = 48
+_NEIGHBOURS = 4
 _FIXED = 1e9
 """Weight of links that are never removed."""
 _CONTRADICTIONS = 16
@@ -115,6 +118,26 @@ def has_other_metres(
             seen = signs.setdefault((graph.keyframes[link.other].robot, other.version), set())
             seen.add(math.copysign(1.0, link.off_scale) if link.off_scale else 0.0)
     return len(signs) > 1 and len(set().union(*signs.values())) == 1 and {0.0} not in signs.values()
+
+
+def has_jumped(graph: Graph, keyframe: int, links: Iterable[MeasuredLink], options: LiveMapOptions) -> bool:
+    """Return whether the odometry of *keyframe* is far from where all of its latest neighbours see it.
+
+    They saw the same place just before, so these are no two places that look the same.
+    """
+    segment = graph.segment_of(keyframe)
+    if segment.version or not segment.is_metric:
+        return False
+    place = bisect_left(segment.keyframes, keyframe)
+    before = set(segment.keyframes[max(0, place - _NEIGHBOURS) : place])
+    are_off = []
+    for link in links:
+        if link.other in before and options.strong.weight_of(link.inliers, link.matches) == 1.0:
+            step = inverse(graph.T_odom[keyframe]) @ graph.T_odom[link.other]
+            off = inverse(np.array(matrix_of(link.T_keyframe_other, 4, 4))) @ step
+            step_m, off_m = (math.sqrt(float(each[:3, 3] @ each[:3, 3])) for each in (step, off))
+            are_off.append(off_m > max(options.lookalike_m, 0.5 * step_m))
+    return bool(are_off) and all(are_off)
 
 
 def disbelieve_contradicting(
@@ -303,11 +326,15 @@ def _off_m(graph: Graph, number: int) -> float:
 def _weakest_bridge(graph: Graph, one: int, other: int, options: LiveMapOptions) -> list[int]:
     """Return the lightest links that connect two segments on the heaviest path between *one* and *other*.
 
-    Links of the version that the map started from are never removed.
+    Links of the version that the map started from are never removed, nor those between two segments in metres
+    if *one* or *other* is not: a segment whose scale is unknown says nothing against known ones.
     """
     bridges = {pair: numbers for pair, numbers in graph.bridges().items() if pair[0] != pair[1]}
+    of_metres = _are_metric(graph, one, other)
     strength = {
-        pair: _FIXED if any(graph.links[n].fixed for n in numbers) else weight_of(graph, numbers, options)
+        pair: _FIXED
+        if any(graph.links[n].fixed for n in numbers) or (_are_metric(graph, *pair) and not of_metres)
+        else weight_of(graph, numbers, options)
         for pair, numbers in bridges.items()
     }
     for least in sorted(set(strength.values()), reverse=True):
@@ -316,6 +343,10 @@ def _weakest_bridge(graph: Graph, one: int, other: int, options: LiveMapOptions)
             pair = min(path, key=lambda each: (strength[each], each))
             return [] if strength[pair] == _FIXED else bridges[pair]
     return []
+
+
+def _are_metric(graph: Graph, *rows: int) -> bool:
+    return all(graph.segments[row].is_metric for row in rows)
 
 
 def _path(one: int, other: int, pairs: list[tuple[int, int]]) -> list[tuple[int, int]]:

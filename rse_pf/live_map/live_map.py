@@ -20,6 +20,7 @@ from rse_pf.geometry import Array, inverse, scaled
 from rse_pf.live_map.beliefs import (
     Changes,
     disbelieve_contradicting,
+    has_jumped,
     has_other_metres,
     judge_again,
     judge_links,
@@ -413,6 +414,9 @@ class LiveMap:
             link for link in event.links
             if link.other != k and not self._is_ignored(k) and not self._is_ignored(link.other)
         ]  # fmt: skip
+        is_off_its_path = has_jumped(graph, k, kept, self.options)
+        if is_off_its_path:
+            kept = []
         information = np.array([matrix_of(link.information, 6, 6) for link in kept]).reshape(-1, 6, 6)
         numbers = [
             graph.add_link(
@@ -425,6 +429,8 @@ class LiveMap:
             for link, each, variances in zip(kept, information, variances_of(information), strict=True)
         ]  # fmt: skip
         changes = judge_links(graph, k, numbers, self.options)
+        if is_off_its_path:
+            changes.verdicts.add("contrary")
         is_off = has_other_metres(graph, k, kept, self.options)
         is_gone = disbelieve_contradicting(graph, k, changes, has_other_metres=is_off)
         again = self._judge_again() if is_gone else []
@@ -432,7 +438,8 @@ class LiveMap:
         window = self._smooth(changes, mine.robot)
         graph.drop_oldest_open(self.options.open_links)
         told = self._tell((mine.robot, mine.number), window)
-        return [*changes.outcomes, *again, *told, *self._cull(k)]
+        # What is off its path would be compared with others, and tell each that it is at two places.
+        return [*changes.outcomes, *again, *told, *(self._drop((k,)) if is_off_its_path else self._cull(k))]
 
     def _take_poses(self, event: Optimised) -> list[Outcome]:
         graph = self._graph
@@ -610,11 +617,14 @@ class LiveMap:
         near = near[turned >= 1.0 + 2.0 * math.cos(math.radians(options.same_place_deg))]
         near = near[[self.is_in_map(int(i)) for i in near]] if len(near) else near
         surplus = len(near) - options.same_place_most
-        gone = tuple(int(i) for i in near[: max(0, surplus)] if i != k)
-        for i in gone:
-            graph.drop_data(i)
+        return self._drop(tuple(int(i) for i in near[: max(0, surplus)] if i != k))
+
+    def _drop(self, ids: tuple[int, ...]) -> list[Outcome]:
+        """Drop the features of keyframes, which are compared with nothing more."""
+        for i in ids:
+            self._graph.drop_data(i)
             self._places.remove(i)
-        return [Culled(ids=gone)] if gone else []
+        return [Culled(ids=ids)] if ids else []
 
     def _candidates(self, k: int, most: int | None = None) -> list[int]:
         """Return the keyframes to compare with *k*: some of its own component, some of others.

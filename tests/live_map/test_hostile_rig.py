@@ -7,6 +7,7 @@ import pytest
 
 from benchmarks.live.hostile_rigs import (
     ATTACKS,
+    HOSTILE,
     REFUSED,
     Outcome,
     SentDrive,
@@ -14,6 +15,15 @@ from benchmarks.live.hostile_rigs import (
     play,
     tell_truth,
 )
+from rse_pf.geometry import Array, exp_se3, inverse
+from rse_pf.live_map import beliefs
+from rse_pf.live_map.beliefs import has_jumped
+from rse_pf.live_map.events import KeyframeAdded, LinksMeasured, MeasuredLink, matrix_bytes
+from rse_pf.live_map.graph import Graph, LiveKeyframe, LiveLink
+from rse_pf.live_map.live_map import LiveMap
+from rse_pf.live_map.options import LiveMapOptions
+from rse_pf.live_map.outcomes import Culled
+from rse_pf.slam.keyframe import decode_keyframe
 
 
 @pytest.fixture(scope="module")
@@ -60,3 +70,92 @@ def test_false_blocks_move_nobody(name: str, drives: dict[str, SentDrive], truth
 
     assert attacked.accepted == 12
     assert same(attacked, truthful)
+
+
+def link(other: int, step: Array, inliers: int = 100) -> MeasuredLink:
+    return MeasuredLink(
+        other=other, T_keyframe_other=matrix_bytes(step), information=matrix_bytes(np.eye(6)),
+        inliers=inliers, matches=inliers,
+    )  # fmt: skip
+
+
+def step_of(metres: float) -> Array:
+    return exp_se3(np.array([metres, 0.0, 0.0, 0.0, 0.0, 0.0]))
+
+
+def path(metres: list[float], is_metric: bool = True) -> Graph:
+    """Return a graph with one robot that says it is so far along its path at each keyframe."""
+    graph = Graph()
+    row = graph.segment_row("x", 0)
+    graph.segments[row].is_metric = is_metric
+    for number, at in enumerate(metres):
+        keyframe = LiveKeyframe(robot="x", segment=0, number=number, timestamp_s=0.0, data=None)
+        graph.add(keyframe, row, step_of(at), step_of(at), 0.0)
+    return graph
+
+
+JUMPED = [0.0, 0.2, 0.4, 0.6, 0.8, 4.0]
+
+
+@pytest.mark.parametrize(
+    ("metres", "links", "is_off"),
+    [
+        (JUMPED, [link(4, step_of(-0.2))], True),
+        (JUMPED, [link(4, step_of(-0.2)), link(3, step_of(-0.4))], True),
+        (JUMPED, [link(4, step_of(-0.2)), link(3, step_of(-3.4))], False),  # one of two agrees
+        (JUMPED, [link(4, step_of(-0.2), inliers=16)], False),
+        (JUMPED, [link(0, step_of(-1.0))], False),  # long before: it may look like another place
+        (JUMPED, [], False),
+        ([0.0, 0.2, 0.4, 0.6, 0.8, 1.7], [link(4, step_of(-0.2))], False),
+        ([0.0, 5.0, 10.0, 15.0, 20.0, 25.0], [link(4, step_of(-3.8))], False),  # a car
+    ],
+)
+def test_a_keyframe_is_off_its_path_where_those_just_before_see_it_elsewhere(
+    metres: list[float], links: list[MeasuredLink], is_off: bool
+) -> None:
+    assert has_jumped(path(metres), 5, links, LiveMapOptions()) is is_off
+    assert not has_jumped(path(metres, is_metric=False), 5, links, LiveMapOptions())
+
+
+def test_a_keyframe_off_its_path_is_compared_with_nothing_and_counts_as_a_contradiction(
+    drives: dict[str, SentDrive],
+) -> None:
+    live_map = LiveMap()
+    for number, data in enumerate(drives[HOSTILE].keyframes[:5]):
+        sent = ATTACKS["some-poses-3-m"](number, decode_keyframe(data))
+        live_map.apply(KeyframeAdded(robot=HOSTILE, segment=0, number=number, data=sent))
+    true = [decode_keyframe(each).T_odom_camera for each in drives[HOSTILE].keyframes[3:5]]
+    measured = LinksMeasured(keyframe=4, links=(link(3, inverse(true[1]) @ true[0]),), failed={})
+
+    outcomes = live_map.apply(measured)
+
+    assert Culled(ids=(4,)) in outcomes
+    assert not live_map._graph.links
+    assert live_map._graph.segments[0].contradictions == 1
+    assert not live_map._graph.held[4]
+    assert LiveMap.restore(live_map.snapshot()).digest() == live_map.digest()
+
+
+@pytest.mark.parametrize(("is_metric", "weakest"), [(True, ("a", "b")), (False, ("b", "x"))])
+def test_a_robot_without_metres_separates_no_two_robots_with_metres(
+    is_metric: bool, weakest: tuple[str, str]
+) -> None:
+    graph = Graph()
+    for robot in ("a", "b", "x"):
+        row = graph.segment_row(robot, 0)
+        keyframe = LiveKeyframe(robot=robot, segment=0, number=0, timestamp_s=0.0, data=None)
+        graph.add(keyframe, row, np.eye(4), np.eye(4), 0.0)
+    graph.segments[2].is_metric = is_metric
+    for one, other, count in ((0, 1, 1), (1, 2, 5)):
+        for _ in range(count):
+            graph.add_link(
+                LiveLink(
+                    a=one, b=other, T_a_b=np.eye(4), information=np.eye(6), inliers=100, matches=100,
+                    variances=np.ones(6), state="believed",
+                )
+            )  # fmt: skip
+
+    numbers = beliefs._weakest_bridge(graph, 0, 2, LiveMapOptions())
+
+    ends = {(graph.links[number].a, graph.links[number].b) for number in numbers}
+    assert ends == {tuple("abx".index(robot) for robot in weakest)}

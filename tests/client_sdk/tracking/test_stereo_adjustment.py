@@ -19,7 +19,7 @@ CAMERA = Camera(fx=500.0, fy=500.0, cx=320.0, cy=240.0, width=640, height=480)
 F_BASELINE, OFFSET_PX, SCALE = 60.0, 0.3, 1.02
 
 
-def drive(offset_px: float, keyframes: int = 8) -> tuple[KeyframeMap, Array, Array]:
+def drive(offset_px: float, keyframes: int = 8, noise_px: float = 0.05) -> tuple[KeyframeMap, Array, Array]:
     """Return a map whose path is 2 % too long, the true ``T_world_camera``, and the true landmarks."""
     rng = np.random.default_rng(4)
     points = CAMERA.back_project(rng.uniform([60, 60], [580, 420], (300, 2)), rng.uniform(4.0, 20.0, 300))
@@ -30,7 +30,7 @@ def drive(offset_px: float, keyframes: int = 8) -> tuple[KeyframeMap, Array, Arr
     for number, T in enumerate(truth):
         seen = transform(inverse(T), points)
         pixels = CAMERA.project(seen) + rng.normal(0.0, 0.3, (len(points), 2))
-        disparities = F_BASELINE / seen[:, 2] - offset_px + rng.normal(0.0, 0.05, len(points))
+        disparities = F_BASELINE / seen[:, 2] - offset_px + rng.normal(0.0, noise_px, len(points))
         features = ImageFeatures(
             pixels=pixels, descriptors=np.zeros((len(points), 32), dtype=np.uint8),
             turns=np.tile([1.0, 0.0], (len(points), 1)), sizes=np.ones(len(points)),
@@ -63,6 +63,14 @@ def test_the_offset_of_disparities_and_the_metres_are_found(offset_px: float) ->
     measured = known.view(3).points_camera[:, 2]
     expected = transform(inverse(truth[3]), points)[:, 2]
     assert abs(np.median(F_BASELINE / measured - F_BASELINE / expected)) < 0.06  # 0.3 before
+
+
+def test_noise_of_disparities_looks_like_no_offset_of_them() -> None:
+    found = [adjust_stereo(drive(each, noise_px=0.4)[0], F_BASELINE) for each in (OFFSET_PX, -OFFSET_PX)]
+
+    # The noise taken at the measured depths makes this -0.06, at the expected ones 0.07.
+    assert None not in found
+    assert abs(np.mean([each.offset_px for each in found if each is not None])) < 0.025
 
 
 def test_poses_between_keyframes_move_with_them() -> None:
