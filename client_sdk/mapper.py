@@ -10,7 +10,7 @@ import asyncio
 import functools
 import json
 from collections import Counter
-from collections.abc import Awaitable, Callable, Coroutine
+from collections.abc import Awaitable, Callable, Coroutine, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, Protocol
@@ -33,6 +33,7 @@ from client_sdk.tracking.segments import (
     landmark_keyframes,
     tracker_record,
 )
+from client_sdk.tracking.stereo_adjustment import StereoAdjustment
 from client_sdk.tracking.tracker import Tracker
 from rse_pf.errors import ConfigurationError, RsePfError, UsageError
 from rse_pf.geometry import Array, Camera
@@ -390,8 +391,7 @@ class Mapper:
             for segment in self._metric:
                 self._make_metric(self._tracker, segment)
         elif self._tracker is not None:
-            if self._depth_by == "stereo" and not self._holds_poses:
-                self._adjust_pairs(self._tracker)
+            self.adjust_pairs()
             if self._inertial is not None:
                 self._align(self._tracker)
                 self._make_upright(self._tracker)
@@ -418,6 +418,21 @@ class Mapper:
                 f"cannot write {folder}: {error.strerror}", hint="name another folder"
             ) from error
         return report
+
+    def adjust_pairs(self) -> Mapping[int, StereoAdjustment]:
+        """Adjust all keyframes of stereo pairs together, with what their disparities lack, as `save` does.
+
+        Returned is by segment what was found, also where it is not clear and nothing moves; nothing of other
+        cameras, and of a mapper that holds its poses.
+        """
+        tracker = self._tracker
+        if not isinstance(tracker, Tracker) or self._depth_by != "stereo" or self._holds_poses:
+            return {}
+        adjusted = tracker.adjust_pairs()
+        self._records.correct(adjusted)
+        if tracker.segment in adjusted:
+            self._disparity_deviation_px = adjusted[tracker.segment].deviation_px
+        return tracker.pair_offsets
 
     def _kept_keyframes(self) -> list[Keyframe]:
         """Return the keyframes that others may use: those in metres."""
@@ -474,13 +489,6 @@ class Mapper:
         if self._T_world_start is None:
             gravity = self._inertial.first_gravity()
             self._T_world_start = upright(_LEVEL_GRAVITY if gravity is None else gravity)
-
-    def _adjust_pairs(self, tracker: Tracker) -> None:
-        """Adjust the keyframes of stereo pairs together, with what their disparities lack."""
-        adjusted = tracker.adjust_pairs()
-        self._records.correct(adjusted)
-        if tracker.segment in adjusted:
-            self._disparity_deviation_px = adjusted[tracker.segment].deviation_px
 
     def _align(self, tracker: Tracker) -> None:
         """Find gravity and biases of a drive in metres."""

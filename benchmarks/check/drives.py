@@ -14,7 +14,7 @@ from client_sdk.datasets import open_dataset
 from client_sdk.frontend import Frame
 from client_sdk.imu.samples import ImuModel
 from client_sdk.mapping import Trajectory
-from client_sdk.simulator import loop_trajectory, make_world, render_along
+from client_sdk.simulator import loop_trajectory, make_world, render_along, render_pairs
 from client_sdk.simulator.inertial import InertialDrive, Motion
 from rse_pf.geometry import Array, exp_se3, inverse
 
@@ -23,6 +23,7 @@ __all__ = ["CheckedDrive", "recorded_drive", "rendered_drive"]
 RATE_HZ, _ODOMETRY_HZ, _STEP_M = 10.0, 20.0, 0.034
 _SCALE, _NOISE_M, _NOISE_RAD = 0.003, 0.0005, 0.0004
 """Of odometry: relative error of its scale, and noise of each of its steps."""
+_BASELINE_M = 0.11
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -35,16 +36,21 @@ class CheckedDrive:
     odometry: Trajectory | None
 
 
-def rendered_drive(seed: int, frames: int = 150) -> CheckedDrive:
-    """Return a drive through the rooms of *seed*: on wheels if it is even, in a hand if it is odd."""
+def rendered_drive(seed: int, frames: int = 150, *, stereo: bool = False) -> CheckedDrive:
+    """Return a drive through the rooms of *seed*: on wheels if it is even, in a hand if it is odd.
+
+    Frames have depth images, or those of a second camera if it is *stereo*.
+    """
     every = round(_ODOMETRY_HZ / RATE_HZ)
     make = partial(_wheels if seed % 2 == 0 else _hand, seed)
     dense = make(every * frames + 10)
     rows = slice(0, every * frames, every)
     truth = Trajectory(dense.timestamps_s[rows], dense.T_world_camera[rows])
+    world, noise = make_world(seed), (seed, 41)
+    made = render_pairs(truth, world, noise, _BASELINE_M) if stereo else render_along(truth, world, noise)
     return CheckedDrive(
-        name=f"world-{seed}",
-        frames=list(render_along(truth, make_world(seed), (seed, 41))),
+        name=f"{'pairs' if stereo else 'world'}-{seed}",
+        frames=list(made),
         truth=truth,
         odometry=odometry_of(dense, seed),
     )

@@ -238,6 +238,21 @@ def _baseline(share: float) -> Plant:
     return _each(change)
 
 
+def _shifted(offset_px: float) -> Plant:
+    """Return pairs whose right images lie to the right, so that disparities are smaller."""
+    moved = np.array([[1.0, 0.0, offset_px], [0.0, 1.0, 0.0]])
+
+    def change(frame: Frame) -> Frame:
+        assert frame.stereo is not None
+        gray = cv2.warpAffine(
+            frame.stereo.gray, moved, frame.stereo.gray.shape[::-1], flags=cv2.INTER_CUBIC,
+            borderMode=cv2.BORDER_REPLICATE,
+        )  # fmt: skip
+        return replace(frame, stereo=replace(frame.stereo, gray=np.asarray(gray, np.uint8)))
+
+    return _each(change)
+
+
 def _swapped(frame: Frame) -> Frame:
     """Return a frame whose left image is the right one of its pair, and the other way round."""
     assert frame.stereo is not None
@@ -289,7 +304,10 @@ def _listed() -> Iterator[Fault]:
     yield from three(kinds.DARK, "dark", [(v, _dark(v)) for v in (0.1, 0.25, 0.5)])
     yield from three(kinds.JITTER, "jitter", [(None, _jittered(v)) for v in (0.25, 0.35, 0.45)])
     yield from three(kinds.MOVING_FOCAL_LENGTH, "focus", [(v, _moving_focal(v)) for v in (0.03, 0.06, 0.12)])
-    yield from three(kinds.BASELINE, "baseline", [(v, _baseline(v)) for v in (0.03, -0.06, 0.1)], "stereo")
+    yield from three(kinds.BASELINE, "baseline", [(v, _baseline(v)) for v in (0.03, -0.03, 0.1)], "stereo")
+    yield from three(
+        kinds.DISPARITY_OFFSET, "disparity", [(v, _shifted(v)) for v in (0.3, -0.3, 0.6)], "stereo"
+    )
     yield from three(kinds.SWAPPED_CAMERAS, "swapped", [(None, _each(_swapped))], "stereo")
 
 

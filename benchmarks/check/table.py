@@ -7,6 +7,7 @@ one that no finding names is missed, whatever its deviation would be.  Poses are
 
     python -m benchmarks check.table --seeds 0 1 --out check.json
     python -m benchmarks check.table --seeds 20 21 --recordings ../shared/data --out check.json
+    python -m benchmarks check.table --seeds --pairs 20 21 --out pairs.json
 """
 
 from __future__ import annotations
@@ -52,6 +53,8 @@ def checked(frames: Sequence[Frame], reference: MotionReference | None) -> tuple
         observer.add(frame, result)
         took_s += time.process_time() - began_s
     began_s = time.process_time()
+    tracker.adjust_pairs()
+    observer.add_offsets(tracker.pair_offsets)
     report = observer.finish()
     return report, took_s + time.process_time() - began_s
 
@@ -94,10 +97,14 @@ def row_of(drive: CheckedDrive, fault: Fault | None) -> dict[str, Any]:
     return row
 
 
-def drives(seeds: Iterable[int], frames: int, recordings: Path | None) -> Iterator[CheckedDrive]:
-    """Yield rendered drives, then parts of recordings."""
+def drives(
+    seeds: Iterable[int], frames: int, recordings: Path | None, pairs: Iterable[int] = ()
+) -> Iterator[CheckedDrive]:
+    """Yield rendered drives, those of stereo pairs, then parts of recordings."""
     for seed in seeds:
         yield rendered_drive(seed, frames)
+    for seed in pairs:
+        yield rendered_drive(seed, frames, stereo=True)
     for name, first, count in _PARTS if recordings is not None else ():
         assert recordings is not None
         yield recorded_drive(recordings / name, first, count)
@@ -114,12 +121,13 @@ def table(
     seeds: Annotated[tuple[int, ...], "of rendered drives"] = (0,),
     frames: Annotated[int, "of a rendered drive"] = 120,
     recordings: Annotated[Path | None, "folder of recordings, whose parts are driven too"] = None,
+    pairs: Annotated[tuple[int, ...], "seeds of rendered drives of stereo pairs"] = (),
     only: Annotated[tuple[str, ...], "names of faults, such as fx k1 (default: all)"] = (),
 ) -> dict[str, Any]:
     """Run every drive healthy and with each fault; return shares, counts by fault, and all rows."""
     chosen = [fault for fault in FAULTS if not only or fault.name.rpartition("-")[0] in only]
     rows: list[dict[str, Any]] = []
-    for drive in drives(seeds, frames, recordings):
+    for drive in drives(seeds, frames, recordings, pairs):
         for fault in (None, *(each for each in chosen if can_have(drive, each))):
             row = row_of(drive, fault) | {"is_recorded": drive.name in _RECORDINGS}
             rows.append(row)

@@ -15,7 +15,7 @@ import numpy as np
 
 from client_sdk.check.competition import Explanation, Measured, explain
 from client_sdk.check.drive_model import DepthReading, DriveModel, best_reading, drive_model, nearest_delay
-from client_sdk.check.findings import CannotTell, FaultKind, Finding
+from client_sdk.check.findings import CannotTell, FaultKind, Finding, matters
 from client_sdk.check.keyframes import FLIPS, KeyframeStore, Tracks, tracks_of
 from client_sdk.check.zooms import judge_zooms
 from rse_pf.errors import DegenerateGeometry
@@ -40,7 +40,6 @@ _LEAST = np.array([0.02, 0.02, 6.0, 6.0, 0.045, 0.015, 0.02])
 """Smaller errors are those of a good calibration."""
 _TOLD = np.array([0.06, 0.06, 20.0, 20.0, 0.15, 0.06, 0.1])
 """A drive that could hide more than this of an unknown cannot tell it."""
-_LEAST_COST_M, _COST_OF_NOISE = 0.002, 1.2
 _FEW_DEG = 12.0
 _OF_FEW_PARTS = 1.5
 """Deviations that come from two to four parts are too small as often as not."""
@@ -223,8 +222,8 @@ class _Errors:
         wrong = np.zeros(len(UNKNOWNS))
         wrong[rows] = self.values[rows]
         cost_m = self.found.bend_m(wrong)
-        matters = cost_m > max(_LEAST_COST_M, _COST_OF_NOISE * self.found.noise_m)
-        return (rows if matters or kind is FaultKind.DEPTH_DELAY else []), cost_m
+        is_kept = matters(cost_m, self.found.noise_m) or kind is FaultKind.DEPTH_DELAY
+        return (rows if is_kept else []), cost_m
 
     def with_the_other(self, rows: list[int]) -> list[int]:
         """Return both focal lengths where one is certain and the other is wrong alike by a deviation.

@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from client_sdk.check.motion import MotionReference
     from client_sdk.check.observer import DriveObserver
     from client_sdk.frontend import Frame, TrackedFrame
+    from client_sdk.tracking.stereo_adjustment import StereoAdjustment
 
 __all__ = ["DriveCheck", "check_lines"]
 
@@ -43,17 +44,30 @@ class DriveCheck:
         if is_wanted:
             self._observer = self._tried(lambda: _observer(is_thinned=is_thinned))
 
+    @property
+    def is_wanted(self) -> bool:
+        """Whether it goes on: it is wanted, and had no error."""
+        return self._observer is not None
+
     def add(self, frame: Frame, tracked: TrackedFrame) -> None:
         """Look at the next frame."""
         observer = self._observer
         if observer is not None:
             self._tried(lambda: observer.add(frame, tracked))
 
-    def finish(self, reference: MotionReference | None = None) -> dict[str, Any] | None:
-        """Return what ``report.json`` holds of the check; None if it was not wanted."""
+    def finish(
+        self,
+        reference: MotionReference | None = None,
+        offsets: Mapping[int, StereoAdjustment] | None = None,
+    ) -> dict[str, Any] | None:
+        """Return what ``report.json`` holds of the check; None if it was not wanted.
+
+        *offsets* are what `Mapper.adjust_pairs` found in a stereo drive.
+        """
         observer = self._observer
         if observer is not None:
             observer.reference = reference
+            observer.add_offsets(offsets or {})
             report = self._tried(observer.finish)
             if report is not None:
                 return report.to_dict()

@@ -10,10 +10,11 @@ from typing import Any
 
 from rse_pf.errors import UsageError
 
-__all__ = ["CannotTell", "CheckReport", "FaultKind", "Finding", "order"]
+__all__ = ["CannotTell", "CheckReport", "FaultKind", "Finding", "matters", "order"]
 
 _DEVIATIONS = 3.0
 """A finding is larger than so many of its deviations."""
+_LEAST_COST_M, _COST_OF_NOISE = 0.002, 1.2
 
 
 class FaultKind(str, Enum):
@@ -23,7 +24,8 @@ class FaultKind(str, Enum):
     ``principal_point`` its error, px, the larger of both.  ``distortion`` is the ``k1`` that the images still
     have.  ``depth_offset`` says by how many metres depths are too large; ``depth_delay`` by how many seconds
     the depth of a frame is older than its colours; ``stamp_delay`` by how many seconds the stamps of images
-    are later than those of odometry, truth or IMU.  ``blur``, ``dark``, ``repeated`` and ``missing`` are
+    are later than those of odometry, truth or IMU; ``disparity_offset`` by how many pixels disparities are
+    too small.  ``blur``, ``dark``, ``repeated`` and ``missing`` are
     shares of the frames; ``jitter`` is the deviation of the interval, relative.  ``two_cameras`` and
     ``moving_focal_length`` are by how much focal lengths differ, relative.  Others are 1.
     """
@@ -44,6 +46,7 @@ class FaultKind(str, Enum):
     SWAPPED_AXES = "swapped_axes"
     SWAPPED_CAMERAS = "swapped_cameras"
     BASELINE = "baseline"
+    DISPARITY_OFFSET = "disparity_offset"
     TWO_CAMERAS = "two_cameras"
     MOVING_FOCAL_LENGTH = "moving_focal_length"
 
@@ -149,6 +152,11 @@ class CheckReport:
             "cannot_tell": [each.to_dict() for each in self.cannot_tell],
             "notes": list(self.notes),
         }
+
+
+def matters(cost_m: float, noise_m: float) -> bool:
+    """Say whether a fault bends a path by more than the path is known: by its noise, and by 2 mm."""
+    return cost_m > max(_LEAST_COST_M, _COST_OF_NOISE * noise_m)
 
 
 def order(findings: Iterable[Finding], noise_m: float = 0.0) -> tuple[Finding, ...]:

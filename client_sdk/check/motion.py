@@ -26,7 +26,14 @@ from client_sdk.mapping import Trajectory, read_trajectory
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Array, inverse, log_se3, rotation_angle_deg
 
-__all__ = ["CameraMotion", "MotionReference", "check_imu", "check_motion", "nothing_to_compare"]
+__all__ = [
+    "FEWEST_ADJUSTED",
+    "CameraMotion",
+    "MotionReference",
+    "check_imu",
+    "check_motion",
+    "nothing_to_compare",
+]
 
 _LEAST_STEP_S, _LONGEST_STEP_S = 0.45, 1.0
 _MOST_PAIRS, _FEWEST_PAIRS, _BLOCKS = 600, 20, 10
@@ -39,7 +46,9 @@ _BETTER, _ALIKE, _DEVIATIONS = 0.5, 1.2, 3.0
 _FITS_WELL = 0.15
 """Axes are judged where a rotation, or a mirror, leaves less than this share."""
 _TURNED_DEG, _NEAR_AXES_DEG = 20.0, 15.0
-_SEGMENT_M, _SEGMENT_S, _FEWEST_SEGMENTS, _FEWEST_ADJUSTED = 0.25, 6.0, 12, 16
+_SEGMENT_M, _SEGMENT_S, _FEWEST_SEGMENTS = 0.25, 6.0, 12
+FEWEST_ADJUSTED = 16
+"""Fewer adjusted keyframes do not tell metres, nor by how much a lens bends them."""
 _ARM_M, _CAMERA_ARM_M = 0.5, 0.02
 _LEAST_SCALE = 0.01
 _OUTLIER = 4.0
@@ -125,7 +134,8 @@ class CameraMotion:
         metres: Where metres come from that can be wrong; ``none`` up to scale.
         adjusted: ``(k,)`` stamps and ``(k, 4, 4)`` poses of keyframes, adjusted with the calibration: metres
             are compared by them, since a wrong lens bends the others.
-        metres_deviation: How well the calibration of *adjusted* tells metres, relative.
+        metres_deviation: How well the calibration of *adjusted* tells metres, relative; of all poses where
+            there are none.
     """
 
     stamps_s: Array
@@ -159,8 +169,8 @@ def check_motion(motion: CameraMotion, reference: MotionReference) -> tuple[list
     findings += axes
     untold += vague
     if motion.metres != "none" and not any(each.kind is FaultKind.MIRRORED for each in axes):
-        moved_s, poses, doubt = stamps_s, T_world_camera, 0.0
-        if motion.adjusted is not None and len(motion.adjusted[0]) >= _FEWEST_ADJUSTED:
+        moved_s, poses, doubt = stamps_s, T_world_camera, 0.0 if motion.adjusted else motion.metres_deviation
+        if motion.adjusted is not None and len(motion.adjusted[0]) >= FEWEST_ADJUSTED:
             (moved_s, poses), segments, doubt = motion.adjusted, None, motion.metres_deviation
         by_metres = CameraMotion(
             stamps_s=moved_s - _DELAYS_S[best],
@@ -431,7 +441,10 @@ def _scale(
     if abs(value) < max(_LEAST_SCALE, _DEVIATIONS * deviation):
         vague = _DEVIATIONS * deviation
         what = kind.value.replace("_", " ")
-        reason = f"parts of the path differ from {reference.name}: {what} within {100 * vague:.0f} %"
+        why = f"parts of the path differ from {reference.name}"
+        if motion.metres_deviation > 0.7 * deviation / scale:
+            why = "what the calibration leaves in doubt bends metres as well"
+        reason = f"{why}: {what} within {100 * vague:.0f} %"
         return [], [CannotTell(kind, reason, vague)] if vague > 0.05 else []
     positions = path.at(stamps_s[inside])[:, :3, 3]
     reach_m = float(np.sqrt(np.square(positions - positions.mean(axis=0)).sum(axis=1).mean()))

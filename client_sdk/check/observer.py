@@ -5,6 +5,8 @@ Small things only are kept: figures of images, poses, features of some frames an
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from typing import Literal
 
 import numpy as np
@@ -14,15 +16,18 @@ from client_sdk.check.findings import CannotTell, CheckReport, FaultKind, Findin
 from client_sdk.check.images import FrameStatistics
 from client_sdk.check.keyframes import KeyframeStore
 from client_sdk.check.motion import (
+    FEWEST_ADJUSTED,
     CameraMotion,
     MotionReference,
     check_imu,
     check_motion,
     nothing_to_compare,
 )
+from client_sdk.check.pairs import PairsJudgement, judge_pairs
 from client_sdk.frontend import Frame, TrackedFrame
 from client_sdk.imu.history import ImuHistory
 from client_sdk.rigs.checks import PairFault
+from client_sdk.tracking.stereo_adjustment import StereoAdjustment
 from rse_pf.geometry import Array
 
 __all__ = ["DriveObserver"]
@@ -48,6 +53,7 @@ class DriveObserver:
         self._poses: list[tuple[float, Array, int]] = []
         self._has_depth = self._has_stereo = self._is_metric = False
         self._pair_fault: PairFault | None = None
+        self._pair_offsets: Mapping[int, StereoAdjustment] = {}
 
     def add(self, frame: Frame, tracked: TrackedFrame | None = None) -> None:
         """Look at the next frame; *tracked* has the pose that a mapper gave it, if there is one.
@@ -71,6 +77,10 @@ class DriveObserver:
         """Take what `client_sdk.rigs.checks.fault_of_pairs` found in stereo pairs of the drive."""
         self._pair_fault = fault
 
+    def add_offsets(self, found: Mapping[int, StereoAdjustment]) -> None:
+        """Take what `Mapper.adjust_pairs` found in a stereo drive, by segment, before `finish`."""
+        self._pair_offsets = found
+
     def finish(self) -> CheckReport:
         """Return what is wrong with the drive, worst first, and what it cannot tell."""
         findings, untold = self._images.findings()
@@ -79,7 +89,11 @@ class DriveObserver:
         untold += calibration.cannot_tell
         if self._pair_fault is not None:
             findings.append(_of_pairs(self._pair_fault))
-        moved, cannot, noted = self._motion(calibration, findings)
+        # A wrong lens bends what near and far points say of disparities.
+        pairs = judge_pairs({} if calibration.findings else self._pair_offsets)
+        findings += pairs.findings
+        untold += pairs.cannot_tell
+        moved, cannot, noted = self._motion(calibration, findings, pairs)
         return CheckReport(
             findings=order([*findings, *moved], calibration.noise_m),
             cannot_tell=(*untold, *cannot),
@@ -88,7 +102,7 @@ class DriveObserver:
         )
 
     def _motion(
-        self, calibration: CalibrationJudgement, known: list[Finding]
+        self, calibration: CalibrationJudgement, known: list[Finding], pairs: PairsJudgement
     ) -> tuple[list[Finding], list[CannotTell], list[str]]:
         """Return what odometry, truth and IMU say of the motion."""
         by_depth = self._has_depth or self._has_stereo
@@ -115,10 +129,13 @@ class DriveObserver:
         if self._history is not None:
             findings, notes = check_imu(self._history, stamps_s, poses)
         if self.reference is not None:
+            adjusted = calibration.stamps_s, calibration.T_world_camera
+            doubt = calibration.metres_deviation if len(adjusted[0]) >= FEWEST_ADJUSTED else 0.0
+            by_pairs = self._pair_offsets and not calibration.findings
             motion = CameraMotion(
-                stamps_s=stamps_s, T_world_camera=poses, segments=segments, metres=self._metres(),
-                adjusted=(calibration.stamps_s, calibration.T_world_camera),
-                metres_deviation=calibration.metres_deviation,
+                stamps_s=stamps_s, T_world_camera=pairs.moved(stamps_s, poses, segments), segments=segments,
+                metres=self._metres(), adjusted=None if by_pairs else adjusted,
+                metres_deviation=math.hypot(doubt, pairs.metres_deviation),
             )  # fmt: skip
             by_reference, untold = check_motion(motion, self.reference)
             findings = [*findings, *by_reference]

@@ -46,6 +46,9 @@ class StereoAdjustment:
         f_baseline: Focal length in pixels times the baseline in metres.
         offset_px: Pixels by which disparities are too small.
         deviation_px: Standard deviation of the offset.
+        bend_m_per_px: By how much an offset of a pixel bends the path, see `Calibrated.bend_m`.
+        growth_per_px: By how much the path grows, relative, if a pixel more is taken for the offset.
+        noise_m: How well the keyframes tell their positions.
     """
 
     stamps_s: Array
@@ -53,6 +56,14 @@ class StereoAdjustment:
     f_baseline: float
     offset_px: float
     deviation_px: float
+    bend_m_per_px: float
+    growth_per_px: float
+    noise_m: float
+
+    @property
+    def is_clear(self) -> bool:
+        """Whether the offset is large enough to move a map: 0.1 px and 4 deviations."""
+        return abs(self.offset_px) >= max(_LEAST_PX, _LEAST_DEVIATIONS * self.deviation_px)
 
     def moved(self, stamps_s: Array, T_world_camera: Array) -> Array:
         """Return ``(n, 4, 4)`` poses of other times, moved as the keyframes around them."""
@@ -62,9 +73,8 @@ class StereoAdjustment:
 def adjust_stereo(known: KeyframeMap, f_baseline: float) -> StereoAdjustment | None:
     """Move the keyframes of a map to where they agree best with all that they see; the first one stays.
 
-    Nothing is done, and None returned, where the offset of the disparities is below 0.1 px or 4 deviations,
-    and where there are fewer than 5 or more than 150 keyframes, or fewer than 50 landmarks that two of them
-    see.
+    Nothing moves where the offset of the disparities is not clear.  None is returned where there are fewer
+    than 5 or more than 150 keyframes, or fewer than 50 landmarks that two of them see.
 
     Args:
         known: The map.
@@ -87,18 +97,23 @@ def adjust_stereo(known: KeyframeMap, f_baseline: float) -> StereoAdjustment | N
     except DegenerateGeometry:
         return None
     assert found is not None
-    offset_px = float(found.values[_CURVE]) * f_baseline
-    deviation_px = float(found.deviations[_CURVE]) * f_baseline
-    if abs(offset_px) < max(_LEAST_PX, _LEAST_DEVIATIONS * deviation_px):
-        return None
     T_new = known.pose(0) @ T[0] @ inverse(T)
     old = np.array([known.pose(row) for row in range(len(known))])
-    known.correct(T_new, f_baseline, offset_px)
-    return StereoAdjustment(
+    pixel = np.zeros(len(UNKNOWNS))
+    pixel[_CURVE] = 1.0 / f_baseline
+    at = inverse(T)[:, :3, 3]
+    at -= at.mean(axis=0)
+    moved = found.bends_m[_CURVE] / f_baseline
+    adjusted = StereoAdjustment(
         stamps_s=np.array([known.view(row).timestamp_s for row in range(len(known))]),
-        T_new_old=T_new @ inverse(old), f_baseline=f_baseline, offset_px=offset_px,
-        deviation_px=deviation_px,
+        T_new_old=T_new @ inverse(old), f_baseline=f_baseline,
+        offset_px=float(found.values[_CURVE]) * f_baseline,
+        deviation_px=float(found.deviations[_CURVE]) * f_baseline, bend_m_per_px=found.bend_m(pixel),
+        growth_per_px=float((moved * at).sum() / max(float((at**2).sum()), 1e-12)), noise_m=found.noise_m,
     )  # fmt: skip
+    if adjusted.is_clear:
+        known.correct(T_new, f_baseline, adjusted.offset_px)
+    return adjusted
 
 
 def _observed(known: KeyframeMap) -> tuple[Rows, DriveObservations]:

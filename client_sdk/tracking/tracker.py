@@ -146,7 +146,8 @@ class Tracker:
     ``frames`` counts the frames prepared so far, ``lost_frames`` those of them without an accepted pose, and
     ``unrecognised`` those since the last pose that show enough and no known place; a covered lens is none.
     ``joins`` are the joins so far, in their order; ``noise`` and ``readout`` are estimates of the camera's,
-    and ``disparity_offset_px`` what the disparities of a stereo pair lack, which `adjust_pairs` finds.
+    and ``disparity_offset_px`` what the disparities of a stereo pair lack, which `adjust_pairs` finds;
+    ``pair_offsets`` is what it found last, by segment.
     """
 
     def __init__(
@@ -164,6 +165,7 @@ class Tracker:
         self.joins: list[Join] = []
         self.noise = NoiseEstimate()
         self.disparity_offset_px = 0.0
+        self.pair_offsets: dict[int, StereoAdjustment] = {}
         self.readout = ReadoutEstimate()
         self._T_world_start = np.eye(4) if T_world_start is None else T_world_start
         self._segments: dict[int, KeyframeMap] = {}
@@ -227,7 +229,8 @@ class Tracker:
         """Adjust all keyframes of each segment of a stereo drive together, such as at its end.
 
         It takes seconds.  Returned is by segment how poses change that were returned before, nothing if no
-        frame came since the last time; the next frame is recognised.
+        frame came since the last time; ``pair_offsets`` has also what was not clear enough to change them.
+        The next frame is recognised.
 
         Raises:
             UsageError: A query is open.
@@ -236,12 +239,14 @@ class Tracker:
         stereo = self._frame.stereo if self._segments else None
         if stereo is None or self._adjusted == self.frames:
             return {}
-        self._adjusted = self.frames
+        self._adjusted, self.pair_offsets = self.frames, {}
         adjusted = {}
         for number, known in self._segments.items():
             found = adjust_stereo(known, self._frame.camera.fx * stereo.baseline_m)
             if found is not None:
-                adjusted[number] = found
+                self.pair_offsets[number] = found
+                if found.is_clear:
+                    adjusted[number] = found
         own = adjusted.get(self._segment)
         if own is not None:
             self.disparity_offset_px += own.offset_px

@@ -190,6 +190,7 @@ def _watched(
     show_progress("", is_over=False)
     if not mapper.frames:
         raise UsageError("the source gives no frame", hint="look at it: rse-pf camera check SOURCE")
+    observer.add_offsets(mapper.adjust_pairs())
     return observer.finish()
 
 

@@ -184,7 +184,7 @@ def map_source(
 
     mapper = asyncio.run(_drive(args, settings, source, scale, frames, watch))
     report = mapper.save(args.out)
-    checked = check.finish(reference)
+    checked = check.finish(reference, mapper.adjust_pairs() if check.is_wanted else None)
     if about is not None:
         report = {**report, **about(mapper.trajectory)}
     if report["unit"] != "m" and report.get("ate_cm") is not None:

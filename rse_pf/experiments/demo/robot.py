@@ -265,11 +265,17 @@ async def _run(spec: RobotSpec, pipe: ParentPipe) -> None:
                     "keyframes_uploaded": uploaded,
                 },
                 is_metric=_is_metric(mapper),
-                check=await asyncio.to_thread(
-                    check.finish, MotionReference.of_truth(truth, loaded.truth_kind, is_camera=False)
-                ),
+                check=await asyncio.to_thread(_checked, check, mapper, truth, loaded.truth_kind),
             )
         )
+
+
+def _checked(
+    check: DriveCheck, mapper: Mapper | LiveMapper, truth: Trajectory | None, kind: str
+) -> dict[str, Any] | None:
+    """Return what is wrong with the drive.  Its files are written: pairs may be adjusted."""
+    offsets = mapper.adjust_pairs() if check.is_wanted and isinstance(mapper, Mapper) else {}
+    return check.finish(MotionReference.of_truth(truth, kind, is_camera=False), offsets)
 
 
 def _is_metric(mapper: Mapper | LiveMapper) -> bool:

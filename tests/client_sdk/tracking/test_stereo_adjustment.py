@@ -90,8 +90,26 @@ def test_a_good_calibration_moves_nothing() -> None:
     known, _, _ = drive(0.0)
     before = known.pose(3).copy()
 
-    assert adjust_stereo(known, F_BASELINE) is None
+    found = adjust_stereo(known, F_BASELINE)
+
+    assert found is not None
+    assert not found.is_clear
     np.testing.assert_array_equal(known.pose(3), before)
+
+
+@pytest.mark.parametrize("offset_px", [OFFSET_PX, -OFFSET_PX])
+def test_what_an_offset_costs_is_what_the_path_moves_by(offset_px: float) -> None:
+    known, _, _ = drive(offset_px)
+    tracked = np.array([known.pose(row) for row in range(len(known))])[:, :3, 3]
+
+    found = adjust_stereo(known, F_BASELINE)
+
+    assert found is not None
+    assert found.is_clear
+    assert found.growth_per_px < 0.0  # with more pixels points are nearer, and paths shorter
+    reach_m = float(np.sqrt(np.square(tracked - tracked.mean(axis=0)).sum(axis=1).mean()))
+    assert found.bend_m_per_px == pytest.approx(abs(found.growth_per_px) * reach_m, rel=0.3)
+    assert 0.0 < found.noise_m < 0.05
 
 
 def test_few_keyframes_stay_where_they_are() -> None:
