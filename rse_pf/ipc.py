@@ -10,9 +10,10 @@ from __future__ import annotations
 import socket
 import struct
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
-from typing import Any
+from functools import cache
+from typing import Any, NamedTuple
 
 import msgspec
 
@@ -24,11 +25,28 @@ _HEADER = struct.Struct("<I")
 _PIECE_BYTES = 1 << 18
 
 
+class _Coding(NamedTuple):
+    encode: Callable[[Any], bytes]
+    decode: Callable[[bytes], Any]
+    check: Callable[[bytes], object]
+
+
+@cache
+def _coding() -> _Coding:
+    """Import once what needs numpy: six imports a call were 7 us of a sandbox's call."""
+    from rse_pf.budget import SERVICE_REPLY, check_msgpack
+    from rse_pf.wire.arrays import binary_encode_hook, extension_hook
+
+    return _Coding(
+        msgspec.msgpack.Encoder(enc_hook=binary_encode_hook).encode,
+        msgspec.msgpack.Decoder(ext_hook=extension_hook).decode,
+        lambda body: check_msgpack(body, SERVICE_REPLY),
+    )
+
+
 def encode_message(message: Any) -> bytes:
     """Return *message* with its length before it."""
-    from rse_pf.wire.arrays import binary_encode_hook
-
-    body = msgspec.msgpack.encode(message, enc_hook=binary_encode_hook)
+    body = _coding().encode(message)
     return _HEADER.pack(len(body)) + body
 
 
@@ -38,10 +56,8 @@ def encode_reply(message: Any) -> bytes:
     Raises:
         LimitExceeded: The worker would refuse it for its values or levels.
     """
-    from rse_pf.budget import SERVICE_REPLY, check_msgpack
-
     data = encode_message(message)
-    check_msgpack(data[_HEADER.size :], SERVICE_REPLY)
+    _coding().check(data[_HEADER.size :])
     return data
 
 
@@ -93,8 +109,6 @@ class FrameReader:
             LimitExceeded: A message is longer than the limit, or holds too many values or levels.
             BadMessage: A body is not MessagePack.
         """
-        from rse_pf.budget import SERVICE_REPLY, check_msgpack
-
         self._received += data
         while len(self._received) >= _HEADER.size:
             (length,) = _HEADER.unpack_from(self._received)
@@ -105,15 +119,13 @@ class FrameReader:
                 return
             body = bytes(self._received[_HEADER.size : end])
             del self._received[:end]
-            check_msgpack(body, SERVICE_REPLY)
+            _coding().check(body)
             yield _decode(body)
 
 
 def _decode(body: bytes) -> Any:
-    from rse_pf.wire.arrays import extension_hook
-
     try:
-        return msgspec.msgpack.decode(body, ext_hook=extension_hook)
+        return _coding().decode(body)
     except RsePfError:
         raise
     except (msgspec.DecodeError, TypeError, ValueError, LookupError, RecursionError) as error:
