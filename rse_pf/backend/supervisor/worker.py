@@ -149,10 +149,11 @@ def run_worker(plan: WorkerPlan, data: socket.socket, control: socket.socket) ->
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     if not die_with_parent(plan.supervisor):
         return
-    set_process_name("rse-pf worker")
+    set_process_name("rse-pf spare" if plan.is_spare else "rse-pf worker")
     begin = _wait_to_begin(control) if plan.is_spare else None
     if plan.is_spare and begin is None:
         return
+    set_process_name("rse-pf worker")
     plan.crash.begin()
     if begin is not None:
         plan = _plan_of(plan, begin)
