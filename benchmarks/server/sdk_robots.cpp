@@ -1,0 +1,45 @@
+// Robots of the C++ client for sdk_overload.py: sdk_robots URL ROBOTS FRAMES_PER_S SECONDS prints their statistics.
+#include <chrono>
+#include <cstdio>
+#include <cstdlib>
+#include <memory>
+#include <thread>
+#include <vector>
+
+#include <rse_pf/client.hpp>
+
+int main(int argc, char** argv) {
+    if (argc != 5) return 2;
+    const int robots = std::atoi(argv[2]);
+    const double period = 1 / std::atof(argv[3]);
+    const auto began = std::chrono::steady_clock::now();
+    const auto at = [&](double seconds) {
+        std::this_thread::sleep_until(began + std::chrono::microseconds(static_cast<long long>(1e6 * seconds)));
+    };
+    std::vector<std::unique_ptr<rse_pf::Client>> clients;
+    for (int k = 0; k < robots; ++k) {
+        rse_pf::Options options;
+        options.url = argv[1];
+        clients.push_back(std::make_unique<rse_pf::Client>(std::move(options)));
+        clients.back()->connect();
+    }
+    rse_pf::CallOptions options;
+    options.stream = "camera";
+    options.deadline_s = 0.25;
+    const int turns = static_cast<int>(std::atof(argv[4]) / period);
+    for (int turn = 0; turn < turns; ++turn) {
+        for (int k = 0; k < robots; ++k) {
+            at((turn + static_cast<double>(k) / robots) * period);
+            clients[static_cast<std::size_t>(k)]->call("echo", rse_pf::json{{"value", turn}}, options, [](auto) {});
+        }
+    }
+    rse_pf::json found;
+    for (const auto& each : clients) {
+        const auto stats = each->stats();
+        rse_pf::json told = nullptr;
+        if (stats.told_rate_per_s) told = *stats.told_rate_per_s;
+        found.push_back({{"held_back", stats.held_back}, {"told_rate_per_s", told}, {"reconnects", stats.reconnects}});
+    }
+    std::puts(found.dump().c_str());
+    return 0;
+}

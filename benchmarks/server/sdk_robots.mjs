@@ -1,0 +1,22 @@
+// Robots of the web client for sdk_overload.py: node sdk_robots.mjs URL ROBOTS FRAMES_PER_S SECONDS prints their statistics.
+
+import { connect } from "../../client_web/rse-pf.js";
+
+const [url, robots, perS, seconds] = [process.argv[2], ...process.argv.slice(3).map(Number)];
+const clients = await Promise.all(Array.from({ length: robots }, () => connect(url, { token: "t" })));
+const began = performance.now();
+const turns = seconds * perS;
+for (let turn = 0; turn < turns; turn++) {
+  for (const [k, client] of clients.entries()) {
+    const due = ((turn + k / robots) / perS) * 1e3;
+    const left = due - (performance.now() - began);
+    if (left > 0) await new Promise((done) => setTimeout(done, left));
+    client.call("echo", { value: turn }, { stream: "camera", deadlineMs: 250 }).catch(() => {});
+  }
+}
+const found = clients.map(({ stats }) => ({
+  held_back: { "server-rate": stats.heldByRate, busy: stats.heldByBusy, "own-limit": stats.heldByLimit },
+  told_rate_per_s: stats.toldRatePerS ?? null, reconnects: stats.reconnects,
+}));
+console.log(JSON.stringify(found));
+process.exit(0);
