@@ -144,6 +144,7 @@ def test_at_a_told_rate_the_newest_frame_waits_and_older_ones_end_at_once():
     robot.hear(Rate(commands_per_s=2.0, for_ms=5000.0), 0.0)
 
     older, newer = robot.submit(0.1, "pose"), robot.submit(0.2, "pose")
+    assert robot.session.next_due(0.2) == 0.2
     robot.until(0.21, 0.2)
     assert robot.ends == {older: "stale"}
     robot.until(0.6, 0.21)
