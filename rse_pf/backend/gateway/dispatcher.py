@@ -26,7 +26,7 @@ from rse_pf.backend.rosbridge.codec import RosbridgeCodec
 from rse_pf.backend.rosbridge.session import RosbridgeSession
 from rse_pf.backend.rosbridge.topics import RosbridgeTopics
 from rse_pf.backend.scheduling.command_queue import CommandQueue
-from rse_pf.backend.scheduling.robot_shares import TOLD_S
+from rse_pf.backend.scheduling.robot_shares import AGAIN_S, TOLD_S
 from rse_pf.backend.scheduling.scheduler import QueueBacklog, QueuedCommand, RefusedCommand
 from rse_pf.errors import NotFound, UnknownService
 from rse_pf.services.pnp import wire_types
@@ -227,24 +227,33 @@ class Dispatcher:
         if connection.allowed_s is None or not self._scheduler.is_behind:
             return False
         self._scheduler.shares.sent.add(connection.robot)
+        if 0.0 < connection.rated_until_s - now < AGAIN_S:
+            self._tell_rate(connection, now)
         retry_ms = 1e3 * (connection.paused_s + self._scheduler.pause_s - now)
         is_early = retry_ms > 0.0
         if not is_early:
-            retry_ms = self._scheduler.retry_unread_ms(connection.robot, connection.allowed_s)
+            spread = self._scheduler.shares.next_spread()
+            retry_ms = spread * self._scheduler.retry_unread_ms(connection.robot, connection.allowed_s)
         envelope = peek(codec, data) if retry_ms else None
         if envelope is None or self._queue_of(envelope.service) is not self.stateless:
             return False
         if not is_early:
-            self._pause(connection, now)
+            self._pause(connection, now + (spread - 1.0) * self._scheduler.pause_s)
         self.stateless.refuse_unread(connection, envelope, retry_ms, len(data), is_early=is_early)
         return True
 
-    def _pause(self, connection: RobotConnection, now: float) -> None:
-        """Note that a robot is told to pause, and tell it its share of what the server can do."""
-        connection.paused_s = now
+    def _pause(self, connection: RobotConnection, paused_s: float) -> None:
+        """Note that a robot is told to pause, as if it had been at *paused_s*, and what its share is."""
+        connection.paused_s = paused_s
+        now = self.context.clocks.monotonic()
+        if now >= connection.rated_until_s:
+            self._tell_rate(connection, now)
+
+    def _tell_rate(self, connection: RobotConnection, now: float) -> None:
         session, share_per_s = connection.session, self._scheduler.shares.per_s
-        if share_per_s and session is not None and session.hears_rate and now >= connection.rated_until_s:
+        if share_per_s and session is not None and session.hears_rate:
             connection.rated_until_s = now + TOLD_S
+            share_per_s *= self._scheduler.shares.next_spread()
             rate = Rate(commands_per_s=share_per_s, for_ms=1e3 * TOLD_S)
             connection.write(session.codec.encode(rate))
 

@@ -10,14 +10,16 @@ from dataclasses import dataclass, field
 
 from rse_pf.identity import RobotId
 
-__all__ = ["TOLD_S", "RobotShares"]
+__all__ = ["AGAIN_S", "TOLD_S", "RobotShares"]
 
-TOLD_S = 2.0
-"""A robot keeps to the rate that it was told for so long."""
-_WINDOW_S = 0.5
+TOLD_S, AGAIN_S = 1.0, 0.4
+"""A robot keeps to the rate that it was told for so long, and is told again when so much is left: all are
+free a second after an overload, and none returns for a moment while it lasts."""
+_WINDOW_S = 1.0
 """Robots and commands are counted for so long; a robot that sends more rarely needs no share."""
 _LESS, _MORE = 0.9, 1.05
 """Factors of the share in each interval in which many, or hardly any, commands were refused."""
+_GOLDEN = 0.6180339887
 _LEAST, _MOST = 0.2, 4.0
 """Bounds of the product of these factors: robots that send less than their share leave room for others."""
 
@@ -35,12 +37,24 @@ class RobotShares:
     sent: set[RobotId] = field(default_factory=set)
     _since_s: float = -math.inf
     _started: int = 0
+    _capacity_per_s: float = 0.0
+    _was_full: bool = False
     _factor: float = 1.0
+    _phase: float = 0.0
+
+    def next_spread(self) -> float:
+        """Return a factor from 0.75 to 1.25 for what one robot is told: robots told together return apart.
+
+        Source:
+            Additive recurrence by the golden ratio; any few of them in a row are spread evenly.
+        """
+        self._phase = (self._phase + _GOLDEN) % 1.0
+        return 0.75 + 0.5 * self._phase
 
     def begin(self, now: float) -> None:
         """Count from *now* (s): the server fell behind."""
         self.sent.clear()
-        self._since_s, self._started = now, 0
+        self._since_s, self._started, self._was_full = now, 0, False
 
     def judge(self, now: float, started: int, *, less: bool, more: bool) -> None:
         """Note what an interval that ends at *now* (s) brought.
@@ -53,11 +67,16 @@ class RobotShares:
         """
         self._started += started
         if less:
+            self._was_full = True
             self._factor = max(_LEAST, _LESS * self._factor)
         elif more:
             self._factor = min(_MOST, _MORE * self._factor)
         elapsed_s = now - self._since_s
         if elapsed_s >= _WINDOW_S:
-            if self._started and self.sent:
-                self.per_s = self._factor * self._started / elapsed_s / len(self.sent)
+            served_per_s = self._started / elapsed_s
+            # What is served while hardly anything is refused may be all that was asked for.
+            full = self._was_full or served_per_s > self._capacity_per_s
+            self._capacity_per_s = served_per_s if full else self._capacity_per_s
+            if self.sent:
+                self.per_s = self._factor * self._capacity_per_s / len(self.sent)
             self.begin(now)
