@@ -7,7 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from client_sdk.check.findings import CheckReport, FaultKind
+from client_sdk.check import observer
+from client_sdk.check.calibration import CalibrationJudgement
+from client_sdk.check.findings import CheckReport, FaultKind, Finding
 from client_sdk.check.motion import MotionReference
 from client_sdk.check.observer import DriveObserver
 from client_sdk.check.pairs import judge_pairs
@@ -91,19 +93,19 @@ def test_the_longest_segment_is_judged_and_each_moves_by_its_own() -> None:
 
 def checked(scale: float, offsets: dict[int, StereoAdjustment]) -> CheckReport:
     """Return what is said of a stereo drive whose path is too large by *scale* beside its odometry."""
-    observer = DriveObserver(MotionReference(path=Trajectory(STAMPS_S, path())))
+    drive = DriveObserver(MotionReference(path=Trajectory(STAMPS_S, path())))
     image = np.full((CAMERA.height, CAMERA.width), 90, dtype=np.uint8)
     for stamp_s, pose in zip(STAMPS_S, path(scale), strict=True):
         frame = Frame(
             timestamp_s=float(stamp_s), rgb=np.repeat(image[:, :, None], 3, axis=2), camera=CAMERA,
             depth_m=np.zeros(image.shape, np.float32), stereo=StereoView(image, 0.11),
         )  # fmt: skip
-        observer.add(
+        drive.add(
             frame,
             TrackedFrame(frame=frame, T_world_camera=pose, keyframe=False, inliers=50, matches=60),
         )
-    observer.add_offsets(offsets)
-    return observer.finish()
+    drive.add_offsets(offsets)
+    return drive.finish()
 
 
 def kinds(report: CheckReport) -> set[FaultKind]:
@@ -130,3 +132,16 @@ def test_a_baseline_is_not_told_where_an_offset_could_be_the_cause() -> None:
     assert kinds(report) == set()
     untold = next(each for each in report.cannot_tell if each.kind is FaultKind.BASELINE)
     assert "calibration leaves in doubt" in untold.reason
+
+
+def test_a_wrong_lens_leaves_no_word_about_disparities(monkeypatch: pytest.MonkeyPatch) -> None:
+    lens = Finding(
+        kind=FaultKind.FOCAL_LENGTH, value=0.1, deviation=0.01, unit="relative", cost_m=0.1,
+        sentence="the focal length is 10 % too large", fix="calibrate", correction={},
+    )  # fmt: skip
+    monkeypatch.setattr(observer, "judge_calibration", lambda store: CalibrationJudgement(findings=(lens,)))
+
+    report = checked(1.03, {0: adjustment(0.3)})
+
+    assert FaultKind.DISPARITY_OFFSET not in kinds(report)
+    assert FaultKind.FOCAL_LENGTH in {each.kind for each in report.findings}
