@@ -34,13 +34,13 @@ class _Coding(NamedTuple):
 @cache
 def _coding() -> _Coding:
     """Import once what needs numpy: six imports a call were 7 us of a sandbox's call."""
-    from rse_pf.budget import SERVICE_REPLY, check_msgpack
+    from rse_pf import budget
     from rse_pf.wire.arrays import binary_encode_hook, extension_hook
 
     return _Coding(
         msgspec.msgpack.Encoder(enc_hook=binary_encode_hook).encode,
         msgspec.msgpack.Decoder(ext_hook=extension_hook).decode,
-        lambda body: check_msgpack(body, SERVICE_REPLY),
+        lambda body: budget.check_msgpack(body, budget.SERVICE_REPLY),
     )
 
 

@@ -200,7 +200,8 @@ class ClientSession:
         self._pending: dict[int, _Pending] = {}
         self._sequence: dict[str, int] = {}
         self._delivered: dict[str, int] = {}
-        self._stream_not_before: dict[str, float] = {}
+        self._busy_streams: dict[str, tuple[float, Failure]] = {}
+        """Until when a stream is held back, and the answer that said so; a new connection begins anew."""
         self._retry_tokens = _RETRY_BURST
         self.subscriptions = ClientSubscriptions()
 
@@ -316,6 +317,7 @@ class ClientSession:
         the order and at the rate that `rse_pf.wire.rate_limit` describes.
         """
         before, self.current = self.current, connection
+        self._busy_streams.clear()
         if before is not None and before is not connection:
             before.leaving = True
             for pending in self._pending.values():
@@ -436,7 +438,9 @@ class ClientSession:
         for pending in self._pending.values():
             first = min(first, pending.deadline)
             if pending.connection is None:
-                if self.current is not None and self._is_replaced(pending.command):
+                if self.current is not None and (
+                    self._is_replaced(pending.command) or self._busy_for_too_long(pending, now)
+                ):
                     return now
                 may_be_sent = max(next_s, self._not_before(pending))
                 first = min(first, may_be_sent if may_be_sent > now else first)
@@ -459,6 +463,8 @@ class ClientSession:
             command = pending.command
             if self._is_replaced(command):
                 events += self._end(identity, _failure(command, "stale", "a newer frame took its place"))
+            elif (busy := self._busy_for_too_long(pending, now)) is not None:
+                events += self._end(identity, busy)
             elif self._may_send(pending, connection, capacity, now):
                 capacity -= 1
                 self._write(pending, connection, now)
@@ -472,7 +478,16 @@ class ClientSession:
 
     def _not_before(self, pending: _Pending) -> float:
         """Return the time until which a busy answer holds back this command or its stream."""
-        return max(pending.not_before, self._stream_not_before.get(pending.command.stream, 0.0))
+        until_s, _ = self._busy_streams.get(pending.command.stream, (0.0, None))
+        return max(pending.not_before, until_s)
+
+    def _busy_for_too_long(self, pending: _Pending, now: float) -> Failure | None:
+        """Return the answer by which a waiting frame ends whose stream is held back past its deadline."""
+        until_s, told = self._busy_streams.get(pending.command.stream, (0.0, None))
+        if told is None or until_s < pending.deadline or until_s <= now:
+            return None
+        command, left_ms = pending.command, 1e3 * (until_s - now)
+        return msgspec.structs.replace(told, id=command.id, trace=command.trace, retry_after_ms=left_ms)
 
     def _may_send(self, pending: _Pending, connection: ConnectionState, capacity: int, now: float) -> bool:
         """Return whether this command may be sent now; count it if it is held back."""
@@ -564,7 +579,7 @@ class ClientSession:
         """Schedule a retry if another server or a later time may help; return whether one is scheduled."""
         pause_s = max(0.0, failure.retry_after_ms or 0.0) / 1e3
         if failure.code == "busy" and pause_s > 0.0 and pending.command.stream:
-            self._stream_not_before[pending.command.stream] = now + min(MAX_PAUSE_S, pause_s)
+            self._busy_streams[pending.command.stream] = now + min(MAX_PAUSE_S, pause_s), failure
         if pending.cancelled:
             return False
         if failure.code == "worker-lost" and pending.losses < _MAX_TRIES_AFTER_LOSS:

@@ -45,7 +45,7 @@ def test_a_cloud_whose_points_were_forgotten_stays_as_it_is() -> None:
     whole.cloud.add_points(np.array([[1.0, 2.0, 3.0]]), np.zeros((1, 3), np.uint8))
     found = StereoAdjustment(
         stamps_s=np.arange(2.0), T_new_old=np.tile(np.eye(4), (2, 1, 1)), f_baseline=60.0, offset_px=0.3,
-        deviation_px=0.01,
+        deviation_px=0.01, bend_m_per_px=0.05, growth_per_px=-0.1, noise_m=0.001,
     )  # fmt: skip
 
     corrected = whole.corrected(found)

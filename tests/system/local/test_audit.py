@@ -129,11 +129,11 @@ async def test_a_platform_records_its_actions_its_robots_its_operator_and_all_he
     assert {"platform.platform-ready", "platform.server-ready", "platform.over"} <= deeds
     assert {verdict.problem for verdict in check_folder(audit)} == {""}
 
-    for who, count, teller in (
-        (server, 1, "the file of heads"),
-        (server, 2, "entry "),
-        ("control-plane", 1, "entry 2 of operator"),
-        ("operator", 1, "the file of heads"),
+    for who, count, tellers in (
+        (server, 1, ("the file of heads", "entry ")),  # whoever heard of it first
+        (server, 2, ("entry ",)),
+        ("control-plane", 1, ("entry 2 of operator",)),
+        ("operator", 1, ("the file of heads",)),
     ):
         path = audit / f"{who}.jsonl"
         whole = path.read_bytes()
@@ -142,7 +142,7 @@ async def test_a_platform_records_its_actions_its_robots_its_operator_and_all_he
         assert main(["audit", "verify", "--name", "audited"]) == 1
         (broken,) = [line for line in capsys.readouterr().out.splitlines() if "BROKEN" in line]
         assert broken.startswith(f"{who}: BROKEN in {who}.jsonl: entry ")
-        assert f"is missing: {teller}" in broken
+        assert any(f"is missing: {teller}" in broken for teller in tellers)
         path.write_bytes(whole)
     assert main(["audit", "show", "--name", "audited", "--only", "robot.disabled", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["subject"] == "robot-7"

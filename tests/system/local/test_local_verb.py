@@ -302,7 +302,8 @@ def test_a_killed_server_is_replaced_and_both_are_told_in_words(terminal: Termin
 
     told = terminal.run("local", "kill", "server-1")
 
-    assert told.stdout == f"killed: server-1 (pid {server.process.pid}, 2 processes)\n"
+    # A supervisor, a worker, and five that wait for a crash of native code.
+    assert told.stdout == f"killed: server-1 (pid {server.process.pid}, 7 processes)\n"
     assert "server-1 ended" in until_said(process, "server-2 is ready")
     terminal.state()
 

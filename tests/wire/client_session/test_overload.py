@@ -300,3 +300,29 @@ def test_the_lower_of_told_rate_and_own_limit_counts():
     robot.until(1.0, 0.0, answers=True)
 
     assert 1 <= len(robot.sent) <= 2
+
+
+def test_a_frame_that_could_not_wait_ends_at_once_with_the_words_of_the_server():
+    robot = Robot()
+    first = robot.submit(0.0, "camera", deadline_s=1.0)
+    robot.hear(Failure(id=first, retry_after_ms=3000.0, **BUSY), 0.1)
+
+    second = robot.submit(0.2, "camera", deadline_s=1.0, trace="t")
+    robot.until(0.21, 0.2)
+
+    assert robot.ends == {first: "busy", second: "busy"}
+    assert robot.sent_ids == [first]
+    third = robot.submit(2.9, "camera", deadline_s=1.0)
+    robot.until(3.2, 2.9)
+    assert robot.sent_ids == [first, third]
+
+
+def test_what_a_server_said_of_a_stream_does_not_count_for_the_next_server():
+    robot = Robot()
+    first = robot.submit(0.0, "camera", deadline_s=1.0)
+    robot.hear(Failure(id=first, retry_after_ms=3000.0, **BUSY), 0.1)
+
+    robot.connect(0.2)
+    second = robot.submit(0.3, "camera", deadline_s=1.0)
+
+    assert robot.sent_ids == [first, second]
