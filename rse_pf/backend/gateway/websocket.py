@@ -251,7 +251,7 @@ class RobotSockets:
         if not data:
             pending.close()
         elif end < 0:
-            self._refuse(pending, self._handshake.too_long, pending.peer)
+            self._refuse(pending, self._handshake.too_long, pending.peer, "")
         else:
             self._judge(pending, RequestHead.parse(pending.seen[:end]), pending.seen[end + 4 :])
         return True
@@ -259,7 +259,7 @@ class RobotSockets:
     def _judge(self, pending: PendingSocket, head: RequestHead | None, rest: bytes) -> None:
         """Answer a handshake; *rest* was read behind its head.  No exception passes: the worker serves on."""
         if head is None:
-            self._refuse(pending, self._handshake.no_request, pending.peer)
+            self._refuse(pending, self._handshake.no_request, pending.peer, "")
             return
         source, token = pending.peer, ""
         try:
@@ -277,7 +277,7 @@ class RobotSockets:
         else:
             self._refuse(pending, verdict, source, token)
 
-    def _refuse(self, pending: PendingSocket, verdict: Rejected, source: str, token: str = "") -> None:
+    def _refuse(self, pending: PendingSocket, verdict: Rejected, source: str, token: str) -> None:
         self._context.metrics.handshakes[verdict.result] += 1
         if verdict.result != HEALTH:
             about = {"source": source, **claimed_by(token)}
