@@ -71,8 +71,8 @@ class StatelessQueue(CommandQueue):
         """Time that commands took in the event loop in this round of it; see `_INLINE_S`."""
         self._throttle_timer: TimerHandle | None = None
         self._sweep_timer: TimerHandle | None = None
-        self._batched: dict[RobotConnection, list[tuple[Envelope, int]]] = {}
-        self._retry_ms: dict[RobotConnection, float] = {}
+        self._batched: dict[RobotConnection, tuple[float, list[tuple[Envelope, int]]]] = {}
+        """Refusals that are written together: when the robot may try again, ms, and which messages."""
 
     @property
     def held(self) -> int:
@@ -171,8 +171,7 @@ class StatelessQueue(CommandQueue):
             return
         if not self._batched:
             self._loop.call_later(BATCH_S, self._send_batch)
-        self._batched.setdefault(connection, []).append((envelope, size_bytes))
-        self._retry_ms[connection] = retry_ms
+        self._batched.setdefault(connection, (retry_ms, []))[1].append((envelope, size_bytes))
 
     # --- from the queue to an answer -----------------------------------------------------------
 
@@ -240,10 +239,9 @@ class StatelessQueue(CommandQueue):
 
     def _send_batch(self) -> None:
         batched, self._batched = self._batched, {}
-        retry_ms, self._retry_ms = self._retry_ms, {}
-        for connection, unread in batched.items():
+        for connection, (retry_ms, unread) in batched.items():
             if connection.is_connected:
-                self._answers.send_unread_refusals(connection, unread, TOO_LATE, retry_ms[connection])
+                self._answers.send_unread_refusals(connection, unread, TOO_LATE, retry_ms)
 
     def _sweep(self) -> None:
         self._sweep_timer = None

@@ -299,6 +299,20 @@ def test_a_robot_that_knows_such_messages_is_told_its_share_once_and_many_ends_i
     assert wire.sent[4].commands_per_s == pytest.approx(2.0, rel=0.25)
 
 
+def test_a_robot_that_does_not_name_them_gets_neither_rate_nor_refused(starved: WorkerParts):
+    connection, wire = starved.join()
+    connection.allowed_s = 0.25
+    fall_behind_for_good(starved)
+    starved.scheduler.shares.per_s = 2.5
+
+    for number in range(3):
+        starved.say(connection, echo(number, deadline_ms=250.0))
+    starved.loop.advance(0.01)
+
+    assert [type(message) for message in wire.sent[1:]] == [Failure] * 3
+    assert refused(wire) == [0, 1, 2]
+
+
 def test_a_robot_that_left_gets_none_of_the_refusals_that_waited(starved: WorkerParts):
     connection, wire = starved.join(hello=False)
     starved.say(connection, Hello(capabilities=[REFUSALS]))

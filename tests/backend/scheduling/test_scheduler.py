@@ -316,6 +316,21 @@ def drive(
     return offered / (4.0 * CAPACITY), served / (4.0 * CAPACITY), last_refusal_s - ends_s
 
 
+def test_a_pause_becomes_longer_while_many_are_refused_and_shorter_afterwards():
+    scheduler = AdmittedScheduler()
+    fall_behind(scheduler)
+    pauses = []
+    for interval in range(1, 40):
+        for _ in range(20):  # those that come too early keep it behind
+            scheduler.note_refused(0.11 * interval, is_early=interval > 10)
+        pauses.append(scheduler.pause_s)
+
+    assert pauses[:10] == sorted(pauses[:10])
+    assert pauses[9] == max(pauses) == pytest.approx(0.8)
+    assert pauses[10:] == sorted(pauses[10:], reverse=True)
+    assert pauses[-1] == pytest.approx(0.1)
+
+
 @pytest.mark.parametrize(("load", "most"), [(1.5, 1.25), (2.0, 1.35), (3.0, 1.6)])
 def test_robots_that_obey_offer_little_more_than_can_be_served(load: float, most: float):
     offered, served, recovery_s = drive(load, obeys=True)
