@@ -1,8 +1,8 @@
 """Load a platform with many robots that send real PnP problems, and measure their round trips.
 
 Send times are fixed before the run and latency counts from them, so that stalls are part of it. Without
---name or --url a platform is started for the run; Ctrl-C ends everything that was started. Options count
-before --scenario.
+--name or --url a platform is started for the run; Ctrl-C ends everything that was started. An option
+given here overrides what --scenario says.
 
 examples:
   rse-pf swarm --robots 20 --seconds 10
