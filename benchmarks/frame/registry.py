@@ -186,7 +186,7 @@ def _add(parser: argparse.ArgumentParser, key: str, hint: Any, default: Any) -> 
     if get_origin(hint) in (Union, types.UnionType):
         hint = next(kind for kind in get_args(hint) if kind is not type(None))
     if get_origin(hint) in (tuple, list):
-        options["nargs"] = "+"
+        options["nargs"] = "+" if default is inspect.Parameter.empty else "*"
         hint = get_args(hint)[0]
     if get_origin(hint) is Literal:
         options["choices"] = get_args(hint)

@@ -66,6 +66,12 @@ def test_the_fields_of_a_dataclass_are_the_arguments() -> None:
     assert vars(given) == {"part": "two", "times": [3, 4, 5], "folder": None, "is_short": True, "out": None}
 
 
+def test_a_list_that_has_a_default_may_be_given_without_values() -> None:
+    given = parser_of("x", Benchmark(measure, ())).parse_args(["one", "--times", "--is-short"])
+
+    assert given.times == []
+
+
 def test_an_unknown_benchmark_is_one_line_with_a_hint(capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["server.nothing"]) == 2
     assert "there is no benchmark 'server.nothing'" in capsys.readouterr().err
