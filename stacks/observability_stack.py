@@ -18,7 +18,14 @@ from rse_pf.config import PlatformSettings
 from rse_pf.config.cloud_layout import parks_when_idle
 from rse_pf.config.resource_names import ResourceNames
 from rse_pf.scaling.alarms import NAMESPACE
-from rse_pf.scaling.operator_alarms import STORE_ERRORS, OperatorAlarm, Series, operator_alarms
+from rse_pf.scaling.operator_alarms import (
+    NATIVE_CRASHES,
+    NATIVE_OFF,
+    STORE_ERRORS,
+    OperatorAlarm,
+    Series,
+    operator_alarms,
+)
 from stacks.canary import Canary
 from stacks.idle_timer import IdleTimer
 from stacks.values import read
@@ -104,6 +111,9 @@ class ObservabilityStack(cdk.Stack):
                 ],
                 "Robots and requests": [
                     of("group", NAMESPACE, name, "Sum") for name in ("Robots", "Requests")
+                ],
+                "Crashes of native code, and servers without the core": [
+                    of("group", NAMESPACE, name, "Sum") for name in (NATIVE_CRASHES, NATIVE_OFF)
                 ],
                 "Queue, and answers' p95": [
                     of("group", NAMESPACE, "QueueMs", "Maximum"), of("group", NAMESPACE, "AnswerMs", "p95"),

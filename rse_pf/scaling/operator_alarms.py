@@ -15,6 +15,8 @@ from rse_pf.scaling.profile import cadence_of
 
 __all__ = [
     "LAMBDA_TIMEOUT_S",
+    "NATIVE_CRASHES",
+    "NATIVE_OFF",
     "STORE_ERRORS",
     "STORE_PERIOD_S",
     "OperatorAlarm",
@@ -34,6 +36,9 @@ STORE_ERRORS, STORE_PERIOD_S = "StoreErrors", 10
 
 Nothing is published while all is well, so the metric costs nothing then; agents that are silent for another
 reason have an alarm of their own."""
+NATIVE_CRASHES, NATIVE_OFF = "NativeCrashes", "NativeOff"
+"""Workers of a server that native code ended in a period, and 1 while it does without the native core; an
+agent publishes neither while it is 0."""
 
 Source = str
 """Of a series: ``group``, ``balancer``, ``targets``, ``firewall``, ``function`` or ``canary``."""
@@ -100,6 +105,12 @@ _REPORTS = Series(
 _STORE_ERRORS = Series(
     name="errors", namespace=NAMESPACE, metric=STORE_ERRORS, statistic="Sum", source="group"
 )  # fmt: skip
+_NATIVE_CRASHES = Series(
+    name="crashes", namespace=NAMESPACE, metric=NATIVE_CRASHES, statistic="Sum", source="group"
+)  # fmt: skip
+_NATIVE_OFF = Series(
+    name="off", namespace=NAMESPACE, metric=NATIVE_OFF, statistic="Maximum", source="group"
+)  # fmt: skip
 _BLOCKED = Series(
     name="blocked", namespace="AWS/WAFV2", metric="BlockedRequests", statistic="Sum", source="firewall"
 )  # fmt: skip
@@ -147,6 +158,22 @@ def operator_alarms(settings: PlatformSettings) -> tuple[OperatorAlarm, ...]:
             period_s=_LONG_PERIOD_S,
             periods=2,
             datapoints=2,
+        ),
+        OperatorAlarm(
+            name="native-crashes",
+            meaning="native code ended a worker of a server",
+            series=(_NATIVE_CRASHES,),
+            expression="IF(crashes >= 1, 1, 0)",
+            periods=1,
+            datapoints=1,
+        ),
+        OperatorAlarm(
+            name="native-off",
+            meaning="a server does without the native core, after crashes of native code",
+            series=(_NATIVE_OFF,),
+            expression="IF(off >= 1, 1, 0)",
+            periods=1,
+            datapoints=1,
         ),
         OperatorAlarm(
             name="lambda-errors",

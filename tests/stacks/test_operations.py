@@ -30,6 +30,7 @@ RUN_HERE = {
     "rse-pf token retire --cloud --force": 0,
     "rse-pf audit verify --cloud": 2,
     "rse-pf audit show --cloud --only refused --out logs": 2,
+    "rse-pf audit show --cloud --only crashed --out logs": 2,
     "rse-pf cloud leftovers": 1,
     "rse-pf cloud logs": 1,
     "rse-pf cloud canary": 2,

@@ -1,7 +1,7 @@
 """Convert a server's Prometheus page into the metrics that CloudWatch's alarms and dashboard read.
 
 Pure functions.  A counter that fell was reset by a restart and counts from zero again.  Metric names are
-those of `rse_pf.scaling.alarms`; no robot's name is published.
+those of `rse_pf.scaling.alarms` and `rse_pf.scaling.operator_alarms`; no robot's name is published.
 """
 
 from __future__ import annotations
@@ -11,6 +11,8 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
+
+from rse_pf.scaling.operator_alarms import NATIVE_CRASHES, NATIVE_OFF
 
 __all__ = ["ROBOTS", "ServerMetrics", "datums", "dimensions_of", "read_cpu_times", "read_page"]
 
@@ -37,6 +39,8 @@ class ServerMetrics:
     requests: float = 0.0
     bytes_in: float = 0.0
     bytes_out: float = 0.0
+    worker_crashes: float = 0.0
+    native_off: float = 0.0
     answers: Mapping[float, float] = field(default_factory=dict)
 
 
@@ -63,6 +67,8 @@ def read_page(text: str) -> ServerMetrics:
         requests=totals["requests_total"],
         bytes_in=totals["bytes_total in"],
         bytes_out=totals["bytes_total out"],
+        worker_crashes=totals["worker_crashes"],
+        native_off=totals["native_off"],
         answers=dict(answers),
     )
 
@@ -84,7 +90,10 @@ def dimensions_of(group: str, server: str = "") -> list[dict[str, str]]:
 
 
 def datums(before: ServerMetrics, now: ServerMetrics, group: str, server: str) -> list[dict[str, Any]]:
-    """Return the MetricData for PutMetricData: what instance *server* did between two samples."""
+    """Return the MetricData for PutMetricData: what instance *server* did between two samples.
+
+    Crashes of native code are left out while there are none, so that their metrics cost nothing.
+    """
     values = {
         ROBOTS: (now.robots, "Count"),
         "InFlight": (now.in_flight, "Count"),
@@ -93,6 +102,11 @@ def datums(before: ServerMetrics, now: ServerMetrics, group: str, server: str) -
         "BytesIn": (_counter_growth(before.bytes_in, now.bytes_in), "Bytes"),
         "BytesOut": (_counter_growth(before.bytes_out, now.bytes_out), "Bytes"),
     }
+    troubles = {
+        NATIVE_CRASHES: _counter_growth(before.worker_crashes, now.worker_crashes),
+        NATIVE_OFF: now.native_off,
+    }
+    values.update({name: (value, "Count") for name, value in troubles.items() if value})
     dimensions = dimensions_of(group)
     data: list[dict[str, Any]] = [
         {"MetricName": name, "Dimensions": dimensions, "Value": value, "Unit": unit}

@@ -55,7 +55,7 @@ from rse_pf.backend.sandbox.circuit_breaker import Block
 from rse_pf.backend.sandbox.manager import SandboxHost, SandboxManager
 from rse_pf.backend.sandbox.reloading import Answer, OnReady, ReloadingSandboxes
 from rse_pf.backend.scheduling.command_queue import CommandQueue
-from rse_pf.backend.supervisor.crash_report import CrashReport
+from rse_pf.backend.supervisor.crashes.report import CrashReport
 from rse_pf.backend.supervisor.orders import (
     BanOrder,
     BeginOrder,

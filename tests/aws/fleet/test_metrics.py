@@ -9,6 +9,7 @@ import pytest
 from rse_pf.aws.fleet.metrics import ServerMetrics, datums, dimensions_of, read_page
 from rse_pf.config import PlatformSettings
 from rse_pf.scaling.alarms import NAMESPACE, alarms_of
+from rse_pf.scaling.operator_alarms import STORE_ERRORS, operator_alarms
 
 
 def page(answers: list[tuple[str, float]], **gauges: float) -> str:
@@ -62,6 +63,32 @@ def test_a_restarted_server_counts_from_zero_again() -> None:
 
     assert told["Requests"]["Value"] == 7
     assert told["AnswerMs"]["Counts"] == [7]
+
+
+def test_crashes_of_native_code_are_published_as_their_increase_and_only_while_there_are_any() -> None:
+    before, now = (
+        read_page(page([], worker_crashes=count, native_off=off)) for count, off in ((2, 0), (3, 1))
+    )
+
+    began, followed = named(datums(before, now, "group", "i-1")), named(datums(now, now, "group", "i-1"))
+
+    assert (began["NativeCrashes"]["Value"], began["NativeOff"]["Value"]) == (1, 1)
+    assert "NativeCrashes" not in followed
+    assert followed["NativeOff"]["Value"] == 1
+    assert not {"NativeCrashes", "NativeOff"} & set(named(datums(before, before, "group", "i-1")))
+
+
+def test_every_series_of_an_operator_alarm_that_we_publish_is_published_by_a_server_in_trouble() -> None:
+    wanted = {
+        series.metric
+        for alarm in operator_alarms(PlatformSettings())
+        for series in alarm.series
+        if series.namespace == NAMESPACE
+    }
+
+    told = named(datums(ServerMetrics(), ServerMetrics(worker_crashes=3, native_off=1), "rse-pf", "i-1"))
+
+    assert wanted - set(told) == {STORE_ERRORS}, "another task publishes that"
 
 
 def test_without_answers_no_answer_times_are_published() -> None:

@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from rse_pf.backend.supervisor.crash_recovery import CrashRecovery
-from rse_pf.backend.supervisor.crash_report import Crash
+from rse_pf.backend.supervisor.crashes.recovery import CrashRecovery
+from rse_pf.backend.supervisor.crashes.report import Crash
 from rse_pf.backend.supervisor.orders import BanOrder
 from rse_pf.backend.supervisor.session_registry import SessionRegistry
 from rse_pf.crash_record import BLOCK_S, WINDOW_S

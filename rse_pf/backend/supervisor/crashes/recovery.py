@@ -13,7 +13,7 @@ from dataclasses import replace
 from rse_pf.auth.trust_store import TrustStore
 from rse_pf.backend.gateway.audit_recorder import ServerAudit
 from rse_pf.backend.ports import Log
-from rse_pf.backend.supervisor.crash_report import CRASH_SIGNALS, CrashReport
+from rse_pf.backend.supervisor.crashes.report import CRASH_SIGNALS, CrashReport
 from rse_pf.backend.supervisor.orders import BanOrder, BeginOrder
 from rse_pf.backend.supervisor.session_registry import SessionRegistry
 from rse_pf.backend.supervisor.worker import WorkerPlan
