@@ -1,4 +1,4 @@
-"""One idea has one place: queues of commands, leases, control ports, and who starts processes."""
+"""One idea has one place: queues of commands, leases, control ports, starts of processes, and load."""
 
 from __future__ import annotations
 
@@ -168,3 +168,108 @@ def test_another_start_of_a_process_is_caught() -> None:
     for start in ("subprocess.Popen([sys.executable])", "os.fork()", "multiprocessing.get_context('spawn')"):
         assert starters({"x.py": f"child = {start}"}) == {"x.py"}
     assert starters({"x.py": "child = start_child(plan)"}) == set()
+
+
+GENERATORS = {"rse_pf/experiments/load/swarm_process.py", "benchmarks/server/load.c"}
+"""Both load generators: that of users, by the real SDK, and that of benchmarks."""
+PACED = {
+    "benchmarks/cloud/burst.py": "the burst function of the SDK decides when frames go elsewhere",
+    "benchmarks/cloud/delaying_proxy.py": "no robot, but the delay of a link",
+    "benchmarks/cloud/network_gone.py": "the SDK reconnects; a robot asks what it sees",
+    "benchmarks/cloud/outage.py": "the SDK reconnects; a robot asks what it sees",
+    "benchmarks/cloud/regions.py": "one robot with two regions",
+    "benchmarks/cloud/s3_outage.py": "robots of the SDK that store and ask, one after another",
+    "benchmarks/cloud/services.py": "calls of a service while it is replaced",
+    "benchmarks/data/floods.py": "HTTP to the data service",
+    "benchmarks/data/requests.py": "HTTP to the data service",
+    "benchmarks/hostile/connections.py": "one robot beside silent connections",
+    "benchmarks/hostile/deadlines.py": "robots of a service of their own, with deadlines of their own",
+    "benchmarks/hostile/maps.py": "the attacker",
+    "benchmarks/hostile/one_tenant.py": "the neighbour drives, stores and asks",
+    "benchmarks/hostile/photos.py": "HTTP to the data service",
+    "benchmarks/hostile/robots.py": "waits for the end of a window",
+    "benchmarks/hostile/sandboxes.py": "robots beside crashes, with services of their own",
+    "benchmarks/live/hostile_rigs.py": "keyframes of a live map",
+    "benchmarks/live/neighbours.py": "keyframes of a live map",
+    "benchmarks/peers/orbslam3_process.py": "frames for another system",
+    "benchmarks/server/sdk_overload.py": "the SDKs decide what is held back",
+    "benchmarks/server/tails.py": "waits for the end of a window",
+    "rse_pf/experiments/demo/robot.py": "the frames of one camera",
+}
+"""Modules that do something at a planned time and are no generator, with what they do then."""
+PROGRAMS_OF_SDKS = {"benchmarks/server/sdk_robots.cpp", "benchmarks/server/sdk_robots.mjs"}
+SCENARIO = "LoadScenario"
+NO_LOAD = {
+    "benchmarks/cloud/elasticity.py: run_benchmark": "gives both to the paper's experiment",
+    "rse_pf/aws/money/costs.py: Load": "what a month of it costs",
+    "rse_pf/experiments/demo/robot.py: DemoOptions": "robots that map with their cameras",
+}
+RATES = {"fps", "frames_per_s", "rate_hz", "per_s", "commands_per_s"}
+
+
+def paced(tree: Mapping[str, str]) -> set[str]:
+    """Return the modules of *tree* that sleep until a time that they have planned."""
+    return {
+        path
+        for path, text in tree.items()
+        for node in ast.walk(ast.parse(text))
+        if isinstance(node, ast.Call) and ast.unparse(node.func).endswith("sleep")
+        if any(isinstance(part, ast.Sub) for each in node.args for part in ast.walk(each))
+    }
+
+
+def scenarios(tree: Mapping[str, str]) -> set[str]:
+    """Return what in *tree* takes a number of robots and their rate, and makes no `LoadScenario` of them."""
+    return {
+        f"{path}: {node.name}"
+        for path, text in tree.items()
+        for node in ast.walk(ast.parse(text))
+        if isinstance(node, ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef)
+        if "robots" in (names := _fields(node)) and names & RATES and SCENARIO not in text
+    }
+
+
+def _fields(node: ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef) -> set[str]:
+    if isinstance(node, ast.ClassDef):
+        return {ast.unparse(each.target) for each in node.body if isinstance(each, ast.AnnAssign)}
+    return {each.arg for each in (*node.args.args, *node.args.kwonlyargs)}
+
+
+def with_benchmarks(repository: Path) -> dict[str, str]:
+    """Return the modules of the product and of its benchmarks, by their paths."""
+    modules = sorted((repository / "benchmarks").rglob("*.py"))
+    return product(repository) | {
+        path.relative_to(repository).as_posix(): path.read_text(encoding="utf-8") for path in modules
+    }
+
+
+def test_load_comes_from_two_generators(repository: Path) -> None:
+    modules = {path: text for path, text in with_benchmarks(repository).items()
+               if path.startswith(("benchmarks/", "rse_pf/experiments/"))}  # fmt: skip
+    programs = {
+        path.relative_to(repository).as_posix()
+        for path in (repository / "benchmarks").rglob("*")
+        if path.is_file() and path.suffix not in (".py", ".pyc", ".md")
+    }
+
+    assert paced(modules) | programs == GENERATORS | PACED.keys() | PROGRAMS_OF_SDKS
+
+
+def test_load_is_described_by_one_scenario(repository: Path) -> None:
+    tree = with_benchmarks(repository)
+
+    assert scenarios(tree) == NO_LOAD.keys()
+    assert [path for path, text in tree.items() if f"class {SCENARIO}" in text] == [
+        "rse_pf/experiments/load/scenario.py"
+    ]
+
+
+def test_a_third_generator_and_a_second_scenario_are_caught() -> None:
+    third = "await asyncio.sleep(max(0.0, due - loop.time()))\nrobot.post(1)"
+    second = "class Load:\n    robots: int = 10\n    fps: float = 5.0"
+
+    assert paced({"x.py": third}) == {"x.py"}
+    assert paced({"x.py": "await asyncio.sleep(PAUSE_S)"}) == set()
+    assert scenarios({"x.py": second}) == {"x.py: Load"}
+    assert scenarios({"x.py": "async def run(robots: int, *, per_s: float) -> None: ..."}) == {"x.py: run"}
+    assert scenarios({"x.py": f"{second}\nscenario = LoadScenario(robots=3)"}) == set()
