@@ -24,6 +24,8 @@ _TARGETS = (
     "native", "answer", "match", "depth", "describe", "track", "stereo", "live",
 )  # fmt: skip
 """Not read from `fuzz.targets`, which atheris has to import by itself."""
+_OF_THE_CORE = frozenset({"native", "answer", "match", "depth", "describe", "track", "stereo"})
+"""Targets that compare the native core with Python: without it they compare nothing."""
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -47,6 +49,8 @@ def _with_hypothesis(options: argparse.Namespace) -> int:
     from fuzz.damage import run_damaged
     from fuzz.targets import TARGETS
 
+    if _lacks_core(options.target):
+        return 0
     meter, run = Meter(), TARGETS[options.target]
     inputs, last = 0, b""
 
@@ -77,6 +81,16 @@ def _with_hypothesis(options: argparse.Namespace) -> int:
     return 0
 
 
+def _lacks_core(target: str) -> bool:
+    """Return, having said so, whether *target* compares the native core and none can be loaded."""
+    from rse_pf.wire.native_codec import native_codec
+
+    lacks = target in _OF_THE_CORE and native_codec() is None
+    if lacks:
+        print(f"{target}: skipped: the native core is not built, or cannot be loaded")
+    return lacks
+
+
 def _replay(options: argparse.Namespace) -> int:
     from fuzz.targets import TARGETS
 
@@ -101,6 +115,8 @@ def _with_atheris(options: argparse.Namespace) -> None:
         from fuzz.targets import TARGETS
     from fuzz.samples import CORPUS, MAX_INPUT_BYTES, samples
 
+    if _lacks_core(options.target):
+        sys.exit(0)
     meter, run = Meter(), TARGETS[options.target]
     folder = options.found / f"{options.target}-corpus"
     folder.mkdir(parents=True, exist_ok=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import subprocess
 import sys
 from pathlib import Path
@@ -9,11 +10,12 @@ from pathlib import Path
 import msgspec
 import pytest
 
+from fuzz.__main__ import main
 from fuzz.damage import run_damaged
 from fuzz.meter import MAX_MIB, MAX_MS, Meter
 from fuzz.samples import CORPUS, MAX_INPUT_BYTES
 from fuzz.targets import TARGETS
-from rse_pf.wire import codec
+from rse_pf.wire import codec, native_codec
 
 _SLOW_MACHINE = 3.0
 """The bar is for a quiet core; what is held on a crowded one still tells a tenth of a second from it."""
@@ -57,6 +59,21 @@ def test_every_target_keeps_a_corpus() -> None:
     assert {target: bool(list((CORPUS / target).glob("*"))) for target in TARGETS} == dict.fromkeys(
         TARGETS, True
     )
+
+
+@pytest.mark.parametrize("engine", ["hypothesis", "atheris"])
+def test_without_a_native_core_its_targets_say_that_they_compare_nothing(
+    engine: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    if engine == "atheris":
+        atheris = pytest.importorskip("atheris", reason="atheris has no wheel for this Python")
+        monkeypatch.setattr(atheris, "Fuzz", lambda: sys.exit("it fuzzed"))
+    monkeypatch.setattr(native_codec, "native_codec", lambda: None)
+
+    with contextlib.suppress(SystemExit):
+        main(["answer", "--engine", engine, "--seconds", "0"])
+
+    assert capsys.readouterr().out == "answer: skipped: the native core is not built, or cannot be loaded\n"
 
 
 @pytest.mark.slow
