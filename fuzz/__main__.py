@@ -125,7 +125,12 @@ def _with_atheris(options: argparse.Namespace) -> None:
 
     def one_input(data: bytes) -> None:
         worst = meter.worst_ms
-        run(data, meter)
+        try:
+            run(data, meter)
+        except Exception:
+            # A libFuzzer that was loaded before Python ends without writing the input of an exception.
+            print(f"{options.target}: {_kept(options.found, data)} failed", file=sys.stderr)
+            raise
         if meter.worst_ms > max(worst, 1.0):
             print(meter.line(), file=sys.stderr)
 

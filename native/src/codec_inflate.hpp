@@ -236,8 +236,9 @@ public:
     int32_t inflate() {
         if (end_ - in_ < 2) return RSE_PF_CODEC_NOT_ONE_STREAM;
         const uint32_t header = static_cast<uint32_t>(in_[0]) << 8 | in_[1];
-        // Deflate with a window of at most 32 KiB, and no dictionary.
-        if (header % 31 != 0 || (in_[0] & 15) != 8 || in_[0] >> 4 > 7 || (in_[1] & 32) != 0) return RSE_PF_CODEC_NOT_ZLIB;
+        // Deflate with a window of at most 32 KiB, and no dictionary; zlib reads the name of one before it refuses it.
+        if (header % 31 != 0 || (in_[0] & 15) != 8 || in_[0] >> 4 > 7) return RSE_PF_CODEC_NOT_ZLIB;
+        if ((in_[1] & 32) != 0) return end_ - in_ < 6 ? RSE_PF_CODEC_NOT_ONE_STREAM : RSE_PF_CODEC_NOT_ZLIB;
         in_ += 2;
         for (bool is_last = false; !is_last;) {
             refill();

@@ -447,6 +447,16 @@ def test_a_malformed_block_is_refused_as_by_zlib(block: str) -> None:
         assert (expected == ("read", b"aaaa")) == (block == "a match" and end == ends[2])
 
 
+@pytest.mark.parametrize("first", [0x78, 0x38, 0x88, 0x79])
+def test_a_short_stream_is_refused_as_by_zlib(first: int) -> None:
+    """With a dictionary, too, whose name zlib reads before it refuses the stream."""
+    for second in range(256):
+        for size in range(7):
+            data = (bytes([first, second]) + b"\x2c\x00\x97\x01\x02")[:size]
+
+            assert inflated(data, BUDGET, native=True) == inflated(data, BUDGET, native=False), data
+
+
 def test_a_stream_of_many_tiny_blocks_is_refused() -> None:
     # A block with codes of its own and nothing in it (RFC 1951, Sect. 3.2.7): 256 zeros, one bit for the end.
     lengths = "".join("100" if symbol in (18, 1) else "000" for symbol in ORDER_OF_LENGTHS[:18])
