@@ -128,6 +128,10 @@ def heap():
     except MemoryError:
         return {"bytes": len(held) << 20, "limit": resource.getrlimit(resource.RLIMIT_AS)}
 
+def limits():
+    names = "FSIZE", "NOFILE", "CORE", "MEMLOCK", "MSGQUEUE"
+    return {name: resource.getrlimit(getattr(resource, f"RLIMIT_{name}")) for name in names}
+
 def inodes():
     made, longest = 0, "n" * 240
     try:
@@ -342,6 +346,12 @@ def test_memory_files_and_their_number_end_at_the_limit(ask):
     made = ask("inodes")
     assert made["why"] == "ENOSPC"
     assert made["made"] <= SCRATCH // 4096
+
+
+def test_no_limit_of_a_sandbox_can_be_raised(ask):
+    limits = {"FSIZE": SCRATCH, "NOFILE": 64, "CORE": 0, "MEMLOCK": 0, "MSGQUEUE": 0}
+
+    assert ask("limits") == {name: [limit] * 2 for name, limit in limits.items()}
 
 
 def test_a_full_scratch_folder_is_an_error_of_the_service(ask):
