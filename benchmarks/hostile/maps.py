@@ -56,7 +56,6 @@ KEY = SigningKey.from_seed(b"m" * 32, "bench-1")
 START_S, SETTLE_S, GRACE_S = 60.0, 3.0, 6.0
 ATTACKERS = 4
 P99_BAR, P99_BAR_MS, MEMORY_BAR_MIB = 1.5, 100.0, 64.0
-CLOUD_SIZES = (30_000, 60_000)
 
 
 _PUT = """

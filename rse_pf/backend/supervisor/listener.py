@@ -1,15 +1,18 @@
-"""The listening socket of a backend server, which no other machine reaches without authentication."""
+"""The listening sockets of a server, which no other machine reaches without authentication."""
 
 from __future__ import annotations
 
+import asyncio
 import socket
+from collections.abc import Awaitable, Callable
 
 from rse_pf.auth.tokens import KeySet
-from rse_pf.config import PlatformSettings
+from rse_pf.config import PlatformSettings, ServingSettings
 from rse_pf.config.placement import is_loopback
+from rse_pf.control_http import ControlReply, ControlRequest, serve_control
 from rse_pf.errors import ConfigurationError
 
-__all__ = ["bound_socket", "check_authentication"]
+__all__ = ["bound_socket", "check_authentication", "open_control"]
 
 
 def check_authentication(settings: PlatformSettings, keys: KeySet | None, conformance_echo: bool) -> None:
@@ -46,7 +49,21 @@ def bound_socket(host: str, port: int) -> socket.socket:
             listener.close()
             raise
     except OSError as error:
-        raise ConfigurationError(
-            f"cannot listen on {host}:{port}: {error.strerror}", hint="choose another serving.port, or 0"
-        ) from error
+        raise _taken(host, port, error, "port") from error
     return listener
+
+
+async def open_control(
+    serving: ServingSettings, answer: Callable[[ControlRequest], Awaitable[ControlReply]]
+) -> asyncio.Server:
+    """Listen on the control port and answer requests with *answer*; raises ConfigurationError."""
+    try:
+        return await serve_control(serving.control_host, serving.control_port, answer)
+    except OSError as error:
+        raise _taken(serving.control_host, serving.control_port, error, "control_port") from error
+
+
+def _taken(host: str, port: int, error: OSError, setting: str) -> ConfigurationError:
+    return ConfigurationError(
+        f"cannot listen on {host}:{port}: {error.strerror}", hint=f"choose another serving.{setting}, or 0"
+    )

@@ -20,12 +20,13 @@ from rse_pf.backend.jobs.queue import JobQueue
 from rse_pf.backend.jobs.runner import JobContext
 from rse_pf.backend.jobs.slots import JobSlots, make_pipe
 from rse_pf.backend.log import JsonLog
+from rse_pf.backend.supervisor.listener import open_control
 from rse_pf.backend.supervisor.worker_handle import BUILTIN
 from rse_pf.batch.helpers import BatchHelpers
 from rse_pf.config import PlatformSettings
 from rse_pf.config.placement import ServerPlacement, batch_ports
-from rse_pf.control_http import ControlReply, ControlRequest, json_reply, serve_control
-from rse_pf.errors import ConfigurationError, RsePfError, UsageError
+from rse_pf.control_http import ControlReply, ControlRequest, json_reply
+from rse_pf.errors import RsePfError, UsageError
 from rse_pf.files import replace_json
 
 __all__ = ["serve_jobs"]
@@ -103,7 +104,7 @@ class _Service:
         loop = asyncio.get_running_loop()
         for number in (signal.SIGTERM, signal.SIGINT):
             loop.add_signal_handler(number, self._over.set)
-        control = await self._open_control()
+        control = await open_control(self._settings.serving, self._answer)
         port = control.sockets[0].getsockname()[1]
         try:
             self._state = "ready"
@@ -138,16 +139,6 @@ class _Service:
     def _leave(self) -> None:
         self._jobs.leave()
         self._helpers.close()
-
-    async def _open_control(self) -> asyncio.Server:
-        host, port = self._settings.serving.control_host, self._settings.serving.control_port
-        try:
-            return await serve_control(host, port, self._answer)
-        except OSError as error:
-            raise ConfigurationError(
-                f"cannot listen on {host}:{port}: {error.strerror}",
-                hint="choose another serving.control_port, or 0",
-            ) from error
 
     async def _answer(self, ask: ControlRequest) -> ControlReply:
         page = (ask.method, ask.path)

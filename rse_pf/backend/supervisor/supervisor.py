@@ -32,7 +32,7 @@ from rse_pf.backend.metrics import merge, merge_isolation, render, tenant_cpu_s
 from rse_pf.backend.rosbridge.peers import peer_channels
 from rse_pf.backend.supervisor.accepting import RobotAcceptor
 from rse_pf.backend.supervisor.crashes.recovery import CrashRecovery, spare_plans
-from rse_pf.backend.supervisor.listener import bound_socket, check_authentication
+from rse_pf.backend.supervisor.listener import bound_socket, check_authentication, open_control
 from rse_pf.backend.supervisor.orders import (
     BlocksOrder,
     DrainOrder,
@@ -58,9 +58,7 @@ from rse_pf.control_http import (
     json_reply,
     number_of,
     refused_reply,
-    serve_control,
 )
-from rse_pf.errors import ConfigurationError
 from rse_pf.event_loop import run_in_loop
 from rse_pf.files import replace_json
 from rse_pf.linux import cpu_seconds, raise_descriptor_limit, resident_bytes
@@ -230,7 +228,8 @@ class _Supervisor:
         self._over: asyncio.Future[int] = loop.create_future()
         for number in (signal.SIGTERM, signal.SIGINT):
             loop.add_signal_handler(number, self._on_signal, number)
-        control = await self._open_control()
+        control = await open_control(self._settings.serving, self._answer)
+        self._control_port = control.sockets[0].getsockname()[1]
         try:
             await self._start(loop)
             return await self._over
@@ -245,18 +244,6 @@ class _Supervisor:
             self._log.info("server-over", exit_code=code)
             self._records.note("server.over", exit_code=code)
             self._log.close()
-
-    async def _open_control(self) -> asyncio.Server:
-        host, port = self._settings.serving.control_host, self._settings.serving.control_port
-        try:
-            control = await serve_control(host, port, self._answer)
-        except OSError as error:
-            raise ConfigurationError(
-                f"cannot listen on {host}:{port}: {error.strerror}",
-                hint="choose another serving.control_port, or 0",
-            ) from error
-        self._control_port = control.sockets[0].getsockname()[1]
-        return control
 
     async def _start(self, loop: asyncio.AbstractEventLoop) -> None:
         readiness = [
