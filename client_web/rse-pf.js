@@ -107,10 +107,12 @@ export const codecs = {
   json: { encode: (text) => text, decode: parse },
   "json+zlib": {
     encode: (text) => through(new CompressionStream("deflate"), new TextEncoder().encode(text)),
-    decode: async (data) => {
-      const bytes = await through(new DecompressionStream("deflate"), bytesOf(data), MAX_INFLATED_BYTES);
-      return parse(new TextDecoder("utf-8", { fatal: true }).decode(bytes));
-    },
+    decode: async (data) =>
+      parse(
+        new TextDecoder("utf-8", { fatal: true }).decode(
+          await through(new DecompressionStream("deflate"), bytesOf(data), MAX_INFLATED_BYTES),
+        ),
+      ),
   },
 };
 
@@ -137,8 +139,7 @@ const sha256 = async (bytes) => {
   if (!crypto.subtle) {
     throw wrong(UNSUPPORTED, "no sha256 on this page", "use https or localhost");
   }
-  const found = bytesOf(await crypto.subtle.digest("SHA-256", bytes));
-  return from(found, (byte) => byte.toString(16).padStart(2, "0")).join("");
+  return from(bytesOf(await crypto.subtle.digest("SHA-256", bytes)), (byte) => byte.toString(16).padStart(2, "0")).join("");
 };
 
 // --- a connection ----------------------------------------------------------------------------------------
@@ -236,7 +237,7 @@ export const connect = async (url, options = {}) => {
     const protocol = "rse-pf.v1." + codec;
     const time = now();
     const link = {
-      _token: used, _limits: {}, _left: Infinity, _filledAt: time, _heardAt: time, _checkedAt: time,
+      _token: used, _left: Infinity, _filledAt: time, _heardAt: time, _checkedAt: time,
       _pingedAt: -Infinity, _renewAt: Infinity, _bad: 0,
     };
     let socket;
@@ -398,6 +399,7 @@ export const connect = async (url, options = {}) => {
         if (each._isLong && !each._isCancelled) each._link = null;
       });
     } else if (!isFirst) counts.reconnects++;
+    for (const name in lanes) lanes[name]._busyUntil = 0;
     subscriptions.forEach(ask);
     renewal(); // this connection was opened with a token that is valid
     tick();
@@ -512,18 +514,33 @@ export const connect = async (url, options = {}) => {
       },
       failure() {
         const failed = told(message);
+        const { code } = message;
+        const isBusy = code === "busy";
+        const after = time + (message.retry_after_ms || 0) / 1e3;
         if (id == null) {
           // It is about a message or the session, not about one command.
-          if (message.code === "busy") {
+          if (isBusy) {
             link._left = 0;
-            link._filledAt = time + (message.retry_after_ms || 0) / 1e3;
+            link._filledAt = after;
           }
           renewal(failed);
-          if (!link._welcome) lose(link, message.code === UNSUPPORTED ? refused(failed) : failed);
+          if (!link._welcome) lose(link, code === UNSUPPORTED ? refused(failed) : failed);
         } else if (subscription && isHere) {
           subscriptions.delete(id);
           later(subscription._onEnd, failed);
-        } else if (isOfLink && !again(each, message, time)) settle(each, failed);
+        } else if (isOfLink) {
+          const { _lane: lane } = each;
+          const isLost = code === "worker-lost" && each._losses++ < 2;
+          if (isBusy && after > time) {
+            lane._busyUntil = min(after, time + MAX_PAUSE_S);
+            lane._busy = message;
+          }
+          // Another server or a later time may help (section 5).
+          if (!each._isCancelled && (isLost || (isBusy && after < each._until && retries >= 1))) {
+            if (isBusy) retries--;
+            each._link = null;
+          } else settle(each, failed);
+        }
       },
       refused() {
         from(new Set(message.ids)).slice(0, MAX_REFUSED_IDS).forEach((id) => receive(link, { ...message, type: "failure", id }));
@@ -541,26 +558,17 @@ export const connect = async (url, options = {}) => {
         if (time >= each._until) settle(each, expired(each, time));
         else if (!isReplaced(each, lane._delivered)) {
           if (!each._isCancelled) lane._delivered = max(seq, lane._delivered);
-          const { reply = null, object = "", server = "", queue_ms: queueMs = 0, compute_ms: computeMs = 0 } = message;
-          settle(each, null, { id, reply, object, server, queueMs, computeMs, roundTripMs: (time - each._from) * 1e3 });
+          settle(each, null, {
+            id, reply: message.reply ?? null, object: message.object || "", server: message.server || "",
+            queueMs: message.queue_ms || 0, computeMs: message.compute_ms || 0,
+            roundTripMs: (time - each._from) * 1e3,
+          });
         }
       },
     }[type];
     if (!take) throw type;
     take();
     flush();
-  };
-
-  /** Send again where another server or a later time may help (section 5); return whether that happens. */
-  const again = (each, { code, retry_after_ms: afterMs }, time) => {
-    const after = time + (afterMs || 0) / 1e3;
-    const isLost = code === "worker-lost" && each._losses++ < 2;
-    const isBusy = code === "busy";
-    if (isBusy && after > time) each._lane._busyUntil = min(after, time + MAX_PAUSE_S);
-    if (each._isCancelled || !(isLost || (isBusy && after < each._until && retries >= 1))) return false;
-    if (isBusy) retries--;
-    each._link = null;
-    return true;
   };
 
   const cancel = (each) => {
@@ -586,11 +594,8 @@ export const connect = async (url, options = {}) => {
   };
 
   /** End a command if it comes before number *newest* of its stream; return whether it does. */
-  const isReplaced = (each, newest) => {
-    const isOlder = !each._keep && each._seq < newest;
-    if (isOlder) settle(each, wrong("stale", "a newer one came"));
-    return isOlder;
-  };
+  const isReplaced = (each, newest) =>
+    !each._keep && each._seq < newest && !settle(each, wrong("stale", "a newer one came"));
 
   const expired = (each, time) => wrong("expired", `no answer within ${round((time - each._from) * 1e3)} ms`);
 
@@ -637,8 +642,15 @@ export const connect = async (url, options = {}) => {
     if (current) {
       let room = min(allowance(time), max(1, current._limits.max_in_flight) - sentOn(current).length);
       pending.forEach((each) => {
-        if (each._link || isReplaced(each, each._lane._sent)) return;
-        const why = time < each._lane._busyUntil ? "Busy"
+        const { _sent: newest, _busyUntil: busyUntil, _busy: busy } = each._lane;
+        if (each._link || isReplaced(each, newest)) return;
+        const heldS = busyUntil - time;
+        const isBusy = heldS > 0;
+        // A command that the pause of a busy server outlasts ends at once, by that server's answer.
+        if (isBusy && busyUntil >= each._until) {
+          return settle(each, told({ ...busy, trace: each._trace, retry_after_ms: heldS * 1e3 }));
+        }
+        const why = isBusy ? "Busy"
           : room-- > 0 ? 0
           : time < current._toldUntil ? "Rate" : "Limit";
         if (why) return (each._isHeld ||= ++counts["heldBy" + why]);
@@ -748,7 +760,7 @@ export const connect = async (url, options = {}) => {
 
     call: (service, payload = null, options = {}) =>
       new Promise((resolve, reject) => {
-        const { deadlineMs, stream = "", keep: isKept = false, trace = "", onProgress, signal } = options;
+        const { deadlineMs, stream, keep: isKept, trace, onProgress, signal } = options;
         if (error || refusal || signal?.aborted) throw error || refusal || cancelled();
         if (!((deadlineMs ?? 1) > 0) || deadlineMs > MAX_DEADLINE_MS) {
           throw wrong(USAGE, `deadlineMs is within 0..${MAX_DEADLINE_MS}, not ${deadlineMs}`);
@@ -760,7 +772,7 @@ export const connect = async (url, options = {}) => {
         const lane = stream ? (lanes[stream] ||= fresh) : fresh;
         const seq = lane._sent + 1;
         const each = {
-          _id: id, _lane: lane, _seq: seq, _keep: isKept, _onProgress: onProgress, _signal: signal,
+          _id: id, _lane: lane, _seq: seq, _keep: isKept, _onProgress: onProgress, _signal: signal, _trace: trace,
           // As text, so that the caller may use the arrays again.
           _head: textOf({ type: "command", id, service, stream, seq, keep: isKept, trace }).slice(0, -1),
           _payload: textOf(payload),

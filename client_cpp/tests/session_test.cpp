@@ -220,6 +220,33 @@ void after_busy_a_stream_waits() {
     expect(full.session.stats.held_back.at("own-limit") == 3, "what the Welcome does not allow");
 }
 
+void a_frame_that_a_pause_outlasts_ends_at_once() {
+    Bench bench(roomy);
+    CallOptions options;
+    options.stream = "front";
+    options.deadline_s = 1;
+    const auto first = bench.send(0, options);
+    bench.said(bench.link);
+    bench.hear(bench.link, busy({first}, 3000), 0.1);
+    Failure told;
+    options.trace = "t";
+    bench.session.submit({99, "echo", encoded({{"value", 1}}), options, [&](Outcome<Answer> outcome) { told = outcome.failure(); }}, 0.2);
+    expect(told.code == "busy" && told.message == "m" && told.trace == "t", "by the answer of the server");
+    expect(std::abs(told.retry_after_ms.value_or(0) - 2900) < 1, "with the time that is left");
+    expect(bench.session.unanswered() == 0 && bench.said(bench.link).empty(), "and is not sent");
+    options.deadline_s = 4;
+    const auto patient = bench.send(0.3, options);
+    expect(bench.ends[patient].empty(), "one that can wait does");
+    bench.session.due(3.15);
+    expect(bench.said(bench.link).size() == 1, "and goes");
+    bench.hear(bench.link, busy({patient}, 3000), 3.2);
+    const auto fresh = bench.welcomed("server-2", 3.3, roomy);
+    bench.said(fresh);
+    options.deadline_s = 1;
+    const auto there = bench.send(3.4, options);
+    expect(bench.said(fresh).size() == 1 && bench.ends[there].empty(), "a pause does not count for the next server");
+}
+
 void words_without_sense_hold_nothing_back() {
     const double nan = std::nan("");
     for (const auto& [per_s, for_ms] : std::vector<std::pair<double, double>>{
@@ -383,6 +410,7 @@ int main() {
     one_message_ends_many_commands();
     a_told_rate_spaces_commands();
     after_busy_a_stream_waits();
+    a_frame_that_a_pause_outlasts_ends_at_once();
     words_without_sense_hold_nothing_back();
     silence_and_missing_pongs_lose_a_connection();
     long_commands_have_no_deadline_and_can_be_cancelled();

@@ -105,6 +105,55 @@ def test_after_busy_no_frame_of_its_stream_is_sent_before_the_pause_is_over() ->
     assert fresh - first >= 0.38
 
 
+def test_a_frame_that_the_pause_outlasts_ends_at_once_with_the_words_of_the_server() -> None:
+    server = Server({"type": "failure", "id": 1, "retry_after_ms": 1500, "trace": "other", **BUSY})
+    program = (
+        OPEN
+        + """
+    const first = await codeOf(robot.call("echo", 1, { stream: "a", deadlineMs: 300 }));
+    const began = performance.now();
+    const options = { stream: "a", deadlineMs: 1000, trace: "t" };
+    const second = await robot.call("echo", 2, options).catch((failed) => failed);
+    const tookMs = performance.now() - began;
+    const { code, message, trace, retryAfterMs } = second;
+    const left = retryAfterMs > 1000 && retryAfterMs < 1500;
+    const third = await codeOf(robot.call("echo", 3, { stream: "a", deadlineMs: 5000 }));
+    say([first, code, message, trace, left, tookMs < 500, third, robot.stats.unanswered]);
+    """
+    )
+
+    told = ["busy", "busy", BUSY["message"], "t", True, True, "ok", 0]
+    assert against(server.answer, program) == told
+    assert server.payloads() == [1, 3]
+
+
+def test_what_a_server_said_of_a_stream_does_not_count_for_the_next_connection() -> None:
+    busy, move = (
+        {"type": "failure", "id": 1, "retry_after_ms": 3000, **BUSY},
+        {"type": "move", "within_ms": 3000},
+    )
+    server = Server(busy, move)
+    names = (f"server-{number}" for number in itertools.count(1))
+
+    def answer(message: dict[str, Any]) -> bytes | None:
+        if message["type"] == "hello":
+            server.welcome = {**WELCOME, "server": next(names)}
+        return server.answer(message)
+
+    program = (
+        OPEN
+        + """
+    const first = await codeOf(robot.call("echo", 1, { stream: "a", deadlineMs: 300 }));
+    const second = await codeOf(robot.call("echo", 2, { stream: "a", deadlineMs: 300 }));
+    robot.call("echo", "move").catch(() => 0);
+    while (!robot.stats.moves) await new Promise((done) => setTimeout(done, 5));
+    say([first, second, await codeOf(robot.call("echo", 3, { stream: "a", deadlineMs: 1000 }))]);
+    """
+    )
+
+    assert against(answer, program) == ["busy", "busy", "ok"]
+
+
 @pytest.mark.parametrize(
     "hostile",
     [

@@ -158,6 +158,7 @@ class Session {
     /// Send on *link* from now on; what is unanswered on the earlier connection stays there.
     void adopt(const std::shared_ptr<Link>& link, double now) {
         const auto before = std::exchange(current_, link);
+        busy_.clear();
         if (before && before != link) {
             before->leaving = true;
             for (auto& [id, pending] : pending_) {  // a job goes on at any server
@@ -325,6 +326,11 @@ class Session {
         OnUpdate on_update;
         OnSubscriptionEnd on_end;
     };
+    /// Until when a stream is held back, and the answer that said so.
+    struct Busy {
+        double until = 0;
+        Failure told{};
+    };
     using PendingMap = std::map<std::uint64_t, Pending>;
 
     std::string encode(const Pending& pending, double now) const {
@@ -356,9 +362,15 @@ class Session {
                 continue;
             }
             if (!current_) continue;
-            const auto busy = busy_until_.find(options.stream);
-            const double held = busy == busy_until_.end() ? pending.not_before : std::max(pending.not_before, busy->second);
-            if (now < held) {
+            const auto busy = busy_.find(options.stream);
+            const double until = busy == busy_.end() ? 0 : busy->second.until;
+            const double held = std::max(pending.not_before, until);
+            if (now < until && until >= pending.deadline) {
+                Failure told = busy->second.told;
+                told.trace = options.trace;
+                told.retry_after_ms = (until - now) * 1e3;
+                end(found, std::move(told));
+            } else if (now < held) {
                 hold(pending, "busy", held);
             } else if (now < current_->rate.held_until()) {
                 hold(pending, "server-rate", current_->rate.held_until());
@@ -502,7 +514,9 @@ class Session {
         Pending& pending = found->second;
         const double pause = std::max(0.0, failure.retry_after_ms.value_or(0)) / 1e3;
         const auto& stream = pending.command.options.stream;
-        if (failure.code == "busy" && pause > 0 && !stream.empty()) busy_until_[stream] = now + std::min(max_pause_s, pause);
+        if (failure.code == "busy" && pause > 0 && !stream.empty()) {
+            busy_[stream] = {now + std::min(max_pause_s, pause), failure_of(failure)};
+        }
         if (pending.cancelled) return false;
         if (failure.code == "worker-lost" && !std::exchange(pending.was_lost, true)) {
             detach(found->first, pending);
@@ -543,7 +557,7 @@ class Session {
     std::set<std::uint64_t> waiting_;
     std::map<std::uint64_t, Subscription> subscriptions_;
     std::unordered_map<std::string, std::uint64_t> sequence_, delivered_;
-    std::unordered_map<std::string, double> busy_until_;  // of a stream
+    std::unordered_map<std::string, Busy> busy_;  // of streams, on this connection
     double retries_ = max_retries, next_deadline_ = never, next_retry_ = never;
 };
 
