@@ -1,12 +1,20 @@
 """What the clients in three languages offer to a small server that twice as many robots use as it can serve.
 
-    python -m benchmarks server.sdk_overload [--sdk python js cpp] [--rounds 1]
+    python -m benchmarks server.sdk_overload [--sdk python js cpp] [--rounds 1] [--real] [--most N] [--obey]
 
 The server is emulated: it answers `CAPACITY_PER_S` commands a second, ends the others as ``busy``, and for
 `TOLD_MS` after a refusal it tells each robot that sends its share of the capacity.  Robots send the frames
 of a camera, newest only, with a deadline of 250 ms, at twice the capacity in all.  Offered is what arrives
-after `SETTLED_S`.  A client in C++ needs its compiler and headers, one in JavaScript Node; what is not there
-is left out.
+after `SETTLED_S`, as a part of the capacity.  A client in C++ needs its compiler and headers, one in
+JavaScript Node; what is not there is left out.
+
+With ``--real`` it is a server of two workers that solves real PnP (200 matches, 30 % wrong), as in
+``server.capacity``.  ``--most`` is how many robots at 5 frames a second it carries, else they are searched.
+Twice as many robots of the generator in C drive all the time; with ``--obey`` they keep to pauses and rates
+that they are told.  Beside them drive `ROBOTS` robots of one client, at 5 frames a second, too.  The share
+of a robot is what the server can answer, divided by all robots; what the robots of the client offer is what
+arrives from them after `SETTLED_S`, as a part of `ROBOTS` shares.  A relay between them and the server counts
+it, and costs processor time of the same machine, as the clients do: the server carries less than the most.
 
 Defends: no client of ours keeps a server in overload, and its statistics say what it held back.
 """
@@ -14,6 +22,7 @@ Defends: no client of ours keeps a server in overload, and its statistics say wh
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 import shutil
 import statistics
@@ -22,16 +31,32 @@ import sys
 import tempfile
 import time
 from collections import Counter
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
+import websockets
 from websockets.asyncio.server import ServerConnection, serve
 from websockets.exceptions import ConnectionClosed
 
 from benchmarks.frame.registry import Bar, benchmark
 from benchmarks.frame.report import say
+from benchmarks.server.capacity import FRAMES_PER_S as REAL_FRAMES_PER_S
+from benchmarks.server.capacity import SOURCES, WARM_UP_S, ServingSite, find_capacity, serving
+from benchmarks.server.load import (
+    LoadPlan,
+    LoadProcess,
+    RobotGroup,
+    command_file,
+    compile_generator,
+    hello_file,
+)
 from client_sdk import connect
+from rse_pf.config import SessionSettings
 from rse_pf.errors import UsageError
+from rse_pf.experiments.load.payloads import make_payloads
+from rse_pf.experiments.load.scenario import LoadScenario
 from rse_pf.token_bucket import TokenBucket
 from rse_pf.wire import (
     SUBPROTOCOLS,
@@ -51,24 +76,49 @@ CAPACITY_PER_S, ROBOTS, FRAMES_PER_S = 100.0, 20, 10.0
 SETTLED_S, SECONDS = 5.0, 10.0
 TOLD_MS, TOLD_EVERY_S = 2000.0, 1.0
 BURST_S = 0.1
+DEADLINE_S = 0.25
+TIMES_THE_MOST = 2
+LONGEST_S = 120.0
+STEP_S = 5.0
 HERE = Path(__file__).parent
 ROOT = HERE.parents[1]
 SDKS = ("python", "js", "cpp")
 COMPILE_S = 300.0
 
 
-class SmallServer:
-    """Answers as many commands as it can, and notes when each one came."""
+@dataclass(slots=True)
+class Counted:
+    """When each command of the robots came, and when each answered one was answered; monotonic seconds."""
+
+    came_s: list[float] = field(default_factory=list)
+    answered_s: list[float] = field(default_factory=list)
+
+    def per_s(self, times_s: list[float], first_s: float, last_s: float) -> float:
+        """Return how many of *times_s* a second lie between two times after the first command."""
+        return sum(first_s <= at - self.came_s[0] < last_s for at in times_s) / (last_s - first_s)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Drive:
+    """What the robots of one client send, *frames_per_s* each, and their part of the capacity."""
+
+    service: str
+    payload: Any
+    frames_per_s: float
+    share_per_s: float
+
+
+class SmallServer(Counted):
+    """Answers as many commands as it can."""
 
     def __init__(self) -> None:
-        self.came_s: list[float] = []
-        self.answered_s: list[float] = []
+        super().__init__()
         self._free = TokenBucket(CAPACITY_PER_S, BURST_S * CAPACITY_PER_S)
         self._refused_s = float("-inf")
 
     async def talk(self, connection: ServerConnection) -> None:
         """Serve one robot."""
-        codec = make_codec({name: short for short, name in SUBPROTOCOLS.items()}[str(connection.subprotocol)])
+        codec = codec_of(connection)
         told_s = float("-inf")
         try:
             async for data in connection:
@@ -100,15 +150,55 @@ class SmallServer:
             return
 
 
-async def python_robots(url: str) -> list[dict[str, Any]]:
+class Relay(Counted):
+    """Passes messages between robots and the server at *port*."""
+
+    def __init__(self, port: int) -> None:
+        super().__init__()
+        self._port = port
+
+    async def talk(self, connection: ServerConnection) -> None:
+        """Serve one robot."""
+        codec, names = codec_of(connection), [str(connection.subprotocol)]
+        url = f"ws://127.0.0.1:{self._port}/ws"
+
+        async def pass_answers(server: Any) -> None:
+            async for data in server:
+                message = codec.decode_from_server(data.encode() if isinstance(data, str) else data)
+                if isinstance(message, Result):
+                    self.answered_s.append(time.monotonic())
+                await connection.send(data)
+
+        async with websockets.connect(url, subprotocols=names, compression=None) as server:  # type: ignore[arg-type]
+            answers = asyncio.ensure_future(pass_answers(server))
+            try:
+                async for data in connection:
+                    message = codec.decode_from_robot(data.encode() if isinstance(data, str) else data)
+                    if isinstance(message, Command):
+                        self.came_s.append(time.monotonic())
+                    await server.send(data)
+            except ConnectionClosed:
+                return
+            finally:
+                answers.cancel()
+
+
+def codec_of(connection: ServerConnection) -> Any:
+    """Return the codec that a robot chose."""
+    return make_codec({name: short for short, name in SUBPROTOCOLS.items()}[str(connection.subprotocol)])
+
+
+async def python_robots(url: str, drive: Drive) -> list[dict[str, Any]]:
     """Let robots of the Python SDK send; return their statistics."""
     robots = [await connect(url, codec="bin") for _ in range(ROBOTS)]
     began = time.monotonic()
-    for turn in range(round(SECONDS * FRAMES_PER_S)):
+    for turn in range(round(SECONDS * drive.frames_per_s)):
         for k, robot in enumerate(robots):
-            due_s = (turn + k / ROBOTS) / FRAMES_PER_S
+            due_s = (turn + k / ROBOTS) / drive.frames_per_s
             await asyncio.sleep(max(0.0, due_s - (time.monotonic() - began)))
-            robot.post("echo", {"value": turn}, lambda _: None, stream="camera", deadline_s=0.25)
+            robot.post(
+                drive.service, drive.payload, lambda _: None, stream="camera", deadline_s=DEADLINE_S
+            )  # fmt: skip
     found = [robot.stats for robot in robots]
     for robot in robots:
         await robot.close()
@@ -122,12 +212,14 @@ async def python_robots(url: str) -> list[dict[str, Any]]:
     ]
 
 
-async def other_robots(program: list[str], url: str) -> list[dict[str, Any]]:
+async def other_robots(program: list[str], url: str, drive: Drive) -> list[dict[str, Any]]:
     """Let the robots of a *program* send; return their statistics."""
-    process = await asyncio.create_subprocess_exec(
-        *program, url, str(ROBOTS), str(FRAMES_PER_S), str(SECONDS), stdout=asyncio.subprocess.PIPE
-    )
-    out, _ = await process.communicate()
+    with tempfile.NamedTemporaryFile("w", suffix=".json") as file:
+        json.dump({"service": drive.service, "payload": drive.payload}, file)
+        file.flush()
+        words = [url, str(ROBOTS), str(drive.frames_per_s), str(SECONDS), file.name]
+        process = await asyncio.create_subprocess_exec(*program, *words, stdout=asyncio.subprocess.PIPE)
+        out, _ = await process.communicate()
     found: list[dict[str, Any]] = json.loads(out)
     return found
 
@@ -148,27 +240,58 @@ def program_of(sdk: str, folder: Path) -> list[str] | None:
     return None if ended.returncode else [str(made)]
 
 
-async def run_sdk(program: list[str] | None) -> dict[str, Any]:
-    """Return what one client offered; *program* None is the Python SDK, in this process."""
-    small = SmallServer()
+async def run_sdk(program: list[str] | None, peer: SmallServer | Relay, drive: Drive) -> dict[str, Any]:
+    """Return what one client offered to *peer*; *program* None is the Python SDK, in this process."""
     names: Any = list(SUBPROTOCOLS.values())
-    async with serve(small.talk, "127.0.0.1", 0, subprotocols=names, compression=None) as server:
+    async with serve(peer.talk, "127.0.0.1", 0, subprotocols=names, compression=None) as server:
         url = f"ws://127.0.0.1:{next(iter(server.sockets)).getsockname()[1]}/ws"
-        robots = await (python_robots(url) if program is None else other_robots(program, url))
-    begin_s = small.came_s[0]
-
-    def per_s(times_s: list[float], first_s: float, last_s: float) -> float:
-        return sum(first_s <= at - begin_s < last_s for at in times_s) / (last_s - first_s)
-
+        robots = await (python_robots(url, drive) if program is None else other_robots(program, url, drive))
+    share_per_s = drive.share_per_s
+    rates = [each["told_rate_per_s"] for each in robots if each["told_rate_per_s"] is not None]
     held = sum((Counter(each["held_back"]) for each in robots), Counter[str]())
     return {
-        "offered_at_first": per_s(small.came_s, 0.0, 0.5) / CAPACITY_PER_S,
-        "offered": per_s(small.came_s, SETTLED_S, SECONDS) / CAPACITY_PER_S,
-        "answered": per_s(small.answered_s, SETTLED_S, SECONDS) / CAPACITY_PER_S,
+        "offered_at_first": peer.per_s(peer.came_s, 0.0, 0.5) / share_per_s,
+        "offered": peer.per_s(peer.came_s, SETTLED_S, SECONDS) / share_per_s,
+        "answered": peer.per_s(peer.answered_s, SETTLED_S, SECONDS) / share_per_s,
         "held_back": dict(held),
-        "told": sum(each["told_rate_per_s"] is not None for each in robots),
+        "told": len(rates),
+        "told_rate_per_s": statistics.median(rates) if rates else None,
         "reconnects": sum(each["reconnects"] for each in robots),
     }
+
+
+def run_emulated(program: list[str] | None) -> dict[str, Any]:
+    """Return what one client offers to the emulated server."""
+    drive = Drive(service="echo", payload={"value": 1}, frames_per_s=FRAMES_PER_S, share_per_s=CAPACITY_PER_S)
+    return asyncio.run(run_sdk(program, SmallServer(), drive))
+
+
+def run_real(program: list[str] | None, port: int, most: int, obeys: bool) -> dict[str, Any]:
+    """Return what one client offers to the server at *port* that twice its *most* robots use."""
+    crowd = TIMES_THE_MOST * most
+    scenario = LoadScenario(codec="bin", deadline_s=DEADLINE_S, keep=False)
+    as_json = make_payloads(replace(scenario, codec="json"), SessionSettings())[0].payload
+    drive = Drive(
+        service="pnp", payload=json.loads(as_json.encoded), frames_per_s=REAL_FRAMES_PER_S,
+        share_per_s=ROBOTS * most * REAL_FRAMES_PER_S / (crowd + ROBOTS),
+    )  # fmt: skip
+    with tempfile.TemporaryDirectory() as made:
+        folder = Path(made)
+        group = RobotGroup(
+            name="crowd", robots=crowd, mode="open", rate=REAL_FRAMES_PER_S,
+            payload=command_file(folder, scenario),
+        )  # fmt: skip
+        plan = LoadPlan(
+            port=port, codec="bin", hello=hello_file(folder, "bin", obeys=obeys), obeys=obeys,
+            groups=(group,), seconds=LONGEST_S, warm_up_s=WARM_UP_S, drain_s=1.0, opening_s=30.0,
+            sources=SOURCES, samples=folder / "crowd.samples",
+        )  # fmt: skip
+        with LoadProcess(plan) as load:
+            load.wait_begun()
+            found = asyncio.run(run_sdk(program, Relay(port), drive))
+            report = load.stop()
+    crowded = report.groups[0]
+    return {**found, "crowd": {"robots": crowd, "ok": crowded.ok, "failed": crowded.failed}}
 
 
 @benchmark(
@@ -180,22 +303,34 @@ def run_benchmark(
     *,
     sdk: Annotated[tuple[str, ...], "which clients"] = SDKS,
     rounds: Annotated[int, "over all clients"] = 1,
+    real: Annotated[bool, "a server of two workers, and a crowd of robots in C"] = False,
+    most: Annotated[int, "robots that the real server carries; 0 searches them"] = 0,
+    obey: Annotated[bool, "the crowd keeps to what it is told"] = False,
 ) -> dict[str, Any]:
     """Let the robots of each client use the server, one client after the other."""
     if unknown := set(sdk) - set(SDKS):
         raise UsageError(f"no client named {sorted(unknown)[0]}", hint=f"choose of {', '.join(SDKS)}")
     rows: list[dict[str, Any]] = []
-    with tempfile.TemporaryDirectory() as made:
+    with contextlib.ExitStack() as opened:
+        made = opened.enter_context(tempfile.TemporaryDirectory())
+        run = run_emulated
+        if real:
+            compile_generator()
+            server, folder = opened.enter_context(serving(2))
+            site = ServingSite(port=server.port, path="/ws", workers=2)
+            most = most or int(find_capacity(site, folder, "bin", STEP_S)["robots"])
+            run = partial(run_real, port=server.port, most=most, obeys=obey)
         programs = {name: None if name == "python" else program_of(name, Path(made)) for name in sdk}
         for number in range(rounds):
             for name, program in programs.items():
                 if program is None and name != "python":
                     say(f"{name}: left out, it cannot run here")
                     continue
-                rows.append({"round": number, "sdk": name, **asyncio.run(run_sdk(program))})
+                rows.append({"round": number, "sdk": name, **run(program)})
                 say(f"{name}: {rows[-1]}")
     offered = {name: [row["offered"] for row in rows if row["sdk"] == name] for name in sdk}
     return {
         "offered": {name: statistics.median(each) for name, each in offered.items() if each},
+        "most": most,
         "rows": rows,
     }

@@ -1,15 +1,21 @@
-// Robots of the C++ client for sdk_overload.py: sdk_robots URL ROBOTS FRAMES_PER_S SECONDS prints their statistics.
+// Robots of the C++ client for sdk_overload.py: sdk_robots URL ROBOTS FRAMES_PER_S SECONDS COMMAND prints their
+// statistics; COMMAND is a JSON file with service and payload.
 #include <chrono>
 #include <cstdio>
 #include <cstdlib>
+#include <fstream>
 #include <memory>
+#include <string>
 #include <thread>
 #include <vector>
 
 #include <rse_pf/client.hpp>
 
 int main(int argc, char** argv) {
-    if (argc != 5) return 2;
+    if (argc != 6) return 2;
+    std::ifstream file(argv[5]);
+    const auto command = rse_pf::json::parse(file);
+    const std::string service = command["service"];
     const int robots = std::atoi(argv[2]);
     const double period = 1 / std::atof(argv[3]);
     const auto began = std::chrono::steady_clock::now();
@@ -30,7 +36,7 @@ int main(int argc, char** argv) {
     for (int turn = 0; turn < turns; ++turn) {
         for (int k = 0; k < robots; ++k) {
             at((turn + static_cast<double>(k) / robots) * period);
-            clients[static_cast<std::size_t>(k)]->call("echo", rse_pf::json{{"value", turn}}, options, [](auto) {});
+            clients[static_cast<std::size_t>(k)]->call(service, command["payload"], options, [](auto) {});
         }
     }
     rse_pf::json found;
