@@ -162,7 +162,7 @@ async def deadline(run: Run) -> None:
 async def newest(run: Run) -> dict[str, Any]:
     are_ok = []
     for _ in range(4):
-        calls = [run.ask(*run.command(0), stream="front", deadline_s=LATE_S) for _ in range(8)]
+        calls = [run.ask(*run.command(0), stream="front", deadline_s=LATE_S) for _ in range(12)]
         are_ok.append(not isinstance((await asyncio.gather(*calls))[-1], RsePfError))
         await asyncio.sleep(0.5)
     return {"newest_ok": all(are_ok)}

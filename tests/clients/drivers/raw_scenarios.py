@@ -90,10 +90,12 @@ async def deadline(robot, say):
 async def newest(robot, say):
     await connected(robot, say)
     command = inputs()["commands"][0]
+    # Eight short ones may be answered before any of them waits.
+    slow = command["payload"] | {name: 8 * command["payload"][name] for name in ("points_world", "pixels")}
     newest_ok = []
     for burst in range(4):
         calls = [
-            robot.call(command["service"], command["payload"], stream="front", seq=8 * burst + number)
+            robot.call(command["service"], slow, stream="front", seq=8 * burst + number)
             for number in range(8)
         ]
         newest_ok.append((await asyncio.gather(*calls))[-1]["type"] == "result")

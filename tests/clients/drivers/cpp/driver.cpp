@@ -367,8 +367,8 @@ void newest(Driver& driver, json& more) {
     driver.connect();
     bool newest_ok = true;
     for (std::size_t burst = 0; burst < 4; ++burst) {
-        for (std::size_t i = 0; i < 8; ++i) driver.send(0, rse_pf::Client::in_stream("front"));
-        newest_ok = newest_ok && driver.tally.outcome(8 * burst + 7).ok();
+        for (std::size_t i = 0; i < 12; ++i) driver.send(0, rse_pf::Client::in_stream("front"));  // 8 are sent
+        newest_ok = newest_ok && driver.tally.outcome(12 * burst + 11).ok();
         wait(0.5);
     }
     require(driver.tally.all_ended(10), "commands without an end");
