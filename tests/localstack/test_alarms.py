@@ -44,12 +44,17 @@ class Server(FakeMachine):
 
     def __init__(self) -> None:
         super().__init__()
+        self._crashes = 0
         self.load(busy=False)
 
     def load(self, *, busy: bool) -> None:
         self._busy = busy
         robots, queue_s = (500, 5.0) if busy else (1, 0.0)
-        self.text = f"rse_pf_robots {robots}\nrse_pf_queue_oldest_s {queue_s}\n"
+        self._crashes += busy
+        self.text = (
+            f"rse_pf_robots {robots}\nrse_pf_queue_oldest_s {queue_s}\n"
+            f"rse_pf_worker_crashes {self._crashes}\nrse_pf_native_off {float(busy)}\n"
+        )
 
     def reaches_store(self) -> bool:
         return not self._busy
