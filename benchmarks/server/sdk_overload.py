@@ -310,6 +310,10 @@ def run_benchmark(
     """Let the robots of each client use the server, one client after the other."""
     if unknown := set(sdk) - set(SDKS):
         raise UsageError(f"no client named {sorted(unknown)[0]}", hint=f"choose of {', '.join(SDKS)}")
+    if not real and (most or obey):
+        raise UsageError("the emulated server has no crowd for --most or --obey", hint="add --real")
+    if most < 0:
+        raise UsageError(f"--most {most} is less than nothing", hint="name a number of robots, or 0")
     rows: list[dict[str, Any]] = []
     with contextlib.ExitStack() as opened:
         made = opened.enter_context(tempfile.TemporaryDirectory())
