@@ -29,6 +29,7 @@ from rse_pf.backend.gateway.handshake import (
     RequestHead,
 )
 from rse_pf.backend.gateway.rate_limits import SourceRates
+from rse_pf.backend.gateway.socket_poller import SocketPoller
 from rse_pf.backend.ports import CrashMarks
 from rse_pf.backend.scheduling.deferred_work import DeferredWork
 from rse_pf.config import ServingSettings
@@ -52,8 +53,6 @@ _HANDSHAKES_S = 0.0005
 """Handshakes are read, judged and ended for so long in one round of the event loop."""
 _MAX_WAITING = 8
 """New sockets that wait for their first look; the supervisor's channel holds the others."""
-_MAX_LONG_READS = 4
-"""Sockets of long messages that are read in one round of the event loop, `_MAX_READ_BYTES` each."""
 _LINGER_S = 2.0
 """Time that a robot has to read the CLOSE frame and to end its side; then the socket is cut."""
 _READ_BUFFER_BYTES = 2048
@@ -168,12 +167,10 @@ class RobotSockets:
         self._recorder = recorder
         picows, self._transport = _libraries()
         clock = self._context.clocks.monotonic
+        self._poller = SocketPoller(self._context.loop, clock=clock)
         self._steps = DeferredWork(self._context.loop, clock=clock, bound_s=_HANDSHAKES_S)
-        self._long_reads = DeferredWork(
-            self._context.loop, clock=clock, bound_s=_HANDSHAKES_S, max_steps=_MAX_LONG_READS
-        )
         max_bytes = self._context.settings.session.max_message_bytes
-        self._protocol = protocol_type(picows, max_bytes, self._long_reads)
+        self._protocol = protocol_type(picows, max_bytes, self._poller)
         self._listener = listener_type(picows, self._context.loop, serving, self._context.crash)
 
     @property
@@ -291,7 +288,7 @@ class RobotSockets:
             # Otherwise the kernel buffers megabytes for a slow reader, unnoticed.
             accepted.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, self._write_buffer_bytes)
             protocol = self._protocol(listener, verdict.subprotocol, upgrade, rest, pending.on_end)
-            self._transport(self._context.loop, accepted, protocol)
+            self._transport(self._poller, accepted, protocol)
         except OSError:
             pending.close()
 
@@ -333,10 +330,10 @@ def _libraries() -> tuple[Any, Any]:
     return picows, SelectorSocketTransport
 
 
-def protocol_type(picows: Any, max_frame_bytes: int, long_reads: DeferredWork) -> Any:
+def protocol_type(picows: Any, max_frame_bytes: int, poller: SocketPoller) -> Any:
     """Return the subclass of picows' protocol that one robot's socket uses.
 
-    picows itself sends no pings and answers none: `RobotConnection` does.  *long_reads* reads on where a
+    picows itself sends no pings and answers none: `RobotConnection` does.  *poller* reads on where a
     message is longer than one read.
     """
     base = picows.WSProtocol
@@ -394,10 +391,10 @@ def protocol_type(picows: Any, max_frame_bytes: int, long_reads: DeferredWork) -
             if size:
                 buffer_updated(self, size)
             if read_bytes >= _MAX_READ_BYTES and self._is_made:
-                # The transport would read on up to 256 KiB, and then the next socket, in the same round.
+                # The transport would read on up to 256 KiB before the next socket.
                 read_bytes = 0
                 self._listener.hold()
-                long_reads.add(self._listener.read_on)
+                poller.end_turn(self._listener.read_on)
             self._read_bytes = read_bytes
 
         def connection_lost(self, error: Exception | None) -> None:

@@ -17,7 +17,7 @@ TOLD_S, AGAIN_S = 1.0, 0.4
 free a second after an overload, and none returns for a moment while it lasts."""
 _WINDOW_S = 1.0
 """Robots and commands are counted for so long; a robot that sends more rarely needs no share."""
-_LESS, _MORE = 0.9, 1.05
+_LESS, _MORE = 0.9, 1.03
 """Factors of the share in each interval in which many, or hardly any, commands were refused."""
 _GOLDEN = 0.6180339887
 _LEAST, _MOST = 0.2, 4.0

@@ -60,7 +60,10 @@ network."""
 _RESERVE_S = 1.5
 """Enough for compute and network of any command: one that has more time may wait for all but this."""
 _MAX_REFUSED_SHARE = 0.1
-"""A server that refuses a smaller share of its commands is no longer behind."""
+_CALM_INTERVALS = 10
+"""A server that refuses a smaller share of its commands in so many intervals in a row is no longer behind.
+Robots that obey offer little while they are told to; let off after the first such interval, they return
+together, and every second they flood a server that is idle in between."""
 _MANY_REFUSED, _LONGER, _SHORTER = 0.15, 1.5, 1.1
 """Robots are told to pause for longer, by these factors in each interval, while more than this share of
 commands is refused, and for shorter at `_MAX_REFUSED_SHARE`: hardly more return than can be served."""
@@ -140,6 +143,7 @@ class Scheduler:
         self._late_since: float | None = None
         self._judged_s = 0.0
         self._started = self._refused = self._early = 0
+        self._calm = 0
         self._pause_s = QUEUE_INTERVAL_S
         self._sweep_from_s = math.inf
         self._service_s = 0.0
@@ -372,19 +376,21 @@ class Scheduler:
         elif self._late_since is None:
             self._late_since = now
         elif now - self._late_since >= QUEUE_INTERVAL_S:
-            self.is_behind, self._late_since = True, None
+            self.is_behind, self._late_since, self._calm = True, None, 0
             self.shares.begin(now)
             self._judged_s, self._started, self._refused, self._early = now, 0, 0, 0
 
     def _judge(self, now: float) -> None:
-        """Leave *behind* after an interval that refused hardly any.
+        """Leave *behind* after some intervals that refused hardly any.
 
         The waits say nothing then: admission keeps them short however much is offered.
         """
         if now - self._judged_s >= QUEUE_INTERVAL_S:
             judged = self._refused + self._started
             refused = self._refused + self._early
-            self.is_behind = refused > _MAX_REFUSED_SHARE * (judged + self._early)
+            is_calm = refused <= _MAX_REFUSED_SHARE * (judged + self._early)
+            self._calm = self._calm + 1 if is_calm else 0
+            self.is_behind = self._calm < _CALM_INTERVALS
             many = self._refused > _MANY_REFUSED * judged
             few = self._refused <= _MAX_REFUSED_SHARE * judged
             if many:

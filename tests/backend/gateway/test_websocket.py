@@ -9,15 +9,15 @@ from types import SimpleNamespace
 from fakes import FakeLoop
 from picows import picows
 
+from rse_pf.backend.gateway.socket_poller import SocketPoller
 from rse_pf.backend.gateway.websocket import listener_type, protocol_type
-from rse_pf.backend.scheduling.deferred_work import DeferredWork
 from rse_pf.config import ServingSettings
 
 
 def test_the_protocol_takes_the_options_that_we_give_it():
     async def make() -> object:
-        reads = DeferredWork(FakeLoop(), clock=lambda: 0.0, bound_s=1.0)
-        return protocol_type(picows, 1000, reads)(picows.WSListener(), "", b"", b"", lambda: None)
+        poller = SocketPoller(FakeLoop(), clock=lambda: 0.0)
+        return protocol_type(picows, 1000, poller)(picows.WSListener(), "", b"", b"", lambda: None)
 
     protocol = asyncio.run(make())
 

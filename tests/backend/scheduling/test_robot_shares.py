@@ -34,9 +34,9 @@ def test_little_demand_lowers_no_share_and_raises_it_slowly() -> None:
     shares.begin(0.0)
     full = window(shares, 1.0, 100, less=True)
 
-    assert window(shares, 2.0, 20, more=True) == pytest.approx(1.05 * full)
-    assert window(shares, 3.0, 0) == pytest.approx(1.05 * full)
-    assert window(shares, 4.0, 200) == pytest.approx(2 * 1.05 * full), "so many can be served"
+    assert window(shares, 2.0, 20, more=True) == pytest.approx(1.03 * full)
+    assert window(shares, 3.0, 0) == pytest.approx(1.03 * full)
+    assert window(shares, 4.0, 200) == pytest.approx(2 * 1.03 * full), "so many can be served"
 
 
 def test_shares_keep_within_bounds() -> None:

@@ -1,0 +1,89 @@
+"""Which of the robots' sockets are readable, for a bounded time in each round of the event loop.
+
+libuv polls up to 48 times within one round while 1024 sockets are readable each time: a worker that once fell
+so far behind read for up to 3.9 s without looking at its timers.  So its sockets have an own epoll object.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import select
+from collections.abc import Callable, Iterator
+from typing import Any
+
+__all__ = ["SocketPoller"]
+
+_AT_ONCE = 64
+"""Sockets that are asked for together; the kernel passes first those that were not passed for longest."""
+_BOUND_S = 0.008
+"""No further socket is read in a round of the event loop once reading has taken so long."""
+
+
+class SocketPoller:
+    """The part of an event loop that the transport of a socket uses.
+
+    Source:
+        ``uv__io_poll`` of libuv (``src/unix/linux.c``); epoll(7).
+    """
+
+    def __init__(self, loop: asyncio.AbstractEventLoop, *, clock: Callable[[], float]) -> None:
+        """Read no socket yet.
+
+        Args:
+            loop: Polls the own epoll object as one of its descriptors, and does all that is not reading.
+            clock: Seconds, monotonic.
+        """
+        self._loop = loop
+        self._clock = clock
+        self._epoll: select.epoll | None = None
+        self._callbacks: dict[int, Callable[[], Any]] = {}
+        self._readable: Iterator[tuple[int, int]] = iter(())
+        """Of those asked for last, the ones that were not read yet."""
+        self._turns_over: list[Callable[[], None]] = []
+
+    def __getattr__(self, name: str) -> Any:
+        """Return what the event loop does itself: all but reading."""
+        return getattr(self._loop, name)
+
+    def add_reader(self, fd: int, callback: Callable[[], Any]) -> None:
+        """Call *callback* as long as the descriptor *fd* is readable."""
+        if self._epoll is None:
+            self._epoll = select.epoll()
+            self._loop.add_reader(self._epoll.fileno(), self._read)
+        if fd not in self._callbacks:
+            self._epoll.register(fd, select.EPOLLIN)
+        self._callbacks[fd] = callback
+
+    def remove_reader(self, fd: int) -> bool:
+        """End what `add_reader` began; return whether there was anything."""
+        if self._epoll is None or self._callbacks.pop(fd, None) is None:
+            return False
+        self._epoll.unregister(fd)
+        return True
+
+    def end_turn(self, read_on: Callable[[], None]) -> None:
+        """Call *read_on* once the present callback has returned: its socket is readable behind the others."""
+        self._turns_over.append(read_on)
+
+    def _read(self) -> None:
+        assert self._epoll is not None
+        until_s = self._clock() + _BOUND_S
+        while self._read_asked(until_s):
+            readable = self._epoll.poll(0, _AT_ONCE)
+            self._readable = iter(readable)
+            if len(readable) < _AT_ONCE:
+                self._read_asked(until_s)
+                return
+
+    def _read_asked(self, until_s: float) -> bool:
+        """Read the sockets that were asked for last; return whether there is time for others."""
+        callbacks, turns_over, clock = self._callbacks, self._turns_over, self._clock
+        for fd, _ in self._readable:
+            callback = callbacks.get(fd)
+            if callback is not None:  # that of another socket may have ended it
+                callback()
+                while turns_over:
+                    turns_over.pop()()
+                if clock() >= until_s:
+                    return False
+        return True
