@@ -35,7 +35,8 @@ class SocketPoller:
         """
         self._loop = loop
         self._clock = clock
-        self._epoll: select.epoll | None = None
+        self._epoll = select.epoll()
+        self._is_polled = False
         self._callbacks: dict[int, Callable[[], Any]] = {}
         self._readable: Iterator[tuple[int, int]] = iter(())
         """Of those asked for last, the ones that were not read yet."""
@@ -47,8 +48,8 @@ class SocketPoller:
 
     def add_reader(self, fd: int, callback: Callable[[], Any]) -> None:
         """Call *callback* as long as the descriptor *fd* is readable."""
-        if self._epoll is None:
-            self._epoll = select.epoll()
+        if not self._is_polled:
+            self._is_polled = True
             self._loop.add_reader(self._epoll.fileno(), self._read)
         if fd not in self._callbacks:
             self._epoll.register(fd, select.EPOLLIN)
@@ -56,7 +57,7 @@ class SocketPoller:
 
     def remove_reader(self, fd: int) -> bool:
         """End what `add_reader` began; return whether there was anything."""
-        if self._epoll is None or self._callbacks.pop(fd, None) is None:
+        if self._callbacks.pop(fd, None) is None:
             return False
         self._epoll.unregister(fd)
         return True
@@ -66,7 +67,6 @@ class SocketPoller:
         self._turns_over.append(read_on)
 
     def _read(self) -> None:
-        assert self._epoll is not None
         until_s = self._clock() + _BOUND_S
         while self._read_asked(until_s):
             readable = self._epoll.poll(0, _AT_ONCE)
