@@ -22,6 +22,7 @@ def serve(
 ) -> None:
     """Run *scenario* with a poller, sockets that are readable, and their other ends."""
     now = 0.0
+    failures: list[object] = []
 
     def clock() -> float:
         nonlocal now
@@ -33,7 +34,9 @@ def serve(
         for ours, theirs in pairs:
             ours.setblocking(False)
             theirs.send(b"frame")
-        poller = SocketPoller(asyncio.get_running_loop(), clock=clock)
+        loop = asyncio.get_running_loop()
+        loop.set_exception_handler(lambda _, context: failures.append(context))
+        poller = SocketPoller(loop, clock=clock)
         try:
             await asyncio.wait_for(scenario(poller, [a for a, _ in pairs], [b for _, b in pairs]), 10.0)
         finally:
@@ -43,6 +46,7 @@ def serve(
                     end.close()
 
     uvloop.run(run())
+    assert failures == []
 
 
 def test_a_round_ends_though_more_sockets_are_readable_and_all_get_their_turn():
