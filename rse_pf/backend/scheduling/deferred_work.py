@@ -16,26 +16,17 @@ __all__ = ["DeferredWork"]
 class DeferredWork:
     """Steps that run oldest first, for a bounded time in each round of an event loop."""
 
-    def __init__(
-        self,
-        loop: AbstractEventLoop,
-        *,
-        clock: Callable[[], float],
-        bound_s: float,
-        max_steps: int | None = None,
-    ) -> None:
+    def __init__(self, loop: AbstractEventLoop, *, clock: Callable[[], float], bound_s: float) -> None:
         """Hold no step yet.
 
         Args:
             loop: Runs the steps.
             clock: Seconds, monotonic.
             bound_s: No further step begins in a round of *loop* once its steps have taken so long.
-            max_steps: Of one round; None means as many as *bound_s* allows.
         """
         self._loop = loop
         self._clock = clock
         self._bound_s = bound_s
-        self._max_steps = max_steps
         self._steps: deque[tuple[Callable[..., object], tuple[Any, ...]]] = deque()
         self._is_planned = False
 
@@ -55,7 +46,7 @@ class DeferredWork:
 
     def _run(self) -> None:
         steps, until = self._steps, self._clock() + self._bound_s
-        steps_left = len(steps) if self._max_steps is None else min(len(steps), self._max_steps)
+        steps_left = len(steps)
         try:
             while steps_left:
                 steps_left -= 1

@@ -14,7 +14,7 @@ __all__ = ["AGAIN_S", "TOLD_S", "RobotShares"]
 
 TOLD_S, AGAIN_S = 1.0, 0.4
 """A robot keeps to the rate that it was told for so long, and is told again when so much is left: all are
-free a second after an overload, and none returns for a moment while it lasts."""
+free a second after the server is no longer behind, and none returns for a moment before."""
 _WINDOW_S = 1.0
 """Robots and commands are counted for so long; a robot that sends more rarely needs no share."""
 _LESS, _MORE = 0.9, 1.03

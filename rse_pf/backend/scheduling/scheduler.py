@@ -60,15 +60,15 @@ network."""
 _RESERVE_S = 1.5
 """Enough for compute and network of any command: one that has more time may wait for all but this."""
 _MAX_REFUSED_SHARE = 0.1
+"""An interval in which at most this share of the commands was refused is calm."""
 _CALM_INTERVALS = 10
-"""A server that refuses a smaller share of its commands in so many intervals in a row is no longer behind.
-Robots that obey offer little while they are told to; let off after the first such interval, they return
-together, and every second they flood a server that is idle in between."""
+"""A server is no longer behind after so many calm intervals in a row.  After the first one, robots that obey
+would return together: they would flood the server every second, and leave it idle in between."""
 _MANY_REFUSED, _LONGER, _SHORTER = 0.15, 1.5, 1.1
 """Robots are told to pause for longer, by these factors in each interval, while more than this share of
 commands is refused, and for shorter at `_MAX_REFUSED_SHARE`: hardly more return than can be served."""
 _MAX_PAUSE_S = 0.8
-"""A quarter more with `RobotShares.next_spread`, so that robots are back a second after an overload."""
+"""A quarter more with `RobotShares.next_spread`, so that no robot is told more than a second."""
 QUEUE_TARGET_S, QUEUE_INTERVAL_S = 0.05, 0.1
 """A server whose robots wait longer than the target for a whole interval is behind.
 
@@ -381,7 +381,7 @@ class Scheduler:
             self._judged_s, self._started, self._refused, self._early = now, 0, 0, 0
 
     def _judge(self, now: float) -> None:
-        """Leave *behind* after some intervals that refused hardly any.
+        """Leave *behind* after `_CALM_INTERVALS`.
 
         The waits say nothing then: admission keeps them short however much is offered.
         """

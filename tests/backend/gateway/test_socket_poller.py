@@ -17,7 +17,7 @@ CLOCK_STEP_S = 0.0002
 """What the clock shows more at each look."""
 
 
-def serve(
+def run_scenario(
     scenario: Callable[[SocketPoller, list[socket.socket], list[socket.socket]], asyncio.Future[None]],
 ) -> None:
     """Run *scenario* with a poller, sockets that are readable, and their other ends."""
@@ -69,7 +69,7 @@ def test_a_round_ends_though_more_sockets_are_readable_and_all_get_their_turn():
         loop.call_soon(count)
         return done
 
-    serve(scenario)
+    run_scenario(scenario)
 
     assert 0 < max(in_each_round) <= 2 * 40, "the clock lets a round read 40, and two may pass between looks"
     times = Counter(read)
@@ -96,7 +96,7 @@ def test_a_socket_that_another_one_ended_is_not_read():
             poller.add_reader(end.fileno(), lambda end=end: on_readable(end))
         return done
 
-    serve(scenario)
+    run_scenario(scenario)
 
     assert len(read) == 1
 
@@ -119,7 +119,7 @@ def test_a_turn_that_ends_early_is_followed_by_others():
             poller.add_reader(end.fileno(), lambda number=number: on_readable(number))
         return done
 
-    serve(scenario)
+    run_scenario(scenario)
 
     times = Counter(order[: 2 * SOCKETS])
     assert len(times) == SOCKETS
@@ -136,4 +136,4 @@ def test_what_is_not_reading_is_the_loops():
         )
         return done
 
-    serve(scenario)
+    run_scenario(scenario)

@@ -13,11 +13,11 @@ BOUND_S = 0.0005
 class Bench:
     """Deferred work on a loop of which a test runs single rounds; each step takes *step_s*."""
 
-    def __init__(self, step_s: float, max_steps: int | None = None) -> None:
+    def __init__(self, step_s: float) -> None:
         self.loop = FakeLoop(0.0)
         self.done: list[int] = []
         self.step_s = step_s
-        self.work = DeferredWork(self.loop, clock=self.loop.time, bound_s=BOUND_S, max_steps=max_steps)  # type: ignore[arg-type]
+        self.work = DeferredWork(self.loop, clock=self.loop.time, bound_s=BOUND_S)  # type: ignore[arg-type]
 
     def step(self, number: int) -> None:
         self.loop.now += self.step_s
@@ -60,14 +60,6 @@ def test_a_step_longer_than_the_bound_is_the_only_one_of_its_round() -> None:
         bench.work.add(bench.step, number)
 
     assert bench.rounds() == [[0], [1], [2]]
-
-
-def test_a_round_has_at_most_so_many_steps() -> None:
-    bench = Bench(0.0, max_steps=4)
-    for number in range(6):
-        bench.work.add(bench.step, number)
-
-    assert bench.rounds() == [[0, 1, 2, 3], [4, 5]]
 
 
 def test_what_a_step_adds_runs_in_a_later_round() -> None:
