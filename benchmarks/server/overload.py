@@ -45,6 +45,7 @@ from benchmarks.server.load import (
     read_samples,
     run_load,
 )
+from rse_pf.errors import UsageError
 from rse_pf.experiments.load.scenario import LoadScenario
 
 Frames = Literal["kept", "newest"]
@@ -153,6 +154,8 @@ def run_benchmark(
     seconds: Annotated[float, "of each overload"] = 4.0,
 ) -> dict[str, Any]:
     """Search the most robots, and go beyond them."""
+    if most < 0:
+        raise UsageError(f"--most {most} is less than nothing", hint="name a number of robots, or 0")
     compile_generator()
     steps: list[dict[str, Any]] = []
     with serving(2) as (server, folder):

@@ -481,6 +481,17 @@ def test_the_server_stops_shedding_when_the_load_is_over():
     assert scheduler.waiting == 0
 
 
+def test_a_server_that_falls_behind_again_is_not_let_off_by_the_calm_of_the_last_time():
+    scheduler = AdmittedScheduler()
+    for began_s in (0.0, 10.0):
+        fall_behind(scheduler, now=began_s)
+        for interval in range(1, 10):
+            scheduler.start(began_s + 0.11 * interval)
+            assert scheduler.is_behind
+        scheduler.start(began_s + 1.1)
+        assert not scheduler.is_behind
+
+
 def test_nothing_is_refused_unread_before_the_server_is_behind():
     scheduler = AdmittedScheduler(max_queue=4)
     for i in range(50):
