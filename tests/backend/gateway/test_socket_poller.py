@@ -71,7 +71,9 @@ def test_a_round_ends_though_more_sockets_are_readable_and_all_get_their_turn():
 
     run_scenario(scenario)
 
-    assert 30 <= max(in_each_round) <= 2 * 40, "the clock lets a round read 40, and two may pass between looks"
+    assert 30 <= max(in_each_round) <= 2 * 40, (
+        "the clock lets a round read 40, and two may pass between looks"
+    )
     times = Counter(read)
     assert len(times) == SOCKETS
     assert max(times.values()) - min(times.values()) <= 2, "those that were just read come last"
