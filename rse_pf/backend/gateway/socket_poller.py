@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import select
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 __all__ = ["SocketPoller"]
@@ -38,8 +38,8 @@ class SocketPoller:
         self._epoll = select.epoll()
         self._is_polled = False
         self._callbacks: dict[int, Callable[[], Any]] = {}
-        self._readable: Iterator[tuple[int, int]] = iter(())
-        """Of those asked for last, the ones that were not read yet."""
+        self._left: list[tuple[int, int]] = []
+        """Of the sockets asked for last, those that there was no time to read."""
         self._turns_over: list[Callable[[], None]] = []
 
     def __getattr__(self, name: str) -> Any:
@@ -67,23 +67,19 @@ class SocketPoller:
         self._turns_over.append(read_on)
 
     def _read(self) -> None:
-        until_s = self._clock() + _BOUND_S
-        while self._read_asked(until_s):
-            readable = self._epoll.poll(0, _AT_ONCE)
-            self._readable = iter(readable)
-            if len(readable) < _AT_ONCE:
-                self._read_asked(until_s)
-                return
-
-    def _read_asked(self, until_s: float) -> bool:
-        """Read the sockets that were asked for last; return whether there is time for others."""
         callbacks, turns_over, clock = self._callbacks, self._turns_over, self._clock
-        for fd, _ in self._readable:
-            callback = callbacks.get(fd)
-            if callback is not None:  # that of another socket may have ended it
-                callback()
-                while turns_over:
-                    turns_over.pop()()
-                if clock() >= until_s:
-                    return False
-        return True
+        until_s = clock() + _BOUND_S
+        while True:
+            readable = self._left or self._epoll.poll(0, _AT_ONCE)
+            self._left = []
+            for number, (fd, _) in enumerate(readable, 1):
+                callback = callbacks.get(fd)
+                if callback is not None:  # that of another socket may have ended it
+                    callback()
+                    while turns_over:
+                        turns_over.pop()()
+                    if clock() >= until_s:
+                        self._left = readable[number:]
+                        return
+            if len(readable) < _AT_ONCE:
+                return
