@@ -15,8 +15,9 @@ __all__ = ["SocketPoller"]
 
 _AT_ONCE = 64
 """Sockets that are asked for together; the kernel passes first those that were not passed for longest."""
-_BOUND_S = 0.008
-"""No further socket is read in a round of the event loop once reading has taken so long."""
+_BOUND_S = 0.03
+"""No further socket is read in a round of the event loop once reading has taken so long.  With 0.008, frames
+of robots that ignore their pauses stayed in the kernel until it was too late."""
 
 
 class SocketPoller:

@@ -13,7 +13,7 @@ import uvloop
 from rse_pf.backend.gateway.socket_poller import SocketPoller
 
 SOCKETS = 200
-CLOCK_STEP_S = 0.0002
+CLOCK_STEP_S = 0.00075
 """What the clock shows more at each look."""
 
 
