@@ -226,19 +226,24 @@ class Dispatcher:
             return True
         if connection.allowed_s is None or not self._scheduler.is_behind:
             return False
-        self._scheduler.shares.sent.add(connection.robot)
-        if 0.0 < connection.rated_until_s - now < AGAIN_S:
+        shares = self._scheduler.shares
+        shares.sent.add(connection.robot)
+        told_s = connection.rated_until_s - now
+        if told_s > 0.0 and (told_s < AGAIN_S or shares.has_room):
             self._tell_rate(connection, now)
         retry_ms = 1e3 * (connection.paused_s + self._scheduler.pause_s - now)
         is_early = retry_ms > 0.0
         if not is_early:
-            spread = self._scheduler.shares.next_spread()
-            retry_ms = spread * self._scheduler.retry_unread_ms(connection.robot, connection.allowed_s)
+            spread = shares.next_spread()
+            retry_ms = spread * self._scheduler.retry_unread_ms(
+                connection.robot, connection.allowed_s, keeps_share=session.hears_rate
+            )
         envelope = peek(codec, data) if retry_ms else None
         if envelope is None or self._queue_of(envelope.service) is not self.stateless:
             return False
         if not is_early:
-            self._pause(connection, now + (spread - 1.0) * self._scheduler.pause_s)
+            pause_s = self._scheduler.pause_s
+            self._pause(connection, now + min(1e-3 * retry_ms, spread * pause_s) - pause_s)
         self.stateless.refuse_unread(connection, envelope, retry_ms, len(data), is_early=is_early)
         return True
 
@@ -246,15 +251,16 @@ class Dispatcher:
         """Note that a robot is told to pause, as if it had been at *paused_s*, and what its share is."""
         connection.paused_s = paused_s
         now = self.context.clocks.monotonic()
-        if now >= connection.rated_until_s:
+        if now >= connection.rated_until_s and not self._scheduler.shares.has_room:
             self._tell_rate(connection, now)
 
     def _tell_rate(self, connection: RobotConnection, now: float) -> None:
         session, share_per_s = connection.session, self._scheduler.shares.per_s
         if share_per_s and session is not None and session.hears_rate:
-            connection.rated_until_s = now + TOLD_S
+            for_s = 0.0 if self._scheduler.shares.has_room else TOLD_S
+            connection.rated_until_s = now + for_s
             share_per_s *= self._scheduler.shares.next_spread()
-            rate = Rate(commands_per_s=share_per_s, for_ms=1e3 * TOLD_S)
+            rate = Rate(commands_per_s=share_per_s, for_ms=1e3 * for_s)
             connection.write(session.codec.encode(rate))
 
     def refuse_long(self, connection: RobotConnection, session: ServerSession, data: bytes) -> bool:

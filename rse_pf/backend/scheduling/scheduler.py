@@ -44,6 +44,9 @@ _SMOOTHING = 0.1
 _MAX_JUMP = 4.0
 """One measurement counts for at most this many times the average: a process that was stopped for a moment is
 not slower afterwards, and a service that became slow shows it again."""
+_TURNS_S = 0.2
+"""Turns are averaged over so long: many short ones are computed in a row before sockets are read again, and
+the average of ten of them would be 0.1 ms at one moment and 4 ms at the next."""
 _MIN_TURN_S = 0.005
 """The average counts as at least this long where `_MAX_JUMP` is applied."""
 _MAX_RETRY_S = 5.0
@@ -61,14 +64,18 @@ _RESERVE_S = 1.5
 """Enough for compute and network of any command: one that has more time may wait for all but this."""
 _MAX_REFUSED_SHARE = 0.1
 """An interval in which at most this share of the commands was refused is calm."""
-_CALM_INTERVALS = 10
-"""A server is no longer behind after so many calm intervals in a row.  After the first one, robots that obey
-would return together: they would flood the server every second, and leave it idle in between."""
+_CALM_INTERVALS, _EASY_COUNTS = 30, 5
+"""A server is no longer behind after so many calm intervals in a row; one with clearly less to do than can be
+served counts as the second number of them.  After fewer, robots that obey would all return: they would flood
+the server every second, and leave it idle in between."""
 _MANY_REFUSED, _LONGER, _SHORTER = 0.15, 1.5, 1.1
 """Robots are told to pause for longer, by these factors in each interval, while more than this share of
 commands is refused, and for shorter at `_MAX_REFUSED_SHARE`: hardly more return than can be served."""
-_MAX_PAUSE_S = 0.8
-"""A quarter more with `RobotShares.next_spread`, so that no robot is told more than a second."""
+_FREE_INTERVAL_S, _LEAST_INTERVAL_S = 1.0, 0.3
+"""The commands that a server serves while it is not behind are counted for so long, and the last ones before
+it falls behind for the second at least."""
+_MAX_PAUSE_S = 0.65
+"""Half more with `RobotShares.next_spread`, so that no robot is told more than a second."""
 QUEUE_TARGET_S, QUEUE_INTERVAL_S = 0.05, 0.1
 """A server whose robots wait longer than the target for a whole interval is behind.
 
@@ -145,6 +152,7 @@ class Scheduler:
         self._started = self._refused = self._early = 0
         self._calm = 0
         self._pause_s = QUEUE_INTERVAL_S
+        self._gaps, self._gaps_s = 0.0, 0.0
         self._sweep_from_s = math.inf
         self._service_s = 0.0
         self._short_share = 0.0
@@ -172,7 +180,7 @@ class Scheduler:
             waiting, self._delay_s(queued.robot, robot), self.turn_s, self.max_delay_s, self.pause_s
         )
 
-    def retry_unread_ms(self, robot_id: RobotId, allowed_s: float) -> float:
+    def retry_unread_ms(self, robot_id: RobotId, allowed_s: float, *, keeps_share: bool = False) -> float:
         """Return when a robot may try again whose next command, not decoded yet, would wait too long.
 
         0 takes the command: the server is not behind, its turn comes in time, or it might replace a frame
@@ -181,6 +189,7 @@ class Scheduler:
         Args:
             robot_id: The robot that sent it.
             allowed_s: Time that the robot's last command had until its deadline; the next is taken for alike.
+            keeps_share: Whether it keeps to the share that it is told, so that it need not pause for longer.
         """
         if not self.is_behind:
             return 0.0
@@ -190,7 +199,8 @@ class Scheduler:
             return 0.0
         if robot is not None and any(map(_is_replaceable, robot.waiting)):
             return 0.0
-        return retry_after_ms(max(delay_s, self.pause_s))
+        longest_s = 1 / self.shares.per_s if keeps_share and self.shares.per_s else math.inf
+        return retry_after_ms(min(max(delay_s, self.pause_s), longest_s))
 
     @property
     def pause_s(self) -> float:
@@ -266,6 +276,8 @@ class Scheduler:
             self._measure_turn(waited_s, now)
         else:  # the same, for a command that did not wait
             self._late_since, self._last_start = None, now
+            if now - self._judged_s >= _FREE_INTERVAL_S:
+                self._note_free(now)
         queued.started_s = now
         self.running += 1
         self._started += 1
@@ -373,12 +385,21 @@ class Scheduler:
             self._judge(now)
         elif wait_s <= QUEUE_TARGET_S or wait_s <= self._accepted_wait_s:
             self._late_since = None
+            if now - self._judged_s >= _FREE_INTERVAL_S:
+                self._note_free(now)
         elif self._late_since is None:
             self._late_since = now
         elif now - self._late_since >= QUEUE_INTERVAL_S:
+            self._note_free(now)
             self.is_behind, self._late_since, self._calm = True, None, 0
             self.shares.begin(now)
             self._judged_s, self._started, self._refused, self._early = now, 0, 0, 0
+
+    def _note_free(self, now: float) -> None:
+        """Note how much was served while the server was not behind: at least that can be."""
+        if now - self._judged_s >= _LEAST_INTERVAL_S:
+            self.shares.note_free(self._started / (now - self._judged_s))
+            self._judged_s, self._started = now, 0
 
     def _judge(self, now: float) -> None:
         """Leave *behind* after `_CALM_INTERVALS`.
@@ -389,7 +410,9 @@ class Scheduler:
             judged = self._refused + self._started
             refused = self._refused + self._early
             is_calm = refused <= _MAX_REFUSED_SHARE * (judged + self._early)
-            self._calm = self._calm + 1 if is_calm else 0
+            self.shares.judge(now, self._started, self._refused)
+            counts = _EASY_COUNTS if self.shares.is_easy else 1
+            self._calm = self._calm + counts if is_calm else 0
             self.is_behind = self._calm < _CALM_INTERVALS
             many = self._refused > _MANY_REFUSED * judged
             few = self._refused <= _MAX_REFUSED_SHARE * judged
@@ -397,7 +420,6 @@ class Scheduler:
                 self._pause_s = min(_MAX_PAUSE_S, _LONGER * self._pause_s)
             elif few:
                 self._pause_s = max(QUEUE_INTERVAL_S, self._pause_s / _SHORTER)
-            self.shares.judge(now, self._started, less=many, more=few)
             self._judged_s, self._started, self._refused, self._early = now, 0, 0, 0
 
     def _note_service(self, spent_s: float) -> None:
@@ -407,7 +429,10 @@ class Scheduler:
     def _measure_turn(self, waited_s: float, now: float) -> None:
         """Average the time between two starts while robots wait; what is before its arrival is no turn."""
         if waited_s > _IMMEDIATE_S and self._last_start > -math.inf:
-            self.turn_s = _smooth(self.turn_s, min(now - self._last_start, waited_s))
+            gap_s = _believed(self.turn_s, min(now - self._last_start, waited_s))
+            kept = max(1.0 - _SMOOTHING, math.exp(-gap_s / _TURNS_S))
+            self._gaps, self._gaps_s = 1.0 + kept * self._gaps, gap_s + kept * self._gaps_s
+            self.turn_s = self._gaps_s / self._gaps
         self._last_start = now
 
     def _replace_waiting(self, robot_id: RobotId, robot: _Robot, still_waiting: deque[QueuedCommand]) -> None:
@@ -444,8 +469,11 @@ def expired_error(queued: QueuedCommand, now: float) -> Expired:
 
 
 def _smooth(average_s: float, measured_s: float) -> float:
-    believed_s = min(measured_s, _MAX_JUMP * max(average_s, _MIN_TURN_S))
-    return average_s + _SMOOTHING * (believed_s - average_s)
+    return average_s + _SMOOTHING * (_believed(average_s, measured_s) - average_s)
+
+
+def _believed(average_s: float, measured_s: float) -> float:
+    return min(measured_s, _MAX_JUMP * max(average_s, _MIN_TURN_S))
 
 
 def max_wait_s(allowed_s: float, max_delay_s: float) -> float:
