@@ -315,6 +315,19 @@ def test_a_robot_that_was_told_its_share_is_told_that_it_is_free_once_there_is_r
     assert [rate.for_ms for rate in rates] == [1000.0, 0.0]
 
 
+def test_a_robot_that_was_told_no_share_is_not_told_that_it_is_free(starved: WorkerParts):
+    connection, wire = starved.join(hello=False)
+    starved.say(connection, Hello(capabilities=[RATE, REFUSALS]))
+    connection.allowed_s = 0.25
+    fall_behind_for_good(starved)
+    starved.scheduler.shares.per_s, starved.scheduler.shares.has_room = 2.5, True
+
+    starved.say(connection, echo(0, deadline_ms=250.0))
+    starved.loop.advance(0.01)
+
+    assert [type(message) for message in wire.sent[1:]] == [Failure]
+
+
 def test_a_robot_that_does_not_name_them_gets_neither_rate_nor_refused(starved: WorkerParts):
     connection, wire = starved.join()
     connection.allowed_s = 0.25

@@ -511,6 +511,56 @@ def test_a_server_with_as_much_to_do_as_it_can_serve_is_behind_for_three_calm_se
     assert not was_behind[40]
 
 
+def test_an_average_turn_is_steady_although_sockets_are_read_after_each_ten_of_them():
+    scheduler, turns = AdmittedScheduler(), []
+    now = 1.0
+    for start in range(2000):
+        now += 0.005 if start % 10 == 0 else 0.0001
+        scheduler.submit(queued("r", at=now - 0.1), now - 0.1)
+        started, _ = scheduler.start(now)
+        assert started is not None
+        scheduler.done(started, now)
+        turns.append(scheduler.turn_s)
+
+    mean_s = (0.005 + 9 * 0.0001) / 10
+    assert 0.7 * mean_s <= min(turns[1000:])
+    assert max(turns[1000:]) <= 1.3 * mean_s
+
+
+def test_a_robot_that_keeps_to_its_share_pauses_no_longer_than_until_its_next_command():
+    scheduler = AdmittedScheduler()
+    fall_behind(scheduler, turn_s=1.0)
+    for number in range(4):
+        Scheduler.submit(scheduler, queued(f"r{number}"))
+    robot = RobotId("default", "another")
+    scheduler.shares.per_s = 5.0
+
+    assert scheduler.retry_unread_ms(robot, 0.25, keeps_share=True) == pytest.approx(200.0)
+    assert scheduler.retry_unread_ms(robot, 0.25) == pytest.approx(4000.0, rel=0.05)
+    scheduler.shares.per_s = 0.0
+    assert scheduler.retry_unread_ms(robot, 0.25, keeps_share=True) == pytest.approx(4000.0, rel=0.05)
+
+
+@pytest.mark.parametrize("is_queued", [False, True])
+def test_what_was_served_before_a_server_fell_behind_counts(is_queued: bool):
+    scheduler = AdmittedScheduler()
+    for step in range(300):
+        at = 0.01 * step
+        command = queued("r", at=at)
+        if is_queued:
+            scheduler.submit(command, at)
+            assert scheduler.start(at)[0] is command
+            scheduler.done(command, at)
+        else:
+            assert scheduler.start_unqueued(command, at)
+            scheduler.finish_unqueued(command, at)
+    fall_behind(scheduler, now=4.0)
+    scheduler.shares.sent.update(RobotId("default", f"r{number}") for number in range(10))
+    scheduler.shares.judge(5.0, 10, 10)
+
+    assert scheduler.shares.per_s == pytest.approx(0.95 * 10.0, rel=0.05)
+
+
 def test_nothing_is_refused_unread_before_the_server_is_behind():
     scheduler = AdmittedScheduler(max_queue=4)
     for i in range(50):
