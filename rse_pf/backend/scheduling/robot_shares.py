@@ -51,7 +51,7 @@ class RobotShares:
     sent: set[RobotId] = field(default_factory=set)
     _since_s: float = -math.inf
     _judged_s: float = -math.inf
-    _roomy: int = 0
+    _room_count: int = 0
     _started: int = 0
     _refused: int = 0
     _capacity_per_s: float = 0.0
@@ -71,7 +71,7 @@ class RobotShares:
 
     def begin(self, now: float) -> None:
         """Count from *now* (s): the server fell behind."""
-        self._judged_s, self._roomy, self.has_room = now, 0, False
+        self._judged_s, self._room_count, self.has_room = now, 0, False
         self._begin_window(now)
 
     def note_free(self, served_per_s: float) -> None:
@@ -91,9 +91,9 @@ class RobotShares:
         can_be_served = self._capacity_per_s * (now - self._judged_s)
         self._judged_s = now
         self.is_easy = not started or started < _ROOM * can_be_served
-        is_roomy = self.is_easy and refused <= _FEW_REFUSED * (started + refused)
-        self._roomy = self._roomy + 1 if is_roomy else 0
-        self.has_room = self._roomy >= _ROOM_INTERVALS
+        there_is_room = self.is_easy and refused <= _FEW_REFUSED * (started + refused)
+        self._room_count = self._room_count + 1 if there_is_room else 0
+        self.has_room = self._room_count >= _ROOM_INTERVALS
         elapsed_s = now - self._since_s
         if elapsed_s >= _WINDOW_S:
             asked = self._started + self._refused

@@ -12,6 +12,7 @@ from backend.gateway.worker_parts import BINARY, UNIX_S, WorkerParts, worker_par
 from backend.scheduling.admitted import fall_behind, queued
 from fakes import FakeLoop, FakeWire
 
+from rse_pf.backend.gateway.connection import RobotConnection
 from rse_pf.backend.scheduling.command_queue import CommandQueue, QueueReport, unmeasured_backlog
 from rse_pf.backend.scheduling.scheduler import QueueBacklog, QueuedCommand
 from rse_pf.config import PlatformSettings
@@ -271,12 +272,18 @@ def fall_behind_for_good(worker: WorkerParts) -> None:
     worker.scheduler.submit(queued("another", at=worker.loop.now))
 
 
-def test_a_robot_that_knows_such_messages_is_told_its_share_once_and_many_ends_in_one(starved: WorkerParts):
-    connection, wire = starved.join(hello=False)
-    starved.say(connection, Hello(capabilities=[RATE, REFUSALS]))
+def join_one_that_hears_rates(worker: WorkerParts) -> tuple[RobotConnection, FakeWire]:
+    """Connect a robot to a worker that is behind; its share is 2.5 commands a second."""
+    connection, wire = worker.join(hello=False)
+    worker.say(connection, Hello(capabilities=[RATE, REFUSALS]))
     connection.allowed_s = 0.25
-    fall_behind_for_good(starved)
-    starved.scheduler.shares.per_s = 2.5
+    fall_behind_for_good(worker)
+    worker.scheduler.shares.per_s = 2.5
+    return connection, wire
+
+
+def test_a_robot_that_knows_such_messages_is_told_its_share_once_and_many_ends_in_one(starved: WorkerParts):
+    connection, wire = join_one_that_hears_rates(starved)
 
     for number in range(MAX_REFUSED_IDS + 3):
         starved.say(connection, echo(number, deadline_ms=250.0))
@@ -300,11 +307,7 @@ def test_a_robot_that_knows_such_messages_is_told_its_share_once_and_many_ends_i
 
 
 def test_a_robot_that_was_told_its_share_is_told_that_it_is_free_once_there_is_room(starved: WorkerParts):
-    connection, wire = starved.join(hello=False)
-    starved.say(connection, Hello(capabilities=[RATE, REFUSALS]))
-    connection.allowed_s = 0.25
-    fall_behind_for_good(starved)
-    starved.scheduler.shares.per_s = 2.5
+    connection, wire = join_one_that_hears_rates(starved)
     starved.say(connection, echo(0, deadline_ms=250.0))
     starved.scheduler.shares.has_room = True
 
@@ -316,16 +319,31 @@ def test_a_robot_that_was_told_its_share_is_told_that_it_is_free_once_there_is_r
 
 
 def test_a_robot_that_was_told_no_share_is_not_told_that_it_is_free(starved: WorkerParts):
-    connection, wire = starved.join(hello=False)
-    starved.say(connection, Hello(capabilities=[RATE, REFUSALS]))
-    connection.allowed_s = 0.25
-    fall_behind_for_good(starved)
-    starved.scheduler.shares.per_s, starved.scheduler.shares.has_room = 2.5, True
+    connection, wire = join_one_that_hears_rates(starved)
+    starved.scheduler.shares.has_room = True
 
     starved.say(connection, echo(0, deadline_ms=250.0))
     starved.loop.advance(0.01)
 
     assert [type(message) for message in wire.sent[1:]] == [Failure]
+
+
+def test_a_robot_that_waited_until_its_next_command_is_not_early_although_others_pause_for_longer(
+    starved: WorkerParts,
+):
+    connection, wire = join_one_that_hears_rates(starved)
+    for interval in range(1, 10):
+        starved.scheduler.note_refused(starved.loop.now + 0.11 * interval)
+    starved.scheduler.shares.per_s = 5.0
+    assert starved.scheduler.pause_s == 0.65
+
+    starved.say(connection, echo(0, deadline_ms=250.0))
+    starved.loop.advance(0.01)
+
+    told_ms = wire.sent[-1].retry_after_ms
+    assert told_ms == pytest.approx(200.0, rel=0.5)
+    early_s = connection.paused_s + starved.scheduler.pause_s - connection.last_heard_s
+    assert early_s == pytest.approx(1e-3 * told_ms)
 
 
 def test_a_robot_that_does_not_name_them_gets_neither_rate_nor_refused(starved: WorkerParts):
