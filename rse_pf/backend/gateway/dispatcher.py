@@ -6,6 +6,7 @@ is known here.  Each queue (`CommandQueue`) answers what it took.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from functools import partial
 from typing import Any
@@ -41,6 +42,8 @@ __all__ = ["Dispatcher"]
 _DECODER_RETRY_MS = 500.0
 _TOKEN_S = 3.0
 """Time from the handshake to the token of a rosbridge client that showed none in it."""
+_FREED_AT_ONCE = 32
+"""With each message, so many robots are told that they are free once there is room."""
 _NO_JOBS = {"jobs": 0.0, "jobs_pending": 0.0}
 """Alarms read these gauges of every server."""
 
@@ -72,6 +75,8 @@ class Dispatcher:
         settings = context.settings
         self.context = context
         self.connections = token_watch.connections
+        self._rated: set[RobotConnection] = set()
+        """Those that were told a rate, which may have ended."""
         self.admission = Admission(settings.session)
         self.rates = self.admission.rates
         self.decoder = DecoderThread(context.loop.call_soon_threadsafe)
@@ -140,6 +145,7 @@ class Dispatcher:
     def _add_connection(self, connection: RobotConnection, expires_s: float | None, now: float) -> None:
         """Add a connection whose robot is known; its token ends at *expires_s* (monotonic clock, s)."""
         self.connections.add(connection)
+        self._scheduler.shares.connected = len(self.connections)
         self._token_watch.watch(connection, expires_s)
         for queue in self._queues:
             queue.enter(connection)
@@ -176,6 +182,10 @@ class Dispatcher:
         self._token_watch.forget(connection)
         if connection in self.connections:
             self.connections.discard(connection)
+            self._rated.discard(connection)
+            shares = self._scheduler.shares
+            shares.forget(connection.robot)
+            shares.connected = len(self.connections)
             if self._topics is not None:
                 self._topics.leave(connection)
             for queue in self._queues:
@@ -224,12 +234,16 @@ class Dispatcher:
         if retry_ms:
             answers.send_unread_refusals(connection, [(peek(codec, data), len(data))], TOO_FAST, retry_ms)
             return True
-        if connection.allowed_s is None or not self._scheduler.is_behind:
+        if connection.allowed_s is None:
             return False
         shares = self._scheduler.shares
-        shares.sent.add(connection.robot)
+        shares.note(connection.robot)
+        if not self._scheduler.is_behind:
+            return False
         told_s = connection.rated_until_s - now
-        if told_s > 0.0 and (told_s < AGAIN_S or shares.has_room):
+        if shares.has_room:
+            self._free_some(now)
+        elif -TOLD_S < told_s < AGAIN_S:
             self._tell_rate(connection, now)
         retry_ms = 1e3 * (connection.paused_s + self._scheduler.pause_s - now)
         is_early = retry_ms > 0.0
@@ -257,11 +271,20 @@ class Dispatcher:
     def _tell_rate(self, connection: RobotConnection, now: float) -> None:
         session, share_per_s = connection.session, self._scheduler.shares.per_s
         if share_per_s and session is not None and session.hears_rate:
-            for_s = 0.0 if self._scheduler.shares.has_room else TOLD_S
-            connection.rated_until_s = now + for_s
+            connection.rated_until_s = now + TOLD_S
+            self._rated.add(connection)
             share_per_s *= self._scheduler.shares.next_spread()
-            rate = Rate(commands_per_s=share_per_s, for_ms=1e3 * for_s)
-            connection.write(session.codec.encode(rate))
+            connection.write(session.codec.encode(Rate(commands_per_s=share_per_s, for_ms=1e3 * TOLD_S)))
+
+    def _free_some(self, now: float) -> None:
+        """Tell some of the robots that keep to a rate that they are free."""
+        for _ in range(min(_FREED_AT_ONCE, len(self._rated))):
+            connection = self._rated.pop()
+            session = connection.session
+            if connection.rated_until_s > now and session is not None and connection.is_connected:
+                rate = Rate(commands_per_s=self._scheduler.shares.per_s, for_ms=0.0)
+                connection.write(session.codec.encode(rate))
+            connection.rated_until_s = -math.inf
 
     def refuse_long(self, connection: RobotConnection, session: ServerSession, data: bytes) -> bool:
         """Refuse a message that is too long for the event loop; False if the decoder thread may take it."""

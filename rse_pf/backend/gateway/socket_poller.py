@@ -42,6 +42,7 @@ class SocketPoller:
         self._left: list[tuple[int, int]] = []
         """Of the sockets asked for last, those that there was no time to read."""
         self._turns_over: list[Callable[[], None]] = []
+        self._leaves_unread = False
 
     def __getattr__(self, name: str) -> Any:
         """Return what the event loop does itself: all but reading."""
@@ -63,6 +64,10 @@ class SocketPoller:
         self._epoll.unregister(fd)
         return True
 
+    def leaves_unread(self) -> bool:
+        """Return whether there was no time for some of the sockets when they were read last."""
+        return self._leaves_unread
+
     def end_turn(self, read_on: Callable[[], None]) -> None:
         """Call *read_on* once the present callback has returned: its socket is readable behind the others."""
         self._turns_over.append(read_on)
@@ -81,6 +86,8 @@ class SocketPoller:
                         turns_over.pop()()
                     if clock() >= until_s:
                         self._left = readable[number:]
+                        self._leaves_unread = True
                         return
             if len(readable) < _AT_ONCE:
+                self._leaves_unread = False
                 return

@@ -6,6 +6,7 @@ Nothing but the computation of an answer (`Answers.compute`) runs outside of the
 from __future__ import annotations
 
 from asyncio import TimerHandle
+from collections.abc import Callable
 
 from rse_pf.backend.gateway.admission import TOO_LATE, is_in_scope
 from rse_pf.backend.gateway.answers import Answers, EncodedAnswer
@@ -27,9 +28,10 @@ from rse_pf.wire.envelope import Envelope
 
 __all__ = ["StatelessQueue"]
 
-_INLINE_S = 0.001
+_INLINE_S, _LONGEST_INLINE_S, _INLINE_SHARE = 0.001, 0.005, 0.5
 """Commands are computed in the event loop for so long in one of its rounds, so that sockets are read again: a
-longer round would hide the queue in the kernel, where its length cannot be seen."""
+longer round would hide the queue in the kernel, where its length cannot be seen.  Where commands wait and no
+socket was left unread, they are for the third part of the time since they last were, up to the second."""
 _LEAST_S = 1e-6
 """What a command counts as that took no time by the clock."""
 
@@ -68,7 +70,10 @@ class StatelessQueue(CommandQueue):
         )
         self._waits = LongestRecently()
         self._inline_s = 0.0
-        """Time that commands took in the event loop in this round of it; see `_INLINE_S`."""
+        """Time that commands took in the event loop in this round of it."""
+        self._most_inline_s, self._round_ended_s = _INLINE_S, 0.0
+        self.leaves_unread: Callable[[], bool] = lambda: False
+        """Whether there was no time for some of the sockets when they were read last."""
         self._throttle_timer: TimerHandle | None = None
         self._sweep_timer: TimerHandle | None = None
         self._batched: dict[RobotConnection, tuple[float, list[tuple[Envelope, int]]]] = {}
@@ -129,7 +134,7 @@ class StatelessQueue(CommandQueue):
         service = queued.command.service
         claims = queued.owner.claims
         if (
-            self._inline_s >= _INLINE_S
+            self._inline_s >= self._most_inline_s
             or service not in self._cheap
             or queued.size_bytes > INLINE_BYTES
             or self._throttle.is_on
@@ -184,7 +189,9 @@ class StatelessQueue(CommandQueue):
     def _start(self) -> None:
         """Start the commands whose turn it is, as many as threads and the throttle allow."""
         scheduler = self.scheduler
-        while self._inline_s < _INLINE_S and scheduler.waiting and scheduler.running < SOLVER_THREADS:
+        while (
+            self._inline_s < self._most_inline_s and scheduler.waiting and scheduler.running < SOLVER_THREADS
+        ):
             now = self._monotonic()
             wait_s = self._throttle.wait_s(now)
             if wait_s > 0:
@@ -229,9 +236,13 @@ class StatelessQueue(CommandQueue):
     # --- timers --------------------------------------------------------------------------------
 
     def _next_round(self) -> None:
-        self._inline_s = 0.0
+        self._inline_s, self._most_inline_s = 0.0, _INLINE_S
         if self.scheduler.waiting:
+            if not self.leaves_unread():
+                since_s = self._monotonic() - self._round_ended_s
+                self._most_inline_s = max(_INLINE_S, min(_LONGEST_INLINE_S, _INLINE_SHARE * since_s))
             self._start()
+        self._round_ended_s = self._monotonic()
 
     def _go_on(self) -> None:
         self._throttle_timer = None

@@ -168,6 +168,7 @@ class RobotSockets:
         picows, self._transport = _libraries()
         clock = self._context.clocks.monotonic
         self._poller = SocketPoller(self._context.loop, clock=clock)
+        dispatcher.stateless.leaves_unread = self._poller.leaves_unread
         self._steps = DeferredWork(self._context.loop, clock=clock, bound_s=_HANDSHAKES_S)
         max_bytes = self._context.settings.session.max_message_bytes
         self._protocol = protocol_type(picows, max_bytes, self._poller)

@@ -398,7 +398,7 @@ class Scheduler:
     def _note_free(self, now: float) -> None:
         """Note how much was served while the server was not behind: at least that can be."""
         if now - self._judged_s >= _LEAST_INTERVAL_S:
-            self.shares.note_free(self._started / (now - self._judged_s))
+            self.shares.note_free(now, self._started / (now - self._judged_s))
             self._judged_s, self._started = now, 0
 
     def _judge(self, now: float) -> None:
@@ -409,9 +409,11 @@ class Scheduler:
         if now - self._judged_s >= QUEUE_INTERVAL_S:
             judged = self._refused + self._started
             refused = self._refused + self._early
+            shares = self.shares
+            shares.judge(now, self._started, self._refused)
             is_calm = refused <= _MAX_REFUSED_SHARE * (judged + self._early)
-            self.shares.judge(now, self._started, self._refused)
-            counts = _EASY_COUNTS if self.shares.is_easy else 1
+            is_calm = is_calm and (shares.is_enough or shares.is_easy)
+            counts = _EASY_COUNTS if shares.is_enough and shares.is_easy else 1
             self._calm = self._calm + counts if is_calm else 0
             self.is_behind = self._calm < _CALM_INTERVALS
             many = self._refused > _MANY_REFUSED * judged

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Iterator
 from typing import Any
@@ -12,6 +13,7 @@ from backend.gateway.worker_parts import BINARY, UNIX_S, WorkerParts, worker_par
 from backend.scheduling.admitted import fall_behind, queued
 from fakes import FakeLoop, FakeWire
 
+from rse_pf.backend.gateway.answers import EncodedAnswer
 from rse_pf.backend.gateway.connection import RobotConnection
 from rse_pf.backend.scheduling.command_queue import CommandQueue, QueueReport, unmeasured_backlog
 from rse_pf.backend.scheduling.scheduler import QueueBacklog, QueuedCommand
@@ -292,14 +294,14 @@ def test_a_robot_that_knows_such_messages_is_told_its_share_once_and_many_ends_i
     told = wire.sent[1:]
     assert [type(message) for message in told] == [Rate, Refused, Refused]
     assert told[0].commands_per_s == pytest.approx(2.5, rel=0.5)
-    assert told[0].for_ms == 1000.0
+    assert told[0].for_ms == 1400.0
     assert [*told[1].ids, *told[2].ids] == list(range(MAX_REFUSED_IDS + 3))
     assert told[1].code == "busy"
     assert told[1].retry_after_ms > 0
     assert starved.metrics.requests["echo", "busy"] == MAX_REFUSED_IDS + 3
 
     starved.scheduler.shares.per_s = 2.0
-    starved.loop.now += 0.7
+    starved.loop.now += 1.1
     starved.say(connection, echo(100, deadline_ms=250.0))
     starved.loop.advance(0.01)
     assert [type(message) for message in wire.sent[4:]] == [Rate, Failure]
@@ -314,8 +316,59 @@ def test_a_robot_that_was_told_its_share_is_told_that_it_is_free_once_there_is_r
     for number in range(1, 4):
         starved.say(connection, echo(number, deadline_ms=250.0))
 
-    rates = [message for message in wire.sent if isinstance(message, Rate)]
-    assert [rate.for_ms for rate in rates] == [1000.0, 0.0]
+    assert told_for_ms(wire) == [1400.0, 0.0]
+    starved.scheduler.shares.has_room = False
+    compute_waiting(starved)
+    starved.loop.now += 1.2
+    starved.say(connection, echo(9, deadline_ms=250.0))
+    assert told_for_ms(wire) == [1400.0, 0.0], "a free robot is told nothing again"
+
+
+def told_for_ms(wire: FakeWire) -> list[float]:
+    return [message.for_ms for message in wire.sent if isinstance(message, Rate)]
+
+
+def test_a_robot_whose_rate_ended_is_told_again_though_its_command_is_taken(starved: WorkerParts):
+    connection, wire = join_one_that_hears_rates(starved)
+    starved.say(connection, echo(0, deadline_ms=250.0))
+    for later_s, told in [(1.5, 2), (3.0, 2)]:
+        compute_waiting(starved)
+        starved.loop.now += later_s
+        connection.paused_s = -math.inf
+        starved.say(connection, echo(1, deadline_ms=250.0))
+        assert len(told_for_ms(wire)) == told, "a robot that sends so rarely needs no rate"
+
+
+def test_one_message_frees_the_robots_that_still_keep_to_a_rate(starved: WorkerParts):
+    hearing = [join_one_that_hears_rates(starved), *(starved.join(f"r{k}", hello=False) for k in range(2))]
+    for connection, _ in hearing[1:]:
+        starved.say(connection, Hello(capabilities=[RATE, REFUSALS]))
+        connection.allowed_s = 0.25
+    for connection, _ in hearing:
+        starved.say(connection, echo(0, deadline_ms=250.0))
+    ended, gone = hearing[1][0], hearing[2][0]
+    ended.rated_until_s = starved.loop.now - 0.1
+    starved.dispatcher.disconnect(gone)
+    starved.scheduler.shares.has_room = True
+
+    starved.say(hearing[0][0], echo(1, deadline_ms=250.0))
+
+    assert [told_for_ms(wire) for _, wire in hearing] == [[1400.0, 0.0], [1400.0], [1400.0]]
+
+
+def test_shares_know_who_is_connected(worker: WorkerParts):
+    shares = worker.scheduler.shares
+    connections = [worker.join(f"r{number}")[0] for number in range(3)]
+    assert shares.connected == 3
+    for connection in connections:
+        worker.say(connection, echo(1))  # notes how long its commands may wait
+        worker.say(connection, echo(2))
+    shares.note_free(0.0, 30.0)
+    worker.dispatcher.disconnect(connections[0])
+    assert shares.connected == 2
+    shares.begin(1.0)
+
+    assert shares.per_s == pytest.approx(15.0)
 
 
 def test_a_robot_that_was_told_no_share_is_not_told_that_it_is_free(starved: WorkerParts):
@@ -608,3 +661,31 @@ def test_a_connection_that_ends_drops_its_waiting_commands(worker: WorkerParts):
     assert worker.metrics.requests["echo", "disconnected"] == 1
     assert results(wire) == []
     assert worker.dispatcher.connections == {other}
+
+
+@pytest.mark.parametrize(
+    ("since_s", "leaves_unread", "computed"),
+    [(0.0005, False, 2), (0.0039, False, 3), (1.0, False, 6), (1.0, True, 2)],
+)
+def test_a_round_computes_for_as_long_as_it_may(since_s: float, leaves_unread: bool, computed: int):
+    with worker_parts() as worker:
+        asked = [worker.join(f"r{number}") for number in range(20)]
+        for number in range(30):  # the service is known to be short
+            worker.say(asked[0][0], echo(number))
+            worker.loop.turn()
+        compute = worker.answers.compute
+
+        def take_a_while(queued: QueuedCommand) -> EncodedAnswer:
+            worker.loop.now += 0.0009
+            return compute(queued)
+
+        worker.answers.compute = take_a_while  # type: ignore[method-assign]
+        worker.dispatcher.stateless.leaves_unread = lambda: leaves_unread
+        for connection, _ in asked:
+            worker.say(connection, echo(100))
+        worker.loop.turn()
+        before = sum(len(results(wire)) for _, wire in asked)
+        worker.loop.now += since_s
+        worker.loop.turn()
+
+        assert sum(len(results(wire)) for _, wire in asked) - before == computed

@@ -51,6 +51,7 @@ def run_scenario(
 
 def test_a_round_ends_though_more_sockets_are_readable_and_all_get_their_turn():
     read: list[int] = []
+    unread: set[bool] = set()
     in_each_round: list[int] = []
 
     def scenario(poller, ours, _):
@@ -58,6 +59,7 @@ def test_a_round_ends_though_more_sockets_are_readable_and_all_get_their_turn():
         done = loop.create_future()
 
         def count() -> None:
+            unread.add(poller.leaves_unread())
             in_each_round.append(len(read) - sum(in_each_round))
             if len(read) < 4 * SOCKETS:
                 loop.call_later(0.0, count)
@@ -74,9 +76,39 @@ def test_a_round_ends_though_more_sockets_are_readable_and_all_get_their_turn():
     assert 30 <= max(in_each_round) <= 2 * 40, (
         "the clock lets a round read 40, and two may pass between looks"
     )
+    assert True in unread
     times = Counter(read)
     assert len(times) == SOCKETS
     assert max(times.values()) - min(times.values()) <= 2, "those that were just read come last"
+
+
+def test_nothing_is_left_unread_once_there_was_time_for_all():
+    def scenario(poller, ours, theirs):
+        loop = asyncio.get_running_loop()
+        done = loop.create_future()
+
+        def on_readable(end: socket.socket) -> None:
+            left.discard(end)
+            end.recv(100)
+
+        def look() -> None:
+            unread.append(poller.leaves_unread())
+            if left or poller.leaves_unread():
+                loop.call_later(0.0, look)
+            else:
+                done.set_result(None)
+
+        left = set(ours)
+        for end in ours:
+            poller.add_reader(end.fileno(), partial(on_readable, end))
+        loop.call_soon(look)
+        return done
+
+    unread: list[bool] = []
+    run_scenario(scenario)
+
+    assert True in unread
+    assert unread[-1] is False
 
 
 def test_a_socket_that_another_one_ended_is_not_read():

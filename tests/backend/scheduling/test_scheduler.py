@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import heapq
+import math
 import random
 from collections import Counter, deque
 
@@ -260,11 +261,11 @@ def drive(
     period_s = robots / (load * CAPACITY)
     due = [(chance.uniform(0.0, period_s), number) for number in range(robots)]
     heapq.heapify(due)
-    told_s, rated_until_s, gaps_s = [-1.0] * robots, [-1.0] * robots, [0.0] * robots
+    told_s, rated_until_s, gaps_s = [-1.0] * robots, [-math.inf] * robots, [0.0] * robots
     now, swept, offered, served, last_refusal_s = 0.0, 0.0, 0, 0, ends_s
 
     def arrive(until: float) -> None:
-        nonlocal offered, last_refusal_s
+        nonlocal offered, last_refusal_s, rated_until_s
         while due and due[0][0] <= until:
             at, number = heapq.heappop(due)
             own_s = period_s if at < ends_s else 2 * robots / CAPACITY
@@ -273,12 +274,13 @@ def drive(
             next_s = at + own_s * chance.uniform(0.5, 1.5)
             if at < rated_until_s[number]:
                 next_s = max(next_s, at + gaps_s[number])
+            scheduler.shares.note(RobotId("default", f"r{number}"))
             if scheduler.is_behind:
-                scheduler.shares.sent.add(RobotId("default", f"r{number}"))
-                if rated_until_s[number] > at and scheduler.shares.has_room:
-                    rated_until_s[number] = at
-                elif 0.0 < rated_until_s[number] - at < AGAIN_S:
-                    rated_until_s[number], gaps_s[number] = at + TOLD_S, 1 / scheduler.shares.per_s
+                if scheduler.shares.has_room:
+                    rated_until_s = [-math.inf] * robots
+                elif -TOLD_S < rated_until_s[number] - at < AGAIN_S:
+                    rated_until_s[number] = at + TOLD_S
+                    gaps_s[number] = 1 / (scheduler.shares.per_s * scheduler.shares.next_spread())
             if at < told_s[number] + scheduler.pause_s:
                 scheduler.note_refused(at, is_early=True)
                 gone = True
@@ -555,10 +557,44 @@ def test_what_was_served_before_a_server_fell_behind_counts(is_queued: bool):
             assert scheduler.start_unqueued(command, at)
             scheduler.finish_unqueued(command, at)
     fall_behind(scheduler, now=4.0)
-    scheduler.shares.sent.update(RobotId("default", f"r{number}") for number in range(10))
+    for number in range(10):
+        scheduler.shares.note(RobotId("default", f"r{number}"))
     scheduler.shares.judge(5.0, 10, 10)
 
     assert scheduler.shares.per_s == pytest.approx(0.95 * 10.0, rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("is_enough", "is_easy", "calm_s"), [(True, True, 0.6), (True, False, 3.0), (False, True, 3.0)]
+)
+def test_a_server_stays_behind_for_longer_while_free_robots_would_send_too_much(
+    is_enough: bool, is_easy: bool, calm_s: float
+):
+    scheduler = judged_for(calm_s - 0.1, is_enough=is_enough, is_easy=is_easy)
+    assert scheduler.is_behind
+    scheduler = judged_for(calm_s + 0.1, is_enough=is_enough, is_easy=is_easy)
+    assert not scheduler.is_behind
+
+
+def test_a_server_at_its_limit_stays_behind_while_free_robots_would_send_too_much():
+    assert judged_for(30.0, is_enough=False, is_easy=False).is_behind
+
+
+def judged_for(seconds: float, *, is_enough: bool, is_easy: bool) -> AdmittedScheduler:
+    """Let calm intervals pass."""
+    scheduler = AdmittedScheduler()
+    fall_behind(scheduler)
+    shares = scheduler.shares
+    shares.judge = lambda *_: None  # type: ignore[method-assign]
+    shares.is_enough, shares.is_easy = is_enough, is_easy
+    began_s = scheduler._judged_s
+    for interval in range(1, round(10 * seconds) + 1):
+        at = began_s + 0.1001 * interval
+        scheduler.submit(queued("r", at=at), at)
+        started, _ = scheduler.start(at)
+        if started is not None:
+            scheduler.done(started, at)
+    return scheduler
 
 
 def test_nothing_is_refused_unread_before_the_server_is_behind():
