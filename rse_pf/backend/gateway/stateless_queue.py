@@ -31,7 +31,8 @@ __all__ = ["StatelessQueue"]
 _INLINE_S, _LONGEST_INLINE_S, _INLINE_SHARE = 0.001, 0.005, 0.5
 """Commands are computed in the event loop for so long in one of its rounds, so that sockets are read again: a
 longer round would hide the queue in the kernel, where its length cannot be seen.  Where commands wait and no
-socket was left unread, they are for the third part of the time since they last were, up to the second."""
+socket was left unread, they are for `_INLINE_SHARE` of the time since they last were, up to
+`_LONGEST_INLINE_S`."""
 _LEAST_S = 1e-6
 """What a command counts as that took no time by the clock."""
 

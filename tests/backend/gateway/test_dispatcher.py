@@ -356,6 +356,22 @@ def test_one_message_frees_the_robots_that_still_keep_to_a_rate(starved: WorkerP
     assert [told_for_ms(wire) for _, wire in hearing] == [[1400.0, 0.0], [1400.0], [1400.0]]
 
 
+def test_a_message_frees_so_many_robots_that_others_need_not_wait(starved: WorkerParts):
+    first, _ = join_one_that_hears_rates(starved)
+    hearing = [starved.join(f"r{number}", hello=False) for number in range(50)]
+    for connection, _ in hearing:
+        starved.say(connection, Hello(capabilities=[RATE, REFUSALS]))
+        connection.allowed_s = 0.25
+        starved.say(connection, echo(0, deadline_ms=250.0))
+    starved.scheduler.shares.has_room = True
+    freed = []
+    for number in range(2):
+        starved.say(first, echo(number, deadline_ms=250.0))
+        freed.append(sum(told_for_ms(wire) == [1400.0, 0.0] for _, wire in hearing))
+
+    assert freed == [32, 50]
+
+
 def test_shares_know_who_is_connected(worker: WorkerParts):
     shares = worker.scheduler.shares
     connections = [worker.join(f"r{number}")[0] for number in range(3)]
