@@ -44,11 +44,17 @@ ROBOT_KEY = "robot:"
 QUOTAS = ("data_bytes",)
 """What an operator may limit for one robot; without a quota the settings apply."""
 
+SYNTHETIC = "synthetic"
+"""The scope that marks a robot of the platform itself, such as the canary.
+
+It allows nothing.  What a synthetic robot sends is answered, and is not counted as load.
+"""
 _SCOPE = re.compile(
     r"services:(?:\*|[A-Za-z0-9][A-Za-z0-9._-]{0,63})"
     r"|data:(?:\*|read|write)"
     r"|maps:(?:\*|read|write|live|watch|localise)(?:/[a-z0-9][a-z0-9-]{0,63})?"
     r"|topics:(?:\*|read|write)"
+    rf"|{SYNTHETIC}"
 )
 _X = re.compile(r"[A-Za-z0-9_-]{43}")
 _MAX_CHARACTERS, _MAX_SCOPES = 64, 64
@@ -286,7 +292,7 @@ def check_scopes(scopes: tuple[str, ...]) -> tuple[str, ...]:
             raise UsageError(
                 f"{scope[:80]!r} is not a scope",
                 hint="write services:NAME, data:read, data:write, maps:read, maps:write, maps:live, "
-                "maps:live/MAP, maps:watch/MAP, maps:localise/MAP, topics:read or topics:write; "
+                "maps:live/MAP, maps:watch/MAP, maps:localise/MAP, topics:read, topics:write or synthetic; "
                 "* stands for all of an area",
             )
     if len(scopes) > _MAX_SCOPES:

@@ -31,7 +31,7 @@ BUCKETS_S = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0
 """Upper bounds of the duration histogram; the last bucket is open."""
 
 GAUGE_HELP = {
-    "robots": "robots that are connected to the server now",
+    "robots": "robots that are connected to the server now, without synthetic ones such as the canary",
     "queue": "commands that wait for a solver thread",
     "queue_oldest_s": "age of the command that has waited longest, in seconds",
     "queue_ms": "longest wait of a command in the last second or two, in milliseconds",
@@ -243,7 +243,8 @@ def render(merged: Mapping[str, Any]) -> bytes:
         def collect(self) -> Iterable[Metric]:
             requests = CounterMetricFamily(
                 "rse_pf_requests",
-                "final answers to commands, by service and result (ok or the code of a failure)",
+                "final answers to commands of robots, without synthetic ones such as the canary, "
+                "by service and result (ok or the code of a failure)",
                 labels=["service", "result"],
             )
             for service, result, n in merged["requests"]:

@@ -137,7 +137,7 @@ class ScalingSettings:
     busy_cpu_percent: float = setting(70.0, unit="%", source="paper, Sect. 6.2", doc="add a server above this average CPU", low=1, high=100)
     very_busy_cpu_percent: float = setting(85.0, unit="%", doc="add two servers above this average CPU", low=1, high=100)
     idle_s: int = setting(300, unit="s", source="paper, Sect. 6.2", doc="remove a server after this long without work", low=60)
-    idle_cpu_percent: float = setting(20.0, unit="%", doc="idle means no requests and CPU below this", low=0, high=100)
+    idle_cpu_percent: float = setting(20.0, unit="%", doc="idle means no command of a robot and CPU below this; the commands of synthetic robots, such as the canary, do not count", low=0, high=100)
     period_s: int = setting(60, unit="s", doc="one sample of the monitor, in the paper's profile", low=10)
     min_servers: int = setting(2, unit="servers", doc="never fewer", low=1)
     max_servers: int = setting(10, unit="servers", doc="never more", low=1)

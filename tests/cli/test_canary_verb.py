@@ -36,7 +36,7 @@ def account(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Any]:
         yield made
 
 
-def test_the_canary_gets_a_key_and_is_enrolled_with_one_scope(
+def test_the_canary_gets_a_key_and_is_enrolled_as_a_synthetic_robot_that_may_ask_for_poses(
     account: Any, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["cloud", "canary"]) == 0
@@ -45,7 +45,7 @@ def test_the_canary_gets_a_key_and_is_enrolled_with_one_scope(
 
     told = account.client("secretsmanager").get_secret_value(SecretId="canarykey")["SecretString"]
     (robot,) = AccessControlStore(S3Store(account.client("s3"), "artifacts")).roster().robots
-    assert (robot.robot, robot.scopes) == ("rse-pf-canary", ("services:pnp",))
+    assert (robot.robot, robot.scopes) == ("rse-pf-canary", ("services:pnp", "synthetic"))
     assert robot.key_id == SigningKey.from_json(told).key_id != SigningKey.from_json(first).key_id
     assert json.loads(told)["d"] not in capsys.readouterr().out
 

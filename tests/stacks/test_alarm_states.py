@@ -10,7 +10,9 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import pytest
+from scaling.fleet_traffic import Robot, measure_traffic
 
+from rse_pf.auth.roster import SYNTHETIC
 from rse_pf.scaling.alarms import CPU
 from rse_pf.scaling.operator_alarms import operator_alarms
 from rse_pf.scaling.profile import cadence_of
@@ -20,6 +22,7 @@ Assembly = Any
 Period = Mapping[str, Sequence[float]]
 """Metric name to the samples of one period; a name that is absent has no data."""
 
+CANARY = Robot(name="rse-pf-canary", scopes=("services:pnp", "services:echo", SYNTHETIC))
 MORE = 3
 """Periods of a fault beyond those that the alarm needs."""
 
@@ -171,3 +174,33 @@ def test_the_budget_tells_the_topic_before_it_is_spent(assembly: Assembly) -> No
         ("ACTUAL", 80), ("FORECASTED", 100),
     ]  # fmt: skip
     assert {each["Subscribers"][0]["SubscriptionType"] for each in told} == {"SNS"}
+
+
+@pytest.mark.parametrize(
+    ("robots", "is_idle"),
+    [
+        ([CANARY], True),
+        ([CANARY, Robot(name="r")], False),
+        ([CANARY, Robot(name="r", active=(2, 7, 12))], False),
+    ],
+    ids=["canary", "canary-and-robot", "canary-and-rare-robot"],
+)
+def test_the_canary_does_not_keep_ten_servers(
+    assembly: Assembly, robots: Sequence[Robot], is_idle: bool
+) -> None:
+    alarm = alarms_in(assembly)["idle"]
+    needed = alarm["EvaluationPeriods"]
+    unloaded = {"Requests": 0.0, "Robots": 0.0}
+    traffic = measure_traffic(robots, needed + MORE)
+    periods = [
+        {
+            **{name: [one.cloud[name], *[unloaded[name]] * 9] for name in unloaded},
+            "QueueMs": [0.0], "CPUUtilization": [17.0] * 10, CPU: [17.0] * 10,
+        }
+        for one in traffic
+    ]  # fmt: skip
+
+    told = states(alarm, periods)
+    assert told[: needed - 1] == ["OK"] * (needed - 1)
+    assert ("ALARM" in told) is is_idle
+    assert set(states(alarm, [without(period, "Requests") for period in periods])) == {"OK"}

@@ -91,10 +91,10 @@ class Platform:
             self.told.append(idle.park_if_idle(self.account, self.settings, now=utc, topic=self.topic))
 
     def _publish(self, at: datetime) -> None:
-        """Publish what agents do when there is only the canary."""
+        """Publish what agents do when there is no robot but the canary, which is not counted."""
         data = [
             {"MetricName": name, "Dimensions": dimensions_of(NAMES.group), "Value": value, "Timestamp": at}
-            for name, value in (("Requests", 60.0), ("Robots", 0.0))
+            for name, value in (("Requests", 0.0), ("Robots", 0.0))
         ]
         self.account.client("cloudwatch").put_metric_data(Namespace="RsePf", MetricData=data)
 

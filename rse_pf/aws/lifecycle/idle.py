@@ -27,7 +27,7 @@ from rse_pf.aws.lifecycle.parking import (
     write_note,
 )
 from rse_pf.config import PlatformSettings, load_settings
-from rse_pf.config.cloud_layout import CANARY_PERIOD_S, RESUME_FIELD
+from rse_pf.config.cloud_layout import RESUME_FIELD
 from rse_pf.config.resource_names import ResourceNames
 from rse_pf.scaling.alarms import NAMESPACE
 from rse_pf.scaling.job_alarms import JOBS
@@ -38,10 +38,6 @@ _log = logging.getLogger(__name__)
 _log.setLevel(logging.INFO)
 
 _HOUR_S = 3600
-_CANARY_REQUESTS = 2 * _HOUR_S / CANARY_PERIOD_S
-"""Of an hour, which are not counted: the canary may repeat each of its requests once."""
-_MAX_IDLE_ROBOTS = 0.5
-"""Robots on average; the canary is connected for a second of each minute."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -55,19 +51,16 @@ class Hour:
     """More than 0 if long jobs waited or ran; only deployments with job servers tell it."""
 
 
-def is_idle(hours: Sequence[Hour], *, idle_hours: int, has_canary: bool) -> bool:
+def is_idle(hours: Sequence[Hour], *, idle_hours: int) -> bool:
     """Return whether nobody used the platform in any of the last *idle_hours* of *hours*, oldest first.
 
     An hour of which nothing is known is not idle: silent agents are a failure, and a deployment that is
     younger, or was resumed later, has not been idle for so long.
     """
     last = hours[-idle_hours:]
-    allowed = _CANARY_REQUESTS if has_canary else 0.0
     return len(last) >= idle_hours and all(
-        hour.requests is not None and hour.requests <= allowed
-        and hour.robots is not None and hour.robots < _MAX_IDLE_ROBOTS and hour.jobs == 0
-        for hour in last
-    )  # fmt: skip
+        hour.requests == 0 and hour.robots == 0 and hour.jobs == 0 for hour in last
+    )
 
 
 def park_if_idle(account: Account, settings: PlatformSettings, *, now: datetime, topic: str) -> str:
@@ -82,7 +75,7 @@ def park_if_idle(account: Account, settings: PlatformSettings, *, now: datetime,
     if note is not None and (note.by != "timer" or not any(group.max_servers for group in groups.values())):
         return f"{names.prefix} is parked since {note.since}"
     hours = _read_hours(account, names, groups, cloud.idle_hours, now)
-    if not is_idle(hours, idle_hours=cloud.idle_hours, has_canary=cloud.canary):
+    if not is_idle(hours, idle_hours=cloud.idle_hours):
         return f"{names.prefix} was used within {cloud.idle_hours} hours, or nobody told"
     message = f"{names.prefix} was idle for {cloud.idle_hours} hours and is parked now; rse-pf cloud resume"
     # Told before it is done: once the groups are empty, a repetition finds the deployment parked and ends.

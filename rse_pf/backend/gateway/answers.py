@@ -139,10 +139,11 @@ class Answers:
         else:
             code, computed_s = message.code, now - queued.started_s if queued.started_s else 0.0
         service = self.label(queued.command.service)
-        self._context.metrics.count_answer(
-            service, code, now - queued.received_s, queued.robot.tenant, computed_s if counts_cpu else 0.0
-        )
         connection: RobotConnection = queued.owner
+        if not connection.is_synthetic:
+            self._context.metrics.count_answer(
+                service, code, now - queued.received_s, queued.robot.tenant, computed_s if counts_cpu else 0.0
+            )
         connection.answer(answer.data, queued.command.id)
         if connection.tap is not None and isinstance(queued.command.payload, msgspec.Struct):
             _tell_pose(connection.tap, message, answer.data)
@@ -216,7 +217,8 @@ class Answers:
 
     def _note_unread(self, connection: RobotConnection, envelope: Envelope, size_bytes: int) -> None:
         service = self.label(envelope.service)
-        self._context.metrics.count_answer(service, Busy.code, 0.0)
+        if not connection.is_synthetic:
+            self._context.metrics.count_answer(service, Busy.code, 0.0)
         if self._logs_frequent:
             self._context.log.debug(
                 "command", robot=connection.robot, service=service, id=envelope.id,
@@ -226,7 +228,8 @@ class Answers:
     def note_undecoded(self, connection: RobotConnection, failure: Failure, size_bytes: int) -> None:
         """Count and log a message of *size_bytes* that was answered with *failure* instead of decoded."""
         if failure.id is not None:
-            self._context.metrics.count_answer(_UNKNOWN, failure.code, 0.0)
+            if not connection.is_synthetic:
+                self._context.metrics.count_answer(_UNKNOWN, failure.code, 0.0)
             connection.commands += 1
             connection.last_result = failure.code
         self._context.log.info(

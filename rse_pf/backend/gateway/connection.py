@@ -11,6 +11,7 @@ from typing import Any, Protocol
 
 from msgspec import Struct
 
+from rse_pf.auth.roster import SYNTHETIC
 from rse_pf.auth.tokens import Claims
 from rse_pf.backend.gateway.decoder_thread import DecoderThread
 from rse_pf.backend.gateway.frames import CloseSocket, FrameAssembler, Received, SendPong
@@ -155,6 +156,11 @@ class RobotConnection:
     def is_closing(self) -> bool:
         """Whether a close frame was sent or received, so that nothing more is read or written."""
         return self._assembler.closed
+
+    @property
+    def is_synthetic(self) -> bool:
+        """Whether the robot belongs to the platform itself, such as the canary: it is no load."""
+        return self.claims is not None and SYNTHETIC in self.claims.scopes
 
     @property
     def is_opening(self) -> bool:

@@ -191,7 +191,8 @@ class Dispatcher:
             for queue in self._queues:
                 for queued in queue.leave(connection):
                     service = self._answers.label(queued.command.service)
-                    self.context.metrics.requests[service, "disconnected"] += 1
+                    if not connection.is_synthetic:
+                        self.context.metrics.requests[service, "disconnected"] += 1
         self.context.log.debug("disconnected", robot=connection.robot)
 
     def greet(self, connection: RobotConnection, now: float) -> None:
@@ -356,7 +357,7 @@ class Dispatcher:
         reports = [queue.report() for queue in self._queues]
         metrics, tap = self.context.metrics, self.context.tap
         gauges = {
-            "robots": float(len(self.connections)),
+            "robots": float(sum(not connection.is_synthetic for connection in self.connections)),
             "loop_lag_s": self._lag_s,
             "cpu_s": self.context.clocks.cpu(),
             "log_lines_dropped": float(self.context.log.dropped),

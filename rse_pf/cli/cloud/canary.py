@@ -15,7 +15,6 @@ from rse_pf.terminal import show
 __all__ = ["add_arguments", "run"]
 
 _SEED_BYTES = 32
-_SCOPES = ("services:pnp",)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -24,7 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     """Write the private key into the canary's secret and the public one into the roster; return 0."""
-    from rse_pf.auth.roster import EnrolledRobot
+    from rse_pf.auth.roster import SYNTHETIC, EnrolledRobot
     from rse_pf.auth.tokens import SigningKey
     from rse_pf.aws.account import open_account
     from rse_pf.aws.storage.key_store import open_key_store
@@ -36,8 +35,9 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     secret = account.resource(names.stack("Observability"), "AWS::SecretsManager::Secret", "CanaryKey")
     key = SigningKey.of_robot(secrets.token_bytes(_SEED_BYTES))
     public = json.loads(key.public_json())["x"]
-    robot = EnrolledRobot(robot=names.canary, x=public, scopes=_SCOPES, enrolled_s=round(time.time(), 3))
+    scopes = ("services:pnp", SYNTHETIC)
+    robot = EnrolledRobot(robot=names.canary, x=public, scopes=scopes, enrolled_s=round(time.time(), 3))
     account.change("secretsmanager", "put_secret_value", SecretId=secret, SecretString=key.to_json())
     access.change_roster(lambda roster: roster.enrolled(robot))
-    show(f"{names.canary} has a new key and the scope {_SCOPES[0]}; servers know it in a few seconds")
+    show(f"{names.canary} has a new key and the scopes {' '.join(scopes)}; servers know it in a few seconds")
     return 0

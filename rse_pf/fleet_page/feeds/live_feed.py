@@ -14,6 +14,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from rse_pf.auth.roster import SYNTHETIC
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import RsePfError, UsageError
 from rse_pf.fleet_page.hub import Hub
@@ -25,8 +26,8 @@ __all__ = ["LIVE", "SCOPES", "LiveFeed", "RobotPaths", "histories", "plain"]
 
 LIVE = "live/"
 _ROBOT = "fleet-page"
-SCOPES = ("maps:live",)
-"""What the page's own token allows."""
+SCOPES = ("maps:live", SYNTHETIC)
+"""What the page's own token allows: its connection is not counted as a robot."""
 _TTL_S = 600.0
 _LOOK_S = 0.5
 _LIST_EVERY_S = 3.0

@@ -16,13 +16,12 @@ from rse_pf.aws.fleet.metrics import dimensions_of
 from rse_pf.aws.lifecycle.deployment import read_deployment
 from rse_pf.aws.lifecycle.idle import Hour, is_idle, park_if_idle
 from rse_pf.aws.lifecycle.plan import plan_park, plan_resume
-from rse_pf.config.cloud_layout import CANARY_PERIOD_S
 from rse_pf.errors import ConfigurationError
 from tests.aws.lifecycle.account_on_moto import NAMES, SETTINGS, Formation, Killer, account_of
 
 SILENT = Hour(requests=None, robots=None)
 IDLE = Hour(requests=0.0, robots=0.0)
-CANARY = Hour(requests=60.0, robots=0.02)
+VISITED = Hour(requests=1.0, robots=0.0)
 BUSY = Hour(requests=9000.0, robots=3.0)
 CONNECTED = Hour(requests=0.0, robots=1.0)
 NOW = datetime(2030, 1, 2, 18, 20, tzinfo=timezone.utc)
@@ -32,10 +31,10 @@ NOW = datetime(2030, 1, 2, 18, 20, tzinfo=timezone.utc)
     ("hours", "idle"),
     [
         ([IDLE] * 3, True),
-        ([CANARY] * 3, True),
         ([BUSY, IDLE, IDLE, IDLE], True),
         ([IDLE, IDLE, BUSY], False),
         ([IDLE, CONNECTED, IDLE], False),
+        ([IDLE, VISITED, IDLE], False),
         ([IDLE, SILENT, IDLE], False),
         ([IDLE, Hour(requests=0.0, robots=0.0, jobs=1.0), IDLE], False),
         ([IDLE] * 2, False),
@@ -43,18 +42,7 @@ NOW = datetime(2030, 1, 2, 18, 20, tzinfo=timezone.utc)
     ],
 )
 def test_idle_is_every_hour_of_which_it_is_known_that_nobody_came(hours: Sequence[Hour], idle: bool) -> None:
-    assert is_idle(hours, idle_hours=3, has_canary=True) is idle
-
-
-def test_a_canary_that_repeats_each_request_once_is_nobody() -> None:
-    twice = 2 * 3600 / CANARY_PERIOD_S
-
-    assert is_idle([Hour(requests=twice, robots=0.0)], idle_hours=1, has_canary=True)
-    assert not is_idle([Hour(requests=twice + 1, robots=0.0)], idle_hours=1, has_canary=True)
-
-
-def test_without_a_canary_a_single_request_counts() -> None:
-    assert not is_idle([CANARY] * 3, idle_hours=3, has_canary=False)
+    assert is_idle(hours, idle_hours=3) is idle
 
 
 def publish(region: str, hours: dict[int, tuple[float, float]]) -> None:
@@ -84,7 +72,7 @@ def test_after_the_last_idle_hour_the_servers_end_and_resume_brings_them_back(
 ) -> None:
     settings = SETTINGS.replace(cloud={"idle_hours": 2})
     account = account_of(region, Killer())
-    publish(region, {3: (500.0, 2.0), 2: (50.0, 0.0), 1: (50.0, 0.0)})
+    publish(region, {3: (500.0, 2.0), 2: (0.0, 0.0), 1: (0.0, 0.0)})
 
     early = park_if_idle(account, settings, now=NOW - timedelta(hours=1), topic=topic)
     still_up = read_deployment(account, settings)

@@ -10,7 +10,7 @@ from typing import Any
 
 from fakes import FakeLoop, FakeWire
 
-from rse_pf.auth.tokens import KeySet
+from rse_pf.auth.tokens import Claims, KeySet
 from rse_pf.backend.compute.lane import ComputeLane
 from rse_pf.backend.compute.limited_services import LimitedServices
 from rse_pf.backend.gateway.answers import Answers, EncodedAnswer
@@ -121,11 +121,21 @@ class WorkerParts:
         )
 
     def join(
-        self, robot: str = "r", *, expires_s: float | None = None, hello: bool = True
+        self,
+        robot: str = "r",
+        *,
+        expires_s: float | None = None,
+        hello: bool = True,
+        scopes: tuple[str, ...] | None = None,
     ) -> tuple[RobotConnection, FakeWire]:
-        """Connect *robot*, whose token expires at Unix time *expires_s*."""
+        """Connect *robot*, whose token expires at Unix time *expires_s*; None as *scopes* is no token."""
+        identity = RobotId("default", robot)
+        claims = None if scopes is None else Claims(
+            robot=identity, token_id="t", issued_s=UNIX_S, expires_s=UNIX_S + 600.0, key_id="k", scopes=scopes
+        )  # fmt: skip
         accepted = Accepted(
-            robot=RobotId("default", robot),
+            robot=identity,
+            claims=claims,
             codec=self.codec.name,
             subprotocol=SUBPROTOCOLS[self.codec.name],
             expires_s=expires_s,
