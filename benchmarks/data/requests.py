@@ -16,7 +16,7 @@ greedy    a robot beside another one that uses its whole rate: GET and PUT, quie
 
 Latency counts from the planned time of a request.  CPU is that of the server's process alone.
 
-Defends: the bars of requests in docs/decisions/data_service.md.
+Defends: the bars of requests in docs/decisions/identity.md.
 """
 
 from __future__ import annotations
