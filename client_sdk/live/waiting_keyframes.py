@@ -16,13 +16,8 @@ from collections import deque
 from dataclasses import dataclass
 from pathlib import Path
 
-import msgspec
-import numpy as np
-
-from rse_pf.errors import BadRequest, InvalidCamera, UsageError
+from rse_pf.errors import UsageError
 from rse_pf.files import TEMPORARY_PREFIX, replace_file
-from rse_pf.geometry import Camera
-from rse_pf.slam.keyframe_v1 import CameraNumbers, keyframe_of_v1
 
 __all__ = ["Base", "WaitingKeyframe", "WaitingKeyframes", "rebase"]
 
@@ -43,17 +38,6 @@ class WaitingKeyframe:
     index: int
     segment: int
     data: bytes
-
-
-class _KeyframeV1(msgspec.Struct, frozen=True, kw_only=True):
-    """The content of a file of protocol version 1, whose name is ``INDEX.keyframe``."""
-
-    index: int
-    segment: int
-    timestamp_s: float
-    T_odom_camera: tuple[float, ...]
-    camera: CameraNumbers
-    features: bytes
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,7 +109,6 @@ class WaitingKeyframes:
             self._take_lock(folder)
             for part in folder.glob(f"{TEMPORARY_PREFIX}*"):
                 part.unlink()
-            _rewrite_version_1(folder)
             for path in sorted(folder.glob(f"*{_SUFFIX}")):
                 index, segment = map(int, path.name.removesuffix(_SUFFIX).split("-"))
                 self._held.append(_Held(index, segment, path.stat().st_size, None))
@@ -137,7 +120,7 @@ class WaitingKeyframes:
             if (folder / _STATE).exists():
                 self._base = Base(**json.loads((folder / _STATE).read_text(encoding="utf-8")))
             self._first_segment = self._held[-1].segment + 1
-        except (OSError, ValueError, TypeError, msgspec.MsgspecError, BadRequest, InvalidCamera) as error:
+        except (OSError, ValueError, TypeError) as error:
             self.close()
             raise UsageError(
                 f"cannot use the keyframes in {folder}: {error}", hint="name another folder as spool"
@@ -222,26 +205,6 @@ class WaitingKeyframes:
 def _path(folder: Path, index: int, segment: int) -> Path:
     """Return the file of a keyframe; names sort by index."""
     return folder / f"{index:012d}-{segment}{_SUFFIX}"
-
-
-def _rewrite_version_1(folder: Path) -> None:
-    """Write the files of protocol version 1 in *folder* as files of today.
-
-    Raises:
-        OSError: The folder cannot be written.
-        ValueError: The content of a file is not of version 1.
-        BadRequest, InvalidCamera: A keyframe is malformed.
-    """
-    for path in list(folder.glob(f"*{_SUFFIX}")):
-        if "-" in path.name:
-            continue
-        old = msgspec.msgpack.decode(path.read_bytes(), type=_KeyframeV1)
-        fx, fy, cx, cy, width, height = old.camera
-        camera = Camera(fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height)
-        T_odom_camera = np.array(old.T_odom_camera).reshape(4, 4)
-        data = keyframe_of_v1(old.timestamp_s, T_odom_camera, camera, old.features)
-        replace_file(_path(folder, old.index, old.segment), data)
-        path.unlink()
 
 
 def rebase(base: Base | None, first: Base, end: int, wanted: Base) -> tuple[Base, int]:

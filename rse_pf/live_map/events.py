@@ -12,10 +12,9 @@ from functools import cached_property
 import msgspec
 import numpy as np
 
-from rse_pf.errors import BadRequest, RsePfError, message_of
-from rse_pf.geometry import Array, Camera
+from rse_pf.errors import BadRequest, message_of
+from rse_pf.geometry import Array
 from rse_pf.slam.keyframe import Keyframe, decode_keyframe
-from rse_pf.slam.keyframe_v1 import CameraNumbers, keyframe_of_v1
 
 __all__ = [
     "Event",
@@ -29,7 +28,6 @@ __all__ = [
     "RobotLeft",
     "StartKeyframe",
     "StartLink",
-    "camera_of",
     "decode_events",
     "encode_events",
     "matrix_bytes",
@@ -141,33 +139,8 @@ class OwnerChanged(msgspec.Struct, frozen=True, kw_only=True, tag="owner"):
 Event = KeyframeAdded | LinksMeasured | Optimised | RobotForgotten | RobotLeft | MapStarted | OwnerChanged
 
 
-class _KeyframeAddedV1(msgspec.Struct, frozen=True, kw_only=True, tag="keyframe"):
-    robot: str
-    segment: int
-    number: int
-    timestamp_s: float
-    T_odom_camera: bytes
-    camera: CameraNumbers
-    features: bytes
-
-
-class _StartKeyframeV1(msgspec.Struct, frozen=True, kw_only=True):
-    robot: str
-    timestamp_s: float
-    T_map_camera: bytes
-    camera: CameraNumbers
-    features: bytes
-
-
-class _MapStartedV1(msgspec.Struct, frozen=True, kw_only=True, tag="started"):
-    source: str
-    keyframes: tuple[_StartKeyframeV1, ...]
-    links: tuple[StartLink, ...] = ()
-    equal_rooms_m: float = 0.0
-
-
 _ENCODER = msgspec.msgpack.Encoder(order="deterministic")
-_DECODER = msgspec.msgpack.Decoder(list[Event | _KeyframeAddedV1 | _MapStartedV1])
+_DECODER = msgspec.msgpack.Decoder(list[Event])
 
 
 def encode_events(events: Sequence[Event]) -> bytes:
@@ -176,14 +149,14 @@ def encode_events(events: Sequence[Event]) -> bytes:
 
 
 def decode_events(data: bytes) -> list[Event]:
-    """Return the events of an entry that `encode_events` returned, of this form or of version 1.
+    """Return the events of an entry that `encode_events` returned.
 
     Raises:
         BadRequest: The bytes are damaged.
     """
     try:
-        return [_upgrade(event) for event in _DECODER.decode(data)]
-    except (msgspec.MsgspecError, ValueError, RecursionError, RsePfError) as error:
+        return _DECODER.decode(data)
+    except (msgspec.MsgspecError, ValueError, RecursionError) as error:
         raise BadRequest(
             f"an entry of the log is damaged: {message_of(error)}", hint="restore the map from a snapshot"
         ) from error
@@ -207,33 +180,3 @@ def matrix_of(data: bytes, rows: int, columns: int) -> Array:
         )
     matrix: Array = np.frombuffer(data, dtype="<f8").reshape(rows, columns)
     return matrix
-
-
-def camera_of(numbers: CameraNumbers) -> Camera:
-    """Return the camera of six numbers; raises InvalidCamera."""
-    fx, fy, cx, cy, width, height = numbers
-    return Camera(fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height)
-
-
-def _upgrade(event: Event | _KeyframeAddedV1 | _MapStartedV1) -> Event:
-    """Return an event of version 1 in today's form, every other one as it is; raises RsePfError."""
-    if isinstance(event, _KeyframeAddedV1):
-        data = keyframe_of_v1(
-            event.timestamp_s, matrix_of(event.T_odom_camera, 4, 4), camera_of(event.camera), event.features
-        )
-        return KeyframeAdded(robot=event.robot, segment=event.segment, number=event.number, data=data)
-    if isinstance(event, _MapStartedV1):
-        keyframes = tuple(
-            StartKeyframe(
-                robot=start.robot,
-                data=keyframe_of_v1(
-                    start.timestamp_s, matrix_of(start.T_map_camera, 4, 4), camera_of(start.camera),
-                    start.features,
-                ),
-            )
-            for start in event.keyframes
-        )  # fmt: skip
-        return MapStarted(
-            source=event.source, keyframes=keyframes, links=event.links, equal_rooms_m=event.equal_rooms_m
-        )
-    return event

@@ -85,7 +85,7 @@ class FeatureParts:
                     if held[i]:
                         graph.set_data(i, keyframe)
                         places.add(i, np.frombuffer(vector, dtype="<f4", count=PLACE_NUMBERS))
-                if (number + 1) * _KEYFRAMES <= len(graph) and not graph.cameras_v1:
+                if (number + 1) * _KEYFRAMES <= len(graph):
                     parts._full[number] = name, frozenset(i for i, _, _ in rows)
         except (msgspec.MsgspecError, KeyError, IndexError, ValueError) as error:
             raise _damaged(message_of(error)) from error

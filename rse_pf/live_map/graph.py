@@ -18,9 +18,7 @@ import numpy.typing as npt
 
 from rse_pf.errors import BadRequest, message_of
 from rse_pf.geometry import Array, scaled
-from rse_pf.live_map.events import camera_of
 from rse_pf.slam.consistency import StrongLink
-from rse_pf.slam.keyframe_v1 import CameraNumbers, keyframe_of_v1
 
 __all__ = ["Graph", "LiveKeyframe", "LiveLink", "Segment", "variances_of"]
 
@@ -126,7 +124,6 @@ class Graph:
         smoothing: By robot, how many keyframes were smoothed because of it beyond what its own ones allow.
         lookalikes: Keyframes at places of which the map knows another one that looks the same.
         gone_objects: Robot and digest of the newest objects whose robot was forgotten.
-        cameras_v1: Cameras by id of a snapshot of version 1, whose parts hold features alone; else empty.
     """
 
     def __init__(self) -> None:
@@ -148,7 +145,6 @@ class Graph:
         self.source = ""
         self.equal_rooms_m = 0.0
         self.gone_objects: list[tuple[str, str]] = []
-        self.cameras_v1: list[CameraNumbers] = []
         self._links_of: dict[int, list[int]] = {}
         self._size = 0
         self._T = np.empty((64, 4, 4))
@@ -238,10 +234,7 @@ class Graph:
         self._held[i] = False
 
     def set_data(self, i: int, data: bytes) -> None:
-        """Give keyframe *i* of a snapshot its bytes, which are features alone in one of version 1."""
-        if self.cameras_v1:
-            camera, timestamp_s = camera_of(self.cameras_v1[i]), self.keyframes[i].timestamp_s
-            data = keyframe_of_v1(timestamp_s, self._T_odom[i], camera, data)
+        """Give keyframe *i* of a snapshot its bytes."""
         self.keyframes[i].data = data
         self._held[i] = True
 
@@ -521,20 +514,20 @@ class Graph:
 
     @classmethod
     def decode(cls, data: bytes) -> tuple[Graph, dict[str, bytes]]:
-        """Return the graph and the extra bytes of a snapshot, of this version or of version 1.
+        """Return the graph and the extra bytes of a snapshot.
 
         Raises:
             BadRequest: The snapshot is damaged, or of another version.
         """
         try:
             version = msgspec.msgpack.decode(data, type=_Versioned).version
-            if version not in (1, _VERSION):
+            if version != _VERSION:
                 raise BadRequest(
                     f"the snapshot is of version {version}, not {_VERSION}",
                     hint="publish the map with the release that wrote it: rse-pf map publish MAP; "
                     "then start from that version: rse-pf map live start MAP --from MAP",
                 )
-            packed = msgspec.msgpack.decode(data, type=_PackedV1 if version == 1 else _Packed)
+            packed = msgspec.msgpack.decode(data, type=_Packed)
         except (msgspec.MsgspecError, ValueError) as error:
             raise BadRequest(
                 f"the snapshot is damaged: {message_of(error)}", hint="take the older one"
@@ -549,7 +542,6 @@ class Graph:
             array[:n] = np.frombuffer(raw, dtype=np.dtype(kind)).reshape(n, *shape)
             setattr(graph, name, array)
         graph._held = np.zeros(capacity, dtype=np.bool_)
-        graph.cameras_v1 = packed.cameras()
         graph.keyframes = [LiveKeyframe(*row[:4], data=None) for row in packed.keyframes]
         for i, row in enumerate(packed.keyframes):
             if row[-1] is not None:
@@ -651,10 +643,6 @@ class _Packed(msgspec.Struct, kw_only=True):
     trust: list[tuple[int, bool]] = []
     smoothing: list[tuple[str, int]] = []
 
-    def cameras(self) -> list[CameraNumbers]:
-        """Return no cameras: they are in the bytes of the keyframes."""
-        return []
-
 
 class _PackedScales(msgspec.Struct, kw_only=True):
     """What segments without metres add to a snapshot; the scales of links are logarithms with variances."""
@@ -668,14 +656,6 @@ class _PackedObjects(msgspec.Struct, kw_only=True):
 
     keyframes: list[tuple[int, tuple[str, ...]]]
     gone: list[tuple[str, str]]
-
-
-class _PackedV1(_Packed, kw_only=True):
-    keyframes: list[tuple[str, int, int, float, CameraNumbers, bytes | None]]  # type: ignore[assignment]
-
-    def cameras(self) -> list[CameraNumbers]:
-        """Return the cameras of the keyframes, by id."""
-        return [row[4] for row in self.keyframes]
 
 
 def _packed_link(number: int, link: LiveLink) -> _PackedLink:

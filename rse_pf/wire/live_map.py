@@ -12,7 +12,6 @@ from typing import Annotated, Literal
 import msgspec
 
 from rse_pf.errors import BadRequest
-from rse_pf.geometry import Camera
 from rse_pf.wire.arrays import Array
 
 __all__ = [
@@ -20,7 +19,6 @@ __all__ = [
     "KEYFRAME",
     "LEAVE",
     "LIVE_REQUESTS",
-    "LIVE_REQUESTS_V1",
     "LIVE_TOPIC",
     "PUBLISH",
     "RELOCALISE",
@@ -30,11 +28,9 @@ __all__ = [
     "AlignmentUpdate",
     "KeyframeKept",
     "KeyframeRequest",
-    "KeyframeRequestV1",
     "LiveForget",
     "LiveMapRequest",
     "LiveRelocalise",
-    "LiveRelocaliseV1",
     "LiveRequest",
     "LiveShow",
     "LiveStart",
@@ -82,18 +78,6 @@ class KeyframeRequest(_Value, frozen=True, kw_only=True):
     keyframe: bytes
 
 
-class KeyframeRequestV1(_Value, frozen=True, kw_only=True):
-    """``live-keyframe`` with the parts of a keyframe; ``features`` as `rse_pf.slam.keyframe_v1` says."""
-
-    map: _MapName
-    segment: _Count
-    number: _Count
-    timestamp_s: float
-    T_odom_camera: Array
-    camera: Camera
-    features: bytes
-
-
 class KeyframeKept(_Value, frozen=True, kw_only=True):
     """The keyframe is durable: the ``number`` that comes next, and the position in the map's log."""
 
@@ -106,14 +90,6 @@ class LiveRelocalise(_Value, frozen=True, kw_only=True):
 
     map: _MapName
     keyframe: bytes
-
-
-class LiveRelocaliseV1(_Value, frozen=True, kw_only=True):
-    """``live-relocalise`` with the parts of a keyframe; ``features`` as `rse_pf.slam.keyframe_v1` says."""
-
-    map: _MapName
-    camera: Camera
-    features: bytes
 
 
 class RelocaliseReply(_Value, frozen=True, kw_only=True):
@@ -165,11 +141,6 @@ LIVE_REQUESTS: dict[str, type[LiveRequest]] = {
     START: LiveStart,
 }
 """The request of each service that the owner of a map answers."""
-LIVE_REQUESTS_V1: dict[str, type[KeyframeRequestV1 | LiveRelocaliseV1]] = {
-    KEYFRAME: KeyframeRequestV1,
-    RELOCALISE: LiveRelocaliseV1,
-}
-"""The same of requests that hold ``features`` of their own, which older robots send."""
 
 
 class MapCause(_Value, frozen=True, kw_only=True):

@@ -184,6 +184,19 @@ def test_another_order_of_events_is_another_map(joined: Run) -> None:
     assert one.digest() != other.digest()
 
 
+@pytest.mark.parametrize("version", [1, 3])
+def test_a_snapshot_of_another_version_is_refused_with_how_to_publish_first(
+    joined: Run, version: int
+) -> None:
+    packed = msgspec.msgpack.decode(joined.map.snapshot())
+    packed["version"] = version
+
+    with pytest.raises(BadRequest, match=f"the snapshot is of version {version}, not 2") as refused:
+        LiveMap.restore(msgspec.msgpack.encode(packed))
+
+    assert "rse-pf map publish MAP" in refused.value.hint
+
+
 def test_a_damaged_snapshot_is_refused(joined: Run) -> None:
     with pytest.raises(BadRequest):
         LiveMap.restore(joined.map.snapshot()[:-100])

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from benchmarks.live.generated_drives import INFORMATION, GeneratedWorld, make_link, straight
-from rse_pf.backend.live_map.router import _check_keyframe, _request_of, _upgrade
+from rse_pf.backend.live_map.router import _check_keyframe, _request_of
 from rse_pf.errors import BadRequest, InternalError
 from rse_pf.geometry import Array, exp_se3, inverse, rigid, rigid_many
 from rse_pf.live_map.events import KeyframeAdded, LinksMeasured
@@ -20,21 +20,16 @@ from rse_pf.slam.keyframe import encode_keyframe
 from rse_pf.slam.optimise import OptimiseOptions
 from rse_pf.slam.pose_graph import PoseGraph
 from rse_pf.wire.live_map import KeyframeRequest
-from tests.slam.v1_features import features_v1
 
 FITTING = np.sqrt(1.0 + 1.9e-3)
 """A rotation that is scaled by this is accepted, and the step between two of them was refused."""
 
 
 def sent(T: Array, good: KeyframeAdded, number: int) -> KeyframeAdded:
-    """Return the event of a keyframe that a raw client of protocol version 1 sent with the pose *T*."""
-    seen = good.keyframe.features
-    payload = {
-        "map": "m", "segment": 0, "number": number, "timestamp_s": 1.0, "T_odom_camera": T.ravel(),
-        "camera": msgspec.structs.asdict(good.keyframe.camera),
-        "features": features_v1(seen.pixels, seen.depths_m, seen.descriptors),
-    }  # fmt: skip
-    request = _upgrade(_request_of("live-keyframe", payload))
+    """Return the event of a keyframe that a raw client sent with the pose *T*."""
+    keyframe = encode_keyframe(dataclasses.replace(good.keyframe, timestamp_s=1.0, T_odom_camera=T))
+    payload = {"map": "m", "segment": 0, "number": number, "keyframe": keyframe}
+    request = _request_of("live-keyframe", payload)
     _check_keyframe(request)
     assert isinstance(request, KeyframeRequest)
     return KeyframeAdded(robot="default/raw", segment=0, number=number, data=request.keyframe)

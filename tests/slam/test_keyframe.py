@@ -26,8 +26,6 @@ from rse_pf.slam.keyframe import (
     encode_keyframe,
     make_features,
 )
-from rse_pf.slam.keyframe_v1 import MAX_FEATURES_BYTES, keyframe_of_v1
-from tests.slam.v1_features import features_v1
 
 CAMERA = Camera(fx=525.0, fy=525.0, cx=319.5, cy=239.5, width=640, height=480)
 POSE = exp_se3([1.0, -2.0, 3.0, 0.1, 0.2, 0.3])
@@ -422,40 +420,3 @@ def test_a_refusal_takes_little_memory_and_time_whatever_the_bytes_promise() -> 
     for data in promising * 100:
         refused(data)
     assert time.process_time() - began_s < 2.0
-
-
-@pytest.mark.parametrize("fraction", [2, 3, 4])
-def test_features_of_version_1_are_the_same_numbers(fraction: int) -> None:
-    pixels, depths_m, descriptors = random_features(100)
-    old = features_v1(pixels, depths_m, descriptors, fraction)
-
-    found = decode_keyframe(keyframe_of_v1(7.5, POSE, CAMERA, old))
-
-    assert (found.timestamp_s, found.camera) == (7.5, CAMERA)
-    assert np.array_equal(found.T_odom_camera, POSE)
-    assert np.array_equal(found.features.pixels, np.rint(pixels * 2.0**fraction) / 2.0**fraction)
-    assert np.array_equal(found.features.depths_m, (np.rint(depths_m * 1e3) / 1e3).astype(np.float32))
-    assert np.array_equal(found.features.descriptors, descriptors)
-
-
-V1 = features_v1(*random_features(20))
-
-
-@pytest.mark.parametrize(
-    ("data", "why"),
-    [
-        (b"", "bytes are not within"),
-        (V1 + bytes(MAX_FEATURES_BYTES), "bytes are not within"),
-        (V1[:-1], "bytes are not 20 features"),
-        (V1 + b"\0", "bytes are not 20 features"),
-        (changed(2, "<H", 65_535, V1), "bytes are not 65535 features"),
-        (changed(0, "<B", 2, V1), "version 2"),
-        (changed(1, "<B", 200, V1), "is not known"),
-        (changed(4, "<H", 65_535, V1), "outside the image of 640x480"),
-        (changed(4 + 20 * 4, "<H", 9, V1), "below 10 mm"),
-    ],
-)
-def test_malformed_features_of_version_1_are_refused_with_a_hint(data: bytes, why: str) -> None:
-    with pytest.raises(BadRequest, match=why) as refusal:
-        keyframe_of_v1(7.5, POSE, CAMERA, data)
-    assert refusal.value.hint

@@ -35,21 +35,17 @@ from rse_pf.errors import (
 from rse_pf.identity import RobotId
 from rse_pf.service import failure_of
 from rse_pf.slam.keyframe import MAX_KEYFRAME_BYTES, check_sent, decode_keyframe
-from rse_pf.slam.keyframe_v1 import MAX_FEATURES_BYTES, keyframe_of_v1
 from rse_pf.wire import Failure, Result, as_type
 from rse_pf.wire.live_map import (
     FORGET,
     KEYFRAME,
     LIVE_REQUESTS,
-    LIVE_REQUESTS_V1,
     PUBLISH,
     RELOCALISE,
     START,
     STOP,
     KeyframeRequest,
-    KeyframeRequestV1,
     LiveRelocalise,
-    LiveRelocaliseV1,
     LiveRequest,
     map_of_topic,
 )
@@ -149,12 +145,11 @@ class LiveMapRouter(CommandQueue):
         deadline_s = queued.deadline_s - now
         if service == LIVE_LIST:
             return lambda: self._list(robot.tenant, claims)
-        sent = _request_of(service, {} if command.payload is None else command.payload)
+        request = _request_of(service, {} if command.payload is None else command.payload)
         right = "maps:write" if service in _FOR_OPERATORS else "maps:live"
-        forbidden = _forbidden(claims, right, sent.map)
+        forbidden = _forbidden(claims, right, request.map)
         if forbidden is not None:
             raise forbidden
-        request = _upgrade(sent)
         _check_keyframe(request)
         return lambda: self._owners.request(robot.tenant, request.map, robot, service, request, deadline_s)
 
@@ -305,40 +300,18 @@ def _forbidden_to_read(claims: Claims | None, map_name: str) -> RsePfError | Non
     return _forbidden(claims, "maps:live", map_name)
 
 
-def _request_of(service: str, payload: Any) -> LiveRequest | KeyframeRequestV1 | LiveRelocaliseV1:
+def _request_of(service: str, payload: Any) -> LiveRequest:
     """Return the typed request of a command.
 
     Raises:
         RsePfError: It is too long, or not valid.
     """
-    kind: type[Any] = LIVE_REQUESTS[service]
     if isinstance(payload, dict):
         _check_size(payload.get("keyframe"), "a keyframe is", MAX_KEYFRAME_BYTES)
-        _check_size(payload.get("features"), "the features of a keyframe are", MAX_FEATURES_BYTES)
-        if "keyframe" not in payload and "features" in payload:
-            kind = LIVE_REQUESTS_V1.get(service, kind)
     try:
-        request: LiveRequest | KeyframeRequestV1 | LiveRelocaliseV1 = as_type(payload, kind)
+        request: LiveRequest = as_type(payload, LIVE_REQUESTS[service])
     except BadMessage as error:
         raise BadRequest(f"{service}: {error.message}", hint=error.hint) from error
-    return request
-
-
-def _upgrade(request: LiveRequest | KeyframeRequestV1 | LiveRelocaliseV1) -> LiveRequest:
-    """Return a request of protocol version 1 in today's form, every other one as it is; raises RsePfError."""
-    if isinstance(request, KeyframeRequestV1):
-        T_odom_camera = request.T_odom_camera
-        if T_odom_camera.size != 16:
-            raise BadRequest("T_odom_camera is no pose: it takes 16 numbers", hint="send it row after row")
-        keyframe = keyframe_of_v1(
-            request.timestamp_s, T_odom_camera.reshape(4, 4), request.camera, request.features
-        )
-        return KeyframeRequest(
-            map=request.map, segment=request.segment, number=request.number, keyframe=keyframe
-        )
-    if isinstance(request, LiveRelocaliseV1):
-        keyframe = keyframe_of_v1(0.0, np.eye(4), request.camera, request.features)
-        return LiveRelocalise(map=request.map, keyframe=keyframe)
     return request
 
 

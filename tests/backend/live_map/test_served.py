@@ -25,7 +25,6 @@ from rse_pf.services.builtin import builtin_services
 from rse_pf.slam.keyframe import Keyframe, encode_keyframe, make_features
 from rse_pf.wire import SUBPROTOCOLS, make_codec, messages
 from rse_pf.wire.server_session import CLOSE_PROTOCOL, UPDATES
-from tests.slam.v1_features import features_v1
 
 pytestmark = [pytest.mark.slow, pytest.mark.system]
 
@@ -33,22 +32,16 @@ CAMERA = {"fx": 525.0, "fy": 525.0, "cx": 319.5, "cy": 239.5, "width": 640, "hei
 
 
 def keyframe(number: int) -> dict[str, Any]:
-    """Return a keyframe as robots of protocol version 1 send it, each second one in today's form."""
+    """Return the request of a keyframe with features at random."""
     noise = np.random.default_rng(number)
     seen = (
         noise.uniform(10, 400, (300, 2)), np.full(300, 2.0), noise.integers(0, 255, (300, 32), dtype=np.uint8)
     )  # fmt: skip
-    begin = {"map": "m", "segment": 0, "number": number}
-    if number % 2:
-        made = Keyframe(
-            timestamp_s=float(number), T_odom_camera=np.eye(4), camera=Camera(**CAMERA),
-            features=make_features(*seen),
-        )  # fmt: skip
-        return {**begin, "keyframe": encode_keyframe(made)}
-    return {
-        **begin, "timestamp_s": float(number), "T_odom_camera": np.eye(4).ravel().tolist(), "camera": CAMERA,
-        "features": features_v1(*seen),
-    }  # fmt: skip
+    made = Keyframe(
+        timestamp_s=float(number), T_odom_camera=np.eye(4), camera=Camera(**CAMERA),
+        features=make_features(*seen),
+    )  # fmt: skip
+    return {"map": "m", "segment": 0, "number": number, "keyframe": encode_keyframe(made)}
 
 
 def robot(server: GuardedServer, name: str, **claims: Any) -> client_sdk.Robot:
