@@ -71,7 +71,7 @@ localstack: ## run the tests of AWS against LocalStack, without Docker and witho
 	@$(SETUP) dev infra
 	@sh scripts/localstack.sh $(ARGS)
 
-ros: ## try the bridge of ROS with a real ROS 1, a real ROS 2, and over DDS
+ros: ## try the bridge of ROS with a real ROS 1 and a real ROS 2
 	@PYTHON=$(PYTHON) sh scripts/ros.sh
 	@$(PYTEST) -q -rs -n 0 -m slow tests/ros_bridge $(ARGS)
 

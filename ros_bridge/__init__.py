@@ -1,7 +1,7 @@
 """A robot of ROS as a robot of the platform: images of topics in, poses, paths and clouds as topics out.
 
 `options`, `incoming`, `outgoing` and `bridge` need no ROS: they take and give the bytes of messages.  The
-shells `ros1_node` (rospy), `ros2_node` (rclpy) and `dds` (Cyclone DDS without ROS) carry those bytes.
+shells `ros1_node` (rospy) and `ros2_node` (rclpy) carry those bytes.
 Nothing of the platform imports this package.
 """
 

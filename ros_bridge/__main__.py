@@ -1,4 +1,4 @@
-"""Run a bridge: ``python -m ros_bridge ros1``, ``ros2`` or ``dds``."""
+"""Run a bridge: ``python -m ros_bridge ros1`` or ``ros2``."""
 
 from __future__ import annotations
 
@@ -30,9 +30,8 @@ def main(arguments: list[str] | None = None) -> int:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument(
-        "shell", choices=("ros1", "ros2", "dds", "where"),
-        help="ros1: rospy; ros2: rclpy; dds: Cyclone DDS without ROS; "
-        "where: print the folder for ROS_PACKAGE_PATH",
+        "shell", choices=("ros1", "ros2", "where"),
+        help="ros1: rospy; ros2: rclpy; where: print the folder for ROS_PACKAGE_PATH",
     )  # fmt: skip
     for each in fields(BridgeOptions):
         parser.add_argument(
@@ -55,13 +54,9 @@ def main(arguments: list[str] | None = None) -> int:
             from ros_bridge.ros1_node import run_ros1_node
 
             return run_ros1_node(["rse-pf-ros", *others], given)
-        if args.shell == "ros2":
-            from ros_bridge.ros2_node import run_ros2_node
+        from ros_bridge.ros2_node import run_ros2_node
 
-            return run_ros2_node([*others, *of_ros], given)
-        from ros_bridge.dds import run_dds
-
-        return run_dds(given)
+        return run_ros2_node([*others, *of_ros], given)
     except RsePfError as error:
         show_error(error)
         return 1

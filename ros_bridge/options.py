@@ -36,7 +36,6 @@ HELP = {
     "publish_odom": "whether to publish the transform from odometry frame to camera",
     "cloud_every_s": "time between two clouds",
     "path_poses": "most poses of a path",
-    "dds_domain": "with dds: ROS_DOMAIN_ID of the robots",
     "out": "folder that the service save writes to",
     "publish_as": "name of the map that the service publish makes of a map of its own",
     "localise_in": "name of the map in which the service localise looks",
@@ -75,7 +74,6 @@ class BridgeOptions:
         out: Folder that the service ``save`` writes to; empty: it is refused.
         publish_as: Name of the map that the service ``publish`` makes of a map of its own; empty: refused.
         localise_in: Name of the map in which the service ``localise`` looks; empty: it is refused.
-        dds_domain: ``ROS_DOMAIN_ID`` of the robots, where no ROS is used.
 
     Raises:
         UsageError: A value cannot be used.
@@ -105,7 +103,6 @@ class BridgeOptions:
     out: str = ""
     publish_as: str = ""
     localise_in: str = ""
-    dds_domain: int = 0
 
     def __post_init__(self) -> None:
         for name in ("depth_scale", "pair_within_s", "cloud_every_s"):

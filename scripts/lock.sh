@@ -27,7 +27,7 @@ lock release release build
 lock browser browser
 lock foxglove foxglove
 lock xfeat xfeat
-lock ros ros-dds
+lock ros ros
 lock batch batch build
 # A client of the conformance table, which the platform itself does not need.
 # shellcheck disable=SC2086

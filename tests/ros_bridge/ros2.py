@@ -12,14 +12,6 @@ __all__ = ["COLOUR", "DOMAIN", "ROS2", "Ros2", "all_is_played"]
 _ROOT = Path(__file__).parents[2]
 ROS2 = _ROOT / "build" / "ros2"
 _PROFILE = _ROOT / "ros_bridge/packages/rse_pf_bridge/config/fastdds.xml"
-_CYCLONE = (
-    '<CycloneDDS><Domain><General><Interfaces><NetworkInterface address="127.0.0.1"/></Interfaces>'
-    "<AllowMulticast>false</AllowMulticast></General><Internal>"
-    '<SocketReceiveBufferSize min="4MB"/></Internal><Discovery><ParticipantIndex>auto</ParticipantIndex>'
-    '<MaxAutoParticipantIndex>20</MaxAutoParticipantIndex><Peers><Peer address="127.0.0.1"/></Peers>'
-    "</Discovery></Domain></CycloneDDS>"
-)
-"""Cyclone DDS on this machine alone, as ROS_AUTOMATIC_DISCOVERY_RANGE makes Fast DDS."""
 DOMAIN = 86
 COLOUR = "/camera/image_raw"
 _TOPICS = {"colour": COLOUR, "depth": "/camera/aligned_depth", "info": "/camera/camera_info"}
@@ -34,7 +26,7 @@ class Ros2(RosPrograms):
     def __init__(self, folder: Path) -> None:
         env = {
             "ROS_DOMAIN_ID": str(DOMAIN), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
-            "FASTDDS_DEFAULT_PROFILES_FILE": str(_PROFILE), "CYCLONEDDS_URI": _CYCLONE,
+            "FASTDDS_DEFAULT_PROFILES_FILE": str(_PROFILE),
             "ROS_HOME": str(folder), "PYTHONUNBUFFERED": "1",
         }  # fmt: skip
         super().__init__(str(ROS2 / "bin" / "python"), _TOPICS, env)

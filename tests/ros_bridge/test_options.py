@@ -42,7 +42,7 @@ def test_topics_and_frames_of_a_robot_have_its_namespace() -> None:
 
 @pytest.mark.parametrize(
     "words",
-    [["ros2"], ["ros1", "--queue-frames", "many"], ["dds", "--url", "ws://127.0.0.1:9/ws"]],
+    [["ros2"], ["ros1", "--queue-frames", "many"]],
     ids=lambda words: words[0],
 )
 def test_what_cannot_start_is_said_in_one_line(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:

@@ -15,7 +15,7 @@ from client_sdk.mapping import read_trajectory
 from rse_pf.config import PlatformSettings
 from rse_pf.local.control.platform import LocalPlatform
 from tests.ros_bridge.programs import own_run, poses, tell_delay, worst_mm
-from tests.ros_bridge.ros2 import COLOUR, DOMAIN, Ros2, all_is_played
+from tests.ros_bridge.ros2 import COLOUR, Ros2, all_is_played
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
 
@@ -123,23 +123,3 @@ async def _share(ros2: Ros2, bag: Path, folder: Path) -> None:
         )
         last = max(first.keys() & second.keys())
         assert math.dist(first[last], second[last]) < 0.05
-
-
-def test_the_shell_of_dds_takes_images_of_a_node_of_ros2(ros2: Ros2, bag: Path, tmp_path: Path) -> None:
-    """Cyclone DDS hears Fast DDS, and is heard by it."""
-    pytest.importorskip("cyclonedds", reason="cyclonedds is not installed: make ros")
-    asyncio.run(_drive_over_dds(ros2, bag, tmp_path))
-
-
-async def _drive_over_dds(ros2: Ros2, bag: Path, folder: Path) -> None:
-    token_file = folder / "token"
-    async with LocalPlatform(PlatformSettings(), port=0, servers=1, state=folder / "platform") as platform:
-        token_file.write_text(platform.issue_token("dds-2"), encoding="ascii")
-        expected = await own_run(bag, platform)
-        bridge = await asyncio.to_thread(ros2.bridge, platform.url, token_file, "dds", dds_domain=str(DOMAIN))
-        listener = await asyncio.to_thread(ros2.listener, "", COLOUR)
-        player = ros2.play(bag, 0.25)
-        await asyncio.to_thread(listener.until, poses(_FRAMES))
-        await asyncio.to_thread(player.end)
-        assert worst_mm(listener.heard("pose"), expected) <= 1.0
-        assert await asyncio.to_thread(bridge.end) == 0
