@@ -34,7 +34,6 @@ T = TypeVar("T")
 
 KINDS = ("latency", "elasticity", "robustness", "map", "live", "verify")
 _ROBOTS = {"latency": 100, "elasticity": 100, "robustness": 100, "map": 3, "live": 3}
-_MAX_SPEED_AS_CLOUD = 10
 _MAX_ROBOTS = {"latency": 2000, "elasticity": 2000, "robustness": 2000, "map": 32, "live": 32}
 
 
@@ -62,9 +61,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--no-rebalance", action="store_true", help="connected robots stay on their servers"
     )
     elasticity.add_argument("--compare", action="store_true", help="with and without rebalancing, in one run")
-    elasticity.add_argument(
-        "--as-cloud", action="store_true", help="play the delays of AWS: from load to a serving server"
-    )
     robustness = parser.add_argument_group("robustness and live")
     robustness.add_argument(
         "--only", metavar="A,B", help="these faults (default: all but random; of a live map: none)"
@@ -126,19 +122,6 @@ def _check(args: argparse.Namespace) -> None:
 def _elasticity(args: argparse.Namespace, settings: PlatformSettings) -> int:
     from rse_pf.experiments.paper.elasticity import ElasticityOptions, run_elasticity
 
-    if args.as_cloud:
-        from rse_pf.experiments.paper.elasticity_as_cloud import run_as_cloud
-
-        if args.compare or args.no_rebalance:
-            raise UsageError(
-                "--as-cloud compares two designs of its own", hint="leave out --compare and --no-rebalance"
-            )
-        if args.speed > _MAX_SPEED_AS_CLOUD:
-            raise UsageError(
-                f"--speed {args.speed:g} makes a sample of the fast profile too short to be measured",
-                hint=f"use at most {_MAX_SPEED_AS_CLOUD} with --as-cloud",
-            )
-        return run_as_cloud(_options(ElasticityOptions, args), settings)
     if settings.scaling.period_s / args.speed < 0.5:
         raise UsageError(
             f"--speed {args.speed:g} makes a period of the policy shorter than 0.5 s",

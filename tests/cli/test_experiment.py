@@ -20,8 +20,6 @@ from rse_pf.errors import UsageError
         (["elasticity", "--speed", "nan"], "--speed nan"),
         (["elasticity", "--fps", "inf"], "--fps inf"),
         (["elasticity", "--emulated-cores", "0"], "--emulated-cores 0"),
-        (["elasticity", "--as-cloud", "--speed", "11"], "--speed 11 makes a sample of the fast profile"),
-        (["elasticity", "--as-cloud", "--compare"], "--as-cloud compares two designs of its own"),
         (["latency", "--link", "papre"], "no link named 'papre'"),
         (["robustness", "--only", "kill,fire"], "there is no fault 'fire'"),
         (["live", "--only", "kill,balancer"], "there is no fault 'balancer'"),

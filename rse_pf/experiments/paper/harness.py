@@ -35,7 +35,6 @@ from rse_pf.experiments.results.result_folder import remove_keys
 from rse_pf.local.control.control_plane import ControlOptions
 from rse_pf.local.control.monitor import MonitorSample
 from rse_pf.local.control.platform import LocalPlatform
-from rse_pf.scaling.cloud_delays import NO_DELAYS, CloudDelays
 from rse_pf.scaling.profile import cadence_of
 
 __all__ = ["Harness", "generator_event", "generator_of", "policy_parameters"]
@@ -58,7 +57,6 @@ class Harness:
         compress: float = 1.0,
         rebalance: bool = True,
         servers: int | None = None,
-        delays: CloudDelays = NO_DELAYS,
     ) -> None:
         """Describe a run; nothing is started.
 
@@ -70,7 +68,6 @@ class Harness:
             compress: Factor by which their periods are shortened.
             rebalance: Whether robots migrate from crowded servers.
             servers: Number of servers at the start; None means that of the settings.
-            delays: Of a cloud, which the platform plays.
         """
         self.folder = folder
         self.settings = settings
@@ -81,7 +78,7 @@ class Harness:
         self._parameters = {**parameters, **policy_parameters(settings, compress)}
         self._servers = servers
         self._control = ControlOptions(
-            elastic=elastic, compress=compress, rebalance=rebalance, on_sample=self._on_sample, delays=delays
+            elastic=elastic, compress=compress, rebalance=rebalance, on_sample=self._on_sample
         )
         self._stack = AsyncExitStack()
         self._changed = asyncio.Event()

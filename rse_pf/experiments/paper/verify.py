@@ -14,8 +14,6 @@ from typing import Any
 
 from rse_pf.errors import UsageError
 from rse_pf.experiments.paper.elasticity import elasticity_figures, find_unjustified_scale_outs
-from rse_pf.experiments.paper.elasticity_as_cloud import KIND as AS_CLOUD
-from rse_pf.experiments.paper.elasticity_as_cloud import as_cloud_figures
 from rse_pf.experiments.paper.latency import latency_figures
 from rse_pf.experiments.paper.live_map import live_experiment_figures
 from rse_pf.experiments.paper.mapping import CLOUD, map_figures
@@ -48,7 +46,6 @@ _HINT = "name the --out of an experiment"
 
 FIGURES: dict[str, Callable[[Records], dict[str, Any]]] = {
     "elasticity": elasticity_figures,
-    AS_CLOUD: as_cloud_figures,
     "latency": latency_figures,
     "robustness": robustness_figures,
     "map": map_figures,

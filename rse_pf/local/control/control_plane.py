@@ -36,7 +36,6 @@ from rse_pf.local.control.monitor import (
 from rse_pf.local.control.rebalancer import MoveRequest, Rebalancer
 from rse_pf.local.control.scale_modifier import LocalScaleModifier
 from rse_pf.local.servers.control_client import ControlPort
-from rse_pf.scaling.cloud_delays import NO_DELAYS, CloudDelays
 from rse_pf.scaling.health import LOCAL_INTERVAL_S, LOCAL_TIMEOUT_S, observe
 from rse_pf.scaling.profile import cadence_of
 
@@ -59,14 +58,13 @@ class ControlOptions:
 
     With ``elastic``, monitor and scale modifier run, and what breaks is replaced; with ``rebalance``, too,
     robots of crowded servers are asked to move.  ``compress`` is the factor by which periods, idle time,
-    warm-up and grace are shorter, for experiments, as are the ``delays`` of a cloud that are played.
-    ``on_sample`` gets each sample of the monitor, which then runs in any case.
+    warm-up and grace are shorter, for experiments.  ``on_sample`` gets each sample of the monitor, which then
+    runs in any case.
     """
 
     elastic: bool = False
     rebalance: bool = True
     compress: float = 1.0
-    delays: CloudDelays = NO_DELAYS
     on_sample: Callable[[Mapping[str, Any]], None] | None = None
 
 
@@ -105,7 +103,6 @@ class ControlPlane:
         period_s = cadence.period_s / options.compress
         self._every_s = sample_interval_s(period_s)
         self._period_s = period_s
-        self._metrics_s = options.delays.metrics_s / options.compress
         self._seen_periods = math.inf
         self._periods = Periods(period_s, keep=cadence.most + 2)
         self._rebalancer = Rebalancer() if options.elastic and options.rebalance else None
@@ -213,7 +210,7 @@ class ControlPlane:
         if self._on_sample is not None:
             self._on_sample(sample.document())
         self._periods.add(sample)
-        seen_periods = math.floor((sample.time - self._metrics_s) / self._period_s)
+        seen_periods = math.floor(sample.time / self._period_s)
         self._act(period_over=seen_periods > self._seen_periods)
         self._seen_periods = seen_periods
         self._rebalance(sample)
@@ -269,7 +266,7 @@ class ControlPlane:
 
     def _act(self, period_over: bool = False) -> None:
         if self._elastic:
-            now_s = time.monotonic() - self._metrics_s
+            now_s = time.monotonic()
             samples = self._periods.samples(now_s)
             self.modifier.act(samples, now_s=now_s, period_over=period_over, hold=self.hold)
 

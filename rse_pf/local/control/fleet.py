@@ -41,7 +41,7 @@ _MIN_UPTIME_S = 10.0
 @dataclass(slots=True, kw_only=True)
 class Member:
     """One server.  ``leaving``: it drains; ``out``: it was replaced and is killed; ``on_trial``: it is the
-    first of a release, and is not replaced until it was healthy; it takes no robots before ``held_until_s``.
+    first of a release, and is not replaced until it was healthy.
 
     Times are monotonic seconds; those of ``health`` are compressed with the rest.
     """
@@ -60,7 +60,6 @@ class Member:
     adopted: bool = False
     robots: int = 0
     observed: Observed | None = None
-    held_until_s: float = 0.0
 
     @property
     def phase(self) -> ServerPhase:
@@ -108,11 +107,9 @@ class Fleet:
         settings: PlatformSettings,
         *,
         compress: float,
-        launch_s: float = 0.0,
         reports: FleetReports,
     ) -> None:
-        """Make a fleet without members; later servers serve *launch_s* after their launch, compressed."""
-        self._launch_s = launch_s / compress
+        """Make a fleet without members."""
         self.members: dict[str, Member] = {}
         self.dead: dict[str, bool] = {}
         self.launched = 0
@@ -207,7 +204,6 @@ class Fleet:
             self._forget(member)
             self._emit_gone(member.name, None, code)
             raise
-        await asyncio.sleep(member.held_until_s - time.monotonic())
         end = time.monotonic() + timeout_s
         member.server = server
         self._still_targets.discard(member.name)
@@ -273,7 +269,6 @@ class Fleet:
         members = [self.launch() for _ in range(count)]
         for member in members:
             member.on_trial = on_trial
-            member.held_until_s = member.launched_s + self._launch_s
             self.start(member)
         return [member.name for member in members]
 
@@ -299,7 +294,6 @@ class Fleet:
             member.out = True
             self._set_targets()
         new = self.launch(replaces_living=cut_off)
-        new.held_until_s = new.launched_s + self._launch_s
         if cut_off:
             self._backend_servers.send(name, signal.SIGKILL)
         self.start(new)

@@ -147,7 +147,7 @@ class LocalPlatform:
         reports = FleetReports(emit=self._emit, changed=self._write_state)
         self._fleet = Fleet(
             self.backend_servers, self.load_balancer, settings,
-            compress=control.compress, launch_s=control.delays.launch_s, reports=reports,
+            compress=control.compress, reports=reports,
         )  # fmt: skip
         self._fleet.is_full = self._disks.is_full
         self._operator_port = OperatorPort(
