@@ -25,7 +25,6 @@ constraints="$constraints --constraint locks/infra.txt"
 lock docs docs build
 lock release release build
 lock browser browser
-lock foxglove foxglove
 lock xfeat xfeat
 lock ros ros
 lock batch batch build

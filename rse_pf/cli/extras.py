@@ -57,9 +57,6 @@ EXTRAS: dict[str, Extra] = {
     "bags": Extra(
         modules={"rosbags": "rosbags", "cv2": "opencv-python-headless"}, enables="maps from ROS bags"
     ),
-    "foxglove": Extra(
-        modules={"foxglove": "foxglove-sdk"}, enables="the live view in Foxglove", includes=("local",)
-    ),
     "ros": Extra(modules={}, enables="robots of ROS: rse-pf-ros", includes=("bags", "keys")),
     "ros2": Extra(
         modules={
@@ -137,7 +134,6 @@ VERBS_NEED: dict[str, tuple[str, ...]] = {
     "compare": ("demo",),
     "experiment": ("experiments",),
     "local": ("local",),
-    "local --foxglove": ("foxglove",),
     "fleet": ("local",),
     "fleet --cloud": ("aws", "data"),
     "swarm": ("local",),

@@ -239,7 +239,6 @@ class LocalSettings:
     warm_standby: bool = setting(True, doc="keep one started process, about 60 MB, that becomes the next server at once", source="warm pools of AWS Auto Scaling")
     metrics_port: int = setting(9464, doc="port of the control plane on loopback: /metrics of all servers, for Prometheus; 0 takes a free one", source="OpenTelemetry's Prometheus exporter", low=0, high=65535)
     page_port: int = setting(8701, doc="port of the fleet page on loopback; 0 takes a free one, and so does a port that is taken", low=0, high=65535)
-    foxglove_port: int = setting(8765, doc="port on loopback of the export to Foxglove (rse-pf local --foxglove); 0 takes a free one", low=0, high=65535)
     burst_port: int = setting(8702, doc="port on loopback of the burst function (rse-pf local --burst)", low=1, high=65535)
     certificate: str = setting("", doc="file of the load balancer's certificate chain (PEM); robots then connect by wss://")
     private_key: str = setting("", doc="file of the private key of local.certificate (PEM)")

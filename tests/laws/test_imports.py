@@ -146,7 +146,6 @@ PACKAGES: dict[str, tuple[str, ...]] = {
     "mcap": ("rse_pf/recording/",),
     "rosbags": ("client_sdk/bags/",),
     "apsw": ("client_sdk/bags/",),
-    "foxglove": ("rse_pf/fleet_page/foxglove_export.py",),
     "viser": ("rse_pf/experiments/plots/map_viewer.py",),
     "rich": ("rse_pf/cli/", "rse_pf/experiments/"),
     "lupa": ("rse_pf/services/",),

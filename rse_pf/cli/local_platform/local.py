@@ -97,11 +97,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument("--no-page", action="store_true", help="start no fleet page")
     parser.add_argument(
-        "--foxglove", action="store_true",
-        help="also export the platform to Foxglove, without a key, at a port on loopback "
-        f"(local.foxglove_port, default {defaults.foxglove_port})",
-    )  # fmt: skip
-    parser.add_argument(
         "--burst", nargs="?", type=int, const=0, metavar="P",
         help="also run the burst function, at port P on loopback (local.burst_port, default "
         f"{defaults.burst_port}): robots ask it while no server answers in time",
@@ -148,15 +143,13 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     chosen = with_recordings(_with_services(chosen, args), args.record)
     lan = chosen_address(args.lan)
     page = not args.no_page
-    if args.foxglove:
-        require("local --foxglove")
     burst_port = None if args.burst is None else args.burst or chosen.local.burst_port
     if burst_port is not None:
         chosen = _with_burst(chosen, burst_port, lan)
     return asyncio.run(
         _foreground(
             args.name, folder, chosen, data=not args.no_data, lan=lan,
-            extras=_Extras(page=page, foxglove=args.foxglove, burst_port=burst_port),
+            extras=_Extras(page=page, burst_port=burst_port),
         )
     )  # fmt: skip
 
@@ -336,10 +329,9 @@ def _wait(end_s: float, seconds: float) -> bool:
 
 
 class _Extras(NamedTuple):
-    """The processes beside a platform: fleet page, export to Foxglove, burst function (None: none)."""
+    """The processes beside a platform: fleet page, burst function (None: none)."""
 
     page: bool
-    foxglove: bool
     burst_port: int | None
 
 
@@ -380,17 +372,12 @@ async def _foreground(
             ready = True
             _show_welcome(platform, name)
             beside = page_beside(folder, settings.local.page_port, _show_page)
-            export = process_beside(
-                "rse_pf.fleet_page.foxglove_export", folder, settings.local.foxglove_port,
-                folder / "foxglove.log", lambda url: show(f"foxglove            {url}"),
-            )  # fmt: skip
             burst = process_beside(
                 "lambda_pnp.local_front", folder, extras.burst_port or 0, folder / "burst.log",
                 lambda url: show(f"burst function      {url}"),
             )  # fmt: skip
             async with (
                 beside if extras.page else nullcontext(),
-                export if extras.foxglove else nullcontext(),
                 burst if extras.burst_port else nullcontext(),
             ):  # fmt: skip
                 await stopped.wait()
