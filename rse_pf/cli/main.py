@@ -39,7 +39,7 @@ VERBS = {
     "camera": "calibrate a camera, print a board for it, check what it gives",
     "map": "show, merge, localise in, roll back and export the maps that robots share",
     "batch": "merge maps that outgrow one process, in parts that survive a crash",
-    "replay": "explain a bad pose from a recording, and solve recorded commands again",
+    "replay": "show why a pose was bad from a recording, and solve recorded commands again",
     "audit": "show the audit log of robots and changes, and check that it is unchanged",
     "cloud": "run the platform on AWS: up, park, resume, down, status, cost, doctor",
     "settings": "show every setting: value, default, unit, source",

@@ -1,8 +1,8 @@
-"""Replay a recording: list what went wrong, solve commands again, and explain a bad pose.
+"""Replay a recording: list what went wrong, solve commands again, and show why a pose was bad.
 
 FILE is what rse-pf local --record wrote, a folder of such files, or a case.rsepf that somebody exported.
-Without --command it lists what went wrong, worst first, with the likeliest cause.  With --command, or for a
-case, it solves the very same bytes again, says whether the answer is equal to the byte, and explains it.
+Without --command it lists what went wrong, worst first.  With --command, or for a case, it solves the very
+same bytes again, says whether the answer is equal to the byte, and shows the evidence for its verdict.
 --all solves everything again, as a test of this version, and exits with 1 if an answer is different.
 
 examples:
@@ -35,10 +35,8 @@ if TYPE_CHECKING:
 
 __all__ = ["add_arguments", "run"]
 
-_SHOWN, _IN_PAGE, _EXPLAINED_IN_JSON = 20, 5, 500
+_SHOWN, _IN_PAGE, _LISTED_IN_JSON = 20, 5, 500
 _ENGINES = ("native", "poselib", "opencv")
-_OF_A_DRIVE = ("blur", "depth_scale", "intrinsics")
-"""Causes that ``rse-pf check`` judges over a whole drive."""
 _IDENTITY = re.compile(r"([0-9a-f]{16}:)?\d{1,16}")
 
 
@@ -46,7 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("file", type=Path, metavar="FILE", help="a recording, a folder of them, or a case")
     parser.add_argument(
-        "--command", metavar="ID", help="explain this command: CONNECTION:ID, or ID if it is clear"
+        "--command", metavar="ID", help="show this command: CONNECTION:ID, or ID if it is clear"
     )
     parser.add_argument("--all", action="store_true", help="solve every command again and say what changed")
     parser.add_argument(
@@ -64,7 +62,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
-    """List, solve again, explain or export; return 1 if an answer that should be equal is not."""
+    """List, solve again, show or export; return 1 if an answer that should be equal is not."""
     require("replay")
     from rse_pf.recording.replay.limited import LimitedReplay
 
@@ -121,16 +119,17 @@ def _show_all(args: argparse.Namespace, replay: LimitedReplay, overrides: Overri
     solve = bool(args.all or args.json or overrides.changes)
     with at_work("reading the recording"):
         overview = replay.overview(
-            args.file, solve=solve, overrides=overrides, worst=_EXPLAINED_IN_JSON if args.json else _SHOWN,
-            explain=_EXPLAINED_IN_JSON if args.json else _SHOWN,
-        )  # fmt: skip
+            args.file, solve=solve, overrides=overrides, worst=_LISTED_IN_JSON if args.json else _SHOWN
+        )
         reports = []
         if args.html is not None:
             reports = [replay.command(args.file, each.id, overrides) for each in overview.troubles[:_IN_PAGE]]
     if args.html is not None:
         _write_page(args.html, reports, overview, args.file.name)
     if args.json:
-        show_json(_overview_json(overview), indent=2)
+        import msgspec
+
+        show_json(msgspec.to_builtins(overview), indent=2)
     else:
         _show_overview(overview, args)
     return 1 if solve and overview.different and not overrides.changes else 0
@@ -161,36 +160,9 @@ def _show_overview(overview: Overview, args: argparse.Namespace) -> None:
     show("", f"went wrong: {told}; worst first:")
     for trouble in overview.troubles:
         show(f"  {trouble.kind:<10} {trouble.id}  {trouble.robot}  {trouble.what}")
-        causes = overview.causes.get(trouble.id, ())
-        if causes and causes[0].cause != "none":
-            show(f"  {'':<10} {causes[0].cause}: {causes[0].sentence}")
     if bad > len(overview.troubles):
-        show(f"  and {bad - len(overview.troubles)} more; --json lists up to {_EXPLAINED_IN_JSON}")
-    show("", f"explain one: rse-pf replay {args.file} --command {overview.troubles[0].id}")
-
-
-def _overview_json(overview: Overview) -> dict[str, Any]:
-    import msgspec
-
-    plain: dict[str, Any] = msgspec.to_builtins(overview)
-    explained: dict[str, list[dict[str, Any]]] = {
-        name: list(found) for name, found in plain.pop("causes").items()
-    }
-    causes: dict[str, int] = {}
-    wrong = {trouble.id for trouble in overview.troubles}
-    for name, found in explained.items():
-        if name not in wrong and found:
-            # A pose that is right by its own evidence does not tell the calibration of a drive.
-            found[:] = [each for each in found if each["cause"] not in _OF_A_DRIVE]
-            likeliest = found[0]["cause"] if found else "none"
-        elif found:
-            likeliest = found[0]["cause"]
-        else:
-            continue
-        causes[likeliest] = causes.get(likeliest, 0) + 1
-    ordered = sorted(causes, key=lambda each: (each == "none", -causes[each]))
-    findings = [{"id": name, "causes": found} for name, found in explained.items()]
-    return {**plain, "causes": ordered, "causes_count": causes, "findings": findings}
+        show(f"  and {bad - len(overview.troubles)} more; --json lists up to {_LISTED_IN_JSON}")
+    show("", f"look at one: rse-pf replay {args.file} --command {overview.troubles[0].id}")
 
 
 # --- one command ------------------------------------------------------------------------------------------
@@ -240,12 +212,6 @@ def _show_report(report: CommandReport) -> None:
             f"{report.matches} matches, {report.inliers} inliers, {report.rmse_px:.2f} px, "
             f"engine {report.engine or 'none'}"
         )
-    if report.causes:
-        show("", "why:")
-        for cause in report.causes:
-            show(f"  {cause.cause:<12} {cause.confidence:.2f}  {cause.sentence}")
-        if report.causes[0].missing:
-            show(f"  not recorded: {'; '.join(report.causes[0].missing)}")
     if report.rules:
         show("", "rules of the evidence:")
         for rule in report.rules:
@@ -285,13 +251,11 @@ def _report_json(report: CommandReport) -> dict[str, Any]:
 
     plain: dict[str, Any] = msgspec.to_builtins(msgspec.structs.replace(report, picture_png=b""))
     plain.pop("picture_png")
-    explanations = plain.pop("causes")
     was_solved = not report.why_not
     return {
         "commands": 1, "equal": int(was_solved and report.is_equal),
         "different": int(was_solved and not report.is_equal),
-        "causes": [cause.cause for cause in report.causes],
-        "explanations": explanations, **plain,
+        **plain,
     }  # fmt: skip
 
 

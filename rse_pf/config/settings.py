@@ -213,7 +213,7 @@ class LiveSettings:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RecordingSettings:
-    """What robots and servers said, kept in files that rse-pf replay explains."""
+    """What robots and servers said, kept in files that rse-pf replay reads."""
 
     folder: str = setting("", doc="folder of recordings; empty: nothing is recorded")
     max_bytes: int = setting(4294967296, unit="bytes", doc="size of all recordings of the folder above which the oldest files are deleted", low=1048576)

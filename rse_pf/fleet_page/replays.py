@@ -1,4 +1,4 @@
-"""The replay of one command of the Poses view: found in the platform's recording, solved again, explained.
+"""The replay of one command of the Poses view: found in the platform's recording, and solved again.
 
 Everything that reads the recording runs in a process with limits (`rse_pf.recording.replay.limited`).
 """
@@ -102,6 +102,12 @@ def replay_document(report: CommandReport) -> dict[str, Any]:
     lines = [
         f"verdict {report.verdict}{reason}; engine {report.engine or '-'}",
         f"{report.inliers} inliers of {report.matches} matches, {report.rmse_px:.2f} px",
+        *(
+            f"{rule.name}: {rule.about}: {rule.measured:.4g} {rule.unit}, not "
+            f"{'at least' if rule.at_least else 'at most'} {rule.limit:.4g}"
+            for rule in report.rules
+            if not rule.is_kept
+        ),
         *(f"{attempt.name}: {attempt.verdict}, {attempt.inliers} inliers" for attempt in tried),
     ]
     if not report.is_equal and (report.why_not or report.difference):
@@ -109,15 +115,6 @@ def replay_document(report: CommandReport) -> dict[str, Any]:
     return {
         "command": printable(report.id),
         "equal": report.is_equal,
-        "findings": [
-            {
-                "cause": printable(cause.cause),
-                "confidence": cause.confidence,
-                "sentence": printable(cause.sentence),
-                "missing": [printable(word) for word in cause.missing],
-            }
-            for cause in report.causes
-        ],
         "lines": [printable(line) for line in lines],
         "picture": f"data:image/png;base64,{base64.b64encode(picture).decode()}" if picture else "",
     }

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import zlib
@@ -13,13 +12,10 @@ import numpy as np
 import pytest
 from recording.replay.made import Made, jpeg
 
-from rse_pf.cli import replay as replay_command
 from rse_pf.cli.main import main
 from rse_pf.pnp.problems import make_degenerate, make_problem
 from rse_pf.recording.mcap_file import McapFile
 from rse_pf.recording.replay import limited
-from rse_pf.recording.replay.report import CauseFound
-from rse_pf.recording.replay.run import Overview
 from rse_pf.wire import Result
 
 
@@ -79,24 +75,24 @@ def test_replay_lists_what_went_wrong_worst_first(
 
     assert "3 commands of 3 robots" in out
     assert out.index(names["failed"]) < out.index(names["weak"])
-    assert "mirrored" in out
+    assert "degenerate" in out
     assert names["good"] not in out
     assert f"rse-pf replay {folder} --command {names['failed']}" in out
 
 
 @pytest.mark.usefixtures("quick")
-def test_json_of_a_recording_has_the_counts_and_the_causes(
+def test_json_of_a_recording_has_the_counts_and_the_troubles(
     recording: tuple[Path, dict[str, str]], capsys: pytest.CaptureFixture[str]
 ) -> None:
     seen = as_json(capsys, recording[0])
 
     assert (seen["commands"], seen["equal"], seen["different"]) == (3, 3, 0)
-    assert {"mirrored", "outliers"} <= set(seen["causes"])
-    assert sum(seen["causes_count"].values()) == 3
+    assert seen["by_kind"] == {"failed": 1, "weak": 1}
+    assert [each["id"] for each in seen["troubles"]] == [recording[1]["failed"], recording[1]["weak"]]
 
 
 @pytest.mark.usefixtures("quick")
-def test_a_command_is_explained_exported_and_replayed_from_its_case(
+def test_a_command_is_shown_exported_and_replayed_from_its_case(
     recording: tuple[Path, dict[str, str]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder, names = recording
@@ -108,7 +104,8 @@ def test_a_command_is_explained_exported_and_replayed_from_its_case(
     assert "equal to the byte" in out
     assert "low-inlier-ratio" in out
     assert (again["commands"], again["equal"], again["different"]) == (1, 1, 0)
-    assert again["causes"][0] == "outliers"
+    broken = [each["name"] for each in again["rules"] if each["measured"] < each["limit"]]
+    assert "low-inlier-ratio" in broken
     text = page.read_text(encoding="utf-8")
     assert "data:image/png;base64," in text
     assert "on the thumbnail of the frame" in text
@@ -210,20 +207,14 @@ def test_a_case_that_is_too_large_is_not_opened(tmp_path: Path, capsys: pytest.C
     assert "above 8388608" in capsys.readouterr().err
 
 
-def test_of_good_poses_text_and_json_blame_no_calibration_and_name_who_judges_it(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path
+@pytest.mark.usefixtures("quick")
+def test_where_nothing_went_wrong_it_says_who_judges_the_calibration(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    blamed = CauseFound(cause="depth_scale", confidence=0.9, sentence="the scale", evidence={})
-    overview = Overview(
-        files=1, cut=(), version="1", side="robot", commands=2, robots=1, seconds=1.0, left_out=0,
-        causes={"a:1": (blamed,), "a:2": (blamed,)}, explained=2,
-    )  # fmt: skip
+    made = Made(tmp_path / "rec")
+    made.send(1)
 
-    replay_command._show_overview(overview, argparse.Namespace(file=tmp_path))
-    told = replay_command._overview_json(overview)
+    out = printed(capsys, made.close())
 
-    out = capsys.readouterr().out
-    assert "nothing went wrong" not in out
+    assert "no command went wrong" in out
     assert "rse-pf check" in out
-    assert told["causes_count"] == {"none": 2}
-    assert told["findings"] == [{"id": "a:1", "causes": []}, {"id": "a:2", "causes": []}]

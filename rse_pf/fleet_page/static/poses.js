@@ -55,10 +55,6 @@ export function posesView(root, count) {
   function replayed(told) {
     const parts = [element("p", { id: "replay-equal" }, told.equal === null ? "The answer was not recorded." : told.equal
       ? "Solved again: the answer is the same, byte for byte." : "Solved again: the answer differs from the one that was sent.")];
-    for (const each of told.findings ?? []) {
-      parts.push(element("p", {}, element("strong", {}, `${each.cause} (${Math.round(each.confidence * 100)} %): `), each.sentence));
-      if (each.missing?.length) parts.push(element("p", { class: "soft" }, `Evidence that is missing: ${each.missing.join(", ")}`));
-    }
     if (told.picture) parts.push(element("p", {}, element("img", { src: told.picture, alt: "matches: inliers and outliers" })),
       element("p", { class: "soft" }, "Blue dots agree with the pose, orange crosses do not; a line leads to where the pose puts the point."));
     for (const line of told.lines ?? []) parts.push(element("div", { class: "soft" }, line));

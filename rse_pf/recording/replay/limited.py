@@ -3,7 +3,7 @@
     with LimitedReplay(settings) as replay:
         report = replay.command(path, "0123456789abcdef:42")
 
-What reads, decodes, solves, draws and explains runs there; the caller gets typed values.  A file that crashes
+What reads, decodes, solves and draws runs there; the caller gets typed values.  A file that crashes
 that process, or takes all its memory or time, costs one error.
 """
 
@@ -44,7 +44,6 @@ class _Order(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     overrides: Overrides = Overrides()
     solve: bool = False
     worst: int = 0
-    explain: int = 0
     with_picture: bool = True
     trace: str = ""
     number: int = 0
@@ -78,12 +77,10 @@ class LimitedReplay:
         solve: bool,
         overrides: Overrides | None = None,
         worst: int = 20,
-        explain: int = 20,
     ) -> run.Overview:
         """Return what `run.overview` returns; raises RsePfError."""
         order = _Order(
             do="overview", path=str(path), solve=solve, overrides=overrides or Overrides(), worst=worst,
-            explain=explain,
         )  # fmt: skip
         return self._ask(order, run.Overview)
 
@@ -155,7 +152,6 @@ def replayer(configuration: str) -> Handler:
         if order.do == "overview":
             reply = run.overview(
                 path, settings, solve=order.solve, overrides=order.overrides, worst=order.worst,
-                explain=order.explain,
             )  # fmt: skip
         elif order.do == "report":
             reply = run.report(

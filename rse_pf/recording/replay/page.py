@@ -38,9 +38,6 @@ h3 { font-size: 1rem; margin: 1.25rem 0 .4rem; }
 p { margin: .3rem 0; } .pale { color: var(--pale); }
 article { border-top: 3px solid var(--line); margin-top: 2.5rem; padding-top: .5rem; }
 .verdict { font-weight: 600; } .good { color: var(--good); } .bad { color: var(--bad); }
-.cause { background: var(--panel); border-left: 4px solid var(--inlier);
-  padding: .5rem .8rem; margin: .5rem 0; }
-.cause p:first-child { margin-top: 0; }
 figure { margin: .5rem 0; } figcaption { color: var(--pale); font-size: .87rem; margin-top: .25rem; }
 img { max-width: 100%; height: auto; border: 1px solid var(--line); display: block; }
 .side { display: flex; flex-wrap: wrap; gap: 1.5rem; } .side figure { flex: 1 1 22rem; }
@@ -87,18 +84,12 @@ def _overview(seen: Overview) -> str:
             f"<code>{_text(trouble.id)}</code>",
             _text(trouble.robot),
             _text(trouble.what),
-            _first_cause(seen, trouble.id),
         ]
         for trouble in seen.troubles
     ]
-    table = _table(["what", "command", "robot", "what was seen", "likeliest cause"], rows)
+    table = _table(["what", "command", "robot", "what was seen"], rows)
     by_kind = ", ".join(f"{count} {_text(kind)}" for kind, count in seen.by_kind.items()) or "nothing"
     return f'<p class="pale">{_text("; ".join(lines))}</p>\n<h2>What went wrong: {by_kind}</h2>\n{table}'
-
-
-def _first_cause(seen: Overview, identity: str) -> str:
-    causes = seen.causes.get(identity, ())
-    return f"{_text(causes[0].cause)}: {_text(causes[0].sentence)}" if causes else ""
 
 
 def _report(seen: CommandReport) -> str:
@@ -108,7 +99,6 @@ def _report(seen: CommandReport) -> str:
         f"<p>{_text(seen.hint)}</p>\n" if seen.hint else "",
         f"<p>{_equality(seen)}</p>\n",
         f'<p class="pale">{_text(_circumstances(seen))}</p>\n',
-        _causes(seen),
         _picture(seen),
         _charts(seen),
         _rules(seen.rules),
@@ -151,22 +141,6 @@ def _circumstances(seen: CommandReport) -> str:
     if seen.version:
         lines.append(f"rse-pf {seen.version}")
     return "; ".join(lines)
-
-
-def _causes(seen: CommandReport) -> str:
-    if not seen.causes:
-        return ""
-    parts = ["<h3>Why</h3>\n"]
-    for cause in seen.causes:
-        numbers = ", ".join(f"{name} {_number(value)}" for name, value in cause.evidence.items())
-        parts.append(
-            f'<div class="cause"><p><strong>{_text(cause.cause)}</strong> '
-            f'<span class="pale">(confidence {cause.confidence:.2f})</span></p>'
-            f'<p>{_text(cause.sentence)}</p><p class="pale">{_text(numbers)}</p></div>\n'
-        )
-    if seen.causes[0].missing:
-        parts.append(f'<p class="pale">Not recorded: {_text("; ".join(seen.causes[0].missing))}.</p>\n')
-    return "".join(parts)
 
 
 def _picture(seen: CommandReport) -> str:

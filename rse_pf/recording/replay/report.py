@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import msgspec
@@ -15,14 +14,13 @@ from rse_pf.geometry import Array, Camera, pose_difference, transform
 from rse_pf.pnp import PnpOptions, WeakLimits, evidence
 from rse_pf.pnp.engines import engine_for
 from rse_pf.pnp.rules import PoseJudgement, Rule
-from rse_pf.recording.explain import PastCommand, PoseExplanation, Timing, explain
 from rse_pf.recording.reader import RecordedCommand
 from rse_pf.recording.replay.picture import match_picture
 from rse_pf.recording.replay.solving import Again, Overrides, Resolver, pnp_reply
 from rse_pf.services.pnp import PnpReply, PnpRequest
 from rse_pf.wire import Failure, Result
 
-__all__ = ["Attempt", "CauseFound", "CommandReport", "Histogram", "causes_of", "report_of"]
+__all__ = ["Attempt", "CommandReport", "Histogram", "report_of"]
 
 _INLIER_PX_TRIED = (2.0, 4.0, 8.0, 16.0)
 _ITERATIONS_TRIED = (100, 1000, 10_000)
@@ -30,7 +28,6 @@ _ERROR_EDGES_PX = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0, math.i
 _DEPTH_BINS = 12
 _GRID = (8, 6)
 _MAX_NUMBER = 1e12
-_SAME_EPOCH_S = 3600.0
 
 
 class Attempt(msgspec.Struct, frozen=True, kw_only=True):
@@ -53,25 +50,6 @@ class Attempt(msgspec.Struct, frozen=True, kw_only=True):
     rmse_px: float = 0.0
     moved_m: float | None = None
     moved_deg: float | None = None
-
-
-class CauseFound(msgspec.Struct, frozen=True, kw_only=True):
-    """One cause, as `rse_pf.recording.explain` found it."""
-
-    cause: str
-    confidence: float
-    sentence: str
-    evidence: dict[str, float]
-    missing: tuple[str, ...] = ()
-
-    @classmethod
-    def of(cls, explanation: PoseExplanation) -> CauseFound:
-        """Return *explanation* as a value that travels between processes."""
-        numbers = {name: _plain(value) for name, value in explanation.evidence.items()}
-        return cls(
-            cause=explanation.cause.value, confidence=_plain(explanation.confidence),
-            sentence=explanation.sentence, evidence=numbers, missing=tuple(explanation.missing),
-        )  # fmt: skip
 
 
 class Histogram(msgspec.Struct, frozen=True, kw_only=True):
@@ -111,7 +89,6 @@ class CommandReport(msgspec.Struct, frozen=True, kw_only=True):
     is_equal: bool
     why_not: str
     difference: str
-    causes: tuple[CauseFound, ...] = ()
     tried: Attempt | None = None
     tried_name: str = ""
     engines: tuple[Attempt, ...] = ()
@@ -140,7 +117,6 @@ class _Problem:
 
 def report_of(
     command: RecordedCommand,
-    history: Sequence[RecordedCommand],
     resolver: Resolver,
     overrides: Overrides | None = None,
     *,
@@ -150,7 +126,6 @@ def report_of(
 
     Args:
         command: Recorded.
-        history: Earlier commands of the same robot, oldest first.
         resolver: Solves again.
         overrides: What the caller wants to try.
         with_picture: Whether to draw the matches.
@@ -178,7 +153,6 @@ def report_of(
     return msgspec.structs.replace(
         base,
         matches=len(problem.pixels),
-        causes=_causes(command, history, problem, reply),
         tried=tried,
         tried_name=_name_of(overrides),
         engines=_engines(command, resolver, pose),
@@ -190,15 +164,6 @@ def report_of(
         grid_outliers=_grid(problem, agrees=False),
         picture_png=picture,
     )
-
-
-def causes_of(
-    command: RecordedCommand, history: Sequence[RecordedCommand], resolver: Resolver
-) -> tuple[CauseFound, ...]:
-    """Return why *command* went wrong, likeliest first; nothing for another service than `pnp`."""
-    reply, _ = _read(command)
-    problem = _problem(command, resolver, pnp_reply(reply))
-    return () if problem is None else _causes(command, history, problem, reply)
 
 
 def _base(
@@ -285,75 +250,6 @@ def _propose(
     T_camera_world = np.eye(4)
     T_camera_world[:3] = pose
     return T_camera_world
-
-
-def _causes(
-    command: RecordedCommand,
-    history: Sequence[RecordedCommand],
-    problem: _Problem,
-    reply: Result | Failure | None,
-) -> tuple[CauseFound, ...]:
-    past = [past_command for past_command in map(_past, history) if past_command is not None]
-    odometry = command.odometry
-    with np.errstate(all="ignore"):
-        explanations = explain(
-            problem.request,
-            problem.recorded,
-            thumbnail=command.thumbnail,
-            history=past or None,
-            timing=_timing(command, history, reply),
-            T_odom_camera=None if odometry is None else odometry.T_odom_camera,
-        )
-    return tuple(CauseFound.of(explanation) for explanation in explanations)
-
-
-def _past(command: RecordedCommand) -> PastCommand | None:
-    """Return what an earlier command gave, None if it was none of `pnp` or cannot be read."""
-    try:
-        reply, payload = pnp_reply(command.reply), command.command.payload
-    except RsePfError:
-        return None
-    if not isinstance(payload, dict):
-        return None
-    pixels = payload.get("pixels", ())
-    count = len(pixels) if isinstance(pixels, (list, np.ndarray)) else 0
-    return PastCommand(
-        sent_s=command.sent_s,
-        T_camera_world=None if reply is None else reply.solution().T_camera_world,
-        T_odom_camera=None if command.odometry is None else command.odometry.T_odom_camera,
-        matches=count // 2,
-        inliers=0 if reply is None else int(reply.inliers.size),
-        thumbnail=command.thumbnail,
-    )
-
-
-def _timing(
-    command: RecordedCommand, history: Sequence[RecordedCommand], reply: Result | Failure | None
-) -> Timing:
-    """Return when command and answer were where, by the clock of the server or robot that recorded."""
-    sent = [past_command.sent_s for past_command in history] + [command.sent_s]
-    gaps = np.diff(np.array(sent))
-    period_s = float(np.median(gaps)) if len(gaps) > 1 else None
-    deadline_ms = command.command.deadline_ms
-    deadline_s = None if deadline_ms is None else deadline_ms / 1e3
-    if (
-        command.about.get("side") != "robot"
-    ):  # the robot saw a longer way, so that what is late here was late there
-        return Timing(
-            sent_s=command.sent_s, answered_s=command.answered_s, received_s=command.sent_s,
-            replied_s=command.answered_s, deadline_s=deadline_s, period_s=period_s,
-        )  # fmt: skip
-    stamped = reply if isinstance(reply, Result) and reply.received_s else None
-    frame_s = None if command.odometry is None else command.odometry.timestamp_s
-    if frame_s is not None and abs(frame_s - command.sent_s) > _SAME_EPOCH_S:
-        frame_s = None  # of a clock with another zero, such as that of frames that were recorded long ago
-    return Timing(
-        frame_s=frame_s,
-        sent_s=command.sent_s, answered_s=command.answered_s,
-        received_s=None if stamped is None else stamped.received_s,
-        replied_s=None if stamped is None else stamped.sent_s,
-        deadline_s=deadline_s, period_s=period_s,
-    )  # fmt: skip
 
 
 def _attempt(name: str, again: Again, recorded: PnpReply | None) -> Attempt:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import heapq
-from collections import Counter, deque
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ from rse_pf.config import PlatformSettings, PnpSettings
 from rse_pf.errors import BadRequest, RsePfError
 from rse_pf.recording.reader import RecordedCommand, WireRecording, open_recording
 from rse_pf.recording.replay.case import CasePart, case_parts
-from rse_pf.recording.replay.report import CauseFound, CommandReport, causes_of, report_of
+from rse_pf.recording.replay.report import CommandReport, report_of
 from rse_pf.recording.replay.solving import Overrides, Resolver
 from rse_pf.recording.replay.troubles import KINDS, RobotHistory, Trouble
 from rse_pf.recording.summary import Wanted
@@ -22,7 +22,7 @@ from rse_pf.recording.summary import Wanted
 __all__ = ["HISTORY", "Changed", "Exported", "Overview", "case_of", "find", "overview", "report"]
 
 HISTORY = 8
-"""Earlier commands of a robot that an explanation looks at."""
+"""Earlier commands of a robot that its case holds."""
 _MAX_ROBOTS = 10_000
 _MAX_CHANGED = 1000
 _MAX_RESOLVERS = 16
@@ -30,7 +30,6 @@ _NEAR_S = 5.0
 _LONGEST_S = 10.0
 """Of a `pnp` command, from its arrival to its answer."""
 _LATEST_S = 9e9
-_MAX_SERVICES = 64
 
 
 class Changed(msgspec.Struct, frozen=True, kw_only=True):
@@ -51,8 +50,6 @@ class Overview(msgspec.Struct, frozen=True, kw_only=True):
         different: Solved again with others; the first of them are ``changed``.
         not_solved: Why others could not be solved again, and how many.
         troubles: What went wrong, worst first; ``by_kind`` counts all.
-        causes: Of the troubles, by the id of the command; ``explained`` says how many commands were looked
-            at for causes.
     """
 
     files: int
@@ -70,8 +67,6 @@ class Overview(msgspec.Struct, frozen=True, kw_only=True):
     not_solved: dict[str, int] = {}
     troubles: tuple[Trouble, ...] = ()
     by_kind: dict[str, int] = {}
-    causes: dict[str, tuple[CauseFound, ...]] = {}
-    explained: int = 0
 
 
 class Exported(msgspec.Struct, frozen=True, kw_only=True):
@@ -84,26 +79,24 @@ class Exported(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class _Worst:
-    """The *count* worst troubles, with their commands and histories."""
+    """The *count* worst troubles."""
 
     def __init__(self, count: int) -> None:
         self._count = count
-        self._heap: list[
-            tuple[tuple[float, ...], int, Trouble, RecordedCommand, tuple[RecordedCommand, ...]]
-        ] = []
+        self._heap: list[tuple[tuple[float, ...], int, Trouble]] = []
         self._added = 0
 
-    def add(self, trouble: Trouble, command: RecordedCommand, history: tuple[RecordedCommand, ...]) -> None:
+    def add(self, trouble: Trouble) -> None:
         self._added += 1
         mildness = tuple(-number for number in trouble.order)
-        entry = mildness, -self._added, trouble, command, history
+        entry = mildness, -self._added, trouble
         if len(self._heap) < self._count:
             heapq.heappush(self._heap, entry)
         elif self._count:
             heapq.heappushpop(self._heap, entry)
 
-    def sorted(self) -> list[tuple[Trouble, RecordedCommand, tuple[RecordedCommand, ...]]]:
-        return [entry[2:] for entry in sorted(self._heap, key=lambda each: each[:2], reverse=True)]
+    def sorted(self) -> tuple[Trouble, ...]:
+        return tuple(entry[2] for entry in sorted(self._heap, key=lambda each: each[:2], reverse=True))
 
 
 def overview(
@@ -113,7 +106,6 @@ def overview(
     solve: bool,
     overrides: Overrides | None = None,
     worst: int = 20,
-    explain: int = 20,
 ) -> Overview:
     """Return what is in the recording at *path*, and what went wrong.
 
@@ -123,16 +115,14 @@ def overview(
         solve: Whether to solve every command again.
         overrides: What to try instead of what was asked for.
         worst: How many troubles are told.
-        explain: How many commands are looked at for causes: the worst troubles first, then the others.
 
     Raises:
         RsePfError: The recording cannot be read, or *overrides* name an engine that is not there.
     """
     recording = open_recording(path, settings.session)
     resolvers = _Resolvers(settings)
-    robots: dict[str, tuple[RobotHistory, dict[str, deque[RecordedCommand]]]] = {}
-    worst_commands = _Worst(max(worst, explain))
-    others: list[tuple[RecordedCommand, tuple[RecordedCommand, ...]]] = []
+    robots: dict[str, RobotHistory] = {}
+    troubles = _Worst(worst)
     by_kind: Counter[str] = Counter()
     not_solved: Counter[str] = Counter()
     changed: list[Changed] = []
@@ -144,17 +134,10 @@ def overview(
         last_s = command.sent_s if last_s is None else max(last_s, command.sent_s)
         if command.robot not in robots and len(robots) >= _MAX_ROBOTS:
             robots.pop(next(iter(robots)))
-        judged, by_service = robots.setdefault(command.robot, (RobotHistory(), {}))
-        past = by_service.setdefault(command.service[:64], deque(maxlen=HISTORY))
-        if len(by_service) > _MAX_SERVICES:
-            by_service.clear()
-        trouble = judged.judge(command)
+        trouble = robots.setdefault(command.robot, RobotHistory()).judge(command)
         if trouble is not None:
             by_kind[trouble.kind] += 1
-            worst_commands.add(trouble, command, tuple(past))
-        elif len(others) < explain:
-            others.append((command, tuple(past)))
-        past.append(command)
+            troubles.add(trouble)
         if not solve:
             continue
         again = resolvers.of(command).again(command, overrides)
@@ -166,8 +149,6 @@ def overview(
             different += 1
             if len(changed) < _MAX_CHANGED:
                 changed.append(Changed(id=command.id, what=again.difference))
-    bad = worst_commands.sorted()
-    looked_at = [*((command, past) for _, command, past in bad), *others][:explain]
     return Overview(
         files=len(recording.files), cut=tuple(sorted({file.name for file in recording.cut})),
         version=recording.metadata.get("version", ""), side=recording.metadata.get("side", ""),
@@ -176,11 +157,7 @@ def overview(
         equal=equal, different=different, was_solved=solve, changed=tuple(changed),
         not_solved=dict(not_solved.most_common(20)),
         by_kind={kind: by_kind[kind] for kind in KINDS if kind in by_kind},
-        troubles=tuple(trouble for trouble, _, _ in bad[:worst]),
-        causes={
-            command.id: causes_of(command, past, resolvers.of(command)) for command, past in looked_at
-        },
-        explained=len(looked_at),
+        troubles=troubles.sorted(),
     )  # fmt: skip
 
 
@@ -199,8 +176,8 @@ def report(
             not there.
     """
     recording = open_recording(path, settings.session)
-    command, history = recording.find_with_history(_identity(recording, identity), HISTORY)
-    return report_of(command, history, _Resolvers(settings).of(command), overrides, with_picture=with_picture)
+    command = recording.find(_identity(recording, identity))
+    return report_of(command, _Resolvers(settings).of(command), overrides, with_picture=with_picture)
 
 
 def case_of(path: Path, settings: PlatformSettings, identity: str) -> Exported:

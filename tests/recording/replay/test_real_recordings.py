@@ -68,7 +68,7 @@ def test_commands_of_two_runs_of_a_server_and_their_cases_are_equal_to_the_byte(
 
     with LimitedReplay() as replay:
         for folder in (recordings, on_robots):
-            seen = replay.overview(folder, solve=True, worst=40, explain=40)
+            seen = replay.overview(folder, solve=True, worst=40)
 
             assert seen.commands == 2 * len(NAMES) * _EACH
             assert (seen.different, seen.changed) == (0, ())
@@ -86,4 +86,4 @@ def test_commands_of_two_runs_of_a_server_and_their_cases_are_equal_to_the_byte(
                 data = case.read_bytes() + b"".join(texts(case))
                 for secret in (*NAMES, *tokens, "server-", "127.0.0.1"):
                     assert secret.encode() not in data
-        assert run.overview(recordings, SETTINGS, solve=False, explain=0).robots == 2 * len(NAMES)
+        assert run.overview(recordings, SETTINGS, solve=False).robots == 2 * len(NAMES)

@@ -39,7 +39,7 @@ def test_every_answer_is_equal_to_the_byte_with_the_engine_that_gave_it(
     for kind in DEGENERATE[:6]:
         made.send(make_degenerate(kind, seed=1), codec=codec)
 
-    seen = run.overview(made.close(), SETTINGS, solve=True, explain=0)
+    seen = run.overview(made.close(), SETTINGS, solve=True)
 
     assert (seen.commands, seen.equal, seen.different) == (10, 10, 0)
 
@@ -89,7 +89,7 @@ def test_what_a_server_refused_or_never_answered_is_not_solved_again(tmp_path: P
     made.send(3, service="warehouse")
     made.send(4)
 
-    seen = run.overview(made.close(), SETTINGS, solve=True, explain=0)
+    seen = run.overview(made.close(), SETTINGS, solve=True)
 
     assert (seen.commands, seen.equal, seen.different) == (4, 1, 0)
     assert seen.not_solved == {
@@ -123,7 +123,7 @@ def test_the_limits_of_the_server_that_recorded_hold_again(tmp_path: Path) -> No
     made.send(make_problem(seed=1, n=60))
     made.send(make_problem(seed=2, n=40, outlier_ratio=0.7))
 
-    seen = run.overview(made.close(), SETTINGS, solve=True, explain=0)
+    seen = run.overview(made.close(), SETTINGS, solve=True)
 
     assert (seen.equal, seen.different) == (2, 0)
 
@@ -146,7 +146,6 @@ def test_what_went_wrong_is_listed_worst_first(tmp_path: Path) -> None:
         ("failed", failed), ("jump", jump), ("unanswered", lost), ("expired", stale), ("weak", weak),
         ("late", late),
     ]  # fmt: skip
-    assert seen.causes[jump]
     assert not seen.was_solved
 
 
@@ -185,7 +184,7 @@ def test_ten_thousand_commands_of_two_servers_are_equal_to_the_byte(tmp_path: Pa
             made.send(make_problem(seed=seed, outlier_ratio=ratio), codec=codec, robot=seed % 3)
         made.close()
 
-    seen = run.overview(tmp_path / "a", SETTINGS, solve=True, explain=0)
+    seen = run.overview(tmp_path / "a", SETTINGS, solve=True)
 
     assert (seen.commands, seen.equal, seen.different) == (10_000, 10_000, 0)
     assert seen.files > 2
