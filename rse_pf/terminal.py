@@ -25,7 +25,6 @@ from rse_pf.errors import RsePfError
 
 __all__ = [
     "at_work",
-    "can_draw",
     "counted",
     "error_lines",
     "json_line",
@@ -93,15 +92,6 @@ def error_lines(error: RsePfError) -> list[str]:
     """Return the report on *error* as lines; a message of several lines cannot pass for several reports."""
     first = f"{type(error).__name__}: {error.message}".rstrip("\n").replace("\n", f"\n{_CONTINUED}")
     return [*first.split("\n"), f"  hint: {error.hint}" if error.hint else f"  see: {error.address()}"]
-
-
-def can_draw(text: str) -> bool:
-    """Return whether standard output is a terminal that has the characters of *text*."""
-    try:
-        text.encode(sys.stdout.encoding or "ascii")
-    except (UnicodeEncodeError, LookupError):
-        return False
-    return sys.stdout.isatty()
 
 
 def show_progress(text: str, *, is_over: bool) -> bool:

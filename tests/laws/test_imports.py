@@ -153,7 +153,6 @@ PACKAGES: dict[str, tuple[str, ...]] = {
     "small_gicp": ("rse_pf/slam/icp.py",),
     "faiss": ("rse_pf/slam/descriptors.py",),
     "envoy": ("rse_pf/local/",),
-    "segno": ("rse_pf/cli/",),
 }
 BASE = {"numpy", "msgspec", "websockets"}
 BASE_ROOMS = ONLY["client_sdk"] | {"client_sdk", "rse_pf", "auth", "scaling", "object_store"}

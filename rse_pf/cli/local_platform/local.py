@@ -413,14 +413,13 @@ def _show_page(url: str) -> None:
 
 
 def _lan_lines(platform: Any, which: str) -> list[str]:
-    """Return what other machines need, and show a QR code; nothing without --lan."""
-    from rse_pf.cli.local_platform.lan import browser_url, lan_lines, show_qr_code
+    """Return what other machines need; nothing without --lan."""
+    from rse_pf.cli.local_platform.lan import lan_lines
 
     if platform.lan is None:
         return []
     from rse_pf.local.lan.listener import authority_file
 
-    show_qr_code(browser_url(platform.url))
     return lan_lines(platform.url, platform.lan.authority(), authority_file(platform.state), which)
 
 

@@ -15,7 +15,6 @@ from typing import Any
 from rse_pf.config import PlatformSettings
 from rse_pf.config.front_door import BODY_TIMEOUT_S, DATA_PATH, LOCALISE_PATH, MAX_HANDSHAKE_BYTES
 from rse_pf.config.resource_names import HEALTH_PATH, READY_PATH, ROSBRIDGE_PATH
-from rse_pf.local.lan.connect_page import connect_page, page_headers
 from rse_pf.local.lan.listener import CERTIFICATE_NAME, LanListener, secret_file
 from rse_pf.scaling.health import HEALTHY_CHECKS, LOCAL_INTERVAL_S, LOCAL_TIMEOUT_S
 
@@ -64,7 +63,7 @@ def envoy_config(
         port: Of the listener; 0 takes a free one.
         endpoints_file: What `endpoints` returned, as JSON; replaced by rename, never written in place.
         data_endpoints_file: The same for the data servers; without targets ``/data/`` is answered with 503.
-        lan: Listens on its address instead, with TLS and its certificate, and answers ``/`` with a page.
+        lan: Listens on its address instead, with TLS and its certificate.
     """
     return {
         "node": {"id": "front-door", "cluster": "rse-pf"},  # endpoint files are refused without
@@ -131,7 +130,7 @@ def _listener(settings: PlatformSettings, port: int, lan: LanListener | None) ->
         "merge_slashes": True,
         "path_with_escaped_slashes_action": "REJECT_REQUEST",
         "upgrade_configs": [{"upgrade_type": "websocket"}],
-        "route_config": {"virtual_hosts": [_virtual_host(settings, lan)]},
+        "route_config": {"virtual_hosts": [_virtual_host(settings)]},
         "http_filters": [
             {
                 "name": "router",
@@ -220,7 +219,7 @@ def _max_connections(most: int) -> dict[str, Any]:
     }
 
 
-def _virtual_host(settings: PlatformSettings, lan: LanListener | None) -> dict[str, Any]:
+def _virtual_host(settings: PlatformSettings) -> dict[str, Any]:
     retry = {
         "retry_on": "connect-failure,refused-stream,reset-before-request,reset",
         "num_retries": 3,
@@ -253,20 +252,6 @@ def _virtual_host(settings: PlatformSettings, lan: LanListener | None) -> dict[s
             # Each would ask the store; the balancer's own checks do not pass the listener.
             {"match": {"path": _DATA_READY}, "direct_response": {"status": 404}},
             *({"match": {"prefix": path}, "route": data_route} for path in (DATA_PATH, LOCALISE_PATH)),
-            *(() if lan is None else (_page(settings),)),
-        ],
-    }
-
-
-def _page(settings: PlatformSettings) -> dict[str, Any]:
-    """Return the route of the page that tests the connection of a browser."""
-    headers = [{"header": {"key": name, "value": value}} for name, value in page_headers().items()]
-    body = {"inline_string": connect_page(settings.serving.path)}
-    return {
-        "match": {"path": "/"},
-        "direct_response": {"status": 200, "body": body},
-        "response_headers_to_add": [
-            {**each, "append_action": "OVERWRITE_IF_EXISTS_OR_ADD"} for each in headers
         ],
     }
 

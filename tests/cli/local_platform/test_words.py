@@ -1,4 +1,4 @@
-"""What the actions of a running platform tell: robots, addresses of a LAN, the QR code, refused pauses."""
+"""What the actions of a running platform tell: robots, addresses of a LAN, refused pauses."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from rse_pf.cli.local_platform.lan import browser_url, chosen_address, lan_lines, qr_lines
+from rse_pf.cli.local_platform.lan import chosen_address, lan_lines
 from rse_pf.cli.local_platform.robots import robots_table
 from rse_pf.cli.main import main
 from rse_pf.config import HealthSettings
@@ -36,22 +36,16 @@ def test_the_table_of_robots_has_a_row_for_each_and_says_how_many_are_left_out()
     assert robots_table({"robots": [], "count": 0, "silent": []}) == ["no robot is connected"]
 
 
-def test_the_lines_of_a_lan_name_browser_port_and_fingerprint(tmp_path: Path) -> None:
+def test_the_lines_of_a_lan_name_port_authority_and_fingerprint(tmp_path: Path) -> None:
     lan = LanListener(address="10.1.2.3", folder=tmp_path)
     lan.prepare("default", now_s=1_800_000_000.0)
 
     text = "\n".join(lan_lines("wss://10.1.2.3:8700/ws", lan.authority(), tmp_path / "authority.crt", ""))
 
-    assert browser_url("wss://[fd00::1]:8700/ws") == "https://[fd00::1]:8700/"
-    assert "https://10.1.2.3:8700/" in text
+    assert str(tmp_path / "authority.crt") in text
     assert "TCP port 8700" in text
     assert lan.authority().fingerprint in text
     assert chosen_address(None) == ""
-
-
-def test_a_qr_code_is_drawn_light_on_dark_with_two_rows_a_line() -> None:
-    assert qr_lines([[0, 1, 0], [0, 1, 1]]) == ["\u2588 \u2580"]
-    assert qr_lines([[0, 1]]) == ["\u2580 "]
 
 
 def test_a_pause_may_last_until_the_control_plane_replaces_the_server() -> None:

@@ -1,4 +1,4 @@
-"""A browser page over https connects by WSS: headless Chromium, on this machine and on another one.
+"""A browser connects by WSS from an https page: headless Chromium, on this machine and on another one.
 
 The authority is trusted by the browser's NSS database (certutil -A), as a person would import it; no switch
 turns the check of certificates off.
@@ -32,13 +32,16 @@ import asyncio, json, re, subprocess, sys
 import websockets
 
 SAID = '''new Promise(done => {
-  const output = document.querySelector("output");
-  const look = () => { if (/^(connected|refused)/.test(output.textContent)) done(output.textContent); };
-  new MutationObserver(look).observe(output, {childList: true, subtree: true, characterData: true});
-  look();
+  const socket = new WebSocket("wss://" + location.host + "/ws", ["rse-pf.v1.json", "rse-pf.token." + TOKEN]);
+  socket.onopen = () => socket.send(JSON.stringify({type: "hello"}));
+  socket.onmessage = event => {
+    const message = JSON.parse(event.data);
+    done(message.type + " by " + message.server + " as " + message.robot);
+  };
+  socket.onclose = () => done("refused");
 })'''
 
-async def visit(url, debugger):
+async def visit(url, token, debugger):
     async with websockets.connect(debugger, max_size=None) as tool:
         async def ask(method, session="", **parameters):
             order = {"id": 1, "method": method, "params": parameters}
@@ -56,18 +59,21 @@ async def visit(url, debugger):
             return opened["errorText"]
         while json.loads(await tool.recv()).get("method") != "Page.loadEventFired":
             pass
-        said = await ask("Runtime.evaluate", session, expression=SAID, awaitPromise=True)
+        connect = SAID.replace("TOKEN", json.dumps(token))
+        said = await ask("Runtime.evaluate", session, expression=connect, awaitPromise=True)
         return said["result"]["value"]
 
-browser = subprocess.Popen(sys.argv[2:], stderr=subprocess.PIPE, text=True)
+browser = subprocess.Popen(sys.argv[3:], stderr=subprocess.PIPE, text=True)
 try:
     debugger = next(found[0] for line in browser.stderr if (found := re.search(r"ws://\S+", line)))
-    print(asyncio.run(asyncio.wait_for(visit(sys.argv[1], debugger), 60)))
+    print(asyncio.run(asyncio.wait_for(visit(sys.argv[1], sys.argv[2], debugger), 60)))
 finally:
     browser.kill()
     browser.communicate()
 """
-"""Opens a page in Chromium by its debugging protocol; prints what the page says, or why it is not shown."""
+"""Opens a page in Chromium by its debugging protocol, and connects from it.
+
+It prints what the platform says, or why the page is not shown."""
 
 
 class Browser:
@@ -84,10 +90,10 @@ class Browser:
         for words in (["-N", "--empty-password"], ["-A", "-t", "C,,", "-n", "rse-pf", "-i", str(authority)]):
             subprocess.run([str(CERTUTIL), "-d", f"sql:{database}", *words], check=True, timeout=SOON_S)
 
-    def visit(self, url: str) -> str:
-        """Return what the page at *url* says at last, or the error of the browser, on the other machine."""
+    def visit(self, url: str, token: str) -> str:
+        """Return what a page at *url* is told with *token*, or the browser's error, on the other machine."""
         done = self._other.run(
-            "env", f"HOME={self._home}", sys.executable, "-c", VISIT, url, str(CHROMIUM), "--headless",
+            "env", f"HOME={self._home}", sys.executable, "-c", VISIT, url, token, str(CHROMIUM), "--headless",
             "--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-background-networking",
             f"--user-data-dir={self._home / 'profile'}", "--remote-debugging-port=0", "about:blank",
             within_s=SOON_S,
@@ -114,16 +120,16 @@ def test_a_page_over_https_connects_with_a_token_and_only_if_the_authority_is_tr
         async with LocalPlatform(
             PlatformSettings(), state=folder, servers=1, port=0, data=False, lan=other_machine.here
         ) as platform:
-            page = platform.url.replace("wss:", "https:").removesuffix("ws")
+            page = platform.url.replace("wss:", "https:").removesuffix("ws") + "healthz"
             token = platform.issue_token("browser-1")
-            untrusted = await asyncio.to_thread(browser.visit, f"{page}#token={token}")
+            untrusted = await asyncio.to_thread(browser.visit, page, token)
             browser.trust(authority_file(folder))
-            connected = await asyncio.to_thread(browser.visit, f"{page}#token={token}")
-            refused = await asyncio.to_thread(browser.visit, f"{page}#token={token[:-4]}AAAA")
+            connected = await asyncio.to_thread(browser.visit, page, token)
+            refused = await asyncio.to_thread(browser.visit, page, f"{token[:-4]}AAAA")
             return untrusted, connected, refused
 
     untrusted, connected, refused = asyncio.run(run())
 
-    assert connected.startswith("connected to server-1 as browser-1; this page may ask for the camera")
-    assert refused.startswith("refused: ")
+    assert connected == "welcome by server-1 as browser-1"
+    assert refused == "refused"
     assert untrusted == "net::ERR_CERT_AUTHORITY_INVALID"
