@@ -14,7 +14,7 @@ from client_sdk.simulator.drive import (
     render_pairs,
     true_trajectory,
 )
-from client_sdk.simulator.world import World, make_world, with_equal_rooms
+from client_sdk.simulator.world import World, make_world
 
 __all__ = [
     "RATE_HZ",
@@ -28,5 +28,4 @@ __all__ = [
     "render_frames",
     "render_pairs",
     "true_trajectory",
-    "with_equal_rooms",
 ]

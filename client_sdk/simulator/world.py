@@ -8,12 +8,10 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
-
-from rse_pf.errors import UsageError
 
 __all__ = [
     "DEPTH_M",
@@ -24,7 +22,6 @@ __all__ = [
     "Face",
     "World",
     "make_world",
-    "with_equal_rooms",
 ]
 
 ROOM_M, DEPTH_M, HEIGHT_M = 5.0, 4.6, 2.6
@@ -146,31 +143,6 @@ def make_world(seed: int, rooms: int = ROOMS) -> World:
     for door in range(1, rooms):
         _door_frame(build, door, wood)
     return World(tuple(build.faces), tuple(build.textures))
-
-
-def with_equal_rooms(world: World, one: int, other: int) -> World:
-    """Return *world* where room *other* looks as room *one* does, to the pixel.
-
-    Raises:
-        UsageError: They are not both between other rooms, or robots drive around a table in one of them only.
-    """
-    last = max(face.room for face in world.faces)
-    if not (0 < one < last and 0 < other < last and (one - other) % 2 == 0):
-        raise UsageError(
-            f"rooms {one} and {other} of {last + 1} cannot be equal",
-            hint="name two rooms with doors on both sides, both even or both odd",
-        )
-    faces = [face for face in world.faces if face.room != other]
-    shift_m = (other - one) * ROOM_M
-    copies = [_shift(face, other, shift_m) for face in world.faces if face.room == one]
-    return World((*faces, *copies), world.textures)
-
-
-def _shift(face: Face, room: int, shift_m: float) -> Face:
-    if face.axis == 0:
-        return replace(face, room=room, offset=face.offset + shift_m)
-    low, high = (face.low[0] + shift_m, face.low[1]), (face.high[0] + shift_m, face.high[1])
-    return replace(face, room=room, low=low, high=high)
 
 
 def _wall_pieces(outer: bool) -> list[tuple[float, float, float]]:

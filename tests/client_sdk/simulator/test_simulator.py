@@ -13,19 +13,16 @@ from client_sdk.frontend import PoseQuery
 from client_sdk.mapping import Trajectory
 from client_sdk.simulator import (
     SIMULATED_CAMERA,
-    World,
     frames_to_overlap,
-    loop_trajectory,
     render_frames,
     true_trajectory,
-    with_equal_rooms,
 )
 from client_sdk.simulator.camera import Painter, add_depth_noise
-from client_sdk.simulator.world import DEPTH_M, DOOR_Y_M, HEIGHT_M, ROOM_M, Face, make_world
+from client_sdk.simulator.world import DEPTH_M, DOOR_Y_M, HEIGHT_M, ROOM_M, make_world
 from client_sdk.tracking.tracker import Tracker
 from rse_pf.errors import UsageError
 from rse_pf.experiments.results.trajectory_error import absolute_error
-from rse_pf.geometry import Camera, pose_difference, transform
+from rse_pf.geometry import pose_difference, transform
 from rse_pf.pnp import PnpOptions, solve_pnp
 
 
@@ -39,31 +36,6 @@ def test_the_same_arguments_give_the_same_frames_and_another_seed_others():
     np.testing.assert_array_equal(first.rgb, again.rgb)
     np.testing.assert_array_equal(first.depth_m, again.depth_m)
     assert np.mean(first.rgb != other.rgb) > 0.5
-
-
-@pytest.mark.slow  # makes a world of its own
-def test_equal_rooms_are_equal_to_the_pixel_and_are_where_they_were():
-    world = with_equal_rooms(make_world(0, 5), 1, 3)
-    here = loop_trajectory(1.0, 1, 0, 5).T_world_camera[0]
-    there = here.copy()
-    there[0, 3] += 2 * ROOM_M
-    small = Camera(fx=60.0, fy=60.0, cx=31.5, cy=23.5, width=64, height=48)
-    left = np.array([[0.0, 0, -1, 0], [0, 1, 0, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
-    for turned in (left, left.T):
-        one, two = (Painter(world, small).draw(pose @ turned) for pose in (here, there))
-        same = np.abs(one[1] - two[1]) < 1e-3
-        assert np.mean(same) > 0.8  # through doors other rooms are seen
-        assert np.mean(np.abs(one[0] - two[0]).max(axis=2)[same] < 5.0) > 0.99
-    plain = Painter(make_world(0, 5), small).draw(there @ left.T)
-    assert np.mean(np.abs(plain[0] - two[0]).max(axis=2) < 5.0) < 0.5
-
-
-@pytest.mark.parametrize(("one", "other"), [(0, 2), (1, 2), (3, 4)])
-def test_rooms_at_an_end_or_of_another_kind_cannot_be_equal(one: int, other: int) -> None:
-    black = (0, 0, 0)
-    faces = tuple(Face(2, 0.0, 1, (0.0, 0.0), (1.0, 1.0), 0, 1.0, black, black, room) for room in range(5))
-    with pytest.raises(UsageError, match="cannot be equal"):
-        with_equal_rooms(World(faces, ()), one, other)
 
 
 @pytest.mark.parametrize(("robots", "seed"), [(1, 0), (3, 1), (5, 4)])
