@@ -15,7 +15,6 @@ from rse_pf.errors import BadRequest, InvalidCamera
 from rse_pf.geometry import Camera
 from rse_pf.live_map.events import matrix_of
 from rse_pf.live_map.measure import measure_links, reference_of_features, view_of_features
-from rse_pf.services.synthetic_maps import make_world
 from rse_pf.slam.keyframe import (
     MAX_FEATURES,
     MAX_KEYFRAME_BYTES,
@@ -26,6 +25,7 @@ from rse_pf.slam.keyframe import (
 )
 from rse_pf.slam.localise import PlacedKeyframe, localise
 from rse_pf.slam.places import place_vector
+from tests.synthetic_maps import make_world
 
 __all__ = ["live"]
 

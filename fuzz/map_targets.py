@@ -24,8 +24,8 @@ from rse_pf.ipc import FrameReader
 from rse_pf.maps.format import Keyframe, MapVersion, decode_map, encode_map
 from rse_pf.service import dispatch
 from rse_pf.services.builtin import builtin_services
-from rse_pf.services.synthetic_maps import make_world
 from rse_pf.wire import Command, Failure, Result, make_codec
+from tests.synthetic_maps import make_world
 
 __all__ = ["cloud", "graph", "keyframes", "maps", "snapshots"]
 

@@ -22,9 +22,9 @@ from rse_pf.maps.format import Edge, MapVersion, decode_map, encode_map
 from rse_pf.pnp import PnpOptions
 from rse_pf.pnp.problems import DEGENERATE, KINECT, make_degenerate, make_problem, make_two_views
 from rse_pf.services.pnp import make_request
-from rse_pf.services.synthetic_maps import make_room, make_sphere, make_world
 from rse_pf.slam.pose_graph import write_g2o
 from rse_pf.wire import Cancel, Command, Failure, Hello, Ping, Rate, Refused, Result, make_codec
+from tests.synthetic_maps import make_room, make_sphere, make_world
 
 __all__ = ["CORPUS", "EXPENSIVE", "MAX_INPUT_BYTES", "samples"]
 

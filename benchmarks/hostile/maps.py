@@ -48,7 +48,7 @@ from rse_pf.experiments.load.swarm import Swarm
 from rse_pf.geometry import exp_se3
 from rse_pf.maps.format import Keyframe, encode_map
 from rse_pf.object_store import digest_of
-from rse_pf.services.synthetic_maps import make_room, make_world
+from tests.synthetic_maps import make_room, make_world
 
 ROOT = Path(__file__).resolve().parents[2]
 CORPUS = ROOT / "tests" / "hostile" / "hostile_maps.py"

@@ -46,7 +46,6 @@ from rse_pf.live_map.outcomes import Added, OptimiseWanted
 from rse_pf.live_map.versions import encode_stored
 from rse_pf.local.control.platform import LocalPlatform
 from rse_pf.maps.format import decode_map
-from rse_pf.services.synthetic_maps import make_world
 from rse_pf.slam.inertial import InertialMotion, KeyframeImu
 from rse_pf.slam.keyframe import (
     Keyframe,
@@ -56,6 +55,7 @@ from rse_pf.slam.keyframe import (
     make_features,
     make_scaleless_features,
 )
+from tests.synthetic_maps import make_world
 
 __all__ = [
     "ATTACKS",

@@ -25,11 +25,11 @@ from benchmarks.frame.registry import Bar, benchmark
 from benchmarks.maps.services import robots_of
 from rse_pf.experiments.results.trajectory_error import ate_m
 from rse_pf.geometry import Array
-from rse_pf.services.synthetic_maps import make_sphere
 from rse_pf.slam import map_merge as join
 from rse_pf.slam.map_merge import merge_versions
 from rse_pf.slam.optimise import OptimisedGraph, OptimiseOptions, optimise_graph, robust_cost
 from rse_pf.slam.pose_graph import PoseGraph, write_g2o
+from tests.synthetic_maps import make_sphere
 
 REFERENCE = Path(__file__).with_name("g2o_reference.py")
 CAUCHY = 3.0

@@ -37,7 +37,6 @@ from rse_pf.service import Report
 from rse_pf.services.mapping.localise import locate
 from rse_pf.services.mapping.place import MapIndex
 from rse_pf.services.mapping.wifi import Locator, fingerprint_of
-from rse_pf.services.synthetic_maps import make_building, make_room, make_sphere
 from rse_pf.slam.consistency import LoopClosure
 from rse_pf.slam.icp import align
 from rse_pf.slam.map_merge import (
@@ -50,6 +49,7 @@ from rse_pf.slam.map_merge import (
 )
 from rse_pf.slam.optimise import optimise_graph
 from rse_pf.slam.relative_pose import View
+from tests.synthetic_maps import make_building, make_room, make_sphere
 
 THREE_ROBOTS = ((0, 84), (84, 168), (168, 250))
 LOCALISE_INLIERS = 30

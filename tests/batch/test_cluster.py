@@ -19,8 +19,8 @@ from rse_pf.config import PlatformSettings
 from rse_pf.errors import BadRequest, Crashed
 from rse_pf.maps.format import MapVersion, encode_map
 from rse_pf.object_store import DirectoryStore
-from rse_pf.services.synthetic_maps import make_world
 from rse_pf.slam.map_merge import Atlas, MergeOptions, merge_versions, propose_links
+from tests.synthetic_maps import make_world
 
 pytestmark = pytest.mark.slow
 

@@ -16,7 +16,7 @@ from rse_pf.batch.parts import Part, PartResult, put_input, read_result
 from rse_pf.batch.tasks import graph_arrays
 from rse_pf.config import PlatformSettings
 from rse_pf.object_store import DirectoryStore, MemoryStore
-from rse_pf.services.synthetic_maps import make_sphere
+from tests.synthetic_maps import make_sphere
 
 pytest.importorskip("distributed", reason="the extra batch is not installed")
 

@@ -17,8 +17,8 @@ from rse_pf.errors import BadRequest, Disconnected, LimitExceeded
 from rse_pf.geometry import Array
 from rse_pf.maps.format import MapVersion, encode_map
 from rse_pf.object_store import MemoryStore
-from rse_pf.services.synthetic_maps import make_world
 from rse_pf.slam.map_merge import Atlas, MergedMap, MergeOptions, merge_versions, propose_links
+from tests.synthetic_maps import make_world
 
 for package in ("faiss", "gtsam"):
     pytest.importorskip(package, reason="the extra maps is not installed")

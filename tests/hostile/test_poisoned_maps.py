@@ -23,10 +23,10 @@ from rse_pf.maps.describe import describe_map
 from rse_pf.maps.format import Edge, Keyframe, MapVersion, encode_map
 from rse_pf.service import dispatch
 from rse_pf.services.builtin import builtin_services
-from rse_pf.services.synthetic_maps import make_sphere, make_world
 from rse_pf.slam.map_export import FORMATS, export_map
 from rse_pf.slam.pose_graph import write_g2o
 from rse_pf.wire import Command, Failure, Result
+from tests.synthetic_maps import make_sphere, make_world
 
 REGISTRY = builtin_services(PlatformSettings())
 INFORMATION = np.diag([100.0, 100, 100, 400, 400, 400])

@@ -28,10 +28,10 @@ from rse_pf.live_map.events import (
 from rse_pf.live_map.live_map import UP_TO_SCALE, LiveMap
 from rse_pf.live_map.measure import measure_links
 from rse_pf.live_map.outcomes import Corrected, Joined
-from rse_pf.services.synthetic_maps import make_world
 from rse_pf.slam.consistency import LinkEnds, OdometryNoise, round_trips_close
 from rse_pf.slam.keyframe import KeyframeFeatures, make_features, make_scaleless_features
 from rse_pf.slam.smoother import ScaleTerms, smooth
+from tests.synthetic_maps import make_world
 
 HOSTILE = "x"
 WAY = 1.0, 1.1

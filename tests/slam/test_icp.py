@@ -10,8 +10,8 @@ from default_cases import first_by_default
 
 from rse_pf.errors import BadRequest
 from rse_pf.geometry import Array, exp_se3, pose_difference
-from rse_pf.services.synthetic_maps import make_room as full_room
 from rse_pf.slam.icp import IcpOptions, align
+from tests.synthetic_maps import make_room as full_room
 
 pytest.importorskip("small_gicp", reason="the extra maps is not installed")
 

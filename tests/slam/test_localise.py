@@ -9,10 +9,10 @@ import pytest
 
 from rse_pf.geometry import exp_se3, inverse, pose_difference
 from rse_pf.live_map.measure import reference_of_features, view_of_features
-from rse_pf.services.synthetic_maps import make_world
 from rse_pf.slam.keyframe import KeyframeFeatures, make_features
 from rse_pf.slam.localise import LocalisationOptions, Localised, PlacedKeyframe, localise, spread_candidates
 from rse_pf.slam.relative_pose import RelativePoseOptions
+from tests.synthetic_maps import make_world
 
 
 def coded(keyframe) -> KeyframeFeatures:

@@ -13,7 +13,6 @@ from rse_pf.geometry import Array, exp_se3, inverse, pose_difference
 from rse_pf.maps.format import MapVersion, decode_map, encode_map
 from rse_pf.service import Report
 from rse_pf.services.mapping.merge import MergeRequest, merge_maps
-from rse_pf.services.synthetic_maps import make_world
 from rse_pf.slam import relative_pose
 from rse_pf.slam.consistency import LoopClosure, OdometryNoise, consistent, largest_clique
 from rse_pf.slam.map_merge import (
@@ -25,6 +24,7 @@ from rse_pf.slam.map_merge import (
     propose_links,
 )
 from rse_pf.slam.optimise import ignore_progress
+from tests.synthetic_maps import make_world
 
 for package in ("faiss", "gtsam"):
     pytest.importorskip(package, reason="the extra maps is not installed")

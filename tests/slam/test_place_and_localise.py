@@ -14,10 +14,10 @@ from rse_pf.service import dispatch
 from rse_pf.services.builtin import builtin_services
 from rse_pf.services.mapping.localise import LocaliseOptions, LocaliseReply, LocaliseRequest, locate
 from rse_pf.services.mapping.place import MapIndex, PlaceReply, PlaceRequest, Within
-from rse_pf.services.synthetic_maps import make_world
 from rse_pf.slam.descriptors import best_matches
 from rse_pf.slam.relative_pose import View
 from rse_pf.wire import Command, Failure, Result
+from tests.synthetic_maps import make_world
 
 pytest.importorskip("faiss", reason="the extra maps is not installed")
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from rse_pf.errors import BadRequest
-from rse_pf.services.synthetic_maps import make_world
 from rse_pf.slam.places import PLACE_NUMBERS, PLACE_WORDS_FILE, PlaceIndex, place_vector
+from tests.synthetic_maps import make_world
 
 
 def unit_vectors(n: int, seed: int = 1):

@@ -14,7 +14,7 @@ import pytest
 from rse_pf.errors import MissingExtra, UsageError
 from rse_pf.experiments.plots.map_viewer import browse_map, first_view
 from rse_pf.maps.format import MapVersion
-from rse_pf.services.synthetic_maps import make_world
+from tests.synthetic_maps import make_world
 
 
 class Page:

@@ -18,11 +18,11 @@ from rse_pf.maps.format import decode_map, encode_map
 from rse_pf.service import dispatch
 from rse_pf.services.builtin import builtin_services
 from rse_pf.services.mapping import place as place_service
-from rse_pf.services.synthetic_maps import make_room, make_world
 from rse_pf.slam import consistency
 from rse_pf.slam.consistency import largest_clique
 from rse_pf.slam.map_merge import merge_versions
 from rse_pf.wire import Command, Failure, Result, make_codec
+from tests.synthetic_maps import make_room, make_world
 
 pytest.importorskip("faiss", reason="needs the extra 'maps'")
 

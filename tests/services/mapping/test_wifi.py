@@ -18,8 +18,8 @@ from rse_pf.services.mapping.wifi import (
     WifiRequest,
     fingerprint_of,
 )
-from rse_pf.services.synthetic_maps import Building, make_building
 from rse_pf.wire import Command, Failure, Result
+from tests.synthetic_maps import Building, make_building
 
 KEY = b"a key of the team"
 
