@@ -45,7 +45,7 @@ from websockets.exceptions import WebSocketException
 
 from benchmarks.frame.registry import Bar, benchmark
 from benchmarks.frame.statistics import median_ratio, percentile
-from benchmarks.hostile.robots import resident_mib
+from benchmarks.server.serving import resident_mib
 from client_sdk import connect
 from client_sdk.robot import Robot
 from rse_pf.accounts import stored_by_tenant

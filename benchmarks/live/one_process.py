@@ -22,15 +22,6 @@ import numpy as np
 from benchmarks.frame.registry import Bar, benchmark
 from benchmarks.frame.report import say
 from benchmarks.frame.statistics import percentile, spread
-from benchmarks.live.generated_drives import (
-    GeneratedDrive,
-    GeneratedWorld,
-    circle,
-    make_link,
-    meander,
-    straight,
-)
-from benchmarks.maps.recordings import Run, drive, frame_poses, red_kitchen, truth_of
 from client_sdk.datasets import Dataset, open_dataset
 from client_sdk.frontend import FrontEndOptions
 from rse_pf.experiments.results.trajectory_error import ate_m
@@ -49,6 +40,15 @@ from rse_pf.live_map.outcomes import (
     Unaligned,
 )
 from rse_pf.live_map.versions import encode_stored
+from tests.live_map.generated_drives import (
+    GeneratedDrive,
+    GeneratedWorld,
+    circle,
+    make_link,
+    meander,
+    straight,
+)
+from tests.recorded_drives import Run, drive, frame_poses, red_kitchen, truth_of
 
 __all__ = ["Played", "play"]
 

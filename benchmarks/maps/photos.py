@@ -16,7 +16,6 @@ Defends: >= 85 % right, no stranger of 300 ok, p50 <= 90 ms on two cores.
 from __future__ import annotations
 
 import contextlib
-import os
 import tempfile
 import time
 from collections import Counter
@@ -28,27 +27,23 @@ from typing import Annotated, Any
 import numpy as np
 import numpy.typing as npt
 
-from benchmarks.data.floods import Server, token_of
+from benchmarks.data.requests import Server, token_of
 from benchmarks.frame.registry import Bar, Recordings, benchmark
 from benchmarks.frame.report import say
 from benchmarks.frame.statistics import percentile
-from benchmarks.maps.recordings import truth_of
 from client_sdk.datasets import open_dataset
 from client_sdk.frontend import Frame, FrontEndOptions, extract
 from client_sdk.mapping import Trajectory
 from client_sdk.simulator import make_world, render_along, true_trajectory
 from client_sdk.transfer.data_client import DataClient
-from rse_pf.auth.tokens import SigningKey
 from rse_pf.geometry import Array, Camera, exp_se3, pose_difference
-from rse_pf.identity import RobotId
 from rse_pf.images import load_opencv
 from rse_pf.maps.format import Keyframe, MapVersion, encode_map
 from rse_pf.maps.photos import Lens
 from rse_pf.slam.keyframe import most_features
+from tests.recorded_drives import truth_of
 
-__all__ = ["Photo", "foreign_photos", "keyframe_of", "lens_of", "photo_of", "world_of"]
-
-ROBOT = RobotId("acme", "robot-1")
+ROBOT = "robot-1"
 RIGHT_M, RIGHT_DEG, QUALITY = 0.05, 2.0, 85
 MAP_STEP, WORLD_FRAMES, WORLD_ROBOTS = 4, 90, 3
 ASIDE = exp_se3(np.array([0.1, -0.1, 0.0, 0.0, np.radians(5.0), 0.0]))
@@ -86,11 +81,10 @@ def run_benchmark(
         sources[f"world-{seed}"] = world_of(seed)
     found: dict[str, Any] = {}
     verdicts = Counter[str]({"ok": 0})
-    key = SigningKey.from_seed(os.urandom(32), "key-1")
     with (
         tempfile.TemporaryDirectory() as folder,
-        Server(Path(folder), key, max_requests_per_s=1e5) as server,
-        contextlib.closing(DataClient(f"http://127.0.0.1:{server.port}", token_of(key, ROBOT))) as client,
+        Server(Path(folder), max_requests_per_s=1e5) as server,
+        contextlib.closing(DataClient(f"http://127.0.0.1:{server.port}", token_of(ROBOT))) as client,
     ):
         for name, (keyframes, photos) in sources.items():
             client.update_map(name, encode_map(MapVersion(keyframes=tuple(keyframes))))

@@ -20,13 +20,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
 from benchmarks.frame.registry import Bar, Recordings, benchmark
 from benchmarks.frame.report import say
-from benchmarks.maps.recordings import RED_KITCHEN, track
 from client_sdk.datasets import Dataset, open_dataset
 from client_sdk.frontend import Frame, TrackedFrame
 from client_sdk.mapping import Trajectory
@@ -36,8 +35,7 @@ from client_sdk.simulator.world import make_world
 from client_sdk.tracking.tracker import Join, Tracker
 from rse_pf.experiments.results.trajectory_error import ate_m, motion_errors
 from rse_pf.geometry import Array, inverse
-
-__all__ = []
+from tests.recorded_drives import RED_KITCHEN, track
 
 _TURNING = "tum_fr1_rpy_start"
 _FIRST_FRAMES = (0, 5, 11)
@@ -176,10 +174,16 @@ def rows(recordings: Path) -> Iterator[tuple[str, Drive, tuple[int, float] | Non
     Bar("rows.*.lost_above_bar", at_most=0, unit="frames"),
     Bar("rows.*.ate_above_bar_cm", at_most=0.0, unit="cm"),
 )
-def run_benchmark(*, recordings: Recordings = Path("../shared/data")) -> dict[str, Any]:
+def run_benchmark(
+    *,
+    recordings: Recordings = Path("../shared/data"),
+    only: Annotated[str, "drives whose name contains this"] = "",
+) -> dict[str, Any]:
     """Track every drive; figures above a bar of `_TURNING_BARS` and `_KITCHEN_BARS` are positive."""
     figures: dict[str, Any] = {}
     for name, drive, bar in rows(recordings):
+        if only not in name:
+            continue
         figures[name] = row = row_of(drive)
         if bar is not None:
             row |= {

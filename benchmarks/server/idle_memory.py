@@ -1,40 +1,77 @@
 """Measure the cost of an idle robot on a server: memory of all processes, kernel buffers, and idle CPU.
 
-    python -m benchmarks server.idle_memory [--robots 10000] [--workers 2] [--tokens] [--base TREE]
-
+    python -m benchmarks server.idle_memory [--robots 10000] [--workers 2] [--tokens]
 
 Robots are plain sockets of sixteen loopback addresses that said Hello.  The memory is the growth of the
-private pages of supervisor and workers; the TCP buffers of the kernel are reported beside it.  The CPU
-of a handshake here has no close; ``benchmarks/server/handshakes.py`` has all of it.
+private pages of supervisor and workers; the TCP buffers of the kernel are reported beside it.  The CPU of a
+handshake here has no close.
+
 Defends: <= 16 KiB per robot in all processes of the server.
 """
 
 from __future__ import annotations
 
 import itertools
+import json
 import os
 import resource
+import socket
+import tempfile
 import time
+import urllib.request
 from pathlib import Path
 from typing import Annotated, Any
 
 from benchmarks.frame.registry import Bar, benchmark
-from benchmarks.server import handshakes
-from rse_pf.auth.tokens import SigningKey
-from rse_pf.config import AuthSettings
+from benchmarks.server.serving import UNLIMITED, BenchServer, private_bytes_of_tree, tree
+from rse_pf.wire import SUBPROTOCOLS, Hello, make_codec
 
 WATCH_S = 2.0
 WARM = 64
 BAR_KIB = 16.0
+WAIT_S = 10.0
+CODEC = "bin"
+SOURCES = 16
+SILENCE_S = 600.0  # no robot says a word while it is measured
 
 
-def private_bytes(pids: list[int]) -> int:
-    """Return the private pages of processes; pages that a fork shares count for nobody."""
-    total = 0
-    for pid in pids:
-        lines = Path(f"/proc/{pid}/smaps_rollup").read_text(encoding="ascii").splitlines()
-        total += sum(int(line.split()[1]) * 1024 for line in lines if line.startswith("Private_"))
-    return total
+def hello_frame() -> bytes:
+    """Return the frame with a robot's Hello, with the mask 0."""
+    payload = make_codec(CODEC).encode(Hello())
+    assert len(payload) < 126
+    return bytes([0x82, 0x80 | len(payload)]) + bytes(4) + payload
+
+
+def join(server: BenchServer, number: int, *, has_token: bool) -> socket.socket:
+    """Return the socket of robot *number* after its handshake and the Welcome."""
+    link = socket.create_connection(
+        ("127.0.0.1", server.port), timeout=WAIT_S, source_address=(f"127.0.0.{2 + number % SOURCES}", 0)
+    )
+    bearer = f"Authorization: Bearer {server.token(f'robot-{number}')}\r\n" if has_token else ""
+    head = (
+        f"GET /ws HTTP/1.1\r\nHost: 127.0.0.1:{server.port}\r\nUpgrade: websocket\r\n"
+        "Connection: Upgrade\r\nSec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\nSec-WebSocket-Version: 13\r\n"
+        f"Sec-WebSocket-Protocol: {SUBPROTOCOLS[CODEC]}\r\n{bearer}"
+        "User-Agent: Python/3.11 websockets/15.0\r\n\r\n"
+    )
+    link.sendall(head.encode())
+    seen = b""
+    while b"\r\n\r\n" not in seen:
+        seen += _received(link)
+    answer, _, seen = seen.partition(b"\r\n\r\n")
+    if b"101" not in answer.partition(b"\r\n")[0]:
+        raise SystemExit("the server refused a robot")
+    link.sendall(hello_frame())
+    while len(seen) < 2 or len(seen) < 2 + seen[1]:
+        seen += _received(link)
+    return link
+
+
+def _received(link: socket.socket) -> bytes:
+    data = link.recv(4096)
+    if not data:
+        raise SystemExit("the server closed the connection")
+    return data
 
 
 def kernel_tcp_bytes() -> int:
@@ -44,59 +81,67 @@ def kernel_tcp_bytes() -> int:
     return int(words[words.index("mem") + 1]) * os.sysconf("SC_PAGE_SIZE")
 
 
-def measure(server: Any, robots: int, tokens: bool) -> dict[str, Any]:
+def robots_of_workers(server: BenchServer) -> list[int]:
+    """Return how many robots each worker has, as the server says."""
+    with urllib.request.urlopen(f"http://127.0.0.1:{server.control_port}/status") as answer:
+        found: list[int] = json.loads(answer.read())["robots_of_workers"]
+    return found
+
+
+def cpu_s(server: BenchServer) -> float:
+    """Return the CPU seconds of all processes, by the kernel's clock of each (CPUCLOCK_SCHED of its pid)."""
+    return sum(time.clock_gettime(~pid << 3 | 2) for pid in tree(server.pid))
+
+
+def settled_cpu_s(server: BenchServer) -> float:
+    """Return the CPU seconds of *server* once it does nothing more."""
+    before, deadline = -1.0, time.monotonic() + WAIT_S
+    while before != (now := cpu_s(server)) and time.monotonic() < deadline:
+        before = now
+        time.sleep(0.004)  # looks again, with a deadline
+    return now
+
+
+def measure(server: BenchServer, robots: int, *, has_tokens: bool) -> dict[str, Any]:
     """Return the figures of *robots* idle connections."""
-    numbers, settings, now = itertools.count(), AuthSettings(), time.time()
-    key = SigningKey.from_seed(handshakes.PLATFORM_SEED, "platform")
-
-    def join() -> Any:
-        number = next(numbers)
-        client = handshakes.Client(server.address, f"127.0.0.{2 + number % 16}")
-        name = f"robot-{number}"
-        token = key.issue(name, now=now, token_id=name, settings=settings) if tokens else ""
-        client.send(handshakes.request(server.address, token))
-        if b"101" not in client.head():
-            raise SystemExit("the server refused a robot")
-        client.send(handshakes.HELLO)
-        client.frame()
-        return client
-
-    clients = [join() for _ in range(WARM)]
-    before, kernel_before = private_bytes(server.pids), kernel_tcp_bytes()
-    cpu_before = handshakes.wait_settled(server)
-    clients += [join() for _ in range(robots)]
-    joined_s = handshakes.wait_settled(server)
-    spread = server.status()["robots_of_workers"]
-    idle_before = server.cpu_s()
-    time.sleep(WATCH_S)
-    idle_s = server.cpu_s() - idle_before
-    assert sum(spread) == robots + WARM, spread
+    numbers = itertools.count()
+    links = [join(server, next(numbers), has_token=has_tokens) for _ in range(WARM)]
+    before, kernel_before = private_bytes_of_tree(server.pid), kernel_tcp_bytes()
+    cpu_before_s = settled_cpu_s(server)
+    links += [join(server, next(numbers), has_token=has_tokens) for _ in range(robots)]
+    joined_s = settled_cpu_s(server)
+    spread = robots_of_workers(server)
+    assert sum(spread) == len(links), spread
+    idle_before_s = cpu_s(server)
+    time.sleep(WATCH_S)  # the window of the measurement
+    idle_s = cpu_s(server) - idle_before_s
     return {
-        "robots": robots,
-        "tokens": tokens,
-        "kib_per_robot": round((private_bytes(server.pids) - before) / robots / 1024, 2),
+        "kib_per_robot": round((private_bytes_of_tree(server.pid) - before) / robots / 1024, 2),
         "kernel_kib_per_robot": round((kernel_tcp_bytes() - kernel_before) / robots / 1024, 2),
         "mib_without_robots": round(before / 2**20, 1),
         "idle_cpu_ms_per_s": round(idle_s / WATCH_S * 1e3, 2),
-        "handshake_cpu_us": round((joined_s - cpu_before) / robots * 1e6),
+        "handshake_cpu_us": round((joined_s - cpu_before_s) / robots * 1e6),
         "spread": spread,
     }
 
 
-@benchmark(Bar("this tree.kib_per_robot", at_most=BAR_KIB, unit="KiB"))
+@benchmark(Bar("kib_per_robot", at_most=BAR_KIB, unit="KiB"))
 def run_benchmark(
     *,
-    robots: Annotated[int, "idle connections"] = 10000,
+    robots: Annotated[int, "idle connections"] = 10_000,
     workers: int = 2,
     tokens: Annotated[bool, "each robot has a token of its own"] = False,
-    base: Annotated[Path | None, "another tree of the sources, measured first"] = None,
 ) -> dict[str, Any]:
-    """Connect the robots to each tree once."""
+    """Connect the robots once."""
     hard = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
     resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
-    figures: dict[str, Any] = {}
-    for name, tree in (*((("base", base),) if base else ()), ("this tree", None)):
-        idle = {"ping_interval_s": 600.0, "hello_timeout_s": 600.0}
-        with handshakes.serve_tree(tree, workers, tokens=tokens, audit=False, **idle) as server:
-            figures[name] = measure(server, robots, tokens)
-    return figures
+    groups = {
+        "serving": {**UNLIMITED["serving"], "trusted_proxies": 0},
+        "auth": {"required": tokens},
+        "session": {"ping_interval_s": SILENCE_S, "hello_timeout_s": SILENCE_S},
+    }
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        BenchServer(Path(folder), workers=workers, **groups) as server,
+    ):
+        return measure(server, robots, has_tokens=tokens)

@@ -51,7 +51,6 @@ FRAMES_PER_S = 5.0
 """The paper's rate (Sect. 6.2)."""
 MANY = 100
 OUTLIERS = (0.3, 0.5)
-"""Own p99 over own p50 of 100 robots at 30 %."""
 PEER, ZLIB, BINARY = "peer", "zlib", "bin"
 SYSTEMS = (PEER, ZLIB, BINARY)
 PROBLEMS = 64
@@ -291,7 +290,7 @@ def run(sources: Path, rounds: int, seconds: float) -> dict[str, Any]:
     Bar("judged.bin 30 % 100.p99_ratio", at_least=12.0),
     Bar("judged.zlib 30 % 100.p99_over_p50", at_most=4.0),
     Bar("judged.bin 30 % 100.p99_over_p50", at_most=4.0),
-    Bar("judged.*.without_pose", equals=0),
+    Bar("judged.*.without_pose", at_most=0),
 )
 def run_benchmark(
     *, peer: Annotated[Path, "sources of the paper's design"], rounds: int = 7,

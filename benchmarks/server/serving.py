@@ -6,11 +6,13 @@ nothing by itself.
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -20,7 +22,7 @@ from rse_pf.config import PlatformSettings
 from rse_pf.errors import ConfigurationError
 from rse_pf.linux import raise_descriptor_limit
 
-__all__ = ["UNLIMITED", "BenchServer", "cpu_of_tree_s", "private_bytes_of_tree", "tree"]
+__all__ = ["UNLIMITED", "BenchServer", "cpu_of_tree_s", "private_bytes_of_tree", "resident_mib", "tree"]
 
 UNLIMITED: dict[str, dict[str, Any]] = {
     "auth": {"required": False},
@@ -72,22 +74,29 @@ def private_bytes_of_tree(pid: int) -> int:
     return 1024 * kilobytes
 
 
+def resident_mib(pids: Sequence[int]) -> float:
+    """Return the resident memory of *pids* and their descendants, MiB."""
+    pages = 0
+    for child in itertools.chain.from_iterable(map(tree, pids)):
+        try:
+            pages += int(Path(f"/proc/{child}/statm").read_text().split()[1])
+        except OSError:
+            continue
+    return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
+
+
 class BenchServer:
     """``with BenchServer(folder, workers=2) as server``: a server of its own, ended with the block.
 
     *groups* are settings beside the defaults, such as ``session={"max_in_flight": 4}``; `UNLIMITED` is a set
-    of them.  *python* is the interpreter whose installation serves, if not this one.  With ``auth.required``,
-    `token` returns tokens that the server accepts.
+    of them.  With ``auth.required``, `token` returns tokens that the server accepts.
     """
 
-    def __init__(
-        self, folder: Path, *, workers: int, python: str | Path = sys.executable, **groups: dict[str, Any]
-    ) -> None:
+    def __init__(self, folder: Path, *, workers: int, **groups: dict[str, Any]) -> None:
         self.settings = PlatformSettings.from_dict(groups)
         self.workers = workers
         self.port = self.control_port = self.pid = 0
         self._folder = folder
-        self._python = python
         self._groups = groups
         self._key = SigningKey.from_seed(os.urandom(_KEY_BYTES), "bench-1")
         self._issued = 0
@@ -99,7 +108,7 @@ class BenchServer:
         announce.unlink(missing_ok=True)
         (self._folder / "settings.json").write_text(json.dumps(document), encoding="utf-8")
         command: list[str | Path] = [
-            self._python, "-m", "rse_pf.cli.main", "serve", "--settings", self._folder / "settings.json",
+            sys.executable, "-m", "rse_pf.cli.main", "serve", "--settings", self._folder / "settings.json",
             "--port", "0", "--control-port", "0", "--workers", str(self.workers), "--announce", announce,
         ]  # fmt: skip
         if self.settings.auth.required:

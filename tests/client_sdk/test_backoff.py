@@ -8,10 +8,10 @@ from random import Random
 
 import pytest
 
-from benchmarks.cloud.played_firewall import PlayedFirewall, rules_of_settings
 from client_sdk.network.backoff import Backoff, Last
 from rse_pf.config import PlatformSettings, SessionSettings
 from rse_pf.config.front_door import DIAL_BURST, DIALS_PER_MINUTE
+from tests.played_firewall import PlayedFirewall, rules_of_settings
 
 SITE = "203.0.113.7"
 BEGAN_S = 1000.0

@@ -13,10 +13,10 @@ import pytest
 from fake_platform import FakePlatform, FakeSocket
 
 import client_sdk
-from benchmarks.cloud.delaying_proxy import DelayingProxy
 from rse_pf.config import SessionSettings
 from rse_pf.errors import ConnectError, Unauthorized, UsageError
 from rse_pf.wire.server_session import CLOSE_REPLACED
+from tests.client_sdk.delaying_proxy import DelayingProxy
 
 pytestmark = pytest.mark.system
 

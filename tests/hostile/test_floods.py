@@ -16,10 +16,10 @@ from typing import Any
 import pytest
 from guarded_server import GuardedServer
 
-from benchmarks.hostile import attacks
-from benchmarks.hostile.attacks import AttackTarget, Outcome
 from client_sdk import connect
 from rse_pf.wire import Command, Result
+from tests.hostile import attacks
+from tests.hostile.attacks import AttackTarget, Outcome
 
 pytestmark = pytest.mark.system
 
@@ -90,9 +90,11 @@ def attacked(
     return asyncio.run(run())
 
 
-@pytest.mark.parametrize(("attack", "code"), [("empty-fragments", "1009"), ("ping-flood", "1008")])
+@pytest.mark.parametrize(
+    ("attack", "code"), [(attacks.empty_fragments, "1009"), (attacks.ping_flood, "1008")]
+)
 def test_endless_frames_are_cut_off_at_the_limit(server, attack, code):
-    outcome, answered = attacked(server, attacks.ATTACKS[attack])
+    outcome, answered = attacked(server, attack)
 
     assert outcome.ends == {code: 1}
     assert answered == 5

@@ -8,8 +8,6 @@ import msgspec
 import numpy as np
 import pytest
 
-from benchmarks.live.generated_drives import GeneratedWorld, circle
-from benchmarks.live.hostile_robot import HOSTILE, error_cm, joins, play, scenario, without
 from rse_pf.geometry import inverse
 from rse_pf.live_map.beliefs import Changes, smooth_changes
 from rse_pf.live_map.events import RobotForgotten
@@ -17,6 +15,8 @@ from rse_pf.live_map.graph import Graph
 from rse_pf.live_map.live_map import LiveMap
 from rse_pf.live_map.options import LiveMapOptions
 from rse_pf.live_map.outcomes import Ambiguous, LinkRemoved, Unaligned
+from tests.live_map.generated_drives import GeneratedWorld, circle
+from tests.live_map.hostile_robot import HOSTILE, error_cm, joins, play, scenario, without
 
 JOINED = {"a": True, "b": True, "c": True}
 

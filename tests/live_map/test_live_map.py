@@ -10,7 +10,6 @@ import msgspec
 import numpy as np
 import pytest
 
-from benchmarks.live.generated_drives import GeneratedDrive, GeneratedWorld, circle, make_link, straight
 from rse_pf.errors import BadRequest
 from rse_pf.geometry import Array, exp_se3, inverse, pose_difference
 from rse_pf.live_map.events import (
@@ -29,6 +28,7 @@ from rse_pf.live_map.options import LiveMapOptions
 from rse_pf.live_map.outcomes import Added, Ambiguous, Corrected, Joined, LinkRemoved, Outcome, Unaligned
 from rse_pf.live_map.versions import started_from
 from rse_pf.slam.keyframe import encode_keyframe
+from tests.live_map.generated_drives import GeneratedDrive, GeneratedWorld, circle, make_link, straight
 
 ROUND = circle(0.5, 1.2)
 

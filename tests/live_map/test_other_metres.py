@@ -8,8 +8,6 @@ import msgspec
 import numpy as np
 import pytest
 
-from benchmarks.live.generated_drives import GeneratedWorld, circle
-from benchmarks.live.hostile_rigs import generated_drives
 from rse_pf.live_map.beliefs import Changes, disbelieve_contradicting, has_other_metres
 from rse_pf.live_map.events import KeyframeAdded, LinksMeasured, MeasuredLink, matrix_bytes
 from rse_pf.live_map.graph import Graph, LiveKeyframe
@@ -18,6 +16,8 @@ from rse_pf.live_map.measure import measure_links
 from rse_pf.live_map.options import LiveMapOptions
 from rse_pf.live_map.outcomes import Outcome, Unaligned
 from rse_pf.slam.keyframe import decode_keyframe, make_features
+from tests.live_map.generated_drives import GeneratedWorld, circle
+from tests.live_map.hostile_rig import generated_drives
 
 OPTIONS = LiveMapOptions()
 
@@ -79,8 +79,8 @@ def test_after_eight_keyframes_with_other_metres_a_robot_is_disbelieved() -> Non
 
 @pytest.mark.parametrize(("factor", "least"), [(1.0, 0.0), (1.1, 0.06), (1 / 1.1, 0.06), (1.5, 0.3)])
 def test_depths_of_both_keyframes_tell_the_ratio_of_their_metres(factor: float, least: float) -> None:
-    drive = generated_drives(seed=1, keyframes=6)["a"]
-    one, other = (decode_keyframe(data) for data in drive.keyframes[2:4])
+    sent = generated_drives(seed=1, keyframes=6)["a"]
+    one, other = (decode_keyframe(data) for data in sent[2:4])
     seen = other.features
     false = make_features(seen.pixels, factor * seen.depths_m, seen.descriptors, seen.noise, seen.kind, 0.0)
 

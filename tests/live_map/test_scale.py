@@ -10,8 +10,6 @@ import msgspec
 import numpy as np
 import pytest
 
-from benchmarks.live.generated_drives import GeneratedDrive, GeneratedWorld, circle, make_link, straight
-from benchmarks.live.hostile_robot import play, without
 from rse_pf.errors import BadRequest
 from rse_pf.geometry import Array, exp_se3, inverse, pose_difference, scaled
 from rse_pf.live_map.agreement import scale_into, step_into
@@ -31,6 +29,8 @@ from rse_pf.live_map.outcomes import Corrected, Joined
 from rse_pf.slam.consistency import LinkEnds, OdometryNoise, round_trips_close
 from rse_pf.slam.keyframe import KeyframeFeatures, make_features, make_scaleless_features
 from rse_pf.slam.smoother import ScaleTerms, smooth
+from tests.live_map.generated_drives import GeneratedDrive, GeneratedWorld, circle, make_link, straight
+from tests.live_map.hostile_robot import play, without
 from tests.synthetic_maps import make_world
 
 HOSTILE = "x"

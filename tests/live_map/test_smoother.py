@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks.live.generated_drives import INFORMATION, GeneratedWorld, circle
 from rse_pf.geometry import Array, exp_se3, inverse, log_se3
 from rse_pf.live_map.graph import LiveLink, variances_of
 from rse_pf.live_map.live_map import LiveMap
@@ -14,6 +13,7 @@ from rse_pf.live_map.smoothing import smooth_around
 from rse_pf.slam.optimise import OptimiseOptions, optimise_graph
 from rse_pf.slam.pose_graph import PoseGraph
 from rse_pf.slam.smoother import SmoothedPoses, smooth
+from tests.live_map.generated_drives import INFORMATION, GeneratedWorld, circle
 
 FREE = 12
 

@@ -6,13 +6,13 @@ import msgspec
 import numpy as np
 import pytest
 
-from benchmarks.live.generated_drives import GeneratedWorld, circle, make_link
 from rse_pf.geometry import exp_se3, inverse
 from rse_pf.live_map.events import LinksMeasured, MeasuredLink
 from rse_pf.live_map.live_map import LiveMap
 from rse_pf.live_map.options import LiveMapOptions
 from rse_pf.live_map.smoothing import edges_of
 from rse_pf.slam.consistency import StrongLink
+from tests.live_map.generated_drives import GeneratedWorld, circle, make_link
 
 STRONG = StrongLink(inliers=30, ratio=0.5)
 WEAK_INLIERS = 20

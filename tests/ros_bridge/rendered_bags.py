@@ -9,7 +9,6 @@ from typing import Any
 import cv2
 import numpy as np
 
-from benchmarks.maps.rendered_rigs import RenderedRig, render_raw, rendered_rig
 from client_sdk.bags import BagWriter
 from client_sdk.bags.message_types import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, IMU
 from client_sdk.rigs.intrinsics import Intrinsics
@@ -20,6 +19,7 @@ from client_sdk.simulator.inertial import InertialDrive, Motion, SimulatedImu
 from client_sdk.simulator.world import DEPTH_M, ROOM_M, make_world
 from rse_pf.geometry import inverse
 from tests.client_sdk.bags.small_bags import camera_info, compressed, raw_image, stamp_of
+from tests.ros_bridge.rendered_rig import RenderedRig, render_raw, rendered_rig
 
 __all__ = ["ENCODINGS", "STEREO", "write_encodings", "write_stereo"]
 
@@ -66,7 +66,7 @@ def write_encodings(path: Path, frames: int) -> None:
 
 def write_stereo(path: Path, rig_file: Path, frames: int) -> None:
     """Write a drive of two distorted lenses and an IMU of 200 Hz at 10 Hz, and the file of its rig."""
-    rig = rendered_rig("pinhole")
+    rig = rendered_rig()
     write_rig(rig_file, Rig(cameras=(rig.left, rig.right), imu=rig.imu))
     motion = Motion(reach_m=0.5, turn_rad=0.35, slowest_hz=0.08, fastest_hz=0.3)
     drive = InertialDrive(rig.imu.model(rig.left.T_body_camera), motion, _SEED)

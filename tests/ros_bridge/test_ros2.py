@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.maps.bags import write_recording
 from client_sdk.mapping import read_trajectory
 from rse_pf.config import PlatformSettings
 from rse_pf.local.control.platform import LocalPlatform
+from tests.client_sdk.bags.recorded_bags import write_recording
 from tests.ros_bridge.programs import own_run, poses, tell_delay, worst_mm
 from tests.ros_bridge.ros2 import COLOUR, Ros2, all_is_played
 

@@ -14,7 +14,6 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from benchmarks.live.generated_drives import GeneratedWorld, circle
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import BadRequest, LimitExceeded
 from rse_pf.geometry import Camera, exp_se3
@@ -39,6 +38,7 @@ from rse_pf.slam.links import Atlas
 from rse_pf.slam.places import place_vector
 from rse_pf.slam.tracking import ImageFeatures, NearLimits, SoughtFeatures, distinct_distances, match_near
 from rse_pf.wire import Command, Failure, Result
+from tests.live_map.generated_drives import GeneratedWorld, circle
 
 CAMERA = Camera(fx=525.0, fy=525.0, cx=319.5, cy=239.5, width=640, height=480)
 SIFT, XFEAT, AKAZE = (

@@ -2,17 +2,44 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import asyncio
+import contextlib
+import json
+import os
+import subprocess
+import sys
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
 from fake_data_service import Service, small_settings
 
+import client_sdk
+from rse_pf.auth.tokens import SigningKey
+from rse_pf.aws.clients import make_client
+from rse_pf.config import PlatformSettings
 from rse_pf.config.resource_names import READY_PATH
 from rse_pf.errors import StoreError
-from rse_pf.object_store import MemoryStore
+from rse_pf.object_store import MemoryStore, digest_of
+from rse_pf.pnp.problems import make_problem
+from rse_pf.scaling.health import CLOUD_TIMEOUT_S, cloud_checks
+from tests.stacks.played_s3 import PlayedS3
 
 Assembly = Any
+BUCKET = "maps"
+KEY = SigningKey.from_seed(b"outage of the bucket, 32 letters", "outage")
+PATIENT_S = 60.0
+SETTINGS = PlatformSettings.from_dict(
+    {
+        "serving": {"port": 0, "control_port": 0, "workers": 1},
+        "data": {"port": 0},
+        "live": {"warm_standby": False},
+    }
+)
 
 
 class Shared(MemoryStore):
@@ -75,29 +102,95 @@ def test_a_replacement_is_ready_before_an_unhealthy_server_ends(assembly: Assemb
     assert policy == {"MinHealthyPercentage": 100, "MaxHealthyPercentage": 110}
 
 
+@contextlib.contextmanager
+def server_on_a_bucket(home: Path) -> Iterator[dict[str, int]]:
+    """Run both processes of one server; yield ``port``, ``control_port`` and ``data_port``."""
+    settings = home / "settings.json"
+    settings.write_text(json.dumps({"context": {"rse-pf": SETTINGS.to_dict()}}))
+    (home / "keys.json").write_text(KEY.key_set().to_json())
+    announced = {}
+    with contextlib.ExitStack() as stack:
+        for verb in ("serve", "data"):
+            announce, log = home / f"{verb}.json", home / f"{verb}.log"
+            command = [
+                sys.executable, "-m", "rse_pf.cli.main", verb, "--settings", str(settings), "--keys",
+                str(home / "keys.json"), "--store", f"s3:{BUCKET}", "--announce", str(announce),
+            ]  # fmt: skip
+            with log.open("wb") as errors:
+                process = stack.enter_context(subprocess.Popen(command, stderr=errors))
+            stack.callback(process.terminate)
+            end_s = time.monotonic() + PATIENT_S
+            while not announce.exists():
+                assert process.poll() is None, log.read_text()
+                assert time.monotonic() < end_s, log.read_text()
+                os.sched_yield()
+            announced[verb] = json.loads(announce.read_text())
+        yield {**announced["serve"], "data_port": announced["data"]["port"]}
+
+
+def status_of(request: str | urllib.request.Request, timeout_s: float = CLOUD_TIMEOUT_S) -> str:
+    """Return the status and, of an error, the code in its JSON; ``none`` without any answer."""
+    try:
+        with urllib.request.urlopen(request, timeout=timeout_s) as answer:
+            return str(answer.status)
+    except urllib.error.HTTPError as error:
+        with error, contextlib.suppress(ValueError, KeyError):
+            return f"{error.code} {json.loads(error.read())['code']}"
+        return f"{error.code}"
+    except OSError:
+        return "none"
+
+
+def token() -> str:
+    return KEY.issue("robot-1", now=time.time(), token_id="t", settings=SETTINGS.auth)
+
+
+def store(ports: dict[str, int], data: bytes) -> str:
+    """Store an object as a robot that does not try again; return what came of it."""
+    url = f"http://127.0.0.1:{ports['data_port']}/data/v1/objects/{digest_of(data)}"
+    headers = {"Authorization": f"Bearer {token()}"}
+    return status_of(urllib.request.Request(url, data=data, method="PUT", headers=headers), PATIENT_S)
+
+
+async def source_of_a_pose(ports: dict[str, int]) -> str:
+    """Return who computed a pose that a robot asked for."""
+    problem = make_problem(seed=1)
+    url = f"ws://127.0.0.1:{ports['port']}{SETTINGS.serving.path}"
+    async with client_sdk.connect(url, token=token()) as robot:
+        frame = problem.points_world, problem.pixels, problem.camera
+        return (await robot.solve_pnp(*frame, deadline_s=PATIENT_S)).source
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(180)
-def test_servers_outlive_a_bucket_that_fails_and_then_is_silent(tmp_path: Any) -> None:
+def test_a_server_outlives_a_bucket_that_fails_and_then_is_silent(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     pytest.importorskip("moto.server", reason="the infra extra is not installed")
-    from benchmarks.cloud.s3_outage import Outage, measure
-
-    report = measure(Outage(servers=2, before_s=5.0, outage_s=36.0, after_s=15.0), tmp_path)
-
-    assert report.ended == []
-    assert set(report.poses) == {"cloud"}, "every pose is computed by a server"
-    assert {each for each in report.data if each != "201"} <= {"503 store"}
-    assert report.alarm_after_s is not None
-    assert report.alarm_after_s <= 60
-    assert set(report.data_after) == {"201"}
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(180)
-def test_the_check_of_the_bucket_would_have_ended_every_server(tmp_path: Any) -> None:
-    pytest.importorskip("moto.server", reason="the infra extra is not installed")
-    from benchmarks.cloud.s3_outage import Outage, measure
-
-    outage = Outage(servers=2, before_s=5.0, outage_s=24.0, after_s=6.0, data_path="/data/readyz")
-    report = measure(outage, tmp_path)
-
-    assert sorted(report.ended) == ["server-0: data", "server-1: data"]
+    for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
+        monkeypatch.setenv(name, "testing")
+    monkeypatch.setenv("AWS_EC2_METADATA_DISABLED", "true")
+    with PlayedS3() as s3:
+        monkeypatch.setenv("AWS_ENDPOINT_URL_S3", s3.url)
+        where = {"LocationConstraint": SETTINGS.cloud.region}
+        make_client("s3", SETTINGS.cloud.region).create_bucket(Bucket=BUCKET, CreateBucketConfiguration=where)
+        with server_on_a_bucket(tmp_path) as ports:
+            at = {"robots": ports["control_port"], "data": ports["data_port"]}
+            checks = {
+                name: f"http://127.0.0.1:{at[name]}{path}"
+                for name, (_, path) in cloud_checks(SETTINGS).items()
+            }
+            assert store(ports, b"well") == "201"
+            for mood in ("unavailable", "silent"):
+                s3.mood = mood
+                assert store(ports, mood.encode()) == "503 store"
+                assert {name: status_of(url) for name, url in checks.items()} == {
+                    "robots": "200", "data": "200"
+                }  # fmt: skip
+                assert asyncio.run(source_of_a_pose(ports)) == "cloud"
+                asks_the_bucket = f"http://127.0.0.1:{ports['data_port']}/data/readyz"
+                assert status_of(asks_the_bucket) != "200", "this check would have ended every server"
+            s3.mood = "well"
+            end_s = time.monotonic() + PATIENT_S
+            while store(ports, b"well again") != "201":
+                assert time.monotonic() < end_s

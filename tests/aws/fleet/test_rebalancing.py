@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 from aws.fleet.fake_machine import FakeMachine
 
-from benchmarks.cloud.delayed_cloudwatch import DELAY_S, DelayedCloudWatch
 from rse_pf.aws.clients import make_client
 from rse_pf.aws.fleet.agent import Agent, AgentConfig, AgentContext
 from rse_pf.aws.fleet.metrics import ROBOTS, dimensions_of
@@ -19,6 +18,7 @@ from rse_pf.aws.fleet.tasks.rebalancing import read_totals
 from rse_pf.config import PlatformSettings
 from rse_pf.object_store import MemoryStore
 from rse_pf.scaling.alarms import CPU, NAMESPACE
+from tests.aws.fleet.delayed_cloudwatch import DELAY_S, DelayedCloudWatch
 
 FAST = PlatformSettings.from_dict({"scaling": {"profile": "fast"}})
 PAPER = PlatformSettings()

@@ -90,13 +90,21 @@ def camera_info(
     return w.make(CAMERA_INFO, header=w.header(stamp, frame), **{**fields, **other})
 
 
-def transforms(w: BagWriter, stamp: int, parent: str, child: str, position: Sequence[float]) -> Any:
-    """Return a ``TFMessage`` with one translation."""
+def transforms(
+    w: BagWriter,
+    stamp: int,
+    parent: str,
+    child: str,
+    position: Sequence[float],
+    quaternion: Sequence[float] = (0.0, 0.0, 0.0, 1.0),
+) -> Any:
+    """Return a ``TFMessage`` with one transform."""
     x, y, z = (float(each) for each in position)
+    qx, qy, qz, qw = (float(each) for each in quaternion)
     moved = w.make(
         "geometry_msgs/msg/Transform",
         translation=w.make("geometry_msgs/msg/Vector3", x=x, y=y, z=z),
-        rotation=w.make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0),
+        rotation=w.make("geometry_msgs/msg/Quaternion", x=qx, y=qy, z=qz, w=qw),
     )
     one = w.make(
         "geometry_msgs/msg/TransformStamped",

@@ -20,6 +20,7 @@ from client_sdk.bags.poses import PoseTopic
 from client_sdk.bags.registration import register_depth
 from client_sdk.datasets import open_dataset
 from rse_pf.geometry import Camera, rotation_angle_deg
+from tests.client_sdk.bags.recorded_bags import write_recording
 from tests.client_sdk.bags.small_bags import (
     COLOUR,
     CX,
@@ -377,8 +378,6 @@ def message_of(pixels: np.ndarray[Any, Any], encoding: str) -> Any:
 def test_the_kitchen_as_a_bag_gives_the_frames_of_the_folder(
     recordings: Path, tmp_path: Path, kind: BagKind
 ) -> None:
-    from benchmarks.maps.bags import write_recording
-
     folder = recordings / "7scenes_redkitchen"
     for is_raw in (True, False):
         path = tmp_path / f"kitchen-{is_raw}{'.bag' if kind == 'ros1' else ''}"

@@ -11,13 +11,13 @@ from typing import Any
 import pytest
 from guarded_server import GuardedServer
 
-from benchmarks.hostile import tenants
-from benchmarks.hostile.attacks import AttackTarget
 from rse_pf.auth.roster import EnrolledRobot, public_key_of
 from rse_pf.auth.tokens import SigningKey
 from rse_pf.identity import RobotId, object_name
 from rse_pf.object_store import DirectoryStore, digest_of
 from rse_pf.wire import Command, Failure, Result
+from tests.hostile.attacks import AttackTarget
+from tests.hostile.identity import tenants
 
 pytestmark = pytest.mark.system
 

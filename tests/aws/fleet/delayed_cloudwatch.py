@@ -10,8 +10,6 @@ from collections.abc import Callable
 from datetime import datetime
 from typing import Any
 
-__all__ = ["DELAY_S", "DelayedCloudWatch"]
-
 DELAY_S = 5.0
 
 _STATISTICS: dict[str, Callable[[list[float]], float]] = {

@@ -5,8 +5,6 @@ from __future__ import annotations
 import asyncio
 from collections import deque
 
-__all__ = ["DelayingProxy"]
-
 
 class DelayingProxy:
     """Relays to *port* of loopback; use it with ``async with``.

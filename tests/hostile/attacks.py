@@ -1,31 +1,23 @@
 """Attacks of a hostile robot or client on a platform, each bounded in number and time.
 
-`run_attack` is one attack in a process of its own, with its outcome as JSON; see robots.py.  It reads the
-tokens (one line of JSON), prints ``ready`` when its messages are prepared, and begins at the next line of
-input.
-
-`ATTACKS` names them.  The attacks send raw frames without any library of ours, and close every socket.
+The attacks send raw frames without any library of ours, and close every socket.
 """
 
 from __future__ import annotations
 
 import asyncio
 import base64
-import json
 import os
 import struct
-import sys
 import time
 import zlib
 from collections import Counter
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable
 from dataclasses import dataclass, field
 from functools import cache
 from urllib.parse import urlsplit
 
 from rse_pf.wire import SUBPROTOCOLS, Command, Failure, Hello, make_codec
-
-__all__ = ["ATTACKS", "AttackTarget", "Outcome", "Socket", "frame"]
 
 CONTINUATION, BINARY, CLOSE, PING, PONG = 0, 2, 8, 9, 10
 FIN, MASKED = 0x80, 0x80
@@ -236,40 +228,6 @@ async def silent_connects(target: AttackTarget, count: int = 2000) -> Outcome:
     return outcome
 
 
-async def slow_reader(target: AttackTarget, count: int = 20) -> Outcome:
-    """Ask on *count* sockets for large replies, and read none of them."""
-    outcome = Outcome(tried=count)
-    filling = {"value": "x" * 200_000}
-
-    async def one(token: str) -> None:
-        reader, writer = await target.open_tcp()
-        writer.write(target.head(token, "json"))
-        await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), LONG_S)
-        codec, began = make_codec("json"), time.monotonic()
-        writer.write(frame(codec.encode(Hello()), 1))
-        writer.transport.pause_reading()  # type: ignore[attr-defined]
-        identity = 0
-        while not writer.transport.is_closing() and time.monotonic() - began < LONG_S:
-            identity += 1
-            data = codec.encode(Command(id=identity, service="echo", payload=filling, keep=True))
-            try:
-                writer.write(frame(data, 1))
-                await asyncio.wait_for(writer.drain(), 0.2)
-            except asyncio.TimeoutError:
-                continue
-            except OSError:
-                break
-            await asyncio.sleep(0.1)  # a slow sender is slow
-        is_over = writer.transport.is_closing()
-        outcome.refused += is_over
-        outcome.ends["cut" if is_over else "open"] += 1
-        outcome.slowest_s = max(outcome.slowest_s, time.monotonic() - began)
-        writer.transport.abort()
-
-    await _all([one(token) for token in target.tokens[:count]])
-    return outcome
-
-
 async def rate_flood(target: AttackTarget, per_s: float = 500.0, seconds: float = 10.0) -> Outcome:
     """Be one robot that sends *per_s* commands a second, and comes back whenever it is cut off."""
     outcome, until = Outcome(), time.monotonic() + seconds
@@ -338,32 +296,3 @@ async def _all(works: list[Awaitable[None]]) -> None:
     for result in await asyncio.gather(*works, return_exceptions=True):
         if isinstance(result, BaseException) and not isinstance(result, OSError):
             raise result
-
-
-ATTACKS: dict[str, Callable[[AttackTarget], Awaitable[Outcome]]] = {
-    "zip-bombs": zip_bombs,
-    "empty-fragments": empty_fragments,
-    "ping-flood": ping_flood,
-    "slow-headers": slow_headers,
-    "silent-connects": silent_connects,
-    "slow-reader": slow_reader,
-    "rate-flood": rate_flood,
-}
-
-
-async def _attack(name: str, target: AttackTarget) -> Outcome:
-    began = time.monotonic()
-    outcome = await ATTACKS[name](target)
-    outcome.took_s = time.monotonic() - began
-    return outcome
-
-
-def run_attack(name: str, url: str) -> None:
-    """Get ready, wait, attack, tell; in a process of its own."""
-    target = AttackTarget(url, tuple(json.loads(sys.stdin.readline())))
-    if name == "zip-bombs":
-        bomb()
-    print("ready", flush=True)
-    sys.stdin.readline()
-    made = asyncio.run(_attack(name, target))
-    print(json.dumps({name: getattr(made, name) for name in made.__slots__}))

@@ -15,8 +15,6 @@ from typing import Any
 from rse_pf.config import PlatformSettings
 from rse_pf.config.front_door import RETRY_AFTER_S, STATUS, RateRule, rate_rules
 
-__all__ = ["PlayedFirewall", "PlayedRule", "Reply", "rules_of_settings", "rules_of_template"]
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Reply:

@@ -9,8 +9,6 @@ import urllib.request
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any, Literal
 
-__all__ = ["Mood", "PlayedS3"]
-
 Mood = Literal["well", "unavailable", "silent"]
 
 _BUSY = b"<Error><Code>SlowDown</Code><Message>Please reduce your request rate.</Message></Error>"
@@ -26,7 +24,6 @@ class PlayedS3:
 
         logging.getLogger("werkzeug").setLevel(logging.ERROR)  # it logs every request
         self.mood: Mood = "well"
-        self.asked: dict[str, int] = {"well": 0, "unavailable": 0, "silent": 0}
         self._over = threading.Event()
         self._moto = ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
         played = self
@@ -38,7 +35,6 @@ class PlayedS3:
             def answer(self) -> None:
                 body = self.rfile.read(int(self.headers.get("Content-Length", 0)))
                 mood = played.mood
-                played.asked[mood] += 1
                 if mood == "silent":
                     while played.mood == "silent" and not played._over.wait(0.1):
                         pass
