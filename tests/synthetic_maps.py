@@ -1,4 +1,4 @@
-"""Seeded problems with known answers for the map services, shared by tests and benchmarks.
+"""Seeded problems with known answers for the map services, shared by tests.
 
 The same arguments give the same problem; every noise is an argument.
 """

@@ -3,7 +3,7 @@
 Many robots may share an address: those of one site stand behind one router.  The limit of each rule is what
 the robots of a site do at the most, computed from the numbers by which they bound themselves; so robots that
 all lose their connection at the same moment stay below it.  Pure arithmetic: the stacks write these rules
-down, tests and benchmarks play them.
+down, and tests play them.
 """
 
 from __future__ import annotations

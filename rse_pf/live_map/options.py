@@ -1,4 +1,4 @@
-"""The numbers of a live map; each was measured with `benchmarks/live/one_process.py`."""
+"""The numbers of a live map; ``python -m benchmarks live.one_process`` measures what they give."""
 
 from __future__ import annotations
 

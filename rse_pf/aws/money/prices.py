@@ -91,7 +91,7 @@ class Prices(_Table, frozen=True, kw_only=True):
     lambda_per_gb_s: _Price
     """A gigabyte of memory for a second, x86-64."""
     command_cpu_ms: _Positive
-    """CPU time of a PnP command on a server or in the Lambda: benchmarks/solver/handler.py and the socket."""
+    """CPU time of a PnP command on a server or in the Lambda, its socket included; measured."""
     command_bytes: _Count
     """One PnP command on the wire: 200 matches, zlib; measured."""
 
