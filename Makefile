@@ -87,15 +87,13 @@ bench: ## run every benchmark that needs no argument; writes JSON to out/bench
 	@$(SETUP) dev
 	@$(BIN)/python -m benchmarks all out/bench
 
-docs: ## write the generated pages, the source tree and the picture of the packages
+docs: ## write the generated pages and documents
 	@$(SETUP) dev
 	@$(BIN)/rse-pf settings --markdown > docs/settings.md
 	@$(BIN)/rse-pf errors --markdown > docs/errors.md
 	@$(BIN)/rse-pf data --openapi > docs/openapi.json
 	@$(BIN)/python scripts/asyncapi.py
 	@$(BIN)/python scripts/grafana.py
-	@$(BIN)/python scripts/architecture.py
-	@$(BIN)/python scripts/source_tree.py
 
 site: ## build the documentation site into build/site; needs no network after setup
 	@$(SETUP) docs

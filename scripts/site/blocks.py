@@ -1,18 +1,13 @@
-"""The code blocks of the pages: which a test executes, and which are parsed only and say why.
+"""The code blocks of the pages: which a test executes, and which are marked with the reason why it does not.
 
-    python scripts/site/blocks.py
-
-prints how many there are of each kind.  A block is a command block (no language, or ``sh``), or code (python,
-json, yaml, ...); ``text`` is no code.  A comment before a block marks it: ``<!-- needs an account -->``; a
-paragraph before it that contains the words marks it as well.  ``<!-- file: NAME -->`` names the file in which
-a program is saved.
+A block is a command block (no language, or ``sh``), or code (python, json, yaml, ...); ``text`` is no code.
+A comment before a block marks it: ``<!-- needs an account -->``; a paragraph before it that contains the
+words marks it as well.  ``<!-- file: NAME -->`` names the file in which a program is saved.
 """
 
 from __future__ import annotations
 
 import re
-import sys
-from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,9 +17,7 @@ __all__ = [
     "RUN_BY_OTHERS",
     "Block",
     "all_blocks",
-    "commands_of",
-    "how",
-    "main",
+    "is_executed",
     "pages",
     "read_blocks",
 ]
@@ -32,7 +25,7 @@ __all__ = [
 MARKS = (
     "needs an account", "needs a device", "needs a recording", "takes long", "part of a program",
 )  # fmt: skip
-"""Why a block is not executed; it is still parsed."""
+"""Why a block is not executed."""
 RUN_BY_OTHERS = {"docs/operations.md": "tests/stacks/test_operations.py"}
 """Page -> test that executes its blocks without a mark; `tests/docs/test_run_pages.py` runs the others."""
 NO_CODE = ("text",)
@@ -93,17 +86,9 @@ def _language_of(body: str) -> str:
     return "python" if re.match(r"(async |import |from |with |def )", first) else ""
 
 
-def commands_of(block: Block) -> list[str]:
-    """Return the commands of a command block, without comments, redirections and assignments."""
-    lines = [line.partition(" #")[0].partition(" > ")[0].strip() for line in block.text.splitlines()]
-    return [re.sub(r"^\w+=\$\((.*)\)$", r"\1", line) for line in lines if line and not line.startswith("#")]
-
-
-def how(block: Block) -> str:
-    """Return how a block is tested: ``executed``, ``parsed``, or its mark."""
-    if block.mark:
-        return block.mark
-    return "parsed" if block.language in ("json", "yaml") else "executed"
+def is_executed(block: Block) -> bool:
+    """Return whether a test executes the block: a program or commands, without a mark."""
+    return not block.mark and block.language not in ("json", "yaml")
 
 
 def all_blocks(root: Path) -> list[Block]:
@@ -114,19 +99,3 @@ def all_blocks(root: Path) -> list[Block]:
         if page not in _GENERATED
         for block in read_blocks(page, (root / page).read_text(encoding="utf-8"))
     ]
-
-
-def main() -> int:
-    """Print the number of blocks, and of commands in them, of each kind."""
-    root = Path(__file__).resolve().parents[2]
-    blocks, commands = Counter[str](), Counter[str]()
-    for block in all_blocks(root):
-        blocks[how(block)] += 1
-        commands[how(block)] += len(commands_of(block)) if not block.language else 0
-    for kind, count in blocks.most_common():
-        print(f"{count:4d} blocks with {commands[kind]:3d} commands: {kind}")
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

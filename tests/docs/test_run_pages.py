@@ -19,7 +19,7 @@ from queue import Empty, Queue
 
 import pytest
 
-from scripts.site.blocks import RUN_BY_OTHERS, Block, all_blocks, how
+from scripts.site.blocks import RUN_BY_OTHERS, Block, all_blocks, is_executed
 
 pytestmark = [pytest.mark.system, pytest.mark.slow, pytest.mark.timeout(400)]
 
@@ -51,7 +51,7 @@ def todo() -> dict[str, list[Block]]:
     """Return the blocks that this module executes, by page."""
     found: dict[str, list[Block]] = {}
     for block in all_blocks(ROOT):
-        if how(block) == "executed" and block.page not in RUN_BY_OTHERS:
+        if is_executed(block) and block.page not in RUN_BY_OTHERS:
             found.setdefault(block.page, []).append(block)
     return found
 

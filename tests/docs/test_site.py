@@ -15,10 +15,37 @@ import pytest
 import client_sdk
 from rse_pf.backend.metrics import Metrics, merge, render
 from rse_pf.cli.main import VERBS
+from scripts.site.blocks import is_executed, read_blocks
 from scripts.site.check import dead_links, outside_requests
 from scripts.site.pages import cli_page, inside, metrics_page, moved, sdk_page
 
 MAX_BUILD_S = 60.0
+PAGE_WITH_BLOCKS = """# Title
+
+Needs an account:
+
+```
+rse-pf cloud doctor
+```
+
+<!-- file: Robot.py -->
+```python
+import json
+```
+
+Some words.
+
+    scrape_configs:
+      - job_name: x
+
+```
+rse-pf demo
+```
+
+```text
+no code
+```
+"""
 
 
 def test_the_page_of_the_command_line_has_every_verb() -> None:
@@ -35,6 +62,13 @@ def test_the_page_of_the_sdk_has_every_public_name() -> None:
 
     assert [name for name in client_sdk.__all__ if f"::: client_sdk.{name}\n" not in page] == []
     assert "::: rse_pf.auth.robot_key.RobotKey\n" in page
+
+
+@pytest.mark.parametrize("name", ["Frame", "TrackedFrame", "Answer", "Stats"])
+def test_the_page_of_the_sdk_lists_the_fields_of_dataclasses(name: str) -> None:
+    (directive,) = re.findall(rf"^::: client_sdk\.{name}\n((?: .*\n)+)", sdk_page(), re.MULTILINE)
+
+    assert "show_if_no_docstring: true" in directive
 
 
 def test_the_page_of_metrics_has_what_a_server_gives(repository: Path) -> None:
@@ -58,6 +92,16 @@ def test_every_page_is_in_the_menu(repository: Path) -> None:
 
     # The page of the results leads to the reports.
     assert {page for page in pages - listed if not page.startswith("results/")} == set()
+
+
+def test_marks_files_and_languages_of_code_blocks_are_read() -> None:
+    doctor, program, scrape, demo = read_blocks("docs/page.md", PAGE_WITH_BLOCKS)
+
+    assert doctor.mark == "needs an account"
+    assert (program.file, program.language) == ("Robot.py", "python")
+    assert scrape.language == "yaml"
+    assert demo.text == "rse-pf demo\n"
+    assert [is_executed(block) for block in (doctor, program, scrape, demo)] == [False, True, False, True]
 
 
 def test_links_of_the_readme_are_those_of_the_site() -> None:

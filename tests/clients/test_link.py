@@ -1,4 +1,4 @@
-"""The table of clients: what a cell says, a line for each scenario, and what the link does to messages."""
+"""What the link of the conformance table does to messages, and what the client of 150 lines imports."""
 
 from __future__ import annotations
 
@@ -25,39 +25,6 @@ def module(path: Path) -> Any:
 
 
 link = module(HERE / "link.py")
-page = module(HERE.parents[1] / "scripts" / "clients_page.py")
-
-
-def row(client: str, scenario: str, passed: bool | None, skipped: str | None = None) -> dict[str, Any]:
-    return {
-        "client": client, "scenario": scenario, "run": 1, "passed": passed, "skipped": skipped, "why": "",
-        "figures": {"p50_ms": 3.21},
-    }  # fmt: skip
-
-
-def test_a_cell_says_whether_every_run_passed_and_why_there_was_none() -> None:
-    rows = [row("a", "pnp", True), row("a", "pnp", False), row("b", "pnp", None, "not claimed")]
-    rows += [row("c", "pnp", None, "node is missing"), row("d", "pnp", True), row("d", "stream/move", True)]
-
-    text = page.table({"version": "1", "date": "2026-01-01", "runs": 2, "load_average": 1.0, "rows": rows})
-
-    (line,) = [each for each in text.splitlines() if each.startswith(f"| {page.FEATURES['pnp']} ")]
-    assert line.split(" | ")[1:] == ["**failed**", "no", "not run", "yes |"]
-    assert text.splitlines()[-1].split(" | ")[1:] == ["", "", "", "3.2 |"]
-
-
-def test_the_text_between_the_marks_is_replaced_and_nothing_else() -> None:
-    before = f"# A\n{page.BEGIN}old\n{page.END}after\n"
-
-    assert page.with_table(before, "new") == f"# A\n{page.BEGIN}\nnew\n{page.END}after\n"
-    assert page.BEGIN in page.PAGE.read_text(encoding="utf-8")
-
-
-def test_every_scenario_of_the_harness_is_a_line_of_the_page() -> None:
-    text = (HERE / "scenarios.py").read_text(encoding="utf-8")
-
-    assert [name for name in page.FEATURES if f'@scenario("{name}"' not in text] == []
-    assert text.count("\n@scenario(") == len(page.FEATURES)
 
 
 def test_the_raw_client_has_at_most_150_lines_and_imports_nothing_of_the_platform() -> None:
