@@ -128,4 +128,4 @@ lock: ## resolve the newest versions and write them with hashes into locks/
 	@sh scripts/lock.sh
 
 clean: ## remove the virtual environment and everything built
-	rm -rf $(VENV) build dist out cdk.out node_modules *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) build dist out cdk.out node_modules *.egg-info .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
