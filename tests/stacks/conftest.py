@@ -6,6 +6,7 @@ import fcntl
 import json
 import os
 import shutil
+import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,6 +32,17 @@ PUBLIC = PlatformSettings.from_dict(
         "serving": {"port": 9001, "control_port": 9002},
     }
 )  # fmt: skip
+
+
+SYNTHESIS_WITHIN_S = 900
+"""A synthesis takes 10 s alone, and minutes beside ten other processes; a test may have to wait for two."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Give the tests that need a synthesis the time to make it, or to wait for another process that does."""
+    for item in items:
+        if {"assembly", "synthesise"} & set(getattr(item, "fixturenames", ())):
+            item.add_marker(pytest.mark.timeout(SYNTHESIS_WITHIN_S), append=False)
 
 
 @dataclass(frozen=True)
@@ -79,12 +91,13 @@ def assembly(
     if "PYTEST_XDIST_WORKER" in os.environ:
         base = base.parent  # of all workers: the first one synthesises, the others read
     folder = base / f"synthesis-{request.param}"
-    folder.mkdir(exist_ok=True)
-    with (folder / "lock").open("w") as lock:
+    with (base / f"{folder.name}.lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        if not (folder / "done").exists():
-            synthesise_into(settings, folder, repository)
-            (folder / "done").touch()
+        if not folder.exists():
+            # A synthesis that is interrupted leaves nothing under the name that others read.
+            unfinished = Path(tempfile.mkdtemp(dir=base, prefix=f"{folder.name}-"))
+            synthesise_into(settings, unfinished, repository)
+            unfinished.rename(folder)
     return read_assembly(settings, folder)
 
 
