@@ -19,13 +19,7 @@ from rse_pf.experiments.paper.live_map import live_experiment_figures
 from rse_pf.experiments.paper.mapping import CLOUD, map_figures
 from rse_pf.experiments.paper.robustness import robustness_figures
 from rse_pf.experiments.results.live_faults import live_fault_figures
-from rse_pf.experiments.results.records import (
-    COMMANDS,
-    EVENTS,
-    Records,
-    parameters_of,
-    read_records,
-)
+from rse_pf.experiments.results.records import EVENTS, Records, parameters_of, read_records
 
 __all__ = [
     "FigureCheck",
@@ -95,9 +89,6 @@ def run_folders(folder: Path) -> dict[str, Path]:
 def verify(folder: Path) -> list[FigureCheck]:
     """Return a check of each figure and invariant of each run in *folder*, or in the experiments below it.
 
-    A run without ``commands.csv`` whose ``commands.sha256`` is kept is checked as far as its events and
-    samples go.
-
     Raises:
         UsageError: The folder holds no run, or a record or the report cannot be read.
     """
@@ -147,26 +138,15 @@ def broken_invariants(records: Records) -> dict[str, str]:
 
 
 def _verify_run(folder: Path, reported: Mapping[str, Any]) -> Iterator[FigureCheck]:
-    has_commands = any((folder / name).exists() for name in (COMMANDS, f"{COMMANDS}.gz"))
-    partial = not has_commands and (folder / "commands.sha256").exists()
-    records = read_records(folder, without_commands=partial)
+    records = read_records(folder)
     figures = json.loads(json.dumps(figures_of(records)))
     for path, value in _leaves(figures):
-        if partial and path[0] in _FROM_COMMANDS:
-            yield FigureCheck(what="/".join(path), agrees=None, detail=f"{COMMANDS} is not kept here")
-        elif path == (_OF_CLOUDS,) and None in value:
+        if path == (_OF_CLOUDS,) and None in value:
             yield FigureCheck(what=_OF_CLOUDS, agrees=None, detail=f"{CLOUD} is not kept here")
         else:
             yield _compare(reported, path, value)
     for name, broken in broken_invariants(records).items():
-        if not partial or "scale-out" in name:
-            yield FigureCheck(what=f"invariant: {name}", agrees=not broken, detail=broken)
-
-
-_FROM_COMMANDS = {
-    "commands", "failures_by_code", "round_trip_ms", "phases", "queue_ms", "compute_ms", "commands_by_server",
-}  # fmt: skip
-"""Figures of an elasticity run that only its commands give."""
+        yield FigureCheck(what=f"invariant: {name}", agrees=not broken, detail=broken)
 
 
 def _prefix(name: str, check: FigureCheck) -> FigureCheck:

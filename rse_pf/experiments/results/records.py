@@ -145,18 +145,14 @@ def write_commands(path: Path, commands: Iterable[CommandRecord]) -> None:
             writer.writerow([_csv_value(value) for value in asdict(command).values()])
 
 
-def read_records(folder: Path, *, without_commands: bool = False) -> Records:
+def read_records(folder: Path) -> Records:
     """Return the records of the run in *folder*.
-
-    Args:
-        folder: The folder of one run.
-        without_commands: Whether ``commands.csv`` is not kept there; the records then hold no commands.
 
     Raises:
         UsageError: A file is missing or malformed.
     """
     return Records(
-        commands=[] if without_commands else read_commands(folder / COMMANDS),
+        commands=read_commands(folder / COMMANDS),
         events=_read_events(folder / EVENTS),
         samples=read_samples(folder / SAMPLES),
         folder=folder,

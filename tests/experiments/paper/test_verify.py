@@ -216,18 +216,6 @@ def test_the_targets_of_a_fault_are_verified_too(run):
     assert differing(run) == ["bars/replaced_in_s/held"]
 
 
-def test_without_the_commands_only_figures_of_events_and_samples_are_checked(run):
-    (run / "commands.csv").unlink()
-    (run / "commands.sha256").write_text("0" * 64)
-
-    checks = {check.what: check.agrees for check in verify(run)}
-
-    assert checks["commands/sent"] is None
-    assert checks["scale_outs"] is True
-    assert checks["invariant: every scale-out follows the required busy samples"] is True
-    assert False not in checks.values()
-
-
 def test_several_experiments_of_a_folder_are_verified_by_their_names(run, tmp_path_factory):
     whole = tmp_path_factory.mktemp("results")
     (whole / "first").symlink_to(run)
