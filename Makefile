@@ -91,7 +91,6 @@ docs: ## write the generated pages and documents
 	@$(SETUP) dev
 	@$(BIN)/rse-pf settings --markdown > docs/settings.md
 	@$(BIN)/rse-pf errors --markdown > docs/errors.md
-	@$(BIN)/rse-pf data --openapi > docs/openapi.json
 	@$(BIN)/python scripts/asyncapi.py
 	@$(BIN)/python scripts/grafana.py
 

@@ -370,7 +370,7 @@ def openapi() -> dict[str, Any]:
 
 @functools.cache
 def openapi_page() -> str:
-    """Return ``docs/openapi.json``."""
+    """Return the document as text: what ``rse-pf data --openapi`` prints."""
     return json.dumps(openapi(), indent=1, sort_keys=True) + "\n"
 
 

@@ -2,19 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 from fake_data_service import Service
 
 from rse_pf.data_server.handlers import Handlers
 from rse_pf.data_server.routes import ROUTES, Route, openapi, openapi_page
-
-
-def test_the_published_document_is_up_to_date(repository: Path) -> None:
-    page = (repository / "docs" / "openapi.json").read_text(encoding="utf-8")
-
-    assert page == openapi_page(), "run rse-pf data --openapi > docs/openapi.json"
 
 
 def test_the_service_returns_the_same_document_without_a_token(service: Service) -> None:
