@@ -192,9 +192,11 @@ def _plain(reply: PnpReply) -> bytes:
 
 def write(folder: Path) -> None:
     """Write all golden files into *folder*."""
-    for name, document in (("messages", golden_messages()), ("poses", golden_poses())):
-        text = json.dumps(document, indent=1, ensure_ascii=False)
-        (folder / f"{name}.json").write_text(text + "\n", encoding="utf-8")
+    messages = json.dumps(golden_messages(), indent=1, ensure_ascii=False)
+    (folder / "messages.json").write_text(f"{messages}\n", encoding="utf-8")
+    rows = [f"{json.dumps(name)}: {json.dumps(pose)}" for name, pose in golden_poses().items()]
+    poses = ",\n".join(rows)
+    (folder / "poses.json").write_text(f"{{\n{poses}\n}}\n", encoding="utf-8")
 
 
 if __name__ == "__main__":
