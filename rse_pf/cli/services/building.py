@@ -22,6 +22,7 @@ from rse_pf.services.custom.dependencies import (
     platform_tag,
 )
 from rse_pf.services.custom.installed import InstalledService, read_service
+from rse_pf.services.custom.native import INCLUDE_FOLDER
 from rse_pf.terminal import at_work, counted, show
 
 __all__ = ["build_service", "built_service", "changed_s", "lock_service"]
@@ -86,7 +87,10 @@ def _check_language(service: InstalledService) -> None:
 
 
 def _compile(folder: Path) -> None:
-    """Build a service that has a CMakeLists.txt and sources newer than its libraries."""
+    """Build a service that has a CMakeLists.txt and sources newer than its libraries.
+
+    Its CMakeLists.txt may take the C interface of this version from the folder ``RSE_PF_INCLUDE``.
+    """
     if not (folder / "CMakeLists.txt").exists():
         return
     libraries = [path.stat().st_mtime for path in (folder / "build").glob("*.so")]
@@ -96,7 +100,8 @@ def _compile(folder: Path) -> None:
         raise UsageError(
             "cmake is not installed, so the service cannot be built", hint="apt install cmake g++"
         )
-    for command in (["cmake", "-S", ".", "-B", "build"], ["cmake", "--build", "build"]):
+    headers = f"-DRSE_PF_INCLUDE={INCLUDE_FOLDER}"
+    for command in (["cmake", "-S", ".", "-B", "build", headers], ["cmake", "--build", "build"]):
         with at_work(f"building {folder.name}"):
             done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
         if done.returncode != 0:

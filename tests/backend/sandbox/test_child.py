@@ -366,11 +366,10 @@ def test_a_full_scratch_folder_is_an_error_of_the_service(ask):
 def test_every_example_answers_its_recorded_requests_in_a_sandbox(tmp_path, example):
     if example != "icp-python" and shutil.which("cmake") is None:
         pytest.skip("cmake is not installed")
-    folder = tmp_path / example
-    shutil.copytree(EXAMPLES / example, folder, ignore=shutil.ignore_patterns("build"))
+    shutil.copytree(EXAMPLES, tmp_path / "services", ignore=shutil.ignore_patterns("build"))
 
     done = subprocess.run(
-        [sys.executable, "-m", "rse_pf.cli.main", "service", "test", str(folder)],
+        [sys.executable, "-m", "rse_pf.cli.main", "service", "test", str(tmp_path / "services" / example)],
         capture_output=True, text=True, timeout=120, check=False,
     )  # fmt: skip
 
