@@ -19,12 +19,12 @@ help: ## show these targets
 	@awk -F':.*## ' '/^[a-z-]+:.*## /{printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
 setup: ## install everything a developer needs: Node, the CDK, the cloud's packages
-	@$(SETUP) dev infra
+	@$(SETUP) dev
 	@$(BIN)/python scripts/assets.py
 	@sh scripts/cdk.sh
 
 assets: ## build the packages for AWS into build/, and the native core for aarch64
-	@$(SETUP) dev infra
+	@$(SETUP) dev
 	@$(BIN)/python scripts/assets.py
 	@$(BIN)/python scripts/assets.py --arm || echo "assets: the packages for AWS are complete, without a core for ARM"
 
@@ -36,7 +36,7 @@ sanitize: ## run the native core with the address and undefined-behaviour saniti
 	@sh scripts/sanitize.sh
 
 synth: ## write the CloudFormation templates into cdk.out; needs no account, and no network after setup
-	@$(SETUP) dev infra
+	@$(SETUP) dev
 	@$(BIN)/python scripts/assets.py
 	@sh scripts/cdk.sh synth --quiet
 
@@ -45,7 +45,7 @@ demo: ## run robots that build point-cloud maps with the PnP service; writes ./o
 	@$(BIN)/rse-pf demo --out out $(ARGS)
 
 test: ## run what CI runs: lint, types, all tests but the slow ones
-	@$(SETUP) dev infra
+	@$(SETUP) dev
 	@$(BIN)/ruff check . && $(BIN)/ruff format --check .
 	@$(BIN)/mypy
 	@$(PYTEST) -m "not slow" -n $(WORKERS) --dist loadfile $(ARGS)
@@ -55,12 +55,12 @@ quick: ## run the pure tests only, in seconds
 	@$(PYTEST) -q -m "not slow and not system" -n 2 --dist loadfile $(ARGS)
 
 slow: ## run what make test leaves out: conformance suites, recordings, a bare Debian
-	@$(SETUP) dev infra
+	@$(SETUP) dev
 	@$(BIN)/python scripts/assets.py
 	@$(PYTEST) -m slow $(ARGS)
 
 browser: ## try the fleet page in Debian's Chromium, and save its pictures in docs/images
-	@$(SETUP) dev browser
+	@$(SETUP) dev ci
 	@RSE_PF_SCREENSHOTS=docs/images $(PYTEST) -q -rs -s -n 0 -m slow tests/fleet_page/test_in_chromium.py $(ARGS)
 
 clients: ## run every client through one table against a real platform; writes out/clients.json
@@ -68,7 +68,7 @@ clients: ## run every client through one table against a real platform; writes o
 	@$(BIN)/python tests/clients/conformance.py $(ARGS)
 
 localstack: ## run the tests of AWS against LocalStack, without Docker and without an account
-	@$(SETUP) dev infra
+	@$(SETUP) dev
 	@sh scripts/localstack.sh $(ARGS)
 
 ros: ## try the bridge of ROS with a real ROS 1 and a real ROS 2
@@ -95,12 +95,12 @@ docs: ## write the generated pages and documents
 	@$(BIN)/python scripts/grafana.py
 
 site: ## build the documentation site into build/site; needs no network after setup
-	@$(SETUP) docs
+	@$(SETUP) ci
 	@sh scripts/site.sh
 
-release: ## build the packages that can be published, twice, and check them; writes build/release
-	@$(SETUP) dev release
-	@$(BIN)/python scripts/release.py $(ARGS)
+release: ## build the packages that can be published, twice, and compare them; writes build/release
+	@$(SETUP) dev
+	@sh scripts/release.sh
 
 fuzz: ## fuzz each target for FUZZ_S seconds (600), with atheris where it is installed, else Hypothesis
 	@$(SETUP) dev

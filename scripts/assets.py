@@ -3,7 +3,7 @@
     python scripts/assets.py [--into build] [--arm]
 
 Installs wheels only, by the hashes of the locks, and runs nothing that it downloads; with --arm it runs the
-compiler of locks/native.txt.  The build is reproducible: the time of every entry is SOURCE_DATE_EPOCH (by
+compiler of locks/tools.txt.  The build is reproducible: the time of every entry is SOURCE_DATE_EPOCH (by
 default the earliest of a zip file).  Nothing is built when neither a lock nor a source has changed; the
 network is needed only for a changed lock.
 
@@ -58,7 +58,7 @@ ENVIRONMENT = "/opt/rse-pf/venv"
 LIBRARIES = ("libraries-0.tar.gz", "libraries-1.tar.gz")
 """Two of about the same size: a server unpacks both at the same time."""
 PLATFORM, ENVIRONMENT_FILE = "platform.tar.gz", "environment.json"
-NATIVE_SOURCES = ("src/*.cpp", "src/*.hpp", "include/*.h", "wheel_builder/*.py", "Makefile", "*.toml", "*.md")
+NATIVE_SOURCES = ("src/*.cpp", "src/*.hpp", "include/*.h", "*.py", "Makefile", "*.toml", "*.md")
 
 
 def main() -> int:
@@ -135,45 +135,29 @@ def _our_wheel(work: Path) -> Path:
     return wheel
 
 
-def _native_wheels(folder: Path, machine: str, *compiler: str) -> list[Path]:
-    """Return the wheel of the native core for *machine*; none where the builder says why it cannot be."""
-    command = [sys.executable, "-m", "native.wheel_builder", "--into", str(folder), "--machine", machine]
-    built = subprocess.run([*command, *compiler], cwd=ROOT, stdout=subprocess.PIPE, text=True, check=False)
-    return [Path(line) for line in built.stdout.splitlines()]
-
-
-def arm_compiler(into: Path) -> str | None:
-    """Install the wheel ziglang into *into* and return its compiler command; None where that fails."""
-    zig = into / "ziglang"
-    stamp, wanted = zig / "lock.sha256", hashlib.sha256((ROOT / "locks/native.txt").read_bytes()).hexdigest()
-    if not stamp.is_file() or stamp.read_text(encoding="utf-8") != wanted:
-        sys.stderr.write("assets: installing the compiler for aarch64 (100 MB, once)\n")
-        _empty(zig)
-        try:
-            _pip(
-                "install", "--quiet", "--require-hashes", "--no-deps", "--only-binary=:all:", "--no-compile",
-                "--target", str(zig), "--requirement", str(ROOT / "locks/native.txt"),
-            )  # fmt: skip
-        except subprocess.CalledProcessError:
-            sys.stderr.write(
-                "assets: there is no wheel for aarch64\n"
-                "  hint: read pip's output above, and check the network\n"
-            )
-            return None
-        stamp.write_text(wanted, encoding="utf-8")
-    os.environ.setdefault("ZIG_GLOBAL_CACHE_DIR", str((into / "zig-cache").resolve()))
-    os.environ.setdefault("ZIG_LOCAL_CACHE_DIR", os.environ["ZIG_GLOBAL_CACHE_DIR"])
-    program = (zig / "ziglang" / "zig").resolve()
-    return f"{program} c++ -target aarch64-linux-gnu.2.28"
+def _native_wheels(folder: Path, machine: str) -> list[Path]:
+    """Return the wheel of the native core for *machine*; none, and say why, where it cannot be built."""
+    folder.mkdir(parents=True, exist_ok=True)
+    pattern = f"rse_pf_native-*_{machine}.whl"
+    for old in folder.glob(pattern):
+        old.unlink()
+    built = subprocess.run(
+        ["/bin/sh", str(ROOT / "scripts/native_wheel.sh"), str(folder.resolve()), machine],
+        env={"SOURCE_DATE_EPOCH": EPOCH, **os.environ},
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    if built.returncode:
+        sys.stderr.write(
+            f"{(built.stdout + built.stderr)[-3000:]}assets: there is no native core for {machine}\n"
+            "  hint: read the output above; sudo apt-get install g++\n"
+        )
+    return list(folder.glob(pattern))
 
 
 def _native_for_arm(into: Path) -> int:
     """Build the wheel for ARM robots and Graviton servers."""
-    compiler = arm_compiler(into)
-    if compiler is None:
-        return 2
     folder = into / "native"
-    if not _native_wheels(folder.resolve(), "aarch64", "--compiler", compiler):
+    if not _native_wheels(folder, "aarch64"):
         return 2
     _write_hashes(folder)
     sys.stderr.write(

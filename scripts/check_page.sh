@@ -6,6 +6,6 @@ if ! command -v chromium-headless-shell > /dev/null && ! command -v chromium > /
   echo "skipped: no Chromium (sudo apt-get install chromium-headless-shell)"
   exit 0
 fi
-sh scripts/setup.sh dev browser
+sh scripts/setup.sh dev ci
 exec .venv/bin/python -m pytest -q -rs -s -n 0 -m slow tests/fleet_page/test_in_chromium.py \
   -k "not million_points and not pause_move_drain"

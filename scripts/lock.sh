@@ -3,64 +3,32 @@
 set -eu
 cd "$(dirname "$0")/.."
 
-ours="--no-emit-package rse-pf --no-emit-package rse-pf-native"
-constraints="--constraint locks/constraints.txt"
-
-lock() { # lock FILE EXTRA...
+lock() { # lock FILE ARGUMENT...
   file=$1
   shift
-  extras=$(for extra in "$@"; do printf -- '--extra %s ' "$extra"; done)
-  # shellcheck disable=SC2086
-  .venv/bin/uv pip compile pyproject.toml --quiet --universal --python-version 3.10 --generate-hashes \
-    --no-emit-index-url --no-emit-find-links --no-annotate $ours \
-    $constraints --custom-compile-command 'make lock' \
-    $extras --output-file "locks/$file.txt"
+  .venv/bin/uv pip compile "$@" --quiet --generate-hashes --no-emit-index-url --no-emit-find-links --no-annotate \
+    --no-emit-package rse-pf --no-emit-package rse-pf-native --custom-compile-command 'make lock' \
+    --output-file "locks/$file.txt"
 }
 
-lock demo demo build
-lock dev dev
-lock infra infra dev
-# What one .venv holds beside the packages of developers has the same versions as they.
-constraints="$constraints --constraint locks/infra.txt"
-lock docs docs build
-lock release release build
-lock browser browser
-lock xfeat xfeat
-lock ros ros
-lock batch batch build
-# A client of the conformance table, which the platform itself does not need.
+every="--universal --python-version 3.10"
 # shellcheck disable=SC2086
-.venv/bin/uv pip compile tests/clients/rosbridge.in --quiet --universal --python-version 3.10 \
-  --generate-hashes --no-emit-index-url --no-emit-find-links --no-annotate $constraints \
-  --custom-compile-command 'make lock' --output-file locks/rosbridge.txt
-# The oldest Node that the documentation names, beside the one of the extra infra.
-.venv/bin/uv pip compile tests/clients/oldest_node.in --quiet --universal --python-version 3.10 \
-  --generate-hashes --no-emit-index-url --no-emit-find-links --no-annotate \
-  --custom-compile-command 'make lock' --output-file locks/oldest-node.txt
+{
+  lock demo pyproject.toml $every --extra demo --extra build
+  lock dev pyproject.toml $every --extra dev --extra infra --extra release
+  # What one .venv holds beside the packages of developers has the same versions as they.
+  lock ci pyproject.toml $every --extra docs --extra browser --extra build --group clients --constraint locks/dev.txt
+  # Each of them lies in a folder of its own: scripts/tool.sh.
+  lock tools $every --group tools
+  # In an environment of its own: later releases of what LocalStack needs break it.
+  lock localstack --universal --python-version 3.11 --group localstack --exclude-newer 2025-10-25
+}
+
 # What boots has one platform, so its locks have no conditions.
-for_platform() { # for_platform FILE PYTHON INPUT...
-  file=$1 python=$2
-  shift 2
-  # shellcheck disable=SC2086
-  .venv/bin/uv pip compile "$@" --quiet --python-version "$python" --python-platform x86_64-manylinux_2_28 \
-    --generate-hashes --no-emit-index-url --no-emit-find-links --no-annotate $ours \
-    --constraint locks/constraints.txt --custom-compile-command 'make lock' --output-file "locks/$file.txt"
-}
-
-for_platform boot 3.11 pyproject.toml --extra boot       # Debian 12
-for_platform lambda 3.13 lambda_pnp/requirements.txt     # the runtime of stacks/serverless_stack.py
+one="--python-platform x86_64-manylinux_2_28"
 # shellcheck disable=SC2086
-.venv/bin/uv pip compile pyproject.toml --extra ros2 tests/ros_bridge/tf2_msgs/generators.in --quiet \
-  --python-version 3.11 --python-platform x86_64-manylinux_2_28 --generate-hashes --no-emit-index-url \
-  --no-emit-find-links --no-annotate $ours --constraint locks/constraints.txt \
-  --custom-compile-command 'make lock' --output-file locks/ros2.txt
-
-# LocalStack in an environment of its own: later releases of what it needs break it.
-.venv/bin/uv pip compile locks/localstack.in --quiet --universal --python-version 3.11 \
-  --exclude-newer 2025-10-25 --generate-hashes --no-emit-index-url --no-emit-find-links --no-annotate \
-  --custom-compile-command 'make lock' --output-file locks/localstack.txt
-
-# The compiler of the native core for aarch64: scripts/assets.py --arm.
-.venv/bin/uv pip compile --group native/pyproject.toml:cross --quiet --universal --python-version 3.10 \
-  --generate-hashes --no-emit-index-url --no-emit-find-links --no-annotate \
-  --custom-compile-command 'make lock' --output-file locks/native.txt
+{
+  lock boot pyproject.toml $one --python-version 3.11 --extra boot             # Debian 12
+  lock lambda lambda_pnp/requirements.txt $one --python-version 3.13           # the runtime of stacks/serverless_stack.py
+  lock ros2 pyproject.toml $one --python-version 3.11 --extra ros2 tests/ros_bridge/tf2_msgs/generators.in
+}

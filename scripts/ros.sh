@@ -3,7 +3,7 @@
 # Whatever is missing, its tests are skipped and say so.
 set -eu
 cd "$(dirname "$0")/.."
-sh scripts/setup.sh dev ros
+sh scripts/setup.sh dev
 PYTHON=${PYTHON:-python3} sh scripts/ros2.sh
 
 packages="ros-core python3-yaml python3-nav-msgs python3-sensor-msgs python3-geometry-msgs python3-tf2-msgs \

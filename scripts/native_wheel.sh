@@ -1,0 +1,21 @@
+#!/bin/sh
+# Build the wheel of the native core that loads on old systems: sh scripts/native_wheel.sh INTO [MACHINE [SOURCE]]
+# For another machine it compiles with zig, which is installed from its lock (100 MB, once).
+set -eu
+cd "$(dirname "$0")/.."
+into=$1 machine=${2:-$(uname -m)} source=${3:-native}
+PATH=$PWD/.venv/bin:$PATH
+
+tag=manylinux_2_28_$machine
+if [ "$machine" != "$(uname -m)" ]; then
+  sh scripts/tool.sh ziglang build/ziglang
+  CXX="$PWD/build/ziglang/ziglang/zig c++ -target $machine-linux-gnu.2.28"
+  ZIG_GLOBAL_CACHE_DIR=$PWD/build/zig-cache ZIG_LOCAL_CACHE_DIR=$PWD/build/zig-cache
+  export CXX ZIG_GLOBAL_CACHE_DIR ZIG_LOCAL_CACHE_DIR
+  tag=auto # auditwheel knows the tags of this machine only by their names
+fi
+work=$(mktemp -d)
+trap 'rm -rf "$work"' EXIT
+_PYTHON_HOST_PLATFORM=linux-$machine python -m build --wheel --no-isolation --outdir "$work" "$source"
+# Refuses a library that needs newer symbols than the tag promises.
+python -m auditwheel repair --plat "$tag" --only-plat --wheel-dir "$into" "$work"/*.whl

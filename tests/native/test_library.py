@@ -1,0 +1,33 @@
+"""The native core of this checkout: its version, and which instructions of the processor it uses."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from rse_pf.native import open_solver
+
+
+def test_the_core_has_the_version_of_the_platform(repository: Path) -> None:
+    platform_file, core_file = (
+        (repository / name).read_text(encoding="utf-8")
+        for name in ("pyproject.toml", "native/pyproject.toml")
+    )
+    version = re.compile(r'^version = "(.+)"$', re.M)
+
+    assert version.findall(core_file) == version.findall(platform_file)
+    assert re.findall(r'"rse-pf-native==([^;]+);', platform_file) == version.findall(platform_file)
+
+
+def test_the_library_uses_what_the_processor_has(repository: Path) -> None:
+    library = repository / "native" / "build" / "librse_pf_native.so"
+    if not library.is_file():
+        pytest.skip("the native core is not built: make setup with a C++ compiler")
+    has = set(Path("/proc/cpuinfo").read_text(encoding="ascii").split())
+    widest = (
+        "avx512" if {"avx512f", "avx512dq", "avx512vl"} <= has else "avx2" if "avx2" in has else "portable"
+    )
+
+    assert open_solver(library).lanes == widest
