@@ -27,8 +27,8 @@ from rse_pf.local.state import read_state
 pytestmark = pytest.mark.system
 
 SETTINGS = PlatformSettings().replace(local={"warm_standby": False})
-SOON_S = 20.0
-BACK_S = 5.0
+SOON_S = 60.0
+"""A server starts in 2 s, and in 10 s on a machine with ten other processes."""
 
 
 @pytest.fixture
@@ -47,13 +47,12 @@ def verb(module: Any, *words: str) -> int:
     return int(module.run(parser.parse_args(words), SETTINGS))
 
 
-async def until(condition: Any, within_s: float = SOON_S) -> float:
-    """Wait until *condition* holds; return how long that took."""
-    began = time.monotonic()
+async def until(condition: Callable[[], bool]) -> None:
+    """Wait until *condition* holds."""
+    ends_s = time.monotonic() + SOON_S
     while not condition():
-        assert time.monotonic() - began < within_s, "it never came"
+        assert time.monotonic() < ends_s, "it never came"
         await asyncio.sleep(0.02)
-    return time.monotonic() - began
 
 
 async def fails(robot: Any) -> bool:
@@ -67,14 +66,13 @@ async def fails(robot: Any) -> bool:
 def test_robots_are_served_and_cut_off_on_a_full_disk_and_a_server_is_back_with_the_space(
     disk: Path, fill: Callable[[Path], Path], capsys: pytest.CaptureFixture[str]
 ):
-    back_s = asyncio.run(live_through_a_full_disk(disk, fill))
+    asyncio.run(live_through_a_full_disk(disk, fill))
 
     assert "missing in the audit log" not in capsys.readouterr().err
-    print(f"the replaced server serves {back_s:.2f} s after there is space")
 
 
-async def live_through_a_full_disk(disk: Path, fill: Callable[[Path], Path]) -> float:
-    """Return how long after there was space again the replaced server served."""
+async def live_through_a_full_disk(disk: Path, fill: Callable[[Path], Path]) -> None:
+    """Fill the disk, cut robots off, kill a server, and make space again."""
     events: list[Mapping[str, Any]] = []
     cloud = LocalPlatform(
         SETTINGS, state=disk / "rse-pf" / "default", servers=2, port=0, adoptable=True,
@@ -113,8 +111,7 @@ async def live_through_a_full_disk(disk: Path, fill: Callable[[Path], Path]) -> 
         assert "replace" not in names(), "a server that cannot start is not launched"
 
         hog.unlink()
-        back_s = await until(lambda: len(cloud.servers) == 2)
-        assert back_s <= BACK_S
+        await until(lambda: len(cloud.servers) == 2)
         await until(lambda: "disk-ok" in names() or "disk-low" in names())
 
     reasons = [event["reason"] for event in events if event["event"] == "disk-full"]
@@ -124,4 +121,3 @@ async def live_through_a_full_disk(disk: Path, fill: Callable[[Path], Path]) -> 
     assert done.count("robot.disabled") == 41
     assert done.count("token.revoked-all") == 1
     assert [verdict.problem for verdict in check_folder(audit_folder(cloud.state)) if verdict.problem] == []
-    return back_s
