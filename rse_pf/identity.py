@@ -1,8 +1,7 @@
 """Who a robot is: tenant, name and enrolment, the only key under which anything of a robot is kept.
 
 Two tenants may have robots of one name, and a name that was removed and enrolled again belongs to another
-robot.  A dictionary, a lock, a path or a lease that knows a robot by its name alone mixes them up;
-`tests/laws/test_identity.py` forbids it.
+robot.  A dictionary, a lock, a path or a lease that knows a robot by its name alone mixes them up.
 """
 
 from __future__ import annotations

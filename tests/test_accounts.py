@@ -90,6 +90,21 @@ def test_threads_of_several_processes_stay_within_the_quota() -> None:
     assert MIB < sum(info.size for info in store.list("objects/acme/")) <= 2 * MIB
 
 
+def test_a_robot_of_the_same_name_in_another_tenant_has_a_quota_of_its_own() -> None:
+    store = MemoryStore()
+    accounts = Accounts(store, DataSettings(quota_bytes=MIB, tenant_quota_bytes=4 * MIB))
+    robot, namesake = RobotId("acme", "r"), RobotId("rival", "r")
+    with accounts.reservation(robot, 900_000):
+        store.put(object_name(robot, digest_of(b"1")), bytes(900_000))
+
+    with pytest.raises(QuotaExceeded):
+        accounts.check_room(robot, 900_000)
+    accounts.check_room(namesake, 900_000)
+    accounts.release(namesake, 900_000)
+    with pytest.raises(QuotaExceeded):
+        accounts.check_room(robot, 900_000)
+
+
 @pytest.mark.parametrize(
     "name",
     [

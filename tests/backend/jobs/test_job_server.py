@@ -32,9 +32,9 @@ SETTINGS = PlatformSettings.from_dict(
 DONE = ["done", 12.5, msgspec.msgpack.encode({"value": 1})]
 
 
-def a_request(number: int = 0) -> JobRequest:
+def a_request(number: int = 0, tenant: str = "default") -> JobRequest:
     return JobRequest(
-        service="long", payload={"n": number}, robot=RobotId("default", f"robot-{number}"),
+        service="long", payload={"n": number}, robot=RobotId(tenant, f"robot-{number}"),
         key=f"{number:02d}" * 32, quota_bytes=1e6,
     )  # fmt: skip
 
@@ -118,6 +118,18 @@ def test_a_job_server_takes_no_more_jobs_than_it_has_slots(bench: Bench) -> None
     wait_until(lambda: bench.queue.waiting() == 1)
     server.leave()
     assert bench.queue.waiting() == 3
+
+
+def test_equal_jobs_of_robots_of_one_name_in_two_tenants_both_run(bench: Bench) -> None:
+    for tenant in ("acme", "rival"):
+        bench.queue.offer(a_request(tenant=tenant))
+    server = bench.job_server([], ends=False, slots=2)
+
+    server.step()
+
+    wait_until(lambda: len(bench.started) == 2)
+    assert server.running == 2
+    server.leave()
 
 
 def test_the_job_of_a_job_server_that_died_is_taken_after_its_lease(bench: Bench) -> None:

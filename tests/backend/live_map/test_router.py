@@ -308,6 +308,7 @@ def test_a_sender_of_garbage_loses_the_live_maps_for_a_while_and_the_others_do_n
 
     async def test(parts: Parts) -> None:
         hostile, good = FakeReader("hostile"), FakeReader("good")
+        namesake = FakeReader("hostile", tenant="acme")
         parts.owners.answer = lambda operation, payload: (
             BadRequest("a keyframe of 10 km away") if payload.segment else {}
         )
@@ -323,10 +324,21 @@ def test_a_sender_of_garbage_loses_the_live_maps_for_a_while_and_the_others_do_n
         assert refused.code == "forbidden"
         assert len(parts.owners.asked) == asked
         assert isinstance(await parts.ask("live-keyframe", keyframe(), connection=good), Result)
+        assert isinstance(await parts.ask("live-keyframe", keyframe(), connection=namesake), Result)
         now[0] += 61.0
         assert isinstance(await parts.ask("live-keyframe", keyframe(), connection=hostile), Result)
 
     with_router(test, now)
+
+
+def test_what_a_robot_of_that_name_in_another_tenant_asked_does_not_count_as_its_own() -> None:
+    async def test(parts: Parts) -> None:
+        parts.owners.answer = lambda operation, payload: None
+        parts.submit("live-show", {"map": "m"}, connection=FakeReader("r", tenant="acme"))
+
+        assert (parts.router.held, waiting(parts)) == (1, 0)
+
+    with_router(test)
 
 
 def test_more_bytes_than_one_worker_holds_are_busy() -> None:

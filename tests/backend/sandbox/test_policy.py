@@ -122,6 +122,17 @@ def test_each_robot_has_a_sandbox_of_its_own():
     assert policy.submit(make_call(B), 0.0) == [CreateSandbox(2, B)]
 
 
+def test_a_robot_of_the_same_name_in_another_tenant_has_a_sandbox_and_a_state_of_its_own():
+    policy, namesake = make_policy(), RobotId("rival", A.name)
+    policy.add_connection(namesake)
+    first, second = make_call(A, "counter"), make_call(namesake, "counter")
+
+    assert policy.submit(first, 0.0) == [CreateSandbox(1, A)]
+    assert policy.submit(second, 0.0) == [CreateSandbox(2, namesake)]
+    assert policy.on_ready(1, 0.1) == [LoadSnapshot(1, first)]
+    assert policy.on_ready(2, 0.1) == [LoadSnapshot(2, second)]
+
+
 def test_an_error_of_the_service_is_answered_and_costs_no_sandbox():
     policy, call = make_policy(), make_call()
     start(policy, call)
@@ -453,6 +464,16 @@ def test_a_sandbox_is_released_a_grace_period_after_the_last_connection_of_its_r
     assert policy.tick(3.0 + GRACE_S - 0.1) == []
     assert policy.tick(3.0 + GRACE_S) == [ReleaseSandbox(1)]
     assert policy.counts["released"] == 1
+
+
+def test_the_sandbox_of_a_robot_stays_when_one_of_the_same_name_in_another_tenant_leaves():
+    policy, namesake = make_policy(), RobotId("rival", A.name)
+    policy.add_connection(namesake)
+    for robot in (A, namesake):
+        policy.on_reply(start(policy, make_call(robot)), OK, 1.0)
+    policy.remove_connection(namesake, 2.0)
+
+    assert policy.tick(2.0 + GRACE_S) == [ReleaseSandbox(2)]
 
 
 def test_a_robot_that_reconnects_within_the_grace_period_keeps_its_sandbox():

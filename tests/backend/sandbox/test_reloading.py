@@ -19,7 +19,8 @@ from rse_pf.identity import RobotId
 from rse_pf.services.custom.installed import InstalledService
 from rse_pf.wire import Command, Failure, Result
 
-ROBOT, OTHER = RobotId("default", "r"), RobotId("default", "o")
+ROBOT, OTHER = RobotId("default", "r"), RobotId("acme", "r")
+"""Two robots of one name."""
 CONNECTION = SimpleNamespace(robot=ROBOT)
 
 

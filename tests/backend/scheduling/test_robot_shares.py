@@ -37,6 +37,15 @@ def test_the_first_share_is_an_equal_part_of_what_can_be_served() -> None:
     assert window(begun(served_per_s=200.0), 1.0, 100) == pytest.approx(20.0)
 
 
+def test_robots_of_one_name_in_two_tenants_have_a_share_each() -> None:
+    shares = RobotShares()
+    send(shares, robots=[RobotId("acme", "r"), RobotId("rival", "r")])
+    shares.note_free(1.0, 200.0)
+    shares.begin(1.0)
+
+    assert shares.per_s == pytest.approx(100.0)
+
+
 @pytest.mark.parametrize("behind_s", [1.0, 1.3])
 def test_robots_are_told_a_share_as_soon_as_the_server_falls_behind(behind_s: float) -> None:
     shares = RobotShares()

@@ -77,6 +77,16 @@ def test_one_robot_never_has_two_commands_running():
     assert second.command.id == 2
 
 
+def test_robots_of_one_name_in_two_tenants_are_queued_and_run_apart():
+    scheduler = AdmittedScheduler(max_queue=1)
+    assert scheduler.submit(queued("a", 1, stream="cam", seq=9, tenant="acme"), 0.0) == []
+    assert scheduler.submit(queued("a", 2, stream="cam", seq=1, tenant="rival"), 0.0) == []
+
+    both = [scheduler.start(0.0)[0] for _ in range(2)]
+
+    assert [(each.robot.tenant, each.command.id) for each in both if each] == [("acme", 1), ("rival", 2)]
+
+
 def test_the_newest_frame_takes_the_place_of_the_one_that_waits():
     scheduler = AdmittedScheduler(max_queue=4)
     scheduler.submit(queued("a", 1, stream="cam", seq=1), 0.0)

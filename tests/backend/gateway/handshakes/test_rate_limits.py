@@ -101,7 +101,9 @@ def test_robots_have_buckets_of_their_own():
     judged(rates, per_s=500.0, seconds=0.5, robot=RobotId("a", "flood"))
 
     assert rates.retry_after_ms(RobotId("a", "calm"), 100.5) == 0
-    assert rates.retry_after_ms(RobotId("b", "flood"), 100.5) == 0, "a name belongs to its tenant"
+    assert rates.banned_s(RobotId("a", "flood"), 100.5) > 0
+    assert rates.banned_s(RobotId("b", "flood"), 100.5) == 0, "a name belongs to its tenant"
+    assert [rates.retry_after_ms(RobotId("b", "flood"), 100.5) for _ in range(3)] == [0, 0, 0]
 
 
 def test_zero_turns_the_rate_off():

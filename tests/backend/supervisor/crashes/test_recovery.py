@@ -134,10 +134,11 @@ def test_two_crashes_by_one_robot_shut_it_out_everywhere_for_a_while() -> None:
     assert late.orders[0].banned == []
 
 
-def test_two_crashes_by_two_robots_shut_nobody_out() -> None:
+@pytest.mark.parametrize("other", [TWO, RobotId("rival", "one")])
+def test_two_crashes_by_two_robots_shut_nobody_out(other: RobotId) -> None:
     server = Server()
     server.crash(ONE)
-    server.crash(TWO)
+    server.crash(other)
     server.crash(None)
 
     assert "server.robot-shut-out" not in server.actions()
