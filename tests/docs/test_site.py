@@ -6,7 +6,6 @@ import os
 import re
 import subprocess
 import sys
-import time
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -19,7 +18,7 @@ from scripts.site.blocks import is_executed, read_blocks
 from scripts.site.check import dead_links, outside_requests
 from scripts.site.pages import cli_page, inside, metrics_page, moved, sdk_page
 
-MAX_BUILD_S = 60.0
+MAX_CPU_S = 60.0
 PAGE_WITH_BLOCKS = """# Title
 
 Needs an account:
@@ -159,8 +158,8 @@ def test_a_dead_link_of_a_site_is_noticed() -> None:
 
 @pytest.mark.slow
 @pytest.mark.skipif(find_spec("mkdocs") is None, reason="the extra docs is not installed: make site")
-def test_the_site_is_built_within_a_minute_without_dead_links_and_outside_requests(repository: Path) -> None:
-    started = time.monotonic()
+def test_the_site_is_built_in_a_minute_of_cpu_time_without_dead_links(repository: Path) -> None:
+    before = os.times()
     path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
 
     done = subprocess.run(
@@ -170,4 +169,6 @@ def test_the_site_is_built_within_a_minute_without_dead_links_and_outside_reques
 
     assert done.returncode == 0, done.stdout + done.stderr
     assert "0 dead links, 0 requests to other hosts" in done.stdout
-    assert time.monotonic() - started < MAX_BUILD_S
+    after = os.times()
+    used_s = sum(after[2:4]) - sum(before[2:4])  # of this process's children
+    assert used_s < MAX_CPU_S
