@@ -148,7 +148,7 @@ if __name__ == "__main__":
     if "--claims" in words:
         say(list(CLAIMS))
         sys.exit(0)
-    if words[-1] not in (*CLAIMS, "round-trips"):
+    if words[-1] not in CLAIMS:
         say({"event": "unsupported"})
         sys.exit(3)
     sys.exit(asyncio.run(main(words[-1], "--worker" in words)))

@@ -229,24 +229,12 @@ async function data({ robot, tally }) {
   }
 }
 
-/** One command after the other, for the time that each takes; no row of the table. */
-async function roundTrips({ robot, input, tally, seconds }) {
-  const end = performance.now() + seconds * 1e3;
-  for (let at = 0; performance.now() < end; at++) {
-    const began = performance.now();
-    const { message } = await tally.call(robot, input.commands[at % input.commands.length]);
-    check(!message, message);
-    await pause(Math.max(0, 70 - (performance.now() - began))); // below the rate that servers allow
-  }
-}
-
 const RUNS = {
   golden, pnp, "typed-error": typedError, undecodable, busy, deadline, newest, stream, renew: stream, expired: ended, revoked: ended,
   updates, progress, data,
 };
 
 export const claims = Object.keys(RUNS);
-RUNS["round-trips"] = roundTrips;
 RUNS.returns = returns; // claimed by what can sign tokens of the robot's own key
 
 /** Run *scenario*; `say` gets its events, the last one is `done` or `error`.  Returns the exit code. */
