@@ -15,7 +15,7 @@ from rse_pf.maps.format import MapVersion, encode_map
 from rse_pf.services.mapping.icp import IcpReply, IcpRequest
 from rse_pf.services.mapping.localise import LocaliseReply, LocaliseRequest
 from rse_pf.services.mapping.place import PlaceReply, PlaceRequest
-from rse_pf.services.synthetic_maps import make_room, make_world
+from tests.synthetic_maps import make_room, make_world
 
 for package in ("faiss", "small_gicp"):
     pytest.importorskip(package, reason="the extra maps is not installed")
