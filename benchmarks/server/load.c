@@ -3,11 +3,10 @@
    benchmarks/server/load.py compiles it and writes its payload files; `load --help` prints the options.
 
    Every robot of a group sends along times that are fixed before the run (open loop: one rate, a uniform
-   random phase each, from a seed), or as soon as it is answered (closed loop), or nothing (idle); a silent
-   connection sends not even a handshake.  Both loops begin when all robots are connected; an early group is
-   an open loop that begins at once, such as the pings of robots that wait for others.  In an open loop,
-   latency counts from the planned time, so a server that stalls cannot hide it; how late this program itself
-   sent is reported beside it.
+   random phase each, from a seed), or as soon as it is answered (closed loop).  Both loops begin when all
+   robots are connected; an early group is an open loop that begins at once, such as the pings of robots that
+   wait for others.  In an open loop, latency counts from the planned time, so a server that stalls cannot
+   hide it; how late this program itself sent is reported beside it.
 
    Answers are matched by their `id`: message k of a payload file has the id k.  An answer without id belongs
    to the oldest unanswered message of its connection.
@@ -52,18 +51,18 @@ enum {
 
 static const char USAGE[] =
     "load --port PORT --group NAME:ROBOTS:MODE:RATE:FILE [--group ...] [options]\n"
-    "  MODE is open, early, closed, idle or silent; RATE counts per robot and second; FILE holds the\n"
+    "  MODE is open, early or closed; RATE counts per robot and second; FILE holds the\n"
     "  messages, each after its length (u32, little endian), and - stands for none\n"
     "  --address 127.0.0.1 --path /ws --subprotocol NAME --tokens FILE --hello FILE\n"
     "  --sources 1 --first-source 1   source addresses 127.0.0.N of the connections, in turn\n"
     "  --reply none|json|zlib|msgpack|peer   how answers are read\n"
     "  --seconds 5 --warm-up 0.5 --drain 4 --opening 60   the window, before it, after it, to connect\n"
-    "  --at-once 64 --reopen 0   connections that open at the same time; pause before a closed one reopens\n"
+    "  --at-once 64   connections that open at the same time\n"
     "  --join-every 0   pause between two robots that connect\n"
     "  --obey 0   1: wait as long as a failure says, and keep to a told rate\n"
     "  --seed 1 --samples FILE\n";
 
-typedef enum { OPEN_LOOP, EARLY_LOOP, CLOSED_LOOP, IDLE, SILENT } Mode;
+typedef enum { OPEN_LOOP, EARLY_LOOP, CLOSED_LOOP } Mode;
 typedef enum { REPLY_NONE, REPLY_JSON, REPLY_ZLIB, REPLY_MSGPACK, REPLY_PEER } ReplyKind;
 typedef enum { ABSENT, CONNECTING, UPGRADING, WELCOMING, READY } State;
 typedef enum { OK, FAILED, LOST, UNSENT } Outcome;
@@ -106,7 +105,7 @@ typedef struct {
   bool says_hello, waits_for_room, is_settled;
   uint8_t *partial;
   size_t partial_size, partial_capacity;
-  double reopen_s, silent_until_s;
+  double opens_s, silent_until_s;
   double told_per_s, told_until_s; /* the rate that it keeps to */
   double may_send, counted_s;      /* messages that this rate allowed and that were not sent, up to this time */
 } Robot;
@@ -126,7 +125,7 @@ static struct {
   struct sockaddr_in address;
   const char *path, *subprotocol;
   int sources, first_source, at_once;
-  double seconds, warm_up_s, drain_s, opening_s, reopen_s, join_every_s;
+  double seconds, warm_up_s, drain_s, opening_s, join_every_s;
   unsigned seed;
   bool obeys;
   ReplyKind reply;
@@ -300,7 +299,7 @@ static void lose_unanswered(Robot *robot) {
 /* ---- connections ---- */
 
 static void wait_to_open(Robot *robot, double at_s) {
-  robot->reopen_s = at_s;
+  robot->opens_s = at_s;
   waiting[(waiting_head + waiting_count++) % robot_count] = (int)(robot - robots);
 }
 
@@ -322,10 +321,7 @@ static void end(Robot *robot, const char *why) {
   robot->offset = robot->partial_size = 0;
   robot->waits_for_room = robot->says_hello = false;
   robot->told_until_s = 0;
-  if (option.reopen_s > 0)
-    wait_to_open(robot, now_s() + option.reopen_s);
-  else
-    settle(robot);
+  settle(robot);
 }
 
 static void watch(Robot *robot, bool for_room) {
@@ -428,10 +424,6 @@ static void upgrade(Robot *robot) {
     return;
   }
   watch(robot, false);
-  if (robot->group->mode == SILENT) {
-    become_ready(robot);
-    return;
-  }
   int size = snprintf(head, sizeof head,
                       "GET %s HTTP/1.1\r\nHost: 127.0.0.1\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
                       "Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: AQIDBAUGBwgJCgsMDQ4PEA==\r\n"
@@ -446,7 +438,7 @@ static void upgrade(Robot *robot) {
 }
 
 static void open_waiting(double now) {
-  while (waiting_count && opening < option.at_once && robots[waiting[waiting_head]].reopen_s <= now) {
+  while (waiting_count && opening < option.at_once && robots[waiting[waiting_head]].opens_s <= now) {
     Robot *robot = &robots[waiting[waiting_head]];
     waiting_head = (waiting_head + 1) % robot_count;
     waiting_count--;
@@ -739,7 +731,7 @@ static void receive(Robot *robot) {
     end(robot, size ? "reset" : "cut");
     return;
   }
-  if (robot->state < UPGRADING || robot->group->mode == SILENT) return;
+  if (robot->state < UPGRADING) return;
   if (!robot->partial_size) {
     size_t used = take_frames(robot, buffer, (size_t)size, at_s);
     if (robot->state != ABSENT && used < (size_t)size) keep(robot, buffer + used, (size_t)size - used);
@@ -780,7 +772,7 @@ static void send_due(double now) {
 static double next_event_s(double now) {
   double next = first_s == INFINITY ? now + 0.05 : now < first_s ? first_s : last_s;
   for (int i = 0; i < group_count; i++) next = fmin(next, fmin(next_send_s(&groups[i]), last_s));
-  if (waiting_count && opening < option.at_once) next = fmin(next, robots[waiting[waiting_head]].reopen_s);
+  if (waiting_count && opening < option.at_once) next = fmin(next, robots[waiting[waiting_head]].opens_s);
   return next;
 }
 
@@ -893,14 +885,13 @@ static void read_group(const char *text) {
   if (sscanf(text, "%31[a-z0-9-]:%d:%15[a-z]:%lf:%4095[^\n]", group->name, &group->robots, mode, &group->rate,
              file) != 5)
     fail("--group takes NAME:ROBOTS:MODE:RATE:FILE, not %s", text);
-  static const char *const modes[] = {"open", "early", "closed", "idle", "silent"};
+  static const char *const modes[] = {"open", "early", "closed"};
   int number = 0;
-  while (number < 5 && strcmp(mode, modes[number])) number++;
+  while (number < 3 && strcmp(mode, modes[number])) number++;
   group->mode = (Mode)number;
-  if (number == 5 || group->robots < 0 || group->robots > 100000) fail("no such group: %s", text);
+  if (number == 3 || group->robots < 0 || group->robots > 100000) fail("no such group: %s", text);
   if (group->mode <= EARLY_LOOP && !(group->rate > 0)) fail("an open loop needs a rate: %s", text);
-  if (group->mode <= CLOSED_LOOP)
-    group->frames = read_frames(file, option.reply == REPLY_JSON ? 1 : 2, &group->frame_count);
+  group->frames = read_frames(file, option.reply == REPLY_JSON ? 1 : 2, &group->frame_count);
   group->first = robot_count;
   robot_count += group->robots;
 }
@@ -968,7 +959,6 @@ static void read_options(int argc, char **argv) {
     else if (!strcmp(name, "--drain")) option.drain_s = atof(value);
     else if (!strcmp(name, "--opening")) option.opening_s = atof(value);
     else if (!strcmp(name, "--at-once")) option.at_once = atoi(value);
-    else if (!strcmp(name, "--reopen")) option.reopen_s = atof(value);
     else if (!strcmp(name, "--join-every")) option.join_every_s = atof(value);
     else if (!strcmp(name, "--obey")) option.obeys = atoi(value) != 0;
     else if (!strcmp(name, "--seed")) option.seed = (unsigned)strtoul(value, NULL, 10);

@@ -38,7 +38,7 @@ __all__ = [
     "run_load", "write_messages",
 ]  # fmt: skip
 
-Mode = Literal["open", "early", "closed", "idle", "silent"]
+Mode = Literal["open", "early", "closed"]
 
 SOURCE = Path(__file__).with_name("load.c")
 FLAGS = ("-O2", "-std=c11", "-Wall", "-Wextra", "-Werror")
@@ -154,7 +154,6 @@ class LoadPlan:
     sources: int = 1
     first_source: int = 1
     at_once: int = 64
-    reopen_s: float = 0.0
     join_every_s: float = 0.0
     seed: int = 1
     samples: Path | None = None
@@ -167,7 +166,7 @@ class LoadPlan:
             "port": self.port, "path": self.path, "reply": _REPLIES[self.codec], "seconds": self.seconds,
             "warm-up": self.warm_up_s, "drain": self.drain_s, "opening": self.opening_s,
             "sources": self.sources, "first-source": self.first_source, "at-once": self.at_once,
-            "reopen": self.reopen_s, "join-every": self.join_every_s, "seed": self.seed,
+            "join-every": self.join_every_s, "seed": self.seed,
             "hello": self.hello, "tokens": self.tokens, "samples": self.samples, "obey": int(self.obeys),
             "subprotocol": SUBPROTOCOLS.get(self.codec),
         }  # fmt: skip
@@ -243,11 +242,6 @@ class GroupReport:
     latency_ms: Percentiles
     late_ms: Percentiles
 
-    @property
-    def is_clean(self) -> bool:
-        """Whether every message was answered by a result."""
-        return self.ok > 0 and not self.failed and not self.lost and not self.unsent
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LoadReport:
@@ -286,25 +280,18 @@ class LoadReport:
 class LoadProcess:
     """``with LoadProcess(plan) as load``: a generator that runs until `stop`, or for the plan's time.
 
-    *on_mark* is called in a thread with ``begin`` and ``end`` when the window begins and ends.  *prefix*
-    starts the generator, such as ``("nice", "-n", "19")``.
+    *on_mark* is called in a thread with ``begin`` and ``end`` when the window begins and ends.
     """
 
-    def __init__(
-        self,
-        plan: LoadPlan,
-        on_mark: Callable[[str], None] = lambda mark: None,
-        prefix: Sequence[str] = (),
-    ) -> None:
+    def __init__(self, plan: LoadPlan, on_mark: Callable[[str], None] = lambda mark: None) -> None:
         self.plan = plan
-        self._prefix = prefix
         self._on_mark = on_mark
         self._begun = threading.Event()
         self._errors: list[str] = []
 
     def __enter__(self) -> LoadProcess:
         self._process = subprocess.Popen(
-            [*self._prefix, *self.plan.command(compile_generator())],
+            self.plan.command(compile_generator()),
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
@@ -362,11 +349,9 @@ class LoadProcess:
         self._begun.set()
 
 
-def run_load(
-    plan: LoadPlan, on_mark: Callable[[str], None] = lambda mark: None, prefix: Sequence[str] = ()
-) -> LoadReport:
+def run_load(plan: LoadPlan, on_mark: Callable[[str], None] = lambda mark: None) -> LoadReport:
     """Run *plan* to its end and return the report; raises ConfigurationError if the generator fails."""
-    with LoadProcess(plan, on_mark, prefix) as load:
+    with LoadProcess(plan, on_mark) as load:
         return load.result()
 
 
