@@ -22,18 +22,6 @@ from rse_pf.geometry import Array, inverse
 from rse_pf.maps.format import Keyframe, MapVersion
 from rse_pf.pnp import PnpOptions, refine_with_depth, solve_pnp
 
-__all__ = [
-    "Run",
-    "cloud_of",
-    "drive",
-    "frame_poses",
-    "judged_answer",
-    "keyframe_of",
-    "red_kitchen",
-    "track",
-    "truth_of",
-]
-
 RED_KITCHEN = "7scenes_redkitchen"
 
 
@@ -107,7 +95,7 @@ def truth_of(dataset: Dataset, stamps_s: Sequence[float]) -> Array:
     return np.asarray(dataset.truth.T_world_camera)[nearest]
 
 
-def judged_answer(query: PoseQuery, *, with_depth: bool = True) -> tuple[Array | None, int, bool]:
+def judged_answer(query: PoseQuery) -> tuple[Array | None, int, bool]:
     """Return ``T_camera_world`` of a query, its inliers, and whether it is weak, as the platform does.
 
     Without a pose they are None, 0 and False.
@@ -118,7 +106,7 @@ def judged_answer(query: PoseQuery, *, with_depth: bool = True) -> tuple[Array |
         solution = solve_pnp(matches.points_world, matches.pixels, query.camera, options)
     except PnpError:
         return None, 0, False
-    if with_depth and matches.depths_m.any():
+    if matches.depths_m.any():
         solution = refine_with_depth(
             solution, matches.points_world, matches.pixels, matches.depths_m, query.camera
         )

@@ -19,7 +19,7 @@ from client_sdk.check.findings import FaultKind
 from client_sdk.frontend import Frame
 from rse_pf.geometry import Camera
 
-__all__ = ["FAULTS", "Fault", "plant"]
+__all__ = ["FAULTS", "Fault"]
 
 _DARK_BRIGHTNESS = 12.0
 _STRETCH = 10
@@ -38,16 +38,9 @@ class Fault:
 
     name: str
     kind: FaultKind
-    severity: int
     value: float | None
     plant: Plant
     needs: str = ""
-
-
-def plant(frames: Iterable[Frame], kind: FaultKind, severity: int) -> Iterator[Frame]:
-    """Return frames with the first fault of a kind at severity 1, 2 or 3."""
-    fault = next(each for each in FAULTS if each.kind is kind and each.severity == severity)
-    return fault.plant(frames)
 
 
 def _each(change: Callable[[Frame], Frame]) -> Plant:
@@ -266,10 +259,7 @@ def _listed() -> Iterator[Fault]:
         kind: FaultKind, name: str, faults: list[tuple[float | None, Plant]], needs: str = ""
     ) -> Iterator[Fault]:
         for severity, (value, planted) in enumerate(faults, 1):
-            yield Fault(
-                name=f"{name}-{severity}", kind=kind, severity=severity, value=value, plant=planted,
-                needs=needs,
-            )  # fmt: skip
+            yield Fault(name=f"{name}-{severity}", kind=kind, value=value, plant=planted, needs=needs)
 
     kinds, half = FaultKind, 0.5
     yield from three(kinds.FOCAL_LENGTH, "fx", [(v, _focal(v)) for v in (0.03, -0.06, 0.10)])

@@ -28,7 +28,6 @@ from rse_pf.experiments.results.trajectory_error import ate_m
 from rse_pf.geometry import Array, exp_se3, inverse
 from rse_pf.live_map.events import Event, KeyframeAdded, LinksMeasured, MapStarted
 from rse_pf.live_map.live_map import LiveMap
-from rse_pf.live_map.options import LiveMapOptions
 from rse_pf.live_map.outcomes import (
     Added,
     Ambiguous,
@@ -50,8 +49,6 @@ from tests.live_map.generated_drives import (
 )
 from tests.recorded_drives import Run, drive, frame_poses, red_kitchen, truth_of
 
-__all__ = ["Played", "play"]
-
 DENSE = FrontEndOptions(is_spread=False, keyframe_m=0.1, keyframe_deg=6.0)
 LATE_FRAMES = 2
 PARTS = ("kitchen", "foreign", "wrong", "twins", "replay", "growth")
@@ -67,7 +64,6 @@ class Played:
     ids: dict[str, list[int]] = field(default_factory=dict)
     given: dict[str, dict[int, Array]] = field(default_factory=dict)
     outcomes: list[Outcome] = field(default_factory=list)
-    measure_ms: list[float] = field(default_factory=list)
 
     def online_cm(self, truth: Mapping[str, Array]) -> float:
         """Return the error of the poses as they were given out."""
@@ -88,9 +84,9 @@ class Played:
         return {name: min(frames) for name, frames in self.given.items() if frames}
 
 
-def play(runs: Mapping[str, Run], starts: Mapping[str, int], options: LiveMapOptions | None = None) -> Played:
+def play(runs: Mapping[str, Run], starts: Mapping[str, int]) -> Played:
     """Let robots drive at the same time, each from its own start (frames), into one live map."""
-    played = Played(live_map=LiveMap(options))
+    played = Played(live_map=LiveMap())
     known: dict[str, Array | None] = dict.fromkeys(runs)
     under_way: list[tuple[int, str, Array | None]] = []
     for name in runs:
@@ -121,10 +117,7 @@ def _send(played: Played, name: str, run: Run, number: int, tick: int) -> list[t
     outcomes = played.live_map.apply(event)
     added = next(outcome for outcome in outcomes if isinstance(outcome, Added))
     played.ids[name].append(added.id)
-    begin = time.process_time()
-    links = played.live_map.measure(added.id)
-    played.measure_ms.append(1000.0 * (time.process_time() - begin))
-    outcomes = [*outcomes, *played.live_map.apply(links)]
+    outcomes = [*outcomes, *played.live_map.apply(played.live_map.measure(added.id))]
     if any(isinstance(outcome, OptimiseWanted) for outcome in outcomes):
         outcomes = [*outcomes, *played.live_map.apply(played.live_map.optimise())]
     played.outcomes += outcomes
