@@ -23,9 +23,7 @@ RUNS = {
     "check.table": (["--seeds", "1", "--frames", "16", "--only", "dark"], "by_fault.dark.n"),
     "data.kills": (["--kills", "6"], "acknowledged"),
     "data.requests": (["--rounds", "1", "--only", "small"], "medians.here.get_p50_ms"),
-    "hostile.one_tenant": (
-        ["--pairs", "1", "--seconds", "3", "--only", "leave"], "leave.p99_ms.pose.0"
-    ),
+    "hostile.one_tenant": (["--pairs", "1", "--seconds", "3", "--only", "leave"], "leave.p99_ms.pose.0"),
     "hostile.tenants": (["--commands", "300"], "commands.acme"),
     "live.one_process": (["growth", "--keyframes", "300"], "wide.keyframes"),
     "server.capacity": (
@@ -33,11 +31,9 @@ RUNS = {
         "connected.kib_per_robot",
     ),
     "server.idle_memory": (["--robots", "100", "--workers", "1"], "kib_per_robot"),
-    "server.overload": (
-        ["--most", "20", "--seconds", "1", "--multiples", "1", "2"], "answered_percent.at_2"
-    ),
+    "server.overload": (["--most", "20", "--seconds", "1", "--multiples", "1", "2"], "answered_percent.at_2"),
     "server.sdk_overload": (["--sdk", "python"], "offered.python"),
-}  # fmt: skip
+}
 """Its arguments, and one figure that it reports, by the name of each benchmark."""
 
 RUNS_ON_RECORDINGS = {
@@ -49,10 +45,8 @@ RUNS_ON_RECORDINGS = {
         ["python", "words.txt", "--part", "ours", "--only", "9.6 Hz STEREO", "--folder", "FOLDER"],
         "rows.0.ours.posed",
     ),
-    "peers.vocabulary": (
-        ["DATA/kitti_06_start", "--every", "20", "--words", "FOLDER/words.txt"], "words"
-    ),
-}  # fmt: skip
+    "peers.vocabulary": (["DATA/kitti_06_start", "--every", "20", "--words", "FOLDER/words.txt"], "words"),
+}
 
 
 def run(name: str, arguments: list[str], folder: Path) -> dict[str, Any]:

@@ -113,9 +113,19 @@ def server_on_a_bucket(home: Path) -> Iterator[dict[str, int]]:
         for verb in ("serve", "data"):
             announce, log = home / f"{verb}.json", home / f"{verb}.log"
             command = [
-                sys.executable, "-m", "rse_pf.cli.main", verb, "--settings", str(settings), "--keys",
-                str(home / "keys.json"), "--store", f"s3:{BUCKET}", "--announce", str(announce),
-            ]  # fmt: skip
+                sys.executable,
+                "-m",
+                "rse_pf.cli.main",
+                verb,
+                "--settings",
+                str(settings),
+                "--keys",
+                str(home / "keys.json"),
+                "--store",
+                f"s3:{BUCKET}",
+                "--announce",
+                str(announce),
+            ]
             with log.open("wb") as errors:
                 process = stack.enter_context(subprocess.Popen(command, stderr=errors))
             stack.callback(process.terminate)
@@ -185,8 +195,9 @@ def test_a_server_outlives_a_bucket_that_fails_and_then_is_silent(
                 s3.mood = mood
                 assert store(ports, mood.encode()) == "503 store"
                 assert {name: status_of(url) for name, url in checks.items()} == {
-                    "robots": "200", "data": "200"
-                }  # fmt: skip
+                    "robots": "200",
+                    "data": "200",
+                }
                 assert asyncio.run(source_of_a_pose(ports)) == "cloud"
                 asks_the_bucket = f"http://127.0.0.1:{ports['data_port']}/data/readyz"
                 assert status_of(asks_the_bucket) != "200", "this check would have ended every server"

@@ -131,11 +131,24 @@ def drive_against_a_small_server(folder: Path, *, has_burst: bool, dies: bool = 
             write_settings(folder, json.loads(front.stdout.readline())["url"])
         server = stack.enter_context(
             running(
-                "rse_pf.cli.main", "serve", "--settings", str(folder / "settings.json"), "--keys",
-                str(folder / "keys.json"), "--port", "0", "--control-port", "0", "--workers", "1",
-                "--emulated-cores", "0.01", "--announce", str(announce),
+                "rse_pf.cli.main",
+                "serve",
+                "--settings",
+                str(folder / "settings.json"),
+                "--keys",
+                str(folder / "keys.json"),
+                "--port",
+                "0",
+                "--control-port",
+                "0",
+                "--workers",
+                "1",
+                "--emulated-cores",
+                "0.01",
+                "--announce",
+                str(announce),
             )
-        )  # fmt: skip
+        )
         end_s = time.monotonic() + 120.0
         while not announce.exists():
             assert server.poll() is None
