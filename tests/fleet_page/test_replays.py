@@ -1,0 +1,25 @@
+"""What the page shows of a replayed command: if it is equal, the rules that it broke, and its matches."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from recording.replay.made import Made
+
+from rse_pf.config import PlatformSettings
+from rse_pf.fleet_page.replays import replay_document
+from rse_pf.pnp.problems import make_problem
+from rse_pf.recording.replay import run
+
+
+def test_a_weak_pose_shows_its_matches_and_the_rules_that_it_broke(tmp_path: Path) -> None:
+    made = Made(tmp_path / "rec")
+    name = made.send(make_problem(seed=9, n=60, outlier_ratio=0.8))
+
+    told = replay_document(run.report(made.close(), PlatformSettings(), name))
+
+    assert told["equal"]
+    assert told["picture"].startswith("data:image/png;base64,")
+    broken = [line for line in told["lines"] if ", not at " in line]
+    assert [line.partition(":")[0] for line in broken] == ["low-inlier-ratio"]
+    assert told["lines"][0].startswith("verdict weak: low-inlier-ratio; engine ")
