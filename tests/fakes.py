@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import functools
 import heapq
 import itertools
 import select
@@ -214,6 +215,22 @@ class FakeWire:
 
     def close(self, code: int, reason: str) -> None:
         self.closed = (code, reason)
+
+
+class FakeLog:
+    """Keeps the events that a `JsonLog` would write, as level, event and fields."""
+
+    def __init__(self) -> None:
+        self.events: list[tuple[str, str, dict[str, Any]]] = []
+        for level in ("debug", "info", "warning", "error"):
+            setattr(self, level, functools.partial(self._note, level))
+
+    def names(self) -> list[str]:
+        """Return the names of the events."""
+        return [event for _, event, _ in self.events]
+
+    def _note(self, level: str, event: str, **fields: Any) -> None:
+        self.events.append((level, event, fields))
 
 
 Answerer = Callable[["FakeServer", "FakeRobot", Command], Result | Failure | None]

@@ -113,39 +113,31 @@ async def settled() -> None:
         await asyncio.sleep(0)
 
 
-def test_requests_one_after_the_other_are_answered_on_one_connection() -> None:
-    async def run() -> None:
-        line = Line()
-        assert await line.send(GET) == b"HTTP/1.1 200 OK\r\ncontent-length: 0\r\n\r\n"
-        put = b"PUT /b%20c HTTP/1.1\r\nHost: x\r\nContent-Length: 5\r\n\r\n"
-        assert (await line.send(put, b"he", b"llo")).endswith(b"\r\n\r\nhello")
-        chunked = b"PUT /d HTTP/1.1\r\nHost: x\r\nTransfer-Encoding: chunked\r\n\r\n"
-        assert (await line.send(*(bytes([each]) for each in chunked + b"2\r\nab\r\n0\r\n\r\n"))).endswith(
-            b"ab"
-        )
-        assert line.app.seen == [("/a", b""), ("/b c", b"hello"), ("/d", b"ab")]
-        assert line.transport.ended == ""
-
-    asyncio.run(run())
+async def test_requests_one_after_the_other_are_answered_on_one_connection() -> None:
+    line = Line()
+    assert await line.send(GET) == b"HTTP/1.1 200 OK\r\ncontent-length: 0\r\n\r\n"
+    put = b"PUT /b%20c HTTP/1.1\r\nHost: x\r\nContent-Length: 5\r\n\r\n"
+    assert (await line.send(put, b"he", b"llo")).endswith(b"\r\n\r\nhello")
+    chunked = b"PUT /d HTTP/1.1\r\nHost: x\r\nTransfer-Encoding: chunked\r\n\r\n"
+    assert (await line.send(*(bytes([each]) for each in chunked + b"2\r\nab\r\n0\r\n\r\n"))).endswith(b"ab")
+    assert line.app.seen == [("/a", b""), ("/b c", b"hello"), ("/d", b"ab")]
+    assert line.transport.ended == ""
 
 
 @pytest.mark.parametrize("cut", [0, 1])
-def test_bytes_behind_a_request_are_no_request_and_end_the_connection(cut: int) -> None:
-    async def run() -> None:
-        line = Line()
-        line.app.hold.clear()
-        await line.send(*((GET + GET,) if cut == 0 else (GET, GET)))
-        line.app.hold.set()
-        await settled()
-        assert line.transport.written.count(b"HTTP/1.1 200") == 1
-        assert b"connection: close" in line.transport.written
-        assert line.transport.ended == "closed"
-        assert len(line.app.seen) == 1
-
-    asyncio.run(run())
+async def test_bytes_behind_a_request_are_no_request_and_end_the_connection(cut: int) -> None:
+    line = Line()
+    line.app.hold.clear()
+    await line.send(*((GET + GET,) if cut == 0 else (GET, GET)))
+    line.app.hold.set()
+    await settled()
+    assert line.transport.written.count(b"HTTP/1.1 200") == 1
+    assert b"connection: close" in line.transport.written
+    assert line.transport.ended == "closed"
+    assert len(line.app.seen) == 1
 
 
-def test_bytes_within_a_reply_end_the_connection_after_it() -> None:
+async def test_bytes_within_a_reply_end_the_connection_after_it() -> None:
     class Slow(Echo):
         async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
             headers = [(b"content-length", b"4")]
@@ -154,16 +146,13 @@ def test_bytes_within_a_reply_end_the_connection_after_it() -> None:
             await self.hold.wait()
             await send({"type": "http.response.body", "body": b"cd"})
 
-    async def run() -> None:
-        line = Line(Slow())
-        line.app.hold.clear()
-        await line.send(GET, GET)
-        line.app.hold.set()
-        await settled()
-        assert line.transport.written == b"cd"
-        assert line.transport.ended == "closed"
-
-    asyncio.run(run())
+    line = Line(Slow())
+    line.app.hold.clear()
+    await line.send(GET, GET)
+    line.app.hold.set()
+    await settled()
+    assert line.transport.written == b"cd"
+    assert line.transport.ended == "closed"
 
 
 @pytest.mark.parametrize(
@@ -171,18 +160,15 @@ def test_bytes_within_a_reply_end_the_connection_after_it() -> None:
     [b"\x16\x03\x01", b"get / HTTP/1.1\r\nHost: x\r\n\r\n", b"G" * MAX_HEAD_BYTES,
      GET.replace(b"\r\n", b"\n\n"), GET[:-2] + b"A: " + b"b" * MAX_HEAD_BYTES],
 )  # fmt: skip
-def test_what_is_no_head_is_refused_and_its_connection_closed(data: bytes) -> None:
-    async def run() -> None:
-        line = Line()
-        written = await line.send(data[:100], data[100:], GET)
-        if line.transport.ended:
-            assert written.startswith(b"HTTP/1.1 400 ")
-            assert line.transport.ended == "closed"
-        else:
-            assert written == b"", "it waits for the end of a head"
-        assert line.app.seen == []
-
-    asyncio.run(run())
+async def test_what_is_no_head_is_refused_and_its_connection_closed(data: bytes) -> None:
+    line = Line()
+    written = await line.send(data[:100], data[100:], GET)
+    if line.transport.ended:
+        assert written.startswith(b"HTTP/1.1 400 ")
+        assert line.transport.ended == "closed"
+    else:
+        assert written == b"", "it waits for the end of a head"
+    assert line.app.seen == []
 
 
 def test_a_body_that_is_no_longer_in_chunks_is_refused() -> None:
@@ -213,26 +199,20 @@ def test_an_application_is_cancelled_when_its_client_is_gone_only_if_asked() -> 
     assert [asyncio.run(run(each)) for each in (False, True)] == [0, 1]
 
 
-def test_a_client_that_expects_it_is_told_to_go_on_before_its_body() -> None:
-    async def run() -> None:
-        line = Line()
-        head = b"PUT /a HTTP/1.1\r\nHost: x\r\nExpect: 100-continue\r\nContent-Length: 2\r\n\r\n"
-        assert await line.send(head) == b"HTTP/1.1 100 Continue\r\n\r\n"
-        assert (await line.send(b"ab")).startswith(b"HTTP/1.1 200 OK")
-
-    asyncio.run(run())
+async def test_a_client_that_expects_it_is_told_to_go_on_before_its_body() -> None:
+    line = Line()
+    head = b"PUT /a HTTP/1.1\r\nHost: x\r\nExpect: 100-continue\r\nContent-Length: 2\r\n\r\n"
+    assert await line.send(head) == b"HTTP/1.1 100 Continue\r\n\r\n"
+    assert (await line.send(b"ab")).startswith(b"HTTP/1.1 200 OK")
 
 
-def test_a_long_body_is_not_read_faster_than_it_is_taken() -> None:
-    async def run() -> None:
-        line = Line()
-        line.protocol.data_received(b"PUT /a HTTP/1.1\r\nHost: x\r\nContent-Length: 9000000\r\n\r\n")
-        line.protocol.data_received(b"x" * 300_000)
-        assert not line.transport.reads
-        await settled()
-        assert line.transport.reads
-
-    asyncio.run(run())
+async def test_a_long_body_is_not_read_faster_than_it_is_taken() -> None:
+    line = Line()
+    line.protocol.data_received(b"PUT /a HTTP/1.1\r\nHost: x\r\nContent-Length: 9000000\r\n\r\n")
+    line.protocol.data_received(b"x" * 300_000)
+    assert not line.transport.reads
+    await settled()
+    assert line.transport.reads
 
 
 @pytest.mark.parametrize(
@@ -243,17 +223,14 @@ def test_a_long_body_is_not_read_faster_than_it_is_taken() -> None:
         ([], b"chunked\r\n\r\n2\r\nab\r\n0\r\n\r\n"),
     ],
 )  # fmt: skip
-def test_a_reply_that_a_client_would_misread_is_not_sent(
+async def test_a_reply_that_a_client_would_misread_is_not_sent(
     headers: list[tuple[bytes, bytes]], written: bytes
 ) -> None:
-    async def run() -> None:
-        line = Line()
-        line.app.headers = headers
-        answer = await line.send(b"PUT /a HTTP/1.1\r\nHost: x\r\nContent-Length: 2\r\n\r\nab")
-        assert written in answer
-        assert line.transport.ended == ("" if b"chunked" in written else "cut" if not written else "closed")
-
-    asyncio.run(run())
+    line = Line()
+    line.app.headers = headers
+    answer = await line.send(b"PUT /a HTTP/1.1\r\nHost: x\r\nContent-Length: 2\r\n\r\nab")
+    assert written in answer
+    assert line.transport.ended == ("" if b"chunked" in written else "cut" if not written else "closed")
 
 
 def test_mutated_requests_in_pieces_reach_the_application_only_as_they_are_understood() -> None:
@@ -277,7 +254,7 @@ def test_mutated_requests_in_pieces_reach_the_application_only_as_they_are_under
     asyncio.run(asyncio.wait_for(run(), TIMEOUT_S))
 
 
-def test_a_client_that_has_the_last_byte_may_ask_again_before_the_application_has_ended() -> None:
+async def test_a_client_that_has_the_last_byte_may_ask_again_before_the_application_has_ended() -> None:
     class Late(Echo):
         async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
             headers = [(b"content-length", b"2")]
@@ -287,29 +264,23 @@ def test_a_client_that_has_the_last_byte_may_ask_again_before_the_application_ha
             await send({"type": "http.response.body", "body": b""})
             self.seen.append((scope["path"], b""))
 
-    async def run() -> None:
-        line = Line(Late())
-        line.app.hold.clear()
-        for _ in range(3):
-            assert (await line.send(GET)).endswith(b"\r\n\r\nab")
-        line.app.hold.set()
-        await settled()
-        assert (line.transport.ended, len(line.app.seen)) == ("", 3)
-
-    asyncio.run(run())
+    line = Line(Late())
+    line.app.hold.clear()
+    for _ in range(3):
+        assert (await line.send(GET)).endswith(b"\r\n\r\nab")
+    line.app.hold.set()
+    await settled()
+    assert (line.transport.ended, len(line.app.seen)) == ("", 3)
 
 
-def test_shutdown_closes_a_waiting_connection_at_once_and_a_busy_one_after_its_reply() -> None:
-    async def run() -> None:
-        idle, busy = Line(), Line()
-        busy.app.hold.clear()
-        await busy.send(GET)
-        for line in (idle, busy):
-            line.protocol.shutdown()
-        assert (idle.transport.ended, busy.transport.ended) == ("closed", "")
-        busy.app.hold.set()
-        await settled()
-        assert b"connection: close" in busy.transport.written
-        assert busy.transport.ended == "closed"
-
-    asyncio.run(run())
+async def test_shutdown_closes_a_waiting_connection_at_once_and_a_busy_one_after_its_reply() -> None:
+    idle, busy = Line(), Line()
+    busy.app.hold.clear()
+    await busy.send(GET)
+    for line in (idle, busy):
+        line.protocol.shutdown()
+    assert (idle.transport.ended, busy.transport.ended) == ("closed", "")
+    busy.app.hold.set()
+    await settled()
+    assert b"connection: close" in busy.transport.written
+    assert busy.transport.ended == "closed"

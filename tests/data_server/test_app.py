@@ -265,7 +265,7 @@ class SlowList(MemoryStore):
             self.gone.wait(30)
 
 
-def test_work_ends_when_its_robot_closed_the_connection() -> None:
+async def test_work_ends_when_its_robot_closed_the_connection() -> None:
     store = SlowList()
     service = Service(small_settings(), store)
 
@@ -280,13 +280,10 @@ def test_work_ends_when_its_robot_closed_the_connection() -> None:
         "headers": [(b"authorization", f"Bearer {service.token()}".encode())],
     }  # fmt: skip
 
-    async def ask_and_leave() -> None:
-        work = asyncio.ensure_future(service.app(scope, receive, send))
-        await asyncio.to_thread(store.listed.wait, 30)
-        work.cancel()  # as `OneRequestProtocol` does
-        await asyncio.wait([work])
-
-    asyncio.run(ask_and_leave())
+    work = asyncio.ensure_future(service.app(scope, receive, send))
+    await asyncio.to_thread(store.listed.wait, 30)
+    work.cancel()  # as `OneRequestProtocol` does
+    await asyncio.wait([work])
     store.gone.set()
     service.app.close()
 

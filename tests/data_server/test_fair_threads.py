@@ -40,13 +40,10 @@ class Gate:
             assert await asyncio.to_thread(self.entered.acquire, timeout=TIMEOUT_S)
 
 
-def test_the_result_and_the_error_of_the_work_are_those_of_the_call(threads: FairThreads) -> None:
-    async def both() -> None:
-        assert await threads.run(ROBOT, divmod, 7, 2) == (3, 1)
-        with pytest.raises(ZeroDivisionError):
-            await threads.run(ROBOT, divmod, 7, 0)
-
-    asyncio.run(both())
+async def test_the_result_and_the_error_of_the_work_are_those_of_the_call(threads: FairThreads) -> None:
+    assert await threads.run(ROBOT, divmod, 7, 2) == (3, 1)
+    with pytest.raises(ZeroDivisionError):
+        await threads.run(ROBOT, divmod, 7, 0)
 
 
 def test_a_robot_and_a_tenant_never_have_all_threads(threads: FairThreads) -> None:
@@ -80,39 +77,33 @@ def test_a_tenant_never_has_all_of_a_few_threads() -> None:
     few.close()
 
 
-def test_a_robot_is_served_beside_the_flood_of_another(threads: FairThreads) -> None:
+async def test_a_robot_is_served_beside_the_flood_of_another(threads: FairThreads) -> None:
     gate = Gate()
 
-    async def flood() -> None:
-        work = [asyncio.ensure_future(threads.run(ROBOT, gate.work)) for _ in range(50)]
-        await gate.wait_entered()
-        assert await asyncio.wait_for(threads.run(OTHER, int, "5"), TIMEOUT_S) == 5
-        assert not gate.entered.acquire(blocking=False)
-        gate.open.set()
-        await asyncio.wait_for(asyncio.gather(*work), TIMEOUT_S)
-
-    asyncio.run(flood())
+    work = [asyncio.ensure_future(threads.run(ROBOT, gate.work)) for _ in range(50)]
+    await gate.wait_entered()
+    assert await asyncio.wait_for(threads.run(OTHER, int, "5"), TIMEOUT_S) == 5
+    assert not gate.entered.acquire(blocking=False)
+    gate.open.set()
+    await asyncio.wait_for(asyncio.gather(*work), TIMEOUT_S)
 
 
-def test_robots_take_turns() -> None:
+async def test_robots_take_turns() -> None:
     threads, gate = FairThreads(1), Gate()
     order: list[str] = []
 
-    async def work() -> None:
-        first = asyncio.ensure_future(threads.run(OTHER, gate.work))
-        await gate.wait_entered()
-        robots = [RobotId("acme", name) for name in "aaaabb"] + [RobotId("rival", "c")]
-        later = [asyncio.ensure_future(threads.run(robot, order.append, robot.name)) for robot in robots]
-        await asyncio.sleep(0)
-        gate.open.set()
-        await asyncio.wait_for(asyncio.gather(first, *later), TIMEOUT_S)
-
-    asyncio.run(work())
+    first = asyncio.ensure_future(threads.run(OTHER, gate.work))
+    await gate.wait_entered()
+    robots = [RobotId("acme", name) for name in "aaaabb"] + [RobotId("rival", "c")]
+    later = [asyncio.ensure_future(threads.run(robot, order.append, robot.name)) for robot in robots]
+    await asyncio.sleep(0)
+    gate.open.set()
+    await asyncio.wait_for(asyncio.gather(first, *later), TIMEOUT_S)
     threads.close()
     assert order == ["a", "b", "c", "a", "b", "a", "a"]
 
 
-def test_unwanted_work_is_not_started_and_running_work_ends_at_its_next_step() -> None:
+async def test_unwanted_work_is_not_started_and_running_work_ends_at_its_next_step() -> None:
     threads, gate = FairThreads(1), Gate()
     steps: list[int] = []
     ended = threading.Event()
@@ -127,18 +118,15 @@ def test_unwanted_work_is_not_started_and_running_work_ends_at_its_next_step() -
             ended.set()
             raise
 
-    async def work() -> None:
-        runs = asyncio.ensure_future(threads.run(ROBOT, endless))
-        waits = asyncio.ensure_future(threads.run(OTHER, steps.append, 5))
-        await gate.wait_entered()
-        for each in (runs, waits):
-            each.cancel()
-        await asyncio.gather(runs, waits, return_exceptions=True)
-        gate.open.set()
-        assert await asyncio.to_thread(ended.wait, TIMEOUT_S)
-        assert await asyncio.wait_for(threads.run(OTHER, int, "1"), TIMEOUT_S) == 1
-
-    asyncio.run(work())
+    runs = asyncio.ensure_future(threads.run(ROBOT, endless))
+    waits = asyncio.ensure_future(threads.run(OTHER, steps.append, 5))
+    await gate.wait_entered()
+    for each in (runs, waits):
+        each.cancel()
+    await asyncio.gather(runs, waits, return_exceptions=True)
+    gate.open.set()
+    assert await asyncio.to_thread(ended.wait, TIMEOUT_S)
+    assert await asyncio.wait_for(threads.run(OTHER, int, "1"), TIMEOUT_S) == 1
     threads.close()
     assert steps == [0]
 

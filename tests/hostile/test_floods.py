@@ -199,37 +199,28 @@ def test_frames_that_the_protocol_forbids_end_their_own_connection_only(server):
     assert "defect" not in server.log
 
 
-def test_a_long_request_head_is_answered_with_431(server):
-    async def send_long_head() -> bytes:
-        reader, writer = await AttackTarget(server.url).open_tcp()
-        writer.write(b"GET /ws HTTP/1.1\r\nHost: a\r\nX-Long: " + b"x" * 9000)
-        answer = await asyncio.wait_for(reader.read(), 10)
-        writer.close()
-        return answer
-
-    assert asyncio.run(send_long_head()).startswith(b"HTTP/1.1 431 ")
+async def test_a_long_request_head_is_answered_with_431(server):
+    reader, writer = await AttackTarget(server.url).open_tcp()
+    writer.write(b"GET /ws HTTP/1.1\r\nHost: a\r\nX-Long: " + b"x" * 9000)
+    answer = await asyncio.wait_for(reader.read(), 10)
+    writer.close()
+    assert answer.startswith(b"HTTP/1.1 431 ")
 
 
-def test_equal_ids_and_streams_of_several_robots_are_kept_apart(server):
-    async def run() -> list[tuple[int, object]]:
-        target = AttackTarget(server.url)
-        robots = [await target.enter(server.token(f"twin-{n}"), "bin") for n in range(20)]
-        heard: list[tuple[int, object]] = []
-        for number, robot in enumerate(robots):
-            for identity in (1, 2):
-                command = Command(
-                    id=identity, service="echo", payload={"value": number}, stream="s", keep=True
-                )
-                robot.say(command)
-        for number, robot in enumerate(robots):
-            for _ in (1, 2):
-                answer = await asyncio.wait_for(robot.hear(), SOON_S)
-                assert isinstance(answer, Result), answer
-                heard.append((number, answer.reply["value"]))
-            robot.end()
-        return heard
-
-    heard = asyncio.run(run())
+async def test_equal_ids_and_streams_of_several_robots_are_kept_apart(server):
+    target = AttackTarget(server.url)
+    robots = [await target.enter(server.token(f"twin-{n}"), "bin") for n in range(20)]
+    heard: list[tuple[int, object]] = []
+    for number, robot in enumerate(robots):
+        for identity in (1, 2):
+            command = Command(id=identity, service="echo", payload={"value": number}, stream="s", keep=True)
+            robot.say(command)
+    for number, robot in enumerate(robots):
+        for _ in (1, 2):
+            answer = await asyncio.wait_for(robot.hear(), SOON_S)
+            assert isinstance(answer, Result), answer
+            heard.append((number, answer.reply["value"]))
+        robot.end()
 
     assert len(heard) == 40
     assert all(number == value for number, value in heard)

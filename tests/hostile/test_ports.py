@@ -7,7 +7,6 @@ import stat
 import urllib.error
 import urllib.request
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -83,23 +82,20 @@ def listening(pids: list[int]) -> list[str]:
     return found
 
 
-def test_the_public_port_has_three_paths_and_nothing_else_listens_publicly(tmp_path: Path) -> None:
-    async def scan() -> tuple[dict[str, int], int, list[str], int, Any]:
-        async with LocalPlatform(PlatformSettings(), state=tmp_path / "p", port=0, servers=1) as cloud:
-            port = cloud.load_balancer.port
-            statuses = {
-                f"{method} {path}": await asyncio.to_thread(status_of, port, path, method)
-                for path in OURS_AND_NOT_PUBLIC
-                for method in ("GET", "POST")
-            }
-            robots = await asyncio.to_thread(status_of, port, "/ws")
-            marks = [*cloud.backend_servers.marks.values(), cloud.load_balancer.process.mark]
-            addresses = listening([mark.pid for mark in marks if mark is not None])
-            mode = stat.S_IMODE(next((tmp_path / "p").rglob(ADMIN_SOCKET)).stat().st_mode)
-            health = await asyncio.to_thread(health_of, port)
-            return statuses, robots, addresses, mode, health
-
-    statuses, robots, addresses, mode, health = asyncio.run(scan())
+async def test_the_public_port_has_three_paths_and_nothing_else_listens_publicly(tmp_path: Path) -> None:
+    async with LocalPlatform(PlatformSettings(), state=tmp_path / "p", port=0, servers=1) as cloud:
+        port = cloud.load_balancer.port
+        statuses = {
+            f"{method} {path}": await asyncio.to_thread(status_of, port, path, method)
+            for path in OURS_AND_NOT_PUBLIC
+            for method in ("GET", "POST")
+        }
+        robots = await asyncio.to_thread(status_of, port, "/ws")
+        marks = [*cloud.backend_servers.marks.values(), cloud.load_balancer.process.mark]
+        addresses = listening([mark.pid for mark in marks if mark is not None])
+        mode = stat.S_IMODE(next((tmp_path / "p").rglob(ADMIN_SOCKET)).stat().st_mode)
+        health = await asyncio.to_thread(health_of, port)
+        statuses, robots, addresses, mode, health = statuses, robots, addresses, mode, health
 
     assert {path: status for path, status in statuses.items() if status not in (400, 404)} == {}
     assert robots in (400, 401, 403, 426), "the WebSocket's path is there, and wants a handshake"
@@ -112,7 +108,7 @@ def test_the_public_port_has_three_paths_and_nothing_else_listens_publicly(tmp_p
     assert named == []
 
 
-def test_a_control_port_answers_health_to_all_and_the_rest_only_with_its_token(tmp_path: Path) -> None:
+async def test_a_control_port_answers_health_to_all_and_the_rest_only_with_its_token(tmp_path: Path) -> None:
     folder = tmp_path / "p"
 
     def probe(port: int) -> tuple[list[int], list[int], set[bytes], list[int], bytes]:
@@ -127,15 +123,16 @@ def test_a_control_port_answers_health_to_all_and_the_rest_only_with_its_token(t
         carried.append(status_of(port, "/drain?wait=60", "POST", bearer(token)))
         return [status for status, _ in told], health, bodies, carried, page
 
-    async def scan() -> tuple[Any, int, int]:
-        async with LocalPlatform(PlatformSettings(), state=folder, port=0, servers=1) as cloud:
-            (server,) = cloud.servers
-            status_port = getattr(read_state(folder), "status_port", 0)
-            unasked = await asyncio.to_thread(status_of, status_port, "/status")
-            mode = stat.S_IMODE((folder / "control.token").stat().st_mode)
-            return await asyncio.to_thread(probe, server.control_port), unasked, mode
-
-    (refused, health, bodies, carried, page), unasked, mode = asyncio.run(scan())
+    async with LocalPlatform(PlatformSettings(), state=folder, port=0, servers=1) as cloud:
+        (server,) = cloud.servers
+        status_port = getattr(read_state(folder), "status_port", 0)
+        unasked = await asyncio.to_thread(status_of, status_port, "/status")
+        mode = stat.S_IMODE((folder / "control.token").stat().st_mode)
+        (refused, health, bodies, carried, page), unasked, mode = (
+            await asyncio.to_thread(probe, server.control_port),
+            unasked,
+            mode,
+        )
 
     assert set(refused) == {401}
     assert bodies == {b'{"code": "unauthorized"}\n'}

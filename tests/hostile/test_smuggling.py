@@ -80,19 +80,16 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[GuardedServer]:
 
 
 @pytest.mark.parametrize("token", ["good", "bad"])
-def test_a_backend_server_never_answers_twice(server: GuardedServer, token: str) -> None:
+async def test_a_backend_server_never_answers_twice(server: GuardedServer, token: str) -> None:
     carried = server.token("robot-1").encode() if token == "good" else b"x"
 
     async def fence(_: int) -> None:
         assert b" 401 " in await answer_to(server.port, upgrade())
 
-    async def run() -> dict[str, list[bytes]]:
-        return {
-            name: STATUS.findall(await heard(server.port, data.replace(b"TOKEN", carried), fence))
-            for name, data in SAMPLES.items()
-        }
-
-    answers = asyncio.run(run())
+    answers = {
+        name: STATUS.findall(await heard(server.port, data.replace(b"TOKEN", carried), fence))
+        for name, data in SAMPLES.items()
+    }
 
     assert {name: codes for name, codes in answers.items() if len(codes) > 1} == {}
     opened = {name for name, codes in answers.items() if codes == [b"101"]}
@@ -124,33 +121,27 @@ def data_port(tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
         process.wait()
 
 
-def test_the_data_service_never_answers_twice(data_port: int) -> None:
+async def test_the_data_service_never_answers_twice(data_port: int) -> None:
     async def fence(_: int) -> None:
         assert b" 401 " in await answer_to(data_port, put(b"Content-Length: 0"))
 
-    async def run() -> dict[str, list[bytes]]:
-        return {name: STATUS.findall(await heard(data_port, data, fence)) for name, data in SAMPLES.items()}
-
-    answers = asyncio.run(run())
+    answers = {name: STATUS.findall(await heard(data_port, data, fence)) for name, data in SAMPLES.items()}
 
     assert {name: codes for name, codes in answers.items() if len(codes) > 1} == {}
     assert not [name for name, codes in answers.items() if codes and int(codes[0]) < 400]
 
 
-def test_the_data_service_keeps_a_connection_whose_client_waits_for_answers(data_port: int) -> None:
-    async def run() -> list[bytes]:
-        reader, writer = await asyncio.open_connection("127.0.0.1", data_port)
-        codes = []
-        for _ in range(3):
-            writer.write(b"GET /data/healthz HTTP/1.1\r\nHost: x\r\n\r\n")
-            head = await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), SOON_S)
-            size = re.search(rb"(?i)content-length: (\d+)", head)
-            await asyncio.wait_for(reader.readexactly(int(size[1]) if size else 0), SOON_S)
-            codes += STATUS.findall(head)
-        writer.transport.abort()
-        return codes
-
-    assert asyncio.run(run()) == [b"200"] * 3
+async def test_the_data_service_keeps_a_connection_whose_client_waits_for_answers(data_port: int) -> None:
+    reader, writer = await asyncio.open_connection("127.0.0.1", data_port)
+    codes = []
+    for _ in range(3):
+        writer.write(b"GET /data/healthz HTTP/1.1\r\nHost: x\r\n\r\n")
+        head = await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), SOON_S)
+        size = re.search(rb"(?i)content-length: (\d+)", head)
+        await asyncio.wait_for(reader.readexactly(int(size[1]) if size else 0), SOON_S)
+        codes += STATUS.findall(head)
+    writer.transport.abort()
+    assert codes == [b"200"] * 3
 
 
 # --- through the load balancer ---------------------------------------------------------------------
@@ -303,33 +294,31 @@ FORGED = (
 """Lines by which a robot says that it is somebody else."""
 
 
-def test_no_robot_chooses_the_address_that_its_handshakes_count_for(tmp_path: Path) -> None:
-    async def run() -> dict[bytes, str]:
-        recorder = Recorder(opens=False)
-        upstream = await asyncio.start_server(recorder.serve, "127.0.0.1", 0)
-        port = upstream.sockets[0].getsockname()[1]
-        balancer = EnvoyLoadBalancer(PlatformSettings(), folder=tmp_path, port=0)
-        balancer.launch()
-        sources = {}
-        try:
-            await balancer.wait_live(SOON_S)
-            balancer.set_targets([Target(name="robots", port=port, control_port=port)])
-            assert await balancer.wait_healthy(["robots"], SOON_S)
-            for line in FORGED:
-                recorder.requests.clear()
-                await answer_to(balancer.port, b"GET /ws HTTP/1.1\r\nHost: x\r\n" + line + b"\r\n\r\n")
-                heads = [head.decode("latin-1").lower() for head, _ in recorder.requests]
-                told = [",".join(re.findall(r"\r\nx-forwarded-for: ([^\r]*)", head)) for head in heads]
-                rates = SourceRates(PlatformSettings().serving)
-                sources[line] = ",".join(rates.source("the balancer", each) for each in told)
-        finally:
-            balancer.kill()
-            upstream.close()
-        return sources
+async def test_no_robot_chooses_the_address_that_its_handshakes_count_for(tmp_path: Path) -> None:
+    recorder = Recorder(opens=False)
+    upstream = await asyncio.start_server(recorder.serve, "127.0.0.1", 0)
+    port = upstream.sockets[0].getsockname()[1]
+    balancer = EnvoyLoadBalancer(PlatformSettings(), folder=tmp_path, port=0)
+    balancer.launch()
+    sources = {}
+    try:
+        await balancer.wait_live(SOON_S)
+        balancer.set_targets([Target(name="robots", port=port, control_port=port)])
+        assert await balancer.wait_healthy(["robots"], SOON_S)
+        for line in FORGED:
+            recorder.requests.clear()
+            await answer_to(balancer.port, b"GET /ws HTTP/1.1\r\nHost: x\r\n" + line + b"\r\n\r\n")
+            heads = [head.decode("latin-1").lower() for head, _ in recorder.requests]
+            told = [",".join(re.findall(r"\r\nx-forwarded-for: ([^\r]*)", head)) for head in heads]
+            rates = SourceRates(PlatformSettings().serving)
+            sources[line] = ",".join(rates.source("the balancer", each) for each in told)
+    finally:
+        balancer.kill()
+        upstream.close()
 
-    found = asyncio.run(run())
-
-    (own,) = {source for source in found.values() if source}  # Envoy names an address of this machine
+    (own,) = {source for source in sources.values() if source}  # Envoy names an address of this machine
     assert own not in ("the balancer", "")
     assert not own.startswith("10.9.9.")
-    assert [line for line, source in found.items() if not source] == [b"X_Forwarded_For: 10.9.9.9"], "refused"
+    assert [line for line, source in sources.items() if not source] == [b"X_Forwarded_For: 10.9.9.9"], (
+        "refused"
+    )

@@ -44,38 +44,32 @@ async def until(found: Callable[[], bool]) -> None:
     await asyncio.wait_for(wait(), SOON_S)
 
 
-def test_the_newest_content_is_written_once_the_disk_has_space(tmp_path: Path, disk: Disk) -> None:
+async def test_the_newest_content_is_written_once_the_disk_has_space(tmp_path: Path, disk: Disk) -> None:
     problems: list[str] = []
     path = tmp_path / "platform.json"
 
-    async def run() -> None:
-        file = LatestFile(path, on_problem=problems.append, retry_s=0.001)
-        file.write("one")
-        disk.is_full = True
-        file.write("two")
-        file.write("three")
-        await until(lambda: disk.attempts > 5)
-        assert path.read_text() == "one"
-        disk.is_full = False
-        await until(lambda: path.read_text() == "three")
-
-    asyncio.run(run())
+    file = LatestFile(path, on_problem=problems.append, retry_s=0.001)
+    file.write("one")
+    disk.is_full = True
+    file.write("two")
+    file.write("three")
+    await until(lambda: disk.attempts > 5)
+    assert path.read_text() == "one"
+    disk.is_full = False
+    await until(lambda: path.read_text() == "three")
     assert problems == ["platform.json cannot be written yet: No space left on device"]
 
 
-def test_each_time_without_space_is_told_once(tmp_path: Path, disk: Disk) -> None:
+async def test_each_time_without_space_is_told_once(tmp_path: Path, disk: Disk) -> None:
     problems: list[str] = []
 
-    async def run() -> None:
-        file = LatestFile(tmp_path / "x", on_problem=problems.append, retry_s=60.0)
-        for text in ("one", "two"):
-            disk.is_full = False
-            file.write(text)
-            disk.is_full = True
-            file.write(f"{text} lost")
-        file.close()
-
-    asyncio.run(run())
+    file = LatestFile(tmp_path / "x", on_problem=problems.append, retry_s=60.0)
+    for text in ("one", "two"):
+        disk.is_full = False
+        file.write(text)
+        disk.is_full = True
+        file.write(f"{text} lost")
+    file.close()
     assert len(problems) == 2
 
 
@@ -86,18 +80,15 @@ def test_a_file_that_was_never_written_fails_at_once(tmp_path: Path, disk: Disk)
         LatestFile(tmp_path / "x").write("one")
 
 
-def test_nothing_is_written_after_the_end(tmp_path: Path, disk: Disk) -> None:
-    async def run() -> None:
-        file = LatestFile(tmp_path / "x", retry_s=0.0)
-        file.write("one")
-        disk.is_full = True
-        file.write("two")
-        file.close()
-        disk.is_full = False
-        attempts = disk.attempts
-        for _ in range(100):
-            await asyncio.sleep(0)  # a retry would be due in each round of the loop
-        assert disk.attempts == attempts
-
-    asyncio.run(run())
+async def test_nothing_is_written_after_the_end(tmp_path: Path, disk: Disk) -> None:
+    file = LatestFile(tmp_path / "x", retry_s=0.0)
+    file.write("one")
+    disk.is_full = True
+    file.write("two")
+    file.close()
+    disk.is_full = False
+    attempts = disk.attempts
+    for _ in range(100):
+        await asyncio.sleep(0)  # a retry would be due in each round of the loop
+    assert disk.attempts == attempts
     assert (tmp_path / "x").read_text() == "one"

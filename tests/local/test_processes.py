@@ -79,16 +79,13 @@ def test_a_zombie_counts_as_gone(child: subprocess.Popen[bytes]) -> None:
     assert mark_of(child.pid) is None
 
 
-def test_the_end_can_be_awaited(child: subprocess.Popen[bytes]) -> None:
+async def test_the_end_can_be_awaited(child: subprocess.Popen[bytes]) -> None:
     mark = marked(child)
 
-    async def run() -> tuple[bool, bool, bool]:
-        early = await ended(mark, 0.0)
-        waiting = asyncio.create_task(ended(mark, SOON_S))
-        send_signal(mark, signal.SIGKILL)
-        return early, await waiting, await ended(mark)
-
-    assert asyncio.run(run()) == (False, True, True)
+    early = await ended(mark, 0.0)
+    waiting = asyncio.create_task(ended(mark, SOON_S))
+    send_signal(mark, signal.SIGKILL)
+    assert (early, await waiting, await ended(mark)) == (False, True, True)
 
 
 def test_a_spawned_process_reads_nothing_and_writes_its_log(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ import pytest
 from rse_pf.local.together import run_together
 
 
-def test_after_a_failure_the_others_are_cancelled_and_have_ended() -> None:
+async def test_after_a_failure_the_others_are_cancelled_and_have_ended() -> None:
     ended: list[str] = []
 
     async def endless() -> None:
@@ -23,9 +23,6 @@ def test_after_a_failure_the_others_are_cancelled_and_have_ended() -> None:
         await asyncio.sleep(0)
         raise OSError("gone")
 
-    async def both() -> None:
-        with pytest.raises(OSError, match="gone"):
-            await run_together(endless(), failing())
-        assert ended == ["endless"]
-
-    asyncio.run(both())
+    with pytest.raises(OSError, match="gone"):
+        await run_together(endless(), failing())
+    assert ended == ["endless"]

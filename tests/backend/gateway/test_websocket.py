@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import errno
 from types import SimpleNamespace
 
@@ -14,12 +13,9 @@ from rse_pf.backend.gateway.websocket import listener_type, protocol_type
 from rse_pf.config import ServingSettings
 
 
-def test_the_protocol_takes_the_options_that_we_give_it():
-    async def make() -> object:
-        poller = SocketPoller(FakeLoop(), clock=lambda: 0.0)
-        return protocol_type(picows, 1000, poller)(picows.WSListener(), "", b"", b"", lambda: None)
-
-    protocol = asyncio.run(make())
+async def test_the_protocol_takes_the_options_that_we_give_it():
+    poller = SocketPoller(FakeLoop(), clock=lambda: 0.0)
+    protocol = protocol_type(picows, 1000, poller)(picows.WSListener(), "", b"", b"", lambda: None)
 
     assert isinstance(protocol, picows.WSProtocol)
     assert protocol.transport is None

@@ -6,10 +6,12 @@ import os
 import threading
 import time
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import msgspec
 import numpy as np
 import pytest
+from fakes import FakeLog
 
 from rse_pf.backend.jobs.job_server import JobServer
 from rse_pf.backend.jobs.lease import JobLease, record_name
@@ -17,7 +19,6 @@ from rse_pf.backend.jobs.process import JobRequest
 from rse_pf.backend.jobs.queue import JobQueue, interleave
 from rse_pf.backend.jobs.runner import JobContext, JobOutcome, JobSignals, run_job
 from rse_pf.backend.jobs.slots import JobSlots, make_pipe
-from rse_pf.backend.log import JsonLog
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import StoreError
 from rse_pf.identity import RobotId
@@ -45,9 +46,7 @@ class Bench:
     def __init__(self) -> None:
         self.store = MemoryStore()
         self.queue = JobQueue(self.store, SETTINGS)
-        self.log = JsonLog(
-            level="error", server="s", wall_clock=lambda: 0.0, fd=os.open(os.devnull, os.O_WRONLY)
-        )
+        self.log: Any = FakeLog()
         self.started: list[FakeProcess] = []
         self.signals = JobSignals()
 

@@ -20,14 +20,13 @@ from rse_pf.backend.jobs.process import JobRequest
 from rse_pf.backend.jobs.queue import JobQueue
 from rse_pf.backend.jobs.runner import JobContext
 from rse_pf.backend.jobs.slots import JobSlots, make_pipe
-from rse_pf.backend.log import JsonLog
 from rse_pf.backend.scheduling.scheduler import QueuedCommand
 from rse_pf.config import PlatformSettings
 from rse_pf.identity import RobotId
 from rse_pf.ipc import encode_message
 from rse_pf.object_store import MemoryStore
 from rse_pf.wire import Command, Failure, Result
-from tests.fakes import FakeLoop
+from tests.fakes import FakeLog, FakeLoop
 
 WAIT_S = 20.0
 
@@ -65,8 +64,6 @@ class Bench:
         self.started: queue.SimpleQueue[FakeProcess] = queue.SimpleQueue()
         self.answers: dict[int, Result | Failure] = {}
         self.progress: list[tuple[int, float, str]] = []
-        self._fd = os.open(os.devnull, os.O_WRONLY)
-        self.log = JsonLog(level="error", server="s", wall_clock=lambda: 0.0, fd=self._fd)
         self.store = MemoryStore()
         context = JobContext(
             store=self.store, server_id="s",
@@ -75,7 +72,7 @@ class Bench:
             queue=JobQueue(self.store, self.settings) if self.settings.serving.offer_jobs else None,
         )  # fmt: skip
         self.jobs = JobManager(
-            context, loop=self.loop, log=self.log,
+            context, loop=self.loop, log=FakeLog(),
             new_owner=lambda: os.urandom(4).hex(),
             answer=lambda job, answer: self.answers.__setitem__(job.command.id, answer),
             progress=lambda _, told: self.progress.append((told.id, told.done, told.what)),
@@ -96,8 +93,6 @@ class Bench:
 
     def close(self) -> None:
         self.jobs.close()
-        self.log.close()
-        os.close(self._fd)
 
 
 @pytest.fixture

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import asyncio
-import os
 import random
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable
 from typing import Any, TypeVar
 
 import msgspec
+from fakes import FakeLog
 
 from rse_pf.accounts import TenantAccount
 from rse_pf.backend.live_map.owner.context import OwnerContext
@@ -18,7 +18,6 @@ from rse_pf.backend.live_map.owner.live_owner import LiveOwner
 from rse_pf.backend.live_map.owner.log import LiveLog
 from rse_pf.backend.live_map.owner.state import MapKind, MapState, take_over
 from rse_pf.backend.live_map.owner.threads import Urgency
-from rse_pf.backend.log import JsonLog
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import NotFound, StoreError
 from rse_pf.identity import RobotId
@@ -170,8 +169,7 @@ class Bench:
         self.settings = PlatformSettings.from_dict({"live": live, "data": data or {}})
         self.keeps_all = keeps_all
         self.threads = InlineThreads()
-        self._null = os.open(os.devnull, os.O_WRONLY)
-        self.log = JsonLog(level="error", server="test", wall_clock=lambda: 0.0, fd=self._null)
+        self.log: Any = FakeLog()
 
     def lease_bytes(self) -> bytes | None:
         try:
@@ -198,18 +196,6 @@ class Bench:
         for entry in log.entries():
             state.apply(log.position, decode_events(entry.events))
         return state
-
-    def run(self, test: Callable[[], Coroutine[Any, Any, None]]) -> None:
-        """Run *test* in an event loop of its own, whatever it leaves running."""
-
-        async def bounded() -> None:
-            await asyncio.wait_for(test(), 20.0)
-
-        try:
-            asyncio.run(bounded())
-        finally:
-            self.log.close()
-            os.close(self._null)
 
 
 async def settle(rounds: int = 60) -> None:

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import os
 import socket
 import time
 from collections.abc import Awaitable, Callable
 from typing import Any
+
+from fakes import FakeLog
 
 from rse_pf.backend.live_map.children import OwnerChild, OwnerChildren
 from rse_pf.backend.live_map.map_link import LinkContext, MapLink, begins_a_map
 from rse_pf.backend.live_map.owner.lease import LeaseRecord, OwnerLease, decode_lease, lease_name
 from rse_pf.backend.live_map.owner.link_security import server_context
 from rse_pf.backend.live_map.owner.process import OwnerOrder
-from rse_pf.backend.log import JsonLog
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import Busy, NotFound
 from rse_pf.identity import RobotId
@@ -73,10 +73,8 @@ class Worker:
         self.started: list[PlayedProcess] = []
         self.told: list[dict[str, Any]] = []
         self.children = OwnerChildren(self._spawn, max_owners=2, keeps_spare=False)
-        self._null = os.open(os.devnull, os.O_WRONLY)
-        self._log = JsonLog(level="error", server="test", wall_clock=time.time, fd=self._null)
         context = LinkContext(
-            store=self.store, settings=PlatformSettings().live, server_id="here", log=self._log,
+            store=self.store, settings=PlatformSettings().live, server_id="here", log=FakeLog(),
             call=self._call, key=lambda: b"k" * 32, children=self.children,
             clock=time.monotonic, wall_clock=time.time,
         )  # fmt: skip
@@ -94,8 +92,6 @@ class Worker:
         self.children.drop_spare()
         for child in self.children.used:
             child.kill()
-        self._log.close()
-        os.close(self._null)
 
     def _spawn(self, calmly: bool) -> PlayedProcess:
         self.started.append(PlayedProcess(self.store))

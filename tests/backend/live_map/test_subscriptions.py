@@ -8,29 +8,17 @@ from typing import Any
 import numpy as np
 import pytest
 from backend.live_map.fake_owners import FakeReader
-from fakes import FakeLoop
+from fakes import FakeLog, FakeLoop
 
 from rse_pf.backend.live_map.subscriptions import Subscriptions
 from rse_pf.errors import Forbidden, RsePfError
 from rse_pf.wire import CODECS, Failure, Update
 
 
-class Log:
-    def __init__(self) -> None:
-        self.errors: list[dict[str, Any]] = []
-
-    def info(self, event: str, **fields: Any) -> None: ...
-
-    warning = info
-
-    def error(self, event: str, **fields: Any) -> None:
-        self.errors.append(fields)
-
-
 class Parts:
     def __init__(self) -> None:
         self.loop = FakeLoop()
-        self.log = Log()
+        self.log = FakeLog()
         self.watched: list[tuple[str, str]] = []
         self.all = Subscriptions(
             loop=self.loop,  # type: ignore[arg-type]
@@ -231,7 +219,7 @@ def test_a_value_that_cannot_be_sent_is_logged_once_and_left_out(parts: Parts, v
     parts.settle()
 
     assert [[key for _, key in told(reader)] for reader in readers] == [["map", "pose/a"]] * 2
-    assert [each["key"] for each in parts.log.errors] == ["odd"]
+    assert [fields["key"] for level, _, fields in parts.log.events if level == "error"] == ["odd"]
 
 
 def test_the_kernel_is_told_to_hold_back_little_of_a_subscriber(parts: Parts) -> None:

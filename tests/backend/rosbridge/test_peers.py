@@ -6,9 +6,8 @@ import os
 from collections.abc import Callable, Iterator
 
 import pytest
-from fakes import FakeLoop
+from fakes import FakeLog, FakeLoop
 
-from rse_pf.backend.log import JsonLog
 from rse_pf.backend.rosbridge.peers import WorkerPeers, peer_channels
 
 KEY = ("default", "chat")
@@ -32,23 +31,20 @@ class Peer:
 @pytest.fixture
 def started() -> Iterator[tuple[FakeLoop, Callable[[int], list[Peer]]]]:
     loop = FakeLoop()
-    null = os.open(os.devnull, os.O_WRONLY)
-    log = JsonLog(level="error", server="s", wall_clock=lambda: 0.0, fd=null)
-    ends: list[int] = [null]
+    ends: list[int] = []
     peers: list[Peer] = []
 
     def start(count: int) -> list[Peer]:
         for index, (read, writes) in enumerate(channels := peer_channels(count)):
             # Each worker is a process of its own, which has every descriptor.
             own = tuple(os.dup(fd) if number != index else fd for number, fd in enumerate(writes))
-            peers.append(Peer(WorkerPeers((read, own), index, loop=loop, log=log)))  # type: ignore[arg-type]
+            peers.append(Peer(WorkerPeers((read, own), index, loop=loop, log=FakeLog())))  # type: ignore[arg-type]
         ends.extend(channels[0][1])
         return peers
 
     yield loop, start
     for peer in peers:
         peer.peers.close()
-    log.close()
     for each in ends:
         os.close(each)
 

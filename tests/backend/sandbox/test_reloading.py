@@ -9,7 +9,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from fakes import FakeLoop
+from fakes import FakeLog, FakeLoop
 
 from rse_pf.backend.sandbox.manager import SandboxHost
 from rse_pf.backend.sandbox.reloading import ReloadingSandboxes
@@ -22,16 +22,6 @@ from rse_pf.wire import Command, Failure, Result
 ROBOT, OTHER = RobotId("default", "r"), RobotId("acme", "r")
 """Two robots of one name."""
 CONNECTION = SimpleNamespace(robot=ROBOT)
-
-
-class Log:
-    def __init__(self) -> None:
-        self.events: list[tuple[str, dict[str, Any]]] = []
-
-    def info(self, event: str, **fields: Any) -> None:
-        self.events.append((event, fields))
-
-    warning = error = info
 
 
 class Sandboxes:
@@ -82,7 +72,7 @@ class Parts:
     """Sandboxes that may be replaced, and what they made, answered and logged."""
 
     def __init__(self, *names: str, accepts_weak_isolation: bool = False) -> None:
-        self.loop, self.log = FakeLoop(), Log()
+        self.loop, self.log = FakeLoop(), FakeLog()
         self.made: list[Sandboxes] = []
         self.answers: list[tuple[int | None, str]] = []
         self.offered: list[tuple[str, ...]] = []
@@ -190,7 +180,7 @@ def test_new_services_run_only_in_full_isolation(missing: Any, accepts: bool, is
     parts.settle()
 
     assert parts.sandboxes.names == (("b",) if is_taken else ("a",))
-    assert [name for name, _ in parts.log.events] == ["services-loaded" if is_taken else "services-refused"]
+    assert parts.log.names() == ["services-loaded" if is_taken else "services-refused"]
     assert parts.made[0].is_retired == is_taken
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from fakes import FakeLog
 
 from rse_pf.backend.sandbox.zygote_client import ZygoteClient
 from rse_pf.config import PlatformSettings
@@ -21,18 +22,6 @@ from rse_pf.ipc import receive
 pytestmark = pytest.mark.system
 SETTINGS = PlatformSettings.from_dict({"services": {"accept_weak_isolation": True}})
 WAIT_S = 20.0
-
-
-class Log:
-    """Events by name."""
-
-    def __init__(self) -> None:
-        self.events: list[str] = []
-
-    def info(self, event: str, **_: Any) -> None:
-        self.events.append(event)
-
-    warning = error = info
 
 
 class Reports:
@@ -48,11 +37,11 @@ class Reports:
         self.ends.put_nowait((-1, "lost"))
 
 
-def run(test: Callable[[ZygoteClient, Reports, Log], Any]) -> None:
+def run(test: Callable[[ZygoteClient, Reports, FakeLog], Any]) -> None:
     """Run *test* with a zygote that has no services, and end the zygote."""
 
     async def with_zygote() -> None:
-        reports, log, loop = Reports(), Log(), asyncio.get_running_loop()
+        reports, log, loop = Reports(), FakeLog(), asyncio.get_running_loop()
         failures: list[dict[str, Any]] = []
         loop.set_exception_handler(lambda _, context: failures.append(context))
         zygote = ZygoteClient([], SETTINGS, loop=loop, log=log, listener=reports)
@@ -86,7 +75,7 @@ async def create(zygote: ZygoteClient, number: int) -> socket.socket:
 
 
 def test_a_sandbox_that_is_ended_is_reported_with_its_number_and_signal() -> None:
-    async def test(zygote: ZygoteClient, reports: Reports, log: Log) -> None:
+    async def test(zygote: ZygoteClient, reports: Reports, log: FakeLog) -> None:
         with await create(zygote, 7), await create(zygote, 8):
             zygote.end(7)
             zygote.end(7)
@@ -97,7 +86,7 @@ def test_a_sandbox_that_is_ended_is_reported_with_its_number_and_signal() -> Non
 
 
 def test_a_sandbox_whose_channel_is_closed_ends_by_itself() -> None:
-    async def test(zygote: ZygoteClient, reports: Reports, log: Log) -> None:
+    async def test(zygote: ZygoteClient, reports: Reports, log: FakeLog) -> None:
         (await create(zygote, 3)).close()
 
         assert await reports.ends.get() == (3, "exit code 0")
@@ -106,7 +95,7 @@ def test_a_sandbox_whose_channel_is_closed_ends_by_itself() -> None:
 
 
 def test_a_paused_sandbox_does_nothing_until_it_is_resumed() -> None:
-    async def test(zygote: ZygoteClient, reports: Reports, log: Log) -> None:
+    async def test(zygote: ZygoteClient, reports: Reports, log: FakeLog) -> None:
         channel = await create(zygote, 3)
         zygote.pause(3)
         channel.close()  # which would end it, see above
@@ -120,7 +109,7 @@ def test_a_paused_sandbox_does_nothing_until_it_is_resumed() -> None:
 
 
 def test_a_sandbox_that_is_paused_while_it_starts_waits_too() -> None:
-    async def test(zygote: ZygoteClient, reports: Reports, log: Log) -> None:
+    async def test(zygote: ZygoteClient, reports: Reports, log: FakeLog) -> None:
         with order(zygote, 3):
             zygote.pause(3)
             (await create(zygote, 4)).close()
@@ -135,14 +124,14 @@ def test_a_sandbox_that_is_paused_while_it_starts_waits_too() -> None:
 
 
 def test_a_zygote_that_is_killed_is_replaced_by_one_that_takes_orders() -> None:
-    async def test(zygote: ZygoteClient, reports: Reports, log: Log) -> None:
+    async def test(zygote: ZygoteClient, reports: Reports, log: FakeLog) -> None:
         with await create(zygote, 3):
             os.kill(zygote_of(os.getpid()), signal.SIGKILL)
             assert await reports.ends.get() == (-1, "lost")
         (await create(zygote, 4)).close()
 
         assert await reports.ends.get() == (4, "exit code 0")
-        assert "zygote-lost" in log.events
+        assert "zygote-lost" in log.names()
 
     run(test)
 
@@ -161,7 +150,7 @@ def zygote_of(worker: int) -> int:
 def test_a_zygote_has_no_variable_and_no_socket_of_its_worker(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "of the worker")
 
-    async def test(zygote: ZygoteClient, reports: Reports, log: Log) -> None:
+    async def test(zygote: ZygoteClient, reports: Reports, log: FakeLog) -> None:
         folder = Path("/proc", str(zygote_of(os.getpid())))
         held = [os.readlink(each) for each in (folder / "fd").iterdir() if int(each.name) > 2]
 

@@ -64,75 +64,56 @@ async def ended(each: socket.socket) -> None:
         assert await asyncio.get_running_loop().sock_recv(each, 1) == b""
 
 
-def run(test: Any) -> None:
-    asyncio.run(asyncio.wait_for(test, DEADLINE_S))
+async def test_silent_sockets_take_nothing_of_the_rate_and_a_robot_is_passed_on_behind_them() -> None:
+    async with opened(max_accepts_per_s=1.0, burst=1, max_unauthenticated=50) as port:
+        silent = [await port.dial() for _ in range(300)]
+        robot = await port.dial(b"GET")
+        assert await port.passed.get() == (301, b"GET")
+        await asyncio.gather(*map(ended, silent[:250]))
+        assert port.acceptor.cut - 250 in (0, 1)  # the robot may have been accepted before its bytes came
+        assert port.acceptor.pauses == 0
+        for each in (robot, *silent):
+            each.close()
 
 
-def test_silent_sockets_take_nothing_of_the_rate_and_a_robot_is_passed_on_behind_them() -> None:
-    async def test() -> None:
-        async with opened(max_accepts_per_s=1.0, burst=1, max_unauthenticated=50) as port:
-            silent = [await port.dial() for _ in range(300)]
-            robot = await port.dial(b"GET")
-            assert await port.passed.get() == (301, b"GET")
-            await asyncio.gather(*map(ended, silent[:250]))
-            assert port.acceptor.cut - 250 in (0, 1)  # the robot may have been accepted before its bytes came
-            assert port.acceptor.pauses == 0
-            for each in (robot, *silent):
-                each.close()
-
-    run(test())
+async def test_a_silent_socket_is_cut_at_its_time_and_one_that_speaks_before_is_passed_on() -> None:
+    async with opened(silent_s=0.2) as port:
+        silent, robot = await port.dial(), await port.dial()
+        robot.send(b"GET")
+        assert await port.passed.get() == (2, b"GET")
+        await ended(silent)
+        assert port.acceptor.cut == 1
+        silent.close()
+        robot.close()
 
 
-def test_a_silent_socket_is_cut_at_its_time_and_one_that_speaks_before_is_passed_on() -> None:
-    async def test() -> None:
-        async with opened(silent_s=0.2) as port:
-            silent, robot = await port.dial(), await port.dial()
-            robot.send(b"GET")
-            assert await port.passed.get() == (2, b"GET")
-            await ended(silent)
-            assert port.acceptor.cut == 1
-            silent.close()
-            robot.close()
-
-    run(test())
+async def test_sockets_that_send_wait_for_the_rate_in_their_order() -> None:
+    async with opened(max_accepts_per_s=100.0, burst=2) as port:
+        began = asyncio.get_running_loop().time()
+        robots = [await port.dial(b"GET") for _ in range(12)]
+        passed = [(await port.passed.get())[0] for _ in robots]
+        assert passed == list(range(1, 13))
+        assert asyncio.get_running_loop().time() - began >= 0.09
+        assert port.acceptor.pauses > 0
+        for each in robots:
+            each.close()
 
 
-def test_sockets_that_send_wait_for_the_rate_in_their_order() -> None:
-    async def test() -> None:
-        async with opened(max_accepts_per_s=100.0, burst=2) as port:
-            began = asyncio.get_running_loop().time()
-            robots = [await port.dial(b"GET") for _ in range(12)]
-            passed = [(await port.passed.get())[0] for _ in robots]
-            assert passed == list(range(1, 13))
-            assert asyncio.get_running_loop().time() - began >= 0.09
-            assert port.acceptor.pauses > 0
-            for each in robots:
-                each.close()
-
-    run(test())
+async def test_a_socket_that_ends_while_it_waits_takes_nothing_of_the_rate() -> None:
+    async with opened(max_accepts_per_s=5.0, burst=1) as port:
+        for _ in range(200):
+            (await port.dial()).close()
+        robot = await port.dial(b"GET")
+        assert await port.passed.get() == (201, b"GET")
+        assert port.acceptor.pauses == 0
+        robot.close()
 
 
-def test_a_socket_that_ends_while_it_waits_takes_nothing_of_the_rate() -> None:
-    async def test() -> None:
-        async with opened(max_accepts_per_s=5.0, burst=1) as port:
-            for _ in range(200):
-                (await port.dial()).close()
-            robot = await port.dial(b"GET")
-            assert await port.passed.get() == (201, b"GET")
-            assert port.acceptor.pauses == 0
-            robot.close()
-
-    run(test())
-
-
-def test_closing_cuts_all_that_wait() -> None:
-    async def test() -> None:
-        async with opened(max_accepts_per_s=0.01, burst=1) as port:
-            waiting = [await port.dial(), *[await port.dial(b"GET") for _ in range(3)]]
-            await port.passed.get()
-            port.acceptor.close()
-            await asyncio.gather(*map(ended, waiting))
-            for each in waiting:
-                each.close()
-
-    run(test())
+async def test_closing_cuts_all_that_wait() -> None:
+    async with opened(max_accepts_per_s=0.01, burst=1) as port:
+        waiting = [await port.dial(), *[await port.dial(b"GET") for _ in range(3)]]
+        await port.passed.get()
+        port.acceptor.close()
+        await asyncio.gather(*map(ended, waiting))
+        for each in waiting:
+            each.close()

@@ -5,7 +5,8 @@ from __future__ import annotations
 import asyncio
 import json
 from pathlib import Path
-from typing import Any
+
+from fakes import FakeLog
 
 from rse_pf.auth.tokens import SigningKey
 from rse_pf.auth.trust_store import TrustStore
@@ -24,19 +25,9 @@ class Worker:
         self.orders.append(order)
 
 
-class Log:
-    def __init__(self) -> None:
-        self.events: list[str] = []
-
-    def info(self, event: str, **details: Any) -> None:
-        self.events.append(event)
-
-    warning = error = info
-
-
-def loaded(folder: Path) -> tuple[TrustStore, list[Worker], Log]:
+def loaded(folder: Path) -> tuple[TrustStore, list[Worker], FakeLog]:
     (folder / "keys.json").write_text(KEYS.to_json())
-    trust, workers, log = TrustStore(folder / "keys.json"), [Worker(), Worker()], Log()
+    trust, workers, log = TrustStore(folder / "keys.json"), [Worker(), Worker()], FakeLog()
     trust.load()
     return trust, workers, log
 
@@ -60,5 +51,5 @@ def test_a_problem_is_logged_once_and_changes_nothing(tmp_path: Path) -> None:
     for _ in range(2):
         asyncio.run(update_workers(trust, workers, log))
 
-    assert log.events.count("access-control-unread") == 1
+    assert log.names().count("access-control-unread") == 1
     assert [worker.orders for worker in workers] == [[], []]

@@ -29,11 +29,6 @@ TOKEN = "a-token-of-this-robot"
 Answer = Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None]]
 
 
-def run(test: Any) -> Any:
-    """Run an async test within a deadline."""
-    return asyncio.run(asyncio.wait_for(test, 30))
-
-
 class Region:
     """A server of a stranger: it answers every connection with *answer*, and keeps what it was told."""
 
@@ -78,34 +73,28 @@ def robot(*urls: str, **options: Any) -> Any:
 
 
 @pytest.mark.parametrize("status", ["301 Moved Permanently", "302 Found", "307 Temporary", "308 Permanent"])
-def test_a_token_follows_no_redirect(status: str) -> None:
-    async def test() -> tuple[list[bytes], list[bytes], RsePfError]:
-        async with region(says("200 OK")) as thief:
-            where = thief.url
-            async with region(says(f"{status}\r\nlocation: {where}")) as listed:
-                with pytest.raises(RsePfError) as raised:
-                    async with robot(listed.url):
-                        pass
-                return listed.heard, thief.heard, raised.value
-
-    listed, stolen, error = run(test())
+async def test_a_token_follows_no_redirect(status: str) -> None:
+    async with region(says("200 OK")) as thief:
+        where = thief.url
+        async with region(says(f"{status}\r\nlocation: {where}")) as listed:
+            with pytest.raises(RsePfError) as raised:
+                async with robot(listed.url):
+                    pass
+            listed, stolen, error = listed.heard, thief.heard, raised.value
     assert any(TOKEN.encode() in each for each in listed)
     assert stolen == []
     assert status[:3] in error.message
     assert error.hint
 
 
-def test_a_region_that_redirects_does_not_keep_a_robot_from_the_other_one() -> None:
-    async def test() -> tuple[str, list[bytes]]:
-        async with AsyncExitStack() as stack:
-            honest = await stack.enter_async_context(FakePlatform())
-            thief = await stack.enter_async_context(region(says("200 OK")))
-            hostile = await stack.enter_async_context(region(says(f"302 Found\r\nlocation: {thief.url}")))
-            async with robot(hostile.url, honest.url) as one:
-                answer = await one.call("echo", {"value": 1}, deadline_s=10)
-            return answer.server, thief.heard
-
-    server, stolen = run(test())
+async def test_a_region_that_redirects_does_not_keep_a_robot_from_the_other_one() -> None:
+    async with AsyncExitStack() as stack:
+        honest = await stack.enter_async_context(FakePlatform())
+        thief = await stack.enter_async_context(region(says("200 OK")))
+        hostile = await stack.enter_async_context(region(says(f"302 Found\r\nlocation: {thief.url}")))
+        async with robot(hostile.url, honest.url) as one:
+            answer = await one.call("echo", {"value": 1}, deadline_s=10)
+        server, stolen = answer.server, thief.heard
     assert server
     assert stolen == []
 
@@ -124,46 +113,38 @@ HOSTILE: dict[str, Answer] = {
 
 
 @pytest.mark.parametrize("what", HOSTILE)
-def test_a_region_that_misbehaves_costs_the_robot_nothing_in_the_other_one(what: str) -> None:
-    async def test() -> tuple[float, int]:
-        async with FakePlatform() as honest, region(HOSTILE[what]) as hostile:
-            begin = asyncio.get_running_loop().time()
-            async with robot(hostile.url, honest.url) as one:
-                connected_s = asyncio.get_running_loop().time() - begin
-                for number in range(20):
-                    assert (await one.call("echo", {"value": number}, deadline_s=5)).reply == {
-                        "value": number
-                    }
-            return connected_s, len(hostile.heard)
-
-    connected_s, dialled = run(test())
+async def test_a_region_that_misbehaves_costs_the_robot_nothing_in_the_other_one(what: str) -> None:
+    async with FakePlatform() as honest, region(HOSTILE[what]) as hostile:
+        begin = asyncio.get_running_loop().time()
+        async with robot(hostile.url, honest.url) as one:
+            connected_s = asyncio.get_running_loop().time() - begin
+            for number in range(20):
+                assert (await one.call("echo", {"value": number}, deadline_s=5)).reply == {"value": number}
+        connected_s, dialled = connected_s, len(hostile.heard)
     assert connected_s < 5.0
     assert dialled < 200
 
 
-def test_a_region_that_accepts_and_hangs_up_in_turn_is_left_and_no_command_is_lost() -> None:
+async def test_a_region_that_accepts_and_hangs_up_in_turn_is_left_and_no_command_is_lost() -> None:
     """A flapping region: it may be the nearest one each time, and loses every connection."""
 
-    async def test() -> tuple[list[str], int]:
-        async with FakePlatform() as honest, FakePlatform() as flapping:
-            honest.landing, flapping.landing = "honest", "flapping"
-            servers = []
-            async with robot(flapping.url, honest.url) as one:
-                for number in range(40):
-                    answer = await one.call("echo", {"value": number}, deadline_s=10)
-                    servers.append(answer.server)
-                    if number % 4 == 0:
-                        for each in flapping.open_sockets():
-                            each.cut()
-                return servers, one.stats.failed
-
-    servers, failed = run(test())
+    async with FakePlatform() as honest, FakePlatform() as flapping:
+        honest.landing, flapping.landing = "honest", "flapping"
+        servers = []
+        async with robot(flapping.url, honest.url) as one:
+            for number in range(40):
+                answer = await one.call("echo", {"value": number}, deadline_s=10)
+                servers.append(answer.server)
+                if number % 4 == 0:
+                    for each in flapping.open_sockets():
+                        each.cut()
+            servers, failed = servers, one.stats.failed
     assert len(servers) == 40
     assert failed == 0
     assert "honest" in servers
 
 
-def test_a_token_goes_to_no_region_whose_certificate_is_not_trusted(tmp_path: Path) -> None:
+async def test_a_token_goes_to_no_region_whose_certificate_is_not_trusted(tmp_path: Path) -> None:
     key, certificate = tmp_path / "key.pem", tmp_path / "certificate.pem"
     command = ["openssl", "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256", "-nodes"]
     command += ["-subj", "/CN=127.0.0.1", "-days", "1", "-keyout", str(key), "-out", str(certificate)]
@@ -171,13 +152,10 @@ def test_a_token_goes_to_no_region_whose_certificate_is_not_trusted(tmp_path: Pa
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.load_cert_chain(certificate, key)
 
-    async def test() -> tuple[list[bytes], RsePfError]:
-        async with region(says("200 OK"), ssl=context) as hostile:
-            with pytest.raises(ConnectError) as raised:
-                async with robot(hostile.url, settings=replace(QUICK, connect_timeout_s=0.5)):
-                    pass
-            return hostile.heard, raised.value
-
-    heard, error = run(test())
+    async with region(says("200 OK"), ssl=context) as hostile:
+        with pytest.raises(ConnectError) as raised:
+            async with robot(hostile.url, settings=replace(QUICK, connect_timeout_s=0.5)):
+                pass
+        heard, error = hostile.heard, raised.value
     assert heard == [], "no byte of the request was sent"
     assert "does not trust" in error.message

@@ -135,27 +135,24 @@ async def conversation(url: str, token: str, words: list[str]) -> int:
 
 
 @pytest.mark.system
-def test_no_token_and_no_payload_is_in_any_log_of_a_real_run(tmp_path: Path) -> None:
+async def test_no_token_and_no_payload_is_in_any_log_of_a_real_run(tmp_path: Path) -> None:
     loud = PlatformSettings().replace(serving={"log_level": "debug"}, session={"max_commands_per_s": 0.0})
     words = [*HOSTILE, *hostile_words(48, seed=2)]
     tokens: list[str] = []
     folder = tmp_path / "platform"
 
-    async def run() -> tuple[int, int]:
-        async with LocalPlatform(loud, servers=1, port=0, state=folder, data=True) as cloud:
-            tokens.extend(cloud.issue_token(f"robot-{number}") for number in range(3))
-            good, other, _ = tokens
-            damaged = other[:-6] + "AAAAAA"
-            tokens.append(damaged)
-            await refused(cloud.url, {"Authorization": f"Bearer {damaged}"})
-            await refused(cloud.url, {"Authorization": f"Basic {other}"})
-            await refused(cloud.url + f"?token={other}", {})
-            await refused(cloud.url, {"Cookie": f"token={other}"})
-            status = await asyncio.wait_for(from_data(cloud.url, other), SOON_S)
-            await asyncio.to_thread(ask_data, cloud.url, damaged)
-            return await conversation(cloud.url, good, words), status
-
-    answered, data_status = asyncio.run(run())
+    async with LocalPlatform(loud, servers=1, port=0, state=folder, data=True) as cloud:
+        tokens.extend(cloud.issue_token(f"robot-{number}") for number in range(3))
+        good, other, _ = tokens
+        damaged = other[:-6] + "AAAAAA"
+        tokens.append(damaged)
+        await refused(cloud.url, {"Authorization": f"Bearer {damaged}"})
+        await refused(cloud.url, {"Authorization": f"Basic {other}"})
+        await refused(cloud.url + f"?token={other}", {})
+        await refused(cloud.url, {"Cookie": f"token={other}"})
+        status = await asyncio.wait_for(from_data(cloud.url, other), SOON_S)
+        await asyncio.to_thread(ask_data, cloud.url, damaged)
+        answered, data_status = await conversation(cloud.url, good, words), status
 
     assert answered == len(words) + 2
     assert data_status == 404

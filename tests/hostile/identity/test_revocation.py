@@ -153,55 +153,48 @@ def test_of_a_hundred_robots_the_ten_that_are_revoked_are_closed_and_no_other(tm
         asyncio.run(revoke_some(fresh, robot_count=100, revoked_count=10))
 
 
-def test_a_socket_ends_within_a_second_of_its_token_and_not_before(server: GuardedServer) -> None:
-    async def run() -> None:
-        async with robots(server, [server.token("short", ttl_s=3.0)]) as (socket,):
-            assert socket.token_s is not None
-            expected = time.monotonic() + socket.token_s
-            assert await socket.end(30.0) == CLOSE_TOKEN_OVER
-            late_s = socket.ended_s - expected
-            print(f"closed {late_s * 1e3:+.0f} ms after the token's end; load {os.getloadavg()[0]:.1f}")
-            assert -0.05 < late_s < 1.0
-
-    asyncio.run(run())
+async def test_a_socket_ends_within_a_second_of_its_token_and_not_before(server: GuardedServer) -> None:
+    async with robots(server, [server.token("short", ttl_s=3.0)]) as (socket,):
+        assert socket.token_s is not None
+        expected = time.monotonic() + socket.token_s
+        assert await socket.end(30.0) == CLOSE_TOKEN_OVER
+        late_s = socket.ended_s - expected
+        print(f"closed {late_s * 1e3:+.0f} ms after the token's end; load {os.getloadavg()[0]:.1f}")
+        assert -0.05 < late_s < 1.0
 
 
-def test_a_fresh_token_moves_the_end_of_the_socket_and_a_bad_one_does_not(server: GuardedServer) -> None:
-    async def run() -> None:
-        names = ["renews", "renews-2", "renews-3"]
-        async with robots(server, [server.token(name, ttl_s=3.0) for name in names]) as (socket, *wrong):
-            assert socket.token_s is not None
-            first_end = time.monotonic() + socket.token_s
-            for other, token in zip(wrong, ("x", server.token("another")), strict=True):
-                refusal = await other.ask(Renew(token=token))
-                assert isinstance(refusal, Failure)
-                assert (refusal.id, refusal.code) == (None, "unauthorized")
-            renewed = await socket.ask(Renew(token=server.token("renews", ttl_s=30.0)))
-            assert isinstance(renewed, Renewed)
-            assert 25.0 < renewed.token_s <= 30.0
-            with pytest.raises(asyncio.TimeoutError):
-                await socket.end(first_end + 1.1 - time.monotonic())
-            assert await socket.echo()
-            assert [other.code for other in wrong] == [CLOSE_TOKEN_OVER] * 2
+async def test_a_fresh_token_moves_the_end_of_the_socket_and_a_bad_one_does_not(
+    server: GuardedServer,
+) -> None:
+    names = ["renews", "renews-2", "renews-3"]
+    async with robots(server, [server.token(name, ttl_s=3.0) for name in names]) as (socket, *wrong):
+        assert socket.token_s is not None
+        first_end = time.monotonic() + socket.token_s
+        for other, token in zip(wrong, ("x", server.token("another")), strict=True):
+            refusal = await other.ask(Renew(token=token))
+            assert isinstance(refusal, Failure)
+            assert (refusal.id, refusal.code) == (None, "unauthorized")
+        renewed = await socket.ask(Renew(token=server.token("renews", ttl_s=30.0)))
+        assert isinstance(renewed, Renewed)
+        assert 25.0 < renewed.token_s <= 30.0
+        with pytest.raises(asyncio.TimeoutError):
+            await socket.end(first_end + 1.1 - time.monotonic())
+        assert await socket.echo()
+        assert [other.code for other in wrong] == [CLOSE_TOKEN_OVER] * 2
 
-    asyncio.run(run())
 
-
-def test_revoking_the_fresh_token_ends_the_socket_that_was_renewed_with_it(server: GuardedServer) -> None:
-    async def run() -> None:
-        async with robots(server, [server.token("twice")]) as (socket,):
-            assert isinstance(await socket.ask(Renew(token=server.token("twice"))), Renewed)
-            fresh = f"t-{server._issued}"
-            server.access.change_deny_list(
-                lambda d: d.with_token("default", "twice", fresh, time.time() + 900)
-            )
-            assert await socket.end(30.0) == CLOSE_REVOKED
-
-    asyncio.run(run())
+async def test_revoking_the_fresh_token_ends_the_socket_that_was_renewed_with_it(
+    server: GuardedServer,
+) -> None:
+    async with robots(server, [server.token("twice")]) as (socket,):
+        assert isinstance(await socket.ask(Renew(token=server.token("twice"))), Renewed)
+        fresh = f"t-{server._issued}"
+        server.access.change_deny_list(lambda d: d.with_token("default", "twice", fresh, time.time() + 900))
+        assert await socket.end(30.0) == CLOSE_REVOKED
 
 
 @pytest.mark.slow
-def test_a_session_outlives_its_tokens_without_a_gap_and_ends_when_its_robot_is_disabled(
+async def test_a_session_outlives_its_tokens_without_a_gap_and_ends_when_its_robot_is_disabled(
     server: GuardedServer, tmp_path: Path
 ) -> None:
     public = make_robot_key(tmp_path / "robot.key")
@@ -216,20 +209,17 @@ def test_a_session_outlives_its_tokens_without_a_gap_and_ends_when_its_robot_is_
         tokens += 1
         return await key.token()
 
-    async def run() -> None:
-        await until(lambda: connects(server, fresh))
-        async with connect(server.url, token=fresh) as robot:
-            began = time.monotonic()
-            await echo_on(robot, until_s=began + 12.0)
-            assert robot.stats.reconnects == 0
-            assert tokens >= 3
-            with pytest.raises(Forbidden):
-                await robot.call("pnp", {})
-            server.access.change_deny_list(lambda d: d.with_robot("default", "own-key", time.time()))
-            with pytest.raises(Unauthorized):
-                await echo_on(robot, until_s=began + 60.0)
-
-    asyncio.run(run())
+    await until(lambda: connects(server, fresh))
+    async with connect(server.url, token=fresh) as robot:
+        began = time.monotonic()
+        await echo_on(robot, until_s=began + 12.0)
+        assert robot.stats.reconnects == 0
+        assert tokens >= 3
+        with pytest.raises(Forbidden):
+            await robot.call("pnp", {})
+        server.access.change_deny_list(lambda d: d.with_robot("default", "own-key", time.time()))
+        with pytest.raises(Unauthorized):
+            await echo_on(robot, until_s=began + 60.0)
 
 
 async def echo_on(robot: Robot, until_s: float) -> None:

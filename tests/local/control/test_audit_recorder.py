@@ -15,7 +15,9 @@ def actions(state: Path) -> list[str]:
     return [entry.action for entry in entries_of(files_of(audit_folder(state), "control-plane"))]
 
 
-def test_the_heads_of_the_other_logs_are_recorded_again_and_again_when_they_grew(tmp_path: Path) -> None:
+async def test_the_heads_of_the_other_logs_are_recorded_again_and_again_when_they_grew(
+    tmp_path: Path,
+) -> None:
     audit = PlatformAudit(tmp_path, heads_s=0.01)
     audit.open()
 
@@ -23,14 +25,11 @@ def test_the_heads_of_the_other_logs_are_recorded_again_and_again_when_they_grew
         while actions(tmp_path).count("log.heads") < count:
             await asyncio.sleep(0.01)
 
-    async def run() -> None:
-        watching = asyncio.create_task(audit.watch())
-        for count in (1, 2):
-            record_once(audit.folder, "operator", "robot.disabled", wall_clock=time.time)
-            await asyncio.wait_for(recorded(count), 10)
-        watching.cancel()
-
-    asyncio.run(run())
+    watching = asyncio.create_task(audit.watch())
+    for count in (1, 2):
+        record_once(audit.folder, "operator", "robot.disabled", wall_clock=time.time)
+        await asyncio.wait_for(recorded(count), 10)
+    watching.cancel()
     audit.close()
 
     assert actions(tmp_path) == ["log.heads", "log.heads", "platform.over"]

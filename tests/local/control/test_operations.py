@@ -28,33 +28,30 @@ async def collected(events: Any) -> list[Any]:
     return [event async for event in events]
 
 
-def test_the_events_of_the_platform_are_told_until_it_is_over() -> None:
-    async def run() -> list[Any]:
-        operations = Operations(Kept())
+async def test_the_events_of_the_platform_are_told_until_it_is_over() -> None:
+    operations = Operations(Kept())
 
-        async def work() -> None:
-            operations.take_event({"event": "drain-start", "server": "server-1"})
+    async def work() -> None:
+        operations.take_event({"event": "drain-start", "server": "server-1"})
 
-        return await asyncio.wait_for(collected(operations.begin("drain", work)), SOON_S)
+    assert [
+        event["event"]
+        for event in (await asyncio.wait_for(collected(operations.begin("drain", work)), SOON_S))
+    ] == ["drain-start", OVER]
 
-    assert [event["event"] for event in asyncio.run(run())] == ["drain-start", OVER]
 
+async def test_a_failure_is_the_last_event_and_the_next_operation_may_begin() -> None:
+    operations = Operations(Kept())
 
-def test_a_failure_is_the_last_event_and_the_next_operation_may_begin() -> None:
-    async def run() -> tuple[Any, Any]:
-        operations = Operations(Kept())
+    async def fail() -> None:
+        raise ConfigurationError("server-3 did not become healthy", hint="look at its log")
 
-        async def fail() -> None:
-            raise ConfigurationError("server-3 did not become healthy", hint="look at its log")
+    async def succeed() -> None:
+        return
 
-        async def succeed() -> None:
-            return
-
-        first = await asyncio.wait_for(collected(operations.begin("roll", fail)), SOON_S)
-        second = await asyncio.wait_for(collected(operations.begin("roll", succeed)), SOON_S)
-        return first[-1], second[-1]
-
-    failed, over = asyncio.run(run())
+    first = await asyncio.wait_for(collected(operations.begin("roll", fail)), SOON_S)
+    second = await asyncio.wait_for(collected(operations.begin("roll", succeed)), SOON_S)
+    failed, over = first[-1], second[-1]
 
     assert failed == {
         "event": FAILED, "message": "server-3 did not become healthy", "hint": "look at its log"
@@ -62,21 +59,18 @@ def test_a_failure_is_the_last_event_and_the_next_operation_may_begin() -> None:
     assert over == {"event": OVER}
 
 
-def test_a_second_operation_is_refused_and_the_first_goes_on_without_a_listener() -> None:
-    async def run() -> bool:
-        kept, go = Kept(), asyncio.Event()
-        operations = Operations(kept)
-        done = asyncio.Event()
+async def test_a_second_operation_is_refused_and_the_first_goes_on_without_a_listener() -> None:
+    kept, go = Kept(), asyncio.Event()
+    operations = Operations(kept)
+    done = asyncio.Event()
 
-        async def work() -> None:
-            await go.wait()
-            done.set()
+    async def work() -> None:
+        await go.wait()
+        done.set()
 
-        operations.begin("roll", work)
-        with pytest.raises(UsageError, match="'roll' is under way"):
-            operations.begin("drain", work)
-        go.set()
-        await asyncio.wait_for(asyncio.gather(*kept.tasks), SOON_S)
-        return done.is_set()
-
-    assert asyncio.run(run())
+    operations.begin("roll", work)
+    with pytest.raises(UsageError, match="'roll' is under way"):
+        operations.begin("drain", work)
+    go.set()
+    await asyncio.wait_for(asyncio.gather(*kept.tasks), SOON_S)
+    assert done.is_set()

@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 import random
 import time
-from collections.abc import AsyncIterator, Coroutine
+from collections.abc import AsyncIterator
 from typing import Any
 
 import pytest
@@ -31,10 +31,6 @@ def lane(**options: Any) -> Lane:
     return Lane(
         **{"delay_s": 0.05, "jitter_s": 0.0, "mbit_per_s": None, "random": random.Random(1), **options}
     )
-
-
-def run(work: Coroutine[Any, Any, None]) -> None:
-    asyncio.run(asyncio.wait_for(work, 30))
 
 
 class Echo:
@@ -129,147 +125,117 @@ def test_the_papers_link_is_its_round_trip_less_its_computing() -> None:
 # --- real sockets -------------------------------------------------------------------------------------
 
 
-def test_a_relayed_byte_takes_the_nominal_time() -> None:
-    async def work() -> None:
-        async with echo() as server:
-            profile = LinkProfile(name="t", up_s=0.04, down_s=0.03)
-            async with EmulatedLink(profile, "127.0.0.1", server.port) as link:
-                reader, writer = await asyncio.open_connection("127.0.0.1", link.port)
-                await trip_s(reader, writer, b"first")
-                trips = [await trip_s(reader, writer, b"x" * 3000) for _ in range(9)]
-                assert min(trips) >= 0.07 - 0.002
-                assert sorted(trips)[4] <= 0.07 + 0.02
-                writer.close()
-
-    run(work())
-
-
-def test_the_first_byte_waits_for_the_handshake() -> None:
-    async def work() -> None:
-        async with echo() as server, EmulatedLink(PROFILES["paper"], "127.0.0.1", server.port) as link:
+async def test_a_relayed_byte_takes_the_nominal_time() -> None:
+    async with echo() as server:
+        profile = LinkProfile(name="t", up_s=0.04, down_s=0.03)
+        async with EmulatedLink(profile, "127.0.0.1", server.port) as link:
             reader, writer = await asyncio.open_connection("127.0.0.1", link.port)
-            assert await trip_s(reader, writer, b"hello") >= 2 * 0.13 - 0.005
+            await trip_s(reader, writer, b"first")
+            trips = [await trip_s(reader, writer, b"x" * 3000) for _ in range(9)]
+            assert min(trips) >= 0.07 - 0.002
+            assert sorted(trips)[4] <= 0.07 + 0.02
             writer.close()
 
-    run(work())
+
+async def test_the_first_byte_waits_for_the_handshake() -> None:
+    async with echo() as server, EmulatedLink(PROFILES["paper"], "127.0.0.1", server.port) as link:
+        reader, writer = await asyncio.open_connection("127.0.0.1", link.port)
+        assert await trip_s(reader, writer, b"hello") >= 2 * 0.13 - 0.005
+        writer.close()
 
 
-def test_megabytes_arrive_whole_and_in_order_through_a_bad_link() -> None:
-    async def work() -> None:
-        profile = LinkProfile(name="t", up_s=0.01, down_s=0.01, jitter_s=0.02, up_mbit_per_s=200.0)
-        async with echo() as server, EmulatedLink(profile, "127.0.0.1", server.port, seed=4) as link:
-            reader, writer = await asyncio.open_connection("127.0.0.1", link.port)
-            data = random.Random(1).randbytes(3_000_000)
-            assert await trip_s(reader, writer, data) >= 3_000_000 * 8 / 200e6
-            writer.close()
-
-    run(work())
+async def test_megabytes_arrive_whole_and_in_order_through_a_bad_link() -> None:
+    profile = LinkProfile(name="t", up_s=0.01, down_s=0.01, jitter_s=0.02, up_mbit_per_s=200.0)
+    async with echo() as server, EmulatedLink(profile, "127.0.0.1", server.port, seed=4) as link:
+        reader, writer = await asyncio.open_connection("127.0.0.1", link.port)
+        data = random.Random(1).randbytes(3_000_000)
+        assert await trip_s(reader, writer, data) >= 3_000_000 * 8 / 200e6
+        writer.close()
 
 
-def test_a_cut_is_silent_and_nothing_is_lost_when_it_heals() -> None:
-    async def work() -> None:
-        async with echo() as server, EmulatedLink(PROFILES["none"], "127.0.0.1", server.port) as link:
-            reader, writer = await asyncio.open_connection("127.0.0.1", link.port)
-            await trip_s(reader, writer, b"before")
-            link.cut()
-            writer.write(b"during")
-            with pytest.raises(asyncio.TimeoutError):
-                await asyncio.wait_for(reader.read(1), 0.3)
-            assert not reader.at_eof()
-            assert not server.ended.is_set()
-            link.heal()
-            writer.write(b" after")
-            assert await asyncio.wait_for(reader.readexactly(12), SOON_S) == b"during after"
-            writer.close()
-
-    run(work())
+async def test_a_cut_is_silent_and_nothing_is_lost_when_it_heals() -> None:
+    async with echo() as server, EmulatedLink(PROFILES["none"], "127.0.0.1", server.port) as link:
+        reader, writer = await asyncio.open_connection("127.0.0.1", link.port)
+        await trip_s(reader, writer, b"before")
+        link.cut()
+        writer.write(b"during")
+        with pytest.raises(asyncio.TimeoutError):
+            await asyncio.wait_for(reader.read(1), 0.3)
+        assert not reader.at_eof()
+        assert not server.ended.is_set()
+        link.heal()
+        writer.write(b" after")
+        assert await asyncio.wait_for(reader.readexactly(12), SOON_S) == b"during after"
+        writer.close()
 
 
-def test_the_server_does_not_learn_during_a_cut_that_the_robot_left() -> None:
-    async def work() -> None:
-        async with echo() as server, EmulatedLink(PROFILES["none"], "127.0.0.1", server.port) as link:
-            reader, writer = await asyncio.open_connection("127.0.0.1", link.port)
-            await trip_s(reader, writer, b"before")
-            link.cut()
-            writer.close()
-            with pytest.raises(asyncio.TimeoutError):
-                await asyncio.wait_for(server.ended.wait(), 0.3)
-            link.heal()
-            await asyncio.wait_for(server.ended.wait(), SOON_S)
-
-    run(work())
+async def test_the_server_does_not_learn_during_a_cut_that_the_robot_left() -> None:
+    async with echo() as server, EmulatedLink(PROFILES["none"], "127.0.0.1", server.port) as link:
+        reader, writer = await asyncio.open_connection("127.0.0.1", link.port)
+        await trip_s(reader, writer, b"before")
+        link.cut()
+        writer.close()
+        with pytest.raises(asyncio.TimeoutError):
+            await asyncio.wait_for(server.ended.wait(), 0.3)
+        link.heal()
+        await asyncio.wait_for(server.ended.wait(), SOON_S)
 
 
-def test_who_dials_during_a_cut_is_connected_after_it() -> None:
-    async def work() -> None:
-        async with echo() as server, EmulatedLink(PROFILES["none"], "127.0.0.1", server.port) as link:
-            link.cut()
-            dialling = asyncio.ensure_future(asyncio.open_connection("127.0.0.1", link.port))
-            done, _ = await asyncio.wait({dialling}, timeout=0.2)
-            assert not done  # nobody answers
-            assert server.accepted == 0
-            link.heal()
-            reader, writer = await dialling  # Linux asks again after a second
-            await trip_s(reader, writer, b"hello")
-            assert server.accepted == 1
-            writer.close()
-
-    run(work())
+async def test_who_dials_during_a_cut_is_connected_after_it() -> None:
+    async with echo() as server, EmulatedLink(PROFILES["none"], "127.0.0.1", server.port) as link:
+        link.cut()
+        dialling = asyncio.ensure_future(asyncio.open_connection("127.0.0.1", link.port))
+        done, _ = await asyncio.wait({dialling}, timeout=0.2)
+        assert not done  # nobody answers
+        assert server.accepted == 0
+        link.heal()
+        reader, writer = await dialling  # Linux asks again after a second
+        await trip_s(reader, writer, b"hello")
+        assert server.accepted == 1
+        writer.close()
 
 
-def test_two_causes_of_a_cut_must_both_heal() -> None:
-    async def work() -> None:
-        async with echo() as server, EmulatedLink(PROFILES["none"], "127.0.0.1", server.port) as link:
-            link.cut("a")
-            link.cut("b")
-            link.heal("a")
-            assert link.is_cut
-            link.heal("b")
-            assert not link.is_cut
-            assert link.cuts == 1
-
-    run(work())
+async def test_two_causes_of_a_cut_must_both_heal() -> None:
+    async with echo() as server, EmulatedLink(PROFILES["none"], "127.0.0.1", server.port) as link:
+        link.cut("a")
+        link.cut("b")
+        link.heal("a")
+        assert link.is_cut
+        link.heal("b")
+        assert not link.is_cut
+        assert link.cuts == 1
 
 
-def test_a_robot_is_dropped_when_nobody_listens_behind_the_link() -> None:
-    async def work() -> None:
-        async with echo() as server:
-            port = server.port
-        async with EmulatedLink(PROFILES["none"], "127.0.0.1", port) as link:
-            reader, writer = await asyncio.open_connection("127.0.0.1", link.port)
-            assert await asyncio.wait_for(reader.read(), SOON_S) == b""
-            writer.close()
-
-    run(work())
+async def test_a_robot_is_dropped_when_nobody_listens_behind_the_link() -> None:
+    async with echo() as server:
+        port = server.port
+    async with EmulatedLink(PROFILES["none"], "127.0.0.1", port) as link:
+        reader, writer = await asyncio.open_connection("127.0.0.1", link.port)
+        assert await asyncio.wait_for(reader.read(), SOON_S) == b""
+        writer.close()
 
 
-def test_a_profile_cuts_by_itself_now_and_then() -> None:
-    async def work() -> None:
-        # Short cuts: were half of the time cut, every 64th message would need six tries, which are 12.6 s.
-        profile = LinkProfile(name="t", up_s=0.0, down_s=0.0, cut_every_s=0.05, cut_for_s=0.005)
-        async with echo() as server, EmulatedLink(profile, "127.0.0.1", server.port, seed=2) as link:
-            reader, writer = await asyncio.open_connection("127.0.0.1", link.port)
-            while link.cuts < 5:
-                await trip_s(reader, writer, b"still here")
-            writer.close()
-
-    run(work())
+async def test_a_profile_cuts_by_itself_now_and_then() -> None:
+    # Short cuts: were half of the time cut, every 64th message would need six tries, which are 12.6 s.
+    profile = LinkProfile(name="t", up_s=0.0, down_s=0.0, cut_every_s=0.05, cut_for_s=0.005)
+    async with echo() as server, EmulatedLink(profile, "127.0.0.1", server.port, seed=2) as link:
+        reader, writer = await asyncio.open_connection("127.0.0.1", link.port)
+        while link.cuts < 5:
+            await trip_s(reader, writer, b"still here")
+        writer.close()
 
 
 @pytest.mark.system
-def test_a_link_in_its_own_process_relays_cuts_and_heals() -> None:
-    async def work() -> None:
-        async with echo() as server, LinkProcess(PROFILES["none"], "127.0.0.1", server.port) as link:
-            reader, writer = await asyncio.open_connection("127.0.0.1", link.port)
-            await trip_s(reader, writer, b"before")
-            await link.cut()
-            writer.write(b"during")
-            with pytest.raises(asyncio.TimeoutError):
-                await asyncio.wait_for(reader.read(1), 0.2)
-            await link.heal()
-            assert await asyncio.wait_for(reader.readexactly(6), SOON_S) == b"during"
-            assert 0.0 < await link.read_cpu_s() < 10.0
-            writer.close()
-            await asyncio.wait_for(server.ended.wait(), SOON_S)
-
-    run(work())
+async def test_a_link_in_its_own_process_relays_cuts_and_heals() -> None:
+    async with echo() as server, LinkProcess(PROFILES["none"], "127.0.0.1", server.port) as link:
+        reader, writer = await asyncio.open_connection("127.0.0.1", link.port)
+        await trip_s(reader, writer, b"before")
+        await link.cut()
+        writer.write(b"during")
+        with pytest.raises(asyncio.TimeoutError):
+            await asyncio.wait_for(reader.read(1), 0.2)
+        await link.heal()
+        assert await asyncio.wait_for(reader.readexactly(6), SOON_S) == b"during"
+        assert 0.0 < await link.read_cpu_s() < 10.0
+        writer.close()
+        await asyncio.wait_for(server.ended.wait(), SOON_S)

@@ -112,19 +112,16 @@ def test_whatever_is_no_answer_is_a_connection_error(answer: bytes) -> None:
     with_server(_quietly(talk), work)
 
 
-def test_a_port_where_nobody_listens_is_a_connection_error() -> None:
+async def test_a_port_where_nobody_listens_is_a_connection_error() -> None:
     async def work(port: ControlPort) -> None:
         with pytest.raises(ConnectionError):
             await port.ask("/a", timeout_s=SOON_S)
 
-    async def run() -> None:
-        server = await asyncio.start_server(lambda reader, writer: None, "127.0.0.1", 0)
-        number = server.sockets[0].getsockname()[1]
-        server.close()
-        await server.wait_closed()
-        await work(ControlPort(number))
-
-    asyncio.run(run())
+    server = await asyncio.start_server(lambda reader, writer: None, "127.0.0.1", 0)
+    number = server.sockets[0].getsockname()[1]
+    server.close()
+    await server.wait_closed()
+    await work(ControlPort(number))
 
 
 def _quietly(talk: Talk) -> Talk:

@@ -12,7 +12,6 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Coroutine
 from pathlib import Path
 from typing import Any
 
@@ -29,10 +28,6 @@ from rse_pf.local.processes import wait_ended
 pytestmark = pytest.mark.system
 
 SETTINGS = PlatformSettings()
-
-
-def run(work: Coroutine[Any, Any, None]) -> None:
-    asyncio.run(asyncio.wait_for(work, 90))
 
 
 def swarm_of(cloud: LocalPlatform, options: LoadScenario, **more: Any) -> Swarm:
@@ -55,102 +50,90 @@ async def start_again(cloud: LocalPlatform, before: Any) -> None:
         balancer.set_targets([server.target for server in cloud.servers])
 
 
-def test_robots_of_two_processes_get_right_poses_and_leave(tmp_path: Path) -> None:
-    async def work() -> None:
-        heard: list[Any] = []
-        async with LocalPlatform(SETTINGS, servers=1, port=0, state=tmp_path / "a") as cloud:
-            options = LoadScenario(robots=6, processes=2, join_every_s=0.05)
-            async with swarm_of(cloud, options, on_event=heard.append) as swarm:
-                await swarm.start()
-                await swarm.wait_joined(20)
-                await swarm.leave(2)
-                assert swarm.left == {"robot-5", "robot-6"}
-                await swarm.wait_answered(20, 20)
-                result = await swarm.finish()
-            assert not any(process.name == "swarm" for process in multiprocessing.active_children())
-        figures = summarise(result.commands)["commands"]
-        assert figures["sent"] == figures["answered"] >= 4 * 5
-        assert figures["lost"] == result.duplicates == result.wrong_poses == 0
-        robots = {f"robot-{number + 1}" for number in range(6)}
-        assert {command.robot for command in result.commands} == robots
-        assert {event["robot"] for event in heard if event["event"] == "robot-joined"} == robots
-        last = {robot: max(c.planned for c in result.commands if c.robot == robot) for robot in robots}
-        assert max(last["robot-5"], last["robot-6"]) < min(last[f"robot-{n}"] for n in range(1, 5))
-        for command in result.commands:
-            assert command.answered is not None
-            assert command.round_trip_ms == pytest.approx(
-                1e3 * (command.answered - command.planned), abs=0.01
-            )
-            assert command.sent >= command.planned - 1e-3
-        assert 0.0 < result.cpu_s < result.wall_s * 2
-
-    run(work())
-
-
-def test_robots_whose_tokens_are_refused_are_reported_and_no_process_is_left(tmp_path: Path) -> None:
-    async def work() -> None:
-        heard: list[Any] = []
-        async with LocalPlatform(SETTINGS, servers=1, port=0, state=tmp_path / "a") as cloud, Swarm(
-            LoadScenario(robots=2), url=cloud.url, token_of=lambda robot: "no-token",
-            session=SETTINGS.session, on_event=heard.append,
-        ) as swarm:  # fmt: skip
-            await swarm.start()
-            with pytest.raises(CommandFailed, match="0 of 2 had joined"):
-                await swarm.wait_joined(2.0)
-        assert {event["code"] for event in heard if event["event"] == "join-failed"} == {"unauthorized"}
-        assert not any(process.name == "swarm" for process in multiprocessing.active_children())
-
-    run(work())
-
-
-def test_the_median_through_the_papers_link_is_little_more_than_its_delay(tmp_path: Path) -> None:
-    async def work() -> None:
-        async with (
-            LocalPlatform(SETTINGS, servers=1, port=0, state=tmp_path / "a") as cloud,
-            swarm_of(cloud, LoadScenario(robots=3, link="paper")) as swarm,
-        ):
+async def test_robots_of_two_processes_get_right_poses_and_leave(tmp_path: Path) -> None:
+    heard: list[Any] = []
+    async with LocalPlatform(SETTINGS, servers=1, port=0, state=tmp_path / "a") as cloud:
+        options = LoadScenario(robots=6, processes=2, join_every_s=0.05)
+        async with swarm_of(cloud, options, on_event=heard.append) as swarm:
             await swarm.start()
             await swarm.wait_joined(20)
-            await swarm.wait_answered(25, 20)
+            await swarm.leave(2)
+            assert swarm.left == {"robot-5", "robot-6"}
+            await swarm.wait_answered(20, 20)
             result = await swarm.finish()
-        median = summarise(result.commands)["round_trip_ms"]["p50"]
-        assert 130.0 <= median <= 130.0 + 40.0
-        assert result.link == "paper"
+        assert not any(process.name == "swarm" for process in multiprocessing.active_children())
+    figures = summarise(result.commands)["commands"]
+    assert figures["sent"] == figures["answered"] >= 4 * 5
+    assert figures["lost"] == result.duplicates == result.wrong_poses == 0
+    robots = {f"robot-{number + 1}" for number in range(6)}
+    assert {command.robot for command in result.commands} == robots
+    assert {event["robot"] for event in heard if event["event"] == "robot-joined"} == robots
+    last = {robot: max(c.planned for c in result.commands if c.robot == robot) for robot in robots}
+    assert max(last["robot-5"], last["robot-6"]) < min(last[f"robot-{n}"] for n in range(1, 5))
+    for command in result.commands:
+        assert command.answered is not None
+        assert command.round_trip_ms == pytest.approx(1e3 * (command.answered - command.planned), abs=0.01)
+        assert command.sent >= command.planned - 1e-3
+    assert 0.0 < result.cpu_s < result.wall_s * 2
 
-    run(work())
+
+async def test_robots_whose_tokens_are_refused_are_reported_and_no_process_is_left(tmp_path: Path) -> None:
+    heard: list[Any] = []
+    async with LocalPlatform(SETTINGS, servers=1, port=0, state=tmp_path / "a") as cloud, Swarm(
+        LoadScenario(robots=2), url=cloud.url, token_of=lambda robot: "no-token",
+        session=SETTINGS.session, on_event=heard.append,
+    ) as swarm:  # fmt: skip
+        await swarm.start()
+        with pytest.raises(CommandFailed, match="0 of 2 had joined"):
+            await swarm.wait_joined(2.0)
+    assert {event["code"] for event in heard if event["event"] == "join-failed"} == {"unauthorized"}
+    assert not any(process.name == "swarm" for process in multiprocessing.active_children())
+
+
+async def test_the_median_through_the_papers_link_is_little_more_than_its_delay(tmp_path: Path) -> None:
+    async with (
+        LocalPlatform(SETTINGS, servers=1, port=0, state=tmp_path / "a") as cloud,
+        swarm_of(cloud, LoadScenario(robots=3, link="paper")) as swarm,
+    ):
+        await swarm.start()
+        await swarm.wait_joined(20)
+        await swarm.wait_answered(25, 20)
+        result = await swarm.finish()
+    median = summarise(result.commands)["round_trip_ms"]["p50"]
+    assert 130.0 <= median <= 130.0 + 40.0
+    assert result.link == "paper"
 
 
 @pytest.mark.slow
-def test_all_robots_reconnect_soon_after_the_load_balancer_was_killed_and_restarted(tmp_path: Path) -> None:
-    async def work() -> None:
-        robots, heard = 40, []
-        all_back = asyncio.Event()
+async def test_all_robots_reconnect_soon_after_the_load_balancer_was_killed_and_restarted(
+    tmp_path: Path,
+) -> None:
+    robots, heard = 40, []
+    all_back = asyncio.Event()
 
-        def listen(event: Any) -> None:
-            heard.append(event)
-            if len({each["robot"] for each in heard if each["event"] == "link-back"}) == robots:
-                all_back.set()
+    def listen(event: Any) -> None:
+        heard.append(event)
+        if len({each["robot"] for each in heard if each["event"] == "link-back"}) == robots:
+            all_back.set()
 
-        async with LocalPlatform(SETTINGS, servers=2, port=free_port(), state=tmp_path / "a") as cloud:
-            origin = time.monotonic()
-            async with swarm_of(cloud, LoadScenario(robots=robots), on_event=listen, origin=origin) as swarm:
-                await swarm.start()
-                await swarm.wait_joined(30)
-                before = cloud.load_balancer.process.mark
-                assert before is not None
-                os.kill(before.pid, signal.SIGKILL)
-                killed_s = time.monotonic() - origin
-                await start_again(cloud, before)
-                await asyncio.wait_for(all_back.wait(), 20)
-                result = await swarm.finish()
-        figures = summarise(result.commands)
-        assert figures["commands"]["lost"] == figures["commands"]["failed"] == 0, figures["failures_by_code"]
-        assert result.duplicates == result.wrong_poses == 0
-        assert result.reconnects >= robots
-        back = sorted(event["time"] - killed_s for event in heard if event["event"] == "link-back")
-        assert back[-1] < 10.0
-
-    run(work())
+    async with LocalPlatform(SETTINGS, servers=2, port=free_port(), state=tmp_path / "a") as cloud:
+        origin = time.monotonic()
+        async with swarm_of(cloud, LoadScenario(robots=robots), on_event=listen, origin=origin) as swarm:
+            await swarm.start()
+            await swarm.wait_joined(30)
+            before = cloud.load_balancer.process.mark
+            assert before is not None
+            os.kill(before.pid, signal.SIGKILL)
+            killed_s = time.monotonic() - origin
+            await start_again(cloud, before)
+            await asyncio.wait_for(all_back.wait(), 20)
+            result = await swarm.finish()
+    figures = summarise(result.commands)
+    assert figures["commands"]["lost"] == figures["commands"]["failed"] == 0, figures["failures_by_code"]
+    assert result.duplicates == result.wrong_poses == 0
+    assert result.reconnects >= robots
+    back = sorted(event["time"] - killed_s for event in heard if event["event"] == "link-back")
+    assert back[-1] < 10.0
 
 
 @pytest.mark.slow

@@ -106,50 +106,41 @@ def elastic_platform(folder: Path, notices: Notices, **scaling: Any) -> LocalPla
 
 
 @pytest.mark.slow
-def test_an_enrolled_canary_is_served_through_the_load_balancer_and_another_key_is_not(
+async def test_an_enrolled_canary_is_served_through_the_load_balancer_and_another_key_is_not(
     tmp_path: Path,
 ) -> None:
-    async def run() -> None:
-        enrol_canary(tmp_path / "a")
-        async with LocalPlatform(SETTINGS, servers=2, port=0, state=tmp_path / "a") as cloud:
-            told = await ask_as_canary(cloud.url)
-            assert told["server"] in ("server-1", "server-2")
-            with pytest.raises(ConnectError, match="401"):
-                await ask_as_canary(cloud.url, SigningKey.of_robot(b"d" * 32))
-
-    asyncio.run(run())
+    enrol_canary(tmp_path / "a")
+    async with LocalPlatform(SETTINGS, servers=2, port=0, state=tmp_path / "a") as cloud:
+        told = await ask_as_canary(cloud.url)
+        assert told["server"] in ("server-1", "server-2")
+        with pytest.raises(ConnectError, match="401"):
+            await ask_as_canary(cloud.url, SigningKey.of_robot(b"d" * 32))
 
 
-def test_servers_leave_while_only_the_canary_sends_commands_and_each_of_its_commands_is_answered(
+async def test_servers_leave_while_only_the_canary_sends_commands_and_each_of_its_commands_is_answered(
     tmp_path: Path,
 ) -> None:
-    async def run() -> None:
-        notices = Notices()
-        enrol_canary(tmp_path / "a")
-        # The rule `underused` would do the same after 15 minutes; it is off, so that `idle` is tested.
-        async with elastic_platform(tmp_path / "a", notices, underused_s=0) as cloud:
-            began_s = time.monotonic()
-            async with repeating(lambda: ask_as_canary(cloud.url)) as failed:
-                await notices.until(notices.shrinks, 60.0)
-                first_s = time.monotonic() - began_s
-                await notices.until(lambda: len(cloud.servers) == 1, 120.0)
-            print(f"first scale-in after {first_s / MINUTE_S:.1f} minutes of the rules")
-            assert not failed
-            assert {event["reason"] for event in notices.shrinks()} == {"idle for 300 s"}
-
-    asyncio.run(run())
+    notices = Notices()
+    enrol_canary(tmp_path / "a")
+    # The rule `underused` would do the same after 15 minutes; it is off, so that `idle` is tested.
+    async with elastic_platform(tmp_path / "a", notices, underused_s=0) as cloud:
+        began_s = time.monotonic()
+        async with repeating(lambda: ask_as_canary(cloud.url)) as failed:
+            await notices.until(notices.shrinks, 60.0)
+            first_s = time.monotonic() - began_s
+            await notices.until(lambda: len(cloud.servers) == 1, 120.0)
+        print(f"first scale-in after {first_s / MINUTE_S:.1f} minutes of the rules")
+        assert not failed
+        assert {event["reason"] for event in notices.shrinks()} == {"idle for 300 s"}
 
 
-def test_one_robot_at_one_frame_a_minute_keeps_the_servers(tmp_path: Path) -> None:
-    async def run() -> None:
-        notices = Notices()
-        async with elastic_platform(tmp_path / "a", notices, underused_s=0) as cloud:
-            async with connect(cloud.url, token=cloud.issue_token("robot")) as robot:
-                began = notices.samples
-                async with repeating(lambda: robot.call("echo", {"value": 1})) as failed:
-                    # Samples are taken once a second or more often: this is twice as long as idleness takes.
-                    await notices.until(lambda: notices.samples > began + 2 * 5 * MINUTE_S, 120.0)
-            assert not failed
-            assert not notices.shrinks()
-
-    asyncio.run(run())
+async def test_one_robot_at_one_frame_a_minute_keeps_the_servers(tmp_path: Path) -> None:
+    notices = Notices()
+    async with elastic_platform(tmp_path / "a", notices, underused_s=0) as cloud:
+        async with connect(cloud.url, token=cloud.issue_token("robot")) as robot:
+            began = notices.samples
+            async with repeating(lambda: robot.call("echo", {"value": 1})) as failed:
+                # Samples are taken once a second or more often: this is twice as long as idleness takes.
+                await notices.until(lambda: notices.samples > began + 2 * 5 * MINUTE_S, 120.0)
+        assert not failed
+        assert not notices.shrinks()

@@ -135,113 +135,98 @@ def check(tally: Tally) -> None:
     assert tally.answered > ROBOTS
 
 
-def test_killed_and_stopped_servers_are_replaced_and_robots_lose_nothing(tmp_path: Path) -> None:
-    async def run() -> None:
-        news = News()
-        async with platform(tmp_path / "a", news) as cloud:
-            async with asking(cloud) as tally:
-                cloud.kill("server-1")
-                new = (await news.heard("replace", server="server-1"))["by"]
-                await news.heard("server-out", server="server-1")
-                await news.heard("server-healthy", server=new)
-                cloud.pause("server-2")
-                newer = (await news.heard("replace", server="server-2"))["by"]
-                gone = await news.heard("server-gone", server="server-2")
-                await news.heard("server-healthy", server=newer)
-                assert [new, newer] == ["server-3", "server-4"], "a name is never used twice"
-                assert gone["exit_code"] == -signal.SIGKILL
-                assert news.find("server-unhealthy", server="server-2")
-                assert not news.find("server-unhealthy", server="server-1"), "it ended, which is known sooner"
-                state = read_state(cloud.state)
-                assert state is not None
-                assert [server.name for server in state.servers] == [new, newer]
-            check(tally)
-
-    asyncio.run(run())
+async def test_killed_and_stopped_servers_are_replaced_and_robots_lose_nothing(tmp_path: Path) -> None:
+    news = News()
+    async with platform(tmp_path / "a", news) as cloud:
+        async with asking(cloud) as tally:
+            cloud.kill("server-1")
+            new = (await news.heard("replace", server="server-1"))["by"]
+            await news.heard("server-out", server="server-1")
+            await news.heard("server-healthy", server=new)
+            cloud.pause("server-2")
+            newer = (await news.heard("replace", server="server-2"))["by"]
+            gone = await news.heard("server-gone", server="server-2")
+            await news.heard("server-healthy", server=newer)
+            assert [new, newer] == ["server-3", "server-4"], "a name is never used twice"
+            assert gone["exit_code"] == -signal.SIGKILL
+            assert news.find("server-unhealthy", server="server-2")
+            assert not news.find("server-unhealthy", server="server-1"), "it ended, which is known sooner"
+            state = read_state(cloud.state)
+            assert state is not None
+            assert [server.name for server in state.servers] == [new, newer]
+        check(tally)
 
 
 @pytest.mark.slow
-def test_a_zone_that_fails_takes_half_of_the_servers_and_no_command(tmp_path: Path) -> None:
-    async def run() -> None:
-        news = News()
-        async with platform(tmp_path / "a", news, servers=4) as cloud:
-            async with asking(cloud) as tally:
-                for name in ("server-1", "server-3"):  # those of the pretended zone
-                    cloud.kill(name)
-                new = [(await news.heard("replace", server=name))["by"] for name in ("server-1", "server-3")]
-                for name in new:
-                    await news.heard("server-healthy", server=name)
-                before = tally.answered
-                await news.until(lambda: tally.answered > before + 2 * ROBOTS)
-            check(tally)
-            assert sorted(new) == ["server-5", "server-6"]
-
-    asyncio.run(run())
+async def test_a_zone_that_fails_takes_half_of_the_servers_and_no_command(tmp_path: Path) -> None:
+    news = News()
+    async with platform(tmp_path / "a", news, servers=4) as cloud:
+        async with asking(cloud) as tally:
+            for name in ("server-1", "server-3"):  # those of the pretended zone
+                cloud.kill(name)
+            new = [(await news.heard("replace", server=name))["by"] for name in ("server-1", "server-3")]
+            for name in new:
+                await news.heard("server-healthy", server=name)
+            before = tally.answered
+            await news.until(lambda: tally.answered > before + 2 * ROBOTS)
+        check(tally)
+        assert sorted(new) == ["server-5", "server-6"]
 
 
-def test_the_warm_standby_is_the_replacement_and_the_next_one_follows(tmp_path: Path) -> None:
-    async def run() -> None:
-        news = News()
-        async with platform(tmp_path / "a", news, compress=6.0) as cloud:
-            standby = (await news.heard("standby-started"))["pid"]
-            async with asking(cloud) as tally:
-                cloud.kill("server-1")
-                await news.heard("server-healthy", server="server-3")
-                assert cloud.backend_servers.marks["server-3"].pid == standby
-                told = await news.heard("server-ready", server="server-3")
-                assert told["pid"] == standby
-            check(tally)
-            started = await news.until(
-                lambda: [told["pid"] for told in news.events if told["event"] == "standby-started"][1:]
-            )
-            mark = mark_of(started[0])
-        assert mark is not None
-        assert not is_alive(mark), "it goes with its platform"
-
-    asyncio.run(run())
+async def test_the_warm_standby_is_the_replacement_and_the_next_one_follows(tmp_path: Path) -> None:
+    news = News()
+    async with platform(tmp_path / "a", news, compress=6.0) as cloud:
+        standby = (await news.heard("standby-started"))["pid"]
+        async with asking(cloud) as tally:
+            cloud.kill("server-1")
+            await news.heard("server-healthy", server="server-3")
+            assert cloud.backend_servers.marks["server-3"].pid == standby
+            told = await news.heard("server-ready", server="server-3")
+            assert told["pid"] == standby
+        check(tally)
+        started = await news.until(
+            lambda: [told["pid"] for told in news.events if told["event"] == "standby-started"][1:]
+        )
+        mark = mark_of(started[0])
+    assert mark is not None
+    assert not is_alive(mark), "it goes with its platform"
 
 
-def test_a_killed_balancer_comes_back_on_its_port_with_its_targets(tmp_path: Path) -> None:
-    async def run() -> None:
-        news = News()
-        async with platform(tmp_path / "a", news) as cloud:
-            url = cloud.url
-            async with asking(cloud) as tally:
-                cloud.kill_balancer()
-                await news.heard("balancer-gone")
-                await news.heard("balancer-back")
-                assert await cloud.load_balancer.wait_healthy(["server-1", "server-2"], SOON_S)
-                before = tally.answered
-                await news.until(lambda: tally.answered > before + 2 * ROBOTS)
-                assert f":{cloud.port}/" in url
-                state = read_state(cloud.state)
-                assert state is not None
-                assert state.load_balancer is not None
-                assert is_alive(state.load_balancer), "the file names the new process"
-            check(tally)
-            assert len(cloud.servers) == 2
-
-    asyncio.run(run())
+async def test_a_killed_balancer_comes_back_on_its_port_with_its_targets(tmp_path: Path) -> None:
+    news = News()
+    async with platform(tmp_path / "a", news) as cloud:
+        url = cloud.url
+        async with asking(cloud) as tally:
+            cloud.kill_balancer()
+            await news.heard("balancer-gone")
+            await news.heard("balancer-back")
+            assert await cloud.load_balancer.wait_healthy(["server-1", "server-2"], SOON_S)
+            before = tally.answered
+            await news.until(lambda: tally.answered > before + 2 * ROBOTS)
+            assert f":{cloud.port}/" in url
+            state = read_state(cloud.state)
+            assert state is not None
+            assert state.load_balancer is not None
+            assert is_alive(state.load_balancer), "the file names the new process"
+        check(tally)
+        assert len(cloud.servers) == 2
 
 
-def test_a_roll_under_load_replaces_every_server_in_order_and_loses_nothing(tmp_path: Path) -> None:
-    async def run() -> None:
-        news = News()
-        async with platform(tmp_path / "a", news) as cloud:
-            async with asking(cloud) as tally:
-                await cloud.roll()
-                assert [server.name for server in cloud.servers] == ["server-3", "server-4"]
-                await news.until(lambda: set(tally.servers.values()) <= {"server-3", "server-4"})
-            check(tally)
-        for old in ("server-1", "server-2"):
-            names = [told["event"] for told in news.events if told.get("server") == old]
-            assert names[-4:] == ["drain-start", "server-out", "server-gone", "drain-over"]
-            over = news.find("drain-over", server=old)
-            assert over is not None
-            assert over["clean"]
-        assert not news.find("replace")
-
-    asyncio.run(run())
+async def test_a_roll_under_load_replaces_every_server_in_order_and_loses_nothing(tmp_path: Path) -> None:
+    news = News()
+    async with platform(tmp_path / "a", news) as cloud:
+        async with asking(cloud) as tally:
+            await cloud.roll()
+            assert [server.name for server in cloud.servers] == ["server-3", "server-4"]
+            await news.until(lambda: set(tally.servers.values()) <= {"server-3", "server-4"})
+        check(tally)
+    for old in ("server-1", "server-2"):
+        names = [told["event"] for told in news.events if told.get("server") == old]
+        assert names[-4:] == ["drain-start", "server-out", "server-gone", "drain-over"]
+        over = news.find("drain-over", server=old)
+        assert over is not None
+        assert over["clean"]
+    assert not news.find("replace")
 
 
 def test_robots_that_are_there_already_spread_over_a_new_server(tmp_path: Path) -> None:
@@ -260,32 +245,29 @@ def test_robots_that_are_there_already_spread_over_a_new_server(tmp_path: Path) 
     asyncio.run(run())
 
 
-def test_load_makes_it_grow_and_rest_makes_it_shrink(tmp_path: Path) -> None:
+async def test_load_makes_it_grow_and_rest_makes_it_shrink(tmp_path: Path) -> None:
     """The ticks of CPU time, 10 ms, are coarse for periods this short: what is idle is set accordingly."""
     short = {"period_s": 10, "idle_s": 60, "warm_up_s": 0, "idle_cpu_percent": 65.0}
     settings = SETTINGS.replace(
         serving={"emulated_cores": 0.1}, scaling={**short, "min_servers": 1, "max_servers": 2}
     )
 
-    async def run() -> None:
-        news = News()
-        async with platform(tmp_path / "a", news, settings=settings, servers=1, compress=40) as cloud:
-            async with asking(cloud, 3 * ROBOTS, every_s=0.001):  # enough also from a crowded machine
-                grown = await news.heard("grow")
-                await news.heard("server-healthy", server="server-2")
-            shrunk = await news.heard("shrink")
-            await news.heard("drain-over")
-            assert grown["reason"].startswith("CPU at")
-            assert shrunk["reason"].startswith("idle")
-            assert len(cloud.servers) == 1
-            assert cloud.sample is not None
-            seen = [sample["cpu_percent"] for sample in news.samples[: news.samples.index(cloud.sample)]]
-            assert max(each for each in seen if each is not None) >= settings.scaling.busy_cpu_percent
-
-    asyncio.run(run())
+    news = News()
+    async with platform(tmp_path / "a", news, settings=settings, servers=1, compress=40) as cloud:
+        async with asking(cloud, 3 * ROBOTS, every_s=0.001):  # enough also from a crowded machine
+            grown = await news.heard("grow")
+            await news.heard("server-healthy", server="server-2")
+        shrunk = await news.heard("shrink")
+        await news.heard("drain-over")
+        assert grown["reason"].startswith("CPU at")
+        assert shrunk["reason"].startswith("idle")
+        assert len(cloud.servers) == 1
+        assert cloud.sample is not None
+        seen = [sample["cpu_percent"] for sample in news.samples[: news.samples.index(cloud.sample)]]
+        assert max(each for each in seen if each is not None) >= settings.scaling.busy_cpu_percent
 
 
-def test_new_servers_that_all_crash_are_started_slowly_and_old_ones_serve_on(
+async def test_new_servers_that_all_crash_are_started_slowly_and_old_ones_serve_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("rse_pf.local.control.control_plane.MAX_RESTARTS_PER_MINUTE", 2)
@@ -295,58 +277,49 @@ def test_new_servers_that_all_crash_are_started_slowly_and_old_ones_serve_on(
         "from rse_pf.cli.main import main\nsys.exit(main())"
     )
 
-    async def run() -> None:
-        news = News()
-        program = (sys.executable, "-c", script)
-        async with platform(tmp_path / "a", news, program=program) as cloud:
-            broken.touch()
-            cloud.kill("server-1")
-            await news.heard("crash-loop")
-            samples = len(news.samples)
-            await news.until(lambda: len(news.samples) >= samples + 2)
-            launched = [told["server"] for told in news.events if told["event"] == "server-launched"]
-            assert launched == ["server-1", "server-2", "server-3", "server-4"]
-            failed = news.find("server-failed", server="server-3")
-            assert failed is not None
-            assert "no cheese today" in failed["reason"]
-            assert [server.name for server in cloud.servers] == ["server-2"]
-
-    asyncio.run(run())
+    news = News()
+    program = (sys.executable, "-c", script)
+    async with platform(tmp_path / "a", news, program=program) as cloud:
+        broken.touch()
+        cloud.kill("server-1")
+        await news.heard("crash-loop")
+        samples = len(news.samples)
+        await news.until(lambda: len(news.samples) >= samples + 2)
+        launched = [told["server"] for told in news.events if told["event"] == "server-launched"]
+        assert launched == ["server-1", "server-2", "server-3", "server-4"]
+        failed = news.find("server-failed", server="server-3")
+        assert failed is not None
+        assert "no cheese today" in failed["reason"]
+        assert [server.name for server in cloud.servers] == ["server-2"]
 
 
-def test_a_server_that_is_told_to_leave_is_replaced_but_not_cut_off(tmp_path: Path) -> None:
-    async def run() -> None:
-        news = News()
-        async with platform(tmp_path / "a", news) as cloud:
-            async with asking(cloud) as tally:
-                cloud.backend_servers.send("server-1", signal.SIGTERM)
-                await news.heard("drain-start", server="server-1")
-                new = (await news.heard("replace", server="server-1"))["by"]
-                gone = await news.heard("server-gone", server="server-1")
-                await news.heard("server-healthy", server=new)
-                assert gone["exit_code"] == 0
-            check(tally)
-
-    asyncio.run(run())
+async def test_a_server_that_is_told_to_leave_is_replaced_but_not_cut_off(tmp_path: Path) -> None:
+    news = News()
+    async with platform(tmp_path / "a", news) as cloud:
+        async with asking(cloud) as tally:
+            cloud.backend_servers.send("server-1", signal.SIGTERM)
+            await news.heard("drain-start", server="server-1")
+            new = (await news.heard("replace", server="server-1"))["by"]
+            gone = await news.heard("server-gone", server="server-1")
+            await news.heard("server-healthy", server=new)
+            assert gone["exit_code"] == 0
+        check(tally)
 
 
-def test_without_elastic_nothing_is_replaced_but_drain_and_grow_can_be_asked_for(tmp_path: Path) -> None:
-    async def run() -> None:
-        news = News()
-        async with LocalPlatform(
-            SETTINGS, servers=1, port=0, state=tmp_path / "a", on_event=news.event
-        ) as cloud:
-            with pytest.raises(UsageError, match="server-1 is the last server"):
-                await cloud.drain("server-1")
-            assert await cloud.grow(1, "asked") == ["server-2"]
-            assert (await cloud.drain("server-1", reason="asked"))["clean"]
-            assert cloud.sample is None
-            document = cloud.status_document()
-            assert [server["name"] for server in document["servers"]] == ["server-2"]
-            with pytest.raises(UsageError, match="no server named 'server-1'"):
-                cloud.pause("server-1")
-
-    asyncio.run(run())
+async def test_without_elastic_nothing_is_replaced_but_drain_and_grow_can_be_asked_for(
+    tmp_path: Path,
+) -> None:
+    news = News()
+    async with LocalPlatform(SETTINGS, servers=1, port=0, state=tmp_path / "a", on_event=news.event) as cloud:
+        with pytest.raises(UsageError, match="server-1 is the last server"):
+            await cloud.drain("server-1")
+        assert await cloud.grow(1, "asked") == ["server-2"]
+        assert (await cloud.drain("server-1", reason="asked"))["clean"]
+        assert cloud.sample is None
+        document = cloud.status_document()
+        assert [server["name"] for server in document["servers"]] == ["server-2"]
+        with pytest.raises(UsageError, match="no server named 'server-1'"):
+            cloud.pause("server-1")
 
 
 CONTROL_PLANE = """

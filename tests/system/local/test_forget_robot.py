@@ -60,7 +60,7 @@ def images_of(version: MapVersion, robot: RobotId) -> Any:
     return (version.provenance or {}).get("images", {}).get(robot.folder)
 
 
-def test_a_forgotten_robot_is_in_no_later_version_and_not_in_the_store(tmp_path: Path) -> None:
+async def test_a_forgotten_robot_is_in_no_later_version_and_not_in_the_store(tmp_path: Path) -> None:
     state = tmp_path / "platform"
     objects = state / "objects"
 
@@ -68,37 +68,34 @@ def test_a_forgotten_robot_is_in_no_later_version_and_not_in_the_store(tmp_path:
         code = await asyncio.to_thread(main, ["map", *words, "--store", f"dir:{objects}"])
         assert code == 0
 
-    async def test() -> None:
-        async with LocalPlatform(SETTINGS, servers=1, port=0, state=state, data=True) as platform:
-            key = ensure_key(state, seed=secrets.token_bytes(32), key_id="unused")
+    async with LocalPlatform(SETTINGS, servers=1, port=0, state=state, data=True) as platform:
+        key = ensure_key(state, seed=secrets.token_bytes(32), key_id="unused")
 
-            def driver(robot: RobotId, depth_m: float) -> Driver:
-                token = key.issue(robot.name, now=time.time(), token_id=robot.name, settings=SETTINGS.auth)
-                return Driver(platform.url, token, robot, depth_m)
+        def driver(robot: RobotId, depth_m: float) -> Driver:
+            token = key.issue(robot.name, now=time.time(), token_id=robot.name, settings=SETTINGS.auth)
+            return Driver(platform.url, token, robot, depth_m)
 
-            gone, stays = driver(FORGOTTEN, 2.0), driver(OTHER, 3.0)
-            async with gone.robot, stays.robot:
-                await gone.drive()
-                await stays.drive()
-                store, maps = DirectoryStore(objects), MapRegistry(DirectoryStore(objects), "default")
-                await operator("publish", MAP)
-                before = maps.load(MAP, "head")
-                assert set(np.round(before.points[:, 2], 3)) == {2.0, 3.0}, "both are in the map"
-                assert len(images_of(before, FORGOTTEN)) == KEYFRAMES
+        gone, stays = driver(FORGOTTEN, 2.0), driver(OTHER, 3.0)
+        async with gone.robot, stays.robot:
+            await gone.drive()
+            await stays.drive()
+            store, maps = DirectoryStore(objects), MapRegistry(DirectoryStore(objects), "default")
+            await operator("publish", MAP)
+            before = maps.load(MAP, "head")
+            assert set(np.round(before.points[:, 2], 3)) == {2.0, 3.0}, "both are in the map"
+            assert len(images_of(before, FORGOTTEN)) == KEYFRAMES
 
-                await operator("live", "forget", MAP, FORGOTTEN.name)
-                for name in gone.names:
-                    with pytest.raises(NotFound):
-                        store.head(name)
-                assert not list(store.list(f"objects/{FORGOTTEN.folder}/"))
-                assert all(store.head(name).size for name in stays.names)
+            await operator("live", "forget", MAP, FORGOTTEN.name)
+            for name in gone.names:
+                with pytest.raises(NotFound):
+                    store.head(name)
+            assert not list(store.list(f"objects/{FORGOTTEN.folder}/"))
+            assert all(store.head(name).size for name in stays.names)
 
-                await gone.robot.store_object(gone.points)  # it was on its way
-                await operator("publish", MAP)
-                after = maps.load(MAP, "head")
-                assert set(np.round(after.points[:, 2], 3)) == {3.0}
-                assert {keyframe.robot for keyframe in after.keyframes} == {str(OTHER)}
-                assert images_of(after, FORGOTTEN) is None
-                assert len(images_of(after, OTHER)) == KEYFRAMES
-
-    asyncio.run(test())
+            await gone.robot.store_object(gone.points)  # it was on its way
+            await operator("publish", MAP)
+            after = maps.load(MAP, "head")
+            assert set(np.round(after.points[:, 2], 3)) == {3.0}
+            assert {keyframe.robot for keyframe in after.keyframes} == {str(OTHER)}
+            assert images_of(after, FORGOTTEN) is None
+            assert len(images_of(after, OTHER)) == KEYFRAMES

@@ -120,74 +120,62 @@ def test_robots_with_a_token_are_welcomed_by_both_servers_and_nothing_is_left(
     assert not key_file(tmp_path / "a").exists(), "a key that nobody needs any more"
 
 
-def test_the_door_refuses_who_has_no_token_and_knows_one_path_only(tmp_path: Path) -> None:
-    async def run() -> list[int]:
-        async with LocalPlatform(SETTINGS, servers=1, port=0, state=tmp_path / "a") as cloud:
-            elsewhere = cloud.url.replace(SETTINGS.serving.path, "/elsewhere")
-            token = cloud.issue_token("robot-1")
-            return [
-                await refusal(cloud.url),
-                await refusal(cloud.url, token[:-4] + "AAAA"),
-                await refusal(elsewhere, token),
-            ]
-
-    assert asyncio.run(run()) == [401, 401, 404]
+async def test_the_door_refuses_who_has_no_token_and_knows_one_path_only(tmp_path: Path) -> None:
+    async with LocalPlatform(SETTINGS, servers=1, port=0, state=tmp_path / "a") as cloud:
+        elsewhere = cloud.url.replace(SETTINGS.serving.path, "/elsewhere")
+        token = cloud.issue_token("robot-1")
+        assert [
+            await refusal(cloud.url),
+            await refusal(cloud.url, token[:-4] + "AAAA"),
+            await refusal(elsewhere, token),
+        ] == [401, 401, 404]
 
 
-def test_targets_change_without_cutting_open_sockets(tmp_path: Path) -> None:
-    async def run() -> None:
-        async with LocalPlatform(SETTINGS, servers=2, port=0, state=tmp_path / "a") as cloud:
-            first, second = cloud.servers
-            balancer = cloud.load_balancer
-            async with robots(cloud, 8) as early:
-                assert {robot.server for robot in early} == {first.name, second.name}
-                for _ in range(3):
-                    balancer.set_targets([first.target])
-                    assert await balancer.wait_gone(second.name, SOON_S)
-                    async with robots(cloud, 4, first=8) as late:
-                        assert {robot.server for robot in late} == {first.name}
-                    balancer.set_targets([first.target, second.target])
-                    assert await balancer.wait_healthy([first.name, second.name], SOON_S)
-                assert [await robot.is_served() for robot in early] == [True] * 8
-
-    asyncio.run(run())
+async def test_targets_change_without_cutting_open_sockets(tmp_path: Path) -> None:
+    async with LocalPlatform(SETTINGS, servers=2, port=0, state=tmp_path / "a") as cloud:
+        first, second = cloud.servers
+        balancer = cloud.load_balancer
+        async with robots(cloud, 8) as early:
+            assert {robot.server for robot in early} == {first.name, second.name}
+            for _ in range(3):
+                balancer.set_targets([first.target])
+                assert await balancer.wait_gone(second.name, SOON_S)
+                async with robots(cloud, 4, first=8) as late:
+                    assert {robot.server for robot in late} == {first.name}
+                balancer.set_targets([first.target, second.target])
+                assert await balancer.wait_healthy([first.name, second.name], SOON_S)
+            assert [await robot.is_served() for robot in early] == [True] * 8
 
 
-def test_a_killed_server_is_noticed_and_the_other_one_serves_on(tmp_path: Path) -> None:
-    async def run() -> None:
-        heard: asyncio.Queue[Any] = asyncio.Queue()
-        async with LocalPlatform(
-            SETTINGS, servers=2, port=0, state=tmp_path / "a", on_event=heard.put_nowait
-        ) as cloud:
+async def test_a_killed_server_is_noticed_and_the_other_one_serves_on(tmp_path: Path) -> None:
+    heard: asyncio.Queue[Any] = asyncio.Queue()
+    async with LocalPlatform(
+        SETTINGS, servers=2, port=0, state=tmp_path / "a", on_event=heard.put_nowait
+    ) as cloud:
+        cloud.kill("server-1")
+        told = await event(cloud, "server-gone", heard)
+        assert (told["server"], told["exit_code"]) == ("server-1", -signal.SIGKILL)
+        assert [server.name for server in cloud.servers] == ["server-2"]
+        assert await cloud.load_balancer.wait_gone("server-1", SOON_S)
+        async with robots(cloud, 4) as served:
+            assert {robot.server for robot in served} == {"server-2"}
+        with pytest.raises(UsageError, match="no server named 'server-1'"):
             cloud.kill("server-1")
-            told = await event(cloud, "server-gone", heard)
-            assert (told["server"], told["exit_code"]) == ("server-1", -signal.SIGKILL)
-            assert [server.name for server in cloud.servers] == ["server-2"]
-            assert await cloud.load_balancer.wait_gone("server-1", SOON_S)
-            async with robots(cloud, 4) as served:
-                assert {robot.server for robot in served} == {"server-2"}
-            with pytest.raises(UsageError, match="no server named 'server-1'"):
-                cloud.kill("server-1")
-
-    asyncio.run(run())
 
 
-def test_two_platforms_do_not_collide_and_a_name_or_port_is_taken_once(tmp_path: Path) -> None:
-    async def run() -> None:
-        async with (
-            LocalPlatform(SETTINGS, servers=1, port=0, state=tmp_path / "a") as first,
-            LocalPlatform(SETTINGS, servers=1, port=0, state=tmp_path / "b") as second,
-        ):
-            assert not set(processes(first)) & set(processes(second))
-            assert await refusal(second.url, first.issue_token("robot-1")) == 401
-            with pytest.raises(ConfigurationError, match="named 'a' is running already"):
-                await LocalPlatform(SETTINGS, servers=1, port=0, state=tmp_path / "a").__aenter__()
-            with pytest.raises(ConfigurationError, match="Address already in use"):
-                await LocalPlatform(SETTINGS, servers=1, port=first.port, state=tmp_path / "c").__aenter__()
-            async with robots(first, 1), robots(second, 1):
-                pass
-
-    asyncio.run(run())
+async def test_two_platforms_do_not_collide_and_a_name_or_port_is_taken_once(tmp_path: Path) -> None:
+    async with (
+        LocalPlatform(SETTINGS, servers=1, port=0, state=tmp_path / "a") as first,
+        LocalPlatform(SETTINGS, servers=1, port=0, state=tmp_path / "b") as second,
+    ):
+        assert not set(processes(first)) & set(processes(second))
+        assert await refusal(second.url, first.issue_token("robot-1")) == 401
+        with pytest.raises(ConfigurationError, match="named 'a' is running already"):
+            await LocalPlatform(SETTINGS, servers=1, port=0, state=tmp_path / "a").__aenter__()
+        with pytest.raises(ConfigurationError, match="Address already in use"):
+            await LocalPlatform(SETTINGS, servers=1, port=first.port, state=tmp_path / "c").__aenter__()
+        async with robots(first, 1), robots(second, 1):
+            pass
 
 
 def test_nothing_is_left_when_the_block_fails(tmp_path: Path, gone: Callable[[int], None]) -> None:

@@ -133,13 +133,10 @@ def test_services_read_what_a_robot_stored_through_the_load_balancer(
         gone(pid)
 
 
-def test_without_a_data_service_an_upload_says_so_soon(tmp_path: Path) -> None:
-    async def run() -> None:
-        async with LocalPlatform(SETTINGS, servers=1, port=0, state=tmp_path / "a") as platform:
-            assert platform.status_document()["data_servers"] == []
-            with client(platform, deadline_s=0.1) as robot, pytest.raises(ConnectError) as refused:
-                await asyncio.to_thread(robot.upload, b"data")
-            assert "has no data service" in refused.value.message
-            assert "--no-data" in refused.value.hint
-
-    asyncio.run(run())
+async def test_without_a_data_service_an_upload_says_so_soon(tmp_path: Path) -> None:
+    async with LocalPlatform(SETTINGS, servers=1, port=0, state=tmp_path / "a") as platform:
+        assert platform.status_document()["data_servers"] == []
+        with client(platform, deadline_s=0.1) as robot, pytest.raises(ConnectError) as refused:
+            await asyncio.to_thread(robot.upload, b"data")
+        assert "has no data service" in refused.value.message
+        assert "--no-data" in refused.value.hint

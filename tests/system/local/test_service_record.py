@@ -52,35 +52,30 @@ def services(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "services"
 
 
-def test_requests_of_robots_are_recorded_without_tokens_and_replayed(
+async def test_requests_of_robots_are_recorded_without_tokens_and_replayed(
     services: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    async def run() -> tuple[int, int, str]:
-        settings = PlatformSettings().replace(
-            services={"folder": str(services), "accept_weak_isolation": True}
-        )
-        state = tmp_path / "state" / "rse-pf" / "default"
-        async with LocalPlatform(settings, state=state, servers=1, port=0, adoptable=True) as platform:
-            server = json.loads((state / "platform.json").read_text())["servers"][0]
-            port = ControlPort(server["control_port"])
-            denied = await port.ask("/record?service=letters&count=5", timeout_s=5, method="POST")
-            port.close()
-            words = ["service", "record", "letters", "--out", "live.jsonl", "--count", "3", "--seconds", "25"]
-            recording = asyncio.create_task(asyncio.to_thread(main, words))
-            robots = [connect(platform.url, token=platform.issue_token(f"robot-{n}")) for n in range(2)]
-            async with robots[0] as one, robots[1] as two:
-                end = time.monotonic() + DEADLINE_S
-                while not recording.done() and time.monotonic() < end:
-                    await one.call("letters", {"text": f"my token is {SECRET}"})
-                    await two.call("letters", {"text": "plain"})
-                unknown = ""
-                try:
-                    await one.call("leters", {})
-                except UnknownService as error:
-                    unknown = error.message
-            return await recording, denied.status, unknown
-
-    code, denied, unknown = asyncio.run(run())
+    settings = PlatformSettings().replace(services={"folder": str(services), "accept_weak_isolation": True})
+    state = tmp_path / "state" / "rse-pf" / "default"
+    async with LocalPlatform(settings, state=state, servers=1, port=0, adoptable=True) as platform:
+        server = json.loads((state / "platform.json").read_text())["servers"][0]
+        port = ControlPort(server["control_port"])
+        denied = await port.ask("/record?service=letters&count=5", timeout_s=5, method="POST")
+        port.close()
+        words = ["service", "record", "letters", "--out", "live.jsonl", "--count", "3", "--seconds", "25"]
+        recording = asyncio.create_task(asyncio.to_thread(main, words))
+        robots = [connect(platform.url, token=platform.issue_token(f"robot-{n}")) for n in range(2)]
+        async with robots[0] as one, robots[1] as two:
+            end = time.monotonic() + DEADLINE_S
+            while not recording.done() and time.monotonic() < end:
+                await one.call("letters", {"text": f"my token is {SECRET}"})
+                await two.call("letters", {"text": "plain"})
+            unknown = ""
+            try:
+                await one.call("leters", {})
+            except UnknownService as error:
+                unknown = error.message
+        code, denied, unknown = await recording, denied.status, unknown
 
     assert (code, denied) == (0, 401)
     assert "letters" in unknown

@@ -95,37 +95,31 @@ def data_port(folder: Path) -> int:
     return int(json.loads(announced.read_text())["port"])
 
 
-def test_the_answer_arrives_directly_and_through_the_balancer(tmp_path: Path) -> None:
-    async def run() -> None:
-        state = tmp_path / "a"
-        async with LocalPlatform(SETTINGS, servers=1, port=0, state=state, data=True) as platform:
-            balancer = urlsplit(platform.url)
-            for address in ((balancer.hostname or "", balancer.port or 0), ("127.0.0.1", data_port(state))):
-                for send in (sent_first, by_curl):
-                    for size in (5 * MIB, 60 * MIB):
-                        for number in range(TIMES):
-                            # What is refused counts, so one robot would soon be told to wait instead.
-                            token = platform.issue_token(f"{send.__name__}-{size}-{number}".replace("_", "-"))
-                            told = await asyncio.to_thread(send, address, size, token)
-                            assert told == (413, "too-large"), (address, send, size)
-
-    asyncio.run(run())
+async def test_the_answer_arrives_directly_and_through_the_balancer(tmp_path: Path) -> None:
+    state = tmp_path / "a"
+    async with LocalPlatform(SETTINGS, servers=1, port=0, state=state, data=True) as platform:
+        balancer = urlsplit(platform.url)
+        for address in ((balancer.hostname or "", balancer.port or 0), ("127.0.0.1", data_port(state))):
+            for send in (sent_first, by_curl):
+                for size in (5 * MIB, 60 * MIB):
+                    for number in range(TIMES):
+                        # What is refused counts, so one robot would soon be told to wait instead.
+                        token = platform.issue_token(f"{send.__name__}-{size}-{number}".replace("_", "-"))
+                        told = await asyncio.to_thread(send, address, size, token)
+                        assert told == (413, "too-large"), (address, send, size)
 
 
-def test_the_cpp_client_has_the_answer_directly_and_through_the_balancer(
+async def test_the_cpp_client_has_the_answer_directly_and_through_the_balancer(
     tmp_path: Path, cpp_program: Path
 ) -> None:
-    async def run() -> None:
-        state = tmp_path / "a"
-        async with LocalPlatform(SETTINGS, servers=1, port=0, state=state, data=True) as platform:
-            token = platform.issue_token("robot-1")
-            for address in (urlsplit(platform.url).netloc, f"127.0.0.1:{data_port(state)}"):
-                for size in (5 * MIB, 60 * MIB):
-                    for _ in range(TIMES):
-                        done = await asyncio.to_thread(
-                            subprocess.run, [cpp_program, address, token, str(size)], capture_output=True,
-                            text=True, timeout=60, check=True,
-                        )  # fmt: skip
-                        assert done.stdout == "too-large", (address, size)
-
-    asyncio.run(run())
+    state = tmp_path / "a"
+    async with LocalPlatform(SETTINGS, servers=1, port=0, state=state, data=True) as platform:
+        token = platform.issue_token("robot-1")
+        for address in (urlsplit(platform.url).netloc, f"127.0.0.1:{data_port(state)}"):
+            for size in (5 * MIB, 60 * MIB):
+                for _ in range(TIMES):
+                    done = await asyncio.to_thread(
+                        subprocess.run, [cpp_program, address, token, str(size)], capture_output=True,
+                        text=True, timeout=60, check=True,
+                    )  # fmt: skip
+                    assert done.stdout == "too-large", (address, size)

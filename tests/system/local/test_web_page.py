@@ -55,25 +55,20 @@ def files_with(folder: Path, secrets: list[str]) -> dict[str, list[str]]:
     return {name: found for name, found in held.items() if found}
 
 
-def test_a_page_connects_by_its_token_which_no_log_holds(tmp_path: Path, capfd) -> None:
+async def test_a_page_connects_by_its_token_which_no_log_holds(tmp_path: Path, capfd) -> None:
     folder = tmp_path / "p"
 
-    async def talk() -> tuple[list[tuple[int, str]], list[tuple[int, str | None]], list[str], dict]:
-        settings = PlatformSettings.from_dict(LOUD)
-        async with LocalPlatform(settings, state=folder, port=0, servers=1, data=True) as cloud:
-            tokens = [cloud.issue_token(name) for name in ("page-1", "page-2", "page-3", "page-4")]
-            tokens[3] = tokens[3][:-4] + "AAAA"
-            own = f"http://127.0.0.1:{cloud.port}"
-            origins = (PAGE, own, "https://evil.example", PAGE)
-            told = [await answer(cloud.url, *each) for each in zip(tokens, origins, strict=True)]
-            data = f"{own}/data/v1/objects/{'0' * 64}"
-            asked = [
-                await asyncio.to_thread(preflight, data, each) for each in (PAGE, "https://evil.example")
-            ]
-            config = json.loads(next(folder.rglob("envoy*.json")).read_text())
-        return told, asked, tokens, config
-
-    told, asked, tokens, config = asyncio.run(talk())
+    settings = PlatformSettings.from_dict(LOUD)
+    async with LocalPlatform(settings, state=folder, port=0, servers=1, data=True) as cloud:
+        tokens = [cloud.issue_token(name) for name in ("page-1", "page-2", "page-3", "page-4")]
+        tokens[3] = tokens[3][:-4] + "AAAA"
+        own = f"http://127.0.0.1:{cloud.port}"
+        origins = (PAGE, own, "https://evil.example", PAGE)
+        told = [await answer(cloud.url, *each) for each in zip(tokens, origins, strict=True)]
+        data = f"{own}/data/v1/objects/{'0' * 64}"
+        asked = [await asyncio.to_thread(preflight, data, each) for each in (PAGE, "https://evil.example")]
+        config = json.loads(next(folder.rglob("envoy*.json")).read_text())
+    told, asked, tokens, config = told, asked, tokens, config
 
     assert told == [
         (101, "rse-pf.v1.json"),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import zlib
 from typing import Any
 
@@ -86,12 +85,11 @@ async def outcome(server: Any, codec: str, data: bytes) -> str:
         return answer.code if isinstance(answer, Failure) else "ok"
 
 
-def test_a_message_is_answered_at_each_limit_and_refused_above_it(start_server, tmp_path):
+async def test_a_message_is_answered_at_each_limit_and_refused_above_it(start_server, tmp_path):
     builtin = "from rse_pf.services.builtin import builtin_services as make\n"
     (tmp_path / "served_in_tests.py").write_text(builtin)
     server = start_server()
 
-    async def send_all() -> dict[str, str]:
-        return {name: await outcome(server, codec, data) for name, (codec, data, _) in MESSAGES.items()}
-
-    assert asyncio.run(send_all()) == {name: expected for name, (_, _, expected) in MESSAGES.items()}
+    assert {name: await outcome(server, codec, data) for name, (codec, data, _) in MESSAGES.items()} == {
+        name: expected for name, (_, _, expected) in MESSAGES.items()
+    }

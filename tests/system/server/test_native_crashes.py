@@ -38,18 +38,15 @@ async def crash(server, robot: str) -> float:
     return time.monotonic() - ended_s
 
 
-def test_a_robot_that_crashes_twice_is_shut_out_and_after_three_crashes_the_core_is_off(start_server):
+async def test_a_robot_that_crashes_twice_is_shut_out_and_after_three_crashes_the_core_is_off(start_server):
     server = start_server(keys=True, serving={"workers": 1})
 
-    async def run():
-        away_s = [await crash(server, "culprit"), await crash(server, "culprit")]
-        with pytest.raises(websockets.InvalidStatus) as refused:
-            await crash(server, "culprit")
-        away_s.append(await crash(server, "third"))
-        async with server.robot(token=server.token("witness")) as other:
-            return away_s, refused.value.response.status_code, await other.ask(1, "core")
-
-    away_s, status, core = asyncio.run(run())
+    away_s = [await crash(server, "culprit"), await crash(server, "culprit")]
+    with pytest.raises(websockets.InvalidStatus) as refused:
+        await crash(server, "culprit")
+    away_s.append(await crash(server, "third"))
+    async with server.robot(token=server.token("witness")) as other:
+        away_s, status, core = away_s, refused.value.response.status_code, await other.ask(1, "core")
 
     print(f"seconds until a robot is answered after a crash: {away_s}")
     assert max(away_s) < PROMPT_S
@@ -66,15 +63,12 @@ def test_a_robot_that_crashes_twice_is_shut_out_and_after_three_crashes_the_core
     assert "rse_pf_native_off 1" in metrics
 
 
-def test_the_other_worker_serves_on_during_a_crash_and_disconnects_who_is_shut_out(start_server):
+async def test_the_other_worker_serves_on_during_a_crash_and_disconnects_who_is_shut_out(start_server):
     server = start_server(keys=True, serving={"workers": 2})
 
-    async def run():
-        async with server.robot(token=server.token("staying")) as staying:
-            async with server.robot(token=server.token("culprit")) as sender:
-                await sender.send(Command(id=1, service="crash"))
-                await asyncio.wait_for(sender.socket.wait_closed(), PROMPT_S)
-            return await staying.ask(1, "echo")
-
-    assert isinstance(asyncio.run(run()), Result)
+    async with server.robot(token=server.token("staying")) as staying:
+        async with server.robot(token=server.token("culprit")) as sender:
+            await sender.send(Command(id=1, service="crash"))
+            await asyncio.wait_for(sender.socket.wait_closed(), PROMPT_S)
+        assert isinstance((await staying.ask(1, "echo")), Result)
     assert server.process.poll() is None

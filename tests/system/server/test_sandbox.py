@@ -201,19 +201,16 @@ def until(condition, within_s=10.0):
     return value
 
 
-def test_each_robot_has_a_process_and_a_count_of_its_own(serve_isolated):
+async def test_each_robot_has_a_process_and_a_count_of_its_own(serve_isolated):
     server = serve_isolated()
 
-    async def run():
-        async with (
-            server.robot(token=server.token("robot-1")) as one,
-            server.robot(token=server.token("robot-2")) as two,
-        ):
-            return [
-                (await robot.ask(i, "counter", {})).reply["count"] for i, robot in enumerate([one, one, two])
-            ]
-
-    assert asyncio.run(run()) == [1, 2, 1]
+    async with (
+        server.robot(token=server.token("robot-1")) as one,
+        server.robot(token=server.token("robot-2")) as two,
+    ):
+        assert [
+            (await robot.ask(i, "counter", {})).reply["count"] for i, robot in enumerate([one, one, two])
+        ] == [1, 2, 1]
 
 
 def test_a_crash_is_one_typed_failure_and_does_not_affect_other_robots(serve_isolated):
@@ -263,32 +260,26 @@ def test_a_sandbox_sees_neither_keys_nor_other_processes_nor_open_files(serve_is
     assert int(descriptors) <= 1, "the IPC socket, and nothing inherited"
 
 
-def test_a_robot_cannot_read_the_scratch_folder_of_another(serve_isolated):
+async def test_a_robot_cannot_read_the_scratch_folder_of_another(serve_isolated):
     server = serve_isolated()
 
-    async def run():
-        async with (
-            server.robot(token=server.token("one")) as one,
-            server.robot(token=server.token("two")) as two,
-        ):
-            await one.ask(0, "worker", {"do": "leave_note"})
-            mine = await one.ask(1, "worker", {"do": "find_note"})
-            return mine.reply["seen"], (await two.ask(2, "worker", {"do": "find_note"})).reply["seen"]
-
-    mine, theirs = asyncio.run(run())
+    async with (
+        server.robot(token=server.token("one")) as one,
+        server.robot(token=server.token("two")) as two,
+    ):
+        await one.ask(0, "worker", {"do": "leave_note"})
+        mine = await one.ask(1, "worker", {"do": "find_note"})
+        mine, theirs = mine.reply["seen"], (await two.ask(2, "worker", {"do": "find_note"})).reply["seen"]
     assert "/scratch/note" in mine
     assert theirs == ""
 
 
-def test_an_endless_loop_is_expired_and_killed_and_the_next_command_is_answered(serve_isolated):
+async def test_an_endless_loop_is_expired_and_killed_and_the_next_command_is_answered(serve_isolated):
     server = serve_isolated()
 
-    async def run():
-        async with server.robot(token=server.token("robot-1")) as robot:
-            late = await robot.ask(1, "worker", {"do": "loop"}, deadline_ms=300.0, keep=True)
-            return late, await robot.ask(2, "worker", {"do": "look"}, deadline_ms=30e3, keep=True)
-
-    late, after = asyncio.run(run())
+    async with server.robot(token=server.token("robot-1")) as robot:
+        late = await robot.ask(1, "worker", {"do": "loop"}, deadline_ms=300.0, keep=True)
+        late, after = late, await robot.ask(2, "worker", {"do": "look"}, deadline_ms=30e3, keep=True)
     assert late.code == "expired"
     assert isinstance(after, Result)
     killed = server.wait_for_log("sandbox-overran")
@@ -384,17 +375,16 @@ def test_state_survives_the_crash_of_its_server(serve_isolated, gone):
     assert ask_all(second, "robot-1", [("counter", {})])[0].reply["count"] == 3
 
 
-def test_a_sandbox_whose_state_was_changed_on_another_server_does_not_answer_with_older_state(serve_isolated):
+async def test_a_sandbox_whose_state_was_changed_on_another_server_does_not_answer_with_older_state(
+    serve_isolated,
+):
     first, second = serve_isolated(), serve_isolated()
 
-    async def run():
-        tokens = first.token("robot-1"), second.token("robot-1")
-        async with first.robot(token=tokens[0]) as old, second.robot(token=tokens[1]) as new:
-            assert (await old.ask(1, "counter", {})).reply["count"] == 1
-            assert (await new.ask(1, "counter", {})).reply["count"] == 2
-            return [await old.ask(i, "counter", {}, keep=True) for i in (2, 3)]
-
-    stale, after = asyncio.run(run())
+    tokens = first.token("robot-1"), second.token("robot-1")
+    async with first.robot(token=tokens[0]) as old, second.robot(token=tokens[1]) as new:
+        assert (await old.ask(1, "counter", {})).reply["count"] == 1
+        assert (await new.ask(1, "counter", {})).reply["count"] == 2
+        stale, after = [await old.ask(i, "counter", {}, keep=True) for i in (2, 3)]
     assert (getattr(stale, "code", stale), after.reply["count"]) == ("worker-lost", 3)
 
 

@@ -49,15 +49,16 @@ async def ask_for_ever(robot) -> None:
 
 
 @pytest.mark.parametrize("codec", CODECS)
-def test_a_command_comes_back_with_its_times(start_server, codec):
+async def test_a_command_comes_back_with_its_times(start_server, codec):
     server = start_server()
 
-    async def run():
-        async with server.robot(codec) as robot:
-            await robot.send(Ping(sent_s=4.5))
-            return robot.welcome, await robot.receive(), await robot.ask(7, "echo", {"value": [1, "é"]})
-
-    welcome, pong, result = asyncio.run(run())
+    async with server.robot(codec) as robot:
+        await robot.send(Ping(sent_s=4.5))
+        welcome, pong, result = (
+            robot.welcome,
+            await robot.receive(),
+            await robot.ask(7, "echo", {"value": [1, "é"]}),
+        )
     assert (welcome.server, welcome.robot) == ("server-0", "anonymous-1")
     assert isinstance(pong, Pong)
     assert pong.sent_s == 4.5
@@ -67,7 +68,7 @@ def test_a_command_comes_back_with_its_times(start_server, codec):
     assert result.queue_ms >= 0
 
 
-def test_rejected_handshakes_get_fixed_bodies(start_server):
+async def test_rejected_handshakes_get_fixed_bodies(start_server):
     server = start_server(keys=True, serving={"max_robots": 1})
     good = {"Authorization": f"Bearer {server.token()}", "Sec_WebSocket_Protocol": SUBPROTOCOLS["bin"]}
     refused = [
@@ -88,11 +89,8 @@ def test_rejected_handshakes_get_fixed_bodies(start_server):
     assert no_protocol[0].startswith("HTTP/1.1 400")
     assert json.loads(no_protocol[1])["code"] == "unsupported"
 
-    async def second():
-        async with server.robot(token=server.token()):
-            return await asyncio.to_thread(handshake, server, **good)
-
-    head, body = asyncio.run(second())
+    async with server.robot(token=server.token()):
+        head, body = await asyncio.to_thread(handshake, server, **good)
     assert head.startswith("HTTP/1.1 503")
     assert "Retry-After: 2" in head
     assert json.loads(body)["code"] == "full"
@@ -109,63 +107,51 @@ def test_a_connection_header_with_two_values_is_accepted(start_server):
     assert f"Sec-WebSocket-Protocol: {SUBPROTOCOLS['json']}" in head
 
 
-def test_sockets_are_spread_evenly_over_the_workers(start_server):
+async def test_sockets_are_spread_evenly_over_the_workers(start_server):
     server = start_server(serving={"workers": 2})
 
-    async def run():
-        async with contextlib.AsyncExitStack() as stack:
-            robots = [await stack.enter_async_context(server.robot()) for _ in range(20)]
-            crowded = await asyncio.to_thread(server.status)
-            for robot in robots[::2]:
-                await robot.socket.close()
-            return crowded, await asyncio.to_thread(server.status)
-
-    crowded, halved = asyncio.run(run())
+    async with contextlib.AsyncExitStack() as stack:
+        robots = [await stack.enter_async_context(server.robot()) for _ in range(20)]
+        crowded = await asyncio.to_thread(server.status)
+        for robot in robots[::2]:
+            await robot.socket.close()
+        crowded, halved = crowded, await asyncio.to_thread(server.status)
     assert crowded["robots_of_workers"] == [10, 10]
     assert crowded["robots"] == 20
     assert sum(halved["robots_of_workers"]) >= 10
 
 
-def test_a_socket_ends_with_its_token(start_server):
+async def test_a_socket_ends_with_its_token(start_server):
     server = start_server(keys=True)
     token = server.token("robot-9", ttl_s=2)
 
-    async def run():
-        async with server.robot(token=token) as robot:
-            return robot.welcome.robot, await closed_with(robot), time.time()
-
-    robot, code, ended = asyncio.run(run())
+    async with server.robot(token=token) as robot:
+        robot, code, ended = robot.welcome.robot, await closed_with(robot), time.time()
     assert (robot, code) == ("robot-9", 4401)
     assert ended - time.time() < 1.0
 
 
-def test_a_newer_frame_replaces_the_one_that_waits(start_server):
+async def test_a_newer_frame_replaces_the_one_that_waits(start_server):
     server = start_server()
 
-    async def run():
-        async with server.robot() as robot:
-            for identity in (1, 2, 3):
-                payload = {"rest_s": 0.1} if identity == 1 else {}
-                await robot.send(
-                    Command(id=identity, service="work", payload=payload, stream="cam", seq=identity)
-                )
-            return [await robot.receive() for _ in range(3)]
-
-    answers = {answer.id: answer for answer in asyncio.run(run())}
+    async with server.robot() as robot:
+        for identity in (1, 2, 3):
+            payload = {"rest_s": 0.1} if identity == 1 else {}
+            await robot.send(
+                Command(id=identity, service="work", payload=payload, stream="cam", seq=identity)
+            )
+        answers = {answer.id: answer for answer in [await robot.receive() for _ in range(3)]}
     assert isinstance(answers[1], Result)
     assert isinstance(answers[2], Failure)
     assert answers[2].code == "stale"
     assert isinstance(answers[3], Result)
 
 
-def test_a_defect_is_a_failure_for_the_robot_and_a_traceback_in_the_log(start_server):
+async def test_a_defect_is_a_failure_for_the_robot_and_a_traceback_in_the_log(start_server):
     server = start_server()
 
-    async def run():
-        async with server.robot() as robot:
-            return await robot.ask(1, "work", {"fail": True}, trace="trace-77")
-
-    failure = asyncio.run(run())
+    async with server.robot() as robot:
+        failure = await robot.ask(1, "work", {"fail": True}, trace="trace-77")
     assert (failure.code, failure.trace) == ("internal", "trace-77")
     assert "secret" not in failure.message + failure.hint
     line = server.wait_for_log("defect")
@@ -173,25 +159,19 @@ def test_a_defect_is_a_failure_for_the_robot_and_a_traceback_in_the_log(start_se
     assert "ZeroDivisionError: secret of the service" in line["traceback"]
 
 
-def test_a_reply_above_the_limit_is_a_typed_failure(start_server):
+async def test_a_reply_above_the_limit_is_a_typed_failure(start_server):
     server = start_server(session={"max_message_bytes": 4096})
 
-    async def run():
-        async with server.robot() as robot:
-            return await robot.ask(1, "work", {"fill": 5000})
-
-    assert asyncio.run(run()).code == "too-large"
+    async with server.robot() as robot:
+        assert (await robot.ask(1, "work", {"fill": 5000})).code == "too-large"
 
 
-def test_one_line_is_logged_for_a_command_and_no_secret(start_server):
+async def test_one_line_is_logged_for_a_command_and_no_secret(start_server):
     server = start_server(keys=True, serving={"log_level": "debug"})
     token = server.token()
 
-    async def run():
-        async with server.robot(token=token) as robot:
-            await robot.ask(5, "echo", {"value": "private-payload"}, trace="a\nb\x1b[31m")
-
-    asyncio.run(run())
+    async with server.robot(token=token) as robot:
+        await robot.ask(5, "echo", {"value": "private-payload"}, trace="a\nb\x1b[31m")
     line = server.wait_for_log("command")
     assert (line["robot"], line["service"], line["id"], line["code"]) == ("robot-1", "echo", 5, "ok")
     assert line["trace"] == "a\nb\x1b[31m"
@@ -202,29 +182,23 @@ def test_one_line_is_logged_for_a_command_and_no_secret(start_server):
     assert token not in server.text
 
 
-def test_successful_commands_are_counted_and_logged_at_debug_level_only(start_server):
+async def test_successful_commands_are_counted_and_logged_at_debug_level_only(start_server):
     server = start_server()
 
-    async def run():
-        async with server.robot() as robot:
-            await robot.ask(5, "echo", {"value": 1})
-            await robot.ask(6, "no-such-service")
-
-    asyncio.run(run())
+    async with server.robot() as robot:
+        await robot.ask(5, "echo", {"value": 1})
+        await robot.ask(6, "no-such-service")
     line = server.wait_for_log("command")
     assert (line["id"], line["code"], line["level"]) == (6, "unknown-service", "info")
     assert server.status()["results"]["ok"] == 1
 
 
-def test_the_control_port_serves_health_status_and_metrics(start_server):
+async def test_the_control_port_serves_health_status_and_metrics(start_server):
     server = start_server(serving={"workers": 2})
 
-    async def run():
-        async with server.robot() as first, server.robot() as second:
-            await first.ask(1, "echo")
-            await second.ask(1, "nothing")
-
-    asyncio.run(run())
+    async with server.robot() as first, server.robot() as second:
+        await first.ask(1, "echo")
+        await second.ask(1, "nothing")
     health = json.loads(server.http("/healthz")[2])
     assert (health["server"], health["settings"]) == ("server-0", server.settings.digest())
     assert server.http("/readyz")[0] == 200
@@ -253,29 +227,23 @@ def test_the_control_port_serves_health_status_and_metrics(start_server):
     [([b"x" * 3000], 1009), ([b""] * 70, 1009), ([b"x" * 900] * 4, 1009)],
     ids=["oversize", "empty fragments", "fragments too big together"],
 )
-def test_messages_that_are_too_large_or_have_too_many_fragments_are_cut(start_server, message, code):
+async def test_messages_that_are_too_large_or_have_too_many_fragments_are_cut(start_server, message, code):
     server = start_server(session={"max_message_bytes": 2048})
 
-    async def run():
-        async with server.robot() as robot:
-            with contextlib.suppress(ConnectionClosed):
-                await robot.socket.send(message)
-            return await closed_with(robot)
-
-    assert asyncio.run(run()) == code
+    async with server.robot() as robot:
+        with contextlib.suppress(ConnectionClosed):
+            await robot.socket.send(message)
+        assert (await closed_with(robot)) == code
 
 
-def test_a_flood_of_pings_is_cut(start_server):
+async def test_a_flood_of_pings_is_cut(start_server):
     server = start_server()
 
-    async def run():
-        async with server.robot() as robot:
-            with contextlib.suppress(ConnectionClosed):
-                for _ in range(30):
-                    await robot.socket.ping()
-            return await closed_with(robot)
-
-    assert asyncio.run(run()) == 1008
+    async with server.robot() as robot:
+        with contextlib.suppress(ConnectionClosed):
+            for _ in range(30):
+                await robot.socket.ping()
+        assert (await closed_with(robot)) == 1008
 
 
 def test_a_silent_connection_is_closed(start_server):
@@ -285,17 +253,14 @@ def test_a_silent_connection_is_closed(start_server):
         assert raw.recv(1) == b""
 
 
-def test_a_socket_without_hello_is_closed(start_server):
+async def test_a_socket_without_hello_is_closed(start_server):
     server = start_server(session={"hello_timeout_s": 0.3})
 
-    async def run():
-        async with server.robot(hello=False) as robot:
-            return await closed_with(robot)
-
-    assert asyncio.run(run()) == 4400
+    async with server.robot(hello=False) as robot:
+        assert (await closed_with(robot)) == 4400
 
 
-def test_a_silent_robot_is_closed(start_server):
+async def test_a_silent_robot_is_closed(start_server):
     server = start_server(
         session={
             "ping_interval_s": 0.1,
@@ -305,40 +270,31 @@ def test_a_silent_robot_is_closed(start_server):
         }
     )
 
-    async def run():
-        async with server.robot() as robot:
-            return await closed_with(robot)
-
-    assert asyncio.run(run()) == 1001
+    async with server.robot() as robot:
+        assert (await closed_with(robot)) == 1001
 
 
-def test_a_robot_that_does_not_read_is_cut_off(start_server):
+async def test_a_robot_that_does_not_read_is_cut_off(start_server):
     server = start_server(serving={"slow_reader_timeout_s": 0.3}, session={"max_commands_per_s": 0.0})
 
-    async def run():
-        async with server.robot(max_queue=1, max_size=1 << 20) as robot:
-            robot.socket.transport.pause_reading()
-            with contextlib.suppress(ConnectionClosed):
-                await asyncio.wait_for(ask_for_ever(robot), LONG_S)
-            robot.socket.transport.abort()
-
-    asyncio.run(run())
+    async with server.robot(max_queue=1, max_size=1 << 20) as robot:
+        robot.socket.transport.pause_reading()
+        with contextlib.suppress(ConnectionClosed):
+            await asyncio.wait_for(ask_for_ever(robot), LONG_S)
+        robot.socket.transport.abort()
     text = server.http("/metrics")[2].decode()
     assert 'rse_pf_closed_total{reason="slow-reader"} 1.0' in text
 
 
 @pytest.mark.slow
-def test_an_emulated_server_uses_no_more_cpu_than_its_cores(start_server):
+async def test_an_emulated_server_uses_no_more_cpu_than_its_cores(start_server):
     server = start_server(serving={"emulated_cores": 0.25})
 
-    async def run():
-        async with server.robot() as robot:
-            before, began = server.status()["worker_cpu_s"][0], time.monotonic()
-            identity = 0
-            while time.monotonic() - began < 4.0:
-                identity += 1
-                await robot.ask(identity, "work", {"burn_s": 0.01})
-            used = server.status()["worker_cpu_s"][0] - before
-            return used / (time.monotonic() - began)
-
-    assert asyncio.run(run()) == pytest.approx(0.25, rel=0.15)
+    async with server.robot() as robot:
+        before, began = server.status()["worker_cpu_s"][0], time.monotonic()
+        identity = 0
+        while time.monotonic() - began < 4.0:
+            identity += 1
+            await robot.ask(identity, "work", {"burn_s": 0.01})
+        used = server.status()["worker_cpu_s"][0] - before
+        assert (used / (time.monotonic() - began)) == pytest.approx(0.25, rel=0.15)

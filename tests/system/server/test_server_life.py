@@ -19,24 +19,21 @@ async def in_thread(function, *arguments):
     return await asyncio.to_thread(function, *arguments)
 
 
-def test_a_drain_moves_the_robots_and_loses_nothing(start_server):
+async def test_a_drain_moves_the_robots_and_loses_nothing(start_server):
     server = start_server(serving={"workers": 2})
 
-    async def run():
-        async with server.robot() as first, server.robot() as second:
-            for robot in (first, second):
-                await robot.send(Command(id=1, service="work", payload={"rest_s": 0.5}))
-                await robot.send(Command(id=2, service="work"))
-            status, _, _ = await in_thread(server.http, "/drain?wait=0", "POST")
-            answers = []
-            for robot in (first, second):
-                got = [await robot.receive() for _ in range(3)]
-                assert isinstance(got[0], Move), "the move comes before the slow answer"
-                answers += got
-                await robot.socket.close()
-            return status, answers
-
-    status, answers = asyncio.run(run())
+    async with server.robot() as first, server.robot() as second:
+        for robot in (first, second):
+            await robot.send(Command(id=1, service="work", payload={"rest_s": 0.5}))
+            await robot.send(Command(id=2, service="work"))
+        status, _, _ = await in_thread(server.http, "/drain?wait=0", "POST")
+        answers = []
+        for robot in (first, second):
+            got = [await robot.receive() for _ in range(3)]
+            assert isinstance(got[0], Move), "the move comes before the slow answer"
+            answers += got
+            await robot.socket.close()
+        status, answers = status, answers
     assert status == 202
     assert [a.id for a in answers if isinstance(a, Result)] == [1, 2, 1, 2]
     moves = [a for a in answers if isinstance(a, Move)]
@@ -44,52 +41,43 @@ def test_a_drain_moves_the_robots_and_loses_nothing(start_server):
     assert server.process.wait(PROMPT_S) == 0
 
 
-def test_robots_that_do_not_move_get_their_answers_before_the_socket_closes(start_server):
+async def test_robots_that_do_not_move_get_their_answers_before_the_socket_closes(start_server):
     server = start_server(serving={"drain_within_ms": 100.0})
 
-    async def run():
-        async with server.robot() as robot:
-            await robot.send(Command(id=1, service="work", payload={"rest_s": 0.8}))
-            await in_thread(server.http, "/drain?wait=0", "POST")
-            got = [await robot.receive(), await robot.receive()]
-            await asyncio.wait_for(robot.socket.wait_closed(), PROMPT_S)
-            return got, robot.socket.close_code
-
-    (move, result), code = asyncio.run(run())
+    async with server.robot() as robot:
+        await robot.send(Command(id=1, service="work", payload={"rest_s": 0.8}))
+        await in_thread(server.http, "/drain?wait=0", "POST")
+        got = [await robot.receive(), await robot.receive()]
+        await asyncio.wait_for(robot.socket.wait_closed(), PROMPT_S)
+        (move, result), code = got, robot.socket.close_code
     assert isinstance(move, Move)
     assert isinstance(result, Result)
     assert code == 1001
     assert server.process.wait(PROMPT_S) == 0
 
 
-def test_a_draining_server_is_not_ready_but_still_accepts(start_server):
+async def test_a_draining_server_is_not_ready_but_still_accepts(start_server):
     server = start_server(serving={"drain_wait_s": 600.0})
 
-    async def run():
-        server.process.send_signal(signal.SIGTERM)
-        await in_thread(server.wait_for_log, "drain")
-        ready = await in_thread(server.http, "/readyz")
-        async with server.robot() as robot:
-            return ready, await robot.ask(1, "echo"), await in_thread(server.status)
-
-    (status, headers, _), answer, seen = asyncio.run(run())
+    server.process.send_signal(signal.SIGTERM)
+    await in_thread(server.wait_for_log, "drain")
+    ready = await in_thread(server.http, "/readyz")
+    async with server.robot() as robot:
+        (status, headers, _), answer, seen = ready, await robot.ask(1, "echo"), await in_thread(server.status)
     assert status == 503
     assert headers["x-envoy-immediate-health-check-fail"] == "1"
     assert isinstance(answer, Result)
     assert seen["state"] == "draining"
 
 
-def test_a_robot_that_connects_during_a_drain_is_told_to_move_as_well(start_server):
+async def test_a_robot_that_connects_during_a_drain_is_told_to_move_as_well(start_server):
     server = start_server()
 
-    async def run():
-        async with server.robot() as staying:
-            await in_thread(server.http, "/drain?wait=0", "POST")
-            assert isinstance(await staying.receive(), Move)
-            async with server.robot() as late:
-                return await late.receive()
-
-    assert isinstance(asyncio.run(run()), Move)
+    async with server.robot() as staying:
+        await in_thread(server.http, "/drain?wait=0", "POST")
+        assert isinstance(await staying.receive(), Move)
+        async with server.robot() as late:
+            assert isinstance((await late.receive()), Move)
     assert server.process.wait(PROMPT_S) == 0
 
 
@@ -116,44 +104,35 @@ def test_a_lost_worker_ends_the_whole_server(start_server, gone):
     gone(server.workers[1])
 
 
-def test_workers_do_not_outlive_their_supervisor(start_server, gone):
+async def test_workers_do_not_outlive_their_supervisor(start_server, gone):
     server = start_server(serving={"workers": 2})
 
-    async def run():
-        async with server.robot() as robot:
-            await robot.send(Command(id=1, service="work", payload={"burn_s": 60.0}))
-            os.kill(server.process.pid, signal.SIGKILL)
-            await asyncio.wait_for(robot.socket.wait_closed(), PROMPT_S)
-
-    asyncio.run(run())
+    async with server.robot() as robot:
+        await robot.send(Command(id=1, service="work", payload={"burn_s": 60.0}))
+        os.kill(server.process.pid, signal.SIGKILL)
+        await asyncio.wait_for(robot.socket.wait_closed(), PROMPT_S)
     for pid in server.workers:
         gone(pid)
 
 
-def test_signals_to_the_whole_group_leave_the_workers_to_the_supervisor(start_server):
+async def test_signals_to_the_whole_group_leave_the_workers_to_the_supervisor(start_server):
     server = start_server(serving={"drain_wait_s": 0.0})
 
-    async def run():
-        async with server.robot() as robot:
-            await robot.send(Command(id=1, service="work", payload={"rest_s": 0.3}))
-            for pid in (*server.workers, server.process.pid):
-                os.kill(pid, signal.SIGTERM)
-            got = [await robot.receive(), await robot.receive()]
-            return sorted(type(each).__name__ for each in got)
-
-    assert asyncio.run(run()) == ["Move", "Result"]
+    async with server.robot() as robot:
+        await robot.send(Command(id=1, service="work", payload={"rest_s": 0.3}))
+        for pid in (*server.workers, server.process.pid):
+            os.kill(pid, signal.SIGTERM)
+        got = [await robot.receive(), await robot.receive()]
+        assert sorted(type(each).__name__ for each in got) == ["Move", "Result"]
     assert server.process.wait(PROMPT_S) == 0
 
 
-def test_a_waiting_command_of_a_robot_that_left_is_dropped(start_server):
+async def test_a_waiting_command_of_a_robot_that_left_is_dropped(start_server):
     server = start_server()
 
-    async def run():
-        async with server.robot() as leaver:
-            await leaver.send(Command(id=1, service="work", payload={"rest_s": 0.3}))
-            await leaver.send(Command(id=2, service="work", payload={"fail": True}))
-        async with server.robot() as robot:
-            return await robot.ask(1, "work")
-
-    assert not isinstance(asyncio.run(run()), Failure)
+    async with server.robot() as leaver:
+        await leaver.send(Command(id=1, service="work", payload={"rest_s": 0.3}))
+        await leaver.send(Command(id=2, service="work", payload={"fail": True}))
+    async with server.robot() as robot:
+        assert not isinstance((await robot.ask(1, "work")), Failure)
     assert not [line for line in server.lines if line["event"] == "defect"]

@@ -63,7 +63,7 @@ def move(server, query: str) -> tuple[int, dict]:
     return status, json.loads(body)
 
 
-def test_robots_move_under_load_and_every_command_is_answered_once(start_server):
+async def test_robots_move_under_load_and_every_command_is_answered_once(start_server):
     old, new = start_server(), start_server()
     target = [old]
 
@@ -71,29 +71,26 @@ def test_robots_move_under_load_and_every_command_is_answered_once(start_server)
         while [(await asyncio.to_thread(each.status))["robots"] for each in (old, new)] != [2, 4]:
             pass
 
-    async def run():
-        async with HandshakePolicy(lambda: target[0]) as url, contextlib.AsyncExitStack() as stack:
-            robots = [await stack.enter_async_context(connect(url)) for _ in range(6)]
-            answers, enough = [], asyncio.Event()
+    async with HandshakePolicy(lambda: target[0]) as url, contextlib.AsyncExitStack() as stack:
+        robots = [await stack.enter_async_context(connect(url)) for _ in range(6)]
+        answers, enough = [], asyncio.Event()
 
-            async def load(robot):
-                for number in itertools.count():
-                    reply = await robot.call("echo", {"value": number}, deadline_s=5.0)
-                    answers.append(reply.reply["value"] == number)
-                    if enough.is_set():
-                        return
+        async def load(robot):
+            for number in itertools.count():
+                reply = await robot.call("echo", {"value": number}, deadline_s=5.0)
+                answers.append(reply.reply["value"] == number)
+                if enough.is_set():
+                    return
 
-            loads = [asyncio.create_task(load(robot)) for robot in robots]
-            target[0] = new
-            told = await asyncio.to_thread(move, old, "robots=4&spread_s=0.3")
-            again = await asyncio.to_thread(move, old, "robots=4")
-            await asyncio.wait_for(spread(), DEADLINE_S)
-            enough.set()
-            await asyncio.gather(*loads)
-            stats = [robot.stats for robot in robots]
-            return told, again, answers, stats, old.status(), new.status()
-
-    told, again, answers, stats, left, taken = asyncio.run(run())
+        loads = [asyncio.create_task(load(robot)) for robot in robots]
+        target[0] = new
+        told = await asyncio.to_thread(move, old, "robots=4&spread_s=0.3")
+        again = await asyncio.to_thread(move, old, "robots=4")
+        await asyncio.wait_for(spread(), DEADLINE_S)
+        enough.set()
+        await asyncio.gather(*loads)
+        stats = [robot.stats for robot in robots]
+        told, again, answers, stats, left, taken = told, again, answers, stats, old.status(), new.status()
 
     assert told[0] == 202
     assert told[1]["robots"] == 4
@@ -105,15 +102,12 @@ def test_robots_move_under_load_and_every_command_is_answered_once(start_server)
     assert (left["robots"], left["moved"], taken["robots"]) == (2, 4, 4)
 
 
-def test_the_request_to_move_gives_the_reason_and_the_time(start_server):
+async def test_the_request_to_move_gives_the_reason_and_the_time(start_server):
     server = start_server()
 
-    async def run():
-        async with server.robot() as robot:
-            await asyncio.to_thread(move, server, "robots=1")
-            return await robot.receive()
-
-    asked = asyncio.run(run())
+    async with server.robot() as robot:
+        await asyncio.to_thread(move, server, "robots=1")
+        asked = await robot.receive()
 
     assert isinstance(asked, Move)
     assert asked.reason == "rebalance"
@@ -130,15 +124,12 @@ def test_a_bad_migration_request_is_refused(start_server, query):
     assert server.status()["moved"] == 0
 
 
-def test_the_status_shows_bytes_and_the_longest_wait(start_server):
+async def test_the_status_shows_bytes_and_the_longest_wait(start_server):
     server = start_server()
 
-    async def run():
-        async with server.robot() as robot:
-            for number in range(3):
-                await robot.ask(number, "work", {"rest_s": 0.0, "fill": 1000})
-
-    asyncio.run(run())
+    async with server.robot() as robot:
+        for number in range(3):
+            await robot.ask(number, "work", {"rest_s": 0.0, "fill": 1000})
     status = server.status()
 
     assert status["bytes_out"] > 3000

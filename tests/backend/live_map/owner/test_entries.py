@@ -52,27 +52,21 @@ def writer(taker: Taker) -> EntryWriter:
     )
 
 
-def test_an_entry_holds_no_more_than_four_mebibytes() -> None:
-    async def test() -> list[int]:
-        entries = writer(taker := Taker())
-        for number in range(5):
-            entries.submit(keyframe(number), 2 << 20)
-        running = asyncio.ensure_future(entries.run())
-        await entries.wait_empty()
-        running.cancel()
-        return taker.sizes
-
-    assert asyncio.run(test()) == [2, 2, 1]
+async def test_an_entry_holds_no_more_than_four_mebibytes() -> None:
+    entries = writer(taker := Taker())
+    for number in range(5):
+        entries.submit(keyframe(number), 2 << 20)
+    running = asyncio.ensure_future(entries.run())
+    await entries.wait_empty()
+    running.cancel()
+    assert taker.sizes == [2, 2, 1]
 
 
-def test_a_keyframe_too_many_is_refused_and_who_leaves_is_not() -> None:
-    async def test() -> None:
-        entries = writer(Taker())
-        for number in range(1024):
-            entries.submit(keyframe(number))
+async def test_a_keyframe_too_many_is_refused_and_who_leaves_is_not() -> None:
+    entries = writer(Taker())
+    for number in range(1024):
+        entries.submit(keyframe(number))
 
-        with pytest.raises(Busy):
-            entries.submit(keyframe(1024))
-        entries.submit(RobotLeft(robot="r"))
-
-    asyncio.run(test())
+    with pytest.raises(Busy):
+        entries.submit(keyframe(1024))
+    entries.submit(RobotLeft(robot="r"))

@@ -174,66 +174,60 @@ def test_a_culled_keyframe_loses_its_objects_a_little_later() -> None:
     assert len(list(store.list(f"objects/{ONE.folder}/"))) == 64
 
 
-def test_a_forgotten_robots_points_are_in_no_later_version_and_not_in_the_store() -> None:
+async def test_a_forgotten_robots_points_are_in_no_later_version_and_not_in_the_store() -> None:
     store = MemoryStore()
     bench = Bench(store, kind=LIVE_MAP, publish_pause_s=0.0)
     mine, late = stored(store, ONE, some_points(2.0)), some_points(2.5)
     theirs = stored(store, OTHER, some_points(3.0))
     arriving = ObjectReference(hashlib.sha256(late).hexdigest(), len(late))
 
-    async def test() -> None:
-        owner, maps = await bench.own("a"), MapRegistry(store, "default")
-        await owner.owner.answer(ONE, "live-keyframe", keyframe_request(0, mine))
-        await owner.owner.answer(ONE, "live-keyframe", keyframe_request(1, arriving))
-        await owner.owner.answer(OTHER, "live-keyframe", keyframe_request(0, theirs))
-        await settle()
-        await owner.ask("live-publish")
-        first = maps.load(MAP, "head")
-        assert np.allclose(first.points[:, 2], 2.0)
-        assert (first.colours == 77).all()
+    owner, maps = await bench.own("a"), MapRegistry(store, "default")
+    await owner.owner.answer(ONE, "live-keyframe", keyframe_request(0, mine))
+    await owner.owner.answer(ONE, "live-keyframe", keyframe_request(1, arriving))
+    await owner.owner.answer(OTHER, "live-keyframe", keyframe_request(0, theirs))
+    await settle()
+    await owner.ask("live-publish")
+    first = maps.load(MAP, "head")
+    assert np.allclose(first.points[:, 2], 2.0)
+    assert (first.colours == 77).all()
 
-        await owner.ask("live-forget", {"robot": "one"})
+    await owner.ask("live-forget", {"robot": "one"})
 
-        with pytest.raises(NotFound):
-            store.head(object_name(ONE, mine.digest))
-        stored(store, ONE, late)  # it was on its way
-        await owner.ask("live-publish")
-        assert np.allclose(maps.load(MAP, "head").points[:, 2], 3.0)
-        assert not list(store.list(f"objects/{ONE.folder}/"))
-        assert store.get(object_name(OTHER, theirs.digest))
-
-    bench.run(test)
+    with pytest.raises(NotFound):
+        store.head(object_name(ONE, mine.digest))
+    stored(store, ONE, late)  # it was on its way
+    await owner.ask("live-publish")
+    assert np.allclose(maps.load(MAP, "head").points[:, 2], 3.0)
+    assert not list(store.list(f"objects/{ONE.folder}/"))
+    assert store.get(object_name(OTHER, theirs.digest))
 
 
 @pytest.mark.parametrize("is_allowed", [True, False])
-def test_a_version_names_images_where_the_operator_allows_them_and_forget_deletes_them(
+async def test_a_version_names_images_where_the_operator_allows_them_and_forget_deletes_them(
     is_allowed: bool,
 ) -> None:
     store = MemoryStore()
     bench = Bench(store, kind=LIVE_MAP, publish_pause_s=0.0, images=is_allowed)
     mine, theirs = stored(store, ONE, b"my image"), stored(store, OTHER, b"their image")
 
-    async def test() -> None:
-        owner, maps = await bench.own("a"), MapRegistry(store, "default")
-        await owner.owner.answer(ONE, "live-keyframe", keyframe_request(0, None, mine))
-        await owner.owner.answer(OTHER, "live-keyframe", keyframe_request(0, None, theirs))
-        await settle()
-        await owner.ask("live-publish")
-        assert (await owner.ask("live-show"))["images"] is is_allowed
-        named = {"images": {ONE.folder: {"0": mine.digest}}} if is_allowed else {}
-        assert maps.load(MAP, "head").provenance == {"made_by": "live", "from": "", **named}
+    owner, maps = await bench.own("a"), MapRegistry(store, "default")
+    await owner.owner.answer(ONE, "live-keyframe", keyframe_request(0, None, mine))
+    await owner.owner.answer(OTHER, "live-keyframe", keyframe_request(0, None, theirs))
+    await settle()
+    await owner.ask("live-publish")
+    assert (await owner.ask("live-show"))["images"] is is_allowed
+    named = {"images": {ONE.folder: {"0": mine.digest}}} if is_allowed else {}
+    assert maps.load(MAP, "head").provenance == {"made_by": "live", "from": "", **named}
 
-        await owner.ask("live-forget", {"robot": "one"})
+    await owner.ask("live-forget", {"robot": "one"})
 
-        assert not list(store.list(f"objects/{ONE.folder}/"))
-        await owner.ask("live-publish")
-        assert ONE.folder not in maps.load(MAP, "head").provenance.get("images", {})
-
-    bench.run(test)
+    assert not list(store.list(f"objects/{ONE.folder}/"))
+    await owner.ask("live-publish")
+    assert ONE.folder not in maps.load(MAP, "head").provenance.get("images", {})
 
 
 @pytest.mark.parametrize("up", [[0.0, 0.6, 0.8], None, "up"])
-def test_a_map_keeps_up_of_the_version_that_it_started_from(up: object) -> None:
+async def test_a_map_keeps_up_of_the_version_that_it_started_from(up: object) -> None:
     store = MemoryStore()
     maps, source = MapRegistry(store, "default"), Bench(MemoryStore(), kind=LIVE_MAP, publish_pause_s=0.0)
 
@@ -245,36 +239,33 @@ def test_a_map_keeps_up_of_the_version_that_it_started_from(up: object) -> None:
         await settle()
         await owner.ask("live-publish")
 
-    source.run(lambda: drive(source, False))
+    await drive(source, False)
     first = MapRegistry(source.store, "default").load(MAP, "head")
     assert first.up is None
     origin = encode_map(dataclasses.replace(first, provenance={UP_FIELD: up}))
     maps.commit("origin", origin, parent=None, author="t", created_s=0.0)
     bench = Bench(store, kind=LIVE_MAP, publish_pause_s=0.0)
 
-    bench.run(lambda: drive(bench, True))
+    await drive(bench, True)
 
     found = maps.load(MAP, "head").up
     assert found is None if not isinstance(up, list) else np.allclose(found, up)
 
 
-def test_the_next_owner_deletes_what_the_last_one_could_not() -> None:
+async def test_the_next_owner_deletes_what_the_last_one_could_not() -> None:
     store = MemoryStore()
     bench = Bench(store, kind=LIVE_MAP, lease_s=1.5)
     mine = stored(store, ONE, some_points(2.0))
 
-    async def test() -> None:
-        owner = await bench.own("a")
-        await owner.owner.answer(ONE, "live-keyframe", keyframe_request(0, mine))
-        await owner.ask("live-forget", {"robot": "one"})
-        stored(store, ONE, some_points(2.0))  # as if the owner had ended before it deleted anything
-        await owner.owner.release()
-        await bench.own("b")
-        await settle()
+    owner = await bench.own("a")
+    await owner.owner.answer(ONE, "live-keyframe", keyframe_request(0, mine))
+    await owner.ask("live-forget", {"robot": "one"})
+    stored(store, ONE, some_points(2.0))  # as if the owner had ended before it deleted anything
+    await owner.owner.release()
+    await bench.own("b")
+    await settle()
 
-        assert not list(store.list(f"objects/{ONE.folder}/"))
-
-    bench.run(test)
+    assert not list(store.list(f"objects/{ONE.folder}/"))
 
 
 def test_a_snapshot_knows_whose_objects_are_to_be_deleted() -> None:
@@ -296,21 +287,18 @@ def test_a_snapshot_knows_whose_objects_are_to_be_deleted() -> None:
     assert restored.digest() == live_map.digest()
 
 
-def test_live_show_has_whole_paths_in_the_map_where_they_are_asked_for() -> None:
+async def test_live_show_has_whole_paths_in_the_map_where_they_are_asked_for() -> None:
     bench = Bench(kind=LIVE_MAP)
 
-    async def test() -> None:
-        owner = await bench.own("a")
-        for number in range(5):
-            await owner.owner.answer(ONE, "live-keyframe", keyframe_request(number, None))
-        await settle()
-        shown = await owner.ask("live-show", {"paths": True})
-        assert "paths" not in await owner.ask("live-show")
-        assert [(each["robot"], each["segment"]) for each in shown["paths"]] == [("one", 0)]
-        assert np.allclose(shown["paths"][0]["points"], [[0.2 * n, 0, 0] for n in range(5)], atol=1e-3)
-        first_and_last = owner.state.live_map.paths(2)[0][2][:, 0]
-        assert first_and_last[0] == 0.0
-        assert abs(first_and_last[-1] - 0.8) < 1e-9
-        assert len(first_and_last) == 3
-
-    bench.run(test)
+    owner = await bench.own("a")
+    for number in range(5):
+        await owner.owner.answer(ONE, "live-keyframe", keyframe_request(number, None))
+    await settle()
+    shown = await owner.ask("live-show", {"paths": True})
+    assert "paths" not in await owner.ask("live-show")
+    assert [(each["robot"], each["segment"]) for each in shown["paths"]] == [("one", 0)]
+    assert np.allclose(shown["paths"][0]["points"], [[0.2 * n, 0, 0] for n in range(5)], atol=1e-3)
+    first_and_last = owner.state.live_map.paths(2)[0][2][:, 0]
+    assert first_and_last[0] == 0.0
+    assert abs(first_and_last[-1] - 0.8) < 1e-9
+    assert len(first_and_last) == 3

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import asyncio
-import time
 from collections.abc import Callable
 from typing import TypeVar
 
 import numpy as np
 import pytest
+from fakes import FakeLog
 
 from rse_pf.backend.live_map.owner.state import MapState, Measuring, candidates_of
 from rse_pf.backend.live_map.owner.threads import Urgency
 from rse_pf.backend.live_map.owner.whole_fit import fit_apart, fit_here
-from rse_pf.backend.log import JsonLog
 from rse_pf.geometry import Array, exp_se3, inverse
 from rse_pf.live_map.events import Event, LinksMeasured
 from rse_pf.slam.optimise import OptimiseOptions
@@ -68,31 +67,28 @@ def test_the_more_keyframes_wait_the_fewer_others_each_is_compared_with() -> Non
     assert min(rest) >= 4
 
 
-def test_waiting_keyframes_are_measured_two_at_a_time_and_one_alone_by_both_threads() -> None:
-    async def act() -> None:
-        live_map, threads, taken = NotingMap(), HeldThreads(), list[Event]()
-        measuring = Measuring(
-            MapState(live_map, 0), threads, taken.append, fit=fit_here, name="warehouse",
-            json_log=JsonLog(level="error", server="server-1", wall_clock=time.time),
-        )  # fmt: skip
-        working = asyncio.ensure_future(measuring.run())
-        measuring.measure(range(20))
+async def test_waiting_keyframes_are_measured_two_at_a_time_and_one_alone_by_both_threads() -> None:
+    live_map, threads, taken = NotingMap(), HeldThreads(), list[Event]()
+    measuring = Measuring(
+        MapState(live_map, 0), threads, taken.append, fit=fit_here, name="warehouse",
+        json_log=FakeLog(),
+    )  # fmt: skip
+    working = asyncio.ensure_future(measuring.run())
+    measuring.measure(range(20))
+    await settle()
+    assert [each[:2] for each in live_map.asked] == [(0, 1), (1, 1)]
+    assert all(candidates is not None for _, _, candidates in live_map.asked)
+    while len(taken) < 20:
+        for held in threads.looking:
+            held.set()
         await settle()
-        assert [each[:2] for each in live_map.asked] == [(0, 1), (1, 1)]
-        assert all(candidates is not None for _, _, candidates in live_map.asked)
-        while len(taken) < 20:
-            for held in threads.looking:
-                held.set()
-            await settle()
-        assert sorted(each.keyframe for each in taken) == list(range(20))  # type: ignore[union-attr]
-        live_map.asked.clear()
-        measuring.measure([20])
-        await settle()
-        assert live_map.asked == [(20, 2, None)]
-        working.cancel()
-        await asyncio.wait({working})
-
-    asyncio.run(act())
+    assert sorted(each.keyframe for each in taken) == list(range(20))  # type: ignore[union-attr]
+    live_map.asked.clear()
+    measuring.measure([20])
+    await settle()
+    assert live_map.asked == [(20, 2, None)]
+    working.cancel()
+    await asyncio.wait({working})
 
 
 @pytest.mark.slow  # starts a process

@@ -102,86 +102,80 @@ async def servers(folder: Path, **live: Any) -> AsyncIterator[Servers]:
 
 
 @pytest.mark.parametrize("fault", [signal.SIGKILL, signal.SIGSTOP])
-def test_a_server_that_dies_or_stands_still_loses_no_acknowledged_keyframe(
+async def test_a_server_that_dies_or_stands_still_loses_no_acknowledged_keyframe(
     tmp_path: Path, fault: signal.Signals
 ) -> None:
-    async def test() -> None:
-        async with servers(tmp_path) as both:
-            await both.send(both.a, 0)
-            number, took = 1, []
-            for _ in range(2):
-                for _ in range(12):
-                    await both.send(both.b, number)
-                    number += 1
-                owner = await both.owner()
-                sent = asyncio.ensure_future(both.send(both.b, number))
-                await asyncio.sleep(0)
-                began = time.monotonic()
-                os.kill(owner.pid, fault)
-                assert (await sent)["number"] == number + 1
-                number += 1
+    async with servers(tmp_path) as both:
+        await both.send(both.a, 0)
+        number, took = 1, []
+        for _ in range(2):
+            for _ in range(12):
                 await both.send(both.b, number)
                 number += 1
-                took.append(time.monotonic() - began)
-                if fault == signal.SIGSTOP:
-                    os.kill(owner.pid, signal.SIGCONT)
-                    assert await asyncio.wait_for(asyncio.shield(owner.ended), PATIENT_S) == 0
-            shown = await both.show(both.b)
-            assert shown["epoch"] >= 3  # more where the machine is so busy that a lease ends
-            state, numbers = both.replayed()
-            assert numbers == list(range(number))
-            assert state.keyframes == shown["keyframes"] == number
-            assert max(took) < 10.0  # 3 s on a machine that does nothing else; see docs/live_maps.md
-
-    asyncio.run(test())
+            owner = await both.owner()
+            sent = asyncio.ensure_future(both.send(both.b, number))
+            await asyncio.sleep(0)
+            began = time.monotonic()
+            os.kill(owner.pid, fault)
+            assert (await sent)["number"] == number + 1
+            number += 1
+            await both.send(both.b, number)
+            number += 1
+            took.append(time.monotonic() - began)
+            if fault == signal.SIGSTOP:
+                os.kill(owner.pid, signal.SIGCONT)
+                assert await asyncio.wait_for(asyncio.shield(owner.ended), PATIENT_S) == 0
+        shown = await both.show(both.b)
+        assert shown["epoch"] >= 3  # more where the machine is so busy that a lease ends
+        state, numbers = both.replayed()
+        assert numbers == list(range(number))
+        assert state.keyframes == shown["keyframes"] == number
+        assert max(took) < 10.0  # 3 s on a machine that does nothing else; see docs/live_maps.md
 
 
 @pytest.mark.parametrize("attackers_drive", [False, True])
-def test_a_tenant_that_holds_most_owners_gives_one_up_within_seconds(
+async def test_a_tenant_that_holds_most_owners_gives_one_up_within_seconds(
     tmp_path: Path, attackers_drive: bool
 ) -> None:
     hostile, victim = RobotId("acme", "robot-1"), RobotId("rival", "robot-1")
 
-    async def test() -> None:
-        async with servers(tmp_path, max_owners=4, idle_s=6.0) as both:
+    async with servers(tmp_path, max_owners=4, idle_s=6.0) as both:
 
-            async def drive(robot: RobotId, name: str, number: int) -> dict[str, Any]:
-                return await both.a.request(
-                    robot.tenant, name, robot, "live-keyframe", keyframe_request(number), PATIENT_S
-                )
+        async def drive(robot: RobotId, name: str, number: int) -> dict[str, Any]:
+            return await both.a.request(
+                robot.tenant, name, robot, "live-keyframe", keyframe_request(number), PATIENT_S
+            )
 
-            async def drive_on(name: str) -> None:
-                number = 1
-                while True:
-                    with contextlib.suppress(RsePfError):
-                        await both.a.request(
-                            "acme", name, hostile, "live-keyframe", keyframe_request(number), 1.0
-                        )
-                        number += 1
+        async def drive_on(name: str) -> None:
+            number = 1
+            while True:
+                with contextlib.suppress(RsePfError):
+                    await both.a.request(
+                        "acme", name, hostile, "live-keyframe", keyframe_request(number), 1.0
+                    )
+                    number += 1
 
-            for name in ("m1", "m2", "m3"):
-                both.a.watch("acme", name)
-                await drive(hostile, name, 0)
-            driving = [
-                asyncio.ensure_future(drive_on(name)) for name in ("m1", "m2", "m3")[: 3 * attackers_drive]
-            ]
-            await drive(victim, "v1", 0)
-            number, end_s = 1, time.monotonic() + PATIENT_S
-            while not attackers_drive and any(  # they are only watched in the end
-                child.unused_s is None for child in both.a.children if child.tenant == "acme"
-            ):
-                assert time.monotonic() < end_s
-                await drive(victim, "v1", number)
-                number += 1
-            began_s = time.monotonic()
-            assert (await drive(victim, "v2", 0))["number"] == 1
-            assert time.monotonic() - began_s < 10.0
-            assert (await drive(victim, "v1", number))["number"] == number + 1
-            assert sorted(child.tenant for child in both.a.children).count("rival") == 2
-            for each in driving:
-                each.cancel()
-
-    asyncio.run(test())
+        for name in ("m1", "m2", "m3"):
+            both.a.watch("acme", name)
+            await drive(hostile, name, 0)
+        driving = [
+            asyncio.ensure_future(drive_on(name)) for name in ("m1", "m2", "m3")[: 3 * attackers_drive]
+        ]
+        await drive(victim, "v1", 0)
+        number, end_s = 1, time.monotonic() + PATIENT_S
+        while not attackers_drive and any(  # they are only watched in the end
+            child.unused_s is None for child in both.a.children if child.tenant == "acme"
+        ):
+            assert time.monotonic() < end_s
+            await drive(victim, "v1", number)
+            number += 1
+        began_s = time.monotonic()
+        assert (await drive(victim, "v2", 0))["number"] == 1
+        assert time.monotonic() - began_s < 10.0
+        assert (await drive(victim, "v1", number))["number"] == number + 1
+        assert sorted(child.tenant for child in both.a.children).count("rival") == 2
+        for each in driving:
+            each.cancel()
 
 
 @contextmanager
@@ -240,76 +234,60 @@ def listens(pid: int) -> bool:
     return any(row[3] == "0A" and f"socket:[{row[9]}]" in own for row in rows)
 
 
-def test_a_process_listens_only_once_it_has_a_map(tmp_path: Path) -> None:
+async def test_a_process_listens_only_once_it_has_a_map(tmp_path: Path) -> None:
     """Strangers would fill the backlog of one that does not accept, and nobody would close them."""
 
-    async def test() -> None:
-        settings = PlatformSettings.from_dict({"data": {"store": f"dir:{tmp_path}"}})
-        child = OwnerChild(start_owner(settings, KIND))
-        try:
-            await child.wait_ready(PATIENT_S)
-            assert child.is_ready
-            assert not listens(child.pid)
-            order = OwnerOrder(tenant="default", map_name=MAP, server="a", known=None)
-            assert await asyncio.wait_for(child.claim(order), PATIENT_S)
-            assert listens(child.pid)
-        finally:
-            child.kill()
-
-    asyncio.run(test())
+    settings = PlatformSettings.from_dict({"data": {"store": f"dir:{tmp_path}"}})
+    child = OwnerChild(start_owner(settings, KIND))
+    try:
+        await child.wait_ready(PATIENT_S)
+        assert child.is_ready
+        assert not listens(child.pid)
+        order = OwnerOrder(tenant="default", map_name=MAP, server="a", known=None)
+        assert await asyncio.wait_for(child.claim(order), PATIENT_S)
+        assert listens(child.pid)
+    finally:
+        child.kill()
 
 
-def test_a_drained_server_gives_its_maps_to_the_next_one_at_once(tmp_path: Path) -> None:
-    async def test() -> None:
-        async with servers(tmp_path) as both:
-            both.b.watch("default", MAP)
-            for number in range(5):
-                await both.send(both.a, number)
-            before = await both.show(both.a)
-            both.a.give_up()
-            assert (await both.send(both.b, 5))["number"] == 6
-            after = await both.show(both.b)
-            assert (before["server"], after["server"]) == ("a", "b")
-            assert after["epoch"] == 2
-            assert after["keyframes"] == 6
-            assert [each["state"] for each in both.updates if each["kind"] == "map"][-1] == "live"
-
-    asyncio.run(test())
+async def test_a_drained_server_gives_its_maps_to_the_next_one_at_once(tmp_path: Path) -> None:
+    async with servers(tmp_path) as both:
+        both.b.watch("default", MAP)
+        for number in range(5):
+            await both.send(both.a, number)
+        before = await both.show(both.a)
+        both.a.give_up()
+        assert (await both.send(both.b, 5))["number"] == 6
+        after = await both.show(both.b)
+        assert (before["server"], after["server"]) == ("a", "b")
+        assert after["epoch"] == 2
+        assert after["keyframes"] == 6
+        assert [each["state"] for each in both.updates if each["kind"] == "map"][-1] == "live"
 
 
-def test_two_servers_that_begin_a_map_at_the_same_time_share_one_owner(tmp_path: Path) -> None:
-    async def test() -> None:
-        async with servers(tmp_path) as both:
-            other = RobotId("default", "robot-2")
-            await asyncio.gather(
-                both.send(both.a, 0),
-                both.b.request("default", MAP, other, "live-keyframe", keyframe_request(0), PATIENT_S),
-            )
-            one, two = await both.show(both.a), await both.show(both.b)
-            assert one["owner"] == two["owner"]
-            assert one["keyframes"] == 2
-            with pytest.raises(Conflict):
-                await both.send(both.b, 9)
-
-    asyncio.run(test())
+async def test_two_servers_that_begin_a_map_at_the_same_time_share_one_owner(tmp_path: Path) -> None:
+    async with servers(tmp_path) as both:
+        other = RobotId("default", "robot-2")
+        await asyncio.gather(
+            both.send(both.a, 0),
+            both.b.request("default", MAP, other, "live-keyframe", keyframe_request(0), PATIENT_S),
+        )
+        one, two = await both.show(both.a), await both.show(both.b)
+        assert one["owner"] == two["owner"]
+        assert one["keyframes"] == 2
+        with pytest.raises(Conflict):
+            await both.send(both.b, 9)
 
 
-def test_a_stopped_map_refuses_later_keyframes_and_another_tenant_sees_nothing(tmp_path: Path) -> None:
-    async def test() -> None:
-        async with servers(tmp_path) as both:
-            await both.send(both.a, 0)
-            stranger = RobotId("other", "robot-1")
-            with pytest.raises(NotFound):
-                await both.b.request(
-                    "other", MAP, stranger, "live-publish", LiveMapRequest(map=MAP), PATIENT_S
-                )
-            assert await both.b.list_maps("other") == []
-            stopped = await both.b.request(
-                "default", MAP, ROBOT, "live-stop", LiveMapRequest(map=MAP), PATIENT_S
-            )
-            assert stopped["keyframes"] == 1
-            with pytest.raises(Conflict, match="was stopped"):
-                await both.send(both.b, 1)
-            assert (await both.send(both.b, 0))["number"] == 1
-
-    asyncio.run(test())
+async def test_a_stopped_map_refuses_later_keyframes_and_another_tenant_sees_nothing(tmp_path: Path) -> None:
+    async with servers(tmp_path) as both:
+        await both.send(both.a, 0)
+        stranger = RobotId("other", "robot-1")
+        with pytest.raises(NotFound):
+            await both.b.request("other", MAP, stranger, "live-publish", LiveMapRequest(map=MAP), PATIENT_S)
+        assert await both.b.list_maps("other") == []
+        stopped = await both.b.request("default", MAP, ROBOT, "live-stop", LiveMapRequest(map=MAP), PATIENT_S)
+        assert stopped["keyframes"] == 1
+        with pytest.raises(Conflict, match="was stopped"):
+            await both.send(both.b, 1)
+        assert (await both.send(both.b, 0))["number"] == 1

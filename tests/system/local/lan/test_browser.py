@@ -111,24 +111,21 @@ def browser(tmp_path: Path, other_machine: OtherMachine) -> Iterator[Browser]:
     return Browser(home, other_machine)
 
 
-def test_a_page_over_https_connects_with_a_token_and_only_if_the_authority_is_trusted(
+async def test_a_page_over_https_connects_with_a_token_and_only_if_the_authority_is_trusted(
     browser: Browser, other_machine: OtherMachine, tmp_path: Path
 ) -> None:
     folder = tmp_path / "platform"
 
-    async def run() -> tuple[str, str, str]:
-        async with LocalPlatform(
-            PlatformSettings(), state=folder, servers=1, port=0, data=False, lan=other_machine.here
-        ) as platform:
-            page = platform.url.replace("wss:", "https:").removesuffix("ws") + "healthz"
-            token = platform.issue_token("browser-1")
-            untrusted = await asyncio.to_thread(browser.visit, page, token)
-            browser.trust(authority_file(folder))
-            connected = await asyncio.to_thread(browser.visit, page, token)
-            refused = await asyncio.to_thread(browser.visit, page, f"{token[:-4]}AAAA")
-            return untrusted, connected, refused
-
-    untrusted, connected, refused = asyncio.run(run())
+    async with LocalPlatform(
+        PlatformSettings(), state=folder, servers=1, port=0, data=False, lan=other_machine.here
+    ) as platform:
+        page = platform.url.replace("wss:", "https:").removesuffix("ws") + "healthz"
+        token = platform.issue_token("browser-1")
+        untrusted = await asyncio.to_thread(browser.visit, page, token)
+        browser.trust(authority_file(folder))
+        connected = await asyncio.to_thread(browser.visit, page, token)
+        refused = await asyncio.to_thread(browser.visit, page, f"{token[:-4]}AAAA")
+        untrusted, connected, refused = untrusted, connected, refused
 
     assert connected == "welcome by server-1 as browser-1"
     assert refused == "refused"
