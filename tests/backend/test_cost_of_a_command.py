@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Callable
-from types import FrameType
 from typing import Any
 
 import msgspec
@@ -17,18 +14,11 @@ from rse_pf.backend.scheduling.scheduler import INLINE_BYTES
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import TooFewCorrespondences
 from rse_pf.identity import RobotId
-from rse_pf.native import find_library
 from rse_pf.object_store import MemoryStore
-from rse_pf.pnp.problems import make_problem
 from rse_pf.service import Registry
-from rse_pf.services import pnp
 from rse_pf.wire import Command
 
 SETTINGS = PlatformSettings.from_dict({"session": {"max_message_bytes": 65536}})
-MAX_CALLS = {"bin": 36, "zlib": 37, "json": 40}
-"""Python calls of the platform from a frame to its answer: a tenth more than there are, a half of 0.1.0."""
-MAX_POSE_CALLS = {"bin": 39, "zlib": 40, "json": 43}
-"""The same of a `pnp` command, whose decoding, pose and reply are one call of the native core each."""
 
 
 class Anything(msgspec.Struct, frozen=True, kw_only=True):
@@ -137,62 +127,3 @@ def test_the_shortest_way_answers_and_counts_as_the_queue_does(
 
     assert shortest == queued
     assert len(shortest[0]) == len(COMMANDS)
-
-
-def calls_of(work: Callable[[], object]) -> list[str]:
-    """Return the Python functions of the platform that *work* calls, in order."""
-    names: list[str] = []
-
-    def note(frame: FrameType, event: str, argument: object) -> None:
-        if event == "call" and "/rse_pf/" in frame.f_code.co_filename:
-            names.append(frame.f_code.co_name)
-
-    sys.setprofile(note)
-    try:
-        work()
-    finally:
-        sys.setprofile(None)
-    return names
-
-
-def calls_of_a_command(worker: WorkerParts, command: Command) -> list[str]:
-    """Return what is called from the frame of *command*, once it was answered three times, to its answer."""
-    connection, wire = worker.join()
-    data = worker.codec.encode(command)
-    opcode = 1 if worker.codec.is_text else 2
-    for _ in range(3):
-        connection.receive_frame(opcode, True, False, data)
-        worker.loop.turn()
-    heard = len(wire.sent)
-    wire.send = lambda data, is_text: wire.sent.append(data)  # type: ignore[method-assign]
-
-    def one() -> None:
-        connection.receive_frame(opcode, True, False, data)
-        worker.loop.turn()
-
-    calls = calls_of(one)
-    assert len(wire.sent) == heard + 1
-    return calls
-
-
-@pytest.mark.parametrize("codec", MAX_CALLS)
-def test_an_echo_takes_few_python_calls(codec: str) -> None:
-    command = Command(id=1, service="echo", payload={"value": "x" * 32}, keep=True)
-    with worker_parts(codec=codec) as worker:
-        calls = calls_of_a_command(worker, command)
-
-    assert len(calls) <= MAX_CALLS[codec], calls
-
-
-@pytest.mark.skipif(find_library() is None, reason="the native core is not built")
-@pytest.mark.parametrize("codec", MAX_POSE_CALLS)
-def test_a_pose_takes_hardly_more_python_calls_than_an_echo(codec: str) -> None:
-    problem = make_problem(seed=3)
-    request = pnp.make_request(problem.points_world, problem.pixels, problem.camera, binary=codec == "bin")
-    command = Command(id=1, service="pnp", payload=request, keep=True)
-    with worker_parts(codec=codec, register=lambda registry: pnp.register(registry, SETTINGS.pnp)) as worker:
-        calls = calls_of_a_command(worker, command)
-
-    assert "answer_plain" in calls
-    assert "pnp" not in calls
-    assert len(calls) <= MAX_POSE_CALLS[codec], calls

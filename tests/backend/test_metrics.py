@@ -5,7 +5,6 @@ from __future__ import annotations
 from prometheus_client.parser import text_string_to_metric_families
 
 from rse_pf.backend.metrics import (
-    GAUGE_HELP,
     MAX_TENANTS,
     OTHER_TENANTS,
     Metrics,
@@ -57,32 +56,6 @@ def test_prometheus_can_parse_the_rendered_text():
 
 def test_a_server_without_workers_that_answered_can_be_rendered():
     assert b"rse_pf_requests" in render(merge([]))
-
-
-def undescribed(text: str) -> list[str]:
-    """Return the metrics of a page without a type, or without a help text of three words."""
-    lines = [line.split(" ", 3) for line in text.splitlines() if line.startswith("# ")]
-    helps = {
-        name: words for _, kind, name, words in (line for line in lines if len(line) == 4) if kind == "HELP"
-    }
-    types = {line[2] for line in lines if line[1] == "TYPE"}
-    shown = {line.split("{")[0].split(" ")[0] for line in text.splitlines() if line and line[0] != "#"}
-    families = {name.removesuffix("_bucket").removesuffix("_sum").removesuffix("_count") for name in shown}
-    return sorted(
-        name
-        for name in families | set(helps)
-        if not (name.endswith("_created") or (name in types and len(helps.get(name, "").split()) >= 3))
-    )
-
-
-def test_every_metric_has_a_type_and_a_help_text_of_at_least_three_words():
-    every = worker([("pnp", "ok", 0.001)], **dict.fromkeys(GAUGE_HELP, 1.0))
-
-    assert undescribed(render(merge([every])).decode()) == []
-
-
-def test_a_gauge_without_a_help_text_is_caught():
-    assert undescribed(render(merge([worker([], brand_new=1.0)])).decode()) == ["rse_pf_brand_new"]
 
 
 def test_what_was_computed_for_each_tenant_is_added_up_over_workers_and_kinds():

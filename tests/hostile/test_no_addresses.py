@@ -7,7 +7,6 @@ import typing
 from collections.abc import Iterator
 
 import msgspec
-import pytest
 
 from rse_pf.config import PlatformSettings
 from rse_pf.services.builtin import builtin_services
@@ -39,21 +38,3 @@ def test_no_message_and_no_request_has_a_field_for_an_address() -> None:
 
     assert addresses(FromRobot, *requests) == []
     assert sum(1 for kind in requests for _ in fields(kind, set())) > 30
-
-
-class Inner(msgspec.Struct):
-    """A part that names a place."""
-
-    bucket: str
-
-
-class Outer(msgspec.Struct):
-    """A request that fetches."""
-
-    parts: list[Inner] | None
-    callback_url: str = ""
-
-
-@pytest.mark.parametrize("kind", [Outer, list[Outer]])
-def test_an_address_would_be_seen_however_deep(kind: object) -> None:
-    assert addresses(kind) == ["Inner.bucket", "Outer.callback_url"]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 
 import pytest
 
@@ -106,9 +106,8 @@ def test_crashes_before_the_breaker_opened_are_not_counted_twice_if_it_is_open_f
 # --- deadlines -------------------------------------------------------------------------------------
 
 
-def deadlines_of_a_robot_are_no_evidence(new_breaker: Callable[[], CircuitBreaker]) -> None:
-    """Assert it for robots of three tenants whose sandboxes are killed for ten minutes."""
-    breaker = new_breaker()
+def test_the_deadlines_of_robots_are_evidence_neither_against_a_service_nor_against_a_request():
+    breaker = CircuitBreaker(SETTINGS)
     for i in range(600):
         for robot in (ONE, TWO, THREE, RIVAL, RIVAL_2, OTHER):
             breaker.note_overrun(robot, "icp", float(i))
@@ -116,19 +115,6 @@ def deadlines_of_a_robot_are_no_evidence(new_breaker: Callable[[], CircuitBreake
     assert refused(breaker, FOUR, RobotId("rival", "x"), RobotId("new", "x"), now=600.0) == ["", "", ""]
     assert breaker.open_services(600.0) == []
     assert {block.reason for block in breaker.blocks(600.0)} == {"overruns"}
-
-
-def test_the_deadlines_of_robots_are_evidence_neither_against_a_service_nor_against_a_request():
-    deadlines_of_a_robot_are_no_evidence(lambda: CircuitBreaker(SETTINGS))
-
-
-def test_that_test_fails_where_a_deadline_counts_as_a_crash(monkeypatch: pytest.MonkeyPatch):
-    def counts(breaker: CircuitBreaker, robot: RobotId, service: str, now: float) -> None:
-        breaker.note_crash(robot, service, "same", now)
-
-    monkeypatch.setattr(CircuitBreaker, "note_overrun", counts)
-    with pytest.raises(AssertionError):
-        deadlines_of_a_robot_are_no_evidence(lambda: CircuitBreaker(SETTINGS))
 
 
 def test_a_robot_whose_deadline_is_overrun_again_and_again_is_refused_the_service_and_told_why():
@@ -161,9 +147,8 @@ def test_crashes_of_three_robots_open_the_breaker_for_their_tenant():
     assert breaker.open_services(61.0) == []
 
 
-def no_tenant_takes_a_service_from_another(new_breaker: Callable[[], CircuitBreaker]) -> None:
-    """Assert it for a tenant with a hundred robots, and two robots of others that crash as well."""
-    breaker = new_breaker()
+def test_no_tenant_takes_a_service_or_a_request_from_the_robots_of_others():
+    breaker = CircuitBreaker(SETTINGS)
     for i in range(100):
         for request in ("same", str(i)):
             breaker.note_crash(RobotId("hostile", f"robot-{i}"), "icp", request, i * 0.01)
@@ -172,17 +157,6 @@ def no_tenant_takes_a_service_from_another(new_breaker: Callable[[], CircuitBrea
     assert refused(breaker, ONE, TWO, RIVAL, now=1.1) == ["", "", ""]
     assert refused(breaker, ONE, TWO, RIVAL, digest="same", now=1.1) == ["", "", ""]
     assert refused(breaker, RobotId("hostile", "new"), digest="same", now=1.1) == ["poison"]
-
-
-def test_no_tenant_takes_a_service_or_a_request_from_the_robots_of_others():
-    no_tenant_takes_a_service_from_another(lambda: CircuitBreaker(SETTINGS))
-
-
-def test_that_test_fails_where_robots_are_known_without_their_tenant(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(circuit_breaker, "_scopes_of", lambda robot: (robot.name, None))
-    monkeypatch.setattr(circuit_breaker, "ROBOTS_OF_OTHERS", 0)
-    with pytest.raises(AssertionError):
-        no_tenant_takes_a_service_from_another(lambda: CircuitBreaker(SETTINGS))
 
 
 @pytest.mark.parametrize(
@@ -279,23 +253,12 @@ def test_what_is_refused_to_all_is_not_lifted_for_one_tenant():
 # --- memory ----------------------------------------------------------------------------------------
 
 
-def poison_expires(new_breaker: Callable[[], CircuitBreaker]) -> None:
-    """Assert that a request of long ago is tried again."""
-    breaker = new_breaker()
+def test_poison_expires_also_while_other_requests_crash():
+    breaker = CircuitBreaker(SETTINGS)
     for now in (0.0, 0.0, 1e6):
         breaker.note_crash(ONE, "icp", "old" if now == 0.0 else "new", now)
 
     assert refused(breaker, ONE, digest="old", now=1e6) == [""]
-
-
-def test_poison_expires_also_while_other_requests_crash():
-    poison_expires(lambda: CircuitBreaker(SETTINGS))
-
-
-def test_that_test_fails_where_poison_does_not_expire(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(circuit_breaker, "POISON_S", float("inf"))
-    with pytest.raises(AssertionError):
-        poison_expires(lambda: CircuitBreaker(SETTINGS))
 
 
 def test_the_oldest_requests_are_forgotten_when_ten_thousand_crashed():

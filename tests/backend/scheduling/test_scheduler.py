@@ -5,7 +5,7 @@ from __future__ import annotations
 import heapq
 import math
 import random
-from collections import Counter, deque
+from collections import Counter
 
 import pytest
 from backend.scheduling.admitted import AdmittedScheduler, fall_behind, measure_turns, queued
@@ -200,28 +200,6 @@ WORK_S, DEADLINE_S, SWEEP_S, SECONDS = 0.005, 0.25, 0.025, 10.0
 CAPACITY = 1 / WORK_S
 
 
-class Fifo:
-    """A plain bounded queue, the mutation that has to fail: it answers, but too late."""
-
-    def __init__(self, bound: int) -> None:
-        self._bound = bound
-        self._jobs: deque[QueuedCommand] = deque()
-
-    def submit(self, work: QueuedCommand, now: float) -> list[QueuedCommand]:
-        if len(self._jobs) >= self._bound:
-            return [work]
-        self._jobs.append(work)
-        return []
-
-    def start(self, now: float) -> tuple[QueuedCommand | None, list[QueuedCommand]]:
-        return (self._jobs.popleft() if self._jobs else None), []
-
-    def done(self, work: QueuedCommand, now: float) -> None: ...
-
-    def sweep(self, now: float) -> list[QueuedCommand]:
-        return []
-
-
 def simulate(
     queue, arrivals: list[tuple[float, str]], jitter: random.Random
 ) -> tuple[list[QueuedCommand], int, list[float]]:
@@ -389,15 +367,6 @@ def test_goodput_holds_under_overload(load, robots):
     assert len(good) >= 0.95 * CAPACITY * SECONDS
     assert late <= 0.02 * len(good)
     assert sorted(refused)[int(0.99 * len(refused))] <= DEADLINE_S / 2 + 2 * SWEEP_S
-
-
-@pytest.mark.parametrize("load", [2, 5])
-def test_a_plain_bounded_queue_would_collapse_under_the_same_load(load):
-    arrivals = poisson(load * CAPACITY, 40, seed=load)
-
-    good, _, _ = simulate(Fifo(bound=60), arrivals, random.Random(1))
-
-    assert len(good) < 0.2 * CAPACITY * SECONDS
 
 
 def test_nothing_is_shed_below_capacity():

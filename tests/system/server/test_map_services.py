@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import asyncio
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from rse_pf.services.synthetic_maps import make_room, make_world
 
 import client_sdk
 from rse_pf.geometry import exp_se3, pose_difference
@@ -15,7 +15,6 @@ from rse_pf.maps.format import MapVersion, encode_map
 from rse_pf.services.mapping.icp import IcpReply, IcpRequest
 from rse_pf.services.mapping.localise import LocaliseReply, LocaliseRequest
 from rse_pf.services.mapping.place import PlaceReply, PlaceRequest
-from tests.synthetic_maps import make_room, make_world
 
 for package in ("faiss", "small_gicp"):
     pytest.importorskip(package, reason="the extra maps is not installed")
@@ -26,7 +25,9 @@ DEADLINE_S = 60.0
 WORLD = make_world(1)
 
 
-def test_clouds_are_aligned_places_recognised_and_views_located(start_server: Any, tmp_path: Path) -> None:
+async def test_clouds_are_aligned_places_recognised_and_views_located(
+    start_server: Any, tmp_path: Path
+) -> None:
     builtin = "from rse_pf.services.builtin import builtin_services as make\n"
     (tmp_path / "served_in_tests.py").write_text(builtin)
     server = start_server(keys=True)
@@ -48,19 +49,14 @@ def test_clouds_are_aligned_places_recognised_and_views_located(start_server: An
         T_target_source=start.ravel(),
     )
 
-    async def ask() -> tuple[IcpReply, PlaceReply, LocaliseReply]:
-        async with client_sdk.connect(server.url, token=server.token(), codec="bin") as robot:
+    async with client_sdk.connect(server.url, token=server.token(), codec="bin") as robot:
 
-            async def call(service: str, request: Any, reply: Any) -> Any:
-                return (await robot.call(service, request, reply_type=reply, deadline_s=DEADLINE_S)).reply
+        async def call(service: str, request: Any, reply: Any) -> Any:
+            return (await robot.call(service, request, reply_type=reply, deadline_s=DEADLINE_S)).reply
 
-            return (
-                await call("icp", clouds, IcpReply),
-                await call("place", PlaceRequest(**view), PlaceReply),
-                await call("localise", LocaliseRequest(**view), LocaliseReply),
-            )
-
-    aligned, place, located = asyncio.run(ask())
+        aligned = await call("icp", clouds, IcpReply)
+        place = await call("place", PlaceRequest(**view), PlaceReply)
+        located = await call("localise", LocaliseRequest(**view), LocaliseReply)
 
     assert aligned.verdict == "ok", aligned.reason
     metres, degrees = pose_difference(np.reshape(aligned.T_target_source, (4, 4)), np.eye(4))

@@ -54,11 +54,8 @@ async def test_a_command_comes_back_with_its_times(start_server, codec):
 
     async with server.robot(codec) as robot:
         await robot.send(Ping(sent_s=4.5))
-        welcome, pong, result = (
-            robot.welcome,
-            await robot.receive(),
-            await robot.ask(7, "echo", {"value": [1, "é"]}),
-        )
+        welcome, pong = robot.welcome, await robot.receive()
+        result = await robot.ask(7, "echo", {"value": [1, "é"]})
     assert (welcome.server, welcome.robot) == ("server-0", "anonymous-1")
     assert isinstance(pong, Pong)
     assert pong.sent_s == 4.5
