@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 import socket
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from typing import Any
 
@@ -209,21 +209,13 @@ async def ended(each: socket.socket) -> None:
             pass
 
 
-def run(kind: Any, folder: Path, test: Callable[[int], Awaitable[None]], seconds: float, **more: Any) -> None:
-    async def started() -> None:
-        async with kind(folder, seconds, **more) as port:
-            await asyncio.wait_for(test(port), DEADLINE_S)
-
-    asyncio.run(started())
-
-
 @pytest.mark.parametrize("kind", KINDS)
-def test_hundreds_of_silent_connections_are_cut_in_time_and_who_asks_is_served(
+async def test_hundreds_of_silent_connections_are_cut_in_time_and_who_asks_is_served(
     kind: Any, tmp_path: Path
 ) -> None:
     is_owner = kind is owner_of_a_map
 
-    async def test(port: int) -> None:
+    async with kind(tmp_path, SECONDS) as port:
         first = await Honest.open(port, is_owner=is_owner)
         answered = await first.ask()
         silent = await silent_to(port, COUNT)
@@ -237,12 +229,10 @@ def test_hundreds_of_silent_connections_are_cut_in_time_and_who_asks_is_served(
         for each in (first, late, *silent):
             each.close()
 
-    run(kind, tmp_path, test, SECONDS)
-
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_above_the_bound_silent_connections_are_cut_at_once(kind: Any, tmp_path: Path) -> None:
-    async def test(port: int) -> None:
+async def test_above_the_bound_silent_connections_are_cut_at_once(kind: Any, tmp_path: Path) -> None:
+    async with kind(tmp_path, 60.0) as port:
         silent = await silent_to(port, MAX_SILENT + 20, (b"",))
         await asyncio.gather(*map(ended, silent[:20]))
         newest = asyncio.ensure_future(ended(silent[-1]))
@@ -253,22 +243,18 @@ def test_above_the_bound_silent_connections_are_cut_at_once(kind: Any, tmp_path:
         for each in (first, *silent):
             each.close()
 
-    run(kind, tmp_path, test, 60.0)
 
-
-def test_a_head_that_begins_after_an_answer_has_its_time_too(tmp_path: Path) -> None:
-    async def test(port: int) -> None:
+async def test_a_head_that_begins_after_an_answer_has_its_time_too(tmp_path: Path) -> None:
+    async with http_service(tmp_path, SECONDS) as port:
         (slow,) = await silent_to(port, 1, (b"GET / HTTP/1.1\r\nHost: a\r\n\r\n",))
         assert b"200" in await asyncio.get_running_loop().sock_recv(slow, 4096)
         await asyncio.get_running_loop().sock_sendall(slow, b"GET / HTTP/1.1\r\n")
         await ended(slow)
         slow.close()
 
-    run(http_service, tmp_path, test, SECONDS)
 
-
-def test_idle_connections_are_bounded_and_the_one_that_waited_longest_is_closed(tmp_path: Path) -> None:
-    async def test(port: int) -> None:
+async def test_idle_connections_are_bounded_and_the_one_that_waited_longest_is_closed(tmp_path: Path) -> None:
+    async with http_service(tmp_path, 60.0, most_idle=5) as port:
         several = [await Honest.open(port, is_owner=False) for _ in range(6)]
         for each in several:
             await each.ask()
@@ -277,8 +263,6 @@ def test_idle_connections_are_bounded_and_the_one_that_waited_longest_is_closed(
         assert b" 200 " in await several[-1].ask()
         for each in several:
             each.close()
-
-    run(http_service, tmp_path, test, 60.0, most_idle=5)
 
 
 def test_a_served_connection_is_kept_longer_than_the_balancer_keeps_it() -> None:

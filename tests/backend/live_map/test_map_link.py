@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 import socket
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import Callable
 from typing import Any
 
 from fakes import FakeLog
@@ -87,7 +87,10 @@ class Worker:
             return decode_lease(LEASE, self.store.get(LEASE))
         return None
 
-    async def close(self) -> None:
+    async def __aenter__(self) -> Worker:
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
         await self.link.close()
         self.children.drop_spare()
         for child in self.children.used:
@@ -101,24 +104,13 @@ class Worker:
         return act()
 
 
-def play(test: Callable[[Worker], Awaitable[None]]) -> None:
-    async def run() -> None:
-        worker = Worker()
-        try:
-            await asyncio.wait_for(test(worker), 20.0)
-        finally:
-            await worker.close()
-
-    asyncio.run(run())
-
-
 async def until(is_so: Callable[[], Any]) -> None:
     while not is_so():
         await asyncio.sleep(0)
 
 
-def test_a_process_is_started_as_soon_as_a_map_that_nobody_has_begun_is_watched() -> None:
-    async def test(worker: Worker) -> None:
+async def test_a_process_is_started_as_soon_as_a_map_that_nobody_has_begun_is_watched() -> None:
+    async with Worker() as worker:
         worker.link.set_watched(True)
         await until(lambda: worker.started)
         worker.started[0].tell("ready")
@@ -132,13 +124,11 @@ def test_a_process_is_started_as_soon_as_a_map_that_nobody_has_begun_is_watched(
         assert len(worker.started) == 1
         sent.cancel()
 
-    play(test)
 
-
-def test_an_owner_elsewhere_is_used_before_the_own_process_is_ready() -> None:
+async def test_an_owner_elsewhere_is_used_before_the_own_process_is_ready() -> None:
     """Else the robots of this server wait until its own process is started, for nothing."""
 
-    async def test(worker: Worker) -> None:
+    async with Worker() as worker:
         sent = asyncio.ensure_future(worker.link.request(ROBOT, "live-keyframe", FIRST, 5.0))
         await until(lambda: worker.started)  # it never gets ready
         with socket.create_server(("127.0.0.1", 0)) as listener:
@@ -153,8 +143,6 @@ def test_an_owner_elsewhere_is_used_before_the_own_process_is_ready() -> None:
         assert worker.started[0].claims == 0
         sent.cancel()
 
-    play(test)
-
 
 def owner_on_a_closed_port(worker: Worker) -> None:
     """Let another server have the lease, with a port where nobody listens."""
@@ -167,8 +155,8 @@ def owner_on_a_closed_port(worker: Worker) -> None:
     assert elsewhere.serve("127.0.0.1", port, "c")
 
 
-def test_an_owner_whose_port_is_closed_is_replaced_at_once_by_those_who_were_connected() -> None:
-    async def test(worker: Worker) -> None:
+async def test_an_owner_whose_port_is_closed_is_replaced_at_once_by_those_who_were_connected() -> None:
+    async with Worker() as worker:
         owner_on_a_closed_port(worker)
         worker.link._welcomed = "b"
         began_s = time.monotonic()
@@ -179,11 +167,9 @@ def test_an_owner_whose_port_is_closed_is_replaced_at_once_by_those_who_were_con
         assert time.monotonic() - began_s < PlatformSettings().live.lease_s
         sent.cancel()
 
-    play(test)
 
-
-def test_a_link_that_ends_while_the_owner_has_not_welcomed_it_closes_its_connection() -> None:
-    async def test(worker: Worker) -> None:
+async def test_a_link_that_ends_while_the_owner_has_not_welcomed_it_closes_its_connection() -> None:
+    async with Worker() as worker:
         is_greeted, is_gone = asyncio.Event(), asyncio.Event()
 
         async def owner(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -207,13 +193,11 @@ def test_a_link_that_ends_while_the_owner_has_not_welcomed_it_closes_its_connect
         await asyncio.wait_for(is_gone.wait(), 10.0)
         server.close()
 
-    play(test)
 
-
-def test_an_owner_whose_port_was_never_reached_keeps_its_lease() -> None:
+async def test_an_owner_whose_port_was_never_reached_keeps_its_lease() -> None:
     """A firewall may refuse what the other servers can reach."""
 
-    async def test(worker: Worker) -> None:
+    async with Worker() as worker:
         owner_on_a_closed_port(worker)
         sent = asyncio.ensure_future(worker.link.request(ROBOT, "live-keyframe", FIRST, 0.3))
         await until(lambda: worker.started)
@@ -222,11 +206,9 @@ def test_an_owner_whose_port_was_never_reached_keeps_its_lease() -> None:
         assert isinstance(sent.exception(), Busy)
         assert decode_lease(LEASE, worker.store.get(LEASE)).epoch == 1
 
-    play(test)
 
-
-def test_who_may_only_watch_starts_no_process_and_is_told_that_the_map_is_idle() -> None:
-    async def test(worker: Worker) -> None:
+async def test_who_may_only_watch_starts_no_process_and_is_told_that_the_map_is_idle() -> None:
+    async with Worker() as worker:
         lease = OwnerLease(
             ObjectRecords(worker.store), LEASE, owner="b", server="there", clock=time.monotonic
         )
@@ -243,19 +225,15 @@ def test_who_may_only_watch_starts_no_process_and_is_told_that_the_map_is_idle()
         await until(lambda: (found := worker.lease()) is not None and found.state == "serving")
         assert worker.told[-1]["state"] == "moving"
 
-    play(test)
 
-
-def test_who_may_only_watch_a_map_that_is_driven_in_takes_no_part_in_a_takeover() -> None:
-    async def test(worker: Worker) -> None:
+async def test_who_may_only_watch_a_map_that_is_driven_in_takes_no_part_in_a_takeover() -> None:
+    async with Worker() as worker:
         owner_on_a_closed_port(worker)
         worker.link._welcomed = "b"
         worker.link.set_watched(True, may_start=False)
         await until(lambda: worker.told and worker.told[-1]["state"] == "idle")
         assert worker.started == []
         assert decode_lease(LEASE, worker.store.get(LEASE)).epoch == 1
-
-    play(test)
 
 
 def test_only_a_first_keyframe_or_an_operator_begins_a_map():

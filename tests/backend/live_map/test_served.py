@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import random
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Iterator
 from pathlib import Path
 from typing import Any, get_args
 
@@ -57,81 +57,71 @@ async def value(updates: client_sdk.Updates, key: str, fits: Callable[[Any], boo
             return payload
 
 
-def run(folder: Path, test: Callable[[GuardedServer], Awaitable[None]]) -> None:
-    (folder / "store").mkdir()
-    data = {"store": f"dir:{folder / 'store'}"}
-    with GuardedServer(folder, workers=2, data=data, session={"max_commands_per_s": 0.0}) as server:
-        asyncio.run(asyncio.wait_for(test(server), 60.0))  # type: ignore[arg-type]
+@pytest.fixture
+def server(tmp_path: Path) -> Iterator[GuardedServer]:
+    (tmp_path / "store").mkdir()
+    data = {"store": f"dir:{tmp_path / 'store'}"}
+    with GuardedServer(tmp_path, workers=2, data=data, session={"max_commands_per_s": 0.0}) as server:
+        yield server
 
 
-def test_robots_of_all_workers_see_the_map_of_their_tenant_and_no_other(tmp_path: Path) -> None:
-    async def test(server: GuardedServer) -> None:
-        async with (
-            robot(server, "sender") as sender,
-            robot(server, "a") as a, robot(server, "b") as b, robot(server, "c") as c,
-            robot(server, "d") as d, robot(server, "stranger", tenant="other") as stranger,
-        ):  # fmt: skip
-            readers = [each.subscribe("live/m") for each in (a, b, c, d)]
-            foreign = stranger.subscribe("live/m")
+async def test_robots_of_all_workers_see_the_map_of_their_tenant_and_no_other(server: GuardedServer) -> None:
+    async with (
+        robot(server, "sender") as sender,
+        robot(server, "a") as a, robot(server, "b") as b, robot(server, "c") as c,
+        robot(server, "d") as d, robot(server, "stranger", tenant="other") as stranger,
+    ):  # fmt: skip
+        readers = [each.subscribe("live/m") for each in (a, b, c, d)]
+        foreign = stranger.subscribe("live/m")
 
-            for number in range(3):
-                answer = await sender.call("live-keyframe", keyframe(number), deadline_s=20.0)
-                assert answer.reply["number"] == number + 1
+        for number in range(3):
+            answer = await sender.call("live-keyframe", keyframe(number), deadline_s=20.0)
+            assert answer.reply["number"] == number + 1
 
-            for updates in readers:
-                pose = await value(updates, "pose/sender", lambda pose: pose["timestamp_s"] == 2.0)
-                np.testing.assert_allclose(pose["T_map_camera"], np.eye(4).ravel())
-            assert [each["name"] for each in (await a.call("live-list", {})).reply["maps"]] == ["m"]
-            assert (await stranger.call("live-list", {})).reply["maps"] == []
-            assert (await stranger.call("live-show", {"map": "m"})).reply["keyframes"] == 0
-            assert await foreign.next() == (
-                "map", {"kind": "map", "keyframes": 0, "version": 0, "owner": "", "state": "moving"},
-            )  # fmt: skip
-            with pytest.raises(asyncio.TimeoutError):
-                await asyncio.wait_for(foreign.next(), 0.5)
-
-    run(tmp_path, test)
+        for updates in readers:
+            pose = await value(updates, "pose/sender", lambda pose: pose["timestamp_s"] == 2.0)
+            np.testing.assert_allclose(pose["T_map_camera"], np.eye(4).ravel())
+        assert [each["name"] for each in (await a.call("live-list", {})).reply["maps"]] == ["m"]
+        assert (await stranger.call("live-list", {})).reply["maps"] == []
+        assert (await stranger.call("live-show", {"map": "m"})).reply["keyframes"] == 0
+        assert await foreign.next() == (
+            "map", {"kind": "map", "keyframes": 0, "version": 0, "owner": "", "state": "moving"},
+        )  # fmt: skip
+        with pytest.raises(asyncio.TimeoutError):
+            await asyncio.wait_for(foreign.next(), 0.5)
 
 
-def test_a_token_for_another_map_neither_reads_nor_writes(tmp_path: Path) -> None:
-    async def test(server: GuardedServer) -> None:
-        async with robot(server, "r", scopes=("maps:live/other",)) as a_robot:
-            with pytest.raises(Forbidden, match="maps:live/m"):
-                await a_robot.subscribe("live/m").next()
-            with pytest.raises(Forbidden, match="maps:live/m"):
-                await a_robot.call("live-keyframe", keyframe(0))
-            assert (await a_robot.subscribe("live/other").next())[0] == "map"
-
-    run(tmp_path, test)
+async def test_a_token_for_another_map_neither_reads_nor_writes(server: GuardedServer) -> None:
+    async with robot(server, "r", scopes=("maps:live/other",)) as a_robot:
+        with pytest.raises(Forbidden, match="maps:live/m"):
+            await a_robot.subscribe("live/m").next()
+        with pytest.raises(Forbidden, match="maps:live/m"):
+            await a_robot.call("live-keyframe", keyframe(0))
+        assert (await a_robot.subscribe("live/other").next())[0] == "map"
 
 
-def test_a_token_to_watch_a_map_allows_to_subscribe_to_it_and_nothing_else(tmp_path: Path) -> None:
-    async def test(server: GuardedServer) -> None:
-        store = tmp_path / "store"
-        async with robot(server, "v", scopes=("maps:watch/m",)) as viewer, robot(server, "r") as driver:
-            updates = viewer.subscribe("live/m")
-            assert (await updates.next())[0] == "map"
-            for service in sorted(
-                {*LIVE_SERVICES, *(each.name for each in builtin_services(server.settings))}
-            ):
-                if service == "live-list":
-                    assert (await viewer.call(service, {})).reply == {"maps": []}
-                    continue
-                with pytest.raises(Forbidden):
-                    await viewer.call(service, keyframe(0) | {"robot": "r"})
+async def test_a_token_to_watch_a_map_allows_to_subscribe_to_it_and_nothing_else(
+    server: GuardedServer, tmp_path: Path
+) -> None:
+    store = tmp_path / "store"
+    async with robot(server, "v", scopes=("maps:watch/m",)) as viewer, robot(server, "r") as driver:
+        updates = viewer.subscribe("live/m")
+        assert (await updates.next())[0] == "map"
+        for service in sorted({*LIVE_SERVICES, *(each.name for each in builtin_services(server.settings))}):
+            if service == "live-list":
+                assert (await viewer.call(service, {})).reply == {"maps": []}
+                continue
             with pytest.raises(Forbidden):
-                await viewer.subscribe("live/other").next()
-            assert not list(store.glob("live/default/*/lease")), "no owner was started"
-            await driver.call("live-keyframe", keyframe(0), deadline_s=20.0)
-            await value(updates, "pose/r", lambda pose: pose["timestamp_s"] == 0.0)
-        assert [
-            route.operation
-            for route in ROUTES
-            if route.scope and scopes_allow(("maps:watch/m",), route.scope)
-        ] == []
-        assert not any(scopes_allow(("maps:watch",), right) for right in ("topics:read", "topics:write"))
-
-    run(tmp_path, test)
+                await viewer.call(service, keyframe(0) | {"robot": "r"})
+        with pytest.raises(Forbidden):
+            await viewer.subscribe("live/other").next()
+        assert not list(store.glob("live/default/*/lease")), "no owner was started"
+        await driver.call("live-keyframe", keyframe(0), deadline_s=20.0)
+        await value(updates, "pose/r", lambda pose: pose["timestamp_s"] == 0.0)
+    assert [
+        route.operation for route in ROUTES if route.scope and scopes_allow(("maps:watch/m",), route.scope)
+    ] == []
+    assert not any(scopes_allow(("maps:watch",), right) for right in ("topics:read", "topics:write"))
 
 
 async def ask_raw(
@@ -246,28 +236,27 @@ SENT_BY_WATCHER: dict[type, Callable[[ClientConnection, GuardedServer], Awaitabl
 connection."""
 
 
-def test_a_token_to_watch_a_map_gets_no_message_of_any_type_past_its_right(tmp_path: Path) -> None:
+async def test_a_token_to_watch_a_map_gets_no_message_of_any_type_past_its_right(
+    server: GuardedServer, tmp_path: Path
+) -> None:
     assert set(SENT_BY_WATCHER) == set(get_args(messages.Message)), "each type of message has its case"
 
-    async def test(server: GuardedServer) -> None:
-        lease = tmp_path / "store/live/default/m/lease"
-        async with robot(server, "r") as driver:
-            await driver.call("live-keyframe", keyframe(0), deadline_s=20.0)
-        server.restart()  # the map has no owner now, and whoever may start one gets one
-        before, token = lease.read_bytes(), server.token("v", scopes=("maps:watch/m",))
-        async with connect(
-            server.url, subprotocols=[SUBPROTOCOLS["json"]], compression=None, ping_interval=None,
-            additional_headers={"Authorization": f"Bearer {token}"},
-        ) as socket:  # fmt: skip
-            [welcome] = await ask_raw(socket, messages.Hello(capabilities=(UPDATES,)), messages.Welcome)
-            assert welcome.robot == "v"
-            for kind, send in SENT_BY_WATCHER.items():
-                await send(socket, server)
-                assert lease.read_bytes() == before, f"{kind.__name__} starts an owner"
-        assert [path.parent.name for path in (tmp_path / "store/live").glob("*/*/lease")] == ["m"]
+    lease = tmp_path / "store/live/default/m/lease"
+    async with robot(server, "r") as driver:
+        await driver.call("live-keyframe", keyframe(0), deadline_s=20.0)
+    server.restart()  # the map has no owner now, and whoever may start one gets one
+    before, token = lease.read_bytes(), server.token("v", scopes=("maps:watch/m",))
+    async with connect(
+        server.url, subprotocols=[SUBPROTOCOLS["json"]], compression=None, ping_interval=None,
+        additional_headers={"Authorization": f"Bearer {token}"},
+    ) as socket:  # fmt: skip
+        [welcome] = await ask_raw(socket, messages.Hello(capabilities=(UPDATES,)), messages.Welcome)
+        assert welcome.robot == "v"
+        for kind, send in SENT_BY_WATCHER.items():
+            await send(socket, server)
+            assert lease.read_bytes() == before, f"{kind.__name__} starts an owner"
+    assert [path.parent.name for path in (tmp_path / "store/live").glob("*/*/lease")] == ["m"]
 
-        async with robot(server, "r") as driver:
-            await value(driver.subscribe("live/m"), "map", lambda payload: payload["owner"] != "")
-        assert lease.read_bytes() != before, "an owner that starts is seen"
-
-    run(tmp_path, test)
+    async with robot(server, "r") as driver:
+        await value(driver.subscribe("live/m"), "map", lambda payload: payload["owner"] != "")
+    assert lease.read_bytes() != before, "an owner that starts is seen"

@@ -7,7 +7,7 @@ import contextlib
 import os
 import signal
 import socket
-from collections.abc import Callable
+from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
 
@@ -37,21 +37,18 @@ class Reports:
         self.ends.put_nowait((-1, "lost"))
 
 
-def run(test: Callable[[ZygoteClient, Reports, FakeLog], Any]) -> None:
-    """Run *test* with a zygote that has no services, and end the zygote."""
-
-    async def with_zygote() -> None:
-        reports, log, loop = Reports(), FakeLog(), asyncio.get_running_loop()
-        failures: list[dict[str, Any]] = []
-        loop.set_exception_handler(lambda _, context: failures.append(context))
-        zygote = ZygoteClient([], SETTINGS, loop=loop, log=log, listener=reports)
-        try:
-            await asyncio.wait_for(test(zygote, reports, log), WAIT_S)
-        finally:
-            zygote.close()
-        assert failures == []
-
-    asyncio.run(with_zygote())
+@contextlib.asynccontextmanager
+async def running_zygote() -> AsyncIterator[tuple[ZygoteClient, Reports, FakeLog]]:
+    """Start a zygote that has no services, and end it."""
+    reports, log, loop = Reports(), FakeLog(), asyncio.get_running_loop()
+    failures: list[dict[str, Any]] = []
+    loop.set_exception_handler(lambda _, context: failures.append(context))
+    zygote = ZygoteClient([], SETTINGS, loop=loop, log=log, listener=reports)
+    try:
+        yield zygote, reports, log
+    finally:
+        zygote.close()
+    assert failures == []
 
 
 def order(zygote: ZygoteClient, number: int) -> socket.socket:
@@ -74,28 +71,24 @@ async def create(zygote: ZygoteClient, number: int) -> socket.socket:
     return ours
 
 
-def test_a_sandbox_that_is_ended_is_reported_with_its_number_and_signal() -> None:
-    async def test(zygote: ZygoteClient, reports: Reports, log: FakeLog) -> None:
+async def test_a_sandbox_that_is_ended_is_reported_with_its_number_and_signal() -> None:
+    async with running_zygote() as (zygote, reports, _):
         with await create(zygote, 7), await create(zygote, 8):
             zygote.end(7)
             zygote.end(7)
 
             assert await reports.ends.get() == (7, "signal SIGKILL")
 
-    run(test)
 
-
-def test_a_sandbox_whose_channel_is_closed_ends_by_itself() -> None:
-    async def test(zygote: ZygoteClient, reports: Reports, log: FakeLog) -> None:
+async def test_a_sandbox_whose_channel_is_closed_ends_by_itself() -> None:
+    async with running_zygote() as (zygote, reports, _):
         (await create(zygote, 3)).close()
 
         assert await reports.ends.get() == (3, "exit code 0")
 
-    run(test)
 
-
-def test_a_paused_sandbox_does_nothing_until_it_is_resumed() -> None:
-    async def test(zygote: ZygoteClient, reports: Reports, log: FakeLog) -> None:
+async def test_a_paused_sandbox_does_nothing_until_it_is_resumed() -> None:
+    async with running_zygote() as (zygote, reports, _):
         channel = await create(zygote, 3)
         zygote.pause(3)
         channel.close()  # which would end it, see above
@@ -105,11 +98,9 @@ def test_a_paused_sandbox_does_nothing_until_it_is_resumed() -> None:
         zygote.resume(3)
         assert await reports.ends.get() == (3, "exit code 0")
 
-    run(test)
 
-
-def test_a_sandbox_that_is_paused_while_it_starts_waits_too() -> None:
-    async def test(zygote: ZygoteClient, reports: Reports, log: FakeLog) -> None:
+async def test_a_sandbox_that_is_paused_while_it_starts_waits_too() -> None:
+    async with running_zygote() as (zygote, reports, _):
         with order(zygote, 3):
             zygote.pause(3)
             (await create(zygote, 4)).close()
@@ -120,11 +111,9 @@ def test_a_sandbox_that_is_paused_while_it_starts_waits_too() -> None:
         zygote.end(3)
         assert await reports.ends.get() == (3, "signal SIGKILL")
 
-    run(test)
 
-
-def test_a_zygote_that_is_killed_is_replaced_by_one_that_takes_orders() -> None:
-    async def test(zygote: ZygoteClient, reports: Reports, log: FakeLog) -> None:
+async def test_a_zygote_that_is_killed_is_replaced_by_one_that_takes_orders() -> None:
+    async with running_zygote() as (zygote, reports, log):
         with await create(zygote, 3):
             os.kill(zygote_of(os.getpid()), signal.SIGKILL)
             assert await reports.ends.get() == (-1, "lost")
@@ -132,8 +121,6 @@ def test_a_zygote_that_is_killed_is_replaced_by_one_that_takes_orders() -> None:
 
         assert await reports.ends.get() == (4, "exit code 0")
         assert "zygote-lost" in log.names()
-
-    run(test)
 
 
 def zygote_of(worker: int) -> int:
@@ -147,24 +134,22 @@ def zygote_of(worker: int) -> int:
     raise AssertionError("no zygote")
 
 
-def test_a_zygote_has_no_variable_and_no_socket_of_its_worker(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_zygote_has_no_variable_and_no_socket_of_its_worker(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "of the worker")
-
-    async def test(zygote: ZygoteClient, reports: Reports, log: FakeLog) -> None:
-        folder = Path("/proc", str(zygote_of(os.getpid())))
-        held = [os.readlink(each) for each in (folder / "fd").iterdir() if int(each.name) > 2]
-
-        assert b"of the worker" not in (folder / "environ").read_bytes()
-        assert sum(name.startswith("socket") for name in held) == 1
-
     with socket.socket() as listener:
         listener.listen()
         listener.set_inheritable(True)
-        run(test)
+        async with running_zygote():
+            folder = Path("/proc", str(zygote_of(os.getpid())))
+            held = [os.readlink(each) for each in (folder / "fd").iterdir() if int(each.name) > 2]
+
+            assert b"of the worker" not in (folder / "environ").read_bytes()
+            assert sum(name.startswith("socket") for name in held) == 1
 
 
-def test_a_zygote_that_does_not_start_is_a_typed_error(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_zygote_that_does_not_start_is_a_typed_error(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sys.executable", "/bin/false")
 
     with pytest.raises(ConfigurationError, match="did not start"):
-        run(lambda *_: asyncio.sleep(0))
+        async with running_zygote():
+            pass

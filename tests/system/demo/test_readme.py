@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import re
 from pathlib import Path
 
@@ -25,20 +24,17 @@ def blocks(repository: Path, language: str) -> list[str]:
     return [block for kind, block in found if kind == language]
 
 
-def test_the_robot_in_ten_lines_gets_its_pose(repository, tmp_path, capsys):
+async def test_the_robot_in_ten_lines_gets_its_pose(repository, tmp_path, capsys):
     (code,) = blocks(repository, "python")
     problem = make_problem(seed=5, camera=make_problem(seed=0).camera)
 
-    async def work() -> None:
-        async with LocalPlatform(PlatformSettings(), state=tmp_path / "platform", servers=1, port=0) as cloud:
-            names: dict = {}
-            mine = code.replace("127.0.0.1:8700", f"127.0.0.1:{cloud.port}")
-            assert mine != code
-            exec(compile(mine, FIRST, "exec"), names)
-            token = cloud.issue_token("robot-1")
-            await names["main"](token, problem.points_world, problem.pixels)
-
-    asyncio.run(asyncio.wait_for(work(), 60))
+    async with LocalPlatform(PlatformSettings(), state=tmp_path / "platform", servers=1, port=0) as cloud:
+        names: dict = {}
+        mine = code.replace("127.0.0.1:8700", f"127.0.0.1:{cloud.port}")
+        assert mine != code
+        exec(compile(mine, FIRST, "exec"), names)
+        token = cloud.issue_token("robot-1")
+        await names["main"](token, problem.points_world, problem.pixels)
 
     assert capsys.readouterr().out.split()[0] in ("ok", "weak")
 

@@ -229,20 +229,17 @@ async def test_a_roll_under_load_replaces_every_server_in_order_and_loses_nothin
     assert not news.find("replace")
 
 
-def test_robots_that_are_there_already_spread_over_a_new_server(tmp_path: Path) -> None:
-    async def run() -> None:
-        news = News()
-        async with platform(tmp_path / "a", news, servers=1) as cloud, asking(cloud, 12, 0.2) as tally:
-            await cloud.grow(1, "more of them")
-            await news.heard("rebalance", server="server-1")
-            await news.until(lambda: is_even(news.samples[-1]))
-        check(tally)
-
+async def test_robots_that_are_there_already_spread_over_a_new_server(tmp_path: Path) -> None:
     def is_even(sample: Mapping[str, Any]) -> bool:
         robots = [server["robots"] for server in sample["servers"]]
         return sum(robots) == 12 and max(robots) <= 6 * (1 + MARGIN)
 
-    asyncio.run(run())
+    news = News()
+    async with platform(tmp_path / "a", news, servers=1) as cloud, asking(cloud, 12, 0.2) as tally:
+        await cloud.grow(1, "more of them")
+        await news.heard("rebalance", server="server-1")
+        await news.until(lambda: is_even(news.samples[-1]))
+    check(tally)
 
 
 async def test_load_makes_it_grow_and_rest_makes_it_shrink(tmp_path: Path) -> None:

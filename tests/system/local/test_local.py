@@ -241,14 +241,11 @@ asyncio.run(run())
         assert wait_ended(mark, SOON_S)
 
 
-def test_an_oversized_head_is_refused_at_the_door(tmp_path: Path) -> None:
-    async def run() -> bytes:
-        async with LocalPlatform(SETTINGS, servers=1, port=0, state=tmp_path / "a") as cloud:
-            return await asyncio.to_thread(answer, cloud.port)
-
+async def test_an_oversized_head_is_refused_at_the_door(tmp_path: Path) -> None:
     def answer(port: int) -> bytes:
         with socket.create_connection(("127.0.0.1", port), SOON_S) as robot:
             robot.sendall(b"GET / HTTP/1.1\r\nHost: x\r\nX-Fill: " + b"x" * 40_000 + b"\r\n\r\n")
             return robot.recv(100)
 
-    assert asyncio.run(run()).startswith(b"HTTP/1.1 431")
+    async with LocalPlatform(SETTINGS, servers=1, port=0, state=tmp_path / "a") as cloud:
+        assert (await asyncio.to_thread(answer, cloud.port)).startswith(b"HTTP/1.1 431")

@@ -113,47 +113,41 @@ def runs(folder: Path) -> list[int]:
     return [int(line) for line in file.read_text().split()] if file.exists() else []
 
 
-def test_a_job_restarts_elsewhere_when_its_job_server_is_killed_and_ends_once(
+async def test_a_job_restarts_elsewhere_when_its_job_server_is_killed_and_ends_once(
     start_server, start_job_server: StartJobServer, tmp_path: Path
 ) -> None:
     (tmp_path / "served_in_tests.py").write_text(_SERVICES)
     groups = settings_of(tmp_path)
     server = start_server(serving=groups["serving"], data=groups["data"])
 
-    async def ask() -> None:
-        async with client_sdk.connect(server.url) as robot:
-            task = asyncio.create_task(robot.call("long", {"name": "go"}))
-            first = await asyncio.to_thread(start_job_server)
-            await asyncio.to_thread(wait_until, lambda: runs(tmp_path) == [first.pid])
-            first.send_signal(signal.SIGKILL)
-            second = await asyncio.to_thread(start_job_server)
-            await asyncio.to_thread(wait_until, lambda: runs(tmp_path) == [first.pid, second.pid])
-            (tmp_path / "go").touch()
-            answer = await asyncio.wait_for(task, 30.0)
-            assert answer.reply["parent"] == second.pid
-
-    asyncio.run(asyncio.wait_for(ask(), 110.0))
+    async with client_sdk.connect(server.url) as robot:
+        task = asyncio.create_task(robot.call("long", {"name": "go"}))
+        first = await asyncio.to_thread(start_job_server)
+        await asyncio.to_thread(wait_until, lambda: runs(tmp_path) == [first.pid])
+        first.send_signal(signal.SIGKILL)
+        second = await asyncio.to_thread(start_job_server)
+        await asyncio.to_thread(wait_until, lambda: runs(tmp_path) == [first.pid, second.pid])
+        (tmp_path / "go").touch()
+        answer = await asyncio.wait_for(task, 30.0)
+        assert answer.reply["parent"] == second.pid
 
     assert len(runs(tmp_path)) == 2
     assert not list(DirectoryStore(tmp_path / "store").list("job-queue/"))
 
 
-def test_a_job_server_that_is_told_to_end_leaves_its_job_at_once(
+async def test_a_job_server_that_is_told_to_end_leaves_its_job_at_once(
     start_server, start_job_server: StartJobServer, tmp_path: Path
 ) -> None:
     (tmp_path / "served_in_tests.py").write_text(_SERVICES)
     groups = settings_of(tmp_path, job_lease_s=60.0)
     server = start_server(serving=groups["serving"], data=groups["data"])
 
-    async def ask() -> None:
-        async with client_sdk.connect(server.url) as robot:
-            task = asyncio.create_task(robot.call("long", {"name": "go"}))
-            first = await asyncio.to_thread(start_job_server)
-            await asyncio.to_thread(wait_until, lambda: len(runs(tmp_path)) == 1)
-            first.send_signal(signal.SIGTERM)
-            assert await asyncio.to_thread(first.wait, 20) == 0
-            (tmp_path / "go").touch()
-            second = await asyncio.to_thread(start_job_server)
-            assert (await asyncio.wait_for(task, 30.0)).reply["parent"] == second.pid
-
-    asyncio.run(asyncio.wait_for(ask(), 110.0))
+    async with client_sdk.connect(server.url) as robot:
+        task = asyncio.create_task(robot.call("long", {"name": "go"}))
+        first = await asyncio.to_thread(start_job_server)
+        await asyncio.to_thread(wait_until, lambda: len(runs(tmp_path)) == 1)
+        first.send_signal(signal.SIGTERM)
+        assert await asyncio.to_thread(first.wait, 20) == 0
+        (tmp_path / "go").touch()
+        second = await asyncio.to_thread(start_job_server)
+        assert (await asyncio.wait_for(task, 30.0)).reply["parent"] == second.pid

@@ -194,50 +194,44 @@ async def first_words(record: LeaseRecord, address: str, key: bytes, *, tls: boo
     return None
 
 
-def test_a_map_goes_on_when_the_machine_of_its_owner_fails(machines: tuple[Machine, Machine]) -> None:
+async def test_a_map_goes_on_when_the_machine_of_its_owner_fails(machines: tuple[Machine, Machine]) -> None:
     here, there = machines
     store = DirectoryStore(here.folder / "store")
 
-    async def test() -> None:
-        async with contextlib.AsyncExitStack() as robots:
-            second = await robots.enter_async_context(robot(there, "second"))
-            first = await robots.enter_async_context(robot(here, "first"))
-            assert [await add(first, 0), await add(first, 1)] == [1, 2]
-            assert await add(second, 0) == 1
-            assert (await shown(second))["server"] == here.name, here.log
-            record = decode_lease("lease", store.get(lease_name("default", "m")))
-            assert (record.address.startswith("10.214."), record.port) == (True, SETTINGS.live.first_port)
+    async with contextlib.AsyncExitStack() as robots:
+        second = await robots.enter_async_context(robot(there, "second"))
+        first = await robots.enter_async_context(robot(here, "first"))
+        assert [await add(first, 0), await add(first, 1)] == [1, 2]
+        assert await add(second, 0) == 1
+        assert (await shown(second))["server"] == here.name, here.log
+        record = decode_lease("lease", store.get(lease_name("default", "m")))
+        assert (record.address.startswith("10.214."), record.port) == (True, SETTINGS.live.first_port)
 
-            here.kill()
+        here.kill()
 
-            assert await add(second, 1) == 2
-            now = await shown(second)
-            assert (now["server"], kept(now)) == (there.name, {"first": 2, "second": 2}), there.log
-
-    asyncio.run(asyncio.wait_for(test(), 3 * WAIT_S))
+        assert await add(second, 1) == 2
+        now = await shown(second)
+        assert (now["server"], kept(now)) == (there.name, {"first": 2, "second": 2}), there.log
 
 
-def test_other_machines_reach_the_ports_of_the_firewall_only_and_owners_only_with_the_key(
+async def test_other_machines_reach_the_ports_of_the_firewall_only_and_owners_only_with_the_key(
     machines: tuple[Machine, Machine],
 ) -> None:
     here = machines[0]
     store = DirectoryStore(here.folder / "store")
     live = range(SETTINGS.live.first_port, SETTINGS.live.first_port + LIVE_PORTS)
 
-    async def test() -> None:
-        async with robot(here, "first") as first:
-            assert await add(first, 0) == 1
-            record = decode_lease("lease", store.get(lease_name("default", "m")))
-            key = internal_key(store)
-            assert await first_words(record, here.address, key) == ["welcome"]
-            refused = await first_words(record, here.address, bytes(32))
-            assert refused[:3] == ["refused", 0, "unauthorized"]
-            assert await first_words(record, here.address, key, tls=False) is None
-            assert kept(await shown(first)) == {"first": 1}
-        for each in machines:
-            ports = each.open_ports()
-            serving = {SETTINGS.serving.port, SETTINGS.serving.control_port}
-            assert serving <= ports <= serving | set(live), each.name
-        assert set(live) & here.open_ports()
-
-    asyncio.run(asyncio.wait_for(test(), 3 * WAIT_S))
+    async with robot(here, "first") as first:
+        assert await add(first, 0) == 1
+        record = decode_lease("lease", store.get(lease_name("default", "m")))
+        key = internal_key(store)
+        assert await first_words(record, here.address, key) == ["welcome"]
+        refused = await first_words(record, here.address, bytes(32))
+        assert refused[:3] == ["refused", 0, "unauthorized"]
+        assert await first_words(record, here.address, key, tls=False) is None
+        assert kept(await shown(first)) == {"first": 1}
+    for each in machines:
+        ports = each.open_ports()
+        serving = {SETTINGS.serving.port, SETTINGS.serving.control_port}
+        assert serving <= ports <= serving | set(live), each.name
+    assert set(live) & here.open_ports()

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from rse_pf.services.synthetic_maps import make_room, make_world
+from synthetic_maps import make_room, make_world
 
 import client_sdk
 from rse_pf.geometry import exp_se3, pose_difference

@@ -177,7 +177,7 @@ def languages(tmp_path: Path) -> list[str]:
     return names
 
 
-def test_a_robot_finds_nothing_that_another_left_in_any_language(start_server, tmp_path, languages):
+async def test_a_robot_finds_nothing_that_another_left_in_any_language(start_server, tmp_path, languages):
     """The second robot comes beside the first one, the third gets its place, user id and memory after it."""
     server = start_server(
         keys=True,
@@ -192,19 +192,16 @@ def test_a_robot_finds_nothing_that_another_left_in_any_language(start_server, t
         ]
         return {name: answer.reply["seen"] for name, answer in zip(languages, answers, strict=True)}
 
-    async def beside():
-        async with (
-            server.robot(token=server.token("one")) as one,
-            server.robot(token=server.token("two")) as two,
-        ):
-            left = await does(one, "leave")
-            return left, await does(one, "find"), await does(two, "find")
-
     async def after(name):
         async with server.robot(token=server.token(name)) as robot:
             return await does(robot, "find")
 
-    left, own, others = asyncio.run(beside())
+    async with (
+        server.robot(token=server.token("one")) as one,
+        server.robot(token=server.token("two")) as two,
+    ):
+        left = await does(one, "leave")
+        left, own, others = left, await does(one, "find"), await does(two, "find")
     assert until(lambda: server.status()["isolation"]["sandboxes"] == 0)
     later = [asyncio.run(after(name)) for name in ("three", "one")]
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import base64
 import sys
 import time
@@ -79,21 +78,18 @@ def of_function(trace: str) -> dict[str, Any]:
 
 
 @pytest.mark.system
-def test_one_id_goes_from_the_robot_to_every_log(start_server: Any, tmp_path: Path) -> None:
+async def test_one_id_goes_from_the_robot_to_every_log(start_server: Any, tmp_path: Path) -> None:
     (tmp_path / "served_in_tests.py").write_text(_SERVICES)
     server = start_server(
         keys=True, data={"store": f"dir:{tmp_path / 'store'}"}, serving={"log_level": "debug"}
     )  # fmt: skip
 
-    async def ask() -> tuple[str, dict[str, Any]]:
-        problem = make_problem(seed=1)
-        async with client_sdk.connect(server.url, token=server.token()) as robot:
-            with traced() as trace:
-                await robot.solve_pnp(problem.points_world, problem.pixels, problem.camera)
-                await robot.call("long", {}, on_progress=lambda done, what: None)
-                return trace, of_function(current_trace())
-
-    trace, function = asyncio.run(asyncio.wait_for(ask(), 60.0))
+    problem = make_problem(seed=1)
+    async with client_sdk.connect(server.url, token=server.token()) as robot:
+        with traced() as trace:
+            await robot.solve_pnp(problem.points_world, problem.pixels, problem.camera)
+            await robot.call("long", {}, on_progress=lambda done, what: None)
+            trace, function = trace, of_function(current_trace())
 
     server.wait_for_log("job")
     logged = [line for line in server.lines if line["event"] in ("command", "job")]
