@@ -102,7 +102,14 @@ def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
     if not inspect.iscoroutinefunction(pyfuncitem.obj):
         return None
     names = inspect.signature(pyfuncitem.obj).parameters
-    asyncio.run(pyfuncitem.obj(**{name: pyfuncitem.funcargs[name] for name in names}))
+    test = pyfuncitem.obj(**{name: pyfuncitem.funcargs[name] for name in names})
+
+    async def run() -> None:
+        await test
+        for _ in range(5):  # servers in this loop see the end of the connections that the test has closed
+            await asyncio.sleep(0)
+
+    asyncio.run(run())
     return True
 
 
