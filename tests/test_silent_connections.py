@@ -27,6 +27,7 @@ from rse_pf.silent_connections import (
     SilentConnections,
     TlsListener,
 )
+from tests.test_http_connections import Transport
 
 COUNT, SECONDS, DEADLINE_S = 300, 1.0, 10.0
 TOKEN = "t" * 32
@@ -280,31 +281,13 @@ def test_a_served_connection_is_kept_longer_than_the_balancer_keeps_it() -> None
     assert loop.timers == 0
 
 
-class _Transport:
-    ended = ""
-
-    def get_extra_info(self, name: str, default: Any = None) -> Any:
-        return default
-
-    def is_closing(self) -> bool:
-        return bool(self.ended)
-
-    def close(self) -> None:
-        self.ended = "closed"
-
-    def abort(self) -> None:
-        self.ended = "cut"
-
-    def set_write_buffer_limits(self, high: int, low: int) -> None: ...
-
-
-def _connected(loop: FakeLoop) -> tuple[Any, _Transport]:
+def _connected(loop: FakeLoop) -> tuple[Any, Transport]:
     import uvicorn
     from uvicorn.server import ServerState
 
     config = uvicorn.Config(lambda *_: None, lifespan="off", log_level="critical")  # type: ignore[arg-type]
     made: Any = bounded_protocol(most_idle=10)
     loop.create_task = lambda work, **_: (work.close(), asyncio.Future(loop=loop))[1]  # type: ignore[attr-defined]
-    protocol, transport = made(config, ServerState(), {}, _loop=loop), _Transport()
+    protocol, transport = made(config, ServerState(), {}, _loop=loop), Transport()
     protocol.connection_made(transport)
     return protocol, transport

@@ -67,10 +67,6 @@ def test_a_good_token_says_who_the_robot_is() -> None:
     )  # fmt: skip
 
 
-def test_the_tests_own_signer_makes_good_tokens_too() -> None:
-    assert verify_token(sign(GOOD), keys=KEYS, now=NOW, settings=SETTINGS).robot.name == "robot-7"
-
-
 PUBLIC = KEY._private.public_key().public_bytes_raw()
 
 
@@ -125,11 +121,6 @@ FORGED: dict[str, Callable[[], str]] = {
     "lives too long": lambda: sign({**GOOD, "exp": int(NOW) + SETTINGS.token_ttl_s + 1}),
     "expired": lambda: sign({**GOOD, "iat": NOW - 800, "exp": NOW - 200}),
 }
-
-
-@pytest.mark.parametrize("name", FORGED)
-def test_a_token_is_refused_when_it_is(name: str) -> None:
-    assert refused(FORGED[name]()) != "unknown"
 
 
 def test_every_refusal_is_in_the_same_words() -> None:

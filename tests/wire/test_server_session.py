@@ -106,27 +106,6 @@ def test_another_protocol_version_is_told_so_and_closed() -> None:
     assert server.state == "closed"
 
 
-@pytest.mark.parametrize("message", [COMMAND, Ping(sent_s=1.0)])
-def test_a_message_before_hello_closes_the_connection(message: Message) -> None:
-    assert say(session(), message) == [Close(CLOSE_PROTOCOL, "say hello first")]
-
-
-def test_hello_is_said_once() -> None:
-    assert say(opened(), HELLO) == [Close(CLOSE_PROTOCOL, "hello came twice")]
-
-
-def test_a_ping_comes_back_with_the_servers_two_stamps() -> None:
-    assert say(opened(), Ping(sent_s=3.25), now=7.5) == [Pong(sent_s=3.25, received_s=7.5, answered_s=7.5)]
-
-
-def test_a_command_is_submitted_and_its_answer_goes_out() -> None:
-    server = opened()
-
-    assert say(server, COMMAND) == [Submit(COMMAND)]
-    assert heard(server, server_sessions.answer(server, Result(id=1, reply=1))) == Result(id=1, reply=1)
-    assert server.in_flight == 0
-
-
 def test_more_unanswered_commands_than_agreed_are_busy_with_a_time() -> None:
     server = opened()
     for number in (1, 2):
@@ -139,18 +118,6 @@ def test_more_unanswered_commands_than_agreed_are_busy_with_a_time() -> None:
     assert busy.hint
     server_sessions.answer(server, Result(id=1))
     assert isinstance(say(server, Command(id=3, service="echo"))[0], Submit)
-
-
-def test_bad_messages_are_tolerated_up_to_a_limit() -> None:
-    server = opened()
-
-    for _ in range(MAX_BAD_MESSAGES):
-        [failure] = [heard(server, each) for each in server_sessions.receive(server, b"nonsense", 1.0)]
-        assert (failure.id, failure.code) == (None, "bad-message")
-    failure, close = [heard(server, each) for each in server_sessions.receive(server, b"nonsense", 1.0)]
-
-    assert failure.code == "bad-message"
-    assert close == Close(CLOSE_PROTOCOL, "too many bad messages")
 
 
 def test_a_closed_session_ignores_messages() -> None:

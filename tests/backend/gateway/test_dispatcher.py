@@ -130,27 +130,6 @@ def test_a_named_object_is_read_by_a_thread_and_a_large_reply_is_stored_in_turn(
     assert threads == {"solver-0"}, "the event loop never waits for the store"
 
 
-def test_an_object_of_another_robot_is_not_found():
-    store = MemoryStore()
-    store.put(object_name(RobotId("default", "other"), digest_of(b"x")), b"x")
-    with worker_parts(register=register, store=store) as worker:
-        connection, wire = worker.join()
-        worker.say(connection, Command(id=4, service="large", payload={"data": {"object": digest_of(b"x")}}))
-        worker.loop.run_until(lambda: len(wire.sent) > 1)
-
-    assert (wire.sent[-1].id, wire.sent[-1].code) == (4, "not-found")
-
-
-def test_a_reply_that_is_too_large_is_a_failure_without_a_store(worker: WorkerParts):
-    connection, _ = worker.join()
-    data = bytes(2 * SETTINGS.session.max_message_bytes)
-    large = Command(id=5, service="large", payload={"data": data})
-
-    answer = worker.answers.compute(QueuedCommand(connection, connection.robot, large, 9, 0.0, 1.0))
-
-    assert (answer.message.id, answer.message.code) == (5, "too-large")
-
-
 def test_a_kind_of_service_that_this_server_does_not_run_is_refused(worker: WorkerParts):
     connection, wire = worker.join()
 
@@ -195,14 +174,6 @@ def test_nothing_is_written_behind_a_close(worker: WorkerParts):
     worker.say(connection, Ping(sent_s=1.0))
 
     assert [type(m) for m in wire.sent] == [Welcome]
-
-
-def test_a_robot_that_says_hello_while_the_server_leaves_is_moved(worker: WorkerParts):
-    worker.dispatcher.move_all("drain", 500.0)
-
-    _, wire = worker.join()
-
-    assert [type(m) for m in wire.sent] == [Welcome, Move]
 
 
 def overload(worker: WorkerParts, *, waiting: int = 1) -> None:

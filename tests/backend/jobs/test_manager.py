@@ -152,16 +152,6 @@ def test_the_same_request_of_another_robot_or_tenant_is_another_job(make):
     assert len({each.request.robot for each in asked}) == 3
 
 
-def test_more_jobs_than_may_wait_are_refused_with_a_retry_time(make):
-    bench, owner = make(max_waiting_jobs=1), robot()
-    for identity in range(3):
-        ask(bench, owner, identity, value=identity)
-
-    assert code(bench.answers[2]) == "busy"
-    assert bench.answers[2].retry_after_ms > 0
-    assert known(bench) == 2
-
-
 def test_the_newest_job_of_a_robot_with_many_is_displaced_by_another_robot(make):
     bench, busy_robot, other_robot = make(max_waiting_jobs=3), robot("greedy"), robot("modest")
     ask(bench, busy_robot, 0, value=0)
@@ -266,35 +256,6 @@ def test_a_robot_cannot_cancel_the_commands_of_another(make):
     bench.run_until(lambda: len(bench.answers) == 2)
 
     assert {code(answer) for answer in bench.answers.values()} == {"ok"}
-
-
-def test_a_job_goes_on_without_its_robot_which_finds_it_after_reconnecting(make):
-    bench, owner = make(), robot()
-    ask(bench, owner, 1)
-    process = bench.process()
-    bench.jobs.leave(owner)
-    assert known(bench) == 1
-
-    again = robot()
-    ask(bench, again, 7)
-    process.done()
-    bench.run_until(lambda: 7 in bench.answers)
-
-    assert list(bench.answers) == [7]
-    assert bench.started.empty()
-
-
-def test_a_draining_server_answers_no_job_because_the_robot_asks_another(make):
-    bench, owner = make(), robot()
-    ask(bench, owner, 1)
-    bench.process()
-
-    bench.jobs.give_up()
-    bench.run_until(lambda: known(bench) == 0)
-    ask(bench, owner, 2)
-
-    assert bench.answers == {}
-    assert known(bench) == 0
 
 
 def test_old_records_are_deleted_when_a_job_ends(make):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from rse_pf.backend.sandbox.circuit_breaker import OPEN_S, POISON_CRASHES, CircuitBreaker
+from rse_pf.backend.sandbox.circuit_breaker import POISON_CRASHES, CircuitBreaker
 from rse_pf.backend.sandbox.policy import (
     START_TIMEOUT_S,
     Action,
@@ -115,13 +115,6 @@ def test_a_second_command_waits_for_the_first_and_uses_the_same_sandbox():
     assert policy.on_reply(1, OK, 1.0) == [AnswerCall(first, OK), SendMessage(1, b"2")]
 
 
-def test_each_robot_has_a_sandbox_of_its_own():
-    policy = make_policy()
-
-    assert policy.submit(make_call(A), 0.0) == [CreateSandbox(1, A)]
-    assert policy.submit(make_call(B), 0.0) == [CreateSandbox(2, B)]
-
-
 def test_a_robot_of_the_same_name_in_another_tenant_has_a_sandbox_and_a_state_of_its_own():
     policy, namesake = make_policy(), RobotId("rival", A.name)
     policy.add_connection(namesake)
@@ -183,32 +176,6 @@ def test_a_request_that_crashed_so_many_sandboxes_of_a_robot_is_poison_for_that_
     assert created(policy.submit(other, 3.0)) == 3
     assert created(policy.submit(same_of_b, 3.0)) == 4
     assert policy.counts == {"created": 4, "crashed": 2, "poison": 2}
-
-
-def test_an_open_circuit_breaker_refuses_the_service_until_it_closes():
-    policy = make_policy(breaker_crashes=2, poison_crashes=1)
-    for i in range(2):
-        number = start(policy, make_call(payload=str(i)), now=i)
-        policy.on_exit(number, "exit code 1", i)
-
-    refused = make_call(payload="new")
-    (answer,) = policy.submit(refused, 2.0)
-    assert isinstance(answer, AnswerCall)
-    assert isinstance(answer.outcome, RsePfError)
-    assert answer.outcome.code == "worker-lost"
-    assert answer.outcome.retry_after_ms == (OPEN_S - 1.0) * 1e3
-    assert created(policy.submit(make_call(B, payload="new"), 2.0)) == 3, "another robot"
-    assert created(policy.submit(make_call(payload="new"), OPEN_S + 1.0)) == 4
-
-
-def test_a_circuit_breaker_that_is_open_for_several_robots_is_reported():
-    policy = make_policy(breaker_crashes=2, poison_crashes=1)
-    for robot in (A, B, C):
-        number = start(policy, make_call(robot, payload=robot.name))
-        policy.on_exit(number, "exit code 1", 1.0)
-        assert policy.breaker.open_services(1.0) == (["icp"] if robot == C else [])
-
-    assert policy.breaker.open_services(OPEN_S + 1.0) == []
 
 
 def test_an_open_circuit_breaker_refuses_what_waits_as_well():
@@ -476,17 +443,6 @@ def test_the_sandbox_of_a_robot_stays_when_one_of_the_same_name_in_another_tenan
     assert policy.tick(2.0 + GRACE_S) == [ReleaseSandbox(2)]
 
 
-def test_a_robot_that_reconnects_within_the_grace_period_keeps_its_sandbox():
-    policy = make_policy()
-    start(policy, make_call())
-    policy.on_reply(1, OK, 1.0)
-    policy.remove_connection(A, 2.0)
-    policy.add_connection(A)
-
-    assert policy.tick(100.0) == []
-    assert policy.submit(make_call(payload="2", now=100.0), 100.0) == [SendMessage(1, b"2")]
-
-
 def test_commands_that_wait_for_a_robot_that_left_are_dropped_and_not_moved():
     policy = make_policy()
     start(policy, make_call(payload="1"))
@@ -495,17 +451,6 @@ def test_commands_that_wait_for_a_robot_that_left_are_dropped_and_not_moved():
     assert policy.held == 1
 
     assert not any(isinstance(each, CreateSandbox) for each in policy.on_exit(1, "exit code 1", 1.5))
-
-
-def test_a_robot_beyond_the_capacity_is_told_when_to_try_again():
-    policy = make_policy(max_sandboxes=1)
-    start(policy, make_call(A))
-
-    (answer,) = policy.submit(make_call(B), 0.0)
-
-    assert isinstance(answer, AnswerCall)
-    assert isinstance(answer.outcome, RsePfError)
-    assert (answer.outcome.code, answer.outcome.retry_after_ms) == ("busy", 1000.0)
 
 
 def test_an_idle_sandbox_in_its_grace_period_gives_its_place_to_another_robot():

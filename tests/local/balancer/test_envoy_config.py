@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import socket
 from pathlib import Path
 from typing import Any
 
-import pytest
-
 from rse_pf.config import PlatformSettings
 from rse_pf.config.resource_names import READY_PATH
 from rse_pf.local.balancer.envoy_config import (
-    ADMIN_SOCKET,
     CLUSTER,
     DATA_CLUSTER,
     Target,
@@ -91,13 +87,6 @@ def test_health_checks_follow_the_settings() -> None:
     assert check["http_health_check"] == {"path": READY_PATH}
 
 
-def test_the_door_is_on_loopback_and_the_admin_page_on_no_port() -> None:
-    made = config()
-
-    assert listener(made)["address"]["socket_address"]["address"] == "127.0.0.1"
-    assert made["admin"]["address"] == {"pipe": {"path": ADMIN_SOCKET, "mode": 0o600}}
-
-
 def test_only_the_path_of_the_robots_leads_to_a_server() -> None:
     assert only_route(config(serving={"path": "/robots"}))["match"] == {"path": "/robots"}
 
@@ -169,11 +158,6 @@ def test_a_robot_that_takes_nothing_is_ended_by_the_kernel() -> None:
     assert (upstream["name"], upstream["int_value"]) == (socket.SO_RCVBUF, 65536)
 
 
-def test_what_a_robot_says_of_its_address_is_not_believed() -> None:
-    assert manager(config())["use_remote_address"] is True
-    assert manager(config())["xff_num_trusted_hops"] == 0
-
-
 def test_the_endpoint_file_sends_robots_and_checks_to_different_ports() -> None:
     made = endpoints([Target(name="a", port=1001, control_port=2001)])
     (resource,) = made["resources"]
@@ -182,26 +166,3 @@ def test_the_endpoint_file_sends_robots_and_checks_to_different_ports() -> None:
     assert resource["cluster_name"] == CLUSTER
     assert member["endpoint"]["address"]["socket_address"]["port_value"] == 1001
     assert member["endpoint"]["health_check_config"]["port_value"] == 2001
-
-
-def test_no_targets_are_an_empty_list_not_a_missing_one() -> None:
-    assert endpoints([])["resources"][0]["endpoints"] == [{"lb_endpoints": []}]
-
-
-@pytest.mark.parametrize("made", [config(), endpoints([Target(name="a", port=1, control_port=2)])])
-def test_everything_is_plain_json(made: dict[str, Any]) -> None:
-    assert json.loads(json.dumps(made)) == made
-
-
-def test_the_door_tells_that_robots_are_served_and_nothing_of_itself() -> None:
-    made = config()
-    (health,) = [each for each in routes(made) if each["match"].get("path") == "/healthz"]
-    closed = [each for each in routes(made) if "direct_response" in each]
-
-    assert health["route"]["cluster"] == CLUSTER, "without a healthy server it is no 200"
-    assert health["route"]["timeout"] != "0s", "no WebSocket begins here"
-    assert [(each["match"], each["direct_response"]) for each in closed] == [
-        ({"path": "/data/readyz"}, {"status": 404})
-    ]
-    assert manager(made)["server_header_transformation"] == "PASS_THROUGH"
-    assert manager(made)["http_filters"][0]["typed_config"]["suppress_envoy_headers"] is True

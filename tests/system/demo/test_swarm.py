@@ -154,5 +154,6 @@ def test_the_report_of_the_verb_follows_from_its_records(tmp_path: Path) -> None
     assert len(report["environment"]["load_average"]) == len(report["generator"]["load_average_after"]) == 3
     events = [json.loads(line) for line in (out / "events.jsonl").read_text().splitlines()]
     assert sum(event["action"] == "robot-joined" for event in events) == 3
-    assert sorted(path.name for path in out.iterdir()) == ["commands.csv", "events.jsonl", "report.json"]
+    written = ["commands.csv", "events.jsonl", "report.json", "scenario.json"]
+    assert sorted(path.name for path in out.iterdir()) == written
     assert "answered" in done.stdout

@@ -9,7 +9,6 @@ from backend.scheduling.admitted import queued
 
 from rse_pf.auth.tokens import Claims
 from rse_pf.backend.gateway.admission import Admission
-from rse_pf.backend.gateway.rate_limits import CUT_OFF
 from rse_pf.backend.scheduling.scheduler import QueueBacklog
 from rse_pf.config import SessionSettings
 from rse_pf.identity import RobotId
@@ -74,15 +73,6 @@ def test_of_several_reasons_the_first_in_order_is_told(admission: Admission):
     assert reason(admission, **everything) == "scope"
     assert reason(admission, **{**everything, "claims": None}) == "expired"
     assert reason(admission, backlog=QueueBacklog(9, 9.0, 1.0)) == "robot-queue"
-
-
-def test_a_robot_above_its_rate_is_refused_and_then_cut_off(admission: Admission):
-    retries_ms = [admission.rates.retry_after_ms(RobotId("default", "r"), 5.0) for _ in range(200)]
-
-    assert retries_ms[:40] == [0] * 40
-    assert retries_ms[40] == pytest.approx(50.0)
-    assert CUT_OFF in retries_ms
-    assert admission.rates.retry_after_ms(RobotId("default", "another"), 5.0) == 0
 
 
 def test_the_bytes_that_wait_for_the_decoder_are_bounded_and_suspects_get_a_quarter(admission: Admission):
