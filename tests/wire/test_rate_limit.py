@@ -4,23 +4,21 @@ from __future__ import annotations
 
 from hypothesis import given
 from hypothesis import strategies as st
+from wire.client_sessions import open_connection
 
 from rse_pf.config import SessionSettings
 from rse_pf.token_bucket import TokenBucket
-from rse_pf.wire import Command, Limits, Ping, Result, Welcome, make_codec
+from rse_pf.wire import Command, Limits, Ping, Result, make_codec
 from rse_pf.wire.client_session import Answered, ClientSession, ConnectionState
 from rse_pf.wire.rate_limit import RateLimiter
 
 CODEC = make_codec("json")
-LIMITS = Limits(max_message_bytes=4096, max_in_flight=8, max_commands_per_s=20.0, command_burst=40)
+RATE = {"max_commands_per_s": 20.0, "command_burst": 40}
 
 
-def welcomed(session: ClientSession, limits: Limits = LIMITS) -> ConnectionState:
-    connection = session.open_connection(0.0)
+def welcomed(session: ClientSession, **limits: float) -> ConnectionState:
+    connection = open_connection(session, **(limits or RATE))
     connection.outgoing.clear()
-    welcome = Welcome(server="a", session="s", robot="r", protocol=1, clock_s=0.0, limits=limits)
-    session.receive(connection, CODEC.encode(welcome), 0.0)
-    session.adopt(connection, 0.0)
     return connection
 
 
@@ -76,7 +74,7 @@ def test_waiting_commands_are_sent_as_soon_as_the_rate_allows():
 
 def test_without_a_rate_nothing_waits():
     session = ClientSession(codec=CODEC, settings=SessionSettings(), sdk="t")
-    connection = welcomed(session, Limits(max_message_bytes=4096, max_in_flight=1000))
+    connection = welcomed(session, room=1000)
     for _ in range(500):
         session.submit("echo", {}, now=0.0, keep=True)
 
@@ -86,7 +84,7 @@ def test_without_a_rate_nothing_waits():
 
 
 def test_pings_count_towards_the_rate():
-    limiter = RateLimiter(LIMITS)
+    limiter = RateLimiter(Limits(max_message_bytes=4096, max_in_flight=8, **RATE))
     before = limiter.available(0.0)
     session = ClientSession(codec=CODEC, settings=SessionSettings(), sdk="t")
     connection = welcomed(session)

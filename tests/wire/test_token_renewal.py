@@ -6,15 +6,12 @@ import itertools
 
 import pytest
 import server_sessions
+from wire.client_sessions import CODEC, SETTINGS, make_session, open_connection
 
-from rse_pf.config import SessionSettings
-from rse_pf.wire import Failure, Hello, Limits, Renew, Renewed, Welcome, make_codec
+from rse_pf.wire import Failure, Hello, Renew, Renewed, Welcome
 from rse_pf.wire.client_session import ClientSession, ConnectionState, RenewalDue
 from rse_pf.wire.renewal_timer import RenewalTimer
 from rse_pf.wire.server_session import RENEWAL_PAUSE_S, Renewal, Send, ServerSession
-
-SETTINGS = SessionSettings()
-CODEC = make_codec("json", SETTINGS)
 
 
 def server_session(token_s: float | None = 100.0) -> tuple[ServerSession, Welcome]:
@@ -28,15 +25,8 @@ def server_session(token_s: float | None = 100.0) -> tuple[ServerSession, Welcom
 
 
 def linked(token_s: float | None) -> tuple[ClientSession, ConnectionState]:
-    session = ClientSession(codec=CODEC, settings=SETTINGS, sdk="test")
-    connection = session.open_connection(0.0)
-    limits = Limits(max_message_bytes=4096, max_in_flight=8)
-    welcome = Welcome(
-        server="a", session="s", robot="r", protocol=1, clock_s=0.0, limits=limits, token_s=token_s
-    )
-    session.receive(connection, CODEC.encode(welcome), 0.0)
-    session.adopt(connection, 0.0)
-    return session, connection
+    session = make_session()
+    return session, open_connection(session, token_s=token_s)
 
 
 def asked_at(session: ClientSession, connection: ConnectionState, until: int) -> list[int]:

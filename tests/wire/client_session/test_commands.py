@@ -5,56 +5,17 @@ from __future__ import annotations
 import math
 
 import pytest
+from wire.client_sessions import SETTINGS, codes, commands, make_session, open_connection, sent, tell
 
-from rse_pf.config import SessionSettings
 from rse_pf.errors import BadMessage, LimitExceeded, ProtocolError
-from rse_pf.wire import Command, Failure, Hello, Limits, Move, Ping, Pong, Result, Welcome, make_codec
+from rse_pf.wire import Command, Failure, Hello, Move, Ping, Pong, Result, make_codec
 from rse_pf.wire.client_session import (
     RETRY_SHARE,
-    Answered,
     ClientSession,
     ConnectionLost,
     ConnectionState,
     MoveRequested,
-    Welcomed,
 )
-
-SETTINGS = SessionSettings()
-CODEC = make_codec("json", SETTINGS)
-
-
-def make_session(settings: SessionSettings = SETTINGS) -> ClientSession:
-    return ClientSession(codec=CODEC, settings=settings, sdk="test")
-
-
-def tell(session: ClientSession, connection: ConnectionState, message, now: float):
-    return session.receive(connection, CODEC.encode(message), now)
-
-
-def open_connection(
-    session: ClientSession, now: float = 0.0, server: str = "a", *, room: int = 8
-) -> ConnectionState:
-    """Open, welcome and adopt a connection."""
-    connection = session.open_connection(now)
-    welcome = Welcome(
-        server=server, session="s", robot="r", protocol=1, clock_s=now,
-        limits=Limits(max_message_bytes=4096, max_in_flight=room),
-    )  # fmt: skip
-    (event,) = tell(session, connection, welcome, now)
-    assert event == Welcomed(welcome)
-    session.adopt(connection, now)
-    return connection
-
-
-def sent(connection: ConnectionState) -> list:
-    """Return and forget what the session wrote on *connection*."""
-    messages = [CODEC.decode_from_robot(data) for data in connection.outgoing]
-    connection.outgoing.clear()
-    return messages
-
-
-def commands(connection: ConnectionState) -> list[Command]:
-    return [message for message in sent(connection) if isinstance(message, Command)]
 
 
 def result(command: Command, **stamps: float) -> Result:
@@ -63,15 +24,6 @@ def result(command: Command, **stamps: float) -> Result:
 
 def failure(command: Command, code: str, **more) -> Failure:
     return Failure(id=command.id, code=code, message=code, **more)
-
-
-def codes(events) -> dict[int, str]:
-    """Return how each answered command ended."""
-    return {
-        event.id: event.answer.code if isinstance(event.answer, Failure) else "ok"
-        for event in events
-        if isinstance(event, Answered)
-    }
 
 
 def tend_until_lost(session: ClientSession, connection: ConnectionState) -> tuple[float, list]:

@@ -7,13 +7,11 @@ from collections import Counter
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
+from wire.client_sessions import CODEC, SETTINGS, make_session, open_connection
 
-from rse_pf.config import SessionSettings
-from rse_pf.wire import Command, Failure, Limits, Ping, Pong, Rate, Refused, Result, Welcome, make_codec
+from rse_pf.wire import Command, Failure, Limits, Ping, Pong, Rate, Refused, Result, Welcome
 from rse_pf.wire.client_session import Answered, ClientSession, ConnectionState, Notice
 
-SETTINGS = SessionSettings()
-CODEC = make_codec("json", SETTINGS)
 ROOM = 3
 CODES = ("busy", "worker-lost", "stale", "expired", "internal", "degenerate")
 
@@ -168,19 +166,15 @@ TestRobotLife.settings = hypothesis_settings(max_examples=30, stateful_step_coun
 
 
 def test_a_failure_without_an_id_is_a_notice():
-    session = ClientSession(codec=CODEC, settings=SETTINGS, sdk="test")
+    session = make_session()
     told = Failure(code="bad-message", message="what?")
 
     assert session.receive(session.open_connection(0.0), CODEC.encode(told), 0.1) == [Notice(told)]
 
 
 def test_an_answer_that_comes_after_the_deadline_is_not_delivered_as_fresh() -> None:
-    session = ClientSession(codec=CODEC, settings=SETTINGS, sdk="test")
-    connection = session.open_connection(0.0)
-    limits = Limits(max_message_bytes=4096, max_in_flight=ROOM)
-    welcome = Welcome(server="a", session="s", robot="r", protocol=1, clock_s=0.0, limits=limits)
-    session.receive(connection, CODEC.encode(welcome), 0.0)
-    session.adopt(connection, 0.0)
+    session = make_session()
+    connection = open_connection(session)
     for _ in range(2):
         session.submit("x", None, now=0.0, deadline_s=1.0)
 

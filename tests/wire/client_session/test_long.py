@@ -2,58 +2,14 @@
 
 from __future__ import annotations
 
-from rse_pf.config import SessionSettings
-from rse_pf.wire import Cancel, Command, Failure, Limits, Progress, Result, Welcome, make_codec
-from rse_pf.wire.client_session import Answered, ClientSession, ConnectionState, Progressed
+from wire.client_sessions import SETTINGS, codes, commands, make_session, open_connection, sent, tell
 
-SETTINGS = SessionSettings()
-CODEC = make_codec("json", SETTINGS)
-
-
-def make_session() -> ClientSession:
-    return ClientSession(codec=CODEC, settings=SETTINGS, sdk="test")
-
-
-def tell(session: ClientSession, connection: ConnectionState, message, now: float):
-    return session.receive(connection, CODEC.encode(message), now)
-
-
-def open_connection(session: ClientSession, now: float = 0.0, server: str = "a") -> ConnectionState:
-    """Open, welcome and adopt a connection."""
-    connection = session.open_connection(now)
-    limits = Limits(max_message_bytes=4096, max_in_flight=8)
-    tell(
-        session,
-        connection,
-        Welcome(server=server, session="s", robot="r", protocol=1, clock_s=now, limits=limits),
-        now,
-    )
-    session.adopt(connection, now)
-    return connection
-
-
-def sent(connection: ConnectionState) -> list:
-    """Return and forget what the session wrote on *connection*."""
-    messages = [CODEC.decode_from_robot(data) for data in connection.outgoing]
-    connection.outgoing.clear()
-    return messages
-
-
-def commands(connection: ConnectionState) -> list[Command]:
-    return [message for message in sent(connection) if isinstance(message, Command)]
+from rse_pf.wire import Cancel, Command, Failure, Progress, Result
+from rse_pf.wire.client_session import Progressed
 
 
 def result(command: Command) -> Result:
     return Result(id=command.id, reply=command.seq, server="a")
-
-
-def codes(events) -> dict[int, str]:
-    """Return how each answered command ended."""
-    return {
-        event.id: event.answer.code if isinstance(event.answer, Failure) else "ok"
-        for event in events
-        if isinstance(event, Answered)
-    }
 
 
 def test_a_command_that_reports_progress_has_no_deadline_but_its_callers():
