@@ -102,13 +102,6 @@ def test_the_data_path_is_everything_but_the_control_plane() -> None:
     assert STATE.processes() == (mark(2), mark(3))
 
 
-def test_a_write_leaves_no_other_file_behind(tmp_path: Path) -> None:
-    STATE.write(tmp_path)
-    STATE.write(tmp_path)
-
-    assert [file.name for file in tmp_path.iterdir()] == ["platform.json"]
-
-
 def test_no_file_means_no_platform(tmp_path: Path) -> None:
     assert read_state(tmp_path) is None
     remove_state(tmp_path)

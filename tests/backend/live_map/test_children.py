@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import socket
-from collections.abc import Awaitable, Callable
 from typing import Any
 
 import pytest
@@ -41,6 +40,14 @@ class Worker:
             lambda calmly: PlayedProcess(), max_owners=max_owners, keeps_spare=False, clock=lambda: self.now_s
         )
 
+    async def __aenter__(self) -> Worker:
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        self.children.drop_spare()
+        for child in self.children.used:
+            child.kill()
+
     def take(self, tenant: str, *, only_watched: bool = False) -> OwnerChild | None:
         return self.children.take(tenant, lambda child, code: None, only_watched=only_watched)
 
@@ -54,21 +61,8 @@ class Worker:
         return child
 
 
-def play(max_owners: int, test: Callable[[Worker], Awaitable[None]]) -> None:
-    async def run() -> None:
-        worker = Worker(max_owners)
-        try:
-            await asyncio.wait_for(test(worker), 10.0)
-        finally:
-            worker.children.drop_spare()
-            for child in worker.children.used:
-                child.kill()
-
-    asyncio.run(run())
-
-
-def test_a_tenant_that_holds_all_gives_one_up_and_does_not_get_it_back() -> None:
-    async def test(worker: Worker) -> None:
+async def test_a_tenant_that_holds_all_gives_one_up_and_does_not_get_it_back() -> None:
+    async with Worker(3) as worker:
         for _ in range(3):
             await worker.gets("acme")
         assert worker.take("acme") is None
@@ -80,32 +74,26 @@ def test_a_tenant_that_holds_all_gives_one_up_and_does_not_get_it_back() -> None
         await asyncio.sleep(0)
         assert worker.held() == ["acme", "acme", "rival"]
 
-    play(3, test)
 
-
-def test_the_map_that_was_only_watched_for_longest_gives_up_first() -> None:
-    async def test(worker: Worker) -> None:
+async def test_the_map_that_was_only_watched_for_longest_gives_up_first() -> None:
+    async with Worker(3) as worker:
         first, second, third = [await worker.gets("acme") for _ in range(3)]
         second.unused_s, third.unused_s = 5.0, 4.0
         await worker.gets("rival")
         assert third not in worker.children.used
         assert {first, second} < set(worker.children.used)
 
-    play(3, test)
 
-
-def test_a_map_that_is_only_watched_gives_up_for_another_one_of_its_tenant() -> None:
-    async def test(worker: Worker) -> None:
+async def test_a_map_that_is_only_watched_gives_up_for_another_one_of_its_tenant() -> None:
+    async with Worker(1) as worker:
         watched = await worker.gets("acme")
         watched.unused_s = 1.0
         driven = await worker.gets("acme")
         assert worker.children.used == [driven]
 
-    play(1, test)
 
-
-def test_a_tenant_does_not_lose_its_only_map_to_one_that_holds_more() -> None:
-    async def test(worker: Worker) -> None:
+async def test_a_tenant_does_not_lose_its_only_map_to_one_that_holds_more() -> None:
+    async with Worker(3) as worker:
         for _ in range(2):
             await worker.gets("acme")
         watched = await worker.gets("rival")
@@ -115,11 +103,9 @@ def test_a_tenant_does_not_lose_its_only_map_to_one_that_holds_more() -> None:
             await asyncio.sleep(0)
         assert watched in worker.children.used
 
-    play(3, test)
 
-
-def test_a_map_that_is_only_watched_takes_a_process_only_while_no_other_map_wants_one() -> None:
-    async def test(worker: Worker) -> None:
+async def test_a_map_that_is_only_watched_takes_a_process_only_while_no_other_map_wants_one() -> None:
+    async with Worker(1) as worker:
         watched = await worker.gets("acme")
         watched.unused_s = 1.0
         assert worker.take("rival", only_watched=True) is None
@@ -131,11 +117,9 @@ def test_a_map_that_is_only_watched_takes_a_process_only_while_no_other_map_want
         worker.now_s += 60.0
         assert worker.take("acme", only_watched=True) is not None
 
-    play(1, test)
 
-
-def test_a_process_that_is_told_to_be_used_is_not_the_first_to_go() -> None:
-    async def test(worker: Worker) -> None:
+async def test_a_process_that_is_told_to_be_used_is_not_the_first_to_go() -> None:
+    async with Worker(1) as worker:
         child = worker.children.prepare()
         assert child is not None
         process = child._process
@@ -152,16 +136,14 @@ def test_a_process_that_is_told_to_be_used_is_not_the_first_to_go() -> None:
             await asyncio.sleep(0)
         assert child.unused_s == 7.0
 
-    play(1, test)
 
-
-def test_the_processor_time_of_owners_counts_for_their_tenants_also_when_they_have_ended(
+async def test_the_processor_time_of_owners_counts_for_their_tenants_also_when_they_have_ended(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     taken_s = [0.0]
     monkeypatch.setattr("rse_pf.backend.live_map.children.cpu_seconds", lambda pid: taken_s[0])
 
-    async def test(worker: Worker) -> None:
+    async with Worker(2) as worker:
         taken_s[0] = 1.0  # its imports
         child = await worker.gets("acme")
         taken_s[0] = 3.5
@@ -172,5 +154,3 @@ def test_the_processor_time_of_owners_counts_for_their_tenants_also_when_they_ha
         await worker.gets("acme")
         taken_s[0] = 4.25
         assert worker.children.cpu_by_tenant() == {"acme": 2.75}
-
-    play(2, test)

@@ -24,7 +24,7 @@ from rse_pf.backend.sandbox.policy import (
 )
 from rse_pf.backend.scheduling.scheduler import QueuedCommand
 from rse_pf.config import PlatformSettings
-from rse_pf.errors import BadRequest, Conflict, RsePfError, StoreError
+from rse_pf.errors import BadRequest, RsePfError, StoreError
 from rse_pf.identity import RobotId
 from rse_pf.ipc import encode_message
 from rse_pf.wire import Command
@@ -161,21 +161,6 @@ def test_a_command_is_tried_twice_and_no_more():
 
     assert outcomes(actions) == [(call, "worker-lost")]
     assert policy.sandboxes == 0
-
-
-def test_a_request_that_crashed_so_many_sandboxes_of_a_robot_is_poison_for_that_robot():
-    policy, call = make_policy(poison_crashes=2), make_call(A)
-    start(policy, call)
-    number = created(policy.on_exit(1, "exit code 1", 1.0))
-    policy.on_ready(number, 1.0)
-    assert outcomes(policy.on_exit(number, "exit code 1", 2.0)) == [(call, "poison")]
-
-    again, other, same_of_b = make_call(A), make_call(A, payload="y"), make_call(B)
-
-    assert outcomes(policy.submit(again, 3.0)) == [(again, "poison")]
-    assert created(policy.submit(other, 3.0)) == 3
-    assert created(policy.submit(same_of_b, 3.0)) == 4
-    assert policy.counts == {"created": 4, "crashed": 2, "poison": 2}
 
 
 def test_an_open_circuit_breaker_refuses_what_waits_as_well():
@@ -609,19 +594,6 @@ def test_a_store_that_fails_is_answered_as_such_and_the_sandbox_goes_on():
 
     assert outcomes(policy.on_store_reply(1, call, StoreError("503"), 1.1)) == [(call, "store")]
     assert policy.submit(make_call(service="counter", payload="2"), 1.2) == [SendMessage(1, b"2")]
-
-
-def test_a_newer_snapshot_in_the_store_ends_the_sandbox_and_moves_what_waits():
-    policy = make_policy()
-    call, second = run_counter(policy), make_call(service="counter", payload="2")
-    policy.submit(second, 0.5)
-    policy.on_reply(1, SandboxReply("done", 1.0, b"2"), 1.0)
-
-    actions = policy.on_store_reply(1, call, Conflict("changed"), 1.1)
-
-    assert outcomes(actions) == [(call, "worker-lost")]
-    assert actions[0] == ReleaseSandbox(1)
-    assert policy.on_ready(created(actions), 1.2) == [LoadSnapshot(2, second)]
 
 
 def test_a_restore_that_failed_is_repeated_before_the_next_command():

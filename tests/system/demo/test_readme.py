@@ -7,7 +7,6 @@ from pathlib import Path
 
 import pytest
 
-from rse_pf.cli.main import VERBS
 from rse_pf.config import PlatformSettings
 from rse_pf.local.control.platform import LocalPlatform
 from rse_pf.pnp.problems import make_problem
@@ -37,19 +36,3 @@ async def test_the_robot_in_ten_lines_gets_its_pose(repository, tmp_path, capsys
         await names["main"](token, problem.points_world, problem.pixels)
 
     assert capsys.readouterr().out.split()[0] in ("ok", "weak")
-
-
-def test_every_verb_of_the_first_pose_exists(repository):
-    named = {word for block in blocks(repository, "") for word in re.findall(r"\brse-pf (\w+)", block)}
-    assert {"local", "token"} == named <= set(VERBS)
-
-
-def test_every_make_verb_the_pages_name_exists(repository):
-    verbs = set(re.findall(r"^([a-z]+):.*##", (repository / "Makefile").read_text(), re.MULTILINE))
-    for page in ("README.md", "CONTRIBUTING.md"):
-        text = (repository / page).read_text(encoding="utf-8")
-        named = set(re.findall(r"`make ([a-z]+)", text)) | set(
-            re.findall(r"^make ([a-z]+)", text, re.MULTILINE)
-        )
-        assert named
-        assert named <= verbs
