@@ -428,6 +428,17 @@ def test_the_sandbox_of_a_robot_stays_when_one_of_the_same_name_in_another_tenan
     assert policy.tick(2.0 + GRACE_S) == [ReleaseSandbox(2)]
 
 
+def test_a_robot_that_reconnects_within_the_grace_period_keeps_its_sandbox():
+    policy = make_policy()
+    start(policy, make_call())
+    policy.on_reply(1, OK, 1.0)
+    policy.remove_connection(A, 2.0)
+    policy.add_connection(A)
+
+    assert policy.tick(100.0) == []
+    assert policy.submit(make_call(payload="2", now=100.0), 100.0) == [SendMessage(1, b"2")]
+
+
 def test_commands_that_wait_for_a_robot_that_left_are_dropped_and_not_moved():
     policy = make_policy()
     start(policy, make_call(payload="1"))

@@ -68,7 +68,6 @@ async def test_a_page_connects_by_its_token_which_no_log_holds(tmp_path: Path, c
         data = f"{own}/data/v1/objects/{'0' * 64}"
         asked = [await asyncio.to_thread(preflight, data, each) for each in (PAGE, "https://evil.example")]
         config = json.loads(next(folder.rglob("envoy*.json")).read_text())
-    told, asked, tokens, config = told, asked, tokens, config
 
     assert told == [
         (101, "rse-pf.v1.json"),

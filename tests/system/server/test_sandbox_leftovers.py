@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import json
 import shutil
 import subprocess
@@ -200,10 +199,9 @@ async def test_a_robot_finds_nothing_that_another_left_in_any_language(start_ser
         server.robot(token=server.token("one")) as one,
         server.robot(token=server.token("two")) as two,
     ):
-        left = await does(one, "leave")
-        left, own, others = left, await does(one, "find"), await does(two, "find")
+        left, own, others = await does(one, "leave"), await does(one, "find"), await does(two, "find")
     assert until(lambda: server.status()["isolation"]["sandboxes"] == 0)
-    later = [asyncio.run(after(name)) for name in ("three", "one")]
+    later = [await after(name) for name in ("three", "one")]
 
     assert set(left["python"]) == {"file"}, "no object of the kernel and no socket could be made"
     assert all(own.values()), "what was left is found by its own robot, so that the search works"

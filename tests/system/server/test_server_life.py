@@ -33,7 +33,6 @@ async def test_a_drain_moves_the_robots_and_loses_nothing(start_server):
             assert isinstance(got[0], Move), "the move comes before the slow answer"
             answers += got
             await robot.socket.close()
-        status, answers = status, answers
     assert status == 202
     assert [a.id for a in answers if isinstance(a, Result)] == [1, 2, 1, 2]
     moves = [a for a in answers if isinstance(a, Move)]

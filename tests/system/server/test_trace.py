@@ -89,7 +89,7 @@ async def test_one_id_goes_from_the_robot_to_every_log(start_server: Any, tmp_pa
         with traced() as trace:
             await robot.solve_pnp(problem.points_world, problem.pixels, problem.camera)
             await robot.call("long", {}, on_progress=lambda done, what: None)
-            trace, function = trace, of_function(current_trace())
+            function = of_function(current_trace())
 
     server.wait_for_log("job")
     logged = [line for line in server.lines if line["event"] in ("command", "job")]

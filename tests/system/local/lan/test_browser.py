@@ -125,7 +125,6 @@ async def test_a_page_over_https_connects_with_a_token_and_only_if_the_authority
         browser.trust(authority_file(folder))
         connected = await asyncio.to_thread(browser.visit, page, token)
         refused = await asyncio.to_thread(browser.visit, page, f"{token[:-4]}AAAA")
-        untrusted, connected, refused = untrusted, connected, refused
 
     assert connected == "welcome by server-1 as browser-1"
     assert refused == "refused"
