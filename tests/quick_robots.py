@@ -20,11 +20,6 @@ QUICK = SessionSettings(
 )
 
 
-def run(test):
-    """Run an async test within a deadline."""
-    return asyncio.run(asyncio.wait_for(test, 20))
-
-
 def robot(url, **options):
     return client_sdk.connect(url, settings=QUICK, random=random.Random(1), **options)
 

@@ -41,26 +41,20 @@ def test_what_no_header_can_hold_is_refused_without_showing_it(wrong: object) ->
 
 
 @pytest.mark.system
-def test_a_token_that_was_read_with_its_newline_connects() -> None:
-    async def test() -> None:
-        async with FakePlatform() as platform:
-            platform.token = SECRET
-            async with robot(platform.url, token=f"{SECRET}\n"):
-                assert platform.tokens_seen == [SECRET]
-
-    asyncio.run(asyncio.wait_for(test(), 20))
+async def test_a_token_that_was_read_with_its_newline_connects() -> None:
+    async with FakePlatform() as platform:
+        platform.token = SECRET
+        async with robot(platform.url, token=f"{SECRET}\n"):
+            assert platform.tokens_seen == [SECRET]
 
 
 @pytest.mark.system
-def test_a_broken_token_ends_at_once_and_is_in_no_message() -> None:
-    async def test() -> None:
-        async with FakePlatform() as platform:
-            with pytest.raises(Unauthorized) as told:
-                await robot(platform.url, token=f"{SECRET}\nX-Other: 1").__aenter__()
-            assert "eyJ" not in str(told.value)
-            assert platform.handshakes == []
-
-    asyncio.run(asyncio.wait_for(test(), 20))
+async def test_a_broken_token_ends_at_once_and_is_in_no_message() -> None:
+    async with FakePlatform() as platform:
+        with pytest.raises(Unauthorized) as told:
+            await robot(platform.url, token=f"{SECRET}\nX-Other: 1").__aenter__()
+        assert "eyJ" not in str(told.value)
+        assert platform.handshakes == []
 
 
 def test_the_client_of_the_data_service_does_not_show_a_broken_token_either() -> None:
@@ -71,47 +65,41 @@ def test_the_client_of_the_data_service_does_not_show_a_broken_token_either() ->
 
 
 @pytest.mark.system
-def test_with_an_offload_a_robot_answers_itself_until_the_cloud_is_there() -> None:
-    async def test() -> None:
-        problem, seen, is_back = make_problem(seed=3), [], asyncio.Event()
-        frame = (problem.points_world, problem.pixels, problem.camera)
+async def test_with_an_offload_a_robot_answers_itself_until_the_cloud_is_there() -> None:
+    problem, seen, is_back = make_problem(seed=3), [], asyncio.Event()
+    frame = (problem.points_world, problem.pixels, problem.camera)
 
-        def note(what: str, why: str) -> None:
-            seen.append(what)
-            if what == "link-back":
-                is_back.set()
+    def note(what: str, why: str) -> None:
+        seen.append(what)
+        if what == "link-back":
+            is_back.set()
 
-        with socket.socket() as held:
-            held.bind(("127.0.0.1", 0))
-            url = f"ws://127.0.0.1:{held.getsockname()[1]}/ws"
-            own = robot(url, offload=client_sdk.CloudFirst(), on_change=note)
-            async with own:
-                answer = await own.solve_pnp(*frame, deadline_s=1.0)
+    with socket.socket() as held:
+        held.bind(("127.0.0.1", 0))
+        url = f"ws://127.0.0.1:{held.getsockname()[1]}/ws"
+        own = robot(url, offload=client_sdk.CloudFirst(), on_change=note)
+        async with own:
+            answer = await own.solve_pnp(*frame, deadline_s=1.0)
 
-                assert (answer.source, answer.why) == ("robot", "no connection to the cloud")
-                np.testing.assert_allclose(answer.solution.T_camera_world, problem.T_camera_world, atol=0.05)
-                assert seen == ["link-lost"]
-                assert url in own.stats.last_error
+            assert (answer.source, answer.why) == ("robot", "no connection to the cloud")
+            np.testing.assert_allclose(answer.solution.T_camera_world, problem.T_camera_world, atol=0.05)
+            assert seen == ["link-lost"]
+            assert url in own.stats.last_error
 
-                port = held.getsockname()[1]
-                held.close()
-                platform = FakePlatform()
-                await platform.listen(port)
-                try:
-                    await is_back.wait()
-                    assert (await own.call("echo", {"value": 1}, deadline_s=5)).reply == {"value": 1}
-                finally:
-                    await platform.stop()
-
-    asyncio.run(asyncio.wait_for(test(), 30))
+            port = held.getsockname()[1]
+            held.close()
+            platform = FakePlatform()
+            await platform.listen(port)
+            try:
+                await is_back.wait()
+                assert (await own.call("echo", {"value": 1}, deadline_s=5)).reply == {"value": 1}
+            finally:
+                await platform.stop()
 
 
 @pytest.mark.system
-def test_without_an_offload_a_cloud_that_is_down_is_an_error() -> None:
-    async def test() -> None:
-        with socket.socket() as held:
-            held.bind(("127.0.0.1", 0))
-            with pytest.raises(ConnectError, match="start it with rse-pf local"):
-                await robot(f"ws://127.0.0.1:{held.getsockname()[1]}/ws").__aenter__()
-
-    asyncio.run(asyncio.wait_for(test(), 20))
+async def test_without_an_offload_a_cloud_that_is_down_is_an_error() -> None:
+    with socket.socket() as held:
+        held.bind(("127.0.0.1", 0))
+        with pytest.raises(ConnectError, match="start it with rse-pf local"):
+            await robot(f"ws://127.0.0.1:{held.getsockname()[1]}/ws").__aenter__()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import random
-from collections.abc import Coroutine
 from typing import Any
 
 import pytest
@@ -18,10 +17,6 @@ from rse_pf.wire.client_session import Answered
 from rse_pf.wire.preencoded import preencode
 
 FAST = SessionSettings(reconnect_max_s=0.05, stall_timeout_s=0.4, ping_interval_s=0.2)
-
-
-def run(work: Coroutine[Any, Any, None]) -> None:
-    asyncio.run(asyncio.wait_for(work, 30))
 
 
 def connect(server: FakeServer, **options: Any) -> client_sdk.Robot:
@@ -46,110 +41,89 @@ class Ends:
 
 
 @pytest.mark.parametrize("codec", ["zlib", "json", "bin"])
-def test_a_preencoded_payload_is_answered_in_every_codec(codec: str) -> None:
-    async def work() -> None:
-        async with FakeServer().running() as server, connect(server, codec=codec) as robot:
-            ends = Ends()
-            robot.post("echo", preencode(make_codec(codec), {"value": [1, 2.5]}), ends)
-            await ends.until(1)
-            assert isinstance(ends.heard[0].answer, Result)
-            assert ends.heard[0].answer.reply == {"value": [1, 2.5]}
-
-    run(work())
+async def test_a_preencoded_payload_is_answered_in_every_codec(codec: str) -> None:
+    async with FakeServer().running() as server, connect(server, codec=codec) as robot:
+        ends = Ends()
+        robot.post("echo", preencode(make_codec(codec), {"value": [1, 2.5]}), ends)
+        await ends.until(1)
+        assert isinstance(ends.heard[0].answer, Result)
+        assert ends.heard[0].answer.reply == {"value": [1, 2.5]}
 
 
-def test_a_posted_command_is_sent_again_on_the_next_socket_and_ends_once() -> None:
-    async def work() -> None:
-        async with FakeServer(answer=answer_nothing).running() as server, connect(server) as robot:
-            ends = Ends()
-            payload = preencode(make_codec("zlib"), {"value": 7})
-            robot.post("echo", payload, ends)
-            await server.until(lambda: len(server.all_commands) == 1)
-            server.answer = answer_at_once
-            server.cut()
-            await ends.until(1)
-            assert isinstance(ends.heard[0].answer, Result)
-            assert ends.heard[0].answer.reply == {"value": 7}
-            assert robot.stats.resent == 1
-            assert robot.stats.duplicates == 0
-
-    run(work())
+async def test_a_posted_command_is_sent_again_on_the_next_socket_and_ends_once() -> None:
+    async with FakeServer(answer=answer_nothing).running() as server, connect(server) as robot:
+        ends = Ends()
+        payload = preencode(make_codec("zlib"), {"value": 7})
+        robot.post("echo", payload, ends)
+        await server.until(lambda: len(server.all_commands) == 1)
+        server.answer = answer_at_once
+        server.cut()
+        await ends.until(1)
+        assert isinstance(ends.heard[0].answer, Result)
+        assert ends.heard[0].answer.reply == {"value": 7}
+        assert robot.stats.resent == 1
+        assert robot.stats.duplicates == 0
 
 
-def test_an_unanswered_posted_command_expires() -> None:
-    async def work() -> None:
-        async with FakeServer(answer=answer_nothing).running() as server, connect(server) as robot:
-            ends = Ends()
-            robot.post("echo", {"value": 1}, ends, deadline_s=0.1)
-            await ends.until(1)
-            assert isinstance(ends.heard[0].answer, Failure)
-            assert ends.heard[0].answer.code == "expired"
-
-    run(work())
+async def test_an_unanswered_posted_command_expires() -> None:
+    async with FakeServer(answer=answer_nothing).running() as server, connect(server) as robot:
+        ends = Ends()
+        robot.post("echo", {"value": 1}, ends, deadline_s=0.1)
+        await ends.until(1)
+        assert isinstance(ends.heard[0].answer, Failure)
+        assert ends.heard[0].answer.code == "expired"
 
 
-def test_a_second_answer_to_one_command_is_dropped() -> None:
+async def test_a_second_answer_to_one_command_is_dropped() -> None:
     async def twice(server: FakeServer, robot: FakeRobot, command: Command) -> None:
         answer = answer_at_once(server, robot, command)
         await robot.websocket.send(robot.session.codec.encode(answer))
 
-    async def work() -> None:
-        def answer(server: FakeServer, robot: FakeRobot, command: Command) -> Result | Failure | None:
-            server.extra = asyncio.ensure_future(twice(server, robot, command))
-            return answer_at_once(server, robot, command)
+    def answer(server: FakeServer, robot: FakeRobot, command: Command) -> Result | Failure | None:
+        server.extra = asyncio.ensure_future(twice(server, robot, command))
+        return answer_at_once(server, robot, command)
 
-        async with FakeServer(answer=answer).running() as server, connect(server) as robot:
-            ends = Ends()
-            robot.post("echo", {"value": 1}, ends)
-            await server.until(lambda: robot.stats.dropped_answers == 1)
-            assert len(ends.heard) == 1
-
-    run(work())
+    async with FakeServer(answer=answer).running() as server, connect(server) as robot:
+        ends = Ends()
+        robot.post("echo", {"value": 1}, ends)
+        await server.until(lambda: robot.stats.dropped_answers == 1)
+        assert len(ends.heard) == 1
 
 
-def test_nothing_is_posted_by_a_robot_that_is_closed() -> None:
-    async def work() -> None:
-        async with FakeServer().running() as server:
-            async with connect(server) as robot:
-                pass
-            with pytest.raises(Disconnected):
-                robot.post("echo", {}, Ends())
-
-    run(work())
+async def test_nothing_is_posted_by_a_robot_that_is_closed() -> None:
+    async with FakeServer().running() as server:
+        async with connect(server) as robot:
+            pass
+        with pytest.raises(Disconnected):
+            robot.post("echo", {}, Ends())
 
 
-def test_a_lost_connection_and_its_return_are_reported_once_each() -> None:
-    async def work() -> None:
-        told: list[tuple[str, str]] = []
-        back = asyncio.Event()
+async def test_a_lost_connection_and_its_return_are_reported_once_each() -> None:
+    told: list[tuple[str, str]] = []
+    back = asyncio.Event()
 
-        def changed(what: str, why: str) -> None:
-            told.append((what, why))
-            if what == "link-back":
-                back.set()
+    def changed(what: str, why: str) -> None:
+        told.append((what, why))
+        if what == "link-back":
+            back.set()
 
-        async with FakeServer().running() as server, connect(server, on_change=changed):
-            server.cut()
-            await back.wait()
-        assert told == [("link-lost", "closed"), ("link-back", "fake")]
-
-    run(work())
+    async with FakeServer().running() as server, connect(server, on_change=changed):
+        server.cut()
+        await back.wait()
+    assert told == [("link-lost", "closed"), ("link-back", "fake")]
 
 
-def test_a_stalled_connection_is_reported_with_its_reason() -> None:
-    async def work() -> None:
-        told: list[tuple[str, str]] = []
-        lost = asyncio.Event()
+async def test_a_stalled_connection_is_reported_with_its_reason() -> None:
+    told: list[tuple[str, str]] = []
+    lost = asyncio.Event()
 
-        def changed(what: str, why: str) -> None:
-            told.append((what, why))
-            lost.set()
+    def changed(what: str, why: str) -> None:
+        told.append((what, why))
+        lost.set()
 
-        async with FakeServer().running() as server, connect(server, on_change=changed) as robot:
-            server.deaf = True
-            robot.post("echo", {"value": 1}, Ends())
-            await lost.wait()
-            server.deaf = False
-        assert told[0] == ("link-lost", "silence")
-
-    run(work())
+    async with FakeServer().running() as server, connect(server, on_change=changed) as robot:
+        server.deaf = True
+        robot.post("echo", {"value": 1}, Ends())
+        await lost.wait()
+        server.deaf = False
+    assert told[0] == ("link-lost", "silence")

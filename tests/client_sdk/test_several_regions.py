@@ -66,11 +66,6 @@ class TwoRegions:
         )  # fmt: skip
 
 
-def run(test):
-    """Run an async test within a deadline."""
-    return asyncio.run(asyncio.wait_for(test, 30))
-
-
 def ask(a_robot, value, **options):
     return asyncio.create_task(a_robot.call("echo", {"value": value}, **options))
 
@@ -81,209 +76,170 @@ async def asked_until(a_robot, server):
         await asyncio.sleep(0)
 
 
-def test_the_nearer_region_is_used_and_the_other_one_stands_by():
-    async def test():
-        async with TwoRegions() as regions:
-            began = time.monotonic()
-            async with regions.robot() as a_robot:
-                assert time.monotonic() - began < 2.0
-                assert (await ask(a_robot, 1)).server == "near-1"
-                assert a_robot.stats.region == regions.near_link.url
+async def test_the_nearer_region_is_used_and_the_other_one_stands_by():
+    async with TwoRegions() as regions:
+        began = time.monotonic()
+        async with regions.robot() as a_robot:
+            assert time.monotonic() - began < 2.0
+            assert (await ask(a_robot, 1)).server == "near-1"
+            assert a_robot.stats.region == regions.near_link.url
+            await regions.both_joined()
+
+            assert not list(regions.far.commands())
+            assert a_robot.stats.region_changes == 0
+
+
+async def test_a_region_is_no_nearer_for_saying_that_all_of_the_time_was_its_own():
+    async with TwoRegions() as regions:
+        send = FakeSocket.send
+
+        async def sends(socket, data):
+            message = json.loads(data) if data[:1] == b"{" else {}
+            if message.get("type") == "pong" and socket.server == "far-1":
+                data = json.dumps({**message, "received_s": message["answered_s"] - 1.0}).encode()
+            await send(socket, data)
+
+        with pytest.MonkeyPatch.context() as patched:
+            patched.setattr(FakeSocket, "send", sends)
+            regions.near_link.delay_s = 0.04
+            async with regions.robot(codec="json") as a_robot:
                 await regions.both_joined()
-
-                assert not list(regions.far.commands())
-                assert a_robot.stats.region_changes == 0
-
-    run(test())
+                until = time.monotonic() + 3 * QUICK.region_hold_s
+                while time.monotonic() < until:
+                    assert (await ask(a_robot, 1)).server == "near-1"
 
 
-def test_a_region_is_no_nearer_for_saying_that_all_of_the_time_was_its_own():
-    async def test():
-        async with TwoRegions() as regions:
-            send = FakeSocket.send
+async def test_a_region_that_dies_is_left_at_once_and_no_command_is_lost():
+    # Nobody would notice its silence before the deadlines of the commands.
+    patient = replace(QUICK, stall_timeout_s=25.0, ping_interval_s=25.0, ping_timeout_s=25.0)
+    async with TwoRegions() as regions, regions.robot(patient) as a_robot:
+        await regions.both_joined()
+        regions.near.hold = True
+        held = [ask(a_robot, n, deadline_s=10) for n in range(8)]
+        await regions.near.until(lambda: len(list(regions.near.commands())) == 8)
+        await regions.near_link.die()
 
-            async def sends(socket, data):
-                message = json.loads(data) if data[:1] == b"{" else {}
-                if message.get("type") == "pong" and socket.server == "far-1":
-                    data = json.dumps({**message, "received_s": message["answered_s"] - 1.0}).encode()
-                await send(socket, data)
+        answers = await asyncio.gather(*held)
 
-            with pytest.MonkeyPatch.context() as patched:
-                patched.setattr(FakeSocket, "send", sends)
-                regions.near_link.delay_s = 0.04
-                async with regions.robot(codec="json") as a_robot:
-                    await regions.both_joined()
-                    until = time.monotonic() + 3 * QUICK.region_hold_s
-                    while time.monotonic() < until:
-                        assert (await ask(a_robot, 1)).server == "near-1"
-
-    run(test())
+        assert [answer.reply["value"] for answer in answers] == list(range(8))
+        assert {answer.server for answer in answers} == {"far-1"}
+        stats = a_robot.stats
+        assert (stats.region, stats.region_changes, stats.duplicates) == (regions.far_link.url, 1, 0)
+        assert regions.changes[0] == ("stands-by", "far-1")
+        assert [what for what, _ in regions.changes[1:]] == ["link-lost", "link-back"]
 
 
-def test_a_region_that_dies_is_left_at_once_and_no_command_is_lost():
-    async def test():
-        # Nobody would notice its silence before the deadlines of the commands.
-        patient = replace(QUICK, stall_timeout_s=25.0, ping_interval_s=25.0, ping_timeout_s=25.0)
-        async with TwoRegions() as regions, regions.robot(patient) as a_robot:
-            await regions.both_joined()
-            regions.near.hold = True
-            held = [ask(a_robot, n, deadline_s=10) for n in range(8)]
-            await regions.near.until(lambda: len(list(regions.near.commands())) == 8)
-            await regions.near_link.die()
+async def test_a_region_that_falls_silent_is_left_although_its_sockets_stay_open():
+    async with TwoRegions() as regions, regions.robot() as a_robot:
+        await regions.both_joined()
+        regions.near_link.is_stalled = True
 
-            answers = await asyncio.gather(*held)
+        answer = await ask(a_robot, 1, deadline_s=10)
 
-            assert [answer.reply["value"] for answer in answers] == list(range(8))
-            assert {answer.server for answer in answers} == {"far-1"}
-            stats = a_robot.stats
-            assert (stats.region, stats.region_changes, stats.duplicates) == (regions.far_link.url, 1, 0)
-            assert regions.changes[0] == ("stands-by", "far-1")
-            assert [what for what, _ in regions.changes[1:]] == ["link-lost", "link-back"]
-
-    run(test())
+        assert answer.server == "far-1"
 
 
-def test_a_region_that_falls_silent_is_left_although_its_sockets_stay_open():
-    async def test():
-        async with TwoRegions() as regions, regions.robot() as a_robot:
-            await regions.both_joined()
-            regions.near_link.is_stalled = True
+async def test_a_region_that_comes_back_is_used_again_once_it_was_nearer_for_long_enough():
+    async with TwoRegions() as regions, regions.robot() as a_robot:
+        await regions.both_joined()
+        await regions.near_link.die()
+        await asked_until(a_robot, "far-1")
+        await regions.near_link.listen()
 
-            answer = await ask(a_robot, 1, deadline_s=10)
+        await asked_until(a_robot, "near-1")
 
-            assert answer.server == "far-1"
+        stats = a_robot.stats
+        assert (stats.region_changes, stats.failed, stats.duplicates) == (2, 0, 0)
+        assert ("moved", "near-1") in regions.changes
 
-    run(test())
+
+async def test_a_region_that_gets_slow_is_left_without_a_gap_and_nothing_is_sent_twice():
+    async with TwoRegions() as regions, regions.robot() as a_robot:
+        await regions.both_joined()
+        regions.near_link.delay_s = 0.2
+
+        await asked_until(a_robot, "far-1")
+
+        stats = a_robot.stats
+        assert (stats.region_changes, stats.reconnects, stats.resent, stats.failed) == (1, 0, 0, 0)
+        await regions.near.until(lambda: not regions.near.sockets[0].is_open)
+        await regions.near.until(lambda: regions.near.open_sockets())
 
 
-def test_a_region_that_comes_back_is_used_again_once_it_was_nearer_for_long_enough():
-    async def test():
-        async with TwoRegions() as regions, regions.robot() as a_robot:
-            await regions.both_joined()
-            await regions.near_link.die()
-            await asked_until(a_robot, "far-1")
+async def test_a_region_that_is_away_at_the_start_is_joined_when_it_is_there():
+    async with TwoRegions() as regions:
+        await regions.near_link.die()
+        async with regions.robot() as a_robot:
+            assert (await ask(a_robot, 1)).server == "far-1"
             await regions.near_link.listen()
 
             await asked_until(a_robot, "near-1")
 
-            stats = a_robot.stats
-            assert (stats.region_changes, stats.failed, stats.duplicates) == (2, 0, 0)
-            assert ("moved", "near-1") in regions.changes
 
-    run(test())
-
-
-def test_a_region_that_gets_slow_is_left_without_a_gap_and_nothing_is_sent_twice():
-    async def test():
-        async with TwoRegions() as regions, regions.robot() as a_robot:
-            await regions.both_joined()
-            regions.near_link.delay_s = 0.2
-
-            await asked_until(a_robot, "far-1")
-
-            stats = a_robot.stats
-            assert (stats.region_changes, stats.reconnects, stats.resent, stats.failed) == (1, 0, 0, 0)
-            await regions.near.until(lambda: not regions.near.sockets[0].is_open)
-            await regions.near.until(lambda: regions.near.open_sockets())
-
-    run(test())
+async def test_no_region_at_all_is_one_connect_error():
+    async with TwoRegions() as regions:
+        await regions.near_link.die()
+        await regions.far_link.die()
+        with pytest.raises(ConnectError, match="cannot connect"):
+            await regions.robot().__aenter__()
 
 
-def test_a_region_that_is_away_at_the_start_is_joined_when_it_is_there():
-    async def test():
-        async with TwoRegions() as regions:
-            await regions.near_link.die()
-            async with regions.robot() as a_robot:
-                assert (await ask(a_robot, 1)).server == "far-1"
-                await regions.near_link.listen()
-
-                await asked_until(a_robot, "near-1")
-
-    run(test())
-
-
-def test_no_region_at_all_is_one_connect_error():
-    async def test():
-        async with TwoRegions() as regions:
-            await regions.near_link.die()
-            await regions.far_link.die()
-            with pytest.raises(ConnectError, match="cannot connect"):
-                await regions.robot().__aenter__()
-
-    run(test())
-
-
-def test_a_robot_that_one_region_does_not_know_uses_the_other_one():
-    async def test():
-        async with TwoRegions() as regions:
-            regions.near.token, regions.far.token = "elsewhere", "mine"
-            async with regions.robot(token="mine") as a_robot:
-                assert (await ask(a_robot, 1)).server == "far-1"
-                regions.far.token = "another"
-                regions.far.open_sockets()[0].cut()
-
-                with pytest.raises(Unauthorized):
-                    await ask(a_robot, 2, deadline_s=10)
-
-    run(test())
-
-
-def test_a_robot_that_no_region_knows_is_told_so_at_once():
-    async def test():
-        async with TwoRegions() as regions:
-            regions.near.token = regions.far.token = "elsewhere"
-            with pytest.raises(Unauthorized):
-                await regions.robot(token="mine").__aenter__()
-            assert len(regions.near.handshakes) == len(regions.far.handshakes) == 1
-
-    run(test())
-
-
-def test_two_addresses_of_one_platform_do_not_replace_each_other_for_ever():
-    async def test():
-        async with (
-            TwoRegions() as regions,
-            regions.robot(settings=replace(QUICK, region_hold_s=60.0)) as a_robot,
-        ):
-            await regions.both_joined()
-            # What a platform does with the older of two connections of one robot.
-            await regions.near.sockets[0].websocket.close(CLOSE_REPLACED, "replaced")
-
+async def test_a_robot_that_one_region_does_not_know_uses_the_other_one():
+    async with TwoRegions() as regions:
+        regions.near.token, regions.far.token = "elsewhere", "mine"
+        async with regions.robot(token="mine") as a_robot:
             assert (await ask(a_robot, 1)).server == "far-1"
-            assert len(regions.near.handshakes) == 1
-            regions.far.sockets[0].cut()
-            assert (await ask(a_robot, 2, deadline_s=10)).reply == {"value": 2}
+            regions.far.token = "another"
+            regions.far.open_sockets()[0].cut()
 
-    run(test())
-
-
-def test_a_server_that_asks_a_standby_to_move_gets_it_closed_and_the_commands_go_on():
-    async def test():
-        async with TwoRegions() as regions, regions.robot() as a_robot:
-            await regions.both_joined()
-            regions.far.landing = "far-2"
-            await regions.far.sockets[0].move()
-
-            await regions.far.until(lambda: [each.server for each in regions.far.open_sockets()] == ["far-2"])
-
-            assert (await ask(a_robot, 1)).server == "near-1"
-            assert a_robot.stats.region_changes == 0
-
-    run(test())
+            with pytest.raises(Unauthorized):
+                await ask(a_robot, 2, deadline_s=10)
 
 
-def test_a_blocking_robot_takes_several_addresses_too():
-    async def test():
-        async with TwoRegions() as regions:
+async def test_a_robot_that_no_region_knows_is_told_so_at_once():
+    async with TwoRegions() as regions:
+        regions.near.token = regions.far.token = "elsewhere"
+        with pytest.raises(Unauthorized):
+            await regions.robot(token="mine").__aenter__()
+        assert len(regions.near.handshakes) == len(regions.far.handshakes) == 1
 
-            def drive():
-                urls = [regions.far_link.url, regions.near_link.url]
-                with client_sdk.connect_blocking(urls, settings=QUICK) as a_robot:
-                    return a_robot.call("echo", {"value": 1}).server, a_robot.stats.region
 
-            assert await asyncio.to_thread(drive) == ("near-1", regions.near_link.url)
+async def test_two_addresses_of_one_platform_do_not_replace_each_other_for_ever():
+    async with (
+        TwoRegions() as regions,
+        regions.robot(settings=replace(QUICK, region_hold_s=60.0)) as a_robot,
+    ):
+        await regions.both_joined()
+        # What a platform does with the older of two connections of one robot.
+        await regions.near.sockets[0].websocket.close(CLOSE_REPLACED, "replaced")
 
-    run(test())
+        assert (await ask(a_robot, 1)).server == "far-1"
+        assert len(regions.near.handshakes) == 1
+        regions.far.sockets[0].cut()
+        assert (await ask(a_robot, 2, deadline_s=10)).reply == {"value": 2}
+
+
+async def test_a_server_that_asks_a_standby_to_move_gets_it_closed_and_the_commands_go_on():
+    async with TwoRegions() as regions, regions.robot() as a_robot:
+        await regions.both_joined()
+        regions.far.landing = "far-2"
+        await regions.far.sockets[0].move()
+
+        await regions.far.until(lambda: [each.server for each in regions.far.open_sockets()] == ["far-2"])
+
+        assert (await ask(a_robot, 1)).server == "near-1"
+        assert a_robot.stats.region_changes == 0
+
+
+async def test_a_blocking_robot_takes_several_addresses_too():
+    async with TwoRegions() as regions:
+
+        def drive():
+            urls = [regions.far_link.url, regions.near_link.url]
+            with client_sdk.connect_blocking(urls, settings=QUICK) as a_robot:
+                return a_robot.call("echo", {"value": 1}).server, a_robot.stats.region
+
+        assert await asyncio.to_thread(drive) == ("near-1", regions.near_link.url)
 
 
 @pytest.mark.parametrize("urls", [[], ["ws://a/ws", "ws://a/ws"], [f"ws://{n}/ws" for n in range(5)]])

@@ -202,26 +202,23 @@ def test_the_cloud_that_a_page_shows_first_is_packed_once_and_before_it_is_asked
     assert len(packed) == 1
 
 
-def test_a_watcher_hears_states_and_events_and_watchers_are_bounded() -> None:
-    async def run() -> None:
-        kept: list[Any] = []
-        operations = Operations(kept.append)
-        watched = operations.watch(lambda: {"servers": 2})
-        assert await watched.__anext__() == {"state": {"servers": 2}}
-        operations.take_event({"event": "server-killed", "server": "server-1"})
-        told = await asyncio.wait_for(watched.__anext__(), 2.0)
-        assert (told["event"], told["number"]) == ("server-killed", 1)
+async def test_a_watcher_hears_states_and_events_and_watchers_are_bounded() -> None:
+    kept: list[Any] = []
+    operations = Operations(kept.append)
+    watched = operations.watch(lambda: {"servers": 2})
+    assert await watched.__anext__() == {"state": {"servers": 2}}
+    operations.take_event({"event": "server-killed", "server": "server-1"})
+    told = await asyncio.wait_for(watched.__anext__(), 2.0)
+    assert (told["event"], told["number"]) == ("server-killed", 1)
 
-        others = [operations.watch(dict) for _ in range(7)]
-        for each in others:
-            await each.__anext__()
-        with pytest.raises(UsageError):
-            operations.watch(dict)
-        for each in (watched, *others):
-            await each.aclose()
-        await operations.watch(dict).__anext__()
-
-    asyncio.run(run())
+    others = [operations.watch(dict) for _ in range(7)]
+    for each in others:
+        await each.__anext__()
+    with pytest.raises(UsageError):
+        operations.watch(dict)
+    for each in (watched, *others):
+        await each.aclose()
+    await operations.watch(dict).__anext__()
 
 
 def test_the_page_may_read_every_live_map_and_do_nothing_else() -> None:

@@ -23,77 +23,65 @@ async def next_of(messages: AsyncGenerator[bytes, None], count: int) -> list[Any
     return [told(await asyncio.wait_for(messages.__anext__(), 5.0)) for _ in range(count)]
 
 
-def test_a_new_page_is_told_what_is_known_and_then_what_is_new() -> None:
-    async def run() -> None:
-        hub = Hub()
-        hub.put("fleet", "now", {"robots": 3})
-        hub.append("event", {"text": "first"})
-        hub.put("robots", "now", [])
-        messages = hub.messages(ALL)
-        await messages.__anext__()
+async def test_a_new_page_is_told_what_is_known_and_then_what_is_new() -> None:
+    hub = Hub()
+    hub.put("fleet", "now", {"robots": 3})
+    hub.append("event", {"text": "first"})
+    hub.put("robots", "now", [])
+    messages = hub.messages(ALL)
+    await messages.__anext__()
 
-        known = await next_of(messages, 2)
-        hub.append("event", {"text": "second"})
-        (new,) = await next_of(messages, 1)
-        await messages.aclose()
+    known = await next_of(messages, 2)
+    hub.append("event", {"text": "second"})
+    (new,) = await next_of(messages, 1)
+    await messages.aclose()
 
-        assert [each["topic"] for each in known] == ["event", "fleet"]
-        assert new["value"] == {"text": "second"}
-        assert hub.pages == 0
-
-    asyncio.run(run())
+    assert [each["topic"] for each in known] == ["event", "fleet"]
+    assert new["value"] == {"text": "second"}
+    assert hub.pages == 0
 
 
-def test_two_hundred_pages_are_not_all_served() -> None:
-    async def run() -> None:
-        hub = Hub()
-        opened = [hub.messages(ALL) for _ in range(200)]
-        served = 0
-        for each in opened:
-            try:
-                await each.__anext__()
-                served += 1
-            except Busy:
-                continue
-        assert (served, hub.pages, hub.refused) == (MAX_PAGES, MAX_PAGES, 200 - MAX_PAGES)
-        for each in opened:
-            await each.aclose()
-        assert hub.pages == 0
-
-    asyncio.run(run())
+async def test_two_hundred_pages_are_not_all_served() -> None:
+    hub = Hub()
+    opened = [hub.messages(ALL) for _ in range(200)]
+    served = 0
+    for each in opened:
+        try:
+            await each.__anext__()
+            served += 1
+        except Busy:
+            continue
+    assert (served, hub.pages, hub.refused) == (MAX_PAGES, MAX_PAGES, 200 - MAX_PAGES)
+    for each in opened:
+        await each.aclose()
+    assert hub.pages == 0
 
 
-def test_a_page_that_does_not_read_gets_the_newest_value_only() -> None:
-    async def run() -> None:
-        hub = Hub()
-        messages = hub.messages(ALL)
-        await messages.__anext__()
+async def test_a_page_that_does_not_read_gets_the_newest_value_only() -> None:
+    hub = Hub()
+    messages = hub.messages(ALL)
+    await messages.__anext__()
 
-        for number in range(10_000):
-            hub.put("fleet", "now", {"robots": number})
-            hub.append("event", {"number": number})
-        rows = await next_of(messages, 2001)
-        await messages.aclose()
+    for number in range(10_000):
+        hub.put("fleet", "now", {"robots": number})
+        hub.append("event", {"number": number})
+    rows = await next_of(messages, 2001)
+    await messages.aclose()
 
-        assert [each["value"]["number"] for each in rows[:2000]] == list(range(8000, 10_000))
-        assert rows[2000] == {"topic": "fleet", "key": "now", "value": {"robots": 9999}}
-
-    asyncio.run(run())
+    assert [each["value"]["number"] for each in rows[:2000]] == list(range(8000, 10_000))
+    assert rows[2000] == {"topic": "fleet", "key": "now", "value": {"robots": 9999}}
 
 
 @pytest.mark.parametrize("name", ["a\n\ndata: {}", "\r\r", "</script>", "\u2028", "event: x\n"])
-def test_no_text_ends_a_message(name: str) -> None:
-    async def run() -> None:
-        hub = Hub()
-        hub.append("event", {"text": name})
-        messages = hub.messages(ALL)
-        await messages.__anext__()
-        message = await messages.__anext__()
-        await messages.aclose()
+async def test_no_text_ends_a_message(name: str) -> None:
+    hub = Hub()
+    hub.append("event", {"text": name})
+    messages = hub.messages(ALL)
+    await messages.__anext__()
+    message = await messages.__anext__()
+    await messages.aclose()
 
-        assert message.endswith(b"\n\n")
-        assert b"\n" not in message[:-2]
-        assert b"\r" not in message
-        assert told(message)["value"]["text"] == name
-
-    asyncio.run(run())
+    assert message.endswith(b"\n\n")
+    assert b"\n" not in message[:-2]
+    assert b"\r" not in message
+    assert told(message)["value"]["text"] == name

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import base64
 import json
-from collections.abc import Coroutine
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -35,10 +34,6 @@ FRAME = Frame(
 )  # fmt: skip
 
 
-def run(work: Coroutine[Any, Any, None]) -> None:
-    asyncio.run(asyncio.wait_for(work, 30))
-
-
 def drive(folder: Path, codec: str = "bin", **options: Any) -> None:
     """Let a robot called "r" record a few poses."""
 
@@ -54,7 +49,7 @@ def drive(folder: Path, codec: str = "bin", **options: Any) -> None:
                 await robot.solve_pnp(PROBLEM.points_world, PROBLEM.pixels, PROBLEM.camera)
             await robot.call("echo", {"value": "left out"})
 
-    run(work())
+    asyncio.run(work())
 
 
 def topics(folder: Path) -> dict[str, list[bytes]]:

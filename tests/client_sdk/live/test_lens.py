@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import math
-from collections.abc import Awaitable, Callable
 from dataclasses import replace
 from typing import Any
 
@@ -31,13 +30,6 @@ LIVE = LiveOptions(leave_s=0.2, bytes_per_s=1e9, relocalise_s=0.001)
 T_MAP_ODOM = exp_se3([1.0, 2.0, 3.0, 0.1, 0.2, 0.3])
 
 
-def run(work: Callable[[FakeLiveRobot], Awaitable[None]]) -> None:
-    async def bounded() -> None:
-        await asyncio.wait_for(work(FakeLiveRobot()), 30.0)
-
-    asyncio.run(bounded())
-
-
 def live_map(robot: Any) -> LiveMapper:
     return LiveMapper(robot, "lab", ask=solve, live=LIVE)
 
@@ -57,146 +49,126 @@ async def drive(mapper: LiveMapper, rows: range) -> list[TrackedFrame]:
     return [await mapper.track(lens(row)) for row in rows]
 
 
-def test_settled_keyframes_of_one_lens_are_sent_in_one_unit() -> None:
-    async def work(robot: FakeLiveRobot) -> None:
-        async with live_map(robot) as mapper:
-            done = await drive(mapper, range(24))
-            await robot.until(lambda: mapper.keyframes_waiting == 0)
-            tracker = mapper._mapper.landmark_tracker
-            assert tracker is not None
-            assert len(robot.kept) == mapper.keyframes == tracker.segment_keyframes - 2 > 5
+async def test_settled_keyframes_of_one_lens_are_sent_in_one_unit(robot: FakeLiveRobot) -> None:
+    async with live_map(robot) as mapper:
+        done = await drive(mapper, range(24))
+        await robot.until(lambda: mapper.keyframes_waiting == 0)
+        tracker = mapper._mapper.landmark_tracker
+        assert tracker is not None
+        assert len(robot.kept) == mapper.keyframes == tracker.segment_keyframes - 2 > 5
 
-        assert {each.status for each in done} == {"starting", "tracked"}
-        assert {each.scale for each in done} == {"up to scale"}
-        assert [each.number for each in robot.kept] == list(range(len(robot.kept)))
-        sent = [decode_keyframe(each.keyframe) for each in robot.kept]
-        assert sent[0].timestamp_s == 0.0
-        moved_m = 10.0 * STEP_M * np.array([each.timestamp_s for each in sent])
-        positions = np.array([each.T_odom_camera[:3, 3] for each in sent])
-        unit_m = moved_m[-1] / np.linalg.norm(positions[-1] - positions[0])
-        np.testing.assert_allclose(unit_m * positions, np.outer(moved_m, [1, 0, 0]), atol=0.02)
-        for each in sent:
-            assert not each.features.is_metric
-            assert 100 < len(each.features) <= LIVE.features
-            band = np.clip(each.features.pixels[:, 1] / 80, 0, 2).astype(int)
-            known = each.features.depths_m > 0
-            true_m = np.array(DEPTHS_M)[band]
-            ratios = each.features.depths_m[known] / true_m[known]
-            assert known.sum() > 50
-            assert abs(unit_m * np.median(ratios) - 1.0) < 0.1  # the tracker's own unit drifts by 6 %
-
-    run(work)
+    assert {each.status for each in done} == {"starting", "tracked"}
+    assert {each.scale for each in done} == {"up to scale"}
+    assert [each.number for each in robot.kept] == list(range(len(robot.kept)))
+    sent = [decode_keyframe(each.keyframe) for each in robot.kept]
+    assert sent[0].timestamp_s == 0.0
+    moved_m = 10.0 * STEP_M * np.array([each.timestamp_s for each in sent])
+    positions = np.array([each.T_odom_camera[:3, 3] for each in sent])
+    unit_m = moved_m[-1] / np.linalg.norm(positions[-1] - positions[0])
+    np.testing.assert_allclose(unit_m * positions, np.outer(moved_m, [1, 0, 0]), atol=0.02)
+    for each in sent:
+        assert not each.features.is_metric
+        assert 100 < len(each.features) <= LIVE.features
+        band = np.clip(each.features.pixels[:, 1] / 80, 0, 2).astype(int)
+        known = each.features.depths_m > 0
+        true_m = np.array(DEPTHS_M)[band]
+        ratios = each.features.depths_m[known] / true_m[known]
+        assert known.sum() > 50
+        assert abs(unit_m * np.median(ratios) - 1.0) < 0.1  # the tracker's own unit drifts by 6 %
 
 
-def test_its_poses_in_the_map_are_metres_once_the_map_tells_the_scale() -> None:
-    async def work(robot: FakeLiveRobot) -> None:
-        async with live_map(robot) as mapper:
-            before = (await drive(mapper, range(14)))[-1]
-            assert (before.T_map_camera, mapper.metres_per_unit) == (None, None)
-            assert mapper.scale == "up to scale"
-            await robot.until(lambda: mapper.keyframes_waiting == 0 and robot.asked.count("live-show") > 1)
-            robot.tell("alignment/me", alignment("me", None, reason="up to scale: alone"))
-            await robot.until(lambda: mapper.reason == "up to scale: alone")
+async def test_its_poses_in_the_map_are_metres_once_the_map_tells_the_scale(robot: FakeLiveRobot) -> None:
+    async with live_map(robot) as mapper:
+        before = (await drive(mapper, range(14)))[-1]
+        assert (before.T_map_camera, mapper.metres_per_unit) == (None, None)
+        assert mapper.scale == "up to scale"
+        await robot.until(lambda: mapper.keyframes_waiting == 0 and robot.asked.count("live-show") > 1)
+        robot.tell("alignment/me", alignment("me", None, reason="up to scale: alone"))
+        await robot.until(lambda: mapper.reason == "up to scale: alone")
 
-            robot.tell("alignment/me", alignment("me", T_MAP_ODOM, scale=0.25))
-            await robot.until(lambda: mapper.aligned)
-            one, two = await drive(mapper, range(14, 16))
+        robot.tell("alignment/me", alignment("me", T_MAP_ODOM, scale=0.25))
+        await robot.until(lambda: mapper.aligned)
+        one, two = await drive(mapper, range(14, 16))
 
-            assert (one.corrected, two.corrected) == (True, False)
-            assert (mapper.scale, mapper.metres_per_unit) == ("metric, by the live map", 0.25)
-            assert not mapper.reason
-            for each in (one, two):
-                assert each.T_world_camera is not None
-                np.testing.assert_allclose(each.T_map_camera, T_MAP_ODOM @ scaled(each.T_world_camera, 0.25))
-            assert (
-                len(mapper.map_trajectory)
-                == sum(each.T_world_camera is not None for each in (before, one, two))
-                + len(mapper._poses)
-                - 3
-            )
-            assert mapper.report()["live"]["metres_per_unit"] == 0.25
-
-    run(work)
+        assert (one.corrected, two.corrected) == (True, False)
+        assert (mapper.scale, mapper.metres_per_unit) == ("metric, by the live map", 0.25)
+        assert not mapper.reason
+        for each in (one, two):
+            assert each.T_world_camera is not None
+            np.testing.assert_allclose(each.T_map_camera, T_MAP_ODOM @ scaled(each.T_world_camera, 0.25))
+        assert (
+            len(mapper.map_trajectory)
+            == sum(each.T_world_camera is not None for each in (before, one, two)) + len(mapper._poses) - 3
+        )
+        assert mapper.report()["live"]["metres_per_unit"] == 0.25
 
 
-def test_a_first_frame_without_the_depth_that_was_promised_is_refused() -> None:
-    async def work(robot: FakeLiveRobot) -> None:
-        async with LiveMapper(robot, "lab", ask=solve, live=LIVE, depth=True) as mapper:
-            with pytest.raises(UsageError, match="the first frame has no depth"):
-                await mapper.track(lens(0))
-            assert (await mapper.track(frame_at(0, depth=True))).status == "first"
-            assert mapper.scale == "metric, by depth"
-        async with LiveMapper(robot, "lab", ask=solve, live=LIVE, depth=False) as mapper:
-            assert (await mapper.track(frame_at(0, depth=True))).status == "starting"
-
-    run(work)
+async def test_a_first_frame_without_the_depth_that_was_promised_is_refused(robot: FakeLiveRobot) -> None:
+    async with LiveMapper(robot, "lab", ask=solve, live=LIVE, depth=True) as mapper:
+        with pytest.raises(UsageError, match="the first frame has no depth"):
+            await mapper.track(lens(0))
+        assert (await mapper.track(frame_at(0, depth=True))).status == "first"
+        assert mapper.scale == "metric, by depth"
+    async with LiveMapper(robot, "lab", ask=solve, live=LIVE, depth=False) as mapper:
+        assert (await mapper.track(frame_at(0, depth=True))).status == "starting"
 
 
-def test_a_tracker_that_changes_its_unit_changes_none_that_was_sent() -> None:
-    async def work(robot: FakeLiveRobot) -> None:
-        async with live_map(robot) as mapper:
-            done = await drive(mapper, range(14))
-            tracker = mapper._mapper.landmark_tracker
-            assert tracker is not None
-            tracker.rescale(0.3)  # as an IMU does
-            done += await drive(mapper, range(14, 18))
-            await robot.until(lambda: mapper.keyframes_waiting == 0)
-        x = [each.T_world_camera[0, 3] for each in done if each.T_world_camera is not None]
-        steps = np.diff(x)
-        assert steps.min() > 0.7 * steps.max()
-        sent = [decode_keyframe(each.keyframe) for each in robot.kept]
-        depths = [np.median(each.features.depths_m[each.features.depths_m > 0]) for each in sent]
-        assert min(depths) > 0.8 * max(depths)
-
-    run(work)
+async def test_a_tracker_that_changes_its_unit_changes_none_that_was_sent(robot: FakeLiveRobot) -> None:
+    async with live_map(robot) as mapper:
+        done = await drive(mapper, range(14))
+        tracker = mapper._mapper.landmark_tracker
+        assert tracker is not None
+        tracker.rescale(0.3)  # as an IMU does
+        done += await drive(mapper, range(14, 18))
+        await robot.until(lambda: mapper.keyframes_waiting == 0)
+    x = [each.T_world_camera[0, 3] for each in done if each.T_world_camera is not None]
+    steps = np.diff(x)
+    assert steps.min() > 0.7 * steps.max()
+    sent = [decode_keyframe(each.keyframe) for each in robot.kept]
+    depths = [np.median(each.features.depths_m[each.features.depths_m > 0]) for each in sent]
+    assert min(depths) > 0.8 * max(depths)
 
 
-def test_another_segment_has_another_unit_until_the_map_tells_it() -> None:
-    async def work(robot: FakeLiveRobot) -> None:
-        async with live_map(robot) as mapper:
-            await drive(mapper, range(14))
-            await robot.until(lambda: mapper.keyframes_waiting == 0 and robot.asked.count("live-show") > 1)
-            robot.tell("alignment/me", alignment("me", T_MAP_ODOM, scale=0.25))
-            await robot.until(lambda: mapper.aligned)
+async def test_another_segment_has_another_unit_until_the_map_tells_it(robot: FakeLiveRobot) -> None:
+    async with live_map(robot) as mapper:
+        await drive(mapper, range(14))
+        await robot.until(lambda: mapper.keyframes_waiting == 0 and robot.asked.count("live-show") > 1)
+        robot.tell("alignment/me", alignment("me", T_MAP_ODOM, scale=0.25))
+        await robot.until(lambda: mapper.aligned)
 
-            elsewhere = [await mapper.track(foreign(row, 5.0 + row / 10)) for row in range(24)]
-            await robot.until(lambda: mapper.keyframes_waiting == 0)
+        elsewhere = [await mapper.track(foreign(row, 5.0 + row / 10)) for row in range(24)]
+        await robot.until(lambda: mapper.keyframes_waiting == 0)
 
-            first = next(each for each in elsewhere if each.T_world_camera is not None)
-            assert (first.segment, mapper.segment, mapper.scale) == (1, 1, "up to scale")
-            assert mapper.metres_per_unit is None
-            assert all(each.T_map_camera is None for each in elsewhere)
-            segments = [each.segment for each in robot.kept]
-            assert segments == sorted(segments)
-            assert set(segments) == {0, 1}
-            times_s = [decode_keyframe(each.keyframe).timestamp_s for each in robot.kept]
-            assert segments == [int(stamp_s >= 5.0) for stamp_s in times_s]
+        first = next(each for each in elsewhere if each.T_world_camera is not None)
+        assert (first.segment, mapper.segment, mapper.scale) == (1, 1, "up to scale")
+        assert mapper.metres_per_unit is None
+        assert all(each.T_map_camera is None for each in elsewhere)
+        segments = [each.segment for each in robot.kept]
+        assert segments == sorted(segments)
+        assert set(segments) == {0, 1}
+        times_s = [decode_keyframe(each.keyframe).timestamp_s for each in robot.kept]
+        assert segments == [int(stamp_s >= 5.0) for stamp_s in times_s]
 
-            robot.tell("alignment/me", alignment("me", np.eye(4), segment=1, scale=3.0))
-            await robot.until(lambda: mapper.aligned)
-            last = await mapper.track(foreign(24, 7.4))
-            assert last.corrected
-            assert last.T_world_camera is not None
-            np.testing.assert_allclose(last.T_map_camera, scaled(last.T_world_camera, 3.0))
-
-    run(work)
+        robot.tell("alignment/me", alignment("me", np.eye(4), segment=1, scale=3.0))
+        await robot.until(lambda: mapper.aligned)
+        last = await mapper.track(foreign(24, 7.4))
+        assert last.corrected
+        assert last.T_world_camera is not None
+        np.testing.assert_allclose(last.T_map_camera, scaled(last.T_world_camera, 3.0))
 
 
-def test_it_asks_for_its_place_with_such_keyframes_and_takes_the_scale() -> None:
-    async def work(robot: FakeLiveRobot) -> None:
-        robot.foreign_keyframes = 5
-        T_map_camera = exp_se3([0.3, 0.1, 0.2, 0.0, 0.1, 0.0])
-        robot.relocalised = {"verdict": "ok", "T_map_camera": T_map_camera.ravel().tolist(), "scale": 0.5}
-        async with live_map(robot) as mapper:
-            await drive(mapper, range(14))
-            await robot.until(lambda: mapper.aligned)
+async def test_it_asks_for_its_place_with_such_keyframes_and_takes_the_scale(robot: FakeLiveRobot) -> None:
+    robot.foreign_keyframes = 5
+    T_map_camera = exp_se3([0.3, 0.1, 0.2, 0.0, 0.1, 0.0])
+    robot.relocalised = {"verdict": "ok", "T_map_camera": T_map_camera.ravel().tolist(), "scale": 0.5}
+    async with live_map(robot) as mapper:
+        await drive(mapper, range(14))
+        await robot.until(lambda: mapper.aligned)
 
-            assert (mapper.aligned_by, mapper.metres_per_unit) == ("relocalisation", 0.5)
-            [asked, *_] = [decode_keyframe(each.keyframe) for each in robot.kept]
-            expected = T_map_camera @ inverse(scaled(asked.T_odom_camera, 0.5))
-            np.testing.assert_allclose(mapper.T_map_odom, expected)
-
-    run(work)
+        assert (mapper.aligned_by, mapper.metres_per_unit) == ("relocalisation", 0.5)
+        [asked, *_] = [decode_keyframe(each.keyframe) for each in robot.kept]
+        expected = T_map_camera @ inverse(scaled(asked.T_odom_camera, 0.5))
+        np.testing.assert_allclose(mapper.T_map_odom, expected)
 
 
 class MovingTracker:

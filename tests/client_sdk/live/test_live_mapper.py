@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import subprocess
 import sys
-from collections.abc import Awaitable, Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -31,13 +30,6 @@ pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
 
 QUICK = LiveOptions(leave_s=0.2, bytes_per_s=1e9, segment_after=2, relocalise_s=0.001)
 T_MAP_ODOM = exp_se3([1.0, 2.0, 3.0, 0.1, 0.2, 0.3])
-
-
-def run(work: Callable[[FakeLiveRobot], Awaitable[None]]) -> None:
-    async def bounded() -> None:
-        await asyncio.wait_for(work(FakeLiveRobot()), 30.0)
-
-    asyncio.run(bounded())
 
 
 def live_map(robot: Any, **options: Any) -> LiveMapper:
@@ -70,26 +62,23 @@ def dark(row: int) -> Frame:
     )
 
 
-def test_a_keyframe_each_10_cm_is_kept_by_the_map_in_order() -> None:
-    async def work(robot: FakeLiveRobot) -> None:
-        async with live_map(robot) as mapper:
-            await drive(mapper, range(9))
-            await robot.until(lambda: mapper.keyframes_waiting == 0)
+async def test_a_keyframe_each_10_cm_is_kept_by_the_map_in_order(robot: FakeLiveRobot) -> None:
+    async with live_map(robot) as mapper:
+        await drive(mapper, range(9))
+        await robot.until(lambda: mapper.keyframes_waiting == 0)
 
-            assert [each.number for each in robot.kept] == [0, 1, 2]
-            assert times_s(robot) == [0.0, 0.4, 0.8]  # 4 steps are 12.8 cm
-            keyframe = decode_keyframe(robot.kept[2].keyframe)
-            np.testing.assert_allclose(keyframe.T_odom_camera[:3, 3], [8 * STEP_M, 0, 0], atol=0.02)
-            assert keyframe.camera == CAMERA
-            assert 100 < len(keyframe.features) <= QUICK.features
-            assert mapper.keyframes == 3
-            assert mapper.report()["live"]["keyframes_kept"] == 3
-        assert "live-leave" in robot.asked
-
-    run(work)
+        assert [each.number for each in robot.kept] == [0, 1, 2]
+        assert times_s(robot) == [0.0, 0.4, 0.8]  # 4 steps are 12.8 cm
+        keyframe = decode_keyframe(robot.kept[2].keyframe)
+        np.testing.assert_allclose(keyframe.T_odom_camera[:3, 3], [8 * STEP_M, 0, 0], atol=0.02)
+        assert keyframe.camera == CAMERA
+        assert 100 < len(keyframe.features) <= QUICK.features
+        assert mapper.keyframes == 3
+        assert mapper.report()["live"]["keyframes_kept"] == 3
+    assert "live-leave" in robot.asked
 
 
-def test_keyframes_have_the_strongest_features_wherever_they_are() -> None:
+async def test_keyframes_have_the_strongest_features_wherever_they_are(robot: FakeLiveRobot) -> None:
     def half_faint(row: int) -> Frame:
         """Return a frame whose right half has a quarter of the contrast: weaker features are there, too."""
         frame = frame_at(row, depth=True)
@@ -97,38 +86,33 @@ def test_keyframes_have_the_strongest_features_wherever_they_are() -> None:
         rgb[:, 160:] = 128 + rgb[:, 160:] // 4
         return Frame(timestamp_s=frame.timestamp_s, rgb=rgb, depth_m=frame.depth_m, camera=CAMERA)
 
-    async def work(robot: FakeLiveRobot) -> None:
-        async with live_map(robot) as mapper:
-            await mapper.track(half_faint(0))
-            await robot.until(lambda: len(robot.kept) == 1)
-        pixels = decode_keyframe(robot.kept[0].keyframe).features.pixels
-        spread = extract(half_faint(0), FrontEndOptions()).pixels
+    async with live_map(robot) as mapper:
+        await mapper.track(half_faint(0))
+        await robot.until(lambda: len(robot.kept) == 1)
+    pixels = decode_keyframe(robot.kept[0].keyframe).features.pixels
+    spread = extract(half_faint(0), FrontEndOptions()).pixels
 
-        assert (pixels[:, 0] > 160).mean() < 0.1
-        assert (spread[:, 0] > 160).mean() > 0.3
+    assert (pixels[:, 0] > 160).mean() < 0.1
+    assert (spread[:, 0] > 160).mean() > 0.3
 
-    run(work)
     by_robot = connect("ws://127.0.0.1:1/ws").live_map("lab")._mapper._options
     assert by_robot is not None
     assert not by_robot.is_spread
 
 
-def test_the_robots_own_cloud_is_made_of_its_keyframes_beside_its_frames() -> None:
-    async def work(robot: FakeLiveRobot) -> None:
-        async with live_map(robot) as mapper:
-            await drive(mapper, range(1))
-        of_one = len(mapper.map)
-        readings = mapper.map.add(frame_at(0, depth=True), np.eye(4))
+async def test_the_robots_own_cloud_is_made_of_its_keyframes_beside_its_frames(robot: FakeLiveRobot) -> None:
+    async with live_map(robot) as mapper:
+        await drive(mapper, range(1))
+    of_one = len(mapper.map)
+    readings = mapper.map.add(frame_at(0, depth=True), np.eye(4))
 
-        async with live_map(robot) as mapper:
-            await drive(mapper, range(5))  # 4 steps are 12.8 cm: the last one is a keyframe
-        counts = len(mapper.map.points(min_readings=1)[0])
+    async with live_map(robot) as mapper:
+        await drive(mapper, range(5))  # 4 steps are 12.8 cm: the last one is a keyframe
+    counts = len(mapper.map.points(min_readings=1)[0])
 
-        assert readings > 0
-        assert of_one > 0
-        assert of_one < counts < 2 * of_one
-
-    run(work)
+    assert readings > 0
+    assert of_one > 0
+    assert of_one < counts < 2 * of_one
 
 
 @pytest.mark.parametrize("codec", ["json", "zlib", "bin"])
@@ -153,126 +137,117 @@ def test_the_largest_keyframe_takes_at_most_34_kb_in_every_codec(codec: str) -> 
     assert 30_000 < len(message) <= 34_000
 
 
-def test_an_alignment_is_an_event_before_a_pose_uses_it() -> None:
-    async def work(robot: FakeLiveRobot) -> None:
-        async with live_map(robot) as mapper:
-            heard: list[Correction] = []
+async def test_an_alignment_is_an_event_before_a_pose_uses_it(robot: FakeLiveRobot) -> None:
+    async with live_map(robot) as mapper:
+        heard: list[Correction] = []
 
-            async def listen() -> None:
-                async for correction in mapper.corrections():
-                    heard.append(correction)
-                    robot.changed.set()
+        async def listen() -> None:
+            async for correction in mapper.corrections():
+                heard.append(correction)
+                robot.changed.set()
 
-            listening = asyncio.create_task(listen())
-            first, second = await drive(mapper, range(2))
-            assert first.T_map_camera is None
-            assert not mapper.aligned
-            assert mapper.reason
-            await robot.until(lambda: len(robot.kept) == 1 and robot.asked[-1] == "live-show")
+        listening = asyncio.create_task(listen())
+        first, second = await drive(mapper, range(2))
+        assert first.T_map_camera is None
+        assert not mapper.aligned
+        assert mapper.reason
+        await robot.until(lambda: len(robot.kept) == 1 and robot.asked[-1] == "live-show")
 
-            robot.tell("alignment/me", alignment("me", T_MAP_ODOM))
-            await robot.until(lambda: len(heard) == 1)
-            third, fourth = await drive(mapper, range(2, 4))
+        robot.tell("alignment/me", alignment("me", T_MAP_ODOM))
+        await robot.until(lambda: len(heard) == 1)
+        third, fourth = await drive(mapper, range(2, 4))
 
-            assert heard[0].before is None
-            assert heard[0].cause == ("other", 3)
-            assert heard[0].by == "map"
-            np.testing.assert_array_equal(heard[0].after, T_MAP_ODOM)
-            assert (third.corrected, fourth.corrected) == (True, False)
-            assert third.T_world_camera is not None
-            assert second.T_world_camera is not None
-            np.testing.assert_allclose(third.T_map_camera, T_MAP_ODOM @ third.T_world_camera)
-            moved_m = np.linalg.norm(third.T_world_camera[:3, 3] - second.T_world_camera[:3, 3])
-            assert abs(moved_m - STEP_M) < 0.005  # the odometry frame does not jump
-            np.testing.assert_allclose(mapper.covariance, 1e-4 * np.eye(6))
-            assert mapper.aligned
-            assert mapper.version == 7
-            assert len(mapper.map_trajectory) == 4
-        await asyncio.wait_for(listening, 5.0)  # it ends with the live map
-
-    run(work)
+        assert heard[0].before is None
+        assert heard[0].cause == ("other", 3)
+        assert heard[0].by == "map"
+        np.testing.assert_array_equal(heard[0].after, T_MAP_ODOM)
+        assert (third.corrected, fourth.corrected) == (True, False)
+        assert third.T_world_camera is not None
+        assert second.T_world_camera is not None
+        np.testing.assert_allclose(third.T_map_camera, T_MAP_ODOM @ third.T_world_camera)
+        moved_m = np.linalg.norm(third.T_world_camera[:3, 3] - second.T_world_camera[:3, 3])
+        assert abs(moved_m - STEP_M) < 0.005  # the odometry frame does not jump
+        np.testing.assert_allclose(mapper.covariance, 1e-4 * np.eye(6))
+        assert mapper.aligned
+        assert mapper.version == 7
+        assert len(mapper.map_trajectory) == 4
+    await asyncio.wait_for(listening, 5.0)  # it ends with the live map
 
 
-def test_others_and_the_state_of_the_map_are_known() -> None:
-    async def work(robot: FakeLiveRobot) -> None:
-        async with live_map(robot) as mapper:
-            pose = {"kind": "pose", "robot": "r2", "segment": 0, "timestamp_s": 4.0}
-            robot.tell("pose/r2", {**pose, "T_map_camera": T_MAP_ODOM.ravel().tolist()})
-            robot.tell("alignment/r3", alignment("r3", None, reason="too few links"))
-            robot.tell("map", {"kind": "map", "keyframes": 9, "version": 12, "owner": "o", "state": "moving"})
-            await robot.until(lambda: mapper.state == "moving")
+async def test_others_and_the_state_of_the_map_are_known(robot: FakeLiveRobot) -> None:
+    async with live_map(robot) as mapper:
+        pose = {"kind": "pose", "robot": "r2", "segment": 0, "timestamp_s": 4.0}
+        robot.tell("pose/r2", {**pose, "T_map_camera": T_MAP_ODOM.ravel().tolist()})
+        robot.tell("alignment/r3", alignment("r3", None, reason="too few links"))
+        robot.tell("map", {"kind": "map", "keyframes": 9, "version": 12, "owner": "o", "state": "moving"})
+        await robot.until(lambda: mapper.state == "moving")
 
-            np.testing.assert_allclose(mapper.others["r2"].T_map_camera, T_MAP_ODOM)
-            assert mapper.others["r3"].reason == "too few links"
-            assert (mapper.map_keyframes, mapper.version, mapper.owner) == (9, 12, "o")
+        np.testing.assert_allclose(mapper.others["r2"].T_map_camera, T_MAP_ODOM)
+        assert mapper.others["r3"].reason == "too few links"
+        assert (mapper.map_keyframes, mapper.version, mapper.owner) == (9, 12, "o")
 
-            robot.tell("pose/r2", {"robot": "r2"})  # damaged: told, and nothing else
-            await robot.until(lambda: "bad-message" in mapper.trouble)
-            assert "r2" in mapper.others
-            robot.connected = False
-            assert mapper.state == "offline"
-
-    run(work)
+        robot.tell("pose/r2", {"robot": "r2"})  # damaged: told, and nothing else
+        await robot.until(lambda: "bad-message" in mapper.trouble)
+        assert "r2" in mapper.others
+        robot.connected = False
+        assert mapper.state == "offline"
 
 
-def test_keyframes_wait_on_disk_while_offline_and_arrive_once_in_order(tmp_path: Path) -> None:
-    async def work(robot: FakeLiveRobot) -> None:
-        async with live_map(robot, spool=tmp_path) as mapper:
-            await drive(mapper, range(1))
-            await robot.until(lambda: len(robot.kept) == 1)
-            robot.connected = False
-            await drive(mapper, range(1, 14))
-            assert mapper.keyframes_waiting == 3
-            assert len(list((tmp_path / "lab").glob("*.keyframe"))) == 3
-            assert mapper.lost_frames == 0
+async def test_keyframes_wait_on_disk_while_offline_and_arrive_once_in_order(
+    robot: FakeLiveRobot, tmp_path: Path
+) -> None:
+    async with live_map(robot, spool=tmp_path) as mapper:
+        await drive(mapper, range(1))
+        await robot.until(lambda: len(robot.kept) == 1)
+        robot.connected = False
+        await drive(mapper, range(1, 14))
+        assert mapper.keyframes_waiting == 3
+        assert len(list((tmp_path / "lab").glob("*.keyframe"))) == 3
+        assert mapper.lost_frames == 0
 
-            robot.connected = robot.lose_answer = True
-            await robot.until(lambda: mapper.keyframes_waiting == 0)
+        robot.connected = robot.lose_answer = True
+        await robot.until(lambda: mapper.keyframes_waiting == 0)
 
-            assert [each.number for each in robot.kept] == [0, 1, 2, 3]
-            assert sorted(times_s(robot)) == [0.0, 0.4, 0.8, 1.2]
-            assert not list((tmp_path / "lab").glob("*.keyframe"))
-
-    run(work)
-
-
-def test_a_program_that_starts_again_sends_what_waited_and_begins_a_new_segment(tmp_path: Path) -> None:
-    async def work(robot: FakeLiveRobot) -> None:
-        async with live_map(robot, spool=tmp_path) as mapper:
-            await drive(mapper, range(1))
-            await robot.until(lambda: len(robot.kept) == 1)
-            robot.connected = False
-            await drive(mapper, range(1, 6))
-        assert len(robot.kept) == 1
-
-        robot.connected = True
-        async with live_map(robot, spool=tmp_path) as mapper:
-            await drive(mapper, range(6, 7))
-            await robot.until(lambda: mapper.keyframes_waiting == 0)
-
-            assert [(each.number, each.segment) for each in robot.kept] == [(0, 0), (1, 0), (2, 1)]
-
-    run(work)
+        assert [each.number for each in robot.kept] == [0, 1, 2, 3]
+        assert sorted(times_s(robot)) == [0.0, 0.4, 0.8, 1.2]
+        assert not list((tmp_path / "lab").glob("*.keyframe"))
 
 
-def test_a_spool_in_use_is_refused_in_one_line_and_free_again_when_its_program_ends(tmp_path: Path) -> None:
-    async def work(robot: FakeLiveRobot) -> None:
-        async with live_map(robot, spool=tmp_path) as mapper:
-            robot.connected = False
-            await drive(mapper, range(6))
-            left = list((tmp_path / "lab").glob("*.keyframe"))
+async def test_a_program_that_starts_again_sends_what_waited_and_begins_a_new_segment(
+    robot: FakeLiveRobot, tmp_path: Path
+) -> None:
+    async with live_map(robot, spool=tmp_path) as mapper:
+        await drive(mapper, range(1))
+        await robot.until(lambda: len(robot.kept) == 1)
+        robot.connected = False
+        await drive(mapper, range(1, 6))
+    assert len(robot.kept) == 1
 
-            with pytest.raises(UsageError, match="another program keeps its keyframes") as refused:
-                async with live_map(FakeLiveRobot(), spool=tmp_path):
-                    pass
+    robot.connected = True
+    async with live_map(robot, spool=tmp_path) as mapper:
+        await drive(mapper, range(6, 7))
+        await robot.until(lambda: mapper.keyframes_waiting == 0)
 
-            assert refused.value.hint == "give each robot a spool of its own"
-            assert list((tmp_path / "lab").glob("*.keyframe")) == left != []
-        robot.connected = True
-        async with live_map(robot, spool=tmp_path) as mapper:
-            await robot.until(lambda: mapper.keyframes_waiting == 0)
+        assert [(each.number, each.segment) for each in robot.kept] == [(0, 0), (1, 0), (2, 1)]
 
-    run(work)
+
+async def test_a_spool_in_use_is_refused_in_one_line_and_free_again_when_its_program_ends(
+    robot: FakeLiveRobot, tmp_path: Path
+) -> None:
+    async with live_map(robot, spool=tmp_path) as mapper:
+        robot.connected = False
+        await drive(mapper, range(6))
+        left = list((tmp_path / "lab").glob("*.keyframe"))
+
+        with pytest.raises(UsageError, match="another program keeps its keyframes") as refused:
+            async with live_map(FakeLiveRobot(), spool=tmp_path):
+                pass
+
+        assert refused.value.hint == "give each robot a spool of its own"
+        assert list((tmp_path / "lab").glob("*.keyframe")) == left != []
+    robot.connected = True
+    async with live_map(robot, spool=tmp_path) as mapper:
+        await robot.until(lambda: mapper.keyframes_waiting == 0)
 
 
 def test_the_spool_of_a_program_that_was_killed_is_free(tmp_path: Path) -> None:
@@ -290,203 +265,178 @@ def test_the_spool_of_a_program_that_was_killed_is_free(tmp_path: Path) -> None:
     waiting.close()
 
 
-def test_keyframes_that_were_refused_are_counted_after_the_drive_too(tmp_path: Path) -> None:
-    async def work(robot: FakeLiveRobot) -> None:
+async def test_keyframes_that_were_refused_are_counted_after_the_drive_too(
+    robot: FakeLiveRobot, tmp_path: Path
+) -> None:
+    async with live_map(robot) as mapper:
+        await drive(mapper, range(6))
+        await robot.until(lambda: mapper.keyframes_waiting == 0)
+        mapper._sender.refused = 2
+    assert mapper.report()["live"]["keyframes_refused"] == 2
+
+
+async def test_a_program_that_starts_again_without_a_spool_asks_for_its_numbers(robot: FakeLiveRobot) -> None:
+    for _ in range(2):
         async with live_map(robot) as mapper:
             await drive(mapper, range(6))
-            await robot.until(lambda: mapper.keyframes_waiting == 0)
-            mapper._sender.refused = 2
-        assert mapper.report()["live"]["keyframes_refused"] == 2
+            await robot.until(lambda mapper=mapper: mapper.keyframes_waiting == 0)
 
-    run(work)
+    assert [(each.number, each.segment) for each in robot.kept] == [(0, 0), (1, 0), (2, 1), (3, 1)]
 
 
-def test_a_program_that_starts_again_without_a_spool_asks_for_its_numbers() -> None:
-    async def work(robot: FakeLiveRobot) -> None:
-        for _ in range(2):
-            async with live_map(robot) as mapper:
-                await drive(mapper, range(6))
-                await robot.until(lambda mapper=mapper: mapper.keyframes_waiting == 0)
+async def test_a_map_that_begins_anew_gets_new_numbers_and_old_alignments_are_forgotten(
+    robot: FakeLiveRobot,
+) -> None:
+    async with live_map(robot) as mapper:
+        await drive(mapper, range(5))
+        await robot.until(lambda: len(robot.kept) == 2)
+        robot.tell("alignment/me", alignment("me", T_MAP_ODOM))
+        await robot.until(lambda: mapper.aligned)
 
-        assert [(each.number, each.segment) for each in robot.kept] == [(0, 0), (1, 0), (2, 1), (3, 1)]
+        robot.restart_map()
+        await mapper.track(foreign(5))
+        await mapper.track(foreign(6))
+        (again,) = await drive(mapper, range(7, 8))
+        await robot.until(lambda: mapper.keyframes_waiting == 0)
 
-    run(work)
-
-
-def test_a_map_that_begins_anew_gets_new_numbers_and_old_alignments_are_forgotten() -> None:
-    async def work(robot: FakeLiveRobot) -> None:
-        async with live_map(robot) as mapper:
-            await drive(mapper, range(5))
-            await robot.until(lambda: len(robot.kept) == 2)
-            robot.tell("alignment/me", alignment("me", T_MAP_ODOM))
-            await robot.until(lambda: mapper.aligned)
-
-            robot.restart_map()
-            await mapper.track(foreign(5))
-            await mapper.track(foreign(6))
-            (again,) = await drive(mapper, range(7, 8))
-            await robot.until(lambda: mapper.keyframes_waiting == 0)
-
-            assert again.segment == 1
-            assert [(each.number, each.segment) for each in robot.kept] == [(0, 0)]
-            robot.tell("alignment/me", alignment("me", T_MAP_ODOM, segment=0))
-            await robot.until(lambda: mapper.aligned)
-            assert len(mapper.map_trajectory) == 1  # the first segment was of the old map
-
-    run(work)
+        assert again.segment == 1
+        assert [(each.number, each.segment) for each in robot.kept] == [(0, 0)]
+        robot.tell("alignment/me", alignment("me", T_MAP_ODOM, segment=0))
+        await robot.until(lambda: mapper.aligned)
+        assert len(mapper.map_trajectory) == 1  # the first segment was of the old map
 
 
-def test_a_lost_robot_begins_a_segment_and_asks_where_it_is() -> None:
-    async def work(robot: FakeLiveRobot) -> None:
-        robot.foreign_keyframes = 50
-        T_map_camera = exp_se3([5.0, 0, 0, 0, 0, 0])
-        async with live_map(robot) as mapper:
-            await drive(mapper, range(3))
-            await robot.until(lambda: "live-relocalise" in robot.asked)
-            assert mapper.reason == "not relocalised: nothing alike"
+async def test_a_lost_robot_begins_a_segment_and_asks_where_it_is(robot: FakeLiveRobot) -> None:
+    robot.foreign_keyframes = 50
+    T_map_camera = exp_se3([5.0, 0, 0, 0, 0, 0])
+    async with live_map(robot) as mapper:
+        await drive(mapper, range(3))
+        await robot.until(lambda: "live-relocalise" in robot.asked)
+        assert mapper.reason == "not relocalised: nothing alike"
 
-            robot.relocalised = {
-                "verdict": "ok",
-                "T_map_camera": T_map_camera.ravel().tolist(),
-                "inliers": 80,
-            }
-            assert [(await mapper.track(foreign(row))).status for row in (3, 4)] == ["lost", "lost"]
-            before = mapper.trajectory.T_world_camera[-1]
-            (found,) = await drive(mapper, range(5, 6))
-            assert found.segment == 1
-            assert not found.lost
-            np.testing.assert_allclose(found.T_world_camera, before)
-            await robot.until(lambda: mapper.aligned)
+        robot.relocalised = {
+            "verdict": "ok",
+            "T_map_camera": T_map_camera.ravel().tolist(),
+            "inliers": 80,
+        }
+        assert [(await mapper.track(foreign(row))).status for row in (3, 4)] == ["lost", "lost"]
+        before = mapper.trajectory.T_world_camera[-1]
+        (found,) = await drive(mapper, range(5, 6))
+        assert found.segment == 1
+        assert not found.lost
+        np.testing.assert_allclose(found.T_world_camera, before)
+        await robot.until(lambda: mapper.aligned)
 
-            (placed,) = await drive(mapper, range(6, 7))
-            assert mapper.aligned_by == "relocalisation"
-            assert placed.T_map_camera is not None
-            np.testing.assert_allclose(placed.T_map_camera[:3, 3], [5 + STEP_M, 0, 0], atol=0.01)
+        (placed,) = await drive(mapper, range(6, 7))
+        assert mapper.aligned_by == "relocalisation"
+        assert placed.T_map_camera is not None
+        np.testing.assert_allclose(placed.T_map_camera[:3, 3], [5 + STEP_M, 0, 0], atol=0.01)
 
-            robot.tell("alignment/me", alignment("me", None, segment=1, reason="too few links"))
-            robot.tell("alignment/me", alignment("me", T_MAP_ODOM, segment=1))
-            await robot.until(lambda: mapper.aligned_by == "map")  # what the map found wins
-
-    run(work)
+        robot.tell("alignment/me", alignment("me", None, segment=1, reason="too few links"))
+        robot.tell("alignment/me", alignment("me", T_MAP_ODOM, segment=1))
+        await robot.until(lambda: mapper.aligned_by == "map")  # what the map found wins
 
 
-def test_a_robot_that_is_told_to_relocalise_asks_with_its_next_keyframe() -> None:
-    async def work(robot: FakeLiveRobot) -> None:
-        robot.foreign_keyframes = 50
-        patient = replace(QUICK, relocalise_s=3600.0, keyframe_m=0.01)
-        async with LiveMapper(robot, "lab", ask=solve, live=patient) as mapper:
-            await drive(mapper, range(2))
-            await robot.until(lambda: "live-relocalise" in robot.asked)
-            await drive(mapper, range(2, 4))
-            await robot.until(lambda: len(robot.kept) == 4)
-            assert robot.asked.count("live-relocalise") == 1
-            mapper.relocalise()
-            await drive(mapper, range(4, 5))
-            await robot.until(lambda: robot.asked.count("live-relocalise") == 2)
-
-    run(work)
+async def test_a_robot_that_is_told_to_relocalise_asks_with_its_next_keyframe(robot: FakeLiveRobot) -> None:
+    robot.foreign_keyframes = 50
+    patient = replace(QUICK, relocalise_s=3600.0, keyframe_m=0.01)
+    async with LiveMapper(robot, "lab", ask=solve, live=patient) as mapper:
+        await drive(mapper, range(2))
+        await robot.until(lambda: "live-relocalise" in robot.asked)
+        await drive(mapper, range(2, 4))
+        await robot.until(lambda: len(robot.kept) == 4)
+        assert robot.asked.count("live-relocalise") == 1
+        mapper.relocalise()
+        await drive(mapper, range(4, 5))
+        await robot.until(lambda: robot.asked.count("live-relocalise") == 2)
 
 
-def test_a_covered_lens_begins_no_segment_and_the_robot_finds_its_place_itself() -> None:
-    async def work(robot: FakeLiveRobot) -> None:
-        async with live_map(robot) as mapper:
-            await drive(mapper, range(6))
-            covered = [await mapper.track(dark(row)) for row in range(6, 16)]
-            (back,) = await drive(mapper, range(2, 3))
+async def test_a_covered_lens_begins_no_segment_and_the_robot_finds_its_place_itself(
+    robot: FakeLiveRobot,
+) -> None:
+    async with live_map(robot) as mapper:
+        await drive(mapper, range(6))
+        covered = [await mapper.track(dark(row)) for row in range(6, 16)]
+        (back,) = await drive(mapper, range(2, 3))
 
-            assert {tracked.status for tracked in covered} == {"lost"}
-            assert (back.status, back.segment) == ("tracked", 0)
-            np.testing.assert_allclose(back.T_world_camera[:3, 3], [2 * STEP_M, 0, 0], atol=0.02)
-
-    run(work)
+        assert {tracked.status for tracked in covered} == {"lost"}
+        assert (back.status, back.segment) == ("tracked", 0)
+        np.testing.assert_allclose(back.T_world_camera[:3, 3], [2 * STEP_M, 0, 0], atol=0.02)
 
 
-def test_a_robot_that_asks_in_vain_asks_more_rarely_until_its_next_segment() -> None:
-    async def work(robot: FakeLiveRobot) -> None:
-        robot.foreign_keyframes = 50
-        async with live_map(robot) as mapper:
-            for row in range(30):
-                if mapper._asked_in_vain == 6:
-                    break
-                assert mapper._relocalise_pause_s() == QUICK.relocalise_s
-                await drive(mapper, range(row, row + 1))
-                asking = mapper._relocalising
-                await robot.until(lambda: asking is None or asking.done())  # noqa: B023
-            assert mapper._relocalise_pause_s() == 4 * QUICK.relocalise_s
-            mapper._begin_segment()
+async def test_a_robot_that_asks_in_vain_asks_more_rarely_until_its_next_segment(
+    robot: FakeLiveRobot,
+) -> None:
+    robot.foreign_keyframes = 50
+    async with live_map(robot) as mapper:
+        for row in range(30):
+            if mapper._asked_in_vain == 6:
+                break
             assert mapper._relocalise_pause_s() == QUICK.relocalise_s
-
-    run(work)
-
-
-def test_an_ambiguous_place_ends_a_relocalisation() -> None:
-    async def work(robot: FakeLiveRobot) -> None:
-        robot.foreign_keyframes = 50
-        robot.relocalised = {"verdict": "ok", "T_map_camera": np.eye(4).ravel().tolist()}
-        async with live_map(robot) as mapper:
-            await drive(mapper, range(1))
-            await robot.until(lambda: mapper.aligned)
-            robot.tell("alignment/me", alignment("me", None, reason="ambiguous: two places look alike"))
-            await robot.until(lambda: not mapper.aligned)
-
-            assert mapper.reason == "ambiguous: two places look alike"
-
-    run(work)
+            await drive(mapper, range(row, row + 1))
+            asking = mapper._relocalising
+            await robot.until(lambda: asking is None or asking.done())  # noqa: B023
+        assert mapper._relocalise_pause_s() == 4 * QUICK.relocalise_s
+        mapper._begin_segment()
+        assert mapper._relocalise_pause_s() == QUICK.relocalise_s
 
 
-def test_a_busy_map_is_asked_again_and_a_refused_keyframe_leaves_no_gap() -> None:
-    async def work(robot: FakeLiveRobot) -> None:
-        async with live_map(robot) as mapper:
-            robot.before_answer = failing(Busy("moving", retry_after_ms=1.0), "live-keyframe", 1)
-            await drive(mapper, range(1))
-            await robot.until(lambda: len(robot.kept) == 1)
-            robot.before_answer = failing(BadRequest("garbage"), "live-keyframe", 1)
-            await drive(mapper, range(1, 9))
-            await robot.until(lambda: mapper.keyframes_waiting == 0)
+async def test_an_ambiguous_place_ends_a_relocalisation(robot: FakeLiveRobot) -> None:
+    robot.foreign_keyframes = 50
+    robot.relocalised = {"verdict": "ok", "T_map_camera": np.eye(4).ravel().tolist()}
+    async with live_map(robot) as mapper:
+        await drive(mapper, range(1))
+        await robot.until(lambda: mapper.aligned)
+        robot.tell("alignment/me", alignment("me", None, reason="ambiguous: two places look alike"))
+        await robot.until(lambda: not mapper.aligned)
 
-            assert [(each.number, each.segment) for each in robot.kept] == [(0, 0), (1, 0)]
-            assert times_s(robot) == [0.0, 0.8]
-            assert mapper.report()["live"]["keyframes_refused"] == 1
-
-    run(work)
+        assert mapper.reason == "ambiguous: two places look alike"
 
 
-def test_a_robot_without_the_right_is_told_at_once() -> None:
-    async def work(robot: FakeLiveRobot) -> None:
-        robot.before_answer = failing(Forbidden("no scope maps:live/lab"), "live-show", 1)
-        with pytest.raises(Forbidden, match="maps:live/lab"):
-            async with live_map(robot):
-                pass
+async def test_a_busy_map_is_asked_again_and_a_refused_keyframe_leaves_no_gap(robot: FakeLiveRobot) -> None:
+    async with live_map(robot) as mapper:
+        robot.before_answer = failing(Busy("moving", retry_after_ms=1.0), "live-keyframe", 1)
+        await drive(mapper, range(1))
+        await robot.until(lambda: len(robot.kept) == 1)
+        robot.before_answer = failing(BadRequest("garbage"), "live-keyframe", 1)
+        await drive(mapper, range(1, 9))
+        await robot.until(lambda: mapper.keyframes_waiting == 0)
 
-    run(work)
+        assert [(each.number, each.segment) for each in robot.kept] == [(0, 0), (1, 0)]
+        assert times_s(robot) == [0.0, 0.8]
+        assert mapper.report()["live"]["keyframes_refused"] == 1
 
 
-def test_a_keyframe_waits_while_a_pose_is_asked_for() -> None:
-    async def work(robot: FakeLiveRobot) -> None:
-        order: list[str] = []
-        asked, answer = asyncio.Event(), asyncio.Event()
+async def test_a_robot_without_the_right_is_told_at_once(robot: FakeLiveRobot) -> None:
+    robot.before_answer = failing(Forbidden("no scope maps:live/lab"), "live-show", 1)
+    with pytest.raises(Forbidden, match="maps:live/lab"):
+        async with live_map(robot):
+            pass
 
-        async def slow(query: PoseQuery) -> PoseAnswer:
-            asked.set()
-            await answer.wait()
-            order.append("pose")
-            return await solve(query)
 
-        async with LiveMapper(robot, "lab", ask=slow, live=QUICK) as mapper:
-            robot.connected = False
-            await mapper.track(frame_at(0, depth=True))
-            await robot.until(lambda: "expired" in mapper.trouble)
-            tracking = asyncio.create_task(mapper.track(frame_at(1, depth=True)))
-            await asked.wait()
-            robot.before_answer = order.append
-            robot.connected = True
-            asyncio.get_running_loop().call_later(0.5, answer.set)  # the keyframe would be sent by then
-            await robot.until(lambda: len(robot.kept) == 1)
-            await tracking
+async def test_a_keyframe_waits_while_a_pose_is_asked_for(robot: FakeLiveRobot) -> None:
+    order: list[str] = []
+    asked, answer = asyncio.Event(), asyncio.Event()
 
-        assert order[:2] == ["pose", "live-keyframe"]
+    async def slow(query: PoseQuery) -> PoseAnswer:
+        asked.set()
+        await answer.wait()
+        order.append("pose")
+        return await solve(query)
 
-    run(work)
+    async with LiveMapper(robot, "lab", ask=slow, live=QUICK) as mapper:
+        robot.connected = False
+        await mapper.track(frame_at(0, depth=True))
+        await robot.until(lambda: "expired" in mapper.trouble)
+        tracking = asyncio.create_task(mapper.track(frame_at(1, depth=True)))
+        await asked.wait()
+        robot.before_answer = order.append
+        robot.connected = True
+        asyncio.get_running_loop().call_later(0.5, answer.set)  # the keyframe would be sent by then
+        await robot.until(lambda: len(robot.kept) == 1)
+        await tracking
+
+    assert order[:2] == ["pose", "live-keyframe"]
 
 
 def test_a_program_without_asyncio_uses_the_same_mapper() -> None:
@@ -505,13 +455,10 @@ def test_a_program_without_asyncio_uses_the_same_mapper() -> None:
         loop.close()
 
 
-def test_a_map_that_is_not_joined_is_refused() -> None:
-    async def work(robot: FakeLiveRobot) -> None:
-        mapper = live_map(robot)
-        with pytest.raises(UsageError, match="not joined"):
-            await mapper.track(frame_at(0, depth=True))
-
-    run(work)
+async def test_a_map_that_is_not_joined_is_refused(robot: FakeLiveRobot) -> None:
+    mapper = live_map(robot)
+    with pytest.raises(UsageError, match="not joined"):
+        await mapper.track(frame_at(0, depth=True))
 
 
 def test_a_full_spool_drops_the_newest_and_a_damaged_one_is_told(tmp_path: Path) -> None:

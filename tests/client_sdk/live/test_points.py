@@ -17,7 +17,7 @@ from rse_pf.errors import ConnectError, Forbidden, UsageError
 from rse_pf.slam.keyframe import decode_keyframe
 from rse_pf.slam.keyframe_points import decode_points
 from tests.client_sdk.live.fake_live_map import FakeLiveRobot, solve
-from tests.client_sdk.live.test_live_mapper import QUICK, drive, run
+from tests.client_sdk.live.test_live_mapper import QUICK, drive
 from tests.client_sdk.mapper.flat_world import CAMERA, DEPTHS_M, frame_at
 
 pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
@@ -79,96 +79,85 @@ def test_a_frame_without_depth_has_no_points() -> None:
     assert points_of(frame_at(0, depth=False), NO_FEATURES, 2_000) is None
 
 
-def test_each_keyframe_refers_to_points_that_the_robot_stores() -> None:
-    async def work(robot: FakeLiveRobot) -> None:
-        objects = Objects()
-        async with mapper_of(robot, objects, replace(QUICK, points_bytes_per_s=1e9, leave_s=5.0)) as mapper:
-            await drive(mapper, range(9))
+async def test_each_keyframe_refers_to_points_that_the_robot_stores(robot: FakeLiveRobot) -> None:
+    objects = Objects()
+    async with mapper_of(robot, objects, replace(QUICK, points_bytes_per_s=1e9, leave_s=5.0)) as mapper:
+        await drive(mapper, range(9))
 
-        keyframes = [decode_keyframe(request.keyframe) for request in robot.kept]
-        references = [each.points for each in keyframes if each.points is not None]
-        assert len(references) == len(keyframes) == 3
-        assert {each.digest: each.size for each in references} == {
-            digest: len(data) for digest, data in objects.held.items()
-        }
-        assert mapper.report()["live"]["points"]["sent"] == 3
-
-    run(work)
+    keyframes = [decode_keyframe(request.keyframe) for request in robot.kept]
+    references = [each.points for each in keyframes if each.points is not None]
+    assert len(references) == len(keyframes) == 3
+    assert {each.digest: each.size for each in references} == {
+        digest: len(data) for digest, data in objects.held.items()
+    }
+    assert mapper.report()["live"]["points"]["sent"] == 3
 
 
-def test_points_wait_while_a_pose_is_asked_for() -> None:
-    async def work(robot: FakeLiveRobot) -> None:
-        objects, is_asked, may_answer = Objects(), asyncio.Event(), asyncio.Event()
+async def test_points_wait_while_a_pose_is_asked_for(robot: FakeLiveRobot) -> None:
+    objects, is_asked, may_answer = Objects(), asyncio.Event(), asyncio.Event()
+    may_answer.set()
+
+    async def ask(query: PoseQuery) -> PoseAnswer:
+        is_asked.set()
+        await may_answer.wait()
+        return await solve(query)
+
+    live = replace(QUICK, points_bytes_per_s=1e9, leave_s=5.0)
+    async with mapper_of(robot, objects, live, ask) as mapper:
+        await drive(mapper, range(2))
+        await robot.until(lambda: len(objects.held) == 1)
+        robot.before_answer = lambda service: None
+        may_answer.clear()
+        is_asked.clear()
+        tracking = asyncio.ensure_future(mapper.track(frame_at(2, depth=True)))
+        await is_asked.wait()
+        mapper._attachments._points.add(b"more")  # type: ignore[union-attr]
+        for _ in range(200):
+            await asyncio.sleep(0)
+        assert len(objects.held) == 1
         may_answer.set()
-
-        async def ask(query: PoseQuery) -> PoseAnswer:
-            is_asked.set()
-            await may_answer.wait()
-            return await solve(query)
-
-        live = replace(QUICK, points_bytes_per_s=1e9, leave_s=5.0)
-        async with mapper_of(robot, objects, live, ask) as mapper:
-            await drive(mapper, range(2))
-            await robot.until(lambda: len(objects.held) == 1)
-            robot.before_answer = lambda service: None
-            may_answer.clear()
-            is_asked.clear()
-            tracking = asyncio.ensure_future(mapper.track(frame_at(2, depth=True)))
-            await is_asked.wait()
-            mapper._attachments._points.add(b"more")  # type: ignore[union-attr]
-            for _ in range(200):
-                await asyncio.sleep(0)
-            assert len(objects.held) == 1
-            may_answer.set()
-            await tracking
-            await robot.until(lambda: len(objects.held) == 2)
-
-    run(work)
+        await tracking
+        await robot.until(lambda: len(objects.held) == 2)
 
 
-def test_keyframes_that_follow_fast_have_fewer_points_within_the_share_of_the_link() -> None:
-    async def work(robot: FakeLiveRobot) -> None:
-        objects = Objects()
-        live = replace(QUICK, points_bytes_per_s=5_000.0)
-        mapper = LiveMapper(
-            robot, "lab", ask=solve, live=live, store=objects.store, clock=lambda: 0.0
-        )  # no time passes
-        async with mapper:
-            await drive(mapper, range(13))
-            await robot.until(lambda: mapper.keyframes_waiting == 0)
-            sizes = [decode_keyframe(request.keyframe).points for request in robot.kept]
-            assert len(sizes) == 4
-            assert sum(each.size for each in sizes if each is not None) < 2 * 5_000 + 4 * 2_000
-
-    run(work)
+async def test_keyframes_that_follow_fast_have_fewer_points_within_the_share_of_the_link(
+    robot: FakeLiveRobot,
+) -> None:
+    objects = Objects()
+    live = replace(QUICK, points_bytes_per_s=5_000.0)
+    mapper = LiveMapper(
+        robot, "lab", ask=solve, live=live, store=objects.store, clock=lambda: 0.0
+    )  # no time passes
+    async with mapper:
+        await drive(mapper, range(13))
+        await robot.until(lambda: mapper.keyframes_waiting == 0)
+        sizes = [decode_keyframe(request.keyframe).points for request in robot.kept]
+        assert len(sizes) == 4
+        assert sum(each.size for each in sizes if each is not None) < 2 * 5_000 + 4 * 2_000
 
 
 @pytest.mark.parametrize("error", [Forbidden("no scope data:write"), ConnectError("no data service")])
-def test_a_robot_that_cannot_store_points_maps_and_leaves_as_before(error: Exception) -> None:
-    async def work(robot: FakeLiveRobot) -> None:
-        objects = Objects()
-        objects.error = error
-        live = replace(QUICK, points_bytes_per_s=1e9, leave_s=0.2)
-        async with mapper_of(robot, objects, live) as mapper:
-            done = await drive(mapper, range(9))
-        assert all(each.T_world_camera is not None for each in done)
-        assert len(robot.kept) == 3
-        assert mapper.report()["live"]["points"]["sent"] == 0
-        assert mapper.report()["live"]["points"]["trouble"]
+async def test_a_robot_that_cannot_store_points_maps_and_leaves_as_before(
+    robot: FakeLiveRobot, error: Exception
+) -> None:
+    objects = Objects()
+    objects.error = error
+    live = replace(QUICK, points_bytes_per_s=1e9, leave_s=0.2)
+    async with mapper_of(robot, objects, live) as mapper:
+        done = await drive(mapper, range(9))
+    assert all(each.T_world_camera is not None for each in done)
+    assert len(robot.kept) == 3
+    assert mapper.report()["live"]["points"]["sent"] == 0
+    assert mapper.report()["live"]["points"]["trouble"]
 
-    run(work)
 
-
-def test_no_points_are_made_where_none_are_wanted() -> None:
-    async def work(robot: FakeLiveRobot) -> None:
-        objects = Objects()
-        async with mapper_of(robot, objects, replace(QUICK, points=0)) as mapper:
-            await drive(mapper, range(5))
-            await robot.until(lambda: mapper.keyframes_waiting == 0)
-        assert not objects.tries
-        assert all(decode_keyframe(request.keyframe).points is None for request in robot.kept)
-
-    run(work)
+async def test_no_points_are_made_where_none_are_wanted(robot: FakeLiveRobot) -> None:
+    objects = Objects()
+    async with mapper_of(robot, objects, replace(QUICK, points=0)) as mapper:
+        await drive(mapper, range(5))
+        await robot.until(lambda: mapper.keyframes_waiting == 0)
+    assert not objects.tries
+    assert all(decode_keyframe(request.keyframe).points is None for request in robot.kept)
 
 
 def test_more_points_than_an_object_holds_are_refused() -> None:
@@ -177,39 +166,37 @@ def test_more_points_than_an_object_holds_are_refused() -> None:
 
 
 @pytest.mark.parametrize(("is_allowed", "is_wanted"), [(True, True), (True, False), (False, True)])
-def test_an_image_is_stored_where_operator_and_robot_want_it(is_allowed: bool, is_wanted: bool) -> None:
+async def test_an_image_is_stored_where_operator_and_robot_want_it(
+    robot: FakeLiveRobot, is_allowed: bool, is_wanted: bool
+) -> None:
     cv2 = pytest.importorskip("cv2")
 
-    async def work(robot: FakeLiveRobot) -> None:
-        objects = Objects()
-        robot.has_images, robot.foreign_keyframes = is_allowed, 1
-        live = replace(QUICK, images=is_wanted, images_bytes_per_s=1e9, points=0, leave_s=5.0)
-        async with mapper_of(robot, objects, live) as mapper:
-            await drive(mapper, range(5))
+    objects = Objects()
+    robot.has_images, robot.foreign_keyframes = is_allowed, 1
+    live = replace(QUICK, images=is_wanted, images_bytes_per_s=1e9, points=0, leave_s=5.0)
+    async with mapper_of(robot, objects, live) as mapper:
+        await drive(mapper, range(5))
 
+    images = [decode_keyframe(request.keyframe).image for request in robot.kept]
+    assert len(images) == 2
+    if not (is_allowed and is_wanted):
+        assert images == [None, None]
+        assert not objects.tries
+        return
+    first = cv2.imdecode(np.frombuffer(objects.held[images[0].digest], np.uint8), cv2.IMREAD_COLOR)
+    assert np.abs(first[:, :, ::-1].astype(int) - frame_at(0, depth=True).rgb).mean() < 8.0
+    assert {each.digest for each in images} == set(objects.held)
+
+
+async def test_keyframes_whose_images_do_not_fit_the_share_of_the_link_have_none(
+    robot: FakeLiveRobot,
+) -> None:
+    objects = Objects()
+    robot.has_images, robot.foreign_keyframes = True, 1
+    live = replace(QUICK, images_bytes_per_s=1_000.0, points=0)
+    mapper = LiveMapper(robot, "lab", ask=solve, live=live, store=objects.store, clock=lambda: 0.0)
+    async with mapper:
+        await drive(mapper, range(9))
+        await robot.until(lambda: mapper.keyframes_waiting == 0)
         images = [decode_keyframe(request.keyframe).image for request in robot.kept]
-        assert len(images) == 2
-        if not (is_allowed and is_wanted):
-            assert images == [None, None]
-            assert not objects.tries
-            return
-        first = cv2.imdecode(np.frombuffer(objects.held[images[0].digest], np.uint8), cv2.IMREAD_COLOR)
-        assert np.abs(first[:, :, ::-1].astype(int) - frame_at(0, depth=True).rgb).mean() < 8.0
-        assert {each.digest for each in images} == set(objects.held)
-
-    run(work)
-
-
-def test_keyframes_whose_images_do_not_fit_the_share_of_the_link_have_none() -> None:
-    async def work(robot: FakeLiveRobot) -> None:
-        objects = Objects()
-        robot.has_images, robot.foreign_keyframes = True, 1
-        live = replace(QUICK, images_bytes_per_s=1_000.0, points=0)
-        mapper = LiveMapper(robot, "lab", ask=solve, live=live, store=objects.store, clock=lambda: 0.0)
-        async with mapper:
-            await drive(mapper, range(9))
-            await robot.until(lambda: mapper.keyframes_waiting == 0)
-            images = [decode_keyframe(request.keyframe).image for request in robot.kept]
-            assert [each is not None for each in images] == [True, False, False]
-
-    run(work)
+        assert [each is not None for each in images] == [True, False, False]
