@@ -33,7 +33,6 @@ os.environ.setdefault("MOTO_AMIS_PATH", str(Path(__file__).parent / "aws" / "ima
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
-ASYNC_TEST_S = 30.0  # an asynchronous test that waits for longer has failed, and shows for what it waited
 _REPOSITORY = Path(__file__).resolve().parents[1]
 _SOURCES = ("rse_pf", "client_sdk", "lambda_pnp", "stacks")
 

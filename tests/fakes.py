@@ -1,8 +1,7 @@
 """Fakes for tests: an event loop whose time stands still, the wire of a robot, and a server.
 
-`FakeLoop` behaves as asyncio's loop does (``tests/test_fakes.py`` compares them).  `FakeServer` speaks the
-protocol with the real `ServerSession` and answers ``echo`` through the real `dispatch`; a test can make it
-misbehave.
+`FakeLoop` behaves as asyncio's loop does.  `FakeServer` speaks the protocol with the real `ServerSession` and
+answers ``echo`` through the real `dispatch`; a test can make it misbehave.
 """
 
 from __future__ import annotations

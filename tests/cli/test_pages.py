@@ -115,14 +115,6 @@ def test_every_command_in_a_sentence_exists(repository: Path, name: str) -> None
     assert wrong == {}
 
 
-def test_a_wrong_command_is_seen(repository: Path) -> None:
-    assert "unknown option" in complaint(repository, "rse-pf map list --shop dir:objects")
-    assert complaint(repository, "rse-pf mop list") == "no verb"
-    assert complaint(repository, "make fuss") == "no target"
-    assert half_a_complaint("rse-pf audit verify --tail") == "--tail"
-    assert half_a_complaint("rse-pf robot ban").startswith("ban is none of keygen")
-
-
 @pytest.mark.parametrize("verb", VERBS)
 def test_every_example_on_a_help_page_is_understood(repository: Path, verb: str) -> None:
     text = verb_module(verb).__doc__ or ""

@@ -11,7 +11,7 @@ from client_sdk.network.dialling import dial_error_of, hide_password, unconnecte
 from rse_pf.auth.tokens import KeySet
 from rse_pf.backend.gateway.handshake import HandshakePolicy, HandshakeRequest, Rejected
 from rse_pf.config import PlatformSettings
-from rse_pf.errors import ConnectError, Forbidden, Unauthorized, UsageError
+from rse_pf.errors import ConnectError, Forbidden, Unauthorized
 from rse_pf.wire.refusal import refusal_body
 
 REFUSALS = [(401, "unauthorized", Unauthorized), (403, "forbidden", Forbidden)]
@@ -139,9 +139,3 @@ def test_the_wait_that_a_server_asks_for_is_bounded(header, after_s):
 
 def test_a_shown_address_holds_no_credentials():
     assert hide_password("wss://robot:secret@host:443/ws?token=x") == "wss://host:443/ws"
-
-
-@pytest.mark.parametrize("url", ["http://host/ws", "ws:///ws", "ws://host:99999/ws", "host"])
-def test_an_address_that_is_no_websocket_address_is_refused(url):
-    with pytest.raises(UsageError, match="not a WebSocket address"):
-        hide_password(url)

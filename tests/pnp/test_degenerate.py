@@ -1,7 +1,4 @@
-"""Input that fixes no pose: a typed error, never an answer.
-
-Each guard is also taken out once, to show that the fault it guards against is real.
-"""
+"""Input that fixes no pose: a typed error, never an answer."""
 
 from __future__ import annotations
 
@@ -15,8 +12,8 @@ from hypothesis.extra import numpy as hnp
 
 from rse_pf import native
 from rse_pf.errors import BadRequest, DegenerateGeometry, NoConsensus, PnpError, RsePfError
-from rse_pf.geometry import pose_difference, transform
-from rse_pf.pnp import PnpOptions, evidence, rules, solve_pnp, solver
+from rse_pf.geometry import transform
+from rse_pf.pnp import PnpOptions, solve_pnp
 from rse_pf.pnp.problems import DEGENERATE, KINECT, make_degenerate, make_problem
 
 NATIVE = pytest.param(
@@ -126,57 +123,6 @@ def test_points_behind_the_camera_say_so(engine):
             messages.append(error.message)
     assert found <= {DegenerateGeometry, NoConsensus}
     assert any("behind the camera or mirrored" in message for message in messages)
-
-
-def test_without_the_rank_check_a_line_comes_back(monkeypatch):
-    monkeypatch.setattr(rules, "COLLINEAR", -1.0)
-    monkeypatch.setattr(rules, "NEARLY_COLLINEAR", -1.0)
-
-    assert {"ok", "weak"} & outcomes("noisy-collinear")
-
-
-def test_without_the_chance_test_noise_comes_back(monkeypatch):
-    monkeypatch.setattr(rules, "MAX_LOG10_FALSE_ALARMS", np.inf)
-
-    assert {"ok", "weak"} & outcomes("noise")
-
-
-def test_without_counting_places_copies_of_four_wrong_matches_are_ok(monkeypatch):
-    monkeypatch.setattr(evidence, "independent_inliers", lambda view, camera: view.shape[1])
-
-    assert "ok" in outcomes("duplicated")
-
-
-def test_without_the_mirror_check_a_left_handed_world_has_poses(monkeypatch):
-    monkeypatch.setattr(solver, "_refuse_mirrored", lambda *_: None)
-
-    assert "weak" in outcomes("mirrored")
-
-
-def test_without_the_second_pose_of_a_plane_a_flip_is_ok(monkeypatch):
-    def wrong_and_ok():
-        count = 0
-        for seed in range(60):
-            rng = np.random.default_rng(seed)
-            flat = np.column_stack([rng.uniform(-0.2, 0.2, (40, 2)), np.zeros(40)])
-            tilt = 0.35
-            flat[:, 2] = flat[:, 0] * np.tan(tilt)
-            points = flat + np.array([0.0, 0.0, 1.8])
-            pixels = KINECT.project(points) + rng.normal(size=(40, 2)) * 2.0
-            try:
-                solution = solve_pnp(points, pixels, KINECT, PnpOptions(engine="poselib"), weak=generous)
-            except PnpError:
-                continue
-            _, degrees = pose_difference(solution.T_camera_world, np.eye(4))
-            count += solution.verdict == "ok" and degrees > 20.0
-        return count
-
-    generous = solver.WeakLimits(translation_m=10.0, rotation_rad=10.0)
-    guarded = wrong_and_ok()
-    monkeypatch.setattr(rules, "WEAK_PERSPECTIVE", 0.0)
-
-    assert guarded == 0
-    assert wrong_and_ok() > 0
 
 
 numbers = st.floats(width=64, allow_nan=True, allow_infinity=True, allow_subnormal=True)
