@@ -7,12 +7,11 @@ import pytest
 from rse_pf.errors import UsageError
 from rse_pf.experiments.paper.elasticity import (
     CpuCost,
-    busy_periods_before,
     crashes,
     elasticity_figures,
     find_unjustified_scale_outs,
 )
-from rse_pf.experiments.results.records import CommandRecord, Records, run_sample
+from rse_pf.experiments.results.records import Records, run_sample
 from rse_pf.local.control.monitor import ServerSample
 
 ASKED = {
@@ -54,43 +53,6 @@ BUSY = [reading(t / 2, 80.0, 80.0) for t in range(1, 20)]
 """80 % throughout, twice a second, from 0 to 9.5 s."""
 
 
-def test_counts_scale_outs_for_load_but_not_replacements():
-    judged = elasticity_figures(
-        run(
-            events=[
-                grow(4.0), grow(5.0, "fewer than scaling.min_servers"), event(9.0, "shrink", servers=1),
-                event(9.1, "shrink", servers=1),
-            ],
-            samples=[reading(1.0, 10, 10), reading(5.0, 10, 10, 10, 10), reading(9.9, 1, 1)],
-        )
-    )  # fmt: skip
-
-    assert (judged["scale_outs"], judged["scale_ins"]) == (1, 2)
-    assert (judged["min_servers"], judged["max_servers"], judged["final_servers"]) == (2, 4, 2)
-    assert judged["healthy_servers_series"] == [[1.0, 2], [5.0, 4], [9.9, 2]]
-    assert judged["cpu_percent_series"] == [[1.0, 10.0], [5.0, 10.0], [9.9, 1.0]]
-
-
-def test_the_mean_cpu_excludes_servers_that_warm_up_or_did_not_answer():
-    assert reading(1.0, 80.0, 10.0, None, warming=(1,)).cpu_percent == 80.0
-    assert reading(1.0, None).cpu_percent is None
-
-
-def test_a_crash_is_replaced_by_the_next_server_that_was_launched_after_it():
-    events = [
-        event(1.0, "server-launched", server="server-3"),
-        event(9.9, "fault", fault="kill", server="server-1", pid=11),
-        event(10.0, "server-gone", server="server-1", pid=11, exit_code=-9),
-        event(10.1, "server-launched", server="server-4"),
-        event(11.0, "server-healthy", server="server-3"),
-        event(12.4, "server-healthy", server="server-4"),
-    ]
-
-    found = crashes(events)
-
-    assert found == [{"server": "server-1", "pid": 11, "time": 9.9, "by": "server-4", "replaced_in_s": 2.5}]
-
-
 def test_two_crashes_need_two_replacements():
     events = [
         event(10.0, "server-gone", server="server-1", pid=11),
@@ -109,20 +71,6 @@ def test_a_drained_server_did_not_crash():
     assert elasticity_figures(run(events=events))["crashes"] == 0
 
 
-def test_periods_follow_the_clock_of_the_monitor():
-    readings = [reading(t / 2, 100.0 if t <= 8 else 0.0) for t in range(20)]
-
-    seen = busy_periods_before(readings, 6.1, origin_s=1000.0, period_s=2.0, periods=3)
-
-    assert seen == [pytest.approx(100.0), pytest.approx(100.0), pytest.approx(0.0)]
-    shifted = busy_periods_before(readings, 6.1, origin_s=1001.0, period_s=2.0, periods=2)
-    assert shifted == [pytest.approx(100.0), pytest.approx(50.0)]
-
-
-def test_a_scale_out_after_busy_periods_is_justified():
-    assert find_unjustified_scale_outs(run(events=[grow(4.05)], samples=BUSY)) == []
-
-
 def test_a_scale_out_without_enough_busy_periods_is_reported():
     calm = [reading(t / 2, 80.0 if t > 4 else 40.0) for t in range(1, 20)]
 
@@ -133,24 +81,6 @@ def test_a_scale_out_without_enough_busy_periods_is_reported():
 
 def test_a_scale_out_without_samples_is_reported():
     assert "none" in find_unjustified_scale_outs(run(events=[grow(30.0)], samples=BUSY))[0]
-
-
-def test_phases_split_the_commands_by_planned_time():
-    def command(number, planned):
-        return CommandRecord(
-            id=number, robot="r", planned=planned, sent=planned, answered=planned + 0.01, server="a",
-            code="ok", round_trip_ms=10.0,
-        )  # fmt: skip
-
-    judged = elasticity_figures(
-        run(
-            events=[event(0.0, "phase", phase="joining"), event(5.0, "phase", phase="full")],
-            commands=[command(1, 1.0), command(2, 4.9), command(3, 5.0)],
-        )
-    )
-
-    assert judged["phases"]["joining"]["commands"]["answered"] == 2
-    assert judged["phases"]["full"]["commands"]["answered"] == 1
 
 
 def test_a_run_without_parameters_is_refused():

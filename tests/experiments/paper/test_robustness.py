@@ -56,17 +56,6 @@ def unanswered(answered, code):
     return CommandRecord(id=999, robot="hit", planned=5, sent=5, answered=answered, server="", code=code)
 
 
-def test_a_kill_without_losses_meets_every_target():
-    judged = robustness_figures(run("kill", KILL, [*HIT, *OTHER]))
-
-    assert judged["gap_s"]["robots"] == 1
-    assert judged["gap_s"]["p99"] == pytest.approx(1.0)
-    assert judged["out_of_rotation_s"] == pytest.approx(0.3)
-    assert judged["replaced_in_s"] == pytest.approx(2.5)
-    assert judged["answered_percent"] == 100.0
-    assert all(bar["held"] for bar in judged["bars"].values())
-
-
 @pytest.mark.parametrize(
     ("events", "commands", "missed"),
     [
@@ -91,19 +80,6 @@ def test_a_figure_that_was_not_measured_misses_its_target():
     assert not bars["gap_s/p99"]["held"]
 
 
-def test_a_fault_of_the_load_balancer_affects_every_robot():
-    fault = event(4.0, "fault", fault="kill -9", watch_s=5.0)
-    commands = [*steady("a", "server-1", 0, 9, silent=(4, 5)), *steady("b", "server-2", 0, 9, silent=(4, 6))]
-    events = [fault, event(4.1, "balancer-gone"), event(4.6, "balancer-back")]
-
-    judged = robustness_figures(run("balancer", events, commands))
-
-    assert judged["gap_s"]["robots"] == 2
-    assert judged["gap_s"]["max"] == pytest.approx(2.2)
-    assert judged["balancer_back_s"] == pytest.approx(0.5)
-    assert not judged["bars"]["gap_s/p99"]["held"]
-
-
 @pytest.mark.parametrize(("after", "not_adopted"), [([1, 2, 3], 0), ([1, 2, 9], 1)])
 def test_adoption_compares_the_processes_before_and_after(after, not_adopted):
     events = [
@@ -118,31 +94,6 @@ def test_adoption_compares_the_processes_before_and_after(after, not_adopted):
     assert judged["not_adopted"] == not_adopted
     assert judged["control_plane_down_s"] == pytest.approx(4.0)
     assert judged["bars"]["not_adopted"]["held"] is (not_adopted == 0)
-
-
-def test_the_figures_of_a_cut_link_cover_both_sides_and_the_first_answers_after_it():
-    events = [
-        event(4.0, "fault", fault="link cut", watch_s=10.0),
-        event(8.5, "link-lost", robot="robot-1"),
-        event(10.0, "healed"),
-    ]
-    readings = [robots(3.0, 1), robots(8.9, 1), robots(9.1, 0), robots(11.0, 1)]
-    stale = CommandRecord(
-        id=999, robot="robot-1", planned=4.5, sent=4.5, answered=10.6, server="server-1", code="ok",
-        round_trip_ms=6100.0,
-    )  # fmt: skip
-    commands = [*steady("robot-1", "server-1", 0, 4), *steady("robot-1", "server-1", 11, 13), stale]
-
-    judged = robustness_figures(run("wifi", events, commands, readings))
-
-    assert judged["server_noticed_s"] == pytest.approx(5.1)
-    assert judged["noticed_s"]["max"] == pytest.approx(4.5)
-    assert judged["first_answer_after_heal_s"]["p99"] == pytest.approx(0.6)
-    assert judged["stale_as_fresh"] == 1
-    assert not judged["bars"]["stale_as_fresh"]["held"]
-
-    looked = run("wifi", [*events[:2], event(9.02, "servers-empty"), events[2]], commands, readings)
-    assert robustness_figures(looked)["server_noticed_s"] == pytest.approx(5.02)
 
 
 def robots(time_s, *counts):

@@ -23,7 +23,6 @@ def test_a_report_names_the_commit_on_its_page_too(folder: Path):
     assert f"Commit {commit}. " in (folder / "report.md").read_text(encoding="utf-8")
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("folder", FOLDERS, ids=lambda folder: folder.name)
 def test_every_figure_that_is_shipped_agrees_with_its_records(folder: Path):
     assert [check.what for check in verify(folder) if check.agrees is False] == []

@@ -10,7 +10,6 @@ from rse_pf.experiments.results.records import CommandRecord
 from rse_pf.experiments.results.summary import (
     longest_outages,
     outage_figures,
-    percentiles,
     robots_on,
     summarise,
 )
@@ -40,11 +39,6 @@ def test_counts_answered_failed_lost_and_twice():
     assert report["commands_by_server"] == {"a": 2, "b": 1, "robot": 1}
 
 
-def test_the_same_id_of_two_robots_is_two_commands():
-    assert summarise([GOOD, replace(GOOD, robot="robot-2")])["commands"]["sent"] == 2
-    assert summarise([GOOD, replace(GOOD, robot="robot-2")])["commands"]["twice"] == 0
-
-
 def test_a_failure_does_not_count_in_the_round_trip():
     slow = replace(GOOD, id=2, code="expired", round_trip_ms=5000.0)
     assert summarise([GOOD, slow])["round_trip_ms"]["max"] == 40.0
@@ -55,11 +49,6 @@ def test_an_empty_run_has_no_percentiles():
     assert report["commands"]["sent"] == 0
     assert report["round_trip_ms"]["p50"] is None
     assert report["payload_bytes"] == {"median": None, "max": None}
-
-
-def test_percentiles_are_those_of_the_values():
-    assert percentiles([1.0, 2.0, 3.0, 4.0, 5.0])["p50"] == 3.0
-    assert percentiles(list(map(float, range(101))))["p95"] == 95.0
 
 
 def answers(robot, server, times, *, planned=None, code="ok"):
@@ -87,28 +76,8 @@ def asked_in_vain(robot, times, code=""):
     ]
 
 
-def test_a_robot_is_on_the_server_that_answered_it_last_before_the_fault():
-    commands = [
-        *answers("moved", "a", [1.0]),
-        *answers("moved", "b", [1.5]),
-        *answers("stayed", "a", [1.2]),
-        *answers("later", "a", [2.5]),
-    ]
-
-    assert robots_on(commands, "a", 2.0) == {"stayed"}
-    assert robots_on(commands, "b", 2.0) == {"moved"}
-
-
 def test_a_failure_is_no_answer_of_a_server():
     assert robots_on(answers("r", "a", [1.0], code="busy"), "a", 2.0) == set()
-
-
-def test_the_outage_is_the_longest_time_without_answers_that_overlaps_the_fault():
-    commands = answers("r", "a", [0.0, 3.0, 3.2, 3.4, 4.9, 5.1, 9.0])
-
-    silences = longest_outages(commands, {"r"}, start_s=3.5, end_s=6.0)
-
-    assert silences == {"r": pytest.approx(3.9)}
 
 
 def test_an_outage_before_the_fault_or_after_the_watched_time_does_not_count():
@@ -117,12 +86,6 @@ def test_an_outage_before_the_fault_or_after_the_watched_time_does_not_count():
     silences = longest_outages(commands, {"r"}, start_s=3.5, end_s=4.2)
 
     assert silences["r"] == pytest.approx(0.5)
-
-
-def test_the_outage_of_a_robot_without_further_answers_ends_with_its_last_command():
-    commands = [*answers("r", "a", [1.0, 1.2]), *asked_in_vain("r", [1.4, 8.0])]
-
-    assert longest_outages(commands, {"r"}, start_s=1.3, end_s=3.0)["r"] == pytest.approx(6.8)
 
 
 def test_failures_do_not_end_an_outage():
@@ -135,9 +98,3 @@ def test_a_robot_that_was_never_answered_is_counted():
     figures = outage_figures(asked_in_vain("r", [1.0, 7.0]), {"r"}, start_s=1.0, end_s=3.0)
 
     assert figures == {"robots": 1, "p50": 6.0, "p99": 6.0, "max": 6.0}
-
-
-def test_unaffected_robots_do_not_change_the_percentiles():
-    commands = [*answers("hit", "a", [1.0, 3.0]), *answers("other", "b", [1.0, 1.2, 1.4, 3.0])]
-
-    assert outage_figures(commands, {"hit"}, start_s=1.1, end_s=2.0)["p50"] == pytest.approx(2.0)
