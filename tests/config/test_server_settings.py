@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import re
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -27,11 +25,6 @@ TOGETHER: dict[tuple[str, str], dict[str, dict[str, Any]]] = {
     ("scaling", "period_s"): {"scaling": {"idle_s": 420}},
 }
 """Settings that are refused alone, with what they need."""
-SERVER_FOLDERS = (
-    "backend", "data_server", "live_map", "services", "wire", "auth", "audit", "recording", "pnp",
-    "aws/fleet/tasks", "aws/storage", "cli/servers",
-)  # fmt: skip
-SERVER_FILES = ("aws/fleet/agent.py", "aws/fleet/drain_hook.py", "aws/fleet/launch_hook.py")
 
 
 def changed(row: SettingRow) -> tuple[PlatformSettings, PlatformSettings] | None:
@@ -82,20 +75,3 @@ def test_the_listed_settings_exist_and_a_server_starts_with_what_travels() -> No
         assert set(names) <= set(BASE.to_dict()[group])
 
     assert server_settings(PlatformSettings.from_dict(server_settings(BASE))) == server_settings(BASE)
-
-
-def test_no_code_of_a_server_reads_a_setting_that_stays_behind(repository: Path) -> None:
-    """Finds ``settings.cloud.x`` and the like; a group in a variable of another name would hide from it."""
-    package = repository / "rse_pf"
-    files = [package / name for name in SERVER_FILES]
-    files += [file for folder in SERVER_FOLDERS for file in (package / folder).rglob("*.py")]
-    pattern = re.compile(rf"settings\.({'|'.join(READ_BY_SERVERS)})\.(\w+)")
-
-    found = {
-        (group, name, file.relative_to(package).as_posix())
-        for file in files
-        for group, name in pattern.findall(file.read_text(encoding="utf-8"))
-    }
-
-    assert len(found) >= 5, "the pattern finds nothing"
-    assert [each for each in sorted(found) if each[1] not in READ_BY_SERVERS[each[0]]] == []

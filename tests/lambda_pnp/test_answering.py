@@ -7,12 +7,9 @@ import itertools
 import json
 import zlib
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
-import server_sessions
 from hostile.hostile_maps import hostile_maps
 from hypothesis import given
 from hypothesis import settings as hypothesis_settings
@@ -22,17 +19,13 @@ from lambda_pnp.answering import Answering
 from lambda_pnp.keys import KeyCache
 from rse_pf.auth.tokens import SigningKey
 from rse_pf.config import PlatformSettings
-from rse_pf.identity import RobotId
-from rse_pf.wire import SUBPROTOCOLS, Command, Failure, Hello, Message, Result, make_codec
+from rse_pf.wire import SUBPROTOCOLS, Command, Failure, Hello, Message, make_codec
 
 SETTINGS = PlatformSettings()
 KEY = SigningKey.from_seed(bytes(range(32)), "key-1")
 KEYS = KeyCache(lambda: KEY.key_set().to_json(), 60.0)
 NOW_S = 1_800_000_000.0
 TOKEN = KEY.issue("robot-1", now=NOW_S, token_id="t", settings=SETTINGS.auth)
-GOLDEN = json.loads(
-    (Path(__file__).parents[1] / "wire" / "golden" / "poses.json").read_text(encoding="utf-8")
-)
 
 
 def answering(settings: PlatformSettings = SETTINGS) -> Answering:
@@ -65,30 +58,6 @@ def failure(what: dict[str, Any]) -> str:
 
 def compressed(text: str) -> bytes:
     return zlib.compress(text.encode())
-
-
-@pytest.mark.parametrize("codec", SUBPROTOCOLS)
-@pytest.mark.parametrize("name", GOLDEN)
-def test_every_golden_command_gets_the_backends_answer(name: str, codec: str) -> None:
-    from rse_pf.service import dispatch
-    from rse_pf.services.builtin import builtin_services
-
-    raw = json.dumps(GOLDEN[name]["command"]).encode()
-    command = make_codec("json").decode_from_robot(raw)
-    assert isinstance(command, Command)
-    expected = dispatch(builtin_services(SETTINGS), command, lambda: 0.0)
-
-    given = answer(event(make_codec(codec).encode(command), codec), codec=codec)
-
-    if isinstance(expected, Failure):
-        assert isinstance(given, Failure)
-        assert given.code == expected.code
-        return
-    assert isinstance(given, Result)
-    reply = given.reply
-    assert reply["verdict"] == expected.reply.verdict
-    np.testing.assert_array_equal(reply["inliers"], expected.reply.inliers)
-    np.testing.assert_allclose(reply["T_camera_world"], expected.reply.T_camera_world, rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("token", ["", "a.b.c", TOKEN[:-4] + "AAAA"])
@@ -142,70 +111,6 @@ def test_a_late_answer_is_expired_before_and_after_the_work() -> None:
     assert isinstance(told, Failure)
     assert told.code == "expired"
     assert told.id == 1
-
-
-def over_the_websocket(body: bytes) -> Failure:
-    """Return what a backend's session, scheduler and dispatch say to the same bytes."""
-    from rse_pf.backend.gateway.admission import Admission
-    from rse_pf.backend.scheduling.scheduler import QueueBacklog, QueuedCommand
-    from rse_pf.service import dispatch, failure_of
-    from rse_pf.services.builtin import builtin_services
-    from rse_pf.wire.server_session import Send, ServerSession, Submit
-
-    codec = make_codec("zlib", SETTINGS.session)
-    session = ServerSession(
-        codec=codec, robot="robot-1", server="lambda", session="s", limits=SETTINGS.session
-    )
-    server_sessions.receive(session, codec.encode(Hello()), 0.0)
-    decision = server_sessions.receive(session, body, 0.0)[0]
-    if isinstance(decision, Send):
-        told = codec.decode_from_server(decision.data)
-    else:
-        assert isinstance(decision, Submit)
-        command = decision.command
-        allowed_s = SETTINGS.session.answer_timeout_s
-        if command.deadline_ms is not None:
-            allowed_s = command.deadline_ms / 1e3
-        queued = QueuedCommand(None, RobotId("default", "robot-1"), command, len(body), 0.0, allowed_s)
-        admission = Admission(SETTINGS.session)
-        refused = admission.judge(queued, None, QueueBacklog())
-        if refused is not None:
-            told = failure_of(refused.error, command, server="lambda")
-        else:
-            told = dispatch(builtin_services(SETTINGS), command, lambda: 0.0, server="lambda")
-    assert isinstance(told, Failure)
-    return told
-
-
-PNP = '{"type":"command","id":7,"trace":"t-1","service":"pnp","payload":%s}'
-BAD = {
-    "bomb": zlib.compress(b" " * 50_000_000),
-    "no zlib": b"hello",
-    "two streams": compressed("1") * 2,
-    "no JSON": compressed("{"),
-    "no command": compressed('{"type":"something"}'),
-    "NaN": compressed(PNP % '{"points_world":[NaN]}'),
-    "infinite": compressed(PNP % '{"points_world":[1e999]}'),
-    "deep": compressed("[" * 1000),
-    "no payload": compressed(PNP % "{}"),
-    "wrong type": compressed(PNP % '{"camera":5}'),
-    "late": make_codec("zlib").encode(Command(id=7, service="pnp", deadline_ms=0.0)),
-    "too few": compressed(
-        PNP % '{"camera":{"fx":500,"fy":500,"cx":320,"cy":240,"width":640,"height":480},'
-        '"points_world":[0,0,1],"pixels":[320,240]}'
-    ),
-}
-
-
-@pytest.mark.parametrize("name", BAD)
-def test_a_bad_command_gets_the_failure_that_the_websocket_gives(name: str) -> None:
-    given = answer(event(BAD[name]))
-    expected = over_the_websocket(BAD[name])
-
-    assert isinstance(given, Failure)
-    assert (given.id, given.code, given.trace) == (expected.id, expected.code, expected.trace)
-    if name != "late":  # the moment differs, and with it the words
-        assert (given.message, given.hint) == (expected.message, expected.hint)
 
 
 def test_another_service_is_unknown_here() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import base64
 import time
+import zlib
 from collections.abc import Iterator
 from typing import Any
 
@@ -21,6 +22,29 @@ from rse_pf.services.pnp import PnpRequest, make_request
 from rse_pf.wire import CODECS, SUBPROTOCOLS, Command, Failure, Hello, Result, make_codec
 
 pytestmark = pytest.mark.system
+PNP = '{"type":"command","id":7,"service":"pnp","payload":%s}'
+
+
+def compressed(text: str) -> bytes:
+    return zlib.compress(text.encode())
+
+
+MALFORMED = {
+    "bomb": zlib.compress(b" " * 50_000_000),
+    "no zlib": b"hello",
+    "two streams": 2 * compressed("1"),
+    "no JSON": compressed("{"),
+    "no command": compressed('{"type":"something"}'),
+    "NaN": compressed(PNP % '{"points_world":[NaN]}'),
+    "infinite": compressed(PNP % '{"points_world":[1e999]}'),
+    "deep": compressed("[" * 1000),
+    "no payload": compressed(PNP % "{}"),
+    "wrong type": compressed(PNP % '{"camera":5}'),
+    "too few": compressed(
+        PNP % '{"camera":{"fx":500,"fy":500,"cx":320,"cy":240,"width":640,"height":480},'
+        '"points_world":[0,0,1],"pixels":[320,240]}'
+    ),
+}
 
 
 def request(problem: Any, codec: str) -> PnpRequest:
@@ -105,3 +129,11 @@ def test_the_function_answers_what_a_server_answers(server: GuardedServer, codec
     assert kinds == [Result, Result, Failure, Failure, Failure, Failure]
     for (name, data), answer in zip(sent.items(), expected, strict=True):
         assert comparable(of_the_function(server, codec, data), codec) == comparable(answer, codec), name
+
+
+@pytest.mark.parametrize("name", MALFORMED)
+def test_the_function_refuses_what_a_server_refuses(server: GuardedServer, name: str) -> None:
+    (refused,) = asyncio.run(of_a_server(server, "zlib", [MALFORMED[name]]))
+
+    assert isinstance(make_codec("zlib").decode_from_server(refused), Failure)
+    assert comparable(of_the_function(server, "zlib", MALFORMED[name]), "zlib") == comparable(refused, "zlib")

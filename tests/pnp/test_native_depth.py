@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import threading
-from pathlib import Path
 
 import msgspec
 import numpy as np
 import pytest
 
 from rse_pf import native
-from rse_pf.errors import BadRequest, ConfigurationError
+from rse_pf.errors import BadRequest
 from rse_pf.geometry import Array, exp_se3, transform
-from rse_pf.pnp import DepthNoise, PnpSolution, refine_with_depth
+from rse_pf.pnp import PnpSolution, refine_with_depth
 from rse_pf.pnp.depth_refinement import refine_by_numpy
 from rse_pf.pnp.native_depth import DepthCore, RefinedPose, depth_core, open_depth
 from rse_pf.pnp.problems import KINECT
@@ -228,18 +227,6 @@ def test_the_refusals_of_both_paths_are_the_same() -> None:
     for depths_m in (np.zeros(3), np.full(100, -1.0), np.full(100, np.nan)):
         with pytest.raises(BadRequest, match="depths_m"):
             refine_with_depth(case.solution, case.points, case.pixels, depths_m, KINECT)
-
-
-def test_the_default_noise_is_the_one_of_these_tests() -> None:
-    noise = DepthNoise()
-    assert (noise.base_m, noise.growth_per_m, noise.from_m) == NOISE
-
-
-def test_a_file_that_is_no_library_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "librse_pf_native.so"
-    path.write_bytes(b"no library")
-    with pytest.raises(ConfigurationError, match="cannot be loaded"):
-        open_depth(path)
 
 
 def test_numbers_at_odd_addresses_are_copied_for_the_library():

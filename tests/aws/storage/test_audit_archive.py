@@ -226,29 +226,6 @@ def test_a_file_truncated_after_its_upload_is_detected(setup: ShipperSetup, tmp_
     assert next(iter(setup.verdicts(tmp_path / "fetched").values())).problem != ""
 
 
-def test_a_missing_piece_is_a_missing_entry(setup: ShipperSetup, tmp_path: Path) -> None:
-    for _ in range(3):
-        setup.write(1)
-        setup.shipper.ship()
-    names = [each.name for each in setup.bucket.list()]
-    setup.bucket.delete(names[1])
-
-    (verdict,) = setup.verdicts(tmp_path / "fetched").values()
-
-    assert verdict.problem.startswith("entry 2 is missing")
-
-
-def test_a_piece_whose_bytes_were_changed_is_reported(setup: ShipperSetup, tmp_path: Path) -> None:
-    setup.write(2)
-    setup.shipper.ship()
-    (name,) = [each.name for each in setup.bucket.list()]
-    setup.bucket.put(name, b"")
-
-    problems = fetch_audit(setup.bucket, tmp_path / "fetched")
-
-    assert problems == [f"{name} was changed: its bytes do not have the digest in its name"]
-
-
 def test_a_foreign_object_is_reported_and_writes_nothing(tmp_path: Path) -> None:
     bucket = MemoryStore()
     bucket.put("audit/i-1/..evil.jsonl".replace("..", "x."), b"x\n")

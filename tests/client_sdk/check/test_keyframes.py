@@ -6,14 +6,10 @@ from dataclasses import replace
 from functools import cache
 
 import numpy as np
-import pytest
 
-from client_sdk.check import keyframes
 from client_sdk.check.keyframes import KeyframeStore, depths_at, matched
 from client_sdk.frontend import Features, Frame, TrackedFrame
-from client_sdk.monocular.descriptors import match_all
 from client_sdk.simulator import render_frames
-from client_sdk.stereo.view import StereoView
 from client_sdk.tracking.monocular_tracker import MonocularTracker
 from client_sdk.tracking.tracker import Tracker
 from rse_pf.maps.descriptors import DescriptorKind
@@ -67,22 +63,6 @@ def found_by(frame: Frame, tracker: Tracker | MonocularTracker) -> Features:
     return tracked.features
 
 
-@pytest.mark.parametrize("make", [Tracker, MonocularTracker])
-def test_features_that_a_tracker_found_are_not_found_again(
-    make: type[Tracker | MonocularTracker], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    frame, store = frames()[0], KeyframeStore()
-    found = found_by(frame, make())
-    monkeypatch.setattr(keyframes, "describe", lambda *_: pytest.fail("features were found twice"))
-
-    store.add(frame, None, found)
-
-    kept = store.keyframes[0]
-    assert 100 < len(kept.pixels) <= 1200
-    one, other = match_all(found.descriptors, kept.descriptors)
-    np.testing.assert_array_equal(found.pixels[one], kept.pixels[other])
-
-
 def test_vectors_of_a_user_are_not_judged_as_orb_is() -> None:
     frame, store = frames()[0], KeyframeStore()
     found = replace(found_by(frame, Tracker()), kind=DescriptorKind("lines", "int8", 16))
@@ -91,14 +71,3 @@ def test_vectors_of_a_user_are_not_judged_as_orb_is() -> None:
 
     assert store.keyframes[0].descriptors.shape == (len(store.keyframes[0].pixels), 32)
     assert len(store.keyframes[0].pixels) <= 500
-
-
-def test_depths_of_a_pair_are_those_that_were_matched_already(monkeypatch: pytest.MonkeyPatch) -> None:
-    frame, store = frames()[0], KeyframeStore()
-    pair = StereoView(gray=frame.rgb[:, :, 1], baseline_m=0.1)
-    found = found_by(frame, Tracker())
-    monkeypatch.setattr(keyframes, "stereo_points", lambda *_: pytest.fail("depths were found twice"))
-
-    store.add(replace(frame, stereo=pair), None, found)
-
-    np.testing.assert_array_equal(store.keyframes[0].depths_m[0], found.points_camera[:, 2])

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from client_sdk.mapping import Trajectory
-from rse_pf.experiments.demo.report import advice, closing_lines, demo_page, is_lost, make_report
+from rse_pf.experiments.demo.report import advice, closing_lines, is_lost, make_report
 from rse_pf.experiments.demo.robot import RobotFinished, _is_metric
 from rse_pf.experiments.results.records import CommandRecord
 
@@ -78,28 +78,6 @@ def test_a_path_without_metres_has_neither_a_length_nor_errors():
 )
 def test_a_drive_is_in_metres_if_its_odometry_is(mapper: SimpleNamespace, expected: bool) -> None:
     assert _is_metric(mapper) is expected
-
-
-def test_the_report_has_the_documented_fields():
-    made = report(walk())
-    for name in ("robots", "frames", "lost_frames", "ate_cm", "rpe_cm", "fps_per_robot", "failures_by_code"):
-        assert name in made
-    assert {"median", "max"} <= set(made["payload_bytes"])
-    assert {"p50", "p95", "p99"} <= set(made["round_trip_ms"]) & set(made["compute_ms"])
-    assert {"sent", "answered", "failed", "lost", "twice"} <= set(made["commands"])
-
-
-def test_the_page_shows_measured_figures_beside_those_of_the_paper():
-    text = demo_page(report(walk()))
-    assert "| round trip, mean ms | 9.0 | 156.36 |" in text
-    assert "29.82" in text
-
-
-def test_the_last_line_names_the_files(tmp_path):
-    last = closing_lines(report(walk()), tmp_path).splitlines()[-1]
-    assert str(tmp_path) in last
-    assert "map.ply" in last
-    assert "report.md" in last
 
 
 def with_lost(lost: int, **asked: object):
