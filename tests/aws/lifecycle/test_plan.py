@@ -43,10 +43,6 @@ def test_up_ends_parking() -> None:
     assert actions(plan_up(PARKED, has_packages=True))[-4:] == ["fill", "alert", "forget", "await-healthy"]
 
 
-def test_the_sizes_are_noted_before_anything_changes() -> None:
-    assert actions(plan_park(UP, deep=False)) == ["note", "silence", "empty", "await-empty"]
-
-
 def test_parking_what_is_parked_does_nothing_and_deeper_goes_on() -> None:
     assert plan_park(PARKED, deep=False) == []
     assert actions(plan_park(PARKED, deep=True)) == [
@@ -54,23 +50,11 @@ def test_parking_what_is_parked_does_nothing_and_deeper_goes_on() -> None:
     ]  # fmt: skip
 
 
-def test_parking_that_was_ended_after_the_note_goes_on() -> None:
-    begun = Deployment(stacks=UP.stacks, groups=UP.groups, note=NOTE, is_bootstrapped=True)
-
-    assert actions(plan_park(begun, deep=False)) == ["silence", "empty", "await-empty"]
-
-
 def test_what_does_not_stand_cannot_be_parked_and_what_is_not_parked_not_resumed() -> None:
     with pytest.raises(ConfigurationError, match="no platform to park"):
         plan_park(Deployment(stacks={"Data": "CREATE_COMPLETE"}), deep=False)
     with pytest.raises(ConfigurationError, match="not parked"):
         plan_resume(UP, has_packages=True)
-
-
-def test_down_destroys_in_the_opposite_order_and_keeps_the_data() -> None:
-    assert actions(plan_down(UP, delete_data=False)) == [
-        "destroy Observability", "destroy Serverless", "destroy Backend", "destroy Network", "sweep",
-    ]  # fmt: skip
 
 
 def test_the_data_goes_last_and_only_on_demand() -> None:

@@ -95,3 +95,40 @@ def test_the_emulated_cores_make_all_robots_need_five_servers_at_the_limit():
 
     cpu_percent_of_five = 100.0 * (500.0 * 0.002 + 5 * 0.01) / (5 * size)
     assert cpu_percent_of_five == pytest.approx(70.0, abs=0.05)
+
+
+def test_counts_scale_outs_for_load_but_not_replacements():
+    judged = elasticity_figures(
+        run(
+            events=[
+                grow(4.0), grow(5.0, "fewer than scaling.min_servers"), event(9.0, "shrink", servers=1),
+                event(9.1, "shrink", servers=1),
+            ],
+            samples=[reading(1.0, 10, 10), reading(5.0, 10, 10, 10, 10), reading(9.9, 1, 1)],
+        )
+    )  # fmt: skip
+
+    assert (judged["scale_outs"], judged["scale_ins"]) == (1, 2)
+    assert (judged["min_servers"], judged["max_servers"], judged["final_servers"]) == (2, 4, 2)
+    assert judged["healthy_servers_series"] == [[1.0, 2], [5.0, 4], [9.9, 2]]
+    assert judged["cpu_percent_series"] == [[1.0, 10.0], [5.0, 10.0], [9.9, 1.0]]
+
+
+def test_the_mean_cpu_excludes_servers_that_warm_up_or_did_not_answer():
+    assert reading(1.0, 80.0, 10.0, None, warming=(1,)).cpu_percent == 80.0
+    assert reading(1.0, None).cpu_percent is None
+
+
+def test_a_crash_is_replaced_by_the_next_server_that_was_launched_after_it():
+    events = [
+        event(1.0, "server-launched", server="server-3"),
+        event(9.9, "fault", fault="kill", server="server-1", pid=11),
+        event(10.0, "server-gone", server="server-1", pid=11, exit_code=-9),
+        event(10.1, "server-launched", server="server-4"),
+        event(11.0, "server-healthy", server="server-3"),
+        event(12.4, "server-healthy", server="server-4"),
+    ]
+
+    found = crashes(events)
+
+    assert found == [{"server": "server-1", "pid": 11, "time": 9.9, "by": "server-4", "replaced_in_s": 2.5}]

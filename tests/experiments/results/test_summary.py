@@ -98,3 +98,9 @@ def test_a_robot_that_was_never_answered_is_counted():
     figures = outage_figures(asked_in_vain("r", [1.0, 7.0]), {"r"}, start_s=1.0, end_s=3.0)
 
     assert figures == {"robots": 1, "p50": 6.0, "p99": 6.0, "max": 6.0}
+
+
+def test_the_outage_of_a_robot_without_further_answers_ends_with_its_last_command():
+    commands = [*answers("r", "a", [1.0, 1.2]), *asked_in_vain("r", [1.4, 8.0])]
+
+    assert longest_outages(commands, {"r"}, start_s=1.3, end_s=3.0)["r"] == pytest.approx(6.8)
