@@ -10,19 +10,13 @@ from pathlib import Path
 
 import pytest
 
+from tests.client_web.test_failures import node
+
 REPOSITORY = Path(__file__).resolve().parents[2]
 CLIENT = REPOSITORY / "client_web"
 TOOLS = Path(__file__).resolve().parent / "tools"
 MAX_BYTES = 12_000
 MINIFY = ("--minify", "--mangle-props=^_", "--format=esm", "--target=es2022", "--tree-shaking=true")
-
-
-def node() -> str:
-    beside = Path(sys.executable).with_name("node")
-    found = str(beside) if beside.exists() else shutil.which("node")
-    if found is None:
-        pytest.skip("no Node: make setup installs it")
-    return found
 
 
 @pytest.fixture(scope="module")

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-import shutil
 import subprocess
-import sys
 import threading
 import time
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -14,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from rse_pf.wire.refusal import refusal_body
+from tests.client_web.test_failures import node
 
 MODULE = Path(__file__).resolve().parents[2] / "client_web" / "rse-pf.js"
 PROGRAM = """
@@ -26,14 +25,6 @@ try {
 }
 process.exit(0);
 """
-
-
-def node() -> str:
-    beside = Path(sys.executable).with_name("node")
-    found = str(beside) if beside.exists() else shutil.which("node")
-    if found is None:
-        pytest.skip("no Node.js: make setup installs it")
-    return found
 
 
 def refused_with(status: int, body: bytes, token: str = "string") -> tuple[str, int]:

@@ -51,16 +51,6 @@ def needs_modules(*names: str, hint: str) -> Callable[[], str]:
     return missing
 
 
-def needs_programs(*names: str, hint: str) -> Callable[[], str]:
-    """Return what says which of the programs are not installed."""
-
-    def missing() -> str:
-        absent = [name for name in names if shutil.which(name) is None]
-        return f"{', '.join(absent)} not installed: {hint}" if absent else ""
-
-    return missing
-
-
 def node() -> str:
     """Return the path of Node: that of .venv, else that of the machine; "" if there is none."""
     beside = Path(sys.executable).with_name("node")

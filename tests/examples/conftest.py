@@ -26,6 +26,7 @@ from rse_pf.enrolment import Enrolment
 from rse_pf.local.control.platform import LocalPlatform
 from rse_pf.object_store import DirectoryStore
 from rse_pf.services.custom.installed import install
+from tests.client_sdk.delaying_proxy import DelayingProxy
 from tests.examples.example_page import PAGE, REPOSITORY, listed
 
 T = TypeVar("T")
@@ -164,56 +165,10 @@ def start(platform: ExamplePlatform) -> Iterator[Callable[[list[str]], Program]]
         yield started
 
 
-class Relay:
-    """Forwards connections to a platform until it is cut, and again after `restore`."""
-
-    def __init__(self, platform: ExamplePlatform) -> None:
-        self._platform = platform
-        self._writers: set[asyncio.StreamWriter] = set()
-        self._server: asyncio.Server | None = None
-        self._port = 0
-        self.restore()
-
-    @property
-    def url(self) -> str:
-        return f"ws://127.0.0.1:{self._port}/ws"
-
-    def restore(self) -> None:
-        """Listen, at the same port as before."""
-        self._platform.wait(self._listen())
-
-    def cut(self) -> None:
-        """End all connections, and refuse new ones."""
-        self._platform.wait(self._end())
-
-    async def _listen(self) -> None:
-        self._server = await asyncio.start_server(self._serve, "127.0.0.1", self._port)
-        self._port = self._server.sockets[0].getsockname()[1]
-
-    async def _end(self) -> None:
-        if self._server is not None:
-            self._server.close()
-        for writer in self._writers:
-            writer.transport.abort()
-
-    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        far_reader, far_writer = await asyncio.open_connection("127.0.0.1", self._platform.cloud.port)
-        self._writers |= {writer, far_writer}
-        await asyncio.gather(_pump(reader, far_writer), _pump(far_reader, writer))
-        self._writers -= {writer, far_writer}
-
-
-async def _pump(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-    with contextlib.suppress(ConnectionError):
-        while data := await reader.read(65536):
-            writer.write(data)
-            await writer.drain()
-    writer.close()
-
-
 @pytest.fixture
-def relay(platform: ExamplePlatform) -> Iterator[Relay]:
+def relay(platform: ExamplePlatform) -> Iterator[DelayingProxy]:
     """A way to the platform that a test can cut."""
-    made = Relay(platform)
+    made = DelayingProxy(platform.cloud.port, delay_s=0.0)
+    platform.wait(made.listen())
     yield made
-    made.cut()
+    platform.wait(made.die())

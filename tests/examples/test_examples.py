@@ -17,7 +17,8 @@ import numpy as np
 import pytest
 
 from client_sdk.mapping import read_ply, read_trajectory
-from tests.examples.conftest import ExamplePlatform, Program, Relay
+from tests.client_sdk.delaying_proxy import DelayingProxy
+from tests.examples.conftest import ExamplePlatform, Program
 from tests.examples.example_page import REPOSITORY
 
 cv2 = pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
@@ -80,15 +81,15 @@ def test_a_control_loop_gets_poses(platform: ExamplePlatform) -> None:
 
 
 def test_a_robot_goes_on_when_the_cloud_is_gone_and_uses_it_again(
-    platform: ExamplePlatform, relay: Relay, start: Start
+    platform: ExamplePlatform, relay: DelayingProxy, start: Start
 ) -> None:
     file = platform.enrolment_at(relay.url, "relay.enrolment")
     program = start(platform.command("without_cloud", "--rate", "20", **{"robot-1.enrolment": file}))
     program.until("pose by the cloud")
 
-    relay.cut()
+    platform.wait(relay.die())
     program.until("pose by the robot (no connection to the cloud)")
-    relay.restore()
+    platform.wait(relay.listen())
     program.until("pose by the cloud")
 
     assert program.interrupt() == 0

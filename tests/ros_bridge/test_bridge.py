@@ -23,8 +23,8 @@ from ros_bridge.bridge import connected_bridge
 from ros_bridge.outgoing import Message
 from rse_pf.errors import ConnectError, Unauthorized, UsageError
 from tests.client_sdk.bags.small_bags import raw_image
+from tests.client_sdk.live.fake_live_map import solve
 from tests.client_sdk.mapper.flat_world import frame_at
-from tests.client_sdk.mapper.test_mapper import solve
 
 START_NS = 1_700_000_000_000_000_000
 

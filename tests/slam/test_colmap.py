@@ -167,7 +167,7 @@ def test_pycolmap_reads_the_model_of_the_kitchen(tmp_path: Path, recordings: Pat
     from client_sdk.datasets import open_dataset
     from client_sdk.mapper import Mapper
     from rse_pf.maps.format import decode_map
-    from tests.client_sdk.mapper.test_mapper import solve
+    from tests.client_sdk.live.fake_live_map import solve
 
     frames = open_dataset(recordings / "7scenes_redkitchen").thinned(10)
     mapper = Mapper(ask=solve, keyframes_of="robot-1")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import json
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +11,6 @@ import pytest
 from rse_pf.config import PlatformSettings, load_settings
 from rse_pf.config.server_settings import server_settings
 from rse_pf.local.control.platform import LocalPlatform
-from rse_pf.scaling.profile import cadence_of
 
 Assembly = Any
 
@@ -51,22 +49,6 @@ def test_what_can_be_tagged_carries_the_deployment_and_every_stack_tells_the_dig
     for kind in ("AWS::EC2::VPC", "AWS::S3::Bucket", "AWS::Lambda::Function"):
         for resource in assembly.all(kind):
             assert {"Key": "rse-pf", "Value": "rse-pf"} in resource["Tags"]
-
-
-def test_the_template_follows_each_watched_setting(assembly: Assembly) -> None:
-    backend = json.dumps(assembly.templates["RsePf-Backend"])
-    network = json.dumps(assembly.templates["RsePf-Network"])
-    settings = assembly.settings
-
-    assert f'"Threshold": {settings.scaling.busy_cpu_percent:g}' in backend
-    cadence = cadence_of(settings.scaling)
-    assert f'"EvaluationPeriods": {cadence.idle}' in backend
-    assert f'"EvaluationPeriods": {cadence.underused}' in backend
-    assert f'"Period": {cadence.period_s}' in backend
-    assert f'"Port": {settings.serving.port}' in backend
-    assert f'"HealthCheckPort": "{settings.serving.control_port}"' in backend
-    assert f'"FromPort": {settings.serving.port}' in network
-    assert f'"FromPort": {settings.serving.control_port}' in network
 
 
 @pytest.mark.system

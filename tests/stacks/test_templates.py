@@ -313,18 +313,6 @@ def test_audit_logs_are_written_once_and_read_changed_or_deleted_by_no_server(as
     assert statement["Resource"]["Fn::Join"][1][-1] == "/audit/*"
 
 
-def test_packages_carry_the_settings_of_a_server_and_the_function_all_of_them(assembly: Assembly) -> None:
-    from rse_pf.config import load_settings
-    from rse_pf.config.server_settings import server_settings
-
-    server = PlatformSettings.from_dict(server_settings(assembly.settings))
-    digests = {load_settings(path).digest() for path in assembly.folder.glob("asset.*/settings.json")}
-
-    assert digests == {assembly.settings.digest(), server.digest()}
-    tag = {"Key": "rse-pf", "Value": "rse-pf"}
-    assert tag in assembly.one("AWS::EC2::VPC")["Tags"]
-
-
 def test_synthesis_asks_nobody(assembly: Assembly) -> None:
     manifest = json.loads((assembly.folder / "manifest.json").read_text(encoding="utf-8"))
 
@@ -391,12 +379,6 @@ def lint() -> Lint:
 def test_cfn_lint_finds_nothing(assembly: Assembly, lint: Lint) -> None:
     for template in assembly.templates.values():
         assert lint(template) == []
-
-
-def test_cfn_lint_sees_a_wrong_property(lint: Lint) -> None:
-    bucket = {"Type": "AWS::S3::Bucket", "Properties": {"BucketNam": "maps"}}
-
-    assert "BucketNam" in str(lint({"Resources": {"Maps": bucket}}))
 
 
 def test_missing_packages_are_one_line_and_a_hint(tmp_path: Path) -> None:

@@ -22,7 +22,6 @@ from rse_pf.aws.fleet.upgrade import (
     state_of_refresh,
     upgrade,
     versions_behind,
-    with_version,
 )
 from rse_pf.cli.main import main
 from rse_pf.config import PlatformSettings
@@ -462,23 +461,6 @@ def test_one_server_more_than_wanted_is_started_at_a_time_and_none_less_is_kept(
 
     assert made["MinHealthyPercentage"] == 100
     assert 0 < 19 * (made["MaxHealthyPercentage"] - 100) / 100 < 2
-
-
-def test_without_alarms_none_are_named() -> None:
-    assert "AlarmSpecification" not in preferences(SETTINGS, ())
-
-
-def test_the_mixed_policy_of_a_group_is_not_changed_in_place() -> None:
-    group = FakeAws(mixed=True).describe_auto_scaling_groups()["AutoScalingGroups"][0]
-    before = group["MixedInstancesPolicy"]["LaunchTemplate"]["LaunchTemplateSpecification"]["Version"]
-
-    made = with_version(group, "9")
-
-    policy = made["MixedInstancesPolicy"]["LaunchTemplate"]
-    assert policy["LaunchTemplateSpecification"] == {"LaunchTemplateId": "lt-1", "Version": "9"}
-    assert len(policy["Overrides"]) == 2
-    after = group["MixedInstancesPolicy"]["LaunchTemplate"]["LaunchTemplateSpecification"]["Version"]
-    assert (before, after) == ("1", "1")
 
 
 @pytest.mark.parametrize(

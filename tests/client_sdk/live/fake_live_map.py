@@ -38,7 +38,8 @@ async def solve(query: PoseQuery) -> PoseAnswer:
     found = query.correspondences
     options = PnpOptions(inlier_px=query.inlier_px, max_iterations=query.max_iterations)
     solution = solve_pnp(found.points_world, found.pixels, query.camera, options)
-    solution = refine_with_depth(solution, found.points_world, found.pixels, found.depths_m, query.camera)
+    if found.depths_m.any():
+        solution = refine_with_depth(solution, found.points_world, found.pixels, found.depths_m, query.camera)
     return PoseAnswer(
         solution=solution, source="cloud", server="s1", round_trip_ms=3.0, queue_ms=0.0, compute_ms=1.0
     )

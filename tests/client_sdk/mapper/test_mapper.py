@@ -23,22 +23,11 @@ from client_sdk.tracking.monocular_tracker import MonocularOptions, MonocularTra
 from rse_pf.errors import Busy, MissingExtra, UsageError
 from rse_pf.experiments.results.trajectory_error import absolute_error
 from rse_pf.geometry import Camera, exp_se3
-from rse_pf.pnp import PnpOptions, refine_with_depth, solve_pnp
+from rse_pf.pnp import solve_pnp
+from tests.client_sdk.live.fake_live_map import solve
 from tests.client_sdk.mapper.flat_world import STEP_M, frame_at
 
 pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
-
-
-async def solve(query: PoseQuery) -> PoseAnswer:
-    """Answer as the PnP service does."""
-    found = query.correspondences
-    options = PnpOptions(inlier_px=query.inlier_px, max_iterations=query.max_iterations)
-    solution = solve_pnp(found.points_world, found.pixels, query.camera, options)
-    if found.depths_m.any():
-        solution = refine_with_depth(solution, found.points_world, found.pixels, found.depths_m, query.camera)
-    return PoseAnswer(
-        solution=solution, source="cloud", server="s1", round_trip_ms=3.0, queue_ms=0.0, compute_ms=1.0
-    )
 
 
 def drive(mapper: Mapper, rows: range, *, depth: bool, odometry: bool = False) -> list[TrackedFrame]:
