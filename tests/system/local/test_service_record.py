@@ -88,7 +88,8 @@ async def test_requests_of_robots_are_recorded_without_tokens_and_replayed(
     assert SECRET not in logs
     assert "counting 5" in logs, "what the service printed without a newline, when its sandbox ended"
     capsys.readouterr()
-    assert main(["service", "test", "letters", "--requests", "live.jsonl"]) == 0
+    repeat = ["service", "test", "letters", "--requests", "live.jsonl"]
+    assert await asyncio.to_thread(main, repeat) == 0
     assert "3 of 3 recorded requests as expected" in capsys.readouterr().out
 
 
