@@ -7,7 +7,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from rse_pf.services.synthetic_maps import make_world
 
 from rse_pf.errors import RsePfError
 from rse_pf.geometry import Array
