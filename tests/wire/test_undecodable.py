@@ -47,10 +47,6 @@ def refusal(decisions: list[Any]) -> Failure:
     return sent.failure
 
 
-def test_there_are_more_than_forty_kinds_for_each_encoding() -> None:
-    assert min(len({kind.name for kind in kinds}) for kinds in (JSON, BINARY)) >= 40
-
-
 @pytest.mark.parametrize("use_native", [True, False], ids=["native", "python"])
 @pytest.mark.parametrize(("codec", "kind"), KINDS, ids=[f"{codec}-{kind.name}" for codec, kind in KINDS])
 def test_a_command_that_cannot_be_decoded_is_answered_with_its_id(

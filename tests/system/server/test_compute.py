@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import functools
 import os
 import time
-from collections.abc import Callable, Coroutine
 from pathlib import Path
 from typing import Any
 
@@ -58,16 +56,6 @@ def server(start_server, tmp_path):
     return start_server(keys=True, serving=limits)
 
 
-def in_a_loop(test: Callable[..., Coroutine[Any, Any, None]]) -> Callable[..., None]:
-    """Run a test in an event loop of its own, within a minute."""
-
-    @functools.wraps(test)
-    def run(**fixtures: Any) -> None:
-        asyncio.run(asyncio.wait_for(test(**fixtures), 60.0))
-
-    return run
-
-
 def robot_of(server: Any, name: str) -> client_sdk.Robot:
     return client_sdk.connect(server.url, token=server.token(name))
 
@@ -81,7 +69,6 @@ async def solve(robot: client_sdk.Robot) -> None:
     await robot.solve_pnp(PROBLEM.points_world, PROBLEM.pixels, PROBLEM.camera, keep=True)
 
 
-@in_a_loop
 async def test_poses_are_answered_while_hostile_commands_end_their_processes(server):
     worker = server.workers[0]
     async with robot_of(server, "hostile") as hostile, robot_of(server, "honest") as honest:
@@ -116,7 +103,6 @@ async def test_poses_are_answered_while_hostile_commands_end_their_processes(ser
 
 
 @pytest.mark.slow
-@in_a_loop
 async def test_a_deadline_ends_the_work_and_is_no_evidence_against_the_robot(server):
     async with robot_of(server, "hasty") as robot:
         pid = await decode(robot, "")
@@ -129,7 +115,6 @@ async def test_a_deadline_ends_the_work_and_is_no_evidence_against_the_robot(ser
         assert await decode(robot, "") != pid
 
 
-@in_a_loop
 async def test_the_processes_end_with_their_worker(server, gone):
     async with robot_of(server, "robot-1") as robot:
         pid = await decode(robot, "")

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import functools
 import os
 import signal
 import time
-from collections.abc import Callable, Coroutine
 from typing import Any
 
 import pytest
@@ -147,21 +145,10 @@ def runs(tmp_path):
     return read
 
 
-def in_a_loop(test: Callable[..., Coroutine[Any, Any, None]]) -> Callable[..., None]:
-    """Run a test in an event loop of its own, within a minute."""
-
-    @functools.wraps(test)
-    def run(**fixtures: Any) -> None:
-        asyncio.run(asyncio.wait_for(test(**fixtures), 60.0))
-
-    return run
-
-
 def asked(robot: client_sdk.Robot, heard: Heard | None = None, **request: Any) -> asyncio.Task[Any]:
     return asyncio.create_task(robot.call("long", request, on_progress=heard or Heard()))
 
 
-@in_a_loop
 async def test_a_job_runs_at_the_lowest_priority_and_its_result_is_stored(platform, runs, tmp_path):
     server, heard = platform(), Heard()
     async with client_sdk.connect(server.url, token=server.token()) as robot:
@@ -184,7 +171,6 @@ async def test_a_job_runs_at_the_lowest_priority_and_its_result_is_stored(platfo
 
 
 @pytest.mark.slow
-@in_a_loop
 async def test_a_reply_too_large_for_a_message_is_answered_with_its_object_name(platform, tmp_path):
     server = platform()
     (tmp_path / "job").touch()
@@ -196,7 +182,6 @@ async def test_a_reply_too_large_for_a_message_is_answered_with_its_object_name(
     assert client_sdk.decode_reply(kept, dict) == {"filling": "x" * 300_000}
 
 
-@in_a_loop
 async def test_a_job_ends_on_the_other_server_when_its_own_is_killed(platform, runs, gone, tmp_path):
     first, second, heard = platform(), platform(), Heard()
     async with Relay() as relay:
@@ -217,7 +202,6 @@ async def test_a_job_ends_on_the_other_server_when_its_own_is_killed(platform, r
 
 
 @pytest.mark.slow
-@in_a_loop
 async def test_after_a_reconnect_the_robot_waits_for_the_same_run(platform, runs, tmp_path):
     server, heard = platform(), Heard()
     async with Relay() as relay:
@@ -235,7 +219,6 @@ async def test_after_a_reconnect_the_robot_waits_for_the_same_run(platform, runs
 
 
 @pytest.mark.slow
-@in_a_loop
 async def test_a_draining_server_gives_up_its_jobs_at_once(platform, runs, tmp_path):
     first, second, heard = platform(job_lease_s=600.0), platform(job_lease_s=600.0), Heard()
     async with Relay() as relay:
@@ -257,7 +240,6 @@ async def test_a_draining_server_gives_up_its_jobs_at_once(platform, runs, tmp_p
 @pytest.mark.parametrize(
     "deaf", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["listens", "is deaf"]
 )
-@in_a_loop
 async def test_a_cancelled_job_ends(platform, runs, gone, deaf):
     server, heard = platform(), Heard()
     async with client_sdk.connect(server.url, token=server.token()) as robot:
@@ -271,7 +253,6 @@ async def test_a_cancelled_job_ends(platform, runs, gone, deaf):
 
 
 @pytest.mark.slow
-@in_a_loop
 async def test_a_cancel_on_another_server_ends_the_job_where_it_runs(platform, runs, gone):
     first, second, heard = platform(), platform(), Heard()
     async with (
@@ -292,7 +273,6 @@ async def test_a_cancel_on_another_server_ends_the_job_where_it_runs(platform, r
 
 
 @pytest.mark.parametrize("fate", ["crash", pytest.param("memory", marks=pytest.mark.slow)])
-@in_a_loop
 async def test_a_job_that_crashes_is_a_typed_failure_and_the_server_keeps_running(platform, fate):
     server = platform()
     async with client_sdk.connect(server.url, token=server.token()) as robot:
@@ -302,7 +282,6 @@ async def test_a_job_that_crashes_is_a_typed_failure_and_the_server_keeps_runnin
 
 
 @pytest.mark.slow
-@in_a_loop
 async def test_one_job_runs_at_a_time_a_limited_number_waits_and_more_are_refused(platform, runs, tmp_path):
     server, heard = platform(max_waiting_jobs=1), Heard()
     async with client_sdk.connect(server.url, token=server.token()) as robot:
@@ -322,7 +301,6 @@ async def test_one_job_runs_at_a_time_a_limited_number_waits_and_more_are_refuse
 
 
 @pytest.mark.slow
-@in_a_loop
 async def test_progress_is_sent_at_most_twice_a_second(platform, tmp_path):
     server, heard = platform(), Heard()
     async with client_sdk.connect(server.url, token=server.token()) as robot:
