@@ -20,17 +20,14 @@ KEY = json.loads(SigningKey.of_robot(b"r" * 32).to_json())
 
 
 @pytest.mark.system
-def test_a_robot_connects_by_the_address_of_its_file(tmp_path: Path) -> None:
+async def test_a_robot_connects_by_the_address_of_its_file(tmp_path: Path) -> None:
     file = tmp_path / "robot-1.enrolment"
 
-    async def run() -> str:
-        async with FakePlatform() as platform:
-            robot = client_sdk.connect(enrolment=file)
-            Enrolment(url=platform.url, robot="robot-1", key=KEY).write(file)
-            async with robot:
-                return (await robot.call("echo", {"value": 7})).reply["value"]
-
-    assert asyncio.run(asyncio.wait_for(run(), 20)) == 7
+    async with FakePlatform() as platform:
+        robot = client_sdk.connect(enrolment=file)
+        Enrolment(url=platform.url, robot="robot-1", key=KEY).write(file)
+        async with robot:
+            assert (await robot.call("echo", {"value": 7})).reply["value"] == 7
 
 
 @pytest.mark.parametrize(

@@ -191,14 +191,11 @@ def test_features_are_spread_and_the_strongest_are_kept() -> None:
 
 @pytest.mark.parametrize("function", [orb_by_hand, sift])
 @pytest.mark.parametrize("depth", [True, False])
-def test_a_mapper_tracks_with_the_features_of_its_user(function: Any, depth: bool) -> None:
+async def test_a_mapper_tracks_with_the_features_of_its_user(function: Any, depth: bool) -> None:
     pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
     mapper = Mapper(ask=solve, features=function, keyframes_of="robot-1" if depth else "")
 
-    async def all_frames() -> list[str]:
-        return [(await mapper.track(frame_at(row, depth=depth))).status for row in range(8 if depth else 14)]
-
-    statuses = asyncio.run(all_frames())
+    statuses = [(await mapper.track(frame_at(row, depth=depth))).status for row in range(8 if depth else 14)]
 
     assert statuses.count("tracked") >= 6, statuses
     positions = mapper.trajectory.positions

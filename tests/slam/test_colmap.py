@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -161,7 +160,7 @@ def test_pycolmap_reads_the_model_of_a_rendered_world(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_pycolmap_reads_the_model_of_the_kitchen(tmp_path: Path, recordings: Path) -> None:
+async def test_pycolmap_reads_the_model_of_the_kitchen(tmp_path: Path, recordings: Path) -> None:
     pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
     pytest.importorskip("pycolmap", reason=NO_PYCOLMAP)
     from client_sdk.datasets import open_dataset
@@ -172,11 +171,8 @@ def test_pycolmap_reads_the_model_of_the_kitchen(tmp_path: Path, recordings: Pat
     frames = open_dataset(recordings / "7scenes_redkitchen").thinned(10)
     mapper = Mapper(ask=solve, keyframes_of="robot-1")
 
-    async def drive() -> None:
-        for row in frames.rows:
-            await mapper.track(frames.read(row))
-
-    asyncio.run(drive())
+    for row in frames.rows:
+        await mapper.track(frames.read(row))
     compare_with_pycolmap(decode_map(mapper.encoded_map()), tmp_path)
 
 

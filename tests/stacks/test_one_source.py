@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 from pathlib import Path
 from typing import Any
 
@@ -52,13 +51,12 @@ def test_what_can_be_tagged_carries_the_deployment_and_every_stack_tells_the_dig
 
 
 @pytest.mark.system
-def test_local_servers_answer_with_the_digest_of_the_same_file(assembly: Assembly, tmp_path: Path) -> None:
+async def test_local_servers_answer_with_the_digest_of_the_same_file(
+    assembly: Assembly, tmp_path: Path
+) -> None:
     settings = assembly.settings.replace(data={"enabled": False})
 
-    async def run() -> tuple[dict[str, Any], Any]:
-        async with LocalPlatform(settings, state=tmp_path / "state", servers=1, port=0) as cloud:
-            return (await cloud.status())[0], load_settings(tmp_path / "state" / "settings.json")
-
-    status, written = asyncio.run(run())
+    async with LocalPlatform(settings, state=tmp_path / "state", servers=1, port=0) as cloud:
+        status, written = (await cloud.status())[0], load_settings(tmp_path / "state" / "settings.json")
     assert status["settings"] == written.digest() == settings.digest()
     assert written.scaling == settings.scaling

@@ -156,7 +156,7 @@ def test_the_depths_of_a_pair_are_those_of_the_world(pairs: Sequence[Frame]) -> 
     assert abs(float(np.nanmedian(relative))) < 0.005
 
 
-def test_a_robot_without_answers_loses_its_place_and_no_more(pairs: Sequence[Frame]) -> None:
+async def test_a_robot_without_answers_loses_its_place_and_no_more(pairs: Sequence[Frame]) -> None:
     async def silent(query: PoseQuery) -> PoseAnswer:
         from rse_pf.errors import Disconnected
 
@@ -164,10 +164,7 @@ def test_a_robot_without_answers_loses_its_place_and_no_more(pairs: Sequence[Fra
 
     mapper = Mapper(ask=silent)
 
-    async def track() -> list[bool]:
-        return [(await mapper.track(frame)).lost for frame in pairs[:3]]
-
-    assert asyncio.run(track()) == [False, True, True]
+    assert [(await mapper.track(frame)).lost for frame in pairs[:3]] == [False, True, True]
 
 
 LACKING_PX = 0.3
