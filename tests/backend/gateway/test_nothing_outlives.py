@@ -1,7 +1,4 @@
-"""Nothing outlives its connection: no timer, no queue, no message of one that is gone.
-
-Real loops and sockets are in ``tests/system/server/test_connections_leave.py``.
-"""
+"""Nothing outlives its connection: no timer, no queue, no message of one that is gone."""
 
 from __future__ import annotations
 
