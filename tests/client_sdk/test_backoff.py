@@ -62,23 +62,6 @@ def test_robots_behind_one_address_are_back_within_30_s_of_an_outage_of_60_s(rob
     assert len(outage.connected_s) == robots
 
 
-def test_without_the_bounds_a_site_is_blocked_and_back_much_later(monkeypatch):
-    monkeypatch.setattr("client_sdk.network.backoff.DIAL_BURST", 10_000)
-    monkeypatch.setattr("client_sdk.network.backoff.DIALS_PER_MINUTE", 600.0)
-    bounded = PlatformSettings()
-    loose = SessionSettings(reconnect_long_max_s=1.0)
-    firewall = PlayedFirewall(rules_of_settings(bounded))
-    backoffs = [Backoff(loose, Random(robot)) for robot in range(100)]
-    now = [BEGAN_S] * 100
-    for _ in range(60):
-        for robot, backoff in enumerate(backoffs):
-            now[robot] += backoff.pause_s(now[robot])
-            backoff.dialled(now[robot])
-            firewall.judge(SITE, "/ws", now[robot])
-
-    assert firewall.blocked > 0
-
-
 @pytest.mark.parametrize("outage_s", [5.0, 60.0, 600.0])
 def test_no_robot_dials_more_often_than_the_limit_is_derived_from(outage_s):
     settings = PlatformSettings()

@@ -14,11 +14,9 @@ from fakes import FakeRobot, FakeServer, answer_at_once, answer_nothing
 import client_sdk
 from rse_pf.config import PnpSettings, SessionSettings
 from rse_pf.errors import (
-    Busy,
     Disconnected,
     Stale,
     Unauthorized,
-    UnknownService,
 )
 from rse_pf.pnp.problems import make_problem
 from rse_pf.services import pnp
@@ -30,39 +28,6 @@ FAST = SessionSettings(reconnect_max_s=0.05, stall_timeout_s=0.4, ping_interval_
 def connect(server: FakeServer, **options: Any) -> client_sdk.Robot:
     options = {"settings": FAST, "random": random.Random(1), **options}
     return client_sdk.connect(server.url, **options)
-
-
-@pytest.mark.parametrize("codec", ["zlib", "json", "bin"])
-async def test_a_call_gets_its_reply_in_every_codec(codec: str) -> None:
-    async with FakeServer().running() as server, connect(server, codec=codec) as robot:
-        answer = await robot.call("echo", {"value": [1, "two", 3.5]})
-        assert answer.reply == {"value": [1, "two", 3.5]}
-        assert answer.source == "cloud"
-        assert answer.server == "fake"
-
-
-async def test_a_failure_of_the_cloud_is_raised_as_its_own_type() -> None:
-    async with FakeServer().running() as server, connect(server) as robot:
-        with pytest.raises(UnknownService, match="pmp"):
-            await robot.call("pmp", {})
-        assert robot.stats.failures_by_code == {"unknown-service": 1}
-
-
-async def test_a_late_answer_of_an_old_socket_is_not_delivered_twice() -> None:
-    def twice(server: FakeServer, robot: FakeRobot, command: Command) -> Result | Failure | None:
-        answer = answer_at_once(server, robot, command)
-        if answer is not None:
-            asyncio.get_running_loop().create_task(
-                robot.send([server_sessions.answer(robot.session, answer)])
-            )
-        return answer
-
-    async with FakeServer(answer=twice).running() as server, connect(server) as robot:
-        await robot.call("echo", {"value": 1})
-        await robot.call("echo", {"value": 2})
-        await robot.call("echo", {"value": 3})
-        assert robot.stats.answered == 3
-        assert robot.stats.dropped_answers >= 1
 
 
 async def test_an_older_answer_of_a_stream_is_stale() -> None:
@@ -128,16 +93,6 @@ async def test_busy_is_retried_within_the_deadline() -> None:
 
     async with FakeServer(answer=busy_once).running() as server, connect(server) as robot:
         assert (await robot.call("echo", {"value": 1})).reply == {"value": 1}
-
-
-async def test_busy_beyond_the_deadline_is_raised() -> None:
-    def busy(server: FakeServer, robot: FakeRobot, command: Command) -> Result | Failure | None:
-        return Failure(id=command.id, code="busy", message="full", retry_after_ms=9000)
-
-    async with FakeServer(answer=busy).running() as server, connect(server) as robot:
-        with pytest.raises(Busy) as caught:
-            await robot.call("echo", {}, deadline_s=1)
-        assert caught.value.retry_after_ms == 9000
 
 
 async def test_cloud_first_answers_from_the_robot_when_the_cloud_is_late_and_says_so() -> None:

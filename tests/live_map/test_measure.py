@@ -94,12 +94,6 @@ def test_a_pose_that_the_evidence_calls_weak_is_no_link():
     assert found.failed == {"nearly-collinear": 1}
 
 
-def test_the_same_keyframes_give_the_same_bytes():
-    once, again = (measure_links(numbered(0), [numbered(2), numbered(1)]) for _ in range(2))
-
-    assert once == again
-
-
 @pytest.mark.skipif(relative_pose.match_core() is None, reason="the native core is not built: make -C native")
 def test_without_the_native_core_the_links_are_the_same(monkeypatch):
     native = measure_links(numbered(0), [numbered(1), numbered(3)])

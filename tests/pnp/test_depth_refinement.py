@@ -108,13 +108,6 @@ def test_evidence_and_inliers_are_those_of_the_solver():
     assert after.rmse_px == pytest.approx(before.rmse_px, rel=0.1)
 
 
-def test_equal_requests_give_equal_bytes():
-    first, second = refined(two_views(6)), refined(two_views(6))
-
-    assert first.T_camera_world.tobytes() == second.T_camera_world.tobytes()
-    assert first.covariance.tobytes() == second.covariance.tobytes()
-
-
 def test_a_fifth_of_wrong_depths_does_not_spoil_the_pose():
     views = [two_views(seed) for seed in range(40)]
     spoilt = [replace(each, depths_m=_with_wrong_depths(each.depths_m)) for each in views]

@@ -52,15 +52,6 @@ def test_the_order_of_the_rows_changes_the_inliers_numbers_only():
     np.testing.assert_allclose(one.T_camera_world, other.T_camera_world, atol=1e-3)
 
 
-def test_kinect_depth_noise_is_tolerated():
-    good = 0
-    for seed in range(40):
-        problem = make_problem(seed=seed, depth_noise=True, outlier_ratio=0.4)
-        metres, degrees = pose_difference(solve(problem).T_camera_world, problem.T_camera_world)
-        good += metres < 0.1 and degrees < 2.0
-    assert good == 40
-
-
 @pytest.mark.parametrize("n", [60, 80])
 def test_thirteen_right_matches_among_many_wrong_ones_are_a_weak_pose(n):
     """The wide-baseline pairs of the real recordings: 13 inliers at 3 px."""
@@ -251,8 +242,3 @@ def test_the_server_chooses_the_engine_when_the_robot_does_not():
 
     assert engine(None, "opencv") == "opencv"
     assert engine(PnpOptions(engine="poselib"), "opencv") == "poselib"
-
-
-def test_a_solution_cannot_be_changed():
-    with pytest.raises(AttributeError):
-        solve(make_problem(seed=1)).verdict = "ok"

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import msgspec
 import numpy as np
 import pytest
 
 from rse_pf.config import PlatformSettings
-from rse_pf.errors import BadRequest
 from rse_pf.geometry import Array, pose_difference
 from rse_pf.maps.format import Keyframe, MapVersion, encode_map
 from rse_pf.service import dispatch
@@ -150,24 +148,3 @@ def test_the_services_answer_encoded_requests() -> None:
     assert isinstance(location.reply, LocaliseReply)
     assert location.reply.T_map_camera is not None
     assert pose_difference(location.reply.T_map_camera.reshape(4, 4), truth)[0] <= 0.03
-
-
-def test_descriptors_that_do_not_fit_the_pixels_are_refused() -> None:
-    keyframe, _ = seen(0.31)
-    request = msgspec.structs.replace(request_of(keyframe, PlaceRequest), descriptors=b"x" * 33)
-
-    answer = ask("place", request)
-
-    assert isinstance(answer, Failure)
-    assert answer.code == BadRequest.code
-    assert "33 bytes" in answer.message
-
-
-def test_a_damaged_map_is_refused() -> None:
-    keyframe, _ = seen(0.31)
-    request = msgspec.structs.replace(request_of(keyframe, PlaceRequest), map=encode_map(MAP)[:-40])
-
-    answer = ask("place", request)
-
-    assert isinstance(answer, Failure)
-    assert answer.code == BadRequest.code

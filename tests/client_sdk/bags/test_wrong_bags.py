@@ -26,7 +26,6 @@ from tests.client_sdk.bags.small_bags import (
     camera_info,
     compressed,
     compressed_frames,
-    raw_frames,
     raw_image,
     stamp_of,
     write_bag,
@@ -278,8 +277,3 @@ def test_the_verb_says_in_two_lines_what_is_missing(
     assert error.startswith("UsageError: the bag has no depth; its topics: /camera")
     assert len(error.splitlines()) == 2
     assert not (tmp_path / "out").exists()
-
-
-def test_raw_frames_are_what_the_other_tests_change(tmp_path: Path) -> None:
-    with open_bag(write_bag(tmp_path, make=raw_frames)) as bag:
-        assert len(bag) == FRAMES

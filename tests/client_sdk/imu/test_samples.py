@@ -19,11 +19,6 @@ def samples(n: int) -> ImuSamples:
     return ImuSamples(np.arange(n) / 200.0, np.zeros((n, 3)), np.zeros((n, 3)), MODEL)
 
 
-def test_samples_have_a_length():
-    assert len(samples(3)) == 3
-    assert len(samples(0)) == 0
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [

@@ -61,19 +61,6 @@ def test_a_damaged_pose_changes_nothing(known: Alignments) -> None:
     assert known.of(0).by == "nothing"
 
 
-def test_a_scale_makes_metres_of_a_segment_without(known: Alignments) -> None:
-    pose = exp_se3([2.0, 0, 0, 0, 0, 0])
-    first = known.updated("alignment/me", {**alignment("me", FIRST, segment=3), "scale": 0.5})
-    metres = known.of(0).in_map(pose)
-    second = known.updated("alignment/me", {**alignment("me", FIRST, segment=3), "scale": 0.6})
-
-    assert first is not None
-    assert second is not None
-    assert (first.scale, second.scale) == (0.5, 0.6)
-    assert metres is not None
-    np.testing.assert_allclose(metres[:3, 3], [2.0, 0, 0])
-
-
 def test_a_relocalisation_with_a_scale_places_the_keyframe_where_it_says(known: Alignments) -> None:
     pose = exp_se3([2.0, 1.0, 0, 0, 0, 0.4])
     reply = RelocaliseReply(verdict="ok", T_map_camera=SECOND.ravel(), scale=0.25)

@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-import ast
-from pathlib import Path
-
 import numpy as np
 import pytest
 
-import client_sdk.simulator
 from client_sdk.frontend import PoseQuery
 from client_sdk.mapping import Trajectory
 from client_sdk.simulator import (
@@ -145,18 +141,6 @@ def test_robots_that_do_not_exist_are_refused():
     for arguments in ((3, 3, 10, 0), (-1, 3, 10, 0), (0, 1, 0, 0)):
         with pytest.raises(UsageError):
             next(render_frames(*arguments))
-
-
-def test_the_renderer_needs_no_image_library():
-    folder = Path(client_sdk.simulator.__file__).parent
-    for path in folder.glob("simulate*.py"):
-        imported = {
-            alias.name
-            for node in ast.walk(ast.parse(path.read_text()))
-            if isinstance(node, ast.Import)
-            for alias in node.names
-        }
-        assert imported <= {"numpy", "numpy.typing"}
 
 
 @pytest.mark.slow
