@@ -13,11 +13,11 @@ from client_sdk.answers import Answer, PoseAnswer
 from client_sdk.frontend import PoseQuery
 from rse_pf.errors import Conflict, Expired, NotFound, RsePfError
 from rse_pf.geometry import Array
-from rse_pf.pnp import PnpOptions, refine_with_depth, solve_pnp
+from rse_pf.pnp import PnpOptions, PnpSolution, refine_with_depth, solve_pnp
 from rse_pf.wire import as_type
 from rse_pf.wire.live_map import KeyframeRequest, LiveRelocalise
 
-__all__ = ["FakeLiveRobot", "alignment", "solve"]
+__all__ = ["FakeLiveRobot", "alignment", "solve", "solved"]
 
 
 def alignment(
@@ -33,15 +33,20 @@ def alignment(
     }  # fmt: skip
 
 
-async def solve(query: PoseQuery) -> PoseAnswer:
-    """Answer as the PnP service does."""
+def solved(query: PoseQuery) -> PnpSolution:
+    """Return the pose as the PnP service finds it."""
     found = query.correspondences
     options = PnpOptions(inlier_px=query.inlier_px, max_iterations=query.max_iterations)
     solution = solve_pnp(found.points_world, found.pixels, query.camera, options)
     if found.depths_m.any():
         solution = refine_with_depth(solution, found.points_world, found.pixels, found.depths_m, query.camera)
+    return solution
+
+
+async def solve(query: PoseQuery) -> PoseAnswer:
+    """Answer as the PnP service does."""
     return PoseAnswer(
-        solution=solution, source="cloud", server="s1", round_trip_ms=3.0, queue_ms=0.0, compute_ms=1.0
+        solution=solved(query), source="cloud", server="s1", round_trip_ms=3.0, queue_ms=0.0, compute_ms=1.0
     )
 
 

@@ -21,7 +21,7 @@ from rse_pf.slam.keyframe import decode_keyframe
 from rse_pf.slam.tracking import ImageFeatures
 from tests.client_sdk.live.fake_live_map import FakeLiveRobot, alignment, solve
 from tests.client_sdk.live.shared_map import SharedMap
-from tests.client_sdk.mapper.flat_world import DEPTHS_M, STEP_M, frame_at
+from tests.client_sdk.mapper.flat_world import DEPTHS_M, STEP_M, foreign, frame_at
 
 pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
 
@@ -36,12 +36,6 @@ def live_map(robot: Any) -> LiveMapper:
 def lens(row: int, stamp_s: float | None = None) -> Frame:
     frame = frame_at(row, depth=False)
     return frame if stamp_s is None else replace(frame, timestamp_s=stamp_s)
-
-
-def foreign(row: int, stamp_s: float) -> Frame:
-    """Return a frame of another place: the same world as a negative, mirrored."""
-    frame = lens(row, stamp_s)
-    return replace(frame, rgb=np.ascontiguousarray(255 - frame.rgb[:, ::-1]))
 
 
 async def drive(mapper: LiveMapper, rows: range) -> list[TrackedFrame]:
@@ -135,7 +129,7 @@ async def test_another_segment_has_another_unit_until_the_map_tells_it(robot: Fa
         robot.tell("alignment/me", alignment("me", T_MAP_ODOM, scale=0.25))
         await robot.until(lambda: mapper.aligned)
 
-        elsewhere = [await mapper.track(foreign(row, 5.0 + row / 10)) for row in range(24)]
+        elsewhere = [await mapper.track(foreign(lens(row, 5.0 + row / 10))) for row in range(24)]
         await robot.until(lambda: mapper.keyframes_waiting == 0)
 
         first = next(each for each in elsewhere if each.T_world_camera is not None)
@@ -150,7 +144,7 @@ async def test_another_segment_has_another_unit_until_the_map_tells_it(robot: Fa
 
         robot.tell("alignment/me", alignment("me", np.eye(4), segment=1, scale=3.0))
         await robot.until(lambda: mapper.aligned)
-        last = await mapper.track(foreign(24, 7.4))
+        last = await mapper.track(foreign(lens(24, 7.4)))
         assert last.corrected
         assert last.T_world_camera is not None
         np.testing.assert_allclose(last.T_map_camera, scaled(last.T_world_camera, 3.0))

@@ -24,7 +24,7 @@ from rse_pf.geometry import exp_se3
 from rse_pf.slam.keyframe import Keyframe, decode_keyframe, encode_keyframe, make_features
 from rse_pf.wire import Command, make_codec
 from tests.client_sdk.live.fake_live_map import FakeLiveRobot, alignment, failing, solve
-from tests.client_sdk.mapper.flat_world import CAMERA, STEP_M, frame_at
+from tests.client_sdk.mapper.flat_world import CAMERA, STEP_M, covered, foreign, frame_at
 
 pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
 
@@ -43,23 +43,6 @@ async def drive(mapper: LiveMapper, rows: range) -> list[TrackedFrame]:
 def times_s(robot: FakeLiveRobot) -> list[float]:
     """Return the times of the keyframes that the map has."""
     return [decode_keyframe(request.keyframe).timestamp_s for request in robot.kept]
-
-
-def foreign(row: int) -> Frame:
-    """Return a frame of a place that the robot has never seen."""
-    frame = frame_at(row, depth=True)
-    return Frame(
-        timestamp_s=frame.timestamp_s, rgb=np.ascontiguousarray(255 - frame.rgb[:, ::-1]),
-        depth_m=frame.depth_m, camera=CAMERA,
-    )  # fmt: skip
-
-
-def dark(row: int) -> Frame:
-    """Return a frame of a covered lens."""
-    frame = frame_at(row, depth=True)
-    return Frame(
-        timestamp_s=frame.timestamp_s, rgb=np.zeros_like(frame.rgb), depth_m=frame.depth_m, camera=CAMERA
-    )
 
 
 async def test_a_keyframe_each_10_cm_is_kept_by_the_map_in_order(robot: FakeLiveRobot) -> None:
@@ -84,7 +67,7 @@ async def test_keyframes_have_the_strongest_features_wherever_they_are(robot: Fa
         frame = frame_at(row, depth=True)
         rgb = frame.rgb.copy()
         rgb[:, 160:] = 128 + rgb[:, 160:] // 4
-        return Frame(timestamp_s=frame.timestamp_s, rgb=rgb, depth_m=frame.depth_m, camera=CAMERA)
+        return replace(frame, rgb=rgb)
 
     async with live_map(robot) as mapper:
         await mapper.track(half_faint(0))
@@ -294,8 +277,8 @@ async def test_a_map_that_begins_anew_gets_new_numbers_and_old_alignments_are_fo
         await robot.until(lambda: mapper.aligned)
 
         robot.restart_map()
-        await mapper.track(foreign(5))
-        await mapper.track(foreign(6))
+        await mapper.track(foreign(frame_at(5, depth=True)))
+        await mapper.track(foreign(frame_at(6, depth=True)))
         (again,) = await drive(mapper, range(7, 8))
         await robot.until(lambda: mapper.keyframes_waiting == 0)
 
@@ -319,7 +302,10 @@ async def test_a_lost_robot_begins_a_segment_and_asks_where_it_is(robot: FakeLiv
             "T_map_camera": T_map_camera.ravel().tolist(),
             "inliers": 80,
         }
-        assert [(await mapper.track(foreign(row))).status for row in (3, 4)] == ["lost", "lost"]
+        assert [(await mapper.track(foreign(frame_at(row, depth=True)))).status for row in (3, 4)] == [
+            "lost",
+            "lost",
+        ]
         before = mapper.trajectory.T_world_camera[-1]
         (found,) = await drive(mapper, range(5, 6))
         assert found.segment == 1
@@ -356,10 +342,10 @@ async def test_a_covered_lens_begins_no_segment_and_the_robot_finds_its_place_it
 ) -> None:
     async with live_map(robot) as mapper:
         await drive(mapper, range(6))
-        covered = [await mapper.track(dark(row)) for row in range(6, 16)]
+        dark = [await mapper.track(covered(frame_at(row, depth=True))) for row in range(6, 16)]
         (back,) = await drive(mapper, range(2, 3))
 
-        assert {tracked.status for tracked in covered} == {"lost"}
+        assert {tracked.status for tracked in dark} == {"lost"}
         assert (back.status, back.segment) == ("tracked", 0)
         np.testing.assert_allclose(back.T_world_camera[:3, 3], [2 * STEP_M, 0, 0], atol=0.02)
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from client_sdk.frontend import Frame
 from rse_pf.geometry import Camera
 
-__all__ = ["CAMERA", "STEP_M", "frame_at"]
+__all__ = ["CAMERA", "STEP_M", "covered", "foreign", "frame_at"]
 
 CAMERA = Camera(fx=500.0, fy=500.0, cx=159.5, cy=119.5, width=320, height=240)
 DEPTHS_M = (2.0, 4.0 / 3.0, 1.0)
@@ -26,3 +28,13 @@ def frame_at(row: int, *, depth: bool) -> Frame:
     rgb = np.repeat(np.vstack(bands)[..., None], 3, axis=2)
     depth_m = np.repeat(np.float32(DEPTHS_M), 80)[:, None] * np.ones(320, np.float32)
     return Frame(timestamp_s=row / 10, rgb=rgb, depth_m=depth_m if depth else 0.0 * depth_m, camera=CAMERA)
+
+
+def foreign(frame: Frame) -> Frame:
+    """Return a frame of another place: the same world as a negative, mirrored."""
+    return replace(frame, rgb=np.ascontiguousarray(255 - frame.rgb[:, ::-1]))
+
+
+def covered(frame: Frame) -> Frame:
+    """Return what the camera sees while its lens is covered."""
+    return replace(frame, rgb=np.zeros_like(frame.rgb))

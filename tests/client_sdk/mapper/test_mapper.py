@@ -25,7 +25,7 @@ from rse_pf.experiments.results.trajectory_error import absolute_error
 from rse_pf.geometry import Camera, exp_se3
 from rse_pf.pnp import solve_pnp
 from tests.client_sdk.live.fake_live_map import solve
-from tests.client_sdk.mapper.flat_world import STEP_M, frame_at
+from tests.client_sdk.mapper.flat_world import STEP_M, foreign, frame_at
 
 pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
 
@@ -177,11 +177,8 @@ def test_a_cut_without_depth_saves_the_second_place_apart(tmp_path: Path) -> Non
     async def go_on_elsewhere() -> list[TrackedFrame]:
         done = []
         for row in range(12):
-            there = frame_at(row, depth=False)
-            there = replace(
-                there, timestamp_s=1.0 + row / 10, rgb=np.ascontiguousarray(255 - there.rgb[:, ::-1])
-            )
-            done.append(await mapper.track(there))
+            there = foreign(frame_at(row, depth=False))
+            done.append(await mapper.track(replace(there, timestamp_s=1.0 + row / 10)))
         return done
 
     elsewhere = asyncio.run(go_on_elsewhere())

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -17,12 +16,12 @@ from client_sdk.tracking.keyframe_map import NO_LANDMARK
 from client_sdk.tracking.landmark_map import LandmarkMap, ViewFeatures
 from client_sdk.tracking.monocular_tracker import MonocularOptions, MonocularTracker
 from client_sdk.tracking.place import place_of
-from rse_pf.errors import PnpError, UsageError
+from rse_pf.errors import UsageError
 from rse_pf.experiments.results.trajectory_error import absolute_error
 from rse_pf.geometry import Array, Camera, exp_se3, inverse, pose_difference, transform
-from rse_pf.pnp import PnpOptions, solve_pnp
 from rse_pf.slam.tracking import ImageFeatures, distinct_distances
-from tests.client_sdk.mapper.flat_world import CAMERA, frame_at
+from tests.client_sdk.mapper.flat_world import CAMERA, covered, foreign, frame_at
+from tests.client_sdk.tracking.driving import run, run_all, solve
 
 pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
 
@@ -31,38 +30,6 @@ OPTIONS = MonocularOptions(segment_after=3)
 
 def frame(row: int, stamp_s: float) -> Frame:
     return replace(frame_at(row, depth=False), timestamp_s=stamp_s)
-
-
-def foreign(row: int, stamp_s: float) -> Frame:
-    """Return a frame of another place: the same world as a negative, mirrored."""
-    here = frame(row, stamp_s)
-    return replace(here, rgb=np.ascontiguousarray(255 - here.rgb[:, ::-1]))
-
-
-def covered(stamp_s: float) -> Frame:
-    here = frame(0, stamp_s)
-    return replace(here, rgb=np.zeros_like(here.rgb))
-
-
-def solve(query: PoseQuery) -> tuple[Array | None, int]:
-    found = query.correspondences
-    options = PnpOptions(inlier_px=query.inlier_px, max_iterations=query.max_iterations)
-    try:
-        solution = solve_pnp(found.points_world, found.pixels, query.camera, options)
-    except PnpError:
-        return None, 0
-    return solution.T_camera_world, len(solution.inliers)
-
-
-def run(tracker: MonocularTracker, shown: Frame) -> TrackedFrame:
-    step = tracker.prepare(shown)
-    while isinstance(step, PoseQuery):
-        step = tracker.accept(step, *solve(step))
-    return step
-
-
-def run_all(tracker: MonocularTracker, frames: Iterable[Frame]) -> list[TrackedFrame]:
-    return [run(tracker, shown) for shown in frames]
 
 
 def assert_places(path: Trajectory, rows: dict[float, int], tolerance: float = 0.05) -> None:
@@ -77,7 +44,11 @@ def test_a_start_that_waited_for_a_place_which_is_gone_begins_at_the_next_one() 
     tracker = MonocularTracker(OPTIONS)
 
     # The camera looks elsewhere for a moment, and then moves on; frames 0 and 1 are of no use.
-    shown = [foreign(0, 0.0), foreign(0, 0.1), *(frame(row, 0.2 + row / 10) for row in range(8))]
+    shown = [
+        foreign(frame(0, 0.0)),
+        foreign(frame(0, 0.1)),
+        *(frame(row, 0.2 + row / 10) for row in range(8)),
+    ]
     done = run_all(tracker, shown)
 
     assert done[-1].status == "tracked"
@@ -99,7 +70,7 @@ def test_a_second_place_gets_a_segment_of_its_own_and_is_never_joined() -> None:
     tracker = MonocularTracker(OPTIONS)
     run_all(tracker, (frame(row, row / 10) for row in range(10)))
 
-    cut = run_all(tracker, (foreign(row, 1.0 + row / 10) for row in range(14)))
+    cut = run_all(tracker, (foreign(frame(row, 1.0 + row / 10)) for row in range(14)))
 
     assert {tracked.status for tracked in cut[:3]} == {"lost"}
     assert [tracked.segment for tracked in cut[6:]] == [1] * 8
@@ -114,7 +85,7 @@ def test_a_second_place_gets_a_segment_of_its_own_and_is_never_joined() -> None:
 def test_a_camera_that_is_back_goes_on_in_the_first_segment() -> None:
     tracker = MonocularTracker(OPTIONS)
     run_all(tracker, (frame(row, row / 10) for row in range(10)))
-    run_all(tracker, (foreign(row, 1.0 + row / 10) for row in range(14)))
+    run_all(tracker, (foreign(frame(row, 1.0 + row / 10)) for row in range(14)))
 
     back = run(tracker, frame(6, 3.0))
 
@@ -125,7 +96,7 @@ def test_a_covered_lens_begins_no_segment_and_the_map_goes_on_after_it() -> None
     tracker = MonocularTracker(OPTIONS)
     run_all(tracker, (frame(row, row / 10) for row in range(10)))
 
-    while_covered = run_all(tracker, (covered(1.0 + row / 10) for row in range(30)))
+    while_covered = run_all(tracker, (covered(frame(0, 1.0 + row / 10)) for row in range(30)))
     assert tracker.unrecognised == 0
     uncovered = run(tracker, frame(3, 4.0))
 

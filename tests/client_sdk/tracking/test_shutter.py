@@ -12,7 +12,7 @@ from client_sdk.tracking.tracker import Tracker
 from rse_pf.geometry import Array, exp_se3, inverse, pose_difference, transform
 from rse_pf.pnp.problems import KINECT
 from rse_pf.slam.tracking import Observations, fit_sway
-from tests.client_sdk.tracking.test_tracker import run
+from tests.client_sdk.tracking.driving import run
 
 READOUT_S, INTERVAL_S = 0.03, 1.0 / 30.0
 RATE = np.array([0.9, -1.1, 0.4])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,58 +13,25 @@ from client_sdk.frontend import Frame, FrontEndOptions, PoseQuery, TrackedFrame
 from client_sdk.mapping import Trajectory
 from client_sdk.monocular import descriptors
 from client_sdk.tracking.tracker import Tracker
-from rse_pf.errors import PnpError, UsageError
+from rse_pf.errors import UsageError
 from rse_pf.experiments.results.trajectory_error import absolute_error
 from rse_pf.geometry import Array, inverse, pose_difference
-from rse_pf.pnp import PnpOptions, refine_with_depth, solve_pnp
-from tests.client_sdk.mapper.flat_world import CAMERA, STEP_M, frame_at
+from tests.client_sdk.mapper.flat_world import STEP_M, covered, foreign, frame_at
+from tests.client_sdk.tracking.driving import NO_ANSWER, Answer, run, run_all, solve
 
 pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
 
 RECORDED = Path(__file__).parents[4] / "shared" / "data"
-Answer = tuple[Array | None, int]
-NO_ANSWER: Answer = (None, 0)
 
 
 def frame(row: int) -> Frame:
     return frame_at(row, depth=True)
 
 
-def foreign(row: int) -> Frame:
-    """Return a frame of another place: the same world as a negative, mirrored."""
-    here = frame(row)
-    rgb = np.ascontiguousarray(255 - here.rgb[:, ::-1])
-    return Frame(timestamp_s=here.timestamp_s, rgb=rgb, depth_m=here.depth_m, camera=CAMERA)
-
-
-def covered(row: int) -> Frame:
-    here = frame(row)
-    return Frame(
-        timestamp_s=here.timestamp_s, rgb=np.zeros_like(here.rgb), depth_m=here.depth_m, camera=CAMERA
-    )
-
-
-def solve(query: PoseQuery) -> Answer:
-    found = query.correspondences
-    options = PnpOptions(inlier_px=query.inlier_px, max_iterations=query.max_iterations)
-    try:
-        solution = solve_pnp(found.points_world, found.pixels, query.camera, options)
-    except PnpError:
-        return NO_ANSWER
-    if found.depths_m.any():
-        solution = refine_with_depth(solution, found.points_world, found.pixels, found.depths_m, query.camera)
-    return solution.T_camera_world, len(solution.inliers)
-
-
-def run(tracker: Tracker, shown: Frame, answer: Callable[[PoseQuery], Answer] = solve) -> TrackedFrame:
-    step = tracker.prepare(shown)
-    while isinstance(step, PoseQuery):
-        step = tracker.accept(step, *answer(step))
-    return step
-
-
-def run_all(tracker: Tracker, frames: Iterable[Frame]) -> list[TrackedFrame]:
-    return [run(tracker, shown) for shown in frames]
+def both(row: int) -> Frame:
+    """Return a frame whose left half is of the place, and whose right half is of another one."""
+    here, there = frame(row), foreign(frame(row))
+    return replace(here, rgb=np.concatenate([here.rgb[:, :160], there.rgb[:, 160:]], axis=1))
 
 
 def at(row: int) -> Array:
@@ -135,9 +102,9 @@ def test_a_lost_frame_has_no_pose_and_the_next_one_is_found_again() -> None:
 
 def test_a_frame_without_features_is_lost_without_a_query() -> None:
     tracker = Tracker()
-    assert run(tracker, covered(0)).lost  # nothing to start from
+    assert run(tracker, covered(frame(0))).lost  # nothing to start from
     assert not run(tracker, frame(0)).lost
-    assert isinstance(tracker.prepare(covered(1)), TrackedFrame)
+    assert isinstance(tracker.prepare(covered(frame(1))), TrackedFrame)
     assert tracker.lost_frames == 2
 
 
@@ -145,7 +112,7 @@ def test_a_camera_that_was_carried_elsewhere_with_a_covered_lens_is_found_in_its
     tracker = Tracker(FrontEndOptions(segment_after=3))
     run_all(tracker, map(frame, range(25)))
 
-    while_covered = run_all(tracker, (covered(row) for row in range(30)))
+    while_covered = run_all(tracker, (covered(frame(row)) for row in range(30)))
     found = run(tracker, frame(2))
 
     assert all(tracked.lost for tracked in while_covered)
@@ -159,7 +126,7 @@ def test_a_place_that_is_not_clear_is_believed_within_four_jumps_however_long_th
 ) -> None:
     tracker = Tracker(FrontEndOptions(max_jump_m=0.1))
     run_all(tracker, map(frame, range(25)))
-    run_all(tracker, (covered(row) for row in range(30)))
+    run_all(tracker, (covered(frame(row)) for row in range(30)))
 
     def doubtful(query: PoseQuery) -> Answer:
         pose, _ = solve(query)
@@ -175,18 +142,13 @@ def test_a_video_that_was_cut_has_two_segments_which_are_joined_where_they_overl
     tracker = Tracker(FrontEndOptions(segment_after=3))
     run_all(tracker, map(frame, range(20)))
 
-    cut = run_all(tracker, (foreign(row) for row in range(8)))
+    cut = run_all(tracker, (foreign(frame(row)) for row in range(8)))
     assert [tracked.lost for tracked in cut[:3]] == [True] * 3
     assert {tracked.segment for tracked in cut[3:]} == {1}
     assert all("not joined" in tracked.reason for tracked in cut[3:])
     assert tracker.joins == []
 
-    # Seen one after the other, so that the second segment shows a place of the first: a wall of both.
-    def both(row: int) -> Frame:
-        here, there = frame(row), foreign(row)
-        rgb = np.concatenate([here.rgb[:, :160], there.rgb[:, 160:]], axis=1)
-        return Frame(timestamp_s=here.timestamp_s, rgb=rgb, depth_m=here.depth_m, camera=CAMERA)
-
+    # Seen one after the other, so that the second segment shows a place of the first.
     joined = run_all(tracker, [both(7)] * 12)
 
     assert len(tracker.joins) == 1
@@ -199,14 +161,9 @@ def test_a_video_that_was_cut_has_two_segments_which_are_joined_where_they_overl
 def test_a_camera_that_is_back_in_the_first_segment_keeps_its_poses_when_the_other_one_is_joined() -> None:
     tracker = Tracker(FrontEndOptions(segment_after=3))
     run_all(tracker, map(frame, range(20)))
-    run_all(tracker, (foreign(row) for row in range(8)))
+    run_all(tracker, (foreign(frame(row)) for row in range(8)))
     back = run(tracker, frame(7))
     assert back.segment == 0
-
-    def both(row: int) -> Frame:
-        here, there = frame(row), foreign(row)
-        rgb = np.concatenate([here.rgb[:, :160], there.rgb[:, 160:]], axis=1)
-        return Frame(timestamp_s=here.timestamp_s, rgb=rgb, depth_m=here.depth_m, camera=CAMERA)
 
     shown = run_all(tracker, [both(7)] * 12)
 
@@ -325,8 +282,8 @@ def test_a_place_is_not_recognised_by_a_patch_that_looks_alike_while_all_else_is
     """A wallpaper that repeats gives matches at another wall."""
     tracker = Tracker()
     run_all(tracker, map(frame, range(25)))
-    run_all(tracker, (covered(row) for row in range(3)))
-    here, there = frame(12), foreign(12)
+    run_all(tracker, (covered(frame(row)) for row in range(3)))
+    here, there = frame(12), foreign(frame(12))
     rgb = there.rgb.copy()
     rgb[60:200, 60:130] = here.rgb[60:200, 60:130]
     answers: list[Answer] = []
@@ -335,7 +292,7 @@ def test_a_place_is_not_recognised_by_a_patch_that_looks_alike_while_all_else_is
         answers.append(solve(query))
         return answers[-1]
 
-    patch = run(tracker, Frame(timestamp_s=2.8, rgb=rgb, depth_m=here.depth_m, camera=CAMERA), answer)
+    patch = run(tracker, replace(here, timestamp_s=2.8, rgb=rgb), answer)
 
     assert any(pose is not None and inliers >= 40 for pose, inliers in answers)
     assert patch.lost
@@ -345,9 +302,9 @@ def test_a_place_is_not_recognised_by_a_patch_that_looks_alike_while_all_else_is
 def test_a_place_is_recognised_though_something_near_hides_most_of_it() -> None:
     tracker = Tracker()
     run_all(tracker, map(frame, range(25)))
-    run_all(tracker, (covered(row) for row in range(3)))
-    here, hand = frame(12), foreign(40)
+    run_all(tracker, (covered(frame(row)) for row in range(3)))
+    here, hand = frame(12), foreign(frame(40))
     rgb, depth_m = here.rgb.copy(), here.depth_m.copy()
     rgb[:, 80:], depth_m[:, 80:] = hand.rgb[:, 80:], 0.4
 
-    assert_at(run(tracker, Frame(timestamp_s=2.8, rgb=rgb, depth_m=depth_m, camera=CAMERA)), 12)
+    assert_at(run(tracker, replace(here, timestamp_s=2.8, rgb=rgb, depth_m=depth_m)), 12)
