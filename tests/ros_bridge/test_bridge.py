@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import json
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -27,6 +28,7 @@ from tests.client_sdk.live.fake_live_map import solve
 from tests.client_sdk.mapper.flat_world import frame_at
 
 START_NS = 1_700_000_000_000_000_000
+MAKER = MessageMaker(is_ros1=True)
 
 
 class Heard:
@@ -69,188 +71,154 @@ def messages_of(maker: MessageMaker, frame: Frame, row: int) -> list[tuple[str, 
     ]
 
 
-async def bridged(rows: list[int], work: Callable[[Bridge, Heard], Any], **options: Any) -> Heard:
-    """Send frames of the flat world to a bridge, wait for their poses, and return what it published."""
-    heard, maker = Heard(), MessageMaker(is_ros1=True)
-    bridge = Bridge(Mapper(ask=solve), BridgeOptions.of(options), heard.publish, is_ros1=True)
-    running = asyncio.create_task(bridge.run())
+@asynccontextmanager
+async def running(heard: Heard, robot: Any = None, **options: Any) -> AsyncIterator[Bridge]:
+    """A bridge that runs, and publishes to *heard*."""
+    bridge = Bridge(
+        Mapper(ask=solve), BridgeOptions.of(options), heard.publish, is_ros1=True, robot=robot
+    )  # fmt: skip
+    task = asyncio.create_task(bridge.run())
     try:
-        for count, row in enumerate(rows, start=1):
-            for role, data in messages_of(maker, frame_at(row, depth=True), row):
-                bridge.receive(role, data)  # type: ignore[arg-type]
-            await heard.until(lambda all_, n=count: sum(m.kind == POSE_WITH_COVARIANCE for m in all_) == n)
-        await work(bridge, heard)
+        yield bridge
+        assert not task.done()
     finally:
-        running.cancel()
-        await asyncio.gather(running, return_exceptions=True)
-    return heard
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
 
 
-async def nothing(bridge: Bridge, heard: Heard) -> None:
-    """Do nothing more."""
+def send(bridge: Bridge, frame: Frame, row: int, *roles: str) -> None:
+    """Send the messages of a frame, or those of some roles."""
+    for role, data in messages_of(MAKER, frame, row):
+        if role in (roles or ("info", "colour", "depth")):
+            bridge.receive(role, data)  # type: ignore[arg-type]
 
 
-def test_poses_are_those_of_the_mapper_with_the_stamps_of_the_images() -> None:
-    heard = asyncio.run(bridged([0, 1, 2], nothing))
+def count_of(kind: str, count: int) -> Callable[[list[Message]], bool]:
+    """Return whether there are so many messages of a kind."""
+    return lambda heard: sum(each.kind == kind for each in heard) >= count
 
-    poses = heard.of(POSE_WITH_COVARIANCE, MessageMaker(is_ros1=True))
-    own = Mapper(ask=solve, depth=True)
 
-    async def track() -> None:
-        for row in range(3):
-            await own.track(frame_at(row, depth=True))
+async def drive(bridge: Bridge, heard: Heard, rows: int) -> None:
+    """Send frames of the flat world, and wait for the pose of each one."""
+    for row in range(rows):
+        send(bridge, frame_at(row, depth=True), row)
+        await heard.until(count_of(POSE_WITH_COVARIANCE, row + 1))
 
-    asyncio.run(track())
+
+async def test_poses_are_those_of_the_mapper_with_the_stamps_of_the_images() -> None:
+    heard, own = Heard(), Mapper(ask=solve, depth=True)
+    async with running(heard) as bridge:
+        await drive(bridge, heard, 3)
+
+    poses = heard.of(POSE_WITH_COVARIANCE, MAKER)
+    for row in range(3):
+        await own.track(frame_at(row, depth=True))
     places = [[each.pose.pose.position.x, each.pose.pose.position.y] for each in poses]
     assert np.allclose(places, own.trajectory.positions[:, :2], atol=2e-3)  # depth is rounded to 1 mm
     stamps = [each.header.stamp.sec * 10**9 + each.header.stamp.nanosec for each in poses]
     assert stamps == [START_NS, START_NS + 100_000_000, START_NS + 200_000_000]
 
 
-def test_a_service_saves_the_map_into_the_folder_of_the_options(tmp_path: Path) -> None:
-    async def save(bridge: Bridge, heard: Heard) -> None:
+async def test_a_service_saves_the_map_into_the_folder_of_the_options(tmp_path: Path) -> None:
+    heard = Heard()
+    async with running(heard, out=str(tmp_path / "saved")) as bridge:
+        await drive(bridge, heard, 2)
         reply = await bridge.save()
-        assert reply.ok
-        assert json.loads(reply.reply)["frames"] == 2
 
-    asyncio.run(bridged([0, 1], save, out=str(tmp_path / "saved")))
+    assert reply.ok
+    assert json.loads(reply.reply)["frames"] == 2
     assert {each.name for each in (tmp_path / "saved").iterdir()} == {
         "map.ply", "trajectory.txt", "report.json"
     }  # fmt: skip
 
 
-def test_without_a_folder_or_a_connection_services_say_so() -> None:
-    async def ask(bridge: Bridge, heard: Heard) -> None:
+async def test_without_a_folder_or_a_connection_services_say_so() -> None:
+    heard = Heard()
+    async with running(heard) as bridge:
+        await drive(bridge, heard, 1)
         assert (await bridge.save()).code == "usage"
         assert (await bridge.call("pnp", "{}")).code == "disconnected"
         for name in ("publish", "relocalise", "localise"):
             assert (await bridge.triggers[name]()).code == "disconnected"
 
-    asyncio.run(bridged([0], ask))
 
-
-def test_diagnostics_count_what_was_left_out_and_say_why() -> None:
-    async def spoil(bridge: Bridge, heard: Heard) -> None:
+async def test_diagnostics_count_what_was_left_out_and_say_why() -> None:
+    heard = Heard()
+    async with running(heard) as bridge:
+        await drive(bridge, heard, 1)
         bridge.receive("colour", b"broken")
         heard.messages.clear()
-        await heard.until(lambda all_: any(m.kind == DIAGNOSTICS for m in all_))
+        await heard.until(count_of(DIAGNOSTICS, 1))
 
-    heard = asyncio.run(bridged([0], spoil))
-    status = heard.of(DIAGNOSTICS, MessageMaker(is_ros1=True))[-1].status[0]
+    status = heard.of(DIAGNOSTICS, MAKER)[-1].status[0]
     values = {each.key: each.value for each in status.values}
     assert (status.level, values["frames"], values["left out: broken"]) == (1, "1", "1")
     assert "cannot be used" in status.message
 
 
-def test_a_frame_without_texture_is_counted_as_lost_and_the_next_one_goes_on() -> None:
-    heard, maker = Heard(), MessageMaker(is_ros1=True)
-
-    async def drive() -> Bridge:
-        bridge = Bridge(Mapper(ask=solve), BridgeOptions(), heard.publish, is_ros1=True)
-        running = asyncio.create_task(bridge.run())
+async def test_a_frame_without_texture_is_counted_as_lost_and_the_next_one_goes_on() -> None:
+    heard = Heard()
+    async with running(heard) as bridge:
         for row in range(5):
             frame = frame_at(row, depth=True)
             if row == 2:
                 frame = replace(frame, rgb=np.full_like(frame.rgb, 128))
-            for role, data in messages_of(maker, frame, row):
-                bridge.receive(role, data)  # type: ignore[arg-type]
-        await heard.until(lambda all_: sum(m.kind == POSE_WITH_COVARIANCE for m in all_) == 4)
-        running.cancel()
-        await asyncio.gather(running, return_exceptions=True)
-        return bridge
+            send(bridge, frame, row)
+        await heard.until(count_of(POSE_WITH_COVARIANCE, 4))
 
-    bridge = asyncio.run(drive())
     assert (bridge.frames, bridge.lost_frames) == (5, 1)
-    stamps = [each.header.stamp.nanosec for each in heard.of(POSE_WITH_COVARIANCE, maker)]
+    stamps = [each.header.stamp.nanosec for each in heard.of(POSE_WITH_COVARIANCE, MAKER)]
     assert stamps == [0, 100_000_000, 300_000_000, 400_000_000]
 
 
-def test_diagnostics_name_the_topic_of_depth_that_never_came() -> None:
-    heard, maker = Heard(), MessageMaker(is_ros1=True)
+async def test_diagnostics_name_the_topic_of_depth_that_never_came() -> None:
+    heard = Heard()
+    async with running(heard, depth="/no/depth") as bridge:
+        send(bridge, frame_at(0, depth=True), 0, "info", "colour")
+        await heard.until(count_of(DIAGNOSTICS, 1))
 
-    async def drive() -> None:
-        options = BridgeOptions.of({"depth": "/no/depth"})
-        bridge = Bridge(Mapper(ask=solve), options, heard.publish, is_ros1=True)
-        for role, data in messages_of(maker, frame_at(0, depth=True), 0)[:2]:
-            bridge.receive(role, data)  # type: ignore[arg-type]
-        running = asyncio.create_task(bridge.run())
-        await heard.until(lambda all_: any(m.kind == DIAGNOSTICS for m in all_))
-        running.cancel()
-        await asyncio.gather(running, return_exceptions=True)
-
-    asyncio.run(drive())
-    assert heard.of(DIAGNOSTICS, maker)[0].status[0].message == "no new message of /no/depth"
+    assert heard.of(DIAGNOSTICS, MAKER)[0].status[0].message == "no new message of /no/depth"
 
 
 @pytest.mark.parametrize(
     ("content", "cause"), [(None, "No such file"), (b"", "it is empty"), (b"se\xffcret", "than ASCII")]
 )
-def test_a_token_file_that_cannot_be_read_is_named_with_the_cause(
+async def test_a_token_file_that_cannot_be_read_is_named_with_the_cause(
     tmp_path: Path, content: bytes | None, cause: str
 ) -> None:
     file = tmp_path / "robot.token"
     if content is not None:
         file.write_bytes(content)
-
-    async def drive() -> None:
-        options = BridgeOptions(url="ws://127.0.0.1:1/ws", token_file=str(file))
-        async with connected_bridge(options, lambda message: None, is_ros1=True):
-            pass
+    options = BridgeOptions(url="ws://127.0.0.1:1/ws", token_file=str(file))
 
     with pytest.raises(UsageError) as told:
-        asyncio.run(drive())
+        async with connected_bridge(options, lambda message: None, is_ros1=True):
+            pass
     assert str(file) in told.value.message
     assert cause in told.value.message
     assert "cret" not in told.value.message
 
 
-def test_diagnostics_and_one_line_say_why_there_is_no_connection(capsys: pytest.CaptureFixture[str]) -> None:
-    heard = Heard()
-    robot: Any = SimpleNamespace(
-        connected=False, failure=None, stats=SimpleNamespace(last_error="the token has expired")
-    )
+EXPIRED = Unauthorized("the token has expired", hint="issue a new one")
 
-    async def drive() -> None:
-        mapper = Mapper(ask=solve)
-        bridge = Bridge(mapper, BridgeOptions(), heard.publish, is_ros1=True, robot=robot)
-        running = asyncio.create_task(bridge.run())
-        await heard.until(lambda all_: any(m.kind == DIAGNOSTICS for m in all_))
-        running.cancel()
-        await asyncio.gather(running, return_exceptions=True)
 
-    asyncio.run(drive())
+@pytest.mark.parametrize("failure", [None, EXPIRED], ids=["lost", "refused"])
+async def test_diagnostics_and_one_line_say_why_there_is_no_connection_and_the_bridge_goes_on(
+    failure: Unauthorized | None, capsys: pytest.CaptureFixture[str]
+) -> None:
+    heard, stats = Heard(), SimpleNamespace(last_error=EXPIRED.message)
+    async with running(heard, SimpleNamespace(connected=False, failure=failure, stats=stats)):
+        await heard.until(count_of(DIAGNOSTICS, 2))
+
     said = "no connection to the platform: the token has expired"
-    assert heard.of(DIAGNOSTICS, MessageMaker(is_ros1=True))[0].status[0].message == said
+    assert {each.status[0].message for each in heard.of(DIAGNOSTICS, MAKER)} == {said}
     assert said in "".join(capsys.readouterr())
 
 
-def test_a_robot_that_is_refused_does_not_end_the_bridge() -> None:
-    heard = Heard()
-    failure = Unauthorized("the token has expired", hint="issue a new one")
-    robot: Any = SimpleNamespace(
-        connected=False, failure=failure, stats=SimpleNamespace(last_error=failure.message)
-    )
-    said = "no connection to the platform: the token has expired"
-
-    async def drive() -> None:
-        bridge = Bridge(Mapper(ask=solve), BridgeOptions(), heard.publish, is_ros1=True, robot=robot)
-        running = asyncio.create_task(bridge.run())
-        await heard.until(lambda all_: sum(m.kind == DIAGNOSTICS for m in all_) >= 2)
-        assert not running.done()
-        running.cancel()
-        await asyncio.gather(running, return_exceptions=True)
-
-    asyncio.run(asyncio.wait_for(drive(), 20))
-    assert heard.of(DIAGNOSTICS, MessageMaker(is_ros1=True))[-1].status[0].message == said
-
-
-def test_an_error_that_a_token_callable_raises_for_its_user_is_told() -> None:
+async def test_an_error_that_a_token_callable_raises_for_its_user_is_told() -> None:
     async def token() -> str:
         raise UsageError("cannot read the token in /a: it is empty", hint="write it")
 
-    async def drive() -> None:
+    with pytest.raises(ConnectError, match="no token: cannot read the token in /a: it is empty"):
         async with connect("ws://127.0.0.1:1/ws", token=token):
             pass
-
-    with pytest.raises(ConnectError, match="no token: cannot read the token in /a: it is empty"):
-        asyncio.run(drive())

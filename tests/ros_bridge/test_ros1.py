@@ -78,15 +78,11 @@ def test_our_definitions_are_those_of_ros(ros: Ros) -> None:
     assert len(wanted) >= 20
 
 
-def test_poses_equal_those_of_the_sdk_and_survive_a_killed_server_and_a_killed_master(
+async def test_poses_equal_those_of_the_sdk_and_survive_a_killed_server_and_a_killed_master(
     ros: Ros, bag: Path, tmp_path: Path
 ) -> None:
-    asyncio.run(_drive(ros, bag, tmp_path))
-
-
-async def _drive(ros: Ros, bag: Path, folder: Path) -> None:
-    token_file = folder / "token"
-    async with LocalPlatform(PlatformSettings(), port=0, servers=2, state=folder / "platform") as platform:
+    token_file = tmp_path / "token"
+    async with LocalPlatform(PlatformSettings(), port=0, servers=2, state=tmp_path / "platform") as platform:
         token_file.write_text(platform.issue_token("ros-1"), encoding="ascii")
         expected = await own_run(bag, platform)
 

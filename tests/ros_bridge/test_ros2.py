@@ -29,14 +29,10 @@ def bag(recordings: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_poses_equal_those_of_the_sdk_and_survive_a_killed_server(
+async def test_poses_equal_those_of_the_sdk_and_survive_a_killed_server(
     ros2: Ros2, bag: Path, tmp_path: Path
 ) -> None:
-    asyncio.run(_drive(ros2, bag, tmp_path))
-
-
-async def _drive(ros2: Ros2, bag: Path, folder: Path) -> None:
-    token_file = folder / "token"
+    folder, token_file = tmp_path, tmp_path / "token"
     settings, state = PlatformSettings(), folder / "platform"
     async with LocalPlatform(settings, port=0, servers=2, state=state, data=True) as platform:
         token_file.write_text(platform.issue_token("ros-2"), encoding="ascii")
@@ -82,18 +78,14 @@ async def _drive(ros2: Ros2, bag: Path, folder: Path) -> None:
         assert bridge.lines[-1] == f"{_FRAMES} frames, 0 lost\n"
 
 
-def test_two_robots_share_a_live_map_lose_nothing_by_a_killed_server_and_get_corrections_as_transforms(
+async def test_two_robots_share_a_live_map_lose_nothing_by_a_killed_server_and_get_corrections_as_transforms(
     ros2: Ros2, bag: Path, tmp_path: Path
 ) -> None:
-    asyncio.run(_share(ros2, bag, tmp_path))
-
-
-async def _share(ros2: Ros2, bag: Path, folder: Path) -> None:
     names = ("robot1", "robot2")
-    async with LocalPlatform(PlatformSettings(), port=0, servers=2, state=folder / "platform") as platform:
+    async with LocalPlatform(PlatformSettings(), port=0, servers=2, state=tmp_path / "platform") as platform:
         listeners = []
         for name in names:
-            token_file = folder / name
+            token_file = tmp_path / name
             token_file.write_text(platform.issue_token(name), encoding="ascii")
             await asyncio.to_thread(ros2.bridge, platform.url, token_file, namespace=name, map="hall")
             listeners.append(await asyncio.to_thread(ros2.listener, f"/{name}", COLOUR))

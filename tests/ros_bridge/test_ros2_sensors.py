@@ -29,18 +29,16 @@ def stereo(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "pair"
 
 
-def test_raw_and_compressed_images_of_each_kind_give_the_poses_of_the_sdk(ros2: Ros2, tmp_path: Path) -> None:
+async def test_raw_and_compressed_images_of_each_kind_give_the_poses_of_the_sdk(
+    ros2: Ros2, tmp_path: Path
+) -> None:
     """Colours as rgb8, JPEG and PNG; depth as 16UC1, compressedDepth and 32FC1."""
     bag = tmp_path / "encodings"
     write_encodings(bag, _FRAMES)
-    asyncio.run(_drive_encodings(ros2, bag, tmp_path))
-
-
-async def _drive_encodings(ros2: Ros2, bag: Path, folder: Path) -> None:
-    async with LocalPlatform(PlatformSettings(), port=0, servers=1, state=folder / "platform") as platform:
+    async with LocalPlatform(PlatformSettings(), port=0, servers=1, state=tmp_path / "platform") as platform:
         listeners, wanted = {}, {"/camera/camera_info": len(ENCODINGS)}
         for name, (colour, depth) in ENCODINGS.items():
-            token_file = folder / name
+            token_file = tmp_path / name
             token_file.write_text(platform.issue_token(name), encoding="ascii")
             await asyncio.to_thread(
                 ros2.bridge, platform.url, token_file, namespace=name, colour=colour, depth=depth
@@ -56,21 +54,17 @@ async def _drive_encodings(ros2: Ros2, bag: Path, folder: Path) -> None:
 
 
 @pytest.mark.parametrize("has_imu", [False, True], ids=["camera_info", "rig-and-imu"])
-def test_a_stereo_pair_gives_the_poses_of_the_sdk(
+async def test_a_stereo_pair_gives_the_poses_of_the_sdk(
     ros2: Ros2, stereo: Path, tmp_path: Path, has_imu: bool
 ) -> None:
     """By the ``CameraInfo`` of both cameras; or by a rig, with ``sensor_msgs/Imu`` of 200 Hz."""
-    asyncio.run(_drive_stereo(ros2, stereo, tmp_path, has_imu))
-
-
-async def _drive_stereo(ros2: Ros2, stereo: Path, folder: Path, has_imu: bool) -> None:
-    token_file, rig_file = folder / "token", stereo.with_name("rig.json")
+    token_file, rig_file = tmp_path / "token", stereo.with_name("rig.json")
     extra = {"imu": "/imu", "rig": str(rig_file), "publish_odom": "true"} if has_imu else {}
     options = BagOptions(
         colour=STEREO["colour"], right=STEREO["right"], use_stereo=True, use_imu=has_imu,
         rig=read_rig(rig_file) if has_imu else None,
     )  # fmt: skip
-    async with LocalPlatform(PlatformSettings(), port=0, servers=1, state=folder / "platform") as platform:
+    async with LocalPlatform(PlatformSettings(), port=0, servers=1, state=tmp_path / "platform") as platform:
         token_file.write_text(platform.issue_token("pair"), encoding="ascii")
         expected = await own_run(stereo, platform, options)
         bridge = await asyncio.to_thread(ros2.bridge, platform.url, token_file, **STEREO, **extra)
@@ -88,13 +82,9 @@ async def _drive_stereo(ros2: Ros2, stereo: Path, folder: Path, has_imu: bool) -
         assert await asyncio.to_thread(bridge.end, signal.SIGTERM) == 0
 
 
-def test_options_are_parameters_and_ctrl_c_ends_with_0(ros2: Ros2, tmp_path: Path) -> None:
-    asyncio.run(_ask_parameters(ros2, tmp_path))
-
-
-async def _ask_parameters(ros2: Ros2, folder: Path) -> None:
-    token_file, words = folder / "token", (ros2.python, "-m", "ros_bridge", "ros2")
-    async with LocalPlatform(PlatformSettings(), port=0, servers=1, state=folder / "platform") as platform:
+async def test_options_are_parameters_and_ctrl_c_ends_with_0(ros2: Ros2, tmp_path: Path) -> None:
+    token_file, words = tmp_path / "token", (ros2.python, "-m", "ros_bridge", "ros2")
+    async with LocalPlatform(PlatformSettings(), port=0, servers=1, state=tmp_path / "platform") as platform:
         token_file.write_text(platform.issue_token("asked"), encoding="ascii")
         bridge = ros2.start(
             *words, "--url", platform.url, "--colour", "/eye/image", "--ros-args", "-r", "__ns:=/robot1",
