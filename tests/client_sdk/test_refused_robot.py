@@ -61,29 +61,8 @@ async def test_a_refusal_that_names_the_time_of_the_cut_off_is_followed_by_a_lat
             assert len(platform.tokens_seen) == 4  # a cut-off is no reason to ask for another token at once
 
 
-async def test_a_robot_whose_clock_is_set_right_is_tried_again_at_once():
-    now_s = [1000.0]
-    settings = replace(QUICK, reconnect_long_max_s=1000.0)
-
-    async def token():
-        return "t"
-
-    async with FakePlatform() as platform:
-        connecting = client_sdk.connect(
-            platform.url, token=token, settings=settings, random=random.Random(1),
-            wall_clock=lambda: now_s[0] + time.monotonic(),
-        )  # fmt: skip
-        async with connecting as a_robot:
-            platform.told = {"cause": "not-yet-valid"}
-            platform.refusals = [(401, None)]
-            platform.sockets[0].cut()
-            await platform.until(lambda: not platform.refusals)
-            now_s[0] -= 120.0
-
-            assert (await answered(a_robot)).reply == {"value": 3}
-
-
-async def test_a_clock_that_is_set_while_the_refusal_is_told_is_noticed():
+@pytest.mark.parametrize("when", ["after the refusal", "while the refusal is told"])
+async def test_a_robot_whose_clock_is_set_right_is_tried_again_at_once(when):
     now_s = [1000.0]
     settings = replace(QUICK, reconnect_long_max_s=1000.0)
 
@@ -91,7 +70,7 @@ async def test_a_clock_that_is_set_while_the_refusal_is_told_is_noticed():
         return "t"
 
     def set_clock(event, detail):
-        if event == "refused":
+        if event == "refused" and when == "while the refusal is told":
             now_s[0] -= 120.0
 
     async with FakePlatform() as platform:
@@ -104,6 +83,8 @@ async def test_a_clock_that_is_set_while_the_refusal_is_told_is_noticed():
             platform.refusals = [(401, None)]
             platform.sockets[0].cut()
             await platform.until(lambda: not platform.refusals)
+            if when == "after the refusal":
+                now_s[0] -= 120.0
 
             assert (await answered(a_robot)).reply == {"value": 3}
 

@@ -21,6 +21,7 @@ import numpy as np
 import pytest
 
 from rse_pf.geometry import Array, exp_se3, pose_difference
+from tests.chromium import chromium, film_as_camera
 from tests.examples.conftest import ExamplePlatform, Program
 from tests.examples.conftest import platform as platform
 
@@ -71,10 +72,6 @@ def page(platform: ExamplePlatform) -> Iterator[str]:
 
 
 def test_the_first_pose_in_a_page_is_shown(platform: ExamplePlatform, tmp_path: Path) -> None:
-    sync_api = pytest.importorskip("playwright.sync_api", reason="no playwright: make browser installs it")
-    chromium = next(filter(None, map(shutil.which, ("chromium-headless-shell", "chromium"))), None)
-    if chromium is None:
-        pytest.skip("no Chromium: sudo apt-get install chromium-headless-shell")
     text = (REPOSITORY / "docs" / "howto" / "browser_robot.md").read_text(encoding="utf-8")
     found = re.search(r"```text\n(<!doctype html>.*?)```", text, re.DOTALL)
     assert found is not None
@@ -89,17 +86,15 @@ def test_the_first_pose_in_a_page_is_shown(platform: ExamplePlatform, tmp_path: 
     )  # fmt: skip
 
     try:
-        with sync_api.sync_playwright() as playwright:
-            browser = playwright.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
+        with chromium() as browser:
             page = browser.new_page()
             for _ in range(100):  # until the server of the page answers
-                with contextlib.suppress(sync_api.Error):
+                with contextlib.suppress(pytest.importorskip("playwright.sync_api").Error):
                     page.goto(f"http://localhost:{PORT}/pose.html#{token}")
                     break
                 page.wait_for_timeout(100)
             page.wait_for_function("document.querySelector('pre').textContent !== ''", timeout=60_000)
             shown = page.inner_text("pre")
-            browser.close()
     finally:
         server.kill()
         server.wait()
@@ -108,10 +103,6 @@ def test_the_first_pose_in_a_page_is_shown(platform: ExamplePlatform, tmp_path: 
 
 
 def test_the_page_draws_the_poses_of_its_camera(platform: ExamplePlatform, page: str) -> None:
-    sync_api = pytest.importorskip("playwright.sync_api", reason="no playwright: make browser installs it")
-    chromium = next(filter(None, map(shutil.which, ("chromium-headless-shell", "chromium"))), None)
-    if chromium is None:
-        pytest.skip("no Chromium: sudo apt-get install chromium-headless-shell")
     film = platform.folder / "film.mjpeg"
     write_film(film)
     token = platform.cloud.issue_token("phone", None)
@@ -119,17 +110,7 @@ def test_the_page_draws_the_poses_of_its_camera(platform: ExamplePlatform, page:
     seen: dict[str, Any] = {}
     wrong: list[str] = []
 
-    with sync_api.sync_playwright() as playwright:
-        camera = f"--use-file-for-fake-video-capture={film}"
-        browser = playwright.chromium.launch(
-            executable_path=chromium,
-            args=[
-                "--no-sandbox",
-                "--use-fake-ui-for-media-stream",
-                "--use-fake-device-for-media-stream",
-                camera,
-            ],
-        )
+    with chromium(*film_as_camera(film)) as browser:
         window = browser.new_page()
         window.on("pageerror", lambda error: wrong.append(str(error)))
         window.goto(f"{page}#{hash_}")
@@ -145,7 +126,6 @@ def test_the_page_draws_the_poses_of_its_camera(platform: ExamplePlatform, page:
             seen |= {each["name"]: (each, told["figures"]) for each in told["found"]}
         picture = window.locator("canvas").screenshot()
         said = window.inner_text("output")
-        browser.close()
 
     assert wrong == []
     assert said == "connected to server-1 as phone"

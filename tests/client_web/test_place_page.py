@@ -6,7 +6,6 @@ The camera is a film of the drive that made the map.
 from __future__ import annotations
 
 import json
-import shutil
 import socket
 import subprocess
 import sys
@@ -18,6 +17,7 @@ from urllib.parse import urlsplit
 import numpy as np
 import pytest
 
+from tests.chromium import chromium, film_as_camera
 from tests.examples.conftest import ExamplePlatform, Program
 from tests.examples.conftest import platform as platform
 
@@ -103,16 +103,9 @@ def test_photos_are_localised_through_the_load_balancer(
 def test_the_page_shows_its_place_and_asks_no_other_host(
     platform: ExamplePlatform, places: Array, token: str, page: str
 ) -> None:
-    sync_api = pytest.importorskip("playwright.sync_api", reason="no playwright: make browser installs it")
-    chromium = next(filter(None, map(shutil.which, ("chromium-headless-shell", "chromium"))), None)
-    if chromium is None:
-        pytest.skip("no Chromium: sudo apt-get install chromium-headless-shell")
     asked: set[str] = set()
     wrong: list[str] = []
-    with sync_api.sync_playwright() as playwright:
-        fake = ["--use-fake-ui-for-media-stream", "--use-fake-device-for-media-stream"]
-        film = f"--use-file-for-fake-video-capture={platform.folder / 'film.mjpeg'}"
-        browser = playwright.chromium.launch(executable_path=chromium, args=["--no-sandbox", *fake, film])
+    with chromium(*film_as_camera(platform.folder / "film.mjpeg")) as browser:
         window = browser.new_page()
         window.on("pageerror", lambda error: wrong.append(str(error)))
         window.on("request", lambda request: asked.add(urlsplit(request.url).netloc))
@@ -127,7 +120,6 @@ def test_the_page_shows_its_place_and_asks_no_other_host(
             "([x, y]) => [...document.querySelector('canvas').getContext('2d')"
             ".getImageData(x, y, 1, 1).data].slice(0, 3)", drawn,
         )  # fmt: skip
-        browser.close()
 
     assert wrong == []
     assert said.startswith("ok ")

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import shutil
 import socket
 import threading
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import pytest
 
+from tests.chromium import chromium
 from tests.examples.conftest import ExamplePlatform
 from tests.examples.conftest import platform as platform
 
@@ -44,21 +44,15 @@ class Page(BaseHTTPRequestHandler):
 
 @pytest.mark.parametrize("size", [5 * MIB, 60 * MIB])
 def test_the_answer_arrives_in_chromium_through_the_balancer(platform: ExamplePlatform, size: int) -> None:
-    sync_api = pytest.importorskip("playwright.sync_api", reason="no playwright: make browser installs it")
-    chromium = next(filter(None, map(shutil.which, ("chromium-headless-shell", "chromium"))), None)
-    if chromium is None:
-        pytest.skip("no Chromium: sudo apt-get install chromium-headless-shell")
     token = platform.cloud.issue_token("page", None)
     url = f"http://127.0.0.1:{platform.cloud.port}/data/v1/objects/{'a' * 64}"
     server = ThreadingHTTPServer(("127.0.0.1", PORT), Page)
     threading.Thread(target=server.serve_forever, daemon=True).start()
 
-    with sync_api.sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
+    with chromium() as browser:
         page = browser.new_page()
         page.goto(ALLOWED_ORIGINS)
         answers = [page.evaluate(STORE, [url, token, size]) for _ in range(TIMES)]
-        browser.close()
     server.shutdown()
     server.server_close()
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import os
 import re
-import shutil
 import subprocess
 import sys
 import time
@@ -19,30 +18,19 @@ from typing import Any
 
 import pytest
 
+from tests.chromium import chromium
+
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
 
-_ARGS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 _NAME = "browser-test"
 _BUSY_ROBOTS = 100
-
-
-def chromium() -> str:
-    """Return the path of a Chromium; skips if there is none."""
-    found = next(filter(None, map(shutil.which, ("chromium-headless-shell", "chromium"))), None)
-    if found is None:
-        pytest.skip("no Chromium: sudo apt-get install chromium-headless-shell")
-    return found
 
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
     """A headless Chromium, drawn by software."""
-    sync_api = pytest.importorskip("playwright.sync_api", reason="no playwright: make browser installs it")
-    path = chromium()
-    with sync_api.sync_playwright() as playwright:
-        started = playwright.chromium.launch(executable_path=path, args=list(_ARGS))
+    with chromium("--use-angle=swiftshader", "--enable-unsafe-swiftshader") as started:
         yield started
-        started.close()
 
 
 class Running:

@@ -7,6 +7,7 @@ import pytest
 
 from client_sdk.bags.message_maker import MessageMaker
 from client_sdk.bags.message_types import CAMERA_INFO, IMAGE
+from client_sdk.frontend import Frame
 from ros_bridge import BridgeOptions, IncomingFrames
 from ros_bridge.incoming import Role
 from tests.client_sdk.bags.small_bags import camera_info, raw_image, scene, stamp_of
@@ -32,6 +33,12 @@ class Robot:
 
     def depth(self, stamp_ns: int, row: int = 0) -> bool:
         return self.send("depth", raw_image(self.maker, stamp_ns, SHOWN.depths_mm[row], "16UC1"))
+
+    def frame(self) -> Frame | None:
+        """Return the next frame, None if its images cannot be used."""
+        images = self.frames.take()
+        assert images is not None
+        return self.frames.decode(images)
 
     def taken(self) -> list[int]:
         found = []
@@ -65,9 +72,7 @@ def test_colours_take_the_nearest_depth_and_wait_while_a_nearer_one_may_come() -
     assert not robot.colour(stamp)
     assert robot.depth(stamp + 3 * MS, 1)
 
-    images = robot.frames.take()
-    assert images is not None
-    frame = robot.frames.decode(images)
+    frame = robot.frame()
     assert frame is not None
     assert frame.depth_m[20, 20] == pytest.approx(SHOWN.depths_mm[1][20, 20] / 1000)
 
@@ -124,9 +129,7 @@ def test_the_oldest_frame_is_dropped_where_too_many_wait() -> None:
 def test_without_depth_each_colour_image_is_a_frame() -> None:
     robot = Robot(depth="")
     assert robot.colour(stamp_of(0))
-    images = robot.frames.take()
-    assert images is not None
-    frame = robot.frames.decode(images)
+    frame = robot.frame()
     assert frame is not None
     assert not frame.depth_m.any()
 
@@ -162,9 +165,7 @@ def test_frames_before_any_camera_info_are_left_out() -> None:
     robot = Robot(depth="")
     robot.frames._camera = None
     robot.colour(stamp_of(0))
-    images = robot.frames.take()
-    assert images is not None
-    assert robot.frames.decode(images) is None
+    assert robot.frame() is None
     assert "no camera_info" in robot.frames.trouble
 
 
@@ -173,9 +174,7 @@ def test_a_lens_with_distortion_is_undistorted() -> None:
     robot.frames._camera = None
     robot.send("info", camera_info(robot.maker, stamp_of(0), (0.3, -0.1, 0.0, 0.0, 0.0)))
     robot.colour(stamp_of(0))
-    images = robot.frames.take()
-    assert images is not None
-    frame = robot.frames.decode(images)
+    frame = robot.frame()
     assert frame is not None
     assert not np.array_equal(frame.rgb, SHOWN.colours[0])
 

@@ -25,6 +25,7 @@ from rse_pf.slam.keyframe import (
     decode_keyframe,
     encode_keyframe,
     make_features,
+    make_scaleless_features,
 )
 
 CAMERA = Camera(fx=525.0, fy=525.0, cx=319.5, cy=239.5, width=640, height=480)
@@ -276,6 +277,7 @@ def test_the_bytes_of_disparities_are_those_of_the_protocol() -> None:
 
 
 STEREO = encode_keyframe(stereo_keyframe())
+SCALELESS = encode_keyframe(replace(keyframe(), features=make_scaleless_features(*random_features(20))))
 DISPARITIES_AT = FEATURES_AT + 8 + 20 * 36 + BLOCK + 4
 
 
@@ -357,10 +359,11 @@ def test_a_keyframe_without_one_of_its_blocks_is_refused() -> None:
         decode_keyframe(changed(3, "<B", 0)[:HEAD])
 
 
-def test_a_keyframe_that_ends_early_is_refused_wherever_it_ends() -> None:
-    for size in range(len(GOOD)):
+@pytest.mark.parametrize("whole", [GOOD, STEREO, SCALELESS], ids=["depth", "stereo", "one lens"])
+def test_a_keyframe_that_ends_early_is_refused_wherever_it_ends(whole: bytes) -> None:
+    for size in range(len(whole)):
         with pytest.raises(BadRequest):
-            decode_keyframe(GOOD[:size])
+            decode_keyframe(whole[:size])
 
 
 def mutants(data: bytes, count: int) -> list[bytes]:
