@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import sys
 from collections import Counter
 from pathlib import Path
@@ -31,7 +30,7 @@ from rse_pf.geometry import Camera, exp_se3
 from rse_pf.maps.descriptors import ORB, DescriptorKind
 from rse_pf.maps.format import decode_map
 from tests.client_sdk.live.fake_live_map import solve
-from tests.client_sdk.mapper.flat_world import STEP_M, frame_at
+from tests.client_sdk.mapper.flat_world import STEP_M, frame_at, tracked
 
 IMAGE: npt.NDArray[np.uint8] = np.zeros((480, 640, 3), dtype=np.uint8)
 
@@ -211,12 +210,7 @@ def test_orb_by_hand_is_tracked_as_well_as_the_built_in_one() -> None:
 
     def errors(features: Any) -> float:
         mapper = Mapper(ask=solve, options=options, features=features)
-
-        async def play() -> None:
-            for row in range(8):
-                await mapper.track(frame_at(row, depth=True))
-
-        asyncio.run(play())
+        played(mapper, list(range(8)))
         return float(np.abs(mapper.trajectory.positions[:, 0] - STEP_M * np.arange(8)).max())
 
     assert errors(orb_by_hand) < 2.0 * errors(None) + 1e-3
@@ -227,10 +221,7 @@ def test_orb_by_hand_is_tracked_as_well_as_the_built_in_one() -> None:
 
 
 def played(mapper: Mapper, rows: list[int], *, depth: bool = True) -> list[TrackedFrame]:
-    async def all_frames() -> list[TrackedFrame]:
-        return [await mapper.track(frame_at(row, depth=depth)) for row in rows]
-
-    return asyncio.run(all_frames())
+    return tracked(mapper, (frame_at(row, depth=depth) for row in rows))
 
 
 @pytest.mark.parametrize("depth", [True, False])

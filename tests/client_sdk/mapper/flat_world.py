@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import asyncio
+from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
 
-from client_sdk.frontend import Frame
+from client_sdk.frontend import Frame, TrackedFrame
+from client_sdk.mapper import Mapper
 from rse_pf.geometry import Camera
 
-__all__ = ["CAMERA", "STEP_M", "covered", "foreign", "frame_at"]
+__all__ = ["CAMERA", "STEP_M", "covered", "foreign", "frame_at", "tracked"]
 
 CAMERA = Camera(fx=500.0, fy=500.0, cx=159.5, cy=119.5, width=320, height=240)
 DEPTHS_M = (2.0, 4.0 / 3.0, 1.0)
@@ -38,3 +41,12 @@ def foreign(frame: Frame) -> Frame:
 def covered(frame: Frame) -> Frame:
     """Return what the camera sees while its lens is covered."""
     return replace(frame, rgb=np.zeros_like(frame.rgb))
+
+
+def tracked(mapper: Mapper, frames: Iterable[Frame]) -> list[TrackedFrame]:
+    """Return what a mapper makes of the frames."""
+
+    async def track() -> list[TrackedFrame]:
+        return [await mapper.track(frame) for frame in frames]
+
+    return asyncio.run(track())

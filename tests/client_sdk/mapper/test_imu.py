@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 from dataclasses import replace
 from typing import Any
 
@@ -15,7 +14,7 @@ from client_sdk.imu.samples import ImuModel, ImuSamples
 from client_sdk.mapper import Mapper
 from rse_pf.geometry import Array, exp_se3, inverse
 from tests.client_sdk.live.fake_live_map import solve
-from tests.client_sdk.mapper.flat_world import STEP_M, frame_at
+from tests.client_sdk.mapper.flat_world import STEP_M, frame_at, tracked
 
 pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
 
@@ -35,10 +34,7 @@ def with_imu(frame: Frame) -> Frame:
 
 
 def drive(mapper: Mapper, rows: range, *, depth: bool) -> list[TrackedFrame]:
-    async def all_frames() -> list[TrackedFrame]:
-        return [await mapper.track(with_imu(frame_at(row, depth=depth))) for row in rows]
-
-    return asyncio.run(all_frames())
+    return tracked(mapper, (with_imu(frame_at(row, depth=depth)) for row in rows))
 
 
 def down_in(T_world_camera: Array | None) -> Array:
@@ -122,7 +118,7 @@ def test_a_turn_of_the_world_is_told_so_that_poses_before_it_compare():
 def test_without_an_imu_the_world_is_that_of_the_first_camera():
     mapper = Mapper(ask=solve)
 
-    done = asyncio.run(mapper.track(frame_at(0, depth=True)))
+    (done,) = tracked(mapper, [frame_at(0, depth=True)])
 
     np.testing.assert_allclose(done.T_world_camera, np.eye(4))
     assert (mapper.imu, mapper.gravity) == ("none", None)

@@ -25,7 +25,7 @@ from rse_pf.experiments.results.trajectory_error import absolute_error
 from rse_pf.geometry import Camera, exp_se3
 from rse_pf.pnp import solve_pnp
 from tests.client_sdk.live.fake_live_map import solve
-from tests.client_sdk.mapper.flat_world import STEP_M, foreign, frame_at
+from tests.client_sdk.mapper.flat_world import STEP_M, foreign, frame_at, tracked
 
 pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
 
@@ -89,26 +89,24 @@ def test_a_robot_that_cannot_ask_at_all_says_so_and_may_go_on() -> None:
     assert drive(mapper, range(2, 3), depth=True)[0].status == "tracked"
 
 
-def test_a_cancelled_frame_leaves_the_mapper_usable() -> None:
-    async def cancel_one() -> TrackedFrame:
-        asked, never = asyncio.Event(), asyncio.Event()
+async def test_a_cancelled_frame_leaves_the_mapper_usable() -> None:
+    asked, never = asyncio.Event(), asyncio.Event()
 
-        async def ask(query: PoseQuery) -> PoseAnswer:
-            if not asked.is_set():
-                asked.set()
-                await never.wait()
-            return await solve(query)
+    async def ask(query: PoseQuery) -> PoseAnswer:
+        if not asked.is_set():
+            asked.set()
+            await never.wait()
+        return await solve(query)
 
-        mapper = Mapper(ask=ask)
-        await mapper.track(frame_at(0, depth=True))
-        task = asyncio.create_task(mapper.track(frame_at(1, depth=True)))
-        await asyncio.wait_for(asked.wait(), 10)
-        task.cancel()
-        with pytest.raises(asyncio.CancelledError):
-            await task
-        return await mapper.track(frame_at(2, depth=True))
+    mapper = Mapper(ask=ask)
+    await mapper.track(frame_at(0, depth=True))
+    task = asyncio.create_task(mapper.track(frame_at(1, depth=True)))
+    await asyncio.wait_for(asked.wait(), 10)
+    task.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await task
 
-    assert asyncio.run(cancel_one()).status == "tracked"
+    assert (await mapper.track(frame_at(2, depth=True))).status == "tracked"
 
 
 def test_a_frame_of_another_camera_is_refused() -> None:
@@ -157,10 +155,7 @@ def test_a_lost_camera_without_depth_is_found_again_where_it_was() -> None:
     blank = frame_at(8, depth=False)
     blank = replace(blank, rgb=np.full_like(blank.rgb, 128))
 
-    async def go_on() -> list[TrackedFrame]:
-        return [await mapper.track(blank), await mapper.track(frame_at(5, depth=False))]
-
-    lost, found = asyncio.run(go_on())
+    lost, found = tracked(mapper, [blank, frame_at(5, depth=False)])
 
     assert (lost.status, lost.T_world_camera) == ("lost", None)
     assert "matches" in lost.reason
@@ -174,14 +169,8 @@ def test_a_cut_without_depth_saves_the_second_place_apart(tmp_path: Path) -> Non
     )  # fmt: skip
     drive(mapper, range(9), depth=False, odometry=True)
 
-    async def go_on_elsewhere() -> list[TrackedFrame]:
-        done = []
-        for row in range(12):
-            there = foreign(frame_at(row, depth=False))
-            done.append(await mapper.track(replace(there, timestamp_s=1.0 + row / 10)))
-        return done
-
-    elsewhere = asyncio.run(go_on_elsewhere())
+    there = (foreign(frame_at(row, depth=False)) for row in range(12))
+    elsewhere = tracked(mapper, (replace(each, timestamp_s=1.0 + each.timestamp_s) for each in there))
     report = mapper.save(tmp_path)
 
     assert (elsewhere[-1].segment, elsewhere[-1].scale) == (1, "up to scale")
@@ -225,11 +214,7 @@ def test_the_kitchen_without_its_depth_is_mapped_within_8_cm(recordings: Path) -
     truth = dataset.truth
     mapper = Mapper(ask=solve, depth=False, scale=OdometryScale(truth.timestamps_s, truth.positions))
 
-    async def run() -> None:
-        for frame in dataset:
-            await mapper.track(replace(frame, depth_m=np.zeros_like(frame.depth_m)))
-
-    asyncio.run(run())
+    tracked(mapper, (replace(frame, depth_m=np.zeros_like(frame.depth_m)) for frame in dataset))
 
     path: Trajectory = mapper.trajectory
     assert mapper.scale.startswith("metric")
@@ -314,13 +299,8 @@ def test_a_rig_gives_the_poses_of_its_body_beside_those_of_its_camera(tmp_path):
     T_body_camera = exp_se3(np.array([0.1, -0.2, 0.3, 0.4, -1.0, 0.7]))
     mapper = Mapper(ask=solve)
 
-    async def all_frames():
-        return [
-            await mapper.track(replace(frame_at(row, depth=True), T_body_camera=T_body_camera))
-            for row in range(3)
-        ]
-
-    done = asyncio.run(all_frames())
+    frames = (frame_at(row, depth=True) for row in range(3))
+    done = tracked(mapper, (replace(frame, T_body_camera=T_body_camera) for frame in frames))
     report = mapper.save(tmp_path)
 
     np.testing.assert_allclose(report["T_body_camera"], T_body_camera)
@@ -334,7 +314,7 @@ def test_a_rig_gives_the_poses_of_its_body_beside_those_of_its_camera(tmp_path):
 
 
 def test_without_metres_or_a_rig_there_is_no_pose_of_a_body(tmp_path):
-    plain = asyncio.run(Mapper(ask=solve).track(frame_at(0, depth=True)))
+    (plain,) = tracked(Mapper(ask=solve), [frame_at(0, depth=True)])
     rigged = replace(plain, frame=replace(plain.frame, T_body_camera=np.eye(4)))
 
     assert plain.T_world_body is None

@@ -23,6 +23,7 @@ from rse_pf.experiments.results.trajectory_error import accuracy
 from rse_pf.geometry import Camera, inverse, transform
 from rse_pf.maps.format import decode_map
 from rse_pf.pnp import DepthNoise
+from tests.client_sdk.mapper.flat_world import tracked
 
 pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
 
@@ -39,12 +40,7 @@ def pairs() -> Sequence[Frame]:
 def drive(frames: Sequence[Frame], **options: object) -> Mapper:
     """Return a mapper that has tracked the frames."""
     mapper = Mapper(ask=InProcessSolver(PlatformSettings()).ask, **options)  # type: ignore[arg-type]
-
-    async def track() -> None:
-        for frame in frames:
-            await mapper.track(frame)
-
-    asyncio.run(track())
+    tracked(mapper, frames)
     return mapper
 
 

@@ -31,6 +31,12 @@ def surveyed(building: Building, seed: int, pitch_m: float = 2.0) -> list[Finger
     return [fingerprint_of(building.scan(np.array(place), rng), KEY, place) for place in places]
 
 
+def asked(request: WifiRequest) -> Result | Failure:
+    """Return the answer of the service."""
+    command = Command(id=1, service="wifi", payload=request)
+    return dispatch(builtin_services(PlatformSettings()), command, lambda: 0.0)
+
+
 def located(building: Building, locator: Locator, scans: int, seed: int) -> tuple[list[float], list[float]]:
     """Return errors and stated radii of scans at random places."""
     rng = np.random.default_rng(seed)
@@ -74,9 +80,7 @@ def test_the_service_answers_with_a_position_and_a_radius() -> None:
     scan = fingerprint_of(building.scan(np.array([10.0, 10.0, 0.3]), np.random.default_rng(1)), KEY)
     request = WifiRequest(scan=scan, survey=surveyed(building, 3, pitch_m=5.0))
 
-    answer = dispatch(
-        builtin_services(PlatformSettings()), Command(id=1, service="wifi", payload=request), lambda: 0.0
-    )
+    answer = asked(request)
 
     assert isinstance(answer, Result), answer
     assert isinstance(answer.reply, WifiReply)
@@ -88,9 +92,7 @@ def test_a_scan_of_unknown_access_points_has_no_position() -> None:
     survey = surveyed(make_building(2), 3, pitch_m=8.0)
     request = WifiRequest(scan=Fingerprint(rssi_dbm={"nobody": -50.0}), survey=survey)
 
-    answer = dispatch(
-        builtin_services(PlatformSettings()), Command(id=1, service="wifi", payload=request), lambda: 0.0
-    )
+    answer = asked(request)
 
     assert isinstance(answer, Result), answer
     assert not answer.reply.found
@@ -127,9 +129,7 @@ def test_names_depend_on_the_key_and_not_on_the_spelling() -> None:
 def test_hardware_addresses_and_impossible_strengths_are_refused(scan: dict[str, float]) -> None:
     request = WifiRequest(scan=Fingerprint(rssi_dbm=scan), survey=[])
 
-    answer = dispatch(
-        builtin_services(PlatformSettings()), Command(id=1, service="wifi", payload=request), lambda: 0.0
-    )
+    answer = asked(request)
 
     assert isinstance(answer, Failure)
     assert answer.code == BadRequest.code
