@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from itertools import pairwise
 
+import pytest
+
 from client_sdk.network.regions import RegionChoice
 
 NEAR, FAR = 0, 1
@@ -62,24 +64,20 @@ def test_a_region_that_gets_slow_is_left_after_a_minute_and_not_before():
     assert 360.0 <= drive.changes[0][0] <= 366.0
 
 
-def test_a_region_that_is_slow_now_and_then_is_kept():
+@pytest.mark.parametrize(
+    "pieces",
+    [
+        pytest.param([(400, 130, 50), (30, 130, 10)] * 30, id="slow now and then"),
+        pytest.param([(30, 24, 90), (24, 30, 90)] * 60, id="about equally far"),
+        pytest.param([(12, 2, 600)], id="a small gain, however large its share"),
+    ],
+)
+def test_a_region_is_kept(pieces):
     drive = Drive()
-    for _ in range(30):
-        drive.measure(400, 130, for_s=50).measure(30, 130, for_s=10)
+    for near_ms, far_ms, for_s in pieces:
+        drive.measure(near_ms, far_ms, for_s=for_s)
 
     assert drive.changes == []
-
-
-def test_two_regions_that_are_about_equally_far_do_not_alternate():
-    drive = Drive()
-    for _ in range(60):
-        drive.measure(30, 24, for_s=90).measure(24, 30, for_s=90)
-
-    assert drive.changes == []
-
-
-def test_a_small_gain_is_no_reason_to_change_however_large_its_share():
-    assert Drive().measure(12, 2, for_s=600).changes == []
 
 
 def test_a_small_share_is_no_reason_to_change_however_much_time_it_is():

@@ -10,17 +10,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from rse_pf import native
 from rse_pf.errors import BadRequest, DegenerateGeometry, NoConsensus, PnpError, RsePfError
 from rse_pf.geometry import transform
 from rse_pf.pnp import PnpOptions, solve_pnp
 from rse_pf.pnp.problems import DEGENERATE, KINECT, make_degenerate, make_problem
-
-NATIVE = pytest.param(
-    "native",
-    marks=pytest.mark.skipif(native.find_library() is None, reason="the native core is not built"),
-)
-EVERY = pytest.mark.parametrize("engine", ["poselib", "opencv", NATIVE])
+from tests.pnp.native_reference import EVERY
 
 
 def outcome(points, pixels, engine="poselib", **options):

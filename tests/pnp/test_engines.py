@@ -14,11 +14,7 @@ from rse_pf.errors import BadRequest, MissingExtra
 from rse_pf.geometry import pose_difference
 from rse_pf.pnp import PnpOptions, available_engines, engines, solve_pnp
 from rse_pf.pnp.problems import make_problem
-
-NATIVE = pytest.param(
-    "native", marks=pytest.mark.skipif(native.find_library() is None, reason="the native core is not built")
-)
-EVERY = pytest.mark.parametrize("engine", ["poselib", "opencv", NATIVE])
+from tests.pnp.native_reference import EVERY
 
 
 def right(solution, problem):

@@ -17,7 +17,6 @@ from mcap.stream_reader import StreamReader
 
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import UsageError
-from rse_pf.recording import writer as writer_module
 from rse_pf.recording.file_format import FileName
 from rse_pf.recording.writer import RecordingWriter, make_folder, with_recordings
 
@@ -143,4 +142,3 @@ def test_the_name_of_a_file_says_when_and_where_it_was_begun():
     assert FileName.parse(str(name)) == name._replace(server="a_b")
     assert FileName.parse("my.mcap") is None
     assert FileName.parse("20261399T000000Z-a-0001.mcap") is None
-    assert writer_module.__all__

@@ -6,7 +6,6 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 import pytest
 from recording.replay.made import Made, jpeg
@@ -18,7 +17,7 @@ from rse_pf.recording.reader import open_recording
 from rse_pf.recording.replay import run
 from rse_pf.recording.replay.case import case_parts, write_case
 from rse_pf.recording.replay.solving import Resolver
-from rse_pf.wire import Command, Result, make_codec
+from rse_pf.wire import Result
 
 SETTINGS = PlatformSettings()
 
@@ -115,14 +114,3 @@ def test_history_of_another_connection_is_left_out(tmp_path: Path) -> None:
 
     assert len(case_parts(second, [first], Resolver())) == 4
     assert len(case_parts(second, [other], Resolver())) == 2
-
-
-def test_a_case_can_be_read_as_messages(tmp_path: Path) -> None:
-    made = Made(tmp_path / "a")
-    name = made.send(1, codec="json")
-    (command,) = open_recording(exported(made.close(), name)).commands()
-
-    message = make_codec("json").decode_from_robot(command.command_bytes)
-
-    assert isinstance(message, Command)
-    assert msgspec.json.decode(command.reply_bytes or b"")["type"] == "result"
