@@ -93,6 +93,7 @@ def test_the_covariance_is_symmetric_and_positive():
     ("kept", "limits", "reason"),
     [
         (slice(None, 9), WeakLimits(), "few-inliers"),
+        (slice(None), WeakLimits(inliers=201), "few-inliers"),
         (slice(None), WeakLimits(inlier_ratio=0.9), "low-inlier-ratio"),
         (slice(None), WeakLimits(translation_m=1e-5), "poorly-constrained"),
         (slice(None), WeakLimits(rotation_rad=1e-6), "poorly-constrained"),
