@@ -121,14 +121,6 @@ def test_a_load_beyond_the_settings_is_said(capsys: pytest.CaptureFixture[str]) 
     assert "robots would be refused" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize(
-    "words", [["--robots", "0"], ["--fps", "0"], ["--fps", "nan"], ["--hours-per-day", "25"], ["--fps", "-1"]]
-)
-def test_a_load_that_nobody_can_have_is_refused(capsys: pytest.CaptureFixture[str], words: list[str]) -> None:
-    assert main(["cloud", "cost", *words]) == 2
-    assert "hint:" in capsys.readouterr().err
-
-
 @pytest.mark.parametrize("action", ["status", "leftovers"])
 def test_without_credentials_there_is_one_line_and_a_hint(
     capsys: pytest.CaptureFixture[str], nobody: None, action: str

@@ -94,28 +94,3 @@ def test_show_as_json_and_by_action(folder: Path, capsys: pytest.CaptureFixture[
 
     (line,) = capsys.readouterr().out.splitlines()
     assert (json.loads(line)["log"], json.loads(line)["subject"]) == ("operator", "robot-1")
-
-
-@pytest.mark.parametrize(
-    "words",
-    [
-        ["verify", "nowhere"],
-        ["verify", "--head", "server-1=nonsense"],
-        ["verify", "--last", "3"],
-        ["show", "--last", "0"],
-        ["show", "--head", "x=1:0"],
-        ["burn"],
-        ["verify", "--name", "nobody-has-this"],
-    ],
-)
-def test_bad_input_is_one_line_and_a_hint(
-    words: list[str], folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-):  # fmt: skip
-    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
-
-    assert main(["audit", *words]) == 2
-
-    error = capsys.readouterr().err
-    assert error.startswith("UsageError: ")
-    assert error.count("\n  hint: ") == 1

@@ -10,7 +10,6 @@ import pytest
 
 from rse_pf.cli.local_platform.lan import chosen_address, lan_lines
 from rse_pf.cli.local_platform.robots import robots_table
-from rse_pf.cli.main import main
 from rse_pf.config import HealthSettings
 from rse_pf.errors import UsageError
 from rse_pf.local.faults.faults import longest_pause_s
@@ -65,37 +64,6 @@ def test_a_pause_may_last_until_the_control_plane_replaces_the_server() -> None:
         name="p", control_plane=gone, url="", settings_digest="", settings_file="", key_file=""
     )
     assert longest_pause_s(unattended, server, health) == math.inf
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (("logs", "server-1"), "takes no server"),
-        (("roll", "server-1"), "takes no server"),
-        (("drain",), "drain needs a server"),
-        (("status", "--follow"), "--server and --follow are for logs"),
-        (("status", "--lan", "10.1.2.3"), "--lan, --metrics-port and --record are for the start"),
-        (("--lan", "status"), "--lan status is not an address"),
-        (("status", "--burst"), "--burst is for the start of a platform"),
-        (("--burst", "70000"), "--burst 70000 is not a port"),
-        (("--burst", "-1"), "--burst -1 is not a port"),
-        (("--lan", "127.0.0.1"), "no address that another machine can connect to"),
-        (("robots",), "is not running"),
-        (("roll",), "is not running"),
-        (("logs",), "no logs in"),
-    ],
-)
-def test_a_wrong_word_is_two_lines(
-    words: tuple[str, ...], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:  # fmt: skip
-    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
-
-    assert main(["local", *words]) == 2
-
-    lines = capsys.readouterr().err.splitlines()
-    assert said in lines[0]
-    assert lines[1].startswith("  hint: ")
 
 
 def test_a_lan_without_tokens_or_with_a_certificate_from_elsewhere_is_refused() -> None:

@@ -188,32 +188,3 @@ def test_check_says_that_a_recording_has_pairs(tmp_path: Path, capsys: pytest.Ca
     line, _, figures = capsys.readouterr().out.splitlines()
     assert line.endswith("64x48 px, 10.0 frames per second, a stereo pair")
     assert (json.loads(figures)["with_stereo"], json.loads(figures)["with_depth"]) == (3, 0)
-
-
-@pytest.mark.parametrize(
-    ("words", "code", "sentence"),
-    [
-        (["calibrate", "none.png"], 2, "there is no video none.png"),
-        (["calibrate", "a.png", "b.png"], 2, "there is no image a.png"),
-        (["calibrate", "97"], 2, "camera 97 cannot be opened"),
-        (["calibrate", "0", "--board", "nine"], 2, "nine is not the size of a board"),
-        (["calibrate", "0", "--board", "2x2"], 2, "2x2 corners is not within 3..40"),
-        (["calibrate", "0", "--square-mm", "0"], 2, "squares of 0 mm"),
-        (["calibrate", "0", "--max-rms-px", "0"], 2, "--max-rms-px 0 is not above 0"),
-        (["calibrate", "0", "--out", "none/i.json"], 2, "there is no folder"),
-        (["board", "--out", "b.jpg"], 2, "neither .pdf nor .png"),
-        (["check", "none"], 2, "there is no video none"),
-        (["check", "0", "--frames", "1"], 2, "--frames 1 is below 2"),
-    ],
-)
-def test_a_wrong_call_gets_one_line_and_a_hint(
-    words: list[str], code: int, sentence: str, tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
-) -> None:  # fmt: skip
-    monkeypatch.chdir(tmp_path)
-
-    assert main(["camera", *words]) == code
-
-    lines = capsys.readouterr().err.splitlines()
-    assert sentence in lines[0]
-    assert lines[1].startswith("  hint: ")

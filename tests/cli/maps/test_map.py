@@ -103,28 +103,6 @@ def test_export_writes_the_file(store: Path, kind: str, begins: bytes) -> None:
     assert out.read_bytes().startswith(begins)
 
 
-@pytest.mark.parametrize(
-    ("words", "code"),
-    [
-        (["show", "nowhere"], 1),
-        (["show", "../x"], 1),
-        (["rollback", "hall", "abc"], 1),
-        (["prune", "hall", "--keep", "0"], 2),
-        (["prune", "nowhere", "--keep", "1"], 1),
-        (["export", "hall", "--format", "obj", "--out", "x"], 2),
-        (["export", "hall", "--format", "ply", "--out", "/nowhere/x"], 2),
-    ],
-)
-def test_an_action_that_fails_is_one_sentence_and_a_hint(
-    store: Path, capsys: pytest.CaptureFixture[str], words: list[str], code: int
-) -> None:
-    assert run(store, *words) == code
-
-    said = capsys.readouterr().err
-    assert "hint:" in said
-    assert "Traceback" not in said
-
-
 def test_a_store_in_memory_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["map", "list", "--store", "memory:"]) == 2
     assert "dir:PATH" in capsys.readouterr().err

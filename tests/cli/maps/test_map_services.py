@@ -111,29 +111,6 @@ def test_each_action_has_an_example(capsys: pytest.CaptureFixture[str], action: 
     assert f"example:\n  rse-pf map {action}" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize(
-    ("words", "code", "told"),
-    [
-        (["merge", "a", "nowhere", "--into", "hall"], 1, "no map 'nowhere'"),
-        (["merge", "a", "b", "--into", "No Name"], 1, "is not a valid name of a map"),
-        (["localise", "a", "nowhere.png"], 2, "no image or recording nowhere.png"),
-        (["localise", "a", "x.png", "--every", "0"], 2, "--every 0"),
-        (["view", "a", "--out", "/nowhere/x.png"], 2, "no folder /nowhere"),
-        (["view", "nowhere"], 1, "no map 'nowhere'"),
-        (["view", "a", "--browser", "--port", "0"], 2, "port 0"),
-    ],
-)
-def test_bad_input_is_one_sentence_and_a_hint(
-    store: Path, capsys: pytest.CaptureFixture[str], words: list[str], code: int, told: str
-) -> None:
-    assert run(store, *words) == code
-
-    said = capsys.readouterr().err
-    assert told in said
-    assert said.count("\n") == 2
-    assert "\n  hint: " in said
-
-
 SHIFT_PX = 16
 """The camera moves to the right by so many pixels, in front of a wall."""
 

@@ -148,40 +148,6 @@ def test_a_server_that_does_not_record_says_why_and_no_file_is_written(
     assert not Path("live.jsonl").exists()
 
 
-@pytest.mark.parametrize(
-    ("words", "says"),
-    [
-        ("record", "needs the name of a service"),
-        ("record icp", "--out icp.jsonl"),
-        ("record icp --out x", "no server of a platform named 'default' is running"),
-        ("record icp --out no/x --control-port 9", "there is no folder"),
-        ("record icp --out x --control-port 9 --count 0", "--count 0 is not within 1..10000"),
-        ("record icp --out x --control-port 9 --seconds nan", "--seconds nan is not within"),
-        ("record icp --out x --control-port 9 --max-mib 65", "--max-mib 65 is not within 1..64"),
-        ("record icp --out x --url https://robots.example.org:9", "http://127.0.0.1:PORT"),
-        ("record icp --out x --url http://127.0.0.1", "is no control port of this machine"),
-        ("test mine --requests typo", "cannot read typo"),
-        ("test mine --requests mine/service.py", "is not JSON"),
-        ("test mine --requests other.jsonl", "holds requests to 'other', not to 'mine'"),
-        ("test mine --requests none.jsonl", "holds no request"),
-        ("test mine --requests a --record b", "exclude each other"),
-    ],
-)
-def test_a_wrong_call_is_two_lines(
-    capsys: pytest.CaptureFixture[str], started: Any, words: str, says: str
-) -> None:
-    main(["service", "new", "mine"])
-    for name in ("other", "none"):
-        head = {"format": "rse-pf-requests", "version": 1, "service": "mine" if name == "none" else name}
-        call = "" if name == "none" else '{"request": {}}\n'
-        Path(f"{name}.jsonl").write_text(json.dumps(head) + "\n" + call)
-
-    shown = told(capsys, *words.split(), code=2)
-
-    assert says in shown
-    assert len(shown.splitlines()) == 2
-
-
 @pytest.mark.system
 def test_a_recording_is_replayed_and_compared_if_that_is_wanted(
     capsys: pytest.CaptureFixture[str], started: Any

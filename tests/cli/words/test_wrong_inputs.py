@@ -1,4 +1,4 @@
-"""One hundred wrong inputs: one line and a hint that fits, the right exit code, and never a traceback."""
+"""Wrong inputs: one line and a hint that fits, the right exit code, and never a traceback."""
 
 from __future__ import annotations
 
