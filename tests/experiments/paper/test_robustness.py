@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from rse_pf.experiments.paper.robustness import BARS, robustness_figures, robustness_page, time_until_even_s
-from rse_pf.experiments.results.records import CommandRecord, Records, run_sample
-from rse_pf.local.control.monitor import ServerSample
+from rse_pf.experiments.paper.robustness import robustness_figures, robustness_page
+from rse_pf.experiments.results.records import CommandRecord, Records
 
 
 def event(time_s, action, **details):
@@ -94,38 +93,6 @@ def test_adoption_compares_the_processes_before_and_after(after, not_adopted):
     assert judged["not_adopted"] == not_adopted
     assert judged["control_plane_down_s"] == pytest.approx(4.0)
     assert judged["bars"]["not_adopted"]["held"] is (not_adopted == 0)
-
-
-def robots(time_s, *counts):
-    servers = tuple(
-        ServerSample(name=f"server-{n + 1}", pid=n, state="healthy", robots=count)
-        for n, count in enumerate(counts)
-    )
-    return run_sample(time_s=time_s, healthy_servers=len(servers), servers=servers)
-
-
-def test_evened_out_means_within_20_percent_of_the_mean_until_the_end():
-    readings = [robots(1, 50, 50, 0), robots(2, 34, 33, 33), robots(3, 50, 30, 20), robots(4, 36, 36, 28)]
-
-    assert time_until_even_s(readings, 0.5) == pytest.approx(3.5)
-    assert time_until_even_s(readings[:3], 0.5) is None
-
-
-def test_growth_of_memory_is_per_process():
-    events = [
-        event(1.0, "resources", when="before", memory_bytes=200, descriptors=20, processes=2),
-        event(9.0, "resources", when="after", memory_bytes=330, descriptors=30, processes=3),
-    ]
-
-    judged = robustness_figures(run("random", events, OTHER))
-
-    assert (judged["memory_percent"], judged["descriptors_percent"]) == (10.0, 0.0)
-    assert not judged["bars"]["memory_percent"]["held"]
-    assert judged["bars"]["descriptors_percent"]["held"]
-
-
-def test_every_scenario_has_targets_for_lost_and_duplicate_answers():
-    assert all({"commands/lost", "commands/twice"} <= set(bars) for bars in BARS.values())
 
 
 def test_a_missed_target_is_reported_as_missed():
