@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 from botocore.exceptions import ClientError
 
+from rse_pf.aws.fleet.task import AgentConfig, AgentContext
+from rse_pf.config import PlatformSettings
 from rse_pf.errors import Disconnected
+from rse_pf.object_store import MemoryStore
 
 WALL_S = float(int(time.time()) // 60 * 60)
 """The wall clock of every machine at 120 s: the begin of this minute."""
@@ -98,3 +102,16 @@ class FakeScaling:
             raise ClientError(refusal, "CompleteLifecycleAction")
         self.completed.append((self._machine.now_s, arguments))
         return {}
+
+
+def agent_context(machine: Any, folder: Path, *, group: str = "rse-pf", **changed: Any) -> AgentContext:
+    """Return the context of an agent on *machine* with its keys in *folder*; *changed* replaces its parts."""
+    config = AgentConfig(
+        group=group, hook="drain", launch_hook="launch", keys_name="keys.json", keys_file=folder / "keys.json"
+    )
+    parts: dict[str, Any] = {
+        "machine": machine, "clients": {}, "artifacts": MemoryStore(), "settings": PlatformSettings(),
+        "config": config, "log": lambda event, **fields: None, "clock": machine.clock,
+        "sleep": machine.sleep, "wall_clock": machine.wall_clock,
+    }  # fmt: skip
+    return AgentContext(**{**parts, **changed})

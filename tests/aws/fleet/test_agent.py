@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from aws.fleet.fake_machine import FakeMachine, FakeScaling
+from aws.fleet.fake_machine import FakeMachine, FakeScaling, agent_context
 from botocore.exceptions import ClientError
 
 from rse_pf.audit.log import record_once
@@ -15,9 +15,8 @@ from rse_pf.audit.verify import check_folder
 from rse_pf.auth.tokens import SigningKey
 from rse_pf.auth.trust_store import DENY_NAME, AccessControlStore
 from rse_pf.aws.clients import make_client
-from rse_pf.aws.fleet.agent import Agent, AgentConfig, AgentContext, main
+from rse_pf.aws.fleet.agent import Agent, main
 from rse_pf.aws.storage.audit_archive import Shipper, fetch_audit
-from rse_pf.config import PlatformSettings
 from rse_pf.errors import StoreError
 from rse_pf.object_store import MemoryStore
 from rse_pf.scaling.alarms import NAMESPACE
@@ -40,18 +39,12 @@ class AgentSetup:
             self.audit, self.archive, marks_file=folder / "shipped.json", instance=self.machine.instance_id,
             on_broken=lambda chain, problem: self.log.append(("broken", {"chain": chain})),
         )  # fmt: skip
-        self.agent = Agent(
-            AgentContext(
-                machine=self.machine, clients={"cloudwatch": cloudwatch, "autoscaling": self.scaling},
-                artifacts=self.artifacts, settings=PlatformSettings(), shipper=shipper,
-                config=AgentConfig(
-                    group="rse-pf", hook="drain", launch_hook="launch", keys_name="keys.json",
-                    keys_file=self.file,
-                ),
-                clock=self.machine.clock, sleep=self.machine.sleep, wall_clock=self.machine.wall_clock,
-                log=lambda event, **fields: self.log.append((event, fields)),
-            )
+        context = agent_context(
+            self.machine, folder, clients={"cloudwatch": cloudwatch, "autoscaling": self.scaling},
+            artifacts=self.artifacts, shipper=shipper,
+            log=lambda event, **fields: self.log.append((event, fields)),
         )  # fmt: skip
+        self.agent = Agent(context)
 
     def note(self, action: str) -> None:
         """Have the server write an entry."""

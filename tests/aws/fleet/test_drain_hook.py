@@ -6,15 +6,13 @@ from pathlib import Path
 from typing import Any
 
 import boto3
-from aws.fleet.fake_machine import FakeMachine, FakeScaling
+from aws.fleet.fake_machine import FakeMachine, FakeScaling, agent_context
 from botocore.stub import Stubber
 
 from rse_pf.audit.log import SYNC_S
-from rse_pf.aws.fleet.agent import AgentConfig, AgentContext
 from rse_pf.aws.fleet.task import Phase
 from rse_pf.aws.fleet.tasks import lifecycle
 from rse_pf.config import PlatformSettings
-from rse_pf.object_store import MemoryStore
 from rse_pf.scaling.health import CLOUD_INTERVAL_S, CLOUD_TIMEOUT_S, DRAIN_S, time_to_notice_s
 
 SETTINGS = PlatformSettings()
@@ -24,11 +22,9 @@ def leave(machine: FakeMachine, scaling: object, settings: PlatformSettings = SE
     """Follow the lifecycle of a leaving instance once; return whether its server ended in time."""
     machine.leaving = True
     told: list[dict[str, Any]] = []
-    context = AgentContext(
-        machine=machine, clients={"autoscaling": scaling}, artifacts=MemoryStore(), settings=settings,
-        config=AgentConfig(group="rse-pf", hook="drain", keys_name="k", keys_file=Path("k")),
+    context = agent_context(
+        machine, Path(), clients={"autoscaling": scaling}, settings=settings,
         log=lambda event, **fields: told.append({"event": event, **fields}),
-        clock=machine.clock, sleep=machine.sleep,
     )  # fmt: skip
     lifecycle.task(context).call()
     assert context.state.phase is Phase.LEFT

@@ -12,12 +12,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from aws.fleet.fake_machine import FakeMachine, FakeScaling
+from aws.fleet.fake_machine import FakeMachine, FakeScaling, agent_context
 from emulated_aws import REGION, emulated_aws
 
 from rse_pf.aws.account import Account, open_account
 from rse_pf.aws.clients import make_client
-from rse_pf.aws.fleet.agent import Agent, AgentConfig, AgentContext
+from rse_pf.aws.fleet.agent import Agent
 from rse_pf.aws.fleet.group import AutoScalingGroup, Server, read_group
 from rse_pf.aws.fleet.group_metrics import read_group_metrics
 from rse_pf.aws.fleet.metrics import ServerMetrics, datums
@@ -26,7 +26,6 @@ from rse_pf.aws.money.spending import read_spending
 from rse_pf.config import PlatformSettings
 from rse_pf.config.resource_names import ResourceNames
 from rse_pf.errors import ConfigurationError
-from rse_pf.object_store import MemoryStore
 from rse_pf.scaling.alarms import NAMESPACE
 
 GROUP = ResourceNames().group
@@ -118,15 +117,8 @@ def test_the_status_shows_what_a_running_agent_publishes(
     machine = FakeMachine()
     machine.instance_id = lambda: servers[0]  # type: ignore[method-assign]
     machine.text = "rse_pf_robots 7\n"
-    config = AgentConfig(group=GROUP, hook="h", keys_name="k", keys_file=tmp_path / "keys.json")
     clients = {"cloudwatch": make_client("cloudwatch", region), "autoscaling": FakeScaling(machine)}
-    agent = Agent(
-        AgentContext(
-            machine=machine, clients=clients, config=config, artifacts=MemoryStore(), settings=SETTINGS,
-            log=lambda event, **fields: None, clock=machine.clock, sleep=machine.sleep,
-            wall_clock=machine.wall_clock,
-        )
-    )  # fmt: skip
+    agent = Agent(agent_context(machine, tmp_path, group=GROUP, clients=clients, settings=SETTINGS))
     agent.step()
     machine.sleep(60.0)
     agent.step()

@@ -6,19 +6,19 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from aws.fleet.fake_machine import FakeMachine, FakeScaling
+from aws.fleet.fake_machine import FakeMachine, FakeScaling, agent_context
 from botocore.exceptions import ClientError
 
-from rse_pf.aws.fleet.agent import Agent, AgentConfig, AgentContext
+from rse_pf.aws.fleet.agent import Agent, AgentContext
 from rse_pf.aws.fleet.launch_hook import LaunchAction, launch_action
 from rse_pf.aws.fleet.task import Phase, Task
+from rse_pf.aws.fleet.tasks import lifecycle
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import ConfigurationError
-from rse_pf.object_store import MemoryStore
 from rse_pf.scaling.boot_time import BOOT_LIMIT_S, BOOT_S, ready_within_s, retry_within_s
 
 SETTINGS = PlatformSettings()
-LAUNCH, DRAIN = "rse-pf-launch", "rse-pf-drain"
+LAUNCH, DRAIN = "launch", "drain"
 
 
 class Setup:
@@ -29,16 +29,10 @@ class Setup:
         self.scaling = FakeScaling(self.machine)
         self.log: list[tuple[str, dict[str, Any]]] = []
         self.published: list[float] = []
-        self.context = AgentContext(
-            machine=self.machine, clients={"autoscaling": self.scaling}, artifacts=MemoryStore(),
-            settings=SETTINGS, log=lambda event, **fields: self.log.append((event, fields)),
-            config=AgentConfig(
-                group="rse-pf", hook=DRAIN, launch_hook=LAUNCH, keys_name="k", keys_file=tmp_path / "k"
-            ),
-            clock=self.machine.clock, sleep=self.machine.sleep,
+        self.context = agent_context(
+            self.machine, tmp_path, clients={"autoscaling": self.scaling},
+            log=lambda event, **fields: self.log.append((event, fields)),
         )  # fmt: skip
-        from rse_pf.aws.fleet.tasks import lifecycle
-
         self.agent = Agent(self.context, (lifecycle.task, self._publisher))
 
     def _publisher(self, context: AgentContext) -> Task:

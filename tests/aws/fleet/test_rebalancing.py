@@ -7,16 +7,15 @@ from datetime import datetime, timedelta, timezone
 from pathlib import Path
 
 import pytest
-from aws.fleet.fake_machine import FakeMachine
+from aws.fleet.fake_machine import FakeMachine, agent_context
 
 from rse_pf.aws.clients import make_client
-from rse_pf.aws.fleet.agent import Agent, AgentConfig, AgentContext
+from rse_pf.aws.fleet.agent import Agent
 from rse_pf.aws.fleet.metrics import ROBOTS, dimensions_of
 from rse_pf.aws.fleet.task import AgentState, Phase
 from rse_pf.aws.fleet.tasks import rebalancing, server_metrics, spot_notice
 from rse_pf.aws.fleet.tasks.rebalancing import read_totals
 from rse_pf.config import PlatformSettings
-from rse_pf.object_store import MemoryStore
 from rse_pf.scaling.alarms import CPU, NAMESPACE
 from tests.aws.fleet.delayed_cloudwatch import DELAY_S, DelayedCloudWatch
 
@@ -40,11 +39,9 @@ class FakeFleet:
             machine.instance_id = lambda at=at: f"i-{at}"  # type: ignore[misc]
             machine.page = lambda at=at: f"rse_pf_robots {self.robots[at]}\n"  # type: ignore[misc]
             machine.move = self._mover(at) if moves else lambda robots, spread_s: robots  # type: ignore[method-assign]
-            context = AgentContext(
-                machine=machine, clients={"cloudwatch": self.cloudwatch}, artifacts=MemoryStore(),
-                config=AgentConfig(group="rse-pf", hook="h", keys_name="k", keys_file=folder / "k"),
-                settings=settings, log=lambda event, **fields: self.log.append(event), clock=machine.clock,
-                wall_clock=machine.wall_clock, state=AgentState(phase=Phase.SERVING),
+            context = agent_context(
+                machine, folder, clients={"cloudwatch": self.cloudwatch}, settings=settings,
+                log=lambda event, **fields: self.log.append(event), state=AgentState(phase=Phase.SERVING),
             )  # fmt: skip
             self.agents.append(Agent(context, (server_metrics.task, rebalancing.task)))
 
@@ -177,11 +174,9 @@ def test_an_interruption_drains_the_server_within_five_seconds_and_a_recommendat
     machine = FakeMachine()
     log: list[tuple[str, float]] = []
     settings = PlatformSettings.from_dict({"cloud": {"spot": spot}})
-    context = AgentContext(
-        machine=machine, clients={}, artifacts=MemoryStore(), settings=settings,
-        config=AgentConfig(group=group, hook="h", keys_name="k", keys_file=tmp_path / "k"),
-        log=lambda event, **fields: log.append((event, machine.now_s)), clock=machine.clock,
-        sleep=machine.sleep, wall_clock=machine.wall_clock, state=AgentState(phase=Phase.SERVING),
+    context = agent_context(
+        machine, tmp_path, group=group, settings=settings, state=AgentState(phase=Phase.SERVING),
+        log=lambda event, **fields: log.append((event, machine.now_s)),
     )  # fmt: skip
     agent = Agent(context, (spot_notice.task,))
     for _ in range(40):
@@ -198,11 +193,7 @@ def test_an_interruption_drains_the_server_within_five_seconds_and_a_recommendat
 def test_without_spot_instances_no_notice_is_asked_for(tmp_path: Path) -> None:
     machine = FakeMachine()
     machine.notice = "interruption"
-    context = AgentContext(
-        machine=machine, clients={}, artifacts=MemoryStore(), settings=PAPER,
-        config=AgentConfig(group="rse-pf", hook="h", keys_name="k", keys_file=tmp_path / "k"),
-        log=lambda event, **fields: None, clock=machine.clock, state=AgentState(phase=Phase.SERVING),
-    )  # fmt: skip
+    context = agent_context(machine, tmp_path, state=AgentState(phase=Phase.SERVING))
 
     Agent(context, (spot_notice.task,)).step()
 

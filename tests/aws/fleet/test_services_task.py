@@ -6,12 +6,11 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
-from aws.fleet.fake_machine import FakeMachine
+from aws.fleet.fake_machine import FakeMachine, agent_context
 
 from rse_pf.aws.fleet.agent import Agent
-from rse_pf.aws.fleet.task import AgentConfig, AgentContext, Task
+from rse_pf.aws.fleet.task import Task
 from rse_pf.aws.fleet.tasks import services
-from rse_pf.config import PlatformSettings
 from rse_pf.object_store import MemoryStore
 from rse_pf.services.custom.publishing import LIST_NAME, PublishedList, PublishedService, archive_name
 
@@ -22,10 +21,9 @@ class Setup:
     def __init__(self, folder: Path, group: str = "rse-pf") -> None:
         self.machine, self.store = FakeMachine(), MemoryStore()
         self.log: list[tuple[str, dict[str, Any]]] = []
-        self.context = AgentContext(
-            machine=self.machine, clients={}, artifacts=self.store, settings=PlatformSettings(),
-            config=AgentConfig(group=group, hook="h", keys_name="k", keys_file=folder / "k"),
-            log=lambda event, **fields: self.log.append((event, fields)), clock=self.machine.clock,
+        self.context = agent_context(
+            self.machine, folder, group=group, artifacts=self.store,
+            log=lambda event, **fields: self.log.append((event, fields)),
         )  # fmt: skip
         self.agent = Agent(self.context, (services.task,))
 

@@ -9,16 +9,15 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import pytest
-from aws.fleet.fake_machine import FakeMachine
+from aws.fleet.fake_machine import FakeMachine, agent_context
 
 from rse_pf.aws.fleet import instance
-from rse_pf.aws.fleet.agent import TASKS, Agent, AgentConfig, AgentContext
+from rse_pf.aws.fleet.agent import TASKS, Agent
 from rse_pf.aws.fleet.instance import Instance
 from rse_pf.aws.fleet.task import AgentState, Phase
 from rse_pf.aws.fleet.tasks import store_errors
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import Disconnected
-from rse_pf.object_store import MemoryStore
 
 
 class CloudWatch:
@@ -38,10 +37,9 @@ class Setup:
 
     def __init__(self, *, group: str = "rse-pf", **groups: Any) -> None:
         self.machine, self.cloudwatch, self.log = FakeMachine(), CloudWatch(), list[str]()
-        context = AgentContext(
-            machine=self.machine, clients={"cloudwatch": self.cloudwatch}, artifacts=MemoryStore(),
+        context = agent_context(
+            self.machine, Path(), group=group, clients={"cloudwatch": self.cloudwatch},
             settings=PlatformSettings.from_dict(groups), state=AgentState(phase=Phase.SERVING),
-            config=AgentConfig(group=group, hook="h", keys_name="k", keys_file=Path("k")),
             log=lambda event, **fields: self.log.append(event),
         )  # fmt: skip
         self.agent = Agent(context, (store_errors.task,))

@@ -14,15 +14,15 @@ from typing import Any
 
 import pytest
 import websockets
-from aws.fleet.fake_machine import FakeMachine, FakeScaling
+from aws.fleet.fake_machine import FakeMachine, FakeScaling, agent_context
 from guarded_server import GuardedServer
 
 from rse_pf.auth.robot_key import RobotKey
 from rse_pf.auth.trust_store import DENY_NAME, ROBOTS_NAME, AccessControlStore, TrustStore
-from rse_pf.aws.fleet.agent import Agent, AgentConfig, AgentContext
+from rse_pf.aws.fleet.agent import Agent
 from rse_pf.aws.storage.s3_store import S3Store
 from rse_pf.cli.main import main
-from rse_pf.config import AuthSettings, PlatformSettings
+from rse_pf.config import AuthSettings
 from rse_pf.errors import Unauthorized
 from rse_pf.wire import SUBPROTOCOLS
 from rse_pf.wire.server_session import CLOSE_REVOKED
@@ -40,14 +40,8 @@ class Done(Exception):
 def agent_of(s3: Any, folder: Path) -> Agent:
     """Return the agent of an instance whose server reads *folder*."""
     machine = FakeMachine()
-    return Agent(
-        AgentContext(
-            machine=machine, clients={"autoscaling": FakeScaling(machine)},
-            artifacts=S3Store(s3, "artifacts"),
-            config=AgentConfig(group="g", hook="h", keys_name="keys.json", keys_file=folder / "keys.json"),
-            settings=PlatformSettings(), log=lambda event, **fields: None,
-        )
-    )  # fmt: skip
+    clients = {"autoscaling": FakeScaling(machine)}
+    return Agent(agent_context(machine, folder, clients=clients, artifacts=S3Store(s3, "artifacts")))
 
 
 @contextlib.contextmanager

@@ -7,13 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from aws.fleet.fake_machine import FakeMachine, FakeScaling
+from aws.fleet.fake_machine import FakeMachine, FakeScaling, agent_context
 
 from rse_pf.aws.fleet.agent import Agent
-from rse_pf.aws.fleet.task import AgentConfig, AgentContext
 from rse_pf.aws.storage.s3_store import S3Store
 from rse_pf.cli.main import main
-from rse_pf.config import PlatformSettings
 from rse_pf.services.custom.installed import installed_services
 from rse_pf.services.custom.publishing import LIST_NAME
 
@@ -26,18 +24,11 @@ class Server:
     def __init__(self, s3: Any, folder: Path) -> None:
         self.machine, self.log = FakeMachine(), []  # type: FakeMachine, list[tuple[str, dict[str, Any]]]
         self.current = folder / "services" / "current"
-        self.agent = Agent(
-            AgentContext(
-                machine=self.machine,  # type: ignore[arg-type]
-                clients={"autoscaling": FakeScaling(self.machine)}, artifacts=S3Store(s3, "artifacts"),
-                config=AgentConfig(
-                    group="g", hook="h", launch_hook="l", keys_name="keys.json",
-                    keys_file=folder / "keys.json",
-                ),
-                settings=PlatformSettings(),
-                log=lambda event, **fields: self.log.append((event, fields)),
-            )
+        context = agent_context(
+            self.machine, folder, clients={"autoscaling": FakeScaling(self.machine)},
+            artifacts=S3Store(s3, "artifacts"), log=lambda event, **fields: self.log.append((event, fields)),
         )  # fmt: skip
+        self.agent = Agent(context)
 
     def look(self) -> list[str]:
         """Let the agent look at the list; return the services that run then."""
