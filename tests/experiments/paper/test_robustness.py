@@ -95,6 +95,19 @@ def test_adoption_compares_the_processes_before_and_after(after, not_adopted):
     assert judged["bars"]["not_adopted"]["held"] is (not_adopted == 0)
 
 
+def test_growth_of_memory_is_per_process():
+    events = [
+        event(1.0, "resources", when="before", memory_bytes=200, descriptors=20, processes=2),
+        event(9.0, "resources", when="after", memory_bytes=330, descriptors=30, processes=3),
+    ]
+
+    judged = robustness_figures(run("random", events, OTHER))
+
+    assert (judged["memory_percent"], judged["descriptors_percent"]) == (10.0, 0.0)
+    assert not judged["bars"]["memory_percent"]["held"]
+    assert judged["bars"]["descriptors_percent"]["held"]
+
+
 def test_a_missed_target_is_reported_as_missed():
     counts = {"sent": 10, "answered": 9, "failed": 1, "lost": 0, "twice": 0}
     bars = {
