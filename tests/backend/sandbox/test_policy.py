@@ -106,15 +106,6 @@ def test_the_first_command_of_a_robot_creates_its_sandbox_and_runs_once_that_is_
     assert policy.held == 0
 
 
-def test_a_second_command_waits_for_the_first_and_uses_the_same_sandbox():
-    policy, first, second = make_policy(), make_call(payload="1"), make_call(payload="2")
-    start(policy, first)
-
-    assert policy.submit(second, 0.0) == []
-    assert policy.held == 2
-    assert policy.on_reply(1, OK, 1.0) == [AnswerCall(first, OK), SendMessage(1, b"2")]
-
-
 def test_a_robot_of_the_same_name_in_another_tenant_has_a_sandbox_and_a_state_of_its_own():
     policy, namesake = make_policy(), RobotId("rival", A.name)
     policy.add_connection(namesake)
@@ -124,15 +115,6 @@ def test_a_robot_of_the_same_name_in_another_tenant_has_a_sandbox_and_a_state_of
     assert policy.submit(second, 0.0) == [CreateSandbox(2, namesake)]
     assert policy.on_ready(1, 0.1) == [LoadSnapshot(1, first)]
     assert policy.on_ready(2, 0.1) == [LoadSnapshot(2, second)]
-
-
-def test_an_error_of_the_service_is_answered_and_costs_no_sandbox():
-    policy, call = make_policy(), make_call()
-    start(policy, call)
-    error = BadRequest("too few points")
-
-    assert policy.on_reply(1, error, 1.0) == [AnswerCall(call, error)]
-    assert policy.sandboxes == 1
 
 
 # --- crashes: retry, poison, circuit breaker -------------------------------------------------------
@@ -517,16 +499,6 @@ def test_a_crash_does_not_help_a_tenant_to_keep_a_place_that_another_one_claims(
 
     assert not any(isinstance(each, CreateSandbox) for each in actions)
     assert [code for _, code in outcomes(actions)] == ["busy", "busy"]
-
-
-def test_a_robot_has_one_sandbox_however_many_it_asks_for():
-    policy = make_policy()
-    start(policy, make_call(A))
-    for i in range(64):
-        policy.submit(make_call(A, payload=str(i)), 0.1)
-
-    assert policy.sandboxes == 1
-    assert created(policy.submit(make_call(B), 0.2)) == 2
 
 
 def test_closing_releases_everything_and_answers_nothing():

@@ -7,13 +7,7 @@ from collections import Counter
 
 import pytest
 
-from rse_pf.backend.scheduling.fair_share import CLAIM_S, FairShare
-
-
-def test_a_tenant_that_is_alone_may_hold_every_place_and_no_more():
-    shares = FairShare(4)
-
-    assert [shares.takes("a", {"a": held}, 0.0) for held in range(6)] == [True] * 4 + [False] * 2
+from rse_pf.backend.scheduling.fair_share import FairShare
 
 
 def test_the_tenant_that_holds_most_owes_a_place_if_it_keeps_no_fewer_than_who_asks():
@@ -25,16 +19,6 @@ def test_the_tenant_that_holds_most_owes_a_place_if_it_keeps_no_fewer_than_who_a
     assert shares.donors("a", {"a": 8}) == []
 
 
-def test_who_holds_most_gives_up_places_as_their_work_ends_while_another_claims_one():
-    shares = FairShare(4)
-    assert not shares.gives("a", {"a": 4}, 0.0)
-    shares.claim("b", 0.0)
-
-    assert shares.gives("a", {"a": 4}, 0.0)
-    assert not shares.gives("a", {"a": 3}, 0.0), "one is free already"
-    assert not shares.gives("a", {"a": 4}, CLAIM_S), "a claim ends"
-
-
 def test_a_place_that_became_free_is_kept_for_who_claimed_it():
     shares = FairShare(4)
     shares.claim("b", 0.0)
@@ -42,22 +26,6 @@ def test_a_place_that_became_free_is_kept_for_who_claimed_it():
     assert not shares.takes("a", {"a": 3}, 1.0)
     assert shares.takes("b", {"a": 3}, 1.0)
     assert shares.takes("a", {"a": 3}, 1.0), "b has taken its place: the claim is over"
-
-
-def test_a_claim_does_not_keep_a_place_from_a_tenant_that_holds_as_few():
-    shares = FairShare(4)
-    shares.claim("b", 0.0)
-
-    assert shares.takes("c", {"a": 3}, 1.0)
-
-
-def test_a_claim_that_is_not_followed_up_blocks_one_place_for_some_seconds_only():
-    shares = FairShare(4)
-    shares.claim("b", 0.0)
-    shares.claim("b", 0.0)
-
-    assert shares.takes("a", {"a": 2}, 0.0)
-    assert shares.takes("a", {"a": 3}, CLAIM_S)
 
 
 @pytest.mark.parametrize("tenants", [2, 3, 5])

@@ -22,15 +22,18 @@ _T = TypeVar("_T")
 OTHER = RobotId("default", "robot-2", "thumb")
 
 
+class Store(MemoryStore):
+    """Refuses leases while it is down."""
+
+    is_down = False
+
+    def compare_and_swap(self, name: str, expected: bytes | None, data: bytes) -> None:
+        if self.is_down:
+            raise StoreError("down")
+        super().compare_and_swap(name, expected, data)
+
+
 async def test_a_keyframe_is_acknowledged_when_it_is_durable():
-    class Store(MemoryStore):
-        is_down = False
-
-        def compare_and_swap(self, name: str, expected: bytes | None, data: bytes) -> None:
-            if self.is_down:
-                raise StoreError("down")
-            super().compare_and_swap(name, expected, data)
-
     bench = Bench(store := Store())
 
     owner = await bench.own("a")
@@ -273,14 +276,6 @@ async def test_a_release_writes_a_snapshot_and_frees_the_map_at_once():
 
 
 async def test_a_silent_lease_ends_what_is_told_until_it_is_renewed():
-    class Store(MemoryStore):
-        is_down = False
-
-        def compare_and_swap(self, name: str, expected: bytes | None, data: bytes) -> None:
-            if self.is_down:
-                raise StoreError("down")
-            super().compare_and_swap(name, expected, data)
-
     bench = Bench(store := Store())
 
     owner = await bench.own("a")
