@@ -6,8 +6,8 @@ import asyncio
 import base64
 import struct
 import time
-from collections.abc import Awaitable, Callable, Sequence
-from contextlib import suppress
+from collections.abc import AsyncIterator, Sequence
+from contextlib import asynccontextmanager, suppress
 from typing import Any
 
 import numpy as np
@@ -102,26 +102,23 @@ def waiting(parts: Parts) -> int:
     return parts.router.backlog(probe).waiting
 
 
-def with_router(test: Callable[[Parts], Awaitable[None]], now: list[float] | None = None) -> None:
-    """Run *test* with a router; its clock shows ``now[0]``, or the real time."""
+@asynccontextmanager
+async def a_router(now: list[float] | None = None) -> AsyncIterator[Parts]:
+    """Run a router; its clock shows ``now[0]``, or the real time."""
     monotonic = time.monotonic if now is None else lambda: now[0]
-
-    async def run() -> None:
-        with quiet_log() as log:
-            context = WorkerContext(
-                settings=PlatformSettings(), server_id="s-1", log=log, loop=asyncio.get_running_loop(),
-                clocks=Clocks(monotonic=monotonic, wall=time.time, cpu=time.process_time),
-            )  # fmt: skip
-            parts = Parts(context)
-            await asyncio.wait_for(test(parts), 20.0)
-            await parts.router.wait_closed()
-            assert parts.owners.closed
-
-    asyncio.run(run())
+    with quiet_log() as log:
+        context = WorkerContext(
+            settings=PlatformSettings(), server_id="s-1", log=log, loop=asyncio.get_running_loop(),
+            clocks=Clocks(monotonic=monotonic, wall=time.time, cpu=time.process_time),
+        )  # fmt: skip
+        parts = Parts(context)
+        yield parts
+        await asyncio.wait_for(parts.router.wait_closed(), 20.0)
+        assert parts.owners.closed
 
 
-def test_a_keyframe_goes_to_the_owner_of_its_tenants_map_and_the_reply_comes_back() -> None:
-    async def test(parts: Parts) -> None:
+async def test_a_keyframe_goes_to_the_owner_of_its_tenants_map_and_the_reply_comes_back() -> None:
+    async with a_router() as parts:
         answer = await parts.ask("live-keyframe", keyframe(), connection=FakeReader("bob", tenant="acme"))
 
         assert isinstance(answer, Result)
@@ -132,30 +129,24 @@ def test_a_keyframe_goes_to_the_owner_of_its_tenants_map_and_the_reply_comes_bac
         assert 4.0 < deadline_s <= 5.0
         assert payload == KeyframeRequest(map="m", segment=0, number=0, keyframe=KEYFRAME)
 
-    with_router(test)
 
-
-def test_a_keyframe_arrives_the_same_from_json_and_from_messagepack() -> None:
-    async def test(parts: Parts) -> None:
+async def test_a_keyframe_arrives_the_same_from_json_and_from_messagepack() -> None:
+    async with a_router() as parts:
         for number, sent in enumerate((KEYFRAME, base64.b64encode(KEYFRAME).decode())):
             await parts.ask("live-keyframe", keyframe(number, keyframe=sent))
 
         assert [asked[4].keyframe for asked in parts.owners.asked] == [KEYFRAME] * 2
         assert [asked[4].number for asked in parts.owners.asked] == [0, 1]
 
-    with_router(test)
 
-
-def test_a_keyframe_ahead_of_the_next_number_is_a_conflict_and_no_garbage() -> None:
-    async def test(parts: Parts) -> None:
+async def test_a_keyframe_ahead_of_the_next_number_is_a_conflict_and_no_garbage() -> None:
+    async with a_router() as parts:
         for _ in range(20):
             answer = await parts.ask("live-keyframe", keyframe(5))
 
             assert isinstance(answer, Failure)
             assert (answer.code, answer.trace) == ("conflict", "t")
             assert answer.hint
-
-    with_router(test)
 
 
 HEAD_BYTES = 108
@@ -191,26 +182,22 @@ WRONG = [
 
 
 @pytest.mark.parametrize(("changes", "code"), WRONG)
-def test_an_invalid_keyframe_is_refused_before_any_owner_sees_it(changes: Any, code: str) -> None:
-    async def test(parts: Parts) -> None:
+async def test_an_invalid_keyframe_is_refused_before_any_owner_sees_it(changes: Any, code: str) -> None:
+    async with a_router() as parts:
         answer = await parts.ask("live-keyframe", keyframe(**changes))
 
         assert isinstance(answer, Failure)
         assert (answer.code, bool(answer.hint)) == (code, True), answer
         assert parts.owners.asked == []
 
-    with_router(test)
-
 
 @pytest.mark.parametrize("payload", [None, 3, [], "m", {}])
-def test_a_payload_of_another_form_is_a_bad_request(payload: Any) -> None:
-    async def test(parts: Parts) -> None:
+async def test_a_payload_of_another_form_is_a_bad_request(payload: Any) -> None:
+    async with a_router() as parts:
         answer = await parts.ask("live-show", payload)
 
         assert isinstance(answer, Failure)
         assert answer.code == "bad-request"
-
-    with_router(test)
 
 
 RIGHTS = [
@@ -230,8 +217,8 @@ RIGHTS = [
 
 
 @pytest.mark.parametrize(("service", "scopes", "allowed"), RIGHTS)
-def test_the_scope_of_the_map_decides(service: str, scopes: tuple[str, ...], allowed: bool) -> None:
-    async def test(parts: Parts) -> None:
+async def test_the_scope_of_the_map_decides(service: str, scopes: tuple[str, ...], allowed: bool) -> None:
+    async with a_router() as parts:
         connection = FakeReader()
         connection.claims = claims(*scopes)
         payload = {**keyframe(), "robot": "bob", "from": "m@ab12"}
@@ -243,11 +230,9 @@ def test_the_scope_of_the_map_decides(service: str, scopes: tuple[str, ...], all
         assert len(parts.owners.asked) == allowed
         assert allowed or (isinstance(answer, Failure) and answer.code == "forbidden")
 
-    with_router(test)
 
-
-def test_a_robot_lists_the_maps_of_its_tenant_that_it_may_enter() -> None:
-    async def test(parts: Parts) -> None:
+async def test_a_robot_lists_the_maps_of_its_tenant_that_it_may_enter() -> None:
+    async with a_router() as parts:
         parts.owners.maps = {"default": [{"name": "a"}, {"name": "b"}], "acme": [{"name": "secret"}]}
         connection = FakeReader()
         connection.claims = claims("maps:live/b")
@@ -257,11 +242,9 @@ def test_a_robot_lists_the_maps_of_its_tenant_that_it_may_enter() -> None:
         assert isinstance(answer, Result)
         assert answer.reply == {"maps": [{"name": "b"}]}
 
-    with_router(test)
 
-
-def test_an_owner_that_does_not_answer_ends_with_the_deadline() -> None:
-    async def test(parts: Parts) -> None:
+async def test_an_owner_that_does_not_answer_ends_with_the_deadline() -> None:
+    async with a_router() as parts:
         parts.owners.answer = lambda operation, payload: None
 
         answer = await parts.ask("live-show", {"map": "m"}, allowed_s=0.02)
@@ -272,11 +255,9 @@ def test_an_owner_that_does_not_answer_ends_with_the_deadline() -> None:
         await asyncio.sleep(0)
         assert (parts.router.held, waiting(parts)) == (0, 0)
 
-    with_router(test)
 
-
-def test_while_the_owner_changes_a_robot_is_told_when_to_ask_again() -> None:
-    async def test(parts: Parts) -> None:
+async def test_while_the_owner_changes_a_robot_is_told_when_to_ask_again() -> None:
+    async with a_router() as parts:
         parts.owners.answer = lambda *_: Busy("the owner changes", hint="wait", retry_after_ms=300.0)
 
         answer = await parts.ask("live-show", {"map": "m"})
@@ -284,11 +265,10 @@ def test_while_the_owner_changes_a_robot_is_told_when_to_ask_again() -> None:
         assert isinstance(answer, Failure)
         assert (answer.code, answer.retry_after_ms) == ("busy", 300.0)
 
-    with_router(test)
 
+async def test_a_defect_is_an_internal_failure_without_its_text() -> None:
+    async with a_router() as parts:
 
-def test_a_defect_is_an_internal_failure_without_its_text() -> None:
-    async def test(parts: Parts) -> None:
         def broken(operation: str, payload: dict[str, Any]) -> dict[str, Any]:
             raise ZeroDivisionError("secret")
 
@@ -300,13 +280,11 @@ def test_a_defect_is_an_internal_failure_without_its_text() -> None:
         assert answer.code == "internal"
         assert "secret" not in answer.message + answer.hint
 
-    with_router(test)
 
-
-def test_a_sender_of_garbage_loses_the_live_maps_for_a_while_and_the_others_do_not() -> None:
+async def test_a_sender_of_garbage_loses_the_live_maps_for_a_while_and_the_others_do_not() -> None:
     now = [100.0]
 
-    async def test(parts: Parts) -> None:
+    async with a_router(now) as parts:
         hostile, good = FakeReader("hostile"), FakeReader("good")
         namesake = FakeReader("hostile", tenant="acme")
         parts.owners.answer = lambda operation, payload: (
@@ -328,21 +306,17 @@ def test_a_sender_of_garbage_loses_the_live_maps_for_a_while_and_the_others_do_n
         now[0] += 61.0
         assert isinstance(await parts.ask("live-keyframe", keyframe(), connection=hostile), Result)
 
-    with_router(test, now)
 
-
-def test_what_a_robot_of_that_name_in_another_tenant_asked_does_not_count_as_its_own() -> None:
-    async def test(parts: Parts) -> None:
+async def test_what_a_robot_of_that_name_in_another_tenant_asked_does_not_count_as_its_own() -> None:
+    async with a_router() as parts:
         parts.owners.answer = lambda operation, payload: None
         parts.submit("live-show", {"map": "m"}, connection=FakeReader("r", tenant="acme"))
 
         assert (parts.router.held, waiting(parts)) == (1, 0)
 
-    with_router(test)
 
-
-def test_more_bytes_than_one_worker_holds_are_busy() -> None:
-    async def test(parts: Parts) -> None:
+async def test_more_bytes_than_one_worker_holds_are_busy() -> None:
+    async with a_router() as parts:
         parts.owners.answer = lambda operation, payload: None
         for tenant in "abcd":
             reader = FakeReader("r", tenant=tenant)
@@ -355,8 +329,6 @@ def test_more_bytes_than_one_worker_holds_are_busy() -> None:
         assert answer.retry_after_ms
         assert parts.router.held == 4
 
-    with_router(test)
-
 
 async def settled(reader: FakeReader, count: int) -> list[Update]:
     """Return what *reader* got once it got *count* messages."""
@@ -367,8 +339,8 @@ async def settled(reader: FakeReader, count: int) -> list[Update]:
     return reader.written
 
 
-def test_two_workers_tell_their_robots_the_same() -> None:
-    async def test(parts: Parts) -> None:
+async def test_two_workers_tell_their_robots_the_same() -> None:
+    async with a_router() as parts:
         other = Parts(parts.context)
         here, there = FakeReader("here", codec="bin"), FakeReader("there")
         parts.router.subscribe(here, 1, "live/m")
@@ -392,8 +364,6 @@ def test_two_workers_tell_their_robots_the_same() -> None:
         assert parts.router.report().gauges["updates"] == 2.0
         await other.router.wait_closed()
 
-    with_router(test)
-
 
 @pytest.mark.parametrize(
     ("topic", "scopes", "code"),
@@ -404,10 +374,10 @@ def test_two_workers_tell_their_robots_the_same() -> None:
         ("live/../m", (), "bad-request"),
     ],
 )
-def test_a_subscription_that_is_not_allowed_is_refused_by_its_id(
+async def test_a_subscription_that_is_not_allowed_is_refused_by_its_id(
     topic: str, scopes: tuple[str, ...], code: str
 ) -> None:
-    async def test(parts: Parts) -> None:
+    async with a_router() as parts:
         reader = FakeReader()
         reader.claims = claims(*scopes)
 
@@ -417,11 +387,9 @@ def test_a_subscription_that_is_not_allowed_is_refused_by_its_id(
         assert (failure.id, failure.code) == (9, code)
         assert parts.owners.watched == []
 
-    with_router(test)
 
-
-def test_a_right_that_a_fresh_token_does_not_give_ends_the_subscription() -> None:
-    async def test(parts: Parts) -> None:
+async def test_a_right_that_a_fresh_token_does_not_give_ends_the_subscription() -> None:
+    async with a_router() as parts:
         reader = FakeReader()
         reader.claims = claims("maps:live/m")
         parts.router.subscribe(reader, 9, "live/m")
@@ -434,11 +402,9 @@ def test_a_right_that_a_fresh_token_does_not_give_ends_the_subscription() -> Non
         assert (failure.id, failure.code) == (9, "forbidden")
         assert parts.owners.unwatched == [("default", "m")]
 
-    with_router(test)
 
-
-def test_a_token_to_watch_a_map_subscribes_to_it_and_starts_no_owner() -> None:
-    async def test(parts: Parts) -> None:
+async def test_a_token_to_watch_a_map_subscribes_to_it_and_starts_no_owner() -> None:
+    async with a_router() as parts:
         viewer, driver = FakeReader("viewer"), FakeReader("driver")
         viewer.claims = claims("maps:watch/m")
         driver.claims = claims("maps:live/m")
@@ -459,11 +425,9 @@ def test_a_token_to_watch_a_map_subscribes_to_it_and_starts_no_owner() -> None:
         parts.router.unsubscribe(viewer, 9)
         assert parts.owners.unwatched == [("default", "m")]
 
-    with_router(test)
 
-
-def test_a_driver_whose_fresh_token_only_allows_to_watch_goes_on_reading_and_starts_no_owner() -> None:
-    async def test(parts: Parts) -> None:
+async def test_a_driver_whose_fresh_token_only_allows_to_watch_goes_on_reading_and_starts_no_owner() -> None:
+    async with a_router() as parts:
         reader = FakeReader()
         reader.claims = claims("maps:live/m")
         parts.router.subscribe(reader, 9, "live/m")
@@ -476,13 +440,11 @@ def test_a_driver_whose_fresh_token_only_allows_to_watch_goes_on_reading_and_sta
         assert isinstance((await settled(reader, 2))[1], Update)
         assert parts.owners.may_start == {("default", "m"): False}
 
-    with_router(test)
-
 
 @pytest.mark.parametrize("service", sorted(LIVE_SERVICES))
 @pytest.mark.parametrize("scope", ["maps:watch/m", "maps:watch"])
-def test_a_token_to_watch_a_map_gives_no_command_to_it(service: str, scope: str) -> None:
-    async def test(parts: Parts) -> None:
+async def test_a_token_to_watch_a_map_gives_no_command_to_it(service: str, scope: str) -> None:
+    async with a_router() as parts:
         viewer = FakeReader()
         viewer.claims = claims(scope)
         parts.owners.maps = {"default": [{"name": "m"}]}
@@ -498,8 +460,6 @@ def test_a_token_to_watch_a_map_gives_no_command_to_it(service: str, scope: str)
             assert isinstance(answer, Failure)
             assert answer.code == "forbidden"
 
-    with_router(test)
-
 
 @pytest.mark.parametrize(
     "error",
@@ -510,8 +470,8 @@ def test_a_token_to_watch_a_map_gives_no_command_to_it(service: str, scope: str)
     ids=lambda error: error.code,
 )  # fmt: skip
 @pytest.mark.parametrize("service", sorted(LIVE_SERVICES - {"live-keyframe", "live-relocalise", "live-list"}))
-def test_an_error_of_the_map_never_counts_against_who_asked(service: str, error: RsePfError) -> None:
-    async def test(parts: Parts) -> None:
+async def test_an_error_of_the_map_never_counts_against_who_asked(service: str, error: RsePfError) -> None:
+    async with a_router() as parts:
         parts.owners.answer = lambda operation, payload: error
         payload = {"map": "m", "robot": "bob", "from": "m@ab12"}
 
@@ -520,14 +480,12 @@ def test_an_error_of_the_map_never_counts_against_who_asked(service: str, error:
             assert isinstance(answer, Failure)
             assert answer.code == error.code
 
-    with_router(test)
-
 
 @pytest.mark.parametrize(
     "error", [QuotaExceeded("full"), StoreFull("full"), Busy("moves"), StoreError("down")]
 )
-def test_a_keyframe_that_the_store_or_the_quota_refuses_is_no_garbage(error: RsePfError) -> None:
-    async def test(parts: Parts) -> None:
+async def test_a_keyframe_that_the_store_or_the_quota_refuses_is_no_garbage(error: RsePfError) -> None:
+    async with a_router() as parts:
         parts.owners.answer = lambda operation, payload: error
 
         for _ in range(15):
@@ -535,11 +493,9 @@ def test_a_keyframe_that_the_store_or_the_quota_refuses_is_no_garbage(error: Rse
             assert isinstance(answer, Failure)
             assert answer.code == error.code
 
-    with_router(test)
 
-
-def test_what_waits_for_owners_is_bounded_for_each_tenant() -> None:
-    async def test(parts: Parts) -> None:
+async def test_what_waits_for_owners_is_bounded_for_each_tenant() -> None:
+    async with a_router() as parts:
         parts.owners.answer = lambda operation, payload: None
         hostile, good = FakeReader("r", tenant="acme"), FakeReader("r", tenant="rival")
         for _ in range(20):
@@ -551,11 +507,9 @@ def test_what_waits_for_owners_is_bounded_for_each_tenant() -> None:
         assert len(parts.answers) == 4
         assert parts.router.held == 17
 
-    with_router(test)
 
-
-def test_closing_ends_what_waits() -> None:
-    async def test(parts: Parts) -> None:
+async def test_closing_ends_what_waits() -> None:
+    async with a_router() as parts:
         parts.owners.answer = lambda operation, payload: None
         parts.submit("live-show", {"map": "m"})
         await asyncio.sleep(0)
@@ -566,5 +520,3 @@ def test_closing_ends_what_waits() -> None:
 
         assert parts.owners.gave_up
         assert parts.router.held == 0
-
-    with_router(test)

@@ -7,7 +7,7 @@ from collections import Counter
 
 import pytest
 
-from rse_pf.backend.scheduling.fair_share import FairShare
+from rse_pf.backend.scheduling.fair_share import CLAIM_S, FairShare
 
 
 def test_the_tenant_that_holds_most_owes_a_place_if_it_keeps_no_fewer_than_who_asks():
@@ -26,6 +26,15 @@ def test_a_place_that_became_free_is_kept_for_who_claimed_it():
     assert not shares.takes("a", {"a": 3}, 1.0)
     assert shares.takes("b", {"a": 3}, 1.0)
     assert shares.takes("a", {"a": 3}, 1.0), "b has taken its place: the claim is over"
+
+
+def test_a_claim_that_is_not_followed_up_blocks_one_place_for_some_seconds_only():
+    shares = FairShare(4)
+    shares.claim("b", 0.0)
+    shares.claim("b", 0.0)
+
+    assert shares.takes("a", {"a": 2}, 0.0)
+    assert shares.takes("a", {"a": 3}, CLAIM_S)
 
 
 @pytest.mark.parametrize("tenants", [2, 3, 5])

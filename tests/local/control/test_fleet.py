@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import signal
-from collections.abc import Callable, Coroutine
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
 
@@ -109,29 +110,24 @@ class World:
         return [event["event"] for event in self.events if event.get("server") == name]
 
 
-def play(story: Callable[[World], Coroutine[Any, Any, None]]) -> World:
-    async def run() -> World:
-        world = World()
-        await asyncio.wait_for(story(world), SOON_S)
-        await world.fleet.close()
-        return world
-
-    return asyncio.run(run())
+@asynccontextmanager
+async def a_fleet() -> AsyncIterator[World]:
+    world = World()
+    yield world
+    await world.fleet.close()
 
 
-def test_a_server_gets_robots_once_it_is_ready_and_each_step_is_told() -> None:
-    async def story(world: World) -> None:
+async def test_a_server_gets_robots_once_it_is_ready_and_each_step_is_told() -> None:
+    async with a_fleet() as world:
         await world.up(2)
-
-    world = play(story)
 
     assert world.told("server-2") == ["server-launched", "server-ready", "server-healthy"]
     assert world.balancer.targets[-1] == ["server-1", "server-2"]
     assert world.fleet.standing(0.0).healthy == 2
 
 
-def test_a_server_that_ends_unasked_is_dead_until_it_is_replaced() -> None:
-    async def story(world: World) -> None:
+async def test_a_server_that_ends_unasked_is_dead_until_it_is_replaced() -> None:
+    async with a_fleet() as world:
         first, _ = await world.up(2)
         world.servers.send(first.name, signal.SIGKILL)
         await first.over.wait()
@@ -146,11 +142,9 @@ def test_a_server_that_ends_unasked_is_dead_until_it_is_replaced() -> None:
         assert world.fleet.standing(0.0).servers == 2
         assert world.fleet.dead == {}
 
-    play(story)
 
-
-def test_a_living_broken_server_leaves_the_targets_before_it_is_killed() -> None:
-    async def story(world: World) -> None:
+async def test_a_living_broken_server_leaves_the_targets_before_it_is_killed() -> None:
+    async with a_fleet() as world:
         first, _ = await world.up(2)
         world.fleet.launch_replacement(first.name, "it failed its health checks")
         assert world.servers.signals == [("server-1", signal.SIGKILL)]
@@ -160,11 +154,11 @@ def test_a_living_broken_server_leaves_the_targets_before_it_is_killed() -> None
         await first.over.wait()
         assert world.fleet.standing(0.0).replacing == 0
 
-    assert play(story).fleet.dead == {}
+    assert world.fleet.dead == {}
 
 
-def test_who_leaves_in_order_is_replaced_but_not_killed() -> None:
-    async def story(world: World) -> None:
+async def test_who_leaves_in_order_is_replaced_but_not_killed() -> None:
+    async with a_fleet() as world:
         first, _ = await world.up(2)
         world.fleet.note_own_drain(first)
         world.fleet.note_own_drain(first)
@@ -173,11 +167,9 @@ def test_who_leaves_in_order_is_replaced_but_not_killed() -> None:
         assert world.servers.signals == []
         assert [each["event"] for each in world.events].count("drain-start") == 1
 
-    play(story)
 
-
-def test_the_one_with_the_fewest_robots_is_drained_and_the_last_one_never() -> None:
-    async def story(world: World) -> None:
+async def test_the_one_with_the_fewest_robots_is_drained_and_the_last_one_never() -> None:
+    async with a_fleet() as world:
         for member, robots in zip(await world.up(3), (5, 2, 9), strict=True):
             member.robots = robots
         assert world.fleet.shrink("idle") == "server-2"
@@ -185,34 +177,28 @@ def test_the_one_with_the_fewest_robots_is_drained_and_the_last_one_never() -> N
         assert world.fleet.shrink("idle") == "server-1"
         assert world.fleet.shrink("idle") is None
 
-    play(story)
 
-
-def test_a_start_that_fails_is_a_young_death_and_an_event() -> None:
-    async def story(world: World) -> None:
+async def test_a_start_that_fails_is_a_young_death_and_an_event() -> None:
+    async with a_fleet() as world:
         world.servers.broken.add("server-1")
         world.fleet.grow(1, "asked")
         while not world.fleet.dead:
             await asyncio.sleep(0)
 
-    world = play(story)
-
     assert world.fleet.dead == {"server-1": True}
     assert world.told("server-1") == ["server-launched", "server-gone", "server-failed"]
 
 
-def test_a_wait_for_a_server_that_ends_does_not_last() -> None:
-    async def story(world: World) -> None:
+async def test_a_wait_for_a_server_that_ends_does_not_last() -> None:
+    async with a_fleet() as world:
         world.servers.broken.add("server-1")
         (name,) = world.fleet.grow(1, "asked")
         with pytest.raises(ConfigurationError, match="server-1 did not become healthy"):
             await world.fleet.wait_until_healthy([world.fleet.members[name]], SOON_S)
 
-    play(story)
 
-
-def test_targets_stay_until_every_adopted_server_is_known_again() -> None:
-    async def story(world: World) -> None:
+async def test_targets_stay_until_every_adopted_server_is_known_again() -> None:
+    async with a_fleet() as world:
         members = []
         for name in ("server-4", "server-7"):
             world.servers.launch(name)
@@ -226,10 +212,8 @@ def test_targets_stay_until_every_adopted_server_is_known_again() -> None:
         assert world.balancer.targets[0] == ["server-4", "server-7"]
         assert world.fleet.launch().name == "server-8", "no name is used twice"
 
-    play(story)
 
-
-def test_the_end_comes_although_a_cancellation_gets_lost() -> None:
+async def test_the_end_comes_although_a_cancellation_gets_lost() -> None:
     heard: list[str] = []
 
     async def deaf() -> None:
@@ -242,10 +226,8 @@ def test_the_end_comes_although_a_cancellation_gets_lost() -> None:
         finally:
             heard.append("over")
 
-    async def story(world: World) -> None:
+    async with a_fleet() as world:
         world.fleet.keep(deaf())
         await asyncio.sleep(0)
         await world.fleet.close()
         assert heard == ["lost", "over"]
-
-    play(story)
