@@ -46,34 +46,28 @@ async def test_the_result_and_the_error_of_the_work_are_those_of_the_call(thread
         await threads.run(ROBOT, divmod, 7, 0)
 
 
-def test_a_robot_and_a_tenant_never_have_all_threads(threads: FairThreads) -> None:
+async def test_a_robot_and_a_tenant_never_have_all_threads(threads: FairThreads) -> None:
     gate = Gate()
 
-    async def flood() -> None:
-        robots = [RobotId("acme", f"robot-{number % 12}") for number in range(96)]
-        flood = [asyncio.ensure_future(threads.run(robot, gate.work)) for robot in robots]
-        one = [asyncio.ensure_future(threads.run(OTHER, gate.work)) for _ in range(8)]
-        await gate.wait_entered(7)
-        assert not gate.entered.acquire(blocking=False), "of eight, six for the tenant, one for the other"
-        gate.open.set()
-        assert await asyncio.wait_for(asyncio.gather(*flood, *one), TIMEOUT_S) == ["done"] * 104
-
-    asyncio.run(flood())
+    robots = [RobotId("acme", f"robot-{number % 12}") for number in range(96)]
+    flood = [asyncio.ensure_future(threads.run(robot, gate.work)) for robot in robots]
+    one = [asyncio.ensure_future(threads.run(OTHER, gate.work)) for _ in range(8)]
+    await gate.wait_entered(7)
+    assert not gate.entered.acquire(blocking=False), "of eight, six for the tenant, one for the other"
+    gate.open.set()
+    assert await asyncio.wait_for(asyncio.gather(*flood, *one), TIMEOUT_S) == ["done"] * 104
 
 
-def test_a_tenant_never_has_all_of_a_few_threads() -> None:
+async def test_a_tenant_never_has_all_of_a_few_threads() -> None:
     gate, few = Gate(), FairThreads(3)
 
-    async def flood() -> None:
-        robots = [RobotId("acme", f"robot-{number}") for number in range(6)]
-        flood = [asyncio.ensure_future(few.run(robot, gate.work)) for robot in robots]
-        await gate.wait_entered(2)
-        assert await asyncio.wait_for(few.run(OTHER, int, "5"), TIMEOUT_S) == 5
-        assert not gate.entered.acquire(blocking=False)
-        gate.open.set()
-        await asyncio.wait_for(asyncio.gather(*flood), TIMEOUT_S)
-
-    asyncio.run(flood())
+    robots = [RobotId("acme", f"robot-{number}") for number in range(6)]
+    flood = [asyncio.ensure_future(few.run(robot, gate.work)) for robot in robots]
+    await gate.wait_entered(2)
+    assert await asyncio.wait_for(few.run(OTHER, int, "5"), TIMEOUT_S) == 5
+    assert not gate.entered.acquire(blocking=False)
+    gate.open.set()
+    await asyncio.wait_for(asyncio.gather(*flood), TIMEOUT_S)
     few.close()
 
 

@@ -19,6 +19,16 @@ def test_the_tenant_that_holds_most_owes_a_place_if_it_keeps_no_fewer_than_who_a
     assert shares.donors("a", {"a": 8}) == []
 
 
+def test_who_holds_most_gives_up_places_as_their_work_ends_while_another_claims_one():
+    shares = FairShare(4)
+    assert not shares.gives("a", {"a": 4}, 0.0)
+    shares.claim("b", 0.0)
+
+    assert shares.gives("a", {"a": 4}, 0.0)
+    assert not shares.gives("a", {"a": 3}, 0.0), "one is free already"
+    assert not shares.gives("a", {"a": 4}, CLAIM_S), "a claim ends"
+
+
 def test_a_place_that_became_free_is_kept_for_who_claimed_it():
     shares = FairShare(4)
     shares.claim("b", 0.0)
