@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 from pathlib import Path
 from random import Random
 from typing import Any
@@ -28,21 +29,15 @@ def token(robot: str = "robot-1") -> str:
     return KEY.issue(robot, now=time.time(), token_id="t", settings=SETTINGS.auth)
 
 
-def with_front(
-    folder: Path, test: Callable[[LocalFront], Awaitable[None]], *, most: int = 4, **burst: int
-) -> None:
+@asynccontextmanager
+async def a_front(folder: Path, *, most: int = 4, **burst: int) -> AsyncIterator[LocalFront]:
     (folder / "keys.json").write_text(KEY.key_set().to_json(), encoding="utf-8")
-
-    async def run() -> None:
-        settings = SETTINGS.replace(burst=burst)
-        front = LocalFront(answering_of(settings, folder), most=most)
-        await front.start()
-        try:
-            await test(front)
-        finally:
-            await front.stop()
-
-    asyncio.run(asyncio.wait_for(run(), 30))
+    front = LocalFront(answering_of(SETTINGS.replace(burst=burst), folder), most=most)
+    await front.start()
+    try:
+        yield front
+    finally:
+        await front.stop()
 
 
 async def said(front: LocalFront, request: bytes) -> int:
@@ -69,27 +64,20 @@ async def said(front: LocalFront, request: bytes) -> int:
         ("POST /burst HTTP/1.1", "content-length: x\r\n", 413),
     ],
 )
-def test_a_wrong_request_gets_the_status_that_aws_would_give(
+async def test_a_wrong_request_gets_the_status_that_aws_would_give(
     tmp_path: Path, request_line: str, headers: str, status: int
 ) -> None:
-    async def test(front: LocalFront) -> None:
+    async with a_front(tmp_path) as front:
         told = headers.format(token=f"Bearer {token()}")
         assert await said(front, f"{request_line}\r\nhost: x\r\n{told}\r\n".encode()) == status
 
-    with_front(tmp_path, test)
 
-
-def test_more_than_the_reserved_executions_are_refused(tmp_path: Path) -> None:
-    async def test(front: LocalFront) -> None:
+async def test_more_than_the_reserved_executions_are_refused(tmp_path: Path) -> None:
+    async with a_front(tmp_path, most=1) as front:
+        front._most = 0
         right = f"POST /burst HTTP/1.1\r\nhost: x\r\nauthorization: Bearer {token()}\r\n\r\n".encode()
         assert await said(front, right) == 502
         assert (front.answered, front.refused) == (0, 1)
-
-    def none_left(front: LocalFront) -> Awaitable[None]:
-        front._most = 0
-        return test(front)
-
-    with_front(tmp_path, none_left, most=1)
 
 
 def robots_of(front: LocalFront, platform: FakePlatform, budget: int) -> client_sdk.Robot:
@@ -103,10 +91,10 @@ def robots_of(front: LocalFront, platform: FakePlatform, budget: int) -> client_
 
 
 @pytest.mark.parametrize("codec", ["zlib", "json", "bin"])
-def test_a_robot_gets_the_pose_of_the_function(tmp_path: Path, codec: str) -> None:
+async def test_a_robot_gets_the_pose_of_the_function(tmp_path: Path, codec: str) -> None:
     problem = make_problem(seed=4)
 
-    async def test(front: LocalFront) -> None:
+    async with a_front(tmp_path) as front:
         async with FakePlatform() as platform:
             platform.refusals = [(503, None)] * 1000
             robot = client_sdk.connect(
@@ -119,13 +107,11 @@ def test_a_robot_gets_the_pose_of_the_function(tmp_path: Path, codec: str) -> No
         assert (answer.source, answer.server, front.executions) == ("burst", "lambda", 1)
         np.testing.assert_allclose(answer.solution.T_camera_world, problem.T_camera_world, atol=0.05)
 
-    with_front(tmp_path, test)
 
-
-def test_a_robot_that_ignores_its_own_budget_is_stopped_by_the_function(tmp_path: Path) -> None:
+async def test_a_robot_that_ignores_its_own_budget_is_stopped_by_the_function(tmp_path: Path) -> None:
     problem = make_problem(seed=4)
 
-    async def test(front: LocalFront) -> None:
+    async with a_front(tmp_path, robot_commands_per_day=4) as front:
         async with FakePlatform() as platform, robots_of(front, platform, budget=10**6) as robot:
             sources = [
                 (
@@ -137,8 +123,6 @@ def test_a_robot_that_ignores_its_own_budget_is_stopped_by_the_function(tmp_path
             ]
         assert sources == ["burst"] * 4 + ["robot"] * 2
         assert front.answered == 5, "the first refusal closes the breaker until tomorrow"
-
-    with_front(tmp_path, test, robot_commands_per_day=4)
 
 
 def test_it_does_not_start_without_a_platform(
