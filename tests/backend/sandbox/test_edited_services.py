@@ -9,7 +9,8 @@ import shutil
 import subprocess
 import tempfile
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
 
@@ -92,8 +93,9 @@ def install_in(language: str, tmp_path: Path) -> list[InstalledService]:
     return installed_services(tmp_path / "services")
 
 
-def serve(services: list[InstalledService], use: Callable[[Ask], Awaitable[None]]) -> list[str]:
-    """Start the sandboxes of *services*, run *use*, and return what was logged."""
+@asynccontextmanager
+async def served(services: list[InstalledService]) -> AsyncIterator[tuple[Ask, list[str]]]:
+    """Start the sandboxes of *services*; yield how to ask them, and what is logged."""
     lines: list[str] = []
 
     class Lines:
@@ -102,39 +104,35 @@ def serve(services: list[InstalledService], use: Callable[[Ask], Awaitable[None]
 
         warning = error = info
 
-    async def run() -> None:
-        answers: dict[int, asyncio.Future[Result | Failure]] = {}
-        loop = asyncio.get_running_loop()
-        sandboxes = SandboxManager(
-            services,
-            settings=PlatformSettings.from_dict({"services": {"accept_weak_isolation": True}}),
-            max_sandboxes=4,
-            store=MemoryStore(),
-            host=SandboxHost(
-                server_id="test",
-                loop=loop,
-                monotonic=time.monotonic,
-                log=Lines(),
-                answer=lambda queued, answer: answers[queued.command.id].set_result(answer),
-            ),
-        )
+    answers: dict[int, asyncio.Future[Result | Failure]] = {}
+    loop = asyncio.get_running_loop()
+    sandboxes = SandboxManager(
+        services,
+        settings=PlatformSettings.from_dict({"services": {"accept_weak_isolation": True}}),
+        max_sandboxes=4,
+        store=MemoryStore(),
+        host=SandboxHost(
+            server_id="test",
+            loop=loop,
+            monotonic=time.monotonic,
+            log=Lines(),
+            answer=lambda queued, answer: answers[queued.command.id].set_result(answer),
+        ),
+    )
 
-        async def ask(robot: str) -> Result | Failure:
-            name, number = RobotId("fleet", robot), len(answers)
-            sandboxes.add_connection(name)
-            answers[number] = loop.create_future()
-            now = time.monotonic()
-            command = Command(id=number, service=services[0].name, payload={}, keep=True)
-            sandboxes.submit(QueuedCommand(None, name, command, 0, now, now + 20))
-            return await asyncio.wait_for(answers[number], 20)
+    async def ask(robot: str) -> Result | Failure:
+        name, number = RobotId("fleet", robot), len(answers)
+        sandboxes.add_connection(name)
+        answers[number] = loop.create_future()
+        now = time.monotonic()
+        command = Command(id=number, service=services[0].name, payload={}, keep=True)
+        sandboxes.submit(QueuedCommand(None, name, command, 0, now, now + 20))
+        return await asyncio.wait_for(answers[number], 20)
 
-        try:
-            await use(ask)
-        finally:
-            sandboxes.close()
-
-    asyncio.run(run())
-    return lines
+    try:
+        yield ask, lines
+    finally:
+        sandboxes.close()
 
 
 def number_of(answer: Result | Failure) -> float:
@@ -153,7 +151,7 @@ EDITS = [
 
 
 @pytest.mark.parametrize(("language", "path", "content"), EDITS)
-def test_a_service_that_is_edited_under_a_running_server_is_refused_in_the_next_sandbox(
+async def test_a_service_that_is_edited_under_a_running_server_is_refused_in_the_next_sandbox(
     tmp_path: Path, language: str, path: str, content: bytes | None
 ) -> None:
     services = install_in(language, tmp_path)
@@ -164,7 +162,7 @@ def test_a_service_that_is_edited_under_a_running_server_is_refused_in_the_next_
         else content
     )
 
-    async def use(ask: Ask) -> None:
+    async with served(services) as (ask, lines):
         assert number_of(await ask("before")) == 1
         file.chmod(0o644)
         file.write_bytes(edited)
@@ -173,28 +171,26 @@ def test_a_service_that_is_edited_under_a_running_server_is_refused_in_the_next_
         assert (answer.code, "cannot be loaded" in answer.message) == ("internal", True)
         assert number_of(await ask("before")) == 1
 
-    lines = serve(services, use)
-
     assert any("changed after it was installed" in line or "were changed" in line for line in lines), lines
     assert any("service install" in line for line in lines)
 
 
-def test_a_service_that_is_edited_before_a_sandbox_loads_it_is_not_loaded_from_there(tmp_path: Path) -> None:
+async def test_a_service_that_is_edited_before_a_sandbox_loads_it_is_not_loaded_from_there(
+    tmp_path: Path,
+) -> None:
     services = install_in("python", tmp_path)
     other = install(write(tmp_path / "author", "lua"), tmp_path / "services")
+    services.append(other)
 
-    async def use(ask: Ask) -> None:
+    async with served(services) as (ask, _):
         assert number_of(await ask("robot")) == 1
         services.reverse()
         (other.folder / "service.lua").write_text(LUA.replace("1", "2"))
         assert number_of(await ask("robot")) == 1  # the same sandbox loads it now, from the copy
 
-    services.append(other)
-    serve(services, use)
-
 
 @pytest.mark.parametrize("moment", ["before the zygote", "compiled"])
-def test_what_was_edited_after_the_comparison_never_runs(tmp_path: Path, moment: str) -> None:
+async def test_what_was_edited_after_the_comparison_never_runs(tmp_path: Path, moment: str) -> None:
     services = install_in("python", tmp_path)
     folder = services[0].folder
     if moment == "compiled":  # Python would take it for the source's, by the time and the size
@@ -208,39 +204,33 @@ def test_what_was_edited_after_the_comparison_never_runs(tmp_path: Path, moment:
     else:
         (folder / "helper" / "number.py").write_text("NUMBER = 2\n")
 
-    async def use(ask: Ask) -> None:
+    async with served(services) as (ask, _):
         answer = await ask("robot")
         if moment == "compiled":
             assert number_of(answer) == 1
         else:
             assert isinstance(answer, Failure)
 
-    serve(services, use)
 
-
-def test_another_installation_in_its_place_waits_for_a_roll(tmp_path: Path) -> None:
+async def test_another_installation_in_its_place_waits_for_a_roll(tmp_path: Path) -> None:
     services = install_in("lua", tmp_path)
 
-    async def use(ask: Ask) -> None:
+    async with served(services) as (ask, _):
         install(write(tmp_path / "newer", "lua", 2), tmp_path / "services")
         assert number_of(await ask("new")) == 1
 
-    serve(services, use)
 
-
-def test_a_service_whose_files_were_only_touched_runs(tmp_path: Path) -> None:
+async def test_a_service_whose_files_were_only_touched_runs(tmp_path: Path) -> None:
     services = install_in("lua", tmp_path)
 
-    async def use(ask: Ask) -> None:
+    async with served(services) as (ask, _):
         (services[0].folder / "service.lua").touch()
         (services[0].folder / "service.lua").chmod(0o600)
         (services[0].folder / "service.lua").chmod(0o644)
         assert number_of(await ask("new")) == 1
 
-    serve(services, use)
 
-
-def test_the_copies_are_gone_after_the_end_and_those_of_a_killed_process_after_the_next_start(
+async def test_the_copies_are_gone_after_the_end_and_those_of_a_killed_process_after_the_next_start(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "temporary").mkdir()
@@ -251,11 +241,9 @@ def test_the_copies_are_gone_after_the_end_and_those_of_a_killed_process_after_t
     abandoned.mkdir(exist_ok=True)
     services = install_in("lua", tmp_path)
 
-    async def use(ask: Ask) -> None:
+    async with served(services) as (ask, _):
         assert number_of(await ask("robot")) == 1
         assert len(list((tmp_path / "temporary").iterdir())) == 2
-
-    serve(services, use)
 
     assert list((tmp_path / "temporary").iterdir()) == [kept]
     held.remove()
