@@ -16,7 +16,7 @@ from typing import Any
 
 import pytest
 
-__all__ = ["REGION", "emulated_aws", "is_localstack", "load_services", "localstack_url"]
+__all__ = ["REGION", "NoRoom", "emulated_aws", "is_localstack", "load_services", "localstack_url"]
 
 REGION = "ap-northeast-2"
 _ENVIRONMENT = "LOCALSTACK_HOST"
@@ -97,3 +97,10 @@ def _is_locked(s3: Any, bucket: str) -> bool:
     except ClientError:
         return False
     return True
+
+
+class NoRoom:
+    """Service quotas of nothing at all; moto lacks a call of them."""
+
+    def __getattr__(self, method: str) -> Any:
+        return lambda **asked: {"Quota": {"Value": 0.0}}

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from emulated_aws import emulated_aws
+from emulated_aws import NoRoom, emulated_aws
 
 from rse_pf.aws.account import Account
 from rse_pf.aws.clients import make_client
@@ -152,13 +152,6 @@ def test_the_doctor_says_all_it_can_without_an_account(
     assert "      fix: make assets" in lines
     assert "fail  no AWS credentials" in lines
     assert lines[-1].endswith("to fix first")
-
-
-class NoRoom:
-    """Service quotas of nothing at all; moto lacks a call of them."""
-
-    def __getattr__(self, method: str) -> Any:
-        return lambda **asked: {"Quota": {"Value": 0.0}}
 
 
 def test_the_doctor_asks_the_account(

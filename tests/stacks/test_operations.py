@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from emulated_aws import NoRoom
 
 from rse_pf.aws.account import Account
 from rse_pf.aws.clients import make_client
@@ -112,13 +113,6 @@ class Formation:
             for name, kind in kinds.items()
         ]
         return {"StackResourceSummaries": rows}
-
-
-class NoRoom:
-    """Service quotas of nothing at all; moto lacks a call of them."""
-
-    def __getattr__(self, method: str) -> Any:
-        return lambda **asked: {"Quota": {"Value": 0.0}}
 
 
 @pytest.fixture

@@ -5,11 +5,8 @@ from __future__ import annotations
 from datetime import date, datetime, timezone
 from typing import Any
 
-import pytest
-
 from rse_pf.aws.account import Account, open_account
 from rse_pf.aws.money.spending import read_spending
-from rse_pf.errors import ConfigurationError
 
 NOW = datetime(2026, 11, 23, 1, 0, tzinfo=timezone.utc)
 
@@ -79,12 +76,3 @@ def test_the_answer_of_cost_explorer_is_understood(region: str) -> None:
     queue.append({"ResultsByTime": [{"Total": {}, "Estimated": True, "Groups": [row("ab12", "EC2", 7.5)]}]})
 
     assert read_spending(open_account(region), now=NOW).services == (("EC2", 7.5),)
-
-
-def test_a_refusal_is_an_error_of_one_line() -> None:
-    class Refusing(Account):
-        def find(self, service: str, method: str, **arguments: Any) -> dict[str, Any] | None:
-            raise ConfigurationError(f"AWS refuses {service} {method}: AccessDeniedException", hint="sign in")
-
-    with pytest.raises(ConfigurationError, match="AccessDenied"):
-        read_spending(Refusing("ap-northeast-2"), now=NOW)

@@ -19,15 +19,6 @@ def test_a_server_on_loopback_needs_no_authentication(host: str) -> None:
     check_authentication(PlatformSettings.from_dict({**OPEN, "serving": {"host": host}}), None, False)
 
 
-def test_a_server_that_other_machines_reach_needs_authentication() -> None:
-    settings = PlatformSettings.from_dict({**OPEN, "serving": {"host": "0.0.0.0"}})
-
-    with pytest.raises(ConfigurationError, match=r"auth\.required") as told:
-        check_authentication(settings, None, False)
-
-    assert "127.0.0.1" in told.value.hint
-
-
 def test_a_socket_is_bound_but_refuses_connections_until_it_listens() -> None:
     with bound_socket("127.0.0.1", 0) as listener:
         address = listener.getsockname()
