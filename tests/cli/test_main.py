@@ -37,6 +37,74 @@ def _alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
 
 
+@pytest.mark.parametrize(
+    ("words", "first", "hint"),
+    [
+        ("lcoal", "no verb 'lcoal'", "did you mean local?"),
+        ("xyzzy", "no verb 'xyzzy'", "known are demo, check, compare"),
+        ("--settings a.json serve", "--settings stands before the verb", "rse-pf VERB OPTIONS"),
+        ("serve --prot 1", "unknown option --prot", "did you mean --port?"),
+        ("serve --prot=1", "unknown option --prot", "did you mean --port?"),
+        ("serve --port one", "argument --port: invalid int value: 'one'", "rse-pf serve --help"),
+        ("serve --port", "argument --port: expected one argument", "rse-pf serve --help"),
+        ("serve --port 99999", "serving.port = 99999 is above 65535", "lower --port"),
+        ("serve --emulated-cores -1", "serving.emulated_cores = -1", "raise --emulated-cores"),
+        ("serve --log-level inf", "'inf' is not one of debug, info", "did you mean info?"),
+        ("serve --keys none.json", "cannot read the keys none.json: No such file", "JWKS"),
+        ("serve --keys .", "cannot read the keys .: Is a directory", "JWKS"),
+        ("serve --keys empty", "this is not a key set", "check empty"),
+        ("serve --announce none/a.json", "there is no folder", "--announce"),
+        ("serve --server-id ", "'' is no name for a server", "1 to 64"),
+        ("serve", "there are no keys", "key set file"),
+        ("serve --settings none.json", "cannot read none.json", "--settings"),
+        ("serve --settings empty", "empty is not JSON", "correct the file"),
+        ("local strat", "'strat' is not one of start, stop", "did you mean start?"),
+        ("local --xyzzy", "unknown option --xyzzy", "rse-pf local --help"),
+        ("local --name ../x", "'../x' is no name for a platform", "1 to 32"),
+        ("local --servers 0", "local.servers = 0 is below 1", "raise --servers"),
+        ("local --port -1", "local.port = -1 is below 0", "raise --port"),
+        ("local --settings open.json", "serving.host = 0.0.0.0 would open", "127.0.0.1"),
+        ("token", "arguments are required", "rse-pf token --help"),
+        ("token isue robot-1", "'isue' is not one of issue, inspect", "did you mean issue?"),
+        ("token issue robot-1", "cannot read the key", "rse-pf local"),
+        ("token issue robot-1 --key empty", "others may read the key empty", "chmod 600 empty"),
+        ("token issue robot-1 --keys empty", "--keys only checks tokens", "--key"),
+        ("token inspect a.b.c", "this is not a token", "rse-pf token issue"),
+        ("token inspect W10.W10.", "this is not a token", "rse-pf token issue"),
+        ("token inspect a.b.c --ttl 3", "are for issue only", "--keys"),
+        ("settings scalign", "no group named 'scalign'", "groups are serving"),
+        ("settings --json --markdown", "not allowed with", "rse-pf settings --help"),
+        ("map --out", "arguments are required: ACTION", "rse-pf map --help"),
+        ("map --xyzzy", "unknown option --xyzzy", "rse-pf map --help"),
+        ("check --xyzzy", "unknown option --xyzzy", "rse-pf check --help"),
+        ("doctor now", "unrecognized arguments: now", "leave it out"),
+        ("demo --rate 0", "--rate 0 is not within", "the paper's"),
+        ("demo --rate nan", "--rate nan is not within", "the paper"),
+        ("demo --robots 0", "--robots 0 is not within", "at least one robot"),
+        ("demo --robots two", "argument --robots: invalid int value", "rse-pf demo --help"),
+        ("demo --engine opencl", "'opencl' is not one of native, poselib, opencv", "did you mean opencv?"),
+        ("demo --codec xml", "'xml' is not one of zlib, json, bin", "rse-pf demo --help"),
+        ("demo --frames 0", "--frames 0 is not within", "80"),
+        ("demo --seed -1", "--seed -1 is below 0", "0 or more"),
+        ("demo --frontend wide", "'wide' is not one of standard, wide-baseline", "rse-pf demo --help"),
+        ("demo --data none", "none", "TUM"),
+        ("demo --xyzzy 3", "unknown option --xyzzy", "rse-pf demo --help"),
+    ],
+)
+def test_a_wrong_call_is_two_lines_and_exit_code_2(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, words: str, first: str, hint: str
+) -> None:
+    (tmp_path / "empty").touch(mode=0o644)
+    open_door = {"context": {"rse-pf": {"serving": {"host": "0.0.0.0"}}}}
+    (tmp_path / "open.json").write_text(json.dumps(open_door))
+
+    code, lines = complaint(capsys, *words.split(" "))
+
+    assert code == 2
+    assert first in lines[0]
+    assert hint in lines[1]
+
+
 @pytest.mark.parametrize("verb", EMPTY)
 def test_every_verb_explains_itself_with_an_example(capsys: pytest.CaptureFixture[str], verb: str) -> None:
     assert main([verb, "--help"]) == 0
