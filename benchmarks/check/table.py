@@ -22,13 +22,13 @@ from benchmarks.check.drives import CheckedDrive, recorded_drive, rendered_drive
 from benchmarks.check.faults import FAULTS, Fault
 from benchmarks.frame.registry import Bar, benchmark
 from benchmarks.frame.report import say
+from benchmarks.recorded_drives import track
 from client_sdk.check.findings import CheckReport, FaultKind
 from client_sdk.check.motion import MotionReference
 from client_sdk.check.observer import DriveObserver
 from client_sdk.frontend import Frame, FrontEndOptions
 from client_sdk.rigs.checks import fault_of_pairs, spread_pairs
 from client_sdk.tracking.tracker import Tracker
-from tests.recorded_drives import track
 
 __all__ = ["table"]
 

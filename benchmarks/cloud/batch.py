@@ -61,7 +61,7 @@ class Options:
 
 def kitchen(recordings: Path, frames: int) -> MapVersion:
     """Return the red kitchen with every frame a keyframe, at tracked poses, and its cloud."""
-    from tests.recorded_drives import cloud_of, drive, keyframe_of, red_kitchen
+    from benchmarks.recorded_drives import cloud_of, drive, keyframe_of, red_kitchen
 
     dataset = red_kitchen(recordings)
     run = drive(dataset, dataset.rows[:frames], "kitchen")

@@ -22,6 +22,7 @@ import numpy as np
 from benchmarks.frame.registry import Bar, benchmark
 from benchmarks.frame.report import say
 from benchmarks.frame.statistics import percentile, spread
+from benchmarks.recorded_drives import Run, drive, frame_poses, red_kitchen, truth_of
 from client_sdk.datasets import Dataset, open_dataset
 from client_sdk.frontend import FrontEndOptions
 from rse_pf.experiments.results.trajectory_error import ate_m
@@ -40,14 +41,13 @@ from rse_pf.live_map.outcomes import (
 )
 from rse_pf.live_map.versions import encode_stored
 from tests.live_map.generated_drives import (
+    STEP_M,
     GeneratedDrive,
     GeneratedWorld,
     circle,
     make_link,
-    meander,
     straight,
 )
-from tests.recorded_drives import Run, drive, frame_poses, red_kitchen, truth_of
 
 DENSE = FrontEndOptions(is_spread=False, keyframe_m=0.1, keyframe_deg=6.0)
 LATE_FRAMES = 2
@@ -82,6 +82,18 @@ class Played:
     def joined_at(self) -> dict[str, int]:
         """Return the own frame from which on each robot knew its place."""
         return {name: min(frames) for name, frames in self.given.items() if frames}
+
+
+def meander(length_m: float, rows: int, apart_m: float = 3.0, x: float = 0.0) -> Array:
+    """Return ``(n, 2)`` positions, a step apart, on a way to and fro that never comes back."""
+    corners: list[tuple[float, float]] = []
+    for row in range(rows):
+        ends = (x, x + length_m) if row % 2 == 0 else (x + length_m, x)
+        corners += [(ends[0], row * apart_m), (ends[1], row * apart_m)]
+    points = np.array(corners)
+    along = np.r_[0.0, np.cumsum(np.sqrt((np.diff(points, axis=0) ** 2).sum(axis=1)))]
+    at = np.arange(0.0, along[-1], STEP_M)
+    return np.column_stack([np.interp(at, along, points[:, 0]), np.interp(at, along, points[:, 1])])
 
 
 def play(runs: Mapping[str, Run], starts: Mapping[str, int]) -> Played:

@@ -31,6 +31,7 @@ from benchmarks.data.requests import Server, token_of
 from benchmarks.frame.registry import Bar, Recordings, benchmark
 from benchmarks.frame.report import say
 from benchmarks.frame.statistics import percentile
+from benchmarks.recorded_drives import truth_of
 from client_sdk.datasets import open_dataset
 from client_sdk.frontend import Frame, FrontEndOptions, extract
 from client_sdk.mapping import Trajectory
@@ -41,7 +42,6 @@ from rse_pf.images import load_opencv
 from rse_pf.maps.format import Keyframe, MapVersion, encode_map
 from rse_pf.maps.photos import Lens
 from rse_pf.slam.keyframe import most_features
-from tests.recorded_drives import truth_of
 
 ROBOT = "robot-1"
 RIGHT_M, RIGHT_DEG, QUALITY = 0.05, 2.0, 85

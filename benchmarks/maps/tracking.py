@@ -26,6 +26,7 @@ import numpy as np
 
 from benchmarks.frame.registry import Bar, Recordings, benchmark
 from benchmarks.frame.report import say
+from benchmarks.recorded_drives import RED_KITCHEN, track
 from client_sdk.datasets import Dataset, open_dataset
 from client_sdk.frontend import Frame, TrackedFrame
 from client_sdk.mapping import Trajectory
@@ -35,7 +36,6 @@ from client_sdk.simulator.world import make_world
 from client_sdk.tracking.tracker import Join, Tracker
 from rse_pf.experiments.results.trajectory_error import ate_m, motion_errors
 from rse_pf.geometry import Array, inverse
-from tests.recorded_drives import RED_KITCHEN, track
 
 _TURNING = "tum_fr1_rpy_start"
 _FIRST_FRAMES = (0, 5, 11)

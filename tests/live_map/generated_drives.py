@@ -18,7 +18,7 @@ from rse_pf.geometry import Array, Camera, exp_se3, inverse, scaled
 from rse_pf.live_map.events import KeyframeAdded, LinksMeasured, MeasuredLink, matrix_bytes, matrix_of
 from rse_pf.slam.keyframe import Keyframe, encode_keyframe, make_features, make_scaleless_features
 
-__all__ = ["GeneratedDrive", "GeneratedWorld", "circle", "make_link", "meander", "straight"]
+__all__ = ["GeneratedDrive", "GeneratedWorld", "circle", "make_link", "straight"]
 
 CAMERA = Camera(fx=525.0, fy=525.0, cx=319.5, cy=239.5, width=640, height=480)
 STEP_M = 0.1
@@ -209,18 +209,6 @@ def straight(begin_m: float, end_m: float) -> Array:
     """Return ``(n, 2)`` positions, a step apart, along x."""
     x = np.arange(begin_m, end_m, STEP_M)
     return np.column_stack([x, np.zeros(len(x))])
-
-
-def meander(length_m: float, rows: int, apart_m: float = 3.0, x: float = 0.0) -> Array:
-    """Return ``(n, 2)`` positions, a step apart, on a way to and fro that never comes back."""
-    corners: list[tuple[float, float]] = []
-    for row in range(rows):
-        ends = (x, x + length_m) if row % 2 == 0 else (x + length_m, x)
-        corners += [(ends[0], row * apart_m), (ends[1], row * apart_m)]
-    points = np.array(corners)
-    along = np.r_[0.0, np.cumsum(np.sqrt((np.diff(points, axis=0) ** 2).sum(axis=1)))]
-    at = np.arange(0.0, along[-1], STEP_M)
-    return np.column_stack([np.interp(at, along, points[:, 0]), np.interp(at, along, points[:, 1])])
 
 
 def _pose(x: float, y: float, yaw: float) -> Array:
