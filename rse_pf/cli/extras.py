@@ -112,7 +112,6 @@ EXTRAS: dict[str, Extra] = {
         },
         enables="npx cdk deploy",
     ),
-    "oracle": Extra(modules={"g2o": "g2o-python"}, enables="one test", is_for_users=False),
     "build": Extra(modules=_same("setuptools"), enables="building packages", is_for_users=False),
     "release": Extra(modules=_same("auditwheel", "twine"), enables="make release", is_for_users=False),
     "docs": Extra(

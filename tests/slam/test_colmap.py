@@ -159,23 +159,6 @@ def test_pycolmap_reads_the_model_of_a_rendered_world(tmp_path: Path) -> None:
     compare_with_pycolmap(world_map(), tmp_path)
 
 
-@pytest.mark.slow
-async def test_pycolmap_reads_the_model_of_the_kitchen(tmp_path: Path, recordings: Path) -> None:
-    pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
-    pytest.importorskip("pycolmap", reason=NO_PYCOLMAP)
-    from client_sdk.datasets import open_dataset
-    from client_sdk.mapper import Mapper
-    from rse_pf.maps.format import decode_map
-    from tests.client_sdk.live.fake_live_map import solve
-
-    frames = open_dataset(recordings / "7scenes_redkitchen").thinned(10)
-    mapper = Mapper(ask=solve, keyframes_of="robot-1")
-
-    for row in frames.rows:
-        await mapper.track(frames.read(row))
-    compare_with_pycolmap(decode_map(mapper.encoded_map()), tmp_path)
-
-
 def compare_with_pycolmap(version: MapVersion, folder: Path) -> None:
     pycolmap = pytest.importorskip("pycolmap", reason=NO_PYCOLMAP)
     for name, data in colmap_files(version).items():
