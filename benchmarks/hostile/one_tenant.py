@@ -277,7 +277,7 @@ async def _topics(robot: Robot, place: _Place) -> None:
                     place.codes["topics"] += 1
         except (WebSocketException, OSError) as error:
             place.codes[f"closed: {error}"[:60]] += 1
-        await asyncio.sleep(0.1)
+        await asyncio.sleep(0.1)  # the pause of a client before it connects again: part of the load
 
 
 async def _in_threads(place: _Place, act: Callable[[DataClient], int]) -> None:
