@@ -1,4 +1,4 @@
-"""The audit log: a hash chain of entries, its files, and the check that nobody changed them.
+"""The audit log: append-only files of JSON lines, one log for each writing process.
 
-What is recorded is decided by the caller; this package only writes, chains and verifies.
+What is recorded is decided by the caller; this package bounds, writes and reads entries.
 """

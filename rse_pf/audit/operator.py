@@ -9,7 +9,7 @@ import getpass
 import time
 from pathlib import Path
 
-from rse_pf.audit.chain import Value
+from rse_pf.audit.entry import Value
 from rse_pf.audit.log import OPERATOR, audit_folder, record_once
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import ConfigurationError

@@ -40,7 +40,7 @@ VERBS = {
     "map": "show, merge, localise in, roll back and export the maps that robots share",
     "batch": "merge maps that outgrow one process, in parts that survive a crash",
     "replay": "show why a pose was bad from a recording, and solve recorded commands again",
-    "audit": "show the audit log of robots and changes, and check that it is unchanged",
+    "audit": "show the audit log: robots that connected or were refused, and changes by operators",
     "cloud": "run the platform on AWS: up, park, resume, down, status, cost, doctor",
     "settings": "show every setting: value, default, unit, source",
     "doctor": "check what this machine needs, and say how to fix it",

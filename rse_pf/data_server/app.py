@@ -15,7 +15,7 @@ import uuid
 from collections.abc import Awaitable, Callable, Mapping
 from typing import Any
 
-from rse_pf.audit.chain import Note, RefusalLimiter
+from rse_pf.audit.entry import RefusalLimiter
 from rse_pf.audit.log import AuditLog
 from rse_pf.auth.claimed import claimed_by, source_address
 from rse_pf.auth.origins import AllowedOrigins
@@ -237,8 +237,7 @@ class DataServer:
             line |= about
             if self._audit is not None and self._refusals.take(line["reason"], self._clock()):
                 self.record_counted()
-                now, recorder = self._wall_clock(), self._audit.who
-                self._audit.add([Note(time=now, actor=recorder, action="auth.refused", detail=about)])
+                self._audit.record("auth.refused", **about)
             raise
         line["tenant"], line["robot"] = claims.robot.tenant, claims.robot.name
         if not scopes_allow(claims.scopes, scope, name):
@@ -257,8 +256,7 @@ class DataServer:
         """Record how many refusals were counted, but not recorded one by one, since the last call."""
         counted = self._refusals.summary()
         if self._audit is not None and counted:
-            now, recorder = self._wall_clock(), self._audit.who
-            self._audit.add([Note(time=now, actor=recorder, action="auth.refused-many", detail=counted)])
+            self._audit.record("auth.refused-many", **counted)
 
 
 async def _send(reply: HttpReply, request: HttpRequest, send: Send) -> int:

@@ -16,6 +16,7 @@ from typing import Any, TypeVar
 
 import msgspec
 
+from rse_pf.audit.entry import Entry
 from rse_pf.audit.log import AuditLog
 from rse_pf.auth.tokens import Claims
 from rse_pf.config import DataSettings
@@ -341,9 +342,11 @@ class Handlers:
         def record_change(action: str, name: str, record: MapRecord) -> None:
             if self._audit is not None:
                 subject = str(RobotId(claims.robot.tenant, name))
-                self._audit.record(
-                    action, subject, actor=str(claims.robot), version=record.id, number=record.number
-                )
+                entry = Entry(
+                    time=self._wall_clock(), actor=str(claims.robot), action=action, subject=subject,
+                    detail={"version": record.id, "number": record.number},
+                )  # fmt: skip
+                self._audit.add([entry])
 
         return MapRegistry(self._store, claims.robot.tenant, on_change=record_change, check=check_wanted)
 

@@ -10,9 +10,8 @@ from pathlib import Path
 import pytest
 from fake_data_service import KEY, Service, small_settings
 
-from rse_pf.audit.chain import REFUSAL_BURST, Entry
-from rse_pf.audit.log import AuditBounds, AuditLog, files_of
-from rse_pf.audit.verify import check_folder, entries_of
+from rse_pf.audit.entry import REFUSAL_BURST, Entry
+from rse_pf.audit.log import AuditLog, read_entries
 from rse_pf.data_server.app import DataServer
 from rse_pf.data_server.server import _write_line
 from rse_pf.maps.format import MapVersion, encode_map
@@ -26,9 +25,7 @@ class Recorded(Service):
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self.log = AuditLog(
-            folder, "data", wall_clock=lambda: 1e9, bounds=AuditBounds(max_bytes=1 << 20, sync_s=0.1)
-        ).open()
+        self.log = AuditLog(folder, "data", wall_clock=lambda: 1e9).open()
         super().__init__(small_settings(), MemoryStore())
 
     def restart(self) -> None:
@@ -40,8 +37,7 @@ class Recorded(Service):
     def entries(self) -> list[Entry]:
         self.app.record_counted()
         self.log.flush()
-        assert check_folder(self.folder)[0].problem == ""
-        return list(entries_of(files_of(self.folder, "data")))
+        return list(read_entries(self.folder / "data.jsonl"))
 
     def commit(self, seed: int, parent: str | None, *, robot: str, tenant: str = "default") -> str:
         data = encode_map(MapVersion(keyframes=(), provenance={"seed": seed}))

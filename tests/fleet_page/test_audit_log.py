@@ -1,4 +1,4 @@
-"""Entries of the audit log are told as they are written; what was changed is told, too."""
+"""Entries of the audit log are shown as they are written."""
 
 from __future__ import annotations
 
@@ -7,32 +7,27 @@ from typing import Any
 
 import pytest
 
-from rse_pf.audit.chain import GENESIS, HEADS, Entry, Head, Note, line_of, next_entry
+from rse_pf.audit.entry import Entry, entry_line
 from rse_pf.fleet_page.feeds.audit_log import AuditRows, audit_sentence
 from rse_pf.fleet_page.feeds.file_tail import FileTail
 
 
 class Writer:
-    """Appends entries to one chain."""
+    """Appends entries to one log."""
 
     def __init__(self, state: Path, who: str) -> None:
         self.who = who
         self.file = state / "audit" / f"{who}.jsonl"
         self.file.parent.mkdir(exist_ok=True)
-        self.head: Head = GENESIS
 
-    def add(self, action: str, subject: str = "", *, time: float = 1.0, **detail: Any) -> bytes:
-        entry = next_entry(
-            self.head, Note(time=time, actor=self.who, action=action, subject=subject, detail=detail)
-        )
-        self.head = entry.head
+    def add(self, action: str, subject: str = "", *, time: float = 1.0, **detail: Any) -> None:
+        line = entry_line(Entry(time=time, actor=self.who, action=action, subject=subject, detail=detail))
         with self.file.open("ab") as opened:
-            opened.write(line_of(entry))
-        return line_of(entry)
+            opened.write(line)
 
 
 def entry(action: str, subject: str, actor: str = "server-1", **detail: Any) -> Entry:
-    return next_entry(GENESIS, Note(time=1.0, actor=actor, action=action, subject=subject, detail=detail))
+    return Entry(time=1.0, actor=actor, action=action, subject=subject, detail=detail)
 
 
 @pytest.mark.parametrize(
@@ -65,48 +60,40 @@ def test_an_entry_is_told_in_words_with_the_tenant_and_the_user(told: Entry, sen
     assert audit_sentence("server-1", told) == sentence
 
 
-def test_entries_of_all_chains_are_told_once_in_their_order_and_heads_are_not(tmp_path: Path) -> None:
+def test_entries_of_all_logs_are_shown_once_in_their_order_without_lines_that_are_none(
+    tmp_path: Path,
+) -> None:
     server, operator = Writer(tmp_path, "server-1"), Writer(tmp_path, "operator")
     rows = AuditRows(tmp_path)
-    assert rows.new_rows(now_s=9.0) == ([], [])
+    assert rows.new_rows() == ([], [])
 
     server.add("auth.accepted", "a", time=3.0)
     operator.add("token.issued", "a", time=2.0, user="ada")
-    operator.add(HEADS, time=2.5, server=f"1:{'0' * 64}")
-    told, events = rows.new_rows(now_s=9.0)
+    with server.file.open("ab") as opened:
+        opened.write(b'{"time":1,"act\n')
+    told, events = rows.new_rows()
 
     assert [(row["kind"], row["group"], row["server"]) for row in told] == [
         ("token.issued", "audit", "operator"),
         ("auth.accepted", "audit", "server-1"),
     ]
     assert events == []
-    assert rows.new_rows(now_s=9.0) == ([], [])
+    assert rows.new_rows() == ([], [])
 
 
-def test_a_chain_that_is_set_aside_is_read_to_its_end(tmp_path: Path) -> None:
+def test_a_file_that_is_renamed_is_read_to_its_end(tmp_path: Path) -> None:
     writer, rows = Writer(tmp_path, "server-1"), AuditRows(tmp_path)
     writer.add("server.ready")
-    assert len(rows.new_rows(now_s=9.0)[0]) == 1
+    assert len(rows.new_rows()[0]) == 1
 
     writer.add("auth.accepted", "last-of-the-old")
     writer.file.rename(writer.file.with_name("server-1.000000000001.jsonl"))
     writer.add("auth.accepted", "first-of-the-new")
 
-    assert [row["text"].split()[2] for row in rows.new_rows(now_s=9.0)[0]] == [
+    assert [row["text"].split()[2] for row in rows.new_rows()[0]] == [
         "last-of-the-old",
         "first-of-the-new",
     ]
-
-
-def test_a_changed_entry_is_told_as_trouble(tmp_path: Path) -> None:
-    writer = Writer(tmp_path, "server-1")
-    line = writer.add("auth.accepted", "robot-1")
-    writer.file.write_bytes(line.replace(b"robot-1", b"robot-2"))
-
-    (row,), _ = AuditRows(tmp_path).new_rows(now_s=9.0)
-
-    assert (row["kind"], row["group"], row["time_s"]) == ("log.changed", "trouble", 9.0)
-    assert "rse-pf audit verify" in row["text"]
 
 
 def test_events_of_the_platform_are_told_from_the_log_only_if_nobody_heard_them(tmp_path: Path) -> None:
@@ -114,7 +101,7 @@ def test_events_of_the_platform_are_told_from_the_log_only_if_nobody_heard_them(
     writer.add("platform.server-launched", "server-1", time=1.0, pid=7)
     writer.add("platform.server-healthy", "server-1", time=5.0)
 
-    told, events = rows.new_rows(now_s=9.0, is_told=lambda entry: entry.time > 3.0)
+    told, events = rows.new_rows(lambda entry: entry.time > 3.0)
 
     assert told == []
     assert events == [{"event": "server-launched", "server": "server-1", "pid": 7, "time_s": 1.0}]
@@ -124,11 +111,11 @@ def test_hostile_names_are_escaped_and_a_flood_is_bounded(tmp_path: Path) -> Non
     writer, rows = Writer(tmp_path, "server-1"), AuditRows(tmp_path)
     writer.add("auth.accepted", "\x1b[2J<img src=x>\u202e")
 
-    (row,), _ = rows.new_rows(now_s=9.0)
+    (row,), _ = rows.new_rows()
     assert r"\x1b[2J<img src=x>\u202e" in row["text"]
     for _ in range(1000):
         writer.add("auth.accepted", "robot-1")
-    assert len(rows.new_rows(now_s=9.0)[0]) == 200
+    assert len(rows.new_rows()[0]) == 200
     assert rows.skipped == 800
 
 

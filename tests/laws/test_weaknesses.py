@@ -50,7 +50,7 @@ NO_SECRETS: Mapping[tuple[str, str], str] = {
         "JSON Web Token",
     ): "made up, to be looked for in the audit log",
     ("client_cpp/tests/client_test.cpp", "Hex High Entropy String"): "the SHA-256 of 'abc', of FIPS 180-4",
-    ("tests/audit/test_chain.py", "JSON Web Token"): "made up, to be looked for in the audit log",
+    ("tests/audit/test_entry.py", "JSON Web Token"): "made up, to be looked for in the audit log",
     ("tests/config/test_settings.py", "Secret Keyword"): "the name of a file",
     ("tests/test_identity.py", "Base64 High Entropy String"): "the example of RFC 8037",
     ("tests/slam/test_places.py", "Hex High Entropy String"): "the digest of a vector",

@@ -29,7 +29,6 @@ RUN_HERE = {
     "rse-pf cloud status": 0,
     "rse-pf token rotate --cloud": 0,
     "rse-pf token retire --cloud --force": 0,
-    "rse-pf audit verify --cloud": 2,
     "rse-pf audit show --cloud --only refused --out logs": 2,
     "rse-pf audit show --cloud --only crashed --out logs": 2,
     "rse-pf cloud leftovers": 1,

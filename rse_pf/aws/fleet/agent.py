@@ -217,7 +217,6 @@ def _shipper(args: argparse.Namespace, region: str, machine: Instance) -> Shippe
     return Shipper(
         args.audit, open_bucket(args.audit_bucket, region), instance=machine.instance_id,
         marks_file=args.audit.with_name(f"{args.audit.name}-shipped.json"),
-        on_broken=lambda chain, problem: _log("audit-broken", chain=chain, problem=problem[:200]),
     )  # fmt: skip
 
 

@@ -1,8 +1,8 @@
 """Record the authentication of robots: accepted and refused handshakes, renewals, and revoked connections.
 
-`AuditRecorder` collects notes in a worker; `ServerAudit` writes them in the supervisor, the only writer of
-the server's log.  A handshake never waits for the log, a flood of refusals is counted instead of written, and
-what an unverified token says is recorded as claimed.
+`AuditRecorder` collects notes in a worker; `ServerAudit` writes them in the supervisor.  A handshake never
+waits for the log, a flood of refusals is counted instead of written, and what an unverified token says is
+recorded as claimed.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
 
-from rse_pf.audit.chain import Note, RefusalLimiter, Value
+from rse_pf.audit.entry import Entry, RefusalLimiter, Value
 from rse_pf.audit.log import SYNC_S, AuditLog
 from rse_pf.auth.claimed import claimed_by
 from rse_pf.auth.tokens import Claims
@@ -132,7 +132,7 @@ class ServerAudit:
     def note(self, action: str, **detail: Value) -> None:
         """Record an action of this server."""
         if self._log is not None:
-            self._log.record(action, **detail)  # type: ignore[arg-type]
+            self._log.record(action, **detail)
 
     def message_handler(
         self, otherwise: Callable[[_W, dict[str, Any]], None]
@@ -146,7 +146,7 @@ class ServerAudit:
             if message["event"] != "audit":
                 otherwise(worker, message)
             elif self._log is not None:
-                self._log.add(Note(actor=self._log.who, **note) for note in message["notes"])
+                self._log.add(Entry(actor=self._log.who, **note) for note in message["notes"])
 
         return handle
 

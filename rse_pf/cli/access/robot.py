@@ -31,7 +31,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from rse_pf.audit.chain import Value
+from rse_pf.audit.entry import Value
 from rse_pf.audit.operator import record
 from rse_pf.auth.roster import (
     DenyList,

@@ -1,7 +1,6 @@
 """Entries of a local platform's audit log as they are written, in words.
 
-Each entry is checked by its own hash; whether none is missing is `rse-pf audit verify`'s question.  Entries
-about heads of chains are left out.  The text in entries may come from robots: it is escaped here.
+A line that is not an entry is left out.  The text in entries may come from robots: it is escaped here.
 """
 
 from __future__ import annotations
@@ -10,7 +9,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from rse_pf.audit.chain import CONTINUED, GAP, HEADS, HEADS_LOST, Chain, Entry
+from rse_pf.audit.entry import Entry, parse_entry
 from rse_pf.audit.log import OPERATOR, audit_folder
 from rse_pf.fleet_page.feeds.file_tail import FileTail
 from rse_pf.identity import RobotId
@@ -20,13 +19,12 @@ __all__ = ["PLATFORM", "AuditRows", "audit_sentence"]
 
 PLATFORM = "platform."
 """Entries of this kind are the control plane's events."""
-_BROKEN = "log.changed"
 _MAX_ROWS = 200
 _MAX_TEXT = 300
 
 
 class AuditRows:
-    """Reads what is appended to the chains of one platform, and first the end of what is there."""
+    """Reads what is appended to the logs of one platform, and first the end of what is there."""
 
     def __init__(self, folder: Path) -> None:
         """Read nothing yet; *folder* is that of the platform's state."""
@@ -35,64 +33,56 @@ class AuditRows:
         self.skipped = 0
         """Entries that came faster than they are shown."""
 
-    def new_entries(self) -> list[tuple[str, Entry | str]]:
-        """Return chain and entry of what was written since the last call, oldest first.
-
-        In place of an entry that does not match its hash stands what is wrong with it.
-        """
-        entries: list[tuple[str, Entry | str]] = []
+    def new_entries(self) -> list[tuple[str, Entry]]:
+        """Return the name of the log and the entry of what was written since the last call, oldest first."""
+        entries: list[tuple[str, Entry]] = []
         files = sorted(self._folder.glob("*.jsonl")) if self._folder.is_dir() else []
         for file in files:
-            chain = file.name.partition(".")[0]
-            entries += [(chain, Chain(None).add(line + b"\n")) for line in self._tail.new_lines(file)]
-        shown = [row for row in entries if isinstance(row[1], str) or row[1].action != HEADS]
-        shown.sort(key=lambda row: row[1].time if isinstance(row[1], Entry) else float("inf"))
-        self.skipped += max(len(shown) - _MAX_ROWS, 0)
-        return shown[-_MAX_ROWS:]
+            parsed = map(parse_entry, self._tail.new_lines(file))
+            entries += [(file.name.partition(".")[0], entry) for entry in parsed if entry is not None]
+        entries.sort(key=lambda row: row[1].time)
+        self.skipped += max(len(entries) - _MAX_ROWS, 0)
+        return entries[-_MAX_ROWS:]
 
     def new_rows(
-        self, *, now_s: float, is_told: Callable[[Entry], bool] = lambda entry: False
+        self, is_reported: Callable[[Entry], bool] = lambda entry: False
     ) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-        """Return what the Events view shows of new entries, and events of the platform to be told from them.
+        """Return what the Events view shows of new entries, and the platform's events among them.
 
         Args:
-            now_s: Unix seconds, the time of what is wrong.
-            is_told: Whether an event was told already.
+            is_reported: Whether an event was reported already; it is then left out.
         """
         rows: list[dict[str, Any]] = []
         events: list[dict[str, Any]] = []
-        for chain, entry in self.new_entries():
-            if isinstance(entry, str):
-                text = f"a line in the audit log of {chain} was changed (rse-pf audit verify says which)"
-                rows.append(_row(chain, _BROKEN, text, time_s=now_s, group="trouble"))
-            elif not entry.action.startswith(PLATFORM):
-                rows.append(_row(chain, entry.action, audit_sentence(chain, entry), time_s=entry.time))
-            elif not is_told(entry):
+        for who, entry in self.new_entries():
+            if not entry.action.startswith(PLATFORM):
+                rows.append(_row(who, entry))
+            elif not is_reported(entry):
                 kind = entry.action.removeprefix(PLATFORM)
                 events.append({"server": entry.subject, **entry.detail, "event": kind, "time_s": entry.time})
         return rows, events
 
 
-def audit_sentence(chain: str, entry: Entry) -> str:
-    """Return an *entry* of the chain *chain* as a sentence; its details if its action has none of its own."""
+def audit_sentence(who: str, entry: Entry) -> str:
+    """Return an *entry* of the log *who* as a sentence; its details if its action has none of its own."""
     values = {name: str(value) for name, value in entry.detail.items()}
     subject = str(RobotId(values["tenant"], entry.subject)) if values.get("tenant") else entry.subject
     actor = values.get("user", entry.actor) if entry.actor == OPERATOR else entry.actor
     text = _SENTENCES.get(entry.action)
     if text is not None:
         return text.format_map(
-            _Missing({**values, "subject": subject or "a robot", "actor": actor, "who": chain})
+            _Missing({**values, "subject": subject or "a robot", "actor": actor, "who": who})
         )
     details = [f"{name} {value}" for name, value in values.items() if name not in ("tenant", "user")]
-    by = [f"by {actor}"] if actor != chain else []
-    words = " ".join([chain, entry.action.replace(".", " ").replace("-", " "), subject, *by]).strip()
+    by = [f"by {actor}"] if actor != who else []
+    words = " ".join([who, entry.action.replace(".", " ").replace("-", " "), subject, *by]).strip()
     return f"{words}: {', '.join(details)}" if details else words
 
 
-def _row(chain: str, kind: str, text: str, *, time_s: float, group: str = "audit") -> dict[str, Any]:
+def _row(who: str, entry: Entry) -> dict[str, Any]:
     return {
-        "time_s": time_s, "kind": printable(kind), "text": printable(text[:_MAX_TEXT]),
-        "server": printable(chain), "group": group,
+        "time_s": entry.time, "kind": printable(entry.action),
+        "text": printable(audit_sentence(who, entry)[:_MAX_TEXT]), "server": printable(who), "group": "audit",
     }  # fmt: skip
 
 
@@ -129,7 +119,5 @@ _SENTENCES: Mapping[str, str] = {
     "token.issued": "{actor} issued the token {token} for {subject}",
     "token.revoked": "{actor} revoked the token {token} of {subject}",
     "token.revoked-all": "{actor} revoked all tokens of {subject}",
-    CONTINUED: "the audit log of {who} goes on in a new file ({reason})",
-    GAP: "entries of {who} are missing in the audit log",
-    HEADS_LOST: "{who} made the file of heads again, which was missing",
+    "log.gap": "{entries} entries of {who} are missing in the audit log",
 }

@@ -18,7 +18,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from rse_pf.audit.chain import Entry
+from rse_pf.audit.entry import Entry
 from rse_pf.auth.control_token import read_control_token
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import RsePfError
@@ -211,9 +211,7 @@ class LocalFeed:
 
     async def _follow_audit(self) -> None:
         while True:
-            rows, events = await asyncio.to_thread(
-                self._audit.new_rows, now_s=time.time(), is_told=self._was_watched
-            )
+            rows, events = await asyncio.to_thread(self._audit.new_rows, self._was_watched)
             for row in rows:
                 self._hub.append("audit", row)
             for event in events:

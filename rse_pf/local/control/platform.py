@@ -432,7 +432,6 @@ class LocalPlatform:
             await run_together(self._adopt(previous, end), self._adopt_data(previous.data_server))
         self.url = robots_url(self.settings, self.port, self.lan)
         await self._open_operator_port(token, 0 if previous is None else previous.status_port)
-        self._fleet.keep(self._audit.watch())
         self._disks.on_space = self._control.retry_replacements
         self._fleet.keep(self._disks.watch())
         self._fleet.keep(rotate_logs(self.state, _LOG_FILE_BYTES, self._fleet.members))

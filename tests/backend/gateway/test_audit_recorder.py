@@ -10,9 +10,8 @@ from fakes import FakeLoop
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rse_pf.audit.chain import RefusalLimiter
-from rse_pf.audit.log import files_of
-from rse_pf.audit.verify import check_folder, entries_of
+from rse_pf.audit.entry import RefusalLimiter
+from rse_pf.audit.log import read_entries
 from rse_pf.auth.tokens import Claims
 from rse_pf.backend.gateway.audit_recorder import AuditRecorder, ServerAudit
 from rse_pf.backend.gateway.handshake import Accepted, Rejected
@@ -162,12 +161,11 @@ def test_the_supervisor_writes_the_notes_of_workers_and_passes_other_messages_on
         hear("worker", {"event": "left", "robot": "robot-1"})
         records.note("server.over", exit_code=0)
 
-    entries = list(entries_of(files_of(tmp_path, "server-1")))
+    entries = read_entries(tmp_path / "server-1.jsonl")
     assert [(entry.actor, entry.action) for entry in entries] == [
         ("server-1", "auth.accepted"), ("server-1", "server.over"),
     ]  # fmt: skip
     assert others == [{"event": "left", "robot": "robot-1"}]
-    assert check_folder(tmp_path)[0].problem == ""
 
 
 @pytest.mark.parametrize("message", [{"event": "audit", "notes": []}])

@@ -1,14 +1,19 @@
-"""`rse-pf audit`: what it prints, and what it exits with."""
+"""`rse-pf audit show`: what it prints of logs on this machine and of those in the bucket."""
 
 from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from rse_pf.audit.log import record_once
+from rse_pf.aws.storage.audit_archive import Shipper
+from rse_pf.aws.storage.s3_store import S3Store
 from rse_pf.cli.main import main
+
+Capture = pytest.CaptureFixture[str]
 
 
 @pytest.fixture
@@ -27,60 +32,17 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path / "audit"
 
 
-def test_verify_prints_a_line_for_each_chain(folder: Path, capsys: pytest.CaptureFixture[str]):
-    assert main(["audit", "verify", str(folder)]) == 0
-
-    lines = capsys.readouterr().out.splitlines()
-    assert [line.rpartition(":")[0] for line in lines] == [
-        "operator: 1 entry good, head 1", "server-1: 2 entries good, head 2",
-    ]  # fmt: skip
-
-
-def test_verify_names_file_entry_and_what_is_wrong(folder: Path, capsys: pytest.CaptureFixture[str]):
-    path = folder / "server-1.jsonl"
-    path.write_bytes(path.read_bytes().replace(b"robot-1", b"robot-2"))
-
-    assert main(["audit", "verify", str(folder)]) == 1
-
-    assert capsys.readouterr().out.splitlines()[1] == (
-        "server-1: BROKEN in server-1.jsonl: entry 1 was changed: its hash does not match its content"
-    )
-
-
-def test_verify_of_a_torn_file_says_how_much_is_good(folder: Path, capsys: pytest.CaptureFixture[str]):
-    path = folder / "server-1.jsonl"
-    path.write_bytes(path.read_bytes()[:-10])
-
-    assert main(["audit", "verify", str(path)]) == 1
-
-    assert "ended in the middle of a line, 1 whole entries good" in capsys.readouterr().out
-
-
-def test_a_head_stored_elsewhere_detects_truncation(folder: Path, capsys: pytest.CaptureFixture[str]):
-    main(["audit", "verify", str(folder)])
-    head = capsys.readouterr().out.splitlines()[1].rpartition(" ")[2]
-    assert main(["audit", "verify", str(folder), "--head", f"server-1={head}"]) == 0
-    path = folder / "server-1.jsonl"
-    path.write_bytes(path.read_bytes().splitlines(keepends=True)[0])
-    (folder / "heads").unlink()
-    record_once(folder, "operator", "robot.enabled", wall_clock=lambda: 1e9 + 9)
-    assert main(["audit", "verify", str(folder)]) == 0, "what is in the folder was forged"
-    capsys.readouterr()
-
-    assert main(["audit", "verify", str(folder), "--head", f"server-1={head}"]) == 1
-
-    assert "entry 2 is missing: the head stored elsewhere has seen it" in capsys.readouterr().out
-
-
-def test_show_prints_all_chains_in_the_order_of_time(folder: Path, capsys: pytest.CaptureFixture[str]):
+def test_show_prints_all_logs_in_the_order_of_time(folder: Path, capsys: Capture):
     assert main(["audit", "show", str(folder)]) == 0
 
     lines = capsys.readouterr().out.splitlines()
-    assert [line.split()[2] for line in lines] == ["server-1#1", "operator#1", "server-1#2"]
-    assert lines[0].startswith("2001-09-09 01:46:40 server-1#1 auth.accepted robot-1 ")
+    assert [line.split()[2:4] for line in lines] == [
+        ["server-1", "auth.accepted"], ["operator", "robot.disabled"], ["server-1", "auth.refused"],
+    ]  # fmt: skip
+    assert lines[0].startswith("2001-09-09 01:46:40 server-1 auth.accepted robot-1 reason=")
 
 
-def test_show_cannot_be_made_to_write_control_characters(folder: Path, capsys: pytest.CaptureFixture[str]):
+def test_show_cannot_be_made_to_write_control_characters(folder: Path, capsys: Capture):
     main(["audit", "show", str(folder), "--last", "1"])
 
     out = capsys.readouterr().out
@@ -89,8 +51,57 @@ def test_show_cannot_be_made_to_write_control_characters(folder: Path, capsys: p
     assert r'reason="a reason\n\u001b[2J"' in out
 
 
-def test_show_as_json_and_by_action(folder: Path, capsys: pytest.CaptureFixture[str]):
-    assert main(["audit", "show", str(folder), "--only", "disabled", "--json"]) == 0
+def test_show_as_json_by_action_and_by_file(folder: Path, capsys: Capture):
+    files = [str(path) for path in folder.iterdir()]
+    assert main(["audit", "show", *files, "--only", "disabled", "--json"]) == 0
 
     (line,) = capsys.readouterr().out.splitlines()
-    assert (json.loads(line)["log"], json.loads(line)["subject"]) == ("operator", "robot-1")
+    assert json.loads(line) == {
+        "log": "operator", "time": 1e9 + 1, "actor": "operator", "action": "robot.disabled",
+        "subject": "robot-1", "detail": {"reason": "a reason\n\x1b[2J"},
+    }  # fmt: skip
+
+
+def test_show_prints_all_servers_of_a_cloud_and_keeps_the_files(cloud: Any, tmp_path: Path, capsys: Capture):
+    for instance, actions in (
+        ("i-1", ("auth.accepted", "auth.cut-off", "server.over")),
+        ("i-2", ("auth.x",)),
+    ):
+        shipper = Shipper(
+            tmp_path / instance, S3Store(cloud, "audit-logs"), marks_file=tmp_path / f"{instance}.json",
+            instance=lambda name=instance: name,
+        )  # fmt: skip
+        for row, action in enumerate(actions):
+            record_once(tmp_path / instance, instance, action, wall_clock=lambda at=row: 1e9 + at)
+            shipper.ship()
+
+    assert main(["audit", "show", "--cloud", "--out", "kept", "--only", "auth"]) == 0
+    shown = capsys.readouterr().out
+    assert [line.split()[2] for line in shown.splitlines()] == ["i-1", "i-2", "i-1"]
+
+    assert main(["audit", "show", "kept", "--only", "auth"]) == 0
+    assert capsys.readouterr().out == shown
+
+
+@pytest.mark.parametrize(
+    ("words", "problem"),
+    [
+        (["--cloud"], "holds no audit log yet"),
+        (["somewhere", "--cloud"], "exclude each other"),
+        (["somewhere"], "there is no somewhere"),
+        (["full"], "there is no audit log in full"),
+        (["--out", "x"], "--out is for --cloud"),
+        (["--cloud", "--out", "full"], "not empty"),
+        (["--last", "0"], "shows no entry"),
+    ],
+)
+def test_bad_input_is_one_line_and_a_hint(
+    cloud: Any, capsys: Capture, words: list[str], problem: str
+) -> None:
+    Path("full").mkdir()
+    Path("full/file").write_text("")
+
+    assert main(["audit", "show", *words]) == 2
+    error = capsys.readouterr().err
+    assert problem in error
+    assert error.count("\n  hint: ") == 1

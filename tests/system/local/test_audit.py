@@ -13,9 +13,8 @@ from typing import Any
 import pytest
 from guarded_server import GuardedServer
 
-from rse_pf.audit.chain import Entry
-from rse_pf.audit.log import audit_folder, chain_names, files_of
-from rse_pf.audit.verify import check_folder, entries_of
+from rse_pf.audit.entry import Entry
+from rse_pf.audit.log import audit_folder, log_files, log_names, read_entries
 from rse_pf.cli.main import main
 from rse_pf.config import PlatformSettings
 from rse_pf.local.control.platform import LocalPlatform
@@ -37,7 +36,7 @@ def awaited(test: Callable[..., Coroutine[Any, Any, None]]) -> Callable[..., Non
 
 
 def entries(folder: Path, who: str) -> list[Entry]:
-    return list(entries_of(files_of(folder, who)))
+    return [entry for path in log_files(folder, who) for entry in read_entries(path)]
 
 
 async def until(found: Callable[[], bool], what: Callable[[], object]) -> None:
@@ -82,7 +81,7 @@ async def test_a_server_records_accepted_and_refused_robots_and_no_token(tmp_pat
 
 
 @awaited
-async def test_the_chain_of_a_server_goes_on_over_kills(tmp_path: Path):
+async def test_the_log_of_a_server_goes_on_over_kills(tmp_path: Path):
     with GuardedServer(tmp_path) as server:
         for number in range(2):
             if number:
@@ -96,13 +95,12 @@ async def test_the_chain_of_a_server_goes_on_over_kills(tmp_path: Path):
                 lambda: entries(tmp_path / "audit", "guarded"),
             )  # fmt: skip
 
-    (verdict,) = check_folder(tmp_path / "audit")
-    assert verdict.problem == ""
-    assert verdict.entries >= 4
+    actions = [entry.action for entry in entries(tmp_path / "audit", "guarded")]
+    assert (actions.count("server.ready"), actions.count("auth.accepted")) == (2, 2)
 
 
 @awaited
-async def test_a_platform_records_its_actions_its_robots_its_operator_and_all_heads(
+async def test_a_platform_records_its_actions_its_robots_and_its_operator(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
@@ -114,35 +112,13 @@ async def test_a_platform_records_its_actions_its_robots_its_operator_and_all_he
         async with connect(cloud.url, token=cloud.issue_token("robot-1")):
             pass
         assert await asyncio.to_thread(main, ["robot", "disable", "robot-7", "--name", "audited"]) == 0
-        (server,) = [who for who in chain_names(audit) if who.startswith("server-")]
-        assert main(["audit", "verify", "--name", "audited"]) == 0
+        (server,) = [who for who in log_names(audit) if who.startswith("server-")]
 
     assert {entry.subject for entry in entries(audit, server) if entry.action == "auth.accepted"} == {
         "robot-1"
     }
-    first, last = entries(audit, "operator")
-    assert (first.action, first.subject) == ("robot.disabled", "robot-7")
-    assert (last.action, list(last.detail)) == ("log.heads", ["control-plane"])
-    told = [entry.detail for entry in entries(audit, "control-plane") if entry.action == "log.heads"]
-    assert {server, "operator"} <= {name for detail in told for name in detail}
     deeds = {entry.action for entry in entries(audit, "control-plane")}
     assert {"platform.platform-ready", "platform.server-ready", "platform.over"} <= deeds
-    assert {verdict.problem for verdict in check_folder(audit)} == {""}
-
-    for who, count, tellers in (
-        (server, 1, ("the file of heads", "entry ")),  # whoever heard of it first
-        (server, 2, ("entry ",)),
-        ("control-plane", 1, ("entry 2 of operator",)),
-        ("operator", 1, ("the file of heads",)),
-    ):
-        path = audit / f"{who}.jsonl"
-        whole = path.read_bytes()
-        path.write_bytes(b"".join(whole.splitlines(keepends=True)[:-count]))
-        capsys.readouterr()
-        assert main(["audit", "verify", "--name", "audited"]) == 1
-        (broken,) = [line for line in capsys.readouterr().out.splitlines() if "BROKEN" in line]
-        assert broken.startswith(f"{who}: BROKEN in {who}.jsonl: entry ")
-        assert any(f"is missing: {teller}" in broken for teller in tellers)
-        path.write_bytes(whole)
+    capsys.readouterr()
     assert main(["audit", "show", "--name", "audited", "--only", "robot.disabled", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["subject"] == "robot-7"
