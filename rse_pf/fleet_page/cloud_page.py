@@ -23,7 +23,6 @@ def serve_cloud_page(
     settings: PlatformSettings,
     *,
     port: int,
-    asks_costs: bool,
     ready: Callable[[str], None],
 ) -> int:
     """Serve the page of the deployment in *account* until a signal; return the exit code.
@@ -32,7 +31,6 @@ def serve_cloud_page(
         account: Of the operator.
         settings: Of the deployment.
         port: On loopback; a free one if it is taken or 0.
-        asks_costs: Whether Cost Explorer is asked, which AWS charges for.
         ready: Called with the address that has the key.
 
     Raises:
@@ -42,7 +40,7 @@ def serve_cloud_page(
     """
     first = read_overview(account, settings, now=datetime.now(timezone.utc))
     hub = Hub()
-    feed = CloudFeed(hub, account, settings, first, asks_costs=asks_costs)
+    feed = CloudFeed(hub, account, settings, first)
     return serve_page(
         hub,
         PageActions(operate=_operate, page=_page),

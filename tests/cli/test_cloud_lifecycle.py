@@ -63,7 +63,7 @@ def test_nothing_is_changed_before_somebody_agrees(
     assert "  1. prepare the account for the CDK" in page
     assert "deploy the stack Backend" in page
     assert "USD an hour" in page
-    assert "UNVERIFIED" in page
+    assert "prices.json" in page
     assert page.endswith("go on? [y/N]\n")
     assert cloud.deployed == []
 

@@ -148,14 +148,12 @@ class Refusing(Account):
         return []
 
 
-def told_by_a_feed(account: Account, *, asks_costs: bool) -> dict[str, Any]:
+def told_by_a_feed(account: Account) -> dict[str, Any]:
     hub, newest = Hub(), dict[str, Any]()
-    feed = CloudFeed(
-        hub, account, SETTINGS, overview(HEALTHY), asks_costs=asks_costs, wall_clock=lambda: NOW_S
-    )
+    feed = CloudFeed(hub, account, SETTINGS, overview(HEALTHY), wall_clock=lambda: NOW_S)
 
     async def listen() -> None:
-        wanted = {"state", "metrics"} | ({"costs"} if asks_costs else set())
+        wanted = {"state", "metrics"}
         async with contextlib.aclosing(hub.messages(frozenset(("fleet", "link")))) as messages:
             async for message in messages:
                 if message.startswith(b"data: "):
@@ -182,30 +180,22 @@ def problems_in(newest: dict[str, Any]) -> list[str]:
     found = {
         "state": not newest.get("link", {}).get("connected", True),
         "metrics": any("not understood" in each for each in fleet.get("unknown", ())),
-        "costs": bool(fleet.get("costs", {}).get("problem")),
     }
     return [name for name, is_there in found.items() if is_there]
 
 
 def test_credentials_that_expire_are_told_on_the_page_and_end_nothing() -> None:
-    told = told_by_a_feed(Refusing("ap-northeast-2"), asks_costs=True)
+    told = told_by_a_feed(Refusing("ap-northeast-2"))
 
     refused = "AWS refuses autoscaling describe_auto_scaling_groups: ExpiredToken (sign in again)"
     assert (told["link"]["connected"], told["link"]["text"]) == (False, refused)
-    assert told["fleet"]["costs"]["problem"].startswith("AWS refuses ce get_cost_and_usage: ExpiredToken")
     assert [each["name"] for each in told["fleet"]["servers"]] == ["i-1"]
-
-
-def test_costs_are_not_asked_unless_the_operator_wants_them() -> None:
-    told = told_by_a_feed(Refusing("ap-northeast-2"), asks_costs=False)
-
-    assert told["fleet"]["costs"] == {"asked": False, "problem": ""}
 
 
 def test_wrong_credentials_are_an_error_before_a_page_is_served() -> None:
     with pytest.raises(ConfigurationError, match="ExpiredToken") as told:
         serve_cloud_page(
-            Refusing("ap-northeast-2"), SETTINGS, port=0, asks_costs=False,
+            Refusing("ap-northeast-2"), SETTINGS, port=0,
             ready=lambda url: pytest.fail("it was served"),
         )  # fmt: skip
     assert told.value.hint == "sign in again"

@@ -42,7 +42,7 @@ COUNTED: dict[str, Callable[[Assembly], float]] = {
         730 * len(it.one("AWS::ElasticLoadBalancingV2::LoadBalancer")["Subnets"])
     ),
     "secrets": lambda it: len(it.all("AWS::SecretsManager::Secret")),
-    "volumes, always": volume_gb,
+    "volumes": volume_gb,
 }
 """A line of the bill to what the templates have of it."""
 

@@ -38,7 +38,6 @@ RUN_HERE = {
 }
 """Each with its exit code on an account that has the Data stack and nothing else."""
 NEEDS_AN_ACCOUNT = {
-    "rse-pf cloud prices --refresh",
     "rse-pf cloud logs SERVER --lines 500",
     "rse-pf cloud logs SERVER --console",
     "aws autoscaling describe-scaling-activities --auto-scaling-group-name rse-pf --max-items 5",

@@ -28,7 +28,6 @@ ACTIONS = {
     "down": "destroy the platform, and prove that nothing is left but what is kept",
     "doctor": "check tools, packages, account, certificate and quotas before a deployment",
     "cost": "what a load costs a month, line by line, on the fleet and on the Lambda",
-    "prices": "the prices of an estimate; --refresh reads them from AWS",
     "status": "servers, their health, alarms, robots",
     "logs": "what a server logged, also one that is gone, and what a failed boot wrote",
     "canary": "give the canary a new key, and enrol it",

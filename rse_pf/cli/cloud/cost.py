@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import argparse
 import math
+from dataclasses import replace
 from datetime import date
 from pathlib import Path
 
-from rse_pf.aws.money.costs import Bill, Costs, Load
+from rse_pf.aws.money.costs import Bill, Load
 from rse_pf.aws.money.prices import Prices
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import UsageError
@@ -34,22 +35,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="commands a day that the Lambda answers beside the fleet (default: none)",
     )  # fmt: skip
     parser.add_argument(
-        "--job-hours", type=float, default=0.0, metavar="H",
-        help="hours a day of all job servers together (default: none); needs cloud.job_servers",
-    )  # fmt: skip
-    parser.add_argument(
         "--prices", type=Path, metavar="FILE", help="JSON file of prices to use in place of ours, all or some"
     )
 
 
 def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     """Print the bill and what other ways to run the platform would cost, and return 0."""
-    from rse_pf.aws.money.costs import NOT_INCLUDED, bill_of, compare
+    from rse_pf.aws.money.costs import NOT_INCLUDED, bill_of
     from rse_pf.aws.money.prices import operators_prices
 
-    load = _load(args, settings)
+    load = _load(args)
     prices = operators_prices(args.prices, Path.cwd())
-    bill, costs = bill_of(settings, prices, load), compare(settings, prices, load)
+    bill = bill_of(settings, prices, load)
     show(
         f"{counted(load.robots, 'robot')}, {load.fps:g} commands/s each, {load.hours_per_day:g} h a day: "
         f"{load.commands_per_s:g} commands/s of {prices.command_cpu_ms:g} ms; {settings.cloud.profile} "
@@ -57,17 +54,15 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
         "",
     )
     _show_bill(bill, prices)
-    _show_alternatives(bill, costs, settings, prices, load)
+    _show_alternatives(bill, settings, prices, load)
     show("", f"prices of {prices.as_of}, {prices.region}: {prices.source}; a month has 730 h")
     for line in prices.warnings(today=date.today(), region=settings.cloud.region):
         show(line)
     show(f"not included: {NOT_INCLUDED}")
-    if settings.cloud.job_servers and not load.job_hours_per_day:
-        show("without --job-hours no job server runs: each is paid while there are jobs")
     return 0
 
 
-def _load(args: argparse.Namespace, settings: PlatformSettings) -> Load:
+def _load(args: argparse.Namespace) -> Load:
     """Return the load that the options describe; raises UsageError."""
     if not 1 <= args.robots <= _MAX_ROBOTS:
         raise UsageError(
@@ -86,22 +81,12 @@ def _load(args: argparse.Namespace, settings: PlatformSettings) -> Load:
             f"--burst {args.burst:g} is not within 0..{_MAX_BURST:g}",
             hint="name commands a day, such as 5000",
         )
-    most = 24 * settings.cloud.job_servers
-    if args.job_hours > 0 == most:
-        raise UsageError(
-            f"--job-hours {args.job_hours:g}, but there are no job servers: cloud.job_servers is 0",
-            hint="leave the option out, or set cloud.job_servers in cdk.json",
-        )
-    if not 0 <= args.job_hours <= most:
-        raise UsageError(
-            f"--job-hours {args.job_hours:g} is not within 0..{most}: "
-            f"cloud.job_servers is {settings.cloud.job_servers}, and a day has 24 hours",
-            hint="name fewer hours, or set more cloud.job_servers in cdk.json",
-        )
     return Load(
-        robots=args.robots, fps=args.fps, hours_per_day=args.hours_per_day,
-        burst_commands_per_day=args.burst, job_hours_per_day=args.job_hours,
-    )  # fmt: skip
+        robots=args.robots,
+        fps=args.fps,
+        hours_per_day=args.hours_per_day,
+        burst_commands_per_day=args.burst,
+    )
 
 
 def _show_bill(bill: Bill, prices: Prices) -> None:
@@ -119,38 +104,43 @@ def _show_bill(bill: Bill, prices: Prices) -> None:
     show(f"{'total':<93}{bill.total:>11.2f}")
 
 
-def _show_alternatives(
-    bill: Bill, costs: Costs, settings: PlatformSettings, prices: Prices, load: Load
-) -> None:
-    from rse_pf.aws.money.costs import bill_of, parked, parked_at_night
+def _show_alternatives(bill: Bill, settings: PlatformSettings, prices: Prices, load: Load) -> None:
+    """Show what other ways to run the platform cost, and whether the settings allow this load."""
+    from rse_pf.aws.money.costs import (
+        DAY_H,
+        bill_of,
+        lambda_alone,
+        lambda_executions,
+        parked,
+        servers_needed,
+    )
 
-    most, executions = settings.scaling.max_servers, settings.cloud.lambda_concurrency
     spot = settings.replace(cloud={"spot": True, "warm_servers": 0})
-    rows = [
-        ("a robot for an hour", f"{bill.total / load.robot_hours:.4f}"),
-        ("without any robot", f"{costs.floor:.2f}"),
-        ("with cloud.spot", f"{bill_of(spot, prices, load).total:.2f}"),
-        ("parked all month", f"{parked(bill, deep=False).total:.2f}"),
-        ("parked all month, --deep", f"{parked(bill, deep=True).total:.2f}"),
-        ("on the Lambda alone", f"{costs.serverless:.2f}"),
-    ]
-    if load.hours_per_day < 24:
-        rows[3:3] = [
-            ("parked outside of the hours", f"{parked_at_night(bill, load, deep=False).total:.2f}"),
-            ("parked outside of the hours, --deep", f"{parked_at_night(bill, load, deep=True).total:.2f}"),
-        ]
+    without_robots = bill_of(settings, prices, replace(load, robots=0))
+    shallow, deep = (parked(without_robots, deep=deep).total for deep in (False, True))
+    at_work = bill_of(settings, prices, replace(load, hours_per_day=DAY_H)).total
+    share = load.hours_per_day / DAY_H
+    rows = {
+        "a robot for an hour": f"{bill.total / (load.robots * load.hours):.4f}",
+        "without any robot": f"{bill_of(settings, prices).total:.2f}",
+        "with cloud.spot": f"{bill_of(spot, prices, load).total:.2f}",
+        "parked outside of the hours": f"{share * at_work + (1 - share) * shallow:.2f}",
+        "parked outside of the hours, --deep": f"{share * at_work + (1 - share) * deep:.2f}",
+        "parked all month": f"{shallow:.2f}",
+        "parked all month, --deep": f"{deep:.2f}",
+        "on the Lambda alone": f"{lambda_alone(settings, prices, load):.2f}",
+    }
     show("")
-    for name, amount in rows:
+    for name, amount in rows.items():
         show(f"{name:<40}{amount:>10} {prices.currency}")
-    rate = costs.crossing_commands_per_s
+    servers, most = servers_needed(settings, prices, load), settings.scaling.max_servers
+    executions, concurrency = lambda_executions(settings, prices, load), settings.cloud.lambda_concurrency
     show(
         "",
-        f"the fleet needs {counted(costs.servers, 'server')} of at most {most}, the Lambda "
-        f"{costs.executions:.1f} executions of at most {executions}",
-        f"the fleet is cheaper from {rate:.1f} commands/s, "
-        f"{counted(math.ceil(rate / load.fps), 'such robot')}"
-        if rate is not None
-        else f"the Lambda is cheaper up to {counted(most, 'server')}",
+        f"the fleet needs {counted(servers, 'server')} of at most {most}, the Lambda alone {executions:.1f} "
+        f"executions of at most {concurrency}",
     )
-    if costs.servers > most or costs.executions > executions:
-        show("more than scaling.max_servers or cloud.lambda_concurrency allows: robots would be refused")
+    if servers > most:
+        show("the fleet needs more than scaling.max_servers: robots would be refused")
+    if executions > concurrency:
+        show("the Lambda alone needs more than cloud.lambda_concurrency: robots would be refused")

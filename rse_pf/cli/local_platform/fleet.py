@@ -3,14 +3,13 @@
 rse-pf local starts the page.  An address has a key that works once, within an hour, in one browser.
 --operate makes a key with which the page may kill, pause, drain, move and roll servers; it can also be typed
 into a page that is open.  --cloud runs the page of the deployment on AWS here, with your credentials, until
-Ctrl-C: it only reads, and opens no port there.  With --costs it also asks AWS what was spent this month, for
-which AWS charges 0.01 USD or more at the start and each six hours.
+Ctrl-C: it only reads, and opens no port there.
 
 examples:
   rse-pf fleet
   rse-pf fleet --operate
   rse-pf fleet --cloud
-  rse-pf fleet --cloud --costs --port 8702
+  rse-pf fleet --cloud --port 8702
 """
 
 from __future__ import annotations
@@ -38,11 +37,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser.add_argument("--cloud", action="store_true", help="the deployment on AWS in cloud.region")
     parser.add_argument(
-        "--costs",
-        action="store_true",
-        help="with --cloud: costs of this month (AWS charges 0.01 USD a request)",
-    )
-    parser.add_argument(
         "--port", type=int, metavar="PORT", help="with --cloud: port on loopback (default: a free one)"
     )
 
@@ -51,10 +45,8 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     """Print the address; with --cloud, serve the page until a signal."""
     if args.cloud:
         return _run_cloud(args, settings)
-    if args.costs or args.port is not None:
-        raise UsageError(
-            "--costs and --port are for --cloud", hint="the port of a local page: local.page_port"
-        )
+    if args.port is not None:
+        raise UsageError("--port is for --cloud", hint="the port of a local page: local.page_port")
     require("fleet")
     from rse_pf.cli.local_platform.page import new_address
     from rse_pf.local.state import state_folder
@@ -83,6 +75,4 @@ def _run_cloud(args: argparse.Namespace, settings: PlatformSettings) -> int:
         else:
             show(f"fleet page  {url}", "the key works once, within an hour; Ctrl-C ends the page")
 
-    return serve_cloud_page(
-        open_account(settings.cloud.region), settings, port=args.port or 0, asks_costs=args.costs, ready=ready
-    )
+    return serve_cloud_page(open_account(settings.cloud.region), settings, port=args.port or 0, ready=ready)

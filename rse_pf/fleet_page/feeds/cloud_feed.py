@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Callable, Coroutine, Mapping
+from collections.abc import Callable, Coroutine
 from dataclasses import replace
 from datetime import datetime, timezone
 from typing import Any, TypeVar
@@ -16,7 +16,6 @@ from rse_pf.aws.account import Account
 from rse_pf.aws.fleet.group import AutoScalingGroup, Server
 from rse_pf.aws.fleet.group_metrics import GroupMetrics, read_group_metrics
 from rse_pf.aws.fleet.overview import CloudOverview, ScalingActivity, read_overview
-from rse_pf.aws.money.spending import REQUEST_USD, Spending, read_spending
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import RsePfError
 from rse_pf.fleet_page.feeds.sentences import waiting_for
@@ -27,7 +26,6 @@ from rse_pf.terminal import printable
 __all__ = ["CloudFeed", "cloud_document", "new_events"]
 
 _STATE_EVERY_S = 10.0
-_COSTS_EVERY_S = 6 * 3600.0
 _TELL_EVERY_S = 3.0
 _LOOK_S = 0.25
 _MAX_TEXT = 300
@@ -53,7 +51,6 @@ class CloudFeed:
         settings: PlatformSettings,
         first: CloudOverview,
         *,
-        asks_costs: bool,
         wall_clock: Callable[[], float] = time.time,
     ) -> None:
         """Read nothing yet.
@@ -63,17 +60,14 @@ class CloudFeed:
             account: Whose deployment.
             settings: Of the platform.
             first: The state that was read before, to see whether the credentials are good.
-            asks_costs: Whether Cost Explorer is asked, which AWS charges for.
             wall_clock: Unix seconds.
         """
         self._hub = hub
         self._account = account
         self._settings = settings
-        self._asks_costs = asks_costs
         self._wall_clock = wall_clock
         self._overview = first
         self._metrics = GroupMetrics(period_s=settings.scaling.period_s)
-        self._spending: Spending | None = None
         self._problems: dict[str, str] = {}
         for event in new_events(None, first, time_s=wall_clock()):
             hub.append("event", event)
@@ -86,8 +80,6 @@ class CloudFeed:
             self._repeat(float(self._settings.scaling.period_s), self._read_metrics),
             self._publish_periodically(),
         ]
-        if self._asks_costs:
-            works.append(self._repeat(_COSTS_EVERY_S, self._read_spending))
         await run_together(*works)
 
     async def _repeat(self, every_s: float, read: Callable[[], Coroutine[Any, Any, None]]) -> None:
@@ -122,10 +114,6 @@ class CloudFeed:
             self._metrics = read
             self._hub.put("history", "minutes", _history(read))
 
-    async def _read_spending(self) -> None:
-        read = await self._read_in_thread("costs", lambda: read_spending(self._account, now=self._now()))
-        self._spending = read or self._spending
-
     async def _read_in_thread(self, subject: str, read: Callable[[], T]) -> T | None:
         """Return what *read* returns in a thread; None, and a problem under *subject*, when AWS refuses."""
         try:
@@ -140,11 +128,11 @@ class CloudFeed:
         return value
 
     def _publish(self) -> None:
-        unread = (text for subject, text in self._problems.items() if subject not in ("state", "costs"))
+        unread = (text for subject, text in self._problems.items() if subject != "state")
         overview = replace(self._overview, problems=(*self._overview.problems, *unread))
         document = cloud_document(
             overview, self._metrics, self._settings, time_s=self._wall_clock(),
-            region=self._account.region, costs=self._costs(),
+            region=self._account.region,
         )  # fmt: skip
         document["pages"] = self._hub.pages
         self._hub.put("fleet", "now", document)
@@ -154,10 +142,6 @@ class CloudFeed:
         wrong = self._problems.get("state")
         link = {"connected": wrong is None, "time_s": self._wall_clock()}
         self._hub.put("link", "control_plane", {**link, **({"text": printable(wrong)} if wrong else {})})
-
-    def _costs(self) -> dict[str, Any]:
-        wrong = self._problems.get("costs", "")
-        return {"asked": self._asks_costs, "problem": printable(wrong), **_costs(self._spending)}
 
     def _now(self) -> datetime:
         return datetime.fromtimestamp(self._wall_clock(), timezone.utc)
@@ -170,7 +154,6 @@ def cloud_document(
     *,
     time_s: float,
     region: str = "",
-    costs: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Return what the Fleet view shows of a deployment, every text escaped; what is unknown is None.
 
@@ -180,7 +163,6 @@ def cloud_document(
         settings: Of the platform.
         time_s: Unix seconds.
         region: Of the deployment.
-        costs: What is told of costs.
     """
     group, balancer, period_s = overview.group, overview.balancer, metrics.period_s
     servers = [_server(server, overview, metrics, time_s) for server in group.servers]
@@ -222,7 +204,6 @@ def cloud_document(
             for name, state in sorted(group.alarms.items())
         ],
         "unknown": [printable(text) for text in unknown],
-        "costs": dict(costs or {}),
     }
 
 
@@ -347,20 +328,6 @@ def _history(metrics: GroupMetrics) -> list[list[float | None]]:
         list(nothing),
         list(series.get("p99_ms", nothing)),
     ]
-
-
-def _costs(spending: Spending | None) -> dict[str, Any]:
-    if spending is None:
-        return {}
-    return {
-        "since": spending.begin.isoformat(),
-        "currency": printable(spending.currency),
-        "total": round(spending.total, 2),
-        "account_total": round(spending.account_total, 2),
-        "is_ours": spending.is_ours,
-        "services": [[printable(name), round(amount, 2)] for name, amount in spending.services[:8]],
-        "asked_usd": round(spending.requests * REQUEST_USD, 2),
-    }
 
 
 def _divide(value: float | None, by: float) -> float | None:

@@ -47,10 +47,8 @@ export function fleetView(root) {
   const racksNote = element("p", { class: "soft" });
   const recent = element("div", {});
   const racksPanel = element("div", { class: "panel" }, element("h2", {}, "Robots on their servers"), racks, racksNote);
-  const costs = element("div", {});
   const unknown = element("ul", { class: "soft" });
   const cloudPanels = element("div", { class: "grid wide", hidden: true },
-    element("div", { class: "panel" }, element("h2", {}, "Costs of this month"), costs),
     element("div", { class: "panel" }, element("h2", {}, "What AWS does not tell"), unknown));
   root.append(
     element("div", { class: "grid" }, ...Object.values(boxes).map((each) => each.panel)),
@@ -97,23 +95,10 @@ export function fleetView(root) {
   }
 
   function takeCloud(told) {
-    const text = JSON.stringify([told.costs, told.unknown]);
-    if (costs.dataset.told === text) return;
-    costs.dataset.told = text;
+    const text = JSON.stringify(told.unknown);
+    if (unknown.dataset.told === text) return;
+    unknown.dataset.told = text;
     unknown.replaceChildren(...told.unknown.map((each) => element("li", {}, `${each[0].toUpperCase()}${each.slice(1)}.`)));
-    costs.replaceChildren(...costsOf(told.costs));
-  }
-
-  function costsOf(told) {
-    if (!told.asked) return [element("p", { class: "soft" }, "AWS is not asked, since it charges 0.01 USD for each request: rse-pf fleet --cloud --costs asks. An estimate: rse-pf cloud cost.")];
-    if (told.problem) return [element("p", { class: "soft" }, told.problem)];
-    if (told.since === undefined) return [element("p", { class: "soft" }, "asking")];
-    const money = (amount) => `${amount.toFixed(2)} ${told.currency}`;
-    const said = told.is_ours ? `of this platform since ${told.since}; the whole account: ${money(told.account_total)}`
-      : `of the whole account since ${told.since}: no cost has the tag rse-pf yet; activate it under Billing, Cost allocation tags`;
-    return [element("div", { class: "big" }, money(told.total)), element("p", { class: "soft" }, `${said}. About a day late.`),
-      element("table", {}, element("caption", { class: "hidden" }, "Costs by service"), element("tbody", {},
-        ...told.services.map(([name, amount]) => element("tr", {}, element("th", { scope: "row" }, name), element("td", { class: "number" }, money(amount))))))];
   }
 
   function takeServers(servers) {

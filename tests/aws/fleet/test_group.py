@@ -22,7 +22,6 @@ from rse_pf.aws.fleet.group import AutoScalingGroup, Server, read_group
 from rse_pf.aws.fleet.group_metrics import read_group_metrics
 from rse_pf.aws.fleet.metrics import ServerMetrics, datums
 from rse_pf.aws.fleet.overview import read_overview
-from rse_pf.aws.money.spending import read_spending
 from rse_pf.config import PlatformSettings
 from rse_pf.config.resource_names import ResourceNames
 from rse_pf.errors import ConfigurationError
@@ -212,7 +211,6 @@ def test_the_page_of_the_cloud_needs_the_permissions_that_its_documentation_list
     account = Noting(region)
     read_overview(account, SETTINGS, now=now)
     read_group_metrics(account, SETTINGS, servers, now=now)
-    read_spending(account, now=now)
     page = (repository / "docs" / "fleet_page.md").read_text("utf-8")
     (policy,) = re.findall(r"```json\n(.*?)```", page, flags=re.S)
 
