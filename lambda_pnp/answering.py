@@ -18,7 +18,6 @@ from typing import Any
 
 from msgspec import structs
 
-from lambda_pnp.day_budget import Claim, DayBudget, claim_in_bucket
 from lambda_pnp.keys import KeyCache, read_object
 from rse_pf.auth.roster import scopes_allow
 from rse_pf.auth.tokens import verify_token
@@ -45,7 +44,7 @@ _SERVER = "lambda"
 _MAX_STALE_S = 30.0
 _MAX_HEADERS = 200
 _RIGHT = "services:pnp"
-"""Without it a token gets nothing here, and nothing is counted."""
+"""Without it a token gets nothing here, and nothing of its body is decoded."""
 _READ = ("authorization", "content-type")
 """Headers that mean something here."""
 
@@ -82,20 +81,18 @@ class LambdaAnswer:
 
 
 class Answering:
-    """Keys, settings and budget of one execution, and the service that it offers."""
+    """Keys and settings of one execution, and the service that it offers."""
 
     def __init__(
         self,
         settings: PlatformSettings,
         keys: KeyCache,
-        claim: Claim,
         *,
         log: Callable[..., None] | None = None,
     ) -> None:
         self._settings = settings
         self._log = log or _to_stderr
         self._keys = keys
-        self._budget = DayBudget(settings.burst, claim)
         self._registry = Registry()
         pnp.register(self._registry, settings.pnp)
         self._codecs: dict[str, Codec] = {
@@ -121,7 +118,6 @@ class Answering:
         try:
             if not scopes_allow(claims.scopes, _RIGHT):
                 raise _forbidden_error(_RIGHT)
-            self._budget.take(claims.robot, now_s)
             data = self._decode(body)
         except RsePfError as error:
             return self._encode(codec, failure_of(error, server=_SERVER))
@@ -252,8 +248,5 @@ def load_answering() -> Answering:
     def read(control: str = "") -> str:
         return read_object(os.environ, datetime.now(timezone.utc), control)
 
-    def claim(day: str, wanted: int, most: int) -> int:
-        return claim_in_bucket(os.environ, day, wanted, most)
-
     period_s = min(_MAX_STALE_S, settings.scaling.period_s)
-    return Answering(settings, KeyCache(read, period_s, read_control=read), claim)
+    return Answering(settings, KeyCache(read, period_s, read_control=read))

@@ -96,34 +96,26 @@ def read_object(environment: Mapping[str, str], now: datetime, control: str = ""
 
 
 def signed_request(
-    environment: Mapping[str, str],
-    now: datetime,
-    control: str = "",
-    *,
-    name: str = "",
-    body: bytes | None = None,
+    environment: Mapping[str, str], now: datetime, control: str = ""
 ) -> urllib.request.Request:
-    """Return a request with AWS Signature Version 4, from Lambda's own variables and the time in UTC.
+    """Return a GET with AWS Signature Version 4, from Lambda's own variables and the time in UTC.
 
     Args:
         environment: Of the function.
         now: UTC.
         control: Name in the folder ``control`` beside the keys; empty for the keys themselves.
-        name: Of another object of the bucket.
-        body: What a PUT writes; None is a GET.
     """
     bucket, _, keys = environment["RSE_PF_KEYS"].partition("/")
-    if not name:
-        name = f"{keys.rpartition('/')[0]}/control/{control}".lstrip("/") if control else keys
+    name = f"{keys.rpartition('/')[0]}/control/{control}".lstrip("/") if control else keys
     region = environment["AWS_REGION"]
     host, stamp = f"{bucket}.s3.{region}.amazonaws.com", now.strftime("%Y%m%dT%H%M%SZ")
-    method, digest = "GET" if body is None else "PUT", hashlib.sha256(body or b"").hexdigest()
+    digest = hashlib.sha256(b"").hexdigest()
     headers = {"host": host, "x-amz-content-sha256": digest, "x-amz-date": stamp}
     if environment.get("AWS_SESSION_TOKEN"):
         headers["x-amz-security-token"] = environment["AWS_SESSION_TOKEN"]
     names = ";".join(sorted(headers))
     lines = "".join(f"{name}:{headers[name]}\n" for name in sorted(headers))
-    request = "\n".join([method, f"/{name}", "", lines, names, digest])
+    request = "\n".join(["GET", f"/{name}", "", lines, names, digest])
     scope = f"{stamp[:8]}/{region}/s3/aws4_request"
     text = "\n".join(["AWS4-HMAC-SHA256", stamp, scope, hashlib.sha256(request.encode()).hexdigest()])
     key = f"AWS4{environment['AWS_SECRET_ACCESS_KEY']}".encode()
@@ -133,4 +125,4 @@ def signed_request(
         f"AWS4-HMAC-SHA256 Credential={environment['AWS_ACCESS_KEY_ID']}/{scope}, SignedHeaders={names}, "
         f"Signature={hmac.new(key, text.encode(), hashlib.sha256).hexdigest()}"
     )
-    return urllib.request.Request(f"https://{host}/{name}", body, headers, method=method)
+    return urllib.request.Request(f"https://{host}/{name}", headers=headers)

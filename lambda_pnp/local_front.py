@@ -16,7 +16,6 @@ import contextlib
 import re
 import signal
 import sys
-import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -182,22 +181,14 @@ async def _write(writer: asyncio.StreamWriter, status: int, headers: dict[str, s
 
 
 def answering_of(settings: PlatformSettings, folder: Path) -> Callable[[], Answering]:
-    """Return what starts executions with the keys in *folder*; they share one budget, as on AWS."""
-    granted: dict[str, int] = {}
-    lock = threading.Lock()
-
-    def claim(day: str, wanted: int, most: int) -> int:
-        with lock:
-            grant = max(0, min(wanted, most - granted.get(day, 0)))
-            granted[day] = granted.get(day, 0) + grant
-            return grant
+    """Return what starts executions with the keys in *folder*."""
 
     def make() -> Answering:
         keys = KeyCache(
             lambda: read_beside(folder), settings.scaling.period_s,
             read_control=lambda name: read_beside(folder, f"control/{name}"),
         )  # fmt: skip
-        return Answering(settings, keys, claim)
+        return Answering(settings, keys)
 
     return make
 

@@ -19,7 +19,7 @@ from constructs import Construct
 
 from rse_pf.config import PlatformSettings
 from rse_pf.config.front_door import BURST_PATH
-from rse_pf.config.resource_names import BUDGET_NAME, KEYS_NAME, ResourceNames
+from rse_pf.config.resource_names import KEYS_NAME, ResourceNames
 from rse_pf.scaling.operator_alarms import LAMBDA_TIMEOUT_S
 from stacks.assets import staged
 from stacks.backend_stack import TRUSTED
@@ -53,12 +53,8 @@ class ServerlessStack(cdk.Stack):
         cast("logs.CfnLogGroup", log.node.default_child).retention_in_days = settings.cloud.log_days
         role = iam.Role(self, "Role", assumed_by=iam.ServicePrincipal("lambda.amazonaws.com"))
         allow(
-            role, ["s3:GetObject"], [artifacts.arn_for_objects(name) for name in (*TRUSTED, BUDGET_NAME)],
-            used_by=("lambda_pnp/keys.py:read_object", "lambda_pnp/day_budget.py:_send"),
-        )  # fmt: skip
-        allow(
-            role, ["s3:PutObject"], [artifacts.arn_for_objects(BUDGET_NAME)],
-            used_by="lambda_pnp/day_budget.py:_send",
+            role, ["s3:GetObject"], [artifacts.arn_for_objects(name) for name in TRUSTED],
+            used_by="lambda_pnp/keys.py:read_object",
         )  # fmt: skip
         log.grant_write(role)
         explain(role, LOG_ACTIONS, used_by=f"{BY_AWS}Lambda writes what the function prints")

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 
 __all__ = [
     "AUDIT_PREFIX",
-    "BUDGET_NAME",
     "DENY_NAME",
     "DEPLOYMENT_TAG",
     "HEALTH_PATH",
@@ -47,8 +46,6 @@ JOURNAL_PREFIX = "journals"
 """Prefix of the journals of servers in the artifact bucket; each instance has a folder below it."""
 SERVICES_PREFIX = "services"
 """Prefix of the published services in the artifact bucket: their list and their archives."""
-BUDGET_NAME = "burst/budget.json"
-"""Name of the object in the artifact bucket that counts a day's commands of the burst function."""
 VERSION_PARAMETER = "ServersVersion"
 """Parameter of the backend stack that holds the version of the launch template that servers run."""
 AUDIT_PREFIX = "audit"

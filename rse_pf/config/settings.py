@@ -249,8 +249,7 @@ class BurstSettings:
     """Poses from a serverless function while the servers are busy, late or gone."""
 
     url: str = setting("", doc="where robots send commands by HTTP when no server answers in time: an address, or a path at their own address; empty: /burst on AWS, and elsewhere nowhere")
-    robot_commands_per_day: int = setting(10000, unit="commands", doc="commands of one robot that go there in a day; more are refused, and the robot computes them itself; 0: none go there", low=0)
-    commands_per_day: int = setting(500000, unit="commands", doc="commands of all robots that are answered there in a day; more are refused", low=1)
+    robot_commands_per_day: int = setting(10000, unit="commands", doc="commands that a robot sends there in a day; it computes more by itself; 0: none go there", low=0)
     commands_per_5_minutes: int = setting(50000, unit="commands", doc="WAF: commands of all robots in five minutes; more are refused with 429", low=100)
 
 
@@ -354,7 +353,6 @@ def _check_contradictions(s: PlatformSettings) -> None:
         ("scaling", "busy_cpu_percent", "very_busy_cpu_percent"),
         ("scaling", "idle_cpu_percent", "busy_cpu_percent"),
         ("session", "max_message_bytes", "max_inflated_bytes"),
-        ("burst", "robot_commands_per_day", "commands_per_day"),
         ("session", "reconnect_max_s", "reconnect_long_max_s"),
     ]
     for group, small, large in pairs:

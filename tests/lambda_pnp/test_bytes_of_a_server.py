@@ -100,9 +100,7 @@ async def of_a_server(server: GuardedServer, codec: str, sent: list[bytes]) -> l
 
 def of_the_function(server: GuardedServer, codec: str, data: bytes) -> bytes:
     """Return the bytes that the function answers to an event of its URL."""
-    function = Answering(
-        server.settings, KeyCache(lambda: KEY.key_set().to_json(), 60.0), lambda day, wanted, most: wanted
-    )
+    function = Answering(server.settings, KeyCache(lambda: KEY.key_set().to_json(), 60.0))
     event = {
         "version": "2.0",
         "rawPath": "/",

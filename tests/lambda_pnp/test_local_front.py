@@ -8,7 +8,6 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
 from random import Random
-from typing import Any
 
 import numpy as np
 import pytest
@@ -17,9 +16,8 @@ from fake_platform import FakePlatform
 import client_sdk
 from lambda_pnp.local_front import LocalFront, answering_of, main
 from rse_pf.auth.tokens import SigningKey
-from rse_pf.config import BurstSettings, PlatformSettings
+from rse_pf.config import PlatformSettings
 from rse_pf.pnp.problems import make_problem
-from rse_pf.wire import Failure
 
 KEY = SigningKey.from_seed(bytes(range(32)), "key-1")
 SETTINGS = PlatformSettings()
@@ -30,9 +28,9 @@ def token(robot: str = "robot-1") -> str:
 
 
 @asynccontextmanager
-async def a_front(folder: Path, *, most: int = 4, **burst: int) -> AsyncIterator[LocalFront]:
+async def a_front(folder: Path, *, most: int = 4) -> AsyncIterator[LocalFront]:
     (folder / "keys.json").write_text(KEY.key_set().to_json(), encoding="utf-8")
-    front = LocalFront(answering_of(SETTINGS.replace(burst=burst), folder), most=most)
+    front = LocalFront(answering_of(SETTINGS, folder), most=most)
     await front.start()
     try:
         yield front
@@ -80,16 +78,6 @@ async def test_more_than_the_reserved_executions_are_refused(tmp_path: Path) -> 
         assert (front.answered, front.refused) == (0, 1)
 
 
-def robots_of(front: LocalFront, platform: FakePlatform, budget: int) -> client_sdk.Robot:
-    async def busy(_: object, command: Any) -> Failure:
-        return Failure(id=command.id, code="busy", message="full", retry_after_ms=9e4)
-
-    platform.on_command = busy
-    platform.burst = BurstSettings(url=front.url, robot_commands_per_day=budget)
-    own = client_sdk.CloudFirst()
-    return client_sdk.connect(platform.url, token=token(), random=Random(1), offload=own)
-
-
 @pytest.mark.parametrize("codec", ["zlib", "json", "bin"])
 async def test_a_robot_gets_the_pose_of_the_function(tmp_path: Path, codec: str) -> None:
     problem = make_problem(seed=4)
@@ -106,23 +94,6 @@ async def test_a_robot_gets_the_pose_of_the_function(tmp_path: Path, codec: str)
                 )
         assert (answer.source, answer.server, front.executions) == ("burst", "lambda", 1)
         np.testing.assert_allclose(answer.solution.T_camera_world, problem.T_camera_world, atol=0.05)
-
-
-async def test_a_robot_that_ignores_its_own_budget_is_stopped_by_the_function(tmp_path: Path) -> None:
-    problem = make_problem(seed=4)
-
-    async with a_front(tmp_path, robot_commands_per_day=4) as front:
-        async with FakePlatform() as platform, robots_of(front, platform, budget=10**6) as robot:
-            sources = [
-                (
-                    await robot.solve_pnp(
-                        problem.points_world, problem.pixels, problem.camera, deadline_s=10.0
-                    )
-                ).source
-                for _ in range(6)
-            ]
-        assert sources == ["burst"] * 4 + ["robot"] * 2
-        assert front.answered == 5, "the first refusal closes the breaker until tomorrow"
 
 
 def test_it_does_not_start_without_a_platform(

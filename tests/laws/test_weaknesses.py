@@ -24,7 +24,6 @@ from detect_secrets.settings import transient_settings
 SOURCES = ("rse_pf", "client_sdk", "lambda_pnp", "stacks", "scripts", "app.py")
 
 HARMLESS: Mapping[tuple[str, str], str] = {
-    ("lambda_pnp/day_budget.py", "B310"): "the same bucket as that of keys.py",
     ("lambda_pnp/keys.py", "B310"): "the address of the bucket, from the stack, always https",
     ("rse_pf/aws/fleet/instance.py", "B105"): "seconds that a metadata token lives",
     ("rse_pf/aws/fleet/instance.py", "B310"): "the instance's own metadata, a literal address",

@@ -61,7 +61,7 @@ def of_function(trace: str) -> dict[str, Any]:
     request = pnp.make_request(problem.points_world, problem.pixels, problem.camera)
     body = make_codec("zlib").encode(Command(id=7, service="pnp", payload=request, trace=trace))
     answering = Answering(
-        settings, KeyCache(lambda: key.key_set().to_json(), 60.0), lambda day, wanted, most: wanted,
+        settings, KeyCache(lambda: key.key_set().to_json(), 60.0),
         log=lambda **fields: lines.append(fields),
     )  # fmt: skip
     token = key.issue("robot-1", now=time.time(), token_id="t", settings=settings.auth)
