@@ -11,14 +11,13 @@ import contextlib
 import threading
 import time
 from asyncio import AbstractEventLoop, TimerHandle
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
 import msgspec
 
-from rse_pf.backend.jobs.fair_queue import job_to_displace
 from rse_pf.backend.jobs.lease import job_key
 from rse_pf.backend.jobs.process import JobRequest
 from rse_pf.backend.jobs.queue import settings_digest_of
@@ -29,6 +28,7 @@ from rse_pf.backend.robot_store import quota_bytes
 from rse_pf.backend.scheduling.command_queue import CommandQueue, QueueReport, unmeasured_backlog
 from rse_pf.backend.scheduling.scheduler import QueueBacklog, QueuedCommand
 from rse_pf.errors import BadRequest, Busy, Cancelled, RsePfError, StoreError
+from rse_pf.fair_queue import largest_holder
 from rse_pf.identity import RobotId
 from rse_pf.service import failure_of
 from rse_pf.wire import Failure, Progress, Result
@@ -191,13 +191,15 @@ class JobManager(CommandQueue):
         here = [entry for entry in self._entries.values() if not entry.signals.giving_up]
         if len(here) < self._serving.max_running_jobs + self._serving.max_waiting_jobs:
             return True
-        known = [(entry.request.robot, entry.what == WAITING) for entry in here]
-        row = job_to_displace(known, request.robot)
-        if row is None:
+        newest = {entry.request.robot: entry for entry in here if entry.what == WAITING}
+        held = Counter(entry.request.robot for entry in here)
+        donor = largest_holder(held, request.robot, newest.__contains__)
+        if donor is None:
             return False
-        here[row].is_displaced = True
-        here[row].signals.give_up()
-        waiters, here[row].waiters = here[row].waiters, []
+        displaced = newest[donor]
+        displaced.is_displaced = True
+        displaced.signals.give_up()
+        waiters, displaced.waiters = displaced.waiters, []
         for waiter in waiters:
             self._fail(waiter.queued, _too_many_error())
         return True
