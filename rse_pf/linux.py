@@ -14,8 +14,8 @@ from pathlib import Path
 
 __all__ = [
     "PR_CAPBSET_DROP", "PR_SET_CHILD_SUBREAPER", "PR_SET_DUMPABLE", "PR_SET_NO_NEW_PRIVS", "PR_SET_SECCOMP",
-    "be_killed_first", "cpu_seconds", "die_with_parent", "limit_memory", "page_table_bytes", "prctl",
-    "proportional_bytes",
+    "be_killed_first", "cpu_seconds", "die_with_parent", "disk_free_percent", "limit_memory",
+    "page_table_bytes", "prctl", "proportional_bytes",
     "raise_descriptor_limit", "resident_bytes", "run_as_batch", "run_when_idle", "set_process_name",
 ]  # fmt: skip
 
@@ -73,6 +73,12 @@ def cpu_seconds(pid: int) -> float:
     except OSError:
         return 0.0
     return sum(int(fields[i]) for i in (11, 12, 13, 14)) / os.sysconf("SC_CLK_TCK")
+
+
+def disk_free_percent(folder: str = ".") -> float:
+    """Return the free share of the file system of *folder*; what only root may still use is not free."""
+    disk = os.statvfs(folder)
+    return 100.0 * disk.f_bavail / max(1, disk.f_blocks)
 
 
 def resident_bytes(pid: int) -> int:

@@ -22,10 +22,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO, Protocol, TypeVar, runtime_checkable
 
-from rse_pf.disk_reserve import SpareFiles, is_full
+from rse_pf.disk_reserve import DiskReserve, is_full
 from rse_pf.errors import Busy, Conflict, NotFound, StoreError, StoreFull, UsageError
 from rse_pf.files import OWNER_ONLY, TEMPORARY_PREFIX, replace_file, sync_folder
-from rse_pf.page_cache import read_cached, start_writing
 
 __all__ = [
     "MIN_CHARGE_BYTES",
@@ -348,10 +347,10 @@ class DirectoryStore:
     wrote them to ``objects/TENANT/ROBOT``, where they are found, too.
     """
 
-    def __init__(self, folder: Path, spares: SpareFiles | None = None) -> None:
-        """Describe the store; on a full disk `compare_and_swap` writes small JSON objects to *spares*."""
+    def __init__(self, folder: Path, reserve: DiskReserve | None = None) -> None:
+        """Describe the store; on a full disk `compare_and_swap` takes space from *reserve*."""
         self._folder, self._root = folder, str(folder)
-        self._spares = spares
+        self._reserve = reserve
         self._measured: dict[str, tuple[int, Usage, _Names]] = {}
 
     def get(self, name: str) -> bytes:
@@ -360,8 +359,8 @@ class DirectoryStore:
             return file.read()
 
     def get_cached(self, name: str, start: int, length: int) -> tuple[int, bytes] | None:
-        """Return size and a part of the object if its name and these bytes are in memory."""
-        return read_cached(self._paths(name)[0], start, length)
+        """Return size and a part of the object if these bytes are in memory."""
+        return _read_cached(self._paths(name)[0], start, length)
 
     def get_range(self, name: str, start: int, length: int) -> bytes:
         """Return a part of the object."""
@@ -393,7 +392,6 @@ class DirectoryStore:
                 except OSError:
                     os.ftruncate(handle, offset)
                     raise
-                start_writing(handle, offset, len(data))
 
         self._write(name, add)
 
@@ -487,17 +485,16 @@ class DirectoryStore:
         def swap(path: str) -> None:
             check()
             lock = _lock_of(path)
-            # Written before it is locked: a process that is paused hardly ever holds the lock then.
-            try:
-                with _temporary(path, [data]) as temporary, _hold_lock(lock):
-                    check()
-                    os.replace(temporary, path)
-            except OSError as error:
-                if self._spares is None or not is_full(error):
-                    raise
-                with _hold_lock(lock):
-                    check()
-                    self._spares.replace(Path(path), data)
+            while True:
+                # Written before it is locked: a process that is paused hardly ever holds the lock then.
+                try:
+                    with _temporary(path, [data]) as temporary, _hold_lock(lock):
+                        check()
+                        os.replace(temporary, path)
+                    break
+                except OSError as error:
+                    if self._reserve is None or not is_full(error) or not self._reserve.release(len(data)):
+                        raise
             sync_folder(os.path.dirname(path))
 
         self._write(name, swap)
@@ -629,6 +626,28 @@ class DirectoryStore:
 
 def _open(path: str) -> BinaryIO:
     return os.fdopen(os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC), "rb")
+
+
+def _read_cached(path: str, start: int, length: int) -> tuple[int, bytes] | None:
+    """Return the size of the file at *path*, which is no link, and at most *length* bytes from *start* on.
+
+    None if it may be absent or these bytes are not in memory, so that reading them would wait for the disk.
+    """
+    try:
+        descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC | os.O_NONBLOCK)
+    except OSError:
+        return None
+    try:
+        status = os.fstat(descriptor)
+        if not stat.S_ISREG(status.st_mode):
+            return None
+        data = bytearray(max(0, min(length, status.st_size - start)))
+        got = os.preadv(descriptor, [data], start, os.RWF_NOWAIT) if data else 0
+        return (status.st_size, bytes(data)) if got == len(data) else None
+    except OSError:  # a part is not in memory, or the file system does not know
+        return None
+    finally:
+        os.close(descriptor)
 
 
 def _lock_of(path: str) -> str:

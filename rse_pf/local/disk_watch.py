@@ -14,24 +14,25 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from rse_pf.auth.trust_store import DENY_NAME, ROBOTS_NAME, AccessControlStore
-from rse_pf.disk_reserve import SPARE_BYTES, SpareFiles, is_full
+from rse_pf.auth.trust_store import AccessControlStore
+from rse_pf.disk_reserve import DiskReserve
 from rse_pf.errors import RsePfError
+from rse_pf.files import replace_file
 from rse_pf.object_store import DirectoryStore
+from rse_pf.scaling.operator_alarms import LOW_DISK_PERCENT
 
 __all__ = [
-    "DISK_WARNING_BYTES",
     "LOOK_S", "DiskSpace", "DiskWatch", "access_control_store", "disk_level", "disk_line", "disk_spaces",
     "folders_of",
 ]  # fmt: skip
 
 Level = Literal["ok", "low", "full"]
 
+# Time between two looks at the disks; work that waits for space continues so soon after there is some.
 LOOK_S = 0.5
-"""Time between two looks; what waits for space goes on so soon after there is some."""
-DISK_WARNING_BYTES = 1 << 30
-"""Less free space than this on the disk of the state folder or of the store is reported."""
+# Below this free space a disk counts as full: a server that starts writes about as much.
 _FULL_BYTES = 1 << 20
+# A disk must gain a tenth above a threshold before it is called better, so that levels do not alternate.
 _HYSTERESIS = 1.1
 _DIRECTORY = "dir:"
 _MIB = 1 << 20
@@ -47,8 +48,9 @@ class DiskSpace:
     level: Level
 
 
-def disk_level(free_bytes: int, low_bytes: int, before: Level = "ok") -> Level:
-    """Return whether a disk is full or nearly so; it has to gain a tenth before it is called better."""
+def disk_level(free_bytes: int, total_bytes: int, before: Level = "ok") -> Level:
+    """Return whether a disk is full or nearly so; *before* is its level at the last look."""
+    low_bytes = total_bytes * LOW_DISK_PERCENT / 100
     if free_bytes < _FULL_BYTES * (_HYSTERESIS if before == "full" else 1):
         return "full"
     return "low" if free_bytes < low_bytes * (1 if before == "ok" else _HYSTERESIS) else "ok"
@@ -59,18 +61,15 @@ def folders_of(state: Path, store: str) -> list[Path]:
     return [state] + ([Path(store.removeprefix(_DIRECTORY))] if store.startswith(_DIRECTORY) else [])
 
 
-def disk_spaces(folders: Iterable[Path], low_bytes: int) -> list[DiskSpace]:
+def disk_spaces(folders: Iterable[Path]) -> list[DiskSpace]:
     """Return the file systems of *folders*, each once; a folder that is missing counts as its parent."""
     spaces: dict[int, DiskSpace] = {}
     for folder in folders:
         there = next(path for path in (folder, *folder.parents) if path.exists())
         about = os.statvfs(there)
-        free = about.f_bavail * about.f_frsize
+        free, total = about.f_bavail * about.f_frsize, about.f_blocks * about.f_frsize
         space = DiskSpace(
-            folder=str(folder),
-            free_bytes=free,
-            total_bytes=about.f_blocks * about.f_frsize,
-            level=disk_level(free, low_bytes),
+            folder=str(folder), free_bytes=free, total_bytes=total, level=disk_level(free, total)
         )
         spaces.setdefault(there.stat().st_dev, space)
     return list(spaces.values())
@@ -89,7 +88,7 @@ def disk_line(space: DiskSpace) -> str:
 
 def access_control_store(state: Path) -> AccessControlStore:
     """Return the roster and the deny list of the platform in *state*; they can be changed on a full disk."""
-    return AccessControlStore(DirectoryStore(state, _spares(state)))
+    return AccessControlStore(DirectoryStore(state, _reserve(state)))
 
 
 class DiskWatch:
@@ -109,12 +108,12 @@ class DiskWatch:
         self._folders = folders_of(state, store)
         self._emit = emit
         self._levels: dict[str, Level] = {}
-        self._reserve_problem = ""
+        self._unwritten: dict[Path, str] = {}
 
     def is_full(self) -> bool:
         """Return whether the disk of the state folder is full now."""
         with contextlib.suppress(OSError):
-            self._take(disk_spaces(self._folders, DISK_WARNING_BYTES))
+            self._take(disk_spaces(self._folders))
         return self._levels.get(str(self._state)) == "full"
 
     def prepare(self) -> None:
@@ -127,13 +126,25 @@ class DiskWatch:
         self._refill()
 
     async def watch(self) -> None:
-        """Look until cancelled; make the reserve anew whenever there is space."""
+        """Look until cancelled; once there is space, write what is left and make the reserve whole."""
         while True:
             await asyncio.sleep(LOOK_S)
             with contextlib.suppress(OSError):  # the folder was removed
-                self._take(await asyncio.to_thread(disk_spaces, self._folders, DISK_WARNING_BYTES))
+                self._take(await asyncio.to_thread(disk_spaces, self._folders))
             if self._levels.get(str(self._state)) != "full":
+                for path, text in tuple(self._unwritten.items()):
+                    self.write(path, text)
                 await asyncio.to_thread(self._refill)
+
+    def write(self, path: Path, text: str) -> None:
+        """Replace the file *path* by *text* in one step, now or as soon as the disk has space."""
+        try:
+            replace_file(path, text)
+            self._unwritten.pop(path, None)
+        except OSError as error:
+            if path not in self._unwritten:
+                self._emit("not-written", reason=f"{path.name} cannot be written yet: {error.strerror}")
+            self._unwritten[path] = text
 
     def document(self) -> list[dict[str, Any]]:
         """Return the disks as plain JSON values."""
@@ -143,7 +154,7 @@ class DiskWatch:
         self.spaces = spaces
         for space in spaces:
             before = self._levels.get(space.folder, "ok")
-            level = disk_level(space.free_bytes, DISK_WARNING_BYTES, before)
+            level = disk_level(space.free_bytes, space.total_bytes, before)
             self._levels[space.folder] = level
             if level != before:
                 free, total = space.free_bytes, space.total_bytes
@@ -155,23 +166,9 @@ class DiskWatch:
                     self.on_space()
 
     def _refill(self) -> None:
-        sizes = [2 * _size(self._state / name) for name in (DENY_NAME, ROBOTS_NAME)]
-        try:
-            _spares(self._state).refill(max(SPARE_BYTES, *sizes))
-            self._reserve_problem = ""
-        except OSError as error:
-            problem = f"no reserve for a full disk: {error.strerror}"
-            if not is_full(error) and problem != self._reserve_problem:
-                self._reserve_problem = problem
-                self._emit("not-written", reason=problem)
+        with contextlib.suppress(OSError):  # the disk is full again, or the folder was removed
+            _reserve(self._state).fill()
 
 
-def _spares(state: Path) -> SpareFiles:
-    return SpareFiles(state / "reserve")
-
-
-def _size(path: Path) -> int:
-    try:
-        return path.stat().st_size
-    except OSError:
-        return 0
+def _reserve(state: Path) -> DiskReserve:
+    return DiskReserve(state / "disk-reserve")

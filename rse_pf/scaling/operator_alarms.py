@@ -14,7 +14,9 @@ from rse_pf.scaling.alarms import NAMESPACE
 from rse_pf.scaling.profile import cadence_of
 
 __all__ = [
+    "DISK_LOW",
     "LAMBDA_TIMEOUT_S",
+    "LOW_DISK_PERCENT",
     "NATIVE_CRASHES",
     "NATIVE_OFF",
     "STORE_ERRORS",
@@ -39,6 +41,9 @@ reason have an alarm of their own."""
 NATIVE_CRASHES, NATIVE_OFF = "NativeCrashes", "NativeOff"
 """Workers of a server that native code ended in a period, and 1 while it does without the native core; an
 agent publishes neither while it is 0."""
+# What an agent publishes, as 1, while the free share of its server's disk is below the percentage.
+DISK_LOW = "DiskLow"
+LOW_DISK_PERCENT = 10.0
 
 Source = str
 """Of a series: ``group``, ``balancer``, ``targets``, ``firewall``, ``function`` or ``canary``."""
@@ -111,6 +116,9 @@ _NATIVE_CRASHES = Series(
 _NATIVE_OFF = Series(
     name="off", namespace=NAMESPACE, metric=NATIVE_OFF, statistic="Maximum", source="group"
 )  # fmt: skip
+_DISK_LOW = Series(
+    name="low", namespace=NAMESPACE, metric=DISK_LOW, statistic="Maximum", source="group"
+)  # fmt: skip
 _BLOCKED = Series(
     name="blocked", namespace="AWS/WAFV2", metric="BlockedRequests", statistic="Sum", source="firewall"
 )  # fmt: skip
@@ -174,6 +182,12 @@ def operator_alarms(settings: PlatformSettings) -> tuple[OperatorAlarm, ...]:
             expression="IF(off >= 1, 1, 0)",
             periods=1,
             datapoints=1,
+        ),
+        OperatorAlarm(
+            name="disk",
+            meaning=f"less than {LOW_DISK_PERCENT:g} % of a server's disk are free",
+            series=(_DISK_LOW,),
+            expression="IF(low >= 1, 1, 0)",
         ),
         OperatorAlarm(
             name="lambda-errors",

@@ -13,7 +13,6 @@ from fake_data_service import Answer, Service, small_settings
 from rse_pf.data_server.running_hashes import RunningHashes
 from rse_pf.errors import Busy, Conflict, NotFound
 from rse_pf.object_store import DirectoryStore, digest_of
-from rse_pf.page_cache import read_cached
 
 DATA = bytes(n % 251 for n in range(10_000))
 DIGEST = digest_of(DATA)
@@ -185,9 +184,11 @@ def test_a_file_is_read_from_memory_as_it_is_or_not_at_all(tmp_path: Path) -> No
     path.write_bytes(DATA)
     (tmp_path / "link").symlink_to(path)
     (tmp_path / "empty").touch()
+    (tmp_path / "folder").mkdir()
 
+    store = DirectoryStore(tmp_path)
     for start, length in ((0, 10_000), (0, 0), (9_000, 5000), (10_001, 5)):
-        found = read_cached(str(path), start, length)
+        found = store.get_cached("a", start, length)
         assert found in ((10_000, DATA[start : start + length]), None), "a kernel may not know"
-    assert [read_cached(str(tmp_path / name), 0, 10) for name in ("link", "missing", ".")] == [None] * 3
-    assert read_cached(str(tmp_path / "empty"), 0, 10) in ((0, b""), None)
+    assert [store.get_cached(name, 0, 10) for name in ("link", "missing", "folder")] == [None] * 3
+    assert store.get_cached("empty", 0, 10) == (0, b"")

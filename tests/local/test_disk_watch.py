@@ -2,28 +2,28 @@
 
 from __future__ import annotations
 
+import asyncio
+import time
 from collections.abc import Callable
 from pathlib import Path
-
-import pytest
 
 from rse_pf.local.disk_watch import DiskWatch, disk_level, disk_spaces, folders_of
 
 MIB = 1 << 20
 
 
-def test_a_disk_is_low_below_the_threshold_and_full_below_a_mebibyte():
-    assert [disk_level(free, 100 * MIB) for free in (200 * MIB, 99 * MIB, MIB - 1)] == ["ok", "low", "full"]
+def test_a_disk_is_low_below_a_tenth_and_full_below_a_mebibyte():
+    assert [disk_level(free, 1000 * MIB) for free in (200 * MIB, 99 * MIB, MIB - 1)] == ["ok", "low", "full"]
 
 
 def test_a_disk_at_the_threshold_does_not_change_its_level_with_every_write():
-    assert disk_level(105 * MIB, 100 * MIB, "low") == "low"
-    assert disk_level(111 * MIB, 100 * MIB, "low") == "ok"
-    assert disk_level(MIB + 1, 100 * MIB, "full") == "full"
+    assert disk_level(105 * MIB, 1000 * MIB, "low") == "low"
+    assert disk_level(111 * MIB, 1000 * MIB, "low") == "ok"
+    assert disk_level(MIB + 1, 1000 * MIB, "full") == "full"
 
 
 def test_folders_on_one_disk_are_one_disk_and_a_store_elsewhere_is_none(tmp_path: Path):
-    (space,) = disk_spaces(folders_of(tmp_path, f"dir:{tmp_path}/objects"), 0)
+    (space,) = disk_spaces(folders_of(tmp_path, f"dir:{tmp_path}/objects"))
 
     assert space.folder == str(tmp_path)
     assert 0 < space.free_bytes <= space.total_bytes
@@ -31,9 +31,8 @@ def test_folders_on_one_disk_are_one_disk_and_a_store_elsewhere_is_none(tmp_path
 
 
 def test_each_change_is_one_event_that_names_folder_and_bytes(
-    small_disk: Callable[[str], Path], fill: Callable[[Path], Path], monkeypatch: pytest.MonkeyPatch
+    small_disk: Callable[[str], Path], fill: Callable[[Path], Path]
 ):
-    monkeypatch.setattr("rse_pf.local.disk_watch.DISK_WARNING_BYTES", 4 * MIB)
     disk = small_disk("8m")
     told: list[dict[str, object]] = []
     back: list[bool] = []
@@ -54,3 +53,25 @@ def test_each_change_is_one_event_that_names_folder_and_bytes(
     assert told[0]["free_bytes"] == 0
     assert f"0 of 8 MiB are free on the disk of {disk}" in str(told[0]["reason"])
     assert back == [False]
+
+
+async def test_the_newest_text_of_a_file_is_written_once_there_is_space(
+    small_disk: Callable[[str], Path], fill: Callable[[Path], Path]
+):
+    disk = small_disk("8m")
+    path = disk / "targets.json"
+    told: list[str] = []
+    watch = DiskWatch(disk, "memory:", emit=lambda event, **more: told.append(event))
+    watch.write(path, "one")
+    hog = fill(disk)
+    watch.write(path, "two")
+    watch.write(path, "three")
+    assert (path.read_text(), told) == ("one", ["not-written"])
+    hog.unlink()
+
+    watching = asyncio.ensure_future(watch.watch())
+    ends_s = time.monotonic() + 30.0
+    while path.read_text() != "three":
+        assert time.monotonic() < ends_s
+        await asyncio.sleep(0.01)
+    watching.cancel()

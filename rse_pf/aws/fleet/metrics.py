@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from rse_pf.scaling.operator_alarms import NATIVE_CRASHES, NATIVE_OFF
+from rse_pf.scaling.operator_alarms import DISK_LOW, LOW_DISK_PERCENT, NATIVE_CRASHES, NATIVE_OFF
 
 __all__ = ["ROBOTS", "ServerMetrics", "datums", "dimensions_of", "read_cpu_times", "read_page"]
 
@@ -41,6 +41,7 @@ class ServerMetrics:
     bytes_out: float = 0.0
     worker_crashes: float = 0.0
     native_off: float = 0.0
+    disk_free_percent: float = 100.0
     answers: Mapping[float, float] = field(default_factory=dict)
 
 
@@ -69,6 +70,7 @@ def read_page(text: str) -> ServerMetrics:
         bytes_out=totals["bytes_total out"],
         worker_crashes=totals["worker_crashes"],
         native_off=totals["native_off"],
+        disk_free_percent=totals.get("disk_free_percent", 100.0),
         answers=dict(answers),
     )
 
@@ -92,7 +94,7 @@ def dimensions_of(group: str, server: str = "") -> list[dict[str, str]]:
 def datums(before: ServerMetrics, now: ServerMetrics, group: str, server: str) -> list[dict[str, Any]]:
     """Return the MetricData for PutMetricData: what instance *server* did between two samples.
 
-    Crashes of native code are left out while there are none, so that their metrics cost nothing.
+    Crashes of native code and a full disk are left out while there are none: their metrics then cost nothing.
     """
     values = {
         ROBOTS: (now.robots, "Count"),
@@ -105,6 +107,7 @@ def datums(before: ServerMetrics, now: ServerMetrics, group: str, server: str) -
     troubles = {
         NATIVE_CRASHES: _counter_growth(before.worker_crashes, now.worker_crashes),
         NATIVE_OFF: now.native_off,
+        DISK_LOW: float(now.disk_free_percent < LOW_DISK_PERCENT),
     }
     values.update({name: (value, "Count") for name, value in troubles.items() if value})
     dimensions = dimensions_of(group)

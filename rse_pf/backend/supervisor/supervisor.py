@@ -61,7 +61,7 @@ from rse_pf.control_http import (
 )
 from rse_pf.event_loop import run_in_loop
 from rse_pf.files import replace_json
-from rse_pf.linux import cpu_seconds, raise_descriptor_limit, resident_bytes
+from rse_pf.linux import cpu_seconds, disk_free_percent, raise_descriptor_limit, resident_bytes
 
 __all__ = ["serve"]
 
@@ -411,6 +411,7 @@ class _Supervisor:
                 "control_refused": float(self._control_refused),
                 "worker_crashes": float(self._crashes.count),
                 "native_off": float(self._crashes.is_native_off),
+                "disk_free_percent": disk_free_percent(),
             }
         )
         return ControlReply(body=render(merged), content_type="text/plain; version=0.0.4; charset=utf-8")

@@ -20,7 +20,7 @@ from typing import Any
 
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import ConfigurationError, MissingExtra
-from rse_pf.files import replace_json
+from rse_pf.files import replace_file, replace_json
 from rse_pf.local.balancer.envoy_config import (
     ADMIN_SOCKET,
     CLUSTER,
@@ -30,7 +30,6 @@ from rse_pf.local.balancer.envoy_config import (
     envoy_config,
 )
 from rse_pf.local.lan.listener import LanListener
-from rse_pf.local.latest_file import LatestFile
 from rse_pf.local.processes import ProcessMark, ServerProcess
 
 __all__ = ["EnvoyLoadBalancer", "TargetStats", "envoy_binary"]
@@ -66,7 +65,7 @@ class EnvoyLoadBalancer:
         folder: Path,
         port: int,
         dies_with_parent: bool = True,
-        on_problem: Callable[[str], None] = lambda problem: None,
+        write: Callable[[Path, str], None] = replace_file,
         lan: LanListener | None = None,
     ) -> None:
         """Describe one; nothing is started.
@@ -76,7 +75,7 @@ class EnvoyLoadBalancer:
             folder: Of its files and its log.
             port: Where robots connect; 0 takes a free one.
             dies_with_parent: Whether it ends with this process.
-            on_problem: Called with a sentence when the disk refuses a list of targets, which is retried.
+            write: Replaces a list of targets by a text.
             lan: Where it listens instead of loopback, with TLS; its files are there before `launch`.
         """
         self.port = 0
@@ -88,8 +87,7 @@ class EnvoyLoadBalancer:
         self._lan = lan
         self._endpoints = folder / "endpoints.json"
         self._data_endpoints = folder / "data-endpoints.json"
-        self._targets = LatestFile(self._endpoints, on_problem=on_problem)
-        self._data_targets = LatestFile(self._data_endpoints, on_problem=on_problem)
+        self._write = write
 
     def launch(self) -> None:
         """Start the process without targets, and return before it listens.
@@ -147,11 +145,11 @@ class EnvoyLoadBalancer:
 
     def set_targets(self, targets: Sequence[Target]) -> None:
         """Let new sockets go to *targets* and nowhere else; open sockets stay where they are."""
-        self._targets.write(json.dumps(endpoints(targets)))
+        self._write(self._endpoints, json.dumps(endpoints(targets)))
 
     def set_data_targets(self, targets: Sequence[Target]) -> None:
         """Let what is asked under ``/data/`` go to *targets*."""
-        self._data_targets.write(json.dumps(endpoints(targets, DATA_CLUSTER)))
+        self._write(self._data_endpoints, json.dumps(endpoints(targets, DATA_CLUSTER)))
 
     async def stats(self) -> Mapping[str, TargetStats]:
         """Return the targets that Envoy has now, by server name; empty when it does not answer."""
@@ -182,17 +180,11 @@ class EnvoyLoadBalancer:
 
     async def stop(self, timeout_s: float) -> None:
         """End the process, which cuts every socket; kill it after *timeout_s*."""
-        self._close_files()
         await self.process.stop(signal.SIGTERM, timeout_s)
 
     def kill(self) -> None:
         """End the process at once, if it is there, and reap it."""
-        self._close_files()
         self.process.kill()
-
-    def _close_files(self) -> None:
-        self._targets.close()
-        self._data_targets.close()
 
     async def _wait_until(self, condition: Callable[[], Any], timeout_s: float) -> bool:
         """Ask *condition* until it holds, the time is over, or Envoy has ended."""

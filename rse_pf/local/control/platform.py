@@ -35,7 +35,6 @@ from rse_pf.local.control.scale_modifier import bounds_for
 from rse_pf.local.disk_watch import DiskWatch
 from rse_pf.local.firewall import check_lan_settings, check_listener, ensure_key, key_file, robots_url
 from rse_pf.local.lan.listener import LanListener, authority_file
-from rse_pf.local.latest_file import LatestFile
 from rse_pf.local.processes import STOP_TIMEOUT_S, is_alive, mark_of, rotate_logs, send_signal
 from rse_pf.local.servers.backend_servers import (
     RSE_PF,
@@ -125,8 +124,6 @@ class LocalPlatform:
         self.lan = LanListener(address=lan, folder=self.state) if lan else None
         self._lock = PlatformLock(self.state)
         self._audit = PlatformAudit(self.state)
-        self._state_file = LatestFile(state_file(self.state), on_problem=self._report_unwritten_state)
-        self._targets_file = LatestFile(self.state / _TARGETS_FILE, on_problem=self._report_unwritten_state)
         self._metrics_port = metrics_port
         self._key: SigningKey | None = None
         self.backend_servers = LocalBackendServers(
@@ -137,7 +134,7 @@ class LocalPlatform:
         )
         self.load_balancer = EnvoyLoadBalancer(
             settings, folder=self.state, port=self._wanted_port, dies_with_parent=not adoptable,
-            on_problem=self._report_unwritten_state, lan=self.lan,
+            write=self._disks.write, lan=self.lan,
         )  # fmt: skip
         self.data_servers = LocalDataServers(
             settings, folder=self.state, store=self._placement.store, dies_with_parent=not adoptable,
@@ -550,8 +547,8 @@ class LocalPlatform:
             lan=self._wanted_address,
             authority_file="" if self.lan is None else str(authority_file(self.state)),
         )
-        self._state_file.write(state.to_json())
-        self._targets_file.write(service_discovery(self.name, state.servers))
+        self._disks.write(state_file(self.state), state.to_json())
+        self._disks.write(self.state / _TARGETS_FILE, service_discovery(self.name, state.servers))
 
     def _report_data_change(self, event: str, **details: Any) -> None:
         self._emit(event, **details)
@@ -575,8 +572,6 @@ class LocalPlatform:
             self.backend_servers.kill_all()
             self.data_servers.kill_all()
             self.load_balancer.kill()
-            self._state_file.close()
-            self._targets_file.close()
             self._fleet.members.clear()
             with contextlib.suppress(OSError):  # the folder may have been removed meanwhile
                 remove_state(self.state)

@@ -19,7 +19,7 @@ from urllib.parse import urlsplit
 from rse_pf.auth.control_token import read_control_token
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import ConfigurationError
-from rse_pf.local.disk_watch import DISK_WARNING_BYTES, DiskSpace, disk_line, disk_spaces, folders_of
+from rse_pf.local.disk_watch import DiskSpace, disk_line, disk_spaces, folders_of
 from rse_pf.local.processes import ProcessMark, is_alive
 from rse_pf.local.servers.backend_servers import local_placement
 from rse_pf.local.servers.control_client import ControlPort
@@ -106,8 +106,7 @@ def _disks(folder: Path) -> list[DiskSpace]:
         settings = platform_settings(folder) or PlatformSettings()
     except ConfigurationError:  # of another version
         settings = PlatformSettings()
-    folders = folders_of(folder, local_placement(settings, folder).store)
-    return disk_spaces(folders, DISK_WARNING_BYTES)
+    return disk_spaces(folders_of(folder, local_placement(settings, folder).store))
 
 
 async def _data_server(server: ServerState) -> dict[str, Any]:

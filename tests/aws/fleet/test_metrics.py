@@ -78,6 +78,14 @@ def test_crashes_of_native_code_are_published_as_their_increase_and_only_while_t
     assert not {"NativeCrashes", "NativeOff"} & set(named(datums(before, before, "group", "i-1")))
 
 
+@pytest.mark.parametrize(("free_percent", "is_low"), [(0.0, True), (9.9, True), (10.0, False), (None, False)])
+def test_a_disk_with_less_than_a_tenth_free_is_published(free_percent: float | None, is_low: bool) -> None:
+    gauges = {} if free_percent is None else {"disk_free_percent": free_percent}
+    now = read_page(page([], **gauges))
+
+    assert ("DiskLow" in named(datums(now, now, "group", "i-1"))) == is_low
+
+
 def test_every_series_of_an_operator_alarm_that_we_publish_is_published_by_a_server_in_trouble() -> None:
     wanted = {
         series.metric
@@ -86,7 +94,14 @@ def test_every_series_of_an_operator_alarm_that_we_publish_is_published_by_a_ser
         if series.namespace == NAMESPACE
     }
 
-    told = named(datums(ServerMetrics(), ServerMetrics(worker_crashes=3, native_off=1), "rse-pf", "i-1"))
+    told = named(
+        datums(
+            ServerMetrics(),
+            ServerMetrics(worker_crashes=3, native_off=1, disk_free_percent=9.9),
+            "rse-pf",
+            "i-1",
+        )
+    )
 
     assert wanted - set(told) == {STORE_ERRORS}, "another task publishes that"
 

@@ -12,10 +12,8 @@ from guarded_server import GuardedServer
 
 from client_sdk import connect
 from rse_pf.auth.roster import DenyList
-from rse_pf.auth.trust_store import AccessControlStore
-from rse_pf.disk_reserve import SpareFiles
 from rse_pf.errors import RsePfError
-from rse_pf.object_store import DirectoryStore
+from rse_pf.local.disk_watch import DiskWatch, access_control_store
 
 pytestmark = pytest.mark.system
 
@@ -35,8 +33,8 @@ def test_a_robot_is_cut_off_within_two_seconds_on_a_full_disk(
     small_disk: Callable[[str], Path], fill: Callable[[Path], Path], name: str
 ) -> None:
     disk = small_disk("24m")
-    access = AccessControlStore(DirectoryStore(disk, SpareFiles(disk / "reserve")))
-    access.create_missing()
+    DiskWatch(disk, "memory:", emit=lambda event, **details: None).prepare()
+    access = access_control_store(disk)
 
     async def run(server: GuardedServer) -> float:
         refused = asyncio.Event()
