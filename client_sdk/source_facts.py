@@ -1,0 +1,302 @@
+"""The gate before tracking: what a source states, assumes and delivers, compared before a frame is used.
+
+Each reader (folder, data set, bag, video, device) fills in `SourceFacts` and calls `check_source`, which
+knows no file and no device.  Two facts that contradict each other raise an error with both of them.  What is
+only unlikely is a `Doubt`: the source is used, the doubt is printed, and the check of the drive gives no
+advice until the user accepts the doubt by its name.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import Enum
+
+import numpy as np
+
+from rse_pf.config.validation import did_you_mean
+from rse_pf.errors import UsageError
+from rse_pf.geometry import Array, Camera
+
+__all__ = [
+    "CameraFacts", "DepthFacts", "Doubt", "DoubtName", "SourceFacts", "TimeFacts", "check_accepted",
+    "check_source", "rows_in_time", "some_names", "time_unit_s", "unresolved",
+]  # fmt: skip
+
+MIN_FIELD_OF_VIEW_DEG = 20.0  # a longer lens is not used for SLAM; a mistake in the unit gives less
+MAX_FIELD_OF_VIEW_DEG = 140.0  # a wider lens is not a pinhole camera
+MIN_MEDIAN_DEPTH_M = 0.05  # nearer than any depth camera measures
+MAX_MEDIAN_DEPTH_M = 30.0  # farther than any depth camera measures
+MIN_ASSUMED_MEDIAN_DEPTH_M = 0.2  # of a depth unit that nobody stated
+MAX_ASSUMED_MEDIAN_DEPTH_M = 6.0  # of a depth unit that nobody stated: rooms are smaller
+MIN_INTERVAL_S = 1e-4  # no camera is faster than 10,000 Hz
+MAX_INTERVAL_S = 1e3  # slower than any drive: the unit of the time stamps is wrong
+_EPOCH_S = (1e9, 1e10)  # seconds since 1970 of the years 2001 to 2286
+_UNITS_S = {"seconds": 1.0, "milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9}
+_MAX_NAMED = 3  # so many files are named in one sentence
+
+
+class DoubtName(str, Enum):
+    """The names of doubts, as ``--accept`` takes them; the values are stable."""
+
+    TIME_ORDER = "time-order"  # time stamps go back: the clock was set in the drive
+    EQUAL_STAMPS = "equal-stamps"  # several images have one time stamp
+    COUNTS = "counts"  # two lists that belong together have different lengths
+    REFERENCE_TIMES = "reference-times"  # truth or odometry has no time stamp within the recording
+    LEFT_OUT = "left-out"  # images were damaged, empty or without a partner
+    ENDED_EARLY = "ended-early"  # the source failed in the drive
+    DEPTH_REGISTRATION = "depth-registration"  # nothing says that depth is registered to the colour image
+    DEPTH_ALONG_RAY = "depth-along-ray"  # depth is measured along the ray, not along the optical axis
+    STATIC_PATTERN = "static-pattern"  # something stands still in the image while the camera moves
+    FROZEN_IMAGES = "frozen-images"  # the driver repeats an image
+    MOVING_OBJECTS = "moving-objects"  # something moves in most of the view
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Doubt:
+    """Something unlikely that was found in a source; *hint* is the action that settles it."""
+
+    name: DoubtName
+    sentence: str
+    hint: str
+
+    def to_dict(self) -> dict[str, str]:
+        """Return what a report holds of the doubt."""
+        return {"name": self.name.value, "sentence": self.sentence, "hint": self.hint}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CameraFacts:
+    """A camera as its source states it (*stated_by* is a file or topic), and the images that it delivers."""
+
+    stated_by: str
+    camera: Camera
+    is_fisheye: bool = False
+    image_size_px: tuple[int, int] | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DepthFacts:
+    """Depth of some frames: its median, m (None without a reading), and the unit that gave it."""
+
+    median_m: float | None
+    units_per_m: float
+    is_unit_stated: bool
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class TimeFacts:
+    """Time stamps ``(n,)`` in seconds, in the order of the source; *stated_by* is a file or topic."""
+
+    stated_by: str
+    stamps_s: Array
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SourceFacts:
+    """What a source states, what was assumed, and what it delivers.
+
+    Attributes:
+        name: Of the source, for people.
+        cameras: As they are stated, before undistortion and rectification.
+        depth: None without depth.
+        times: Of the images, of each camera that has its own.
+        counts: Lengths of lists without a key that belong together, by their names.
+        references: Times of the truth and of the odometry.
+        doubts: What the reader itself met.
+        assumed: Sentences on what the source does not state.
+    """
+
+    name: str
+    cameras: Sequence[CameraFacts] = ()
+    depth: DepthFacts | None = None
+    times: Sequence[TimeFacts] = ()
+    counts: Mapping[str, int] = field(default_factory=dict)
+    references: Sequence[TimeFacts] = ()
+    doubts: Sequence[Doubt] = ()
+    assumed: tuple[str, ...] = ()
+
+
+def check_source(facts: SourceFacts) -> tuple[Doubt, ...]:
+    """Return the doubts about a source.
+
+    Raises:
+        UsageError: Two facts contradict each other, or a fact is impossible.
+    """
+    return (*facts.doubts, *(doubt for rule in _RULES for doubt in rule(facts)))
+
+
+def check_accepted(names: Iterable[str]) -> None:
+    """Refuse names of ``--accept`` that are no doubt's; raises UsageError."""
+    known = [each.value for each in DoubtName]
+    for name in names:
+        if name not in known:
+            raise UsageError(
+                f"--accept {name} names no finding",
+                hint=did_you_mean(name, known, f"write one of {', '.join(known)}"),
+            )
+
+
+def unresolved(doubts: Iterable[Doubt], accepted: Iterable[str]) -> tuple[Doubt, ...]:
+    """Return the doubts whose names are not accepted."""
+    names = set(accepted)
+    return tuple(doubt for doubt in doubts if doubt.name.value not in names)
+
+
+def time_unit_s(stamps: Array) -> tuple[str, float]:
+    """Return the name and the length, s, of the unit of time stamps ``(n,)`` that state none.
+
+    Stamps since 1970 tell their unit by their size.  Of others it is the unit in which images come 0.1 to
+    100 times a second.
+    """
+    size = float(np.median(np.abs(stamps))) if len(stamps) else 0.0
+    for name, unit_s in _UNITS_S.items():
+        if _EPOCH_S[0] <= size * unit_s < _EPOCH_S[1]:
+            return name, unit_s
+    steps = np.diff(np.unique(stamps))
+    interval = float(np.median(steps)) if len(steps) else 0.0
+    if interval < 10.0:
+        return "seconds", 1.0
+    if interval < 1e4:
+        return "milliseconds", 1e-3
+    return ("microseconds", 1e-6) if interval < 1e7 else ("nanoseconds", 1e-9)
+
+
+def rows_in_time(times: TimeFacts) -> tuple[list[int], tuple[Doubt, ...]]:
+    """Return the rows whose time stamps increase, and doubts about the others.
+
+    Rows with the time stamp of the row before are left out.  The recording ends where the clock was set
+    back.
+
+    Raises:
+        UsageError: The time stamps go back more than once: the rows are in no order of time.
+    """
+    steps_s = np.diff(times.stamps_s)
+    backs = np.flatnonzero(steps_s < 0.0)
+    total = len(times.stamps_s)
+    if len(backs) > 1:
+        raise UsageError(
+            f"{times.stated_by}: {len(backs)} of {total} time stamps are earlier than the one before, first "
+            f"{times.stamps_s[backs[0] + 1]:.6f} s after {times.stamps_s[backs[0]]:.6f} s",
+            hint="sort the images in the order in which they were taken, if their clock can be trusted",
+        )
+    doubts = []
+    end = total
+    if len(backs):
+        end = int(backs[0]) + 1
+        doubts.append(
+            Doubt(
+                name=DoubtName.TIME_ORDER,
+                sentence=f"{times.stated_by}: the clock goes back by {-steps_s[end - 1]:.3f} s after "
+                f"{times.stamps_s[end - 1]:.6f} s; the recording ends there, with {end} of {total} images",
+                hint="make two recordings of it, one before and one after the jump",
+            )
+        )
+    rows = [0][:total] + [row + 1 for row in range(end - 1) if steps_s[row] > 0.0]
+    equal = end - len(rows)
+    if equal:
+        first_s = times.stamps_s[int(np.flatnonzero(steps_s[: end - 1] == 0.0)[0])]
+        doubts.append(
+            Doubt(
+                name=DoubtName.EQUAL_STAMPS,
+                sentence=f"{times.stated_by}: {equal} of {total} images have the time stamp of the image "
+                f"before, first {first_s:.6f} s; they are left out",
+                hint="write the time of each exposure, with all its digits",
+            )
+        )
+    return rows, tuple(doubts)
+
+
+def some_names(names: Sequence[str]) -> str:
+    """Return the first names of a list, and how many there are."""
+    more = len(names) - _MAX_NAMED
+    return ", ".join(names[:_MAX_NAMED]) + (f" and {more} more" if more > 0 else "")
+
+
+def _check_cameras(facts: SourceFacts) -> Iterable[Doubt]:
+    for each in facts.cameras:
+        camera = each.camera
+        size = (camera.width, camera.height)
+        if each.image_size_px is not None and each.image_size_px != size:
+            raise UsageError(
+                f"{facts.name} has images of {each.image_size_px[0]}x{each.image_size_px[1]} px, "
+                f"{each.stated_by} is for {size[0]}x{size[1]} px",
+                hint="give the intrinsics of this size: scale fx fy cx cy with the image",
+            )
+        if not (0.0 <= camera.cx <= camera.width and 0.0 <= camera.cy <= camera.height):
+            raise UsageError(
+                f"{each.stated_by}: the principal point ({camera.cx:g}, {camera.cy:g}) lies outside of the "
+                f"image of {size[0]}x{size[1]} px",
+                hint="give the intrinsics of this size: scale fx fy cx cy with the image",
+            )
+        seen_deg = math.degrees(
+            2.0 * math.atan(max(camera.width / camera.fx, camera.height / camera.fy) / 2.0)
+        )
+        if not each.is_fisheye and not MIN_FIELD_OF_VIEW_DEG <= seen_deg <= MAX_FIELD_OF_VIEW_DEG:
+            raise UsageError(
+                f"{each.stated_by}: fx {camera.fx:g} fy {camera.fy:g} at {size[0]}x{size[1]} px is a "
+                f"field of view of {seen_deg:.0f} degrees, not within {MIN_FIELD_OF_VIEW_DEG:g}.."
+                f"{MAX_FIELD_OF_VIEW_DEG:g}",
+                hint="give fx and fy in pixels of this image size; a wide lens has model fisheye",
+            )
+    return ()
+
+
+def _check_depth(facts: SourceFacts) -> Iterable[Doubt]:
+    depth = facts.depth
+    if depth is not None and depth.median_m is not None:
+        low, high = MIN_MEDIAN_DEPTH_M, MAX_MEDIAN_DEPTH_M
+        if not depth.is_unit_stated:
+            low, high = MIN_ASSUMED_MEDIAN_DEPTH_M, MAX_ASSUMED_MEDIAN_DEPTH_M
+        if not low <= depth.median_m <= high:
+            how = "" if depth.is_unit_stated else "assumed "
+            raise UsageError(
+                f"the median depth of {facts.name} is {depth.median_m:g} m at {how}{depth.units_per_m:g} "
+                f"units a metre, not within {low:g}..{high:g} m",
+                hint="state the unit of depth: depth_scale 1000 for mm, 5000 for TUM, 4000 for 0.25 mm",
+            )
+    return ()
+
+
+def _check_times(facts: SourceFacts) -> Iterator[Doubt]:
+    for each in facts.times:
+        yield from rows_in_time(each)[1]
+        steps_s = np.diff(np.unique(each.stamps_s))
+        interval_s = float(np.median(steps_s)) if len(steps_s) else 1.0
+        if not MIN_INTERVAL_S <= interval_s <= MAX_INTERVAL_S:
+            raise UsageError(
+                f"{each.stated_by}: images are {interval_s:g} s apart in the median, not within "
+                f"{MIN_INTERVAL_S:g}..{MAX_INTERVAL_S:g} s",
+                hint="correct the unit of the time stamps",
+            )
+
+
+def _check_counts(facts: SourceFacts) -> Iterator[Doubt]:
+    if len(set(facts.counts.values())) > 1:
+        counted = ", ".join(f"{count} in {name}" for name, count in facts.counts.items())
+        yield Doubt(
+            name=DoubtName.COUNTS,
+            sentence=f"{facts.name} has lists of different lengths: {counted}; nothing says which "
+            "row is missing",
+            hint="give rows that belong together one number or one time stamp",
+        )
+
+
+def _check_references(facts: SourceFacts) -> Iterator[Doubt]:
+    stamps_s = np.concatenate([each.stamps_s for each in facts.times]) if facts.times else np.empty(0)
+    for each in facts.references if len(stamps_s) else ():
+        within = (each.stamps_s >= stamps_s.min()) & (each.stamps_s <= stamps_s.max())
+        if len(each.stamps_s) and not within.any():
+            yield Doubt(
+                name=DoubtName.REFERENCE_TIMES,
+                sentence=f"{each.stated_by} has no time stamp within the recording: it covers "
+                f"{each.stamps_s.min():.3f}..{each.stamps_s.max():.3f} s, the images "
+                f"{stamps_s.min():.3f}..{stamps_s.max():.3f} s",
+                hint="write its time stamps in seconds of the clock of the images",
+            )
+
+
+_RULES: tuple[Callable[[SourceFacts], Iterable[Doubt]], ...] = (
+    _check_cameras, _check_depth, _check_times, _check_counts, _check_references,
+)  # fmt: skip
