@@ -337,7 +337,7 @@ def read_trajectory(path: Path) -> Trajectory:
         UsageError: The file is missing, or a line does not hold eight finite numbers.
     """
     try:
-        text = read_regular_file(path, _MAX_TRAJECTORY_BYTES).decode()
+        text = read_regular_file(path, _MAX_TRAJECTORY_BYTES).decode("utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         raise UsageError(f"cannot read {path}: {error}", hint="name a trajectory in TUM format") from error
     timestamps_s: list[float] = []

@@ -12,16 +12,19 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from rse_pf.config.validation import did_you_mean
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Array, Camera
 
 __all__ = [
-    "CameraFacts", "DepthFacts", "Doubt", "DoubtName", "SourceFacts", "TimeFacts", "check_accepted",
-    "check_source", "rows_in_time", "some_names", "time_unit_s", "unresolved",
+    "CameraFacts", "DepthFacts", "Doubt", "DoubtLog", "DoubtName", "SourceFacts", "TimeFacts",
+    "check_accepted", "check_reference", "check_source", "doubt_line", "is_since_1970", "median_depth_m",
+    "rows_in_time", "some_names", "stamps_in_seconds", "time_unit_s", "unresolved",
 ]  # fmt: skip
 
 MIN_FIELD_OF_VIEW_DEG = 20.0  # a longer lens is not used for SLAM; a mistake in the unit gives less
@@ -34,7 +37,7 @@ MIN_INTERVAL_S = 1e-4  # no camera is faster than 10,000 Hz
 MAX_INTERVAL_S = 1e3  # slower than any drive: the unit of the time stamps is wrong
 _EPOCH_S = (1e9, 1e10)  # seconds since 1970 of the years 2001 to 2286
 _UNITS_S = {"seconds": 1.0, "milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9}
-_MAX_NAMED = 3  # so many files are named in one sentence
+_MAX_NAMED = 12  # so many files are named in one sentence
 
 
 class DoubtName(str, Enum):
@@ -61,9 +64,19 @@ class Doubt:
     sentence: str
     hint: str
 
+    def line(self) -> str:
+        """Return the doubt in one line for people."""
+        return doubt_line(self.to_dict())
+
     def to_dict(self) -> dict[str, str]:
         """Return what a report holds of the doubt."""
         return {"name": self.name.value, "sentence": self.sentence, "hint": self.hint}
+
+
+def doubt_line(told: Mapping[str, Any]) -> str:
+    """Return a doubt of a report in one line for people."""
+    name = told.get("name")
+    return f"finding {name}: {told.get('sentence')}; {told.get('hint')}, or --accept {name}"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -78,11 +91,15 @@ class CameraFacts:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DepthFacts:
-    """Depth of some frames: its median, m (None without a reading), and the unit that gave it."""
+    """Depth of some frames: its median, m (None without a reading), and the unit that gave it.
+
+    ``is_registered`` says whether depth images show the view of the colour camera; None if nobody stated it.
+    """
 
     median_m: float | None
     units_per_m: float
     is_unit_stated: bool
+    is_registered: bool | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -117,6 +134,41 @@ class SourceFacts:
     doubts: Sequence[Doubt] = ()
     assumed: tuple[str, ...] = ()
 
+    @property
+    def span_s(self) -> tuple[float, float] | None:
+        """The first and the last time stamp of the images; None if they are not known before the drive."""
+        stamps_s = np.concatenate([each.stamps_s for each in self.times]) if self.times else np.empty(0)
+        return (float(stamps_s.min()), float(stamps_s.max())) if len(stamps_s) else None
+
+
+class DoubtLog:
+    """The doubts about a source: those of the gate, and those that appear while the source is read."""
+
+    def __init__(self, doubts: Iterable[Doubt] = ()) -> None:
+        self._doubts = list(doubts)
+        self._left_out: list[str] = []
+
+    def add(self, doubt: Doubt) -> None:
+        """Add a doubt that appeared in the drive."""
+        self._doubts.append(doubt)
+
+    def leave_out(self, image: str) -> None:
+        """Count an image that cannot be used, by its name."""
+        self._left_out.append(image)
+
+    @property
+    def doubts(self) -> tuple[Doubt, ...]:
+        """All doubts so far, in the order in which they appeared."""
+        if not self._left_out:
+            return tuple(self._doubts)
+        images = f"{len(self._left_out)} image" + ("s" if len(self._left_out) > 1 else "")
+        left_out = Doubt(
+            name=DoubtName.LEFT_OUT,
+            sentence=f"{images} left out, damaged or empty: {some_names(self._left_out)}",
+            hint="copy the recording again, or record it again",
+        )
+        return (*self._doubts, left_out)
+
 
 def check_source(facts: SourceFacts) -> tuple[Doubt, ...]:
     """Return the doubts about a source.
@@ -150,10 +202,9 @@ def time_unit_s(stamps: Array) -> tuple[str, float]:
     Stamps since 1970 tell their unit by their size.  Of others it is the unit in which images come 0.1 to
     100 times a second.
     """
-    size = float(np.median(np.abs(stamps))) if len(stamps) else 0.0
-    for name, unit_s in _UNITS_S.items():
-        if _EPOCH_S[0] <= size * unit_s < _EPOCH_S[1]:
-            return name, unit_s
+    unit = _unit_since_1970(stamps)
+    if unit is not None:
+        return unit
     steps = np.diff(np.unique(stamps))
     interval = float(np.median(steps)) if len(steps) else 0.0
     if interval < 10.0:
@@ -163,6 +214,38 @@ def time_unit_s(stamps: Array) -> tuple[str, float]:
     return ("microseconds", 1e-6) if interval < 1e7 else ("nanoseconds", 1e-9)
 
 
+def is_since_1970(stamps_s: Array) -> bool:
+    """Return whether stamps ``(n,)`` are seconds since 1970, of the years 2001 to 2286."""
+    return bool(len(stamps_s)) and _EPOCH_S[0] <= float(np.median(stamps_s)) < _EPOCH_S[1]
+
+
+def _unit_since_1970(stamps: Array) -> tuple[str, float] | None:
+    return next((unit for unit in _UNITS_S.items() if is_since_1970(stamps * unit[1])), None)
+
+
+def stamps_in_seconds(
+    stamps: Array, stated_by: str, layout_unit: str | None = None
+) -> tuple[Array, tuple[str, ...]]:
+    """Return time stamps ``(n,)`` in seconds, and a note where their unit was assumed.
+
+    *layout_unit* is the unit that the format of the file prescribes; it counts unless the stamps are times
+    since 1970 in another one.  None means seconds, unless the stamps look otherwise.
+    """
+    expected = layout_unit or "seconds"
+    unit, unit_s = time_unit_s(stamps)
+    if layout_unit is not None:
+        unit, unit_s = _unit_since_1970(stamps) or (expected, _UNITS_S[expected])
+    notes = () if unit == expected else (f"the time stamps of {stated_by} are taken as {unit}",)
+    return stamps * unit_s if unit_s == 1.0 else stamps / round(1.0 / unit_s), notes
+
+
+def median_depth_m(images: Iterable[npt.NDArray[np.float32]]) -> float | None:
+    """Return the median reading, m, of ``(h, w)`` depth images; None without a reading."""
+    readings = [some[some > 0] for some in (image[::8, ::8] for image in images)]
+    known = np.concatenate(readings) if readings else np.empty(0, dtype=np.float32)
+    return float(np.median(known)) if len(known) else None
+
+
 def rows_in_time(times: TimeFacts) -> tuple[list[int], tuple[Doubt, ...]]:
     """Return the rows whose time stamps increase, and doubts about the others.
 
@@ -170,12 +253,12 @@ def rows_in_time(times: TimeFacts) -> tuple[list[int], tuple[Doubt, ...]]:
     back.
 
     Raises:
-        UsageError: The time stamps go back more than once: the rows are in no order of time.
+        UsageError: The time stamps go back more than once, or at once: the rows are in no order of time.
     """
     steps_s = np.diff(times.stamps_s)
     backs = np.flatnonzero(steps_s < 0.0)
     total = len(times.stamps_s)
-    if len(backs) > 1:
+    if len(backs) > 1 or (len(backs) == 1 and backs[0] == 0):
         raise UsageError(
             f"{times.stated_by}: {len(backs)} of {total} time stamps are earlier than the one before, first "
             f"{times.stamps_s[backs[0] + 1]:.6f} s after {times.stamps_s[backs[0]]:.6f} s",
@@ -206,6 +289,19 @@ def rows_in_time(times: TimeFacts) -> tuple[list[int], tuple[Doubt, ...]]:
             )
         )
     return rows, tuple(doubts)
+
+
+def check_reference(reference: TimeFacts, span_s: tuple[float, float]) -> tuple[Doubt, ...]:
+    """Return a doubt if a truth or an odometry has no time stamp within the span of the images."""
+    stamps_s = reference.stamps_s
+    if not len(stamps_s) or ((stamps_s >= span_s[0]) & (stamps_s <= span_s[1])).any():
+        return ()
+    sentence = (
+        f"{reference.stated_by} has no time stamp within the recording: it covers {stamps_s.min():.3f}.."
+        f"{stamps_s.max():.3f} s, the images {span_s[0]:.3f}..{span_s[1]:.3f} s"
+    )
+    hint = "write its time stamps in seconds of the clock of the images"
+    return (Doubt(name=DoubtName.REFERENCE_TIMES, sentence=sentence, hint=hint),)
 
 
 def some_names(names: Sequence[str]) -> str:
@@ -243,8 +339,15 @@ def _check_cameras(facts: SourceFacts) -> Iterable[Doubt]:
     return ()
 
 
-def _check_depth(facts: SourceFacts) -> Iterable[Doubt]:
+def _check_depth(facts: SourceFacts) -> Iterator[Doubt]:
     depth = facts.depth
+    if depth is not None and depth.is_registered is False:
+        yield Doubt(
+            name=DoubtName.DEPTH_REGISTRATION,
+            sentence=f"depth of {facts.name} is stated not to be registered to the colour image, and is used "
+            "as if it were",
+            hint="record depth that the driver has aligned to the colours",
+        )
     if depth is not None and depth.median_m is not None:
         low, high = MIN_MEDIAN_DEPTH_M, MAX_MEDIAN_DEPTH_M
         if not depth.is_unit_stated:
@@ -256,7 +359,6 @@ def _check_depth(facts: SourceFacts) -> Iterable[Doubt]:
                 f"units a metre, not within {low:g}..{high:g} m",
                 hint="state the unit of depth: depth_scale 1000 for mm, 5000 for TUM, 4000 for 0.25 mm",
             )
-    return ()
 
 
 def _check_times(facts: SourceFacts) -> Iterator[Doubt]:
@@ -284,17 +386,10 @@ def _check_counts(facts: SourceFacts) -> Iterator[Doubt]:
 
 
 def _check_references(facts: SourceFacts) -> Iterator[Doubt]:
-    stamps_s = np.concatenate([each.stamps_s for each in facts.times]) if facts.times else np.empty(0)
-    for each in facts.references if len(stamps_s) else ():
-        within = (each.stamps_s >= stamps_s.min()) & (each.stamps_s <= stamps_s.max())
-        if len(each.stamps_s) and not within.any():
-            yield Doubt(
-                name=DoubtName.REFERENCE_TIMES,
-                sentence=f"{each.stated_by} has no time stamp within the recording: it covers "
-                f"{each.stamps_s.min():.3f}..{each.stamps_s.max():.3f} s, the images "
-                f"{stamps_s.min():.3f}..{stamps_s.max():.3f} s",
-                hint="write its time stamps in seconds of the clock of the images",
-            )
+    span_s = facts.span_s
+    for each in facts.references:
+        if span_s is not None:
+            yield from check_reference(each, span_s)
 
 
 _RULES: tuple[Callable[[SourceFacts], Iterable[Doubt]], ...] = (

@@ -33,6 +33,8 @@ _FRAMES, _NO_FRAMES = range(0xC0, 0xD0), (0xC4, 0xC8, 0xCC)
 _DECODED_FRAMES = (0xC0, 0xC1, 0xC2)
 """Baseline, extended and progressive Huffman coding."""
 _SCAN, _END_OF_JPEG = b"\xff\xda", b"\xff\xd9"
+_END_OF_PNG = b"IEND"
+_LONGEST_TRAILER = 1 << 16  # bytes that some programs write after the end of a PNG
 _HINT = "send a JPEG or PNG file as a camera writes it"
 
 
@@ -51,7 +53,10 @@ def load_opencv() -> Any:
 
 
 def read_image(path: Path, flags: int) -> npt.NDArray[Any] | None:
-    """Return the image of a file as OpenCV decodes it with *flags*; None if it is no image, or too large.
+    """Return the image of a file as OpenCV decodes it with *flags*; None if it is damaged or too large.
+
+    Pixels stay as they are stored: an orientation in the EXIF data does not turn them, so that intrinsics and
+    depth fit.
 
     Raises:
         MissingExtra: OpenCV is not installed.
@@ -60,10 +65,23 @@ def read_image(path: Path, flags: int) -> npt.NDArray[Any] | None:
     if not path.is_file():  # OpenCV would print a warning, or wait for what a pipe brings
         return None
     try:
-        image: npt.NDArray[Any] | None = cv2.imread(str(path), flags)
-    except cv2.error:
+        data = path.read_bytes()
+        if not data or _is_cut_off(data):
+            return None
+        image: npt.NDArray[Any] | None = cv2.imdecode(
+            np.frombuffer(data, dtype=np.uint8),
+            flags if flags == cv2.IMREAD_UNCHANGED else flags | cv2.IMREAD_IGNORE_ORIENTATION,
+        )
+    except (OSError, cv2.error):
         return None
     return image
+
+
+def _is_cut_off(data: bytes) -> bool:
+    """Return whether a JPEG or PNG has no end: OpenCV would fill what is missing with grey."""
+    if data.startswith(_JPEG):
+        return data.rfind(_END_OF_JPEG) < max(0, data.rfind(_SCAN))
+    return data.startswith(_PNG) and _END_OF_PNG not in data[-_LONGEST_TRAILER:]
 
 
 def photo_size(data: bytes) -> tuple[int, int]:

@@ -141,12 +141,12 @@ def job_of(recordings: Path, drive: Drive, sensor: Sensor) -> Job:
         pairs = associate_stamps(
             [stamp for stamp, _ in colours], [stamp for stamp, _ in depths], _MAX_STAMP_DIFFERENCE_S
         )
-        lens = read_intrinsics(folder / "intrinsics.json", with_depth_scale=True)
+        lens = read_intrinsics(folder / "intrinsics.json")
         frames = [
             (stamp, str(folder / colours[pairs[row][0]][1]), str(folder / depths[pairs[row][1]][1]))
             for stamp, row in zip(stamps_s, rows, strict=True)
         ]
-        more = [f"RGBD.DepthMapFactor: {lens.depth_scale:.1f}", *_baseline(_DEPTH_BASELINE_M)]
+        more = [f"RGBD.DepthMapFactor: {lens.depth_units_per_m:.1f}", *_baseline(_DEPTH_BASELINE_M)]
         return Job(settings=_yaml(lens, sensor, drive.rate_hz, more), frames=frames, T_camera_peer=same)
     if name == _EUROC:
         images = folder / "mav0"

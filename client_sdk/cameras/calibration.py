@@ -72,7 +72,7 @@ class BoardViews:
         return bool(moved < _NEW_VIEW_SHARE * self.size[0])
 
 
-def calibrate(views: BoardViews, *, max_rms_px: float = 1.0, depth_scale: float = 1000.0) -> Intrinsics:
+def calibrate(views: BoardViews, *, max_rms_px: float = 1.0, depth_scale: float | None = None) -> Intrinsics:
     """Return the intrinsics that explain all views best.
 
     Raises:

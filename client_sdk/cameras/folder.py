@@ -1,102 +1,243 @@
-"""A folder of images as a camera: colours, with or without depth.
+"""A folder of images as a camera: colours, with or without depth; and two folders as a pair of cameras.
 
-Colours lie in ``rgb/`` or in the folder itself, depth (16-bit) in ``depth/`` under the same names.  Names
-with a decimal point are time stamps in seconds; other images are 0.1 s apart.  Recordings that list their
+Colours lie in ``rgb/``, ``color/``, ``images/`` or in the folder itself, depth (16 bits) in ``depth/``, or
+beside the colours with ``depth`` in its names.  Images that belong together have one name, one number or one
+time.  Names that are decimal numbers, or times since 1970, are time stamps.  Recordings that list their
 images are read by `client_sdk.datasets`.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator
+import re
+from collections.abc import Callable, Hashable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from client_sdk.cameras.source import RawFrame, colour_of
+from client_sdk.bags.index import pair_stamps
+from client_sdk.cameras.source import RawFrame, RawPair
+from client_sdk.datasets.images import (
+    image_files,
+    numbers_in_name,
+    probe,
+    read_colour,
+    read_depth,
+    readable,
+)
+from client_sdk.rigs.intrinsics import Intrinsics
+from client_sdk.source_facts import (
+    CameraFacts,
+    DepthFacts,
+    Doubt,
+    DoubtLog,
+    DoubtName,
+    SourceFacts,
+    TimeFacts,
+    is_since_1970,
+    median_depth_m,
+    rows_in_time,
+    some_names,
+    stamps_in_seconds,
+)
 from rse_pf.errors import UsageError
-from rse_pf.images import MAX_IMAGE_PIXELS, load_opencv, read_image
+from rse_pf.geometry import Array
 
-__all__ = ["image_files", "is_image", "open_folder", "read_raw_image"]
+__all__ = ["FolderImages", "list_folder", "list_pairs"]
 
-_ENDINGS = {".png", ".jpg", ".jpeg", ".bmp", ".ppm", ".pgm", ".tif", ".tiff", ".webp"}
-_PERIOD_S = 0.1
-
-
-def is_image(path: Path) -> bool:
-    """Say whether a file is an image by its name."""
-    return path.suffix.lower() in _ENDINGS and path.is_file()
-
-
-def image_files(folder: Path) -> list[Path]:
-    """Return the images of a folder in the order of their names, numbers by value."""
-    return sorted((path for path in folder.iterdir() if is_image(path)), key=_order)
+_COLOUR_FOLDERS = ("rgb", "color", "colour", "image", "images")
+_DEPTH_FOLDERS = ("depth", "depths", "aligned_depth", "depth_image", "depth_images")
+_PERIOD_S = 0.1  # between images that state neither time nor rate
+_MAX_APART_S = 0.02  # of a colour and a depth image that are paired by time
+_NANOSECOND_DIGITS = 9  # ROS writes seconds, a point and nanoseconds, often without their leading zeros
+_TIME = re.compile(r"(?:[A-Za-z][A-Za-z_]*[-_]?)?(-?\d+(?:\.\d+)?)(?:[._-][A-Za-z]+)?")
 
 
-def open_folder(folder: Path, depth_scale: float) -> tuple[Iterator[RawFrame], bool]:
-    """Return the images of a folder, and whether they have depth; *depth_scale* units are a metre.
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FolderImages:
+    """Images in the order of time, their ``(n,)`` stamps, and what belongs to them, if anything does.
+
+    ``partners`` are the depth images, or the images of the right camera.
+    """
+
+    name: str
+    images: Sequence[Path]
+    partners: Sequence[Path] | None
+    stamps_s: Array
+    doubts: tuple[Doubt, ...]
+    assumed: tuple[str, ...]
+
+    def facts(self, lens: Intrinsics, stated_by: str, *, has_depth: bool) -> SourceFacts:
+        """Return what the folder states and delivers; some of its images are read for it.
+
+        Raises:
+            UsageError: No image can be read, or depth is of another kind.
+        """
+        assumed = self.assumed
+        depth = None
+        if has_depth and self.partners is not None:
+            units_per_m = lens.depth_units_per_m
+            depths = probe(self.partners, lambda path: read_depth(path, units_per_m))
+            depth = DepthFacts(
+                median_m=median_depth_m(depths), units_per_m=units_per_m,
+                is_unit_stated=lens.depth_scale is not None, is_registered=lens.is_depth_registered,
+            )  # fmt: skip
+            if not depth.is_unit_stated:
+                assumed += (f"{stated_by} states no depth_scale: {units_per_m:g} units a metre are assumed",)
+        height, width = probe(self.images, read_colour)[0].shape[:2]
+        camera = CameraFacts(
+            stated_by=stated_by, camera=lens.camera, is_fisheye=lens.model == "fisheye",
+            image_size_px=(width, height),
+        )  # fmt: skip
+        return SourceFacts(
+            name=self.name, cameras=(camera,), depth=depth, doubts=self.doubts, assumed=assumed,
+            times=(TimeFacts(stated_by=self.name, stamps_s=self.stamps_s),),
+        )  # fmt: skip
+
+    def frames(self, log: DoubtLog, depth_units_per_m: float | None) -> Iterator[RawFrame]:
+        """Yield the frames, without depth if its unit is None; *log* counts images that cannot be read."""
+
+        def read(row: int) -> RawFrame:
+            depth_m = None
+            if depth_units_per_m is not None and self.partners is not None:
+                depth_m = read_depth(self.partners[row], depth_units_per_m)
+            return float(self.stamps_s[row]), read_colour(self.images[row]), depth_m
+
+        return readable(range(len(self.images)), read, log)
+
+    def pairs(self, log: DoubtLog) -> Iterator[RawPair]:
+        """Yield the pairs of two cameras; *log* counts images that cannot be read."""
+        rights = self.partners or ()
+
+        def read(row: int) -> RawPair:
+            return float(self.stamps_s[row]), read_colour(self.images[row]), read_colour(rights[row])
+
+        return readable(range(len(self.images)), read, log)
+
+
+def list_folder(folder: Path, rate_hz: float | None = None) -> FolderImages:
+    """Return the images of a folder; *rate_hz* is that of images that state no time.
 
     Raises:
-        UsageError: There is no image, or depth lacks an image.
+        UsageError: There is no image, or depth that belongs to none.
     """
-    colours = image_files(folder / "rgb" if (folder / "rgb").is_dir() else folder)
+    inside = _first_folder(folder, _COLOUR_FOLDERS) or folder
+    depth_folder = _first_folder(folder, _DEPTH_FOLDERS)
+    colours = image_files(inside)
+    depths = [] if depth_folder is None else image_files(depth_folder)
+    if depth_folder is None:
+        depths = [path for path in colours if "depth" in path.stem.lower()]
+        colours = [path for path in colours if path not in set(depths)]
     if not colours:
         raise UsageError(f"{folder} holds no image", hint="put images into it, or into its folder rgb/")
-    depths: dict[str, Path] = {}
-    if (folder / "depth").is_dir():
-        depths = {path.stem: path for path in image_files(folder / "depth")}
-    missing = [path.name for path in colours if path.stem not in depths]
-    if depths and missing:
+    return _listed(str(folder), colours, depths or None, "depth image", rate_hz)
+
+
+def list_pairs(folder: Path, rate_hz: float | None = None) -> FolderImages:
+    """Return the images of ``left/`` and ``right/`` that belong together.
+
+    Raises:
+        UsageError: There is no image, or none of the left has a partner.
+    """
+    lefts, rights = (image_files(folder / side) for side in ("left", "right"))
+    if not lefts:
         raise UsageError(
-            f"{missing[0]} has no depth image of the same name in {folder / 'depth'}",
-            hint="name depth images as colour images, or remove the folder depth/",
+            f"{folder / 'left'} holds no image", hint="put the images of the left camera into it"
         )
-    return _images(colours, depths, depth_scale), bool(depths)
+    return _listed(str(folder), lefts, rights, "right image", rate_hz)
 
 
-def read_raw_image(path: Path) -> npt.NDArray[Any]:
-    """Return an image as OpenCV reads it, unchanged; raises UsageError and MissingExtra."""
-    cv2 = load_opencv()
-    image = read_image(path, cv2.IMREAD_UNCHANGED)
-    if image is None:
-        raise UsageError(
-            f"cannot read the image {path}",
-            hint=f"check that it is a whole image of at most {MAX_IMAGE_PIXELS} pixels",
-        )
-    return image
+def _listed(
+    name: str, images: list[Path], partners: list[Path] | None, what: str, rate_hz: float | None
+) -> FolderImages:
+    """Join images with their partners, and put them in the order of time."""
+    doubts: tuple[Doubt, ...] = ()
+    named_s, assumed = _named_times(images, name)
+    period_s = _PERIOD_S if rate_hz is None else 1.0 / rate_hz
+    stamps_s: Array = np.arange(len(images), dtype=np.float64) * period_s if named_s is None else named_s
+    if named_s is None and rate_hz is None:
+        assumed = (f"names of images in {name} are no times: {_PERIOD_S:g} s between images are assumed",)
+    chosen: list[Path] | None = None
+    if partners is not None:
+        pairs = _joined(images, partners)
+        if not pairs:
+            raise UsageError(
+                f"none of {len(images)} images of {name} has a {what} of the same name, number or time among "
+                f"{len(partners)}",
+                hint="give images that belong together one number or one time stamp",
+            )
+        joined = {row for row, _ in pairs}
+        alone = [path.name for row, path in enumerate(images) if row not in joined]
+        if alone:
+            sentence = f"{len(alone)} of {len(images)} images of {name} left out, without a {what}: "
+            doubts = (
+                Doubt(name=DoubtName.LEFT_OUT, sentence=sentence + some_names(alone), hint="copy all images"),
+            )
+        images = [images[row] for row, _ in pairs]
+        chosen = [partners[row] for _, row in pairs]
+        stamps_s = stamps_s[[row for row, _ in pairs]]
+    order = np.argsort(stamps_s, kind="stable")
+    times = TimeFacts(stated_by=name, stamps_s=stamps_s[order])
+    rows, of_times = rows_in_time(times)
+    used = order[rows]
+    return FolderImages(
+        name=name, images=[images[row] for row in used], stamps_s=stamps_s[used],
+        partners=None if chosen is None else [chosen[row] for row in used],
+        doubts=(*doubts, *of_times), assumed=assumed,
+    )  # fmt: skip
 
 
-def _images(colours: list[Path], depths: dict[str, Path], depth_scale: float) -> Iterator[RawFrame]:
-    stamps = _stamps(colours)
-    for stamp, path in zip(stamps, colours, strict=True):
-        rgb = colour_of(read_raw_image(path), str(path))
-        depth_m = None
-        if depths:
-            depth = read_raw_image(depths[path.stem])
-            if depth.dtype != np.uint16 or depth.ndim != 2:
-                raise UsageError(
-                    f"{depths[path.stem]} is not a 16-bit depth image",
-                    hint="depth is one 16-bit channel, value / depth_scale in m",
-                )
-            depth_m = np.where(depth == np.iinfo(np.uint16).max, 0, depth).astype(np.float32)
-            depth_m /= np.float32(depth_scale)
-        yield stamp, rgb, depth_m
+def _first_folder(folder: Path, names: Sequence[str]) -> Path | None:
+    return next((folder / name for name in names if (folder / name).is_dir()), None)
 
 
-def _stamps(paths: list[Path]) -> list[float]:
-    """Return the names as seconds if they are decimal numbers, else multiples of the period."""
-    try:
-        values = [float(path.stem) for path in paths]
-    except ValueError:
-        values = []
-    is_time = any("." in path.stem for path in paths) and len(set(values)) == len(paths)
-    is_time = is_time and all(map(math.isfinite, values))
-    return values if is_time else [row * _PERIOD_S for row in range(len(paths))]
+def _joined(firsts: list[Path], seconds: list[Path]) -> list[tuple[int, int]]:
+    """Return rows of images that belong together by name, by numbers, by the last number, or by time."""
+    keys: tuple[Callable[[Path], Hashable], ...] = (
+        lambda path: path.stem, numbers_in_name, lambda path: numbers_in_name(path)[-1:],
+    )  # fmt: skip
+    for key in keys:
+        rows = {key(path): row for row, path in enumerate(seconds)}
+        of_firsts = [key(path) for path in firsts]
+        if len(rows) == len(seconds) and len(set(of_firsts)) == len(firsts):
+            pairs = [(row, rows[each]) for row, each in enumerate(of_firsts) if each in rows]
+            if 2 * len(pairs) > min(len(firsts), len(seconds)):
+                return pairs
+    first_s, second_s = _named_times(firsts, "")[0], _named_times(seconds, "")[0]
+    if first_s is None or second_s is None:
+        return []
+    first_rows, second_rows = np.argsort(first_s), np.argsort(second_s)
+    pairs = pair_stamps(first_s[first_rows], second_s[second_rows], _MAX_APART_S)
+    return [(int(first_rows[first]), int(second_rows[second])) for first, second in pairs]
 
 
-def _order(path: Path) -> tuple[float, str]:
-    stem = path.stem
-    digits = stem if stem.replace(".", "", 1).isdecimal() else "".join(filter(str.isdecimal, stem))
-    return (float(digits) if digits else 0.0, path.name)
+def _named_times(paths: Sequence[Path], name: str) -> tuple[Array | None, tuple[str, ...]]:
+    """Return the times, s, that names state, None if they state none; and what was assumed of them."""
+    matches = [_TIME.fullmatch(path.stem) for path in paths]
+    words = [match[1] for match in matches if match is not None]
+    if len(words) < len(paths):
+        return None, ()
+    values = np.array([float(word) for word in words])
+    if any("." in word for word in words):
+        nanoseconds = _seconds_and_nanoseconds(words)
+        if nanoseconds is not None and _unevenness(nanoseconds) < _unevenness(values):
+            return nanoseconds, (f"names in {name} are taken as seconds, a point and whole nanoseconds",)
+        return values, ()
+    stamps_s, assumed = stamps_in_seconds(values, f"names in {name}", "seconds")
+    return (stamps_s, assumed) if is_since_1970(stamps_s) else (None, ())
+
+
+def _seconds_and_nanoseconds(words: Sequence[str]) -> Array | None:
+    """Return names as seconds and a whole number of nanoseconds; None where they cannot be that."""
+    parts = [word.partition(".") for word in words]
+    lengths = {len(fraction) for _, _, fraction in parts}
+    if max(lengths) != _NANOSECOND_DIGITS or len(lengths) == 1:
+        return None
+    return np.array([float(seconds) + 1e-9 * float(fraction or 0) for seconds, _, fraction in parts])
+
+
+def _unevenness(stamps_s: Array) -> float:
+    """Return how much intervals differ from their median, relative to it."""
+    steps_s = np.diff(np.sort(stamps_s))
+    typical_s = float(np.median(steps_s)) if len(steps_s) else 1.0
+    return float(np.median(np.abs(steps_s - typical_s))) / max(typical_s, 1e-12)

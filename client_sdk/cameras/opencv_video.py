@@ -1,23 +1,47 @@
 """Cameras and videos that OpenCV opens: a device number, a video file, or the address of a stream.
 
-The time stamps of a file are its own, those of a device are the clock's.  There is no depth.
+The time stamps of a file are its presentation times, those of a device are the clock's.  There is no depth.
 """
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from client_sdk.cameras.source import RawFrame, colour_of
+from client_sdk.cameras.source import RawFrame
+from client_sdk.datasets.images import colour_of
 from rse_pf.errors import UsageError
 from rse_pf.images import MAX_IMAGE_PIXELS, load_opencv
 
-__all__ = ["is_video_file", "open_video"]
+__all__ = ["Video", "is_video_file", "open_video"]
 
+_LOOKED_AT = 3  # so many frames of a file tell whether it has presentation times
 _MAX_MISSES = 30
 """A device that gives no image so many times in a row has gone."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Video:
+    """Images of a device or of a file, and how to close it.
+
+    ``frames`` is how many a file states, 0 if it states none; ``period_s`` is the time between them, of a
+    device 0.  ``notes`` say what was assumed.
+    """
+
+    images: Iterator[RawFrame]
+    close: Callable[[], None]
+    frames: int = 0
+    period_s: float = 0.0
+    notes: tuple[str, ...] = ()
+
+    @property
+    def span_s(self) -> tuple[float, float] | None:
+        """First and last time of a file, by the frames that it states; None of a device."""
+        return (0.0, self.frames * self.period_s) if self.frames else None
 
 
 def is_video_file(source: str) -> bool:
@@ -32,10 +56,8 @@ def is_video_file(source: str) -> bool:
     return is_file
 
 
-def open_video(
-    source: str, clock: Callable[[], float] = time.monotonic
-) -> tuple[Iterator[RawFrame], Callable[[], None]]:
-    """Open a device (``0``), a video file or a stream; return its images and how to close it.
+def open_video(source: str, clock: Callable[[], float] = time.monotonic) -> Video:
+    """Open a device (``0``), a video file or a stream.
 
     Raises:
         UsageError: There is no such device or file, or OpenCV cannot read it.
@@ -68,8 +90,29 @@ def open_video(
         )
     if is_device:
         capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
-    images = _file_images(cv2, capture, source) if is_file else _device_images(capture, source, clock)
-    return images, capture.release
+    if not is_file:
+        return Video(images=_device_images(capture, source, clock), close=capture.release)
+    rate_hz = float(capture.get(cv2.CAP_PROP_FPS))
+    period_s = 1.0 / rate_hz if 0.1 <= rate_hz <= 1000 else 1.0 / 30.0
+    has_times = _has_times(cv2, source)
+    assumed = f"{source} states no presentation times: {1.0 / period_s:g} frames a second are assumed"
+    return Video(
+        images=_file_images(cv2, capture, source, None if has_times else period_s),
+        close=capture.release,
+        frames=max(0, int(capture.get(cv2.CAP_PROP_FRAME_COUNT))),
+        period_s=period_s,
+        notes=() if has_times else (assumed,),
+    )
+
+
+def _has_times(cv2: Any, source: str) -> bool:
+    """Return whether the first frames of a file have presentation times: some containers report none."""
+    capture = cv2.VideoCapture(source)
+    try:
+        times_ms = [float(capture.get(cv2.CAP_PROP_POS_MSEC)) for _ in range(_LOOKED_AT) if capture.grab()]
+    finally:
+        capture.release()
+    return len(times_ms) < 2 or all(earlier < later for earlier, later in itertools.pairwise(times_ms))
 
 
 def _is_text(path: Path) -> bool:
@@ -88,9 +131,8 @@ def _silence(cv2: Any) -> None:
     logging.setLogLevel(0)
 
 
-def _file_images(cv2: Any, capture: Any, name: str) -> Iterator[RawFrame]:
-    rate_hz = float(capture.get(cv2.CAP_PROP_FPS))
-    period_s = 1.0 / rate_hz if 0.1 <= rate_hz <= 1000 else 1.0 / 30.0
+def _file_images(cv2: Any, capture: Any, name: str, period_s: float | None) -> Iterator[RawFrame]:
+    """Yield the images of a file with their presentation times, or *period_s* apart."""
     row = 0
     while True:
         good, image = capture.read()
@@ -98,8 +140,8 @@ def _file_images(cv2: Any, capture: Any, name: str) -> Iterator[RawFrame]:
             if row == 0:
                 raise UsageError(f"{name} holds no image", hint="record it again")
             return
-        # By number: the position that containers report is 0 in some of them.
-        yield row * period_s, colour_of(image, name), None
+        stamp_s = float(capture.get(cv2.CAP_PROP_POS_MSEC)) / 1e3 if period_s is None else row * period_s
+        yield stamp_s, colour_of(image, name), None
         row += 1
 
 

@@ -1,58 +1,76 @@
-"""Pairs of images of a stereo camera: two devices or videos, one image with both side by side, two folders.
+"""Pairs of images of a stereo camera: two devices or videos, or one image with both side by side.
 
 What is wrong with a pair of images is judged in `client_sdk.rigs`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from pathlib import Path
+from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 
-from client_sdk.cameras.folder import image_files, open_folder
-from client_sdk.cameras.opencv_video import open_video
+from client_sdk.cameras.opencv_video import Video, open_video
 from client_sdk.cameras.source import RawFrame, RawPair
+from client_sdk.source_facts import DoubtLog, SourceFacts
 from rse_pf.errors import UsageError
 
-__all__ = ["open_pair_folder", "open_pair_videos", "split_pairs"]
+__all__ = ["PairVideos", "open_pair_videos", "split_pairs"]
+
+_MAX_APART = 0.4  # of a pair of two files, in frames: images that are farther apart show two moments
 
 
-def open_pair_folder(folder: Path) -> Iterator[RawPair]:
-    """Return the images of ``left/`` with those of the same names in ``right/``.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PairVideos:
+    """Two devices or two videos."""
 
-    Raises:
-        UsageError: There is no image, or one of the left has no partner.
-    """
-    names = [{path.stem for path in image_files(folder / side)} for side in ("left", "right")]
-    missing = sorted(names[0] ^ names[1])
-    if missing:
-        side = "right" if missing[0] in names[0] else "left"
-        raise UsageError(
-            f"{missing[0]} is missing in {folder / side}", hint="give both images of a pair one name"
-        )
-    left, right = (open_folder(folder / side, 1000.0)[0] for side in ("left", "right"))
-    return _joined(left, right)
+    name: str
+    left: Video
+    right: Video
+
+    def facts(self, names: tuple[str, str]) -> SourceFacts:
+        """Return how many images both videos state, and what was assumed."""
+        frames = (self.left.frames, self.right.frames)
+        counts = dict(zip(names, frames, strict=True)) if all(frames) else {}
+        return SourceFacts(name=self.name, counts=counts, assumed=(*self.left.notes, *self.right.notes))
+
+    def pairs(self, log: DoubtLog) -> Iterator[RawPair]:
+        """Yield images of devices as they come, and images of files that have one time.
+
+        *log* counts images of files without a partner.
+        """
+        within_s = _MAX_APART * self.left.period_s
+        left, right = next(self.left.images, None), next(self.right.images, None)
+        while left is not None and right is not None:
+            apart_s = right[0] - left[0]
+            if within_s and apart_s > within_s:
+                log.leave_out(f"the left image at {left[0]:.3f} s")
+                left = next(self.left.images, None)
+            elif within_s and apart_s < -within_s:
+                log.leave_out(f"the right image at {right[0]:.3f} s")
+                right = next(self.right.images, None)
+            else:
+                yield left[0], left[1], right[1]
+                left, right = next(self.left.images, None), next(self.right.images, None)
+
+    def close(self) -> None:
+        """Release both."""
+        self.left.close()
+        self.right.close()
 
 
-def open_pair_videos(left: str, right: str) -> tuple[Iterator[RawPair], Callable[[], None]]:
-    """Open two devices or two videos, and return their images in pairs, and how to close them.
+def open_pair_videos(left: str, right: str) -> PairVideos:
+    """Open two devices or two videos.
 
     Raises:
         UsageError: One cannot be opened.
     """
-    lefts, close_left = open_video(left)
+    of_left = open_video(left)
     try:
-        rights, close_right = open_video(right)
+        return PairVideos(name=f"{left},{right}", left=of_left, right=open_video(right))
     except UsageError:
-        close_left()
+        of_left.close()
         raise
-
-    def close() -> None:
-        close_left()
-        close_right()
-
-    return _joined(lefts, rights), close
 
 
 def split_pairs(raw: Iterator[RawFrame], name: str) -> Iterator[RawPair]:
@@ -69,8 +87,3 @@ def split_pairs(raw: Iterator[RawFrame], name: str) -> Iterator[RawPair]:
                 hint="use a camera that gives both images side by side, or two devices: 0,2",
             )
         yield stamp, np.ascontiguousarray(rgb[:, :half]), np.ascontiguousarray(rgb[:, half:])
-
-
-def _joined(lefts: Iterator[RawFrame], rights: Iterator[RawFrame]) -> Iterator[RawPair]:
-    for (stamp, left, _), (_, right, _) in zip(lefts, rights, strict=False):
-        yield stamp, left, right

@@ -13,7 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from client_sdk.cameras.source import RawFrame, RawPair, colour_of
+from client_sdk.cameras.source import RawFrame, RawPair
+from client_sdk.datasets.images import colour_of
 from client_sdk.rigs.intrinsics import Intrinsics
 from client_sdk.rigs.rig import Rig, RigCamera
 from rse_pf.errors import MissingExtra, UsageError

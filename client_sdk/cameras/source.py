@@ -10,7 +10,7 @@ import itertools
 import math
 from collections import deque
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
@@ -23,12 +23,13 @@ from client_sdk.rigs.checks import check_pairs
 from client_sdk.rigs.intrinsics import Intrinsics, Undistortion
 from client_sdk.rigs.rectification import Rectification
 from client_sdk.rigs.rig import Rig
+from client_sdk.source_facts import Doubt, DoubtLog, DoubtName
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Camera
 
 __all__ = [
     "FrameSource", "FrameStream", "RawFrame", "RawPair", "RawSource", "SourceInfo", "StereoSource",
-    "colour_of", "no_depth",
+    "no_depth",
 ]  # fmt: skip
 
 _LOOKED_AT = 8
@@ -68,18 +69,26 @@ class FrameSource(Protocol):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SourceInfo:
-    """What `FrameSource` says of a source."""
+    """What `FrameSource` says of a source.
+
+    ``notes`` say what was assumed, ``log`` what is unlikely; ``span_s`` are the first and the last time
+    stamp, None where only the drive tells them.
+    """
 
     name: str
     camera: Camera
     has_depth: bool = False
     has_stereo: bool = False
+    notes: tuple[str, ...] = ()
+    log: DoubtLog = field(default_factory=DoubtLog)
+    span_s: tuple[float, float] | None = None
 
 
 class FrameStream(Closing):
     """A `FrameSource` over items ``(seconds, ...)``, each of which a function makes a frame of.
 
-    Items that do not ascend in time or are thinned out are dropped before a frame is made.
+    Items that are thinned out are dropped before a frame is made; so are those that do not ascend in time,
+    which is a doubt about the source.
     """
 
     def __init__(
@@ -101,6 +110,9 @@ class FrameStream(Closing):
         self.camera = about.camera
         self.has_depth = about.has_depth
         self.has_stereo = about.has_stereo
+        self.notes = about.notes
+        self.log = about.log
+        self.span_s = about.span_s
         self._items: Iterator[Any] = items
         self._make: Callable[[Any], Frame] = make
         self._last_s = -math.inf
@@ -123,9 +135,21 @@ class FrameStream(Closing):
         while True:
             item = next(self._items)
             timestamp_s = item[0]
-            if timestamp_s > self._last_s and (self._thinning is None or self._thinning.plays(timestamp_s)):
+            if timestamp_s <= self._last_s:
+                self._report_order(timestamp_s)
+            elif self._thinning is None or self._thinning.plays(timestamp_s):
                 self._last_s = timestamp_s
                 return self._make(item)
+
+    def _report_order(self, timestamp_s: float) -> None:
+        if any(doubt.name is DoubtName.TIME_ORDER for doubt in self.log.doubts):
+            return
+        sentence = (
+            f"{self.name} gives an image of {timestamp_s:.6f} s after one of {self._last_s:.6f} s; images "
+            "that are not later than the image before are left out"
+        )
+        hint = "let the driver stamp images with a clock that is never set back"
+        self.log.add(Doubt(name=DoubtName.TIME_ORDER, sentence=sentence, hint=hint))
 
     def close(self) -> None:
         """Release the device or file; the iterator is then at its end."""
@@ -140,11 +164,10 @@ class RawSource(FrameStream):
 
     def __init__(
         self,
-        name: str,
+        about: SourceInfo,
         raw: Iterator[RawFrame],
         intrinsics: Intrinsics,
         *,
-        has_depth: bool,
         rate_hz: float | None = None,
         close: Callable[[], None] | None = None,
     ) -> None:
@@ -153,7 +176,6 @@ class RawSource(FrameStream):
         Raises:
             UsageError: The rate is not above 0.
         """
-        about = SourceInfo(name=name, camera=intrinsics.camera, has_depth=has_depth)
         super().__init__(about, raw, self._frame, rate_hz=rate_hz, close=close)
         self._undistortion = Undistortion(intrinsics)
         self._no_depth = no_depth(self.camera)
@@ -181,22 +203,22 @@ class StereoSource(FrameStream):
 
     def __init__(
         self,
-        name: str,
+        about: SourceInfo,
         raw: Iterator[RawPair],
         rig: Rig,
         *,
         rate_hz: float | None = None,
         close: Callable[[], None] | None = None,
     ) -> None:
-        """Take pairs from *raw*; the other arguments are those of `FrameStream`.
+        """Take pairs from *raw*, rectified to a camera of their own; other arguments as of `FrameStream`.
 
         Raises:
             UsageError: The rate is not above 0, or the rig has no stereo pair.
         """
         if rig.right is None:
-            raise UsageError(f"the rig of {name} has one camera", hint="calibrate both: --stereo")
+            raise UsageError(f"the rig of {about.name} has one camera", hint="calibrate both: --stereo")
         self._rectification = Rectification(rig.left, rig.right)
-        about = SourceInfo(name=name, camera=self._rectification.camera, has_stereo=True)
+        about = replace(about, camera=self._rectification.camera)
         super().__init__(about, raw, self._frame, rate_hz=rate_hz, close=close)
         self._no_depth = no_depth(self.camera)
         self._ahead: deque[Frame] | None = None
@@ -231,19 +253,3 @@ def no_depth(camera: Camera) -> npt.NDArray[np.float32]:
     depth_m = np.zeros((camera.height, camera.width), dtype=np.float32)
     depth_m.flags.writeable = False
     return depth_m
-
-
-def colour_of(image: npt.NDArray[np.uint8], name: str) -> npt.NDArray[np.uint8]:
-    """Return ``(h, w, 3)``, red first, of an image as OpenCV reads it: grey, BGR or BGRA.
-
-    Raises:
-        UsageError: The image has another number of channels, or not 8 bits.
-    """
-    channels = 1 if image.ndim == 2 else image.shape[2]
-    if image.dtype != np.uint8 or channels not in (1, 3, 4):
-        raise UsageError(
-            f"{name} has {channels} channels of {image.dtype}", hint="use grey or colour images of 8 bits"
-        )
-    if channels == 1:
-        return np.ascontiguousarray(np.repeat(image.reshape(*image.shape[:2], 1), 3, axis=2))
-    return np.ascontiguousarray(image[:, :, 2::-1])

@@ -36,9 +36,8 @@ def corrected(intrinsics: Intrinsics, findings: Iterable[Finding]) -> tuple[Intr
             lens = tuple(finding.correction.get(name, 0.0) for name in _LENS)
             changed.append("distortion none to " + ", ".join(f"{each:.4f}" for each in lens))
         if finding.kind is FaultKind.DEPTH_SCALE:
-            right = scale / (1.0 + finding.value)
-            changed.append(f"depth_scale {scale:.6g} to {right:.6g}")
-            scale = right
+            scale = intrinsics.depth_units_per_m / (1.0 + finding.value)
+            changed.append(f"depth_scale {intrinsics.depth_units_per_m:.6g} to {scale:.6g}")
     made = Camera(**values, width=camera.width, height=camera.height)
     # What the calibration said of its error is not true of other numbers.
     same = replace(intrinsics, rms_px=None, views=None) if changed else intrinsics

@@ -5,10 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from client_sdk.source_facts import doubt_line
+
 if TYPE_CHECKING:
     from client_sdk.check.motion import MotionReference
     from client_sdk.check.observer import DriveObserver
     from client_sdk.frontend import Frame, TrackedFrame
+    from client_sdk.source_facts import Doubt
     from client_sdk.tracking.stereo_adjustment import StereoAdjustment
 
 __all__ = ["DriveCheck", "check_lines"]
@@ -26,7 +29,13 @@ def check_lines(told: Mapping[str, Any], *, is_whole: bool = False) -> list[str]
         bends = "" if cost is None else f"; it bends the path by about {100 * cost:.1f} cm"
         lines.append(f"check: {each.get('sentence')}{bends}; {each.get('fix')}")
     kinds = sorted({str(each.get("kind")) for each in untold})
-    if not findings:
+    doubts: Sequence[Mapping[str, Any]] = told.get("source") or []
+    lines += [doubt_line(each) for each in doubts]
+    if doubts:
+        lines.append(
+            "check: no advice on the calibration while the source has a finding that is not accepted"
+        )
+    elif not findings:
         vague = "" if is_whole or not kinds else f"; this drive cannot tell {', '.join(kinds)}"
         lines.append(f"check: nothing wrong found in {told.get('frames')} frames{vague}")
     if is_whole:
@@ -59,16 +68,18 @@ class DriveCheck:
         self,
         reference: MotionReference | None = None,
         offsets: Mapping[int, StereoAdjustment] | None = None,
+        doubts: Sequence[Doubt] = (),
     ) -> dict[str, Any] | None:
         """Return what ``report.json`` holds of the check; None if it was not wanted.
 
-        *offsets* are what `Mapper.adjust_pairs` found in a stereo drive.
+        *offsets* are what `Mapper.adjust_pairs` found in a stereo drive; *doubts* about the source are not
+        accepted by the user.
         """
         observer = self._observer
         if observer is not None:
             observer.reference = reference
             observer.add_offsets(offsets or {})
-            report = self._tried(observer.finish)
+            report = self._tried(lambda: observer.finish(doubts))
             if report is not None:
                 return report.to_dict()
         return {"failed": self._failed} if self._failed else None

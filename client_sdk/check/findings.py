@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import Any
 
+from client_sdk.source_facts import Doubt
 from rse_pf.errors import UsageError
 
 __all__ = ["CannotTell", "CheckReport", "FaultKind", "Finding", "matters", "order"]
@@ -137,12 +138,14 @@ class CheckReport:
         cannot_tell: What the drive cannot show.
         frames: So many were looked at.
         notes: Sentences on what was not looked at, and why.
+        doubts: What is unlikely about the source; while there is a doubt, nothing is advised.
     """
 
     findings: tuple[Finding, ...] = ()
     cannot_tell: tuple[CannotTell, ...] = ()
     frames: int = 0
     notes: tuple[str, ...] = ()
+    doubts: tuple[Doubt, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """Return what ``report.json`` holds."""
@@ -151,6 +154,7 @@ class CheckReport:
             "findings": [each.to_dict() for each in self.findings],
             "cannot_tell": [each.to_dict() for each in self.cannot_tell],
             "notes": list(self.notes),
+            "source": [each.to_dict() for each in self.doubts],
         }
 
 

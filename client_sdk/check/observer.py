@@ -6,7 +6,7 @@ Small things only are kept: figures of images, poses, features of some frames an
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Literal
 
 import numpy as np
@@ -27,6 +27,7 @@ from client_sdk.check.pairs import PairsJudgement, judge_pairs
 from client_sdk.frontend import Frame, TrackedFrame
 from client_sdk.imu.history import ImuHistory
 from client_sdk.rigs.checks import PairFault
+from client_sdk.source_facts import Doubt
 from client_sdk.tracking.stereo_adjustment import StereoAdjustment
 from rse_pf.geometry import Array
 
@@ -81,8 +82,14 @@ class DriveObserver:
         """Take what `Mapper.adjust_pairs` found in a stereo drive, by segment, before `finish`."""
         self._pair_offsets = found
 
-    def finish(self) -> CheckReport:
-        """Return what is wrong with the drive, worst first, and what it cannot tell."""
+    def finish(self, doubts: Sequence[Doubt] = ()) -> CheckReport:
+        """Return what is wrong with the drive, worst first, and what it cannot tell.
+
+        While there are *doubts* about the source, nothing is fitted to its frames: a calibration would be
+        fitted to the damage.
+        """
+        if doubts:
+            return CheckReport(frames=len(self._images), doubts=tuple(doubts))
         findings, untold = self._images.findings()
         calibration = judge_calibration(self._store)
         findings += calibration.findings

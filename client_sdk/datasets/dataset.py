@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
+from client_sdk.datasets.images import readable
 from client_sdk.datasets.thinning import Thinning, median_interval_s
 from client_sdk.frontend import Frame
 from client_sdk.mapping import Trajectory
 from client_sdk.rigs.checks import check_pairs, spread_pairs
 from client_sdk.rigs.imu_track import ImuTrack, with_imu
+from client_sdk.source_facts import Doubt, DoubtLog
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Array, Camera
 
@@ -27,7 +29,7 @@ class Dataset:
     user on what was assumed.  ``T_body_camera`` is the pose of the camera in the body whose path was
     measured, None where that is the camera itself, or not known.  With *has_stereo* the camera is the
     rectified left one, and so is that of the truth.  ``imu`` holds all samples of an IMU; each frame that is
-    iterated over gets those since the frame before it in this dataset.
+    iterated over gets those since the frame before it in this dataset.  ``log`` collects `doubts`.
     """
 
     name: str
@@ -42,6 +44,17 @@ class Dataset:
     has_stereo: bool = False
     T_body_camera: Array | None = None
     imu: ImuTrack | None = None
+    log: DoubtLog = field(default_factory=DoubtLog)
+
+    @property
+    def doubts(self) -> tuple[Doubt, ...]:
+        """What is unlikely about the recording, and images that were left out while it was iterated over."""
+        return self.log.doubts
+
+    @property
+    def span_s(self) -> tuple[float, float] | None:
+        """The first and the last time stamp; None without a frame."""
+        return (self.timestamps_s[0], self.timestamps_s[-1]) if self.timestamps_s else None
 
     @property
     def has_imu(self) -> bool:
@@ -58,7 +71,7 @@ class Dataset:
         return len(self.rows)
 
     def __iter__(self) -> Iterator[Frame]:
-        frames: Iterator[Frame] = map(self.read, self.rows)
+        frames = readable(self.rows, self.read, self.log)
         if self.T_body_camera is not None:
             frames = (replace(frame, T_body_camera=self.T_body_camera) for frame in frames)
         return with_imu(frames, self.imu)

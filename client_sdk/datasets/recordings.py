@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -18,16 +19,29 @@ from client_sdk.bags import Bag, BagOptions, is_bag, lens_or_rig, open_bag
 from client_sdk.bags.index import pair_stamps
 from client_sdk.datasets import nyu
 from client_sdk.datasets.dataset import Dataset
-from client_sdk.datasets.images import read_image_file
+from client_sdk.datasets.images import check_size, probe, read_colour, read_depth
 from client_sdk.datasets.rig_recordings import CameraChoice, is_euroc, is_kitti, open_euroc, open_kitti
 from client_sdk.frontend import Frame
 from client_sdk.mapping import Trajectory, read_trajectory
-from client_sdk.rigs.intrinsics import Intrinsics, Undistortion, read_intrinsics
+from client_sdk.rigs.intrinsics import Intrinsics, Undistortion
+from client_sdk.rigs.rig import Rig
+from client_sdk.rigs.rig_file import read_calibration
+from client_sdk.source_facts import (
+    CameraFacts,
+    DepthFacts,
+    DoubtLog,
+    SourceFacts,
+    TimeFacts,
+    check_source,
+    median_depth_m,
+    rows_in_time,
+    stamps_in_seconds,
+)
 from rse_pf.errors import UsageError
 from rse_pf.files import read_regular_file
 from rse_pf.geometry import Camera
 
-__all__ = ["associate_stamps", "dataset_of_bag", "open_dataset"]
+__all__ = ["associate_stamps", "dataset_of_bag", "is_listed", "open_dataset"]
 
 _MAX_LIST_BYTES = 64 << 20
 """Of ``rgb.txt`` and ``depth.txt``: a million images."""
@@ -55,9 +69,10 @@ def open_dataset(
 ) -> Dataset:
     """Detect the format of *path* and return its frames; images are read later.
 
-    Accepts a folder in TUM layout (``rgb.txt``, ``depth.txt``, with or without ``intrinsics.json``), a
-    recording of EuRoC or a sequence of KITTI's odometry benchmark, a raw NYU Depth V2 folder (``r-*.ppm``,
-    ``d-*.pgm``), its labelled ``.mat`` file, of which *scene* picks one scene, or a ROS bag.
+    Accepts a folder in TUM layout (``rgb.txt``, ``depth.txt``, or a list of associations; with or without
+    ``intrinsics.json``), a recording of EuRoC or a sequence of KITTI's odometry benchmark, a raw NYU Depth V2
+    folder (``r-*.ppm``, ``d-*.pgm``), its labelled ``.mat`` file, of which *scene* picks one scene, or a ROS
+    bag.
 
     Args:
         path: The folder or file.
@@ -73,7 +88,7 @@ def open_dataset(
         MissingExtra: OpenCV, h5py or rosbags is needed and not installed.
     """
     path = Path(path)
-    if intrinsics is not None and not (_is_bag(path) or (path / "rgb.txt").is_file()):
+    if intrinsics is not None and not (_is_bag(path) or is_listed(path)):
         raise UsageError(
             f"{path} has a calibration of its own format", hint="leave out --intrinsics, or change that file"
         )
@@ -95,7 +110,17 @@ def open_dataset(
 
 
 def _is_bag(path: Path) -> bool:
-    return is_bag(path) and not (path / "rgb.txt").is_file()
+    return is_bag(path) and not is_listed(path)
+
+
+def is_listed(path: Path) -> bool:
+    """Return whether a folder lists its images: in ``rgb.txt``, or colour and depth in one list."""
+    return (path / "rgb.txt").is_file() or _associations(path) is not None
+
+
+def _associations(folder: Path) -> Path | None:
+    """Return the list of both, as TUM's ``associate.py`` and ORB-SLAM write it."""
+    return next(iter(sorted(folder.glob("*assoc*.txt"))), None)
 
 
 def _open_single(path: Path, scene: str | None, intrinsics: Path | None) -> Dataset:
@@ -110,7 +135,7 @@ def _open_single(path: Path, scene: str | None, intrinsics: Path | None) -> Data
         )
     if scene is not None:
         raise UsageError(f"{path} has no scenes", hint="name scenes for the labelled .mat file only")
-    if not (path / "rgb.txt").exists() and any(path.glob("d-*.pgm")):
+    if not is_listed(path) and any(path.glob("d-*.pgm")):
         return _open_raw(path)
     return _open_tum(path, intrinsics or path / "intrinsics.json")
 
@@ -145,85 +170,155 @@ def associate_stamps(
 # --- TUM layout --------------------------------------------------------------------------------
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _List:
+    """Images of one kind, in the order of time, and what their list states."""
+
+    times: TimeFacts
+    stamps_s: tuple[float, ...]
+    images: tuple[str, ...]
+    notes: tuple[str, ...]
+
+
 def _open_tum(folder: Path, of_camera: Path) -> Dataset:
-    colours, depths = _read_list(folder, "rgb.txt"), _read_list(folder, "depth.txt")
-    pairs = associate_stamps(
-        [stamp for stamp, _ in colours], [stamp for stamp, _ in depths], _MAX_STAMP_DIFFERENCE_S
-    )
-    for name, entries in (("rgb.txt", colours), ("depth.txt", depths)):
-        if not entries:
+    colours, depths = _read_lists(folder)
+    intrinsics, notes = _intrinsics(folder, of_camera, has_depth=depths is not None)
+    pairs = [(row, row) for row in range(len(colours.images))]
+    if depths is not None:
+        pairs = associate_stamps(colours.stamps_s, depths.stamps_s, _MAX_STAMP_DIFFERENCE_S)
+        if not pairs:
             raise UsageError(
-                f"{folder / name} lists no image", hint="write a line for each image: timestamp filename"
+                f"no colour image of {folder} has a depth image within {_MAX_STAMP_DIFFERENCE_S:g} s: "
+                f"colours begin at {colours.stamps_s[0]:.3f} s, depth at {depths.stamps_s[0]:.3f} s",
+                hint="check that rgb.txt and depth.txt use the same clock",
             )
-    if not pairs:
-        raise UsageError(
-            f"no colour image of {folder} has a depth image within {_MAX_STAMP_DIFFERENCE_S:g} s",
-            hint="check that rgb.txt and depth.txt use the same clock",
-        )
-    intrinsics, notes = _intrinsics(folder, of_camera)
     camera, undistort = intrinsics.camera, Undistortion(intrinsics)
+    units_per_m = intrinsics.depth_units_per_m
+    no_depth: npt.NDArray[np.float32] = np.zeros((camera.height, camera.width), dtype=np.float32)
+
+    def depth_of(row: int) -> npt.NDArray[np.float32]:
+        if depths is None:
+            return no_depth
+        path = folder / depths.images[pairs[row][1]]
+        depth_m = read_depth(path, units_per_m)
+        check_size(depth_m, camera, path)
+        return depth_m
 
     def read(row: int) -> Frame:
-        colour_row, depth_row = pairs[row]
-        rgb = read_image_file(folder / colours[colour_row][1], is_depth=False)
-        png = read_image_file(folder / depths[depth_row][1], is_depth=True)
-        _check_size(rgb, camera, folder / colours[colour_row][1])
-        _check_size(png, camera, folder / depths[depth_row][1])
-        depth_m = png.astype(np.float32) / np.float32(intrinsics.depth_scale)
-        depth_m[png == np.iinfo(png.dtype).max] = 0.0  # some recorders write "no reading" so
-        _check_metres(depth_m, folder)
+        path = folder / colours.images[pairs[row][0]]
+        rgb = read_colour(path)
+        check_size(rgb, camera, path)
         return Frame(
-            timestamp_s=colours[colour_row][0],
+            timestamp_s=colours.stamps_s[pairs[row][0]],
             rgb=undistort.colour(rgb),
-            depth_m=undistort.depth(depth_m),
+            depth_m=undistort.depth(depth_of(row)),
             camera=camera,
         )
 
-    truth, truth_kind = _read_truth(folder)
+    truth, truth_kind, of_truth = _read_truth(folder)
+    stated_by = str(of_camera if of_camera.exists() else folder)
+    is_fisheye = intrinsics.model == "fisheye"
+    probed = probe(range(len(pairs)), depth_of)
+    depth = DepthFacts(
+        median_m=median_depth_m(probed), units_per_m=units_per_m, is_unit_stated=True,
+        is_registered=intrinsics.is_depth_registered,
+    )  # fmt: skip
+    lists = (colours,) if depths is None else (colours, depths)
+    facts = SourceFacts(
+        name=str(folder),
+        cameras=(CameraFacts(stated_by=stated_by, camera=camera, is_fisheye=is_fisheye),),
+        depth=None if depths is None else depth,
+        times=tuple(each.times for each in lists),
+        references=() if truth is None else (TimeFacts(stated_by=of_truth[0], stamps_s=truth.timestamps_s),),
+        assumed=(*notes, *(note for each in lists for note in each.notes), *of_truth[1:]),
+    )
     return Dataset(
         name=folder.name,
         camera=camera,
-        timestamps_s=tuple(colours[row][0] for row, _ in pairs),
+        timestamps_s=tuple(colours.stamps_s[row] for row, _ in pairs),
         truth=truth,
         truth_kind=truth_kind,
         rows=tuple(range(len(pairs))),
         read=read,
-        notes=notes,
+        has_depth=depths is not None,
+        log=DoubtLog(check_source(facts)),
+        notes=facts.assumed,
     )
 
 
-def _read_list(folder: Path, name: str) -> list[tuple[float, str]]:
+def _read_lists(folder: Path) -> tuple[_List, _List | None]:
+    """Return the lists of colours and of depth; None without depth."""
+    associations = _associations(folder)
+    if not (folder / "rgb.txt").is_file() and associations is not None:
+        rows = _read_rows(associations, 4)
+        first, second = ([(row[at], row[at + 1]) for row in rows] for at in (0, 2))
+        if rows and "depth" in first[0][1].lower() and "depth" not in second[0][1].lower():
+            first, second = second, first
+        return _listed(folder, associations.name, first), _listed(folder, associations.name, second)
+    colours = _listed(folder, "rgb.txt", _read_rows(folder / "rgb.txt", 2))
+    if not (folder / "depth.txt").exists() and not (folder / "depth").is_dir():
+        return colours, None
+    return colours, _listed(folder, "depth.txt", _read_rows(folder / "depth.txt", 2))
+
+
+def _listed(folder: Path, name: str, rows: Sequence[Sequence[str]]) -> _List:
+    """Return the images of a list whose times increase."""
+    if not rows:
+        raise UsageError(
+            f"{folder / name} lists no image", hint="write a line for each image: timestamp filename"
+        )
+    stamps_s, notes = stamps_in_seconds(np.array([float(row[0]) for row in rows]), str(folder / name))
+    times = TimeFacts(stated_by=str(folder / name), stamps_s=stamps_s)
+    used, _ = rows_in_time(times)
+    return _List(
+        times=times, notes=notes,
+        stamps_s=tuple(stamps_s[used].tolist()), images=tuple(rows[row][1].strip() for row in used),
+    )  # fmt: skip
+
+
+def _read_rows(path: Path, columns: int) -> list[list[str]]:
+    """Return the rows of a list: time stamps, each with the path of an image."""
     try:
-        text = read_regular_file(folder / name, _MAX_LIST_BYTES).decode()
+        text = read_regular_file(path, _MAX_LIST_BYTES).decode("utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         raise UsageError(
-            f"no {name} in {folder}", hint="name a folder in TUM layout: rgb.txt, depth.txt, images"
+            f"no {path.name} in {path.parent}", hint="name a folder in TUM layout: rgb.txt, depth.txt, images"
         ) from error
-    entries = []
+    rows = []
     for number, line in enumerate(text.splitlines(), start=1):
-        words = line.split(maxsplit=1)
+        words = line.split(maxsplit=columns - 1)
         if not words or words[0].startswith("#"):
             continue
         try:
-            stamp, image = float(words[0]), words[1].strip()
-        except (ValueError, IndexError) as error:
+            stamps = [float(word) for word in words[::2]]
+            images = [Path(word.strip()) for word in words[1::2]]
+        except ValueError:
+            stamps, images = [], []
+        if len(images) * 2 != columns:
             raise UsageError(
-                f"{folder / name}, line {number} is not an image", hint="write: timestamp filename"
-            ) from error
-        inside = Path(image)
-        if not math.isfinite(stamp) or inside.is_absolute() or ".." in inside.parts:
+                f"{path}, line {number} is not an image",
+                hint="write: timestamp filename" + (" timestamp filename" if columns == 4 else ""),
+            )
+        is_inside = not any(image.is_absolute() or ".." in image.parts for image in images)
+        if not all(map(math.isfinite, stamps)) or not is_inside:
             raise UsageError(
-                f"{folder / name}, line {number} names no time, or no image below its folder",
+                f"{path}, line {number} names no time, or no image below its folder",
                 hint="write seconds, and a path such as rgb/1.png",
             )
-        entries.append((stamp, image))
-    return sorted(entries)
+        rows.append(words)
+    return rows
 
 
-def _intrinsics(folder: Path, file: Path) -> tuple[Intrinsics, tuple[str, ...]]:
+def _intrinsics(folder: Path, file: Path, *, has_depth: bool) -> tuple[Intrinsics, tuple[str, ...]]:
     """Return the intrinsics of a file, and notes on what was assumed where the folder has none."""
     if file.exists() or file.parent != folder:
-        return read_intrinsics(file, with_depth_scale=True), ()
+        found = read_calibration(file)
+        lens = found.left.lens if isinstance(found, Rig) else found
+        if has_depth and lens.depth_scale is None:
+            raise UsageError(
+                f"{file} has no depth_scale", hint="state it: 5000 for TUM, 1000 for millimetres"
+            )
+        return lens, ()
     name = next(key for key in _FREIBURG if key in folder.resolve().name)
     fx, fy, cx, cy, distortion = _FREIBURG[name]
     camera = Camera(fx=fx, fy=fy, cx=cx, cy=cy, width=640, height=480)
@@ -236,32 +331,22 @@ def _intrinsics(folder: Path, file: Path) -> tuple[Intrinsics, tuple[str, ...]]:
     return assumed, (note,)
 
 
-def _read_truth(folder: Path) -> tuple[Trajectory | None, Literal["ground truth", "reference", "none"]]:
-    if (folder / "groundtruth.txt").exists():
-        return read_trajectory(folder / "groundtruth.txt"), "ground truth"
-    if (folder / "reference_poses.txt").exists():
-        return read_trajectory(folder / "reference_poses.txt"), "reference"
-    return None, "none"
-
-
-def _check_size(image: npt.NDArray[Any], camera: Camera, path: Path) -> None:
-    """Refuse an image of another size: the intrinsics would be those of another camera."""
-    height, width = image.shape[:2]
-    if (width, height) != (camera.width, camera.height):
-        raise UsageError(
-            f"{path} is {width}x{height} px, the camera of the recording {camera.width}x{camera.height} px",
-            hint="give colour and depth the size in intrinsics.json, and scale fx, fy, cx, cy with it",
-        )
-
-
-def _check_metres(depth_m: npt.NDArray[np.float32], folder: Path) -> None:
-    some = depth_m[::8, ::8]
-    readings = some[some > 0]
-    if len(readings) and not 0.05 <= float(np.median(readings)) <= 30.0:
-        raise UsageError(
-            f"the median depth in {folder} is {float(np.median(readings)):g} m",
-            hint="set depth_scale in intrinsics.json: 5000 for TUM, 1000 for millimetres",
-        )
+def _read_truth(
+    folder: Path,
+) -> tuple[Trajectory | None, Literal["ground truth", "reference", "none"], tuple[str, ...]]:
+    """Return the truth, what it is, and its file with notes on its time stamps."""
+    known: tuple[tuple[str, Literal["ground truth", "reference"]], ...] = (
+        ("groundtruth.txt", "ground truth"), ("reference_poses.txt", "reference"),
+    )  # fmt: skip
+    for name, kind in known:
+        if (folder / name).exists():
+            path = str(folder / name)
+            read = read_trajectory(folder / name)
+            stamps_s, notes = stamps_in_seconds(read.timestamps_s, path)
+            if bool((np.diff(stamps_s) < 0.0).any()):
+                notes = (*notes, f"the poses of {path} are not in the order of time, and are sorted")
+            return Trajectory(stamps_s, read.T_world_camera), kind, (path, *notes)
+    return None, "none", ("",)
 
 
 # --- NYU Depth V2 ------------------------------------------------------------------------------

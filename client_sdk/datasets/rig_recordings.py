@@ -5,7 +5,7 @@ Frames of one camera are undistorted, those of a pair rectified; the truth is th
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from client_sdk.bags.index import pair_stamps
 from client_sdk.datasets.dataset import Dataset
-from client_sdk.datasets.images import read_colour
+from client_sdk.datasets.images import check_size, image_files, probe, read_colour
 from client_sdk.frontend import Frame, load_opencv
 from client_sdk.mapping import Trajectory
 from client_sdk.rigs.benchmark_files import (
@@ -29,6 +29,18 @@ from client_sdk.rigs.imu_track import ImuTrack
 from client_sdk.rigs.intrinsics import Undistortion
 from client_sdk.rigs.rectification import Rectification
 from client_sdk.rigs.rig import Rig
+from client_sdk.source_facts import (
+    CameraFacts,
+    Doubt,
+    DoubtLog,
+    DoubtName,
+    SourceFacts,
+    TimeFacts,
+    check_source,
+    rows_in_time,
+    some_names,
+    stamps_in_seconds,
+)
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Array, from_quaternion
 
@@ -39,6 +51,8 @@ CameraChoice = Literal["stereo", "left"]
 _EUROC_TRUTH = "state_groundtruth_estimate0/data.csv"
 _MAX_PAIR_S = 0.005
 """The shutters of a pair open together; stamps that are farther apart are those of other images."""
+_KITTI_PAIRS = ("image_0", "image_1"), ("image_2", "image_3")
+"""The grey and the colour cameras; the digit is that of their projection in ``calib.txt``."""
 
 
 def is_euroc(folder: Path) -> bool:
@@ -48,17 +62,23 @@ def is_euroc(folder: Path) -> bool:
 
 def is_kitti(folder: Path) -> bool:
     """Return whether a folder has the layout of a sequence of KITTI's odometry benchmark."""
-    return (folder / "image_0").is_dir() and (folder / "calib.txt").is_file()
+    return (folder / "calib.txt").is_file() and any((folder / left).is_dir() for left, _ in _KITTI_PAIRS)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Files:
-    """Images of the left camera, and of the right one where it is used, with their ``(n,)`` times."""
+    """Images of the left camera, and of the right one where it is used, with their ``(n,)`` times.
+
+    ``stated_by`` are the files of the calibration, and of the times; ``truth`` is the file of the true path.
+    """
 
     lefts: Sequence[Path]
     rights: Sequence[Path] | None
     stamps_s: Array
+    stated_by: tuple[str, str]
+    truth: str = ""
     notes: tuple[str, ...] = ()
+    doubts: tuple[Doubt, ...] = ()
 
 
 def open_euroc(folder: Path, camera: CameraChoice | None = None, imu: bool | None = None) -> Dataset:
@@ -78,13 +98,13 @@ def open_euroc(folder: Path, camera: CameraChoice | None = None, imu: bool | Non
     stereo = _takes(folder / "cam1" / "sensor.yaml", None if camera is None else camera == "stereo", "cam1")
     has_imu = _takes(folder / "imu0" / "sensor.yaml", imu, "imu0")
     cameras = [read_euroc_camera(folder / "cam0" / "sensor.yaml", "left")]
-    paths, stamps_s = _euroc_images(folder / "cam0")
+    paths, stamps_s, notes, doubts = _euroc_images(folder / "cam0")
     rights: list[Path] | None = None
-    notes: tuple[str, ...] = ()
     if stereo:
         cameras.append(read_euroc_camera(folder / "cam1" / "sensor.yaml", "right"))
-        others, others_s = _euroc_images(folder / "cam1")
-        pairs, notes = _pairs(stamps_s, others_s, folder.parent.name)
+        others, others_s, *_ = _euroc_images(folder / "cam1")
+        pairs, of_pairs = _pairs(stamps_s, others_s, folder.parent.name)
+        notes += of_pairs
         paths, stamps_s = [paths[row] for row, _ in pairs], stamps_s[[row for row, _ in pairs]]
         rights = [others[row] for _, row in pairs]
     rig = Rig(
@@ -97,20 +117,27 @@ def open_euroc(folder: Path, camera: CameraChoice | None = None, imu: bool | Non
         poses = np.tile(np.eye(4), (len(values), 1, 1))
         poses[:, :3, 3] = values[:, 1:4]
         poses[:, :3, :3] = [from_quaternion(xyzw) for xyzw in values[:, [5, 6, 7, 4]]]
-        bodies = Trajectory(values[:, 0] / 1e9, poses)
+        truth_s, of_truth = stamps_in_seconds(values[:, 0], str(folder / _EUROC_TRUTH), "nanoseconds")
+        bodies = Trajectory(truth_s, poses)
+        notes += of_truth
     name = folder.parent.name if folder.name == "mav0" else folder.name
     samples = None
     if has_imu:
         rows = [row[:7] for row in _csv(folder / "imu0" / "data.csv", 7)]
         values = read_numbers(folder / "imu0" / "data.csv", [word for row in rows for word in row])
         samples = values.reshape(-1, 7)
-        samples[:, 0] /= 1e9
-    files = _Files(lefts=paths, rights=rights, stamps_s=stamps_s, notes=notes)
+        samples[:, 0], of_imu = stamps_in_seconds(samples[:, 0], str(folder / "imu0"), "nanoseconds")
+        notes += of_imu
+    stated_by = str(folder / "cam0" / "sensor.yaml"), str(folder / "cam0" / "data.csv")
+    files = _Files(
+        lefts=paths, rights=rights, stamps_s=stamps_s, notes=notes, doubts=doubts, stated_by=stated_by,
+        truth=_EUROC_TRUTH,
+    )  # fmt: skip
     return _dataset(name or folder.name, rig, files, bodies, samples)
 
 
 def open_kitti(folder: Path, camera: CameraChoice | None = None, imu: bool | None = None) -> Dataset:
-    """Return the frames of ``image_0``, or of both grey cameras.
+    """Return the frames of ``image_0``, or of both grey cameras; of the colour cameras without grey ones.
 
     The truth is in ``poses.txt``, or in ``../../poses/NAME.txt``.
 
@@ -124,59 +151,117 @@ def open_kitti(folder: Path, camera: CameraChoice | None = None, imu: bool | Non
     """
     if imu:
         raise UsageError(f"{folder} has no IMU: KITTI's sequences hold none", hint="leave out --imu")
-    stereo = _takes(folder / "image_1", None if camera is None else camera == "stereo", "image_1")
-    stamps_s = read_numbers(folder / "times.txt", read_text(folder / "times.txt").split())
-    paths = _kitti_images(folder / "image_0")
-    if not paths or not len(stamps_s):
+    left, right = next(pair for pair in _KITTI_PAIRS if (folder / pair[0]).is_dir())
+    stereo = _takes(folder / right, None if camera is None else camera == "stereo", right)
+    times_s = read_numbers(folder / "times.txt", read_text(folder / "times.txt").split())
+    paths = image_files(folder / left)
+    if not paths or not len(times_s):
         raise UsageError(f"{folder} lacks images or times", hint="unpack the sequence again")
-    paths, stamps_s = paths[: len(stamps_s)], stamps_s[: len(paths)]
-    height, width = read_colour(paths[0]).shape[:2]
-    rig = read_kitti_rig(folder / "calib.txt", (width, height), with_right=stereo)
-    rights = None
-    if stereo:
-        by_name = {path.stem: path for path in _kitti_images(folder / "image_1")}
-        missing = [path.name for path in paths if path.stem not in by_name]
-        if missing:
-            raise UsageError(
-                f"{folder / 'image_1'} lacks {missing[0]}", hint="unpack the sequence again, or --camera left"
-            )
-        rights = [by_name[path.stem] for path in paths]
-    truth = None
     known = (folder / "poses.txt", folder.parent.parent / "poses" / f"{folder.name}.txt")
-    path = next((each for each in known if each.is_file()), None)
-    if path is not None:
-        values = read_numbers(path, read_text(path).split())
-        if len(values) % 12 or len(values) < 12 * len(paths):
-            raise UsageError(f"{path} has not 12 numbers for each image", hint="unpack the sequence again")
-        poses = np.tile(np.eye(4), (len(paths), 1, 1))
-        poses[:, :3] = values.reshape(-1, 3, 4)[: len(paths)]
-        truth = Trajectory(stamps_s, poses)
-    files = _Files(lefts=paths, rights=rights, stamps_s=stamps_s)
+    truth_file = next((each for each in known if each.is_file()), None)
+    poses = None if truth_file is None else _kitti_poses(truth_file)
+    lists = {"times.txt": len(times_s)} | ({} if poses is None else {"poses.txt": len(poses)})
+    rows, notes = _kitti_rows(paths, lists, folder)
+    stamps_s = times_s[rows["times.txt"]]
+    used, doubts = rows_in_time(TimeFacts(stated_by=str(folder / "times.txt"), stamps_s=stamps_s))
+    rights: list[Path] | None = None
+    if stereo:
+        partners = {path.stem: path for path in image_files(folder / right)}
+        alone = [paths[row].name for row in used if paths[row].stem not in partners]
+        used = [row for row in used if paths[row].stem in partners]
+        if not used:
+            raise UsageError(
+                f"no image of {folder / left} has one of the same number in {folder / right}",
+                hint="unpack the sequence again, or --camera left",
+            )
+        if alone:
+            sentence = f"{len(alone)} of {len(paths)} images of {folder} left out, without a right image: "
+            doubt = Doubt(
+                name=DoubtName.LEFT_OUT, sentence=sentence + some_names(alone), hint="unpack it again"
+            )
+            doubts = (*doubts, doubt)
+        rights = [partners[paths[row].stem] for row in used]
+    truth = None
+    if poses is not None:
+        truth = Trajectory(stamps_s[used], poses[rows["poses.txt"]][used])
+    lefts = [paths[row] for row in used]
+    height, width = probe(lefts, read_colour)[0].shape[:2]
+    keys = (f"P{left[-1]}", f"P{right[-1]}") if stereo else (f"P{left[-1]}",)
+    rig = read_kitti_rig(folder / "calib.txt", (width, height), keys)
+    files = _Files(
+        lefts=lefts, rights=rights, stamps_s=stamps_s[used], notes=notes, doubts=doubts,
+        stated_by=(str(folder / "calib.txt"), str(folder / "times.txt")), truth=str(truth_file),
+    )  # fmt: skip
     dataset = _dataset(folder.name, rig, files, truth, None)
     # The path that KITTI measured is that of the left camera itself, as it is rectified.
     return replace(dataset, T_body_camera=None)
 
 
+def _kitti_poses(path: Path) -> Array:
+    """Return the ``(n, 4, 4)`` poses of a file of 12 numbers a line."""
+    values = read_numbers(path, read_text(path).split())
+    if len(values) % 12:
+        raise UsageError(f"{path} has not 12 numbers in each line", hint="unpack the sequence again")
+    poses = np.tile(np.eye(4), (len(values) // 12, 1, 1))
+    poses[:, :3] = values.reshape(-1, 3, 4)
+    return poses
+
+
+def _kitti_rows(
+    paths: Sequence[Path], lists: Mapping[str, int], folder: Path
+) -> tuple[dict[str, list[int]], tuple[str, ...]]:
+    """Return for each list, by its name and length, the row of each image, and what was assumed.
+
+    An image has the row of its number.  A list that is too short for the numbers, and as long as there are
+    images, was cut out with them.
+
+    Raises:
+        UsageError: A list is too short for the images.
+    """
+    numbers = [int(path.stem) if path.stem.isdecimal() else None for path in paths]
+    rows: dict[str, list[int]] = {}
+    notes: tuple[str, ...] = ()
+    for name, length in lists.items():
+        by_number = [number for number in numbers if number is not None and number < length]
+        if len(by_number) == len(paths):
+            rows[name] = by_number
+        elif length == len(paths):
+            rows[name] = list(range(length))
+            notes += (
+                f"{name} of {folder} has a line for each of the {length} images, and none for the number "
+                f"{paths[-1].stem}: they are joined in their order",
+            )
+        else:
+            counts = ", ".join(f"{each} lines in {other}" for other, each in lists.items())
+            raise UsageError(
+                f"{folder}: {len(paths)} images with numbers up to {paths[-1].stem}, {counts}",
+                hint="unpack the sequence again: line n belongs to the image of number n",
+            )
+    return rows, notes
+
+
 def _dataset(name: str, rig: Rig, files: _Files, bodies: Trajectory | None, samples: Array | None) -> Dataset:
     """Return the frames of a rig; *bodies* is the true path of its body, *samples* ``(n, 7)`` of its IMU."""
     paths, rights, stamps_s = files.lefts, files.rights, files.stamps_s
-    if not len(paths) or bool((np.diff(stamps_s) <= 0).any()):
-        raise UsageError(
-            f"{name} has no images, or their times do not ascend", hint="unpack the recording again"
-        )
+    if not len(paths):
+        raise UsageError(f"{name} has no images", hint="unpack the recording again")
     left, right = rig.left, rig.right
     rectify = None if rights is None or right is None else Rectification(left, right)
     undistort = Undistortion(left.lens)
+    right_camera = (left if right is None else right).lens.camera
     camera = left.lens.camera if rectify is None else rectify.camera
     T_body_camera = left.T_body_camera if rectify is None else rectify.T_body_camera
     no_depth: npt.NDArray[np.float32] = np.zeros((camera.height, camera.width), dtype=np.float32)
 
     def read(row: int) -> Frame:
         rgb, stamp_s = read_colour(paths[row]), float(stamps_s[row])
+        check_size(rgb, left.lens.camera, paths[row])
         if rectify is None or rights is None:
             return Frame(timestamp_s=stamp_s, rgb=undistort.colour(rgb), depth_m=no_depth, camera=camera)
         cv2 = load_opencv()
-        gray = cv2.cvtColor(read_colour(rights[row]), cv2.COLOR_RGB2GRAY)
+        other = read_colour(rights[row])
+        check_size(other, right_camera, rights[row])
+        gray = cv2.cvtColor(other, cv2.COLOR_RGB2GRAY)
         return Frame(
             timestamp_s=stamp_s,
             rgb=rectify.left(rgb),
@@ -196,6 +281,18 @@ def _dataset(name: str, rig: Rig, files: _Files, bodies: Trajectory | None, samp
     truth = None
     if bodies is not None:
         truth = Trajectory(bodies.timestamps_s, bodies.T_world_camera @ T_body_camera)
+    stated = [
+        CameraFacts(
+            stated_by=files.stated_by[0] if each is left else f"the right camera of {name}",
+            camera=each.lens.camera, is_fisheye=each.lens.model == "fisheye",
+        )
+        for each in rig.cameras
+    ]  # fmt: skip
+    facts = SourceFacts(
+        name=name, cameras=stated, doubts=files.doubts, assumed=files.notes,
+        times=(TimeFacts(stated_by=files.stated_by[1], stamps_s=stamps_s),),
+        references=() if truth is None else (TimeFacts(stated_by=files.truth, stamps_s=truth.timestamps_s),),
+    )  # fmt: skip
     return Dataset(
         name=name,
         camera=camera,
@@ -204,7 +301,8 @@ def _dataset(name: str, rig: Rig, files: _Files, bodies: Trajectory | None, samp
         truth_kind="none" if truth is None else "ground truth",
         rows=tuple(range(len(paths))),
         read=read,
-        notes=files.notes,
+        notes=facts.assumed,
+        log=DoubtLog(check_source(facts)),
         has_depth=False,
         has_stereo=rectify is not None,
         T_body_camera=T_body_camera,
@@ -240,21 +338,22 @@ def _asl(folder: Path) -> Path:
     return folder / "mav0" if (folder / "mav0").is_dir() else folder
 
 
-def _euroc_images(folder: Path) -> tuple[list[Path], Array]:
-    rows = _csv(folder / "data.csv", 2)
-    stamps_s = read_numbers(folder / "data.csv", [row[0] for row in rows]) / 1e9
-    names = [row[1].strip() for row in rows]
+def _euroc_images(folder: Path) -> tuple[list[Path], Array, tuple[str, ...], tuple[Doubt, ...]]:
+    """Return the images of a camera whose times increase, their times, and notes and doubts on these."""
+    file = folder / "data.csv"
+    lines = _csv(file, 2)
+    stamps_s, notes = stamps_in_seconds(
+        read_numbers(file, [line[0] for line in lines]), str(file), "nanoseconds"
+    )
+    rows, doubts = rows_in_time(TimeFacts(stated_by=str(file), stamps_s=stamps_s))
+    names = [lines[row][1].strip() for row in rows]
     outside = [name for name in names if Path(name).name != name]
     if outside:
         raise UsageError(
-            f"{folder / 'data.csv'} names {outside[0]!r}, which is no image of its folder data",
+            f"{file} names {outside[0]!r}, which is no image of its folder data",
             hint="write the name of a file alone",
         )
-    return [folder / "data" / name for name in names], stamps_s
-
-
-def _kitti_images(folder: Path) -> list[Path]:
-    return sorted(path for path in folder.iterdir() if path.suffix in (".png", ".jpg"))
+    return [folder / "data" / name for name in names], stamps_s[rows], notes, doubts
 
 
 def _csv(path: Path, columns: int) -> list[list[str]]:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from client_sdk.rigs.intrinsics import Intrinsics
+from client_sdk.rigs.intrinsics import Intrinsics, lens_model
 from client_sdk.rigs.rig import Rig, RigCamera, RigImu
 from rse_pf.errors import InvalidCamera, UsageError
 from rse_pf.files import read_regular_file
@@ -43,7 +43,11 @@ def read_euroc_camera(path: Path, name: str) -> RigCamera:
     (fx, fy, cx, cy), (width, height) = found["intrinsics"], found["resolution"]
     try:
         camera = Camera(fx=fx, fy=fy, cx=cx, cy=cy, width=int(width), height=int(height))
-        lens = Intrinsics(camera=camera, distortion=tuple(found["distortion_coefficients"]))
+        lens_model(_word_after(text, "camera_model"))  # refuses projections such as omni
+        lens = Intrinsics(
+            camera=camera, model=lens_model(_word_after(text, "distortion_model")),
+            distortion=tuple(found["distortion_coefficients"]),
+        )  # fmt: skip
         return RigCamera(name=name, lens=lens, T_body_camera=np.array(pose).reshape(4, 4))
     except (InvalidCamera, UsageError) as error:
         raise UsageError(f"{path}: {error.message}", hint=error.hint) from error
@@ -72,15 +76,17 @@ def read_euroc_imu(path: Path) -> RigImu:
         raise UsageError(f"{path}: {error.message}", hint=error.hint) from error
 
 
-def read_kitti_rig(path: Path, size: tuple[int, int], *, with_right: bool) -> Rig:
-    """Return the grey cameras of a ``calib.txt``, of images of *size*; the body is the left one.
+def read_kitti_rig(path: Path, size: tuple[int, int], keys: Sequence[str]) -> Rig:
+    """Return the cameras of a ``calib.txt``, of images of *size*; the body is the left grey one.
+
+    *keys* are the names of the projections, such as ``P0`` and ``P1``, the left camera first.
 
     Raises:
         UsageError: A number is missing or impossible.
     """
     lines = dict(line.split(":", 1) for line in read_text(path).splitlines() if ":" in line)
     cameras = []
-    for key, name in (("P0", "left"), ("P1", "right"))[: 2 if with_right else 1]:
+    for key, name in zip(keys, ("left", "right"), strict=False):
         numbers = number_list(path, lines.get(key, ""))
         if len(numbers) != 12:
             raise UsageError(f"{path} lacks the 12 numbers of {key}", hint="unpack the sequence again")
@@ -103,7 +109,7 @@ def read_kitti_rig(path: Path, size: tuple[int, int], *, with_right: bool) -> Ri
 def read_text(path: Path) -> str:
     """Return the text of a file of a recording; raises UsageError."""
     try:
-        return read_regular_file(path, _MAX_BYTES).decode()
+        return read_regular_file(path, _MAX_BYTES).decode("utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         raise UsageError(f"cannot read {path}", hint="unpack the recording again") from error
 
@@ -123,6 +129,12 @@ def read_numbers(path: Path, words: Sequence[str]) -> Array:
     if not np.isfinite(values).all():
         raise UsageError(f"{path} holds a number that is not finite", hint="unpack it again")
     return values
+
+
+def _word_after(text: str, field: str) -> str | None:
+    """Return the value of a field that is one word, in quotes or not; None without it."""
+    found = re.search(rf"^{field}:\s*['\"]?([\w-]+)", text, re.MULTILINE)
+    return None if found is None else found[1]
 
 
 def _list_after(text: str, heading: str, path: Path) -> list[float]:

@@ -7,15 +7,17 @@
      "depth_scale": 1000, "rms_px": 0.31, "views": 24}
 
 Lengths are pixels.  ``distortion`` (OpenCV's order), ``depth_scale`` (units of a 16-bit depth image in a
-metre), ``rms_px`` and ``views`` (of the calibration) may be left out, and ``model`` for all lenses but
-``fisheye`` (Kannala and Brandt), whose ``distortion`` is ``[k1, k2, k3, k4]``.
+metre), ``rate_hz`` (of images that state no time), ``rms_px`` and ``views`` (of the calibration) may be left
+out, and ``model`` for all lenses but ``fisheye`` (Kannala and Brandt), whose ``distortion`` is
+``[k1, k2, k3, k4]``.  The names that other programs give to these fields are read as well; an unknown field
+is refused, since it may state what would be missed.
 """
 
 from __future__ import annotations
 
 import contextlib
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, TypeVar, get_args
@@ -24,32 +26,84 @@ import numpy as np
 
 from client_sdk.frontend import load_opencv
 from client_sdk.image_map import ImageMap
+from rse_pf.config.validation import did_you_mean
 from rse_pf.errors import InvalidCamera, UsageError
 from rse_pf.files import read_regular_file
 from rse_pf.geometry import Array, Camera
 from rse_pf.images import MAX_IMAGE_PIXELS
 
 __all__ = [
-    "Intrinsics", "LensModel", "Undistortion", "intrinsics_of", "lens_maps", "read_intrinsics", "read_json",
-    "told_with", "values_of", "write_intrinsics", "write_json",
+    "INTRINSICS_HINT", "TYPICAL_HINT", "Intrinsics", "LensModel", "Undistortion", "intrinsics_of",
+    "lens_maps", "lens_model", "read_intrinsics", "read_json", "told_with", "values_of", "write_intrinsics",
+    "write_json",
 ]  # fmt: skip
 
 LensModel = Literal["radial-tangential", "fisheye"]
 
-_T = TypeVar("_T", int, float)
+_T = TypeVar("_T")
 _MAX_FILE_BYTES = 1 << 20
 _MAX_DISTORTION = 1e3
 _MIN_DEPTH_SCALE, _MAX_DEPTH_SCALE = 1e-2, 1e7
-_HINT = "it needs fx fy cx cy width height, and may have distortion [k1 k2 p1 p2 k3] and depth_scale"
+_MIN_RATE_HZ, _MAX_RATE_HZ = 1e-3, 1e4
+_DEFAULT_DEPTH_SCALE = 1000.0  # millimetres, as most depth cameras write them
+_LENS_MODELS: dict[str, LensModel] = {
+    **dict.fromkeys(
+        (
+            "radial-tangential", "radtan", "plumb_bob", "brown_conrady", "pinhole", "opencv", "none",
+            "simple_pinhole", "perspective", "",
+        ),
+        "radial-tangential",
+    ),
+    **dict.fromkeys(
+        ("fisheye", "equidistant", "kannala_brandt4", "kannalabrandt8", "opencv_fisheye"), "fisheye"
+    ),
+}  # fmt: skip
+"""Names of lens models, in lower case, in files of EuRoC, Kalibr, ROS, COLMAP, ORB-SLAM3 and nerfstudio."""
+_OTHER_NAMES = {
+    **dict.fromkeys(("w", "image_width"), "width"),
+    **dict.fromkeys(("h", "image_height"), "height"),
+    **dict.fromkeys(("fl_x", "f_x", "fu"), "fx"),
+    **dict.fromkeys(("fl_y", "f_y", "fv"), "fy"),
+    **dict.fromkeys(("c_x", "cu", "ppx"), "cx"),
+    **dict.fromkeys(("c_y", "cv", "ppy"), "cy"),
+    **dict.fromkeys(
+        ("distortion_coefficients", "distortion_coeffs", "dist_coeffs", "dist_coeff", "coeffs", "dist", "D"),
+        "distortion",
+    ),
+    **dict.fromkeys(("distortion_model", "camera_model", "lens_model"), "model"),
+    **dict.fromkeys(("camera_matrix", "intrinsic_matrix", "matrix", "K"), "matrix"),
+    **dict.fromkeys(("depth_map_factor", "png_depth_scale", "depth_factor"), "depth_scale"),
+    **dict.fromkeys(("fps", "frame_rate", "Camera.fps"), "rate_hz"),
+}  # fmt: skip
+"""Fields as OpenCV, ROS, COLMAP, Open3D, librealsense and nerfstudio call them, and as this file does."""
+_NUMBERED = ("k1", "k2", "p1", "p2", "k3"), ("k1", "k2", "k3", "k4")
+"""Coefficients that have fields of their own, of a radial-tangential lens and of a fisheye."""
+_FIELDS = {
+    "fx", "fy", "cx", "cy", "width", "height", "matrix", "distortion", "model", "depth_scale", "rate_hz",
+    "depth_registered_to_color", "rms_px", "views", *_NUMBERED[0], *_NUMBERED[1],
+}  # fmt: skip
+_REMARKS = {"name", "comment", "description", "source", "serial", "camera_name", "depth_unit"}
+"""Fields for people."""
+INTRINSICS_HINT = (
+    "write fx fy cx cy width height, and distortion [k1 k2 p1 p2 k3] and depth_scale if they are known, as "
+    "JSON into intrinsics.json; files of OpenCV, ROS, ORB-SLAM and COLMAP hold them (docs/cameras.md)"
+)
+TYPICAL_HINT = (
+    "calibrate: rse-pf camera calibrate SOURCE --board 9x6 --square-mm 25 (docs/cameras.md); a typical fx "
+    "and fy in that file is a guess that bends the map: Kinect 525 and RealSense D435 615 px at 640x480; "
+    "phones 0.8 and webcams 0.9 of the width"
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Intrinsics:
-    """A camera, the distortion of its lens (0, 4 or 5 numbers) and the scale of its 16-bit depth images.
+    """A camera, the distortion of its lens (0, 4 or 5 numbers) and the unit of its 16-bit depth images.
 
     ``model`` says what the numbers of ``distortion`` are: k1 k2 p1 p2 k3 of a ``radial-tangential`` lens, or
     k1 k2 k3 k4 of a ``fisheye`` (Kannala and Brandt, PAMI 2006, as OpenCV's fisheye module has it).
-    ``rms_px`` and ``views`` tell how it was calibrated; None if unknown.
+    ``depth_scale`` is None if nobody stated it.  ``rate_hz`` is that of images without a time.
+    ``is_depth_registered`` False says that depth images show another camera's view.  ``rms_px`` and ``views``
+    tell how the camera was calibrated.  All of these are None if unknown.
 
     Raises:
         UsageError: A number is impossible.
@@ -57,10 +111,17 @@ class Intrinsics:
 
     camera: Camera
     distortion: tuple[float, ...] = ()
-    depth_scale: float = 1000.0
+    depth_scale: float | None = None
     rms_px: float | None = None
     views: int | None = None
     model: LensModel = "radial-tangential"
+    rate_hz: float | None = None
+    is_depth_registered: bool | None = None
+
+    @property
+    def depth_units_per_m(self) -> float:
+        """The ``depth_scale``, or the one that is assumed."""
+        return _DEFAULT_DEPTH_SCALE if self.depth_scale is None else self.depth_scale
 
     def __post_init__(self) -> None:
         if self.model not in get_args(LensModel):
@@ -76,12 +137,17 @@ class Intrinsics:
         ):
             raise UsageError(
                 f"{len(self.distortion)} distortion numbers, or one that is not within {_MAX_DISTORTION:g}",
-                hint=_HINT,
+                hint=INTRINSICS_HINT,
             )
-        if not _MIN_DEPTH_SCALE <= self.depth_scale <= _MAX_DEPTH_SCALE:
+        if not _MIN_DEPTH_SCALE <= self.depth_units_per_m <= _MAX_DEPTH_SCALE:
             raise UsageError(
                 f"depth_scale {self.depth_scale:g} is not within {_MIN_DEPTH_SCALE:g}..{_MAX_DEPTH_SCALE:g}",
                 hint="1000 for mm, 5000 for TUM",
+            )
+        if self.rate_hz is not None and not _MIN_RATE_HZ <= self.rate_hz <= _MAX_RATE_HZ:
+            raise UsageError(
+                f"rate_hz {self.rate_hz:g} is not within {_MIN_RATE_HZ:g}..{_MAX_RATE_HZ:g}",
+                hint="give the images in a second, or leave it out",
             )
         pixels = self.camera.width * self.camera.height
         if pixels > MAX_IMAGE_PIXELS:
@@ -91,21 +157,15 @@ class Intrinsics:
             )
 
 
-def read_intrinsics(path: Path | str, *, with_depth_scale: bool = False) -> Intrinsics:
+def read_intrinsics(path: Path | str) -> Intrinsics:
     """Return the intrinsics of a file.
 
-    Args:
-        path: The file.
-        with_depth_scale: Refuse a file without ``depth_scale``, instead of taking 1000.
-
     Raises:
-        UsageError: The file is missing, or lacks a number, or a number is impossible.
+        UsageError: The file is missing, lacks a number, has an unknown field, or a number is impossible.
     """
     path = Path(path)
-    values = read_json(path, _HINT)
-    with told_with(path, _HINT):
-        if with_depth_scale:
-            values["depth_scale"]
+    values = read_json(path, INTRINSICS_HINT)
+    with told_with(path, INTRINSICS_HINT):
         return intrinsics_of(values)
 
 
@@ -115,7 +175,7 @@ def read_json(path: Path, hint: str) -> Any:
         return json.loads(read_regular_file(path, _MAX_FILE_BYTES))
     except FileNotFoundError as error:
         raise UsageError(
-            f"there is no {path}", hint="make one: rse-pf camera calibrate SOURCE --board 9x6 --square-mm 25"
+            f"there is no {path}, and the intrinsics are not known", hint=TYPICAL_HINT
         ) from error
     except (OSError, ValueError, RecursionError) as error:
         raise UsageError(f"{path} is not a file of intrinsics", hint=hint) from error
@@ -136,6 +196,12 @@ def told_with(path: Path, hint: str) -> Iterator[None]:
 
 def intrinsics_of(values: Any) -> Intrinsics:
     """Return the intrinsics of a JSON object; what is wrong with it raises as it comes, see `told_with`."""
+    values = _with_our_names(values)
+    model = lens_model(values.get("model"))
+    if "matrix" in values:
+        K = np.array(values["matrix"], dtype=np.float64).reshape(3, 3)
+        K = K.T if K[2, 0] or K[2, 1] else K  # Open3D writes column after column
+        values = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2], **values}
     camera = Camera(
         **{name: float(values[name]) for name in ("fx", "fy", "cx", "cy")},
         width=int(values["width"]),
@@ -143,15 +209,59 @@ def intrinsics_of(values: Any) -> Intrinsics:
     )
     return Intrinsics(
         camera=camera,
-        distortion=tuple(float(value) for value in values.get("distortion", ())),
-        depth_scale=float(values.get("depth_scale", 1000.0)),
+        distortion=_distortion(values, model),
+        depth_scale=_optional(values.get("depth_scale"), float),
         rms_px=_optional(values.get("rms_px"), float),
         views=_optional(values.get("views"), int),
-        model=values.get("model", "radial-tangential"),
+        model=model,
+        rate_hz=_optional(values.get("rate_hz"), float),
+        is_depth_registered=_optional(values.get("depth_registered_to_color"), bool),
     )
 
 
-def _optional(value: Any, kind: type[_T]) -> _T | None:
+def lens_model(name: Any) -> LensModel:
+    """Return the model of a lens by one of its names, None for none; raises UsageError."""
+    model = _LENS_MODELS.get("radtan" if name is None else str(name).lower())
+    if model is None:
+        raise UsageError(
+            f"the lens model {name!r} is not known",
+            hint=f"calibrate with one of {', '.join(get_args(LensModel))}, or name the model of the numbers",
+        )
+    return model
+
+
+def _with_our_names(values: Any) -> dict[str, Any]:
+    """Return the fields of a file by the names of this module; raises UsageError for one that is unknown."""
+    ours: dict[str, Any] = {}
+    for name, value in values.items():
+        field = _OTHER_NAMES.get(name, name)
+        if field not in _FIELDS and name not in _REMARKS:
+            raise UsageError(
+                f"the field {name!r} is not known", hint=did_you_mean(name, sorted(_FIELDS), INTRINSICS_HINT)
+            )
+        if field in ours and ours[field] != value and field != "model":
+            raise UsageError(f"{field} is {ours[field]} and, as {name}, {value}", hint="give the field once")
+        if field != "model" or str(value).lower() not in ("pinhole", "perspective", ""):
+            ours[field] = value  # "pinhole" names the projection, not the distortion
+    return ours
+
+
+def _distortion(values: dict[str, Any], model: LensModel) -> tuple[float, ...]:
+    """Return the coefficients, from one field or from fields of their own; raises UsageError."""
+    names = _NUMBERED[model == "fisheye"]
+    own = [name for name in {*_NUMBERED[0], *_NUMBERED[1]} if float(values.get(name, 0.0))]
+    if "distortion" not in values:
+        if not set(own) <= set(names):
+            raise UsageError(
+                f"a lens of model {model} has no {min(set(own) - set(names))}", hint=INTRINSICS_HINT
+            )
+        return tuple(float(values.get(name, 0.0)) for name in names) if own else ()
+    if own:
+        raise UsageError("distortion is given twice, as a list and by names", hint="give the list")
+    return tuple(float(value) for value in np.ravel(values["distortion"]))
+
+
+def _optional(value: Any, kind: Callable[[Any], _T]) -> _T | None:
     return None if value is None else kind(value)
 
 
@@ -174,8 +284,14 @@ def values_of(intrinsics: Intrinsics) -> dict[str, Any]:
     values: dict[str, Any] = {
         "fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy,
         "width": camera.width, "height": camera.height,
-        "distortion": list(intrinsics.distortion), "depth_scale": intrinsics.depth_scale,
+        "distortion": list(intrinsics.distortion),
     }  # fmt: skip
+    if intrinsics.depth_scale is not None:
+        values["depth_scale"] = intrinsics.depth_scale
+    if intrinsics.rate_hz is not None:
+        values["rate_hz"] = intrinsics.rate_hz
+    if intrinsics.is_depth_registered is not None:
+        values["depth_registered_to_color"] = intrinsics.is_depth_registered
     if intrinsics.model != "radial-tangential":
         values["model"] = intrinsics.model
     if intrinsics.rms_px is not None:

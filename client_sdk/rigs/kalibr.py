@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from client_sdk.rigs.intrinsics import Intrinsics, LensModel, told_with
+from client_sdk.rigs.intrinsics import INTRINSICS_HINT, Intrinsics, lens_model, told_with
 from client_sdk.rigs.rig import Rig, RigCamera, RigImu
 from rse_pf.errors import MissingExtra, UsageError
 from rse_pf.files import read_regular_file
@@ -21,9 +21,7 @@ __all__ = ["read_kalibr"]
 
 _MAX_BYTES = 1 << 18
 _HINT = "name the camchain that kalibr_calibrate_cameras or kalibr_calibrate_imu_camera wrote"
-_MODELS: dict[str, LensModel] = {
-    "radtan": "radial-tangential", "none": "radial-tangential", "equidistant": "fisheye",
-}  # fmt: skip
+_MODELS = ("radtan", "none", "equidistant")
 _NAMES = ("left", "right")
 _IMU_FILES = ("imu.yaml", "imu0.yaml")
 
@@ -39,7 +37,7 @@ def read_kalibr(path: Path) -> Rig:
     with told_with(path, _HINT):
         names = sorted(name for name in values if str(name).startswith("cam"))
         if not names or names[0] != "cam0":
-            raise UsageError("there is no cam0", hint=_HINT)
+            raise UsageError("there is no camera cam0", hint=INTRINSICS_HINT)
         cameras: list[RigCamera] = []
         for row, name in enumerate(names):
             each = values[name]
@@ -72,7 +70,7 @@ def _lens(values: Any) -> Intrinsics:
     return Intrinsics(
         camera=Camera(fx=fx, fy=fy, cx=cx, cy=cy, width=int(width), height=int(height)),
         distortion=tuple(float(value) for value in values.get("distortion_coeffs", ())),
-        model=_MODELS[distortion],
+        model=lens_model(distortion),
     )
 
 
@@ -112,7 +110,7 @@ def _read_yaml(path: Path) -> Any:
         text = read_regular_file(path, _MAX_BYTES).decode()
         values = yaml.safe_load(text.removeprefix("%YAML:1.0"))
     except (OSError, ValueError, yaml.YAMLError, RecursionError) as error:
-        raise UsageError(f"{path} is no YAML that can be read", hint=_HINT) from error
+        raise UsageError(f"{path} is no camchain of Kalibr", hint=INTRINSICS_HINT) from error
     if not isinstance(values, dict):
-        raise UsageError(f"{path} is no camchain", hint=_HINT)
+        raise UsageError(f"{path} is no camchain of Kalibr", hint=INTRINSICS_HINT)
     return values

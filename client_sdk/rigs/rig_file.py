@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from client_sdk.rigs.intrinsics import (
+    INTRINSICS_HINT,
     Intrinsics,
     intrinsics_of,
     read_json,
@@ -34,6 +35,8 @@ from rse_pf.geometry import Array
 __all__ = ["read_calibration", "read_rig", "write_rig"]
 
 _HINT = "it needs cameras, each with name, fx fy cx cy width height and T_body_camera: see docs/cameras.md"
+_OF_RIG = ("name", "T_body_camera", "time_offset_s")
+"""Fields of a camera beside those of its lens."""
 _NOISE = ("gyro_noise", "gyro_walk", "accel_noise", "accel_walk", "rate_hz")
 _LIMITS = ("max_gyro", "max_accel")
 
@@ -61,10 +64,11 @@ def read_calibration(path: Path | str) -> Intrinsics | Rig:
     path = Path(path)
     if path.suffix in (".yaml", ".yml"):
         return read_kalibr(path)
-    values = read_json(path, _HINT)
-    with told_with(path, _HINT):
-        if "cameras" not in values:
+    values = read_json(path, INTRINSICS_HINT)
+    if isinstance(values, dict) and "cameras" not in values:
+        with told_with(path, INTRINSICS_HINT):
             return intrinsics_of(values)
+    with told_with(path, _HINT):
         return Rig(
             cameras=tuple(_camera(each) for each in values["cameras"]),
             imu=None if values.get("imu") is None else _imu(values["imu"]),
@@ -95,8 +99,9 @@ def write_rig(path: Path | str, rig: Rig) -> None:
 
 
 def _camera(values: Any) -> RigCamera:
+    lens = {name: value for name, value in values.items() if name not in _OF_RIG}
     return RigCamera(
-        name=str(values["name"]), lens=intrinsics_of(values), T_body_camera=_pose(values["T_body_camera"]),
+        name=str(values["name"]), lens=intrinsics_of(lens), T_body_camera=_pose(values["T_body_camera"]),
         time_offset_s=float(values.get("time_offset_s", 0.0)),
     )  # fmt: skip
 

@@ -1,11 +1,15 @@
-"""The options that say which sensors of a drive are used, and whether it is checked."""
+"""The options that say which sensors of a drive are used, and whether it is checked; lines on its source."""
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterable
 from typing import Any
 
-__all__ = ["add_check_argument", "add_sensor_arguments"]
+from client_sdk.source_facts import Doubt
+from rse_pf.terminal import show
+
+__all__ = ["add_accept_argument", "add_check_argument", "add_sensor_arguments", "show_source"]
 
 
 def add_sensor_arguments(parser: argparse.ArgumentParser | argparse._ArgumentGroup) -> None:
@@ -26,3 +30,17 @@ def add_check_argument(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--no-check", dest="check", action="store_false", help="do not check calibration, times and images"
     )
+    add_accept_argument(parser)
+
+
+def add_accept_argument(parser: argparse.ArgumentParser) -> None:
+    """Declare ``--accept``."""
+    parser.add_argument(
+        "--accept", action="append", default=[], metavar="NAME",
+        help="take a finding about the source for right: NAME stands before it, such as counts",
+    )  # fmt: skip
+
+
+def show_source(notes: Iterable[str], doubts: Iterable[Doubt]) -> None:
+    """Show what was assumed about a source, and what is unlikely, before it is used."""
+    show(*(f"note: {note}" for note in notes), *(doubt.line() for doubt in doubts), error=True)

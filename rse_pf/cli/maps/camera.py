@@ -67,8 +67,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--max-rms-px", type=float, default=1.0, metavar="PX", help="refuse a larger error (default: 1)"
     )
     calibrate.add_argument(
-        "--depth-scale", type=float, default=1000.0, metavar="N",
-        help="units of a 16-bit depth image in a metre (default: 1000)",
+        "--depth-scale", type=float, metavar="N",
+        help="units of a 16-bit depth image in a metre (default: left out, which means 1000)",
     )  # fmt: skip
     write = actions.add_parser("board", parents=[board], help="write a board to print")
     write.add_argument("--out", type=Path, default=Path("board.pdf"), metavar="FILE", help=".pdf or .png")
@@ -178,9 +178,8 @@ def _raw_pairs(sources: list[str]) -> Iterator[tuple[npt.NDArray[np.uint8], npt.
 
 def _raw_images(sources: list[str]) -> Iterator[npt.NDArray[np.uint8]]:
     """Yield grey images as the lens gives them."""
-    from client_sdk.cameras.folder import image_files, is_image, read_raw_image
     from client_sdk.cameras.opencv_video import open_video
-    from client_sdk.cameras.source import colour_of
+    from client_sdk.datasets.images import image_files, is_image, read_colour
 
     paths = [
         path
@@ -189,17 +188,17 @@ def _raw_images(sources: list[str]) -> Iterator[npt.NDArray[np.uint8]]:
         if is_image(path)
     ]
     for path in paths:
-        yield _gray(colour_of(read_raw_image(path), str(path)))
+        yield _gray(read_colour(path))
     if paths:
         return
     if len(sources) > 1 or Path(sources[0]).is_dir():
         raise UsageError(f"there is no image {sources[0]}", hint="name images, one video, or one device")
-    images, close = open_video(sources[0])
+    video = open_video(sources[0])
     try:
-        for _, rgb, _ in images:
+        for _, rgb, _ in video.images:
             yield _gray(rgb)
     finally:
-        close()
+        video.close()
 
 
 def _check(args: argparse.Namespace) -> int:
@@ -242,14 +241,15 @@ def _frames(source: str) -> Iterator[tuple[float, npt.NDArray[np.uint8], str]]:
     A video and a device need no intrinsics here.
     """
     from client_sdk.cameras import open_camera
-    from client_sdk.cameras.folder import open_folder
+    from client_sdk.cameras.folder import list_folder
     from client_sdk.cameras.open_camera import is_recording
     from client_sdk.cameras.opencv_video import open_video
+    from client_sdk.source_facts import DoubtLog
 
     path = Path(source)
     has_pairs = (path / "left").is_dir() and (path / "right").is_dir()
     if path.is_dir() and not has_pairs and not is_recording(path) and not (path / "rgb.txt").exists():
-        images, _ = open_folder(path, 1000.0)
+        images = list_folder(path).frames(DoubtLog(), 1000.0)
         yield from ((stamp, rgb, "" if depth_m is None else "depth") for stamp, rgb, depth_m in images)
     elif (
         source in ("realsense", "realsense-stereo")
@@ -261,11 +261,11 @@ def _frames(source: str) -> Iterator[tuple[float, npt.NDArray[np.uint8], str]]:
                 by_depth = "depth" if frame.depth_m.any() else ""
                 yield frame.timestamp_s, frame.rgb, by_depth if frame.stereo is None else "a stereo pair"
     else:
-        images, close = open_video(source)
+        video = open_video(source)
         try:
-            yield from ((stamp, rgb, "") for stamp, rgb, _ in images)
+            yield from ((stamp, rgb, "") for stamp, rgb, _ in video.images)
         finally:
-            close()
+            video.close()
 
 
 def _gray(rgb: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from client_sdk.cameras import Intrinsics
-from client_sdk.cameras.source import RawFrame, RawSource
+from client_sdk.cameras.source import RawFrame, RawSource, SourceInfo
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Camera
 
@@ -26,7 +26,7 @@ async def test_all_frames_come_while_the_loop_goes_on() -> None:
             go_on.clear()
             yield float(row), np.zeros((6, 8, 3), np.uint8), None
 
-    source = RawSource("slow", slow_camera(), INTRINSICS, has_depth=False)
+    source = RawSource(SourceInfo(name="slow", camera=INTRINSICS.camera), slow_camera(), INTRINSICS)
     stamps = []
     asyncio.get_running_loop().call_soon(go_on.set)
     async for frame in source:
@@ -39,7 +39,8 @@ def test_a_frame_that_cannot_be_used_is_refused_there_as_well() -> None:
     wrong = iter([(0.0, np.zeros((7, 8, 3), np.uint8), None)])
 
     async def read() -> None:
-        async for _ in RawSource("wrong", wrong, INTRINSICS, has_depth=False):
+        about = SourceInfo(name="wrong", camera=INTRINSICS.camera)
+        async for _ in RawSource(about, wrong, INTRINSICS):
             raise AssertionError
 
     with pytest.raises(UsageError, match="images of 8x7 px"):

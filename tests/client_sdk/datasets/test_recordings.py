@@ -294,7 +294,11 @@ def test_named_intrinsics_of_a_folder_with_depth_say_its_scale(tmp_path: Path):
 
 
 def test_assumed_intrinsics_are_told(tmp_path: Path):
-    (note,) = open_dataset(write_tum(tmp_path / "mine", [0.0], intrinsics=False)).notes
+    folder = write_tum(tmp_path / "mine", [0.0])
+    for path in (folder / "rgb/0.png", folder / "depth/0.png"):
+        cv2.imwrite(str(path), cv2.resize(cv2.imread(str(path), cv2.IMREAD_UNCHANGED), (640, 480)))
+    (folder / "intrinsics.json").unlink()
+    (note,) = open_dataset(folder).notes
     assert "has no intrinsics.json, so a Kinect's are assumed: fx 525 fy 525" in note
     assert "depth_scale 5000" in note
 

@@ -222,7 +222,7 @@ def test_recordings_without_truth_are_read(tmp_path: Path) -> None:
         ("mav0/cam0/sensor.yaml", SENSOR.format(data="1, x"), "no number"),
         ("mav0/cam0/data.csv", "#\n12\n", "less than 2 values"),
         ("mav0/cam0/data.csv", "#\n", "has no images"),
-        ("mav0/cam0/data.csv", "2,b.png\n1,a.png\n", "do not ascend"),
+        ("mav0/cam0/data.csv", "2,b.png\n1,a.png\n", "1 of 2 time stamps are earlier"),
         ("mav0/cam0/data.csv", "x,a.png\n", "no number"),
         ("mav0/cam0/data.csv", "1,../a.png\n", "no image of its folder"),
         ("mav0/cam0/data.csv", "1,/etc/a.png\n", "no image of its folder"),
@@ -244,8 +244,8 @@ def test_a_broken_file_of_euroc_is_one_line(tmp_path: Path, file: str, text: str
         ("calib.txt", "", "12 numbers of P0"),
         ("times.txt", "0.0\nx\n", "no number"),
         ("times.txt", "0.0\nnan\n", "not finite"),
-        ("times.txt", "0.2\n0.1\n0.0\n", "do not ascend"),
-        ("poses.txt", "1 2 3\n", "12 numbers for each image"),
+        ("times.txt", "0.2\n0.1\n0.0\n", "2 of 3 time stamps are earlier"),
+        ("poses.txt", "1 2 3\n", "12 numbers in each line"),
     ],
 )
 def test_a_broken_file_of_kitti_is_one_line(tmp_path: Path, file: str, text: str, says: str) -> None:
