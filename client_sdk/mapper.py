@@ -251,6 +251,11 @@ class Mapper:
         return 0 if self._tracker is None else self._tracker.lost_frames
 
     @property
+    def frames_before_start(self) -> int:
+        """The number of frames of a camera without depth before it had moved enough to begin."""
+        return self._tracker.starting_frames if isinstance(self._tracker, MonocularTracker) else 0
+
+    @property
     def keyframes(self) -> int:
         """The number of keyframes."""
         return 0 if self._tracker is None else self._tracker.keyframes
@@ -321,7 +326,6 @@ class Mapper:
     def report(self) -> dict[str, Any]:
         """Return the figures of the drive, as for ``report.json``."""
         trips = np.array(self._round_trips_ms)
-        starting = self._tracker.starting_frames if isinstance(self._tracker, MonocularTracker) else 0
         trajectory, apart = self.trajectory, self._apart()
         offset: dict[str, float] = {}
         if isinstance(self._tracker, Tracker) and np.isfinite(self._disparity_deviation_px):
@@ -330,7 +334,7 @@ class Mapper:
         return {
             "frames": self.frames,
             "lost_frames": self.lost_frames,
-            "frames_before_start": starting,
+            "frames_before_start": self.frames_before_start,
             "keyframes": self.keyframes,
             "segments_apart": len(apart),
             "frames_apart": sum(len(record.poses) for record, _ in apart),

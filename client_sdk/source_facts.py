@@ -18,13 +18,13 @@ import numpy as np
 import numpy.typing as npt
 
 from rse_pf.config.validation import did_you_mean
-from rse_pf.errors import UsageError
+from rse_pf.errors import RsePfError, UsageError
 from rse_pf.geometry import Array, Camera
 
 __all__ = [
     "CameraFacts", "DepthFacts", "Doubt", "DoubtLog", "DoubtName", "SourceFacts", "TimeFacts",
-    "check_accepted", "check_reference", "check_source", "doubt_line", "is_since_1970", "median_depth_m",
-    "rows_in_time", "some_names", "stamps_in_seconds", "time_unit_s", "unresolved",
+    "check_accepted", "check_reference", "check_source", "doubt_line", "ended_early", "is_since_1970",
+    "median_depth_m", "rows_in_time", "some_names", "stamps_in_seconds", "time_unit_s", "unresolved",
 ]  # fmt: skip
 
 MIN_FIELD_OF_VIEW_DEG = 20.0  # a longer lens is not used for SLAM; a mistake in the unit gives less
@@ -152,6 +152,12 @@ class DoubtLog:
         """Add a doubt that appeared in the drive."""
         self._doubts.append(doubt)
 
+    def add_reference(self, file: str, stamps_s: Array, span_s: tuple[float, float] | None) -> None:
+        """Add a doubt if an odometry or truth has no time stamp within the span of the images."""
+        if span_s is not None:
+            reference = TimeFacts(stated_by=file, stamps_s=stamps_s)
+            self._doubts += check_reference(reference, span_s)
+
     def leave_out(self, image: str) -> None:
         """Count an image that cannot be used, by its name."""
         self._left_out.append(image)
@@ -168,6 +174,12 @@ class DoubtLog:
             hint="copy the recording again, or record it again",
         )
         return (*self._doubts, left_out)
+
+
+def ended_early(error: RsePfError, frames: int) -> Doubt:
+    """Return the doubt about a source that failed after so many frames."""
+    sentence = f"the source failed after {frames} frames, which are kept: {error.message}"
+    return Doubt(name=DoubtName.ENDED_EARLY, sentence=sentence, hint=error.hint)
 
 
 def check_source(facts: SourceFacts) -> tuple[Doubt, ...]:

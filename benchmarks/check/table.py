@@ -46,7 +46,9 @@ def checked(frames: Sequence[Frame], reference: MotionReference | None) -> tuple
     """Track frames, and return the report with the seconds that the check took beside that."""
     observer, tracker, took_s = DriveObserver(reference), Tracker(FrontEndOptions()), 0.0
     if _has_stereo(frames):
-        observer.add_pairs(fault_of_pairs(spread_pairs(range(len(frames)), frames.__getitem__)))
+        observer.add_pairs(
+            fault_of_pairs((frames[row], frames[after]) for row, after in spread_pairs(range(len(frames))))
+        )
     for frame in frames:
         result = track(tracker, frame)
         began_s = time.process_time()

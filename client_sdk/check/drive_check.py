@@ -35,6 +35,8 @@ def check_lines(told: Mapping[str, Any], *, is_whole: bool = False) -> list[str]
         lines.append(
             "check: no advice on the calibration while the source has a finding that is not accepted"
         )
+    elif told.get("poses") == 0:
+        lines.append(f"check: none of {told.get('frames')} frames got a pose: the calibration is not checked")
     elif not findings:
         vague = "" if is_whole or not kinds else f"; this drive cannot tell {', '.join(kinds)}"
         lines.append(f"check: nothing wrong found in {told.get('frames')} frames{vague}")

@@ -137,6 +137,7 @@ class CheckReport:
         findings: Worst first, see `order`.
         cannot_tell: What the drive cannot show.
         frames: So many were looked at.
+        poses: So many of them got a pose; None if unknown.
         notes: Sentences on what was not looked at, and why.
         doubts: What is unlikely about the source; while there is a doubt, nothing is advised.
     """
@@ -144,6 +145,7 @@ class CheckReport:
     findings: tuple[Finding, ...] = ()
     cannot_tell: tuple[CannotTell, ...] = ()
     frames: int = 0
+    poses: int | None = None
     notes: tuple[str, ...] = ()
     doubts: tuple[Doubt, ...] = ()
 
@@ -151,6 +153,7 @@ class CheckReport:
         """Return what ``report.json`` holds."""
         return {
             "frames": self.frames,
+            "poses": self.poses,
             "findings": [each.to_dict() for each in self.findings],
             "cannot_tell": [each.to_dict() for each in self.cannot_tell],
             "notes": list(self.notes),

@@ -23,6 +23,7 @@ from client_sdk.check.findings import CannotTell, FaultKind, Finding
 from client_sdk.imu.checks import RateCheck, check_rates, trouble_of_samples
 from client_sdk.imu.history import ImuHistory
 from client_sdk.mapping import Trajectory, read_trajectory
+from client_sdk.source_facts import stamps_in_seconds
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Array, inverse, log_se3, rotation_angle_deg
 
@@ -93,10 +94,15 @@ class MotionReference:
     @classmethod
     def of_file(cls, file: Path) -> MotionReference:
         """Return a path in TUM format, of what the camera is mounted on; raises as `beside`."""
-        path = read_trajectory(file)
-        if len(path) < 2:
-            raise UsageError(f"{file} holds {len(path)} poses", hint="a motion needs 2 or more")
-        return cls(path=path, is_camera=False)
+        return cls(path=read_odometry(file), is_camera=False)
+
+
+def read_odometry(file: Path) -> Trajectory:
+    """Return a path in TUM format, its stamps in seconds; raises UsageError with fewer than two poses."""
+    path = read_trajectory(file)
+    if len(path) < 2:
+        raise UsageError(f"{file} holds {len(path)} poses", hint="a motion needs 2 or more")
+    return Trajectory(stamps_in_seconds(path.timestamps_s, str(file))[0], path.T_world_camera)
 
 
 def nothing_to_compare(*, has_depth: bool) -> list[CannotTell]:

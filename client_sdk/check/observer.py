@@ -89,7 +89,7 @@ class DriveObserver:
         fitted to the damage.
         """
         if doubts:
-            return CheckReport(frames=len(self._images), doubts=tuple(doubts))
+            return CheckReport(frames=len(self._images), poses=len(self._poses), doubts=tuple(doubts))
         findings, untold = self._images.findings()
         calibration = judge_calibration(self._store)
         findings += calibration.findings
@@ -105,6 +105,7 @@ class DriveObserver:
             findings=order([*findings, *moved], calibration.noise_m),
             cannot_tell=(*untold, *cannot),
             frames=len(self._images),
+            poses=len(self._poses),
             notes=tuple(noted),
         )
 

@@ -401,6 +401,11 @@ class LiveMapper:
         return self._mapper.lost_frames
 
     @property
+    def frames_before_start(self) -> int:
+        """The number of frames of a camera without depth before it had moved enough to begin."""
+        return self._mapper.frames_before_start
+
+    @property
     def keyframes(self) -> int:
         """The number of keyframes made for the map in this run."""
         return self._made

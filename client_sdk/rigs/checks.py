@@ -5,7 +5,7 @@ Features of both images are matched over the whole image, so that a wrong rig ca
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -33,10 +33,10 @@ _FAST_PX_S, _KEPT_PX, _MOSTLY = 15.0, 2.0, 0.9
 _PAIRS = 14
 
 
-def spread_pairs(rows: Sequence[int], read: Callable[[int], Frame]) -> Iterable[tuple[Frame, Frame]]:
-    """Yield some frames of a recording, each with the one after it."""
-    for place in np.unique(np.linspace(0, len(rows) - 2, _PAIRS).astype(int)) if len(rows) > 1 else ():
-        yield read(rows[place]), read(rows[place + 1])
+def spread_pairs(rows: Sequence[int]) -> list[tuple[int, int]]:
+    """Return some rows of a recording, each with the one after it."""
+    places = np.unique(np.linspace(0, len(rows) - 2, _PAIRS).astype(int)) if len(rows) > 1 else ()
+    return [(rows[place], rows[place + 1]) for place in places]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -20,15 +20,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from client_sdk.check.drive_check import check_lines
+from client_sdk.source_facts import DoubtLog, check_accepted, ended_early, unresolved
 from rse_pf.cli.extras import require
-from rse_pf.cli.sensors import add_sensor_arguments
+from rse_pf.cli.sensors import add_accept_argument, add_sensor_arguments, show_source
 from rse_pf.config import PlatformSettings
-from rse_pf.errors import UsageError
+from rse_pf.errors import RsePfError, UsageError
 from rse_pf.files import read_regular_file, replace_file
 from rse_pf.terminal import show, show_json, show_progress
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
 
     from client_sdk.check.findings import CheckReport
     from client_sdk.check.motion import MotionReference
@@ -65,6 +66,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add("--out", type=Path, metavar="DIR", help="write report.json to this folder")
     add("--json", action="store_true", help="print the report as JSON")
+    add_accept_argument(parser)
 
 
 def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
@@ -78,6 +80,7 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     if results.is_file() and not any((folder / name).exists() for name in _OF_RECORDINGS):
         return _show_results(args, results)
     require("check")
+    check_accepted(args.accept)
     if args.out is not None:
         try:
             args.out.mkdir(parents=True, exist_ok=True)
@@ -94,7 +97,7 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
         show_json(told, indent=2)
     else:
         show(*check_lines(told, is_whole=True), *written)
-    return 1 if report.findings else 0
+    return 1 if report.findings or report.doubts or report.poses == 0 else 0
 
 
 def _show_results(args: argparse.Namespace, file: Path) -> int:
@@ -116,7 +119,7 @@ def _show_results(args: argparse.Namespace, file: Path) -> int:
         show_json(told, indent=2)
     else:
         show(*check_lines(told, is_whole=True))
-    return 1 if told.get("findings") else 0
+    return 1 if told.get("findings") or told.get("source") or told.get("poses") == 0 else 0
 
 
 def _checked(args: argparse.Namespace, settings: PlatformSettings) -> tuple[CheckReport, Intrinsics]:
@@ -129,26 +132,42 @@ def _checked(args: argparse.Namespace, settings: PlatformSettings) -> tuple[Chec
     from client_sdk.rigs.intrinsics import Intrinsics
 
     path = Path(args.source)
-    if not (path.exists() and (is_recording(path) or is_bag(path) or (path / "rgb.txt").is_file())):
+    if not (path.exists() and (is_recording(path) or is_bag(path))):
         reference = _reference(args, None)
         with open_camera(
             args.source, intrinsics=args.intrinsics, depth=not args.no_depth, camera=args.camera, imu=args.imu
         ) as source:
             most = args.frames or (_MOST_LIVE if str(args.source).isdigit() else None)
-            report = _watched(source, settings, reference, None, has_depth=source.has_depth, most=most)
+            log = _compared(source.log, reference, source.span_s)
+            show_source(source.notes, unresolved(log.doubts, args.accept))
+            report = _watched(
+                source, settings, reference, None, log, args.accept, has_depth=source.has_depth, most=most
+            )
             return report, _base(args, Intrinsics(camera=source.camera))
     dataset = open_dataset(path, camera=args.camera, imu=args.imu, intrinsics=args.intrinsics)
-    show(*(f"note: {note}" for note in dataset.notes), error=True)
     fault: PairFault | None = None
     if dataset.has_stereo:
-        from client_sdk.rigs.checks import fault_of_pairs, spread_pairs
+        from client_sdk.rigs.checks import fault_of_pairs
 
-        fault = fault_of_pairs(spread_pairs(dataset.rows, dataset.read))
+        fault = fault_of_pairs(dataset.some_pairs())
     truth = MotionReference.of_truth(dataset.truth, dataset.truth_kind, is_camera=not is_bag(path))
     reference = _reference(args, truth)
+    log = dataset.log if reference is truth else _compared(dataset.log, reference, dataset.span_s)
+    show_source(dataset.notes, unresolved(log.doubts, args.accept))
     has_depth = dataset.has_depth and not args.no_depth
-    report = _watched(iter(dataset), settings, reference, fault, has_depth=has_depth, most=args.frames)
+    report = _watched(
+        iter(dataset), settings, reference, fault, log, args.accept, has_depth=has_depth, most=args.frames
+    )
     return report, _base(args, Intrinsics(camera=dataset.camera))
+
+
+def _compared(
+    log: DoubtLog, reference: MotionReference | None, span_s: tuple[float, float] | None
+) -> DoubtLog:
+    """Return the log, with a doubt if the odometry has no time stamp within the recording."""
+    if reference is not None:
+        log.add_reference(f"the {reference.name}", reference.path.timestamps_s, span_s)
+    return log
 
 
 def _reference(args: argparse.Namespace, truth: MotionReference | None) -> MotionReference | None:
@@ -165,11 +184,16 @@ def _watched(
     settings: PlatformSettings,
     reference: MotionReference | None,
     fault: PairFault | None,
+    log: DoubtLog,
+    accepted: Sequence[str],
     *,
     has_depth: bool,
     most: int | None,
 ) -> CheckReport:
-    """Track all frames in this process, and return what is wrong with them."""
+    """Track all frames in this process, and return what is wrong with them.
+
+    A source that fails ends the drive; what was seen before is judged.
+    """
     from client_sdk.check.observer import DriveObserver
     from client_sdk.mapper import Mapper
     from rse_pf.experiments.compare.solvers import InProcessSolver
@@ -179,7 +203,7 @@ def _watched(
     mapper = Mapper(ask=InProcessSolver(settings).ask, depth=has_depth, adds_frames=False)
 
     async def drive() -> None:
-        for count, frame in enumerate(frames, 1):
+        for count, frame in enumerate(_until_it_fails(frames, log), 1):
             observer.add(frame, await mapper.track(frame))
             if count % 10 == 0:
                 show_progress(f"{count} frames, {mapper.lost_frames} lost", is_over=False)
@@ -191,7 +215,20 @@ def _watched(
     if not mapper.frames:
         raise UsageError("the source gives no frame", hint="look at it: rse-pf camera check SOURCE")
     observer.add_offsets(mapper.adjust_pairs())
-    return observer.finish()
+    return observer.finish(unresolved(log.doubts, accepted))
+
+
+def _until_it_fails(frames: Iterator[Frame], log: DoubtLog) -> Iterator[Frame]:
+    """Yield frames; an error after the first one ends them, and is a doubt about the source."""
+    count = 0
+    try:
+        for frame in frames:
+            count += 1
+            yield frame
+    except RsePfError as error:
+        if not count:
+            raise
+        log.add(ended_early(error, count))
 
 
 def _base(args: argparse.Namespace, seen: Intrinsics) -> Intrinsics:

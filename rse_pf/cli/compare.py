@@ -18,8 +18,9 @@ import argparse
 import math
 from pathlib import Path
 
+from client_sdk.source_facts import check_accepted
 from rse_pf.cli.extras import require
-from rse_pf.cli.sensors import add_sensor_arguments
+from rse_pf.cli.sensors import add_accept_argument, add_sensor_arguments
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import UsageError
 
@@ -43,6 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="play so many frames per second, one after the other (default: all)",
     )  # fmt: skip
     add_sensor_arguments(parser)
+    add_accept_argument(parser)
     parser.add_argument(
         "--runs", type=int, default=1, metavar="N", help="run each so often, and show the spread (default: 1)"
     )
@@ -66,6 +68,7 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
             raise UsageError(
                 f"--rate {rate_hz:g} is not within 0.1..1000 Hz", hint="leave it out to play all frames"
             )
+    check_accepted(args.accept)
     require("compare")
     from rse_pf.experiments.compare.configurations import configurations_of
     from rse_pf.experiments.compare.recordings import drives_of
@@ -75,5 +78,6 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
         configurations=configurations_of(args.configs),
         drives=drives_of(args.data, args.rate, camera=args.camera, imu=args.imu),
         runs=args.runs, out=args.out, platform=args.platform,
+        accepted=tuple(args.accept),
     )  # fmt: skip
     return run_compare(options, settings)

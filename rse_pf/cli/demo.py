@@ -17,8 +17,9 @@ import argparse
 import math
 from pathlib import Path
 
+from client_sdk.source_facts import check_accepted, unresolved
 from rse_pf.cli.extras import require
-from rse_pf.cli.sensors import add_check_argument, add_sensor_arguments
+from rse_pf.cli.sensors import add_check_argument, add_sensor_arguments, show_source
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import UsageError
 from rse_pf.recording.writer import with_recordings
@@ -129,9 +130,10 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     if args.data is not None:
         from client_sdk.datasets import open_dataset
 
+        check_accepted(args.accept)
         dataset = open_dataset(args.data, camera=args.camera, imu=args.imu)
         dataset.check()
-        show(*(f"note: {note}" for note in dataset.notes))
+        show_source(dataset.notes, unresolved(dataset.log.doubts, args.accept))
         thinned = dataset.thinned(args.rate)
         if len(thinned) < len(dataset):
             show(
@@ -157,5 +159,6 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
         live=args.live,
         quiet=args.quiet,
         check=args.check,
+        accepted=tuple(args.accept),
     )
     return run_demo(options, settings)

@@ -114,6 +114,8 @@ def _from_bag(args: argparse.Namespace, settings: PlatformSettings) -> int:
         has_depth=bag.has_depth,
         has_stereo=bag.has_stereo,
         close=bag.close,
+        log=frames.log,
+        span_s=frames.span_s,
     ) as source:
         frames.check()
 

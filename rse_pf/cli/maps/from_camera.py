@@ -18,10 +18,11 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
 from client_sdk.check.drive_check import DriveCheck
+from client_sdk.source_facts import check_accepted, ended_early, unresolved
 from rse_pf.cli.maps.frame_table import FRAMES_FILE, FrameTable
 from rse_pf.cli.maps.keyframe_images import IMAGES_FOLDER, KeyframeImages
 from rse_pf.cli.maps.map_store import add_keep_arguments, drive_store, keep_map, map_name
-from rse_pf.cli.sensors import add_check_argument, add_sensor_arguments
+from rse_pf.cli.sensors import add_check_argument, add_sensor_arguments, show_source
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import CommandFailed, RsePfError, UsageError
 from rse_pf.files import replace_file
@@ -30,7 +31,7 @@ from rse_pf.terminal import show, show_progress
 
 if TYPE_CHECKING:
     from client_sdk import MarkerScale, OdometryScale, Robot, TrackedFrame
-    from client_sdk.cameras import FrameSource
+    from client_sdk.cameras.source import FrameStream
     from client_sdk.check.motion import MotionReference
     from client_sdk.datasets import Dataset
     from client_sdk.frontend import Frame
@@ -102,13 +103,17 @@ def run_from_camera(args: argparse.Namespace, settings: PlatformSettings) -> int
     """Track the camera and write the results; the exit code is 1 if most frames have no pose."""
     scale = check_drive(args)
     from client_sdk.cameras import open_camera
-    from client_sdk.check.motion import MotionReference
+    from client_sdk.check.motion import MotionReference, read_odometry
 
     recording = _recording(args)
     reference = None
+    kind, _, scale_file = (args.scale or "").partition(":")
+    odometries = [Path(scale_file)] if kind == "odometry" else []
     if args.check:
         try:
             reference = MotionReference.beside(args.source)
+            if reference is not None:
+                odometries.append(Path(args.source) / "odometry.txt")
         except UsageError as error:
             show(f"note: {error}: it is not compared with the motion", error=True)
     if recording is not None and args.check:
@@ -128,6 +133,8 @@ def run_from_camera(args: argparse.Namespace, settings: PlatformSettings) -> int
         camera=args.camera,
         imu=args.imu,
     ) as source:
+        for file in odometries:
+            source.log.add_reference(str(file), read_odometry(file).timestamps_s, source.span_s)
         return map_source(args, settings, source, scale, about, reference)
 
 
@@ -154,7 +161,7 @@ def errors_of(
 def map_source(
     args: argparse.Namespace,
     settings: PlatformSettings,
-    source: FrameSource,
+    source: FrameStream,
     scale: OdometryScale | MarkerScale | None,
     about: Callable[[Trajectory], dict[str, Any]] | None = None,
     reference: MotionReference | None = None,
@@ -170,6 +177,7 @@ def map_source(
             hint=f"leave out --scale, or add {option}",
         )
     from rse_pf.experiments.plots.map_image import RobotPath, draw_map
+    from rse_pf.experiments.results.markdown import lost_line
 
     _make_folder(args.out)
     kept_in = drive_store(args, settings)
@@ -182,9 +190,14 @@ def map_source(
         if images is not None:
             images.add(tracked)
 
-    mapper = asyncio.run(_drive(args, settings, source, scale, frames, watch))
-    report = mapper.save(args.out)
-    checked = check.finish(reference, mapper.adjust_pairs() if check.is_wanted else None)
+    check_accepted(args.accept)
+    show_source(source.notes, unresolved(source.log.doubts, args.accept))
+    mapper, failed = asyncio.run(_drive(args, settings, source, scale, frames, watch))
+    if failed is not None:
+        source.log.add(ended_early(failed, mapper.frames))
+    doubts = unresolved(source.log.doubts, args.accept)
+    report = {**mapper.save(args.out), "assumed": list(source.notes)}
+    checked = check.finish(reference, mapper.adjust_pairs() if check.is_wanted else None, doubts)
     if about is not None:
         report = {**report, **about(mapper.trajectory)}
     if report["unit"] != "m" and report.get("ate_cm") is not None:
@@ -205,19 +218,26 @@ def map_source(
     posed = len(path)
     trip = report["round_trip_ms"]["p50"]
     show(
-        f"{report['frames']} frames, {report['lost_frames']} lost, {report['keyframes']} keyframes, "
+        f"{report['frames']} frames, {lost_line(report)}, {report['keyframes']} keyframes, "
         f"{report['map_points']} points; path {report['path']:.2f} {unit}; scale: {mapper.scale}"
         + ("" if trip is None else f"; round trip p50 {trip} ms"),
         *offset_lines(report),
         *accuracy_lines(report),
         *frames.lines(),
+        *([f"the IMU is {report['imu']}"] if str(report.get("imu") or "").startswith("not") else []),
+        *([] if args.check else [doubt.line() for doubt in doubts]),
         *check.lines(checked),
         f"results: {args.out}/map.ply, map.png, trajectory.txt, {FRAMES_FILE}, report.json",
         kept_line,
     )
+    if failed is not None:
+        raise CommandFailed(f"the source failed after {report['frames']} frames: {failed.message}",
+                            hint=failed.hint)  # fmt: skip
     if posed <= (1 - _MOST) * report["frames"]:
         raise CommandFailed(
-            f"{report['frames'] - posed} of {report['frames']} frames have no pose", hint=_advice(mapper)
+            f"{report['frames'] - posed} of {report['frames']} frames have no pose: {report['lost_frames']} "
+            f"lost, {report['frames_before_start']} before the start",
+            hint=_advice(mapper, source),
         )
     return 0
 
@@ -285,15 +305,13 @@ def check_drive(args: argparse.Namespace) -> OdometryScale | MarkerScale | None:
 def _scale(word: str | None) -> OdometryScale | MarkerScale | None:
     """Return the source of metres that ``marker:MM`` or ``odometry:FILE`` names."""
     from client_sdk import MarkerScale, OdometryScale
-    from client_sdk.mapping import read_trajectory
+    from client_sdk.check.motion import read_odometry
 
     if word is None:
         return None
     kind, _, value = word.partition(":")
     if kind == "odometry" and value:
-        path = read_trajectory(Path(value))
-        if len(path) < 2:
-            raise UsageError(f"{value} holds {len(path)} poses", hint="odometry needs a metre of them")
+        path = read_odometry(Path(value))
         return OdometryScale(path.timestamps_s, path.positions)
     with contextlib.suppress(ValueError):
         if kind == "marker":
@@ -311,12 +329,15 @@ def _make_folder(folder: Path) -> None:
 async def _drive(
     args: argparse.Namespace,
     settings: PlatformSettings,
-    source: FrameSource,
+    source: FrameStream,
     scale: Any,
     frames: FrameTable,
     watch: Callable[[Frame, TrackedFrame], None],
-) -> Mapper:
-    """Track all frames, each of which *watch* gets; Ctrl-C ends the drive, and what was mapped is kept."""
+) -> tuple[Mapper, RsePfError | None]:
+    """Track all frames, each of which *watch* gets; return the error that ended the source, if one did.
+
+    Ctrl-C, or a source that fails, ends the drive, and what was mapped is kept.
+    """
     from client_sdk.slots import load_features
 
     stop = asyncio.Event()
@@ -326,8 +347,15 @@ async def _drive(
         mapper = robot.mapper(scale=scale, depth=source.has_depth, features=load_features(args.features),
                               keyframes_of=_ROBOT)  # fmt: skip
         status = _Status(time.monotonic)
+        failed: RsePfError | None = None
         while not stop.is_set() and (args.frames is None or mapper.frames < args.frames):
-            frame = await asyncio.to_thread(next, source, None)
+            try:
+                frame = await asyncio.to_thread(next, source, None)
+            except RsePfError as error:
+                if not mapper.frames:
+                    raise
+                failed = error
+                break
             if frame is None:
                 break
             tracked = await mapper.track(frame)
@@ -337,7 +365,7 @@ async def _drive(
         status.end()
     if not mapper.frames:
         raise UsageError(f"{args.source} gives no frame", hint="look at it: rse-pf camera check")
-    return mapper
+    return mapper, failed
 
 
 @contextlib.asynccontextmanager
@@ -399,7 +427,7 @@ class _Status:
         show_progress(self._last, is_over=True)
 
 
-def _advice(mapper: Mapper) -> str:
-    if mapper.keyframes == 0:
+def _advice(mapper: Mapper, source: FrameStream) -> str:
+    if mapper.keyframes == 0 and not source.has_depth and not source.has_stereo:
         return "without depth the camera must move sideways, over things with texture; or use a depth camera"
     return "move more slowly, with more light, and check the intrinsics; see frames.csv for the reasons"

@@ -12,8 +12,9 @@ from typing import Any
 
 from client_sdk.frontend import load_opencv
 from client_sdk.mapping import write_trajectory
+from client_sdk.source_facts import unresolved
 from rse_pf.config import PlatformSettings
-from rse_pf.errors import UsageError
+from rse_pf.errors import CommandFailed, UsageError
 from rse_pf.experiments.compare.configurations import Configuration
 from rse_pf.experiments.compare.evo_figures import evo_ate_cm, evo_command
 from rse_pf.experiments.compare.recordings import Drive
@@ -46,21 +47,31 @@ class CompareOptions:
     runs: int = 1
     out: Path = Path("out-compare")
     platform: bool = False
+    accepted: tuple[str, ...] = ()
+    """Names of doubts about the recordings that the user takes for right."""
 
 
 def run_compare(options: CompareOptions, settings: PlatformSettings) -> int:
-    """Run the comparison; return 0."""
+    """Run the comparison; return 0.
+
+    Raises:
+        CommandFailed: A run gave no pose.
+    """
     _make_folder(options.out)
     load_opencv().setNumThreads(1)
     for drive in options.drives:
         show(*(f"note: {drive.dataset.name}: {note}" for note in drive.notes))
+    doubts = _doubts(options)
+    show(*doubts)
     before = environment(settings)
     rows, panels = asyncio.run(_compare(options, settings))
     solved_by = "a platform on this machine" if options.platform else "the service in this process"
     report = make_report(rows, options.configurations, solved_by, before, load_average())
+    report["source"] = _doubts(options)
     write_json(options.out / REPORT, report)
     draw_trajectories(options.out / PICTURE, panels)
     show(
+        *(line for line in report["source"] if line not in doubts),
         tolerance_line(),
         runs_line(rows, is_platform=options.platform),
         f"CPU of a frame: robot without reading its image, OpenCV on one thread; server: "
@@ -68,7 +79,25 @@ def run_compare(options: CompareOptions, settings: PlatformSettings) -> int:
         f"{before['load_average'][0]:g} before, {load_average()[0]:g} after",
         f"results: {options.out}/{REPORT}, {PICTURE}, {TRAJECTORIES}/",
     )
+    empty = [
+        f"{row['configuration']} on {row['recording']}" for row in rows if not row["figures"]["posed"][0]
+    ]
+    if empty:
+        raise CommandFailed(
+            f"no frame got a pose: {', '.join(empty)}",
+            hint="rse-pf check RECORDING says what is wrong with it",
+        )
     return 0
+
+
+def _doubts(options: CompareOptions) -> list[str]:
+    """Return what is unlikely about the recordings, a line for each doubt."""
+    datasets = {drive.dataset.name: drive.dataset for drive in options.drives}
+    return [
+        doubt.line()
+        for dataset in datasets.values()
+        for doubt in unresolved(dataset.log.doubts, options.accepted)
+    ]
 
 
 async def _compare(

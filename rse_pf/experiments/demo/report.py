@@ -12,7 +12,7 @@ from client_sdk.check.drive_check import DriveCheck
 from rse_pf.experiments.demo.robot import RobotFinished
 from rse_pf.experiments.results.live_error import live_lines, live_table
 from rse_pf.experiments.results.map_error import merged_lines, merged_table
-from rse_pf.experiments.results.markdown import failures, page, slashed, table, three
+from rse_pf.experiments.results.markdown import failures, lost_line, page, slashed, table, three
 from rse_pf.experiments.results.records import CommandRecord
 from rse_pf.experiments.results.summary import PAPER, summarise
 from rse_pf.experiments.results.trajectory_error import trajectory_figures
@@ -43,6 +43,7 @@ def make_report(
         "robots": len(finished),
         "frames": sum(robot.frames for robot in finished),
         "lost_frames": sum(robot.lost_frames for robot in finished),
+        "frames_before_start": sum(robot.frames_before_start for robot in finished),
         "keyframes": sum(robot.keyframes for robot in finished),
         "weak_poses": sum(robot.weak_poses for robot in finished),
         "truth": finished[0].truth_kind,
@@ -99,7 +100,7 @@ def closing_lines(report: Mapping[str, Any], folder: Path) -> str:
     times = f"round trip p50 {trip['p50']} ms, p99 {trip['p99']} ms"
     first = (
         f"{counted(report['robots'], 'robot')} tracked {counted(report['frames'], 'frame')}, "
-        f"{report['lost_frames']} lost; {times if trip['p50'] is not None else 'no command was answered'}; "
+        f"{lost_line(report)}; {times if trip['p50'] is not None else 'no command was answered'}; "
         f"{commands['answered']} of {counted(commands['sent'], 'command')} answered, {commands['lost']} lost"
     )
     known = [value for value in report["ate_cm"] if value is not None]
@@ -129,7 +130,8 @@ def closing_lines(report: Mapping[str, Any], folder: Path) -> str:
 
 def is_lost(report: Mapping[str, Any]) -> bool:
     """Return whether a command got no answer, or most frames got no pose."""
-    return bool(report["commands"]["lost"] > 0 or report["lost_frames"] > _MOST * report["frames"])
+    without_pose = report["lost_frames"] + report["frames_before_start"]
+    return bool(report["commands"]["lost"] > 0 or without_pose > _MOST * report["frames"])
 
 
 def advice(report: Mapping[str, Any]) -> str:

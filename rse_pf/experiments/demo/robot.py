@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import AsyncExitStack
 from dataclasses import dataclass, field, replace
 from multiprocessing.connection import Connection
@@ -27,6 +27,7 @@ from client_sdk.mapping import Trajectory, write_ply, write_trajectory
 from client_sdk.offloading.offload import CloudFirst
 from client_sdk.robot import Robot
 from client_sdk.slots import load_features
+from client_sdk.source_facts import DoubtLog, unresolved
 from rse_pf.config import DataSettings, SessionSettings
 from rse_pf.errors import RsePfError, error_of_system
 from rse_pf.experiments.child_process import ChildFailed, ChildReady, ParentPipe
@@ -71,6 +72,8 @@ class DemoOptions:
     quiet: bool = False
     check: bool = False
     """Whether drives of a recording are checked."""
+    accepted: tuple[str, ...] = ()
+    """Names of doubts about the recording that the user takes for right."""
 
     @property
     def frame_count(self) -> int:
@@ -139,6 +142,8 @@ class RobotFinished:
     trajectory: Trajectory
     truth: Trajectory | None
     truth_kind: str
+    frames_before_start: int = 0
+    """Frames of a camera without depth before it had moved enough."""
     stats: dict[str, Any] = field(default_factory=dict)
     is_metric: bool = True
     check: dict[str, Any] | None = None
@@ -165,6 +170,7 @@ class _Loaded:
     truth_kind: str
     has_depth: bool
     is_thinned: bool = False
+    log: DoubtLog = field(default_factory=DoubtLog)
 
 
 def run_robot(spec: RobotSpec, pipe: Connection) -> None:
@@ -227,7 +233,9 @@ async def _run(spec: RobotSpec, pipe: ParentPipe) -> None:
             waiting = iter(frames)
             following: asyncio.Future[Any] = asyncio.ensure_future(asyncio.to_thread(next, waiting, None))
             for row in range(len(frames)):
-                frame: Frame = await following
+                frame: Frame | None = await following
+                if frame is None:  # damaged images are left out
+                    break
                 planned = began + (row + spec.number / options.robots) / options.rate_hz
                 await asyncio.sleep(max(0.0, planned - time.monotonic()))
                 # The next frame is read while this one is tracked, as a camera's driver would.
@@ -249,6 +257,7 @@ async def _run(spec: RobotSpec, pipe: ParentPipe) -> None:
             RobotFinished(
                 frames=mapper.frames,
                 lost_frames=mapper.lost_frames,
+                frames_before_start=mapper.frames_before_start,
                 keyframes=mapper.keyframes,
                 weak_poses=drive.weak_poses,
                 map_points=len(mapper.map),
@@ -265,17 +274,18 @@ async def _run(spec: RobotSpec, pipe: ParentPipe) -> None:
                     "keyframes_uploaded": uploaded,
                 },
                 is_metric=_is_metric(mapper),
-                check=await asyncio.to_thread(_checked, check, mapper, truth, loaded.truth_kind),
+                check=await asyncio.to_thread(_checked, check, mapper, loaded, options.accepted),
             )
         )
 
 
 def _checked(
-    check: DriveCheck, mapper: Mapper | LiveMapper, truth: Trajectory | None, kind: str
+    check: DriveCheck, mapper: Mapper | LiveMapper, loaded: _Loaded, accepted: Sequence[str]
 ) -> dict[str, Any] | None:
     """Return what is wrong with the drive.  Its files are written: pairs may be adjusted."""
     offsets = mapper.adjust_pairs() if check.is_wanted and isinstance(mapper, Mapper) else {}
-    return check.finish(MotionReference.of_truth(truth, kind, is_camera=False), offsets)
+    reference = MotionReference.of_truth(loaded.truth, loaded.truth_kind, is_camera=False)
+    return check.finish(reference, offsets, unresolved(loaded.log.doubts, accepted))
 
 
 def _is_metric(mapper: Mapper | LiveMapper) -> bool:
@@ -334,7 +344,9 @@ def _load(spec: RobotSpec, pipe: ParentPipe) -> _Loaded:
     if options.data is not None:
         recording = options.share(number)
         is_thinned = int(np.ptp(recording.rows)) >= len(recording)
-        return _Loaded(recording, recording.truth, recording.truth_kind, recording.has_depth, is_thinned)
+        return _Loaded(
+            recording, recording.truth, recording.truth_kind, recording.has_depth, is_thinned, recording.log
+        )
     from client_sdk.simulator import render_frames, true_trajectory
 
     truth = true_trajectory(number, options.robots, options.frame_count, options.seed)

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-__all__ = ["about_run", "failures", "number", "page", "slashed", "table", "three"]
+__all__ = ["about_run", "failures", "lost_line", "number", "page", "slashed", "table", "three"]
 
 
 def page(*blocks: str | Sequence[str]) -> str:
@@ -62,3 +62,9 @@ def about_run(report: Mapping[str, Any]) -> str:
         f"Python {about['python']}; {versions}; settings digest "
         f"{about['settings_digest']}.{generators}"
     )
+
+
+def lost_line(report: Mapping[str, Any]) -> str:
+    """Return how many frames have no pose, lost ones and those before the start."""
+    before = report["frames_before_start"]
+    return f"{report['lost_frames']} lost" + (f", {before} before the start" if before else "")
