@@ -22,6 +22,7 @@ from rse_pf.maps.registry import MapRegistry
 from rse_pf.terminal import at_work, show, show_json
 
 if TYPE_CHECKING:
+    from client_sdk.datasets import Dataset
     from client_sdk.slots import FeaturesSlot
     from client_sdk.transfer.data_client import DataClient
     from rse_pf.services.mapping.localise import LocaliseReply
@@ -40,7 +41,7 @@ def add_localise_arguments(localise: argparse.ArgumentParser) -> None:
         "frames",
         nargs="+",
         metavar="FRAME",
-        help="an image, a recording, RECORDING:ROW or RECORDING:FIRST-LAST",
+        help="an image, a folder of images, a recording, RECORDING:ROW or RECORDING:FIRST-LAST",
     )
     localise.add_argument("--every", type=int, default=1, metavar="N", help="only every n-th frame")
     localise.add_argument(
@@ -109,7 +110,7 @@ def localise_photos(args: argparse.Namespace) -> int:
             "--store, --features and --every are for a map of a store", hint="leave them out, or leave --url"
         )
     lens = _lens_of(args)
-    photos = [(word, _photo(Path(word))) for word in args.frames]
+    photos = [(str(path), _photo(path)) for word in args.frames for path in _photo_files(Path(word))]
     client = _client(args)
     found: list[dict[str, Any]] = []
     try:
@@ -144,6 +145,12 @@ def _lens_of(args: argparse.Namespace) -> Lens:
         fx=camera.fx, fy=camera.fy, cx=camera.cx, cy=camera.cy, width=camera.width, height=camera.height,
         distortion=read.distortion, model=read.model,
     )  # fmt: skip
+
+
+def _photo_files(path: Path) -> list[Path]:
+    from client_sdk.datasets.images import image_files
+
+    return image_files(path) if path.is_dir() else [path]
 
 
 def _photo(path: Path) -> bytes:
@@ -188,17 +195,18 @@ def _finish(args: argparse.Namespace, found: list[dict[str, Any]]) -> int:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _NamedFrame:
-    """A frame to localise: a row of a recording, or (row None) an image."""
+    """A frame to localise: an image, or a row of a recording."""
 
     label: str
     path: Path
-    row: int | None
+    recording: Dataset | None = None
+    row: int = 0
 
 
 def _frames(word: str, every: int) -> Iterator[_NamedFrame]:
     path = Path(word)
     if path.is_file():
-        yield _NamedFrame(label=word, path=path, row=None)
+        yield _NamedFrame(label=word, path=path)
         return
     first, last = 0, -1
     match = None if path.is_dir() else _FRAME_RANGE.fullmatch(word)
@@ -211,26 +219,32 @@ def _frames(word: str, every: int) -> Iterator[_NamedFrame]:
             f"there is no image or recording {word}",
             hint="name an image, a recording, or RECORDING:FIRST-LAST",
         )
+    from client_sdk.cameras.open_camera import is_recording
     from client_sdk.datasets import open_dataset
+    from client_sdk.datasets.images import image_files
 
-    count = len(open_dataset(path))
+    photos = image_files(path) if path.is_dir() and not is_recording(path) else []
+    if photos:
+        yield from (_NamedFrame(label=photo.name, path=photo) for photo in photos[::every])
+        return
+    recording = open_dataset(path)
+    count = len(recording)
     if match is not None and not first <= last < count:
         raise UsageError(
             f"{path} has the frames 0 to {count - 1}, not {word.rpartition(':')[2]}",
             hint="count frames from 0",
         )
     for row in range(first, count if last < 0 else last + 1, every):
-        yield _NamedFrame(label=f"{path.name}:{row}", path=path, row=row)
+        yield _NamedFrame(label=f"{path.name}:{row}", path=path, recording=recording, row=row)
 
 
 def _view_of(named: _NamedFrame, version: MapVersion, camera: str | None, slot: FeaturesSlot | None) -> View:
-    from client_sdk.datasets import open_dataset, read_colour
+    from client_sdk.datasets import read_colour
     from client_sdk.frontend import Frame, FrontEndOptions, extract
     from rse_pf.slam.relative_pose import View
 
-    if named.row is not None:
-        recording = open_dataset(named.path)
-        frame = recording.read(recording.rows[named.row])
+    if named.recording is not None:
+        frame = named.recording.read(named.recording.rows[named.row])
     else:
         rgb = read_colour(named.path)
         height, width = rgb.shape[:2]
