@@ -16,6 +16,7 @@ import numpy as np
 from rse_pf.errors import PnpError
 from rse_pf.geometry import Array, adjoint, exp_se3, inverse, log_se3, pose_difference, transform
 from rse_pf.pnp import PnpOptions, PnpSolution, solve_pnp
+from rse_pf.slam.camera_fit import CameraFit, fit_camera
 from rse_pf.slam.relative_pose import (
     MeasuredPose,
     Reference,
@@ -27,6 +28,9 @@ from rse_pf.slam.relative_pose import (
 
 __all__ = ["LocalisationOptions", "Localised", "PlacedKeyframe", "localise", "spread_candidates"]
 
+_MAX_LOG_FOCAL = 0.07  # logarithm of an adjusted focal length over the given one; good photos: up to 0.06
+_MAX_CAMERA_STEP_M = 0.12  # between the poses of the given and the adjusted camera; good photos: up to 0.1
+_MAX_CAMERA_TURN_DEG = 6.0  # between both; good photos with a rolling shutter: up to 5.1
 _MAX_M = 1e6
 """A keyframe farther from the origin of its map than any robot drives is no rival for a place."""
 
@@ -48,6 +52,9 @@ class LocalisationOptions:
         of_place: of which so many are compared.
         has_equal_rooms: Whether rooms may look the same; then a view, which shows less than a room, is never
             enough.
+        fits_camera: Whether the camera of a view without depths may be wrong, as that of a photo.  Its pose
+            then counts only if it agrees with the one that the best fitting camera has, and what lies between
+            both is part of the covariance.
     """
 
     measured: RelativePoseOptions = field(default_factory=lambda: RelativePoseOptions(min_inliers=30))
@@ -60,6 +67,7 @@ class LocalisationOptions:
     place_deg: float = 45.0
     of_place: int = 4
     has_equal_rooms: bool = False
+    fits_camera: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -67,7 +75,8 @@ class Localised:
     """Where a camera is in the map.
 
     ``verdict`` is ``ok``; ``weak`` with a reason ("ambiguous", "few-inliers", "low-inlier-ratio",
-    "one-keyframe", or one of PnP); or ``none`` with a reason ("no-candidates", "no-pose") and without a pose.
+    "one-keyframe", "wrong-intrinsics", or one of PnP); or ``none`` with a reason ("no-candidates", "no-pose")
+    and without a pose.
     ``covariance`` ``(6, 6)`` is of the twist (metres, radians) on the left of ``T_map_camera``.  ``inliers``,
     ``matches`` and ``rmse_px`` are those of the best keyframe; ``keyframes`` are the ids of those that agree,
     best first.  ``scale`` is how many metres the unit of the view's depths is, None if that is a metre;
@@ -152,6 +161,11 @@ def localise(
         solution = _solved_together(agreeing, view, options)
         T_map_camera = best.T_map_keyframe @ inverse(solution.T_camera_world)
     reason = _weakness(agreeing, others, solution, options)
+    if options.fits_camera and view.depths_m is None:
+        points_map, pixels = _matches_of(agreeing)
+        fit = fit_camera(points_map, pixels, T_map_camera, view.camera)
+        covariance = covariance + _uncertainty_of_camera(fit, T_map_camera)
+        reason = reason or _camera_weakness(fit, T_map_camera)
     scale = None if view.is_metric else _scale_of(agreeing, options)
     if scale is None and not view.is_metric:
         reason = reason or "no-scale"
@@ -199,6 +213,27 @@ def _scale_of(placements: Sequence[_Placement], options: LocalisationOptions) ->
         return None
     weights = np.array([1.0 / each.variance for each in known])
     return math.exp(float(weights @ [each.log_ratio for each in known] / weights.sum()))
+
+
+def _matches_of(placements: Sequence[_Placement]) -> tuple[Array, Array]:
+    """Return ``(n, 3)`` points of the map and ``(n, 2)`` pixels of all matches, agreeing or not."""
+    points = [transform(each.T_map_keyframe, each.found.points_reference) for each in placements]
+    return np.concatenate(points), np.concatenate([each.found.pixels for each in placements])
+
+
+def _uncertainty_of_camera(fit: CameraFit, T_map_camera: Array) -> Array:
+    """Return the ``(6, 6)`` covariance that an unknown error of the camera adds to the pose."""
+    moved = log_se3((fit.T_map_camera @ inverse(T_map_camera))[None])[0]
+    covariance: Array = np.outer(moved, moved) + fit.covariance
+    return covariance
+
+
+def _camera_weakness(fit: CameraFit, T_map_camera: Array) -> str:
+    """Return "wrong-intrinsics" if the matches contradict the camera of the view, else ""."""
+    is_other_lens = abs(fit.log_focal) > _MAX_LOG_FOCAL + 2.0 * fit.log_focal_deviation
+    moved_m, turned_deg = pose_difference(fit.T_map_camera, T_map_camera)
+    has_moved = moved_m > _MAX_CAMERA_STEP_M or turned_deg > _MAX_CAMERA_TURN_DEG
+    return "wrong-intrinsics" if is_other_lens or has_moved else ""
 
 
 def _agree(one: _Placement, other: _Placement, options: LocalisationOptions) -> bool:

@@ -143,6 +143,26 @@ def test_the_distortion_of_a_lens_is_taken_out(service: PhotoService, drive: Dri
     assert untold.json["verdict"] != "ok" or not drive.is_right(untold, 1)
 
 
+@pytest.mark.parametrize(
+    ("first_px", "factor"),
+    [(0, 0.6), (0, 0.8), (0, 0.9), (0, 0.95), (0, 1.05), (0, 1.1), (0, 1.4), (64, 1.0), (100, 1.0)],
+)
+def test_a_photo_with_another_camera_is_weak_or_knows_its_error(
+    service: PhotoService, drive: Drive, first_px: int, factor: float
+) -> None:
+    """Cut *first_px* columns and rows in the shape of the photo, and multiply the focal length."""
+    image = drive.frames[3].rgb[first_px * 3 // 4 :, first_px:, ::-1]
+    cropped = bytes(cv2.imencode(".jpg", cv2.resize(image, (640, 480)))[1])
+
+    answer = service.localise(cropped, query=f"fx={525 * factor}&fy={525 * factor}&cx=319.5&cy=239.5").json
+
+    if abs(factor - 1.0) >= 0.1 or first_px:
+        assert answer["verdict"] in ("weak", "lost"), answer
+    if answer["verdict"] == "ok":
+        metres, _ = pose_difference(np.array(answer["T_map_camera"]), drive.poses[3])
+        assert metres < max(0.05, 3.0 * answer["position_sigma_m"])
+
+
 def test_a_photo_of_another_place_is_lost(service: PhotoService) -> None:
     answer = service.localise(photo())
 

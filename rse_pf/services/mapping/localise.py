@@ -117,6 +117,7 @@ def locate(
         agree_m=options.agree_m,
         agree_deg=options.agree_deg,
         of_place=max(1, 3 * options.candidates // 4),
+        fits_camera=True,
     )  # fmt: skip
     rows = spread_candidates(similar, index.T_map_keyframe, options.candidates, limits)
     keyframes = [index.keyframes[row] for row in rows]
