@@ -39,6 +39,8 @@ __all__ = [
     "round_for_wire",
 ]
 
+_MAX_STAMP_S = 1e10  # seconds since 1970 of the year 2286; milliseconds and nanoseconds are beyond it
+
 # So many matches fit into a command of 10 kB.  Each takes 14 to 15 bytes with zlib in recordings, and 18 if
 # all digits are random; 24 with MessagePack; 40 with plain JSON, 43 at most.
 _MATCHES_OF_CODEC = {"zlib": 530, "bin": 400, "json": 220}
@@ -52,6 +54,9 @@ class Frame:
     the optical axis, 0 where there is no reading.  With *stereo*, ``rgb`` and ``camera`` are those of the
     rectified left camera, and ``depth_m`` is all 0.  *imu* has the samples since the last frame.
     *T_body_camera* ``(4, 4)``, metres, is the pose of the camera in the body of its rig, None without a rig.
+
+    Raises:
+        UsageError: Arrays have another type or size, or the time stamp is not one of seconds.
     """
 
     timestamp_s: float
@@ -69,6 +74,16 @@ class Frame:
                 f"colour {self.rgb.shape} and depth {self.depth_m.shape} do not fit a camera of "
                 f"{size[1]}x{size[0]} px",
                 hint="give colour, registered depth and intrinsics of one size",
+            )
+        if self.rgb.dtype != np.uint8 or not np.issubdtype(self.depth_m.dtype, np.floating):
+            raise UsageError(
+                f"rgb holds {self.rgb.dtype} and depth_m {self.depth_m.dtype}, not uint8 and float32",
+                hint="convert colours to 0..255 with astype(numpy.uint8), and depth to metres of float32",
+            )
+        if not abs(self.timestamp_s) <= _MAX_STAMP_S:
+            raise UsageError(
+                f"timestamp_s = {self.timestamp_s:g} is not within {_MAX_STAMP_S:g} s",
+                hint="give seconds; divide nanoseconds by 1e9 and milliseconds by 1e3",
             )
         if self.stereo is not None and self.stereo.gray.shape != size:
             raise UsageError(

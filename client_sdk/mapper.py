@@ -25,6 +25,7 @@ from client_sdk.imu.samples import ImuSamples
 from client_sdk.mapping import MapOptions, PointMap, Trajectory, write_ply, write_trajectory
 from client_sdk.monocular.scale import MarkerScale, OdometryScale
 from client_sdk.slots import FeaturesFunction, LoopsFunction, MotionFunction, OptimiserFunction, Slots
+from client_sdk.source_facts import DepthFacts, SourceFacts, check_source, median_depth_m
 from client_sdk.tracking.monocular_tracker import MonocularOptions, MonocularTracker
 from client_sdk.tracking.segments import (
     DriveRecords,
@@ -164,7 +165,8 @@ class Mapper:
         self._depth = depth
         self._scale: OdometryScale | MarkerScale | ImuScale | None = scale
         self._inertial: Inertial | None = None
-        self._began_s = float("-inf")
+        self._began_s = self._last_stamp_s = float("-inf")
+        self._is_depth_known = False
         self._holds_poses, self._disparity_deviation_px = holds_world, float("nan")
         self._is_upright, self._holds_world = False, holds_world or T_world_start is not None
         self._map_options = map_options or MapOptions()
@@ -191,10 +193,12 @@ class Mapper:
             position_m: ``(3,)``, position of the camera by the robot's odometry, for `OdometryScale`.
 
         Raises:
-            UsageError: The frame is of another camera.
+            UsageError: The frame is of another camera, not later than the one before, or its depth is not in
+                metres.
             ConfigurationError: The function that answers cannot work at all, such as without a package.
         """
         async with self._one_frame:
+            self._check(frame)
             if self._recorder is not None:
                 self._recorder.frame(frame.timestamp_s, frame.rgb)
             tracker = self._tracker_for(frame)
@@ -463,15 +467,31 @@ class Mapper:
             for number in tracker.segments[1:]
         ]
 
-    def _tracker_for(self, frame: Frame) -> Tracker | MonocularTracker:
-        self.camera = self.camera or frame.camera
-        if self.T_body_camera is None:
-            self.T_body_camera = frame.T_body_camera
-        if frame.camera != self.camera:
+    def _check(self, frame: Frame) -> None:
+        """Refuse a frame that cannot follow the one before; what is refused changes nothing."""
+        own, camera = frame.camera, self.camera or frame.camera
+        if own != camera:
             raise UsageError(
-                f"a frame of {frame.camera.width}x{frame.camera.height} px is of another camera",
+                f"a frame of {own.width}x{own.height} px, fx {own.fx:g} is of another camera "
+                f"than those before, of {camera.width}x{camera.height} px, fx {camera.fx:g}",
                 hint="use one mapper for each camera, and give it the intrinsics of the frames",
             )
+        if frame.timestamp_s <= self._last_stamp_s:
+            raise UsageError(
+                f"a frame of {frame.timestamp_s:.6f} s is not later than the one before, "
+                f"of {self._last_stamp_s:.6f} s",
+                hint="give frames in the order of their exposure, each with its own time",
+            )
+        if not self._is_depth_known and frame.stereo is None:
+            median_m = median_depth_m([frame.depth_m])
+            depth = DepthFacts(median_m=median_m, units_per_m=1.0, is_unit_stated=True)
+            check_source(SourceFacts(name="a frame", depth=depth))
+            self._is_depth_known = median_m is not None
+        self.camera, self._last_stamp_s = camera, frame.timestamp_s
+
+    def _tracker_for(self, frame: Frame) -> Tracker | MonocularTracker:
+        if self.T_body_camera is None:
+            self.T_body_camera = frame.T_body_camera
         if self._tracker is None:
             if frame.imu is not None:
                 self._begin_inertial(frame.imu, frame.camera)

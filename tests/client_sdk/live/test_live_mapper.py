@@ -343,7 +343,7 @@ async def test_a_covered_lens_begins_no_segment_and_the_robot_finds_its_place_it
     async with live_map(robot) as mapper:
         await drive(mapper, range(6))
         dark = [await mapper.track(covered(frame_at(row, depth=True))) for row in range(6, 16)]
-        (back,) = await drive(mapper, range(2, 3))
+        back = await mapper.track(replace(frame_at(2, depth=True), timestamp_s=16.0))
 
         assert {tracked.status for tracked in dark} == {"lost"}
         assert (back.status, back.segment) == ("tracked", 0)

@@ -5,10 +5,12 @@ from __future__ import annotations
 import asyncio
 import json
 import threading
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -22,7 +24,7 @@ from client_sdk.robot import Robot, connect
 from client_sdk.tracking.monocular_tracker import MonocularOptions, MonocularTracker
 from rse_pf.errors import Busy, MissingExtra, UsageError
 from rse_pf.experiments.results.trajectory_error import absolute_error
-from rse_pf.geometry import Camera, exp_se3
+from rse_pf.geometry import exp_se3
 from rse_pf.pnp import solve_pnp
 from tests.client_sdk.live.fake_live_map import solve
 from tests.client_sdk.mapper.flat_world import STEP_M, foreign, frame_at, tracked
@@ -109,11 +111,38 @@ async def test_a_cancelled_frame_leaves_the_mapper_usable() -> None:
     assert (await mapper.track(frame_at(2, depth=True))).status == "tracked"
 
 
-def test_a_frame_of_another_camera_is_refused() -> None:
-    mapper = Mapper(ask=solve, camera=Camera(fx=400.0, fy=400.0, cx=160.0, cy=120.0, width=320, height=240))
+def zoomed(frame: Frame) -> Frame:
+    return replace(frame, camera=msgspec.structs.replace(frame.camera, fx=2.0 * frame.camera.fx))
 
-    with pytest.raises(UsageError, match="another camera"):
-        drive(mapper, range(1), depth=True)
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        (lambda f: replace(f, rgb=(f.rgb / 255).astype(np.float32)), "rgb holds float32"),
+        (lambda f: replace(f, depth_m=(f.depth_m * 1000).astype(np.uint16)), "depth_m uint16"),
+        (lambda f: replace(f, depth_m=f.depth_m * 1000), "median depth"),
+        (lambda f: replace(f, depth_m=f.depth_m * 100), "median depth"),
+        (lambda f: replace(f, rgb=f.rgb[:-1]), "do not fit a camera"),
+        (lambda f: replace(f, timestamp_s=float("nan")), "timestamp_s = nan"),
+        (lambda f: replace(f, timestamp_s=1.7e18 + f.timestamp_s), "timestamp_s = 1.7e"),
+        (lambda f: replace(f, timestamp_s=7.0), "not later than the one before, of 7.000000 s"),
+        (lambda f: replace(f, timestamp_s=-f.timestamp_s), "not later than the one before"),
+        (zoomed, "of another camera"),
+    ],
+)
+def test_an_odd_frame_is_refused_with_a_hint_and_the_drive_goes_on(
+    change: Callable[[Frame], Frame], expected: str
+) -> None:
+    mapper = Mapper(ask=solve)
+    frames = [replace(frame_at(row, depth=True), timestamp_s=1.0 + row) for row in range(4)]
+    is_alone = "median" in expected
+
+    with pytest.raises(UsageError, match=expected) as refused:
+        tracked(mapper, [*([] if is_alone else frames[:2]), *map(change, frames[2:])])
+
+    assert refused.value.hint
+    later = [replace(frame, timestamp_s=10.0 + frame.timestamp_s) for frame in frames]
+    assert not any(each.lost for each in tracked(mapper, later))
 
 
 def test_frames_without_depth_give_a_map_up_to_scale_and_say_so() -> None:
@@ -155,7 +184,7 @@ def test_a_lost_camera_without_depth_is_found_again_where_it_was() -> None:
     blank = frame_at(8, depth=False)
     blank = replace(blank, rgb=np.full_like(blank.rgb, 128))
 
-    lost, found = tracked(mapper, [blank, frame_at(5, depth=False)])
+    lost, found = tracked(mapper, [blank, replace(frame_at(5, depth=False), timestamp_s=9.0)])
 
     assert (lost.status, lost.T_world_camera) == ("lost", None)
     assert "matches" in lost.reason
