@@ -59,7 +59,7 @@ _RESERVE_SHARE = 0.1
 """Share of the store's disk that no tenant alone may fill: when less is free, a tenant that holds more than
 its share is refused."""
 _NEVER = float("-inf")
-_OF_TENANT = ("objects", "maps", "live", "states", "jobs", "job-queue")
+_OF_TENANT = ("objects", "maps", "live", "states", "jobs")
 
 
 class _Ledger(msgspec.Struct, frozen=True, array_like=True):

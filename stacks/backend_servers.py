@@ -178,7 +178,6 @@ def launch_template(
     firewall_group: ec2.ISecurityGroup,
     settings: PlatformSettings,
     facts: Mapping[str, str],
-    kind: ec2.InstanceType | None = None,
 ) -> ec2.LaunchTemplate:
     """Return the launch template of a server; *facts* are what `stacks/boot/first_boot.py` is told.
 
@@ -188,7 +187,6 @@ def launch_template(
         firewall_group: The only security group of the instance.
         settings: Image and instance type.
         facts: Plain words by name.
-        kind: Instance type; None is that of the backend servers.
     """
     encrypted = ec2.BlockDeviceVolume.ebs(
         _GIB, encrypted=True, volume_type=ec2.EbsDeviceVolumeType.GP3, delete_on_termination=True
@@ -196,7 +194,7 @@ def launch_template(
     script = _BOOT.read_text(encoding="utf-8")
     commands = f"{script}\nmain({cdk.Stack.of(scope).to_json_string(dict(facts))!s})\n"
     return ec2.LaunchTemplate(
-        scope, "Template", instance_type=kind or ec2.InstanceType(settings.cloud.instance_type), role=role,
+        scope, "Template", instance_type=ec2.InstanceType(settings.cloud.instance_type), role=role,
         machine_image=ec2.MachineImage.from_ssm_parameter(
             settings.cloud.image_parameter, os=ec2.OperatingSystemType.LINUX
         ),

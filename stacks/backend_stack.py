@@ -16,7 +16,6 @@ from rse_pf.config.cloud_layout import zone_count
 from rse_pf.config.resource_names import DENY_NAME, KEYS_NAME, ROBOTS_NAME, SERVICES_PREFIX, ResourceNames
 from stacks.assets import SERVERS, staged, sums_digest
 from stacks.backend_servers import BackendServers
-from stacks.job_servers import JobServers
 from stacks.load_balancer import LoadBalancer
 from stacks.network_stack import CIDR, ZONES
 from stacks.permissions import allow
@@ -87,23 +86,15 @@ class BackendStack(cdk.Stack):
             why="archives of published services are named by their digests; operators alone write them",
         )  # fmt: skip
         group = self.servers.group
-        groups = [names.group]
-        if settings.cloud.job_servers:
-            groups.append(names.job_group)
-            JobServers(
-                self, "JobServers", vpc=vpc, firewall_group=import_group(self, names, "jobs"),
-                role=self.servers.role, facts=self.servers.facts, topic=self.topic, settings=settings,
-            )  # fmt: skip
         # By name, not by reference: a reference would make a cycle with the group.
         allow(
             self.servers.role, ["autoscaling:CompleteLifecycleAction"],
             [
                 self.format_arn(
                     service="autoscaling", resource="autoScalingGroup",
-                    resource_name=f"*:autoScalingGroupName/{each}",
+                    resource_name=f"*:autoScalingGroupName/{names.group}",
                     arn_format=cdk.ArnFormat.COLON_RESOURCE_NAME,
                 )
-                for each in groups
             ],
             used_by=("rse_pf/aws/fleet/launch_hook.py:complete_hook", "stacks/boot/first_boot.py:abandon"),
             why="the ARN of an Auto Scaling group holds an id that only AWS knows",

@@ -25,10 +25,8 @@ BALANCER_LOGS = "alb"
 """Prefix of the load balancer's access logs in their bucket."""
 
 _DAY = cdk.Duration.days(1)
-_LEASES = ("live/", "jobs/", "batch/schedulers/", "accounts/")
+_LEASES = ("live/", "jobs/", "accounts/")
 """Prefixes of leases and accounts, which change up to twice a second: each change leaves a former version."""
-_OFFERS, _OFFER_DAYS = "job-queue/", 7
-"""Offers of jobs that nobody withdrew, because their server was killed or its settings are gone."""
 _INFREQUENT_AFTER_DAYS = 30
 """The soonest that S3 takes an object there."""
 _GLACIER_AFTER_DAYS = 90
@@ -70,9 +68,6 @@ class DataStack(cdk.Stack):
         )
         for prefix in _LEASES:
             self.maps.add_lifecycle_rule(prefix=prefix, noncurrent_version_expiration=_DAY)
-        self.maps.add_lifecycle_rule(
-            prefix=_OFFERS, expiration=cdk.Duration.days(_OFFER_DAYS), noncurrent_version_expiration=_DAY
-        )
         self.artifacts = self._bucket("Artifacts", self.access_logs)
         for bucket in (self.maps, self.artifacts):
             bucket.add_lifecycle_rule(

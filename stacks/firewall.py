@@ -10,7 +10,7 @@ from aws_cdk import aws_ec2 as ec2
 from constructs import Construct
 
 from rse_pf.config import PlatformSettings
-from rse_pf.config.placement import batch_ports, fixed_live_ports
+from rse_pf.config.placement import fixed_live_ports
 from rse_pf.errors import ConfigurationError
 from stacks.findings import acknowledge
 
@@ -75,21 +75,8 @@ class Firewall(Construct):
         self.servers.add_egress_rule(
             ec2.Peer.prefix_list(s3_prefix_list(settings)), ec2.Port.tcp(_HTTPS), "S3"
         )
-        self.jobs = self._job_servers(vpc, settings) if settings.cloud.job_servers else None
         self.servers.add_egress_rule(self.endpoints, ec2.Port.tcp(_HTTPS), "to the endpoints")
         self.endpoints.add_ingress_rule(self.servers, ec2.Port.tcp(_HTTPS), "from the servers")
-
-    def _job_servers(self, vpc: ec2.IVpc, settings: PlatformSettings) -> ec2.SecurityGroup:
-        """Let job servers reach S3, the endpoints and, for batches, each other; nobody else reaches them."""
-        jobs = self._group("Jobs", vpc, "job servers: each other in, S3 and endpoints out")
-        batch = batch_ports(settings.batch)
-        ports = ec2.Port.tcp_range(batch[0], batch[-1])
-        jobs.add_egress_rule(jobs, ports, "batches: scheduler and workers")
-        jobs.add_ingress_rule(jobs, ports, "batches: scheduler and workers")
-        jobs.add_egress_rule(ec2.Peer.prefix_list(s3_prefix_list(settings)), ec2.Port.tcp(_HTTPS), "S3")
-        jobs.add_egress_rule(self.endpoints, ec2.Port.tcp(_HTTPS), "to the endpoints")
-        self.endpoints.add_ingress_rule(jobs, ec2.Port.tcp(_HTTPS), "from the job servers")
-        return jobs
 
     def _group(self, name: str, vpc: ec2.IVpc, description: str) -> ec2.SecurityGroup:
         return ec2.SecurityGroup(self, name, vpc=vpc, description=description, allow_all_outbound=False)

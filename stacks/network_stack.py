@@ -87,8 +87,6 @@ class NetworkStack(cdk.Stack):
             ("endpoints", self.firewall.endpoints),
         ):  # fmt: skip
             provide(self, names, f"network/group-{name}", group.security_group_id)
-        if self.firewall.jobs is not None:
-            provide(self, names, "network/group-jobs", self.firewall.jobs.security_group_id)
 
     @property
     @jsii.member(jsii_name="availabilityZones")

@@ -28,7 +28,7 @@ import numpy as np
 
 from benchmarks.frame.registry import Bar, Recordings, benchmark, command_of
 from benchmarks.frame.report import say
-from rse_pf.batch.cluster import DaskEngine, LocalCluster, new_cluster_key
+from rse_pf.batch.cluster import DaskEngine, LocalCluster
 from rse_pf.batch.merge import BatchMerge, BatchMergeResult
 from rse_pf.batch.tasks import InProcessEngine
 from rse_pf.config import PlatformSettings
@@ -182,10 +182,9 @@ def _in_workers(
     for name in names:
         store.put(name, source.get(name))
     settings = PlatformSettings().replace(data={"store": f"dir:{folder / called}"})
-    key = new_cluster_key()
-    cluster = LocalCluster(key, args.workers)
+    cluster = LocalCluster(args.workers)
     events: list[str] = []
-    engine = DaskEngine(store, settings, cluster, key, on_event=events.append)
+    engine = DaskEngine(store, settings, cluster, on_event=events.append)
     kill = _killer(cluster) if kills else _nothing
     began = time.monotonic()
     try:

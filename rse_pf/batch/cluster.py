@@ -1,7 +1,7 @@
-"""The engine of parts on Dask: a scheduler and workers in processes, here or on other machines.
+"""The engine of parts on Dask: with processes of its own on this machine, or a scheduler that runs already.
 
-Dask is told names only.  A worker that ends is replaced and its part is given to another; a scheduler on this
-machine that ends is started again, and the parts that are not stored yet are handed to it.
+Dask is told names only.  A worker of its own that ends is replaced, and its part is given to another; a
+scheduler that is lost is started or connected again, and the parts that are not stored yet are handed to it.
 """
 
 from __future__ import annotations
@@ -10,12 +10,13 @@ import contextlib
 import logging
 import os
 import queue
+import re
 import subprocess
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import CancelledError
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import msgspec
 
@@ -23,18 +24,19 @@ from rse_pf.batch.node import NodeOrder, compute, security_of
 from rse_pf.batch.parts import Part, encode_part, is_done
 from rse_pf.child.start import Child, ChildPlan, start_child
 from rse_pf.config import PlatformSettings
-from rse_pf.errors import Crashed, Disconnected, MissingExtra, error_from_code
+from rse_pf.errors import ConfigurationError, Crashed, Disconnected, MissingExtra, UsageError, error_from_code
 from rse_pf.ipc import receive
 from rse_pf.object_store import ObjectStore
 from rse_pf.one_thread import ONE_THREAD
 from rse_pf.terminal import counted
 
 __all__ = [
+    "Cluster",
     "ClusterKey",
     "DaskEngine",
     "LocalCluster",
+    "RemoteCluster",
     "new_cluster_key",
-    "start_worker",
 ]
 
 PART_TRIES = 3
@@ -42,6 +44,9 @@ PART_TRIES = 3
 _SCHEDULER_RESTARTS = 3
 """How often a lost scheduler is started again."""
 _START_TIMEOUT_S = 60.0
+_REMOTE_TIMEOUT_S = 10.0
+"""A scheduler that runs already has to answer, and to have a worker, within this."""
+_ADDRESS = re.compile(r"(?:(?:tcp|tls)://)?[^\s:/]+(?::[^\s:/]+)*:\d{1,5}")
 _POLL_S = 0.2
 _DASK = {
     "DASK_DISTRIBUTED__COMM__TIMEOUTS__CONNECT": "10s",
@@ -70,35 +75,100 @@ def new_cluster_key() -> ClusterKey:
     return ClusterKey(certificate=made.tls_ca_file, key=made.tls_client_key)
 
 
+class Cluster(Protocol):
+    """A scheduler with workers."""
+
+    address: str
+    part_tries: int
+
+    @property
+    def is_lost(self) -> bool:
+        """Whether the scheduler has ended, as far as this process knows."""
+
+    def start(self) -> None:
+        """Start it, or check that it runs; raises RsePfError."""
+
+    def replace_dead_workers(self) -> int:
+        """Start a worker for each one that ended; return how many."""
+
+    def stop(self) -> None:
+        """End what `start` started."""
+
+    def security(self) -> Any:
+        """Return Dask's TLS for a client; None for what Dask is configured with."""
+
+
+class RemoteCluster:
+    """A scheduler and workers that somebody else has started; TLS is that of Dask's configuration."""
+
+    is_lost = False
+    part_tries = PART_TRIES
+
+    def __init__(self, address: str) -> None:
+        """Connect to nothing yet; raises UsageError if *address* is none of a scheduler."""
+        if _ADDRESS.fullmatch(address) is None:
+            raise UsageError(
+                f"{address[:80]!r} is no address of a Dask scheduler",
+                hint="write HOST:PORT, tcp://HOST:PORT or tls://HOST:PORT, as dask scheduler prints it",
+            )
+        self.address = address if "://" in address else f"tcp://{address}"
+
+    def start(self) -> None:
+        """Check that the scheduler answers and has a worker; raises Disconnected or ConfigurationError."""
+        from distributed import Client
+
+        _silence()
+        try:
+            client = Client(self.address, timeout=_REMOTE_TIMEOUT_S, set_as_default=False)
+        except TypeError as error:  # what Dask raises for tls:// without certificates
+            raise ConfigurationError(
+                f"{self.address} needs certificates, and Dask is configured with none",
+                hint="set DASK_DISTRIBUTED__COMM__TLS__CA_FILE and TLS__CLIENT__CERT and TLS__CLIENT__KEY",
+            ) from error
+        except (OSError, TimeoutError) as error:
+            raise Disconnected(
+                f"no Dask scheduler answered at {self.address} within {_REMOTE_TIMEOUT_S:g} s",
+                hint="start one (dask scheduler --host ADDRESS), or leave --scheduler out",
+            ) from error
+        try:
+            client.wait_for_workers(1, timeout=_REMOTE_TIMEOUT_S)
+            _check_versions(client.get_versions(check=False, packages=["rse_pf"]))
+        except TimeoutError as error:
+            raise Disconnected(
+                f"the Dask scheduler at {self.address} has no worker after {_REMOTE_TIMEOUT_S:g} s",
+                hint=f"start some with this version of rse-pf (dask worker {self.address} --nthreads 1)",
+            ) from error
+        finally:
+            client.close(timeout=1)
+
+    def replace_dead_workers(self) -> int:
+        """Replace none: who started the workers looks after them."""
+        return 0
+
+    def stop(self) -> None:
+        """Stop nothing."""
+
+    def security(self) -> None:
+        """Leave TLS to Dask's configuration."""
+
+
 class LocalCluster:
     """A scheduler and workers as child processes of this one; they end with it."""
 
-    def __init__(
-        self,
-        key: ClusterKey,
-        workers: int,
-        *,
-        part_tries: int = PART_TRIES,
-        host: str = "127.0.0.1",
-        port: int = 0,
-    ) -> None:
+    def __init__(self, workers: int, *, part_tries: int = PART_TRIES) -> None:
         """Start nothing yet.
 
         Args:
-            key: Of the cluster.
-            workers: Number of worker processes on this machine; others may join.
+            workers: Number of worker processes.
             part_tries: A part whose workers ended this often is not tried again.
-            host: Address on which the scheduler listens.
-            port: Its port; 0 takes a free one.
         """
         self.address = ""
         self.part_tries = part_tries
-        self._key = key
+        self._key = new_cluster_key()
         self._count = workers
         self._environment = {
             **_DASK, "DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": str(part_tries - 1)
         }  # fmt: skip
-        self._host, self._port = host, port
         self._scheduler: Child | None = None
         self._workers: list[Child] = []
         self._starts = 0
@@ -121,9 +191,7 @@ class LocalCluster:
     def start(self) -> None:
         """Start scheduler and workers; raises Crashed if the scheduler does not come up."""
         self.stop()
-        self._scheduler = self._spawn(
-            "scheduler", NodeOrder(**self._order(), host=self._host, port=self._port)
-        )
+        self._scheduler = self._spawn("scheduler", "")
         self.address = _address(self._scheduler, _START_TIMEOUT_S)
         self._workers = [self._start_worker() for _ in range(self._count)]
 
@@ -151,28 +219,21 @@ class LocalCluster:
             each.kill()
         self._workers, self._scheduler = [], None
 
-    def _order(self) -> dict[str, Any]:
-        return {"certificate": self._key.certificate, "key": self._key.key}
+    def security(self) -> Any:
+        """Return the TLS of the cluster's key."""
+        return security_of(self._key.certificate, self._key.key)
 
     def _start_worker(self) -> Child:
-        return self._spawn("worker", NodeOrder(**self._order(), address=self.address))
+        return self._spawn("worker", self.address)
 
-    def _spawn(self, role: str, order: NodeOrder) -> Child:
-        return _spawn(role, order, self._environment)
-
-
-def start_worker(certificate: str, key: str, address: str, *, ports: str) -> Child:
-    """Start a worker of the scheduler at *address*, on one of *ports*; it ends with this process."""
-    return _spawn("worker", NodeOrder(certificate=certificate, key=key, address=address, ports=ports), _DASK)
-
-
-def _spawn(role: str, order: NodeOrder, environment: Mapping[str, str]) -> Child:
-    plan = ChildPlan(target=f"rse_pf.batch.node:run_{role}", name=f"batch-{role}")
-    child = start_child(
-        plan, environment={**os.environ, **ONE_THREAD, **environment}, output=subprocess.DEVNULL
-    )
-    child.say(msgspec.to_builtins(order))
-    return child
+    def _spawn(self, role: str, address: str) -> Child:
+        child = start_child(
+            ChildPlan(target=f"rse_pf.batch.node:run_{role}", name=f"batch-{role}"),
+            environment={**os.environ, **ONE_THREAD, **self._environment}, output=subprocess.DEVNULL,
+        )  # fmt: skip
+        order = NodeOrder(certificate=self._key.certificate, key=self._key.key, address=address)
+        child.say(msgspec.to_builtins(order))
+        return child
 
 
 class DaskEngine:
@@ -182,11 +243,9 @@ class DaskEngine:
         self,
         store: ObjectStore,
         settings: PlatformSettings,
-        cluster: LocalCluster,
-        key: ClusterKey,
+        cluster: Cluster,
         *,
         on_event: Callable[[str], None] = lambda text: None,
-        on_start: Callable[[str], None] | None = None,
     ) -> None:
         """Connect to nothing yet.
 
@@ -194,24 +253,18 @@ class DaskEngine:
             store: The same as that of ``settings.data.store``, which the workers open.
             settings: Sent to the workers.
             cluster: Started, but not stopped, by this engine.
-            key: Of the cluster.
             on_event: Called with one line when a worker or a scheduler was replaced.
-            on_start: Called with the scheduler's address when it was started.
         """
         self._store = store
         self._settings = msgspec.json.encode(settings.to_dict())
         self._cluster = cluster
-        self._key = key
         self._on_event = on_event
-        self._on_start = on_start
         self._client: Any = None
         self._restarts = 0
 
     def start(self) -> None:
-        """Start the cluster; raises Crashed if it does not come up."""
+        """Start the cluster; raises RsePfError if it does not come up."""
         self._cluster.start()
-        if self._on_start is not None:
-            self._on_start(self._cluster.address)
 
     def run(self, parts: Sequence[Part], on_done: Callable[[int], None]) -> None:
         """Compute *parts*.
@@ -247,11 +300,11 @@ class DaskEngine:
         from distributed import Client
 
         _silence()
-        security = security_of(self._key.certificate, self._key.key)
         try:
             self._client = Client(
-                self._cluster.address, security=security, timeout=_START_TIMEOUT_S, set_as_default=False
-            )
+                self._cluster.address, security=self._cluster.security(), timeout=_START_TIMEOUT_S,
+                set_as_default=False,
+            )  # fmt: skip
         except (OSError, TimeoutError) as error:
             raise _SchedulerLost from error
 
@@ -309,7 +362,20 @@ class DaskEngine:
                 f"the scheduler ended {self._restarts} times", hint="run the same command again: it continues"
             )
         self.start()
-        self._on_event("the scheduler ended and was started again")
+        self._on_event("the connection to the scheduler was lost and is there again")
+
+
+def _check_versions(about: Mapping[str, Any]) -> None:
+    """Raise ConfigurationError if the scheduler or a worker cannot load what this process sends."""
+    ours = about["client"]["packages"]["rse_pf"]
+    for address, process in {"the Dask scheduler": about["scheduler"], **about["workers"]}.items():
+        theirs = process["packages"].get("rse_pf")
+        if theirs != ours:
+            version = f"rse-pf {theirs}" if theirs else "no rse-pf"
+            raise ConfigurationError(
+                f"{address} has {version}, this command is rse-pf {ours}",
+                hint=f"install rse-pf[batch]=={ours} there",
+            )
 
 
 def _silence() -> None:

@@ -30,6 +30,8 @@ from rse_pf.terminal import show
 
 __all__ = ["NodeOrder", "compute", "run_scheduler", "run_worker", "security_of"]
 
+_HOST = "127.0.0.1"
+"""Where scheduler and workers of one command listen: only processes of this machine reach them."""
 _DEATH_TIMEOUT_S = 20.0
 """A worker that finds no scheduler ends after this."""
 
@@ -39,11 +41,8 @@ class NodeOrder(msgspec.Struct, frozen=True, kw_only=True):
 
     certificate: str
     key: str
-    host: str = "127.0.0.1"
-    port: int = 0
     address: str = ""
-    ports: str = ""
-    """Of a worker, such as ``8791:8889``; empty takes a free one."""
+    """Of the scheduler that a worker joins."""
 
 
 def security_of(certificate: str, key: str) -> Any:
@@ -106,7 +105,7 @@ async def _scheduler(parent: socket.socket, order: NodeOrder) -> None:
     security = security_of(order.certificate, order.key)
     bound_handshakes()
     async with without_pages(Scheduler)(
-        host=order.host, port=order.port, protocol="tls", security=security, dashboard=False
+        host=_HOST, port=0, protocol="tls", security=security, dashboard=False
     ) as scheduler:
         parent.sendall(encode_message(scheduler.address))
         await scheduler.finished()
@@ -114,16 +113,13 @@ async def _scheduler(parent: socket.socket, order: NodeOrder) -> None:
 
 async def _worker(order: NodeOrder) -> None:
     from distributed import Worker
-    from distributed.comm import get_address_host
-    from distributed.utils import get_ip
 
     bound_handshakes()
-    host = get_ip(get_address_host(order.address))  # by which the scheduler is reached
     security = security_of(order.certificate, order.key)
     with tempfile.TemporaryDirectory(prefix="rse-pf-batch-") as folder:
         async with without_pages(Worker)(
-            order.address, host=host, port=order.ports or None, nthreads=1, security=security,
-            local_directory=folder, memory_limit=0, death_timeout=_DEATH_TIMEOUT_S,
+            order.address, host=_HOST, nthreads=1, security=security, local_directory=folder,
+            memory_limit=0, death_timeout=_DEATH_TIMEOUT_S,
         ) as worker:  # fmt: skip
             await worker.finished()
 

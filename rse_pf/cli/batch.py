@@ -1,19 +1,19 @@
-"""Merge maps that outgrow one process: in parts, by worker processes here and by job servers.
+"""Merge maps that outgrow one process: in parts, by worker processes here or by those of a Dask scheduler.
 
 Finished parts are kept in the store of the maps, so that the same command continues after an interruption: a
 worker that ends is replaced, a scheduler that ends is started again, and Ctrl-C or a crash of this machine
 lose at most the parts that were being computed.  The result is that of rse-pf map merge, plus links from
-aligned clouds (--no-icp leaves them out).  With --host, idle job servers join (docs/batch.md).
+aligned clouds (--no-icp leaves them out).  --scheduler uses the workers of a Dask scheduler that runs.
 
 examples:
   rse-pf batch run merge robot-1 robot-2 robot-3 --out kitchen --store dir:objects
+  rse-pf batch run merge robot-1 robot-2 --out kitchen --store s3:maps --scheduler tcp://10.0.1.7:8786
   rse-pf batch clean --store dir:objects
 """
 
 from __future__ import annotations
 
 import argparse
-import ipaddress
 import os
 import time
 
@@ -55,15 +55,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     merge.add_argument("--out", required=True, metavar="MAP", help="the map that gets a new version")
     merge.add_argument(
         "--workers", type=int, metavar="N",
-        help="worker processes on this machine; 0 leaves all parts to job servers (batch.workers)",
+        help="worker processes on this machine (batch.workers)",
     )  # fmt: skip
     merge.add_argument(
         "--candidates", type=int, default=8, metavar="N", help="other keyframes tried for each"
     )
     merge.add_argument("--no-icp", action="store_true", help="do not align clouds")
     merge.add_argument(
-        "--host", default="127.0.0.1", metavar="ADDRESS",
-        help="address of this machine on which job servers reach it (default: only this machine)",
+        "--scheduler", metavar="ADDRESS",
+        help="use the workers of the Dask scheduler at ADDRESS, not of this machine; they need the store",
     )  # fmt: skip
     merge.add_argument("--tenant", default="default", help="tenant of the maps (default: %(default)s)")
     merge.add_argument("--note", default="", help="note of the new version")
@@ -100,18 +100,18 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
 
 def _merge(args: argparse.Namespace, settings: PlatformSettings) -> int:
     """Merge in parts; the exit code is 1 if a map was not joined."""
-    from rse_pf.batch.cluster import DaskEngine, LocalCluster, new_cluster_key
-    from rse_pf.batch.invitation import Invitation
+    from rse_pf.batch.cluster import Cluster, DaskEngine, LocalCluster, RemoteCluster
     from rse_pf.batch.merge import BatchMerge
     from rse_pf.services.mapping.merge import reply_of
     from rse_pf.slam.links import MergeOptions
 
-    is_alone = _is_loopback(args.host)
-    if is_alone and settings.batch.workers == 0:
+    if args.scheduler is not None and args.workers is not None:
         raise UsageError(
-            "no worker would compute anything: --workers 0 without --host",
-            hint="name --host ADDRESS, on which job servers reach this machine, or --workers 2",
+            "--workers and --scheduler exclude each other", hint="the scheduler has workers of its own"
         )
+    cluster: Cluster = (
+        LocalCluster(settings.batch.workers) if args.scheduler is None else RemoteCluster(args.scheduler)
+    )
     store = open_data_store(settings)
 
     def record(action: str, name: str, version: MapRecord) -> None:
@@ -123,15 +123,7 @@ def _merge(args: argparse.Namespace, settings: PlatformSettings) -> int:
     options = MergeOptions(candidates=args.candidates)
     inputs = [_object_of(word, maps) for word in args.names]
     parent = _id_of_head(args.out, maps)
-    key = new_cluster_key()
-    cluster = LocalCluster(
-        key, settings.batch.workers, host=args.host, port=0 if is_alone else settings.batch.first_port
-    )
-    invitation = None if is_alone else Invitation(store, key)
-    engine = DaskEngine(
-        store, settings, cluster, key, on_event=lambda text: show(text, error=True),
-        on_start=invitation.announce if invitation is not None else None,
-    )  # fmt: skip
+    engine = DaskEngine(store, settings, cluster, on_event=lambda text: show(text, error=True))
     merge = BatchMerge(store, engine, settings, options=options, align_clouds=not args.no_icp)
     began = time.perf_counter()
     try:
@@ -140,8 +132,6 @@ def _merge(args: argparse.Namespace, settings: PlatformSettings) -> int:
     finally:
         engine.close()
         cluster.stop()
-        if invitation is not None:
-            invitation.withdraw()
     seconds = round(time.perf_counter() - began, 3)
     fields = {
         "seconds": seconds,
@@ -183,12 +173,3 @@ def _id_of_head(name: str, maps: MapRegistry) -> str | None:
         return maps.head(name).id
     except NotFound:
         return None
-
-
-def _is_loopback(host: str) -> bool:
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError as error:
-        raise UsageError(
-            f"--host {host[:80]!r} is no address", hint="write an address such as 10.0.1.7"
-        ) from error

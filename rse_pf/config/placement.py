@@ -12,10 +12,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from rse_pf.config.settings import LIVE_PORTS, BatchSettings, LiveSettings, PlatformSettings
+from rse_pf.config.settings import LIVE_PORTS, LiveSettings, PlatformSettings
 from rse_pf.errors import SettingsError
 
-__all__ = ["ServerPlacement", "batch_ports", "fixed_live_ports", "is_loopback", "live_ports"]
+__all__ = ["ServerPlacement", "fixed_live_ports", "is_loopback", "live_ports"]
 
 _ELSEWHERE = {"store": ("data", "store"), "live_host": ("live", "host")}
 """Fields that are no settings of the group serving: their groups and names there."""
@@ -88,15 +88,6 @@ def live_ports(live: LiveSettings) -> range:
 def fixed_live_ports(live: LiveSettings) -> range:
     """Return the ports of `live_ports` where other machines connect; ``live.first_port`` is not 0."""
     return range(live.first_port, live.first_port + LIVE_PORTS)
-
-
-_BATCH_PORTS = 100
-"""Ports of a batch, which the firewall opens between job servers."""
-
-
-def batch_ports(batch: BatchSettings) -> range:
-    """Return the ports of a batch that has workers on other machines: of its scheduler first."""
-    return range(batch.first_port, batch.first_port + _BATCH_PORTS)
 
 
 def is_loopback(host: str) -> bool:

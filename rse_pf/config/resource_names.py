@@ -104,21 +104,6 @@ class ResourceNames:
         return f"{self.prefix}-launch"
 
     @property
-    def job_group(self) -> str:
-        """Return the name of the Auto Scaling group of job servers."""
-        return f"{self.prefix}-jobs"
-
-    @property
-    def job_drain_hook(self) -> str:
-        """Return the name of the lifecycle hook that a job server completes when it has left its jobs."""
-        return f"{self.prefix}-jobs-drain"
-
-    @property
-    def job_launch_hook(self) -> str:
-        """Return the name of the lifecycle hook that a job server completes when it is ready."""
-        return f"{self.prefix}-jobs-launch"
-
-    @property
     def dashboard(self) -> str:
         """Return the name of the dashboard."""
         return self.prefix

@@ -19,7 +19,6 @@ READ_BY_SERVERS: dict[str, tuple[str, ...]] = {
         "name",
         "region",
         "spot",
-        "job_servers",
     ),
     "scaling": ("period_s", "profile", "warm_up_s"),
     "burst": ("url", "robot_commands_per_day", "commands_per_day"),

@@ -80,9 +80,7 @@ class ServingSettings:
     compute_processes: int = setting(1, doc="processes of each worker that compute map services; they are killed at the deadline", low=1, high=64)
     max_compute_memory_bytes: int = setting(1073741824, unit="bytes", doc="memory of one command of a map service; the process of one that needs more is ended", low=67108864)
     max_compute_s: float = setting(20.0, unit="s", doc="CPU time of one command of a map service; the process of one that needs more is ended", low=0.1)
-    max_running_jobs: int = setting(1, doc="long jobs that run at the same time on one server; 0 leaves them to job servers, or turns long services off where none are offered", low=0, high=64)
-    offer_jobs: bool = setting(False, doc="offer jobs that wait to job servers (rse-pf serve --jobs-only), through data.store")
-    job_poll_s: float = setting(5.0, unit="s", doc="time between two looks of a job server for jobs that wait; each look is one request to the store", low=0.05)
+    max_running_jobs: int = setting(1, doc="long jobs that run at the same time on one server; 0 turns long services off", low=0, high=64)
     max_waiting_jobs: int = setting(8, doc="further jobs of one worker that wait, or that it follows on another server; more are refused", low=0, high=1000)
     max_job_memory_bytes: int = setting(2147483648, unit="bytes", doc="memory of one job; a job that needs more is ended", low=134217728)
     job_lease_s: float = setting(5.0, unit="s", doc="another server takes a job over when its lease was not renewed for this long", low=0.1)
@@ -223,9 +221,8 @@ class RecordingSettings:
 class BatchSettings:
     """Merges that are computed in parts, by several processes or machines: rse-pf batch."""
 
-    workers: int = setting(2, unit="processes", doc="processes on this machine that compute parts; 0 leaves all parts to job servers", low=0, high=64)
+    workers: int = setting(2, unit="processes", doc="processes on this machine that compute parts", low=1, high=64)
     pairs_per_part: int = setting(500, unit="pairs", doc="keyframe pairs of one part; what a killed worker loses", source="5.3 ms for a pair of 1,000 features each: 2.7 s", low=10, high=100000)
-    first_port: int = setting(8790, doc="first of the ports of a batch with --host: of its scheduler; workers take the next ones", low=1024, high=65000)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -268,8 +265,6 @@ class CloudSettings:
     warm_servers: int = setting(0, unit="servers", doc="stopped servers that are ready to start; not together with spot or other_instance_types", source="warm pools of AWS Auto Scaling", low=0, high=50)
     spot: bool = setting(False, doc="servers above on_demand_servers are Spot instances, which AWS may take back within two minutes")
     on_demand_servers: int = setting(1, unit="servers", doc="servers that are never Spot instances", low=0, high=1000)
-    job_servers: int = setting(0, unit="servers", doc="most job servers: Spot instances that run long jobs of robots and batches; needs serving.offer_jobs; 0 is none", low=0, high=100)
-    job_instance_types: str = setting("c7i.large c6i.large m7i.large", doc="EC2 types of job servers (x86-64), with spaces between; the cheapest that is to be had is taken")
     image_parameter: str = setting("/aws/service/debian/release/12/latest/amd64", doc="SSM parameter that names the machine image", source="Debian's public parameter")
     profile: str = setting("standard", doc="small: one zone for servers and endpoints, and one server of a small type unless you set these; see docs/operations.md", choices=("standard", "small"))
     canary: bool = setting(True, doc="a function that asks for one known pose through the load balancer every minute, and an alarm")
@@ -372,11 +367,6 @@ def _check_contradictions(s: PlatformSettings) -> None:
     for origin in s.serving.allowed_origins.split():
         check_origin("serving.allowed_origins", origin)
     check_elasticity(dataclasses.asdict(s.scaling), dataclasses.asdict(s.cloud))
-    if s.cloud.job_servers and not s.serving.offer_jobs:
-        raise SettingsError(
-            f"cloud.job_servers = {s.cloud.job_servers} without serving.offer_jobs",
-            hint=f"set serving.offer_jobs to true, or cloud.job_servers to 0 {WHERE}",
-        )
     check_deployment(s.cloud.name, s.cloud.bootstrap_qualifier)
     for name in ("replica_maps", "replica_artifacts"):
         check_buckets(f"cloud.{name}", getattr(s.cloud, name))

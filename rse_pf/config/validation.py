@@ -141,11 +141,6 @@ def check_deployment(name: str, qualifier: str) -> None:
             f"cloud.name = {_shown(name)} is no name of a deployment",
             hint=f"use at most 16 small letters, digits and hyphens, such as lab or team-2, {WHERE}",
         )
-    if f"-{name}".endswith("-jobs"):
-        raise SettingsError(
-            f"cloud.name = {_shown(name)} would name the job servers of another deployment",
-            hint=f"choose a name that is not jobs and does not end in -jobs, {WHERE}",
-        )
     if _QUALIFIER.fullmatch(qualifier) is None:
         raise SettingsError(
             f"cloud.bootstrap_qualifier = {_shown(qualifier)} is no qualifier of the CDK",

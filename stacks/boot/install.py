@@ -24,14 +24,11 @@ VENV = HOME / "venv"
 ARCHIVES = ("libraries-0.tar.gz", "libraries-1.tar.gz", "platform.tar.gz")
 AGENT = "rse-pf-agent.service"
 ALWAYS = ("rse-pf.service", AGENT)
-JOBS = "rse-pf-jobs.service"
 DATA = "rse-pf-data.service"
 
 
-def units_of(settings, role="servers"):
+def units_of(settings):
     """Return the units that start with the machine, for merged *settings* (group to names to values)."""
-    if role == "jobs":
-        return (JOBS, AGENT)
     return (*ALWAYS, DATA) if settings["data"]["enabled"] else ALWAYS
 
 
@@ -58,7 +55,7 @@ def main(facts):
     unpack(json.loads((PACKAGE / "environment.json").read_text(encoding="utf-8")))
     CONFIGURATION.mkdir(exist_ok=True)
     (CONFIGURATION / "server.env").write_text(environment_file(facts), encoding="utf-8")
-    started = units_of(settings, facts.get("role", "servers"))
+    started = units_of(settings)
     for unit in started:
         shutil.copyfile(PACKAGE / unit, UNITS / unit)
     run("/usr/bin/systemctl", "daemon-reload")

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rse_pf.batch.cluster import DaskEngine, LocalCluster, new_cluster_key
+from rse_pf.batch.cluster import DaskEngine, LocalCluster
 from rse_pf.batch.merge import BatchMerge
 from rse_pf.batch.parts import Part
 from rse_pf.config import PlatformSettings
@@ -43,9 +43,9 @@ def test_a_merge_survives_its_workers_and_its_scheduler(tmp_path: Path, versions
     settings = PlatformSettings().replace(
         data={"store": f"dir:{tmp_path}"}, batch={"pairs_per_part": 10, "workers": 2}
     )
-    key, events, killed = new_cluster_key(), [], []
-    cluster = LocalCluster(key, 2)
-    engine = DaskEngine(store, settings, cluster, key, on_event=events.append)
+    events, killed = [], []
+    cluster = LocalCluster(2)
+    engine = DaskEngine(store, settings, cluster, on_event=events.append)
 
     def report(done: float, what: str) -> None:
         if "parts of links" in what and not killed:
@@ -63,7 +63,7 @@ def test_a_merge_survives_its_workers_and_its_scheduler(tmp_path: Path, versions
         cluster.stop()
 
     assert len(killed) == 2
-    assert "the scheduler ended and was started again" in events
+    assert "the connection to the scheduler was lost and is there again" in events
     expected = propose_links(Atlas.of(versions), MergeOptions()).links
     assert len(found.links) == len(expected)
     for one, other in zip(found.links, expected, strict=True):
@@ -75,9 +75,8 @@ def test_a_merge_survives_its_workers_and_its_scheduler(tmp_path: Path, versions
 
 def test_a_part_that_fails_is_one_error_with_a_hint(tmp_path: Path) -> None:
     settings = PlatformSettings().replace(data={"store": f"dir:{tmp_path}"})
-    key = new_cluster_key()
-    cluster = LocalCluster(key, 1)
-    engine = DaskEngine(DirectoryStore(tmp_path), settings, cluster, key)
+    cluster = LocalCluster(1)
+    engine = DaskEngine(DirectoryStore(tmp_path), settings, cluster)
     try:
         engine.start()
         with pytest.raises(BadRequest, match="no kind of part") as caught:
@@ -96,9 +95,9 @@ def test_a_part_that_ends_its_workers_ends_the_job_and_not_all_workers(
 
     monkeypatch.setattr("rse_pf.batch.cluster.compute", compute)
     settings = PlatformSettings().replace(data={"store": f"dir:{tmp_path}"})
-    key, events = new_cluster_key(), []
-    cluster = LocalCluster(key, 1, part_tries=2)
-    engine = DaskEngine(DirectoryStore(tmp_path), settings, cluster, key, on_event=events.append)
+    events: list[str] = []
+    cluster = LocalCluster(1, part_tries=2)
+    engine = DaskEngine(DirectoryStore(tmp_path), settings, cluster, on_event=events.append)
     try:
         engine.start()
         with pytest.raises(Crashed, match="ended 2 workers"):
@@ -110,7 +109,7 @@ def test_a_part_that_ends_its_workers_ends_the_job_and_not_all_workers(
 
 
 def test_who_has_not_the_key_is_refused() -> None:
-    cluster = LocalCluster(new_cluster_key(), 0)
+    cluster = LocalCluster(0)
     try:
         cluster.start()
         host, port = cluster.address.removeprefix("tls://").rsplit(":", 1)
@@ -145,9 +144,8 @@ def sockets_of(pid: int) -> list[tuple[str, int]]:
 
 
 def test_every_process_listens_at_one_port_on_the_given_host(tmp_path: Path) -> None:
-    key = new_cluster_key()
-    cluster = LocalCluster(key, 2)
-    engine = DaskEngine(DirectoryStore(tmp_path), PlatformSettings(), cluster, key)
+    cluster = LocalCluster(2)
+    engine = DaskEngine(DirectoryStore(tmp_path), PlatformSettings(), cluster)
     try:
         engine.start()
         engine._connect()
@@ -162,9 +160,8 @@ def test_every_process_listens_at_one_port_on_the_given_host(tmp_path: Path) -> 
 
 
 def test_connections_that_shake_no_hands_are_cut_and_a_client_is_served_meanwhile(tmp_path: Path) -> None:
-    key = new_cluster_key()
-    cluster = LocalCluster(key, 1)
-    engine = DaskEngine(DirectoryStore(tmp_path), PlatformSettings(), cluster, key)
+    cluster = LocalCluster(1)
+    engine = DaskEngine(DirectoryStore(tmp_path), PlatformSettings(), cluster)
     with contextlib.ExitStack() as stack:
         stack.callback(cluster.stop)
         stack.callback(engine.close)

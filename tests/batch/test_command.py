@@ -9,7 +9,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +25,8 @@ pytestmark = pytest.mark.slow
 for package in ("distributed", "faiss", "gtsam"):
     pytest.importorskip(package, reason="the extra batch is not installed")
 
-MERGE = ("run", "merge", "a", "b", "--out", "hall", "--workers", "1", "--json", "--store")
+MERGE = ("run", "merge", "a", "b", "--out", "hall", "--json")
+LONG_ENOUGH_S = 60.0
 
 
 @pytest.fixture
@@ -42,10 +43,11 @@ def store(tmp_path: Path) -> Path:
     return folder
 
 
-def begun(store: Path) -> subprocess.Popen[str]:
+def begun(store: Path, *workers: str) -> subprocess.Popen[str]:
     settings = ["--settings", str(store.parent / "settings.json")]
+    options = ["--store", f"dir:{store}", *(workers or ("--workers", "1"))]
     return subprocess.Popen(
-        [sys.executable, "-m", "rse_pf.cli.main", "batch", *settings, *MERGE, f"dir:{store}"],
+        [sys.executable, "-m", "rse_pf.cli.main", "batch", *settings, *MERGE, *options],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
     )  # fmt: skip
 
@@ -58,7 +60,7 @@ def children_of(pid: int) -> list[int]:
     return [int(word) for word in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
 
 
-def wait_until(is_so: Callable[[], bool], within_s: float = 60.0) -> None:
+def wait_until(is_so: Callable[[], bool], within_s: float = LONG_ENOUGH_S) -> None:
     until = time.monotonic() + within_s
     while not is_so():
         assert time.monotonic() < until, "it did not happen in time"
@@ -97,3 +99,53 @@ def test_ctrl_c_ends_the_command_and_its_processes_and_keeps_the_parts(store: Pa
     assert "Traceback" not in errors
     wait_until(lambda: not any(Path(f"/proc/{pid}").exists() for pid in children))
     assert links_in(store) >= 1
+
+
+@pytest.fixture
+def start_dask(tmp_path: Path) -> Iterator[Callable[..., str]]:
+    """Return a function that starts ``dask scheduler`` with workers, and returns its address."""
+    processes = []
+
+    def run(*words: str) -> None:
+        dask = [sys.executable, "-m", "dask", *words, "--no-dashboard", "--host", "127.0.0.1"]
+        processes.append(subprocess.Popen(dask, cwd=tmp_path, stderr=subprocess.DEVNULL))
+
+    def start(workers: int) -> str:
+        file = tmp_path / "scheduler.json"
+        run("scheduler", "--port", "0", "--scheduler-file", str(file))
+        wait_until(lambda: file.exists() and bool(file.read_bytes()))
+        address: str = json.loads(file.read_bytes())["address"]
+        for _ in range(workers):
+            run("worker", address, "--nthreads", "1", "--no-nanny")
+        return address
+
+    yield start
+    for process in processes:
+        process.kill()
+        process.wait()
+
+
+def test_a_dask_scheduler_that_runs_computes_the_parts(store: Path, start_dask: Callable[..., str]) -> None:
+    process = begun(store, "--scheduler", start_dask(1))
+
+    text, errors = process.communicate(timeout=100)
+
+    assert process.returncode == 0, errors
+    assert json.loads(text)["joined"] == ["a", "b"]
+    assert json.loads(text)["parts"]["computed"] > 3
+
+
+@pytest.mark.parametrize(
+    ("is_running", "problem"), [(False, "no Dask scheduler answered"), (True, "no worker")]
+)
+def test_a_scheduler_that_cannot_compute_is_one_line_with_a_hint(
+    store: Path, start_dask: Callable[..., str], is_running: bool, problem: str
+) -> None:
+    address = start_dask(0) if is_running else "127.0.0.1:1"
+
+    process = begun(store, "--scheduler", address)
+    _, errors = process.communicate(timeout=100)
+
+    assert process.returncode == 1
+    assert problem in errors
+    assert (errors.count("\n"), errors.count("  hint: ")) == (2, 1), errors

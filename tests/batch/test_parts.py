@@ -6,8 +6,6 @@ import msgspec
 import numpy as np
 import pytest
 
-from rse_pf.batch.cluster import ClusterKey
-from rse_pf.batch.invitation import Invitation, invitations
 from rse_pf.batch.parts import (
     Part,
     PartResult,
@@ -65,15 +63,3 @@ def test_a_result_is_never_a_pickle() -> None:
     with pytest.raises(StoreError):
         decode_result("x", b"\x80\x04K*.")
     assert encode_result(PartResult())[:1] != b"\x80\x04"
-
-
-def test_job_servers_find_a_scheduler_that_invites_them_until_it_withdraws() -> None:
-    store = MemoryStore()
-    invitation = Invitation(store, ClusterKey("certificate", "pem"), name="one")
-
-    invitation.announce("tls://10.0.1.7:4000")
-
-    (found,) = invitations(store).values()
-    assert (found.address, found.certificate, found.key) == ("tls://10.0.1.7:4000", "certificate", "pem")
-    invitation.withdraw()
-    assert not invitations(store)

@@ -19,7 +19,6 @@ TOGETHER: dict[tuple[str, str], dict[str, dict[str, Any]]] = {
     ("cloud", "allow_insecure"): {
         "cloud": {"certificate_arn": "arn:aws:acm:a:1:certificate/b", "domain_name": "a.org"}
     },
-    ("cloud", "job_servers"): {"serving": {"offer_jobs": True}},
     ("local", "certificate"): {"local": {"private_key": "key.pem"}},
     ("local", "private_key"): {"local": {"certificate": "chain.pem"}},
     ("scaling", "period_s"): {"scaling": {"idle_s": 420}},

@@ -11,7 +11,6 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from rse_pf.config import PlatformSettings, SettingRow, load_settings, setting_rows
-from rse_pf.config.resource_names import ResourceNames
 from rse_pf.errors import SettingsError
 
 ROWS = list(setting_rows())
@@ -98,21 +97,6 @@ def test_a_bad_setting_is_refused_with_a_hint(overrides: dict[str, Any], message
     assert hint in caught.value.hint
 
 
-@pytest.mark.parametrize("name", ["jobs", "lab-jobs", "jobs-jobs"])
-def test_a_deployment_is_not_called_like_the_job_servers_of_another(name: str) -> None:
-    another = ResourceNames(name.removesuffix("jobs").rstrip("-"))
-    assert another.job_group == ResourceNames(name).group
-
-    with pytest.raises(SettingsError, match=f"cloud.name = '{name}'") as told:
-        PlatformSettings.from_dict({"cloud": {"name": name}})
-    assert "does not end in -jobs" in told.value.hint
-
-
-@pytest.mark.parametrize("name", ["job", "jobs-2", "myjobs"])
-def test_other_names_of_deployments_may_hold_the_word_jobs(name: str) -> None:
-    assert PlatformSettings.from_dict({"cloud": {"name": name}}).cloud.name == name
-
-
 @pytest.mark.parametrize("row", [row for row in ROWS if row.low is not None], ids=lambda row: row.name)
 def test_a_number_below_its_range_is_refused(row: SettingRow) -> None:
     assert row.low is not None
@@ -141,11 +125,10 @@ def test_the_digest_changes_with_every_setting(row: SettingRow) -> None:
         "replica_artifacts": {"replica_artifacts": "artifacts-in-virginia"},
     }
     values = {row.name: other(row), **companions.get(row.name, {})}
-    elsewhere: dict[str, Any] = {"serving": {"offer_jobs": True}} if row.name == "job_servers" else {}
 
-    changed = PlatformSettings.from_dict({row.group: values, **elsewhere})
+    changed = PlatformSettings.from_dict({row.group: values})
 
-    assert changed.digest() != PlatformSettings.from_dict(elsewhere).digest()
+    assert changed.digest() != PlatformSettings().digest()
 
 
 def test_the_digest_is_the_same_wherever_the_settings_are() -> None:

@@ -23,7 +23,6 @@ CORNERS: dict[str, Mapping[str, Mapping[str, Any]]] = {
     "small": {"cloud": {"profile": "small"}},
     "spot": {"cloud": {"spot": True, "other_instance_types": "c6i.large m7i.large"}},
     "warm": {"cloud": {"warm_servers": 2}},
-    "job servers": {"cloud": {"job_servers": 4}, "serving": {"offer_jobs": True, "max_running_jobs": 0}},
     "no data": {"data": {"enabled": False}},
     "min = max": {"scaling": {"min_servers": 3, "max_servers": 3}},
     "one server": {"scaling": {"min_servers": 1, "max_servers": 1}},

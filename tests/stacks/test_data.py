@@ -86,18 +86,8 @@ def test_former_versions_of_leases_do_not_pile_up(assembly: Assembly) -> None:
         if "Prefix" in each
     }
 
-    assert short == {"live/": 1, "jobs/": 1, "batch/schedulers/": 1, "accounts/": 1, "job-queue/": 1}
+    assert short == {"live/": 1, "jobs/": 1, "accounts/": 1}
     assert lease_name("default", "m").startswith("live/")
-
-
-def test_an_offer_that_nobody_withdraws_ends(assembly: Assembly) -> None:
-    ends = {
-        each["Prefix"]: each["ExpirationInDays"]
-        for each in rules(buckets(assembly)["Maps"])
-        if "ExpirationInDays" in each
-    }
-
-    assert ends == {"job-queue/": 7}
 
 
 def test_an_identity_and_maps_are_copied_to_other_regions_and_nothing_else(assembly: Assembly) -> None:

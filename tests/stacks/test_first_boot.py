@@ -179,17 +179,6 @@ def test_a_server_that_was_drained_stays_down(repository: Path) -> None:
     assert unit(repository, "rse-pf.service")["Service"]["Restart"] == "on-failure"
 
 
-def test_a_job_server_starts_neither_robots_nor_data(repository: Path) -> None:
-    settings = PlatformSettings().to_dict()
-
-    assert units_of(settings, "jobs") == ("rse-pf-jobs.service", "rse-pf-agent.service")
-    service = unit(repository, "rse-pf-jobs.service")["Service"]
-    assert " serve --jobs-only " in service["ExecStart"]
-    assert " --store ${STORE}" in service["ExecStart"]
-    for name, value in unit(repository, "rse-pf.service")["Service"].items():
-        assert name.startswith("Exec") or service[name] == value
-
-
 def test_a_data_group_is_attached_exactly_when_the_data_unit_starts(assembly: Any) -> None:
     units = units_of(json.loads(json.dumps(assembly.settings.to_dict())))
     ports = {each.get("Port") for each in assembly.all("AWS::ElasticLoadBalancingV2::TargetGroup")}

@@ -57,7 +57,6 @@ NEEDS_AN_ACCOUNT = {
     "npx cdk diff",
     "rse-pf cloud upgrade",
     "aws ec2 get-console-output --latest --output text --instance-id INSTANCE",
-    "aws autoscaling describe-scaling-activities --auto-scaling-group-name rse-pf-jobs --max-items 5",
     "aws ssm get-parameter --region us-east-1 --name /rse-pf/data/maps --query Parameter.Value --output text",
     "aws ssm get-parameter --region us-east-1 --name /rse-pf/data/artifacts --query Parameter.Value"
     " --output text",

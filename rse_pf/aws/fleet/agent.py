@@ -27,7 +27,6 @@ from rse_pf.aws.fleet.task import AgentConfig, AgentContext, Phase, Task
 from rse_pf.aws.fleet.tasks import (
     access_control,
     audit,
-    job_metrics,
     journals,
     keys,
     lifecycle,
@@ -40,7 +39,6 @@ from rse_pf.aws.fleet.tasks import (
 from rse_pf.aws.storage.audit_archive import Shipper
 from rse_pf.aws.storage.s3_store import open_bucket
 from rse_pf.config import load_settings
-from rse_pf.config.resource_names import ResourceNames
 from rse_pf.errors import RsePfError, StoreError, message_of
 from rse_pf.files import replace_file
 from rse_pf.terminal import show, show_error
@@ -57,7 +55,6 @@ TASKS: tuple[Callable[[AgentContext], Task], ...] = (
     journals.task,
     access_control.task,
     services.task,
-    job_metrics.task,
     store_errors.task,
 )
 """The table, in the order of a step: one row and one module for each task."""
@@ -190,8 +187,7 @@ def _context(args: argparse.Namespace) -> AgentContext:
     if args.once and args.control_token is not None:
         ensure_control_token(args.control_token, seed=secrets.token_bytes(32))
     region = settings.cloud.region
-    runs_jobs = args.group == ResourceNames(settings.cloud.name).job_group  # without a data service
-    data_port = settings.data.port if settings.data.enabled and not runs_jobs else 0
+    data_port = settings.data.port if settings.data.enabled else 0
     machine = Instance(settings.serving.control_port, args.control_token, data_port)
     return AgentContext(
         machine=machine,

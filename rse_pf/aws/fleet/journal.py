@@ -16,7 +16,7 @@ import msgspec
 __all__ = ["UNITS", "Batch", "JournalReader", "journal_command", "make_batch", "read_journal"]
 
 UNITS = (
-    "rse-pf.service", "rse-pf-agent.service", "rse-pf-data.service", "rse-pf-jobs.service",
+    "rse-pf.service", "rse-pf-agent.service", "rse-pf-data.service",
     "cloud-init.service", "cloud-final.service",
 )  # fmt: skip
 """Whose entries are read; the last two are the boot, with what first_boot.py and install.py print."""

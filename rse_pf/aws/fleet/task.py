@@ -17,7 +17,6 @@ from rse_pf.aws.fleet.instance import Instance
 from rse_pf.aws.fleet.journal import JournalReader
 from rse_pf.aws.storage.audit_archive import Shipper
 from rse_pf.config import PlatformSettings
-from rse_pf.config.resource_names import ResourceNames
 from rse_pf.object_store import ObjectStore
 
 __all__ = ["ALWAYS", "AgentConfig", "AgentContext", "AgentState", "Phase", "Task"]
@@ -78,11 +77,6 @@ class AgentContext:
     wall_clock: Callable[[], float] = time.time
     sleep: Callable[[float], None] = time.sleep
     state: AgentState = field(default_factory=AgentState)
-
-    @property
-    def runs_jobs(self) -> bool:
-        """Whether the instance is a job server."""
-        return self.config.group == ResourceNames(self.settings.cloud.name).job_group
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -20,7 +20,6 @@ from rse_pf.config import PlatformSettings
 from rse_pf.config.resource_names import VERSION_PARAMETER, ResourceNames
 from rse_pf.errors import ConfigurationError, RsePfError
 from rse_pf.scaling.health import MAX_HEALTHY_PERCENT
-from rse_pf.terminal import counted
 
 __all__ = [
     "Release",
@@ -224,8 +223,6 @@ def upgrade(
                 return ended
             replaced = True
         step = UpgradeStep.RECORD
-    if settings.cloud.job_servers:
-        _end_old_job_servers(account, settings, tell)
     if step is UpgradeStep.RECORD:
         _record_version(account, settings, version, sleep)
         tell(f"the stack names version {version}")
@@ -320,24 +317,6 @@ def _read_console(account: Account, activity: Mapping[str, Any]) -> tuple[str, .
     lines = [line.strip() for line in str(output.get("Output", "")).splitlines() if line.strip()]
     ours = [line for line in lines if "rse-pf" in line]
     return tuple((ours or lines)[-_LINES:])
-
-
-def _end_old_job_servers(account: Account, settings: PlatformSettings, tell: Callable[[str], None]) -> None:
-    """Empty the group of job servers if one is old: their jobs are given up, and alarms start new ones."""
-    name = ResourceNames(settings.cloud.name).job_group
-    groups = account.pages(
-        "autoscaling", "describe_auto_scaling_groups", "AutoScalingGroups", AutoScalingGroupNames=[name]
-    )
-    for group in groups:
-        versions = [
-            str(instance.get("LaunchTemplate", {}).get("Version", "")) for instance in group["Instances"]
-        ]
-        newest = _read_newest_version(account, group) if versions else ""
-        if any(version != newest for version in versions):
-            tell(f"ending {counted(len(versions), 'job server')}: an alarm starts new ones when jobs wait")
-            account.change(
-                "autoscaling", "update_auto_scaling_group", AutoScalingGroupName=name, DesiredCapacity=0
-            )
 
 
 def _record_version(

@@ -30,7 +30,6 @@ from rse_pf.config import PlatformSettings, load_settings
 from rse_pf.config.cloud_layout import RESUME_FIELD
 from rse_pf.config.resource_names import ResourceNames
 from rse_pf.scaling.alarms import NAMESPACE
-from rse_pf.scaling.job_alarms import JOBS
 
 __all__ = ["Hour", "handler", "is_idle", "park_if_idle", "resume_if_parked"]
 
@@ -47,8 +46,6 @@ class Hour:
     requests: float | None
     robots: float | None
     """Mean over the hour of the robots on all servers."""
-    jobs: float = 0.0
-    """More than 0 if long jobs waited or ran; only deployments with job servers tell it."""
 
 
 def is_idle(hours: Sequence[Hour], *, idle_hours: int) -> bool:
@@ -58,9 +55,7 @@ def is_idle(hours: Sequence[Hour], *, idle_hours: int) -> bool:
     younger, or was resumed later, has not been idle for so long.
     """
     last = hours[-idle_hours:]
-    return len(last) >= idle_hours and all(
-        hour.requests == 0 and hour.robots == 0 and hour.jobs == 0 for hour in last
-    )
+    return len(last) >= idle_hours and all(hour.requests == 0 and hour.robots == 0 for hour in last)
 
 
 def park_if_idle(account: Account, settings: PlatformSettings, *, now: datetime, topic: str) -> str:
@@ -130,13 +125,12 @@ def _read_hours(
     """Return the last *count* whole hours before *now*, oldest first."""
     end_s = int(now.timestamp()) // _HOUR_S * _HOUR_S
     end = datetime.fromtimestamp(end_s, timezone.utc)
-    values: dict[str, dict[int, float]] = {"requests": {}, "robots": {}, "jobs": {}}
+    values: dict[str, dict[int, float]] = {"requests": {}, "robots": {}}
     rows = account.pages(
         "cloudwatch", "get_metric_data", "MetricDataResults",
         MetricDataQueries=[
             _make_query(names.group, "requests", "Requests", "Sum"),
             _make_query(names.group, "robots", ROBOTS, "Average"),
-            _make_query(names.job_group, "jobs", JOBS, "Maximum"),
         ],
         StartTime=end - timedelta(hours=count), EndTime=end, ScanBy="TimestampAscending",
     )  # fmt: skip
@@ -148,8 +142,7 @@ def _read_hours(
     for hour in range(end_s // _HOUR_S - count, end_s // _HOUR_S):
         mean = values["robots"].get(hour)
         robots = None if mean is None else mean * servers
-        jobs = values["jobs"].get(hour, 0.0)
-        hours.append(Hour(requests=values["requests"].get(hour), robots=robots, jobs=jobs))
+        hours.append(Hour(requests=values["requests"].get(hour), robots=robots))
     return hours
 
 

@@ -7,7 +7,8 @@ at most twice a second.
 
 from __future__ import annotations
 
-import contextlib
+import hashlib
+import json
 import threading
 import time
 from asyncio import AbstractEventLoop, TimerHandle
@@ -20,14 +21,14 @@ import msgspec
 
 from rse_pf.backend.jobs.lease import job_key
 from rse_pf.backend.jobs.process import JobRequest
-from rse_pf.backend.jobs.queue import settings_digest_of
 from rse_pf.backend.jobs.record_gc import RECORD_TTL_S, RecordCollector
 from rse_pf.backend.jobs.runner import WAITING, JobContext, JobOutcome, JobSignals, run_job
 from rse_pf.backend.ports import Log
 from rse_pf.backend.robot_store import quota_bytes
 from rse_pf.backend.scheduling.command_queue import CommandQueue, QueueReport, unmeasured_backlog
 from rse_pf.backend.scheduling.scheduler import QueueBacklog, QueuedCommand
-from rse_pf.errors import BadRequest, Busy, Cancelled, RsePfError, StoreError
+from rse_pf.config import PlatformSettings
+from rse_pf.errors import BadRequest, Busy, Cancelled, RsePfError
 from rse_pf.fair_queue import largest_holder
 from rse_pf.identity import RobotId
 from rse_pf.service import failure_of
@@ -59,7 +60,6 @@ class _Entry:
     what: str = WAITING
     thread: threading.Thread | None = None
     progress_timer: TimerHandle | None = None
-    is_displaced: bool = False
 
 
 class JobManager(CommandQueue):
@@ -103,7 +103,7 @@ class JobManager(CommandQueue):
             clock=context.clock,
             wall_clock=time.time,
         )
-        self._settings_digest = settings_digest_of(context.settings)
+        self._settings_digest = _settings_digest(context.settings)
 
     held = 0
     """No job keeps a server from ending: others go on with it."""
@@ -197,7 +197,6 @@ class JobManager(CommandQueue):
         if donor is None:
             return False
         displaced = newest[donor]
-        displaced.is_displaced = True
         displaced.signals.give_up()
         waiters, displaced.waiters = displaced.waiters, []
         for waiter in waiters:
@@ -218,9 +217,6 @@ class JobManager(CommandQueue):
             except Exception as error:  # noqa: BLE001  a defect must not leave the robot without an answer
                 self._log.error("job-defect", service=entry.request.service, reason=repr(error))
                 outcome = JobOutcome(error=RsePfError("the job failed", hint="the server's log has it"))
-            if entry.is_displaced and self._context.queue is not None:
-                with contextlib.suppress(StoreError):  # a job server computes what nobody waits for
-                    self._context.queue.withdraw(entry.request)
             in_loop(self._on_outcome, entry, outcome)
             if not outcome.is_given_up:
                 self._collector.collect()
@@ -294,6 +290,13 @@ class JobManager(CommandQueue):
 
     def _fail(self, queued: QueuedCommand, error: RsePfError) -> None:
         self._answer(queued, failure_of(error, queued.command, server=self._context.server_id))
+
+
+def _settings_digest(settings: PlatformSettings) -> str:
+    """Return the digest of the settings that the result of a job depends on."""
+    plain = settings.to_dict()
+    chosen = json.dumps([plain["services"], plain["pnp"]], sort_keys=True)
+    return hashlib.sha256(chosen.encode()).hexdigest()
 
 
 def _too_many_error() -> Busy:

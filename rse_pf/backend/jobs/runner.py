@@ -6,7 +6,6 @@ process that it started has ended when it returns.
 
 from __future__ import annotations
 
-import contextlib
 import os
 import select
 import socket
@@ -18,7 +17,6 @@ from typing import Any, Literal
 from rse_pf.accounts import Accounts
 from rse_pf.backend.jobs.lease import MAX_TRIES, JobLease, JobRecord, record_name, renewal_s, verdict_on
 from rse_pf.backend.jobs.process import JobRequest, inline_bytes, retry_store
-from rse_pf.backend.jobs.queue import JobQueue
 from rse_pf.backend.jobs.slots import JobSlots
 from rse_pf.backend.robot_store import store_within_quota
 from rse_pf.child.start import Child, how_ended
@@ -63,12 +61,6 @@ class JobContext:
     clock: Callable[[], float]
     services: frozenset[str] = frozenset()
     """Names of the long services, of which robots may ask."""
-    queue: JobQueue | None = None
-    """Where jobs that wait are offered to job servers; None where there are none."""
-    finished: Callable[[JobRequest], None] | None = None
-    """Called when a job has an outcome; a job server withdraws the offer."""
-    follows: bool = True
-    """Whether `run_job` waits for a job that another server runs; else it gives such a job up."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -132,12 +124,7 @@ Tell = Callable[[float, str], None]
 
 
 def run_job(
-    request: JobRequest,
-    context: JobContext,
-    signals: JobSignals,
-    tell: Tell,
-    owner: str,
-    watched: JobLease | None = None,
+    request: JobRequest, context: JobContext, signals: JobSignals, tell: Tell, owner: str
 ) -> JobOutcome:
     """Run or follow the job and return its outcome; blocks until then.
 
@@ -147,21 +134,13 @@ def run_job(
         signals: Set by the event loop of the worker.
         tell: Called in this thread with the share that is done, and what is being done.
         owner: Name that is unique to this process and this call.
-        watched: View of the job's record under the name *owner*, if the caller has watched it before.
     """
     name = record_name(request.robot, request.key)
-    lease = watched or JobLease(ObjectRecords(context.store), name, owner, context.clock)
+    lease = JobLease(ObjectRecords(context.store), name, owner, context.clock)
     try:
-        outcome = _follow_or_run(request, context, signals, tell, lease)
-    except StoreError as error:
-        return JobOutcome(error=error)  # nothing is known of the job: its offer stays
+        return _follow_or_run(request, context, signals, tell, lease)
     except RsePfError as error:
-        outcome = JobOutcome(error=error)
-    finished = context.finished if context.queue is None else context.queue.withdraw
-    if finished is not None and not outcome.is_given_up:
-        with contextlib.suppress(StoreError):  # a job server finds that the job is done, and withdraws it
-            finished(request)
-    return outcome
+        return JobOutcome(error=error)
 
 
 def _follow_or_run(
@@ -178,8 +157,6 @@ def _follow_or_run(
         verdict = verdict_on(
             record, unchanged_s=lease.unchanged_s, lease_s=serving.job_lease_s, is_watched=lease.is_watched
         )
-        if verdict == "follow" and not context.follows:
-            return JobOutcome()
         if verdict == "follow" and record is not None:
             tell(record.share, record.what)
             signals.wait(renewal_s(serving.job_lease_s) * _POLL_SHARE)
@@ -194,7 +171,7 @@ def _follow_or_run(
             if stored is not None:
                 return stored
         tell(0.0, WAITING)
-        if not _get_slot(request, context, signals, lease):
+        if not context.slots.acquire(request.robot, signals.wait):
             continue
         try:
             if lease.take():
@@ -203,26 +180,6 @@ def _follow_or_run(
                     return outcome
         finally:
             context.slots.release()
-
-
-def _get_slot(request: JobRequest, context: JobContext, signals: JobSignals, lease: JobLease) -> bool:
-    """Wait for a slot of this server; False after a signal, or when a job server changed the record."""
-    if context.queue is None:
-        return context.slots.acquire(request.robot, signals.wait)
-    context.queue.offer(request)
-    poll_s = renewal_s(context.settings.serving.job_lease_s) * _POLL_SHARE
-    due_s, before = context.clock() + poll_s, lease.record
-
-    def wait(seconds: float) -> bool:
-        nonlocal due_s
-        if not signals.wait(seconds):
-            return False
-        if context.clock() < due_s:
-            return True
-        due_s = context.clock() + poll_s
-        return lease.read() == before
-
-    return context.slots.acquire(request.robot, wait)
 
 
 def _stored_outcome(request: JobRequest, context: JobContext, record: JobRecord) -> JobOutcome | None:

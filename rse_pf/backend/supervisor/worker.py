@@ -40,7 +40,6 @@ from rse_pf.backend.gateway.token_watch import TokenWatch
 from rse_pf.backend.gateway.websocket import RobotSockets
 from rse_pf.backend.jobs.manager import JobManager
 from rse_pf.backend.jobs.process import spawner
-from rse_pf.backend.jobs.queue import JobQueue, has_jobs
 from rse_pf.backend.jobs.runner import JobContext
 from rse_pf.backend.jobs.slots import JobSlots
 from rse_pf.backend.live_map.map_link import OwnerLinks
@@ -242,7 +241,7 @@ class _Worker:
             self._sandboxes,
             self._live_maps,
             self._compute(plan, context, registry, answers),
-            self._jobs(plan, answers) if has_jobs(settings) else None,
+            self._jobs(plan, answers) if settings.serving.max_running_jobs else None,
         ]
         self._dispatcher = Dispatcher(
             context,
@@ -397,7 +396,6 @@ class _Worker:
             start=spawner(plan.services, settings),
             clock=time.monotonic,
             services=frozenset(service.name for service in self._registry if service.kind == "long"),
-            queue=JobQueue(store, settings) if settings.serving.offer_jobs else None,
         )
         return JobManager(
             context, loop=self._loop, log=self._log, answer=answers.send_message,

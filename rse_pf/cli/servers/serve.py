@@ -79,10 +79,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="run them even if this kernel lacks a kind of isolation (services.accept_weak_isolation)",
     )  # fmt: skip
     parser.add_argument(
-        "--jobs-only", action="store_true",
-        help="serve no robots: take long jobs that servers with serving.offer_jobs offer in --store",
-    )  # fmt: skip
-    parser.add_argument(
         "--conformance-echo", action="store_true", help="echo raw messages without tokens, loopback only"
     )
 
@@ -110,12 +106,6 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
         raise UsageError(
             f"there is no folder {args.announce.absolute().parent}",
             hint="make it, or name another --announce",
-        )
-    if args.jobs_only:
-        from rse_pf.backend.supervisor.serve_jobs import serve_jobs
-
-        return serve_jobs(
-            chosen, placement=placement, server_id=server_id, announce=args.announce, control_token=token
         )
     trust = None if args.keys is None else _trust(args.keys)
     from rse_pf.backend.supervisor import serve

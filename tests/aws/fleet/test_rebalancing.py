@@ -159,23 +159,15 @@ def test_the_emulator_answers_the_agents_query(region: str) -> None:
     assert totals[0].start_s == end_s - timedelta(minutes=1).total_seconds()
 
 
-@pytest.mark.parametrize(
-    ("notice", "spot", "group", "drains"),
-    [
-        ("interruption", True, "rse-pf", True),
-        ("interruption", False, "rse-pf-jobs", True),
-        ("rebalance", True, "rse-pf", False),
-        ("rebalance", False, "rse-pf-jobs", False),
-    ],
-)
+@pytest.mark.parametrize(("notice", "drains"), [("interruption", True), ("rebalance", False)])
 def test_an_interruption_drains_the_server_within_five_seconds_and_a_recommendation_is_noted_once(
-    tmp_path: Path, notice: str, spot: bool, group: str, drains: bool
+    tmp_path: Path, notice: str, drains: bool
 ) -> None:
     machine = FakeMachine()
     log: list[tuple[str, float]] = []
-    settings = PlatformSettings.from_dict({"cloud": {"spot": spot}})
+    settings = PlatformSettings.from_dict({"cloud": {"spot": True}})
     context = agent_context(
-        machine, tmp_path, group=group, settings=settings, state=AgentState(phase=Phase.SERVING),
+        machine, tmp_path, settings=settings, state=AgentState(phase=Phase.SERVING),
         log=lambda event, **fields: log.append((event, machine.now_s)),
     )  # fmt: skip
     agent = Agent(context, (spot_notice.task,))

@@ -39,15 +39,6 @@ def test_a_server_without_published_services_loads_the_empty_list(tmp_path: Path
     assert setup.machine.reloads == 1
 
 
-def test_a_job_server_follows_no_published_services(tmp_path: Path) -> None:
-    setup = Setup(tmp_path, group="rse-pf-jobs")
-
-    setup.attempt()
-
-    assert setup.machine.reloads == 0
-    assert setup.log == []
-
-
 def test_an_archive_of_another_size_than_the_list_says_is_refused_before_it_is_read(tmp_path: Path) -> None:
     setup, digest = Setup(tmp_path), "ab" * 32
     entry = PublishedService(

@@ -64,8 +64,9 @@ def test_only_failures_are_published_and_each_change_is_one_line() -> None:
     assert setup.log == ["store-silent", "store-back"]
 
 
-@pytest.mark.parametrize("setup", [Setup(data={"enabled": False}), Setup(group="rse-pf-jobs")])
-def test_a_server_without_a_data_service_is_not_asked(setup: Setup) -> None:
+def test_a_server_without_a_data_service_is_not_asked() -> None:
+    setup = Setup(data={"enabled": False})
+
     setup.look(False)
 
     assert setup.cloudwatch.published == []

@@ -59,7 +59,6 @@ class FakeAws:
         self.refreshes: list[dict[str, Any]] = []
         self.activities: list[dict[str, Any]] = []
         self.firing: set[str] = set()
-        self.job_servers: list[str] = []
         self.calls: list[str] = []
         self.least_serving = servers
         self.interrupt_at = -1
@@ -118,12 +117,7 @@ class FakeAws:
         template = {"LaunchTemplateSpecification": plain, "Overrides": overrides}
         return {"MixedInstancesPolicy": {"LaunchTemplate": template}}
 
-    def describe_auto_scaling_groups(
-        self, AutoScalingGroupNames: tuple[str, ...] = (NAMES.group,), **_: Any
-    ) -> dict[str, Any]:
-        if list(AutoScalingGroupNames) == [NAMES.job_group]:
-            jobs = [{"InstanceId": "i-j", "LaunchTemplate": {"Version": each}} for each in self.job_servers]
-            return {"AutoScalingGroups": [{"Instances": jobs, **self._specification(self.newest)}]}
+    def describe_auto_scaling_groups(self, **_: Any) -> dict[str, Any]:
         instances = [
             {"InstanceId": f"i-{at}", "LaunchTemplate": {"Version": version}}
             for at, version in enumerate(self.servers)
@@ -172,10 +166,6 @@ class FakeAws:
         return {}
 
     def update_auto_scaling_group(self, **arguments: Any) -> dict[str, Any]:
-        if arguments["AutoScalingGroupName"] == NAMES.job_group:
-            assert arguments["DesiredCapacity"] == 0
-            self.job_servers = []
-            return {}
         self.group = arguments["LaunchTemplate"]["Version"]
         return {}
 
@@ -361,31 +351,6 @@ def test_a_parked_fleet_gets_the_version_without_a_refresh() -> None:
 
     assert (aws.group, aws.recorded, ended.reason) == ("2", "2", "")
     assert aws.refreshes == []
-
-
-WITH_JOB_SERVERS = PlatformSettings.from_dict({"cloud": {"job_servers": 4}, "serving": {"offer_jobs": True}})
-
-
-@pytest.mark.parametrize("newest", [1, 2])
-def test_old_job_servers_end_with_an_upgrade_even_if_an_upgrade_before_was_interrupted(newest: int) -> None:
-    aws = FakeAws(newest=newest, mixed=True)
-    aws.job_servers = ["1", "0"]
-
-    ended, told = run(aws, WITH_JOB_SERVERS)
-
-    assert ended.reason == ""
-    assert aws.job_servers == []
-    assert "ending 2 job servers: an alarm starts new ones when jobs wait" in told
-
-
-@pytest.mark.parametrize("bad", [False, True])
-def test_new_job_servers_stay_and_a_release_that_is_taken_back_ends_none(bad: bool) -> None:
-    aws = FakeAws(bad=bad, mixed=True)
-    aws.job_servers = ["1", "2"] if bad else ["2", "2"]
-
-    run(aws, WITH_JOB_SERVERS)
-
-    assert len(aws.job_servers) == 2
 
 
 def test_a_group_that_is_behind_is_told_with_both_versions() -> None:

@@ -36,7 +36,6 @@ NOW = datetime(2030, 1, 2, 18, 20, tzinfo=timezone.utc)
         ([IDLE, CONNECTED, IDLE], False),
         ([IDLE, VISITED, IDLE], False),
         ([IDLE, SILENT, IDLE], False),
-        ([IDLE, Hour(requests=0.0, robots=0.0, jobs=1.0), IDLE], False),
         ([IDLE] * 2, False),
         ([], False),
     ],

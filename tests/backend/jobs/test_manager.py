@@ -17,7 +17,6 @@ import pytest
 from rse_pf.backend.jobs.lease import JobRecord
 from rse_pf.backend.jobs.manager import JobManager
 from rse_pf.backend.jobs.process import JobRequest
-from rse_pf.backend.jobs.queue import JobQueue
 from rse_pf.backend.jobs.runner import JobContext
 from rse_pf.backend.jobs.slots import JobSlots, make_pipe
 from rse_pf.backend.scheduling.scheduler import QueuedCommand
@@ -69,7 +68,6 @@ class Bench:
             store=self.store, server_id="s",
             slots=JobSlots(make_pipe(self.settings.serving.max_running_jobs)),
             settings=self.settings, start=self.start, clock=lambda: self.loop.now,
-            queue=JobQueue(self.store, self.settings) if self.settings.serving.offer_jobs else None,
         )  # fmt: skip
         self.jobs = JobManager(
             context, loop=self.loop, log=FakeLog(),
@@ -172,21 +170,6 @@ def test_the_newest_job_of_a_robot_with_many_is_displaced_by_another_robot(make)
     bench.run_until(lambda: 4 in bench.answers)
     assert code(bench.answers[4]) == "busy"
     assert set(bench.answers) == {2, 3, 4, 12}
-
-
-def test_the_offer_of_a_displaced_job_is_withdrawn(make):
-    bench, busy_robot, other_robot = make(max_waiting_jobs=3, offer_jobs=True), robot("a"), robot("b")
-    for identity in range(4):
-        ask(bench, busy_robot, identity, value=identity)
-
-    def offers() -> list[str]:
-        return [info.name.split("/")[2] for info in bench.store.list("job-queue/")]
-
-    bench.run_until(lambda: len(offers()) == 4)
-
-    ask(bench, other_robot, 10, value=10)
-
-    bench.run_until(lambda: known(bench) == 4 and offers() == ["a", "a", "a", "b"])
 
 
 def test_progress_is_sent_at_once_then_at_most_twice_a_second_and_never_repeated(make):

@@ -41,8 +41,6 @@ def task(context: AgentContext) -> Task:
 
     def follow() -> None:
         nonlocal refused, loaded
-        if context.runs_jobs:  # a job server runs no published services
-            return
         try:
             data = context.artifacts.get(LIST_NAME)
         except NotFound:

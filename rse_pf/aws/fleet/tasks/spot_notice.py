@@ -19,7 +19,7 @@ LOOK_EVERY_S = 2.0
 
 def task(context: AgentContext) -> Task:
     """Look for a notice every two seconds, where there are Spot instances, and drain once."""
-    is_spot = context.settings.cloud.spot or context.runs_jobs  # job servers always are
+    is_spot = context.settings.cloud.spot
     last = ""
 
     def follow() -> None:
