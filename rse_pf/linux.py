@@ -16,13 +16,12 @@ __all__ = [
     "PR_CAPBSET_DROP", "PR_SET_CHILD_SUBREAPER", "PR_SET_DUMPABLE", "PR_SET_NO_NEW_PRIVS", "PR_SET_SECCOMP",
     "be_killed_first", "cpu_seconds", "die_with_parent", "disk_free_percent", "limit_memory",
     "page_table_bytes", "prctl", "proportional_bytes",
-    "raise_descriptor_limit", "resident_bytes", "run_as_batch", "run_when_idle", "set_process_name",
+    "raise_descriptor_limit", "resident_bytes", "run_as_batch", "set_process_name",
 ]  # fmt: skip
 
 PR_SET_DUMPABLE, PR_SET_SECCOMP, PR_CAPBSET_DROP = 4, 22, 24
 PR_SET_CHILD_SUBREAPER, PR_SET_NO_NEW_PRIVS = 36, 38
 _PR_SET_PDEATHSIG, _PR_SET_NAME = 1, 15
-_LOWEST = 19
 _PRCTL = ctypes.CDLL(None, use_errno=True).prctl
 """Looked up once, at import: a child that was just forked may not take locks."""
 
@@ -106,18 +105,6 @@ def proportional_bytes(pid: int) -> int:
     except PermissionError:
         pages = _kilobytes(f"/proc/{pid}/status", "RssAnon", "RssShmem", "VmSwap")
     return 1024 * pages + page_table_bytes(pid)
-
-
-def run_when_idle(pid: int) -> None:
-    """Make *pid* (0: this process) run only when nothing else wants the processor, for good.
-
-    A parent that does this right after the start spares its other children the imports of the new one: a
-    second of CPU for a job.
-    """
-    with contextlib.suppress(OSError):
-        os.setpriority(os.PRIO_PROCESS, pid, _LOWEST)
-    with contextlib.suppress(OSError):
-        os.sched_setscheduler(pid, os.SCHED_IDLE, os.sched_param(0))
 
 
 def run_as_batch(pid: int, nice: int) -> None:

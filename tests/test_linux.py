@@ -8,17 +8,17 @@ import sys
 
 import pytest
 
-from rse_pf.linux import proportional_bytes, resident_bytes, run_when_idle
+from rse_pf.linux import proportional_bytes, resident_bytes, run_as_batch
 
 pytestmark = pytest.mark.system
 
 
-def test_a_child_runs_only_when_the_processor_is_idle_before_it_does_anything() -> None:
+def test_a_child_gives_way_before_it_does_anything() -> None:
     with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as child:
-        run_when_idle(child.pid)
+        run_as_batch(child.pid, 10)
         try:
-            assert os.sched_getscheduler(child.pid) == os.SCHED_IDLE
-            assert os.getpriority(os.PRIO_PROCESS, child.pid) == 19
+            assert os.sched_getscheduler(child.pid) == os.SCHED_BATCH
+            assert os.getpriority(os.PRIO_PROCESS, child.pid) == max(10, os.nice(0))
         finally:
             child.kill()
 
@@ -27,7 +27,7 @@ def test_a_process_that_is_gone_is_no_error() -> None:
     child = subprocess.Popen([sys.executable, "-c", ""])
     child.wait()
 
-    run_when_idle(child.pid)
+    run_as_batch(child.pid, 10)
 
 
 @pytest.mark.skipif(os.getuid() != 0, reason="needs root, to become a plain user")

@@ -1,6 +1,6 @@
 """Start a child process, and end it.
 
-    child = start_child(ChildPlan(target="rse_pf.backend.jobs.process:run", name="rse-pf job", policy="idle"))
+    child = start_child(ChildPlan(target="rse_pf.backend.jobs.process:run", name="rse-pf job", nice=10))
     child.say({"service": "map-optimise"})
     child.kill()
 
@@ -22,7 +22,7 @@ from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
 from rse_pf.ipc import encode_message
-from rse_pf.linux import run_as_batch, run_when_idle
+from rse_pf.linux import run_as_batch
 from rse_pf.one_thread import ONE_THREAD
 
 __all__ = ["Child", "ChildPlan", "how_ended", "start_child"]
@@ -36,10 +36,10 @@ class ChildPlan:
     """``module:function``; the function takes the socket to the parent, and the child ends with it."""
     name: str
     """The name that top shows, of at most 15 letters."""
-    policy: Literal["usual", "batch", "idle"] = "usual"
-    """It gets a processor as its parent does, takes none from who runs, or gets what nobody else wants."""
+    policy: Literal["usual", "batch"] = "usual"
+    """It gets a processor as its parent does, or takes none from who runs."""
     nice: int = 0
-    """Above that of its parent, for ``usual`` and ``batch``."""
+    """Above that of its parent."""
     import_nice: int = 0
     """While it imports *target*, above ``nice``."""
     memory_bytes: int | None = None
@@ -119,9 +119,7 @@ def start_child(
         ours.close()
         raise
     nice = os.getpriority(os.PRIO_PROCESS, 0) + plan.nice
-    if plan.policy == "idle":
-        run_when_idle(process.pid)
-    elif plan.policy == "batch":
+    if plan.policy == "batch":
         run_as_batch(process.pid, nice)
     elif plan.nice:
         with suppress(OSError):  # it has ended

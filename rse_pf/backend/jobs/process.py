@@ -1,8 +1,8 @@
 """The process of one job: the worker starts it with `spawner`, it runs one command and ends.
 
-Over one socket it receives an order, sends progress and then one answer.  It runs at the lowest priority,
-within its memory limit, and does not outlive its worker.  It reads its inputs and stores its reply itself, so
-that the worker can serve robots meanwhile.
+Over one socket it receives an order, sends progress and then one answer.  It runs at a lower priority than
+the workers, within its memory limit, and does not outlive its worker.  It reads its inputs and stores its
+reply itself, so that the worker can serve robots meanwhile.
 """
 
 from __future__ import annotations
@@ -42,6 +42,9 @@ from rse_pf.wire.arrays import binary_encode_hook
 
 __all__ = ["JobRequest", "inline_bytes", "retry_store", "run", "spawner", "store_reply"]
 
+_NICE = 10
+"""A job gets a tenth of a core that others want, and so ends on a machine that is always busy; commands of
+robots, which have a weight nine times as large, do not wait for it."""
 _REPORT_INTERVAL_S = 0.5
 _STORE_TRIES = 3
 T = TypeVar("T")
@@ -63,7 +66,7 @@ class JobRequest:
 def spawner(services: str, settings: PlatformSettings) -> Callable[[JobRequest], Child]:
     """Return a function that starts the process of a job; *services* is ``module:function``."""
     plan = ChildPlan(
-        target=f"{__name__}:run", name="rse-pf job", policy="idle", is_killed_first=True,
+        target=f"{__name__}:run", name="rse-pf job", policy="batch", nice=_NICE, is_killed_first=True,
         memory_bytes=settings.serving.max_job_memory_bytes,
     )  # fmt: skip
     order = {"services": services, "settings": settings.to_dict()}

@@ -18,7 +18,7 @@ REQUEST = JobRequest(
 )
 
 
-def test_a_job_process_has_the_lowest_priority_before_it_runs_any_code(
+def test_a_job_process_gives_way_to_robots_before_it_runs_any_code(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     sleeper = tmp_path / "python"  # it never asks for a priority itself
@@ -30,4 +30,4 @@ def test_a_job_process_has_the_lowest_priority_before_it_runs_any_code(
     policy = os.sched_getscheduler(job.pid)
     job.kill()
 
-    assert policy == os.SCHED_IDLE
+    assert policy == os.SCHED_BATCH
