@@ -20,6 +20,7 @@ from client_sdk.local_services import LocalServices
 from client_sdk.network.connection import Connection, ForRobot, OnChange
 from client_sdk.network.dialling import DialError
 from client_sdk.network.handshake import Token
+from client_sdk.network.timings import ConnectTimings
 from client_sdk.offloading.asking import Asking, Call, OnProgress
 from client_sdk.offloading.burst import Burst
 from client_sdk.offloading.burst_rules import check_burst_url
@@ -67,6 +68,7 @@ class Robot:
         enrolment: str | Path | None = None,
         codec: str = "zlib",
         settings: SessionSettings | None = None,
+        timings: ConnectTimings | None = None,
         offload: CloudFirst | None = None,
         clock: Callable[[], float] = time.monotonic,
         wall_clock: Callable[[], float] = time.time,
@@ -88,7 +90,8 @@ class Robot:
             enrolment: File of ``rse-pf robot enrol --out``, instead of *url* and *token*; with a list of
                 addresses, these count and not the one of the file.
             codec: ``zlib`` (the paper's), ``json`` or ``bin``.
-            settings: Limits and timeouts; None means the defaults.
+            settings: Limits and timeouts of the platform; None means the defaults.
+            timings: How patient the robot is when it connects; None means the defaults.
             offload: `CloudFirst` lets the robot answer itself when the cloud cannot.
             clock: Seconds, monotonic.
             wall_clock: Unix seconds: the clock by which *token* signs.
@@ -121,6 +124,7 @@ class Robot:
             urls,
             token=token,
             session=self._session,
+            timings=timings or ConnectTimings(),
             on_answer=self._take_answer,
             clock=clock,
             random=random,

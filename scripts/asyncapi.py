@@ -14,6 +14,7 @@ import msgspec
 import numpy as np
 
 from rse_pf.config import PlatformSettings
+from rse_pf.config.resource_names import ROBOTS_PATH
 from rse_pf.services.builtin import builtin_services
 from rse_pf.wire import PROTOCOL_VERSION, SUBPROTOCOLS, FromRobot, FromServer
 
@@ -45,7 +46,7 @@ def asyncapi_document() -> dict[str, Any]:
         },
         "channels": {
             "robot": {
-                "address": settings.serving.path,
+                "address": ROBOTS_PATH,
                 "messages": {kind.__name__: _message_ref(kind) for kind in (*up, *down)},
                 "bindings": {"ws": {"headers": _handshake()}},
             }

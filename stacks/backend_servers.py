@@ -30,7 +30,7 @@ from rse_pf.config.cloud_layout import zone_count
 from rse_pf.config.resource_names import AUDIT_PREFIX, JOURNAL_PREFIX, VERSION_PARAMETER, ResourceNames
 from rse_pf.scaling.alarms import NAMESPACE
 from rse_pf.scaling.boot_time import BOOT_LIMIT_S, retry_within_s
-from rse_pf.scaling.health import DRAIN_S, MAX_HEALTHY_PERCENT
+from rse_pf.scaling.health import DRAIN_S, GRACE_S, MAX_HEALTHY_PERCENT
 from stacks.capacity import Capacity
 from stacks.permissions import allow
 
@@ -84,7 +84,7 @@ class BackendServers(Construct):
             ),
             health_checks=autoscaling.HealthChecks.with_additional_checks(
                 additional_types=[autoscaling.AdditionalHealthCheckType.ELB],
-                grace_period=cdk.Duration.seconds(settings.health.grace_s),
+                grace_period=cdk.Duration.seconds(GRACE_S),
             ),
             default_instance_warmup=cdk.Duration.seconds(scaling.warm_up_s),
             group_metrics=[autoscaling.GroupMetrics.all()],

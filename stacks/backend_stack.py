@@ -13,7 +13,14 @@ from constructs import Construct
 
 from rse_pf.config import PlatformSettings
 from rse_pf.config.cloud_layout import zone_count
-from rse_pf.config.resource_names import DENY_NAME, KEYS_NAME, ROBOTS_NAME, SERVICES_PREFIX, ResourceNames
+from rse_pf.config.resource_names import (
+    DENY_NAME,
+    KEYS_NAME,
+    ROBOTS_NAME,
+    ROBOTS_PATH,
+    SERVICES_PREFIX,
+    ResourceNames,
+)
 from stacks.assets import SERVERS, staged, sums_digest
 from stacks.backend_servers import BackendServers
 from stacks.load_balancer import LoadBalancer
@@ -112,7 +119,7 @@ class BackendStack(cdk.Stack):
     def _outputs(self, settings: PlatformSettings) -> None:
         cdk.CfnOutput(self, "Topic", value=self.topic.topic_arn, description="subscribe to be told of alarms")
         name, domain = self.balancer.alb.load_balancer_dns_name, settings.cloud.domain_name
-        path, insecure = settings.serving.path, settings.cloud.allow_insecure
+        path, insecure = ROBOTS_PATH, settings.cloud.allow_insecure
         url = f"ws://{name}{path}" if insecure else f"wss://{domain}{path}"
         cdk.CfnOutput(self, "Url", value=url)
         provide(self, ResourceNames(settings.cloud.name), "backend/url", url)

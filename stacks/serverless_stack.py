@@ -18,6 +18,7 @@ from aws_cdk import aws_logs as logs
 from constructs import Construct
 
 from rse_pf.config import PlatformSettings
+from rse_pf.config.cloud_layout import LAMBDA_MEMORY_MB
 from rse_pf.config.front_door import BURST_PATH
 from rse_pf.config.resource_names import KEYS_NAME, ResourceNames
 from rse_pf.scaling.operator_alarms import LAMBDA_TIMEOUT_S
@@ -63,7 +64,7 @@ class ServerlessStack(cdk.Stack):
             function = lambda_.Function(
                 self, "Pnp", runtime=lambda_.Runtime.PYTHON_3_13, architecture=lambda_.Architecture.X86_64,
                 handler="lambda_pnp.handler.handler", code=code, role=role, log_group=log,
-                function_name=names.function, memory_size=settings.cloud.lambda_memory_mb,
+                function_name=names.function, memory_size=LAMBDA_MEMORY_MB,
                 timeout=cdk.Duration.seconds(LAMBDA_TIMEOUT_S),
                 reserved_concurrent_executions=settings.cloud.lambda_concurrency,
                 environment={"RSE_PF_KEYS": f"{artifacts.bucket_name}/{KEYS_NAME}"},

@@ -6,22 +6,23 @@ import asyncio
 import random
 
 import client_sdk
+from client_sdk.network.timings import ConnectTimings
 from rse_pf.config import SessionSettings
 from rse_pf.errors import Conflict, Unauthorized
 
 QUICK = SessionSettings(
-    connect_timeout_s=0.5,
     stall_timeout_s=0.3,
     ping_interval_s=0.1,
     ping_timeout_s=0.5,
-    reconnect_max_s=0.05,
-    reconnect_long_max_s=0.4,
     hello_timeout_s=1.0,
 )
+TIMINGS = ConnectTimings(connect_timeout_s=0.5, reconnect_max_s=0.05, reconnect_long_max_s=0.4)
 
 
 def robot(url, **options):
-    return client_sdk.connect(url, settings=QUICK, random=random.Random(1), **options)
+    return client_sdk.connect(
+        url, random=random.Random(1), **{"settings": QUICK, "timings": TIMINGS, **options}
+    )
 
 
 def ask(a_robot, value, **options):

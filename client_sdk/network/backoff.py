@@ -12,7 +12,7 @@ from __future__ import annotations
 from enum import Enum
 from random import Random
 
-from rse_pf.config import SessionSettings
+from client_sdk.network.timings import ConnectTimings
 from rse_pf.config.front_door import DIAL_BURST, DIALS_PER_MINUTE
 from rse_pf.token_bucket import TokenBucket
 
@@ -46,8 +46,8 @@ class Last(Enum):
 class Backoff:
     """The pauses before the attempts of one robot to connect to one address."""
 
-    def __init__(self, settings: SessionSettings, random: Random) -> None:
-        self._settings = settings
+    def __init__(self, timings: ConnectTimings, random: Random) -> None:
+        self._timings = timings
         self._random = random
         self._attempt = 0
         self._failing_since: float | None = None
@@ -73,8 +73,8 @@ class Backoff:
         """Return how long to wait before the next attempt, from the start of the last one.
 
         Within the first seconds of attempts that are answered, exponential with full jitter up to
-        ``session.reconnect_max_s``; then between a sixth and a third of that time, up to
-        ``session.reconnect_long_max_s``.  After a refusal, between the half and the whole of the latter.
+        ``reconnect_max_s``; then between a sixth and a third of that time, up to
+        ``reconnect_long_max_s``.  After a refusal, between the half and the whole of the latter.
 
         Args:
             now: Seconds of the robot's clock.
@@ -91,7 +91,7 @@ class Backoff:
         return max(asked_s + self._own_s(now, last, valid_in_s), wait_s)
 
     def _own_s(self, now: float, last: Last, valid_in_s: float | None) -> float:
-        s, uniform = self._settings, self._random.uniform
+        s, uniform = self._timings, self._random.uniform
         if last is Last.UNANSWERED:
             return uniform(*_UNANSWERED_S)
         if last is Last.REFUSED:

@@ -23,6 +23,7 @@ from client_sdk.network.handshake import Dialler, Token
 from client_sdk.network.pauses import Pauses
 from client_sdk.network.region_sockets import Region, RegionSocket, cancel_all, either
 from client_sdk.network.regions import MAX_REGIONS, RegionChoice
+from client_sdk.network.timings import ConnectTimings
 from rse_pf.errors import (
     Conflict,
     ConnectError,
@@ -83,6 +84,7 @@ class Connection:
         *,
         token: Token,
         session: ClientSession,
+        timings: ConnectTimings,
         on_answer: Callable[[ForRobot], None],
         clock: Callable[[], float],
         random: random_module.Random,
@@ -100,7 +102,8 @@ class Connection:
         self.refusal: RsePfError | None = None
         self._session = session
         self._settings = session.settings
-        self.dialler = Dialler(token, codec=session.codec.name, settings=session.settings)
+        self._timings = timings
+        self.dialler = Dialler(token, codec=session.codec.name, settings=session.settings, timings=timings)
         self._on_answer = on_answer
         self._on_change = on_change or (lambda what, why: None)
         self._clock = clock
@@ -191,8 +194,8 @@ class Connection:
                 f"{len(urls)} addresses, of which {len(set(urls))} differ",
                 hint=f"name 1 to {MAX_REGIONS} different addresses",
             )
-        made = [Region(n, url, Backoff(self._settings, self._random)) for n, url in enumerate(urls)]
-        return made, RegionChoice(len(made), hold_s=self._settings.region_hold_s)
+        made = [Region(n, url, Backoff(self._timings, self._random)) for n, url in enumerate(urls)]
+        return made, RegionChoice(len(made), hold_s=self._timings.region_hold_s)
 
     def _current_region(self) -> Region:
         current = self._session.current
@@ -309,7 +312,7 @@ class Connection:
 
     async def _reconnect(self, region: Region) -> None:
         """Connect to *region*, with pauses, until a server sends Welcome."""
-        if self._clock() - region.since > self._settings.reconnect_max_s:
+        if self._clock() - region.since > self._timings.reconnect_max_s:
             region.backoff.restart()
         began = self._clock()
         offset_s = self._pauses.offset_s()
@@ -392,7 +395,7 @@ class Connection:
         socket.tasks = [self._spawn(self._read(socket)), self._spawn(self._write(socket))]
         socket.dirty.set()
         try:
-            done, _ = await asyncio.wait({socket.welcome}, timeout=self._settings.connect_timeout_s)
+            done, _ = await asyncio.wait({socket.welcome}, timeout=self._timings.connect_timeout_s)
             if not done:
                 raise DialError(ConnectError(f"{region.address} sends no Welcome", hint=CHECK_ADDRESS))
             socket.welcome.result()

@@ -27,6 +27,7 @@ from client_sdk.network.dialling import (
     untrusted_error,
 )
 from client_sdk.network.tcp import TcpDialler
+from client_sdk.network.timings import ConnectTimings
 from client_sdk.token_text import strip_token
 from rse_pf.config import SessionSettings
 from rse_pf.errors import ConnectError, RsePfError, Unauthorized, UnsupportedProtocol
@@ -42,13 +43,13 @@ _ANSWER_S = 1.0
 """How long a TCP connection may take before another attempt begins."""
 
 
-def websocket_options(settings: SessionSettings) -> dict[str, Any]:
+def websocket_options(settings: SessionSettings, timings: ConnectTimings) -> dict[str, Any]:
     """Return the options of every WebSocket: no compression, no pings of the library, our size limit."""
     return {
         "compression": None,
         "max_size": settings.max_message_bytes,
         "ping_interval": None,
-        "open_timeout": settings.connect_timeout_s,
+        "open_timeout": timings.connect_timeout_s,
         "close_timeout": settings.stall_timeout_s,
         "proxy": None,
     }
@@ -65,11 +66,14 @@ class _StraightConnect(websocket_connect):
 class Dialler:
     """Opens WebSockets as one robot; *codec* names the sub-protocol."""
 
-    def __init__(self, token: Token, *, codec: str, settings: SessionSettings) -> None:
+    def __init__(
+        self, token: Token, *, codec: str, settings: SessionSettings, timings: ConnectTimings
+    ) -> None:
         self.token = token
         self.ssl_context: ssl.SSLContext | None = None
         self._subprotocol = SUBPROTOCOLS[codec]
         self._settings = settings
+        self._timings = timings
         self._tcp = TcpDialler()
 
     async def open(self, url: str, on_answered: Callable[[], None]) -> tuple[ClientConnection, str | None]:
@@ -114,7 +118,7 @@ class Dialler:
 
     async def _connect(self, url: str, on_answered: Callable[[], None]) -> socket.socket:
         """Return a TCP connection to the host of *url*: what is tried is what dials."""
-        parts, within_s = urlsplit(url), min(_ANSWER_S, self._settings.connect_timeout_s)
+        parts, within_s = urlsplit(url), min(_ANSWER_S, self._timings.connect_timeout_s)
         port = parts.port or (443 if parts.scheme == "wss" else 80)
         try:
             made = await self._tcp.connect(parts.hostname or "", port, within_s)
@@ -129,7 +133,7 @@ class Dialler:
     async def _handshake(
         self, url: str, token: str | None, on_answered: Callable[[], None]
     ) -> ClientConnection:
-        address, options = hide_password(url), websocket_options(self._settings)
+        address, options = hide_password(url), websocket_options(self._settings, self._timings)
         options["sock"] = await self._connect(url, on_answered)
         if self.ssl_context is not None and url.startswith("wss:"):
             options["ssl"] = self.ssl_context

@@ -15,12 +15,16 @@ from collections.abc import Callable
 from pathlib import Path
 
 from client_sdk.transfer.data_client import DataClient
-from rse_pf.config import DataSettings
 from rse_pf.errors import BadRequest, LimitExceeded, RsePfError, UsageError
 from rse_pf.files import replace_file
 from rse_pf.token_bucket import TokenBucket
 
-__all__ = ["BackgroundUploader"]
+__all__ = ["BYTES_PER_S", "MAX_SPOOL_BYTES", "BackgroundUploader"]
+
+# Rate of the uploads: a small part of a wireless link, so that poses are not delayed.
+BYTES_PER_S = 262_144.0
+# Keyframes of some hours without a network.
+MAX_SPOOL_BYTES = 1 << 30
 
 _JOIN_TIMEOUT_S = 5.0
 _RETRY_PAUSE_S = 5.0
@@ -34,8 +38,9 @@ class BackgroundUploader:
         self,
         uploads: DataClient,
         folder: Path,
-        settings: DataSettings,
         *,
+        bytes_per_s: float = BYTES_PER_S,
+        max_spool_bytes: int = MAX_SPOOL_BYTES,
         clock: Callable[[], float] = time.monotonic,
         is_busy: Callable[[], bool] = lambda: False,
     ) -> None:
@@ -44,7 +49,8 @@ class BackgroundUploader:
         Args:
             uploads: Client of the data service.
             folder: The spool; created by `start`, which also takes over keyframes of an earlier run.
-            settings: ``background_bytes_per_s``, ``max_spool_bytes``.
+            bytes_per_s: Rate of the uploads.
+            max_spool_bytes: Size of the spool; keyframes above it are dropped.
             clock: Monotonic seconds.
             is_busy: Whether live poses are waiting; no keyframe and no part is started meanwhile.
         """
@@ -53,7 +59,8 @@ class BackgroundUploader:
         self.last_error = ""
         self._uploads = uploads
         self._folder = folder
-        self._settings = settings
+        self._bytes_per_s = bytes_per_s
+        self._max_spool_bytes = max_spool_bytes
         self._clock = clock
         self._is_busy = is_busy
         self._condition = threading.Condition()
@@ -81,7 +88,7 @@ class BackgroundUploader:
         """Spool a keyframe and return its digest; None if the spool is full and it was dropped."""
         digest = hashlib.sha256(data).hexdigest()
         with self._condition:
-            if sum(self._held.values()) + len(data) > self._settings.max_spool_bytes:
+            if sum(self._held.values()) + len(data) > self._max_spool_bytes:
                 self.dropped += 1
                 return None
             name = f"{self._next:012d}-{digest[:16]}.keyframe"
@@ -111,7 +118,7 @@ class BackgroundUploader:
             self._thread.join(_JOIN_TIMEOUT_S)
 
     def _work(self) -> None:
-        bucket = TokenBucket(self._settings.background_bytes_per_s, burst=0.0)
+        bucket = TokenBucket(self._bytes_per_s, burst=0.0)
         while True:
             with self._condition:
                 self._condition.wait_for(lambda: self._over or bool(self._held))

@@ -18,7 +18,7 @@ import msgspec
 from rse_pf.accounts import Accounts
 from rse_pf.auth.tokens import Claims
 from rse_pf.backend.robot_store import quota_bytes, store_within_quota
-from rse_pf.config import DataSettings, ServingSettings
+from rse_pf.config import DataSettings
 from rse_pf.errors import BadRequest, LimitExceeded, NotFound, QuotaExceeded, StoreError
 from rse_pf.identity import RobotId, object_name
 from rse_pf.object_store import ObjectStore, digest_of
@@ -32,6 +32,8 @@ _KEY = "object"
 _DIGEST = re.compile(r"[0-9a-f]{64}")
 MAX_OBJECTS_PER_COMMAND = 64
 """Stored objects that one command may refer to; each costs a request to the store."""
+# Size of all objects of one command together, which its process holds in memory beside the command.
+MAX_OBJECT_BYTES_PER_COMMAND = 128 << 20
 _MAX_DEPTH = 8
 """Below this depth, and in recursive types, references are not looked for."""
 
@@ -55,8 +57,6 @@ def resolve(
     payload: Any,
     robot: RobotId,
     store: ObjectStore,
-    *,
-    settings: ServingSettings,
 ) -> Any:
     """Return *payload* with the robot's own objects in the place of the references; blocks for the store.
 
@@ -67,7 +67,6 @@ def resolve(
         payload: As decoded from the wire: plain dicts and lists; not changed.
         robot: The robot that the token names.
         store: The store of the platform.
-        settings: ``max_object_bytes_per_command``.
 
     Raises:
         BadRequest: A reference is no sha256 in hex.
@@ -84,9 +83,9 @@ def resolve(
             hint="put them into fewer commands",
         )
     size = sum(_size(store, object_name(robot, digest), digest) for digest in digests)
-    if size > settings.max_object_bytes_per_command:
+    if size > MAX_OBJECT_BYTES_PER_COMMAND:
         raise LimitExceeded(
-            f"the objects have {size} bytes, above {settings.max_object_bytes_per_command}",
+            f"the objects have {size} bytes, above {MAX_OBJECT_BYTES_PER_COMMAND}",
             hint="put them into fewer commands",
         )
     held = {digest: _read(store, object_name(robot, digest), digest) for digest in digests}
@@ -105,7 +104,6 @@ class ObjectRefs:
     """The store and limits of one worker; without a store, references are not resolved."""
 
     store: ObjectStore | None
-    settings: ServingSettings
     data: DataSettings = field(default_factory=DataSettings)
     """Quotas of tenants, and of robots whose tokens name none."""
 
@@ -135,9 +133,7 @@ class ObjectRefs:
         service = registry.get(command.service)
         if self.store is None or not self.has_references(command, service):
             return command
-        payload = resolve(
-            service.request_type, command.payload, who.robot, self.store, settings=self.settings
-        )
+        payload = resolve(service.request_type, command.payload, who.robot, self.store)
         return msgspec.structs.replace(command, payload=payload)
 
     def store_large_reply(self, result: Result, too_large: Failure, who: Owner) -> Result | Failure:
@@ -156,7 +152,7 @@ class ObjectRefs:
         if self.store is None:
             return too_large
         reply = msgspec.msgpack.encode(result.reply, enc_hook=binary_encode_hook)
-        if len(reply) > self.settings.max_object_bytes_per_command:
+        if len(reply) > MAX_OBJECT_BYTES_PER_COMMAND:
             return too_large
         max_bytes = quota_bytes(who.claims, self.data.quota_bytes)
         accounts = Accounts(self.store, self.data)

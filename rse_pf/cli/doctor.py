@@ -218,8 +218,8 @@ def _open_files(settings: PlatformSettings) -> Iterator[Finding]:
 
 def _size(settings: PlatformSettings) -> Iterator[Finding]:
     cores = len(os.sched_getaffinity(0))
-    processes = settings.local.servers * settings.local.workers
-    fix = f"expect shared cores: local.servers x local.workers = {processes}" if cores < processes else ""
+    processes = settings.local.servers * (settings.serving.workers or 1)
+    fix = f"expect shared cores: local.servers x serving.workers = {processes}" if cores < processes else ""
     yield _finding(f"{cores} cores", fix)
     match = None
     with contextlib.suppress(OSError):

@@ -8,11 +8,14 @@ __all__ = [
     "CANARY_MB",
     "CANARY_PERIOD_S",
     "ENDPOINT_SERVICES",
+    "LAMBDA_MEMORY_MB",
     "RESUME_FIELD",
     "parks_when_idle",
     "zone_count",
 ]
 
+# Memory of the serverless PnP: AWS gives it one whole vCPU, and a command uses no second one.
+LAMBDA_MEMORY_MB = 1769
 CANARY_MB, CANARY_PERIOD_S = 512, 60
 """Memory of the canary's function, and the time between two calls."""
 ENDPOINT_SERVICES = {"monitoring": "monitor", "autoscaling": "scale modifier"}

@@ -25,6 +25,7 @@ __all__ = [
     "MAX_HANDSHAKE_BYTES",
     "RETRY_AFTER_S",
     "STATUS",
+    "WRITE_BUFFER_BYTES",
     "RateRule",
     "rate_rules",
 ]
@@ -37,6 +38,8 @@ BODY_TIMEOUT_S = 10.0
 as long."""
 MAX_HANDSHAKE_BYTES = 8192
 """Request head of a handshake; load balancer and server refuse a longer one with 431 (OWASP, slowloris)."""
+# A client with more unsent bytes than this counts as a slow reader; its answers in flight are fewer.
+WRITE_BUFFER_BYTES = 262_144
 DIAL_BURST = 20
 """Attempts to connect that a robot may make at once."""
 DIALS_PER_MINUTE = 10.0

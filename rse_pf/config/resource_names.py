@@ -17,6 +17,7 @@ __all__ = [
     "KEYS_NAME",
     "READY_PATH",
     "ROBOTS_NAME",
+    "ROBOTS_PATH",
     "ROSBRIDGE_PATH",
     "SERVICES_PREFIX",
     "SETTINGS_CONTEXT",
@@ -34,6 +35,8 @@ the data service, where load balancers ask it whether the process is alive."""
 READY_PATH = "/readyz"
 """At the control port, where load balancers ask it; below ``/data`` at the data service, whether its store
 answers, which agents publish and for which no server is ended."""
+# Path of the robots' WebSocket.
+ROBOTS_PATH = "/ws"
 ROSBRIDGE_PATH = "/rosbridge"
 """At the robots' port, where ``serving.rosbridge`` is on."""
 KEYS_NAME = "keys.json"

@@ -21,7 +21,7 @@ READ_BY_SERVERS: dict[str, tuple[str, ...]] = {
         "spot",
     ),
     "scaling": ("period_s", "profile", "warm_up_s"),
-    "burst": ("url", "robot_commands_per_day", "commands_per_day"),
+    "burst": ("url", "robot_commands_per_day"),
     "health": ("unhealthy_checks",),
     "local": ("start_timeout_s",),
 }

@@ -63,9 +63,8 @@ class ServingSettings:
     port: int = setting(8765, doc="port of the robots' socket; 0 takes a free one", low=0, high=65535)
     control_host: str = setting("127.0.0.1", doc="address of the control port")
     control_port: int = setting(8766, doc="port of /healthz, /readyz, /metrics and drain; 0 takes a free one", low=0, high=65535)
-    path: str = setting("/ws", doc="path of the robots' WebSocket")
     rosbridge: bool = setting(False, doc="also serve rosbridge v2 clients, on the path /rosbridge")
-    workers: int = setting(0, doc="worker processes; 0 means one per core", low=0, high=256)
+    workers: int = setting(0, doc="worker processes of a server; 0 means one per core, and one where rse-pf local runs several servers on a machine", low=0, high=256)
     max_robots: int = setting(10000, unit="robots", doc="connections of one server; more are refused with 503", low=1)
     max_unauthenticated: int = setting(200, unit="sockets", doc="sockets without a verified token; the oldest one is closed when a new one exceeds the limit", low=1)
     max_unauthenticated_per_source: int = setting(50, unit="sockets", doc="the same for each source address; not counted behind trusted proxies; 0 is off", low=0)
@@ -73,9 +72,7 @@ class ServingSettings:
     max_handshakes_per_source_per_s: float = setting(200.0, unit="handshakes/s", doc="handshakes of one source address; more are refused with 429; 0 is off", low=0)
     trusted_proxies: int = setting(1, unit="proxies", doc="load balancers that append to x-forwarded-for; 0: robots connect directly", low=0, high=8)
     allowed_origins: str = setting("", doc="origins of web pages that may connect, such as https://robots.example.org, with spaces between; pages of the platform itself always may")
-    write_buffer_bytes: int = setting(262144, unit="bytes", doc="unsent bytes above which a client counts as a slow reader", low=4096)
     slow_reader_timeout_s: float = setting(1.0, unit="s", doc="a slow reader is disconnected after this", low=0.05)
-    max_object_bytes_per_command: int = setting(134217728, unit="bytes", doc="total size of the objects that one command refers to", low=1024)
     emulated_cores: float = setting(0.0, unit="cores", doc="CPU seconds per second that each worker may use, to emulate a smaller server; 0 is off", low=0, high=64)
     compute_processes: int = setting(1, doc="processes of each worker that compute map services; they are killed at the deadline", low=1, high=64)
     max_compute_memory_bytes: int = setting(1073741824, unit="bytes", doc="memory of one command of a map service; the process of one that needs more is ended", low=67108864)
@@ -99,14 +96,9 @@ class SessionSettings:
     max_fragments: int = setting(64, doc="fragments of one message, empty ones included", source="GHSA-96hv-2xvq-fx4p", low=1)
     max_in_flight: int = setting(8, unit="commands", doc="unanswered commands of one robot", low=1)
     max_commands_per_s: float = setting(20.0, unit="commands/s", doc="messages of one robot; more are refused; 0 is off", source="AWS IoT and Discord limit so", low=0)
-    rate_ban_s: float = setting(5.0, unit="s", doc="a robot that was disconnected for its rate is refused for this long", low=0)
     ping_interval_s: float = setting(2.0, unit="s", doc="time between application pings", source="paper, Sect. 3.3 (delays); ours in value", low=0.05)
     ping_timeout_s: float = setting(3.0, unit="s", doc="a connection without an answer to a ping for this long counts as lost", low=0.1)
     hello_timeout_s: float = setting(5.0, unit="s", doc="a socket is closed when its handshake, or after it the Hello message, takes longer", source="slowloris, OWASP", low=0.1)
-    connect_timeout_s: float = setting(2.0, unit="s", doc="time limit of one attempt to connect", low=0.1)
-    reconnect_max_s: float = setting(1.0, unit="s", doc="longest reconnect back-off in the first seconds without a connection", low=0.01)
-    reconnect_long_max_s: float = setting(40.0, unit="s", doc="longest reconnect back-off after minutes without a connection; after a refusal half of it at least", low=0.01)
-    region_hold_s: float = setting(60.0, unit="s", doc="a robot with several addresses changes to another region that has been clearly nearer for this long", low=0.1)
     answer_timeout_s: float = setting(5.0, unit="s", doc="deadline of a command that sets none", low=0.05)
     stall_timeout_s: float = setting(1.0, unit="s", doc="the client reconnects when a command is unanswered and nothing arrived for this long", low=0.05)
 
@@ -116,7 +108,6 @@ class PnpSettings:
     """The perspective-n-point service."""
 
     engine: str = setting("native", doc="solver of a command that chooses none; poselib stands in where the native library is missing", choices=("native", "poselib", "opencv"))
-    max_correspondences: int = setting(5000, doc="correspondences of one command", low=4)
     max_iterations: int = setting(1000, doc="RANSAC iterations a command may ask for", low=1, high=100000)
 
 
@@ -125,7 +116,6 @@ class HealthSettings:
     """When a server counts as healthy."""
 
     unhealthy_checks: int = setting(2, unit="checks", doc="failed checks in a row after which a server is unhealthy", low=2, high=10)
-    grace_s: int = setting(90, unit="s", doc="failed checks of a new server do not count for this long", low=0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -133,7 +123,6 @@ class ScalingSettings:
     """When the cloud grows and shrinks."""
 
     busy_cpu_percent: float = setting(70.0, unit="%", source="paper, Sect. 6.2", doc="add a server above this average CPU", low=1, high=100)
-    very_busy_cpu_percent: float = setting(85.0, unit="%", doc="add two servers above this average CPU", low=1, high=100)
     idle_s: int = setting(300, unit="s", source="paper, Sect. 6.2", doc="remove a server after this long without work", low=60)
     idle_cpu_percent: float = setting(20.0, unit="%", doc="idle means no command of a robot and CPU below this; the commands of synthetic robots, such as the canary, do not count", low=0, high=100)
     period_s: int = setting(60, unit="s", doc="one sample of the monitor, in the paper's profile", low=10)
@@ -146,6 +135,11 @@ class ScalingSettings:
     underused_s: int = setting(900, unit="s", doc="remove a server after CPU was below 15 % for this long, although robots send commands; 0 is off", low=0, high=86400)
     schedule: str = setting("", doc="min_servers by day and time, such as: weekdays 08:00 min 4; weekdays 18:00 min 1; sat,sun 10:00 min 2")
     time_zone: str = setting("UTC", doc="time zone of scaling.schedule, such as Asia/Seoul", source="IANA time zones")
+
+    @property
+    def very_busy_cpu_percent(self) -> float:
+        """Return the average CPU above which two servers are added: halfway from busy to full."""
+        return (self.busy_cpu_percent + 100.0) / 2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -163,8 +157,6 @@ class DataSettings:
     max_requests_per_s: float = setting(50.0, unit="requests/s", doc="requests of one robot; a list counts as 5, a photo to localise as 10 or one for each 5 ms of its CPU time, a commit of a map as 20; more are refused with 429", low=0.1)
     part_bytes: int = setting(4194304, unit="bytes", doc="body of one request; larger objects are sent in parts", low=1024)
     max_uploads: int = setting(32, doc="request bodies received at the same time; more are refused with 503 and Retry-After", low=1)
-    background_bytes_per_s: int = setting(262144, unit="bytes/s", doc="rate at which a robot uploads keyframes in the background", low=1024)
-    max_spool_bytes: int = setting(1073741824, unit="bytes", doc="keyframes that a robot keeps on its disk while it is offline", low=1024)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -198,10 +190,8 @@ class LiveSettings:
     host: str = setting("127.0.0.1", doc="address on which owners of live maps listen for the other servers; 0.0.0.0 listens on all and tells the main one")
     first_port: int = setting(8800, doc="first of the 64 ports of owners of live maps; on loopback, and with 0, any free one is taken", low=0, high=65535 - 63)
     max_owners: int = setting(4, doc="owner processes of one worker; further maps are refused until another server takes them; 0 switches live maps off", low=0, high=64)
-    max_memory_bytes: int = setting(2147483648, unit="bytes", doc="memory of one owner process; one that needs more is ended", low=134217728)
     warm_standby: bool = setting(True, doc="keep one started process, about 70 MB, in each worker whose robots use live maps; it takes a map over a second sooner")
     lease_s: float = setting(1.5, unit="s", doc="another server takes a live map over when its lease was not renewed for this long", low=0.1)
-    publish_s: float = setting(600.0, unit="s", doc="time between two versions that a live map publishes while it changes; 0: only when the last robot leaves, or on request", low=0)
     publish_pause_s: float = setting(10.0, unit="s", doc="shortest time between two versions of a live map; a version that is asked for earlier comes then", source="a robot that left again and again wrote 959 MB in 45 s", low=0)
     keep_versions: int = setting(20, unit="versions", doc="newest versions of a live map that stay, of those that nobody asked for; older ones are removed, and those above a quarter of the tenant's quota; 0 keeps all", low=0)
     idle_s: float = setting(60.0, unit="s", doc="the owner of a map that nobody uses for this long publishes it and ends", low=1)
@@ -231,12 +221,10 @@ class LocalSettings:
 
     port: int = setting(8700, doc="port of the local load balancer; 0 takes a free one", low=0, high=65535)
     servers: int = setting(2, unit="servers", doc="backend servers at the start", low=1, high=64)
-    workers: int = setting(1, doc="worker processes of each local server", low=1, high=64)
     start_timeout_s: float = setting(20.0, unit="s", doc="a server that is not ready by then has failed", low=1)
     warm_standby: bool = setting(True, doc="keep one started process, about 60 MB, that becomes the next server at once", source="warm pools of AWS Auto Scaling")
     metrics_port: int = setting(9464, doc="port of the control plane on loopback: /metrics of all servers, for Prometheus; 0 takes a free one", source="OpenTelemetry's Prometheus exporter", low=0, high=65535)
     page_port: int = setting(8701, doc="port of the fleet page on loopback; 0 takes a free one, and so does a port that is taken", low=0, high=65535)
-    burst_port: int = setting(8702, doc="port on loopback of the burst function (rse-pf local --burst)", low=1, high=65535)
     certificate: str = setting("", doc="file of the load balancer's certificate chain (PEM); robots then connect by wss://")
     private_key: str = setting("", doc="file of the private key of local.certificate (PEM)")
 
@@ -272,7 +260,6 @@ class CloudSettings:
     s3_prefix_list: str = setting("", doc="prefix list of S3 in the region; empty: from the table in stacks/firewall.py")
     robot_cidr: str = setting("0.0.0.0/0", doc="addresses that robots may connect from")
     robots_per_site: int = setting(100, unit="robots", doc="WAF: robots behind one address that may all connect, and send data, in the same minute", low=1, high=100000)
-    lambda_memory_mb: int = setting(1769, unit="MB", doc="memory of the serverless PnP; 1769 is one vCPU", low=128, high=10240)
     lambda_concurrency: int = setting(20, doc="concurrent executions of the serverless PnP", low=1)
     idle_hours: int = setting(24, unit="h", doc="hours without robots after which idle_action is taken", low=1, high=168)
     idle_action: str = setting("auto", doc="what a deployment does that has been idle for idle_hours: park ends its servers until rse-pf cloud resume or scaling.schedule; none; auto: park a trial, and none with TLS (allow_insecure is false) or scaling.schedule", choices=("auto", "park", "none"))
@@ -345,10 +332,8 @@ def _check_contradictions(s: PlatformSettings) -> None:
     """Raise SettingsError if two settings cannot both hold."""
     pairs = [
         ("scaling", "min_servers", "max_servers"),
-        ("scaling", "busy_cpu_percent", "very_busy_cpu_percent"),
         ("scaling", "idle_cpu_percent", "busy_cpu_percent"),
         ("session", "max_message_bytes", "max_inflated_bytes"),
-        ("session", "reconnect_max_s", "reconnect_long_max_s"),
     ]
     for group, small, large in pairs:
         low, high = (getattr(getattr(s, group), name) for name in (small, large))

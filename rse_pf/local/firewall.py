@@ -13,6 +13,7 @@ from pathlib import Path
 from rse_pf.auth.tokens import KeySet, SigningKey
 from rse_pf.config import PlatformSettings
 from rse_pf.config.placement import is_loopback
+from rse_pf.config.resource_names import ROBOTS_PATH
 from rse_pf.errors import ConfigurationError, UsageError
 from rse_pf.files import OWNER_ONLY, read_private_file, replace_file
 from rse_pf.local.lan.listener import LanListener
@@ -38,7 +39,7 @@ def robots_url(settings: PlatformSettings, port: int, lan: LanListener | None = 
     address = settings.serving.host if lan is None else lan.address
     host = f"[{address}]" if ":" in address else address
     scheme = "wss" if settings.local.certificate or lan is not None else "ws"
-    return f"{scheme}://{host}:{port}{settings.serving.path}"
+    return f"{scheme}://{host}:{port}{ROBOTS_PATH}"
 
 
 def check_listener(host: str, port: int, *, is_protected: bool = False) -> None:

@@ -17,6 +17,7 @@ __all__ = [
     "CLOUD_INTERVAL_S",
     "CLOUD_TIMEOUT_S",
     "DRAIN_S",
+    "GRACE_S",
     "HEALTHY_CHECKS",
     "LOCAL_INTERVAL_S",
     "LOCAL_TIMEOUT_S",
@@ -33,6 +34,8 @@ LOCAL_INTERVAL_S, LOCAL_TIMEOUT_S = 0.25, 0.25
 """Time between checks on one machine; a check that takes longer than the second failed."""
 CLOUD_INTERVAL_S, CLOUD_TIMEOUT_S = 5, 4
 """Time between checks of the ALB, the least it offers; a check that takes longer than the second failed."""
+# Failed checks of a new server do not count for this long: its boot and start of 60 s, and some more.
+GRACE_S = 90
 DRAIN_S = 60
 """Time that the termination hook of a cloud gives a server to drain."""
 
@@ -68,14 +71,14 @@ def observe(health: Health, ok: bool, settings: HealthSettings, *, now_s: float)
     """Return the health after one more check.
 
     A server becomes healthy after `HEALTHY_CHECKS` good ones in a row, and unhealthy after
-    ``unhealthy_checks`` failed ones; one that was never healthy only after ``grace_s``.
+    ``unhealthy_checks`` failed ones; one that was never healthy only after `GRACE_S`.
     """
     row = health.row + 1 if ok == health.last_ok else 1
     state = health.state
     if ok and row >= HEALTHY_CHECKS:
         state = "healthy"
     elif not ok and row >= settings.unhealthy_checks:
-        in_grace = state == "starting" and now_s - health.started_s < settings.grace_s
+        in_grace = state == "starting" and now_s - health.started_s < GRACE_S
         state = "starting" if in_grace else "unhealthy"
     return dataclasses.replace(health, state=state, last_ok=ok, row=row)
 

@@ -29,6 +29,8 @@ _FLAT_UPPER = 6 * _UPPER[0] + _UPPER[1]
 _POINT_DECIMALS = 4
 _PIXEL_DECIMALS = 2
 _DEPTH_DECIMALS = 3
+# Matches of one command; more cost time, and do not make the pose better.
+MAX_CORRESPONDENCES = 5000
 
 
 class PnpRequest(msgspec.Struct, frozen=True, kw_only=True):
@@ -146,7 +148,7 @@ def register(registry: Registry, settings: PnpSettings) -> None:
     defaults = PnpOptions(max_iterations=settings.max_iterations)
     engine = usable_engine(settings.engine)
     solver = native_solver() if engine == "native" else None
-    plain, most = native_options(defaults, WeakLimits()), settings.max_correspondences
+    plain = native_options(defaults, WeakLimits())
 
     @registry.service("pnp", cheap=True)
     def pnp(request: PnpRequest) -> PnpReply:
@@ -157,7 +159,7 @@ def register(registry: Registry, settings: PnpSettings) -> None:
             solver is not None
             and request.options is None
             and (request.depths_m is msgspec.UNSET or request.depths_m is None)
-            and 8 <= request.pixels.size <= 2 * most
+            and 8 <= request.pixels.size <= 2 * MAX_CORRESPONDENCES
         ):
             found = solver.solve_flat(request.points_world, request.pixels, request.camera, plain)
             if found is not None:
@@ -169,9 +171,9 @@ def register(registry: Registry, settings: PnpSettings) -> None:
         points_world = reshaped("points_world", request.points_world, 3)
         pixels = reshaped("pixels", request.pixels, 2)
         n = len(points_world)
-        if n > settings.max_correspondences:
+        if n > MAX_CORRESPONDENCES:
             raise LimitExceeded(
-                f"{n} correspondences are above {settings.max_correspondences}",
+                f"{n} correspondences are above {MAX_CORRESPONDENCES}",
                 hint="send the best matches only",
             )
         if n < 4:
@@ -198,7 +200,9 @@ def register(registry: Registry, settings: PnpSettings) -> None:
 
         def answer_plain(read: PlainPnp) -> EncodedReply | PnpReply:
             """Answer as `pnp`, without a Python object for each part of the request and the reply."""
-            is_common = read.options is None and not read.depths and 8 <= read.pixels <= 2 * most
+            is_common = (
+                read.options is None and not read.depths and 8 <= read.pixels <= 2 * MAX_CORRESPONDENCES
+            )
             reply = replies.answer(read, plain) if replies is not None and is_common else None
             return reply or pnp(read.request())
 

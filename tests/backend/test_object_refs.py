@@ -70,7 +70,7 @@ def name(data: bytes) -> dict[str, str]:
 
 
 def resolved(payload: Any, store: MemoryStore, kind: type[Any] = Asked, *, robot: RobotId = ROBOT) -> Any:
-    return resolve(kind, payload, robot, store, settings=SERVING)
+    return resolve(kind, payload, robot, store)
 
 
 def test_references_become_bytes_wherever_the_request_declares_bytes(store: Counting) -> None:
@@ -132,11 +132,11 @@ def test_more_than_a_command_may_refer_to_is_refused_before_it_is_read(
     store: Counting, objects: int, limit_bytes: int, reads: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("rse_pf.backend.object_refs.MAX_OBJECTS_PER_COMMAND", objects)
-    settings = PlatformSettings().replace(serving={"max_object_bytes_per_command": limit_bytes}).serving
+    monkeypatch.setattr("rse_pf.backend.object_refs.MAX_OBJECT_BYTES_PER_COMMAND", limit_bytes)
     payload = {"many": [name(MAP), name(OTHER)]}
 
     with pytest.raises(LimitExceeded):
-        resolve(Asked, payload, ROBOT, store, settings=settings)
+        resolve(Asked, payload, ROBOT, store)
 
     assert (store.heads, store.gets) == (reads, 0)
 
@@ -164,7 +164,7 @@ def test_the_map_services_take_objects_and_pnp_takes_none(store: Counting) -> No
 
 
 def test_an_invalid_payload_is_left_to_the_service_to_refuse(store: Counting) -> None:
-    gate, registry = ObjectRefs(store, SERVING, DataSettings()), Registry()
+    gate, registry = ObjectRefs(store, DataSettings()), Registry()
 
     @registry.service("asked")
     def asked(request: Asked) -> Asked:

@@ -80,8 +80,8 @@ def test_short_objects_and_committed_maps_count():
 
 
 def test_a_large_reply_beyond_the_quota_is_refused_with_the_reason():
-    store, settings = MemoryStore(), PlatformSettings()
-    gate = ObjectRefs(store, settings.serving, DataSettings(quota_bytes=4000))
+    store = MemoryStore()
+    gate = ObjectRefs(store, DataSettings(quota_bytes=4000))
     answer, sent = Result(id=1, reply=bytes(500)), Failure(id=1, code="too-large", message="too large")
     owner = SimpleNamespace(robot=ROBOT, claims=None)
 

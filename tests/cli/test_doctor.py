@@ -149,7 +149,10 @@ def test_the_limit_of_open_files_is_held_against_the_robots(
 
 
 def test_fewer_cores_than_workers_is_a_warning() -> None:
-    assert only("cores", findings(SETTINGS.replace(local={"servers": 64, "workers": 64}))).grade == "warn"
+    assert (
+        only("cores", findings(SETTINGS.replace(local={"servers": 64}, serving={"workers": 64}))).grade
+        == "warn"
+    )
 
 
 @pytest.mark.parametrize(("grade", "code"), [("ok", 0), ("warn", 0), ("fail", 1)])

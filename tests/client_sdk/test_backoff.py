@@ -9,7 +9,8 @@ from random import Random
 import pytest
 
 from client_sdk.network.backoff import Backoff, Last
-from rse_pf.config import PlatformSettings, SessionSettings
+from client_sdk.network.timings import ConnectTimings
+from rse_pf.config import PlatformSettings
 from rse_pf.config.front_door import DIAL_BURST, DIALS_PER_MINUTE
 from tests.played_firewall import PlayedFirewall, rules_of_settings
 
@@ -29,7 +30,7 @@ class Outage:
 def play(settings: PlatformSettings, *, robots: int, outage_s: float, seed: int = 0) -> Outage:
     """Cut all robots off at the same moment; the load balancer answers 503, and the firewall its rules."""
     firewall = PlayedFirewall(rules_of_settings(settings))
-    backoffs = [Backoff(settings.session, Random(f"{seed}/{robot}")) for robot in range(robots)]
+    backoffs = [Backoff(ConnectTimings(), Random(f"{seed}/{robot}")) for robot in range(robots)]
     due = [(BEGAN_S + each.pause_s(BEGAN_S), robot) for robot, each in enumerate(backoffs)]
     heapq.heapify(due)
     connected_s: list[float] = []
@@ -73,8 +74,8 @@ def test_no_robot_dials_more_often_than_the_limit_is_derived_from(outage_s):
 
 
 def test_a_server_that_accepts_and_dies_again_and_again_does_not_empty_the_allowance():
-    session = SessionSettings()
-    backoff, now, dials = Backoff(session, Random(1)), 0.0, 0
+    timings = ConnectTimings()
+    backoff, now, dials = Backoff(timings, Random(1)), 0.0, 0
     while now < 600.0:
         now += backoff.pause_s(now)
         backoff.dialled(now)
@@ -87,8 +88,8 @@ def test_a_server_that_accepts_and_dies_again_and_again_does_not_empty_the_allow
 
 
 def test_a_move_that_does_not_succeed_leaves_half_of_the_allowance():
-    session = SessionSettings()
-    backoff, now = Backoff(session, Random(2)), 0.0
+    timings = ConnectTimings()
+    backoff, now = Backoff(timings, Random(2)), 0.0
     dials_until_s = []
     while now < 30.0:
         backoff.dialled(now)
@@ -98,35 +99,35 @@ def test_a_move_that_does_not_succeed_leaves_half_of_the_allowance():
     assert len(dials_until_s) <= 0.5 * DIAL_BURST + 0.5 * DIALS_PER_MINUTE + 1
     backoff.restart()
     for _ in range(DIAL_BURST // 2):
-        assert backoff.pause_s(now) <= session.reconnect_max_s
+        assert backoff.pause_s(now) <= timings.reconnect_max_s
         backoff.dialled(now)
 
 
 def test_a_server_that_dies_is_dialled_again_within_a_second():
     for seed in range(50):
-        assert Backoff(SessionSettings(), Random(seed)).pause_s(50.0) <= 0.1
+        assert Backoff(ConnectTimings(), Random(seed)).pause_s(50.0) <= 0.1
 
 
 def test_the_pauses_grow_to_a_bound_and_not_beyond():
-    session = SessionSettings()
-    backoff, now, pauses = Backoff(session, Random(5)), 0.0, []
+    timings = ConnectTimings()
+    backoff, now, pauses = Backoff(timings, Random(5)), 0.0, []
     while now < 3600.0:
         pauses.append(backoff.pause_s(now))
         now += pauses[-1]
 
-    assert max(pauses[-10:]) <= session.reconnect_long_max_s
-    assert min(pauses[-10:]) >= 0.5 * session.reconnect_long_max_s
+    assert max(pauses[-10:]) <= timings.reconnect_long_max_s
+    assert min(pauses[-10:]) >= 0.5 * timings.reconnect_long_max_s
 
 
 def test_robots_that_are_told_the_same_time_do_not_come_back_together():
-    pauses = [Backoff(SessionSettings(), Random(seed)).pause_s(0.0, 60.0) for seed in range(100)]
+    pauses = [Backoff(ConnectTimings(), Random(seed)).pause_s(0.0, 60.0) for seed in range(100)]
 
     assert min(pauses) >= 60.0
     assert max(pauses) - min(pauses) >= 10.0
 
 
 def test_attempts_that_nobody_answers_go_on_once_a_second_and_cost_no_allowance():
-    backoff, now = Backoff(SessionSettings(), Random(3)), 0.0
+    backoff, now = Backoff(ConnectTimings(), Random(3)), 0.0
     pauses = []
     for _ in range(200):
         pauses.append(backoff.pause_s(now, last=Last.UNANSWERED))
@@ -137,18 +138,18 @@ def test_attempts_that_nobody_answers_go_on_once_a_second_and_cost_no_allowance(
 
 
 def test_pauses_grow_with_the_time_of_answers_and_not_with_that_of_silence():
-    session = SessionSettings()
+    timings = ConnectTimings()
     for seed in range(20):
-        backoff, now = Backoff(session, Random(seed)), 0.0
+        backoff, now = Backoff(timings, Random(seed)), 0.0
         backoff.pause_s(now, last=Last.NONE)
         while now < 120.0:
             now += backoff.pause_s(now, last=Last.UNANSWERED)
 
-        assert backoff.pause_s(now) <= session.reconnect_max_s
+        assert backoff.pause_s(now) <= timings.reconnect_max_s
 
 
 def test_a_robot_that_is_refused_tries_again_every_20_to_40_s_for_ever():
-    backoff, now, pauses = Backoff(SessionSettings(), Random(4)), 0.0, []
+    backoff, now, pauses = Backoff(ConnectTimings(), Random(4)), 0.0, []
     while now < 7200.0:
         backoff.dialled(now)
         pauses.append(backoff.pause_s(now, last=Last.REFUSED))
@@ -162,7 +163,7 @@ def test_a_robot_that_is_refused_tries_again_every_20_to_40_s_for_ever():
 @pytest.mark.parametrize(("valid_in_s", "least_s"), [(-120.0, 0.0), (0.0, 0.0), (0.7, 0.7), (9.0, 9.0)])
 def test_after_a_cut_off_a_robot_is_back_half_a_second_after_its_tokens_are_late_enough(valid_in_s, least_s):
     for seed in range(50):
-        pause_s = Backoff(SessionSettings(), Random(seed)).pause_s(
+        pause_s = Backoff(ConnectTimings(), Random(seed)).pause_s(
             5.0, last=Last.REFUSED, valid_in_s=valid_in_s
         )
 
@@ -170,12 +171,12 @@ def test_after_a_cut_off_a_robot_is_back_half_a_second_after_its_tokens_are_late
 
 
 def test_a_cut_off_far_away_by_a_wrong_clock_does_not_keep_a_robot_from_trying():
-    assert Backoff(SessionSettings(), Random(1)).pause_s(0.0, last=Last.REFUSED, valid_in_s=1e6) <= 40.0
+    assert Backoff(ConnectTimings(), Random(1)).pause_s(0.0, last=Last.REFUSED, valid_in_s=1e6) <= 40.0
 
 
 def test_refusals_cost_the_allowance_of_the_firewall_like_every_other_answer():
-    session = SessionSettings()
-    backoff = Backoff(session, Random(1))
+    timings = ConnectTimings()
+    backoff = Backoff(timings, Random(1))
     for _ in range(DIAL_BURST):
         backoff.dialled(0.0)
 

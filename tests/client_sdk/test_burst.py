@@ -13,6 +13,7 @@ from fake_burst import FakeBurst
 from fake_platform import FakePlatform
 
 import client_sdk
+from client_sdk.network.timings import ConnectTimings
 from rse_pf.config import BurstSettings, PlatformSettings, SessionSettings
 from rse_pf.errors import Busy, Expired, NoConsensus, UsageError
 from rse_pf.pnp import solve_pnp
@@ -20,7 +21,8 @@ from rse_pf.pnp.problems import make_degenerate, make_problem
 from rse_pf.services.builtin import builtin_services
 from rse_pf.wire import Failure
 
-FAST = SessionSettings(reconnect_max_s=0.05, stall_timeout_s=0.4, connect_timeout_s=0.5)
+FAST = SessionSettings(stall_timeout_s=0.4)
+TIMINGS = ConnectTimings(reconnect_max_s=0.05, connect_timeout_s=0.5)
 PROBLEM = make_problem(seed=5)
 FRAME = (PROBLEM.points_world, PROBLEM.pixels, PROBLEM.camera)
 BUDGET = 1000
@@ -28,7 +30,9 @@ PLATFORM = PlatformSettings()
 
 
 def robot(url: str, **options: Any) -> client_sdk.Robot:
-    return client_sdk.connect(url, settings=FAST, random=Random(1), **{"token": "a.b.c", **options})
+    return client_sdk.connect(
+        url, settings=FAST, timings=TIMINGS, random=Random(1), **{"token": "a.b.c", **options}
+    )
 
 
 def own_solver(platform: FakePlatform) -> client_sdk.Robot:

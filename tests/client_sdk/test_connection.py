@@ -9,7 +9,7 @@ import time
 
 import pytest
 from fake_platform import FakePlatform
-from quick_robots import QUICK, answered, ask, robot
+from quick_robots import QUICK, TIMINGS, answered, ask, robot
 
 import client_sdk
 from client_sdk.network.handshake import websocket_options
@@ -289,7 +289,7 @@ async def test_a_server_that_never_sends_welcome_is_a_connect_error():
         began = time.monotonic()
         with pytest.raises(ConnectError, match="sends no Welcome"):
             await robot(platform.url).__aenter__()
-        assert time.monotonic() - began < QUICK.connect_timeout_s * 6
+        assert time.monotonic() - began < TIMINGS.connect_timeout_s * 6
 
 
 async def test_an_address_without_a_server_is_one_line_with_a_hint():
@@ -400,7 +400,7 @@ async def test_reconnects_spread_over_the_whole_back_off(monkeypatch):
 
 
 def test_every_socket_is_opened_without_compression_and_with_our_limits():
-    options = websocket_options(QUICK)
+    options = websocket_options(QUICK, TIMINGS)
 
     assert options["compression"] is None
     assert options["ping_interval"] is None

@@ -12,18 +12,18 @@ import pytest
 from fake_platform import FakePlatform
 
 import client_sdk
+from client_sdk.network.timings import ConnectTimings
 from client_sdk.token_text import strip_token
 from client_sdk.transfer.data_client import DataClient
-from rse_pf.config import SessionSettings
 from rse_pf.errors import ConnectError, Unauthorized
 from rse_pf.pnp.problems import make_problem
 
-QUICK = SessionSettings(connect_timeout_s=0.5, reconnect_max_s=0.05)
+TIMINGS = ConnectTimings(connect_timeout_s=0.5, reconnect_max_s=0.05)
 SECRET = "eyJhbGciOi.JFZERTQS.c2VjcmV0"
 
 
 def robot(url: str, **options: Any) -> client_sdk.Robot:
-    return client_sdk.connect(url, settings=QUICK, random=random.Random(1), **options)
+    return client_sdk.connect(url, timings=TIMINGS, random=random.Random(1), **options)
 
 
 @pytest.mark.parametrize("around", ["{}\n", " {}", "\t{}\r\n"])

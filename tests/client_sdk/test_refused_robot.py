@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import pytest
 from fake_platform import FakePlatform
-from quick_robots import QUICK, answered, ask, robot
+from quick_robots import QUICK, TIMINGS, answered, ask, robot
 
 import client_sdk
 from rse_pf.config import SessionSettings
@@ -64,7 +64,7 @@ async def test_a_refusal_that_names_the_time_of_the_cut_off_is_followed_by_a_lat
 @pytest.mark.parametrize("when", ["after the refusal", "while the refusal is told"])
 async def test_a_robot_whose_clock_is_set_right_is_tried_again_at_once(when):
     now_s = [1000.0]
-    settings = replace(QUICK, reconnect_long_max_s=1000.0)
+    timings = replace(TIMINGS, reconnect_long_max_s=1000.0)
 
     async def token():
         return "t"
@@ -75,8 +75,8 @@ async def test_a_robot_whose_clock_is_set_right_is_tried_again_at_once(when):
 
     async with FakePlatform() as platform:
         connecting = client_sdk.connect(
-            platform.url, token=token, settings=settings, random=random.Random(1), on_change=set_clock,
-            wall_clock=lambda: now_s[0] + time.monotonic(),
+            platform.url, token=token, settings=QUICK, timings=timings, random=random.Random(1),
+            on_change=set_clock, wall_clock=lambda: now_s[0] + time.monotonic(),
         )  # fmt: skip
         async with connecting as a_robot:
             platform.told = {"cause": "not-yet-valid"}

@@ -12,6 +12,7 @@ import server_sessions
 from fakes import FakeRobot, FakeServer, answer_at_once, answer_nothing
 
 import client_sdk
+from client_sdk.network.timings import ConnectTimings
 from rse_pf.config import PnpSettings, SessionSettings
 from rse_pf.errors import (
     Disconnected,
@@ -22,11 +23,16 @@ from rse_pf.pnp.problems import make_problem
 from rse_pf.services import pnp
 from rse_pf.wire import Command, Failure, Result
 
-FAST = SessionSettings(reconnect_max_s=0.05, stall_timeout_s=0.4, ping_interval_s=0.2)
+FAST = SessionSettings(stall_timeout_s=0.4, ping_interval_s=0.2)
 
 
 def connect(server: FakeServer, **options: Any) -> client_sdk.Robot:
-    options = {"settings": FAST, "random": random.Random(1), **options}
+    options = {
+        "settings": FAST,
+        "timings": ConnectTimings(reconnect_max_s=0.05),
+        "random": random.Random(1),
+        **options,
+    }
     return client_sdk.connect(server.url, **options)
 
 

@@ -11,6 +11,7 @@ from fake_platform import FakePlatform, echo_services
 
 import client_sdk
 from client_sdk.local_services import LocalServices
+from client_sdk.network.timings import ConnectTimings
 from client_sdk.stats import StatsKeeper
 from rse_pf.config import PlatformSettings, SessionSettings
 from rse_pf.errors import (
@@ -27,12 +28,14 @@ from rse_pf.services.builtin import builtin_services
 from rse_pf.services.echo import EchoReply
 from rse_pf.wire import Failure
 
-FAST = SessionSettings(reconnect_max_s=0.05, stall_timeout_s=0.4)
+FAST = SessionSettings(stall_timeout_s=0.4)
 OWN_ECHO = client_sdk.CloudFirst(registry=echo_services(), robot_solve_s=0.01)
 
 
 def connect(platform, **options):
-    return client_sdk.connect(platform.url, settings=FAST, random=Random(1), **options)
+    return client_sdk.connect(
+        platform.url, settings=FAST, timings=ConnectTimings(reconnect_max_s=0.05), random=Random(1), **options
+    )
 
 
 async def test_a_typed_reply_comes_typed_and_a_wrong_type_is_a_bad_message():

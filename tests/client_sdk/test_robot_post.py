@@ -10,17 +10,24 @@ import pytest
 from fakes import FakeRobot, FakeServer, answer_at_once, answer_nothing
 
 import client_sdk
+from client_sdk.network.timings import ConnectTimings
 from rse_pf.config import SessionSettings
 from rse_pf.errors import Disconnected
 from rse_pf.wire import Command, Failure, Result, make_codec
 from rse_pf.wire.client_session import Answered
 from rse_pf.wire.preencoded import preencode
 
-FAST = SessionSettings(reconnect_max_s=0.05, stall_timeout_s=0.4, ping_interval_s=0.2)
+FAST = SessionSettings(stall_timeout_s=0.4, ping_interval_s=0.2)
 
 
 def connect(server: FakeServer, **options: Any) -> client_sdk.Robot:
-    return client_sdk.connect(server.url, settings=FAST, random=random.Random(1), **options)
+    return client_sdk.connect(
+        server.url,
+        settings=FAST,
+        timings=ConnectTimings(reconnect_max_s=0.05),
+        random=random.Random(1),
+        **options,
+    )
 
 
 class Ends:

@@ -13,6 +13,7 @@ import pytest
 from fake_platform import FakePlatform, FakeSocket
 
 import client_sdk
+from client_sdk.network.timings import ConnectTimings
 from rse_pf.config import SessionSettings
 from rse_pf.errors import ConnectError, Unauthorized, UsageError
 from rse_pf.wire.server_session import CLOSE_REPLACED
@@ -21,13 +22,12 @@ from tests.client_sdk.delaying_proxy import DelayingProxy
 pytestmark = pytest.mark.system
 
 QUICK = SessionSettings(
-    connect_timeout_s=1.0,
     stall_timeout_s=0.6,
     ping_interval_s=0.1,
     ping_timeout_s=0.8,
-    reconnect_max_s=0.05,
-    reconnect_long_max_s=0.2,
-    region_hold_s=0.5,
+)
+TIMINGS = ConnectTimings(
+    connect_timeout_s=1.0, reconnect_max_s=0.05, reconnect_long_max_s=0.2, region_hold_s=0.5
 )
 NEAR_S, FAR_S = 0.01, 0.06
 
@@ -59,9 +59,10 @@ class TwoRegions:
         if what == "stands-by":
             self._stands_by.set()
 
-    def robot(self, settings=QUICK, **options):
+    def robot(self, settings=QUICK, timings=TIMINGS, **options):
         return client_sdk.connect(
-            [self.far_link.url, self.near_link.url], settings=settings, random=random.Random(1),
+            [self.far_link.url, self.near_link.url], settings=settings, timings=timings,
+            random=random.Random(1),
             on_change=self._changed, **options,
         )  # fmt: skip
 
@@ -104,7 +105,7 @@ async def test_a_region_is_no_nearer_for_saying_that_all_of_the_time_was_its_own
             regions.near_link.delay_s = 0.04
             async with regions.robot(codec="json") as a_robot:
                 await regions.both_joined()
-                until = time.monotonic() + 3 * QUICK.region_hold_s
+                until = time.monotonic() + 3 * TIMINGS.region_hold_s
                 while time.monotonic() < until:
                     assert (await ask(a_robot, 1)).server == "near-1"
 
@@ -207,7 +208,7 @@ async def test_a_robot_that_no_region_knows_is_told_so_at_once():
 async def test_two_addresses_of_one_platform_do_not_replace_each_other_for_ever():
     async with (
         TwoRegions() as regions,
-        regions.robot(settings=replace(QUICK, region_hold_s=60.0)) as a_robot,
+        regions.robot(timings=replace(TIMINGS, region_hold_s=60.0)) as a_robot,
     ):
         await regions.both_joined()
         # What a platform does with the older of two connections of one robot.
@@ -236,7 +237,7 @@ async def test_a_blocking_robot_takes_several_addresses_too():
 
         def drive():
             urls = [regions.far_link.url, regions.near_link.url]
-            with client_sdk.connect_blocking(urls, settings=QUICK) as a_robot:
+            with client_sdk.connect_blocking(urls, settings=QUICK, timings=TIMINGS) as a_robot:
                 return a_robot.call("echo", {"value": 1}).server, a_robot.stats.region
 
         assert await asyncio.to_thread(drive) == ("near-1", regions.near_link.url)

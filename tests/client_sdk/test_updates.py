@@ -10,19 +10,22 @@ import pytest
 from fake_platform import FakePlatform
 
 import client_sdk
+from client_sdk.network.timings import ConnectTimings
 from client_sdk.updates import Updates
 from rse_pf.config import SessionSettings
 from rse_pf.errors import Disconnected, Forbidden
 from rse_pf.wire import CODECS
 
 QUICK = SessionSettings(
-    connect_timeout_s=0.5, stall_timeout_s=0.3, ping_interval_s=0.1, ping_timeout_s=0.5,
-    reconnect_max_s=0.05,
+    stall_timeout_s=0.3, ping_interval_s=0.1, ping_timeout_s=0.5,
 )  # fmt: skip
+TIMINGS = ConnectTimings(connect_timeout_s=0.5, reconnect_max_s=0.05)
 
 
 def robot(platform: FakePlatform, **options: Any) -> client_sdk.Robot:
-    return client_sdk.connect(platform.url, settings=QUICK, random=random.Random(1), **options)
+    return client_sdk.connect(
+        platform.url, settings=QUICK, timings=TIMINGS, random=random.Random(1), **options
+    )
 
 
 async def subscribed(platform: FakePlatform, number: int = 0) -> Any:
@@ -131,7 +134,7 @@ async def test_a_blocking_robot_iterates_without_asyncio() -> None:
         seen: list[Any] = []
 
         def drive() -> None:
-            blocking = client_sdk.connect_blocking(platform.url, settings=QUICK)
+            blocking = client_sdk.connect_blocking(platform.url, settings=QUICK, timings=TIMINGS)
             with blocking as a_robot, a_robot.subscribe("live/m") as updates:
                 for key, value in updates:
                     seen.append((key, value))

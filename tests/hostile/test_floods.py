@@ -34,7 +34,7 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[GuardedServer]:
     """One worker with short timeouts, where sockets come directly and from one address."""
     groups: dict[str, dict[str, Any]] = {
         "serving": {
-            "slow_reader_timeout_s": 0.3, "write_buffer_bytes": 65536,
+            "slow_reader_timeout_s": 0.3,
             "trusted_proxies": 0, "max_unauthenticated_per_source": 20, "max_unauthenticated": 40,
             "max_handshakes_per_source_per_s": 0.0, "max_accepts_per_s": 0.0,
         },

@@ -30,9 +30,9 @@ LIBRARY = find_library()
 pytestmark = pytest.mark.skipif(LIBRARY is None, reason="the native core is not built: make -C native")
 
 
-def registered(engine: str = "native", most: int = 5000) -> Registry:
+def registered(engine: str = "native") -> Registry:
     registry = Registry()
-    pnp.register(registry, PnpSettings(engine=engine, max_correspondences=most))
+    pnp.register(registry, PnpSettings(engine=engine))
     return registry
 
 
@@ -112,10 +112,11 @@ def test_what_the_native_core_does_not_plainly_know_is_answered_by_python(
     assert not isinstance(reply, EncodedReply)
 
 
-def test_a_server_with_limits_or_another_engine_answers_as_before() -> None:
+def test_a_server_with_limits_or_another_engine_answers_as_before(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rse_pf.services.pnp.MAX_CORRESPONDENCES", 39)
     problem = make_problem(seed=1, n=40)
     request = make_request(problem.points_world, problem.pixels, problem.camera)
-    for registry in (registered(most=39), registered("poselib")):
+    for registry in (registered(), registered("poselib")):
         expected, _ = answer_of(request, "json", plain=False, registry=registry)
         got, reply = answer_of(request, "json", plain=True, registry=registry)
 

@@ -165,7 +165,7 @@ def store(ports: dict[str, int], data: bytes) -> str:
 async def source_of_a_pose(ports: dict[str, int]) -> str:
     """Return who computed a pose that a robot asked for."""
     problem = make_problem(seed=1)
-    url = f"ws://127.0.0.1:{ports['port']}{SETTINGS.serving.path}"
+    url = f"ws://127.0.0.1:{ports['port']}/ws"
     async with client_sdk.connect(url, token=token()) as robot:
         frame = problem.points_world, problem.pixels, problem.camera
         return (await robot.solve_pnp(*frame, deadline_s=PATIENT_S)).source

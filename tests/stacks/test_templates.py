@@ -76,7 +76,7 @@ def test_the_group_has_the_settings_bounds_and_asks_the_load_balancer(assembly: 
 
     assert (group["MinSize"], group["MaxSize"]) == (str(scaling.min_servers), str(scaling.max_servers))
     assert group["HealthCheckType"] == "ELB"
-    assert group["HealthCheckGracePeriod"] == assembly.settings.health.grace_s
+    assert group["HealthCheckGracePeriod"] == 90
     assert group["DefaultInstanceWarmup"] == scaling.warm_up_s
     assert len(group["TargetGroupARNs"]) == (2 if assembly.settings.data.enabled else 1)
 
@@ -216,7 +216,7 @@ def test_the_front_door_speaks_tls_unless_it_is_a_lab(assembly: Assembly) -> Non
     else:
         assert (listener["Port"], listener["Protocol"]) == (443, "HTTPS")
         assert listener["SslPolicy"] == "ELBSecurityPolicy-TLS13-1-2-Res-2021-06"
-        assert url == f"wss://robots.example.org{assembly.settings.serving.path}"
+        assert url == "wss://robots.example.org/ws"
 
 
 def test_the_load_balancer_refuses_what_two_readers_may_understand_differently(assembly: Assembly) -> None:

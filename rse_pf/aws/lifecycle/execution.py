@@ -28,7 +28,7 @@ from rse_pf.config import PlatformSettings
 from rse_pf.config.resource_names import ResourceNames
 from rse_pf.config.schedule import minimum_at, parse_schedule, zone_named
 from rse_pf.errors import DeploymentFailed
-from rse_pf.scaling.health import DRAIN_S
+from rse_pf.scaling.health import DRAIN_S, GRACE_S
 
 __all__ = ["StepContext", "Tools", "carry_out"]
 
@@ -183,7 +183,7 @@ def _forget(step: Step, world: StepContext) -> None:
 
 
 def _await_healthy(step: Step, world: StepContext) -> None:
-    limit_s = world.settings.health.grace_s + _HEALTHY_S
+    limit_s = GRACE_S + _HEALTHY_S
     deadline = world.clock() + limit_s
     while True:
         group = read_group(world.account, world.settings, now=world.now(), asks_robots=False)

@@ -15,7 +15,13 @@ from typing import Literal
 from rse_pf.aws.fleet.metrics import ServerMetrics, datums
 from rse_pf.aws.money.prices import Prices
 from rse_pf.config import PlatformSettings
-from rse_pf.config.cloud_layout import CANARY_MB, CANARY_PERIOD_S, ENDPOINT_SERVICES, zone_count
+from rse_pf.config.cloud_layout import (
+    CANARY_MB,
+    CANARY_PERIOD_S,
+    ENDPOINT_SERVICES,
+    LAMBDA_MEMORY_MB,
+    zone_count,
+)
 from rse_pf.config.front_door import rate_rules
 from rse_pf.scaling.alarms import alarms_of
 from rse_pf.scaling.operator_alarms import operator_alarms
@@ -51,8 +57,6 @@ _CONNECTIONS_OF_A_UNIT = 3000
 _BYTES_OF_A_UNIT = 1e9
 # The load balancer needs a public address in each of two zones.
 _BALANCER_ZONES = 2
-# Memory at which AWS gives a function one whole vCPU.
-_MB_OF_A_VCPU = 1769
 # Metrics that EC2 publishes each minute for a server with detailed monitoring.
 _DETAILED_METRICS = 7
 # Metrics that the agent of a server with robots reads each period: the numbers of robots and of servers.
@@ -138,7 +142,7 @@ def bill_of(settings: PlatformSettings, prices: Prices, load: Load | None = None
         *_server_lines(settings, prices, load),
         *_balancer_lines(settings, prices, load),
         *_standing_lines(settings, prices),
-        *_lambda_lines(settings, prices, load.burst_commands_per_day * HOURS / DAY_H),
+        *_lambda_lines(prices, load.burst_commands_per_day * HOURS / DAY_H),
     )
     return Bill(tuple(line for line in lines if line.count))
 
@@ -152,15 +156,15 @@ def parked(bill: Bill, *, deep: bool) -> Bill:
     return Bill(tuple(line for line in bill.lines if line.needs not in gone))
 
 
-def lambda_alone(settings: PlatformSettings, prices: Prices, load: Load) -> float:
+def lambda_alone(prices: Prices, load: Load) -> float:
     """Return what a month costs if the Lambda answers every command of *load*."""
     commands = load.commands_per_s * load.hours * _HOUR_S
-    return sum(line.count * line.price for line in _lambda_lines(settings, prices, commands))
+    return sum(line.count * line.price for line in _lambda_lines(prices, commands))
 
 
-def lambda_executions(settings: PlatformSettings, prices: Prices, load: Load) -> float:
+def lambda_executions(prices: Prices, load: Load) -> float:
     """Return how many executions the Lambda needs at the same time to answer every command of *load*."""
-    return load.commands_per_s * _billed_ms(settings, prices) / 1e3
+    return load.commands_per_s * _billed_ms(prices) / 1e3
 
 
 def servers_needed(settings: PlatformSettings, prices: Prices, load: Load) -> int:
@@ -245,10 +249,10 @@ def _standing_lines(settings: PlatformSettings, prices: Prices) -> list[CostLine
     return _lines("nothing", rows)
 
 
-def _lambda_lines(settings: PlatformSettings, prices: Prices, commands: float) -> list[CostLine]:
+def _lambda_lines(prices: Prices, commands: float) -> list[CostLine]:
     """Return what the Lambda costs for *commands* in a month."""
     millions = commands / 1e6
-    gb_s = commands * settings.cloud.lambda_memory_mb / 1024 * _billed_ms(settings, prices) / 1e3
+    gb_s = commands * LAMBDA_MEMORY_MB / 1024 * _billed_ms(prices) / 1e3
     rows = (
         ("Lambda", "executions", millions, "million", prices.lambda_per_million),
         ("Lambda", "computing", gb_s, "GB-s", prices.lambda_per_gb_s),
@@ -257,10 +261,9 @@ def _lambda_lines(settings: PlatformSettings, prices: Prices, commands: float) -
     return _lines("nothing", rows)
 
 
-def _billed_ms(settings: PlatformSettings, prices: Prices) -> int:
-    """Return the time of a warm execution; less memory is less of a vCPU."""
-    slowdown = max(1.0, _MB_OF_A_VCPU / settings.cloud.lambda_memory_mb)
-    return math.ceil(prices.command_cpu_ms * slowdown)
+def _billed_ms(prices: Prices) -> int:
+    """Return the time of a warm execution, which AWS rounds up to a millisecond."""
+    return math.ceil(prices.command_cpu_ms)
 
 
 def _count_published_metrics() -> tuple[int, int]:

@@ -77,7 +77,7 @@ def _answer(registry: Registry, settings: PlatformSettings, store: ObjectStore |
     try:
         if store is not None:
             kind = registry.get(name).request_type
-            payload = resolve(kind, payload, RobotId(*robot), store, settings=settings.serving)
+            payload = resolve(kind, payload, RobotId(*robot), store)
     except RsePfError as error:
         return _encode_failure(failure_of(error))
     command = Command(id=0, service=name, payload=payload, trace=trace)

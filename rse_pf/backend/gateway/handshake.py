@@ -26,9 +26,10 @@ from rse_pf.auth.tokens import (
     token_problem,
     verify_token,
 )
+from rse_pf.backend.gateway.rate_limits import RATE_BAN_S
 from rse_pf.backend.rosbridge.codec import CODEC as ROSBRIDGE
 from rse_pf.config import PlatformSettings
-from rse_pf.config.resource_names import HEALTH_PATH, ROSBRIDGE_PATH
+from rse_pf.config.resource_names import HEALTH_PATH, ROBOTS_PATH, ROSBRIDGE_PATH
 from rse_pf.errors import Unauthorized
 from rse_pf.identity import DEFAULT_TENANT, RobotId
 from rse_pf.wire import SUBPROTOCOLS, codec_for
@@ -208,20 +209,19 @@ class HandshakePolicy:
         self._settings = settings
         self.keys = keys
         self._conformance_echo = conformance_echo
-        path = settings.serving.path
-        self._path = path.encode()
+        self._path = ROBOTS_PATH.encode()
         self._rosbridge = ROSBRIDGE_PATH.encode() if settings.serving.rosbridge else None
         self._origins = AllowedOrigins(settings.serving.allowed_origins)
         self._healthy = _http_answer(200, HEALTH, b'{"status":"ok"}', _JSON)
         self.defect = _rejection(500, "internal", "the handshake failed", "try again")
-        self._not_found = _rejection(404, "not-found", "nothing is served here", f"connect to {path}")
+        self._not_found = _rejection(404, "not-found", "nothing is served here", f"connect to {ROBOTS_PATH}")
         self._full = _rejection(
             503, "full", "this server serves as many robots as it may", "try again later",
             Retry_After=str(_RETRY_AFTER_S),
         )  # fmt: skip
         self.too_fast = _rejection(
             429, "quota", "too many messages, or handshakes of this address", "wait, and slow down",
-            Retry_After=str(max(1, math.ceil(settings.session.rate_ban_s))),
+            Retry_After=str(max(1, math.ceil(RATE_BAN_S))),
         )  # fmt: skip
         self._no_token = _rejection(
             401, "unauthorized", "the token is missing or not valid",

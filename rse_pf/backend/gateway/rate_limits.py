@@ -18,11 +18,13 @@ from rse_pf.identity import RobotId
 from rse_pf.token_bucket import TokenBucket
 from rse_pf.wire.rate_limit import command_burst
 
-__all__ = ["CUT_OFF", "HANDSHAKE_BURST", "RobotRates", "SourceRates"]
+__all__ = ["CUT_OFF", "HANDSHAKE_BURST", "RATE_BAN_S", "RobotRates", "SourceRates"]
 
 CUT_OFF = math.inf
 """The robot ignores refusals, so that its connection ends: it may not try again at all."""
 
+# A robot that was disconnected for its rate is refused for this long.
+RATE_BAN_S = 5.0
 HANDSHAKE_BURST = 1000.0
 """Sockets or handshakes above their rate that are accepted at once: a fleet that comes back."""
 _MAX_NAMES = 20000
@@ -48,7 +50,7 @@ class RobotRates:
     """The rate of each robot, over all of its sockets of one worker.
 
     A violation is `command_burst` refusals: a robot a little above its rate gets refusals only, one
-    far above it is cut off within a second and banned for ``session.rate_ban_s``.
+    far above it is cut off within a second and banned for `RATE_BAN_S`.
     """
 
     def __init__(self, limits: SessionSettings, *, max_names: int = _MAX_NAMES) -> None:
@@ -74,14 +76,14 @@ class RobotRates:
             return 0.0
         if self._violations(known, now) >= _MAX_VIOLATIONS:
             known.violations.clear()
-            known.banned_until = now + self._limits.rate_ban_s
+            known.banned_until = now + RATE_BAN_S
             return CUT_OFF
         return max(_MIN_RETRY_MS, wait_s * 1e3)
 
     def ban(self, robot: RobotId, now: float, seconds: float | None = None) -> None:
-        """Refuse the handshakes of *robot*, cut off at *now* (s), for *seconds* or ``session.rate_ban_s``."""
+        """Refuse the handshakes of *robot*, cut off at *now* (s), for *seconds* or `RATE_BAN_S`."""
         known = self._robots.get(robot) or self._add(robot, now)
-        known.banned_until = now + (self._limits.rate_ban_s if seconds is None else seconds)
+        known.banned_until = now + (RATE_BAN_S if seconds is None else seconds)
 
     def banned_s(self, robot: RobotId, now: float) -> float:
         """Return for how many seconds more *robot* is banned, 0 if it is not."""

@@ -33,7 +33,7 @@ from rse_pf.backend.gateway.socket_poller import SocketPoller
 from rse_pf.backend.ports import CrashMarks
 from rse_pf.backend.scheduling.deferred_work import DeferredWork
 from rse_pf.config import ServingSettings
-from rse_pf.config.front_door import MAX_HANDSHAKE_BYTES
+from rse_pf.config.front_door import MAX_HANDSHAKE_BYTES, WRITE_BUFFER_BYTES
 from rse_pf.errors import MissingExtra
 from rse_pf.silent_connections import PendingHandshakes
 
@@ -156,7 +156,6 @@ class RobotSockets:
         self._context = dispatcher.context
         self._handshake = handshake
         serving = self._context.settings.serving
-        self._write_buffer_bytes = serving.write_buffer_bytes
         self._max_robots = max_robots
         self._sources = SourceRates(serving)
         per_source = 0 if serving.trusted_proxies else serving.max_unauthenticated_per_source
@@ -287,7 +286,7 @@ class RobotSockets:
         accepted = pending.accepted
         try:
             # Otherwise the kernel buffers megabytes for a slow reader, unnoticed.
-            accepted.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, self._write_buffer_bytes)
+            accepted.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, WRITE_BUFFER_BYTES)
             protocol = self._protocol(listener, verdict.subprotocol, upgrade, rest, pending.on_end)
             self._transport(self._poller, accepted, protocol)
         except OSError:
@@ -431,8 +430,9 @@ def listener_type(
 
         def on_ws_connected(self, transport: Any) -> None:
             self._transport = transport
-            high = serving.write_buffer_bytes
-            transport.underlying_transport.set_write_buffer_limits(high=high, low=high // 4)
+            transport.underlying_transport.set_write_buffer_limits(
+                high=WRITE_BUFFER_BYTES, low=WRITE_BUFFER_BYTES // 4
+            )
             if crash is not None and self._accepted.claims is not None:
                 crash.enter(self._number, self._accepted.robot)
             self._connection = self._dispatcher.connect(self, self._accepted, self._number)

@@ -158,7 +158,7 @@ def _resolve_payload(request: JobRequest, kind: type[Any], settings: PlatformSet
     if not named_in(kind, request.payload):
         return request.payload
     store = open_data_store(settings)
-    return resolve(kind, request.payload, request.robot, store, settings=settings.serving)
+    return resolve(kind, request.payload, request.robot, store)
 
 
 def _check_quota(request: JobRequest, settings: PlatformSettings) -> None:

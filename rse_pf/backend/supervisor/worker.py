@@ -219,7 +219,7 @@ class _Worker:
             context,
             registry=registry,
             services=frozenset(service.name for service in (*registry, *installed)) | LIVE_SERVICES,
-            objects=ObjectRefs(store, settings.serving, settings.data),
+            objects=ObjectRefs(store, settings.data),
         )
         handshake = HandshakePolicy(settings, plan.keys, conformance_echo=plan.conformance_echo)
         self._recorder = AuditRecorder(context.clocks, loop=loop, tell=self._say, is_on=plan.audit)

@@ -128,13 +128,13 @@ def _show_alternatives(bill: Bill, settings: PlatformSettings, prices: Prices, l
         "parked outside of the hours, --deep": f"{share * at_work + (1 - share) * deep:.2f}",
         "parked all month": f"{shallow:.2f}",
         "parked all month, --deep": f"{deep:.2f}",
-        "on the Lambda alone": f"{lambda_alone(settings, prices, load):.2f}",
+        "on the Lambda alone": f"{lambda_alone(prices, load):.2f}",
     }
     show("")
     for name, amount in rows.items():
         show(f"{name:<40}{amount:>10} {prices.currency}")
     servers, most = servers_needed(settings, prices, load), settings.scaling.max_servers
-    executions, concurrency = lambda_executions(settings, prices, load), settings.cloud.lambda_concurrency
+    executions, concurrency = lambda_executions(prices, load), settings.cloud.lambda_concurrency
     show(
         "",
         f"the fleet needs {counted(servers, 'server')} of at most {most}, the Lambda alone {executions:.1f} "

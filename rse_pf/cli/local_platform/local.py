@@ -42,6 +42,8 @@ from rse_pf.terminal import show, show_json, show_page
 __all__ = ["DEFAULT_NAME", "add_arguments", "run"]
 
 DEFAULT_NAME = "default"
+# Port on loopback of the burst function, unless --burst names another one.
+_BURST_PORT = 8702
 _FAULTS = ("kill", "pause", "resume", "slow", "partition")
 _OF_A_SERVER = (*_FAULTS, "drain")
 _ACTIONS = ("start", "stop", "status", "robots", "logs", "drain", "roll", *_FAULTS, "kill-balancer")
@@ -98,8 +100,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--no-page", action="store_true", help="start no fleet page")
     parser.add_argument(
         "--burst", nargs="?", type=int, const=0, metavar="P",
-        help="also run the burst function, at port P on loopback (local.burst_port, default "
-        f"{defaults.burst_port}): robots ask it while no server answers in time",
+        help="also run the burst function, at port P on loopback (default "
+        f"{_BURST_PORT}): robots ask it while no server answers in time",
     )  # fmt: skip
     parser.add_argument(
         "--no-data", action="store_true", help="start no data service (large data by HTTP under /data/)"
@@ -143,7 +145,7 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     chosen = with_recordings(_with_services(chosen, args), args.record)
     lan = chosen_address(args.lan)
     page = not args.no_page
-    burst_port = None if args.burst is None else args.burst or chosen.local.burst_port
+    burst_port = None if args.burst is None else args.burst or _BURST_PORT
     if burst_port is not None:
         chosen = _with_burst(chosen, burst_port, lan)
     return asyncio.run(

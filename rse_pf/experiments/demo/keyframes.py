@@ -16,7 +16,6 @@ from client_sdk.frontend import FrontEndOptions, TrackedFrame, extract
 from client_sdk.slots import FeaturesFunction, FeaturesSlot
 from client_sdk.transfer.background_upload import BackgroundUploader
 from client_sdk.transfer.data_client import DataClient
-from rse_pf.config import DataSettings
 from rse_pf.experiments.demo.merge import commit
 from rse_pf.maps.format import Keyframe, MapVersion, encode_map
 
@@ -33,12 +32,11 @@ class KeyframeUploads:
         url: str,
         token: Callable[[], str],
         spool: Path,
-        settings: DataSettings,
         is_busy: Callable[[], bool],
     ) -> None:
         """Begin to upload; while *is_busy* (a live pose is on its way) keyframes wait."""
         self._client = DataClient(url, token)
-        self._background = BackgroundUploader(DataClient(url, token), spool, settings, is_busy=is_busy)
+        self._background = BackgroundUploader(DataClient(url, token), spool, is_busy=is_busy)
         self._background.start()
 
     def keyframe(self, data: bytes) -> None:

@@ -28,7 +28,7 @@ from client_sdk.offloading.offload import CloudFirst
 from client_sdk.robot import Robot
 from client_sdk.slots import load_features
 from client_sdk.source_facts import DoubtLog, unresolved
-from rse_pf.config import DataSettings, SessionSettings
+from rse_pf.config import SessionSettings
 from rse_pf.errors import RsePfError, error_of_system
 from rse_pf.experiments.child_process import ChildFailed, ChildReady, ParentPipe
 from rse_pf.experiments.demo.keyframes import KeyframeCollector, KeyframeUploads
@@ -111,7 +111,6 @@ class RobotSpec:
     folder: Path
     options: DemoOptions
     session: SessionSettings
-    data_settings: DataSettings
     has_offload: bool = False
     """Whether it solves poses itself where the cloud does not answer, and keeps keyframes on its disk."""
 
@@ -362,7 +361,7 @@ def _collector(
 ) -> KeyframeCollector | None:
     if not spec.options.merge:
         return None
-    uploads = KeyframeUploads(spec.url, token, spec.folder / "spool", spec.data_settings, is_busy)
+    uploads = KeyframeUploads(spec.url, token, spec.folder / "spool", is_busy)
     features = load_features(spec.options.features)
     return KeyframeCollector(spec.name, spec.options.frontend_options, uploads, features)
 

@@ -151,7 +151,6 @@ async def _run(
                         folder=folder / _name(number),
                         options=options,
                         session=settings.session,
-                        data_settings=settings.data,
                         has_offload=fault is not None and fault.has_offload,
                     ),
                     screen,

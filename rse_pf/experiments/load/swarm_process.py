@@ -42,6 +42,8 @@ __all__ = [
 _NO_PARTS = (math.nan,) * 4
 _ROWS = 256
 _FLUSH_EVERY_S = 0.5
+# Pause of a robot whose first connection failed.
+_REJOIN_S = 1.0
 _PHASE = (math.sqrt(5.0) - 1.0) / 2.0
 
 
@@ -286,7 +288,7 @@ class _Robot:
                 break
             except RsePfError as error:
                 process.report("join-failed", robot=self.name, code=error.code, why=error.message)
-                await asyncio.sleep(spec.session.reconnect_max_s)
+                await asyncio.sleep(_REJOIN_S)
         first = plan_s(scenario, self._number, start_s, 0)
         missed = max(0, math.ceil((time.monotonic() - first) * scenario.fps))
         if self._stopping:

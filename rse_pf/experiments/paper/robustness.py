@@ -71,7 +71,9 @@ def run_robustness(options: RobustnessOptions, settings: PlatformSettings) -> in
     """Run the faults, write records, report and figure; return 1 if a command was lost or duplicated."""
     require_matplotlib()
     # One server must be able to serve the robots of another one: give it a worker for each of two cores.
-    settings = settings.replace(local={"workers": max(settings.local.workers, min(2, os.cpu_count() or 1))})
+    settings = settings.replace(
+        serving={"workers": max(settings.serving.workers, min(2, os.cpu_count() or 1))}
+    )
     folder = fresh_folder(
         options.out, [*RUN_FILES, FIGURE, *SCENARIOS, *(f"{name}-[1-9]*" for name in SCENARIOS)]
     )

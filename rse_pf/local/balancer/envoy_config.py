@@ -13,8 +13,14 @@ from pathlib import Path
 from typing import Any
 
 from rse_pf.config import PlatformSettings
-from rse_pf.config.front_door import BODY_TIMEOUT_S, DATA_PATH, LOCALISE_PATH, MAX_HANDSHAKE_BYTES
-from rse_pf.config.resource_names import HEALTH_PATH, READY_PATH, ROSBRIDGE_PATH
+from rse_pf.config.front_door import (
+    BODY_TIMEOUT_S,
+    DATA_PATH,
+    LOCALISE_PATH,
+    MAX_HANDSHAKE_BYTES,
+    WRITE_BUFFER_BYTES,
+)
+from rse_pf.config.resource_names import HEALTH_PATH, READY_PATH, ROBOTS_PATH, ROSBRIDGE_PATH
 from rse_pf.local.lan.listener import CERTIFICATE_NAME, LanListener, secret_file
 from rse_pf.scaling.health import HEALTHY_CHECKS, LOCAL_INTERVAL_S, LOCAL_TIMEOUT_S
 
@@ -149,8 +155,8 @@ def _listener(settings: PlatformSettings, port: int, lan: LanListener | None) ->
         # Robots that are connected wait for no burst of new connections.
         "max_connections_to_accept_per_socket_event": 1,
         # Behind a slow reader no more is kept, here and in the kernel, than a server would keep itself.
-        "per_connection_buffer_limit_bytes": settings.serving.write_buffer_bytes,
-        "socket_options": [_kernel_buffer(socket.SO_SNDBUF, settings), _unread_timeout(settings)],
+        "per_connection_buffer_limit_bytes": WRITE_BUFFER_BYTES,
+        "socket_options": [_kernel_buffer(socket.SO_SNDBUF), _unread_timeout(settings)],
         "filter_chains": [{"filters": [{"name": "http", "typed_config": manager}], **_tls(settings, lan)}],
     }
 
@@ -192,9 +198,10 @@ def _watched_certificate(lan: LanListener) -> dict[str, Any]:
     return {"tls_certificate_sds_secret_configs": [{"name": CERTIFICATE_NAME, "sds_config": config}]}
 
 
-def _kernel_buffer(name: int, settings: PlatformSettings) -> dict[str, Any]:
-    value = settings.serving.write_buffer_bytes
-    return {"level": socket.SOL_SOCKET, "name": name, "int_value": value, "state": "STATE_PREBIND"}
+def _kernel_buffer(name: int) -> dict[str, Any]:
+    return {
+        "level": socket.SOL_SOCKET, "name": name, "int_value": WRITE_BUFFER_BYTES, "state": "STATE_PREBIND",
+    }  # fmt: skip
 
 
 def _unread_timeout(settings: PlatformSettings) -> dict[str, Any]:
@@ -246,7 +253,7 @@ def _virtual_host(settings: PlatformSettings) -> dict[str, Any]:
         "name": "platform",
         "domains": ["*"],
         "routes": [
-            {"match": {"path": settings.serving.path}, "route": route},
+            {"match": {"path": ROBOTS_PATH}, "route": route},
             *(({"match": {"path": ROSBRIDGE_PATH}, "route": route},) if settings.serving.rosbridge else ()),
             {"match": {"path": HEALTH_PATH}, "route": {**route, "timeout": timeout}},
             # Each would ask the store; the balancer's own checks do not pass the listener.
@@ -282,8 +289,8 @@ def _cluster(
         # A server that leaves the file gets nothing new, and keeps its open sockets.
         "ignore_health_on_host_removal": True,
         "connect_timeout": "0.5s",
-        "upstream_bind_config": {"socket_options": [_kernel_buffer(socket.SO_RCVBUF, settings)]},
-        "per_connection_buffer_limit_bytes": settings.serving.write_buffer_bytes,
+        "upstream_bind_config": {"socket_options": [_kernel_buffer(socket.SO_RCVBUF)]},
+        "per_connection_buffer_limit_bytes": WRITE_BUFFER_BYTES,
         "circuit_breakers": {"thresholds": [dict.fromkeys(limits, _NO_LIMIT)]},
         "health_checks": [
             {

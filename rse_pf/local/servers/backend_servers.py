@@ -182,6 +182,6 @@ def local_placement(settings: PlatformSettings, state: Path) -> ServerPlacement:
         port=0,
         control_host=_LOOPBACK,
         control_port=0,
-        workers=settings.local.workers,
+        workers=settings.serving.workers or 1,  # the servers share the cores of one machine
         store=f"dir:{state / 'objects'}" if store == "memory:" else store,
     )

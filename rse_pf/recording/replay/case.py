@@ -132,7 +132,6 @@ def _settings_of(metadata: Mapping[str, str]) -> dict[str, str]:
         given = msgspec.json.decode(metadata.get("pnp", "{}"))
         settings = PnpSettings(
             engine=str(given["engine"]),
-            max_correspondences=int(given["max_correspondences"]),
             max_iterations=int(given["max_iterations"]),
         )
     except (msgspec.DecodeError, RsePfError, KeyError, TypeError, ValueError):

@@ -109,24 +109,16 @@ def test_the_lambda_alone_pays_for_a_command_what_a_burst_pays() -> None:
 
     of_bursts = bill_of(SETTINGS, prices, burst).sum_by_box()["Lambda"]
 
-    assert lambda_alone(SETTINGS, prices, every) == pytest.approx(of_bursts, abs=0.02)
+    assert lambda_alone(prices, every) == pytest.approx(of_bursts, abs=0.02)
 
 
-@pytest.mark.parametrize(
-    ("memory_mb", "cpu_ms", "billed_ms"),
-    [
-        pytest.param(2048, 1.5, 2, id="billed by the millisecond"),
-        pytest.param(1769, 7.0, 7, id="one vCPU"),
-        pytest.param(885, 7.0, 14, id="less memory is less of a vCPU"),
-    ],
-)
-def test_the_lambda_is_billed_by_memory_and_time(memory_mb: int, cpu_ms: float, billed_ms: int) -> None:
-    settings = SETTINGS.replace(cloud={"lambda_memory_mb": memory_mb})
+@pytest.mark.parametrize(("cpu_ms", "billed_ms"), [(1.5, 2), (7.0, 7)])
+def test_the_lambda_is_billed_by_memory_and_by_the_millisecond(cpu_ms: float, billed_ms: int) -> None:
     prices = replaced(lambda_per_million=0.0, lambda_per_gb_s=1e-5, command_cpu_ms=cpu_ms)
 
-    gb_s = 730 * 3600 * memory_mb / 1024 * billed_ms / 1e3
-    assert lambda_alone(settings, prices, at(1, fps=1.0)) == pytest.approx(gb_s * 1e-5)
-    assert lambda_executions(settings, prices, at(1000, fps=1.0)) == pytest.approx(billed_ms)
+    gb_s = 730 * 3600 * 1769 / 1024 * billed_ms / 1e3
+    assert lambda_alone(prices, at(1, fps=1.0)) == pytest.approx(gb_s * 1e-5)
+    assert lambda_executions(prices, at(1000, fps=1.0)) == pytest.approx(billed_ms)
 
 
 @pytest.mark.parametrize(

@@ -87,7 +87,7 @@ class WorkerParts:
             self.context,
             registry=self.registry,
             services=frozenset(service.name for service in self.registry),
-            objects=ObjectRefs(store, self.settings.serving, self.settings.data),
+            objects=ObjectRefs(store, self.settings.data),
         )
         self.token_watch = TokenWatch(
             self.context,

@@ -9,7 +9,6 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from client_sdk.transfer import BackgroundUploader
-from rse_pf.config import DataSettings
 from rse_pf.errors import BadRequest
 from rse_pf.token_bucket import TokenBucket
 
@@ -46,8 +45,7 @@ class FakeUploads:
 
 @contextmanager
 def started(uploads: FakeUploads, folder: Path, **more: object) -> Iterator[BackgroundUploader]:
-    settings = DataSettings(background_bytes_per_s=100_000_000, max_spool_bytes=4000)
-    uploader = BackgroundUploader(uploads, folder, settings, **more)  # type: ignore[arg-type]
+    uploader = BackgroundUploader(uploads, folder, bytes_per_s=1e8, max_spool_bytes=4000, **more)  # type: ignore[arg-type]
     uploader.start()
     try:
         yield uploader

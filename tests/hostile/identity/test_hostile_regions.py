@@ -16,15 +16,18 @@ import pytest
 from fake_platform import FakePlatform
 
 import client_sdk
+from client_sdk.network.timings import ConnectTimings
 from rse_pf.config import SessionSettings
 from rse_pf.errors import ConnectError, RsePfError
 
 pytestmark = pytest.mark.system
 
 QUICK = SessionSettings(
-    connect_timeout_s=1.0, stall_timeout_s=0.6, ping_interval_s=0.1, ping_timeout_s=0.8,
-    reconnect_max_s=0.05, reconnect_long_max_s=0.2, region_hold_s=0.5,
+    stall_timeout_s=0.6, ping_interval_s=0.1, ping_timeout_s=0.8,
 )  # fmt: skip
+TIMINGS = ConnectTimings(
+    connect_timeout_s=1.0, reconnect_max_s=0.05, reconnect_long_max_s=0.2, region_hold_s=0.5
+)
 TOKEN = "a-token-of-this-robot"
 Answer = Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None]]
 
@@ -68,7 +71,12 @@ def says(head: str, body: bytes = b"") -> Answer:
 
 def robot(*urls: str, **options: Any) -> Any:
     return client_sdk.connect(
-        list(urls), token=TOKEN, settings=options.pop("settings", QUICK), random=random.Random(1), **options
+        list(urls),
+        token=TOKEN,
+        settings=QUICK,
+        timings=options.pop("timings", TIMINGS),
+        random=random.Random(1),
+        **options,
     )
 
 
@@ -154,7 +162,7 @@ async def test_a_token_goes_to_no_region_whose_certificate_is_not_trusted(tmp_pa
 
     async with region(says("200 OK"), ssl=context) as hostile:
         with pytest.raises(ConnectError) as raised:
-            async with robot(hostile.url, settings=replace(QUICK, connect_timeout_s=0.5)):
+            async with robot(hostile.url, timings=replace(TIMINGS, connect_timeout_s=0.5)):
                 pass
         heard, error = hostile.heard, raised.value
     assert heard == [], "no byte of the request was sent"

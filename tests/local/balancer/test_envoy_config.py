@@ -88,7 +88,7 @@ def test_health_checks_follow_the_settings() -> None:
 
 
 def test_only_the_path_of_the_robots_leads_to_a_server() -> None:
-    assert only_route(config(serving={"path": "/robots"}))["match"] == {"path": "/robots"}
+    assert only_route(config())["match"] == {"path": "/ws"}
 
 
 def test_rosbridge_has_a_way_to_the_servers_if_it_is_switched_on() -> None:
@@ -136,26 +136,24 @@ def test_large_data_has_a_way_of_its_own_that_is_never_repeated_by_the_balancer(
 
 
 def test_connections_and_buffers_are_bounded() -> None:
-    made = config(serving={"write_buffer_bytes": 65536})
+    made = config()
     (monitor,) = made["overload_manager"]["resource_monitors"]
 
     assert monitor["typed_config"]["max_active_downstream_connections"] == "12000"
-    assert listener(made)["per_connection_buffer_limit_bytes"] == 65536
-    assert cluster(made)["per_connection_buffer_limit_bytes"] == 65536
+    assert listener(made)["per_connection_buffer_limit_bytes"] == 262_144
+    assert cluster(made)["per_connection_buffer_limit_bytes"] == 262_144
 
 
 def test_a_robot_that_takes_nothing_is_ended_by_the_kernel() -> None:
-    made = config(
-        serving={"write_buffer_bytes": 65536}, session={"ping_interval_s": 2.0, "ping_timeout_s": 1.0}
-    )
+    made = config(session={"ping_interval_s": 2.0, "ping_timeout_s": 1.0})
     options = {(each["level"], each["name"]): each["int_value"] for each in listener(made)["socket_options"]}
     (upstream,) = cluster(made)["upstream_bind_config"]["socket_options"]
 
     assert options == {
-        (socket.SOL_SOCKET, socket.SO_SNDBUF): 65536,
+        (socket.SOL_SOCKET, socket.SO_SNDBUF): 262_144,
         (socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT): 6000,
     }
-    assert (upstream["name"], upstream["int_value"]) == (socket.SO_RCVBUF, 65536)
+    assert (upstream["name"], upstream["int_value"]) == (socket.SO_RCVBUF, 262_144)
 
 
 def test_the_endpoint_file_sends_robots_and_checks_to_different_ports() -> None:

@@ -118,7 +118,7 @@ def test_other_options_are_tried_and_said(tmp_path: Path) -> None:
 
 
 def test_the_limits_of_the_server_that_recorded_hold_again(tmp_path: Path) -> None:
-    small = SETTINGS.replace(pnp={"max_correspondences": 50, "max_iterations": 40})
+    small = SETTINGS.replace(pnp={"max_iterations": 40})
     made = Made(tmp_path / "a", settings=small)
     made.send(make_problem(seed=1, n=60))
     made.send(make_problem(seed=2, n=40, outlier_ratio=0.7))

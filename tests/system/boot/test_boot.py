@@ -73,7 +73,7 @@ def token() -> str:
 
 def ask_for_a_pose(world: World) -> dict:
     serving = SETTINGS.serving
-    return world.inside("pose", token(), f"ws://127.0.0.1:{serving.port}{serving.path}")
+    return world.inside("pose", token(), f"ws://127.0.0.1:{serving.port}/ws")
 
 
 def test_the_machine_becomes_healthy_in_every_attached_target_group(world: World) -> None:
@@ -113,7 +113,7 @@ def test_once_the_keys_appear_a_robot_gets_a_right_pose(world: World) -> None:
 def test_every_service_of_maps_answers_on_the_machine(world: World) -> None:
     serving = SETTINGS.serving
 
-    said = world.inside("services", token(), f"ws://127.0.0.1:{serving.port}{serving.path}")
+    said = world.inside("services", token(), f"ws://127.0.0.1:{serving.port}/ws")
 
     assert said == {"icp": "", "optimise": "", "live-start": ""}
 

@@ -122,7 +122,7 @@ def test_robots_with_a_token_are_welcomed_by_both_servers_and_nothing_is_left(
 
 async def test_the_door_refuses_who_has_no_token_and_knows_one_path_only(tmp_path: Path) -> None:
     async with LocalPlatform(SETTINGS, servers=1, port=0, state=tmp_path / "a") as cloud:
-        elsewhere = cloud.url.replace(SETTINGS.serving.path, "/elsewhere")
+        elsewhere = cloud.url.replace("/ws", "/elsewhere")
         token = cloud.issue_token("robot-1")
         assert [
             await refusal(cloud.url),

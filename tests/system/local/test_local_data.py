@@ -30,7 +30,7 @@ from rse_pf.object_store import DirectoryStore
 pytestmark = pytest.mark.system
 
 WAIT_S = 60.0
-SETTINGS = PlatformSettings().replace(local={"workers": 1})
+SETTINGS = PlatformSettings()
 MIB = 1 << 20
 
 

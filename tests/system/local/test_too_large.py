@@ -19,7 +19,7 @@ from rse_pf.local.control.platform import LocalPlatform
 pytestmark = [pytest.mark.system, pytest.mark.slow, pytest.mark.timeout(300)]
 
 MIB = 1 << 20
-SETTINGS = PlatformSettings().replace(local={"workers": 1})
+SETTINGS = PlatformSettings()
 OBJECT = "/data/v1/objects/" + "a" * 64
 TIMES = 5
 

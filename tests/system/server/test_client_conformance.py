@@ -16,6 +16,7 @@ import pytest
 import websockets
 
 from client_sdk.network.handshake import websocket_options
+from client_sdk.network.timings import ConnectTimings
 from rse_pf.config import SessionSettings
 
 pytestmark = [pytest.mark.system, pytest.mark.slow]
@@ -38,7 +39,7 @@ def free_port() -> int:
 
 async def drive(base: str) -> int:
     """Echo through every case with the options that the SDK opens its sockets with."""
-    options: dict[str, Any] = websocket_options(SessionSettings())
+    options: dict[str, Any] = websocket_options(SessionSettings(), ConnectTimings())
     cases = int(await _first_message(f"{base}/getCaseCount", options))
     for case in range(1, cases + 1):
         with contextlib.suppress(websockets.WebSocketException, asyncio.TimeoutError):

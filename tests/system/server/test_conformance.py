@@ -83,7 +83,7 @@ def test_through_the_load_balancer_only_the_order_of_closing_differs(start_serve
 
     try:
         asyncio.run(start())
-        path = settings.serving.path
+        path = "/ws"
         select = ("-x", "9.*", "-x", "12.*", "-x", "13.*")
         passed, failed, printed = run_suite(balancer.port, tmp_path / "r", *select, path=path)
     finally:

@@ -150,7 +150,7 @@ def machines(tmp_path: Path) -> Iterator[tuple[Machine, Machine]]:
 
 def robot(machine: Machine, name: str) -> client_sdk.Robot:
     token = KEY.issue(name, now=time.time(), token_id=name, settings=SETTINGS.auth)
-    url = f"ws://{machine.address}:{SETTINGS.serving.port}{SETTINGS.serving.path}"
+    url = f"ws://{machine.address}:{SETTINGS.serving.port}/ws"
     return client_sdk.connect(url, token=token, codec="bin", random=random.Random(name))
 
 

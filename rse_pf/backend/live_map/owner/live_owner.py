@@ -71,6 +71,8 @@ from rse_pf.wire.live_map import (
 
 __all__ = ["LiveOwner", "MapMoves"]
 
+# Time between two versions that a live map publishes while it changes.
+PUBLISH_S = 600.0
 _SETTLED_S = 5.0
 """An owner that served for this long does not die of its map; nor one that has measured a keyframe."""
 _LAST_VERSION_S = 3.0
@@ -124,7 +126,7 @@ class LiveOwner:
         self._present: dict[str, None] = {}
         self._renewed = asyncio.Event()
         self._wrote_snapshot = self._unsaved_bytes = 0
-        self._publish_due_s = context.clock() + (context.settings.publish_s or float("inf"))
+        self._publish_due_s = context.clock() + PUBLISH_S
         self._untold = False
         self._is_waiting_for_store = self._is_closing = False
         self._idle_since_s = self._began_s = context.clock()
@@ -456,7 +458,7 @@ class LiveOwner:
         if self._is_closing:
             return
         if now >= self._publish_due_s:
-            self._publish_due_s = now + settings.publish_s
+            self._publish_due_s = now + PUBLISH_S
             self._publisher.ask(_CHANGED)
         if now - self._used_s >= _UNUSED_SHARE * settings.idle_s:
             self._note_use(is_used=False)

@@ -53,6 +53,8 @@ __all__ = ["MAP_KIND", "OwnerOrder", "advertised_address", "run", "start_owner"]
 
 MAP_KIND = "rse_pf.backend.live_map.owner.state:LIVE_MAP"
 """Where the `MapKind` of real maps is, as ``module:name``."""
+# Memory of the process of one live map; a process that needs more is ended.
+_MAX_MEMORY_BYTES = 2 << 30
 _READ_BYTES = 1 << 16
 _RETRY_S = 0.1
 _CALM_NICE = 10
@@ -79,7 +81,7 @@ def start_owner(settings: PlatformSettings, kind: str = MAP_KIND, *, calmly: boo
     """
     child = start_child(
         ChildPlan(
-            target=f"{__name__}:run", name="rse-pf live map", memory_bytes=settings.live.max_memory_bytes,
+            target=f"{__name__}:run", name="rse-pf live map", memory_bytes=_MAX_MEMORY_BYTES,
             import_nice=_CALM_NICE if calmly else 0,
         )
     )  # fmt: skip

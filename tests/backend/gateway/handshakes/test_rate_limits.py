@@ -13,7 +13,7 @@ from rse_pf.silent_connections import PendingHandshakes
 from rse_pf.token_bucket import TokenBucket
 
 ROBOT = RobotId("default", "r")
-LIMITS = SessionSettings(max_commands_per_s=20.0, rate_ban_s=5.0)
+LIMITS = SessionSettings(max_commands_per_s=20.0)
 
 
 def judged(rates: RobotRates, per_s: float, seconds: float, robot: tuple[str, str] = ROBOT) -> list[float]:

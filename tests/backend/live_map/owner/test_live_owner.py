@@ -338,8 +338,9 @@ async def test_a_map_is_published_when_the_last_robot_leaves_and_the_same_map_on
     assert reply == {"name": MAP, "version": maps.head(MAP).id, "number": 1, "keyframes": 2}
 
 
-async def test_a_map_that_changes_is_published_every_so_often():
-    bench = Bench(publish_s=5.0)
+async def test_a_map_that_changes_is_published_every_so_often(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("rse_pf.backend.live_map.owner.live_owner.PUBLISH_S", 5.0)
+    bench = Bench()
 
     owner = await bench.own("a")
     owner.owner.users = 1
