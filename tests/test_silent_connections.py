@@ -12,13 +12,13 @@ from typing import Any
 
 import pytest
 from fakes import FakeLoop
+from http_service import http_service
 
 from lambda_pnp.local_front import LocalFront
 from rse_pf.backend.live_map.owner.link_security import client_context, server_context
 from rse_pf.backend.live_map.owner.server import listen
 from rse_pf.config.front_door import BALANCER_IDLE_TIMEOUT_S
 from rse_pf.control_http import ControlReply, serve_control
-from rse_pf.http_connections import bounded_protocol
 from rse_pf.local.control.control_port import serve_control_port
 from rse_pf.silent_connections import (
     FIRST_REQUEST_S,
@@ -27,7 +27,6 @@ from rse_pf.silent_connections import (
     SilentConnections,
     TlsListener,
 )
-from tests.test_http_connections import Transport
 
 COUNT, SECONDS, DEADLINE_S = 300, 1.0, 10.0
 TOKEN = "t" * 32
@@ -114,30 +113,14 @@ async def burst_front(folder: Path, seconds: float) -> Started:
         await front.stop()
 
 
-@contextlib.asynccontextmanager
-async def http_service(folder: Path, seconds: float, **bounds: Any) -> Started:
-    import uvicorn
+async def answer(scope: Any, receive: Any, send: Any) -> None:
+    headers = [(b"content-length", b"2")]
+    await send({"type": "http.response.start", "status": 200, "headers": headers})
+    await send({"type": "http.response.body", "body": b"{}"})
 
-    async def app(scope: Any, receive: Any, send: Any) -> None:
-        headers = [(b"content-length", b"2")]
-        await send({"type": "http.response.start", "status": 200, "headers": headers})
-        await send({"type": "http.response.body", "body": b"{}"})
 
-    listening = socket.create_server(("127.0.0.1", 0), backlog=1024)
-    protocol = bounded_protocol(seconds=seconds, **{"most_idle": 100, **bounds})
-    config = uvicorn.Config(app, http=protocol, ws="none", lifespan="off", log_level="critical")
-    server = uvicorn.Server(config)
-    server.install_signal_handlers = lambda: None  # type: ignore[attr-defined]
-    with contextlib.ExitStack() as stack:
-        stack.callback(listening.close)
-        serving = asyncio.ensure_future(server._serve([listening]))
-        while not server.started:
-            await asyncio.sleep(0)
-        try:
-            yield listening.getsockname()[1]
-        finally:
-            server.should_exit = server.force_exit = True
-            await serving
+def data_or_fleet_page(folder: Path, seconds: float, **bounds: Any) -> Any:
+    return http_service(answer, seconds=seconds, **bounds)
 
 
 @contextlib.asynccontextmanager
@@ -160,7 +143,7 @@ async def owner_of_a_map(folder: Path, seconds: float) -> Started:
         listener.close()
 
 
-KINDS = [control_of_a_server, control_of_a_platform, burst_front, http_service, owner_of_a_map]
+KINDS = [control_of_a_server, control_of_a_platform, burst_front, data_or_fleet_page, owner_of_a_map]
 BEGUN = (b"", b"G", b"GET /healthz HTTP/1.1\r\nHost: a\r\nContent-")
 """What silent connections send before they fall silent."""
 
@@ -246,7 +229,7 @@ async def test_above_the_bound_silent_connections_are_cut_at_once(kind: Any, tmp
 
 
 async def test_a_head_that_begins_after_an_answer_has_its_time_too(tmp_path: Path) -> None:
-    async with http_service(tmp_path, SECONDS) as port:
+    async with data_or_fleet_page(tmp_path, SECONDS) as port:
         (slow,) = await silent_to(port, 1, (b"GET / HTTP/1.1\r\nHost: a\r\n\r\n",))
         assert b"200" in await asyncio.get_running_loop().sock_recv(slow, 4096)
         await asyncio.get_running_loop().sock_sendall(slow, b"GET / HTTP/1.1\r\n")
@@ -255,7 +238,7 @@ async def test_a_head_that_begins_after_an_answer_has_its_time_too(tmp_path: Pat
 
 
 async def test_idle_connections_are_bounded_and_the_one_that_waited_longest_is_closed(tmp_path: Path) -> None:
-    async with http_service(tmp_path, 60.0, most_idle=5) as port:
+    async with data_or_fleet_page(tmp_path, 60.0, most_idle=5) as port:
         several = [await Honest.open(port, is_owner=False) for _ in range(6)]
         for each in several:
             await each.ask()
@@ -264,30 +247,3 @@ async def test_idle_connections_are_bounded_and_the_one_that_waited_longest_is_c
         assert b" 200 " in await several[-1].ask()
         for each in several:
             each.close()
-
-
-def test_a_served_connection_is_kept_longer_than_the_balancer_keeps_it() -> None:
-    loop = FakeLoop()
-    protocol, transport = _connected(loop)
-    for _ in range(2):
-        protocol.data_received(b"GET / HTTP/1.1\r\nHost: a\r\n\r\n")
-        protocol.on_answered(closes=False)
-        loop.advance(BALANCER_IDLE_TIMEOUT_S + 5.0)
-        assert transport.ended == ""
-    loop.advance(KEEP_ALIVE_S)
-
-    assert transport.ended == "closed"
-    protocol.connection_lost(ConnectionResetError())
-    assert loop.timers == 0
-
-
-def _connected(loop: FakeLoop) -> tuple[Any, Transport]:
-    import uvicorn
-    from uvicorn.server import ServerState
-
-    config = uvicorn.Config(lambda *_: None, lifespan="off", log_level="critical")  # type: ignore[arg-type]
-    made: Any = bounded_protocol(most_idle=10)
-    loop.create_task = lambda work, **_: (work.close(), asyncio.Future(loop=loop))[1]  # type: ignore[attr-defined]
-    protocol, transport = made(config, ServerState(), {}, _loop=loop), Transport()
-    protocol.connection_made(transport)
-    return protocol, transport

