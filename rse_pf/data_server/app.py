@@ -135,9 +135,8 @@ class DataServer:
         began = self._clock()
         request = HttpRequest(scope, receive, self._clock)
         line: dict[str, Any] = {"event": "request", "method": request.method}
-        admitted: list[tuple[RobotId, bool]] = []
         try:
-            reply = await self._reply(request, line, admitted)
+            reply = await self._reply(request, line)
             sent = await _send(reply, request, send)
             line |= {"status": reply.status, "sent_bytes": sent}
         except Disconnected:
@@ -146,21 +145,18 @@ class DataServer:
             line["status"] = "disconnected"
             raise
         finally:
-            for robot, has_body in admitted:
-                self._limits.end(robot, has_body=has_body)
+            self._limits.end(request)
             line["received_bytes"] = request.received_bytes
             line["took_ms"] = round(1000 * (self._clock() - began), 2)
             if request.path not in _PROBES:
                 self._log(line)
 
-    async def _reply(
-        self, request: HttpRequest, line: dict[str, Any], admitted: list[tuple[RobotId, bool]]
-    ) -> HttpReply:
+    async def _reply(self, request: HttpRequest, line: dict[str, Any]) -> HttpReply:
         origin, shared_with = request.headers.get("origin", ""), ""
         try:
             self._origins.check(origin, request.headers.get("host", ""))
             shared_with = origin
-            reply = await self._handle(request, line, admitted)
+            reply = await self._handle(request, line)
         except Disconnected:
             raise
         except RsePfError as error:
@@ -177,10 +173,7 @@ class DataServer:
             reply = dataclasses.replace(reply, headers={**reply.headers, "Connection": "close"})
         return shared_reply(reply, shared_with)
 
-    async def _handle(
-        self, request: HttpRequest, line: dict[str, Any], admitted: list[tuple[RobotId, bool]]
-    ) -> HttpReply:
-        """Reply to a request; what *admitted* gets is given back when the reply was sent."""
+    async def _handle(self, request: HttpRequest, line: dict[str, Any]) -> HttpReply:
         if is_preflight(request):
             line["operation"] = "preflight"
             return preflight_reply(self._methods(request.path))
@@ -191,11 +184,10 @@ class DataServer:
         claims = self._claims(request, route.scope, path.get("name", ""), line)
         has_body = route.body is not None
         try:
-            self._limits.begin(claims.robot, route.cost, self._clock(), has_body=has_body)
+            self._limits.begin(request, claims.robot, route.cost, self._clock(), has_body=has_body)
         except TooManyRequests:
             await self._pause(_REFUSAL_PAUSE_S)  # each of its connections asks again only after this
             raise
-        admitted.append((claims.robot, has_body))
         if not has_body and not await request.drain(self._settings.data.part_bytes):
             raise BadRequest("this request takes no body", hint="leave it out")
         try:

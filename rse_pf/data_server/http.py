@@ -55,11 +55,13 @@ __all__ = [
 _T = TypeVar("_T")
 Receive = Callable[[], Awaitable[Mapping[str, Any]]]
 Send = Callable[[Mapping[str, Any]], Awaitable[None]]
-_MIN_BODY_BYTES_PER_S, _BODY_GRACE_S = 1024, 5.0
-"""A body that has been slower than the first after the second is refused."""
+_MIN_BODY_BYTES_PER_S = 1024  # a slower body is refused, also if nobody else waits for its place
+_BODY_GRACE_S = 5.0  # in which a body may be slower: a robot in motion loses its network for as long
+_LEAST_TIME_S = 0.1  # for the rate of a body that has just begun
 _IN_PARTS = "send the object in parts: PUT an upload"
-_DRAIN_S = 0.1
-_DISCARD_BYTES, _DISCARD_S = 8 << 20, 2.0
+_DRAIN_S = 0.1  # before a refusal: what is on its way can still be read, and the connection goes on
+_DISCARD_S = 2.0  # after a refusal, before the connection is closed
+_MAX_DROPPED_BYTES = 32 << 20  # of a body that is too long: the photo of a phone is shorter
 
 
 class MethodNotAllowed(BadRequest):
@@ -118,7 +120,9 @@ class HttpRequest:
         self.received_bytes = 0
         self.is_complete = not self.headers.keys() & _FRAMES
         """Whether the whole request was read, or its connection was closed."""
-        self._whole: bytes | None = None
+        self._reader: asyncio.Task[Any] | None = None
+        self._began_s = clock()
+        self._refusal: RsePfError | None = None
         self._receive = receive
         self._clock = clock
 
@@ -134,22 +138,54 @@ class HttpRequest:
     async def body(self, max_bytes: int, *, hint: str = _IN_PARTS) -> bytes:
         """Return the whole body; *hint* says what to do if it is too long.
 
+        Most clients read a reply when they have sent all, and lose it if the connection is reset before.  So
+        a body that is too long is read to its end, and dropped, up to `_MAX_DROPPED_BYTES`.
+
         Raises:
             LimitExceeded: It is longer than *max_bytes*.
             Expired: It pauses for `BODY_TIMEOUT_S` or stays below `_MIN_BODY_BYTES_PER_S`.
             Disconnected: The robot closed the connection before the end.
+            RsePfError: The refusal of `end_body`.
         """
-        announced = self.header_number("content-length")
-        if announced is not None and announced > max_bytes:
+        announced = self.header_number("content-length") or 0
+        is_sent = "expect" not in self.headers  # before the client was told to go on
+        if announced > (_MAX_DROPPED_BYTES if is_sent else max_bytes):
             raise _too_long(announced, max_bytes, hint)
         pieces = []
-        async for piece in self._pieces():
-            pieces.append(piece)
-            if self.received_bytes > max_bytes:
-                raise _too_long(self.received_bytes, max_bytes, hint)
-        if self._whole is not None:
-            return self._whole
+        self._reader = asyncio.current_task()
+        try:
+            async for piece in self._pieces():
+                pieces.append(piece)
+                if self.received_bytes > max_bytes:
+                    pieces.clear()
+                if self.received_bytes > _MAX_DROPPED_BYTES:
+                    break
+                if self._refusal is not None:  # wait_for of Python 3.10 may lose a cancellation
+                    raise self._refusal
+        except asyncio.CancelledError:
+            if self._refusal is None:  # the client is gone
+                raise
+            raise self._refusal from None
+        finally:
+            self._reader = None
+        if self.received_bytes > max_bytes:
+            raise _too_long(max(announced, self.received_bytes), max_bytes, hint)
         return pieces[0] if len(pieces) == 1 else b"".join(pieces)
+
+    @property
+    def is_receiving(self) -> bool:
+        """Whether `body` waits for the rest of a body."""
+        return self._reader is not None and not self.is_complete
+
+    def received_bytes_per_s(self, now: float) -> float:
+        """Return how fast the body has come until *now*."""
+        return self.received_bytes / max(now - self._began_s, _LEAST_TIME_S)
+
+    def end_body(self, refusal: RsePfError) -> None:
+        """Let `body`, which is receiving, raise *refusal*."""
+        assert self._reader is not None
+        self._refusal = refusal
+        self._reader.cancel()
 
     async def drain_soon(self, max_bytes: int) -> bool:
         """Do the same as `drain`, for `_DRAIN_S` at the most: what is on its way can still be read."""
@@ -161,8 +197,9 @@ class HttpRequest:
     async def discard(self) -> None:
         """Read and drop what a robot sends that has its reply: it reads the reply when it has sent.
 
-        Closing the connection instead would reset it, and the reply would be lost.  At most `_DISCARD_BYTES`
-        are read, and for `_DISCARD_S`.  A robot that waits to be told to go on sends nothing.
+        Closing the connection instead would reset it, and the reply would be lost.  At most
+        `_MAX_DROPPED_BYTES` are read, and for `_DISCARD_S`.  A robot that waits to be told to go on sends
+        nothing.
         """
         if "expect" in self.headers and not self.received_bytes:
             return
@@ -170,7 +207,7 @@ class HttpRequest:
             await _within(_DISCARD_S, self._drop())
 
     async def _drop(self) -> None:
-        remaining = _DISCARD_BYTES
+        remaining = _MAX_DROPPED_BYTES
         while remaining > 0:
             message = await self._receive()
             if message["type"] == "http.disconnect" or not message.get("more_body", False):
@@ -190,7 +227,6 @@ class HttpRequest:
         return True
 
     async def _pieces(self) -> AsyncIterator[bytes]:
-        began = self._clock()
         while not self.is_complete:
             try:
                 message = await _within(BODY_TIMEOUT_S, self._receive())
@@ -200,12 +236,11 @@ class HttpRequest:
                 self.is_complete = True
                 raise Disconnected("the robot closed the connection within its request")
             piece: bytes = message.get("body", b"")
-            self._whole = message.get("whole")  # of `OneRequestProtocol`, in one piece
             self.received_bytes += len(piece)
             if not message.get("more_body", False):
                 self.is_complete = True
             yield piece
-            took_s, min_rate = self._clock() - began, _MIN_BODY_BYTES_PER_S
+            took_s, min_rate = self._clock() - self._began_s, _MIN_BODY_BYTES_PER_S
             if not self.is_complete and took_s > _BODY_GRACE_S and self.received_bytes < min_rate * took_s:
                 raise _too_slow(
                     f"{self.received_bytes} bytes in {took_s:.1f} s; at least {min_rate} a second"

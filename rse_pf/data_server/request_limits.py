@@ -1,7 +1,8 @@
 """Decide whether a robot's request is taken now: its rate, its requests in progress, and bodies in memory.
 
-What one robot sends never uses up what others need: every limit is kept for each robot, and the memory for
-bodies, which all share, is limited for each robot and each tenant, too.  Time is an argument.
+What one robot sends never uses up what others need.  Every limit is kept for each robot.  The places for
+bodies, which all robots share, are limited for each robot and each tenant, too; when none is free, the
+slowest body of the tenant, then robot, that holds most places gives up its place.  Time is an argument.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from collections import Counter, OrderedDict
 from dataclasses import dataclass
 
 from rse_pf.config import DataSettings
-from rse_pf.data_server.http import TooManyRequests
+from rse_pf.data_server.http import HttpRequest, TooManyRequests
 from rse_pf.errors import Busy
 from rse_pf.identity import RobotId
 from rse_pf.token_bucket import TokenBucket
@@ -22,11 +23,13 @@ _BURST_S = 4.0
 _MAX_ROBOTS = 10_000
 MAX_REQUESTS_PER_ROBOT = 8
 """Requests of one robot in progress; more are refused."""
-_BODIES_PER_ROBOT, _BODIES_PER_TENANT = 0.25, 0.75
-"""Shares of ``data.max_uploads``."""
-_RETRY_AFTER_MS = 1000.0
-_REFUSED_BYTES, _REFUSED_COST = 64 << 10, 32.0
-"""So many bytes of a refused body count as one request more, and one refusal as this many more at most."""
+_BODIES_PER_ROBOT = 0.25  # of ``data.max_uploads``
+_BODIES_PER_TENANT = 0.75  # of ``data.max_uploads``
+_RETRY_AFTER_MS = 1000.0  # for who got no place, or lost it: most bodies come within this time
+_REFUSED_BYTES = (
+    64 << 10
+)  # so many bytes of a refused body count as one request more: they are read and dropped
+_REFUSED_COST = 32.0  # requests that one refused body counts for at the most: 2 MiB
 
 CPU_S_PER_REQUEST = 0.005
 """A request whose work took more CPU time than its cost in requests counts by its CPU time."""
@@ -36,7 +39,6 @@ CPU_S_PER_REQUEST = 0.005
 class _Robot:
     bucket: TokenBucket
     requests: int = 0
-    bodies: int = 0
 
 
 class RequestLimits:
@@ -45,17 +47,20 @@ class RequestLimits:
     def __init__(self, settings: DataSettings) -> None:
         self._settings = settings
         self._robots: OrderedDict[RobotId, _Robot] = OrderedDict()
-        self._tenant_bodies: Counter[str] = Counter()
+        self._in_progress: dict[HttpRequest, RobotId] = {}
+        self._bodies: dict[HttpRequest, RobotId] = {}
+        """The requests that have a place for their body."""
 
     @property
     def known_robots(self) -> int:
         """How many robots are remembered; bounded, however many send."""
         return len(self._robots)
 
-    def begin(self, robot: RobotId, cost: float, now: float, *, has_body: bool) -> None:
-        """Take a request of *robot*, which `end` gives back.
+    def begin(self, request: HttpRequest, robot: RobotId, cost: float, now: float, *, has_body: bool) -> None:
+        """Take a request of *robot*, until `end`.
 
         Args:
+            request: What it sends.
             robot: Who sends it.
             cost: How many plain requests it counts for.
             now: Monotonic seconds.
@@ -73,8 +78,6 @@ class RequestLimits:
                 hint="wait for their replies",
                 retry_after_ms=_RETRY_AFTER_MS,
             )
-        if has_body:
-            self._check_bodies(state, robot.tenant)
         wait_s = state.bucket.wait_s(now)
         if wait_s:
             raise TooManyRequests(
@@ -82,11 +85,19 @@ class RequestLimits:
                 hint="send fewer and larger ones",
                 retry_after_ms=1000 * wait_s,
             )
+        if has_body:
+            self._make_room(robot, now)
+            self._bodies[request] = robot
         state.bucket.spend(cost, now)
         state.requests += 1
-        if has_body:
-            state.bodies += 1
-            self._tenant_bodies[robot.tenant] += 1
+        self._in_progress[request] = robot
+
+    def end(self, request: HttpRequest) -> None:
+        """Give back what `begin` took, except for the rate; a request that was not taken took nothing."""
+        robot = self._in_progress.pop(request, None)
+        if robot is not None:
+            self._robots[robot].requests -= 1
+            self._bodies.pop(request, None)
 
     def charge_refused(self, robot: RobotId, body_bytes: int, now: float) -> None:
         """Count the body of a request that was refused: it is read and dropped, which takes time from others.
@@ -112,30 +123,51 @@ class RequestLimits:
         bucket = self._state_of(robot, now).bucket
         bucket.spend(max(0.0, min(cpu_s / CPU_S_PER_REQUEST, bucket.burst) - paid), now)
 
-    def end(self, robot: RobotId, *, has_body: bool) -> None:
-        """Give back what `begin` took, except for the rate."""
-        state = self._robots[robot]
-        state.requests -= 1
-        if has_body:
-            state.bodies -= 1
-            self._tenant_bodies[robot.tenant] -= 1
-            if not self._tenant_bodies[robot.tenant]:
-                del self._tenant_bodies[robot.tenant]
-
-    def _check_bodies(self, state: _Robot, tenant: str) -> None:
+    def _make_room(self, robot: RobotId, now: float) -> None:
+        """Free a place for a body of *robot* if it has none left; raises Busy."""
+        of_robot = Counter(self._bodies.values())
+        of_tenant = Counter(holder.tenant for holder in self._bodies.values())
         most = self._settings.max_uploads
         limits = (
-            (state.bodies, _share(most, _BODIES_PER_ROBOT), "this robot"),
-            (self._tenant_bodies[tenant], _share(most, _BODIES_PER_TENANT), "this tenant"),
-            (self._tenant_bodies.total(), most, "all robots"),
+            (of_robot[robot], _share(most, _BODIES_PER_ROBOT), "this robot"),
+            (of_tenant[robot.tenant], _share(most, _BODIES_PER_TENANT), "this tenant"),
+            (len(self._bodies), most, "all robots"),
         )
-        for count, limit, whose in limits:
-            if count >= limit:
-                raise Busy(
-                    f"{count} uploads of {whose} are in progress, the limit is {limit}",
-                    hint="retry later",
-                    retry_after_ms=_RETRY_AFTER_MS,
-                )
+        reached = next((limit for limit in limits if limit[0] >= limit[1]), None)
+        if reached is None:
+            return
+        # What is complete keeps its place: it is being worked on, and no client holds it up.
+        receiving = [
+            (request, holder)
+            for request, holder in self._bodies.items()
+            if request.is_receiving and (holder.tenant == robot.tenant or reached is limits[-1])
+        ]
+
+        def claim(body: tuple[HttpRequest, RobotId]) -> tuple[int, int, float]:
+            request, holder = body
+            return of_tenant[holder.tenant], of_robot[holder], -request.received_bytes_per_s(now)
+
+        slowest, holder = max(receiving, key=claim, default=(None, robot))
+        is_other_tenant = holder.tenant != robot.tenant
+        held = of_tenant[holder.tenant] if is_other_tenant else of_robot[holder]
+        own = of_tenant[robot.tenant] if is_other_tenant else of_robot[robot]
+        # With one place fewer, the holder must still have as many as this robot, or they would take turns.
+        if slowest is None or held < own + 2 or reached is limits[0]:
+            count, limit, whose = reached
+            raise Busy(
+                f"{count} uploads of {whose} are in progress, the limit is {limit}",
+                hint="retry later",
+                retry_after_ms=_RETRY_AFTER_MS,
+            )
+        del self._bodies[slowest]
+        slowest.end_body(
+            Busy(
+                f"the body came at {slowest.received_bytes_per_s(now):.0f} bytes a second, and another robot "
+                "needed its place",
+                hint="send it again in smaller parts",
+                retry_after_ms=_RETRY_AFTER_MS,
+            )
+        )
 
     def _state_of(self, robot: RobotId, now: float) -> _Robot:
         state = self._robots.get(robot)

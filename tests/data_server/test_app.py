@@ -166,7 +166,7 @@ def test_a_body_over_the_limit_is_refused_by_its_announcement_and_by_its_length(
     path = f"/data/v1/objects/{digest_of(large)}"
 
     assert service.ask("PUT", path, large).status == 413
-    announced = service.ask("PUT", path, b"", headers={"content-length": "999999"})
+    announced = service.ask("PUT", path, b"", headers={"content-length": "99999999"})
     assert (announced.status, announced.headers["connection"]) == (413, "close")
     assert list(service.store.list("objects/")) == []
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from rse_pf.config import DataSettings
-from rse_pf.data_server.http import TooManyRequests
+from rse_pf.data_server.http import HttpRequest, TooManyRequests
 from rse_pf.data_server.request_limits import MAX_REQUESTS_PER_ROBOT, RequestLimits
 from rse_pf.errors import Busy
 from rse_pf.identity import RobotId
@@ -17,9 +17,22 @@ def admission(**settings: float) -> RequestLimits:
     return RequestLimits(DataSettings(**{"max_requests_per_s": 10.0, **settings}))  # type: ignore[arg-type]
 
 
-def ask(admission: RequestLimits, robot: RobotId, now: float, cost: float = 1.0) -> None:
-    admission.begin(robot, cost, now, has_body=False)
-    admission.end(robot, has_body=False)
+async def nothing() -> dict[str, str]:
+    return {"type": "http.disconnect"}
+
+
+def begin(
+    gate: RequestLimits, robot: RobotId, cost: float = 1.0, now: float = 0.0, *, body: bool = False
+) -> HttpRequest:
+    request = HttpRequest(
+        {"method": "GET", "path": "/", "headers": [], "query_string": b""}, nothing, lambda: now
+    )
+    gate.begin(request, robot, cost, now, has_body=body)
+    return request
+
+
+def ask(gate: RequestLimits, robot: RobotId, now: float, cost: float = 1.0) -> None:
+    gate.end(begin(gate, robot, cost, now))
 
 
 def test_a_robot_beyond_its_rate_is_told_when_to_come_back_and_others_are_served() -> None:
@@ -61,15 +74,14 @@ def test_the_body_of_a_refused_request_counts_for_several_and_is_paid_off_within
 
 def test_a_robot_has_a_limit_of_requests_in_progress() -> None:
     gate = admission()
-    for _ in range(MAX_REQUESTS_PER_ROBOT):
-        gate.begin(ROBOT, 1.0, 0.0, has_body=False)
+    first, *_ = [begin(gate, ROBOT) for _ in range(MAX_REQUESTS_PER_ROBOT)]
 
     with pytest.raises(TooManyRequests, match=f"{MAX_REQUESTS_PER_ROBOT} requests"):
-        gate.begin(ROBOT, 1.0, 0.0, has_body=False)
+        begin(gate, ROBOT)
 
-    gate.begin(OTHER, 1.0, 0.0, has_body=False)
-    gate.end(ROBOT, has_body=False)
-    gate.begin(ROBOT, 1.0, 0.0, has_body=False)
+    begin(gate, OTHER)
+    gate.end(first)
+    begin(gate, ROBOT)
 
 
 def test_bodies_are_limited_for_a_robot_its_tenant_and_all() -> None:
@@ -77,28 +89,26 @@ def test_bodies_are_limited_for_a_robot_its_tenant_and_all() -> None:
     robots = [RobotId("acme", f"robot-{number}") for number in range(4)]
 
     for robot in robots[:3]:
-        for _ in range(2):
-            gate.begin(robot, 1.0, 0.0, has_body=True)
+        first, _ = (begin(gate, robot, body=True) for _ in range(2))
         with pytest.raises(Busy, match="this robot"):
-            gate.begin(robot, 1.0, 0.0, has_body=True)
+            begin(gate, robot, body=True)
     with pytest.raises(Busy, match="this tenant"):
-        gate.begin(robots[3], 1.0, 0.0, has_body=True)
+        begin(gate, robots[3], body=True)
     for robot in (OTHER, OTHER._replace(tenant="third")):
-        gate.begin(robot, 1.0, 0.0, has_body=True)
+        begin(gate, robot, body=True)
     with pytest.raises(Busy, match="all robots"):
-        gate.begin(OTHER, 1.0, 0.0, has_body=True)
-    gate.end(robots[0], has_body=True)
-    gate.begin(OTHER, 1.0, 0.0, has_body=True)
+        begin(gate, OTHER, body=True)
+    gate.end(first)
+    begin(gate, OTHER, body=True)
 
 
-def test_a_refused_request_takes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("rse_pf.data_server.request_limits.MAX_REQUESTS_PER_ROBOT", 1)
+def test_a_refused_request_takes_nothing() -> None:
     gate = admission(max_uploads=4)
-    gate.begin(ROBOT, 1.0, 0.0, has_body=True)
+    request = begin(gate, ROBOT, body=True)
     for _ in range(1000):
-        with pytest.raises(TooManyRequests):
-            gate.begin(ROBOT, 1.0, 0.0, has_body=True)
-    gate.end(ROBOT, has_body=True)
+        with pytest.raises(Busy):
+            begin(gate, ROBOT, body=True)
+    gate.end(request)
 
     ask(gate, ROBOT, now=0.0, cost=39.0)
 
