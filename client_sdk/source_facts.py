@@ -374,8 +374,12 @@ def _check_depth(facts: SourceFacts) -> Iterator[Doubt]:
 
 
 def _check_times(facts: SourceFacts) -> Iterator[Doubt]:
+    named: set[DoubtName] = set()
     for each in facts.times:
-        yield from rows_in_time(each)[1]
+        # Colour and depth of one driver have one fault.
+        doubts = [doubt for doubt in rows_in_time(each)[1] if doubt.name not in named]
+        named |= {doubt.name for doubt in doubts}
+        yield from doubts
         steps_s = np.diff(np.unique(each.stamps_s))
         interval_s = float(np.median(steps_s)) if len(steps_s) else 1.0
         if not MIN_INTERVAL_S <= interval_s <= MAX_INTERVAL_S:
