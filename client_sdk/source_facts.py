@@ -49,6 +49,7 @@ class DoubtName(str, Enum):
     REFERENCE_TIMES = "reference-times"  # truth or odometry has no time stamp within the recording
     LEFT_OUT = "left-out"  # images were damaged, empty or without a partner
     ENDED_EARLY = "ended-early"  # the source failed in the drive
+    CAMERA_CHANGES = "camera-changes"  # several calibrations are stated in one drive
     DEPTH_REGISTRATION = "depth-registration"  # nothing says that depth is registered to the colour image
     DEPTH_ALONG_RAY = "depth-along-ray"  # depth is measured along the ray, not along the optical axis
     STATIC_PATTERN = "static-pattern"  # something stands still in the image while the camera moves

@@ -6,8 +6,10 @@ which only those that wait for their partner are in memory.
 
 from __future__ import annotations
 
+import contextlib
 import math
-from collections.abc import Iterator, Mapping
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -25,9 +27,17 @@ from client_sdk.bags.choose import (
 )
 from client_sdk.bags.images import ImageFormat, decode_colour, decode_depth, format_of
 from client_sdk.bags.imu import ImuMount, imu_track
-from client_sdk.bags.index import BagIndex, nearest_gap_s, pair_stamps, read_index
+from client_sdk.bags.index import (
+    BagIndex,
+    CameraTimes,
+    ImageStamps,
+    nearest_gap_s,
+    pair_stamps,
+    read_index,
+)
 from client_sdk.bags.lens import Lens, Rectifier, lens_of
 from client_sdk.bags.message_types import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, POSE
+from client_sdk.bags.realsense_recording import stated_depth_unit_m, stated_T_colour_depth
 from client_sdk.bags.registration import register_depth
 from client_sdk.bags.stereo import pair_of
 from client_sdk.bags.stream import ImageStream
@@ -37,11 +47,24 @@ from client_sdk.mapping import Trajectory
 from client_sdk.rigs.imu_track import ImuTrack, with_imu
 from client_sdk.rigs.rectification import Rectification
 from client_sdk.rigs.rig import Rig, RigCamera
+from client_sdk.source_facts import (
+    CameraFacts,
+    DepthFacts,
+    Doubt,
+    DoubtLog,
+    DoubtName,
+    SourceFacts,
+    TimeFacts,
+    check_source,
+    median_depth_m,
+)
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Array, Camera, inverse
 
 __all__ = ["Bag", "BagOptions", "open_bag"]
 
+_USUAL_DEPTH_SCALE = 1000.0  # units of 16-bit depth in a metre: millimetres (REP 118)
+_SAME_VIEW = 0.01  # focal lengths and principal points of one view differ by less of the image's size
 _ESTIMATED_FRAMES = {"odom", "map"}
 """Roots of tf whose poses another SLAM system or an odometry estimated."""
 
@@ -59,7 +82,8 @@ class BagOptions:
         imu: Topic of the IMU.
         lens: The camera, instead of that in the bag.
         rig: The cameras of a stereo pair, or the one camera, and the IMU, instead of those in the bag.
-        depth_scale: Units of a 16-bit depth image in a metre.
+        depth_scale: Units of depth in a metre; None takes what the bag states, else 1000 of 16 bits and 1 of
+            32 bits.
         pair_within_s: Colour and depth, or left and right, belong together up to this difference of stamps.
         use_depth: False leaves the depth out, and takes one camera unless *right* is named.
         use_stereo: None takes a pair where there is no depth; True takes it always, False its left camera.
@@ -77,7 +101,7 @@ class BagOptions:
     imu: str | None = None
     lens: Lens | None = None
     rig: Rig | None = None
-    depth_scale: float = 1000.0
+    depth_scale: float | None = None
     pair_within_s: float = 0.02
     use_depth: bool = True
     use_stereo: bool | None = None
@@ -85,7 +109,7 @@ class BagOptions:
 
     def __post_init__(self) -> None:
         for name, value in (("depth_scale", self.depth_scale), ("pair_within_s", self.pair_within_s)):
-            if not (math.isfinite(value) and value > 0):
+            if value is not None and not (math.isfinite(value) and value > 0):
                 raise UsageError(f"{name} = {value:g} is not above 0", hint="leave it out for the default")
 
 
@@ -95,7 +119,7 @@ class Bag(Closing):
 
     Frames that are iterated over carry the samples of ``imu``; those that are read do not.
     ``notes`` are sentences for the user: which topics were taken, and what was left out.  ``truth_kind`` is
-    ``reference`` for poses that another program estimated.
+    ``reference`` for poses that another program estimated.  ``log`` has what is unlikely about the bag.
     """
 
     name: str
@@ -107,12 +131,14 @@ class Bag(Closing):
     notes: tuple[str, ...]
     chosen: ChosenTopics
     imu: ImuTrack | None
+    log: DoubtLog
     _file: BagFile
     _stream: ImageStream
-    _pairs: tuple[tuple[tuple[str, int, int], ...], ...]
-    _rectify_colour: Rectifier
-    _rectify_depth: Rectifier
+    _pairs: tuple[_Pair, ...]
+    _colour_way: _Way
+    _depth_way: _Way
     _depth_scale: float
+    _is_float_depth: bool = False
     _registration: tuple[Camera, Array] | None = None
     _rectification: Rectification | None = None
     _no_depth: npt.NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 0), dtype=np.float32))
@@ -134,13 +160,14 @@ class Bag(Closing):
         Raises:
             UsageError: The image cannot be decoded.
         """
-        raw = self._stream.take(self._pairs[row])
+        pair = self._pairs[row]
+        raw = self._stream.take(pair)
         try:
             colours = decode_colour(self._file.parse(raw[0]))
             if self._rectification is not None:
                 return self._stereo_frame(row, self._rectification, colours, raw[1])
-            rgb = self._rectify_colour.colour(colours)
-            depth_m = self._depth_of(raw)
+            rgb = self._colour_way.of(pair[0]).colour(colours)
+            depth_m = self._depth_of(pair, raw)
         except BrokenMessage as error:
             raise UsageError(
                 f"{self.name} at {self.timestamps_s[row]:.6f} s: {error}", hint="record the bag again"
@@ -161,10 +188,15 @@ class Bag(Closing):
             T_body_camera=rectify.T_body_camera,
         )
 
-    def _depth_of(self, raw: list[RawMessage]) -> npt.NDArray[np.float32]:
+    def _depth_of(self, pair: _Pair, raw: list[RawMessage]) -> npt.NDArray[np.float32]:
         if not self.has_depth:
             return self._no_depth
-        depth_m = self._rectify_depth.depth(decode_depth(self._file.parse(raw[1]), self._depth_scale))
+        message = self._file.parse(raw[1])
+        if self._is_float_depth:
+            depth_m = decode_depth(message, 1.0) / np.float32(self._depth_scale)
+        else:
+            depth_m = decode_depth(message, self._depth_scale)
+        depth_m = self._depth_way.of(pair[1]).depth(depth_m)
         if self._registration is None:
             return depth_m
         return register_depth(depth_m, *self._registration, self.camera)
@@ -197,7 +229,7 @@ def _open(file: BagFile, options: BagOptions) -> Bag:
     chosen = choose_topics(
         file.topics,
         formats,
-        {topic: frame for topic, (frame, _) in infos.items()},
+        infos,
         colour=options.colour,
         depth=options.depth,
         right=options.right,
@@ -208,20 +240,25 @@ def _open(file: BagFile, options: BagOptions) -> Bag:
         use_stereo=options.use_stereo,
         use_imu=options.use_imu is not False,
     )
-    lens = _lens_of_colour(file, chosen, infos, options, formats)
     index = read_index(file, chosen, formats)
-    rectification, T_left_camera = _rectification(file, chosen, formats, infos, index, options)
+    lenses, times = _lenses_of_colour(file, chosen, index, options, formats)
+    rectification, T_left_camera = _rectification(file, chosen, formats, index, options)
+    lens = _usual_lens(lenses, times, index.colour)
     camera = lens.camera if rectification is None else rectification.camera
-    pairs = _pairs(name, index, chosen, options)
-    rectify_depth, registration, note = _depth_way(file, chosen, formats, infos, lens, index)
-    stamps_ns = [pair[0][1] for pair in pairs]
+    pairs, stamps_ns = _pairs(name, index, chosen, options)
+    depth_way, registration, doubts = _depth_way(file, chosen, formats, lenses, lens, times, index)
     truth, truth_kind, truth_note = _truth(chosen, formats, index, stamps_ns)
     if truth is not None:
         truth = Trajectory(truth.timestamps_s, truth.T_world_camera @ T_left_camera)
     imu, imu_notes = _imu(chosen, formats, index, np.array(stamps_ns) / 1e9, T_left_camera, options)
     no_depth = np.zeros((camera.height, camera.width), dtype=np.float32)
     no_depth.flags.writeable = False
-    return Bag(
+    unit_m = None if chosen.depth is None else stated_depth_unit_m(file, chosen.depth.name)
+    is_float = chosen.depth is not None and formats[chosen.depth.name].encoding.startswith("32FC1")
+    usual = 1.0 if is_float else _USUAL_DEPTH_SCALE
+    depth_scale = options.depth_scale or (usual if unit_m is None else 1.0 / unit_m)
+    stream = ImageStream(file, list({pair[0] for pair in pairs[0]}), use_log_time=index.uses_log_time)
+    bag = Bag(
         name=name,
         camera=camera,
         timestamps_s=tuple(stamp / 1e9 for stamp in stamps_ns),
@@ -232,31 +269,105 @@ def _open(file: BagFile, options: BagOptions) -> Bag:
             *_notes(chosen, formats, lens, options),
             *_pair_note(rectification),
             *imu_notes,
-            *note,
+            *_unit_note(unit_m, options, depth_scale),
+            *_registration_note(chosen, registration),
             truth_note,
             *_losses(index, pairs, chosen, options),
         ),
         chosen=chosen,
         imu=imu,
+        log=DoubtLog(),
         _file=file,
-        _stream=ImageStream(file, list({pair[0] for pair in pairs[0]}), use_log_time=index.uses_log_time),
+        _stream=stream,
         _pairs=tuple(pairs),
-        _rectify_colour=Rectifier(lens, lens.camera),
-        _rectify_depth=rectify_depth,
-        _depth_scale=options.depth_scale,
+        _colour_way=_Way(times, [Rectifier(each, lens.camera) for each in lenses]),
+        _depth_way=depth_way,
+        _depth_scale=depth_scale,
+        _is_float_depth=is_float,
         _registration=registration,
         _rectification=rectification,
         _no_depth=no_depth,
     )
+    facts = SourceFacts(
+        name=name,
+        cameras=[
+            CameraFacts(stated_by=_stated_by(chosen, options), camera=each.camera, is_fisheye=each.is_fisheye)
+            for each in lenses
+        ],
+        depth=_depth_facts(bag),
+        times=[TimeFacts(stated_by=chosen.colour.name, stamps_s=np.array(bag.timestamps_s))],
+        doubts=(*doubts, *_changes(chosen, lenses, lens)),
+    )
+    bag.log = DoubtLog(check_source(facts))
+    return bag
 
 
-_Lenses = Mapping[str, "tuple[str, RawMessage]"]
+_Pair = tuple[tuple[str, int, int], ...]
+"""Of each image of a frame: topic, stamp of the message, and when it was written, nanoseconds."""
 
 
-def _first_messages(file: BagFile) -> tuple[dict[str, ImageFormat], dict[str, tuple[str, RawMessage]]]:
-    """Return what the images of each topic are, and the first message of each camera with its frame."""
+@dataclass(frozen=True, slots=True, eq=False)
+class _Way:
+    """How images of a topic become those of the camera, whose lens may change in the drive."""
+
+    times: CameraTimes
+    rectifiers: Sequence[Rectifier]
+
+    def of(self, image: tuple[str, int, int]) -> Rectifier:
+        """Return what rectifies an image."""
+        _, stamp_ns, log_ns = image
+        return self.rectifiers[self.times.row_at(stamp_ns, log_ns) if len(self.rectifiers) > 1 else 0]
+
+
+def _depth_facts(bag: Bag) -> DepthFacts | None:
+    """Return the median depth of some frames of a bag."""
+    if not bag.has_depth:
+        return None
+    rows = sorted({round(share * (len(bag) - 1)) for share in (0.0, 0.5, 1.0)})
+    depths_m = []
+    for row in rows:
+        with contextlib.suppress(UsageError):  # of a message that cannot be decoded, when it is its turn
+            depths_m.append(bag.read(row).depth_m)
+    return DepthFacts(median_m=median_depth_m(depths_m), units_per_m=bag._depth_scale, is_unit_stated=True)
+
+
+def _stated_by(chosen: ChosenTopics, options: BagOptions) -> str:
+    if options.lens is None and options.rig is None and chosen.colour_info:
+        return chosen.colour_info.name
+    return "the file of intrinsics"
+
+
+def _changes(chosen: ChosenTopics, lenses: Sequence[Lens], lens: Lens) -> tuple[Doubt, ...]:
+    """Return a doubt about a camera that changes in the drive."""
+    if len(lenses) < 2 or chosen.colour_info is None:
+        return ()
+    focal = ", ".join(f"{each.camera.fx:g}" for each in lenses)
+    sentence = (
+        f"{chosen.colour_info.name} states {len(lenses)} cameras in the drive, with fx {focal}; images of "
+        f"each are resampled to fx {lens.camera.fx:g}"
+    )
+    hint = "give one calibration with --intrinsics, if the lens was not moved"
+    return (Doubt(name=DoubtName.CAMERA_CHANGES, sentence=sentence, hint=hint),)
+
+
+def _unit_note(unit_m: float | None, options: BagOptions, depth_scale: float) -> tuple[str, ...]:
+    if unit_m is None:
+        return ()
+    used = "" if options.depth_scale is None else f", but depth_scale {depth_scale:g} is used"
+    return (f"the recorder states depth in units of {1000.0 * unit_m:g} mm{used}",)
+
+
+def _registration_note(chosen: ChosenTopics, registration: tuple[Camera, Array] | None) -> tuple[str, ...]:
+    if registration is None or chosen.depth is None:
+        return ()
+    apart_mm = 1000.0 * float(np.linalg.norm(registration[1][:3, 3]))
+    return (f"{chosen.depth.name} is moved to {chosen.colour.name} over {apart_mm:.1f} mm, pixel by pixel",)
+
+
+def _first_messages(file: BagFile) -> tuple[dict[str, ImageFormat], dict[str, str]]:
+    """Return what the images of each topic are, and the frames of the cameras."""
     formats: dict[str, ImageFormat] = {}
-    infos: dict[str, tuple[str, RawMessage]] = {}
+    infos: dict[str, str] = {}
     for topic in file.topics:
         if topic.kind not in (IMAGE, COMPRESSED_IMAGE, CAMERA_INFO) or not topic.messages:
             continue
@@ -264,7 +375,7 @@ def _first_messages(file: BagFile) -> tuple[dict[str, ImageFormat], dict[str, tu
             try:
                 message = file.parse(raw)
                 if topic.kind == CAMERA_INFO:
-                    infos[topic.name] = (str(message.header.frame_id), raw)
+                    infos[topic.name] = str(message.header.frame_id)
                 else:
                     formats[topic.name] = format_of(message, topic.kind)
             except BrokenMessage:
@@ -284,23 +395,34 @@ def _some(file: BagFile, topic: str) -> Iterator[RawMessage]:
         return
 
 
-def _lens_of_colour(
-    file: BagFile, chosen: ChosenTopics, infos: _Lenses, options: BagOptions, formats: dict[str, ImageFormat]
-) -> Lens:
-    if options.lens is not None:
-        return options.lens
-    if options.rig is not None:
-        return Lens.of(options.rig.left.lens)
+def _lenses_of_colour(
+    file: BagFile, chosen: ChosenTopics, index: BagIndex, options: BagOptions, formats: dict[str, ImageFormat]
+) -> tuple[list[Lens], CameraTimes]:
+    """Return the lenses of the colours, and when each of them is valid; nearly always there is one."""
     info = chosen.colour_info
-    if info is None or info.name not in infos:
+    if options.lens is not None or options.rig is not None:
+        lens = options.lens if options.rig is None else Lens.of(options.rig.left.lens)
+        assert lens is not None
+        _check_size(chosen.colour.name, formats, "the file of intrinsics", lens.camera)
+        return [lens], CameraTimes()
+    times = CameraTimes() if info is None else index.cameras[info.name]
+    if info is None or not times.messages:
         raise UsageError(
             f"the bag has no camera_info for {chosen.colour.name}; its topics: "
             f"{topics_line(file.topics, formats)}",
             hint="name its topic with --info TOPIC, or give a file with --intrinsics",
         )
-    lens = lens_of(file.parse(infos[info.name][1]), info.name, is_rectified=is_rectified(chosen.colour))
-    _check_size(chosen.colour.name, formats, info.name, lens.camera)
-    return lens
+    is_flat = is_rectified(chosen.colour)
+    lenses = [lens_of(message, info.name, is_rectified=is_flat) for message in times.messages]
+    for lens in lenses:
+        _check_size(chosen.colour.name, formats, info.name, lens.camera)
+    return lenses, times
+
+
+def _usual_lens(lenses: Sequence[Lens], times: CameraTimes, images: ImageStamps) -> Lens:
+    """Return the lens of most images."""
+    rows = [times.row_at(int(s), int(log)) for s, log in zip(images.header_ns, images.log_ns, strict=True)]
+    return lenses[Counter(rows).most_common(1)[0][0]] if rows and len(lenses) > 1 else lenses[0]
 
 
 def _check_size(topic: str, formats: Mapping[str, ImageFormat], source: str, camera: Camera) -> None:
@@ -317,7 +439,6 @@ def _rectification(
     file: BagFile,
     chosen: ChosenTopics,
     formats: dict[str, ImageFormat],
-    infos: _Lenses,
     index: BagIndex,
     options: BagOptions,
 ) -> tuple[Rectification | None, Array]:
@@ -336,28 +457,31 @@ def _rectification(
                 "the intrinsics are those of one camera, and a pair needs two",
                 hint="give --intrinsics rig.json, or take one camera: --no-depth",
             )
-        left, right = _pair_of_bag(file, chosen, formats, infos, index)
+        left, right = _pair_of_bag(file, chosen, formats, index)
     rectification = Rectification(left, right)
     return rectification, inverse(left.T_body_camera) @ rectification.T_body_camera
 
 
 def _pair_of_bag(
-    file: BagFile,
-    chosen: ChosenTopics,
-    formats: dict[str, ImageFormat],
-    infos: _Lenses,
-    index: BagIndex,
+    file: BagFile, chosen: ChosenTopics, formats: dict[str, ImageFormat], index: BagIndex
 ) -> tuple[RigCamera, RigCamera]:
     left, right = chosen.colour_info, chosen.right_info
     assert chosen.right is not None
-    if left is None or right is None or right.name not in infos:
+    if left is None or right is None or not index.cameras[right.name].messages:
         raise UsageError(
             f"the bag has no camera_info for {chosen.right.name}; its topics: "
             f"{topics_line(file.topics, formats)}",
             hint="give both cameras with --intrinsics rig.json, or take one: --no-depth",
         )
+    for info in (left, right):
+        if len(index.cameras[info.name].messages) > 1:
+            raise UsageError(
+                f"{info.name} states {len(index.cameras[info.name].messages)} cameras in the drive, and a "
+                "pair is rectified for one",
+                hint="give both cameras with --intrinsics rig.json, or take one: --no-depth",
+            )
     messages = [
-        (info.name, file.parse(infos[info.name][1]), is_rectified(topic))
+        (info.name, index.cameras[info.name].messages[0], is_rectified(topic))
         for info, topic in ((left, chosen.colour), (right, chosen.right))
     ]
     frames = [formats[topic.name].frame for topic in (chosen.colour, chosen.right)]
@@ -369,17 +493,17 @@ def _pair_of_bag(
 
 def _pairs(
     name: str, index: BagIndex, chosen: ChosenTopics, options: BagOptions
-) -> list[tuple[tuple[str, int, int], ...]]:
-    """Return what each frame is made of: topic, stamp and time of writing of its colours and its depth."""
+) -> tuple[list[_Pair], list[int]]:
+    """Return what each frame is made of, and its stamp."""
     colour, second = index.colour, index.second
     topic, partner_topic = chosen.colour.name, chosen.second
     if not len(colour.stamps_ns) or not len(second.stamps_ns):
         bad = topic if not len(colour.stamps_ns) or partner_topic is None else partner_topic.name
         reason = index.first_broken or index.ended or "it has no message"
         raise UsageError(f"{name}: no image of {bad} can be used: {reason}", hint="name another topic")
-    wanted = [(topic, int(s), int(log)) for s, log in zip(colour.stamps_ns, colour.log_ns, strict=True)]
+    wanted = _images_of(topic, colour)
     if partner_topic is None:
-        return [(row,) for row in wanted]
+        return [(image,) for image in wanted], colour.stamps_ns.tolist()
     rows = pair_stamps(colour.stamps_ns, second.stamps_ns, round(1e9 * options.pair_within_s))
     if not rows:
         gap_s = nearest_gap_s(colour.stamps_ns, second.stamps_ns)
@@ -388,10 +512,13 @@ def _pairs(
             f"the nearest is {gap_s:.3f} s away",
             hint="widen it with --pair-within S, or check that both drivers use the same clock",
         )
-    return [
-        (wanted[row], (partner_topic.name, int(second.stamps_ns[partner]), int(second.log_ns[partner])))
-        for row, partner in rows
-    ]
+    partners = _images_of(partner_topic.name, second)
+    stamps_ns = [int(colour.stamps_ns[row]) for row, _ in rows]
+    return [(wanted[row], partners[partner]) for row, partner in rows], stamps_ns
+
+
+def _images_of(topic: str, images: ImageStamps) -> list[tuple[str, int, int]]:
+    return [(topic, int(s), int(log)) for s, log in zip(images.header_ns, images.log_ns, strict=True)]
 
 
 def _partner(chosen: ChosenTopics) -> str:
@@ -402,51 +529,76 @@ def _depth_way(
     file: BagFile,
     chosen: ChosenTopics,
     formats: Mapping[str, ImageFormat],
-    infos: _Lenses,
+    lenses: Sequence[Lens],
     lens: Lens,
+    times: CameraTimes,
     index: BagIndex,
-) -> tuple[Rectifier, tuple[Camera, Array] | None, tuple[str, ...]]:
-    """Return how depth images become those of the colour camera: rectified, registered, and what to say."""
+) -> tuple[_Way, tuple[Camera, Array] | None, tuple[Doubt, ...]]:
+    """Return how depth images become those of the colour camera: rectified, registered, and doubts."""
     camera, depth = lens.camera, chosen.depth
     if depth is None:
-        return Rectifier(Lens(camera=camera), camera), None, ()
-    info = chosen.depth_info
-    own = None
-    if info is not None and info.name in infos:
-        own = lens_of(file.parse(infos[info.name][1]), info.name, is_rectified=is_rectified(depth))
-    size, frame, colour_frame = (
-        formats[depth.name].size,
-        formats[depth.name].frame,
-        formats[chosen.colour.name].frame,
-    )
-    same_size = size in (None, (camera.width, camera.height))
-    own_fits = own is not None and size in (None, (own.camera.width, own.camera.height))
-    if is_registered(depth) or not frame or frame.strip("/") == colour_frame.strip("/"):
-        T_colour_depth: Array | None = np.eye(4)
-    else:
-        T_colour_depth = index.tree.between(colour_frame, frame)
-    is_there = T_colour_depth is not None and np.allclose(T_colour_depth, np.eye(4), atol=1e-6)
-    if same_size and is_there:
-        return Rectifier(own if own is not None and own_fits else lens, camera), None, ()
-    if T_colour_depth is not None and own is not None and own_fits:
-        note = f"depth is moved from {frame} to {colour_frame}, pixel by pixel"
-        return Rectifier(own, own.camera), (own.camera, T_colour_depth), (note,)
-    if same_size:
-        note = (
-            f"{depth.name} is taken as registered to the colours: no transform from {frame} to {colour_frame}"
+        return _Way(times, [Rectifier(Lens(camera=camera), camera)]), None, ()
+    info, image, colours = chosen.depth_info, formats[depth.name], formats[chosen.colour.name]
+    own_times = CameraTimes() if info is None else index.cameras[info.name]
+    own = [
+        lens_of(message, info.name, is_rectified=is_rectified(depth))
+        for message in own_times.messages
+        if info is not None
+    ]
+    if any(image.size not in (None, (each.camera.width, each.camera.height)) for each in own):
+        own = []
+    like_colours = _Way(times, [Rectifier(each, camera) for each in lenses])
+    T_colour_depth = stated_T_colour_depth(file, chosen.colour.name, depth.name)
+    if T_colour_depth is None and is_registered(depth):
+        T_colour_depth = np.eye(4)
+    elif T_colour_depth is None and image.frame.strip("/") != colours.frame.strip("/"):
+        T_colour_depth = index.tree.between(colours.frame, image.frame) if image.frame else None
+    elif T_colour_depth is None and not any(_is_other_view(each.camera, camera) for each in own):
+        T_colour_depth = np.eye(4)
+    is_same_size = image.size in (None, (camera.width, camera.height))
+    if T_colour_depth is not None and is_same_size and np.allclose(T_colour_depth, np.eye(4), atol=1e-6):
+        return _Way(own_times, [Rectifier(each, camera) for each in own]) if own else like_colours, None, ()
+    if T_colour_depth is not None and own:
+        return (
+            _Way(own_times, [Rectifier(each, own[0].camera) for each in own]),
+            (own[0].camera, T_colour_depth),
+            (),
         )
-        return Rectifier(lens, camera), None, (note,)
-    raise UsageError(
-        f"{depth.name} is not registered to {chosen.colour.name}, and its camera_info or the transform from "
-        f"{frame} to {colour_frame} is missing",
-        hint="record the registered (aligned) depth topic of your driver, with camera_info and /tf_static",
+    if not own and not is_same_size:
+        raise UsageError(
+            f"{depth.name} is not registered to {chosen.colour.name}, and its camera_info or the transform "
+            f"from {image.frame} to {colours.frame} is missing",
+            hint="record the registered (aligned) depth topic of your driver, or camera_info and /tf_static",
+        )
+    fx = own[0].camera.fx if own else camera.fx
+    doubt = Doubt(
+        name=DoubtName.DEPTH_REGISTRATION,
+        sentence=f"{depth.name} (fx {fx:g}) is taken as seen from where {chosen.colour.name} "
+        f"(fx {camera.fx:g}) is: nothing states the transform from {image.frame or 'its frame'} to "
+        f"{colours.frame or 'the other'}",
+        hint="record the registered (aligned) depth topic of your driver, or /tf_static",
     )
+    if own:
+        return _Way(own_times, [Rectifier(each, camera) for each in own]), None, (doubt,)
+    return like_colours, None, (doubt,)
+
+
+def _is_other_view(one: Camera, other: Camera) -> bool:
+    """Return whether two cameras see different parts of the world from one place."""
+
+    def shares_of(camera: Camera) -> Array:
+        across, down = camera.width, camera.height
+        return np.array([camera.fx / across, camera.fy / down, camera.cx / across, camera.cy / down])
+
+    return not np.allclose(shares_of(one), shares_of(other), rtol=0.0, atol=_SAME_VIEW)
 
 
 def _truth(
     chosen: ChosenTopics, formats: Mapping[str, ImageFormat], index: BagIndex, stamps_ns: list[int]
 ) -> tuple[Trajectory | None, Literal["ground truth", "reference", "none"], str]:
     """Return the true path, its kind, and a sentence about it."""
+    if index.colour.clock_step_ns:
+        return None, "none", "no ground truth: the clock of its stamps was set back in the drive"
     frame = formats[chosen.colour.name].frame
     root, moves = index.tree.root_of(frame)
     by_tf = index.tree.path(frame, stamps_ns) if moves else None
@@ -467,11 +619,7 @@ def _notes(
     chosen: ChosenTopics, formats: Mapping[str, ImageFormat], lens: Lens, options: BagOptions
 ) -> tuple[str, ...]:
     camera = lens.camera
-    where = (
-        chosen.colour_info.name
-        if options.lens is None and options.rig is None and chosen.colour_info
-        else "the file of intrinsics"
-    )
+    where = _stated_by(chosen, options)
     distorted = "distorted, so images are undistorted" if lens.distortion else "no distortion"
     first = "colour" if chosen.right is None else "left"
     taken = [(first, chosen.colour), ("right", chosen.right), ("depth", chosen.depth)]
@@ -501,6 +649,8 @@ def _imu(
         return None, ()
     frame, imu_frame = formats[chosen.colour.name].frame, index.imu.frame
     try:
+        if index.colour.clock_step_ns:
+            raise UsageError("the clock of its stamps was set back in the drive", hint="cut the bag there")
         track, note = imu_track(
             index.imu,
             chosen.imu.name,
@@ -530,7 +680,7 @@ def _pair_note(rectification: Rectification | None) -> tuple[str, ...]:
 
 
 def _losses(
-    index: BagIndex, pairs: list[tuple[tuple[str, int, int], ...]], chosen: ChosenTopics, options: BagOptions
+    index: BagIndex, pairs: list[_Pair], chosen: ChosenTopics, options: BagOptions
 ) -> tuple[str, ...]:
     """Return a sentence for each thing that was left out or put right."""
     names = []
@@ -545,10 +695,18 @@ def _losses(
     copies = index.colour.copies + (index.second.copies if chosen.second is not None else 0)
     if copies:
         names.append(f"{_count(copies, 'message')} with the time stamp of another left out")
+    unstamped = index.colour.unstamped + (index.second.unstamped if chosen.second is not None else 0)
+    if unstamped:
+        names.append(f"{_count(unstamped, 'image')} with the time stamp 0 left out")
+    if index.colour.clock_step_ns:
+        names.append(
+            f"the clock of the time stamps was set back by {index.colour.clock_step_ns / 1e9:.3f} s in the "
+            "drive; the times of recording bridge it"
+        )
     if not (index.colour.was_in_order and index.second.was_in_order):
         names.append("the time stamps were not in order; frames are sorted by them")
     if index.uses_log_time:
-        names.append("all time stamps are 0; the times of recording are used")
+        names.append("a topic has no time stamp but 0; the times of recording are used")
     if index.ended:
         names.append(f"the bag cannot be read to its end ({index.ended}); what comes before is used")
     return tuple(names)

@@ -5,6 +5,7 @@ Pure decisions over what is known of the topics; a topic that the user names alw
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -49,6 +50,13 @@ class ChosenTopics:
     poses: Topic | None
     imu: Topic | None
     tf: tuple[str, ...]
+
+    @property
+    def infos(self) -> tuple[str, ...]:
+        """The topics of the cameras that are used."""
+        return tuple(
+            info.name for info in (self.colour_info, self.depth_info, self.right_info) if info is not None
+        )
 
     @property
     def second(self) -> Topic | None:
@@ -271,20 +279,41 @@ def _encodings(wanted: str) -> str:
 
 def _base(topic: Topic) -> str:
     """Return the name of the raw topic that a compressed one belongs to."""
-    return topic.name.rpartition("/")[0] if topic.kind == COMPRESSED_IMAGE else topic.name
+    return _base_of(topic.name) if topic.kind == COMPRESSED_IMAGE else topic.name
+
+
+def _base_of(name: str) -> str:
+    head, _, tail = name.rpartition("/")
+    return head if tail.startswith("compressed") else name
 
 
 def _info_of(
     topic: Topic, infos: Sequence[Topic], formats: Mapping[str, ImageFormat], frames: Mapping[str, str]
 ) -> Topic | None:
-    """Return the camera of an image topic: its neighbour by name, or one of the same frame."""
+    """Return the camera of an image topic: its neighbour by name, that of its namespace, or of its frame.
+
+    A RealSense recorder writes ``Color_0/image/data`` beside ``Color_0/info/camera_info``, all of one frame.
+    """
     base = _base(topic)
     wanted = (f"{base.rpartition('/')[0]}/camera_info", f"{base}/camera_info")
-    for info in infos:
-        if info.name in wanted:
-            return info
+    others = {_base_of(name) for name in formats} - {base}
+
+    def is_own(info: Topic) -> bool:
+        shared = _shared(base, info.name)
+        return shared > 0 and all(_shared(other, info.name) < shared for other in others)
+
     frame = formats[topic.name].frame
-    return next((topic for topic in infos if frame and frames.get(topic.name) == frame), None)
+    same_frame = [info for info in infos if frame and frames.get(info.name) == frame]
+    found = [info for info in infos if info.name in wanted] or [info for info in infos if is_own(info)]
+    if found:
+        return max(found, key=lambda info: _shared(base, info.name))
+    return same_frame[0] if len(same_frame) == 1 else None
+
+
+def _shared(name: str, other: str) -> int:
+    """Return how many of the first parts of two topics are equal."""
+    parts = zip(name.strip("/").split("/"), other.strip("/").split("/"), strict=False)
+    return sum(1 for _ in itertools.takewhile(lambda pair: pair[0] == pair[1], parts))
 
 
 def _poses(topics: Sequence[Topic], named: str | None) -> Topic | None:

@@ -15,7 +15,8 @@ import numpy.typing as npt
 
 from client_sdk.bags.bag_file import BrokenMessage
 from client_sdk.bags.message_types import COMPRESSED_IMAGE
-from client_sdk.frontend import load_opencv
+from rse_pf.errors import RsePfError
+from rse_pf.images import load_opencv, photo_size
 
 __all__ = ["ImageFormat", "check_image", "decode_colour", "decode_depth", "format_of"]
 
@@ -59,7 +60,7 @@ def format_of(message: Any, kind: str) -> ImageFormat:
         size = (int(message.width), int(message.height))
         return ImageFormat(holds=holds, encoding=encoding, frame=message.header.frame_id, size=size)
     encoding = str(message.format)
-    data = bytes(message.data[:64])
+    data = message.data.tobytes()
     if "compressedDepth" in encoding:
         if "rvl" not in encoding.lower():
             holds = "depth"
@@ -70,7 +71,7 @@ def format_of(message: Any, kind: str) -> ImageFormat:
         # IHDR holds width, height, bits of a channel and the kind of colour: 16 bits of grey are depth.
         holds = "depth" if data[24:26] == b"\x10\x00" else "colour"
     return ImageFormat(
-        holds=holds, encoding=encoding or "no format", frame=message.header.frame_id, size=_png_size(data)
+        holds=holds, encoding=encoding or "no format", frame=message.header.frame_id, size=_coded_size(data)
     )
 
 
@@ -97,6 +98,9 @@ def check_image(message: Any, expected: ImageFormat) -> None:
         _check_png(data)
     else:
         raise BrokenMessage("an image is neither JPEG nor PNG")
+    size = _coded_size(data)
+    if size is not None and expected.size is not None and size != expected.size:
+        raise BrokenMessage(f"an image is {size[0]}x{size[1]}, unlike the first one")
 
 
 def decode_colour(message: Any) -> npt.NDArray[np.uint8]:
@@ -108,7 +112,7 @@ def decode_colour(message: Any) -> npt.NDArray[np.uint8]:
     """
     cv2 = load_opencv()
     if not hasattr(message, "encoding"):
-        image = _decode(cv2, np.asarray(message.data), cv2.IMREAD_COLOR)
+        image = _decode(cv2, np.asarray(message.data), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
         rgb: npt.NDArray[np.uint8] = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
         return rgb
     bytes_per_px, conversion = _COLOUR[message.encoding]
@@ -191,11 +195,12 @@ def _metres_of_floats(values: npt.NDArray[Any]) -> npt.NDArray[np.float32]:
     return metres
 
 
-def _png_size(data: bytes) -> tuple[int, int] | None:
-    if not data.startswith(_PNG) or len(data) < 24:
+def _coded_size(data: bytes) -> tuple[int, int] | None:
+    """Return width and height that a JPEG or PNG states, px; None if it states none that can be used."""
+    try:
+        return photo_size(data)
+    except RsePfError:
         return None
-    width, height = struct.unpack_from(">II", data, 16)
-    return int(width), int(height)
 
 
 def _check_png(data: bytes) -> None:

@@ -54,6 +54,8 @@ def lens_or_rig(file: Path) -> tuple[Lens | None, Rig | None]:
 def lens_of(message: Any, topic: str, *, is_rectified: bool) -> Lens:
     """Return the lens of a ``CameraInfo``; that of rectified images has the matrix P and no distortion.
 
+    Numbers are those of the whole sensor; the lens is that of the region of interest after binning (REP 104).
+
     Raises:
         UsageError: The camera is not calibrated, or the model of its lens is unknown.
     """
@@ -63,17 +65,14 @@ def lens_of(message: Any, topic: str, *, is_rectified: bool) -> Lens:
         D = np.zeros(0)
     else:
         fx, cx, fy, cy = K[0], K[2], K[4], K[5]
-    if message.binning_x > 1 or message.binning_y > 1 or message.roi.width or message.roi.height:
-        roi = message.roi
-        if (
-            message.binning_x > 1
-            or message.binning_y > 1
-            or (roi.width, roi.height) != (message.width, message.height)
-        ):
-            raise UsageError(
-                f"{topic} describes a part of the sensor (binning or region of interest)", hint=_HINT
-            )
-    model = str(message.distortion_model)
+    roi, width, height = message.roi, int(message.width), int(message.height)
+    across, down = max(1, message.binning_x), max(1, message.binning_y)
+    if (roi.width, roi.height, across, down) not in ((0, 0, 1, 1), (width, height, 1, 1)):
+        # The centre of the first pixel is (0, 0), so that the corner of the image is at -0.5.
+        fx, cx = fx / across, (cx - roi.x_offset + 0.5) / across - 0.5
+        fy, cy = fy / down, (cy - roi.y_offset + 0.5) / down - 0.5
+        width, height = (roi.width or width) // across, (roi.height or height) // down
+    model = str(message.distortion_model).lower().replace(" ", "_")
     has_distortion = bool(np.any(D))
     if has_distortion and model not in _BROWN | _FISHEYE:
         raise UsageError(f"{topic} has a lens of the unknown model {model or '(none)'}", hint=_HINT)
@@ -85,7 +84,7 @@ def lens_of(message: Any, topic: str, *, is_rectified: bool) -> Lens:
     try:
         camera = Camera(
             fx=float(fx), fy=float(fy), cx=float(cx), cy=float(cy),
-            width=int(message.width), height=int(message.height),
+            width=width, height=height,
         )  # fmt: skip
     except InvalidCamera as error:
         raise UsageError(f"{topic} holds no calibration: {error.message}", hint=_HINT) from error

@@ -16,6 +16,7 @@ __all__ = [
     "CAMERA_INFO",
     "COMPRESSED_IMAGE",
     "DIAGNOSTICS",
+    "FLOAT",
     "IMAGE",
     "IMU",
     "ODOMETRY",
@@ -25,6 +26,7 @@ __all__ = [
     "POSE_WITH_COVARIANCE",
     "TF",
     "TF_OF_ROS1",
+    "TRANSFORM",
     "load_types",
 ]
 
@@ -40,6 +42,8 @@ ODOMETRY = "nav_msgs/msg/Odometry"
 PATH = "nav_msgs/msg/Path"
 POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
 DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
+FLOAT = "std_msgs/msg/Float32"
+TRANSFORM = "geometry_msgs/msg/Transform"
 
 _HEADER = "time stamp\nstring frame_id"
 _COMMON = {
@@ -48,7 +52,8 @@ _COMMON = {
     "geometry_msgs/msg/Point": "float64 x\nfloat64 y\nfloat64 z",
     "geometry_msgs/msg/Quaternion": "float64 x\nfloat64 y\nfloat64 z\nfloat64 w",
     "geometry_msgs/msg/Pose": "geometry_msgs/Point position\ngeometry_msgs/Quaternion orientation",
-    "geometry_msgs/msg/Transform": "geometry_msgs/Vector3 translation\ngeometry_msgs/Quaternion rotation",
+    FLOAT: "float32 data",
+    TRANSFORM: "geometry_msgs/Vector3 translation\ngeometry_msgs/Quaternion rotation",
     "geometry_msgs/msg/Twist": "geometry_msgs/Vector3 linear\ngeometry_msgs/Vector3 angular",
     "geometry_msgs/msg/PoseWithCovariance": "geometry_msgs/Pose pose\nfloat64[36] covariance",
     "geometry_msgs/msg/TwistWithCovariance": "geometry_msgs/Twist twist\nfloat64[36] covariance",

@@ -14,7 +14,7 @@ from rse_pf.errors import UsageError
 __all__ = ["ImageStream", "WantedImage"]
 
 WantedImage = tuple[str, int, int]
-"""Topic, stamp and time of writing, nanoseconds."""
+"""Topic, stamp of the message and time of writing, nanoseconds."""
 
 _MAX_WAITING_BYTES = 64 * 1024 * 1024
 _SKIP_NS = 2_000_000_000
@@ -30,7 +30,7 @@ class ImageStream:
         self._use_log_time = use_log_time
         self._messages: Iterator[RawMessage] | None = None
         self._at_ns = 0
-        self._waiting: OrderedDict[tuple[str, int], RawMessage] = OrderedDict()
+        self._waiting: OrderedDict[WantedImage, RawMessage] = OrderedDict()
         self._waiting_bytes = 0
 
     def take(self, wanted: Sequence[WantedImage]) -> list[RawMessage]:
@@ -39,7 +39,7 @@ class ImageStream:
         Raises:
             UsageError: The bag does not hold them any more.
         """
-        missing = {(topic, stamp): log_ns for topic, stamp, log_ns in wanted}
+        missing = {image: image[2] for image in wanted}
         for key in list(missing):
             if key in self._waiting:
                 del missing[key]
@@ -54,10 +54,9 @@ class ImageStream:
                     raise UsageError(
                         f"{self._file.path} does not hold its messages any more", hint="read it again"
                     )
-        keys = [(topic, stamp) for topic, stamp, _ in wanted]
-        taken = [self._waiting[key] for key in keys]
-        oldest = min(stamp for _, stamp in keys)
-        for key in [key for key in self._waiting if key[1] <= oldest or key in keys]:
+        taken = [self._waiting[image] for image in wanted]
+        oldest = min(stamp for _, stamp, _ in wanted)
+        for key in [key for key in self._waiting if key[1] <= oldest or key in wanted]:
             self._waiting_bytes -= len(self._waiting.pop(key).data)
         return taken
 
@@ -71,7 +70,7 @@ class ImageStream:
         self._messages = self._file.messages(self._topics, start_ns=start_ns)
         self._at_ns = start_ns
 
-    def _read(self, missing: dict[tuple[str, int], int], until_ns: int | None) -> bool:
+    def _read(self, missing: dict[WantedImage, int], until_ns: int | None) -> bool:
         """Read on until no message is missing; return False at the end of the bag, or of that time."""
         assert self._messages is not None
         while missing:
@@ -86,12 +85,13 @@ class ImageStream:
                 break
         return not missing
 
-    def _keep(self, raw: RawMessage, missing: dict[tuple[str, int], int]) -> None:
+    def _keep(self, raw: RawMessage, missing: dict[WantedImage, int]) -> None:
         self._at_ns = max(self._at_ns, raw.log_ns)
         try:
-            key = (raw.topic, raw.log_ns if self._use_log_time else self._file.stamp_ns(raw))
+            stamp_ns = raw.log_ns if self._use_log_time else self._file.stamp_ns(raw)
         except BrokenMessage:
             return
+        key = (raw.topic, stamp_ns, raw.log_ns)
         if key in self._waiting:
             return
         self._waiting[key] = raw

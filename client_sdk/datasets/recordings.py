@@ -154,6 +154,7 @@ def dataset_of_bag(bag: Bag) -> Dataset:
         has_depth=bag.has_depth,
         has_stereo=bag.has_stereo,
         imu=bag.imu,
+        log=bag.log,
     )
 
 

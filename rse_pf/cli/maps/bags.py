@@ -75,8 +75,8 @@ def _add_from_bag(parser: argparse.ArgumentParser) -> None:
         help="images belong together up to this difference of time (default: %(default)s s)",
     )  # fmt: skip
     add(
-        "--depth-scale", type=float, default=1000.0, metavar="N",
-        help="units of 16-bit depth in a metre (default: 1000)",
+        "--depth-scale", type=float, metavar="N",
+        help="units of 16-bit depth in a metre (default: what the bag states, else 1000)",
     )  # fmt: skip
     add_drive_arguments(parser, Path("out-bag"))
 

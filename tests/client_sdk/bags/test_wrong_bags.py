@@ -156,7 +156,7 @@ def test_clocks_that_differ_are_told_with_the_smallest_difference(tmp_path: Path
         ({"distortion_model": "cubic", "d": np.array([0.1])}, "unknown model cubic"),
         ({"d": np.array([0.1, 0.2, 0.3])}, "3 distortion numbers"),
         ({"d": np.array([0.1, np.nan, 0.3, 0, 0])}, "5 distortion numbers"),
-        ({"binning_x": 2, "binning_y": 2}, "a part of the sensor"),
+        ({"binning_x": 2, "binning_y": 2}, "64x48 px, /camera/color/camera_info is for 32x24 px"),
         ({"width": 2 * WIDTH, "height": 2 * HEIGHT}, "has images of 64x48 px"),
     ],
 )

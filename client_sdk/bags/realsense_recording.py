@@ -1,0 +1,65 @@
+"""What a recorder of RealSense cameras writes beside its images: the unit of depth, and where sensors sit.
+
+Topics are those of librealsense's file format: ``/device_0/sensor_0/Depth_0/image/data`` are images,
+``/device_0/sensor_0/option/Depth_Units/value`` metres of a unit, and ``/device_0/sensor_0/Depth_0/tf/0`` the
+transform that takes points of reference 0 to the sensor.  All frames of reference are named "0".
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from client_sdk.bags.bag_file import BagFile, BrokenMessage
+from client_sdk.bags.message_types import FLOAT, TRANSFORM
+from rse_pf.geometry import Array, from_quaternion, inverse
+
+__all__ = ["stated_T_colour_depth", "stated_depth_unit_m"]
+
+_IMAGES = "/image/data"
+
+
+def stated_depth_unit_m(file: BagFile, depth: str) -> float | None:
+    """Return how many metres a unit of the topic *depth* is; None if the bag does not state it."""
+    stream = _stream_of(depth)
+    if not stream:
+        return None
+    sensor = stream.rpartition("/")[0]
+    message = _first(file, f"{sensor}/option/Depth_Units", FLOAT)
+    unit_m = (
+        0.0 if message is None else round(float(message.data), 9)
+    )  # a float of 32 bits has no more digits
+    return unit_m if math.isfinite(unit_m) and unit_m > 0.0 else None
+
+
+def stated_T_colour_depth(file: BagFile, colour: str, depth: str) -> Array | None:
+    """Return ``(4, 4)`` from the frame of *depth* to that of *colour*; None if the bag does not state it."""
+    mounts = [_first(file, f"{_stream_of(topic)}/tf/", TRANSFORM) for topic in (colour, depth)]
+    if not (_stream_of(colour) and _stream_of(depth)) or mounts[0] is None or mounts[1] is None:
+        return None
+    T_colour_reference, T_depth_reference = (_matrix_of(mount) for mount in mounts)
+    T_colour_depth: Array = T_colour_reference @ inverse(T_depth_reference)
+    return T_colour_depth if np.isfinite(T_colour_depth).all() else None
+
+
+def _stream_of(topic: str) -> str:
+    return topic.removesuffix(_IMAGES) if topic.endswith(_IMAGES) else ""
+
+
+def _first(file: BagFile, start: str, kind: str) -> Any | None:
+    """Return the first good message of the topics of one type whose names have this start."""
+    names = [topic.name for topic in file.topics if topic.kind == kind and topic.name.startswith(start)]
+    try:
+        return next((file.parse(raw) for raw in file.messages(names)), None)
+    except BrokenMessage:
+        return None
+
+
+def _matrix_of(transform: Any) -> Array:
+    T = np.eye(4)
+    turn, step = transform.rotation, transform.translation
+    T[:3, :3] = from_quaternion(np.array([turn.x, turn.y, turn.z, turn.w]))
+    T[:3, 3] = step.x, step.y, step.z
+    return T
