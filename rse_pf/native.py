@@ -13,7 +13,7 @@ from collections.abc import Callable
 from functools import cache, lru_cache
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeVar
+from typing import Any, Literal, TypeVar
 
 import msgspec
 import numpy as np
@@ -50,18 +50,12 @@ __all__ = [
     "solver_error",
 ]
 
-if TYPE_CHECKING:
-    from functools import _lru_cache_wrapper
-
 Part = TypeVar("Part")
 
 _ABI = 2
 _FILE = "librse_pf_native.so"
 _PROPOSE = 2
 _LANES = {"avx512": 0, "avx2": 4, "portable": 1}
-_is_off = False
-_FORGET: list[Callable[[], None]] = []
-"""Forget what was opened in the library."""
 # rse_pf_pnp_request: abi, flags, rows, points, pixels | camera | options | deadline, cancelled.
 _HEAD = struct.Struct("=IIqQQ")
 _BODY = struct.Struct("=ddddiiddiiQdddd")
@@ -352,25 +346,8 @@ def solver_error(values: tuple[Any, ...], n: int, options: NativeOptions) -> Rse
     return BadRequest("the options or sizes of the request do not fit", hint="leave the options out")
 
 
-def switch_off() -> None:
-    """Find no library in this process from now on, and forget what was opened in it."""
-    global _is_off
-    _is_off = True
-    for forget in _FORGET:
-        forget()
-
-
-def remembered(open_part: Callable[[], Part]) -> _lru_cache_wrapper[Part]:
-    """Return *open_part*, whose result is remembered until `switch_off`."""
-    cached = cache(open_part)
-    _FORGET.append(cached.cache_clear)
-    return cached
-
-
 def find_library() -> Path | None:
     """Return the library's file: that of the package ``rse_pf_native``, else that built in this checkout."""
-    if _is_off:
-        return None
     folders = [Path(__file__).parent.parent / "native" / "build"]
     installed = find_spec("rse_pf_native")
     if installed is not None and installed.origin:
@@ -436,7 +413,7 @@ def open_solver(path: Path) -> NativeSolver:
     return NativeSolver(solve, lanes().decode())
 
 
-@remembered
+@cache
 def native_solver() -> NativeSolver:
     """Return the solver of the library that `find_library` finds; later calls return the same.
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import ctypes
 import math
 from collections.abc import Callable, Sequence
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rse_pf.geometry import Array, Camera
-from rse_pf.native import address_of, aligned, load_part, open_found, remembered
+from rse_pf.native import address_of, aligned, load_part, open_found
 from rse_pf.native_matcher import MATCH_ABI, Lanes, MatchCore, Workspace, open_matcher
 
 __all__ = ["FrontEndCore", "Keypoints", "front_end_core", "open_front_end"]
@@ -238,7 +238,7 @@ def open_front_end(path: Path, lanes: Lanes = "avx512") -> FrontEndCore:
     return FrontEndCore(detect, describe, points_at, open_matcher(path, lanes))
 
 
-@remembered
+@cache
 def front_end_core() -> FrontEndCore | None:
     """Return the front end of the library that `rse_pf.native` finds; None without one that fits."""
     return open_found(open_front_end)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import ctypes
 import threading
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -15,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rse_pf.geometry import Array
-from rse_pf.native import address_of, aligned, load_part, open_found, remembered
+from rse_pf.native import address_of, aligned, load_part, open_found
 
 __all__ = ["MATCH_ABI", "Lanes", "MatchCore", "Workspace", "match_core", "open_matcher"]
 
@@ -118,7 +119,7 @@ def open_matcher(path: Path, lanes: Lanes = "avx512") -> MatchCore:
     return MatchCore(matches, lanes)
 
 
-@remembered
+@cache
 def match_core() -> MatchCore | None:
     """Return the matcher of the library that `rse_pf.native` finds; None without one that fits."""
     return open_found(open_matcher)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ import numpy.typing as npt
 
 from rse_pf.errors import BadRequest
 from rse_pf.geometry import Array
-from rse_pf.native import address_of, aligned, load_part, open_found, remembered
+from rse_pf.native import address_of, aligned, load_part, open_found
 
 __all__ = ["StereoCore", "StereoRequest", "open_stereo", "stereo_core"]
 
@@ -85,7 +86,7 @@ def open_stereo(path: Path, *, portable: bool = False) -> StereoCore:
     return StereoCore(disparities, portable=portable)
 
 
-@remembered
+@cache
 def stereo_core() -> StereoCore | None:
     """Return the stereo part of the library that `rse_pf.native` finds; None without one that fits."""
     return open_found(open_stereo)

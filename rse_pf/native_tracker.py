@@ -7,13 +7,14 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
 from rse_pf.geometry import Array, Camera
-from rse_pf.native import address_of, aligned, load_part, open_found, remembered
+from rse_pf.native import address_of, aligned, load_part, open_found
 from rse_pf.native_matcher import Workspace
 
 __all__ = ["TrackCore", "open_tracker", "track_core"]
@@ -134,7 +135,7 @@ def open_tracker(path: Path) -> TrackCore:
     return TrackCore(distinct, near, fit)
 
 
-@remembered
+@cache
 def track_core() -> TrackCore | None:
     """Return the tracker's part of the library that `rse_pf.native` finds; None without one that fits."""
     return open_found(open_tracker)

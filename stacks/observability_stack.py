@@ -20,7 +20,6 @@ from rse_pf.config.resource_names import ResourceNames
 from rse_pf.scaling.alarms import NAMESPACE
 from rse_pf.scaling.operator_alarms import (
     NATIVE_CRASHES,
-    NATIVE_OFF,
     STORE_ERRORS,
     OperatorAlarm,
     Series,
@@ -112,9 +111,7 @@ class ObservabilityStack(cdk.Stack):
                 "Robots and requests": [
                     of("group", NAMESPACE, name, "Sum") for name in ("Robots", "Requests")
                 ],
-                "Crashes of native code, and servers without the core": [
-                    of("group", NAMESPACE, name, "Sum") for name in (NATIVE_CRASHES, NATIVE_OFF)
-                ],
+                "Crashes of native code": [of("group", NAMESPACE, NATIVE_CRASHES, "Sum")],
                 "Queue, and answers' p95": [
                     of("group", NAMESPACE, "QueueMs", "Maximum"), of("group", NAMESPACE, "AnswerMs", "p95"),
                 ],

@@ -61,7 +61,6 @@ GAUGE_HELP = {
     "accept_pauses": "pauses because sockets began to send faster than max_accepts_per_s",
     "worker_crashes": "workers that native code ended, and that were replaced, since the start",
     "disk_free_percent": "free share of the disk of the server's working folder, in percent",
-    "native_off": "whether workers that begin do without the native core, after crashes: 1 or 0",
     "control_refused": "requests to the control port that were refused for lack of its token",
 }
 """What each gauge means; a new gauge needs a line here."""

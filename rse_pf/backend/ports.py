@@ -49,7 +49,7 @@ class Wire(Protocol):
 
 
 class CrashMarks(Protocol):
-    """Where a worker notes for whom it computes; `rse_pf.backend.supervisor.crashes.report` reads it."""
+    """Where a worker notes for whom it computes; `rse_pf.backend.supervisor.crash_report` reads it."""
 
     of_loop: memoryview
     """The connection for which the thread of the event loop works, in its only element; 0 for none."""

@@ -170,7 +170,7 @@ def native_options(options: PnpOptions, weak: WeakLimits) -> native.NativeOption
     )
 
 
-@native.remembered
+@cache
 def _native_engine() -> Engine:
     solver = native.native_solver()
 

@@ -9,13 +9,14 @@ import ctypes
 import struct
 import threading
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
 
 from rse_pf.geometry import Array, Camera
-from rse_pf.native import address_of, aligned, load_part, open_found, remembered
+from rse_pf.native import address_of, aligned, load_part, open_found
 from rse_pf.pnp.solver import PnpSolution
 
 __all__ = ["DepthCore", "RefinedPose", "depth_core", "open_depth"]
@@ -125,7 +126,7 @@ def open_depth(path: Path, *, portable: bool = False) -> DepthCore:
     return DepthCore(refine, portable=portable)
 
 
-@remembered
+@cache
 def depth_core() -> DepthCore | None:
     """Return the refinement of the library that `rse_pf.native` finds; None without one that fits."""
     return open_found(open_depth)

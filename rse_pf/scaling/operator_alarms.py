@@ -18,7 +18,6 @@ __all__ = [
     "LAMBDA_TIMEOUT_S",
     "LOW_DISK_PERCENT",
     "NATIVE_CRASHES",
-    "NATIVE_OFF",
     "STORE_ERRORS",
     "STORE_PERIOD_S",
     "OperatorAlarm",
@@ -38,9 +37,8 @@ STORE_ERRORS, STORE_PERIOD_S = "StoreErrors", 10
 
 Nothing is published while all is well, so the metric costs nothing then; agents that are silent for another
 reason have an alarm of their own."""
-NATIVE_CRASHES, NATIVE_OFF = "NativeCrashes", "NativeOff"
-"""Workers of a server that native code ended in a period, and 1 while it does without the native core; an
-agent publishes neither while it is 0."""
+NATIVE_CRASHES = "NativeCrashes"
+"""Workers of a server that native code ended in a period; an agent does not publish 0."""
 # What an agent publishes, as 1, while the free share of its server's disk is below the percentage.
 DISK_LOW = "DiskLow"
 LOW_DISK_PERCENT = 10.0
@@ -113,9 +111,6 @@ _STORE_ERRORS = Series(
 _NATIVE_CRASHES = Series(
     name="crashes", namespace=NAMESPACE, metric=NATIVE_CRASHES, statistic="Sum", source="group"
 )  # fmt: skip
-_NATIVE_OFF = Series(
-    name="off", namespace=NAMESPACE, metric=NATIVE_OFF, statistic="Maximum", source="group"
-)  # fmt: skip
 _DISK_LOW = Series(
     name="low", namespace=NAMESPACE, metric=DISK_LOW, statistic="Maximum", source="group"
 )  # fmt: skip
@@ -172,14 +167,6 @@ def operator_alarms(settings: PlatformSettings) -> tuple[OperatorAlarm, ...]:
             meaning="native code ended a worker of a server",
             series=(_NATIVE_CRASHES,),
             expression="IF(crashes >= 1, 1, 0)",
-            periods=1,
-            datapoints=1,
-        ),
-        OperatorAlarm(
-            name="native-off",
-            meaning="a server does without the native core, after crashes of native code",
-            series=(_NATIVE_OFF,),
-            expression="IF(off >= 1, 1, 0)",
             periods=1,
             datapoints=1,
         ),

@@ -9,7 +9,7 @@ from __future__ import annotations
 import ctypes
 import struct
 from collections.abc import Callable
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -18,7 +18,7 @@ import numpy as np
 
 from rse_pf.budget import Budget, Refusal, refusal
 from rse_pf.errors import RsePfError
-from rse_pf.native import load_part, open_found, remembered
+from rse_pf.native import load_part, open_found
 from rse_pf.native_buffers import SLACK, CallBuffers
 from rse_pf.wire.messages import Command
 from rse_pf.wire.plain_pnp import PlainPnp
@@ -261,7 +261,7 @@ def open_codec(path: Path) -> NativeCodec:
     return NativeCodec(path)
 
 
-@remembered
+@cache
 def native_codec() -> NativeCodec | None:
     """Return the codec of the library that `find_library` finds, None if there is none that fits."""
     return open_found(open_codec)

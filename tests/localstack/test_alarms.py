@@ -53,7 +53,7 @@ class Server(FakeMachine):
         self._crashes += busy
         self.text = (
             f"rse_pf_robots {robots}\nrse_pf_queue_oldest_s {queue_s}\n"
-            f"rse_pf_worker_crashes {self._crashes}\nrse_pf_native_off {float(busy)}\n"
+            f"rse_pf_worker_crashes {self._crashes}\n"
         )
 
     def reaches_store(self) -> bool:

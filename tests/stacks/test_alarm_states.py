@@ -85,7 +85,6 @@ FAULTS: dict[str, list[dict[str, list[float] | None]]] = {
     ],
     "silent-agent": [{"Robots": None}, {"Robots": "one server less"}],  # type: ignore[dict-item]
     "native-crashes": [{"NativeCrashes": [1.0]}, {"NativeCrashes": [1.0, 2.0], "Robots": None}],
-    "native-off": [{"NativeOff": [1.0]}, {"NativeOff": [1.0, 1.0]}],
     "disk": [{"DiskLow": [1.0]}],
     "lambda-errors": [{"Errors": [1.0]}],
     "lambda-throttles": [{"Throttles": [3.0]}],

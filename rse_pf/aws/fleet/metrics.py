@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from rse_pf.scaling.operator_alarms import DISK_LOW, LOW_DISK_PERCENT, NATIVE_CRASHES, NATIVE_OFF
+from rse_pf.scaling.operator_alarms import DISK_LOW, LOW_DISK_PERCENT, NATIVE_CRASHES
 
 __all__ = ["ROBOTS", "ServerMetrics", "datums", "dimensions_of", "read_cpu_times", "read_page"]
 
@@ -40,7 +40,6 @@ class ServerMetrics:
     bytes_in: float = 0.0
     bytes_out: float = 0.0
     worker_crashes: float = 0.0
-    native_off: float = 0.0
     disk_free_percent: float = 100.0
     answers: Mapping[float, float] = field(default_factory=dict)
 
@@ -69,7 +68,6 @@ def read_page(text: str) -> ServerMetrics:
         bytes_in=totals["bytes_total in"],
         bytes_out=totals["bytes_total out"],
         worker_crashes=totals["worker_crashes"],
-        native_off=totals["native_off"],
         disk_free_percent=totals.get("disk_free_percent", 100.0),
         answers=dict(answers),
     )
@@ -106,7 +104,6 @@ def datums(before: ServerMetrics, now: ServerMetrics, group: str, server: str) -
     }
     troubles = {
         NATIVE_CRASHES: _counter_growth(before.worker_crashes, now.worker_crashes),
-        NATIVE_OFF: now.native_off,
         DISK_LOW: float(now.disk_free_percent < LOW_DISK_PERCENT),
     }
     values.update({name: (value, "Count") for name, value in troubles.items() if value})

@@ -66,7 +66,7 @@ class LimitedServices:
 
     def blocked_robots(self, now: float) -> int:
         """Return how many robots are refused now."""
-        return self._crashes.count_blocked(now)
+        return len(self._crashes.blocked(now))
 
     def cpu_s(self) -> float:
         """Return the CPU seconds of all processes so far; less again after a template was lost."""

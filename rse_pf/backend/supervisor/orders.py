@@ -99,12 +99,12 @@ class BanOrder(msgspec.Struct, tag="ban", tag_field="do", frozen=True):
 class BeginOrder(msgspec.Struct, tag="begin", tag_field="do", frozen=True):
     """Take the place of worker *index*, which has crashed; the first order of a process that waits for one.
 
-    ``snapshot`` is the text of a `TrustStore`, "" for the keys of the server's start; the robots ``banned``
-    are refused for *seconds*.
+    It begins after *wait_s*.  ``snapshot`` is the text of a `TrustStore`, "" for the keys of the server's
+    start; the robots ``banned`` are refused for *seconds*.
     """
 
     index: int
-    is_native: bool
+    wait_s: float
     snapshot: str
     banned: list[RobotId]
     seconds: float

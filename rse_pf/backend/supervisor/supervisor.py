@@ -2,7 +2,7 @@
 
 The supervisor accepts each robot and passes the socket, when it has begun to send, to the worker with the
 fewest robots.  It consumes no byte of a robot.  A worker that native code ended is replaced
-(`crashes`); otherwise the server ends with its first worker that is lost, and the scale modifier
+(`crash_recovery`); otherwise the server ends with its first worker that is lost, and the scale modifier
 replaces it.  A drain loses no command.
 """
 
@@ -31,7 +31,7 @@ from rse_pf.backend.log import JsonLog
 from rse_pf.backend.metrics import merge, merge_isolation, render, tenant_cpu_s
 from rse_pf.backend.rosbridge.peers import peer_channels
 from rse_pf.backend.supervisor.accepting import RobotAcceptor
-from rse_pf.backend.supervisor.crashes.recovery import CrashRecovery, spare_plans
+from rse_pf.backend.supervisor.crash_recovery import CrashRecovery, spare_plans
 from rse_pf.backend.supervisor.listener import bound_socket, check_authentication, open_control
 from rse_pf.backend.supervisor.orders import (
     BlocksOrder,
@@ -410,7 +410,6 @@ class _Supervisor:
                 "accept_pauses": float(self._acceptor.pauses),
                 "control_refused": float(self._control_refused),
                 "worker_crashes": float(self._crashes.count),
-                "native_off": float(self._crashes.is_native_off),
                 "disk_free_percent": disk_free_percent(),
             }
         )

@@ -24,7 +24,6 @@ from typing import Any, TypeVar
 
 import msgspec
 
-from rse_pf import native
 from rse_pf.auth.tokens import KeySet
 from rse_pf.auth.trust_store import key_set_from_snapshot
 from rse_pf.aws.storage import open_data_store
@@ -54,7 +53,7 @@ from rse_pf.backend.sandbox.circuit_breaker import Block
 from rse_pf.backend.sandbox.manager import SandboxHost, SandboxManager
 from rse_pf.backend.sandbox.reloading import Answer, OnReady, ReloadingSandboxes
 from rse_pf.backend.scheduling.command_queue import CommandQueue
-from rse_pf.backend.supervisor.crashes.report import CrashReport
+from rse_pf.backend.supervisor.crash_report import CrashReport
 from rse_pf.backend.supervisor.orders import (
     BanOrder,
     BeginOrder,
@@ -155,6 +154,7 @@ def run_worker(plan: WorkerPlan, data: socket.socket, control: socket.socket) ->
     set_process_name("rse-pf worker")
     plan.crash.begin()
     if begin is not None:
+        time.sleep(begin.wait_s)
         plan = _plan_of(plan, begin)
     loop = event_loop_maker()()
     asyncio.set_event_loop(loop)
@@ -176,8 +176,6 @@ def _wait_to_begin(control: socket.socket) -> BeginOrder | None:
 
 def _plan_of(plan: WorkerPlan, order: BeginOrder) -> WorkerPlan:
     """Return the plan of a process that takes the place of a worker."""
-    if not order.is_native:
-        native.switch_off()
     keys = key_set_from_snapshot(order.snapshot) if order.snapshot and plan.keys is not None else plan.keys
     return replace(plan, index=order.index, peers=plan.all_peers[order.index], keys=keys)
 

@@ -108,7 +108,6 @@ _SENTENCES: Mapping[str, str] = {
     "robot.removed": "{actor} removed {subject}",
     "server.drain": "{who} drains: its robots are asked to move after {wait_s} s",
     "server.move": "{who} asks {robots} of its robots to move within {spread_s} s",
-    "server.native-core-off": "{who} does without the native core from now on, after {crashes} crashes",
     "server.over": "{who} has ended",
     "server.ready": "{who} is ready",
     "server.record": "{who} begins or ends to record {calls} calls of the service {service}",

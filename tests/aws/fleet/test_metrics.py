@@ -66,16 +66,12 @@ def test_a_restarted_server_counts_from_zero_again() -> None:
 
 
 def test_crashes_of_native_code_are_published_as_their_increase_and_only_while_there_are_any() -> None:
-    before, now = (
-        read_page(page([], worker_crashes=count, native_off=off)) for count, off in ((2, 0), (3, 1))
-    )
+    before, now = (read_page(page([], worker_crashes=count)) for count in (2, 3))
 
     began, followed = named(datums(before, now, "group", "i-1")), named(datums(now, now, "group", "i-1"))
 
-    assert (began["NativeCrashes"]["Value"], began["NativeOff"]["Value"]) == (1, 1)
+    assert began["NativeCrashes"]["Value"] == 1
     assert "NativeCrashes" not in followed
-    assert followed["NativeOff"]["Value"] == 1
-    assert not {"NativeCrashes", "NativeOff"} & set(named(datums(before, before, "group", "i-1")))
 
 
 @pytest.mark.parametrize(("free_percent", "is_low"), [(0.0, True), (9.9, True), (10.0, False), (None, False)])
@@ -97,7 +93,7 @@ def test_every_series_of_an_operator_alarm_that_we_publish_is_published_by_a_ser
     told = named(
         datums(
             ServerMetrics(),
-            ServerMetrics(worker_crashes=3, native_off=1, disk_free_percent=9.9),
+            ServerMetrics(worker_crashes=3, disk_free_percent=9.9),
             "rse-pf",
             "i-1",
         )

@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 import pytest
 
-from rse_pf.backend.supervisor.crashes.report import Crash, CrashReport
+from rse_pf.backend.supervisor.crash_report import Crash, CrashReport
 from rse_pf.identity import RobotId
 
 ROBOT = RobotId("acme", "r-ü", "thumbprint")

@@ -1,4 +1,4 @@
-"""What follows the crash of a worker: who takes its place, who is shut out, when the core is not used."""
+"""What follows the crash of a worker: who takes its place and when, and which robot is refused."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from rse_pf.backend.supervisor.crashes.recovery import CrashRecovery
-from rse_pf.backend.supervisor.crashes.report import Crash
+from rse_pf.backend.supervisor.crash_recovery import CrashRecovery
+from rse_pf.backend.supervisor.crash_report import Crash
 from rse_pf.backend.supervisor.orders import BanOrder
 from rse_pf.backend.supervisor.session_registry import SessionRegistry
 from rse_pf.crash_record import BLOCK_S, WINDOW_S
@@ -91,7 +91,7 @@ def test_a_process_that_waits_takes_the_place_of_a_worker_that_crashed() -> None
     assert heir is not ended
     assert ended.killed
     assert server.recovery.cpu_s == ended.cpu_s
-    assert (heir.orders[0].index, heir.orders[0].is_native, heir.orders[0].banned) == (1, True, [])
+    assert (heir.orders[0].index, heir.orders[0].wait_s, heir.orders[0].banned) == (1, 0.0, [])
     assert server.noted == [("server.worker-crashed", {"pid": 2, "signal": 11, "robot": "acme/one"})]
     assert server.said[0][1]["at"] == "f.py:1 f"
 
@@ -144,23 +144,20 @@ def test_two_crashes_by_two_robots_shut_nobody_out(other: RobotId) -> None:
     assert "server.robot-shut-out" not in server.actions()
 
 
-@pytest.mark.parametrize(("apart_s", "is_off"), [(WINDOW_S / 2, True), (WINDOW_S / 2 + 1, False)])
-def test_three_crashes_by_any_robots_within_the_window_end_the_use_of_the_core(
-    apart_s: float, is_off: bool
+@pytest.mark.parametrize(
+    ("apart_s", "waits_s"), [(0.0, [0.0, 0.0, 1.0, 2.0, 4.0]), (WINDOW_S / 2 + 1, [0.0] * 5)]
+)
+def test_after_two_crashes_within_the_window_each_successor_waits_twice_as_long(
+    apart_s: float, waits_s: list[float]
 ) -> None:
     server = Server()
-    heirs = []
-    for robot in (ONE, TWO, THREE):
-        heirs.append(server.crash(robot))
+    successors = []
+    for _ in waits_s:
+        successors.append(server.crash(None))
         server.now += apart_s
 
-    assert [heir.orders[0].is_native for heir in heirs if heir is not None] == [True, True, not is_off]
-    assert server.recovery.is_native_off is is_off
-    assert ("server.native-core-off" in server.actions()) is is_off
-    assert server.recovery.count == 3
-    following = server.crash(None)
-    assert following is not None
-    assert following.orders[0].is_native is not is_off
+    assert [each.orders[0].wait_s for each in successors if each is not None] == waits_s
+    assert server.recovery.count == 5
 
 
 def test_a_robot_that_the_report_does_not_name_is_found_by_its_connection() -> None:

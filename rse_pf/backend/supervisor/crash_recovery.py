@@ -1,7 +1,8 @@
-"""Replace a worker that native code ended, shut out a robot whose bytes do that, and do without the core.
+"""Replace a worker that native code ended, and refuse a robot whose bytes do that.
 
-The processes that take over were forked with the workers, before any loop and thread, and wait.  A server has
-a few of them; when they are used up, or a worker ends in another way, the server ends with its worker.
+The processes that take over were forked with the workers, before any loop and thread, and wait.  After many
+crashes a successor begins later (`restart_delay_s`).  A server has a few of these processes; when they are
+used up, or a worker ends in another way, the server ends with its worker.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from dataclasses import replace
 from rse_pf.auth.trust_store import TrustStore
 from rse_pf.backend.gateway.audit_recorder import ServerAudit
 from rse_pf.backend.ports import Log
-from rse_pf.backend.supervisor.crashes.report import CRASH_SIGNALS, CrashReport
+from rse_pf.backend.supervisor.crash_report import CRASH_SIGNALS, CrashReport
 from rse_pf.backend.supervisor.orders import BanOrder, BeginOrder
 from rse_pf.backend.supervisor.session_registry import SessionRegistry
 from rse_pf.backend.supervisor.worker import WorkerPlan
@@ -21,12 +22,17 @@ from rse_pf.backend.supervisor.worker_handle import WorkerProcess
 from rse_pf.crash_record import BLOCK_S, WINDOW_S, CrashRecord
 from rse_pf.identity import RobotId
 
-__all__ = ["CrashRecovery", "spare_plans"]
+__all__ = ["CrashRecovery", "restart_delay_s", "spare_plans"]
 
-_MOST_CRASHES = 3
-"""Within `WINDOW_S`, by any robots: then the Python twin computes in each worker that begins."""
 _SPARES = 5
-"""Processes that wait for a crash: three until the twin computes, and two of workers that began before."""
+"""Processes that wait for a crash."""
+_PROMPT_RESTARTS = 2
+"""Crashes within `WINDOW_S` whose successors begin at once: one robot is refused after so many."""
+
+
+def restart_delay_s(crashes: int) -> float:
+    """Return how long the successor of a worker waits after the *crashes*-th crash within `WINDOW_S`."""
+    return 0.0 if crashes <= _PROMPT_RESTARTS else 2.0 ** (crashes - _PROMPT_RESTARTS - 1)
 
 
 def spare_plans(plans: Sequence[WorkerPlan]) -> list[WorkerPlan]:
@@ -37,7 +43,7 @@ def spare_plans(plans: Sequence[WorkerPlan]) -> list[WorkerPlan]:
 
 
 class CrashRecovery:
-    """The crashes of one server, and the processes that wait for them."""
+    """Counts the crashes of the workers of one server, and has the processes that wait for them."""
 
     def __init__(
         self,
@@ -62,14 +68,11 @@ class CrashRecovery:
         self._workers, self._spares = workers, spares
         self._registry, self._trust, self._log, self._records = registry, trust, log, records
         self._crashes = CrashRecord()
-        self._times: deque[float] = deque(maxlen=_MOST_CRASHES)
-        self._banned: dict[RobotId, float] = {}
+        self._times: deque[float] = deque(maxlen=_SPARES)
         self.cpu_s = 0.0
         """CPU seconds of workers that were replaced."""
         self.count = 0
         """Crashes since the start."""
-        self.is_native_off = False
-        """Whether workers that begin do not use the native core."""
 
     def replace(self, worker: WorkerProcess, now: float) -> WorkerProcess | None:
         """Return the process that takes the place of *worker*, which ended at *now* (s), or None."""
@@ -87,24 +90,18 @@ class CrashRecovery:
         index = self._workers.index(worker)
         worker.kill()
         if robot is not None and self._crashes.note_crash(robot, now):
-            self._shut_out(robot, now)
+            self._refuse(robot)
         self._times.append(now)
-        if len(self._times) == _MOST_CRASHES and now - self._times[0] <= WINDOW_S and not self.is_native_off:
-            self.is_native_off = True
-            self._log.error("native-core-off", hint="send the log lines worker-crashed to the developers")
-            self._records.note("server.native-core-off", crashes=_MOST_CRASHES)
-        banned = [robot for robot, until_s in self._banned.items() if until_s > now]
+        wait_s = restart_delay_s(sum(now - at_s <= WINDOW_S for at_s in self._times))
         snapshot = "" if self._trust is None else self._trust.snapshot
-        order = BeginOrder(index, not self.is_native_off, snapshot, banned, BLOCK_S)
+        order = BeginOrder(index, wait_s, snapshot, self._crashes.blocked(now), BLOCK_S)
         while self._spares:
             spare = self._workers[index] = self._spares.pop()
             if spare.begin(order):
                 return spare
         return None
 
-    def _shut_out(self, robot: RobotId, now: float) -> None:
-        self._banned = {each: until_s for each, until_s in self._banned.items() if until_s > now}
-        self._banned[robot] = now + BLOCK_S
+    def _refuse(self, robot: RobotId) -> None:
         self._log.warning("cut-off", robot=robot, reason="crashes")
         self._records.note("server.robot-shut-out", robot=str(robot), seconds=BLOCK_S)
         for worker in self._workers:
