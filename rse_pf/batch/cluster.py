@@ -116,15 +116,17 @@ class RemoteCluster:
     def start(self) -> None:
         """Check that the scheduler answers and has a worker; raises Disconnected or ConfigurationError."""
         from distributed import Client
+        from distributed.security import Security
 
         _silence()
-        try:
-            client = Client(self.address, timeout=_REMOTE_TIMEOUT_S, set_as_default=False)
-        except TypeError as error:  # what Dask raises for tls:// without certificates
+        certificates = Security().get_connection_args("client").get("ssl_context")
+        if self.address.startswith("tls:") and certificates is None:
             raise ConfigurationError(
                 f"{self.address} needs certificates, and Dask is configured with none",
-                hint="set DASK_DISTRIBUTED__COMM__TLS__CA_FILE and TLS__CLIENT__CERT and TLS__CLIENT__KEY",
-            ) from error
+                hint="set DASK_DISTRIBUTED__COMM__TLS__CA_FILE, and ...__CLIENT__CERT and ...__CLIENT__KEY",
+            )
+        try:
+            client = Client(self.address, timeout=_REMOTE_TIMEOUT_S, set_as_default=False)
         except (OSError, TimeoutError) as error:
             raise Disconnected(
                 f"no Dask scheduler answered at {self.address} within {_REMOTE_TIMEOUT_S:g} s",
