@@ -52,7 +52,7 @@ NOT_INCLUDED = (
 )
 
 _HOUR_S = 3600.0
-# A capacity unit of the load balancer holds this many new connections an hour, or this many bytes.
+# A capacity unit of the load balancer holds this many open connections, or passes this many bytes in an hour.
 _CONNECTIONS_OF_A_UNIT = 3000
 _BYTES_OF_A_UNIT = 1e9
 # The load balancer needs a public address in each of two zones.
