@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -25,7 +25,7 @@ from client_sdk.imu.history import ImuHistory
 from client_sdk.mapping import Trajectory, read_trajectory
 from client_sdk.source_facts import stamps_in_seconds
 from rse_pf.errors import UsageError
-from rse_pf.geometry import Array, inverse, log_se3, rotation_angle_deg
+from rse_pf.geometry import Array, from_quaternion, inverse, log_se3, rotation_angle_deg, to_quaternion
 
 __all__ = [
     "FEWEST_ADJUSTED",
@@ -167,6 +167,9 @@ def check_motion(motion: CameraMotion, reference: MotionReference) -> tuple[list
     seen = _twists(T_world_camera[pairs[:, 0]], T_world_camera[pairs[:, 1]], *stamps_s[pairs.T])
     fits = _fits(seen, stamps_s[pairs], reference)
     best = min(range(len(fits)), key=lambda row: fits[row].cost)
+    left = fits[best].left
+    if left > _WELL_EXPLAINED and _explains_reordered(seen, stamps_s[pairs], reference, left):
+        return [_quaternion_finding(reference)], []
     if fits[best].left > _EXPLAINED:
         reason = f"the camera does not move as {reference.name} says, at any delay within 0.5 s"
         return [], [CannotTell(FaultKind.STAMP_DELAY, reason), CannotTell(FaultKind.DEPTH_SCALE, reason)]
@@ -191,8 +194,32 @@ def check_motion(motion: CameraMotion, reference: MotionReference) -> tuple[list
     return findings, untold
 
 
+def _explains_reordered(seen: Array, stamps_s: Array, reference: MotionReference, left: float) -> bool:
+    """Return whether a reference explains what it *left* once w of its quaternions changes its place."""
+    quaternions = np.array([to_quaternion(pose[:3, :3]) for pose in reference.path.T_world_camera])
+    for order in _QUATERNION_ORDERS:
+        poses = reference.path.T_world_camera.copy()
+        poses[:, :3, :3] = [from_quaternion(each) for each in quaternions[:, order]]
+        other = replace(reference, path=Trajectory(reference.path.timestamps_s, poses))
+        if min(fit.left for fit in _fits(seen, stamps_s, other)) <= min(_EXPLAINED, left / 2.0):
+            return True
+    return False
+
+
+def _quaternion_finding(reference: MotionReference) -> Finding:
+    return Finding(
+        kind=FaultKind.SWAPPED_AXES, value=1.0, deviation=0.0, unit="", cost_m=None,
+        sentence=f"the quaternions of {reference.name} have w at the wrong end of the four numbers",
+        fix="write qx qy qz qw in a file in TUM format, and qw qx qy qz in one of EuRoC",
+    )  # fmt: skip
+
+
 # --- motions ----------------------------------------------------------------------------------------------
 
+_WELL_EXPLAINED = 0.1
+"""Share of the motions that a right reference leaves at most, with the noise of a tracker."""
+_QUATERNION_ORDERS = [1, 2, 3, 0], [3, 0, 1, 2]
+"""How to read x, y, z, w of quaternions that were written with w first, or with w last and read as first."""
 _DELAYS_S: Array = np.arange(-_MOST_DELAY_S, _MOST_DELAY_S + 1e-9, _DELAY_STEP_S)
 
 

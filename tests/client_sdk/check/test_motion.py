@@ -18,7 +18,7 @@ from client_sdk.imu.history import ImuHistory
 from client_sdk.imu.samples import ImuModel
 from client_sdk.mapping import Trajectory
 from client_sdk.simulator.inertial import InertialDrive, Motion, SimulatedImu
-from rse_pf.geometry import Array, exp_se3
+from rse_pf.geometry import Array, exp_se3, from_quaternion, to_quaternion
 
 MODEL = ImuModel(
     T_imu_camera=np.eye(4), gyro_noise=1e-3, gyro_walk=1e-5, accel_noise=1e-2, accel_walk=1e-4, rate_hz=200.0
@@ -93,6 +93,17 @@ def test_an_odometry_of_another_body_may_have_other_axes_and_no_mirror_hides_in_
     assert found(mirror @ tracked(stamps()) @ mirror, mounted, is_camera=False).keys() == {FaultKind.MIRRORED}
     swapped = found(tracked(stamps()), mounted)[FaultKind.SWAPPED_AXES]
     assert "-y, -z, x" in swapped.sentence or "z, -x, -y" in swapped.sentence
+
+
+@pytest.mark.parametrize("order", [[3, 0, 1, 2], [1, 2, 3, 0]])
+def test_quaternions_with_w_at_the_wrong_end_are_named(order: list[int]) -> None:
+    path = odometry()
+    poses = path.T_world_camera.copy()
+    poses[:, :3, :3] = [from_quaternion(to_quaternion(pose[:3, :3])[order]) for pose in poses]
+
+    (finding,) = found(tracked(stamps()), Trajectory(path.timestamps_s, poses)).values()
+
+    assert "quaternions of odometry" in finding.sentence
 
 
 def test_a_drive_at_one_speed_without_turns_tells_no_delay() -> None:
