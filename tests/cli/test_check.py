@@ -138,3 +138,24 @@ def test_odometry_beside_the_images_knows_metres(tmp_path: Path, capsys: pytest.
     (tmp_path / "odometry.txt").write_text("0 0 0 0 0 0 0 1\n")
     assert main(["check", str(tmp_path)]) == 2
     assert "holds 1 poses" in capsys.readouterr().err
+
+
+def test_nothing_is_advised_while_the_source_has_a_finding(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("cv2")
+    from client_sdk.simulator import render_frames, true_trajectory
+    from tests.tum_recording import write_tum
+
+    write_tum(tmp_path, render_frames(0, 1, 40, 3), true_trajectory(0, 1, 40, 3), depth_scale=1100)
+    (tmp_path / "rgb/020.png").write_bytes(b"")
+
+    assert main(["check", str(tmp_path)]) == 1
+    told = capsys.readouterr().out
+    assert "finding left-out: 1 image left out, damaged or empty: 020.png" in told
+    assert "check: no advice" in told
+    assert "depth scale" not in told
+    assert main(["check", str(tmp_path), "--accept", "left-out"]) == 1
+    assert "depth scale is set" in capsys.readouterr().out
+    assert main(["check", str(tmp_path), "--accept", "leftout"]) == 2
+    assert "did you mean left-out?" in capsys.readouterr().err

@@ -122,6 +122,20 @@ def test_a_recording_with_true_poses_tells_the_error_of_the_path(
     assert f"error beside the ground truth: ATE {report['ate_cm']:.2f} cm" in out
 
 
+def test_a_source_that_fails_keeps_what_was_mapped(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    truth = Trajectory(np.arange(6) * 0.1, np.tile(np.eye(4), (6, 1, 1)))
+    write_tum(folder / "drive", [frame_at(row, depth=True) for row in range(6)], truth)
+    cv2.imwrite("drive/rgb/004.png", np.zeros((24, 32, 3), np.uint8))
+
+    code = main(["map", "from-camera", "drive", *PLATFORM, "--out", "out"])
+
+    shown = capsys.readouterr()
+    assert code == 1
+    assert "finding ended-early: the source failed after 4 frames, which are kept" in shown.out
+    assert "is 32x24 px, the camera of the recording 320x240 px" in shown.err
+    assert len(read_trajectory(folder / "out/trajectory.txt")) == 4
+
+
 def test_a_path_without_scale_has_no_error_in_centimetres(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
