@@ -113,8 +113,12 @@ def closing_lines(report: Mapping[str, Any], folder: Path) -> str:
     shown = _relative(folder)
     files = f"{shown}/map.png, " if (folder / "map.png").exists() else ""
     third = ""
+    if _without_pose(report) > _MOST * report["frames"]:
+        third = f"failed: {_without_pose(report)} of {counted(report['frames'], 'frame')} have no pose\n"
+        if report["frames_before_start"]:
+            third += "a camera without depth begins once it has moved sideways, over things with texture\n"
     if "merged" in report:
-        third = merged_lines(report["merged"])
+        third += merged_lines(report["merged"])
         files = f"{shown}/map_merged.png, {shown}/merged.ply, "
         third += f"show the merged map: rse-pf map show merged --store dir:{shown}/platform/objects\n"
     for name, told in report.get("checks", {}).items():
@@ -130,8 +134,11 @@ def closing_lines(report: Mapping[str, Any], folder: Path) -> str:
 
 def is_lost(report: Mapping[str, Any]) -> bool:
     """Return whether a command got no answer, or most frames got no pose."""
-    without_pose = report["lost_frames"] + report["frames_before_start"]
-    return bool(report["commands"]["lost"] > 0 or without_pose > _MOST * report["frames"])
+    return bool(report["commands"]["lost"] > 0 or _without_pose(report) > _MOST * report["frames"])
+
+
+def _without_pose(report: Mapping[str, Any]) -> int:
+    return int(report["lost_frames"] + report["frames_before_start"])
 
 
 def advice(report: Mapping[str, Any]) -> str:

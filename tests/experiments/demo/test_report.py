@@ -105,9 +105,15 @@ def test_when_frames_are_lost_the_last_lines_say_what_helps(
     assert ("--rate" in advice(made)) == ("--rate above 5" in words)
 
 
-@pytest.mark.parametrize(("lost", "failed"), [(0, False), (5, False), (6, True), (10, True)])
-def test_a_run_that_loses_most_frames_has_failed(lost: int, failed: bool) -> None:
-    assert is_lost(with_lost(lost)) is failed
+@pytest.mark.parametrize(
+    ("lost", "before", "failed"), [(0, 0, False), (5, 0, False), (6, 0, True), (2, 3, False), (0, 10, True)]
+)
+def test_a_run_in_which_most_frames_have_no_pose_has_failed(lost: int, before: int, failed: bool) -> None:
+    made = {**with_lost(lost), "frames_before_start": before}
+    assert is_lost(made) is failed
+    assert (
+        f"failed: {lost + before} of 10 frames have no pose" in closing_lines(made, Path("out"))
+    ) is failed
 
 
 def test_a_run_without_answers_says_so_instead_of_none() -> None:
