@@ -45,7 +45,7 @@ from rse_pf.geometry import Array
 
 __all__ = ["FolderImages", "list_folder", "list_pairs"]
 
-_COLOUR_FOLDERS = ("rgb", "color", "colour", "image", "images")
+_COLOUR_FOLDERS = ("rgb", "color", "colour", "image", "images", "results")
 _DEPTH_FOLDERS = ("depth", "depths", "aligned_depth", "depth_image", "depth_images")
 _PERIOD_S = 0.1  # between images that state neither time nor rate
 _MAX_APART_S = 0.02  # of a colour and a depth image that are paired by time
@@ -125,7 +125,7 @@ def list_folder(folder: Path, rate_hz: float | None = None) -> FolderImages:
     depth_folder = _first_folder(folder, _DEPTH_FOLDERS)
     colours = image_files(inside)
     depths = [] if depth_folder is None else image_files(depth_folder)
-    if depth_folder is None:
+    if depth_folder is None or not depths:
         depths = [path for path in colours if "depth" in path.stem.lower()]
         colours = [path for path in colours if path not in set(depths)]
     if not colours:
@@ -188,13 +188,17 @@ def _listed(
 
 
 def _first_folder(folder: Path, names: Sequence[str]) -> Path | None:
-    return next((folder / name for name in names if (folder / name).is_dir()), None)
+    """Return the folder of the first of *names* that there is; ``rgb_0`` is a folder of ``rgb``."""
+    found = sorted((path for path in folder.iterdir() if path.is_dir()), reverse=True)
+    by_name = {path.name.lower().rstrip("_0123456789"): path for path in found}
+    return next((by_name[name] for name in names if name in by_name), None)
 
 
 def _joined(firsts: list[Path], seconds: list[Path]) -> list[tuple[int, int]]:
-    """Return rows of images that belong together by name, by numbers, by the last number, or by time."""
+    """Return rows of images that belong together by name, by numbers, by the last or first, or by time."""
     keys: tuple[Callable[[Path], Hashable], ...] = (
-        lambda path: path.stem, numbers_in_name, lambda path: numbers_in_name(path)[-1:],
+        lambda path: path.stem, numbers_in_name,
+        lambda path: numbers_in_name(path)[-1:], lambda path: numbers_in_name(path)[:1],
     )  # fmt: skip
     for key in keys:
         rows = {key(path): row for row, path in enumerate(seconds)}
