@@ -225,7 +225,9 @@ def _pair(
             facts, lambda log: ((stamp, left, None) for stamp, left, _ in pairs(log)), rig.left.lens, rate_hz,
             False, close, span_s,
         )  # fmt: skip
-    log = DoubtLog(check_source(facts))
+    right = rig.left if rig.right is None else rig.right
+    of_right = _facts_of_lens(facts.name, right.lens, f"the right camera of {facts.name}").cameras
+    log = DoubtLog(check_source(replace(facts, cameras=(*facts.cameras, *of_right))))
     about = SourceInfo(
         name=facts.name, camera=rig.left.lens.camera, has_stereo=True, notes=facts.assumed, log=log,
         span_s=span_s or facts.span_s,
