@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from client_sdk.source_facts import doubt_line
@@ -71,17 +71,18 @@ class DriveCheck:
         reference: MotionReference | None = None,
         offsets: Mapping[int, StereoAdjustment] | None = None,
         doubts: Sequence[Doubt] = (),
+        accepted: Iterable[str] = (),
     ) -> dict[str, Any] | None:
         """Return what ``report.json`` holds of the check; None if it was not wanted.
 
         *offsets* are what `Mapper.adjust_pairs` found in a stereo drive; *doubts* about the source are not
-        accepted by the user.
+        among the names that the user has *accepted*.
         """
         observer = self._observer
         if observer is not None:
             observer.reference = reference
             observer.add_offsets(offsets or {})
-            report = self._tried(lambda: observer.finish(doubts))
+            report = self._tried(lambda: observer.finish(doubts, accepted))
             if report is not None:
                 return report.to_dict()
         return {"failed": self._failed} if self._failed else None

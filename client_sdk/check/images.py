@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
 import numpy.typing as npt
 
 from client_sdk.check.findings import CannotTell, FaultKind, Finding
+from client_sdk.source_facts import Doubt, DoubtName
 from rse_pf.geometry import Array
 
 __all__ = ["FrameStatistics", "sharpness"]
@@ -23,6 +25,7 @@ _FEWEST_FRAMES = 10
 _LEAST_SHARE = {FaultKind.BLUR: 0.3, FaultKind.DARK: 0.05, FaultKind.REPEATED: 0.05, FaultKind.MISSING: 0.05}
 _LEAST_FRAMES = 3
 _STILL, _LONGEST_RUN = 0.3, 10
+_FROZEN_JUMP = 1.7  # times the usual change; a camera that was at rest drives on with less
 _NEAR_WHOLE, _LEAST_JITTER, _LONGEST_GAP = 0.15, 0.15, 50.0
 
 
@@ -120,6 +123,26 @@ class FrameStatistics:
             is_repeated[row + 1 : end] = end - row - 1 <= _LONGEST_RUN and after >= least
             end = row
         return is_repeated
+
+    def frozen(self) -> tuple[Doubt, ...]:
+        """Return a doubt about runs of one image that are longer than `repeated` takes, and end in a jump."""
+        change = np.array(self._change)
+        moving = change[(change > 0.0) & np.isfinite(change)]
+        ends = np.flatnonzero(change != 0.0)
+        runs = [
+            (last, end - last - 1)
+            for last, end in itertools.pairwise(ends)
+            if end - last - 1 > _LONGEST_RUN and change[end] > _FROZEN_JUMP * np.median(moving)
+        ]
+        if not runs:
+            return ()
+        row, length = max(runs, key=lambda run: run[1])
+        sentence = (
+            f"one image is repeated {length} times after {self._stamps_s[row]:.3f} s, with new time stamps, "
+            "and the next one shows another place"
+        )
+        hint = "look for a driver or a recorder that repeats its last image"
+        return (Doubt(name=DoubtName.FROZEN_IMAGES, sentence=sentence, hint=hint),)
 
     def _share(self, kind: FaultKind, rows: npt.NDArray[np.bool_], what: str, fix: str) -> Finding | None:
         n, count = len(rows), int(rows.sum())

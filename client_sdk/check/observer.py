@@ -6,7 +6,7 @@ Small things only are kept: figures of images, poses, features of some frames an
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Literal
 
 import numpy as np
@@ -24,10 +24,11 @@ from client_sdk.check.motion import (
     nothing_to_compare,
 )
 from client_sdk.check.pairs import PairsJudgement, judge_pairs
+from client_sdk.check.scene import SceneWatch, doubts_of_depth
 from client_sdk.frontend import Frame, TrackedFrame
 from client_sdk.imu.history import ImuHistory
 from client_sdk.rigs.checks import PairFault
-from client_sdk.source_facts import Doubt
+from client_sdk.source_facts import Doubt, unresolved
 from client_sdk.tracking.stereo_adjustment import StereoAdjustment
 from rse_pf.geometry import Array
 
@@ -50,6 +51,7 @@ class DriveObserver:
         self.reference = reference
         self._store = KeyframeStore()
         self._images = FrameStatistics(is_thinned=is_thinned)
+        self._scene = SceneWatch()
         self._history: ImuHistory | None = None
         self._poses: list[tuple[float, Array, int]] = []
         self._has_depth = self._has_stereo = self._is_metric = False
@@ -70,6 +72,8 @@ class DriveObserver:
         if frame.imu is not None and len(frame.imu):
             self._history = self._history or ImuHistory(frame.imu.model)
             self._history.add(frame.imu)
+        if tracked is not None:
+            self._scene.add(frame, tracked)
         if tracked is not None and tracked.T_world_camera is not None:
             self._is_metric = tracked.scale == "metric"
             self._poses.append((frame.timestamp_s, tracked.T_world_camera, tracked.segment))
@@ -82,12 +86,16 @@ class DriveObserver:
         """Take what `Mapper.adjust_pairs` found in a stereo drive, by segment, before `finish`."""
         self._pair_offsets = found
 
-    def finish(self, doubts: Sequence[Doubt] = ()) -> CheckReport:
+    def finish(self, doubts: Sequence[Doubt] = (), accepted: Iterable[str] = ()) -> CheckReport:
         """Return what is wrong with the drive, worst first, and what it cannot tell.
 
-        While there are *doubts* about the source, nothing is fitted to its frames: a calibration would be
-        fitted to the damage.
+        While there are *doubts* about the source or its images, but for those that are *accepted*, nothing is
+        fitted to the frames: a calibration would be fitted to the damage.
         """
+        seen = [*self._images.frozen(), *self._scene.doubts()]
+        if self._has_depth:
+            seen += doubts_of_depth(self._store.keyframes)
+        doubts = (*doubts, *unresolved(seen, accepted))
         if doubts:
             return CheckReport(frames=len(self._images), poses=len(self._poses), doubts=tuple(doubts))
         findings, untold = self._images.findings()

@@ -215,7 +215,7 @@ def _watched(
     if not mapper.frames:
         raise UsageError("the source gives no frame", hint="look at it: rse-pf camera check SOURCE")
     observer.add_offsets(mapper.adjust_pairs())
-    return observer.finish(unresolved(log.doubts, accepted))
+    return observer.finish(unresolved(log.doubts, accepted), accepted)
 
 
 def _until_it_fails(frames: Iterator[Frame], log: DoubtLog) -> Iterator[Frame]:

@@ -197,7 +197,7 @@ def map_source(
         source.log.add(ended_early(failed, mapper.frames))
     doubts = unresolved(source.log.doubts, args.accept)
     report = {**mapper.save(args.out), "assumed": list(source.notes)}
-    checked = check.finish(reference, mapper.adjust_pairs() if check.is_wanted else None, doubts)
+    checked = check.finish(reference, mapper.adjust_pairs() if check.is_wanted else None, doubts, args.accept)
     if about is not None:
         report = {**report, **about(mapper.trajectory)}
     if report["unit"] != "m" and report.get("ate_cm") is not None:

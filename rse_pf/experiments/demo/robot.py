@@ -284,7 +284,7 @@ def _checked(
     """Return what is wrong with the drive.  Its files are written: pairs may be adjusted."""
     offsets = mapper.adjust_pairs() if check.is_wanted and isinstance(mapper, Mapper) else {}
     reference = MotionReference.of_truth(loaded.truth, loaded.truth_kind, is_camera=False)
-    return check.finish(reference, offsets, unresolved(loaded.log.doubts, accepted))
+    return check.finish(reference, offsets, unresolved(loaded.log.doubts, accepted), accepted)
 
 
 def _is_metric(mapper: Mapper | LiveMapper) -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
 import cv2
@@ -78,3 +78,76 @@ def test_findings_of_all_judges_are_in_one_order(frames: list[Frame]) -> None:
     assert len(findings) >= 2
     assert findings == order(findings)
     assert findings[0].kind is FaultKind.DARK  # counted, and so better known than what is measured
+
+
+def dotted(frames: Sequence[Frame]) -> Iterator[Frame]:
+    """Lay the dots of a projector that moves with the camera over each second image."""
+    rng = np.random.default_rng(0)
+    dots = np.zeros(frames[0].rgb.shape[:2], np.int16)
+    for row, column in zip(*(rng.integers(1, side - 1, 4000) for side in dots.shape), strict=True):
+        dots[row - 1 : row + 2, column - 1 : column + 2] = 90
+    for row, frame in enumerate(frames):
+        rgb = frame.rgb * 0.6 + (row % 2) * dots[:, :, None]
+        yield replace(frame, rgb=np.clip(rgb, 0, 255).astype(np.uint8))
+
+
+def covered_in_part(frames: Sequence[Frame]) -> Iterator[Frame]:
+    """Show a part of the robot on the left, as the camera sees it at all times."""
+    for frame in frames:
+        rgb = frame.rgb.copy()
+        rgb[:, :160] = frames[0].rgb[:, :160]
+        yield replace(frame, rgb=rgb)
+
+
+def passed_by(frames: Sequence[Frame]) -> Iterator[Frame]:
+    """Let a textured box pass before a camera at rest."""
+    texture = np.random.default_rng(0).integers(0, 255, (80, 60, 3)).astype(np.uint8)
+    box = cv2.resize(texture, (360, frames[0].rgb.shape[0]), interpolation=cv2.INTER_NEAREST)
+    for row, frame in enumerate(frames):
+        rgb, first = frames[0].rgb.copy(), 14 * row - 340
+        shown = slice(max(0, first), max(0, min(rgb.shape[1], first + box.shape[1])))
+        rgb[:, shown] = box[:, shown.start - first : shown.stop - first]
+        yield replace(frame, rgb=rgb)
+
+
+def frozen(frames: Sequence[Frame]) -> Iterator[Frame]:
+    """Repeat one image 20 times."""
+    return (replace(frame, rgb=frames[20 if 20 <= row < 40 else row].rgb) for row, frame in enumerate(frames))
+
+
+def along_the_ray(frames: Sequence[Frame]) -> Iterator[Frame]:
+    """Measure depth along the ray of each pixel."""
+    camera = frames[0].camera
+    rows, columns = np.mgrid[: camera.height, : camera.width]
+    pixels = np.stack([columns, rows], axis=-1).reshape(-1, 2).astype(np.float64)
+    rays = np.linalg.norm(camera.back_project(pixels, np.ones(len(pixels))), axis=1).reshape(rows.shape)
+    return (replace(frame, depth_m=(frame.depth_m * rays).astype(np.float32)) for frame in frames)
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        (iter, []),
+        (dotted, ["static-pattern"]),
+        (covered_in_part, ["static-pattern"]),
+        (passed_by, ["moving-objects"]),
+        (frozen, ["frozen-images"]),
+        (along_the_ray, ["depth-along-ray"]),
+    ],
+)
+def test_what_is_wrong_in_the_view_is_found_and_silences_the_advice(
+    frames: list[Frame],
+    truth: Trajectory,
+    change: Callable[[Sequence[Frame]], Iterator[Frame]],
+    expected: list[str],
+) -> None:
+    observer = DriveObserver()
+    for frame, pose in zip(change(frames), truth.T_world_camera, strict=True):
+        tracked = TrackedFrame(frame=frame, T_world_camera=pose, keyframe=False, inliers=50, matches=60)
+        observer.add(frame, tracked)
+
+    report = observer.finish()
+
+    assert [doubt.name.value for doubt in report.doubts] == expected
+    assert not (report.doubts and report.findings)
+    assert not observer.finish(accepted=expected).doubts
